@@ -1,0 +1,93 @@
+"""Hessian blocks of the cells, and their gather into the value array of a matrix layout."""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from .matrices import matrix_functions
+
+
+@functools.cache
+def assembly_kernels(scalar: type) -> SimpleNamespace:
+    """Kernels that build the Hessian for one scalar type (``wp.float64`` or ``wp.float32``)."""
+    module = f"warp_resphys.{scalar.__name__}"
+    kernel = functools.partial(wp.kernel, module=module, enable_backward=False)
+    functions = matrix_functions(scalar)
+    mat33, vec3 = functions.mat33, functions.vec3
+    zero = scalar(0.0)
+
+    @kernel
+    def cell_blocks(
+        gradients: wp.array2d[vec3],
+        points_per_cell: int,
+        u_point: wp.array2d[mat33],
+        v_point: wp.array2d[mat33],
+        direct_point: wp.array2d[mat33],
+        normal_point: wp.array2d[mat33],
+        cross_point: wp.array2d[mat33],
+        geometric_point: wp.array2d[mat33],
+        block_offset: int,
+        blocks_out: wp.array2d[mat33],  # (B, C K (K + 1) / 2 from block_offset on) [N/m], rows a >= columns c
+    ):
+        """Block (a, c) of a cell: d force_a / d x_c, from the tangent in the SVD frame of each point."""
+        b, cell, a = wp.tid()
+        k = gradients.shape[1]
+        first = block_offset + cell * (k * (k + 1)) / 2 + (a * (a + 1)) / 2
+        for c in range(a + 1):
+            total = mat33(zero, zero, zero, zero, zero, zero, zero, zero, zero)
+            for q in range(points_per_cell):
+                p = cell * points_per_cell + q
+                ga = gradients[p, a]
+                gc = gradients[p, c]
+                u = u_point[b, p]
+                v = v_point[b, p]
+                direct = direct_point[b, p]
+                normal = normal_point[b, p]
+                cross = cross_point[b, p]
+                ha = ga @ v
+                hc = gc @ v
+                # dF' = e_k hc^T for a unit displacement of node c along u_k; force on a: dP' ha.
+                diagonal = direct * wp.cw_mul(ha, hc)
+                block = wp.cw_mul(normal, wp.outer(ha, hc)) + wp.cw_mul(cross, wp.outer(hc, ha))
+                block[0, 0] = diagonal[0]
+                block[1, 1] = diagonal[1]
+                block[2, 2] = diagonal[2]
+                total += u * block * wp.transpose(u)
+                g = wp.dot(ga, geometric_point[b, p] * gc)
+                total[0, 0] += g
+                total[1, 1] += g
+                total[2, 2] += g
+            blocks_out[b, first + c] = total
+
+    @kernel
+    def scatter_blocks(
+        block_start: wp.array[int],  # (blocks + 1) where a matrix block's contributions begin
+        contribution: wp.array[int],  # cell block, or -1 - cell block where it enters transposed
+        diagonal_vertex: wp.array[int],  # (blocks) the vertex of a diagonal block, else -1
+        address: wp.array2d[int],  # (blocks, 9) place in the layout's value array, or -1
+        cell_block: wp.array2d[mat33],
+        inertia: wp.array2d[scalar],  # (B, N) [N/m]
+        values_out: wp.array2d[scalar],  # (B, layout size) [N/m]
+    ):
+        b, block = wp.tid()
+        total = mat33(zero, zero, zero, zero, zero, zero, zero, zero, zero)
+        for entry in range(block_start[block], block_start[block + 1]):
+            source = contribution[entry]
+            if source >= 0:
+                total += cell_block[b, source]
+            else:
+                total += wp.transpose(cell_block[b, -1 - source])
+        i = diagonal_vertex[block]
+        if i >= 0:
+            k = inertia[b, i]
+            total[0, 0] += k
+            total[1, 1] += k
+            total[2, 2] += k
+        for r in range(3):
+            for c in range(3):
+                at = address[block, 3 * r + c]
+                if at >= 0:
+                    values_out[b, at] = total[r, c]
+
+    return SimpleNamespace(cell_blocks=cell_blocks, scatter_blocks=scatter_blocks)

@@ -1,0 +1,275 @@
+import logging
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+import types
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from warp_resphys import cli
+from warp_resphys.errors import InputError
+from warp_resphys.stages import StageInterrupted
+
+REPOSITORY = Path(__file__).parents[1]
+CONFIG = {
+    "config.yaml": """
+        defaults:
+          - _self_
+          - material: soft
+          - experiment: beam
+          - override hydra/job_logging: none
+          - override hydra/hydra_logging: none
+        name: none
+        seed: 0
+        hydra:
+          run: {dir: "runs/${name}/${run_label:${hydra:overrides.task},[experiment]}"}
+          sweep: {dir: "runs/${name}", subdir: "${run_label:${hydra:overrides.task},[experiment]}"}
+        """,
+    "material/soft.yaml": "{density: 1070.0, model: {youngs_modulus: 264e3}}",
+    "material/stiff.yaml": "{density: 2000.0}",
+    "experiment/beam.yaml": "# @package _global_\nname: beam",
+    "experiment/beam_twist.yaml": "# @package _global_\nname: beam_twist",
+}
+
+
+@pytest.fixture
+def config_dir(tmp_path: Path) -> Path:
+    for name, text in CONFIG.items():
+        path = tmp_path / "conf" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(textwrap.dedent(text))
+    return tmp_path / "conf"
+
+
+class Command:
+    """Runs `warp-resphys` in this process, with a job of the test's choice."""
+
+    def __init__(
+        self, config_dir: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        self.job: Callable[[DictConfig], object] = lambda config: None
+        self.outputs: list[str] = []
+        self.arguments = ["warp-resphys", "--config-path", str(config_dir)]
+        self.monkeypatch, self.capsys = monkeypatch, capsys
+        tasks = types.ModuleType("warp_resphys.tasks")
+        tasks.run = self.run  # type: ignore[attr-defined]
+        monkeypatch.setitem(sys.modules, "warp_resphys.tasks", tasks)
+        monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+
+    def run(self, config: DictConfig) -> object:
+        self.outputs.append(os.path.relpath(HydraConfig.get().runtime.output_dir))
+        return self.job(config)
+
+    def __call__(self, *arguments: str) -> tuple[int, str]:
+        self.monkeypatch.setattr(sys, "argv", [*self.arguments, *arguments])
+        self.outputs.clear()
+        code = 0
+        try:
+            cli.main()
+        except SystemExit as end:
+            code = end.code
+        return code, self.capsys.readouterr().err
+
+
+@pytest.fixture
+def command(config_dir, tmp_path, monkeypatch, capsys) -> Command:
+    monkeypatch.chdir(tmp_path)
+    return Command(config_dir, monkeypatch, capsys)
+
+
+class TestRunFolder:
+    def test_it_is_the_same_for_the_same_overrides_alone_and_in_a_sweep(self, command):
+        assert command() == (0, "")
+        assert command.outputs == ["runs/beam/default"]
+        command("seed=3", "material.density=900", "experiment=beam_twist")
+        assert command.outputs == ["runs/beam_twist/material.density=900,seed=3"]
+        assert command("--multirun", "experiment=beam,beam_twist", "material.density=900", "seed=3")[0] == 0
+        assert command.outputs == [
+            f"runs/{name}/material.density=900,seed=3" for name in ("beam", "beam_twist")
+        ]
+
+    def test_the_working_folder_stays(self, command, tmp_path):
+        folders = []
+        command.job = lambda config: folders.append(Path.cwd())
+        command()
+        assert folders == [tmp_path]
+
+    def test_labels(self):
+        assert cli.run_label([]) == "default"
+        assert cli.run_label(["device=cuda", "+extra.device=cpu"], ["device", "extra.device"]) == "default"
+        assert cli.run_label(["b=2", "a.c=1e-3", "~d"]) == "a.c=1e-3,b=2,~d"
+        assert cli.run_label(["a=2", "a=1"]) == "a=1"
+        awkward = [cli.run_label([f"a={value}"]) for value in ("x/y", "x y", "x" * 300, "x" * 301)]
+        assert len(set(awkward)) == 4
+        assert all(set(label) <= set("axy=-0123456789abcdef") and len(label) < 120 for label in awkward)
+
+
+class TestUserErrors:
+    @pytest.mark.parametrize(
+        ("arguments", "sentence"),
+        [
+            ("experiment=beam_twst", "unknown experiment 'beam_twst', did you mean 'beam_twist'"),
+            ("experiment=zzz", "unknown experiment 'zzz'; known are beam, beam_twist"),
+            ("sed=1", "unknown key 'sed', did you mean 'seed'? (--cfg job lists all keys"),
+            (
+                "youngs_modulus=1",
+                "unknown key 'youngs_modulus', did you mean 'material.model.youngs_modulus'?",
+            ),
+            ("material.densty=1", "unknown key 'material.densty', did you mean 'material.density'"),
+            ("--multirun sed=1,2", "unknown key 'sed', did you mean 'seed'"),
+            ("seed=[1", "cannot read the override 'seed=[1'"),
+            ("seed", "cannot read the override 'seed'"),
+            ("seed=${nothing}", "Interpolation key 'nothing' not found"),
+            ("+seed=1", "Could not append to config. An item is already at 'seed'."),
+            ("hydra.run.dir=conf/config.yaml", "cannot write conf/config.yaml (File exists)"),
+            ("--config-name other", "Cannot find primary config 'other'."),
+            ("--config-dir nowhere", "Additional config directory"),
+            ("--cfg job --run", "Only one of --run"),
+            ("--experimental-rerun config.pickle", "--experimental-rerun reads a pickle"),
+        ],
+    )
+    def test_command_line(self, command, arguments, sentence):
+        code, errors = command(*arguments.split(" "))
+        assert code == 2
+        assert errors.startswith(f"error: {sentence}")
+        assert errors.count("\n") == 1
+        assert command.outputs == []
+
+    def test_of_the_job(self, command):
+        def fail(config: DictConfig) -> None:
+            raise InputError(f"density is {config.material.density}: choose a positive one")
+
+        command.job = fail
+        assert command("material.density=-1") == (2, "error: density is -1: choose a positive one\n")
+
+    def test_key_that_the_job_misses(self, command):
+        command.job = lambda config: config.material.model.poissons_ratio
+        assert command() == (
+            2,
+            "error: Key 'poissons_ratio' is not in struct (at material.model.poissons_ratio)\n",
+        )
+
+    def test_full_disk_outside_of_our_own_files(self, command):
+        def fail(config: DictConfig) -> None:
+            raise OSError(28, "No space left on device", "picture.png")
+
+        command.job = fail
+        code, errors = command()
+        assert (code, errors.partition(":")[2]) == (
+            2,
+            " disk is full while writing picture.png: free some space and run the same command again\n",
+        )
+
+    def test_inside_an_instantiated_object(self, command):
+        command.job = lambda config: __import__("hydra").utils.instantiate({"_target_": f"{__name__}.refuse"})
+        assert command() == (2, "error: no such body\n")
+
+    def test_in_a_sweep_the_other_jobs_run_and_each_error_is_told_once(self, command):
+        def fail(config: DictConfig) -> None:
+            if config.seed != 2:
+                raise InputError(f"seed {config.seed} is bad")
+
+        command.job = fail
+        code, errors = command("--multirun", "seed=1,2,3")
+        assert code == 2
+        assert len(command.outputs) == 3
+        assert [line for line in errors.splitlines() if line.startswith("error: ")] == [
+            "error: seed 1 is bad",
+            "error: seed 3 is bad",
+        ]
+        assert "Traceback" not in errors
+
+
+def refuse() -> None:
+    raise InputError("no such body")
+
+
+class TestOtherEnds:
+    def test_faults_of_the_program_keep_their_traceback(self, command, monkeypatch):
+        command.job = lambda config: 1 / 0
+        with pytest.raises(ZeroDivisionError):
+            command()
+        command.job = lambda config: Path("missing").read_text()
+        with pytest.raises(FileNotFoundError):
+            command()
+        command.job = lambda config: refuse()
+        monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+        with pytest.raises(InputError):
+            command()
+        assert os.environ["HYDRA_FULL_ERROR"] == "1"
+
+    def test_nothing_global_is_left_changed(self, command):
+        before = logging.raiseExceptions
+        command("sed=1")
+        assert "HYDRA_FULL_ERROR" not in os.environ
+        assert logging.raiseExceptions == before
+
+    @pytest.mark.parametrize("mode", ["--run", "--multirun"])
+    def test_interruption(self, command, mode):
+        def interrupt(config: DictConfig) -> None:
+            raise StageInterrupted("interrupted in stage 'train'; the same command goes on")
+
+        command.job = interrupt
+        assert command(mode, "seed=1,2" if mode == "--multirun" else "seed=1") == (
+            130,
+            "\ninterrupted in stage 'train'; the same command goes on\n",
+        )
+        assert len(command.outputs) == 1
+
+    def test_scripts_share_it(self, command, monkeypatch, capsys):
+        seeds = []
+
+        @cli.hydra_entry("config")
+        def check(config: DictConfig) -> None:
+            seeds.append(config.seed)
+            raise InputError("bad gradient")
+
+        monkeypatch.setattr(sys, "argv", [*command.arguments, "seed=5"])
+        with pytest.raises(SystemExit) as end:
+            check()
+        assert (end.value.code, seeds) == (2, [5])
+        assert capsys.readouterr().err == "error: bad gradient\n"
+
+
+class TestProcess:
+    def start(self, config_dir: Path, before: str, *arguments: str) -> subprocess.Popen:
+        program = f"{textwrap.dedent(before)}\nfrom warp_resphys.cli import main\nmain()"
+        command = [sys.executable, "-c", program, "--config-path", str(config_dir), *arguments]
+        environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+        return subprocess.Popen(command, env=environment, cwd=config_dir.parent, text=True, **pipes)
+
+    def test_help_is_quick_and_imports_nothing_heavy(self, config_dir):
+        heavy = """
+            import sys
+            for name in ("torch", "warp", "scipy", "pyvista", "matplotlib"):
+                sys.modules[name] = None  # importing it fails
+        """
+        start = time.perf_counter()
+        out, err = self.start(config_dir, heavy, "--help").communicate(timeout=20)
+        assert time.perf_counter() - start < 2.0
+        assert "experiment: beam, beam_twist" in out
+        assert err == ""
+
+    def test_ctrl_c(self, config_dir):
+        sleeping = """
+            import signal, sys, time, types
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+            def run(config):
+                print("running", flush=True)
+                time.sleep(60)
+            sys.modules["warp_resphys.tasks"] = types.ModuleType("tasks")
+            sys.modules["warp_resphys.tasks"].run = run
+        """
+        child = self.start(config_dir, sleeping)
+        assert child.stdout.readline() == "running\n"
+        child.send_signal(signal.SIGINT)
+        assert child.wait(timeout=20) == 130
+        assert child.stderr.read() == "\ninterrupted\n"

@@ -1,0 +1,216 @@
+"""The console command `warp-resphys`, and what it shares with the scripts: Hydra, errors in one sentence."""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import hashlib
+import logging
+import os
+import re
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import (
+    HydraException,
+    InstantiationException,
+    MissingConfigException,
+    OverrideParseException,
+)
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+
+from warp_resphys.errors import ResphysError
+from warp_resphys.files import is_disk_full
+
+CONFIG_PACKAGE = "pkg://warp_resphys.conf"
+USER_ERROR = 2
+INTERRUPTED = 130
+_LABEL_LENGTH = 100
+
+
+def hydra_entry(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Callable[[], None]]:
+    """Turns a function of a configuration into a command that is configured by Hydra.
+
+    The command ends with exit code 2 and one sentence on stderr where the user can mend what is wrong, with
+    130 after Ctrl-C, and with 1 and a traceback for everything else. With HYDRA_FULL_ERROR=1 in the
+    environment, every error keeps its traceback.
+
+    Args:
+        config_name: Name of a configuration in the package warp_resphys.conf.
+    """
+
+    def decorate(job: Callable[[DictConfig], Any]) -> Callable[[], None]:
+        @functools.wraps(job)
+        def command() -> None:
+            _run_command(job, config_name)
+
+        return command
+
+    return decorate
+
+
+@hydra_entry("config")
+def main(config: DictConfig) -> Any:
+    """Runs the configured experiment: the console command `warp-resphys`."""
+    from warp_resphys.tasks import run
+
+    return run(config)
+
+
+def _run_command(job: Callable[[DictConfig], Any], config_name: str) -> None:
+    """Runs a job under Hydra and exits with the code that fits its outcome."""
+    reported: list[BaseException] = []
+    started = False
+
+    @functools.wraps(job)
+    def reporting_job(config: DictConfig) -> Any:
+        nonlocal started
+        started = True
+        try:
+            return job(config)
+        except Exception as error:
+            sentence = _explain(error, started)
+            if sentence is None or full_error:
+                raise
+            print(f"error: {sentence}", file=sys.stderr, flush=True)
+            reported.append(error)
+            if HydraConfig.get().mode == RunMode.RUN:
+                raise SystemExit(USER_ERROR) from error
+            raise
+
+    full_error = os.environ.get("HYDRA_FULL_ERROR") == "1"
+    raise_exceptions = logging.raiseExceptions
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra hands errors on instead of printing them and leaving
+    logging.raiseExceptions = False  # a log file on a full disk must not fill the screen with tracebacks
+    OmegaConf.register_new_resolver("run_label", run_label, replace=True)
+    try:
+        if any(argument.startswith("--experimental-rerun") for argument in sys.argv[1:]):
+            raise HydraException("--experimental-rerun reads a pickle, which can run code: use overrides")
+        hydra.main(version_base="1.3", config_path=CONFIG_PACKAGE, config_name=config_name)(reporting_job)()
+    except KeyboardInterrupt as error:
+        print(f"\n{error}" if str(error) else "\ninterrupted", file=sys.stderr, flush=True)
+        raise SystemExit(INTERRUPTED) from None
+    except Exception as error:
+        sentence = _explain(error, started)
+        if sentence is None or full_error:
+            raise
+        if not any(error is known for known in reported):
+            print(f"error: {sentence}", file=sys.stderr, flush=True)
+        raise SystemExit(USER_ERROR) from None
+    finally:
+        logging.raiseExceptions = raise_exceptions
+        if not full_error:
+            del os.environ["HYDRA_FULL_ERROR"]
+
+
+def _explain(error: BaseException, started: bool) -> str | None:
+    """The sentence to print for an error that the user can mend; None for a fault of the program.
+
+    Args:
+        error: What was raised.
+        started: Whether the job had begun; before that, it is the command line that is wrong.
+    """
+    if isinstance(error, ResphysError):
+        return str(error)
+    if isinstance(error, InstantiationException) and error.__cause__ is not None:
+        return _explain(error.__cause__, started)
+    if isinstance(error, MissingConfigException):
+        return _explain_missing(error)
+    cause = error.__cause__
+    if isinstance(error, HydraException) and isinstance(cause, (ConfigAttributeError, ConfigKeyError)):
+        return _explain_key(error, cause)
+    if isinstance(error, OverrideParseException):
+        return f"cannot read the override {error.override!r} ({_sentence(error)}): write key=value"
+    if isinstance(error, (HydraException, OmegaConfBaseException)):
+        return _sentence(error)
+    if is_disk_full(error):
+        name = getattr(error, "filename", None)
+        place = f" while writing {name}" if name else ""
+        return f"disk is full{place}: free some space and run the same command again"
+    if isinstance(error, OSError) and not started:
+        return f"cannot write {error.filename} ({error.strerror}): choose another run folder"
+    if isinstance(error, ValueError) and not started:
+        return _sentence(error)
+    return None
+
+
+def _explain_missing(error: MissingConfigException) -> str:
+    """Names the options of a group where one was asked for that does not exist."""
+    if error.missing_cfg_file is None or not error.options:
+        return _sentence(error)
+    group, _, option = error.missing_cfg_file.rpartition("/")
+    known = ", ".join(error.options)
+    return f"unknown {group} '{option}'{_did_you_mean(option, error.options)}; known are {known}"
+
+
+def _explain_key(error: HydraException, cause: OmegaConfBaseException) -> str:
+    """Names the closest keys where one was set that does not exist."""
+    named = re.search(r"'([^']+)'", str(error))
+    wanted = named.group(1) if named else str(cause.full_key)
+    root = {} if cause.parent_node is None else OmegaConf.to_container(cause.parent_node._get_root())
+    known = [key for key in _keys(root) if key.partition(".")[0] != "hydra"]
+    same_name = [key for key in known if key.rpartition(".")[2] == wanted.rpartition(".")[2]]
+    hint = _did_you_mean(wanted, known, preferred=same_name)
+    return f"unknown key '{wanted}'{hint} (--cfg job lists all keys, +{wanted}=... adds a new one)"
+
+
+def _keys(config: Any, prefix: str = "") -> Iterator[str]:
+    """The dotted names of all entries of a configuration."""
+    if isinstance(config, dict):
+        for key, value in config.items():
+            yield f"{prefix}{key}"
+            yield from _keys(value, f"{prefix}{key}.")
+
+
+def _did_you_mean(wanted: str, known: Sequence[str], preferred: Sequence[str] = ()) -> str:
+    matches = list(preferred[:3]) or difflib.get_close_matches(wanted, known, n=3, cutoff=0.6)
+    return f", did you mean {' or '.join(repr(match) for match in matches)}?" if matches else ""
+
+
+def _sentence(error: BaseException) -> str:
+    """The message of a library in one line, without the parts that do not help."""
+    text = re.split(
+        r"\n\s*(?:Config search|Search path|full_key|object_type|reference_type|See )", str(error)
+    )[0]
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    if isinstance(error, OmegaConfBaseException) and error.full_key and error.full_key not in lines[0]:
+        lines.append(f"(at {error.full_key})")
+    if isinstance(error.__cause__, (OmegaConfBaseException, ResphysError)):
+        lines.append(f"({_sentence(error.__cause__)})")
+    return " ".join(lines)
+
+
+def run_label(overrides: Sequence[str], excluded: Sequence[str] = ()) -> str:
+    """Names a run folder after the overrides that tell it from the default run; an OmegaConf resolver.
+
+    The same overrides give the same name in any order, so that a repeated command finds its own files.
+
+    Args:
+        overrides: Hydra's task overrides, such as "material.density=900".
+        excluded: Keys that do not change the results, or that the folder is named after elsewhere.
+
+    Returns:
+        "key=value,key=value" sorted by key, "default" where nothing is left. Long names, and names with
+        characters that a folder should not have, are made fit and end in a hash of the whole.
+    """
+    settings = {}
+    for override in overrides:
+        key, _, value = override.partition("=")
+        if key.lstrip("+~") not in excluded:
+            settings[key] = f"{key}={value}" if value else key
+    whole = ",".join(settings[key] for key in sorted(settings))
+    if not whole:
+        return "default"
+    label = re.sub(r"[^A-Za-z0-9._=,+~-]", "-", whole)
+    if label == whole and len(label) <= _LABEL_LENGTH:
+        return label
+    return f"{label[:_LABEL_LENGTH]}-{hashlib.sha256(whole.encode()).hexdigest()[:8]}"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,33 @@
+"""What can go wrong in a way that the user can mend: one sentence each, exit code 2 on the command line."""
+
+from typing import Any
+
+
+class ResphysError(Exception):
+    """Base of every error whose message is written for the user: what was wrong, where, and what to do."""
+
+
+class InputError(ResphysError, ValueError):
+    """An argument or a configured value that cannot be simulated."""
+
+
+class MeshError(InputError):
+    """A mesh that cannot be read, or that a finite-element method cannot use."""
+
+
+class DataFileError(ResphysError):
+    """A data file that is missing, truncated, foreign or cannot be written."""
+
+
+class ConvergenceError(ResphysError, RuntimeError):
+    """A solve that stopped short of its tolerance.
+
+    Attributes:
+        positions: (B, N, 3) [m] the last iterate, on its device.
+        report: iterations, residual and convergence of each environment.
+    """
+
+    def __init__(self, message: str, positions: Any, report: Any) -> None:
+        super().__init__(message)
+        self.positions = positions
+        self.report = report

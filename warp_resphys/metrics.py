@@ -1,0 +1,160 @@
+"""Roll-out errors as the experiments define them, and the published numbers that stand beside them."""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Final, NamedTuple, TypedDict
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from warp_resphys.errors import InputError
+
+MILLIMETRES_PER_METRE: Final = 1e3
+
+
+class PublishedError(NamedTuple):
+    """A published roll-out error [mm]: mean and standard deviation over the authors' test trajectories."""
+
+    mean: float
+    std: float
+
+
+class ErrorSummary(TypedDict):
+    """One model's roll-out error [mm] on one split, ready for `metrics.json`.
+
+    `mean` and `std` are None when a roll-out diverged: a mean over the survivors would flatter the model.
+    """
+
+    mean: float | None
+    std: float | None
+    trajectories: int
+    diverged: int
+
+
+# J. Gao, M. Y. Michelis, A. Spielberg, R. K. Katzschmann, "Sim-to-Real of Soft Robots with Learned Residual
+# Physics", IEEE Robotics and Automation Letters, 2024: the tables of sim-to-sim results (beam_oscillation,
+# beam_twist), the sim-to-real results (beam_real, sopra) and the extrapolation to 10 s after training on 5 s.
+PUBLISHED_MM: Final[Mapping[str, Mapping[str, PublishedError]]] = {
+    "beam_oscillation": {
+        "simulation": PublishedError(4.488, 1.468),
+        "simfree": PublishedError(0.035, 0.070),
+        "resphys": PublishedError(0.004, 0.010),
+    },
+    "beam_twist": {
+        "simulation": PublishedError(4.362, 1.541),
+        "simfree": PublishedError(0.038, 0.147),
+        "resphys": PublishedError(0.004, 0.011),
+    },
+    "beam_real": {
+        "simulation": PublishedError(5.46, 1.78),
+        "sysid": PublishedError(1.32, 1.38),
+        "simfree": PublishedError(0.63, 0.49),
+        "resphys": PublishedError(0.52, 0.48),
+    },
+    "sopra": {
+        "simulation": PublishedError(7.50, 3.69),
+        "sysid": PublishedError(7.31, 3.54),
+        "simfree": PublishedError(8.35, 4.03),
+        "resphys": PublishedError(5.77, 3.00),
+    },
+    "sopra_extrapolation": {
+        "sysid": PublishedError(7.57, 3.59),
+        "simfree": PublishedError(9.89, 5.02),
+        "resphys": PublishedError(6.10, 3.22),
+    },
+}
+
+
+def trajectory_errors(positions: ArrayLike, target: ArrayLike) -> NDArray[np.float64]:
+    """Return the error of one roll-out at each step: the mean distance of its vertices from the target's.
+
+    State 0 is given to the roll-out, so it is left out. A roll-out that diverged keeps its non-finite values,
+    and a caller that stopped one early pads it with NaN: `summarise` counts both.
+
+    Args:
+        positions: (T+1, N, 3) simulated vertices or markers [m], states 0 to T.
+        target: (T+1, N, 3) where they should have been [m].
+
+    Returns:
+        (T,) errors [mm] of the steps 1 to T.
+
+    Raises:
+        InputError: The shapes differ or are not (T+1, N, 3), or the target is not finite.
+    """
+    simulated = np.asarray(positions, dtype=np.float64)  # (T+1, N, 3) [m]
+    wanted = np.asarray(target, dtype=np.float64)  # (T+1, N, 3) [m]
+    if (
+        simulated.shape != wanted.shape
+        or simulated.ndim != 3
+        or simulated.shape[2] != 3
+        or len(simulated) < 2
+    ):
+        raise InputError(
+            f"cannot compare positions of shape {simulated.shape} with a target of shape {wanted.shape}: "
+            "both must be (steps + 1, vertices, 3)"
+        )
+    if not np.isfinite(wanted).all():
+        state = int(np.argwhere(~np.isfinite(wanted))[0, 0])
+        raise InputError(
+            f"the target trajectory is not finite at state {state}: leave out what was not observed"
+        )
+    with np.errstate(over="ignore", invalid="ignore"):  # A diverged roll-out reaches inf, and inf - inf.
+        distance = np.linalg.norm(simulated[1:] - wanted[1:], axis=2)  # (T, N) [m]
+        return np.asarray(distance.mean(axis=1) * MILLIMETRES_PER_METRE)
+
+
+def summarise(errors: Iterable[NDArray[np.float64]]) -> ErrorSummary:
+    """Return the mean error over trajectories, steps and vertices, with its standard deviation.
+
+    The mean is E_q of the published source. The deviation is over trajectories and steps, of the mean over
+    the vertices.
+
+    Args:
+        errors: One (T,) array [mm] a trajectory, as `trajectory_errors` returns it; T may differ.
+
+    Raises:
+        InputError: There is no trajectory, or one has no step.
+    """
+    rows = [np.asarray(each, dtype=np.float64) for each in errors]
+    if not rows or any(row.size == 0 for row in rows):
+        raise InputError(
+            "no roll-out error to summarise: the test split needs a trajectory of at least one step"
+        )
+    diverged = sum(not np.isfinite(row).all() for row in rows)
+    pooled = np.concatenate(rows)  # (sum of T,) [mm]
+    return {
+        "mean": None if diverged else float(pooled.mean()),
+        "std": None if diverged else float(pooled.std()),
+        "trajectories": len(rows),
+        "diverged": diverged,
+    }
+
+
+def summarise_each(
+    names: Sequence[str], errors: Mapping[str, Iterable[NDArray[np.float64]]]
+) -> list[dict[str, Any]]:
+    """Return what `metrics.json` lists under `per_trajectory`: the mean error of every model on each.
+
+    Args:
+        names: R names of the trajectories.
+        errors: For each model R arrays (T,) [mm], or one (R, T).
+
+    Returns:
+        R entries `{"name": ..., "errors_mm": {model: mean [mm], or None where the roll-out diverged}}`.
+
+    Raises:
+        InputError: A model has another number of trajectories than there are names.
+    """
+    means = {model: [_finite_mean(row) for row in rows] for model, rows in errors.items()}
+    for model, rows in means.items():
+        if len(rows) != len(names):
+            raise InputError(f"{model} has {len(rows)} roll-outs for {len(names)} test trajectories")
+    return [
+        {"name": name, "errors_mm": {model: rows[index] for model, rows in means.items()}}
+        for index, name in enumerate(names)
+    ]
+
+
+def _finite_mean(values: NDArray[np.float64]) -> float | None:
+    mean = float(np.mean(values))
+    return mean if math.isfinite(mean) else None

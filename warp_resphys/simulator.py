@@ -1,0 +1,354 @@
+"""Batched, differentiable simulation of one body."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import scipy.sparse
+import torch
+
+from .body import Body
+from .equilibrium import Equilibrium, GreenStrain, Workspace
+from .errors import InputError
+from .integrator import ImplicitStage, State, make_integrator
+from .material import MODELS, Material, as_parameter
+from .potential import BlockPattern
+from .solver import SolveReport, SolverSettings
+
+GRAVITY = (0.0, 0.0, -9.80709)
+
+
+@dataclass(frozen=True)
+class MaterialTensors:
+    """What a material makes of a body: differentiable tensors, computed once a roll-out.
+
+    Attributes:
+        shape_stiffness: (1 or B, P) [J].
+        volume_stiffness: (1 or B, P) [J].
+        mass: (1 or B, N) [kg].
+        weight: (1 or B, N, 3) force of gravity [N].
+        mass_damping: (1 or B, 1) [1/s].
+        stiffness_damping: (1 or B,) [s].
+        damped: whether stiffness damping acts at all.
+    """
+
+    shape_stiffness: torch.Tensor
+    volume_stiffness: torch.Tensor
+    mass: torch.Tensor
+    weight: torch.Tensor
+    mass_damping: torch.Tensor
+    stiffness_damping: torch.Tensor
+    damped: bool
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Result of a roll-out.
+
+    Attributes:
+        q: (T + 1, B, N, 3) positions, the start included [m].
+        v: (T + 1, B, N, 3) velocities [m/s].
+        reports: T outcomes of the solver.
+        final: the last state, from which a further roll-out goes on.
+    """
+
+    q: torch.Tensor
+    v: torch.Tensor
+    reports: list[SolveReport]
+    final: State
+
+
+@dataclass
+class Simulator:
+    """Steps a body through time.
+
+    Args:
+        body: what is simulated.
+        material: its constants; every method takes another one by keyword.
+        time_step: h [s].
+        gravity: acceleration (3,) [m/s^2].
+        integrator: ``implicit_euler``, ``bdf2`` or ``midpoint``.
+        solver: a name, or `SolverSettings`.
+        relative_tolerance: shorthand for that field of the settings.
+        device: a torch device.
+        dtype: ``torch.float64`` or ``torch.float32``.
+
+    Raises:
+        InputError: a time step that is not positive, an unknown integrator or solver, or a CUDA device that is not there.
+    """
+
+    body: Body
+    material: Material = field(default_factory=Material)
+    time_step: float = 0.01
+    gravity: Sequence[float] = GRAVITY
+    integrator: str = "implicit_euler"
+    solver: str | SolverSettings = "quasi_newton"
+    relative_tolerance: float | None = None
+    device: str | torch.device = "cpu"
+    dtype: torch.dtype = torch.float64
+
+    def __post_init__(self) -> None:
+        """Uploads what is constant."""
+        if not (np.isfinite(self.time_step) and self.time_step > 0.0):
+            raise InputError(f"time_step is {self.time_step:g}: it must be positive, in seconds.")
+        if self.dtype not in (torch.float64, torch.float32):
+            raise InputError(f"dtype is {self.dtype}: choose torch.float64 or torch.float32.")
+        self.device = torch.device(self.device)
+        if self.device.type == "cuda" and not torch.cuda.is_available():
+            raise InputError("device is 'cuda', but torch finds no CUDA device: choose device=cpu.")
+        settings = SolverSettings(name=self.solver) if isinstance(self.solver, str) else self.solver
+        if self.relative_tolerance is not None:
+            settings = replace(settings, relative_tolerance=self.relative_tolerance)
+        self.settings = settings
+        self._method = make_integrator(self.integrator)
+        self._pattern = BlockPattern(self.body)
+        self._gravity = self.tensor(self.gravity)
+        self.rest_positions = self.tensor(self.body.mesh.vertices)  # (N, 3) [m]
+        self.fixed = torch.as_tensor(self.body.fixed_vertices, device=self.device)
+        self._workspaces: dict[tuple[int, str], Workspace] = {}
+        sets = self.body.discretisation.point_sets
+        self._shape_volume = self._sparse(scipy.sparse.vstack([s.shape_volume for s in sets]))
+        self._volume_volume = self._sparse(scipy.sparse.vstack([s.volume_volume for s in sets]))
+        self._mass_volume = self._sparse(self.body.mass_volume)
+        self._load_volume = self._sparse(self.body.load_volume)
+        self._attached_mass = self.tensor(self.body.attached_mass)
+
+    def tensor(self, values: object) -> torch.Tensor:
+        """Values on the simulator's device, in its type."""
+        return torch.as_tensor(values, device=self.device, dtype=self.dtype)
+
+    def _sparse(self, matrix: scipy.sparse.sparray) -> torch.Tensor:
+        coo = matrix.tocoo()
+        indices = torch.as_tensor(np.stack([coo.row, coo.col]).astype(np.int64))
+        tensor = torch.sparse_coo_tensor(indices, torch.as_tensor(coo.data), coo.shape, check_invariants=False)
+        return tensor.to(device=self.device, dtype=self.dtype).coalesce()
+
+    def _spread(self, operator: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+        """(1 or B, rows): a sparse (rows, M) operator applied to (1 or B, 1 or M) element values."""
+        m = operator.shape[1]
+        if values.shape[1] not in (1, m):
+            raise InputError(
+                f"a material parameter has {values.shape[1]} values for {m} elements: give one value, one an element "
+                f"({m}), or one an environment with shape (B, 1)."
+            )
+        return torch.sparse.mm(operator, values.expand(-1, m).mT).mT
+
+    def prepare(self, material: Material | None = None) -> MaterialTensors:
+        """Turns a material into stiffness, mass and weight; pass the result to `step` when stepping one by one."""
+        material = self.material if material is None else material
+        device = torch.device(self.device)
+        mu, lame_lambda = material.lame(device, self.dtype)
+        density = as_parameter(material.density, device, self.dtype)
+        mass = self._spread(self._mass_volume, density) + self._attached_mass
+        loaded = self._spread(self._load_volume, density) + self._attached_mass
+        damping = self.tensor(material.stiffness_damping).reshape(-1)
+        damped = bool((damping > 0).any()) or damping.requires_grad
+        return MaterialTensors(
+            shape_stiffness=self._spread(self._shape_volume, mu.broadcast_to(self._common(mu, lame_lambda))),
+            volume_stiffness=self._spread(self._volume_volume, lame_lambda),
+            mass=mass,
+            weight=loaded[..., None] * self._gravity,
+            mass_damping=self.tensor(material.mass_damping).reshape(-1, 1),
+            stiffness_damping=damping,
+            damped=damped,
+        )
+
+    @staticmethod
+    def _common(*tensors: torch.Tensor) -> torch.Size:
+        return torch.broadcast_shapes(*(t.shape for t in tensors))
+
+    def workspace(self, batch: int, model: str | None = None) -> Workspace:
+        """Buffers for a batch size, made at its first use."""
+        key = (batch, model or self.material.model)
+        if key not in self._workspaces:
+            self._workspaces[key] = Workspace(
+                self.body, MODELS[key[1]], self._pattern, batch, torch.device(self.device), self.dtype
+            )
+        return self._workspaces[key]
+
+    def rest_state(self, batch: int = 1) -> State:
+        """The undeformed body at rest."""
+        q = self.rest_positions.expand(batch, -1, -1).clone()
+        return State(q, torch.zeros_like(q))
+
+    def step(
+        self,
+        state: State,
+        external_force: torch.Tensor | None = None,
+        fixed_positions: torch.Tensor | None = None,
+        material: Material | MaterialTensors | None = None,
+    ) -> tuple[State, SolveReport]:
+        """Advances a batch by one time step.
+
+        Args:
+            state: where it is.
+            external_force: (B, N, 3) held during the step, gravity not included [N]; zero where left out.
+            fixed_positions: (B, D, 3) of the fixed vertices at the end of the step [m]; where they are, if left out.
+            material: another material than the simulator's, or one already prepared.
+
+        Returns:
+            The new state, differentiable, and the solver's report.
+
+        Raises:
+            InputError: wrong shapes, or values that are not finite.
+            ConvergenceError: see `solver.SolverSettings.on_failure`.
+        """
+        tensors = material if isinstance(material, MaterialTensors) else self.prepare(material)
+        self._check(state, external_force, fixed_positions)
+        stage = self._method.stage(state, self.time_step)
+        if fixed_positions is None:
+            fixed_positions = state.q[:, self.fixed]
+        at_stage = state.q[:, self.fixed] + stage.end * (fixed_positions - state.q[:, self.fixed])
+        model = None if isinstance(material, MaterialTensors) or material is None else material.model
+        workspace = self.workspace(state.batch, model)
+        x, report = self._solve(workspace, stage, state, external_force, at_stage, tensors)
+        new = self._method.finish(state, x, self.time_step)
+        return new, report
+
+    def _solve(
+        self,
+        workspace: Workspace,
+        stage: ImplicitStage,
+        state: State,
+        external_force: torch.Tensor | None,
+        fixed_positions: torch.Tensor,
+        tensors: MaterialTensors,
+    ) -> tuple[torch.Tensor, SolveReport]:
+        batch, h = state.batch, stage.step
+        # Mass damping is linear in x: it joins inertia and moves the target.
+        damping = tensors.mass_damping[..., None] * h  # (1 or B, 1, 1)
+        target = (stage.target + damping * stage.velocity_reference) / (1.0 + damping)
+        inertia = (tensors.mass / h**2 * (1.0 + damping[..., 0])).expand(batch, -1)
+        force = tensors.weight if external_force is None else tensors.weight + external_force
+        strain = None
+        if tensors.damped:
+            p = workspace.potential
+            strain = sum(w * GreenStrain.apply(p, q) for q, w in stage.strain_weights)
+        reports: list[SolveReport] = []
+        x = Equilibrium.apply(
+            workspace,
+            workspace.solver("dynamics", self.settings),
+            reports,
+            stage.target,
+            fixed_positions,
+            target,
+            inertia,
+            force.expand(batch, -1, -1),
+            tensors.shape_stiffness,
+            tensors.volume_stiffness,
+            (tensors.stiffness_damping / h).expand(batch),
+            strain,
+        )
+        return x, reports[0]
+
+    def static_equilibrium(
+        self,
+        external_force: torch.Tensor | None = None,
+        fixed_positions: torch.Tensor | None = None,
+        material: Material | None = None,
+        start: torch.Tensor | None = None,
+        batch: int | None = None,
+    ) -> State:
+        """The state of rest under gravity and constant loads, differentiable like a step.
+
+        Args:
+            external_force: (B, N, 3) [N].
+            fixed_positions: (B, D, 3) of the fixed vertices [m].
+            material: another material than the simulator's.
+            start: (B, N, 3) first guess [m]; the rest shape where left out.
+            batch: environments, where no other argument tells.
+
+        Raises:
+            InputError: wrong shapes, values that are not finite, or a body without fixed vertices.
+            ConvergenceError: no equilibrium was found.
+        """
+        if not len(self.fixed):
+            raise InputError("a body without fixed vertices has no static equilibrium: fix some vertices.")
+        given = [t for t in (external_force, fixed_positions, start) if t is not None]
+        tensors = self.prepare(material)
+        batch = batch or max([len(t) for t in given] + [len(tensors.shape_stiffness), len(tensors.weight)])
+        state = self.rest_state(batch)
+        self._check(state, external_force, fixed_positions)
+        if fixed_positions is None:
+            fixed_positions = state.q[:, self.fixed]
+        force = tensors.weight if external_force is None else tensors.weight + external_force
+        workspace = self.workspace(batch, None if material is None else material.model)
+        settings = replace(self.settings, name="newton")
+        x = Equilibrium.apply(
+            workspace,
+            workspace.solver("statics", settings),
+            [],
+            state.q if start is None else start,
+            fixed_positions,
+            state.q,
+            torch.zeros(batch, self.body.n_vertices, device=self.device, dtype=self.dtype),
+            force.expand(batch, -1, -1),
+            tensors.shape_stiffness,
+            tensors.volume_stiffness,
+            torch.zeros(batch, device=self.device, dtype=self.dtype),
+            None,
+        )
+        return State(x, torch.zeros_like(x))
+
+    def rollout(
+        self,
+        state: State,
+        steps: int,
+        external_forces: torch.Tensor | None = None,
+        fixed_positions: torch.Tensor | None = None,
+        material: Material | None = None,
+    ) -> Trajectory:
+        """Steps many times.
+
+        Memory grows by the states alone: the adjoint of a step rebuilds its Hessian from the state it led to.
+
+        Args:
+            state: the start.
+            steps: T.
+            external_forces: (T, B, N, 3) for each step, or (B, N, 3) throughout [N].
+            fixed_positions: (T, B, D, 3) for each step [m].
+            material: another material than the simulator's.
+
+        Raises:
+            InputError: wrong shapes, or values that are not finite.
+            ConvergenceError: see `step`.
+        """
+        for name, values in (("external_forces", external_forces), ("fixed_positions", fixed_positions)):
+            if values is not None and values.ndim == 4 and len(values) != steps:
+                raise InputError(f"{name} has {len(values)} time steps, but {steps} are to be simulated.")
+        model = self.material.model if material is None else material.model
+        simulator = self if model == self.material.model else replace(self, material=material)
+        tensors = simulator.prepare(material)
+        states, reports = [state], []
+        for t in range(steps):
+            force = external_forces
+            if external_forces is not None and external_forces.ndim == 4:
+                force = external_forces[t]
+            moved = None if fixed_positions is None else fixed_positions[t]
+            state, report = simulator.step(state, force, moved, tensors)
+            states.append(state)
+            reports.append(report)
+        q, v = (torch.stack([getattr(s, name) for s in states]) for name in ("q", "v"))
+        return Trajectory(q, v, reports, state)
+
+    def _check(
+        self, state: State, external_force: torch.Tensor | None, fixed_positions: torch.Tensor | None
+    ) -> None:
+        """One sentence on the first argument that cannot be simulated."""
+        b, n, d = state.batch, self.body.n_vertices, len(self.fixed)
+        wanted = {
+            "state.q": (state.q, (b, n, 3), "m"),
+            "state.v": (state.v, (b, n, 3), "m/s"),
+            "external_force": (external_force, (b, n, 3), "N"),
+            "fixed_positions": (fixed_positions, (b, d, 3), "m"),
+        }
+        for name, (values, shape, unit) in wanted.items():
+            if values is None:
+                continue
+            if tuple(values.shape) != shape:
+                raise InputError(f"{name} has shape {tuple(values.shape)}: it must be {shape} in {unit}.")
+            if not bool(torch.isfinite(values).all()):
+                where = (~torch.isfinite(values)).nonzero()[0].tolist()
+                raise InputError(
+                    f"{name} is not finite in environment {where[0]}, vertex {where[1]}: check what computes it."
+                )

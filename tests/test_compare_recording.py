@@ -180,7 +180,9 @@ def test_hung_weight_lengthens_the_period():
     [
         ("recording.path=null", "set recording.path to a C3D file"),
         ("recording.path=absent.c3d", "Cannot read absent.c3d: No such file"),
-        ("recording.hung_weight=-1", "recording.hung_weight is -1: set it to a number, zero or more"),
+        ("recording.hung_weight=-1", "recording.hung_weight is -1: set it to a number, not below zero"),
+        ("simulation.gravity=0", "simulation.gravity is 0: set it to a number, more than zero"),
+        ("recording.release_frame=soon", "release_frame is 'soon': set it to a number"),
         ("material.density=heavy", "material.density is 'heavy': set it to a number"),
     ],
 )

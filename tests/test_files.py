@@ -54,6 +54,14 @@ class TestAtomicFiles:
         assert files.read_json(path) == 2
         assert os.listdir(tmp_path) == ["metrics.json"]
 
+    def test_the_content_is_on_the_disk_before_the_name_is(self, tmp_path, monkeypatch):
+        calls = []
+        for name in ("fsync", "replace"):
+            real = getattr(os, name)
+            monkeypatch.setattr(os, name, lambda *a, name=name, real=real: (calls.append(name), real(*a)))
+        files.write_json(tmp_path / "a.json", {})
+        assert calls == ["fsync", "replace", "fsync"]
+
     def test_nothing_is_at_the_place_before_the_block_has_ended(self, tmp_path):
         with files.atomic_hdf5(tmp_path / "a.h5", "k") as file:
             files.create(file, "x", np.zeros(3))
@@ -342,6 +350,14 @@ class TestResumable:
             write(file, 10)
             file.finish()
             assert np.array_equal(file.read(5)["force"], force(5))
+
+    def test_the_system_may_write_less_than_it_was_given(self, tmp_path, monkeypatch):
+        pwrite = os.pwrite
+        monkeypatch.setattr(os, "pwrite", lambda file, data, offset: pwrite(file, data[:7], offset))
+        with resumable(tmp_path / "a.h5") as file:
+            write(file, 3)
+        with resumable(tmp_path / "a.h5") as file:
+            assert file.done == 3
 
     def test_misuse(self, tmp_path):
         with resumable(tmp_path / "a.h5") as file:

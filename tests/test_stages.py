@@ -259,6 +259,13 @@ class TestProgress:
             "train: 100/100 epochs, 2 epochs/s, in 0:30, loss 0.00123, rate slow",
         ]
 
+    def test_a_short_loop_gets_one_line(self, clock):
+        stream = io.StringIO()
+        with Progress("mesh", 2, "bodies", console=Console(file=stream)) as bar:
+            clock[0] += 0.5
+            bar.advance(2)
+        assert stream.getvalue() == "mesh: 2/2 bodies, 4 bodies/s, in 0:00\n"
+
     def test_slow_units_and_interruption(self, clock):
         stream = io.StringIO()
 

@@ -8,6 +8,7 @@ a CPU up to tens of thousands of unknowns. Wide meshes go to CHOLMOD (cholespy),
 """
 
 from abc import ABC, abstractmethod
+from contextlib import AbstractContextManager
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ import scipy.sparse.csgraph
 import scipy.sparse.linalg
 import torch
 from numpy.typing import NDArray
+from threadpoolctl import ThreadpoolController
 
 from .errors import InputError
 
@@ -103,17 +105,22 @@ class BandedSolver(LinearSolver):
         dofs = (order[:, None] * self.block + np.arange(self.block)).ravel()
         self._order = torch.as_tensor(dofs)
         self._place = torch.argsort(self._order)
+        self._threads = ThreadpoolController()
 
     def factor(self, values: torch.Tensor, definite: bool = True) -> Factor:
         bands = values.reshape(-1, self.n, self.bandwidth + 1)
-        return _BandedFactor(bands.numpy(), self._order, self._place, definite)
+        with _one_thread(self._threads):
+            return _BandedFactor(bands.numpy(), self, definite)
+
+
+def _one_thread(threads: ThreadpoolController) -> AbstractContextManager[Any]:
+    """BLAS on one thread: a band is too narrow to share, and threads that wait for one another cost milliseconds."""
+    return threads.limit(limits=1, user_api="blas")
 
 
 class _BandedFactor(Factor):
-    def __init__(
-        self, bands: NDArray[Any], order: torch.Tensor, place: torch.Tensor, definite: bool
-    ) -> None:
-        self._order, self._place = order, place
+    def __init__(self, bands: NDArray[Any], solver: BandedSolver, definite: bool) -> None:
+        self._order, self._place, self._threads = solver._order, solver._place, solver._threads
         self._definite = definite
         self.failed = np.zeros(len(bands), dtype=bool)
         self._factors: list[Any] = []
@@ -135,15 +142,21 @@ class _BandedFactor(Factor):
         ordered = rhs[:, self._order]
         # LAPACK wants columns: (groups, columns, n) in memory is (n, columns) in Fortran order.
         columns = ordered.transpose(1, 2).reshape((1, b * m, n) if shared else (b, m, n)).contiguous().numpy()
-        for factor, block in zip(self._factors, columns, strict=True):
-            if self._definite:
-                solution, _ = self._solve(factor, block.T, lower=1, overwrite_b=1)
-            else:
-                solution, _ = self._solve(factor[0], self._width, self._width, block.T, factor[1], overwrite_b=1)
-            if not np.shares_memory(solution, block):
-                block.T[:] = solution
+        with _one_thread(self._threads):
+            for factor, block in zip(self._factors, columns, strict=True):
+                self._solve_in_place(factor, block.T)
         solved = torch.from_numpy(columns).reshape(b, m, n).transpose(1, 2)
         return solved[:, self._place]
+
+    def _solve_in_place(self, factor: Any, columns: NDArray[Any]) -> None:
+        """Overwrites (n, columns) in Fortran order."""
+        w = self._width
+        if self._definite:
+            solution, _ = self._solve(factor, columns, lower=1, overwrite_b=1)
+        else:
+            solution, _ = self._solve(factor[0], w, w, columns, factor[1], overwrite_b=1)
+        if solution is not columns and not np.may_share_memory(solution, columns):
+            columns[:] = solution
 
 
 def _general_band(band: NDArray[Any]) -> NDArray[Any]:

@@ -160,7 +160,7 @@ def fill_gaps(recording: Recording, longest: int = 5) -> Recording:
     for column, label in enumerate(recording.labels):
         seen = np.isfinite(positions[:, column]).all(axis=1)
         for start, stop in _runs(~seen):
-            if stop - start > longest:
+            if stop - start > longest or np.count_nonzero(seen) < 2:
                 raise DataFileError(
                     f"{recording.source}: marker {label} is occluded in frames {start} to {stop - 1}, longer "
                     f"than the {longest} frames that are interpolated; leave it out or raise the limit."

@@ -265,9 +265,15 @@ class IncrementalPotential:
         self.residual.mul_(self.free_mask[:, None])
         return self._point_energy.sum(1).add_(self._vertex_energy.sum(1)), balance
 
-    def energy_scale(self) -> torch.Tensor:
-        """(B,) sum of the magnitudes of the energies last evaluated: what their rounding is relative to [J]."""
-        return self._point_energy.sum(1) + self._vertex_energy.abs().sum(1)
+    def energy_rounding(self) -> torch.Tensor:
+        """(B,) how far rounding may have moved the energy last evaluated [J].
+
+        Terms of the size of the stiffness cancel in the energy of a small strain.
+        """
+        t = self._terms
+        stiffness = t.shape_stiffness.sum(1) + t.volume_stiffness.sum(1)
+        energy = self._point_energy.sum(1) + self._vertex_energy.abs().sum(1)
+        return 8.0 * torch.finfo(self.dtype).eps * (stiffness + 100.0 * energy)
 
     def update_tangent(self, positive: torch.Tensor | None = None) -> None:
         """Computes dP/dF at ``positions``.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from types import TracebackType
 
@@ -62,7 +63,9 @@ class Progress:
                 BarColumn(bar_width=24),
                 TextColumn("{task.fields[status]}"),
             )
-            self._bars = Bars(*columns, console=self._console, refresh_per_second=5)
+            self._bars = Bars(
+                *columns, console=self._console, refresh_per_second=5, redirect_stdout=sys.stdout.isatty()
+            )
             self._bars.start()
             self._task = self._bars.add_task(
                 self.description, total=self.total, completed=self.done, status=self.status()

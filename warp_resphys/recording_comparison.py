@@ -34,6 +34,7 @@ FloatArray = NDArray[np.float64]
 
 _MILLI = 1e3
 _CLOSE_UP_SECONDS = 1.4
+_POSITIVE_GROUPS = ("simulation", "comparison")
 _HELD_FRAMES = 20  # that give the rest position where the release is configured
 # Ink and the vermilion of Okabe and Ito (2008), which everyone can tell apart.
 _LINES: dict[str, dict[str, Any]] = {
@@ -313,16 +314,19 @@ def draw_comparison(measured: Swing, simulated: Swing, result: Mapping[str, Any]
 
 
 def _check_numbers(config: Mapping[str, Any]) -> None:
-    """Raises InputError where a number is not one, or negative; zero is refused by those that use it."""
+    """Raises InputError for the first number that is not one or out of range."""
     names = [
         f"{group}.{key}" for group in ("material", "registration", "comparison") for key in config[group]
     ]
     names += ["recording.hung_weight", "simulation.time_step", "simulation.gravity"]
+    if config["recording"]["release_frame"] is not None:
+        names.append("recording.release_frame")
     for name in names:
         group, _, key = name.partition(".")
         value = config[group][key]
-        if name != "material.model" and not (isinstance(value, int | float) and 0.0 <= value < np.inf):
-            raise InputError(f"{name} is {value!r}: set it to a number, zero or more.")
+        least, wanted = (1e-12, "more than zero") if group in _POSITIVE_GROUPS else (0.0, "not below zero")
+        if name != "material.model" and not (isinstance(value, int | float) and least <= value < np.inf):
+            raise InputError(f"{name} is {value!r}: set it to a number, {wanted}.")
 
 
 def _write_numbers(axes: "Axes", result: Mapping[str, Any]) -> None:

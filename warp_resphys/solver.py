@@ -157,7 +157,6 @@ class _Run:
         self.factorisations = 0
         self.iteration = 0
         self.clamp = False
-        self.rounding = 1e-13 if p.dtype == torch.float64 else 1e-5
         solver._update.reset()
         self._accept(*p.evaluate())
 
@@ -203,7 +202,7 @@ class _Run:
         p = self.potential
         start = p.positions.clone()
         step = torch.ones_like(slope)
-        noise = self.rounding * p.energy_scale()
+        noise = p.energy_rounding()
         before = self.residual
         for _ in range(_MAX_HALVINGS):
             p.positions.copy_(start).add_((step[:, None] * direction).view_as(start))

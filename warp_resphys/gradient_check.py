@@ -1,0 +1,157 @@
+"""Adjoint gradients of a short roll-out against central differences, for every kind of parameter."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+
+from .integrator import State
+from .material import Material
+from .simulator import Simulator
+
+POSES = ("rest", "bent", "twisted")
+# Five-point stencil: error of fourth order in the step, so that a large step drowns the solver's rounding.
+_STENCIL = ((-2, 1.0 / 12.0), (-1, -8.0 / 12.0), (1, 8.0 / 12.0), (2, -1.0 / 12.0))
+
+
+@dataclass(frozen=True)
+class GradientRow:
+    """One comparison.
+
+    Attributes:
+        parameter: its name.
+        adjoint: directional derivative of the loss by the adjoint.
+        difference: the same by central differences.
+    """
+
+    parameter: str
+    adjoint: float
+    difference: float
+
+    @property
+    def relative_error(self) -> float:
+        """|adjoint - difference| over the larger magnitude."""
+        scale = max(abs(self.adjoint), abs(self.difference))
+        return abs(self.adjoint - self.difference) / scale if scale > 0.0 else 0.0
+
+
+def pose(simulator: Simulator, name: str, batch: int) -> State:
+    """A state of a body that extends along x from its clamp: at rest, bent, or twisted by 90 degrees about x.
+
+    Args:
+        simulator: of the body.
+        name: one of `POSES`.
+        batch: environments; each is posed a little differently, but for the rest state.
+    """
+    state = simulator.rest_state(batch)
+    if name == "rest":
+        return state
+    q = state.q
+    low, high = q[0].min(0).values, q[0].max(0).values
+    s = (q[..., :1] - low[0]) / (high[0] - low[0])
+    scale = 1.0 + 0.1 * torch.arange(batch, device=q.device, dtype=q.dtype)[:, None, None]
+    if name == "bent":
+        offset = torch.zeros_like(q)
+        offset[..., 2:] = -0.15 * (high[0] - low[0]) * scale * s**2
+        return State(q + offset, 0.3 * offset)
+    angle = (0.5 * torch.pi / scale * s)[..., 0]
+    y, z = (q[..., i] - 0.5 * (low[i] + high[i]) for i in (1, 2))
+    turned = q.clone()
+    turned[..., 1] += torch.cos(angle) * y - torch.sin(angle) * z - y
+    turned[..., 2] += torch.sin(angle) * y + torch.cos(angle) * z - z
+    return State(turned, torch.zeros_like(q))
+
+
+def check_gradients(
+    simulator: Simulator, pose_name: str = "bent", steps: int = 3, batch: int = 2, seed: int = 0
+) -> list[GradientRow]:
+    """Compares the directional derivatives of a random linear functional of all positions and velocities.
+
+    The material's damping constants should be positive, or their central differences would leave the physical range.
+
+    Args:
+        simulator: with a tight tolerance, in float64.
+        pose_name: start of the roll-out (see `pose`).
+        steps: of the roll-out.
+        batch: environments.
+        seed: of directions and functional.
+
+    Returns:
+        One row a parameter: initial positions and velocities, external forces, Dirichlet targets, and E and nu (scalar,
+        per element, per environment), density, mass and stiffness damping.
+    """
+    problem = _Problem(simulator, pose_name, steps, batch, seed)
+    return [problem.compare(name, *case) for name, case in problem.cases().items()]
+
+
+class _Problem:
+    """A roll-out's loss as a function of one parameter at a time."""
+
+    def __init__(self, simulator: Simulator, pose_name: str, steps: int, batch: int, seed: int) -> None:
+        self.simulator, self.steps, self.batch = simulator, steps, batch
+        self.random = torch.Generator().manual_seed(seed)
+        self.state = pose(simulator, pose_name, batch)
+        n = simulator.body.n_vertices
+        self.forces = 1e-3 * self.noise(steps, batch, n, 3)
+        self.targets = self.state.q[:, simulator.fixed].expand(steps, -1, -1, -1).clone()
+        h = simulator.time_step
+        self.weights = self.noise(steps + 1, batch, n, 3), h * self.noise(steps + 1, batch, n, 3)
+
+    def noise(self, *shape: int) -> torch.Tensor:
+        return self.simulator.tensor(torch.randn(*shape, generator=self.random, dtype=torch.float64))
+
+    def loss(
+        self,
+        q: torch.Tensor | None = None,
+        v: torch.Tensor | None = None,
+        forces: torch.Tensor | None = None,
+        targets: torch.Tensor | None = None,
+        material: Material | None = None,
+    ) -> torch.Tensor:
+        state = State(self.state.q if q is None else q, self.state.v if v is None else v)
+        trajectory = self.simulator.rollout(
+            state,
+            self.steps,
+            self.forces if forces is None else forces,
+            self.targets if targets is None else targets,
+            material,
+        )
+        return (self.weights[0] * trajectory.q).sum() + (self.weights[1] * trajectory.v).sum()
+
+    def cases(self) -> dict[str, tuple[Callable[[torch.Tensor], torch.Tensor], torch.Tensor, float]]:
+        """Loss, value and typical size of a change, by parameter."""
+        m, b = self.simulator.material, self.batch
+        elements = len(self.simulator.body.mesh.cells)
+        length = float((self.state.q[0].max(0).values - self.state.q[0].min(0).values).max())
+        full = self.simulator.tensor
+        cases: dict[str, tuple[Callable[[torch.Tensor], torch.Tensor], torch.Tensor, float]] = {
+            "initial positions": (lambda x: self.loss(q=x), self.state.q, 1e-4 * length),
+            "initial velocities": (lambda x: self.loss(v=x), self.state.v, 1e-2 * length),
+            "external forces": (lambda x: self.loss(forces=x), self.forces, 1e-3),
+            "fixed positions": (lambda x: self.loss(targets=x), self.targets, 1e-4 * length),
+        }
+        shapes = {"scalar": (1,), "per element": (elements,), "per environment": (b, 1)}
+        for name, key, size in (
+            ("E", "youngs_modulus", 1e-2 * float(m.youngs_modulus)),
+            ("nu", "poissons_ratio", 2e-3 * (0.5 - float(m.poissons_ratio))),
+        ):
+            for kind, shape in shapes.items():
+                value = full(float(getattr(m, key))).expand(shape).clone()
+                cases[f"{name}, {kind}"] = (self._vary(key), value, size)
+        for key in ("density", "mass_damping", "stiffness_damping"):
+            value = full(float(getattr(m, key))).reshape(1)
+            cases[key.replace("_", " ")] = (self._vary(key), value, 1e-2 * float(value))
+        return cases
+
+    def _vary(self, key: str) -> Callable[[torch.Tensor], torch.Tensor]:
+        return lambda x: self.loss(material=replace(self.simulator.material, **{key: x}))
+
+    def compare(
+        self, name: str, loss: Callable[[torch.Tensor], torch.Tensor], value: torch.Tensor, size: float
+    ) -> GradientRow:
+        direction = size * self.noise(*value.shape)
+        variable = value.detach().clone().requires_grad_(True)
+        (gradient,) = torch.autograd.grad(loss(variable), variable)
+        with torch.no_grad():
+            difference = sum(w * float(loss(value + k * direction)) for k, w in _STENCIL)
+        return GradientRow(name, float((gradient * direction).sum()), difference)

@@ -125,14 +125,14 @@ class _Problem:
         length = float((self.state.q[0].max(0).values - self.state.q[0].min(0).values).max())
         full = self.simulator.tensor
         cases: dict[str, tuple[Callable[[torch.Tensor], torch.Tensor], torch.Tensor, float]] = {
-            "initial positions": (lambda x: self.loss(q=x), self.state.q, 1e-4 * length),
+            "initial positions": (lambda x: self.loss(q=x), self.state.q, 1e-5 * length),
             "initial velocities": (lambda x: self.loss(v=x), self.state.v, 1e-2 * length),
             "external forces": (lambda x: self.loss(forces=x), self.forces, 1e-3),
-            "fixed positions": (lambda x: self.loss(targets=x), self.targets, 1e-4 * length),
+            "fixed positions": (lambda x: self.loss(targets=x), self.targets, 1e-5 * length),
         }
         shapes = {"scalar": (1,), "per element": (elements,), "per environment": (b, 1)}
         for name, key, size in (
-            ("E", "youngs_modulus", 1e-2 * float(m.youngs_modulus)),
+            ("E", "youngs_modulus", 3e-3 * float(m.youngs_modulus)),
             ("nu", "poissons_ratio", 2e-3 * (0.5 - float(m.poissons_ratio))),
         ):
             for kind, shape in shapes.items():
@@ -140,7 +140,7 @@ class _Problem:
                 cases[f"{name}, {kind}"] = (self._vary(key), value, size)
         for key in ("density", "mass_damping", "stiffness_damping"):
             value = full(float(getattr(m, key))).reshape(1)
-            cases[key.replace("_", " ")] = (self._vary(key), value, 1e-2 * float(value))
+            cases[key.replace("_", " ")] = (self._vary(key), value, 3e-3 * float(value))
         return cases
 
     def _vary(self, key: str) -> Callable[[torch.Tensor], torch.Tensor]:

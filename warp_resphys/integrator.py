@@ -70,6 +70,11 @@ class Integrator(ABC):
     def finish(self, state: State, x: torch.Tensor, h: float) -> State:
         """The new state from the solution x (B, N, 3) of the stage."""
 
+    def solution_for(self, state: State, q: torch.Tensor) -> torch.Tensor:
+        """The solution x that `finish` turns into the positions q (B, N, 3)."""
+        del state
+        return q
+
 
 class ImplicitEuler(Integrator):
     """First order, strongly damping: y = q + h v, v+ = (x - q) / h."""
@@ -112,6 +117,9 @@ class Midpoint(Integrator):
 
     def stage(self, state: State, h: float) -> ImplicitStage:
         return ImplicitStage(h / 2.0, state.q + h / 2.0 * state.v, state.q, ((state.q, 1.0),), end=0.5)
+
+    def solution_for(self, state: State, q: torch.Tensor) -> torch.Tensor:
+        return 0.5 * (state.q + q)
 
     def finish(self, state: State, x: torch.Tensor, h: float) -> State:
         half = (x - state.q) * (2.0 / h)

@@ -52,6 +52,18 @@ class StepTerms:
     viscosity: torch.Tensor
     reference_strain: torch.Tensor | None = None
 
+    def tensors(self) -> tuple[torch.Tensor | None, ...]:
+        """The terms in the order of their declaration."""
+        return (
+            self.target,
+            self.inertia,
+            self.force,
+            self.shape_stiffness,
+            self.volume_stiffness,
+            self.viscosity,
+            self.reference_strain,
+        )
+
 
 class BlockPattern:
     """Which pairs of vertices the Hessian couples, and which cell blocks make up each pair.
@@ -253,6 +265,11 @@ class IncrementalPotential:
     def force(self) -> torch.Tensor:
         """(B, N, 3) loads of the current terms [N]."""
         return self._terms.force
+
+    @property
+    def inertia(self) -> torch.Tensor:
+        """(B, N) inertia of the current terms [N/m], zero at fixed vertices."""
+        return self._terms.inertia
 
     def evaluate(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Energy (B,) [J] and the norm of inertia less loads (B,) [N] at ``positions``; sets ``residual`` [N].

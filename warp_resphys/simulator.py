@@ -12,7 +12,7 @@ from .equilibrium import Equilibrium, GreenStrain, Workspace
 from .errors import InputError
 from .integrator import ImplicitStage, State, make_integrator
 from .material import MODELS, Material, as_parameter
-from .potential import BlockPattern
+from .potential import BlockPattern, StepTerms
 from .solver import SolveReport, SolverSettings
 
 GRAVITY = (0.0, 0.0, -9.80709)
@@ -100,7 +100,7 @@ class Simulator:
         if self.relative_tolerance is not None:
             settings = replace(settings, relative_tolerance=self.relative_tolerance)
         self.settings = settings
-        self._method = make_integrator(self.integrator)
+        self.method = make_integrator(self.integrator)
         self._pattern = BlockPattern(self.body)
         self._gravity = self.tensor(self.gravity)
         self.rest_positions = self.tensor(self.body.mesh.vertices)  # (N, 3) [m]
@@ -195,51 +195,44 @@ class Simulator:
         """
         tensors = material if isinstance(material, MaterialTensors) else self.prepare(material)
         self._check(state, external_force, fixed_positions)
-        stage = self._method.stage(state, self.time_step)
+        stage = self.method.stage(state, self.time_step)
         if fixed_positions is None:
             fixed_positions = state.q[:, self.fixed]
         at_stage = state.q[:, self.fixed] + stage.end * (fixed_positions - state.q[:, self.fixed])
         model = None if isinstance(material, MaterialTensors) or material is None else material.model
         workspace = self.workspace(state.batch, model)
-        x, report = self._solve(workspace, stage, state, external_force, at_stage, tensors)
-        new = self._method.finish(state, x, self.time_step)
-        return new, report
+        terms = self.step_terms(stage, state.batch, external_force, tensors, workspace)
+        reports: list[SolveReport] = []
+        solver = workspace.solver("dynamics", self.settings)
+        x = Equilibrium.apply(workspace, solver, reports, stage.target, at_stage, *terms.tensors())
+        return self.method.finish(state, x, self.time_step), reports[0]
 
-    def _solve(
+    def step_terms(
         self,
-        workspace: Workspace,
         stage: ImplicitStage,
-        state: State,
+        batch: int,
         external_force: torch.Tensor | None,
-        fixed_positions: torch.Tensor,
         tensors: MaterialTensors,
-    ) -> tuple[torch.Tensor, SolveReport]:
-        batch, h = state.batch, stage.step
+        workspace: Workspace,
+    ) -> StepTerms:
+        """The incremental potential of a step, differentiable in everything that it depends on."""
+        h = stage.step
         # Mass damping is linear in x: it joins inertia and moves the target.
         damping = tensors.mass_damping[..., None] * h  # (1 or B, 1, 1)
-        target = (stage.target + damping * stage.velocity_reference) / (1.0 + damping)
-        inertia = (tensors.mass / h**2 * (1.0 + damping[..., 0])).expand(batch, -1)
         force = tensors.weight if external_force is None else tensors.weight + external_force
         strain = None
         if tensors.damped:
             p = workspace.potential
             strain = sum(w * GreenStrain.apply(p, q) for q, w in stage.strain_weights)
-        reports: list[SolveReport] = []
-        x = Equilibrium.apply(
-            workspace,
-            workspace.solver("dynamics", self.settings),
-            reports,
-            stage.target,
-            fixed_positions,
-            target,
-            inertia,
-            force.expand(batch, -1, -1),
-            tensors.shape_stiffness,
-            tensors.volume_stiffness,
-            (tensors.stiffness_damping / h).expand(batch),
-            strain,
+        return StepTerms(
+            target=(stage.target + damping * stage.velocity_reference) / (1.0 + damping),
+            inertia=(tensors.mass / h**2 * (1.0 + damping[..., 0])).expand(batch, -1),
+            force=force.expand(batch, -1, -1),
+            shape_stiffness=tensors.shape_stiffness,
+            volume_stiffness=tensors.volume_stiffness,
+            viscosity=(tensors.stiffness_damping / h).expand(batch),
+            reference_strain=strain,
         )
-        return x, reports[0]
 
     def static_equilibrium(
         self,

@@ -1,0 +1,174 @@
+"""Supervised training of a residual force, with the model chosen by its roll-outs."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+
+from ..errors import InputError
+from .networks import ResidualForce
+
+
+@dataclass(frozen=True)
+class Samples:
+    """States and the residual forces that belong to them, each (S, N, 3)."""
+
+    q: torch.Tensor
+    v: torch.Tensor
+    force: torch.Tensor
+
+
+@dataclass
+class TrainingState:
+    """All that training goes on from.
+
+    Attributes:
+        epoch: epochs done.
+        history: one record an epoch: ``epoch``, ``train_loss``, ``validation_loss``, ``learning_rate``, and
+            ``rollout_error_mm`` where it was measured.
+        best_error: smallest roll-out error so far [mm].
+        best: weights that had it.
+    """
+
+    epoch: int = 0
+    history: list[dict[str, float]] = field(default_factory=list)
+    best_error: float = math.inf
+    best: dict[str, torch.Tensor] = field(default_factory=dict)
+
+
+class Trainer:
+    """Adam on the mean squared error of the standardised force, with a cosine schedule.
+
+    Args:
+        model: to train; on the device of the samples.
+        train: training samples.
+        validation: held-out samples.
+        rollout_error: mean roll-out error on the validation split [mm]; infinite where a roll-out diverged.
+        config: the group ``trainer``.
+        seed: of the batches and the noise.
+
+    Raises:
+        InputError: an empty split, or a setting out of range.
+    """
+
+    def __init__(
+        self,
+        model: ResidualForce,
+        train: Samples,
+        validation: Samples,
+        rollout_error: Callable[[ResidualForce], float],
+        config: Mapping[str, Any],
+        seed: int,
+    ) -> None:
+        for name, samples in (("training", train), ("validation", validation)):
+            if not len(samples.q):
+                raise InputError(f"the {name} split is empty: give it at least one trajectory.")
+        for key in ("epochs", "batch_size", "learning_rate", "final_learning_rate", "rollout_every"):
+            if not config[key] > 0:
+                raise InputError(f"trainer.{key} is {config[key]}: it must be positive.")
+        self.model, self.config, self.rollout_error = model, config, rollout_error
+        self.state = TrainingState()
+        with torch.no_grad():
+            self._train = (model.encode(train.q, train.v), model.force.encode(train.force).float())
+            self._validation = (
+                model.encode(validation.q, validation.v),
+                model.force.encode(validation.force).float(),
+            )
+        self._random = torch.Generator().manual_seed(seed)
+        self._optimiser = torch.optim.Adam(
+            model.network.parameters(), lr=config["learning_rate"], weight_decay=config["weight_decay"]
+        )
+
+    @property
+    def finished(self) -> bool:
+        """Whether all epochs are done."""
+        return self.state.epoch >= self.config["epochs"]
+
+    def learning_rate(self, epoch: int) -> float:
+        """Cosine from the first to the final rate."""
+        first, last = self.config["learning_rate"], self.config["final_learning_rate"]
+        phase = epoch / max(self.config["epochs"] - 1, 1)
+        return float(last + 0.5 * (first - last) * (1.0 + math.cos(math.pi * phase)))
+
+    def run_epoch(self) -> dict[str, float]:
+        """One pass over the training samples; returns its record."""
+        rate = self.learning_rate(self.state.epoch)
+        for group in self._optimiser.param_groups:
+            group["lr"] = rate
+        inputs, outputs = self._train
+        order = torch.randperm(len(inputs), generator=self._random).to(inputs.device)
+        total = torch.zeros((), device=inputs.device)
+        self.model.train()
+        for batch in order.split(self.config["batch_size"]):
+            x = inputs[batch]
+            if self.config["noise"] > 0.0:
+                noise = torch.randn(x.shape, generator=self._random).to(x.device)
+                x = x + self.config["noise"] * noise
+            loss = torch.nn.functional.mse_loss(self.model.network(x), outputs[batch])
+            self._optimiser.zero_grad()
+            loss.backward()
+            self._optimiser.step()
+            total += loss.detach() * len(batch)
+        self.state.epoch += 1
+        record = {
+            "epoch": float(self.state.epoch),
+            "train_loss": float(total) / len(inputs),
+            "validation_loss": self._validate(),
+            "learning_rate": rate,
+        }
+        if self.state.epoch % self.config["rollout_every"] == 0 or self.finished:
+            record["rollout_error_mm"] = self._select()
+        self.state.history.append(record)
+        return record
+
+    def _validate(self) -> float:
+        self.model.eval()
+        with torch.no_grad():
+            x, y = self._validation
+            return float(torch.nn.functional.mse_loss(self.model.network(x), y))
+
+    def _select(self) -> float:
+        """Rolls out, and keeps the weights if they are the best so far."""
+        error = self.rollout_error(self.model)
+        if error < self.state.best_error or not self.state.best:
+            self.state.best_error = error
+            self.state.best = {k: t.detach().clone() for k, t in self.model.network.state_dict().items()}
+        return error
+
+    def snapshot(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+        """Tensors and metadata from which `resume` goes on exactly."""
+        tensors = {f"model.{k}": t for k, t in self.model.state_dict().items()}
+        tensors |= {f"best.{k}": t for k, t in self.state.best.items()}
+        tensors["random"] = self._random.get_state()
+        for i, slot in self._optimiser.state_dict()["state"].items():
+            tensors |= {f"adam.{i}.{k}": t for k, t in slot.items()}
+        best = self.state.best_error if math.isfinite(self.state.best_error) else None
+        return tensors, {"epoch": self.state.epoch, "best_error": best, "history": self.state.history}
+
+    def resume(self, tensors: Mapping[str, torch.Tensor], metadata: Mapping[str, Any]) -> None:
+        """Goes on from a `snapshot`."""
+        self.model.load_state_dict(_part(tensors, "model."))
+        best = metadata["best_error"]
+        self.state = TrainingState(
+            metadata["epoch"],
+            list(metadata["history"]),
+            math.inf if best is None else best,
+            _part(tensors, "best."),
+        )
+        self._random.set_state(tensors["random"])
+        slots: dict[int, dict[str, torch.Tensor]] = {}
+        for key, tensor in _part(tensors, "adam.").items():
+            index, name = key.split(".")
+            slots.setdefault(int(index), {})[name] = tensor
+        self._optimiser.load_state_dict({**self._optimiser.state_dict(), "state": slots})
+
+    def use_best(self) -> ResidualForce:
+        """The model with the weights of the smallest roll-out error."""
+        self.model.network.load_state_dict(self.state.best)
+        return self.model.eval()
+
+
+def _part(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
+    return {key.removeprefix(prefix): tensor for key, tensor in tensors.items() if key.startswith(prefix)}

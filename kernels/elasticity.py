@@ -107,7 +107,7 @@ def elasticity_kernels(scalar: type) -> SimpleNamespace:
             e, s = shape_term(model, f)
             energy += shape * e
             stress += shape * s
-        if volume > zero:
+        if volume != zero:
             e, s = volume_term(model, f)
             energy += volume * e
             stress += volume * s
@@ -257,7 +257,7 @@ def elasticity_kernels(scalar: type) -> SimpleNamespace:
         normal, flip, twist = neo_hookean_hessian(s, shape, volume)
         if model == COROTATED:
             d = s
-            if volume > zero:
+            if volume != zero:
                 d = wp.get_diag(wp.transpose(u) * nearest_unimodular(f) * v)
             normal, flip, twist = corotated_hessian(s, d, shape, volume)
         if positive[b] == 1:
@@ -349,16 +349,12 @@ def elasticity_kernels(scalar: type) -> SimpleNamespace:
         dz = deformation_gradient(adjoint, nodes, gradients, b, p, cell)
         shape = shape_stiffness[b, p]
         volume = volume_stiffness[b, p]
-        dshape = zero
-        dvolume = zero
-        if shape > zero:
-            _e, s = shape_term(model, f)
-            dshape = -wp.ddot(s, dz)
-        if volume > zero:
-            _e2, s2 = volume_term(model, f)
-            dvolume = -wp.ddot(s2, dz)
+        # A stiffness of zero has a derivative too (nu = 0), so nothing is skipped here.
+        _e, s = shape_term(model, f)
+        dshape = -wp.ddot(s, dz)
+        _e2, s2 = volume_term(model, f)
+        dvolume = -wp.ddot(s2, dz)
         c = viscosity[b]
-        dviscosity = zero
         reference = mat33(zero, zero, zero, zero, zero, zero, zero, zero, zero)
         bulk_factor = linear_volume_factor(model)
         m = wp.transpose(f) * dz
@@ -367,10 +363,8 @@ def elasticity_kernels(scalar: type) -> SimpleNamespace:
         viscous = isotropic(rate, shape, bulk_factor * volume)
         dviscosity = -wp.ddot(viscous, m)
         if c > zero:
-            if shape > zero:
-                dshape -= c * two * wp.ddot(rate, m)
-            if volume > zero:
-                dvolume -= c * bulk_factor * wp.trace(rate) * wp.trace(m)
+            dshape -= c * two * wp.ddot(rate, m)
+            dvolume -= c * bulk_factor * wp.trace(rate) * wp.trace(m)
             reference = c * isotropic(m, shape, bulk_factor * volume)
         shape_out[b, p] = dshape
         volume_out[b, p] = dvolume

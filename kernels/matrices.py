@@ -74,7 +74,9 @@ def matrix_functions(scalar: type) -> SimpleNamespace:
         """The matrix D with det D = 1 that minimises ||F - D||.
 
         Successive projection of F on the tangent plane of {det D = 1} at the last D: at convergence F - D is normal
-        to that surface, which is the stationarity condition (Bouaziz et al. 2014, section 5.2).
+        to that surface, which is the stationarity condition (Bouaziz et al. 2014, section 5.2). From an F that is
+        turned inside out as a whole it may end on another stationary point, and an F of rank one or zero, where every
+        tangent plane vanishes, is returned as it is.
         """
         d = f
         for _ in range(60):

@@ -14,9 +14,7 @@ from warp_resphys.errors import ConvergenceError, ResphysError
 
 LARGEST_ERROR = 1e-8  # m
 SOLVERS = ("projective_dynamics", "quasi_newton", "newton")
-# Relative residual. Solutions are then closer to the reference than a tenth of the error allowed; the constant matrix of
-# projective dynamics needs the smaller one, for its residual says less about its distance from the solution.
-TOLERANCES = {"projective_dynamics": 1e-7, "quasi_newton": 1e-7, "newton": 1e-7}
+TOLERANCE = 1e-7  # relative residual; every solver then stays within a tenth of the largest error
 MAX_ITERATIONS = 50_000
 
 
@@ -43,7 +41,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--solver", action="append", choices=SOLVERS, help="may be repeated; all of them where left out"
     )
-    parser.add_argument("--tolerance", type=float, help="relative residual of every solve, default 1e-7")
+    parser.add_argument(
+        "--tolerance", type=float, default=TOLERANCE, help=f"relative residual, default {TOLERANCE:.0e}"
+    )
     parser.add_argument("--device", default="cpu", help="cpu or cuda, default cpu")
     return parser
 
@@ -62,9 +62,10 @@ def _verify(options: argparse.Namespace) -> int:
     print(f"{'file':32}{'solver':22}{'tolerance':>10}{'iterations':>12}{'largest error [m]':>20}")
     for path, reference in references.items():
         for name in options.solver or SOLVERS:
-            tolerance = TOLERANCES[name] if options.tolerance is None else options.tolerance
-            settings = SolverSettings(name, relative_tolerance=tolerance, max_iterations=MAX_ITERATIONS)
-            label = f"{path.stem:32}{name:22}{tolerance:10.0e}"
+            settings = SolverSettings(
+                name, relative_tolerance=options.tolerance, max_iterations=MAX_ITERATIONS
+            )
+            label = f"{path.stem:32}{name:22}{options.tolerance:10.0e}"
             try:
                 result = compare_with_reference(reference, settings, device)
             except ConvergenceError as error:

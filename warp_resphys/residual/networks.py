@@ -126,6 +126,8 @@ class ResidualForce(nn.Module):
     """
 
     rest: torch.Tensor
+    linear: torch.Tensor
+    remainder: torch.Tensor
 
     def __init__(
         self,
@@ -139,7 +141,28 @@ class ResidualForce(nn.Module):
         self.register_buffer("rest", rest)
         self.position, self.velocity, self.force = position, velocity, force
         self.architecture = {key: int(architecture[key]) for key in ("blocks", "layers", "width")}
-        self.network = SkipMLP(position.size + velocity.size, force.size, **self.architecture).to(rest.device)
+        n_in = position.size + velocity.size
+        self.network = SkipMLP(n_in, force.size, **self.architecture).to(rest.device)
+        self.register_buffer("linear", torch.zeros(n_in, force.size, device=rest.device))
+        self.register_buffer("remainder", torch.ones((), device=rest.device))
+
+    def fit_linear(self, inputs: torch.Tensor, outputs: torch.Tensor, noise: float) -> None:
+        """Sets the linear part by least squares, as if the inputs had noise of that deviation (ridge regression).
+
+        Args:
+            inputs: (S, n_in) standardised.
+            outputs: (S, n_out) standardised.
+            noise: standard deviation.
+        """
+        x, y = inputs.double(), outputs.double()
+        gram = x.mT @ x + len(x) * noise**2 * torch.eye(x.shape[1], device=x.device, dtype=x.dtype)
+        linear = torch.linalg.solve(gram, x.mT @ y)
+        self.linear.copy_(linear)
+        self.remainder.copy_((y - x @ linear).square().mean().sqrt())
+
+    def standardised(self, inputs: torch.Tensor) -> torch.Tensor:
+        """(S, n_out) standardised force from (S, n_in) standardised inputs: linear part and network."""
+        return inputs @ self.linear + self.remainder * self.network(inputs)
 
     def encode(self, q: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
         """(S, M) standardised inputs in float32 from (S, N, 3) positions [m] and velocities [m/s]."""
@@ -147,7 +170,7 @@ class ResidualForce(nn.Module):
 
     def forward(self, q: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
         """(S, N, 3) residual force [N]."""
-        return self.force.decode(self.network(self.encode(q, v)).to(q.dtype))
+        return self.force.decode(self.standardised(self.encode(q, v)).to(q.dtype))
 
     def description(self) -> dict[str, Any]:
         """What `restore` needs beside the tensors."""

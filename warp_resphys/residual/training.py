@@ -76,6 +76,8 @@ class Trainer:
                 model.encode(validation.q, validation.v),
                 model.force.encode(validation.force).float(),
             )
+            if config["linear_noise"] is not None:
+                model.fit_linear(*self._train, config["linear_noise"])
         self._random = torch.Generator().manual_seed(seed)
         self._optimiser = torch.optim.Adam(
             model.network.parameters(), lr=config["learning_rate"], weight_decay=config["weight_decay"]
@@ -106,7 +108,7 @@ class Trainer:
             if self.config["noise"] > 0.0:
                 noise = torch.randn(x.shape, generator=self._random).to(x.device)
                 x = x + self.config["noise"] * noise
-            loss = torch.nn.functional.mse_loss(self.model.network(x), outputs[batch])
+            loss = self._loss(x, outputs[batch])
             self._optimiser.zero_grad()
             loss.backward()
             self._optimiser.step()
@@ -114,7 +116,7 @@ class Trainer:
         self.state.epoch += 1
         record = {
             "epoch": float(self.state.epoch),
-            "train_loss": float(total) / len(inputs),
+            "train_loss": float(total) / len(inputs) * float(self.model.remainder) ** 2,
             "validation_loss": self._validate(),
             "learning_rate": rate,
         }
@@ -127,7 +129,12 @@ class Trainer:
         self.model.eval()
         with torch.no_grad():
             x, y = self._validation
-            return float(torch.nn.functional.mse_loss(self.model.network(x), y))
+            return float(self._loss(x, y)) * float(self.model.remainder) ** 2
+
+    def _loss(self, inputs: torch.Tensor, outputs: torch.Tensor) -> torch.Tensor:
+        """Mean squared error of the standardised force, in units of what the linear part leaves."""
+        error = self.model.standardised(inputs) - outputs
+        return (error / self.model.remainder).square().mean()
 
     def _select(self) -> float:
         """Rolls out, and keeps the weights if they are the best so far."""

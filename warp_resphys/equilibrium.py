@@ -9,6 +9,7 @@ from .linear_solver import make_linear_solver
 from .metric import HessianMetric
 from .potential import BlockPattern, IncrementalPotential, StepTerms
 from .solver import NonlinearSolver, SolveReport, SolverSettings
+from .threads import threads_for
 
 
 class Workspace:
@@ -86,7 +87,8 @@ class Equilibrium(torch.autograd.Function):
         if len(workspace.fixed):
             start = start.detach().clone()
             start[:, workspace.fixed] = fixed_positions.detach()
-        reports.append(solver.solve(start.detach()))
+        with threads_for(start.numel()):
+            reports.append(solver.solve(start.detach()))
         x = workspace.potential.positions.clone()
         ctx.workspace, ctx.linear_solver = workspace, solver.settings.linear_solver
         ctx.save_for_backward(x, *terms)
@@ -101,8 +103,9 @@ class Equilibrium(torch.autograd.Function):
         potential.set_terms(terms)
         potential.positions.copy_(x)
         metric = ctx.workspace.adjoint_metric(ctx.linear_solver)
-        metric.refactor_exact()
-        z = metric.apply(gradient.reshape(len(x), -1)).view_as(x)
+        with threads_for(x.numel()):
+            metric.refactor_exact()
+            z = metric.apply(gradient.reshape(len(x), -1)).view_as(x)
         needs = dict(zip(_INPUTS, ctx.needs_input_grad, strict=True))
         grads: dict[str, torch.Tensor | None] = dict.fromkeys(_INPUTS)
         grads["target"] = terms.inertia[..., None] * z * potential.free_mask[:, None]

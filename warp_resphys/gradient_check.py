@@ -132,15 +132,15 @@ class _Problem:
         }
         shapes = {"scalar": (1,), "per element": (elements,), "per environment": (b, 1)}
         for name, key, size in (
-            ("E", "youngs_modulus", 3e-3 * float(m.youngs_modulus)),
-            ("nu", "poissons_ratio", 2e-3 * (0.5 - float(m.poissons_ratio))),
+            ("E", "youngs_modulus", 1e-2 * float(m.youngs_modulus)),
+            ("nu", "poissons_ratio", 1e-2 * (0.5 - float(m.poissons_ratio))),
         ):
             for kind, shape in shapes.items():
                 value = full(float(getattr(m, key))).expand(shape).clone()
                 cases[f"{name}, {kind}"] = (self._vary(key), value, size)
-        for key in ("density", "mass_damping", "stiffness_damping"):
+        for key, change in (("density", 1e-2), ("mass_damping", 0.3), ("stiffness_damping", 1e-2)):
             value = full(float(getattr(m, key))).reshape(1)
-            cases[key.replace("_", " ")] = (self._vary(key), value, 3e-3 * float(value))
+            cases[key.replace("_", " ")] = (self._vary(key), value, change * float(value))
         return cases
 
     def _vary(self, key: str) -> Callable[[torch.Tensor], torch.Tensor]:
@@ -149,7 +149,7 @@ class _Problem:
     def compare(
         self, name: str, loss: Callable[[torch.Tensor], torch.Tensor], value: torch.Tensor, size: float
     ) -> GradientRow:
-        direction = size * self.noise(*value.shape)
+        direction = size * torch.sign(self.noise(*value.shape))
         variable = value.detach().clone().requires_grad_(True)
         (gradient,) = torch.autograd.grad(loss(variable), variable)
         with torch.no_grad():

@@ -21,6 +21,7 @@ from ..integrator import State
 from ..linear_solver import Factor, make_linear_solver
 from ..potential import IncrementalPotential
 from ..simulator import Simulator
+from ..threads import threads_for
 
 
 LinearMap = Callable[[torch.Tensor], torch.Tensor]
@@ -163,7 +164,8 @@ class GaussNewton(Reconstructor):
             return out
 
         right = -offset - self.regularisation * hessian(force)
-        return conjugate_gradients(operator, preconditioner, right, tolerance=1e-6)
+        with threads_for(right.numel()):
+            return conjugate_gradients(operator, preconditioner, right, tolerance=1e-6)
 
     def _precondition(self, p: IncrementalPotential) -> tuple[Factor, torch.Tensor]:
         """Factor of I + sqrt(lambda) H on the free vertices; H clamped where that is not positive definite."""

@@ -1,0 +1,83 @@
+"""An experiment: its stages in order, from a configuration."""
+
+from pathlib import Path
+from typing import Any
+
+import torch
+import warp as wp
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
+from rich.table import Table
+
+from ..files import digest, write_json
+from ..report.page import number_text
+from ..stages import Stage, StageContext, run_stages
+from .evaluate import evaluate
+from .generate import generate
+from .reconstruct import reconstruct
+from .report import collect_metrics, make_report
+from .train import train
+from .trajectories import (
+    ERRORS,
+    METRICS,
+    MODEL,
+    RECONSTRUCTION,
+    REPORT,
+    ROLLOUTS,
+    TRAINING,
+    TRAJECTORIES,
+)
+
+_SIMULATED = ("mesh", "physics", "fixed", "gravity", "time_step", "integrator", "solver", "device", "dtype")
+
+
+def stages(config: dict[str, Any]) -> list[Stage]:
+    """The stages of an experiment, each with the settings that it depends on."""
+    base = {key: config[key] for key in _SIMULATED}
+    if config["mesh"]["kind"] == "file":
+        base["mesh_digest"] = digest(config["mesh"]["path"])
+    corrected = {**base, "simulation": config["simulation"]}
+    learned = {**corrected, "data": config["data"]}
+    network = {key: config[key] for key in ("network", "trainer", "seed")}
+    return [
+        Stage("generate", generate, (TRAJECTORIES,), {**base, **_pick(config, "reality", "data")}),
+        Stage(
+            "reconstruct",
+            reconstruct,
+            (RECONSTRUCTION,),
+            {**corrected, **_pick(config, "reconstruction")},
+            ("generate",),
+        ),
+        Stage("train", train, (MODEL, TRAINING), {**learned, **network}, ("generate", "reconstruct")),
+        Stage("evaluate", evaluate, (ROLLOUTS, ERRORS), learned, ("generate", "reconstruct", "train")),
+        Stage("report", make_report, (REPORT,), {"config": config}, ("train", "evaluate")),
+    ]
+
+
+def _pick(config: dict[str, Any], *keys: str) -> dict[str, Any]:
+    return {key: config[key] for key in keys}
+
+
+def run_experiment(config: DictConfig) -> None:
+    """Runs what has changed, writes metrics.json and prints the errors."""
+    wp.config.quiet = True
+    if config.device == "cpu" or not torch.cuda.is_available():
+        torch.set_num_threads(1)  # The networks are small: see threads.py.
+    plain: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    run_stages(stages(plain), folder)
+    metrics = collect_metrics(StageContext("metrics", folder, "", {}), plain)
+    write_json(folder / METRICS, metrics)
+    _print(metrics, folder)
+
+
+def _print(metrics: dict[str, Any], folder: Path) -> None:
+    """Errors as a table, and where the report is."""
+    table = Table("model", "mean [mm]", "std [mm]", "diverged", title="Roll-out error against the target, test split")
+    for model, summary in metrics["errors_mm"].items():
+        row = (number_text(summary["mean"]), number_text(summary["std"]), str(summary["diverged"]))
+        table.add_row(model, *row)
+    console = Console()
+    console.print(table)
+    console.print(f"Report: {folder / REPORT}", soft_wrap=True)

@@ -208,7 +208,8 @@ def elasticity_kernels(scalar: type) -> SimpleNamespace:
             normal[k, k] += volume + two * shape
             stretch_sum = wp.max(s[(k + 1) % 3] + s[(k + 2) % 3], smallest_stretch_sum)
             flip[k] = two * shape + volume * (one - one / (one - m * d[k]))
-            twist[k] = two * shape * (one - two / stretch_sum) + volume * (one - one / (one + m * d[k]))
+            d_sum = d[(k + 1) % 3] + d[(k + 2) % 3]
+            twist[k] = two * shape * (one - two / stretch_sum) + volume * (one - d_sum / stretch_sum)
         return normal, flip, twist
 
     @function

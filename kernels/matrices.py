@@ -16,6 +16,7 @@ def matrix_functions(scalar: type) -> SimpleNamespace:
     # Squared size of the last update at which an iteration has converged to rounding.
     update_tolerance = scalar(1.0e-30 if scalar is wp.float64 else 1.0e-13)
     singular = scalar(1.0e-12 if scalar is wp.float64 else 1.0e-6)
+    nearly_a_line = scalar(1.0e-3)
     zero = scalar(0.0)
     half = scalar(0.5)
     one = scalar(1.0)
@@ -74,11 +75,14 @@ def matrix_functions(scalar: type) -> SimpleNamespace:
         """The matrix D with det D = 1 that minimises ||F - D||.
 
         Successive projection of F on the tangent plane of {det D = 1} at the last D: at convergence F - D is normal
-        to that surface, which is the stationarity condition (Bouaziz et al. 2014, section 5.2). From an F that is
-        turned inside out as a whole it may end on another stationary point, and an F of rank one or zero, where every
-        tangent plane vanishes, is returned as it is.
+        to that surface, which is the stationarity condition (Bouaziz et al. 2014, section 5.2). It starts from F, or from
+        F's rotation where F is so close to a line or a point that its own tangent plane is lost. From an F that is
+        turned inside out as a whole it may end on another stationary point.
         """
         d = f
+        c = cofactor(f)
+        if wp.ddot(c, c) < nearly_a_line:
+            d = polar_rotation(f)
         for _ in range(60):
             c = cofactor(d)
             offset = wp.ddot(c, d - f) - (wp.ddot(c, d) / scalar(3.0) - one)

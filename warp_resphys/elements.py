@@ -150,9 +150,10 @@ def discretise(mesh: Mesh, volume_integration: str = "centre") -> Discretisation
     """The points, masses and loads of a mesh.
 
     Hexahedra take 2 x 2 x 2 Gauss points, 10-node tetrahedra 4 and 4-node tetrahedra 1 for the shape term. The volume term
-    is under-integrated against locking (``centre``): one point at the centre of hexahedra and 10-node tetrahedra, and for
-    4-node tetrahedra the volume-weighted mean deformation gradient of the cells around each vertex (Bonet and Burton
-    1998); ``full`` takes the shape term's points.
+    is under-integrated against locking (``centre``), on a volume-weighted mean deformation gradient: that of each element
+    for hexahedra and 10-node tetrahedra, that of the cells around each vertex for 4-node tetrahedra (Bonet and Burton
+    1998). The mean is the value at the centre where an element is not distorted, and passes the patch test where it is
+    (Flanagan and Belytschko 1981). ``full`` takes the shape term's points.
 
     Args:
         mesh: the rest shape.
@@ -168,10 +169,9 @@ def discretise(mesh: Mesh, volume_integration: str = "centre") -> Discretisation
         )
     full = volume_integration == "full"
     if mesh.kind == "hexahedron":
-        return _isoparametric(mesh, hexahedron_shape, gauss_hexahedron(), np.zeros((1, 3)), full)
+        return _isoparametric(mesh, hexahedron_shape, gauss_hexahedron(), full)
     if mesh.kind == "tetrahedron10":
-        centre = np.full((1, 3), 0.25)
-        return _isoparametric(mesh, tetrahedron10_shape, gauss_tetrahedron(), centre, full)
+        return _isoparametric(mesh, tetrahedron10_shape, gauss_tetrahedron(), full)
     if mesh.kind == "tetrahedron":
         return _linear_tetrahedra(mesh, full)
     raise MeshError(f"elements of kind {mesh.kind!r} cannot be simulated: use tetrahedra or hexahedra.")
@@ -181,10 +181,9 @@ def _isoparametric(
     mesh: Mesh,
     shape: Callable[[Array], tuple[Array, Array]],
     rule: tuple[Array, Array],
-    centre: Array,
     full: bool,
 ) -> Discretisation:
-    """Gauss points for the shape term, the same or the centre for the volume term."""
+    """Gauss points for the shape term; the same, or one point with their mean gradients, for the volume term."""
     points, weights = rule
     values, reference = shape(points)
     gradients, determinants = physical_gradients(mesh.vertices, mesh.cells, reference)
@@ -193,8 +192,8 @@ def _isoparametric(
     if full:
         shape_volume = volume_volume = volumes
     else:
-        at_centre, _ = physical_gradients(mesh.vertices, mesh.cells, shape(centre)[1])
-        gradients = np.concatenate([gradients, at_centre], axis=1)
+        mean = np.einsum("cq,cqki->cki", volumes, gradients) / element_volumes[:, None, None]
+        gradients = np.concatenate([gradients, mean[:, None]], axis=1)
         shape_volume = np.concatenate([volumes, np.zeros((len(volumes), 1))], axis=1)
         volume_volume = np.concatenate([np.zeros_like(volumes), element_volumes[:, None]], axis=1)
     load = volumes @ values

@@ -61,7 +61,7 @@ def _pick(config: dict[str, Any], *keys: str) -> dict[str, Any]:
 
 def run_experiment(config: DictConfig) -> None:
     """Runs what has changed, writes metrics.json and prints the errors."""
-    wp.config.quiet = True
+    wp.config.log_level = wp.LOG_WARNING
     if config.device == "cpu" or not torch.cuda.is_available():
         torch.set_num_threads(1)  # The networks are small: see threads.py.
     plain: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]

@@ -44,7 +44,9 @@ class PointMass:
             raise InputError(f"a point mass must hang on vertices 0 to {n_vertices - 1} of the mesh.")
         if weights.shape != (n,) or abs(weights.sum() - 1.0) > 1e-9:
             raise InputError(f"a point mass on {n} vertices needs {n} weights that sum to one.")
-        return np.bincount(vertices, weights * self.mass, minlength=n_vertices)
+        mass = np.zeros(n_vertices)
+        np.add.at(mass, vertices, weights * self.mass)
+        return mass
 
 
 @dataclass(frozen=True)
@@ -54,8 +56,8 @@ class Body:
     Attributes:
         mesh: the rest shape.
         fixed: (D,) vertices with prescribed positions (Dirichlet); they rest where they are unless moved.
-        mass: ``row_sum`` lumps each element's own mass on its vertices (HRZ for 10-node tetrahedra). ``per_vertex`` gives
-            every vertex the density times the mean element volume, which is wrong by a factor of two on the published
+        mass: ``row_sum`` lumps each element's own mass on its vertices (HRZ for 10-node tetrahedra). ``per_vertex``
+            gives every vertex the density times the mean element volume, which is wrong by a factor of two on the published
             beam and serves for comparison with the published code alone.
         volume_integration: ``centre`` or ``full`` (see `elements.discretise`).
         point_masses: attached weights.

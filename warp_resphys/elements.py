@@ -1,7 +1,7 @@
 """Finite elements as points: every integration rule is a list of points with a gradient operator and a weight.
 
-A *point* holds the rest-space gradients of the shape functions of its cell's nodes, so that the deformation gradient there
-is ``F = sum_a x_a (grad N_a)^T``, and says how much of each element's volume it carries for the shape and for the
+A *point* holds the rest-space gradients of the shape functions of its cell's nodes, so that the deformation gradient
+there is ``F = sum_a x_a (grad N_a)^T``, and says how much of each element's volume it carries for the shape and for the
 volume term of the energy. Gauss points, element centres and averages over vertex patches are all of this form.
 """
 
@@ -149,11 +149,11 @@ def _per_vertex(cells: NDArray[np.int64], n_vertices: int, values: Array) -> sci
 def discretise(mesh: Mesh, volume_integration: str = "centre") -> Discretisation:
     """The points, masses and loads of a mesh.
 
-    Hexahedra take 2 x 2 x 2 Gauss points, 10-node tetrahedra 4 and 4-node tetrahedra 1 for the shape term. The volume term
-    is under-integrated against locking (``centre``), on a volume-weighted mean deformation gradient: that of each element
-    for hexahedra and 10-node tetrahedra, that of the cells around each vertex for 4-node tetrahedra (Bonet and Burton
-    1998). The mean is the value at the centre where an element is not distorted, and passes the patch test where it is
-    (Flanagan and Belytschko 1981). ``full`` takes the shape term's points.
+    Hexahedra take 2 x 2 x 2 Gauss points, 10-node tetrahedra 4 and 4-node tetrahedra 1 for the shape term. The volume
+    term is under-integrated against locking (``centre``), on a volume-weighted mean deformation gradient: that of each
+    element for hexahedra and 10-node tetrahedra, that of the cells around each vertex for 4-node tetrahedra (Bonet and
+    Burton 1998). The mean is the value at the centre where an element is not distorted, and passes the patch test where
+    it is (Flanagan and Belytschko 1981). ``full`` takes the shape term's points.
 
     Args:
         mesh: the rest shape.

@@ -3,6 +3,7 @@
 from typing import Any
 
 import torch
+from typing_extensions import override
 
 from .body import Body
 from .linear_solver import make_linear_solver
@@ -58,14 +59,16 @@ class Workspace:
 class Equilibrium(torch.autograd.Function):
     """x* = argmin of the incremental potential, with x = d at the fixed vertices.
 
-    With the residual g(x, theta) = 0 and the Hessian H = dg/dx, the implicit function theorem gives dx = -H^-1 (dg/dtheta)
-    dtheta. For a loss with gradient w at x*, solve H z = w on the free vertices (z = 0 on the fixed ones); then
+    With the residual g(x, theta) = 0 and the Hessian H = dg/dx, the implicit function theorem gives dx = -H^-1
+    (dg/dtheta) dtheta. For a loss with gradient w at x*, solve H z = w on the free vertices (z = 0 on the fixed ones);
+    then
 
         dL/dy = k z,  dL/dk = -z . (x - y),  dL/df = z,  dL/dd = w_D - (K z)_D,  dL/dtheta = -z . dg/dtheta
 
     with K the stiffness. H is exact here, never clamped.
     """
 
+    @override
     @staticmethod
     def forward(
         ctx: Any,
@@ -94,9 +97,10 @@ class Equilibrium(torch.autograd.Function):
         ctx.save_for_backward(x, *terms)
         return x
 
+    @override
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         x, *saved = ctx.saved_tensors
         terms = StepTerms(*saved)
         potential = ctx.workspace.potential
@@ -115,10 +119,11 @@ class Equilibrium(torch.autograd.Function):
             fixed = ctx.workspace.fixed
             grads["fixed_positions"] = (gradient - potential.stiffness_product(z))[:, fixed]
         if any(needs[k] for k in ("shape_stiffness", "volume_stiffness", "viscosity", "reference_strain")):
-            grads.update(potential.parameter_adjoint(z))
+            adjoints = potential.parameter_adjoint(z)
             for name in ("shape_stiffness", "volume_stiffness"):
-                if getattr(terms, name).shape[0] == 1 and grads[name] is not None:
-                    grads[name] = grads[name].sum(0, keepdim=True)
+                if getattr(terms, name).shape[0] == 1:
+                    adjoints[name] = adjoints[name].sum(0, keepdim=True)
+            grads.update(adjoints)
             if terms.reference_strain is None:
                 grads["reference_strain"] = None
         return tuple(grads[name] if needs[name] else None for name in _INPUTS)
@@ -143,14 +148,16 @@ _INPUTS = (
 class GreenStrain(torch.autograd.Function):
     """E = (F^T F - I) / 2 at every point, (B, N, 3) to (B, P, 3, 3)."""
 
+    @override
     @staticmethod
     def forward(ctx: Any, potential: IncrementalPotential, positions: torch.Tensor) -> torch.Tensor:
         ctx.potential = potential
         ctx.save_for_backward(positions)
         return potential.strain(positions.detach())
 
+    @override
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[None, torch.Tensor]:  # type: ignore[override]
+    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[None, torch.Tensor]:
         (positions,) = ctx.saved_tensors
         return None, ctx.potential.strain_adjoint(positions, gradient)

@@ -1,10 +1,14 @@
 """Adjoint gradients of a short roll-out against central differences, for every kind of parameter."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
+from rich.table import Table
 
+from .configured import build_simulator
+from .errors import InputError
 from .integrator import State
 from .material import Material
 from .simulator import Simulator
@@ -156,3 +160,53 @@ class _Problem:
         with torch.no_grad():
             difference = sum(w * float(loss(value + k * direction)) for k, w in _STENCIL)
         return GradientRow(name, float((gradient * direction).sum()), difference)
+
+
+def check_configured(config: Mapping[str, Any]) -> Iterator[tuple[float, dict[str, list[GradientRow]]]]:
+    """Checks the gradients of a configured body, material and solver.
+
+    Args:
+        config: with the keys of ``conf/gradcheck.yaml``.
+
+    Yields:
+        Each Poisson's ratio with its comparisons by pose.
+
+    Raises:
+        InputError: a value that cannot be simulated, an unknown pose, or float32, whose rounding drowns differences.
+        ConvergenceError: the solver does not reach the tolerance.
+    """
+    check = config["gradcheck"]
+    for name in check["poses"]:
+        if name not in POSES:
+            raise InputError(f"gradcheck.poses has {name!r}: choose from {', '.join(POSES)}.")
+    if config["dtype"] != "float64":
+        raise InputError(f"dtype is {config['dtype']!r}: gradients are checked in float64.")
+    for key in ("mass_damping", "stiffness_damping", "steps", "batch"):
+        if not check[key] > 0:
+            raise InputError(f"gradcheck.{key} is {check[key]}: it must be positive.")
+    damping = {key: check[key] for key in ("mass_damping", "stiffness_damping")}
+    solver = {**config["solver"], "relative_tolerance": check["relative_tolerance"]}
+    simulator = build_simulator({**config, "solver": solver})
+    for poissons_ratio in check["poissons_ratios"]:
+        material = replace(simulator.material, poissons_ratio=poissons_ratio, **damping)
+        checked = replace(simulator, material=material)
+        arguments = (check["steps"], check["batch"], check["seed"])
+        yield poissons_ratio, {name: check_gradients(checked, name, *arguments) for name in check["poses"]}
+
+
+def gradient_table(by_pose: Mapping[str, list[GradientRow]], poissons_ratio: float, tolerance: float) -> Table:
+    """A row a parameter; adjoint, difference and relative error a pose, in red beyond the tolerance."""
+    table = Table(title=f"Adjoint gradients against central differences, nu = {poissons_ratio:g}")
+    table.add_column("parameter")
+    for name in by_pose:
+        table.add_column(f"{name}: adjoint", justify="right")
+        table.add_column("difference", justify="right")
+        table.add_column("error", justify="right")
+    for rows in zip(*by_pose.values(), strict=True):
+        cells = [rows[0].parameter]
+        for row in rows:
+            error = f"{row.relative_error:.1e}"
+            failed = not row.relative_error <= tolerance
+            cells += [f"{row.adjoint:.4e}", f"{row.difference:.4e}", f"[red]{error}[/red]" if failed else error]
+        table.add_row(*cells)
+    return table

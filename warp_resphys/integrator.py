@@ -1,14 +1,15 @@
 """Time integrators, each as an implicit Euler step of another length from another start.
 
-A step of every method here is: find x, the minimum of the incremental potential with effective step ``h_e``, inertial target
-y and strain-rate reference r; then read the new state off x. All of it is linear in the states, so that a method is five
-lines, and its gradients follow from those of the one nonlinear solve.
+A step of every method here is: find x, the minimum of the incremental potential with effective step ``h_e``, inertial
+target y and strain-rate reference r; then read the new state off x. All of it is linear in the states, so that a method
+is five lines, and its gradients follow from those of the one nonlinear solve.
 """
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import torch
+from typing_extensions import override
 
 from .errors import InputError
 
@@ -79,9 +80,11 @@ class Integrator(ABC):
 class ImplicitEuler(Integrator):
     """First order, strongly damping: y = q + h v, v+ = (x - q) / h."""
 
+    @override
     def stage(self, state: State, h: float) -> ImplicitStage:
         return ImplicitStage(h, state.q + h * state.v, state.q, ((state.q, 1.0),))
 
+    @override
     def finish(self, state: State, x: torch.Tensor, h: float) -> State:
         return State(x, (x - state.q) / h)
 
@@ -92,6 +95,7 @@ class BDF2(Integrator):
     q+ = (4 q - q') / 3 + 2h/3 v+ and the same for v+ (Hairer and Wanner 1996, section V.1), q' being one step back.
     """
 
+    @override
     def stage(self, state: State, h: float) -> ImplicitStage:
         if state.previous is None:
             return ImplicitEuler().stage(state, h)
@@ -101,6 +105,7 @@ class BDF2(Integrator):
         target = reference + step * (4.0 * state.v - v_back) / 3.0
         return ImplicitStage(step, target, reference, ((state.q, 4.0 / 3.0), (q_back, -1.0 / 3.0)))
 
+    @override
     def finish(self, state: State, x: torch.Tensor, h: float) -> State:
         back = (state.q, state.v)
         if state.previous is None:
@@ -119,14 +124,17 @@ class Midpoint(Integrator):
     2 E(q) - (E(q + s v) + E(q - s v)) / 2 with s = h/2 mends that, and rigid rotations stay undamped.
     """
 
+    @override
     def stage(self, state: State, h: float) -> ImplicitStage:
         ahead = h / 2.0 * state.v
         strains = ((state.q, 2.0), (state.q + ahead, -0.5), (state.q - ahead, -0.5))
         return ImplicitStage(h / 2.0, state.q + ahead, state.q, strains, end=0.5)
 
+    @override
     def solution_for(self, state: State, q: torch.Tensor) -> torch.Tensor:
         return 0.5 * (state.q + q)
 
+    @override
     def finish(self, state: State, x: torch.Tensor, h: float) -> State:
         half = (x - state.q) * (2.0 / h)
         return State(2.0 * x - state.q, 2.0 * half - state.v)

@@ -16,8 +16,8 @@ class InverseHessianUpdate:
     """BFGS updates of a given inverse Hessian by the last pairs of displacement and residual change.
 
     With the pairs as rows of S and Y, R = triu(S Y^T) and D its diagonal, the two-loop recursion (Nocedal and Wright
-    2006, algorithm 7.4) is two triangular solves: a = R^-1 S g, z = H0 (g - Y^T a), b = R^-T (D a - Y z), and the result
-    is z + S^T b. Each environment skips pairs of no positive curvature of its own.
+    2006, algorithm 7.4) is two triangular solves: a = R^-1 S g, z = H0 (g - Y^T a), b = R^-T (D a - Y z), and the
+    result is z + S^T b. Each environment skips pairs of no positive curvature of its own.
 
     Args:
         memory: pairs kept; 0 leaves the given inverse Hessian as it is.

@@ -1,13 +1,15 @@
 """Symmetric linear systems of a batch of bodies: banded, sparse and dense factorisations behind one interface.
 
-A solver is built once for a sparsity pattern; it says at which ``address`` of its value array each matrix entry belongs, so
-that one Warp kernel assembles for every layout. ``factor`` turns a batch of value arrays into a `Factor`.
+A solver is built once for a sparsity pattern; it says at which ``address`` of its value array each matrix entry
+belongs, so that one Warp kernel assembles for every layout. ``factor`` turns a batch of value arrays into a `Factor`.
 
-The bodies of this field are slender: with a bandwidth-reducing order, LAPACK's banded Cholesky is the cheapest choice on
-a CPU up to tens of thousands of unknowns. Wide meshes go to CHOLMOD (cholespy), small ones on a GPU to batched dense Cholesky.
+The bodies of this field are slender: with a bandwidth-reducing order, LAPACK's banded Cholesky is the cheapest choice
+on a CPU up to tens of thousands of unknowns. Wide meshes go to CHOLMOD (cholespy), small ones on a GPU to batched dense
+Cholesky.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import Any
 
@@ -19,6 +21,7 @@ import scipy.sparse.linalg
 import torch
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
+from typing_extensions import override
 
 from .errors import InputError
 
@@ -91,6 +94,7 @@ class LinearSolver(ABC):
 class BandedSolver(LinearSolver):
     """LAPACK's banded Cholesky in reverse Cuthill-McKee order, on the CPU, one environment after another."""
 
+    @override
     def _lay_out(self, rows: Indices, cols: Indices, n_nodes: int) -> None:
         order = bandwidth_reducing_order(rows, cols, n_nodes)
         place = np.empty(n_nodes, dtype=np.int64)
@@ -107,6 +111,7 @@ class BandedSolver(LinearSolver):
         self._place = torch.argsort(self._order)
         self._threads = ThreadpoolController()
 
+    @override
     def factor(self, values: torch.Tensor, definite: bool = True) -> Factor:
         bands = values.reshape(-1, self.n, self.bandwidth + 1)
         with _one_thread(self._threads):
@@ -136,6 +141,7 @@ class _BandedFactor(Factor):
                 self._factors.append((lu, pivots))
             self.failed[i] = info != 0
 
+    @override
     def solve(self, rhs: torch.Tensor) -> torch.Tensor:
         b, n, m = rhs.shape
         shared = len(self._factors) == 1
@@ -172,12 +178,14 @@ def _general_band(band: NDArray[Any]) -> NDArray[Any]:
 class DenseSolver(LinearSolver):
     """Batched dense Cholesky in torch, on any device."""
 
+    @override
     def _lay_out(self, rows: Indices, cols: Indices, n_nodes: int) -> None:
         i, j = self._entries(rows, cols)
         self.address = (np.maximum(i, j) * self.n + np.minimum(i, j)).astype(np.int32)
         self.address[(rows == cols)[:, None] & (i < j)] = -1
         self.n_values = self.n * self.n
 
+    @override
     def factor(self, values: torch.Tensor, definite: bool = True) -> Factor:
         return _DenseFactor(values.reshape(-1, self.n, self.n), definite)
 
@@ -192,6 +200,7 @@ class _DenseFactor(Factor):
             self._lu, self._pivots, info = torch.linalg.lu_factor_ex(full)
         self.failed = info.cpu().numpy() != 0
 
+    @override
     def solve(self, rhs: torch.Tensor) -> torch.Tensor:
         b, n, m = rhs.shape
         columns = rhs
@@ -208,6 +217,7 @@ class _DenseFactor(Factor):
 class SparseSolver(LinearSolver):
     """CHOLMOD through cholespy (CPU and CUDA); SciPy's SuperLU for indefinite matrices and where cholespy is absent."""
 
+    @override
     def _lay_out(self, rows: Indices, cols: Indices, n_nodes: int) -> None:
         i, j = self._entries(rows, cols)
         keep = ~((rows == cols)[:, None] & (i < j))
@@ -215,6 +225,7 @@ class SparseSolver(LinearSolver):
         self._rows, self._cols = np.maximum(i, j)[keep], np.minimum(i, j)[keep]
         self.n_values = len(self._rows)
 
+    @override
     def factor(self, values: torch.Tensor, definite: bool = True) -> Factor:
         return _SparseFactor(self, values, definite)
 
@@ -251,6 +262,7 @@ class _SparseFactor(Factor):
                 self.failed[i] = True
                 self._factors.append(None)
 
+    @override
     def solve(self, rhs: torch.Tensor) -> torch.Tensor:
         b, n, m = rhs.shape
         shared = len(self._factors) == 1
@@ -289,7 +301,7 @@ def _cholmod_factor(cholmod: Any, solver: SparseSolver, rows: Indices, cols: Ind
 
 
 def bandwidth_reducing_order(rows: Indices, cols: Indices, n_nodes: int) -> Indices:
-    """The given order or reverse Cuthill-McKee's, whichever has the smaller bandwidth: (n_nodes,) node at each place."""
+    """(n_nodes,) node at each place: the given order or reverse Cuthill-McKee's, whichever has the smaller bandwidth."""
     i, j = np.concatenate([rows, cols]), np.concatenate([cols, rows])
     graph = scipy.sparse.csr_array((np.ones(len(i), dtype=np.int8), (i, j)), shape=(n_nodes, n_nodes))
     order = scipy.sparse.csgraph.reverse_cuthill_mckee(graph.tocsr(), symmetric_mode=True).astype(np.int64)
@@ -320,12 +332,16 @@ def make_linear_solver(
         raise InputError("linear_solver=banded runs on the CPU alone: choose dense, sparse or auto on a GPU.")
     if name == "auto":
         name = _cheapest(rows, cols, n_nodes, block, device)
-    solvers = {"banded": BandedSolver, "dense": DenseSolver, "sparse": SparseSolver}
+    solvers: dict[str, Callable[..., LinearSolver]] = {
+        "banded": BandedSolver,
+        "dense": DenseSolver,
+        "sparse": SparseSolver,
+    }
     return solvers[name](rows, cols, n_nodes, block, device, dtype)
 
 
 def _cheapest(rows: Indices, cols: Indices, n_nodes: int, block: int, device: torch.device) -> str:
-    """Dense up to 4,000 unknowns on a GPU; on a CPU banded unless the band is so wide that CHOLMOD's fill is smaller."""
+    """Dense up to 4,000 unknowns on a GPU; banded on a CPU, unless the band is so wide that CHOLMOD fills in less."""
     if device.type != "cpu":
         return "dense" if n_nodes * block <= 4000 else "sparse"
     order = bandwidth_reducing_order(rows, cols, n_nodes)

@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 import torch
+from typing_extensions import override
 
 from .linear_solver import Factor, LinearSolver
 from .potential import BlockPattern, IncrementalPotential
@@ -47,9 +48,11 @@ class HessianMetric(Metric):
         self._dofs = (3 * free[:, None] + torch.arange(3, device=potential.device)).reshape(-1)
         self._factor: Factor | None = None
 
+    @override
     def ready(self) -> bool:
         return self._factor is not None
 
+    @override
     def refactor(self, clamp: bool = False) -> None:
         self.clamped = clamp
         everywhere = np.ones(self._potential.batch, dtype=bool)
@@ -71,6 +74,7 @@ class HessianMetric(Metric):
         if self._factor.failed.any():
             self._factor = self._linear.factor(self._assemble(), definite=False)
 
+    @override
     def apply(self, residual: torch.Tensor) -> torch.Tensor:
         if self._factor is None:
             raise RuntimeError("refactor before apply")
@@ -90,8 +94,8 @@ class HessianMetric(Metric):
 class ProjectiveMetric(Metric):
     """Inertia plus ``(2 mu + lambda) V G G^T`` at every point, the same in each coordinate.
 
-    This is the Hessian of the distances to fixed projections (Bouaziz et al. 2014, equation 10). It does not depend on the
-    positions: one factor serves until inertia or stiffness change, and the whole batch where these are shared.
+    This is the Hessian of the distances to fixed projections (Bouaziz et al. 2014, equation 10). It does not depend on
+    the positions: one factor serves until inertia or stiffness change, and the whole batch where these are shared.
     """
 
     def __init__(self, potential: IncrementalPotential, pattern: BlockPattern, linear: LinearSolver) -> None:
@@ -113,10 +117,12 @@ class ProjectiveMetric(Metric):
         t = self._potential._terms
         return t.inertia, t.shape_stiffness, t.volume_stiffness
 
+    @override
     def ready(self) -> bool:
         terms = self._terms()
         return self._key is not None and all(map(torch.equal, self._key, terms))
 
+    @override
     def refactor(self, clamp: bool = False) -> None:
         del clamp  # The matrix is positive definite as it is.
         self._key = tuple(t.clone() for t in self._terms())
@@ -141,6 +147,7 @@ class ProjectiveMetric(Metric):
         values[:, self._address[diagonal]] += inertia[:, vertex]
         self._factor = self._linear.factor(values)
 
+    @override
     def apply(self, residual: torch.Tensor) -> torch.Tensor:
         if self._factor is None:
             raise RuntimeError("refactor before apply")

@@ -4,15 +4,14 @@ One time step of every integrator, and a static equilibrium too, is the minimum 
 
     sum_i k_i / 2 |x_i - y_i|^2 - f . x + E(x) + c/2 sum_p |E_p(x) - E_p^ref|^2_C
 
-with k the inertia over the square of the effective time step, y where inertia alone would go, f the loads, E the elastic
-energy, and the last term the Kelvin-Voigt dissipation potential of the Green strain E_p with viscosity c.
+with k the inertia over the square of the effective time step, y where inertia alone would go, f the loads, E the
+elastic energy, and the last term the Kelvin-Voigt dissipation potential of the Green strain E_p with viscosity c.
 """
 
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy.sparse
 import torch
 import warp as wp
 from numpy.typing import NDArray

@@ -309,8 +309,9 @@ class Simulator:
         for name, values in (("external_forces", external_forces), ("fixed_positions", fixed_positions)):
             if values is not None and values.ndim == 4 and len(values) != steps:
                 raise InputError(f"{name} has {len(values)} time steps, but {steps} are to be simulated.")
-        model = self.material.model if material is None else material.model
-        simulator = self if model == self.material.model else replace(self, material=material)
+        simulator = self
+        if material is not None and material.model != self.material.model:
+            simulator = replace(self, material=material)
         tensors = simulator.prepare(material)
         states, reports = [state], []
         for t in range(steps):

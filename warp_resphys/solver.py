@@ -8,8 +8,8 @@ Three solvers differ in the matrix of the global step and share everything else:
 ``newton``               Hessian of every iterate, clamped to positive eigenvalues where it is not positive definite
 =======================  ====================================================================================
 
-An environment of the batch has converged when its residual is at most ``relative_tolerance`` times the norm of the forces
-that balance: inertia and loads.
+An environment of the batch has converged when its residual is at most ``relative_tolerance`` times the norm of the
+forces that balance: inertia and loads.
 """
 
 from dataclasses import dataclass
@@ -125,9 +125,9 @@ class NonlinearSolver:
         if self.settings.on_failure == "raise" and not bool(run.converged.all()):
             worst = int((~run.converged).nonzero()[0])
             raise ConvergenceError(
-                f"the {self.settings.name} solver stopped after {int(run.iterations[worst])} iterations with a relative "
-                f"residual of {float(run.relative_residual[worst]):.2e} in environment {worst} of {len(run.converged)}: "
-                "take a smaller time step or loads, raise solver.max_iterations, or choose solver.name=newton.",
+                f"the {self.settings.name} solver stopped after {int(run.iterations[worst])} iterations with a "
+                f"relative residual of {float(run.relative_residual[worst]):.2e} in environment {worst} of "
+                f"{len(run.converged)}: take a smaller time step or loads, raise solver.max_iterations, or choose solver.name=newton.",
                 self.potential.positions.clone(),
                 report,
             )

@@ -1,6 +1,6 @@
 """Roll-outs on a Warp tape: the second door to the gradients that ``torch.autograd`` gives.
 
-A recorded roll-out stands between its user's kernels on one tape, and ``tape.backward`` differentiates the whole:
+A recorded roll-out stands between its user's kernels on a tape, and ``tape.backward`` differentiates all of it:
 
     with wp.Tape() as tape:
         wp.launch(forces, dim=..., inputs=[parameters], outputs=[external_forces])
@@ -8,8 +8,8 @@ A recorded roll-out stands between its user's kernels on one tape, and ``tape.ba
         wp.launch(loss, dim=..., inputs=[rollout.q], outputs=[value])
     tape.backward(value)
 
-Nothing is copied on the way in or out: torch sees the memory of the arrays that are passed, and the arrays that come
-back see torch's. What a step keeps for its adjoint is what it keeps for torch, its states alone.
+Nothing is copied on the way in or out: torch sees the memory of the arrays that are passed, and the arrays
+that come back see torch's. What a step keeps for its adjoint is what it keeps for torch, its states alone.
 """
 
 from collections.abc import Callable, Mapping
@@ -59,9 +59,9 @@ def record_rollout(
 ) -> RecordedRollout:
     """Steps many times, and records on a tape how to differentiate that.
 
-    Gradients are added to the ``grad`` of every array given that requires gradients. As for Warp's own kernels,
-    the arrays must keep their values until ``tape.backward``, which reads the gradients of the results and sets
-    them to zero unless they are to be retained. It may be called again.
+    Gradients are added to the ``grad`` of every array given that requires gradients. As for Warp's own
+    kernels, the arrays must keep their values until ``tape.backward``, which reads the gradients of the
+    results and sets them to zero unless they are to be retained. It may be called again.
 
     Args:
         tape: entered by the caller or not.
@@ -75,8 +75,8 @@ def record_rollout(
         parameters: values in place of the material's, by a name of `PARAMETERS`, shaped as `Material` says.
 
     Raises:
-        InputError: an unknown parameter, an array of another type or device than the simulator's, wrong shapes,
-            or values that are not finite.
+        InputError: an unknown parameter, an array of another type or device than the simulator's, wrong
+            shapes, or values that are not finite.
         ConvergenceError: see `Simulator.step`.
     """
     leaves = _Leaves(simulator)
@@ -123,7 +123,7 @@ class _Leaves:
     def _leaf(self, name: str, array: wp.array, dtype: type) -> torch.Tensor:
         if not isinstance(array, wp.array) or array.dtype != dtype or array.device != self._warp_device:
             raise InputError(
-                f"{name} must be a Warp array of {dtype.__name__} on {self._warp_device}, as the simulator is."
+                f"{name} must be a Warp array of {dtype.__name__} on {self._warp_device}, like the simulator."
             )
         leaf = wp.to_torch(array, requires_grad=False)
         if array.requires_grad:
@@ -133,8 +133,9 @@ class _Leaves:
 
     def result(self, tensor: torch.Tensor) -> wp.array:
         """The array of vec3 on the memory of a tensor of the graph."""
-        gradient = bool(self.pairs)
-        return cast(wp.array, wp.from_torch(tensor.detach(), dtype=_VECTORS[self.dtype], requires_grad=gradient))
+        dtype = _VECTORS[self.dtype]
+        array = wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=bool(self.pairs))
+        return cast(wp.array, array)
 
     def stream(self) -> AbstractContextManager[object]:
         """Makes torch work on Warp's stream, so that neither overtakes the other."""

@@ -1,7 +1,7 @@
 """Networks that predict the residual force from the state.
 
-A model is a coder around a multi-layer perceptron: the coder turns (q, v) into standardised inputs and standardised outputs
-into forces. Its constants come from the training split and are saved with the weights.
+A model is a coder around a multi-layer perceptron: the coder turns (q, v) into standardised inputs and standardised
+outputs into forces. Its constants come from the training split and are saved with the weights.
 """
 
 from collections.abc import Mapping

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.optimize
 import torch
+from typing_extensions import override
 
 from ..errors import ConvergenceError, InputError
 from ..integrator import State
@@ -22,7 +23,6 @@ from ..linear_solver import Factor, make_linear_solver
 from ..potential import IncrementalPotential
 from ..simulator import Simulator
 from ..threads import threads_for
-
 
 LinearMap = Callable[[torch.Tensor], torch.Tensor]
 
@@ -78,8 +78,8 @@ class Reconstructor(ABC):
 class GaussNewton(Reconstructor):
     """Gauss-Newton in the positions.
 
-    With the full state observed, f is a function of x = q+: the residual g(x) of the step without it, with Jacobian H. A
-    Gauss-Newton step of |x - x*|^2 + lambda |g(x)|^2 solves
+    With the full state observed, f is a function of x = q+: the residual g(x) of the step without it, with Jacobian H.
+    A Gauss-Newton step of |x - x*|^2 + lambda |g(x)|^2 solves
 
         (I + lambda H^2) dx = -(x - x*) - lambda H g(x)
 
@@ -88,6 +88,7 @@ class GaussNewton(Reconstructor):
     ``tolerance`` is the last change of any position [m].
     """
 
+    @override
     def step(self, state: State, observed: torch.Tensor) -> Reconstruction:
         sim, batch = self.simulator, state.batch
         workspace = sim.workspace(batch)
@@ -103,8 +104,8 @@ class GaussNewton(Reconstructor):
         while float(change) > self.tolerance:
             if iterations == self.max_iterations:
                 raise ConvergenceError(
-                    f"Gauss-Newton reconstruction moved by {float(change):.1e} m in its last iteration of {iterations}: "
-                    "raise reconstruction.max_iterations or reconstruction.tolerance.",
+                    f"Gauss-Newton reconstruction moved by {float(change):.1e} m in its last iteration, the "
+                    f"{iterations}th: raise reconstruction.max_iterations or reconstruction.tolerance.",
                     x,
                     None,
                 )
@@ -203,6 +204,7 @@ class LBFGSB(Reconstructor):
 
     _last: torch.Tensor | None = None
 
+    @override
     def step(self, state: State, observed: torch.Tensor) -> Reconstruction:
         sim = self.simulator
         free = torch.ones(sim.body.n_vertices, 1, device=observed.device, dtype=observed.dtype)

@@ -13,8 +13,8 @@ Predictor = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 class HybridSimulator:
     """A simulator and the force that is added to it.
 
-    An environment in which the solver fails, or whose state is no longer finite, has diverged: from then on it stands at
-    rest, and is reported as lost.
+    An environment in which the solver fails, or whose state is no longer finite, has diverged: from then on it stands
+    at rest, and is reported as lost.
 
     Args:
         simulator: one whose solver settings count failures rather than raise them.

@@ -109,7 +109,7 @@ class _Run:
         rest = simulator.rest_state(len(positions)).q
         start = torch.where(lost[:, None, None], rest, positions)
         self.hybrid = HybridSimulator(simulator, predict, lost)
-        self.state = State(start, simulator.tensor(v), previous)  # type: ignore[arg-type]
+        self.state = State(start, simulator.tensor(v), previous)
 
     def frame(self, index: int) -> dict[str, NDArray[np.float64]]:
         """Positions and velocities of the next frame; the first is the start."""

@@ -73,10 +73,10 @@ def _run_epochs(trainer: Trainer, checkpoint: Path, fingerprint: str) -> None:
                 if time.monotonic() - saved > _CHECKPOINT_SECONDS:
                     _save(checkpoint, kept, fingerprint)
                     saved = time.monotonic()
-                shown = {"loss": f"{record['train_loss']:.2e}"}
+                shown: dict[str, object] = {"loss": f"{record['train_loss']:.2e}"}
                 if trainer.state.best:
                     shown["rollout"] = f"{trainer.state.best_error:.2g} mm"
-                progress.advance(**shown)
+                progress.advance(1, **shown)
         except KeyboardInterrupt:
             _save(checkpoint, kept, fingerprint)
             raise
@@ -123,6 +123,7 @@ class ValidationError:
         self._start = State(self.simulator.tensor(q[part, 0]), self.simulator.tensor(v[part, 0]))
 
     def __call__(self, model: ResidualForce) -> float:
+        """Rolls the model out."""
         steps = self._target.shape[1] - 1
         positions = closed_loop(self.simulator, predictor(model), self._start, steps).cpu().numpy()
         pairs = zip(positions, self._target, strict=True)

@@ -30,6 +30,7 @@ class MaterialTensors:
         mass_damping: (1 or B, 1) [1/s].
         stiffness_damping: (1 or B,) [s].
         damped: whether stiffness damping acts at all.
+        model: the material's.
     """
 
     shape_stiffness: torch.Tensor
@@ -39,6 +40,7 @@ class MaterialTensors:
     mass_damping: torch.Tensor
     stiffness_damping: torch.Tensor
     damped: bool
+    model: str
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,8 @@ class Simulator:
         dtype: ``torch.float64`` or ``torch.float32``.
 
     Raises:
-        InputError: a time step that is not positive, an unknown integrator or solver, or a CUDA device that is not there.
+        InputError: a time step that is not positive, an unknown integrator or solver, or a CUDA device that is not
+            there.
     """
 
     body: Body
@@ -151,6 +154,7 @@ class Simulator:
             mass_damping=self.tensor(material.mass_damping).reshape(-1, 1),
             stiffness_damping=damping,
             damped=damped,
+            model=material.model,
         )
 
     @staticmethod
@@ -158,7 +162,7 @@ class Simulator:
         return torch.broadcast_shapes(*(t.shape for t in tensors))
 
     def workspace(self, batch: int, model: str | None = None) -> Workspace:
-        """Buffers for a batch size, made at its first use."""
+        """Buffers for a batch size and material model, made at their first use."""
         key = (batch, model or self.material.model)
         if key not in self._workspaces:
             self._workspaces[key] = Workspace(
@@ -199,8 +203,7 @@ class Simulator:
         if fixed_positions is None:
             fixed_positions = state.q[:, self.fixed]
         at_stage = state.q[:, self.fixed] + stage.end * (fixed_positions - state.q[:, self.fixed])
-        model = None if isinstance(material, MaterialTensors) or material is None else material.model
-        workspace = self.workspace(state.batch, model)
+        workspace = self.workspace(state.batch, tensors.model)
         terms = self.step_terms(stage, state.batch, external_force, tensors, workspace)
         reports: list[SolveReport] = []
         solver = workspace.solver("dynamics", self.settings)
@@ -265,7 +268,7 @@ class Simulator:
         if fixed_positions is None:
             fixed_positions = state.q[:, self.fixed]
         force = tensors.weight if external_force is None else tensors.weight + external_force
-        workspace = self.workspace(batch, None if material is None else material.model)
+        workspace = self.workspace(batch, tensors.model)
         settings = replace(self.settings, name="newton")
         x = Equilibrium.apply(
             workspace,
@@ -309,17 +312,14 @@ class Simulator:
         for name, values in (("external_forces", external_forces), ("fixed_positions", fixed_positions)):
             if values is not None and values.ndim == 4 and len(values) != steps:
                 raise InputError(f"{name} has {len(values)} time steps, but {steps} are to be simulated.")
-        simulator = self
-        if material is not None and material.model != self.material.model:
-            simulator = replace(self, material=material)
-        tensors = simulator.prepare(material)
+        tensors = self.prepare(material)
         states, reports = [state], []
         for t in range(steps):
             force = external_forces
             if external_forces is not None and external_forces.ndim == 4:
                 force = external_forces[t]
             moved = None if fixed_positions is None else fixed_positions[t]
-            state, report = simulator.step(state, force, moved, tensors)
+            state, report = self.step(state, force, moved, tensors)
             states.append(state)
             reports.append(report)
         q, v = (torch.stack([getattr(s, name) for s in states]) for name in ("q", "v"))

@@ -194,7 +194,7 @@ def elasticity_kernels(scalar: type) -> SimpleNamespace:
 
     @function
     def corotated_hessian(s: vec3, d: vec3, shape: scalar, volume: scalar):
-        """normal (3, 3), flip and twist by the index of the axis left out; d are the singular values of D."""
+        """Normal (3, 3), flip and twist by the index of the axis left out; d are the singular values of D."""
         # D shares F's singular frame: s = d + m cof(d), prod d = 1. Differentiating both gives the 3x3 block of
         # dD as the projection on the surface's tangent plane in the metric I + m (d off the diagonal).
         cof = vec3(d[1] * d[2], d[0] * d[2], d[0] * d[1])
@@ -214,7 +214,7 @@ def elasticity_kernels(scalar: type) -> SimpleNamespace:
 
     @function
     def neo_hookean_hessian(s: vec3, shape: scalar, volume: scalar):
-        """normal (3, 3), flip and twist by the index of the axis left out."""
+        """Normal (3, 3), flip and twist by the index of the axis left out."""
         jac = s[0] * s[1] * s[2]
         cof = vec3(s[1] * s[2], s[0] * s[2], s[0] * s[1])
         slope = shape * (jac - two) + volume * (jac - one)

@@ -75,9 +75,9 @@ def matrix_functions(scalar: type) -> SimpleNamespace:
         """The matrix D with det D = 1 that minimises ||F - D||.
 
         Successive projection of F on the tangent plane of {det D = 1} at the last D: at convergence F - D is normal
-        to that surface, which is the stationarity condition (Bouaziz et al. 2014, section 5.2). It starts from F, or from
-        F's rotation where F is so close to a line or a point that its own tangent plane is lost. From an F that is
-        turned inside out as a whole it may end on another stationary point.
+        to that surface, which is the stationarity condition (Bouaziz et al. 2014, section 5.2). It starts from F, or
+        from F's rotation where F is so close to a line or a point that its own tangent plane is lost. From an F that
+        is turned inside out as a whole it may end on another stationary point.
         """
         d = f
         c = cofactor(f)

@@ -55,16 +55,14 @@ def _verify(options: argparse.Namespace) -> int:
     from warp_resphys.solver import SolverSettings
     from warp_resphys.verification import compare_with_reference, read_reference
 
-    wp.config.quiet = True
+    wp.config.log_level = wp.LOG_WARNING
     device = choose_device(options.device)
     references = {path: read_reference(path) for path in options.files}
     within = True
     print(f"{'file':32}{'solver':22}{'tolerance':>10}{'iterations':>12}{'largest error [m]':>20}")
     for path, reference in references.items():
         for name in options.solver or SOLVERS:
-            settings = SolverSettings(
-                name, relative_tolerance=options.tolerance, max_iterations=MAX_ITERATIONS
-            )
+            settings = SolverSettings(name, relative_tolerance=options.tolerance, max_iterations=MAX_ITERATIONS)
             label = f"{path.stem:32}{name:22}{options.tolerance:10.0e}"
             try:
                 result = compare_with_reference(reference, settings, device)

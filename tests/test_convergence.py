@@ -33,9 +33,7 @@ def tip_sag(mesh, material, gravity=9.80709, **body):
     return float(moved[tip, 2].mean())
 
 
-@pytest.mark.parametrize(
-    ("integration", "sag_mm", "tolerance_mm"), [("centre", -6.42, 0.03), ("full", -3.07, 0.03)]
-)
+@pytest.mark.parametrize(("integration", "sag_mm", "tolerance_mm"), [("centre", -6.42, 0.03), ("full", -3.07, 0.03)])
 def test_sag_of_the_beam(integration, sag_mm, tolerance_mm):
     sag = tip_sag(box_hexahedra(), Material(poissons_ratio=0.499, **SILICONE), volume_integration=integration)
     assert 1e3 * sag == pytest.approx(sag_mm, abs=tolerance_mm)

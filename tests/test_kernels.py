@@ -30,9 +30,7 @@ GRADIENTS = np.concatenate(
 )
 
 
-def unit_potential(
-    gradients, model="corotated", shape=SHAPE, volume=VOLUME, viscosity=0.0, reference=None, **where
-):
+def unit_potential(gradients, model="corotated", shape=SHAPE, volume=VOLUME, viscosity=0.0, reference=None, **where):
     """Potential of the unit tetrahedron, whose residual on vertices 1 to 3 is V times the stress's columns."""
     count = len(gradients)
     where = {"device": torch.device("cpu"), "dtype": torch.float64} | where
@@ -70,9 +68,7 @@ def reference_unimodular(f):
         return ((d - s) ** 2).sum(), np.array([slope[0] - slope[2], slope[1] - slope[2]])
 
     starts = [(a, b) for a in (-0.7, 0.0, 0.7) for b in (-0.7, 0.0, 0.7)]
-    found = [
-        scipy.optimize.minimize(distance, start, jac=True, options={"gtol": 1e-12}) for start in starts
-    ]
+    found = [scipy.optimize.minimize(distance, start, jac=True, options={"gtol": 1e-12}) for start in starts]
     best = min(found, key=lambda result: result.fun).x
     return u * np.exp([best[0], best[1], -best.sum()]) @ vt
 
@@ -83,7 +79,7 @@ def cofactor(f):
 
 def reference_energy(f, model):
     if model == "corotated":
-        u, s, _ = signed_svd(f)
+        _, s, _ = signed_svd(f)
         return SHAPE * ((s - 1) ** 2).sum() + VOLUME / 2 * ((f - reference_unimodular(f)) ** 2).sum()
     j = np.linalg.det(f)
     return SHAPE * (((f**2).sum() - 3) / 2 - (j - 1) + (j - 1) ** 2 / 2) + VOLUME / 2 * (j - 1) ** 2
@@ -131,9 +127,7 @@ def test_viscous_stress_is_the_derivative_of_the_dissipation_potential(model, la
     stress, energy = stress_and_energy(GRADIENTS, model, **viscous)
     elastic_stress, elastic_energy = stress_and_energy(GRADIENTS, model)
     arguments = (viscous["reference"], viscous["viscosity"], lame_factor)
-    np.testing.assert_allclose(
-        energy - elastic_energy, viscous_energy(GRADIENTS, *arguments), rtol=1e-9, atol=1e-12
-    )
+    np.testing.assert_allclose(energy - elastic_energy, viscous_energy(GRADIENTS, *arguments), rtol=1e-9, atol=1e-12)
     step, direction = 1e-5, rng.normal(size=GRADIENTS.shape)
     ahead, behind = (viscous_energy(GRADIENTS + s * step * direction, *arguments) for s in (1, -1))
     slope = np.einsum("nij,nij->n", stress - elastic_stress, direction)
@@ -150,9 +144,7 @@ def test_tangent_is_the_derivative_of_the_stress(model, viscosity):
     potential = unit_potential(GRADIENTS, model, **viscous)
     potential.update_tangent()
     product = potential.stiffness_product(torch.as_tensor(UNIT @ direction.transpose(0, 2, 1)))[:, 1:].mT
-    ahead, behind = (
-        stress_and_energy(GRADIENTS + s * step * direction, model, **viscous)[0] for s in (1, -1)
-    )
+    ahead, behind = (stress_and_energy(GRADIENTS + s * step * direction, model, **viscous)[0] for s in (1, -1))
     # Where F is flat or inverted the energies are stiffer and less smooth.
     np.testing.assert_allclose(product, (ahead - behind) / (2 * step), rtol=1e-5, atol=2e-5)
 
@@ -233,10 +225,9 @@ def loaded_potential(mesh):
     potential = IncrementalPotential(body, MODELS["corotated"], b, torch.device("cpu"), torch.float64)
     sets = body.discretisation.point_sets
     volumes = [
-        np.concatenate([getattr(s, name).sum(axis=1) for s in sets])
-        for name in ("shape_volume", "volume_volume")
+        np.concatenate([getattr(s, name).sum(axis=1) for s in sets]) for name in ("shape_volume", "volume_volume")
     ]
-    stiffness = [torch.as_tensor(v) * (1.0 + noise(b, 1)) * scale for v, scale in zip(volumes, (1e5, 1e6))]
+    stiffness = [torch.as_tensor(v) * (1.0 + noise(b, 1)) * scale for v, scale in zip(volumes, (1e5, 1e6), strict=True)]
     strain = 0.01 * noise(b, potential.n_points, 3, 3)
     potential.set_terms(
         StepTerms(noise(b, n, 3), 1e4 * (1 + noise(b, n)), noise(b, n, 3), *stiffness, noise(b), strain + strain.mT)

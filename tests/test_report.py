@@ -2,16 +2,18 @@
 
 import base64
 import dataclasses
+import logging
 import re
+import sys
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import matplotlib.colors
 import matplotlib.image
 import numpy as np
 import pytest
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from matplotlib import colormaps
 
 from warp_resphys.errors import DataFileError, InputError
 from warp_resphys.mesh import Mesh, box_hexahedra, box_tetrahedra
@@ -94,6 +96,23 @@ def report_data() -> ReportData:
 
 
 @pytest.fixture(scope="module")
+def why_no_drawing() -> str:
+    """Why bodies cannot be drawn on this machine; empty where they can."""
+    mesh = box_hexahedra(divisions=(1, 1, 1))
+    try:
+        render.draw_bodies(mesh, {"box": mesh.vertices}, mesh.vertices)
+    except render.DrawingError as error:
+        return str(error)
+    return ""
+
+
+@pytest.fixture
+def can_draw(why_no_drawing: str) -> None:
+    if why_no_drawing:
+        pytest.skip(why_no_drawing)
+
+
+@pytest.fixture(scope="module")
 def report(report_data: ReportData, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("run") / "new" / "report.html"
     write_report(path, report_data)
@@ -119,10 +138,10 @@ class Page(HTMLParser):
         self.text += data
 
 
-def test_page_needs_nothing_beside_it(report: Path) -> None:
+def test_page_needs_nothing_beside_it(report: Path, why_no_drawing: str) -> None:
     source = report.read_text(encoding="utf-8")
     page = Page(source)
-    assert len(page.images) == 4
+    assert len(page.images) == (3 if why_no_drawing else 4)
     assert page.links
     assert all(link.startswith("data:") for link in page.links)
     assert re.search(r"https?://|url\(|@import|<script", source) is None
@@ -133,9 +152,7 @@ def test_page_needs_nothing_beside_it(report: Path) -> None:
             assert re.search(r'href="(?!#|data:)', svg) is None
 
 
-def test_page_says_how_far_and_stands_beside_the_published_numbers(
-    report: Path, report_data: ReportData
-) -> None:
+def test_page_says_how_far_and_stands_beside_the_published_numbers(report: Path, report_data: ReportData) -> None:
     text = " ".join(Page(report.read_text(encoding="utf-8")).text.replace("\u00a0", " ").split())
     for model in ("simulation", "reconstruction", "resphys"):
         mean, deviation = error_parts(report_data.metrics["errors_mm"][model])
@@ -162,9 +179,10 @@ def test_every_image_is_described(report: Path) -> None:
         assert len(image["alt"] or "") > 40
 
 
-def test_figures_are_written_and_show_something(report: Path) -> None:
+def test_figures_are_written_and_show_something(report: Path, why_no_drawing: str) -> None:
     written = {path.stem: matplotlib.image.imread(path) for path in (report.parent / "figures").glob("*.png")}
-    assert set(written) == {"tip_displacement", "shape", "error_over_time", "training"}
+    shape = set() if why_no_drawing else {"shape"}
+    assert set(written) == {"tip_displacement", "error_over_time", "training"} | shape
     for pixels in written.values():
         assert pixels.shape[1] == round(200 * figures.WIDE)
         assert pixels[..., :3].std() > 0.02
@@ -178,7 +196,7 @@ def test_the_same_run_gives_the_same_page(report: Path, report_data: ReportData,
 
 
 def test_a_diverged_rollout_is_said_and_does_not_hide_the_rest(
-    report_data: ReportData, tmp_path: Path
+    report_data: ReportData, tmp_path: Path, why_no_drawing: str
 ) -> None:
     corrected = report_data.example.resphys.copy()
     corrected[5:9] *= 1e200
@@ -200,7 +218,7 @@ def test_a_diverged_rollout_is_said_and_does_not_hide_the_rest(
     page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
     assert "1 of 2 diverged" in page.text
     assert "1 of 2 test roll-outs diverged" in page.text.replace("\u00a0", " ")
-    assert len(page.images) == 3  # Nothing was trained.
+    assert len(page.images) == (2 if why_no_drawing else 3)  # Nothing was trained.
 
 
 @pytest.mark.parametrize(
@@ -249,9 +267,7 @@ def test_the_picture_is_taken_where_the_simulation_is_worst(report_data: ReportD
 
 def test_arrays_that_do_not_fit_are_refused(report_data: ReportData) -> None:
     with pytest.raises(InputError, match="resphys trajectory"):
-        dataclasses.replace(
-            report_data, example=dataclasses.replace(report_data.example, resphys=np.zeros((3, 4, 3)))
-        )
+        dataclasses.replace(report_data, example=dataclasses.replace(report_data.example, resphys=np.zeros((3, 4, 3))))
     with pytest.raises(InputError, match="errors of simulation"):
         dataclasses.replace(report_data, errors_mm={"simulation": np.zeros(3)})
 
@@ -262,69 +278,114 @@ def test_a_page_that_cannot_be_written_is_one_sentence(report_data: ReportData, 
         write_report(tmp_path / "file" / "report.html", report_data)
 
 
+@pytest.mark.parametrize(
+    ("script", "time_out", "reason"),
+    [
+        ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", 60.0, "Segmentation fault"),
+        ("import no_such_renderer", 60.0, "No module named 'no_such_renderer'"),
+        ("import time; time.sleep(60)", 0.1, "not done after 0.1 s"),
+    ],
+    ids=["crash", "import", "time-out"],
+)
+def test_a_body_that_cannot_be_drawn_is_said_and_does_not_hide_the_rest(
+    report_data: ReportData,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    script: str,
+    time_out: float,
+    reason: str,
+) -> None:
+    monkeypatch.setattr(render, "COMMAND", (sys.executable, "-c", script))
+    monkeypatch.setattr(render, "TIME_OUT", time_out)
+    stale = tmp_path / "figures" / "shape.png"
+    stale.parent.mkdir()
+    stale.write_bytes(b"of an earlier run")
+    with caplog.at_level(logging.WARNING):
+        write_report(tmp_path / "report.html", report_data)
+    page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
+    for said in (page.text, caplog.text):
+        assert "cannot draw the deformed body on this machine (" in said
+        assert reason in said
+        assert "libegl1" in said
+    assert len(page.images) == 3
+    written = {path.stem for path in stale.parent.iterdir()}
+    assert written == {"tip_displacement", "error_over_time", "training"}
+
+
 MESHES = {
     "hexahedra": box_hexahedra(divisions=(3, 2, 2)),
     "tetrahedra": box_tetrahedra((0.1, 0.03, 0.03), (3, 2, 2)),
     "tetrahedra10": box_tetrahedra((0.1, 0.03, 0.03), (3, 2, 2), order=2),
 }
+TOWARDS_VIEWER = np.asarray(render.TOWARDS_VIEWER) / np.linalg.norm(render.TOWARDS_VIEWER)
 
 
+def draw(mesh: Mesh, errors: np.ndarray, count: int = 1) -> list[np.ndarray]:
+    """(H, W, 4) pictures of the undeformed body, with (N,) errors [m] along x."""
+    target = mesh.vertices - errors[:, None] * [1.0, 0.0, 0.0]
+    bodies = render.draw_bodies(mesh, {str(each): mesh.vertices for each in range(count)}, target)
+    drawn = [body for body in bodies.values() if body]
+    assert [body.largest for body in drawn] == pytest.approx([errors.max()] * count, rel=1e-6)
+    return [body.pixels for body in drawn]
+
+
+def shaded(value: float, normal: tuple[float, float, float]) -> np.ndarray:
+    """(3,) colour of a value in [0, 1] on a face that looks along a normal."""
+    facing = max(0.0, float(np.dot(normal, render.TOWARDS_LIGHT) / np.linalg.norm(render.TOWARDS_LIGHT)))
+    return np.asarray(colormaps[render.COLOUR_MAP](value)[:3]) * (1.0 - render.SHADE * (1.0 - facing))
+
+
+def share(pixels: np.ndarray, colour: np.ndarray) -> float:
+    """Share of the opaque pixels that have a colour, to within a hundredth."""
+    opaque = pixels[pixels[..., 3] == 1.0][:, :3]
+    return float(np.mean(np.all(np.abs(opaque - colour) < 0.01, axis=1)))
+
+
+@pytest.mark.usefixtures("can_draw")
 @pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES.keys())
-def test_surface_pieces_cover_the_boundary_and_face_outwards(mesh: Mesh) -> None:
-    surface = render.Surface.of(mesh)
-    pieces = surface.interpolate(mesh.vertices)[:, surface.pieces].reshape(-1, surface.pieces.shape[1], 3)
-    centre = mesh.vertices.mean(axis=0)
-    areas, volumes = 0.0, 0.0
-    for corner in range(1, pieces.shape[1] - 1):
-        normal = np.cross(pieces[:, corner] - pieces[:, 0], pieces[:, corner + 1] - pieces[:, 0]) / 2.0
-        areas += np.linalg.norm(normal, axis=1).sum()
-        volumes += np.einsum("pc,pc->", normal, pieces[:, 0] - centre) / 3.0
-    assert areas == pytest.approx(2 * (0.03 * 0.03 + 2 * 0.1 * 0.03))
-    assert volumes == pytest.approx(0.1 * 0.03 * 0.03)
-    linear = mesh.vertices @ [[1.0], [2.0], [3.0]]  # Shape functions reproduce linear functions.
-    np.testing.assert_allclose(
-        surface.interpolate(linear), surface.interpolate(mesh.vertices) @ [[1.0], [2.0], [3.0]], atol=1e-15
-    )
-    owners = surface.pieces[surface.rim_owners]
-    assert all(set(rim) <= set(piece) for rim, piece in zip(surface.rims, owners, strict=True))
+def test_a_body_is_drawn_whole_to_scale_and_in_the_colours_of_the_scale(mesh: Mesh) -> None:
+    # With one error everywhere each visible face has one colour, in the share of the picture that it covers.
+    faces = {(1.0, 0.0, 0.0): 0.03 * 0.03, (0.0, -1.0, 0.0): 0.1 * 0.03, (0.0, 0.0, 1.0): 0.1 * 0.03}  # [m²]
+    covered = {normal: area * float(np.dot(normal, TOWARDS_VIEWER)) for normal, area in faces.items()}
+    pictures = draw(mesh, np.full(len(mesh.vertices), 1e-3), count=2)
+    for pixels in pictures:
+        for normal, area in covered.items():
+            expected = area / sum(covered.values())
+            assert share(pixels, shaded(1.0, normal)) == pytest.approx(expected, abs=0.06)  # Edges, outline.
+        rows, columns = np.nonzero(pixels[..., 3] == 1.0)
+        for seen, length in ((rows, pixels.shape[0]), (columns, pixels.shape[1])):
+            margin = render.MARGIN * max(pixels.shape)
+            assert seen.min() == pytest.approx(margin, abs=0.3 * margin)
+            assert length - seen.max() == pytest.approx(margin, abs=0.3 * margin)
+    np.testing.assert_array_equal(*pictures)
 
 
-@pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES.keys())
-def test_outline_is_the_twelve_edges_of_the_box(mesh: Mesh) -> None:
-    outline = render.Surface.of(mesh).outline(mesh.vertices)
-    assert np.linalg.norm(outline[:, 1] - outline[:, 0], axis=1).sum() == pytest.approx(
-        4 * (0.1 + 0.03 + 0.03)
-    )
-
-
-def test_ten_node_faces_are_curved() -> None:
-    mesh = box_tetrahedra((0.1, 0.03, 0.03), (1, 1, 1), order=2)
-    surface = render.Surface.of(mesh)
-    squared = mesh.vertices**2  # Quadratic shape functions reproduce it, linear ones do not.
-    np.testing.assert_allclose(
-        surface.interpolate(squared), surface.interpolate(mesh.vertices) ** 2, atol=1e-15
-    )
-
-
-def test_what_stands_before_hides_what_is_behind() -> None:
-    # The face x = 0.1 of the box is turned to the viewer, the face x = 0 away: its colour must not be seen.
+@pytest.mark.usefixtures("can_draw")
+def test_colours_are_where_the_errors_are_and_what_stands_before_hides_what_is_behind() -> None:
     mesh = box_hexahedra((0.1, 0.03, 0.03), (1, 1, 1))
-    colours = np.where(mesh.vertices[:, [0]] > 0.05, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0])
-    surface = render.Surface.of(mesh)
-    view = render.View.around(mesh.vertices)
-    figure = Figure(figsize=(3.0, 3.0 / view.aspect), dpi=100)
-    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    render.paint(axes, view, surface, mesh.vertices, colours, np.zeros((0, 2, 3)), "black")
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    pixels = np.asarray(canvas.buffer_rgba())[..., :3] / 255.0
+    low, high = (shaded(value, (0.0, -1.0, 0.0)) for value in (0.0, 1.0))
+    (pixels,) = draw(mesh, np.where(mesh.vertices[:, 0] > 0.05, 1e-3, 0.0))
+    middle = pixels[pixels.shape[0] // 2, :, :3]
+    np.testing.assert_allclose(middle[round(0.04 * len(middle))], low, atol=0.05)
+    np.testing.assert_allclose(middle[round(0.86 * len(middle))], high, atol=0.12)
 
-    def seen_at(point: tuple[float, float, float]) -> np.ndarray:
-        share = (np.asarray(point) @ view.axes[:2].T - view.lower) / (view.upper - view.lower)
-        return pixels[round((1.0 - share[1]) * len(pixels)), round(share[0] * pixels.shape[1])]
+    hidden = np.all(mesh.vertices == [0.0, 0.03, 0.0], axis=1)  # The corner behind the three visible faces.
+    (pixels,) = draw(mesh, np.where(hidden, 1e-3, 0.0))
+    assert share(pixels, low) > 0.4
+    assert pixels[pixels[..., 3] == 1.0][:, 0].max() < 0.55  # Dark violet and the grey outline.
 
-    assert seen_at((0.1, 0.015, 0.015))[2] > 0.5
-    assert seen_at((0.1, 0.015, 0.015))[0] < 0.05
-    assert seen_at((0.005, 0.0, 0.015))[0] > 0.5
-    middle = seen_at((0.05, 0.0, 0.012))
-    assert middle[0] == pytest.approx(middle[2], abs=0.08)
+
+@pytest.mark.usefixtures("can_draw")
+def test_the_undeformed_outline_shows_where_the_body_has_left() -> None:
+    mesh = box_hexahedra(divisions=(3, 1, 1))
+    moved = mesh.vertices + [0.0, 0.0, 0.05]
+    body = render.draw_bodies(mesh, {"moved": moved}, moved)["moved"]
+    assert body is not None
+    assert share(body.pixels, np.asarray(matplotlib.colors.to_rgb(render.OUTLINE))) > 0.03
+
+
+def test_only_what_has_not_diverged_is_drawn() -> None:
+    mesh = box_hexahedra(divisions=(1, 1, 1))
+    diverged = {"far": mesh.vertices + 2.0, "gone": np.full_like(mesh.vertices, np.nan)}
+    assert render.draw_bodies(mesh, diverged, mesh.vertices) == {"far": None, "gone": None}

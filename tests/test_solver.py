@@ -147,6 +147,19 @@ def test_float32_runs_and_agrees(name, device):
     torch.testing.assert_close(found.q.double(), reference, rtol=0.0, atol=2e-5)
 
 
+@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("offset", [0.0, 1.0])
+def test_a_body_on_which_nothing_acts_converges_at_once(name, dtype, offset):
+    """Its residual is rounding, and so are the forces that it would be measured against."""
+    s = Simulator(BODY, Material(264e3, 0.499, 1070.0), gravity=(0.0, 0.0, 0.0), solver=name, dtype=dtype)
+    rest = s.rest_state(2)
+    trajectory = s.rollout(State(rest.q + offset, rest.v), 3)
+    assert max(int(report.iterations.max()) for report in trajectory.reports) <= 10
+    moved = trajectory.q[-1] - offset - s.rest_positions
+    assert float(moved.abs().max()) < 200 * torch.finfo(dtype).eps * (0.06 + offset)
+
+
 def test_quasi_newton_reuses_its_factor_and_newton_does_not():
     counts = {}
     for name in ("quasi_newton", "newton"):

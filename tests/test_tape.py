@@ -36,9 +36,7 @@ def make_simulator(device: str, integrator: str = "implicit_euler") -> Simulator
     mesh = box_hexahedra((0.04, 0.02, 0.02), (2, 1, 1))
     material = Material(1e5, 0.4, 1000.0, mass_damping=0.5, stiffness_damping=0.001)
     clamped = np.flatnonzero(mesh.vertices[:, 0] == 0.0)
-    return Simulator(
-        Body(mesh, clamped), material, integrator=integrator, relative_tolerance=1e-11, device=device
-    )
+    return Simulator(Body(mesh, clamped), material, integrator=integrator, relative_tolerance=1e-11, device=device)
 
 
 def array(tensor: torch.Tensor, dtype: type = wp.vec3d) -> wp.array:
@@ -81,9 +79,7 @@ def test_gradients_equal_those_of_torch(device: str, integrator: str) -> None:
     loss = (weights[0] * trajectory.q).sum() + (weights[1] * trajectory.v).sum()
     expected = torch.autograd.grad(loss, list(leaves.values()))
 
-    arrays = {
-        name: array(value, wp.vec3d if value.ndim > 2 else wp.float64) for name, value in inputs.items()
-    }
+    arrays = {name: array(value, wp.vec3d if value.ndim > 2 else wp.float64) for name, value in inputs.items()}
     tape = wp.Tape()
     rollout = record_rollout(
         tape,
@@ -180,9 +176,7 @@ def test_two_roll_outs_on_one_tape_are_one(device: str, integrator: str) -> None
         now: tuple[wp.array, wp.array] = (q, v)
         before = None
         for steps in parts:
-            rollout = record_rollout(
-                tape, simulator, *now, steps, previous=before, parameters={"density": density}
-            )
+            rollout = record_rollout(tape, simulator, *now, steps, previous=before, parameters={"density": density})
             now, before = (rollout.q[-1], rollout.v[-1]), (rollout.q[-2], rollout.v[-2])
         rollout.q.grad[-1].fill_(1.0)
         rollout.v.grad[-1].fill_(0.01)

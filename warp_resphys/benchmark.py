@@ -1,7 +1,7 @@
 """Times the simulator: forward and backward steps, the parts of a step, the cold start.
 
-Machines differ, and so does one machine from minute to minute. The cases of a refinement therefore take turns, medians are
-reported, and a fixed task of LAPACK, the *yardstick*, takes its turn with them: times over the yardstick's compare.
+Machines differ, and so does one machine from minute to minute. The cases of a refinement therefore take turns, medians
+are reported, and a fixed task of LAPACK, the *yardstick*, takes its turn with them: times over the yardstick's compare.
 """
 
 import datetime
@@ -104,8 +104,9 @@ def run_benchmark(config: Mapping[str, Any]) -> dict[str, Any]:
     """Measures everything that the section ``benchmark`` of a configuration asks for.
 
     Returns:
-        ``steps`` (a row for each `Case`), ``parts`` (milliseconds of the parts of a step), ``cold_start`` (seconds of a new
-        process with and without compiled kernels), ``yardstick_ms``, ``hardware``, ``versions``, ``date``, ``settings``.
+        ``steps`` (a row for each `Case`), ``parts`` (milliseconds of the parts of a step), ``cold_start`` (seconds of a
+        new process without and with compiled kernels), ``yardstick_ms``, ``hardware``, ``versions``, ``date`` and
+        ``settings``.
 
     Raises:
         InputError: a configuration that cannot be simulated or refined.
@@ -204,7 +205,7 @@ def _take_turns(cases: list[Case], settings: Mapping[str, Any], yardstick: list[
 
 
 def measure_yardstick() -> float:
-    """Seconds of a Cholesky factorisation and a product of 480 x 480 matrices in NumPy on one thread, the median of five."""
+    """Seconds of a product and a Cholesky factor of 480 x 480 matrices in NumPy on one thread, the median of five."""
     n = _YARDSTICK_SIZE
     random = np.random.default_rng(0).standard_normal((n, n))
 
@@ -222,9 +223,7 @@ def _time_parts(case: Case, repeats: int) -> dict[str, Any]:
     potential, pattern = workspace.potential, workspace.pattern
     device = potential.device
     kind = sim.settings.linear_solver
-    linear = make_linear_solver(
-        kind, pattern.rows, pattern.cols, len(pattern.free), 3, device, potential.dtype
-    )
+    linear = make_linear_solver(kind, pattern.rows, pattern.cols, len(pattern.free), 3, device, potential.dtype)
     assemble = potential.scatterer(linear, pattern)
     potential.update_tangent()
     values = assemble().clone()
@@ -282,7 +281,7 @@ first_step(began, sys.stdin.read())
 
 
 def cold_start(config: Mapping[str, Any]) -> dict[str, dict[str, float]]:
-    """Seconds that a new process takes to import, to get its kernels and to make a step: without a kernel cache, then with.
+    """Seconds that a new process takes to import, to get its kernels and to step, without a kernel cache and with it.
 
     Raises:
         RuntimeError: the process failed.

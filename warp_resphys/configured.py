@@ -28,9 +28,13 @@ def choose_device(name: str) -> torch.device:
     try:
         device = torch.device(name)
     except RuntimeError:
-        raise InputError(f"device is {name!r}: choose auto, cpu or cuda.") from None
+        device = None
+    if device is None or device.type not in ("cpu", "cuda"):
+        raise InputError(f"device is {name!r}: choose auto, cpu or cuda.")
     if device.type == "cuda" and not available:
         raise InputError(f"device is {name!r}, but torch finds no CUDA device: choose device=cpu.")
+    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+        raise InputError(f"device is {name!r}, but torch finds {torch.cuda.device_count()} CUDA devices.")
     return device
 
 
@@ -85,13 +89,17 @@ def build_simulator(
     """
     if config["dtype"] not in _DTYPES:
         raise InputError(f"dtype is {config['dtype']!r}: choose float64 or float32.")
+    try:
+        constants = Material(**config[material])
+    except InputError as error:
+        raise InputError(f"{material}: {error}") from error
     settings = dict(config["solver"])
     if on_failure is not None:
         settings["on_failure"] = on_failure
     device = "cpu" if config["device"] == "auto" else config["device"]
     return Simulator(
         build_body(config) if body is None else body,
-        Material(**config[material]),
+        constants,
         time_step=config["time_step"],
         gravity=config["gravity"],
         integrator=config["integrator"],

@@ -12,8 +12,8 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from .errors import InputError, MeshError
-from .mesh import Mesh
+from .errors import InputError
+from .mesh import Mesh, check_mesh
 
 Array = NDArray[np.float64]
 
@@ -161,20 +161,19 @@ def discretise(mesh: Mesh, volume_integration: str = "centre") -> Discretisation
 
     Raises:
         InputError: an unknown volume integration.
-        MeshError: an element kind without a discretisation.
+        MeshError: a mesh that cannot be used (see `mesh.check_mesh`).
     """
     if volume_integration not in VOLUME_INTEGRATIONS:
         raise InputError(
             f"volume_integration is {volume_integration!r}: choose one of {', '.join(VOLUME_INTEGRATIONS)}."
         )
+    check_mesh(mesh)
     full = volume_integration == "full"
     if mesh.kind == "hexahedron":
         return _isoparametric(mesh, hexahedron_shape, gauss_hexahedron(), full)
     if mesh.kind == "tetrahedron10":
         return _isoparametric(mesh, tetrahedron10_shape, gauss_tetrahedron(), full)
-    if mesh.kind == "tetrahedron":
-        return _linear_tetrahedra(mesh, full)
-    raise MeshError(f"elements of kind {mesh.kind!r} cannot be simulated: use tetrahedra or hexahedra.")
+    return _linear_tetrahedra(mesh, full)
 
 
 def _isoparametric(

@@ -150,9 +150,7 @@ class _Leaves:
             with self.stream():
                 adjoints = [wp.to_torch(array.grad) for array in arrays]
                 leaves = [leaf for _, leaf in self.pairs]
-                gradients = torch.autograd.grad(
-                    results, leaves, adjoints, retain_graph=True, allow_unused=True
-                )
+                gradients = torch.autograd.grad(results, leaves, adjoints, retain_graph=True, allow_unused=True)
                 for (array, _), gradient in zip(self.pairs, gradients, strict=True):
                     if gradient is not None:
                         wp.to_torch(array.grad).add_(gradient)

@@ -5,6 +5,7 @@ vertices only, in x-major order; the hexahedra between them follow from the dist
 """
 
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from .body import Body
-from .errors import DataFileError
+from .errors import DataFileError, InputError
 from .integrator import State
 from .material import Material
 from .mesh import Mesh, box_hexahedra, select_vertices
@@ -80,17 +81,23 @@ def read_reference(path: Path) -> ReferenceTrajectory:
         path: a NumPy archive (.npz) without pickled objects.
 
     Raises:
-        DataFileError: the file is missing, is no such archive, or lacks entries, has others, or holds entries of wrong
-            shape or type; or its vertices are not a box grid in x-major order.
-        InputError: constants outside their physical range.
+        DataFileError: the file is missing or no such archive; it lacks entries, has others, or has some of wrong shape,
+            type or range; or its vertices are no box grid in x-major order.
     """
     values = _read_archive(path)
-    constants = {name: float(values[name]) for name in ("youngs_modulus", "poissons_ratio", "density")}
     if not values["dt"] > 0.0:
         raise DataFileError(f"{path}: dt is {float(values['dt']):g}: it must be positive, in seconds.")
+    try:
+        material = Material(
+            youngs_modulus=float(values["youngs_modulus"]),
+            poissons_ratio=float(values["poissons_ratio"]),
+            density=float(values["density"]),
+        )
+    except InputError as error:
+        raise DataFileError(f"{path}: {error}") from None
     mesh = box_of_vertices(values["vertices"], str(path))
     return ReferenceTrajectory(
-        Material(**constants),
+        material,
         float(values["dt"]),
         values["gravity"],
         mesh,
@@ -103,15 +110,17 @@ def read_reference(path: Path) -> ReferenceTrajectory:
 def _read_archive(path: Path) -> dict[str, FloatArray]:
     """The entries of `REFERENCE_SHAPES`, checked."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise DataFileError(f"{path} is a single array: give a reference trajectory (.npz).")
-            values = {name: archive[name] for name in archive.files}
+        loaded = np.load(path, allow_pickle=False)
+        if not isinstance(loaded, np.lib.npyio.NpzFile):
+            raise DataFileError(f"{path} is a single array: give a reference trajectory (.npz).")
+        with loaded:
+            values = {name: loaded[name] for name in loaded.files}
     except FileNotFoundError:
         raise DataFileError(f"{path} does not exist: give a reference trajectory (.npz).") from None
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise DataFileError(f"{path} cannot be read as a NumPy archive without pickles: {reason}") from None
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error):
+        raise DataFileError(
+            f"{path} is no NumPy archive of plain arrays, or a damaged one: give a reference trajectory (.npz)."
+        ) from None
     _check_names(values, path)
     _check_values(values, path)
     return {name: np.asarray(value, dtype=np.float64) for name, value in values.items()}
@@ -120,9 +129,7 @@ def _read_archive(path: Path) -> dict[str, FloatArray]:
 def _check_names(values: dict[str, NDArray[np.generic]], path: Path) -> None:
     missing = [name for name in REFERENCE_SHAPES if name not in values]
     foreign = sorted(name for name in values if name not in REFERENCE_SHAPES)
-    found = [
-        f"{problem} {', '.join(names)}" for problem, names in (("lacks", missing), ("has", foreign)) if names
-    ]
+    found = [f"{problem} {', '.join(names)}" for problem, names in (("lacks", missing), ("has", foreign)) if names]
     if found:
         raise DataFileError(
             f"{path} {' and '.join(found)}: a reference trajectory has {', '.join(REFERENCE_SHAPES)} and no more."

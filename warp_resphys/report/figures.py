@@ -19,8 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
-from warp_resphys.mesh import Mesh
-from warp_resphys.report import render
+from warp_resphys.report.render import COLOUR_MAP, Body
 
 FloatArray = NDArray[np.float64]
 
@@ -52,7 +51,6 @@ LABELS: Final[Mapping[str, str]] = {
     "resphys": "Corrected (ResPhys)",
 }
 LARGEST_SHOWN: Final = 1e5  # Of an error [mm], or a loss.
-OUTLINE: Final = "#808891"  # Drawn into pixels, hence one grey that reads on both themes.
 FONT: Final = (
     "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, 'DejaVu Sans', sans-serif"
 )
@@ -186,48 +184,35 @@ def training_curves(records: Sequence[Mapping[str, Any]], *, narrow: bool) -> Fi
     return figure
 
 
-def shape_comparison(
-    mesh: Mesh, positions: Mapping[str, FloatArray], target: FloatArray, *, narrow: bool
-) -> Figure:
-    """Draw each model's deformed body side by side, coloured by the distance from the target's vertices.
+def shape_comparison(bodies: Mapping[str, Body | None], *, narrow: bool) -> Figure:
+    """Show each model's deformed body side by side, coloured by the distance from the target's vertices.
 
     Args:
-        mesh: The undeformed body, shown as an outline.
-        positions: (N, 3) deformed positions [m] of each model at one time; one that diverged is not drawn.
-        target: (N, 3) the target's at the same time [m].
+        bodies: What `warp_resphys.report.render.draw_bodies` drew, by model; None for one that diverged.
         narrow: Whether the figure is for a narrow page.
     """
-    size = np.ptp(mesh.vertices, axis=0).max()
-    shown = {model: each for model, each in positions.items() if np.all(np.abs(each - target) < 10.0 * size)}
-    view = render.View.around(np.concatenate([mesh.vertices, target, *shown.values()]))
-    surface = render.Surface.of(mesh)
-    outline = surface.outline(mesh.vertices)
-    height = (NARROW if narrow else WIDE / len(positions)) / view.aspect + 0.75
+    shapes = [body.pixels.shape for body in bodies.values() if body]
+    rise = shapes[0][0] / shapes[0][1] if shapes else 0.5  # Height over width.
+    height = (NARROW if narrow else WIDE / len(bodies)) * rise + 0.75
     with mpl.rc_context(_STYLE):
-        figure = _figure(height, height * len(positions), narrow=narrow)
-        grid = (len(positions), 1) if narrow else (1, len(positions))
+        figure = _figure(height, height * len(bodies), narrow=narrow)
+        grid = (len(bodies), 1) if narrow else (1, len(bodies))
         panels = figure.subplots(*grid, squeeze=False).flat
-        for axes, (model, deformed) in zip(panels, positions.items(), strict=True):
+        for axes, (model, body) in zip(panels, bodies.items(), strict=True):
             axes.set_title(LABELS[model])
-            if model not in shown:
+            axes.set_axis_off()
+            if body is None:
                 axes.text(0.5, 0.5, "diverged before this time", ha="center", transform=axes.transAxes)
-                axes.set_axis_off()
                 continue
-            scale, unit, colours = _colours(np.linalg.norm(deformed - target, axis=1))
-            render.paint(axes, view, surface, deformed, colours, outline, OUTLINE)
+            axes.imshow(body.pixels)
+            factor, unit = (1e3, "mm") if body.largest >= 1e-4 else (1e6, "µm")
+            scale = ScalarMappable(Normalize(0.0, factor * body.largest), mpl.colormaps[COLOUR_MAP])
             bar = figure.colorbar(scale, ax=axes, orientation="horizontal", shrink=0.8, aspect=34, pad=0.02)
             bar.outline.set_visible(False)
             bar.set_label(f"distance from the target [{unit}]")
             bar.locator = MaxNLocator(5, steps=ROUND_STEPS)
             bar.update_ticks()
     return figure
-
-
-def _colours(error: FloatArray) -> tuple[ScalarMappable, str, FloatArray]:
-    """A colour scale for (N,) errors [m], its unit, and (N, 3) the colours."""
-    factor, unit = (1e3, "mm") if error.max() >= 1e-4 else (1e6, "µm")
-    scale = ScalarMappable(Normalize(0.0, factor * max(error.max(), 1e-12)), mpl.colormaps["viridis"])
-    return scale, unit, np.asarray(scale.to_rgba(factor * error))[:, :3]
 
 
 def save_png(figure: Figure, path: Path) -> None:

@@ -122,6 +122,8 @@ def write_report(path: Path, data: ReportData) -> None:
 
     The page is whole or not there: it is written beside its final place first.
 
+    Where the deformed bodies cannot be drawn, the page says why in their place, and so does a warning.
+
     Args:
         path: The page's file, such as `report.html`; missing folders are made.
         data: What to show.
@@ -132,7 +134,7 @@ def write_report(path: Path, data: ReportData) -> None:
     try:
         folder = path.parent / "figures"
         folder.mkdir(parents=True, exist_ok=True)
-        page = _render_page(data, _draw(data, folder))
+        page = _render_page(data, *_draw(data, folder))
         draft = path.with_name(path.name + ".part")
         draft.write_text(page, encoding="utf-8")
         os.replace(draft, path)
@@ -141,9 +143,9 @@ def write_report(path: Path, data: ReportData) -> None:
     _LOG.info("report written: %s", path)
 
 
-def _draw(data: ReportData, folder: Path) -> dict[str, Picture]:
-    """Draw the figures in two widths, and save the wide ones."""
-    from warp_resphys.report import figures
+def _draw(data: ReportData, folder: Path) -> tuple[dict[str, Picture], dict[str, str]]:
+    """Draw the figures in two widths, and save the wide ones; say of those that cannot be drawn why."""
+    from warp_resphys.report import figures, render
 
     def both(name: str, draw: "Callable[..., Figure]", alt: str) -> Picture:
         wide, narrow = draw(narrow=False), draw(narrow=True)
@@ -158,16 +160,24 @@ def _draw(data: ReportData, folder: Path) -> dict[str, Picture]:
     shapes = {"simulation": data.example.simulation[state], "resphys": data.example.resphys[state]}
     draw_motion = partial(figures.tip_displacement, motion, data.time_step)
     draw_errors = partial(figures.error_over_time, data.errors_mm, data.time_step)
-    draw_shapes = partial(figures.shape_comparison, data.mesh, shapes, target)
     pictures = {
         "tip_displacement": both("tip_displacement", draw_motion, _describe_motion(motion)),
-        "shape": both("shape", draw_shapes, _describe_shapes(shapes, target)),
         "error_over_time": both("error_over_time", draw_errors, _describe_errors(data.errors_mm)),
     }
+    missing = {}
+    try:
+        bodies = render.draw_bodies(data.mesh, shapes, target)
+    except render.DrawingError as error:
+        missing["shape"] = f"{error}, then delete this page and run the same command again."
+        _LOG.warning("the report lacks a picture: %s", error)
+        (folder / "shape.png").unlink(missing_ok=True)  # Of an earlier report, it would not belong to this one.
+    else:
+        alt = _describe_shapes(shapes, target)
+        pictures["shape"] = both("shape", partial(figures.shape_comparison, bodies), alt)
     if data.training:
         alt = f"Losses and validation roll-out error over {len(data.training)} epochs, on logarithmic axes."
         pictures["training"] = both("training", partial(figures.training_curves, data.training), alt)
-    return pictures
+    return pictures, missing
 
 
 def worst_state(example: Example) -> int:
@@ -176,7 +186,7 @@ def worst_state(example: Example) -> int:
     return 1 + int(np.argmax(np.where(np.isfinite(errors), errors, -1.0)))
 
 
-def _render_page(data: ReportData, pictures: Mapping[str, Picture]) -> str:
+def _render_page(data: ReportData, pictures: Mapping[str, Picture], missing: Mapping[str, str]) -> str:
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("warp_resphys", "report"),
         undefined=jinja2.StrictUndefined,
@@ -191,6 +201,7 @@ def _render_page(data: ReportData, pictures: Mapping[str, Picture]) -> str:
         data=data,
         metrics=metrics,
         pictures=pictures,
+        missing=missing,
         names=_MODELS,
         models=models,
         verdict=verdict(metrics["errors_mm"], data.published, data.simulator, data.reality),

@@ -1,218 +1,231 @@
-"""Pictures of deformed bodies, coloured by a value at the vertices and painted from back to front.
+"""Pictures of deformed bodies, coloured by their distance from a target and drawn off screen by pyvista.
 
-Every boundary face is cut into pieces small enough that sorting them by depth hides what is hidden. It needs
-no graphics driver, display or subprocess, so the picture is the same on every machine.
+Where there is no OpenGL driver, VTK ends the process that asks for a picture. Hence pyvista is only ever
+imported in a process of its own, `python -m warp_resphys.report.render scene.npz picture.png`.
 """
 
-from dataclasses import dataclass
-from typing import Final
+import logging
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final, NamedTuple
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.collections import PolyCollection
-from matplotlib.colors import to_rgba
 from numpy.typing import NDArray
 
-from warp_resphys.mesh import Mesh, boundary_faces
+from warp_resphys.errors import ResphysError
+from warp_resphys.mesh import Mesh, boundary_faces, boundary_triangles
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-PIECES: Final = 9000  # About how many pieces a surface is cut into; the colour is constant on a piece.
-FEATURE_ANGLE: Final = np.deg2rad(30.0)  # Faces that meet at a sharper angle share an edge of the outline.
-OUTLINE_SETBACK: Final = 0.01  # Relative to the size of the body, as that of a piece.
-TOWARDS_VIEWER: Final = (
-    0.40,
-    -1.0,
-    0.40,
-)  # z is up; a body along x is seen from the side, its free end nearer.
+_LOG = logging.getLogger(__name__)
+COMMAND: Final = (sys.executable, "-P", "-m", "warp_resphys.report.render")
+TIME_OUT: Final = 120.0  # [s]; it takes about one.
+COLOUR_MAP: Final = "viridis"
+OUTLINE: Final = "#808891"  # Of the undeformed body: one grey that reads on a light and on a dark page.
+LONGER_SIDE: Final = 1600  # Of a picture [px].
+MARGIN: Final = 0.02  # Around the bodies, as the lengths below relative to the longer side of what is seen.
+LINE_WIDTHS: Final = {"outline": 0.0034, "edges": 0.0015}
+NUDGE: Final = 0.005  # The outline is drawn this far behind the body where they coincide.
+TOWARDS_VIEWER: Final = (0.40, -1.0, 0.40)  # A body along x is seen from the side, the end of high x nearer.
 TOWARDS_LIGHT: Final = (0.15, -0.75, 1.0)
 SHADE: Final = 0.25  # Share of the colour that depends on the light; the rest stays readable as a value.
+FEATURE_ANGLE: Final = 30.0  # Faces that meet at a sharper angle [degrees] share an edge of the outline.
+_RINGS: Final = {3: [0, 1, 2], 4: [0, 1, 2, 3], 6: [0, 3, 1, 4, 2, 5]}  # Nodes along the rim of a face.
+_DIVERGED: Final = 10.0  # Distance from the target, relative to the body's, beyond which nothing is drawn.
 
 
-@dataclass(frozen=True, eq=False)
-class View:
-    """A parallel projection that shows a given set of points whole.
-
-    Attributes:
-        axes: (3, 3) orthonormal rows: to the right, up, towards the viewer.
-        lower: (2,) lower left corner of what is seen [m].
-        upper: (2,) upper right corner [m].
-    """
-
-    axes: FloatArray
-    lower: FloatArray
-    upper: FloatArray
-
-    @classmethod
-    def around(cls, points: FloatArray, margin: float = 0.02) -> "View":
-        """Return the view of (P, 3) points [m] with a margin relative to the longer side."""
-        towards = _normalised(np.asarray(TOWARDS_VIEWER))
-        right = _normalised(np.cross([0.0, 0.0, 1.0], towards))
-        axes = np.stack([right, np.cross(towards, right), towards])
-        seen = points @ axes[:2].T  # (P, 2) [m]
-        lower, upper = seen.min(axis=0), seen.max(axis=0)
-        space = margin * np.max(upper - lower)
-        return cls(axes, lower - space, upper + space)
-
-    @property
-    def aspect(self) -> float:
-        """Width over height."""
-        width, height = self.upper - self.lower
-        return float(width / height)
+class DrawingError(ResphysError):
+    """A picture that cannot be drawn on this machine."""
 
 
-@dataclass(frozen=True, eq=False)
-class Surface:
-    """The boundary of a mesh in small pieces, as a linear map from its vertices.
+class Body(NamedTuple):
+    """A drawn body.
 
     Attributes:
-        faces: (F, K) vertices of the boundary faces, outward-oriented.
-        weights: (P, K) shape functions of a face at the P points where it is cut.
-        pieces: (C, 3 | 4) points of a piece, oriented as the face is.
-        rims: (E, 2) points of the segments along the edges of the face.
-        rim_owners: (E,) piece of each segment.
+        pixels: (H, W, 4) red, green, blue and opacity in [0, 1]; what is around the body is transparent.
+        largest: Distance from the target [m] that has the last colour of `COLOUR_MAP`; 0 has the first.
     """
 
-    faces: IntArray
-    weights: FloatArray
-    pieces: IntArray
-    rims: IntArray
-    rim_owners: IntArray
-
-    @classmethod
-    def of(cls, mesh: Mesh) -> "Surface":
-        """Return the surface of a mesh of hexahedra, 4-node or 10-node tetrahedra."""
-        faces = boundary_faces(mesh)
-        cuts = int(np.clip(np.sqrt(PIECES / len(faces)), 1, 12))
-        nodes = faces.shape[1]
-        weights, pieces, rims = _cut_quadrilateral(cuts) if nodes == 4 else _cut_triangle(cuts, nodes)
-        touches = (rims[:, :, None, None] == pieces).any(axis=3).all(axis=1)  # (E, C)
-        return cls(faces, weights, pieces, rims, touches.argmax(axis=1))
-
-    def interpolate(self, values: FloatArray) -> FloatArray:
-        """Return (F, P, C) values at the points of every face from (N, C) values at the vertices."""
-        return np.asarray(np.einsum("pk,fkc->fpc", self.weights, values[self.faces]))
-
-    def outline(self, vertices: FloatArray) -> FloatArray:
-        """Return the (L, 2, 3) ends [m] of the sharp edges of the body with these (N, 3) vertices [m]."""
-        corners = self.faces[:, : 4 if self.faces.shape[1] == 4 else 3]
-        first, second, third = (vertices[corners[:, node]] for node in range(3))
-        normals = _normalised(np.cross(second - first, third - first))  # (F, 3)
-        sides = np.sort(np.stack([corners, np.roll(corners, -1, axis=1)], axis=2), axis=2)  # (F, K, 2)
-        edges, owners = np.unique(sides.reshape(-1, 2), axis=0, return_inverse=True)
-        by_edge = np.argsort(owners.ravel(), kind="stable")
-        starts = np.searchsorted(owners.ravel()[by_edge], np.arange(len(edges)))
-        ends = np.append(starts[1:], len(by_edge))
-        owner = by_edge // corners.shape[1]  # Faces, edge by edge.
-        cosine = np.einsum("ec,ec->e", normals[owner[starts]], normals[owner[ends - 1]])
-        return np.asarray(vertices[edges[cosine < np.cos(FEATURE_ANGLE)]])
+    pixels: NDArray[np.float32]
+    largest: float
 
 
-def paint(
-    axes: Axes,
-    view: View,
-    surface: Surface,
-    vertices: FloatArray,
-    colours: FloatArray,
-    outline: FloatArray,
-    outline_colour: str,
-) -> None:
-    """Draw a body, the edges of its faces, and an outline, each hidden where something stands before it.
+def draw_bodies(mesh: Mesh, positions: Mapping[str, FloatArray], target: FloatArray) -> dict[str, Body | None]:
+    """Draw deformed bodies, coloured by the distance from the target's vertices, in pictures of one size.
 
     Args:
-        axes: Where to draw; limits and aspect are set to the view's, ticks and frame removed.
-        view: The projection.
-        surface: The boundary of the body.
-        vertices: (N, 3) deformed positions [m].
-        colours: (N, 3) red, green and blue in [0, 1] at the vertices.
-        outline: (L, 2, 3) ends of further edges [m], such as those of the undeformed body.
-        outline_colour: Their colour.
+        mesh: The undeformed body, drawn as an outline.
+        positions: (N, 3) deformed positions [m] by name.
+        target: (N, 3) the target's [m].
+
+    Returns:
+        A drawn body by name; None for one that has diverged.
+
+    Raises:
+        DrawingError: There is no pyvista, or no OpenGL driver that works off screen.
     """
-    points = surface.interpolate(vertices)  # (F, P, 3) [m]
-    corners = surface.pieces.shape[1]
-    pieces = points[:, surface.pieces].reshape(-1, corners, 3)
-    rims = points[:, surface.rims].reshape(-1, 2, 3)
-    dashes = _cut_lines(outline, cuts=60)
-
-    shaded = (
-        surface.interpolate(colours)[:, surface.pieces].mean(axis=2).reshape(-1, 3) * _shade(pieces)[:, None]
+    size = np.ptp(mesh.vertices, axis=0).max()
+    shown = {name: q for name, q in positions.items() if np.all(np.abs(q - target) < _DIVERGED * size)}
+    if not shown:
+        return dict.fromkeys(positions)
+    errors = np.stack([np.linalg.norm(q - target, axis=1) for q in shown.values()])  # (B, N) [m]
+    largest = np.maximum(errors.max(axis=1), 1e-15)
+    sides = boundary_faces(mesh)
+    rims = sides[:, _RINGS[sides.shape[1]]]
+    edges = np.sort(np.stack([rims, np.roll(rims, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
+    picture = _run(
+        {
+            "rest": mesh.vertices,
+            "positions": np.stack(list(shown.values())),
+            "values": errors / largest[:, None],
+            "triangles": boundary_triangles(mesh),
+            "edges": np.unique(edges, axis=0),
+        }
     )
-    rgba = np.concatenate(
-        [
-            np.column_stack([shaded, np.ones(len(pieces))]),
-            np.broadcast_to([0.0, 0.0, 0.0, 0.3], (len(rims), 4)),
-            np.broadcast_to(to_rgba(outline_colour), (len(dashes), 4)),
-        ]
+    pixels = np.split(picture, len(shown), axis=1)
+    drawn = {name: Body(*each) for name, *each in zip(shown, pixels, largest.tolist(), strict=True)}
+    return {name: drawn.get(name) for name in positions}
+
+
+def _run(scene: Mapping[str, Any]) -> NDArray[np.float32]:
+    """(H, B x W, 4) the pictures that another process draws, side by side."""
+    from matplotlib.image import imread
+
+    environment = dict(os.environ)
+    if sys.platform == "linux":  # Neither X nor OSMesa is looked for where there is none.
+        environment.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
+    with TemporaryDirectory() as folder:
+        source, picture = Path(folder) / "scene.npz", Path(folder) / "picture.png"
+        np.savez(source, **scene)
+        try:
+            done = subprocess.run(
+                [*COMMAND, str(source), str(picture)],
+                env=environment,
+                timeout=TIME_OUT,
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                text=True,
+                errors="replace",
+            )
+        except subprocess.TimeoutExpired as error:
+            raise _failure(f"not done after {TIME_OUT:g} s") from error
+        except OSError as error:
+            raise _failure(error.strerror or str(error)) from error
+        if done.returncode:
+            _LOG.debug("the drawing process wrote: %s", done.stderr)
+            raise _failure(_last_words(done.returncode, done.stderr))
+        return np.asarray(imread(picture))
+
+
+def _failure(reason: str) -> DrawingError:
+    return DrawingError(
+        f"pyvista cannot draw the deformed body on this machine ({reason}): install the Python package pyvista and "
+        "an OpenGL driver that works without a display, such as libegl1 and libgl1-mesa-dri on Debian and Ubuntu"
     )
-    widths = np.repeat(
-        [0.5, 0.4, 0.9], [len(pieces), len(rims), len(dashes)]
-    )  # [pt]; a piece's covers its seams.
-    depths = pieces.mean(axis=1) @ view.axes[2]
-    rim_depths = depths.reshape(len(points), -1)[:, surface.rim_owners].ravel()  # Each follows its piece.
-    behind = OUTLINE_SETBACK * np.ptp(vertices)  # Where body and outline coincide, the body shows.
-    depths = np.concatenate([depths, rim_depths, dashes.mean(axis=1) @ view.axes[2] - behind])
-    flat = [each @ view.axes[:2].T for each in (*pieces, *rims, *dashes)]  # (3 | 4 | 2, 2) [m] each
-    order = np.argsort(depths, kind="stable")  # The viewer is at plus infinity, so what is far comes first.
-    axes.add_collection(
-        PolyCollection(
-            [flat[index] for index in order],
-            facecolors=rgba[order],
-            edgecolors=rgba[order],
-            linewidths=widths[order],
-            rasterized=True,
-        ),
-        autolim=False,
+
+
+def _last_words(code: int, stderr: str) -> str:
+    """Why a process ended: the signal, which tells more than VTK does before it, or the last line it wrote."""
+    if code < 0:
+        return signal.strsignal(-code) or f"signal {-code}"
+    return (stderr.strip().splitlines() or [f"exit code {code}"])[-1].rstrip(".")
+
+
+def main(source: str, picture: str) -> None:
+    """Draw a scene, the bodies side by side.
+
+    Args:
+        source: An .npz file with rest (N, 3) and positions (B, N, 3) [m], values (B, N) in [0, 1], triangles
+            (F, 3) and edges (E, 2) of the surface.
+        picture: The .png file to write.
+
+    Raises:
+        RuntimeError: Nothing is to be seen in the picture.
+    """
+    import pyvista
+
+    with np.load(source, allow_pickle=False) as arrays:
+        scene: dict[str, Any] = dict(arrays)
+    bodies = scene["positions"]
+    axes = _view_axes()
+    seen = np.concatenate([scene["rest"], *bodies]) @ axes.T  # (P, 3) [m] to the right, up, towards the viewer
+    lower, upper = seen.min(axis=0), seen.max(axis=0)
+    extent = upper[:2] - lower[:2]
+    length = extent.max()  # [m]
+    extent += 2.0 * MARGIN * length
+    width, height = np.ceil(extent * LONGER_SIDE / extent.max()).astype(int).tolist()  # [px]
+    centre = 0.5 * (lower + upper) @ axes
+
+    plotter: Any = pyvista.Plotter(
+        shape=(1, len(bodies)),
+        off_screen=True,
+        border=False,
+        lighting="none",
+        window_size=[len(bodies) * width, height],
     )
-    axes.set(xlim=(view.lower[0], view.upper[0]), ylim=(view.lower[1], view.upper[1]), aspect="equal")
-    axes.set_axis_off()
+    plotter.enable_anti_aliasing("msaa", multi_samples=8, all_renderers=True)
+    plotter.set_background(OUTLINE, all_renderers=True)  # Transparent, but for a share of it in smooth rims.
+    light = pyvista.Light(position=TOWARDS_LIGHT, focal_point=(0.0, 0.0, 0.0), light_type="scene light")
+    plotter.add_light(light)  # In all pictures.
+    for column in range(len(bodies)):
+        plotter.subplot(0, column)
+        _add_body(plotter, scene, column, axes[2] * length)
+        plotter.camera.focal_point = centre
+        plotter.camera.position = centre + axes[2] * 10.0 * length
+        plotter.camera.up = axes[1]
+        plotter.enable_parallel_projection()
+        plotter.camera.parallel_scale = 0.5 * extent[1]
+        plotter.reset_camera_clipping_range()
+    pixels = plotter.screenshot(picture, transparent_background=True, return_img=True)
+    plotter.close()
+    if pixels is None or not pixels[..., 3].any():
+        raise RuntimeError("the picture is empty")
 
 
-def _cut_quadrilateral(cuts: int) -> tuple[FloatArray, IntArray, IntArray]:
-    """Weights, pieces and rims of a 4-node face cut into a grid."""
-    ticks = np.linspace(0.0, 1.0, cuts + 1)
-    s, t = (each.ravel() for each in np.meshgrid(ticks, ticks, indexing="ij"))
-    weights = np.stack([(1 - s) * (1 - t), s * (1 - t), s * t, (1 - s) * t], axis=1)
-    index = np.arange((cuts + 1) ** 2).reshape(cuts + 1, cuts + 1)
-    pieces = np.stack([index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]], axis=2).reshape(-1, 4)
-    return weights, pieces, _segments(index[:, 0], index[-1], index[:, -1], index[0])
+def _view_axes() -> FloatArray:
+    """(3, 3) orthonormal rows: to the right, up, towards the viewer; z points up."""
+    towards = np.asarray(TOWARDS_VIEWER) / np.linalg.norm(TOWARDS_VIEWER)
+    right = np.cross([0.0, 0.0, 1.0], towards)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(towards, right), towards])
 
 
-def _cut_triangle(cuts: int, nodes: int) -> tuple[FloatArray, IntArray, IntArray]:
-    """Weights, pieces and rims of a 3- or 6-node face (corners, then midpoints of sides 01, 12, 20)."""
-    lattice = [(i, j) for i in range(cuts + 1) for j in range(cuts + 1 - i)]
-    index = {node: number for number, node in enumerate(lattice)}
-    i, j = np.asarray(lattice).T
-    corners = np.stack([cuts - i - j, i, j], axis=1) / cuts  # (P, 3) barycentric coordinates
-    following = np.roll(corners, -1, axis=1)
-    weights = corners if nodes == 3 else np.hstack([corners * (2 * corners - 1), 4 * corners * following])
-    pieces = [[index[i, j], index[i + 1, j], index[i, j + 1]] for i, j in lattice if i + j < cuts]
-    pieces += [
-        [index[i + 1, j], index[i + 1, j + 1], index[i, j + 1]] for i, j in lattice if i + j < cuts - 1
-    ]
-    run = range(cuts + 1)
-    sides = ([index[k, 0] for k in run], [index[cuts - k, k] for k in run], [index[0, k] for k in run])
-    return weights, np.asarray(pieces), _segments(*map(np.asarray, sides))
+def _add_body(plotter: Any, scene: Mapping[str, NDArray[Any]], column: int, towards: FloatArray) -> None:
+    """Add one body, the edges of its faces and its outline at rest.
+
+    Args:
+        plotter: The pyvista plotter.
+        scene: See `main`.
+        column: Which body.
+        towards: (3,) the way to the viewer, as long as what is seen [m].
+    """
+    import pyvista
+
+    positions, triangles = scene["positions"][column], scene["triangles"]
+    surface = pyvista.PolyData.from_regular_faces(positions, triangles)
+    surface["values"] = scene["values"][column]
+    plotter.add_mesh(
+        surface,
+        scalars="values",
+        cmap=COLOUR_MAP,
+        clim=(0.0, 1.0),
+        show_scalar_bar=False,
+        ambient=1.0 - SHADE,
+        diffuse=SHADE,
+    )
+    pairs = np.insert(scene["edges"], 0, 2, axis=1)  # VTK wants the number of points before each line.
+    edges = pyvista.PolyData(positions + 0.2 * NUDGE * towards, lines=pairs.ravel())
+    plotter.add_mesh(edges, color="black", opacity=0.35, lighting=False, line_width=LINE_WIDTHS["edges"] * LONGER_SIDE)
+    rest = pyvista.PolyData.from_regular_faces(scene["rest"] - NUDGE * towards, triangles)
+    outline = rest.extract_feature_edges(FEATURE_ANGLE)
+    plotter.add_mesh(outline, color=OUTLINE, lighting=False, line_width=LINE_WIDTHS["outline"] * LONGER_SIDE)
 
 
-def _segments(*runs: IntArray) -> IntArray:
-    return np.concatenate([np.stack([run[:-1], run[1:]], axis=1) for run in runs])
-
-
-def _cut_lines(lines: FloatArray, cuts: int) -> FloatArray:
-    """(L, 2, 3) lines as (L x cuts, 2, 3) short ones."""
-    along = np.linspace(0.0, 1.0, cuts + 1)[:, None]
-    dots = lines[:, None, 0] * (1.0 - along) + lines[:, None, 1] * along  # (L, cuts + 1, 3)
-    return np.stack([dots[:, :-1], dots[:, 1:]], axis=2).reshape(-1, 2, 3)
-
-
-def _shade(pieces: FloatArray) -> FloatArray:
-    """(C,) brightness of flat pieces, 1 where they face the light."""
-    normals = _normalised(np.cross(pieces[:, 1] - pieces[:, 0], pieces[:, 2] - pieces[:, 0]))
-    facing = np.clip(normals @ _normalised(np.asarray(TOWARDS_LIGHT)), 0.0, 1.0)
-    return np.asarray(1.0 - SHADE * (1.0 - facing))
-
-
-def _normalised(vectors: FloatArray) -> FloatArray:
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.asarray(vectors / np.maximum(length, np.finfo(np.float64).tiny))
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -32,8 +32,6 @@ class SkipMLP(nn.Module):
 
     def __init__(self, n_in: int, n_out: int, blocks: int, layers: int, width: int) -> None:
         super().__init__()
-        if min(blocks, layers, width) < 1:
-            raise InputError("network.blocks, network.layers and network.width must be at least 1.")
         self.blocks = nn.ModuleList(
             _perceptron(n_in if i == 0 else n_out, n_out, layers, width) for i in range(blocks)
         )
@@ -196,17 +194,30 @@ def build_model(
     Raises:
         InputError: an unknown kind, or sizes that do not fit the samples.
     """
+    check_network(config)
     if config["kind"] == "reduced":
         coders = (
             pod_coder(q - rest, config["position_modes"]),
             pod_coder(v, config["velocity_modes"]),
             pod_coder(force, config["force_modes"]),
         )
-    elif config["kind"] == "nodal":
-        coders = (nodal_coder(q - rest), nodal_coder(v), nodal_coder(force))
     else:
-        raise InputError(f"network.kind is {config['kind']!r}: choose one of {', '.join(NETWORK_KINDS)}.")
+        coders = (nodal_coder(q - rest), nodal_coder(v), nodal_coder(force))
     return ResidualForce(rest, *coders, config)
+
+
+def check_network(config: Mapping[str, Any]) -> None:
+    """Checks the ranges of the group ``network``.
+
+    Raises:
+        InputError: an unknown kind, or a size that is not positive.
+    """
+    if config["kind"] not in NETWORK_KINDS:
+        raise InputError(f"network.kind is {config['kind']!r}: choose one of {', '.join(NETWORK_KINDS)}.")
+    modes = ("position_modes", "velocity_modes", "force_modes") if config["kind"] == "reduced" else ()
+    for key in ("blocks", "layers", "width", *modes):
+        if not config[key] > 0:
+            raise InputError(f"network.{key} is {config[key]}: it must be positive.")
 
 
 def restore(tensors: Mapping[str, torch.Tensor], description: Mapping[str, Any]) -> ResidualForce:

@@ -52,7 +52,7 @@ class Reconstructor(ABC):
         max_iterations: after which a step has failed.
 
     Raises:
-        InputError: a regularisation that is negative, or a tolerance that is not positive.
+        InputError: a regularisation that is negative, or a tolerance or number of iterations that is not positive.
     """
 
     def __init__(
@@ -62,13 +62,22 @@ class Reconstructor(ABC):
             raise InputError(f"reconstruction.regularisation is {regularisation:g}: it must be zero or more.")
         if not tolerance > 0.0:
             raise InputError(f"reconstruction.tolerance is {tolerance:g}: it must be positive.")
+        if not max_iterations > 0:
+            raise InputError(f"reconstruction.max_iterations is {max_iterations}: it must be positive.")
         self.simulator = simulator
         self.regularisation, self.tolerance, self.max_iterations = regularisation, tolerance, max_iterations
         self._tensors = simulator.prepare()
 
     @abstractmethod
-    def step(self, state: State, observed: torch.Tensor) -> Reconstruction:
-        """Reconstructs the step from a state to (B, N, 3) observed positions [m].
+    def step(
+        self, state: State, observed: torch.Tensor, first_guess: torch.Tensor | None = None
+    ) -> Reconstruction:
+        """Reconstructs the step from a state to observed positions.
+
+        Args:
+            state: where the step starts.
+            observed: (B, N, 3) [m].
+            first_guess: (B, N, 3) force to start from, such as that of the step before [N].
 
         Raises:
             ConvergenceError: no minimum was found.
@@ -85,17 +94,24 @@ class GaussNewton(Reconstructor):
 
     by conjugate gradients, preconditioned with (I + sqrt(lambda) H)^2: for every eigenvalue h of H the quotient
     (1 + lambda h^2) / (1 + sqrt(lambda) h)^2 lies between 1/2 and 1, so that a dozen iterations do for any lambda.
-    ``tolerance`` is the last change of any position [m].
+    ``tolerance`` is the last change of any position [m]. Where x stands at a fraction e of the time step, |q+ - q*| is
+    |x - x*| / e, and lambda e^2 takes the place of lambda. The first guess is x*, and no force is needed.
     """
 
+    _assembled: IncrementalPotential | None = None
+
     @override
-    def step(self, state: State, observed: torch.Tensor) -> Reconstruction:
+    def step(
+        self, state: State, observed: torch.Tensor, first_guess: torch.Tensor | None = None
+    ) -> Reconstruction:
+        del first_guess
         sim, batch = self.simulator, state.batch
         workspace = sim.workspace(batch)
         p = workspace.potential
         stage = sim.method.stage(state, sim.time_step)
         p.set_terms(sim.step_terms(stage, batch, None, self._tensors, workspace))
-        target = sim.method.solution_for(state, observed)
+        self._weight = self.regularisation * stage.end**2
+        target = sim.method.solution_for(state, observed).clone()
         target[:, sim.fixed] = state.q[:, sim.fixed]
         x = target.clone()
         objective, force = self._evaluate(p, x, target)
@@ -124,7 +140,7 @@ class GaussNewton(Reconstructor):
         p.positions.copy_(x)
         p.evaluate()
         force = p.residual.clone()
-        return ((x - target) ** 2).sum((1, 2)) + self.regularisation * (force**2).sum((1, 2)), force
+        return ((x - target) ** 2).sum((1, 2)) + self._weight * (force**2).sum((1, 2)), force
 
     def _search(
         self,
@@ -154,7 +170,7 @@ class GaussNewton(Reconstructor):
             return (p.stiffness_product(d) + inertia * d) * mask
 
         def operator(d: torch.Tensor) -> torch.Tensor:
-            return d + self.regularisation * hessian(hessian(d))
+            return d + self._weight * hessian(hessian(d))
 
         factor, dofs = self._precondition(p)
 
@@ -164,17 +180,15 @@ class GaussNewton(Reconstructor):
             out[:, dofs] = factor.solve(factor.solve(right)).reshape(len(r), -1, 3)
             return out
 
-        right = -offset - self.regularisation * hessian(force)
+        right = -offset - self._weight * hessian(force)
         with threads_for(right.numel()):
             return conjugate_gradients(operator, preconditioner, right, tolerance=1e-6)
 
     def _precondition(self, p: IncrementalPotential) -> tuple[Factor, torch.Tensor]:
         """Factor of I + sqrt(lambda) H on the free vertices; H clamped where that is not positive definite."""
-        sim = self.simulator
-        workspace = sim.workspace(p.batch)
-        pattern = workspace.pattern
-        if not hasattr(self, "_linear"):
-            name = sim.settings.linear_solver
+        if self._assembled is not p:
+            pattern = self.simulator.workspace(p.batch).pattern
+            name = self.simulator.settings.linear_solver
             where = (p.device, p.dtype)
             linear = make_linear_solver(name, pattern.rows, pattern.cols, len(pattern.free), 3, *where)
             diagonal = linear.address[pattern.rows == pattern.cols][:, [0, 4, 8]].ravel()
@@ -182,9 +196,10 @@ class GaussNewton(Reconstructor):
             self._free = torch.as_tensor(pattern.free, device=p.device)
             self._assemble = p.scatterer(linear, pattern)
             self._linear = linear
+            self._assembled = p
 
         def factorise() -> Factor:
-            values = np.sqrt(self.regularisation) * self._assemble()
+            values = np.sqrt(self._weight) * self._assemble()
             values[:, self._diagonal] += 1.0
             return self._linear.factor(values)
 
@@ -199,13 +214,13 @@ class GaussNewton(Reconstructor):
 class LBFGSB(Reconstructor):
     """The published method: L-BFGS-B on the forces, with gradients through the simulator.
 
-    Each step starts from the forces of the step before. ``tolerance`` is the relative change of the objective.
+    ``tolerance`` is the relative change of the objective.
     """
 
-    _last: torch.Tensor | None = None
-
     @override
-    def step(self, state: State, observed: torch.Tensor) -> Reconstruction:
+    def step(
+        self, state: State, observed: torch.Tensor, first_guess: torch.Tensor | None = None
+    ) -> Reconstruction:
         sim = self.simulator
         free = torch.ones(sim.body.n_vertices, 1, device=observed.device, dtype=observed.dtype)
         free[sim.fixed] = 0.0
@@ -219,9 +234,9 @@ class LBFGSB(Reconstructor):
             (gradient,) = torch.autograd.grad(value, force)
             # In units of lambda both the objective and its change are of the size of f^2.
             scale = 1.0 / max(self.regularisation, 1e-12)
-            return scale * float(value), scale * gradient.cpu().double().numpy().ravel()
+            return scale * float(value.detach()), scale * gradient.cpu().double().numpy().ravel()
 
-        start = torch.zeros_like(observed) if self._last is None else self._last
+        start = torch.zeros_like(observed) if first_guess is None else first_guess
         result = scipy.optimize.minimize(
             objective,
             start.cpu().double().numpy().ravel(),
@@ -229,8 +244,14 @@ class LBFGSB(Reconstructor):
             method="L-BFGS-B",
             options={"maxiter": self.max_iterations, "maxcor": 30, "ftol": self.tolerance, "gtol": 0.0},
         )
+        if result.status == 1:  # A line search that ends early is another matter: the objective is down to rounding.
+            raise ConvergenceError(
+                f"L-BFGS-B found no minimum in {result.nit} iterations: raise reconstruction.max_iterations, "
+                "reconstruction.tolerance or reconstruction.regularisation.",
+                observed,
+                None,
+            )
         force = free * sim.tensor(result.x.reshape(observed.shape))
-        self._last = force
         with torch.no_grad():
             new, _ = sim.step(state, force, material=self._tensors)
         return Reconstruction(new, force, int(result.nit))
@@ -276,9 +297,9 @@ def conjugate_gradients(
 def make_reconstructor(
     simulator: Simulator,
     method: str,
-    regularisation: float = 1e-9,
-    tolerance: float = 1e-10,
-    max_iterations: int = 20,
+    regularisation: float,
+    tolerance: float,
+    max_iterations: int,
 ) -> Reconstructor:
     """The named method.
 

@@ -65,9 +65,7 @@ class Trainer:
         for name, samples in (("training", train), ("validation", validation)):
             if not len(samples.q):
                 raise InputError(f"the {name} split is empty: give it at least one trajectory.")
-        for key in ("epochs", "batch_size", "learning_rate", "final_learning_rate", "rollout_every"):
-            if not config[key] > 0:
-                raise InputError(f"trainer.{key} is {config[key]}: it must be positive.")
+        check_trainer(config)
         self.model, self.config, self.rollout_error = model, config, rollout_error
         self.state = TrainingState()
         with torch.no_grad():
@@ -175,6 +173,22 @@ class Trainer:
         """The model with the weights of the smallest roll-out error."""
         self.model.network.load_state_dict(self.state.best)
         return self.model.eval()
+
+
+def check_trainer(config: Mapping[str, Any]) -> None:
+    """Checks the ranges of the group ``trainer``.
+
+    Raises:
+        InputError: a setting out of range.
+    """
+    for key in ("epochs", "batch_size", "learning_rate", "final_learning_rate", "rollout_every"):
+        if not config[key] > 0:
+            raise InputError(f"trainer.{key} is {config[key]}: it must be positive.")
+    for key in ("weight_decay", "noise"):
+        if not config[key] >= 0:
+            raise InputError(f"trainer.{key} is {config[key]}: it must be zero or more.")
+    if config["linear_noise"] is not None and not config["linear_noise"] > 0:
+        raise InputError(f"trainer.linear_noise is {config['linear_noise']}: it must be positive, or null.")
 
 
 def _part(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:

@@ -13,6 +13,7 @@ from rich.table import Table
 from ..files import digest, write_json
 from ..report.page import number_text
 from ..stages import Stage, StageContext, run_stages
+from .checks import check_configuration
 from .evaluate import evaluate
 from .generate import generate
 from .reconstruct import reconstruct
@@ -64,7 +65,8 @@ def run_experiment(config: DictConfig) -> None:
     wp.config.log_level = wp.LOG_WARNING
     if config.device == "cpu" or not torch.cuda.is_available():
         torch.set_num_threads(1)  # The networks are small: see threads.py.
-    plain: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
+    plain: dict[str, Any] = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)  # type: ignore[assignment]
+    check_configuration(plain)
     folder = Path(HydraConfig.get().runtime.output_dir)
     run_stages(stages(plain), folder)
     metrics = collect_metrics(StageContext("metrics", folder, "", {}), plain)

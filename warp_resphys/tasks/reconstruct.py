@@ -29,12 +29,13 @@ def reconstruct(context: StageContext) -> None:
         Progress("reconstruct", frames, "frames", file.done) as progress,
     ):
         state = State(simulator.tensor(observed[:, 0]), simulator.tensor(velocity[:, 0]))
+        force, iterations = torch.zeros_like(state.q), 0
         if file.done > 0:
             state = last_state(file, simulator.rest_positions)
+            force = simulator.tensor(file.read(file.done - 1)["force"])
         while file.done < file.steps:
-            force, iterations = torch.zeros_like(state.q), 0
             if file.done > 0:
-                result = reconstructor.step(state, simulator.tensor(observed[:, file.done]))
+                result = reconstructor.step(state, simulator.tensor(observed[:, file.done]), first_guess=force)
                 state, force, iterations = result.state.detach(), result.force, result.iterations
             file.append(q=state.q.cpu().numpy(), v=state.v.cpu().numpy(), force=force.cpu().numpy())
             progress.advance(iterations=iterations)

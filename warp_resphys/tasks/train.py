@@ -61,7 +61,7 @@ def train(context: StageContext) -> None:
 
 
 def _run_epochs(trainer: Trainer, checkpoint: Path, fingerprint: str) -> None:
-    """Trains to the end; on the way, and when interrupted, keeps the last whole epoch."""
+    """Trains to the end; on the way, and however it ends, keeps the last whole epoch."""
     epochs = trainer.config["epochs"]
     saved = time.monotonic()
     kept = _copy(trainer.snapshot())
@@ -77,9 +77,8 @@ def _run_epochs(trainer: Trainer, checkpoint: Path, fingerprint: str) -> None:
                 if trainer.state.best:
                     shown["rollout"] = f"{trainer.state.best_error:.2g} mm"
                 progress.advance(1, **shown)
-        except KeyboardInterrupt:
+        finally:
             _save(checkpoint, kept, fingerprint)
-            raise
 
 
 def _copy(

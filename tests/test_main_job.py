@@ -1,0 +1,543 @@
+"""The main job through its command line: `warp-resphys` with a small beam, a few steps and a few epochs."""
+
+import contextlib
+import io
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+import h5py
+import meshio
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+
+from warp_resphys import box_hexahedra, cli
+from warp_resphys.configured import build_simulator
+from warp_resphys.files import read_checkpoint, read_hdf5
+from warp_resphys.residual.training import Trainer
+from warp_resphys.resumable import ResumableHDF5
+from warp_resphys.stages import package_versions
+from warp_resphys.tasks import experiment
+from warp_resphys.tasks.checks import check_configuration
+
+REPOSITORY = Path(__file__).parents[1]
+STAGES = ["generate", "reconstruct", "train", "evaluate", "report"]
+MODELS = ("simulation", "resphys", "reconstruction")
+SMALL = ["mesh.divisions=[4,2,2]"]
+SHORT = [
+    "data.steps=12",
+    "data.weights_g.train=[50,90,130]",
+    "data.weights_g.validation=[110]",
+    "data.weights_g.test=[70,150]",
+    "trainer.epochs=40",
+    "trainer.rollout_every=10",
+    "network.width=32",
+    "hydra/job_logging=none",
+    "hydra/hydra_logging=none",
+]
+TINY = [*SMALL, *SHORT]
+IN_RUN = "hydra.run.dir=run"
+
+
+def run(*arguments):
+    """Exit code of the command in this process, and what it wrote to stderr."""
+    out, err, argv = io.StringIO(), io.StringIO(), sys.argv
+    sys.argv = ["warp-resphys", *arguments]
+    code = 0
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            cli.main()
+        except SystemExit as end:
+            code = end.code
+        finally:
+            sys.argv = argv
+    return code, err.getvalue()
+
+
+def metrics(folder="run"):
+    return json.loads((Path(folder) / "metrics.json").read_text())
+
+
+def errors(folder="run"):
+    """All errors [mm] of a run, flat."""
+    found = metrics(folder)
+    groups = [found["errors_mm"], found["errors_vs_reconstruction_mm"]]
+    values = [group[model][key] for group in groups for model in sorted(group) for key in ("mean", "std")]
+    return values + [each["errors_mm"][model] for each in found["per_trajectory"] for model in MODELS]
+
+
+def same_errors(a, b):
+    np.testing.assert_allclose(a, b, rtol=1e-6)
+
+
+def files(folder="run"):
+    """Content of everything in the run folder but Hydra's own, by name."""
+    root = Path(folder)
+    paths = [p for p in root.rglob("*") if p.is_file() and ".hydra" not in p.parts and p.name != ".lock"]
+    return {str(p.relative_to(root)): (p.stat().st_mtime_ns, p.read_bytes()) for p in paths}
+
+
+def ran(before):
+    """Stages whose record is another than before."""
+    now = files()
+    return [s for s in STAGES if now[f"stages/{s}.json"] != before.get(f"stages/{s}.json")]
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def no_report(monkeypatch):
+    """The report takes most of a tiny run's time, and has tests of its own."""
+    monkeypatch.setattr(experiment, "make_report", lambda context: (context.run_dir / "report.html").write_text("-"))
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A complete run with its report, and one more of the same command."""
+    root = tmp_path_factory.mktemp("finished")
+    with contextlib.chdir(root):
+        assert run(*TINY, IN_RUN)[0] == 0
+        first = files()
+        assert run(*TINY, IN_RUN)[0] == 0
+        return root / "run", first, files()
+
+
+@pytest.fixture
+def copied(finished, folder):
+    """A copy of the complete run, to change."""
+    shutil.copytree(finished[0], "run")
+    return files()
+
+
+class TestCompleteRun:
+    def test_files(self, finished):
+        names = set(finished[1]) - {f"stages/{name}.json" for name in STAGES}
+        names = {name for name in names if not name.startswith("figures/")}
+        data = {"trajectories.h5", "reconstruction.h5", "rollouts.h5", "model.safetensors", "training.json"}
+        assert names == data | {"errors.json", "metrics.json", "report.html"}
+
+    def test_metrics(self, finished):
+        found = metrics(finished[0])
+        keys = ["errors_mm", "errors_vs_reconstruction_mm", "per_trajectory", "seconds", "versions", "device"]
+        assert list(found) == keys
+        assert set(found["errors_mm"]) == {"simulation", "reconstruction", "resphys"}
+        assert set(found["errors_vs_reconstruction_mm"]) == {"simulation", "resphys"}
+        assert list(found["seconds"]) == STAGES
+        assert all(0.0 < s < 600.0 for s in found["seconds"].values())
+        assert found["versions"] == package_versions()
+        assert {"python", "warp-resphys", "warp-lang", "torch"} <= set(found["versions"])
+        assert found["device"] in ("cpu", "cuda")
+        assert [each["name"] for each in found["per_trajectory"]] == ["70 g", "150 g"]
+
+    def test_the_correction_corrects(self, finished):
+        found = metrics(finished[0])["errors_mm"]
+        assert found["simulation"]["mean"] > 0.5
+        assert found["resphys"]["mean"] < 0.02 * found["simulation"]["mean"]
+        assert found["reconstruction"]["mean"] < 1e-3
+        assert all(found[model]["diverged"] == 0 for model in MODELS)
+
+    def test_errors_are_those_of_the_stored_positions(self, finished):
+        with read_hdf5(finished[0] / "trajectories.h5", "trajectories") as file:
+            assert list(file.attrs["names"]) == [f"{w} g" for w in (50, 90, 130, 110, 70, 150)]
+            target = file["q"][4:, 1:]
+            assert file["q"].shape == (6, 13, 45, 3)
+            assert file["q"].attrs["units"] == "m"
+        with read_hdf5(finished[0] / "rollouts.h5", "rollouts") as file:
+            stored = {model: file[f"{model}_q"][:, 1:] for model in ("simulation", "resphys")}
+        with read_hdf5(finished[0] / "reconstruction.h5", "reconstruction") as file:
+            stored["reconstruction"] = file["q"][4:, 1:]
+            assert not file["force"][:, 0].any()
+        found = metrics(finished[0])
+        for model, q in stored.items():
+            distances = 1e3 * np.linalg.norm(q - target, axis=-1).mean(-1)
+            summary = found["errors_mm"][model]
+            np.testing.assert_allclose([summary["mean"], summary["std"]], [distances.mean(), distances.std()])
+        against = 1e3 * np.linalg.norm(stored["resphys"] - stored["reconstruction"], axis=-1).mean()
+        np.testing.assert_allclose(found["errors_vs_reconstruction_mm"]["resphys"]["mean"], against)
+
+    def test_the_roll_out_starts_from_the_target_and_knows_nothing_else_of_it(self, finished):
+        with read_hdf5(finished[0] / "trajectories.h5", "trajectories") as file:
+            start, target = file["q"][4:, 0], file["q"][4:]
+        with read_hdf5(finished[0] / "rollouts.h5", "rollouts") as file:
+            np.testing.assert_array_equal(file["resphys_q"][:, 0], start)
+            np.testing.assert_array_equal(file["simulation_q"][:, 0], start)
+            assert np.abs(file["resphys_q"][:, -1] - target[:, -1]).max() > 0.0
+
+    def test_settings_and_seeds_are_saved(self, finished):
+        record = json.loads((finished[0] / "stages" / "train.json").read_text())
+        assert record["settings"]["seed"] == 0
+        assert record["settings"]["trainer"]["epochs"] == 40
+        saved = OmegaConf.load(finished[0] / ".hydra" / "config.yaml")
+        assert saved.network.width == 32
+        history = json.loads((finished[0] / "training.json").read_text())
+        assert [r["epoch"] for r in history if "rollout_error_mm" in r] == [10, 20, 30, 40]
+        _, metadata = read_checkpoint(finished[0] / "model.safetensors", "residual force")
+        assert metadata["validation_rollout_error_mm"] == min(r.get("rollout_error_mm", 1e9) for r in history)
+
+    def test_the_report_is_self_contained(self, finished):
+        page = (finished[0] / "report.html").read_text()
+        assert "4.488" in page  # published, beside ours
+        for marker in ('src="http', "src='http", "<link", "@import"):
+            assert marker not in page
+
+    def test_the_second_call_runs_nothing(self, finished):
+        _, first, second = finished
+        changed = [name for name in second if second[name] != first.get(name)]
+        assert changed == ["metrics.json"]
+        assert json.loads(first["metrics.json"][1]) == json.loads(second["metrics.json"][1])
+
+
+@pytest.mark.usefixtures("no_report")
+class TestChanges:
+    @pytest.mark.parametrize(
+        ("override", "expected"),
+        [
+            ("trainer.epochs=30", ["train", "evaluate", "report"]),
+            ("network.blocks=2", ["train", "evaluate", "report"]),
+            ("seed=3", ["train", "evaluate", "report"]),
+            ("reconstruction.regularisation=1e-9", ["reconstruct", "train", "evaluate", "report"]),
+            ("simulation.youngs_modulus=220e3", ["reconstruct", "train", "evaluate", "report"]),
+            ("reality.youngs_modulus=270e3", STAGES),
+            ("data.weights_g.test=[60]", STAGES),
+            ("title=Another", ["report"]),
+        ],
+    )
+    def test_what_depends_on_it_runs_again_and_nothing_else(self, copied, override, expected):
+        assert run(*TINY, IN_RUN, override)[0] == 0
+        assert ran(copied) == expected
+
+    def test_the_same_seed_gives_the_same_numbers_in_another_folder(self, finished, folder):
+        assert run(*TINY, "hydra.run.dir=again")[0] == 0
+        same_errors(errors("again"), errors(finished[0]))
+
+    def test_multirun(self, finished, folder):
+        code, err = run("--multirun", "seed=0,1", *TINY)
+        assert (code, "Traceback" in err) == (0, False)
+        folders = sorted(Path("runs/beam_oscillation").glob("*/metrics.json"))
+        assert len(folders) == 2
+        found = [errors(path.parent) for path in folders]
+        seeds = [OmegaConf.load(path.parent / ".hydra" / "config.yaml").seed for path in folders]
+        same_errors(found[seeds.index(0)], errors(finished[0]))
+        assert found[0] != found[1]
+        assert metrics(folders[0].parent)["errors_mm"]["simulation"] == metrics(folders[1].parent)["errors_mm"]["simulation"]
+
+    @pytest.mark.parametrize(
+        "options",
+        [
+            ["mesh=beam_tetrahedra", "mesh.divisions=[2,1,1]", *SHORT],
+            ["physics=published", *TINY],
+            ["solver=newton", *TINY],
+            ["solver=projective_dynamics", *TINY],
+            ["reconstruction=lbfgsb", *TINY, "data.steps=4", "network.force_modes=6"],
+            ["trainer=published", *TINY],
+            ["integrator=bdf2", *TINY],
+            ["integrator=midpoint", *TINY],
+            ["reality.model=stable_neo_hookean", "reality.stiffness_damping=1e-3", *TINY],
+        ],
+        ids=lambda options: options[0],
+    )
+    def test_other_options_run_and_the_correction_corrects(self, folder, options):
+        code, err = run(*options, IN_RUN)
+        assert (code, "Warning" in err) == (0, False)
+        found = metrics()["errors_mm"]
+        assert found["reconstruction"]["mean"] < 0.1 * found["simulation"]["mean"]
+        assert found["resphys"]["mean"] < 0.2 * found["simulation"]["mean"]
+
+    def test_the_published_network_runs_and_a_diverged_roll_out_is_no_number(self, folder):
+        short = [option for option in TINY if not option.startswith("network")]
+        small = ["network=published", "network.width=16", "trainer.epochs=2", "trainer.rollout_every=1"]
+        assert run(*short, *small, "data.steps=60", IN_RUN)[0] == 0
+        found = metrics()["errors_mm"]["resphys"]
+        assert (found["mean"] is None) == (found["diverged"] > 0)
+        assert metrics()["errors_mm"]["simulation"]["diverged"] == 0
+
+
+class Interruption:
+    """Sends SIGINT to this process at a chosen step or epoch, and counts the work done."""
+
+    def __init__(self, monkeypatch):
+        self.at = None
+        self.done = Counter()
+        append, run_epoch = ResumableHDF5.append, Trainer.run_epoch
+
+        def interrupted_append(file, **arrays):
+            append(file, **arrays)
+            self.count(file.kind)
+
+        def interrupted_epoch(trainer):
+            record = run_epoch(trainer)
+            self.count("epochs")
+            return record
+
+        monkeypatch.setattr(ResumableHDF5, "append", interrupted_append)
+        monkeypatch.setattr(Trainer, "run_epoch", interrupted_epoch)
+
+    def count(self, kind):
+        self.done[kind] += 1
+        if self.at == (kind, self.done[kind]):
+            signal.raise_signal(signal.SIGINT)
+
+
+@pytest.mark.usefixtures("no_report")
+class TestInterruption:
+    @pytest.fixture
+    def interruption(self, monkeypatch):
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)
+        yield Interruption(monkeypatch)
+        signal.signal(signal.SIGINT, before)
+
+    @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
+    def test_ctrl_c_in_every_stage(self, folder, interruption, integrator):
+        arguments = [*TINY, f"integrator={integrator}"]
+        assert run(*arguments, "hydra.run.dir=whole")[0] == 0
+        whole = Counter(interruption.done)
+        assert whole == {"trajectories": 13, "reconstruction": 13, "epochs": 40, "rollouts": 13}
+        interruption.done.clear()
+        cuts = {"trajectories": ("generate", 1), "reconstruction": ("reconstruct", 7), "epochs": ("train", 25)}
+        for kind, (stage, at) in {**cuts, "rollouts": ("evaluate", 5)}.items():
+            interruption.at = (kind, at)
+            code, err = run(*arguments, IN_RUN)
+            assert code == 130
+            assert f"interrupted in stage '{stage}'" in err
+            assert "the same command goes on from there" in err
+            assert "Traceback" not in err
+            assert not Path("run/metrics.json").exists()
+            assert not list(Path("run").rglob("*.partial"))
+        interruption.at = None
+        assert run(*arguments, IN_RUN)[0] == 0
+        repeated = interruption.done - whole
+        assert repeated <= {"epochs": 1}  # the epoch that the signal fell into
+        same_errors(errors(), errors("whole"))
+        assert not list(Path("run").glob("*.journal"))
+        assert not Path("run/training.safetensors").exists()
+
+    def test_twice_in_one_stage_and_before_the_first_frame(self, finished, folder, interruption):
+        for at in (1, 2, 9):
+            interruption.at = ("reconstruction", at)
+            assert run(*TINY, IN_RUN)[0] == 130
+        interruption.at = None
+        assert run(*TINY, IN_RUN)[0] == 0
+        same_errors(errors(), errors(finished[0]))
+
+    def test_lbfgsb_goes_on_from_the_same_guess(self, folder, interruption):
+        arguments = [*TINY, "reconstruction=lbfgsb", "data.steps=4", "network.force_modes=6"]
+        assert run(*arguments, "hydra.run.dir=whole")[0] == 0
+        interruption.done.clear()
+        interruption.at = ("reconstruction", 3)
+        assert run(*arguments, IN_RUN)[0] == 130
+        assert run(*arguments, IN_RUN)[0] == 0
+        same_errors(errors(), errors("whole"))
+
+    def test_a_real_process(self, finished, folder):
+        program = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        program += "from warp_resphys.cli import main\nmain()"
+        command = [sys.executable, "-c", program, *TINY, IN_RUN]
+        environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+        child = subprocess.Popen(command, env=environment, text=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+        deadline = time.monotonic() + 60.0
+        while not Path("run/trajectories.h5.journal").exists() and time.monotonic() < deadline:
+            time.sleep(0.002)
+        child.send_signal(signal.SIGINT)
+        err = child.communicate(timeout=60)[1]
+        assert child.returncode == 130
+        assert "interrupted in stage" in err
+        assert "Traceback" not in err
+        assert run(*TINY, IN_RUN)[0] == 0
+        same_errors(errors(), errors(finished[0]))
+
+    def test_killed_without_warning(self, finished, folder):
+        program = "from warp_resphys.cli import main\nmain()"
+        command = [sys.executable, "-c", program, *TINY, IN_RUN]
+        environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+        child = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        deadline = time.monotonic() + 60.0
+        while not Path("run/reconstruction.h5.journal").exists() and time.monotonic() < deadline:
+            time.sleep(0.002)
+        child.kill()
+        child.wait(timeout=60)
+        assert run(*TINY, IN_RUN)[0] == 0
+        same_errors(errors(), errors(finished[0]))
+
+
+class TestBadInput:
+    @pytest.mark.parametrize(
+        ("overrides", "sentence"),
+        [
+            ("simulation.youngs_modulus=0", "simulation: youngs_modulus is 0: it must be positive, in pascals."),
+            ("reality.youngs_modulus=-1e5", "reality: youngs_modulus is -100000: it must be positive, in pascals."),
+            ("simulation.youngs_modulus=.nan", "simulation: youngs_modulus is nan: it must be positive, in pascals."),
+            ("simulation.poissons_ratio=0.5", "simulation: poissons_ratio is 0.5: it must be greater than -1 and less"),
+            ("reality.poissons_ratio=-1", "reality: poissons_ratio is -1: it must be greater than -1 and less than 0.5."),
+            ("time_step=0", "time_step is 0: it must be positive, in seconds."),
+            ("time_step=-0.01", "time_step is -0.01: it must be positive, in seconds."),
+            ("experiment=beam_oscilation", "unknown experiment 'beam_oscilation', did you mean 'beam_oscillation'"),
+            ("trainer.epoch=5", "unknown key 'trainer.epoch', did you mean 'trainer.epochs'"),
+            ("+simulation.stiffness=5", "unknown key 'simulation.stiffness': simulation has youngs_modulus, "),
+            ("simulation.youngs_modulus=soft", "simulation.youngs_modulus is 'soft': it must be a number."),
+            ("trainer.epochs=2.5", "trainer.epochs is 2.5: it must be a whole number."),
+            ("trainer.learning_rate=0", "trainer.learning_rate is 0: it must be positive."),
+            ("reconstruction.regularisation=-1", "reconstruction.regularisation is -1: it must be zero or more."),
+            ("network.kind=graph", "network.kind is 'graph': choose one of reduced, nodal."),
+            ("network.force_modes=1000", "1000 modes were asked for, but 36 samples give 1 to 36."),
+            ("solver.name=gradient_descent", "solver is 'gradient_descent': choose one of"),
+            ("integrator=rk4", "integrator is 'rk4': choose one of implicit_euler, bdf2, midpoint."),
+            ("device=tpu", "device is 'tpu': choose auto, cpu or cuda."),
+            ("device=mps", "device is 'mps': choose auto, cpu or cuda."),
+            ("dtype=float16", "dtype is 'float16': choose float64 or float32."),
+            ("seed=-1", "seed is -1: it must lie between 0 and 2^63 - 1."),
+            ("gravity=[0,0]", "gravity is [0, 0]: it must be three finite numbers, in m/s^2."),
+            ("gravity=[0,0,.inf]", "gravity is [0, 0, inf]: it must be three finite numbers, in m/s^2."),
+            ("fixed=null", "fixed is None: it must be a group of settings."),
+            ("fixed.x=0.5", "no vertex lies within 1e-09 m of x = 0.5 m"),
+            ("data.load.x=0.5", "no vertex lies within 1e-09 m of x = 0.5 m"),
+            ("data.steps=0", "data.steps is 0: it must be positive."),
+            ("data.weights_g.train=[]", "data.weights_g.train is empty: give the split at least one weight."),
+            ("data.weights_g.validation=[]", "data.weights_g.validation is empty"),
+            ("data.weights_g.test=[]", "data.weights_g.test is empty"),
+            ("data.weights_g.test=[90]", "data.weights_g names 90 g twice: every trajectory belongs to one split."),
+            ("data.weights_g.test=[-4]", "data.weights_g.test holds a weight that is not positive, in grams: [-4.0]."),
+            ("data.weights_g.test=70", "data.weights_g.test is 70: it must be a list of numbers."),
+            ("data.kind=drop", "data.kind is 'drop': choose release_from_load."),
+            ("solver.max_iterations=1", "the newton solver stopped after 1 iterations"),
+            ("reconstruction.max_iterations=1", "Gauss-Newton reconstruction moved by"),
+        ],
+    )
+    def test_settings(self, folder, overrides, sentence):
+        code, err = run(*TINY, IN_RUN, overrides)
+        self.check(code, err, sentence)
+
+    @pytest.mark.parametrize("content", [None, b"", b"not a mesh", b"\x89HDF\r\n\x1a\n", "truncated", "surface"])
+    def test_mesh(self, folder, content):
+        box = box_hexahedra((0.1, 0.03, 0.03), (4, 2, 2))
+        name = "box.vtu"
+        if content in ("truncated", "surface"):
+            faces = [("quad", box.cells[:, :4])] if content == "surface" else [("hexahedron", box.cells)]
+            meshio.write(name, meshio.Mesh(box.vertices, faces))
+            if content == "truncated":
+                Path(name).write_bytes(Path(name).read_bytes()[:-300])
+        elif content is not None:
+            Path(name).write_bytes(content)
+        code, err = run(*SHORT, IN_RUN, "mesh=file", f"mesh.path={name}")
+        self.check(code, err, "box.vtu: ")
+
+    def test_mesh_without_path(self, folder):
+        code, err = run(*SHORT, IN_RUN, "mesh=file")
+        self.check(code, err, "Missing mandatory value: path (at mesh.path)")
+
+    @staticmethod
+    def check(code, err, sentence):
+        lines = [line for line in err.splitlines() if not line.startswith(tuple(f"{stage}: " for stage in STAGES))]
+        assert code == 2
+        assert len(lines) == 1
+        assert lines[0].startswith(f"error: {sentence}")
+        written = {path.name for path in Path("run").rglob("*") if path.is_file()} if Path("run").exists() else set()
+        assert not written & {"metrics.json", "report.html", "model.safetensors", "rollouts.h5"}
+        assert not [name for name in written if name.endswith(".partial")]
+
+    def test_a_file_mesh_runs(self, folder, no_report, finished):
+        box = box_hexahedra((0.1, 0.03, 0.03), (4, 2, 2))
+        meshio.write("box.vtu", meshio.Mesh(100.0 * box.vertices, [("hexahedron", box.cells)]))
+        tolerance = ["+fixed.tolerance=1e-6", "+data.load.tolerance=1e-6"]
+        arguments = [*SHORT, IN_RUN, "mesh=file", "mesh.path=box.vtu", "mesh.units=cm", *tolerance]
+        assert run(*arguments)[0] == 0
+        np.testing.assert_allclose(errors()[:2], errors(finished[0])[:2], rtol=0.05)
+        before = files()
+        box = box_hexahedra((0.1, 0.03, 0.03), (3, 2, 2))
+        meshio.write("box.vtu", meshio.Mesh(100.0 * box.vertices, [("hexahedron", box.cells)]))
+        assert run(*arguments)[0] == 0
+        assert ran(before) == STAGES  # the file's content counts, not its name
+
+    @pytest.mark.parametrize("damage", ["truncated", "foreign", "of another stage", "changed"])
+    def test_a_damaged_file_in_the_run_folder_is_told_of_and_made_again(
+        self, finished, copied, no_report, caplog, damage
+    ):
+        path = Path("run/reconstruction.h5")
+        if damage == "truncated":
+            path.write_bytes(path.read_bytes()[:-1000])
+        elif damage == "foreign":
+            path.unlink()
+            with h5py.File(path, "w") as file:
+                file["q"] = np.zeros(3)
+        elif damage == "of another stage":
+            shutil.copy("run/trajectories.h5", path)
+        else:
+            content = bytearray(path.read_bytes())
+            content[len(content) // 2] ^= 0xFF
+            path.write_bytes(content)
+        assert run(*TINY, IN_RUN)[0] == 0
+        assert "reconstruct: missing or changed since they were written: reconstruction.h5" in caplog.text
+        assert ran(copied) == ["reconstruct"]  # the same forces as before: what follows is still valid
+        same_errors(errors(), errors(finished[0]))
+
+    @pytest.mark.parametrize("kilobytes", [10, 60, 160, 230, 600])
+    def test_full_disk(self, finished, folder, kilobytes):
+        """Limits that hit the first frames, the journals, the finished files and the report."""
+        limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1000 * kilobytes, limits[1]))
+        try:
+            code, err = run(*TINY, IN_RUN)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        line = err.splitlines()[-1]
+        assert code == 2
+        assert line.startswith("error: disk is full while writing run/")
+        assert "free some space and run the same command again" in line
+        assert "Traceback" not in err
+        assert not Path("run/metrics.json").exists()
+        assert not list(Path("run").rglob("*.partial"))
+        assert run(*TINY, IN_RUN)[0] == 0
+        same_errors(errors(), errors(finished[0]))
+        assert (Path("run") / "report.html").stat().st_size > 100_000
+
+
+def options(group):
+    return sorted(path.stem for path in (REPOSITORY / "conf" / group).glob("*.yaml"))
+
+
+GROUPS = ("mesh", "physics", "solver", "reconstruction", "network", "trainer", "budget")
+CHOICES = [
+    (name, group, option) for name in options("experiment") for group in GROUPS for option in options(group)
+]
+
+
+class TestConfiguration:
+    def composed(self, *overrides):
+        with initialize_config_module("warp_resphys.conf", version_base="1.3"):
+            config = compose("config", overrides=list(overrides))
+        return OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+
+    @pytest.mark.parametrize(("name", "group", "option"), CHOICES, ids="-".join)
+    def test_every_option_of_every_experiment_is_accepted_and_built(self, folder, name, group, option):
+        overrides = [f"experiment={name}", f"{group}={option}"]
+        if (group, option) == ("mesh", "file"):
+            box = box_hexahedra((0.1, 0.03, 0.03), (4, 2, 2))
+            meshio.write("box.vtu", meshio.Mesh(box.vertices, [("hexahedron", box.cells)]))
+            overrides.append("mesh.path=box.vtu")
+        config = self.composed(*overrides)
+        check_configuration(config)
+        real, wrong = (build_simulator(config, which) for which in ("reality", "simulation"))
+        assert real.material != wrong.material
+        assert [stage.name for stage in experiment.stages(config)] == STAGES
+
+    def test_published_sizes_and_settings(self):
+        config = self.composed("physics=published", "network=published", "trainer=published")
+        assert build_simulator(config).body.n_vertices * 3 == 528
+        assert {k: len(v) for k, v in config["data"]["weights_g"].items()} == {"train": 9, "validation": 2, "test": 5}
+        assert config["data"]["steps"] == 150
+        assert [config["network"][k] for k in ("blocks", "layers", "width")] == [5, 3, 512]
+        keys = ("epochs", "batch_size", "learning_rate", "weight_decay")
+        assert [config["trainer"][k] for k in keys] == [1000, 256, 1e-3, 1e-5]
+        assert config["physics"] == {"mass": "per_vertex", "volume_integration": "full"}

@@ -1,0 +1,188 @@
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from warp_resphys.errors import InputError
+from warp_resphys.files import read_checkpoint, write_checkpoint
+from warp_resphys.residual.networks import SkipMLP, build_model, nodal_coder, pod_coder, restore
+
+REDUCED = {"kind": "reduced", "position_modes": 3, "velocity_modes": 4, "force_modes": 5}
+ARCHITECTURE = {"blocks": 2, "layers": 1, "width": 16}
+KINDS = {"reduced": {**REDUCED, **ARCHITECTURE}, "nodal": {"kind": "nodal", **ARCHITECTURE}}
+
+
+def field(samples, vertices=6, rank=None, seed=0):
+    """(S, N, 3) of falling singular values."""
+    random = np.random.default_rng(seed)
+    columns = 3 * vertices
+    rank = rank or min(samples, columns)
+    left = np.linalg.qr(random.normal(size=(samples, rank)))[0]
+    right = np.linalg.qr(random.normal(size=(columns, rank)))[0]
+    values = 3.0 * 0.5 ** np.arange(rank)
+    return torch.tensor((left * values) @ right.T).view(samples, vertices, 3)
+
+
+def built(kind):
+    torch.manual_seed(0)
+    rest, q, v, force = field(1, seed=5)[0], field(40, seed=1), field(40, seed=2), field(40, seed=3)
+    return build_model(KINDS[kind], rest, rest + q, v, force), rest + q, v, force
+
+
+class TestSkipMLP:
+    def test_published_structure(self):
+        network = SkipMLP(30, 12, blocks=5, layers=3, width=512)
+        assert len(network.blocks) == 5
+        for i, block in enumerate(network.blocks):
+            hidden = [nn.Linear, nn.LayerNorm, nn.ELU]
+            assert [type(m) for m in block] == 3 * hidden + [nn.Linear]
+            sizes = [(m.in_features, m.out_features) for m in block if isinstance(m, nn.Linear)]
+            assert sizes == [(30 if i == 0 else 12, 512), (512, 512), (512, 512), (512, 12)]
+            assert all(m.normalized_shape == (512,) for m in block if isinstance(m, nn.LayerNorm))
+
+    def test_blocks_after_the_first_add_to_their_input(self):
+        torch.manual_seed(0)
+        network = SkipMLP(4, 3, blocks=3, layers=1, width=8)
+        x = torch.randn(5, 4)
+        first = network.blocks[0](x)
+        second = first + network.blocks[1](first)
+        assert torch.equal(network(x), second + network.blocks[2](second))
+        for block in list(network.blocks)[1:]:
+            nn.init.zeros_(block[-1].weight)
+            nn.init.zeros_(block[-1].bias)
+        assert torch.equal(network(x), first)
+
+
+class TestPOD:
+    def test_basis_is_orthonormal_and_the_best_of_its_size(self):
+        samples = field(40)
+        coder = pod_coder(samples, 4)
+        basis = coder.basis
+        np.testing.assert_allclose(basis.mT @ basis, np.eye(4), atol=1e-14)
+        x = samples.flatten(1)
+        missed = (samples - coder.decode(coder.encode(samples))).flatten(1)
+        smallest = torch.linalg.svdvals(x)[4:].square().sum()  # Eckart and Young
+        np.testing.assert_allclose(missed.square().sum(), smallest, rtol=1e-10)
+
+    def test_round_trip_and_projection(self):
+        samples = field(40)
+        coder = pod_coder(samples, 4)
+        coordinates = torch.randn(7, 4, dtype=torch.float64)
+        assert coder.size == 4
+        np.testing.assert_allclose(coder.encode(coder.decode(coordinates)), coordinates, atol=1e-12)
+        whole = pod_coder(samples, 18)
+        np.testing.assert_allclose(whole.decode(whole.encode(samples)), samples, atol=1e-12)
+
+    def test_coordinates_have_unit_mean_square_down_to_the_floor(self):
+        samples = field(40)  # deviations fall as 2^-k: the floor of 0.3 % lies between the 8th and 9th after the first
+        coordinates = pod_coder(samples, 12).encode(samples)
+        size = coordinates.square().mean(0).sqrt().numpy()
+        np.testing.assert_allclose(size[:9], 1.0, rtol=1e-10)
+        np.testing.assert_allclose(size[9:], 0.5 ** np.arange(9, 12) / 3e-3, rtol=1e-10)
+
+    @pytest.mark.parametrize(("samples", "modes"), [(40, 19), (5, 6), (40, 0), (40, -1)])
+    def test_modes_that_the_samples_do_not_have(self, samples, modes):
+        with pytest.raises(InputError, match=f"{modes} modes were asked for, but {samples} samples give 1 to"):
+            pod_coder(field(samples), modes)
+
+
+class TestNodalCoder:
+    def test_round_trip_and_standardisation(self):
+        samples = 2.0 + field(40)
+        coder = nodal_coder(samples)
+        coordinates = coder.encode(samples)
+        np.testing.assert_allclose(coordinates.mean(0), 0.0, atol=1e-12)
+        np.testing.assert_allclose(coordinates.std(0), 1.0, rtol=1e-12)
+        np.testing.assert_allclose(coder.decode(coordinates), samples, atol=1e-14)
+        assert coder.size == 18
+
+    def test_constant_coordinates_stay_zero(self):
+        samples = field(40)
+        samples[:, 2, 1] = 0.25
+        coder = nodal_coder(samples)
+        assert not coder.encode(samples)[:, 3 * 2 + 1].any()
+        assert torch.isfinite(coder.decode(coder.encode(samples))).all()
+        assert torch.equal(coder.decode(coder.encode(samples))[:, 2, 1], samples[:, 2, 1])
+
+
+class TestResidualForce:
+    def test_linear_part_is_ridge_regression(self):
+        model, *_ = built("reduced")
+        random = np.random.default_rng(0)
+        x, y = random.normal(size=(30, 7)).astype(np.float32), random.normal(size=(30, 5)).astype(np.float32)
+        noise = 0.3
+        model.fit_linear(torch.tensor(x), torch.tensor(y), noise)
+        # Least squares with rows that say: noise sqrt(S) times each weight is zero.
+        rows = np.vstack([x, np.sqrt(30) * noise * np.eye(7)]).astype(np.float64)
+        expected = np.linalg.lstsq(rows, np.vstack([y, np.zeros((7, 5))]), rcond=None)[0]
+        np.testing.assert_allclose(model.linear, expected, rtol=1e-5, atol=1e-7)
+        left = y - x @ expected
+        np.testing.assert_allclose(model.remainder, np.sqrt((left**2).mean()), rtol=1e-6)
+        inputs = torch.tensor(x)
+        together = model.standardised(inputs)
+        np.testing.assert_allclose(
+            together.detach(), inputs @ model.linear + model.remainder * model.network(inputs).detach(), rtol=1e-6
+        )
+
+    def test_ridge_is_what_noisy_inputs_teach(self):
+        model, *_ = built("reduced")
+        random = np.random.default_rng(1)
+        x, y = random.normal(size=(20, 7)), random.normal(size=(20, 5))
+        model.fit_linear(torch.tensor(x), torch.tensor(y), 0.5)
+        many = np.repeat(x, 20000, axis=0)
+        noisy = many + 0.5 * random.normal(size=many.shape)
+        expected = np.linalg.lstsq(noisy, np.repeat(y, 20000, axis=0), rcond=None)[0]
+        np.testing.assert_allclose(model.linear, expected, atol=5e-3)
+
+    @pytest.mark.parametrize("kind", KINDS)
+    def test_force_from_state(self, kind):
+        model, q, v, force = built(kind)
+        inputs = model.encode(q, v)
+        sizes = {"reduced": (7, 5), "nodal": (36, 18)}[kind]
+        assert (inputs.shape[1], model.force.size) == sizes
+        assert inputs.dtype == torch.float32
+        np.testing.assert_allclose(inputs[:, : sizes[0] // 2].std(0), 1.0, rtol=0.05)
+        # With a linear part that is exact, the force comes back.
+        with torch.no_grad():
+            model.linear.copy_(torch.linalg.lstsq(inputs, model.force.encode(force).float()).solution)
+            model.remainder.zero_()
+            found = model(q, v)
+        wanted = model.force.decode((inputs @ model.linear).double())
+        assert found.dtype == torch.float64
+        np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-12)
+
+    @pytest.mark.parametrize("kind", KINDS)
+    def test_saved_and_restored_it_gives_identical_forces(self, kind, tmp_path):
+        model, q, v, force = built(kind)
+        model.fit_linear(model.encode(q, v), model.force.encode(force).float(), 1e-2)
+        write_checkpoint(tmp_path / "model.safetensors", "residual force", model.state_dict(), model.description())
+        again = restore(*read_checkpoint(tmp_path / "model.safetensors", "residual force"))
+        assert again.state_dict().keys() == model.state_dict().keys()
+        assert not again.training
+        with torch.no_grad():
+            expected = model(q, v)
+            assert expected.abs().max() > 1e-3
+            assert torch.equal(again(q, v), expected)
+
+    def test_the_rest_shape_is_subtracted(self):
+        model, q, v, _ = built("nodal")
+        rest = model.rest.clone()
+        shifted = build_model(KINDS["nodal"], rest + 1.0, q + 1.0, v, field(40, seed=3))
+        np.testing.assert_allclose(shifted.encode(q + 1.0, v), model.encode(q, v), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        ({"kind": "graph"}, "network.kind is 'graph': choose one of reduced, nodal."),
+        ({"blocks": 0}, "network.blocks is 0: it must be positive."),
+        ({"layers": 0}, "network.layers is 0: it must be positive."),
+        ({"width": -1}, "network.width is -1: it must be positive."),
+        ({"force_modes": 0}, "network.force_modes is 0: it must be positive."),
+    ],
+)
+def test_bad_settings(settings, sentence):
+    samples = field(40)
+    with pytest.raises(InputError) as error:
+        build_model({**KINDS["reduced"], **settings}, samples[0], samples, samples, samples)
+    assert str(error.value) == sentence

@@ -1,0 +1,190 @@
+import json
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from warp_resphys.errors import InputError
+from warp_resphys.files import read_checkpoint, write_checkpoint
+from warp_resphys.residual.networks import build_model
+from warp_resphys.residual.training import Samples, Trainer
+
+NETWORK = {"kind": "nodal", "blocks": 2, "layers": 1, "width": 16}
+CONFIG = {
+    "epochs": 6,
+    "batch_size": 16,
+    "learning_rate": 5e-3,
+    "final_learning_rate": 1e-4,
+    "weight_decay": 1e-5,
+    "noise": 0.01,
+    "linear_noise": 0.01,
+    "rollout_every": 2,
+}
+
+
+def samples(count, seed):
+    """A force that depends on the state in part linearly."""
+    random = torch.Generator().manual_seed(seed)
+    q, v = (torch.randn(count, 4, 3, generator=random, dtype=torch.float64) for _ in range(2))
+    return Samples(q, v, 0.5 * q - 0.2 * v.flip(1) + torch.sin(2.0 * q) * v)
+
+
+TRAIN, VALIDATION = samples(70, 1), samples(20, 2)
+
+
+def rollout_error(model):
+    """Depends on the weights, like the real one."""
+    with torch.no_grad():
+        return float((model(VALIDATION.q, VALIDATION.v) - VALIDATION.force).abs().mean())
+
+
+def trainer(seed=0, error=rollout_error, **settings):
+    torch.manual_seed(seed)
+    model = build_model(NETWORK, torch.zeros(4, 3, dtype=torch.float64), TRAIN.q, TRAIN.v, TRAIN.force)
+    return Trainer(model, TRAIN, VALIDATION, error, {**CONFIG, **settings}, seed)
+
+
+def finish(trainer):
+    while not trainer.finished:
+        trainer.run_epoch()
+    return trainer
+
+
+def same(a, b):
+    return a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
+
+
+class TestResume:
+    @pytest.mark.parametrize("after", [1, 2, 3, 5])
+    def test_a_snapshot_goes_on_exactly(self, after, tmp_path):
+        whole = finish(trainer())
+        first = trainer()
+        for _ in range(after):
+            first.run_epoch()
+        path = tmp_path / "training.safetensors"
+        write_checkpoint(path, "training", *first.snapshot())
+        second = trainer(seed=17)  # nothing of its own start may remain
+        second.resume(*read_checkpoint(path, "training"))
+        finish(second)
+        assert second.state.history == whole.state.history
+        assert second.state.best_error == whole.state.best_error
+        assert same(second.state.best, whole.state.best)
+        assert same(second.model.state_dict(), whole.model.state_dict())
+        assert same(second.use_best().state_dict(), whole.use_best().state_dict())
+
+    def test_with_nothing_but_diverged_roll_outs(self, tmp_path):
+        first = trainer(error=lambda model: math.inf)
+        for _ in range(3):
+            first.run_epoch()
+        path = tmp_path / "training.safetensors"
+        write_checkpoint(path, "training", *first.snapshot())
+        second = trainer(error=lambda model: 1.0)
+        second.resume(*read_checkpoint(path, "training"))
+        assert (second.state.best_error, same(second.state.best, first.state.best)) == (math.inf, True)
+        finish(second)
+        assert second.state.best_error == 1.0
+
+
+class TestSelection:
+    @pytest.mark.parametrize(
+        ("errors", "best"),
+        [([3.0, 1.0, 2.0], 1), ([math.inf, 5.0, math.inf], 1), ([2.0, 2.0, 2.0], 0), ([math.inf, 4.0, 3.0], 2)],
+    )
+    def test_the_smallest_roll_out_error_wins_whatever_the_loss(self, errors, best):
+        queue, weights = list(errors), []
+
+        def error(model):
+            weights.append({k: t.clone() for k, t in model.network.state_dict().items()})
+            return queue.pop(0)
+
+        run = finish(trainer(error=error))
+        losses = [record["validation_loss"] for record in run.state.history]
+        assert losses == sorted(losses, reverse=True)  # the last epoch has the best loss
+        assert run.state.best_error == errors[best]
+        assert not same(weights[0], weights[2])
+        assert same(dict(run.use_best().network.state_dict()), weights[best])
+        assert not run.model.training
+
+    def test_diverged_alone_still_give_a_model(self):
+        run = finish(trainer(error=lambda model: math.inf))
+        assert run.state.best_error == math.inf
+        assert all(torch.isfinite(t).all() for t in run.use_best().state_dict().values())
+
+    def test_roll_outs_at_the_configured_epochs_and_at_the_end(self):
+        run = finish(trainer(epochs=7, rollout_every=3))
+        assert [r["epoch"] for r in run.state.history] == [1, 2, 3, 4, 5, 6, 7]
+        assert [r["epoch"] for r in run.state.history if "rollout_error_mm" in r] == [3, 6, 7]
+        json.dumps(run.state.history, allow_nan=False)
+
+
+class TestRepeatability:
+    def test_the_seed_decides(self):
+        a, b, other = finish(trainer()), finish(trainer()), finish(trainer(seed=1))
+        assert a.state.history == b.state.history
+        assert same(a.model.state_dict(), b.model.state_dict())
+        assert not same(a.model.state_dict(), other.model.state_dict())
+
+    def test_the_roll_out_draws_no_random_numbers_of_the_training(self):
+        def drawing(model):
+            torch.rand(7)
+            return rollout_error(model)
+
+        assert same(finish(trainer(error=drawing)).model.state_dict(), finish(trainer()).model.state_dict())
+
+
+class TestLearning:
+    def test_losses_fall_below_what_the_linear_part_leaves(self):
+        run = finish(trainer(epochs=100, batch_size=8, noise=0.0))
+        linear = float(run.model.remainder) ** 2
+        assert 0.1 < linear < 1.0
+        assert run.state.history[-1]["train_loss"] < 0.5 * linear
+        assert run.state.history[-1]["validation_loss"] < run.state.history[0]["validation_loss"]
+
+    def test_losses_are_mean_squared_errors_of_the_standardised_force(self):
+        run = finish(trainer(epochs=1))
+        with torch.no_grad():
+            wanted = run.model.force.encode(VALIDATION.force)
+            found = run.model.force.encode(run.model(VALIDATION.q, VALIDATION.v))
+        expected = float((found - wanted).square().mean())
+        assert run.state.history[0]["validation_loss"] == pytest.approx(expected, rel=1e-5)
+
+    def test_without_linear_part(self):
+        run = trainer(linear_noise=None)
+        assert not run.model.linear.any()
+        assert float(run.model.remainder) == 1.0
+
+    def test_cosine_schedule(self):
+        rates = [r["learning_rate"] for r in finish(trainer(epochs=5)).state.history]
+        assert (rates[0], rates[-1]) == (5e-3, pytest.approx(1e-4))
+        assert rates[2] == pytest.approx((5e-3 + 1e-4) / 2)
+        assert rates == sorted(rates, reverse=True)
+
+
+@pytest.mark.parametrize("name", ["training", "validation"])
+def test_empty_split(name):
+    empty = Samples(*(torch.zeros(0, 4, 3) for _ in range(3)))
+    splits = {"training": TRAIN, "validation": VALIDATION, name: replace(empty)}
+    model = trainer().model
+    with pytest.raises(InputError, match=f"the {name} split is empty"):
+        Trainer(model, splits["training"], splits["validation"], rollout_error, CONFIG, 0)
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        ({"epochs": 0}, "trainer.epochs is 0: it must be positive."),
+        ({"batch_size": 0}, "trainer.batch_size is 0: it must be positive."),
+        ({"learning_rate": 0.0}, "trainer.learning_rate is 0.0: it must be positive."),
+        ({"learning_rate": math.nan}, "trainer.learning_rate is nan: it must be positive."),
+        ({"final_learning_rate": -1.0}, "trainer.final_learning_rate is -1.0: it must be positive."),
+        ({"rollout_every": 0}, "trainer.rollout_every is 0: it must be positive."),
+        ({"weight_decay": -1.0}, "trainer.weight_decay is -1.0: it must be zero or more."),
+        ({"noise": -1.0}, "trainer.noise is -1.0: it must be zero or more."),
+        ({"linear_noise": 0.0}, "trainer.linear_noise is 0.0: it must be positive, or null."),
+    ],
+)
+def test_bad_settings(settings, sentence):
+    with pytest.raises(InputError) as error:
+        trainer(**settings)
+    assert str(error.value) == sentence

@@ -1,0 +1,144 @@
+"""Checks of a whole configuration before anything is computed, so that a slip costs no stage that comes before it."""
+
+import inspect
+import math
+import numbers
+from collections.abc import Callable, Iterator, Mapping
+from fnmatch import fnmatchcase
+from typing import Any
+
+from ..configured import build_simulator
+from ..errors import InputError
+from ..material import Material
+from ..mesh import select_vertices
+from ..residual.networks import check_network
+from ..residual.reconstruction import make_reconstructor
+from ..residual.training import check_trainer
+from ..solver import SolverSettings
+
+_GROUPS = (
+    "mesh",
+    "physics",
+    "solver",
+    "reconstruction",
+    "network",
+    "trainer",
+    "fixed",
+    "simulation",
+    "reality",
+    "data",
+    "data.load",
+    "data.weights_g",
+)
+_WORDS = ("dtype", "device", "integrator", "*.kind", "*.model", "*.name", "*.method", "solver.linear_solver")
+_WHOLE_NUMBERS = (
+    "seed",
+    "data.steps",
+    "*.max_iterations",
+    "solver.memory",
+    "solver.refactor_after",
+    "network.*",
+    "trainer.epochs",
+    "trainer.batch_size",
+    "trainer.rollout_every",
+)
+_NUMBERS = (
+    "time_step",
+    "fixed.*",
+    "data.load.*",
+    "simulation.*",
+    "reality.*",
+    "*.relative_tolerance",
+    "*.absolute_tolerance",
+    "reconstruction.*",
+    "trainer.*",
+)
+_LISTS = ("gravity", "data.weights_g.*")
+_OPTIONAL = ("trainer.linear_noise",)
+# Groups that are handed on as keyword arguments.
+_TAKEN_BY: Mapping[str, Callable[..., Any]] = {
+    "simulation": Material,
+    "reality": Material,
+    "solver": SolverSettings,
+    "reconstruction": make_reconstructor,
+    "fixed": select_vertices,
+}
+
+
+def check_configuration(config: Mapping[str, Any]) -> None:
+    """Checks what is known without computing anything.
+
+    Args:
+        config: with the keys of ``conf/config.yaml``.
+
+    Raises:
+        InputError: a value of the wrong kind or out of range, or an unknown key.
+    """
+    for key in _GROUPS:
+        group = _value(config, key)
+        if not isinstance(group, Mapping):
+            raise InputError(f"{key} is {group!r}: it must be a group of settings.")
+    for key, value in _leaves(config):
+        _check_kind(key, value)
+    if len(config["gravity"]) != 3 or not all(map(math.isfinite, config["gravity"])):
+        raise InputError(f"gravity is {config['gravity']}: it must be three finite numbers, in m/s^2.")
+    if not 0 <= config["seed"] < 2**63:
+        raise InputError(f"seed is {config['seed']}: it must lie between 0 and 2^63 - 1.")
+    for key, function in _TAKEN_BY.items():
+        known = [name for name in inspect.signature(function).parameters if name not in ("mesh", "simulator")]
+        for name in config[key]:
+            if name not in known:
+                raise InputError(f"unknown key '{key}.{name}': {key} has {', '.join(known)}.")
+    check_network(config["network"])
+    check_trainer(config["trainer"])
+    make_reconstructor(build_simulator(config), **config["reconstruction"])
+
+
+def _value(config: Mapping[str, Any], key: str) -> Any:
+    for name in key.split("."):
+        config = config[name]
+    return config
+
+
+def _leaves(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted keys and values."""
+    for name, value in config.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def _check_kind(key: str, value: Any) -> None:
+    """Compares a value with the first kind that its key belongs to; other keys may hold anything."""
+    if value is None and key in _OPTIONAL:
+        return
+    for patterns, fits, wanted in _KINDS:
+        if any(fnmatchcase(key, pattern) for pattern in patterns):
+            if not fits(value):
+                raise InputError(f"{key} is {value!r}: it must be {wanted}.")
+            return
+
+
+def _is_word(value: Any) -> bool:
+    return isinstance(value, str)
+
+
+def _is_whole_number(value: Any) -> bool:
+    return isinstance(value, numbers.Integral) and not isinstance(value, bool)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, numbers.Real) and not isinstance(value, bool)
+
+
+def _is_list(value: Any) -> bool:
+    return isinstance(value, list) and all(_is_number(v) for v in value)
+
+
+_KINDS = (
+    (_WORDS, _is_word, "a word"),
+    (_WHOLE_NUMBERS, _is_whole_number, "a whole number"),
+    (_NUMBERS, _is_number, "a number"),
+    (_LISTS, _is_list, "a list of numbers"),
+)

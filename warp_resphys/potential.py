@@ -134,6 +134,8 @@ class IncrementalPotential:
         self.n_points = sum(points.n_points for points in body.discretisation.point_sets)
         self._sets = [self._upload(points) for points in body.discretisation.point_sets]
         self._slices = self._point_slices()
+        norms = [np.sqrt((points.gradients**2).sum(axis=(2, 3))).ravel() for points in body.discretisation.point_sets]
+        self._gradient_norms = torch.as_tensor(np.concatenate(norms), device=device, dtype=dtype)  # (P,) [1/m]
         self.free_mask = torch.ones(body.n_vertices, device=device, dtype=dtype)
         self.free_mask[torch.as_tensor(body.fixed_vertices, device=device)] = 0.0
         self._terms = self._allocate_terms()
@@ -205,9 +207,7 @@ class IncrementalPotential:
         ]
 
     def _record(self, kernel: Any, dim: tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> Any:
-        return wp.launch(
-            kernel, dim=dim, inputs=inputs, outputs=outputs, device=str(self.device), record_cmd=True
-        )
+        return wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=str(self.device), record_cmd=True)
 
     def _gather(self, s: dict[str, Any], stress: torch.Tensor, part: slice, out: torch.Tensor) -> Any:
         """Recorded launch that adds a point set's transposed gradient of the stress to (B, N, 3)."""
@@ -290,6 +290,18 @@ class IncrementalPotential:
         stiffness = t.shape_stiffness.sum(1) + t.volume_stiffness.sum(1)
         energy = self._point_energy.sum(1) + self._vertex_energy.abs().sum(1)
         return 8.0 * torch.finfo(self.dtype).eps * (stiffness + 100.0 * energy)
+
+    def residual_rounding(self) -> torch.Tensor:
+        """(B,) norm that rounding may give the residual, with a margin [N].
+
+        A relative error eps of positions and stresses errs by eps (1 + |x| |grad N|) in a point's stress over its
+        stiffness, and |grad N| carries that to the force. Residuals at rest are a fiftieth to a half of the result.
+        """
+        t = self._terms
+        stiffness = (2.0 * t.shape_stiffness + t.volume_stiffness.abs()) * (1.0 + t.viscosity[:, None])
+        reach = self.positions.abs().amax(dim=(1, 2))[:, None]
+        forces = stiffness * self._gradient_norms * (1.0 + reach * self._gradient_norms)
+        return 4.0 * torch.finfo(self.dtype).eps * torch.linalg.vector_norm(forces, dim=1)
 
     def update_tangent(self, positive: torch.Tensor | None = None) -> None:
         """Computes dP/dF at ``positions``.
@@ -404,9 +416,7 @@ class HessianAssembly:
             inputs += [p._points(p._tangent[name], part, p._mat33) for name in names]
             inputs.append(offset)
             self._commands.append(
-                p._record(
-                    k.cell_blocks, (p.batch, s["cells"], s["k"]), inputs, [warp_view(blocks, p._mat33)]
-                )
+                p._record(k.cell_blocks, (p.batch, s["cells"], s["k"]), inputs, [warp_view(blocks, p._mat33)])
             )
         inputs = [
             p._array(pattern.start.astype(np.int32), int),

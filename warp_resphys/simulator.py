@@ -42,6 +42,18 @@ class MaterialTensors:
     damped: bool
     model: str
 
+    def check_batch(self, batch: int) -> None:
+        """Refuses constants of another number of environments.
+
+        Raises:
+            InputError: some constant has neither one value nor one for each environment.
+        """
+        for tensor in (self.shape_stiffness, self.mass, self.mass_damping, self.stiffness_damping):
+            if len(tensor) not in (1, batch):
+                raise InputError(
+                    f"a material parameter has values for {len(tensor)} environments, but the state has {batch}."
+                )
+
 
 @dataclass(frozen=True)
 class Trajectory:
@@ -105,6 +117,8 @@ class Simulator:
         self.settings = settings
         self.method = make_integrator(self.integrator)
         self._pattern = BlockPattern(self.body)
+        if np.shape(self.gravity) != (3,) or not np.isfinite(self.gravity).all():
+            raise InputError(f"gravity is {self.gravity}: it must be three finite accelerations, in m/s^2.")
         self._gravity = self.tensor(self.gravity)
         self.rest_positions = self.tensor(self.body.mesh.vertices)  # (N, 3) [m]
         self.fixed = torch.as_tensor(self.body.fixed_vertices, device=self.device)
@@ -199,6 +213,7 @@ class Simulator:
         """
         tensors = material if isinstance(material, MaterialTensors) else self.prepare(material)
         self._check(state, external_force, fixed_positions)
+        tensors.check_batch(state.batch)
         stage = self.method.stage(state, self.time_step)
         if fixed_positions is None:
             fixed_positions = state.q[:, self.fixed]
@@ -264,7 +279,8 @@ class Simulator:
         tensors = self.prepare(material)
         batch = batch or max([len(t) for t in given] + [len(tensors.shape_stiffness), len(tensors.weight)])
         state = self.rest_state(batch)
-        self._check(state, external_force, fixed_positions)
+        self._check(state, external_force, fixed_positions, start)
+        tensors.check_batch(batch)
         if fixed_positions is None:
             fixed_positions = state.q[:, self.fixed]
         force = tensors.weight if external_force is None else tensors.weight + external_force
@@ -274,7 +290,7 @@ class Simulator:
             workspace,
             workspace.solver("statics", settings),
             [],
-            state.q if start is None else start,
+            state.q if start is None else start.detach(),
             fixed_positions,
             state.q,
             torch.zeros(batch, self.body.n_vertices, device=self.device, dtype=self.dtype),
@@ -326,7 +342,11 @@ class Simulator:
         return Trajectory(q, v, reports, state)
 
     def _check(
-        self, state: State, external_force: torch.Tensor | None, fixed_positions: torch.Tensor | None
+        self,
+        state: State,
+        external_force: torch.Tensor | None,
+        fixed_positions: torch.Tensor | None,
+        start: torch.Tensor | None = None,
     ) -> None:
         """One sentence on the first argument that cannot be simulated."""
         b, n, d = state.batch, self.body.n_vertices, len(self.fixed)
@@ -335,6 +355,7 @@ class Simulator:
             "state.v": (state.v, (b, n, 3), "m/s"),
             "external_force": (external_force, (b, n, 3), "N"),
             "fixed_positions": (fixed_positions, (b, d, 3), "m"),
+            "start": (start, (b, n, 3), "m"),
         }
         for name, (values, shape, unit) in wanted.items():
             if values is None:

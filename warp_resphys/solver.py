@@ -9,7 +9,8 @@ Three solvers differ in the matrix of the global step and share everything else:
 =======================  ====================================================================================
 
 An environment of the batch has converged when its residual is at most ``relative_tolerance`` times the norm of the
-forces that balance: inertia and loads.
+forces that balance: inertia and loads. Where next to nothing moves, rounding leaves more than that: an environment
+whose residual is within rounding and has not halved in three iterations has converged too.
 """
 
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ from .potential import BlockPattern, IncrementalPotential
 SOLVERS = ("projective_dynamics", "quasi_newton", "newton")
 _ARMIJO = 1e-4
 _MAX_HALVINGS = 25
+_STALLS = 3
 
 
 @dataclass(frozen=True)
@@ -94,9 +96,7 @@ class NonlinearSolver:
         settings: see `SolverSettings`.
     """
 
-    def __init__(
-        self, potential: IncrementalPotential, pattern: BlockPattern, settings: SolverSettings
-    ) -> None:
+    def __init__(self, potential: IncrementalPotential, pattern: BlockPattern, settings: SolverSettings) -> None:
         self.potential, self.settings = potential, settings
         self.metric: Metric
         kind = settings.linear_solver
@@ -154,6 +154,9 @@ class _Run:
         self.force_norm = torch.linalg.vector_norm(p.force.view(self.batch, -1), dim=1)
         self.iterations = torch.zeros(self.batch, dtype=torch.int64, device=p.device)
         self.stuck = torch.zeros(self.batch, dtype=torch.bool, device=p.device)
+        self.rounding = p.residual_rounding()
+        self.smallest = torch.full_like(self.rounding, torch.inf)
+        self.stalls = torch.zeros_like(self.iterations)
         self.factorisations = 0
         self.iteration = 0
         self.clamp = False
@@ -167,7 +170,10 @@ class _Run:
         norm = torch.linalg.vector_norm(self.residual, dim=1)
         scale = balance + self.force_norm
         self.relative_residual = norm / scale.clamp_min(s.absolute_tolerance)
-        self.converged = (norm <= s.relative_tolerance * scale) | (norm <= s.absolute_tolerance)
+        self.stalls = torch.where(norm < 0.5 * self.smallest, 0, self.stalls + 1)
+        self.smallest = torch.minimum(self.smallest, norm)
+        at_rounding = (norm <= self.rounding) & (self.stalls >= _STALLS)
+        self.converged = (norm <= s.relative_tolerance * scale) | (norm <= s.absolute_tolerance) | at_rounding
 
     def advance(self) -> bool:
         """One global step and line search; False when every environment is done."""
@@ -220,9 +226,7 @@ class _Run:
         self._accept(energy, balance)
         self.solver._update.add(step[:, None] * direction, self.residual - before)
 
-    def _give_up(
-        self, failed: torch.Tensor, start: torch.Tensor, direction: torch.Tensor, step: torch.Tensor
-    ) -> None:
+    def _give_up(self, failed: torch.Tensor, start: torch.Tensor, direction: torch.Tensor, step: torch.Tensor) -> None:
         """Stays where it was; a clamped Hessian gets one more try before the environment counts as stuck."""
         step.masked_fill_(failed, 0.0)
         self.potential.positions.copy_(start).add_((step[:, None] * direction).view_as(start))

@@ -21,44 +21,27 @@ def assembly_kernels(scalar: type) -> SimpleNamespace:
     def cell_blocks(
         gradients: wp.array2d[vec3],
         points_per_cell: int,
-        u_point: wp.array2d[mat33],
-        v_point: wp.array2d[mat33],
-        direct_point: wp.array2d[mat33],
-        normal_point: wp.array2d[mat33],
-        cross_point: wp.array2d[mat33],
-        geometric_point: wp.array2d[mat33],
+        tangent_point: wp.array3d[mat33],  # (B, P, 6)
         block_offset: int,
         blocks_out: wp.array2d[mat33],  # (B, C K (K + 1) / 2 from block_offset on) [N/m], rows a >= columns c
     ):
-        """Block (a, c) of a cell: d force_a / d x_c, from the tangent in the SVD frame of each point."""
+        """Block (a, c) of a cell: d force_a / d x_c."""
         b, cell, a = wp.tid()
         k = gradients.shape[1]
         first = block_offset + cell * (k * (k + 1)) / 2 + (a * (a + 1)) / 2
-        for c in range(a + 1):
-            total = mat33(zero, zero, zero, zero, zero, zero, zero, zero, zero)
-            for q in range(points_per_cell):
-                p = cell * points_per_cell + q
-                ga = gradients[p, a]
-                gc = gradients[p, c]
-                u = u_point[b, p]
-                v = v_point[b, p]
-                direct = direct_point[b, p]
-                normal = normal_point[b, p]
-                cross = cross_point[b, p]
-                ha = ga @ v
-                hc = gc @ v
-                # dF' = e_k hc^T for a unit displacement of node c along u_k; force on a: dP' ha.
-                diagonal = direct * wp.cw_mul(ha, hc)
-                block = wp.cw_mul(normal, wp.outer(ha, hc)) + wp.cw_mul(cross, wp.outer(hc, ha))
-                block[0, 0] = diagonal[0]
-                block[1, 1] = diagonal[1]
-                block[2, 2] = diagonal[2]
-                total += u * block * wp.transpose(u)
-                g = wp.dot(ga, geometric_point[b, p] * gc)
-                total[0, 0] += g
-                total[1, 1] += g
-                total[2, 2] += g
-            blocks_out[b, first + c] = total
+        for q in range(points_per_cell):
+            p = cell * points_per_cell + q
+            g = gradients[p, a]
+            t = tangent_point[b, p]
+            x = g[0] * t[0] + g[1] * t[1] + g[2] * t[3]
+            y = g[0] * wp.transpose(t[1]) + g[1] * t[2] + g[2] * t[4]
+            z = g[0] * wp.transpose(t[3]) + g[1] * wp.transpose(t[4]) + g[2] * t[5]
+            for c in range(a + 1):
+                h = gradients[p, c]
+                block = h[0] * x + h[1] * y + h[2] * z
+                if q > 0:
+                    block += blocks_out[b, first + c]
+                blocks_out[b, first + c] = block
 
     @kernel
     def scatter_blocks(

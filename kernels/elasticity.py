@@ -1,4 +1,4 @@
-"""Local step and its derivatives: stress, tangent and their products at the points, gather to the vertices."""
+"""Local step and its adjoints: stress and energy at the points, gather to the vertices."""
 
 import functools
 from types import SimpleNamespace
@@ -19,11 +19,10 @@ def elasticity_kernels(scalar: type) -> SimpleNamespace:
     function = functools.partial(wp.func, module=module)
     functions = matrix_functions(scalar)
     mat33, vec3 = functions.mat33, functions.vec3
-    cofactor, signed_svd = functions.cofactor, functions.signed_svd
+    cofactor = functions.cofactor
     polar_rotation, nearest_unimodular = functions.polar_rotation, functions.nearest_unimodular
     zero, half, one, two = scalar(0.0), scalar(0.5), scalar(1.0), scalar(2.0)
     third = scalar(1.0 / 3.0)
-    smallest_stretch_sum = scalar(1.0e-3)
 
     @function
     def deformation_gradient(
@@ -182,150 +181,6 @@ def elasticity_kernels(scalar: type) -> SimpleNamespace:
         residual_out[b, i] = pull - force[b, i]
         energy_out[b, i] = wp.dot(half * pull - force[b, i], offset)
 
-    # The tangent dP/dF of an isotropic energy in the frame of the SVD F = U diag(s) V^T, with dF' = U^T dF V:
-    #   dP'_ij = direct_ij dF'_ij + cross_ij dF'_ji            (i != j)
-    #   dP'_ii = direct_ii dF'_ii + sum_{k != i} normal_ik dF'_kk
-    # with direct = (flip + twist) / 2 and cross = (flip - twist) / 2 off the diagonal, where flip and twist are the
-    # eigenvalues (sigma_i - sigma_j) / (s_i - s_j) and (sigma_i + sigma_j) / (s_i + s_j) of the symmetric and skew
-    # pairs (Smith, de Goes, Kim 2019), written so that equal singular values do not divide by zero.
-    @function
-    def third_index(i: int, j: int) -> int:
-        return 3 - i - j
-
-    @function
-    def corotated_hessian(s: vec3, d: vec3, shape: scalar, volume: scalar):
-        """Normal (3, 3), flip and twist by the index of the axis left out; d are the singular values of D."""
-        # D shares F's singular frame: s = d + m cof(d), prod d = 1. Differentiating both gives the 3x3 block of
-        # dD as the projection on the surface's tangent plane in the metric I + m (d off the diagonal).
-        cof = vec3(d[1] * d[2], d[0] * d[2], d[0] * d[1])
-        m = wp.dot(s - d, cof) / wp.dot(cof, cof)
-        inverse = wp.inverse(mat33(one, m * d[2], m * d[1], m * d[2], one, m * d[0], m * d[1], m * d[0], one))
-        icof = inverse * cof
-        normal = volume * (wp.outer(icof, icof) / wp.dot(cof, icof) - inverse)
-        flip = vec3(zero, zero, zero)
-        twist = vec3(zero, zero, zero)
-        for k in range(3):
-            normal[k, k] += volume + two * shape
-            stretch_sum = wp.max(s[(k + 1) % 3] + s[(k + 2) % 3], smallest_stretch_sum)
-            flip[k] = two * shape + volume * (one - one / (one - m * d[k]))
-            d_sum = d[(k + 1) % 3] + d[(k + 2) % 3]
-            twist[k] = two * shape * (one - two / stretch_sum) + volume * (one - d_sum / stretch_sum)
-        return normal, flip, twist
-
-    @function
-    def neo_hookean_hessian(s: vec3, shape: scalar, volume: scalar):
-        """Normal (3, 3), flip and twist by the index of the axis left out."""
-        jac = s[0] * s[1] * s[2]
-        cof = vec3(s[1] * s[2], s[0] * s[2], s[0] * s[1])
-        slope = shape * (jac - two) + volume * (jac - one)
-        normal = (shape + volume) * wp.outer(cof, cof)
-        flip = vec3(zero, zero, zero)
-        twist = vec3(zero, zero, zero)
-        for k in range(3):
-            i = (k + 1) % 3
-            j = (k + 2) % 3
-            normal[k, k] += shape
-            normal[i, j] += slope * s[k]
-            normal[j, i] += slope * s[k]
-            flip[k] = shape - slope * s[k]
-            twist[k] = shape + slope * s[k]
-        return normal, flip, twist
-
-    @kernel
-    def tangent(
-        model: int,
-        nodes: wp.array2d[int],
-        gradients: wp.array2d[vec3],
-        shape_stiffness: wp.array2d[scalar],
-        volume_stiffness: wp.array2d[scalar],
-        viscosity: wp.array[scalar],
-        reference_strain: wp.array2d[mat33],
-        points_per_cell: int,
-        positions: wp.array2d[vec3],
-        positive: wp.array[int],  # (B) 1: clamp the eigenvalues at zero
-        u_out: wp.array2d[mat33],
-        v_out: wp.array2d[mat33],
-        direct_out: wp.array2d[mat33],
-        normal_out: wp.array2d[mat33],
-        cross_out: wp.array2d[mat33],
-        geometric_out: wp.array2d[mat33],  # (B, P) second Piola-Kirchhoff stress of the viscous term [J]
-    ):
-        b, p = wp.tid()
-        f = deformation_gradient(positions, nodes, gradients, b, p, p / points_per_cell)
-        shape = shape_stiffness[b, p]
-        volume = volume_stiffness[b, p]
-        u, s, v = signed_svd(f)
-        normal, flip, twist = neo_hookean_hessian(s, shape, volume)
-        if model == COROTATED:
-            d = s
-            if volume != zero:
-                d = wp.get_diag(wp.transpose(u) * nearest_unimodular(f) * v)
-            normal, flip, twist = corotated_hessian(s, d, shape, volume)
-        if positive[b] == 1:
-            q, e = wp.eig3(normal)
-            clamped = wp.diag(vec3(wp.max(e[0], zero), wp.max(e[1], zero), wp.max(e[2], zero)))
-            normal = q * clamped * wp.transpose(q)
-            for k in range(3):
-                flip[k] = wp.max(flip[k], zero)
-                twist[k] = wp.max(twist[k], zero)
-        direct = mat33(zero, zero, zero, zero, zero, zero, zero, zero, zero)
-        cross = direct
-        for i in range(3):
-            direct[i, i] = normal[i, i]
-            for j in range(3):
-                if i != j:
-                    k = third_index(i, j)
-                    direct[i, j] = half * (flip[k] + twist[k])
-                    cross[i, j] = half * (flip[k] - twist[k])
-        c = viscosity[b]
-        geometric = mat33(zero, zero, zero, zero, zero, zero, zero, zero, zero)
-        if c > zero:
-            bulk = c * linear_volume_factor(model) * volume
-            for i in range(3):
-                direct[i, i] += (two * c * shape + bulk) * s[i] * s[i]
-                for j in range(3):
-                    if i != j:
-                        direct[i, j] += c * shape * s[i] * s[i]
-                        cross[i, j] += c * shape * s[i] * s[j]
-                        normal[i, j] += bulk * s[i] * s[j]
-            # The stress part of the viscous Hessian may be indefinite: a clamped Hessian leaves it out.
-            if positive[b] == 0:
-                rate = green_strain(f) - reference_strain[b, p]
-                geometric = c * isotropic(rate, shape, linear_volume_factor(model) * volume)
-        u_out[b, p] = u
-        v_out[b, p] = v
-        direct_out[b, p] = direct
-        normal_out[b, p] = normal
-        cross_out[b, p] = cross
-        geometric_out[b, p] = geometric
-
-    @kernel
-    def tangent_product(
-        nodes: wp.array2d[int],
-        gradients: wp.array2d[vec3],
-        points_per_cell: int,
-        u_point: wp.array2d[mat33],
-        v_point: wp.array2d[mat33],
-        direct_point: wp.array2d[mat33],
-        normal_point: wp.array2d[mat33],
-        cross_point: wp.array2d[mat33],
-        geometric_point: wp.array2d[mat33],
-        direction: wp.array2d[vec3],  # (B, N) [m]
-        stress_out: wp.array2d[mat33],  # (B, P) dP in that direction [J]
-    ):
-        b, p = wp.tid()
-        df = deformation_gradient(direction, nodes, gradients, b, p, p / points_per_cell)
-        u = u_point[b, p]
-        v = v_point[b, p]
-        turned = wp.transpose(u) * df * v
-        dp = wp.cw_mul(direct_point[b, p], turned) + wp.cw_mul(cross_point[b, p], wp.transpose(turned))
-        normal = normal_point[b, p]
-        for i in range(3):
-            for k in range(3):
-                if i != k:
-                    dp[i, i] += normal[i, k] * turned[k, k]
-        stress_out[b, p] = u * dp * wp.transpose(v) + df * geometric_point[b, p]
-
     @kernel
     def stiffness_adjoint(
         model: int,
@@ -375,12 +230,14 @@ def elasticity_kernels(scalar: type) -> SimpleNamespace:
     return SimpleNamespace(
         mat33=mat33,
         vec3=vec3,
+        deformation_gradient=deformation_gradient,
+        green_strain=green_strain,
+        isotropic=isotropic,
+        linear_volume_factor=linear_volume_factor,
         local_step=local_step,
         strain=strain,
         strain_adjoint=strain_adjoint,
         gather=gather,
         inertia_residual=inertia_residual,
-        tangent=tangent,
-        tangent_product=tangent_product,
         stiffness_adjoint=stiffness_adjoint,
     )

@@ -13,8 +13,9 @@ def matrix_functions(scalar: type) -> SimpleNamespace:
     function = functools.partial(wp.func, module=module)
     mat33 = wp.types.matrix((3, 3), scalar)
     vec3 = wp.types.vector(3, scalar)
-    # Squared size of the last update at which an iteration has converged to rounding.
+    # Squared size of the last update at which an iteration has converged to rounding: Newton's squares its error.
     update_tolerance = scalar(1.0e-30 if scalar is wp.float64 else 1.0e-13)
+    newton_tolerance = scalar(1.0e-16 if scalar is wp.float64 else 1.0e-8)
     singular = scalar(1.0e-12 if scalar is wp.float64 else 1.0e-6)
     nearly_a_line = scalar(1.0e-3)
     zero = scalar(0.0)
@@ -60,12 +61,12 @@ def matrix_functions(scalar: type) -> SimpleNamespace:
         if wp.determinant(f) > singular:
             for _ in range(20):
                 c = cofactor(r)
-                following = half * (r + c / wp.ddot(c, r) * scalar(3.0))
+                following = half * r + (scalar(1.5) / wp.ddot(c, r)) * c
                 update = wp.ddot(following - r, following - r)
                 r = following
-                if update < update_tolerance:
+                if update < newton_tolerance:
                     break
-        if not (update < scalar(1.0e3) * update_tolerance):
+        if not (update < newton_tolerance):
             u, _s, v = signed_svd(f)
             r = u * wp.transpose(v)
         return r

@@ -388,7 +388,10 @@ class TestBadInput:
             ("reality.youngs_modulus=-1e5", "reality: youngs_modulus is -100000: it must be positive, in pascals."),
             ("simulation.youngs_modulus=nan", "simulation: youngs_modulus is nan: it must be positive, in pascals."),
             ("simulation.poissons_ratio=0.5", "simulation: poissons_ratio is 0.5: it must be greater than -1 and less"),
-            ("reality.poissons_ratio=-1", "reality: poissons_ratio is -1: it must be greater than -1 and less than 0.5."),
+            (
+                "reality.poissons_ratio=-1",
+                "reality: poissons_ratio is -1: it must be greater than -1 and less than 0.5.",
+            ),
             ("time_step=0", "time_step is 0: it must be positive, in seconds."),
             ("time_step=-0.01", "time_step is -0.01: it must be positive, in seconds."),
             ("experiment=beam_oscilation", "unknown experiment 'beam_oscilation', did you mean 'beam_oscillation'"),
@@ -531,9 +534,7 @@ def options(group):
 
 
 GROUPS = ("mesh", "physics", "solver", "reconstruction", "network", "trainer", "budget")
-CHOICES = [
-    (name, group, option) for name in options("experiment") for group in GROUPS for option in options(group)
-]
+CHOICES = [(name, group, option) for name in options("experiment") for group in GROUPS for option in options(group)]
 
 
 class TestConfiguration:

@@ -45,12 +45,12 @@ class InverseHessianUpdate:
             self._r[:, :-1, :-1] = self._r[:, 1:, 1:].clone()
             self.count -= 1
         k = self.count
-        curvature = torch.einsum("bi,bi->b", displacement, change)
+        curvature = torch.linalg.vecdot(displacement, change)
         norms = torch.linalg.vector_norm(displacement, dim=1) * torch.linalg.vector_norm(change, dim=1)
         useful = curvature > 1e-10 * norms
-        self._s[:, k] = displacement * useful[:, None]
-        self._y[:, k] = change * useful[:, None]
-        self._r[:, : k + 1, k] = torch.einsum("bmi,bi->bm", self._s[:, : k + 1], self._y[:, k])
+        torch.mul(displacement, useful[:, None], out=self._s[:, k])
+        torch.mul(change, useful[:, None], out=self._y[:, k])
+        self._r[:, : k + 1, k] = (self._s[:, : k + 1] @ self._y[:, k, :, None])[:, :, 0]
         self._r[:, k, k] += ~useful
         self.count += 1
 

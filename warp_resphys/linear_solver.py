@@ -125,7 +125,7 @@ def _one_thread(threads: ThreadpoolController) -> AbstractContextManager[Any]:
 
 class _BandedFactor(Factor):
     def __init__(self, bands: NDArray[Any], solver: BandedSolver, definite: bool) -> None:
-        self._order, self._place, self._threads = solver._order, solver._place, solver._threads
+        self._order, self._place = solver._order, solver._place
         self._definite = definite
         self.failed = np.zeros(len(bands), dtype=bool)
         self._factors: list[Any] = []
@@ -148,9 +148,9 @@ class _BandedFactor(Factor):
         ordered = rhs[:, self._order]
         # LAPACK wants columns: (groups, columns, n) in memory is (n, columns) in Fortran order.
         columns = ordered.transpose(1, 2).reshape((1, b * m, n) if shared else (b, m, n)).contiguous().numpy()
-        with _one_thread(self._threads):
-            for factor, block in zip(self._factors, columns, strict=True):
-                self._solve_in_place(factor, block.T)
+        # Triangular solves with a band run on one thread in any case.
+        for factor, block in zip(self._factors, columns, strict=True):
+            self._solve_in_place(factor, block.T)
         solved = torch.from_numpy(columns).reshape(b, m, n).transpose(1, 2)
         return solved[:, self._place]
 

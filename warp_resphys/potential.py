@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from .body import Body
 from .kernels.assembly import assembly_kernels
 from .kernels.elasticity import elasticity_kernels
+from .kernels.tangent import tangent_kernels
 from .linear_solver import LinearSolver
 
 _SCALARS = {torch.float64: wp.float64, torch.float32: wp.float32}
@@ -129,6 +130,7 @@ class IncrementalPotential:
         self._model = model
         scalar = _SCALARS[dtype]
         self._elastic, self._assembly = elasticity_kernels(scalar), assembly_kernels(scalar)
+        self._second = tangent_kernels(scalar)
         self._scalar, self._vec3, self._mat33 = scalar, self._elastic.vec3, self._elastic.mat33
         self.n_vertices = body.n_vertices
         self.n_points = sum(points.n_points for points in body.discretisation.point_sets)
@@ -146,8 +148,9 @@ class IncrementalPotential:
         self._vertex_energy = self._zeros(self.n_vertices)
         self._viscous = False
         self._record_evaluation()
-        self._tangent: dict[str, torch.Tensor] = {}
-        self._blocks: torch.Tensor | None = None
+        self._tangent: torch.Tensor | None = None
+        self._direction = self._zeros(self.n_vertices, 3)
+        self._adjoint_commands: list[Any] = []
 
     def _zeros(self, *shape: int) -> torch.Tensor:
         return torch.zeros(self.batch, *shape, device=self.device, dtype=self.dtype)
@@ -309,7 +312,7 @@ class IncrementalPotential:
         Args:
             positive: (B,) environments whose eigenvalues are clamped at zero; none where left out.
         """
-        if not self._tangent:
+        if self._tangent is None:
             self._record_tangent()
         self._positive.zero_()
         if positive is not None:
@@ -317,22 +320,31 @@ class IncrementalPotential:
         self._launch(*self._tangent_commands)
 
     def _record_tangent(self) -> None:
-        names = ("u", "v", "direct", "normal", "cross", "geometric")
-        self._tangent = {name: self._zeros(self.n_points, 3, 3) for name in names}
+        self._tangent = self._zeros(self.n_points, 6, 3, 3)
         self._positive = torch.zeros(self.batch, device=self.device, dtype=torch.int32)
         self._product_stress = self._zeros(self.n_points, 3, 3)
-        self._direction, self._product = self._zeros(self.n_vertices, 3), self._zeros(self.n_vertices, 3)
+        self._product = self._zeros(self.n_vertices, 3)
         self._tangent_commands, self._product_commands = [], []
-        k = self._elastic
+        k = self._second
         for s, part in zip(self._sets, self._slices, strict=True):
-            tangent = [self._points(self._tangent[name], part, self._mat33) for name in names]
+            tangent = self._points(self._tangent, part, self._mat33)
             inputs = [*self._energy_arguments(s, part), warp_view(self._positive, wp.int32)]
-            self._tangent_commands.append(self._record(k.tangent, (self.batch, s["n_points"]), inputs, tangent))
-            inputs = [s["nodes"], s["gradients"], s["points_per_cell"], *tangent]
+            self._tangent_commands.append(self._record(k.tangent, (self.batch, s["n_points"]), inputs, [tangent]))
+            inputs = [s["nodes"], s["gradients"], s["points_per_cell"], tangent]
             inputs.append(warp_view(self._direction, self._vec3))
             product = [self._points(self._product_stress, part, self._mat33)]
             launch = self._record(k.tangent_product, (self.batch, s["n_points"]), inputs, product)
             self._product_commands += [launch, self._gather(s, self._product_stress, part, self._product)]
+
+    def _record_adjoint(self) -> None:
+        scalars = [self._zeros(self.n_points) for _ in range(3)]
+        self._adjoints = [*scalars, self._zeros(self.n_points, 3, 3)]
+        types = [self._scalar] * 3 + [self._mat33]
+        for s, part in zip(self._sets, self._slices, strict=True):
+            outputs = [self._points(o, part, t) for o, t in zip(self._adjoints, types, strict=True)]
+            inputs = [*self._energy_arguments(s, part), warp_view(self._direction, self._vec3)]
+            dim = (self.batch, s["n_points"])
+            self._adjoint_commands.append(self._record(self._elastic.stiffness_adjoint, dim, inputs, outputs))
 
     def stiffness_product(self, direction: torch.Tensor) -> torch.Tensor:
         """(B, N, 3) product of the internal forces' stiffness with a displacement, all vertices included [N].
@@ -350,7 +362,7 @@ class IncrementalPotential:
 
     def scatterer(self, solver: LinearSolver, pattern: BlockPattern) -> "HessianAssembly":
         """Recorded launches that assemble for a solver."""
-        if not self._tangent:
+        if self._tangent is None:
             self._record_tangent()
         return HessianAssembly(self, solver, pattern)
 
@@ -363,14 +375,11 @@ class IncrementalPotential:
         Returns:
             ``shape_stiffness`` and ``volume_stiffness`` (B, P), ``viscosity`` (B,), ``reference_strain`` (B, P, 3, 3).
         """
-        k = self._elastic
-        out = [self._zeros(self.n_points) for _ in range(3)] + [self._zeros(self.n_points, 3, 3)]
-        types = [self._scalar] * 3 + [self._mat33]
-        z = warp_view(adjoint.contiguous(), self._vec3)
-        for s, part in zip(self._sets, self._slices, strict=True):
-            outputs = [self._points(o, part, t) for o, t in zip(out, types, strict=True)]
-            inputs = [*self._energy_arguments(s, part), z]
-            self._launch(self._record(k.stiffness_adjoint, (self.batch, s["n_points"]), inputs, outputs))
+        if not self._adjoint_commands:
+            self._record_adjoint()
+        self._direction.copy_(adjoint)
+        self._launch(*self._adjoint_commands)
+        out = [values.clone() for values in self._adjoints]
         names = ("shape_stiffness", "volume_stiffness", "viscosity", "reference_strain")
         result = dict(zip(names, out, strict=True))
         result["viscosity"] = result["viscosity"].sum(1)
@@ -409,12 +418,10 @@ class HessianAssembly:
         self._potential = p
         blocks = p._zeros(pattern.n_cell_blocks, 3, 3)
         self._values = p._zeros(solver.n_values)
-        names = ("u", "v", "direct", "normal", "cross", "geometric")
         self._commands = []
         for s, part, offset in zip(p._sets, p._slices, pattern.offsets, strict=True):
             inputs = [s["gradients"], s["points_per_cell"]]
-            inputs += [p._points(p._tangent[name], part, p._mat33) for name in names]
-            inputs.append(offset)
+            inputs += [p._points(p._tangent, part, p._mat33), offset]
             self._commands.append(
                 p._record(k.cell_blocks, (p.batch, s["cells"], s["k"]), inputs, [warp_view(blocks, p._mat33)])
             )

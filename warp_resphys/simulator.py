@@ -173,7 +173,7 @@ class Simulator:
 
     @staticmethod
     def _common(*tensors: torch.Tensor) -> torch.Size:
-        return torch.broadcast_shapes(*(t.shape for t in tensors))
+        return torch.Size(np.broadcast_shapes(*(t.shape for t in tensors)))
 
     def workspace(self, batch: int, model: str | None = None) -> Workspace:
         """Buffers for a batch size and material model, made at their first use."""

@@ -49,7 +49,7 @@ class SolverSettings:
     absolute_tolerance: float = 1e-12
     max_iterations: int = 2000
     memory: int = 12
-    refactor_after: int = 8
+    refactor_after: int = 4
     linear_solver: str = "auto"
     on_failure: str = "raise"
 
@@ -184,11 +184,11 @@ class _Run:
             self._refactor()
         direction = -self.solver._update.apply(self.residual, self.solver.metric)
         direction *= active[:, None]
-        slope = torch.einsum("bi,bi->b", self.residual, direction)
+        slope = torch.linalg.vecdot(self.residual, direction)
         if bool((slope > 0).any()):
             self.solver._update.reset()
             direction = -self.solver.metric.apply(self.residual) * active[:, None]
-            slope = torch.einsum("bi,bi->b", self.residual, direction)
+            slope = torch.linalg.vecdot(self.residual, direction)
         self.iterations += active
         self.iteration += 1
         self._line_search(direction, slope, active)
@@ -208,15 +208,15 @@ class _Run:
         p = self.potential
         start = p.positions.clone()
         step = torch.ones_like(slope)
-        noise = p.energy_rounding()
         before = self.residual
         for _ in range(_MAX_HALVINGS):
             p.positions.copy_(start).add_((step[:, None] * direction).view_as(start))
             energy, balance = p.evaluate()
-            after = torch.einsum("bi,bi->b", p.residual.view(self.batch, -1), direction)
-            decreased = energy <= self.energy + _ARMIJO * step * slope
-            flat = (energy <= self.energy + noise) & (after <= (2 * _ARMIJO - 1) * slope)
-            failed = active & ~(decreased | flat)
+            failed = active & ~(energy <= self.energy + _ARMIJO * step * slope)
+            if bool(failed.any()):
+                after = torch.linalg.vecdot(p.residual.view(self.batch, -1), direction)
+                flat = (energy <= self.energy + p.energy_rounding()) & (after <= (2 * _ARMIJO - 1) * slope)
+                failed &= ~flat
             if not bool(failed.any()):
                 break
             step = torch.where(failed, 0.5 * step, step)

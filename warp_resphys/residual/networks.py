@@ -32,9 +32,7 @@ class SkipMLP(nn.Module):
 
     def __init__(self, n_in: int, n_out: int, blocks: int, layers: int, width: int) -> None:
         super().__init__()
-        self.blocks = nn.ModuleList(
-            _perceptron(n_in if i == 0 else n_out, n_out, layers, width) for i in range(blocks)
-        )
+        self.blocks = nn.ModuleList(_perceptron(n_in if i == 0 else n_out, n_out, layers, width) for i in range(blocks))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """(S, n_in) to (S, n_out)."""

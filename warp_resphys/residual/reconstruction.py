@@ -55,9 +55,7 @@ class Reconstructor(ABC):
         InputError: a regularisation that is negative, or a tolerance or number of iterations that is not positive.
     """
 
-    def __init__(
-        self, simulator: Simulator, regularisation: float, tolerance: float, max_iterations: int
-    ) -> None:
+    def __init__(self, simulator: Simulator, regularisation: float, tolerance: float, max_iterations: int) -> None:
         if not regularisation >= 0.0:
             raise InputError(f"reconstruction.regularisation is {regularisation:g}: it must be zero or more.")
         if not tolerance > 0.0:
@@ -69,9 +67,7 @@ class Reconstructor(ABC):
         self._tensors = simulator.prepare()
 
     @abstractmethod
-    def step(
-        self, state: State, observed: torch.Tensor, first_guess: torch.Tensor | None = None
-    ) -> Reconstruction:
+    def step(self, state: State, observed: torch.Tensor, first_guess: torch.Tensor | None = None) -> Reconstruction:
         """Reconstructs the step from a state to observed positions.
 
         Args:
@@ -101,9 +97,7 @@ class GaussNewton(Reconstructor):
     _assembled: IncrementalPotential | None = None
 
     @override
-    def step(
-        self, state: State, observed: torch.Tensor, first_guess: torch.Tensor | None = None
-    ) -> Reconstruction:
+    def step(self, state: State, observed: torch.Tensor, first_guess: torch.Tensor | None = None) -> Reconstruction:
         del first_guess
         sim, batch = self.simulator, state.batch
         workspace = sim.workspace(batch)
@@ -218,9 +212,7 @@ class LBFGSB(Reconstructor):
     """
 
     @override
-    def step(
-        self, state: State, observed: torch.Tensor, first_guess: torch.Tensor | None = None
-    ) -> Reconstruction:
+    def step(self, state: State, observed: torch.Tensor, first_guess: torch.Tensor | None = None) -> Reconstruction:
         sim = self.simulator
         free = torch.ones(sim.body.n_vertices, 1, device=observed.device, dtype=observed.dtype)
         free[sim.fixed] = 0.0

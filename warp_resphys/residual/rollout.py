@@ -22,9 +22,7 @@ class HybridSimulator:
         lost: (B,) bool, environments that diverged before.
     """
 
-    def __init__(
-        self, simulator: Simulator, predict: Predictor | None, lost: torch.Tensor | None = None
-    ) -> None:
+    def __init__(self, simulator: Simulator, predict: Predictor | None, lost: torch.Tensor | None = None) -> None:
         self.simulator, self.predict, self.lost = simulator, predict, lost
         self._tensors = simulator.prepare()
 

@@ -55,9 +55,7 @@ def _errors(positions: NDArray[np.float64], target: NDArray[np.float64]) -> list
     return [trajectory_errors(q, t) for q, t in zip(positions, target, strict=True)]
 
 
-def _roll_out(
-    context: StageContext, q: NDArray[np.float64], v: NDArray[np.float64], frames: int
-) -> None:
+def _roll_out(context: StageContext, q: NDArray[np.float64], v: NDArray[np.float64], frames: int) -> None:
     """Both models over all frames; frame 0 is the start."""
     simulator = build_simulator(context.settings, on_failure="count")
     predict: dict[str, Predictor | None] = {

@@ -43,8 +43,7 @@ def make_report(context: StageContext) -> None:
     positions = {"simulation": simulation, "reconstruction": reconstruction[part], "resphys": resphys}
     target = target[part]
     errors = {
-        m: np.stack([trajectory_errors(a, b) for a, b in zip(q, target, strict=True)])
-        for m, q in positions.items()
+        m: np.stack([trajectory_errors(a, b) for a, b in zip(q, target, strict=True)]) for m, q in positions.items()
     }
     mesh = build_mesh(config["mesh"])
     worst = int(np.argmax(np.nanmean(errors["simulation"], axis=1)))
@@ -70,9 +69,7 @@ def make_report(context: StageContext) -> None:
 def collect_metrics(context: StageContext, config: dict[str, Any]) -> dict[str, Any]:
     """Errors, seconds of the stages that are done, versions and device."""
     records = sorted((context.run_dir / "stages").glob("*.json"))
-    seconds = {
-        r.stem: read_json(r)["seconds"] for r in records if not r.name.endswith(".progress.json")
-    }
+    seconds = {r.stem: read_json(r)["seconds"] for r in records if not r.name.endswith(".progress.json")}
     return {
         **read_json(context.run_dir / ERRORS),
         "seconds": {k: seconds[k] for k in config_order(seconds)},

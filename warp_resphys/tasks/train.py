@@ -92,9 +92,7 @@ def _copy(
     }
 
 
-def _save(
-    checkpoint: Path, kept: tuple[dict[str, torch.Tensor], dict[str, Any]], fingerprint: str
-) -> None:
+def _save(checkpoint: Path, kept: tuple[dict[str, torch.Tensor], dict[str, Any]], fingerprint: str) -> None:
     write_checkpoint(checkpoint, "training", kept[0], {**kept[1], "fingerprint": fingerprint})
 
 
@@ -105,9 +103,7 @@ def _samples(run_dir: Path, split: Split, device: torch.device) -> dict[str, Sam
     samples = {}
     for name in ("train", "validation"):
         part = split.indices(name)
-        samples[name] = Samples(
-            q[part, :-1].flatten(0, 1), v[part, :-1].flatten(0, 1), force[part, 1:].flatten(0, 1)
-        )
+        samples[name] = Samples(q[part, :-1].flatten(0, 1), v[part, :-1].flatten(0, 1), force[part, 1:].flatten(0, 1))
     return samples
 
 

@@ -1,0 +1,129 @@
+"""The wheel, installed where no file of the repository is in reach; dependencies come from the tests' environment."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import zipfile
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).parents[1]
+TINY = [
+    "mesh.divisions=[4,2,2]",
+    "data.steps=12",
+    "data.weights_g.train=[50,90,130]",
+    "data.weights_g.validation=[110]",
+    "data.weights_g.test=[70,150]",
+    "trainer.epochs=40",
+    "trainer.rollout_every=10",
+    "network.width=32",
+    "hydra.run.dir=run",
+]
+
+
+def can_build():
+    """Whether setuptools is there, and new enough for the build of the wheel."""
+    try:
+        return int(version("setuptools").partition(".")[0]) >= 77
+    except PackageNotFoundError:
+        return False
+
+
+pytestmark = pytest.mark.skipif(
+    not can_build(),
+    reason="building the wheel without a network takes setuptools 77 or newer: pip install -U setuptools",
+)
+
+
+def call(*command, folder, **environment):
+    """Runs a command without the repository on its path; its output."""
+    inherited = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")}
+    result = subprocess.run(
+        [str(part) for part in command],
+        cwd=folder,
+        env={**inherited, **environment},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert result.returncode == 0, result.stdout + result.stderr
+    return result.stdout
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    """Built from a copy of what is needed, so that no build folder is left in the repository."""
+    source, target = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(REPOSITORY / name, source)
+    for name in ("warp_resphys", "kernels", "conf"):
+        shutil.copytree(REPOSITORY / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    offline = ("--no-deps", "--no-build-isolation", "--no-index", "--quiet", "--disable-pip-version-check")
+    call(sys.executable, "-m", "pip", "wheel", *offline, "--wheel-dir", target, source, folder=target)
+    (built,) = target.glob("*.whl")
+    return built
+
+
+@pytest.fixture(scope="module")
+def installed(wheel, tmp_path_factory):
+    """Folder of the commands of a fresh virtual environment with the wheel in it."""
+    root = tmp_path_factory.mktemp("environment")
+    call(sys.executable, "-m", "venv", "--without-pip", root, folder=root)
+    commands = root / ("Scripts" if os.name == "nt" else "bin")
+    offline = ("--no-deps", "--no-index", "--quiet", "--disable-pip-version-check")
+    pip = (sys.executable, "-m", "pip", "--python", commands / "python")
+    call(*pip, "install", *offline, wheel, folder=root)
+    site = call(commands / "python", "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", folder=root)
+    # A plain path: the .pth files behind it, such as those of an editable install, are not read.
+    Path(site.strip(), "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    return commands
+
+
+def test_the_wheel_holds_every_module_and_configuration(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+    for folder, package in (("warp_resphys", ""), ("kernels", "kernels/"), ("conf", "conf/")):
+        for suffix in (".py", ".yaml", ".html", "py.typed"):
+            for path in (REPOSITORY / folder).rglob(f"*{suffix}"):
+                assert f"warp_resphys/{package}{path.relative_to(REPOSITORY / folder).as_posix()}" in names
+    metadata = {name for name in names if ".dist-info/" in name}
+    assert {name.partition("/")[0] for name in names - metadata} == {"warp_resphys"}
+    assert any(name.endswith("LICENSE") for name in metadata)
+
+
+def test_the_main_job_runs_from_an_empty_folder(installed, tmp_path):
+    where = call(installed / "python", "-c", "import warp_resphys; print(warp_resphys.__file__)", folder=tmp_path)
+    assert Path(where.strip()).is_relative_to(installed.parent)
+    out = call(installed / "warp-resphys", *TINY, folder=tmp_path)
+    assert "Report: " in out
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics["errors_mm"]["resphys"]["mean"] < 0.1 * metrics["errors_mm"]["simulation"]["mean"]
+    assert metrics["versions"]["warp-resphys"] == version("warp-resphys")
+    assert (tmp_path / "run" / "report.html").stat().st_size > 100_000
+
+
+def test_help_imports_neither_torch_nor_warp(installed, tmp_path):
+    program = """
+import sys
+for name in ("torch", "warp", "scipy", "matplotlib", "pyvista", "vtk", "meshio", "trimesh", "ezc3d"):
+    sys.modules[name] = None  # importing it fails
+sys.argv = ["warp-resphys", "--help"]
+from warp_resphys.cli import main
+main()
+"""
+    out = call(installed / "python", "-c", program, folder=tmp_path)
+    assert "experiment: beam_oscillation" in out
+    assert "budget=quick" in out
+    assert not list(tmp_path.iterdir())
+
+
+def test_importing_the_package_imports_nothing_heavy(installed, tmp_path):
+    program = "import sys, warp_resphys; print(sorted({'torch', 'warp', 'numpy', 'hydra'} & set(sys.modules)))"
+    assert call(installed / "python", "-c", program, folder=tmp_path) == "[]\n"

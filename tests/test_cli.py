@@ -52,9 +52,7 @@ def config_dir(tmp_path: Path) -> Path:
 class Command:
     """Runs `warp-resphys` in this process, with a job of the test's choice."""
 
-    def __init__(
-        self, config_dir: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-    ) -> None:
+    def __init__(self, config_dir: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
         self.job: Callable[[DictConfig], object] = lambda config: None
         self.outputs: list[str] = []
         self.arguments = ["warp-resphys", "--config-path", str(config_dir)]
@@ -92,9 +90,7 @@ class TestRunFolder:
         command("seed=3", "material.density=900", "experiment=beam_twist")
         assert command.outputs == ["runs/beam_twist/material.density=900,seed=3"]
         assert command("--multirun", "experiment=beam,beam_twist", "material.density=900", "seed=3")[0] == 0
-        assert command.outputs == [
-            f"runs/{name}/material.density=900,seed=3" for name in ("beam", "beam_twist")
-        ]
+        assert command.outputs == [f"runs/{name}/material.density=900,seed=3" for name in ("beam", "beam_twist")]
 
     def test_the_working_folder_stays(self, command, tmp_path):
         folders = []

@@ -126,9 +126,7 @@ def test_markers_in_the_wrong_order_are_noticed():
 
 def test_comparison_of_a_simulation_with_its_own_recording(tmp_path, monkeypatch):
     """Release, registration, binding and estimators leave nothing of their own: the two swings are one."""
-    config = configured(
-        "recording.path=swing.c3d", "simulation.time_step=0.01", "comparison.tail_seconds=0.5"
-    )
+    config = configured("recording.path=swing.c3d", "simulation.time_step=0.01", "comparison.tail_seconds=0.5")
     tip = np.array([marker.position for marker in TIP])
     truth = simulate_swing(config, tip, 2.2)
     recording = recorded(truth.displacement, release=50)

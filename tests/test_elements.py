@@ -230,7 +230,7 @@ def stateless_terms(potential):
     """The last terms without inertia and loads."""
     from dataclasses import replace
 
-    terms = potential._terms
+    terms = potential.terms
     return replace(
         terms, inertia=torch.zeros_like(terms.inertia), force=torch.zeros_like(terms.force), reference_strain=None
     )

@@ -130,9 +130,7 @@ class TestHdf5:
             assert dataset.attrs["units"] == "m"
             assert file.attrs["time_step"] == 0.01
             assert files.read_array(file, "weights/mass", shape=()) == 0.05
-            assert np.array_equal(
-                files.read_array(file, "positions", index=(slice(3, 5), 2)), POSITIONS[3:5, 2]
-            )
+            assert np.array_equal(files.read_array(file, "positions", index=(slice(3, 5), 2)), POSITIONS[3:5, 2])
         assert np.array_equal(read_positions(trajectory), POSITIONS)
 
     def test_chunks(self):
@@ -146,9 +144,7 @@ class TestHdf5:
         content = trajectory.read_bytes()
         for length in [*range(0, 2048, 97), len(content) // 2, len(content) - 1]:
             trajectory.write_bytes(content[:length])
-            with pytest.raises(
-                DataFileError, match=r"trajectory\.h5 (is truncated|is not an HDF5 file|is damaged)"
-            ):
+            with pytest.raises(DataFileError, match=r"trajectory\.h5 (is truncated|is not an HDF5 file|is damaged)"):
                 read_positions(trajectory)
 
     def test_a_flipped_bit_never_gives_other_numbers(self, trajectory):
@@ -478,9 +474,7 @@ class TestCheckpoints:
     def test_round_trip(self, tmp_path):
         path = tmp_path / "a.safetensors"
         shared = {**self.tensors, "alias": self.tensors["weight"]}
-        files.write_checkpoint(
-            path, "network", shared, {"epoch": 3, "mean": np.float64(0.5), "fingerprint": "f"}
-        )
+        files.write_checkpoint(path, "network", shared, {"epoch": 3, "mean": np.float64(0.5), "fingerprint": "f"})
         tensors, metadata = files.read_checkpoint(path, "network")
         assert all(torch.equal(tensors[name], shared[name]) for name in shared)
         assert metadata == {"epoch": 3, "mean": 0.5, "fingerprint": "f"}

@@ -313,9 +313,7 @@ def test_unreferenced_vertices_are_dropped_only_on_request(tmp_path: Path) -> No
     assert np.array_equal(read.cells, mesh.cells)
 
 
-@pytest.mark.parametrize(
-    ("size", "written_in", "units"), [(0.1, "mm", "m"), (0.1, "m", "mm"), (6.0, "m", "m")]
-)
+@pytest.mark.parametrize(("size", "written_in", "units"), [(0.1, "mm", "m"), (0.1, "m", "mm"), (6.0, "m", "m")])
 def test_implausible_size_is_refused(tmp_path: Path, size: float, written_in: str, units: str) -> None:
     path = write(tmp_path / "box.vtk", box_hexahedra([size] * 3, (1, 1, 1)), units=written_in)
     diagonal = f"{np.sqrt(3) * size * PER_METRE[written_in] / PER_METRE[units]:g} m"

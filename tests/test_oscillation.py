@@ -18,9 +18,7 @@ def test_exact_signal(period, decay_rate, rate):
     measured = measure_oscillation(swing(period, decay_rate, -6.4e-3, rate=rate, seconds=12.0), rate)
     assert measured.period == pytest.approx(period, rel=1e-7)
     assert measured.decay_rate == pytest.approx(decay_rate, abs=1e-5)
-    assert measured.damping_ratio == pytest.approx(
-        decay_rate / np.hypot(decay_rate, 2 * np.pi / period), abs=1e-6
-    )
+    assert measured.damping_ratio == pytest.approx(decay_rate / np.hypot(decay_rate, 2 * np.pi / period), abs=1e-6)
     assert measured.fit_residual < 1e-9
     if decay_rate > 0.0:
         assert measured.sag == pytest.approx(-6.4e-3, abs=1e-6)

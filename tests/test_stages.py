@@ -42,8 +42,7 @@ class Experiment:
     def stages(self) -> list[Stage]:
         upstream = {"generate": (), "train": ("generate",), "report": ("generate", "train")}
         return [
-            Stage(name, self.work, (f"{name}.json",), self.settings[name], upstream[name])
-            for name in self.settings
+            Stage(name, self.work, (f"{name}.json",), self.settings[name], upstream[name]) for name in self.settings
         ]
 
     def run(self) -> list[str]:
@@ -76,9 +75,7 @@ class TestSkipping:
         assert seconds.keys() == experiment.settings.keys()
         assert experiment.run() == []
         assert experiment.seconds == seconds
-        assert [r.message for r in caplog.records[-3:]] == [
-            f"{name}: up to date" for name in experiment.settings
-        ]
+        assert [r.message for r in caplog.records[-3:]] == [f"{name}: up to date" for name in experiment.settings]
         record = json.loads((experiment.run_dir / "stages" / "train.json").read_text())
         assert record["settings"] == {"epochs": 5}
         assert record["versions"]["h5py"]

@@ -23,6 +23,7 @@ import torch
 from rich.table import Table
 from threadpoolctl import threadpool_limits
 
+from .assembly import HessianAssembly
 from .configured import build_body, build_simulator
 from .errors import InputError
 from .integrator import State
@@ -224,7 +225,7 @@ def _time_parts(case: Case, repeats: int) -> dict[str, Any]:
     device = potential.device
     kind = sim.settings.linear_solver
     linear = make_linear_solver(kind, pattern.rows, pattern.cols, len(pattern.free), 3, device, potential.dtype)
-    assemble = potential.scatterer(linear, pattern)
+    assemble = HessianAssembly(potential, linear, pattern)
     potential.update_tangent()
     values = assemble().clone()
     factor = linear.factor(values)

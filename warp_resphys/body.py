@@ -57,8 +57,8 @@ class Body:
         mesh: the rest shape.
         fixed: (D,) vertices with prescribed positions (Dirichlet); they rest where they are unless moved.
         mass: ``row_sum`` lumps each element's own mass on its vertices (HRZ for 10-node tetrahedra). ``per_vertex``
-            gives every vertex the density times the mean element volume, which is wrong by a factor of two on the published
-            beam and serves for comparison with the published code alone.
+            gives every vertex the density times the mean element volume, which is wrong by a factor of two on the
+            published beam and serves for comparison with the published code alone.
         volume_integration: ``centre`` or ``full`` (see `elements.discretise`).
         point_masses: attached weights.
     """

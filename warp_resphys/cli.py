@@ -174,9 +174,7 @@ def _did_you_mean(wanted: str, known: Sequence[str], preferred: Sequence[str] = 
 
 def _sentence(error: BaseException) -> str:
     """The message of a library in one line, without the parts that do not help."""
-    text = re.split(
-        r"\n\s*(?:Config search|Search path|full_key|object_type|reference_type|See )", str(error)
-    )[0]
+    text = re.split(r"\n\s*(?:Config search|Search path|full_key|object_type|reference_type|See )", str(error))[0]
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     if isinstance(error, OmegaConfBaseException) and error.full_key and error.full_key not in lines[0]:
         lines.append(f"(at {error.full_key})")

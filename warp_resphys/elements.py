@@ -95,9 +95,7 @@ def tetrahedron10_shape(points: Array) -> tuple[Array, Array]:
     i, j = TETRAHEDRON_EDGES.T
     values = np.concatenate([corner * (2.0 * corner - 1.0), 4.0 * corner[:, i] * corner[:, j]], axis=1)
     at_corners = (4.0 * corner - 1.0)[..., None] * corner_gradient
-    at_edges = 4.0 * (
-        corner[:, i, None] * corner_gradient[:, j] + corner[:, j, None] * corner_gradient[:, i]
-    )
+    at_edges = 4.0 * (corner[:, i, None] * corner_gradient[:, j] + corner[:, j, None] * corner_gradient[:, i])
     return values, np.concatenate([at_corners, at_edges], axis=1)
 
 
@@ -124,9 +122,7 @@ def degree_four_tetrahedron() -> tuple[Array, Array]:
     return np.stack([a, b * (1.0 - a), c * (1.0 - a) * (1.0 - b)], axis=1), weights
 
 
-def physical_gradients(
-    vertices: Array, cells: NDArray[np.int64], reference_gradients: Array
-) -> tuple[Array, Array]:
+def physical_gradients(vertices: Array, cells: NDArray[np.int64], reference_gradients: Array) -> tuple[Array, Array]:
     """Gradients in rest space (C, Q, K, 3) [1/m] and Jacobian determinants (C, Q) [m^3] of isoparametric cells."""
     jacobian = np.einsum("cki,qkj->cqij", vertices[cells], reference_gradients)
     return np.einsum("qkj,cqji->cqki", reference_gradients, np.linalg.inv(jacobian)), np.linalg.det(jacobian)

@@ -5,10 +5,11 @@ from typing import Any
 import torch
 from typing_extensions import override
 
+from .assembly import BlockPattern
 from .body import Body
 from .linear_solver import make_linear_solver
 from .metric import HessianMetric
-from .potential import BlockPattern, IncrementalPotential, StepTerms
+from .potential import IncrementalPotential, StepTerms
 from .solver import NonlinearSolver, SolveReport, SolverSettings
 from .threads import threads_for
 

@@ -44,9 +44,7 @@ def is_disk_full(error: BaseException) -> bool:
 def disk_full_error(path: str | Path, kept: str | Path | None = None) -> DataFileError:
     """The error to raise when there was no space for `path`; `kept` is where the work done so far lies."""
     rest = "" if kept is None else f"; what was computed is kept in {kept}"
-    return DataFileError(
-        f"disk is full while writing {path}: free some space and run the same command again{rest}"
-    )
+    return DataFileError(f"disk is full while writing {path}: free some space and run the same command again{rest}")
 
 
 @contextmanager
@@ -157,9 +155,7 @@ def _read_error(path: str | Path, error: OSError) -> DataFileError:
 
 
 @contextmanager
-def atomic_hdf5(
-    path: str | Path, kind: str, attributes: Mapping[str, Any] | None = None
-) -> Iterator[h5py.File]:
+def atomic_hdf5(path: str | Path, kind: str, attributes: Mapping[str, Any] | None = None) -> Iterator[h5py.File]:
     """Gives an HDF5 file to fill in memory; it appears at `path` when the block ends without an error.
 
     Args:
@@ -185,9 +181,7 @@ def atomic_hdf5(
         output.write(file.id.get_file_image())
 
 
-def create(
-    group: h5py.Group, name: str, array: npt.ArrayLike, units: str = "1", time_axis: int = 0
-) -> h5py.Dataset:
+def create(group: h5py.Group, name: str, array: npt.ArrayLike, units: str = "1", time_axis: int = 0) -> h5py.Dataset:
     """Stores an array as a checksummed dataset, in chunks of 64 steps along `time_axis`.
 
     Args:
@@ -267,9 +261,7 @@ def _refuse_outside_data(file: h5py.File, path: Path) -> None:
             item = group[name] if isinstance(group.get(name, getlink=True), h5py.HardLink) else None
             if item is None or (isinstance(item, h5py.Dataset) and (item.external or item.is_virtual)):
                 place = f"{group.name.rstrip('/')}/{name}"
-                raise DataFileError(
-                    f"'{place}' of {path} refers to data elsewhere: use a file that holds its own data"
-                )
+                raise DataFileError(f"'{place}' of {path} refers to data elsewhere: use a file that holds its own data")
             if isinstance(item, h5py.Group):
                 groups.append(item)
 
@@ -325,9 +317,7 @@ def read_array(
             len(found) != len(shape) or any(b not in (a, None) for a, b in zip(found, shape, strict=True))
         ):
             wanted = " x ".join("any" if length is None else str(length) for length in shape)
-            raise DataFileError(
-                f"'{name}' of {path} has the shape {found} where {wanted} is needed: check the path"
-            )
+            raise DataFileError(f"'{name}' of {path} has the shape {found} where {wanted} is needed: check the path")
         return np.asarray(dataset[index])
     except OSError as error:
         raise _hdf5_error(Path(path), error) from error

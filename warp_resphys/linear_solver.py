@@ -301,7 +301,7 @@ def _cholmod_factor(cholmod: Any, solver: SparseSolver, rows: Indices, cols: Ind
 
 
 def bandwidth_reducing_order(rows: Indices, cols: Indices, n_nodes: int) -> Indices:
-    """(n_nodes,) node at each place: the given order or reverse Cuthill-McKee's, whichever has the smaller bandwidth."""
+    """(n_nodes,) node at each place, in the given order or reverse Cuthill-McKee's: whichever band is smaller."""
     i, j = np.concatenate([rows, cols]), np.concatenate([cols, rows])
     graph = scipy.sparse.csr_array((np.ones(len(i), dtype=np.int8), (i, j)), shape=(n_nodes, n_nodes))
     order = scipy.sparse.csgraph.reverse_cuthill_mckee(graph.tocsr(), symmetric_mode=True).astype(np.int64)

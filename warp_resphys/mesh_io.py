@@ -23,9 +23,7 @@ _CELL_TYPES = ("tetra", "tetra10", "hexahedron")  # meshio's names of the cells 
 _log = logging.getLogger(__name__)
 
 
-def read_mesh(
-    path: str | os.PathLike[str], units: str = "m", order: int = 1, drop_unreferenced: bool = False
-) -> Mesh:
+def read_mesh(path: str | os.PathLike[str], units: str = "m", order: int = 1, drop_unreferenced: bool = False) -> Mesh:
     """Read and check a tetrahedral or hexahedral mesh in any format that meshio reads.
 
     Points, lines and surface cells of the file are ignored, as are its data fields.
@@ -93,9 +91,7 @@ def _volume_cells(content: "meshio.Mesh") -> IntArray:
         raise MeshError(f"the file has no tetrahedra or hexahedra (only: {others}); mesh the volume first")
     if len(solids) > 1 or not solids.issubset(_CELL_TYPES):
         wanted = f"{', '.join(_CELL_TYPES[:-1])} or {_CELL_TYPES[-1]}"
-        raise MeshError(
-            f"the file has {' and '.join(sorted(solids))} cells; all must be {wanted}, and of one kind"
-        )
+        raise MeshError(f"the file has {' and '.join(sorted(solids))} cells; all must be {wanted}, and of one kind")
     blocks = [np.asarray(block.data, dtype=np.int64) for block in content.cells if block.type in solids]
     return np.concatenate([block for block in blocks if len(block)])
 

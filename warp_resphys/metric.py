@@ -6,8 +6,9 @@ import numpy as np
 import torch
 from typing_extensions import override
 
+from .assembly import BlockPattern, HessianAssembly
 from .linear_solver import Factor, LinearSolver
-from .potential import BlockPattern, IncrementalPotential
+from .potential import IncrementalPotential
 
 
 class Metric(ABC):
@@ -43,7 +44,7 @@ class HessianMetric(Metric):
 
     def __init__(self, potential: IncrementalPotential, pattern: BlockPattern, linear: LinearSolver) -> None:
         self._potential, self._linear = potential, linear
-        self._assemble = potential.scatterer(linear, pattern)
+        self._assemble = HessianAssembly(potential, linear, pattern)
         free = torch.as_tensor(pattern.free, device=potential.device)
         self._dofs = (3 * free[:, None] + torch.arange(3, device=potential.device)).reshape(-1)
         self._factor: Factor | None = None
@@ -114,7 +115,7 @@ class ProjectiveMetric(Metric):
         return torch.as_tensor(products, device=self._potential.device, dtype=self._potential.dtype)
 
     def _terms(self) -> tuple[torch.Tensor, ...]:
-        t = self._potential._terms
+        t = self._potential.terms
         return t.inertia, t.shape_stiffness, t.volume_stiffness
 
     @override
@@ -126,13 +127,11 @@ class ProjectiveMetric(Metric):
     def refactor(self, clamp: bool = False) -> None:
         del clamp  # The matrix is positive definite as it is.
         self._key = tuple(t.clone() for t in self._terms())
-        inertia, shape, volume = (
-            t[:1] if bool((t == t[:1]).all()) else t for t in self._key
-        )
+        inertia, shape, volume = (t[:1] if bool((t == t[:1]).all()) else t for t in self._key)
         batch = max(len(inertia), len(shape), len(volume))
         weights = (2.0 * shape + volume).expand(batch, -1)
         parts = []
-        for products, part in zip(self._products, self._potential._slices, strict=True):
+        for products, part in zip(self._products, self._potential.point_slices, strict=True):
             w = weights[:, part].reshape(batch, *products.shape[:2])
             parts.append(torch.einsum("bcq,cqp->bcp", w, products).reshape(batch, -1))
         blocks = torch.cat(parts, dim=1)

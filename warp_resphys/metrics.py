@@ -83,21 +83,14 @@ def trajectory_errors(positions: ArrayLike, target: ArrayLike) -> NDArray[np.flo
     """
     simulated = np.asarray(positions, dtype=np.float64)  # (T+1, N, 3) [m]
     wanted = np.asarray(target, dtype=np.float64)  # (T+1, N, 3) [m]
-    if (
-        simulated.shape != wanted.shape
-        or simulated.ndim != 3
-        or simulated.shape[2] != 3
-        or len(simulated) < 2
-    ):
+    if simulated.shape != wanted.shape or simulated.ndim != 3 or simulated.shape[2] != 3 or len(simulated) < 2:
         raise InputError(
             f"cannot compare positions of shape {simulated.shape} with a target of shape {wanted.shape}: "
             "both must be (steps + 1, vertices, 3)"
         )
     if not np.isfinite(wanted).all():
         state = int(np.argwhere(~np.isfinite(wanted))[0, 0])
-        raise InputError(
-            f"the target trajectory is not finite at state {state}: leave out what was not observed"
-        )
+        raise InputError(f"the target trajectory is not finite at state {state}: leave out what was not observed")
     with np.errstate(over="ignore", invalid="ignore"):  # A diverged roll-out reaches inf, and inf - inf.
         distance = np.linalg.norm(simulated[1:] - wanted[1:], axis=2)  # (T, N) [m]
         return np.asarray(distance.mean(axis=1) * MILLIMETRES_PER_METRE)
@@ -117,9 +110,7 @@ def summarise(errors: Iterable[NDArray[np.float64]]) -> ErrorSummary:
     """
     rows = [np.asarray(each, dtype=np.float64) for each in errors]
     if not rows or any(row.size == 0 for row in rows):
-        raise InputError(
-            "no roll-out error to summarise: the test split needs a trajectory of at least one step"
-        )
+        raise InputError("no roll-out error to summarise: the test split needs a trajectory of at least one step")
     diverged = sum(not np.isfinite(row).all() for row in rows)
     pooled = np.concatenate(rows)  # (sum of T,) [mm]
     return {
@@ -130,9 +121,7 @@ def summarise(errors: Iterable[NDArray[np.float64]]) -> ErrorSummary:
     }
 
 
-def summarise_each(
-    names: Sequence[str], errors: Mapping[str, Iterable[NDArray[np.float64]]]
-) -> list[dict[str, Any]]:
+def summarise_each(names: Sequence[str], errors: Mapping[str, Iterable[NDArray[np.float64]]]) -> list[dict[str, Any]]:
     """Return what `metrics.json` lists under `per_trajectory`: the mean error of every model on each.
 
     Args:

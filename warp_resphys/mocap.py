@@ -130,9 +130,7 @@ def read_c3d(path: str | Path) -> Recording:
             "header declares; copy or export it again."
         )
     if len(labels) < points.shape[1]:
-        raise DataFileError(
-            f"{path} names {len(labels)} of its {points.shape[1]} markers: export it with labels."
-        )
+        raise DataFileError(f"{path} names {len(labels)} of its {points.shape[1]} markers: export it with labels.")
     unit = str(decoded["units"][0]).strip() if decoded["units"].size else ""
     if unit not in _METRES_PER_UNIT:
         raise DataFileError(f"{path} gives positions in '{unit}': export it in m, cm or mm.")
@@ -250,16 +248,12 @@ def _declared_frames(path: Path) -> int:
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise DataFileError(
-            f"Cannot read {path}: {error.strerror}; check the path of the recording."
-        ) from error
+        raise DataFileError(f"Cannot read {path}: {error.strerror}; check the path of the recording.") from error
     if len(content) < 2 or content[1] != _C3D_MAGIC:
         raise DataFileError(f"{path} is not a C3D file: give a motion-capture recording in C3D format.")
     processor_at = (content[0] - 1) * 512 + 3
     if len(content) < 512 or content[0] == 0 or len(content) <= processor_at:
-        raise DataFileError(
-            f"{path} is truncated: it ends after {len(content)} bytes; copy or export it again."
-        )
+        raise DataFileError(f"{path} is truncated: it ends after {len(content)} bytes; copy or export it again.")
     order = ">" if content[processor_at] == _BIG_ENDIAN_PROCESSOR else "<"
     first, last = struct.unpack_from(order + "2H", content, 6)
     return int(last - first + 1)
@@ -271,14 +265,10 @@ def _decode(path: Path) -> dict[str, NDArray]:
     try:
         result = subprocess.run(command, capture_output=True, timeout=_DECODE_SECONDS, check=False)
     except subprocess.TimeoutExpired as error:
-        raise DataFileError(
-            f"{path} is damaged: decoding it does not end; copy or export it again."
-        ) from error
+        raise DataFileError(f"{path} is damaged: decoding it does not end; copy or export it again.") from error
     if result.returncode != 0:
         lines = result.stderr.decode(errors="replace").strip().splitlines()
-        reason = (
-            lines[-1] if lines and result.returncode > 0 else f"the decoder ended with {result.returncode}"
-        )
+        reason = lines[-1] if lines and result.returncode > 0 else f"the decoder ended with {result.returncode}"
         raise DataFileError(f"{path} is damaged or truncated ({reason}); copy or export it again.")
     with np.load(io.BytesIO(result.stdout), allow_pickle=False) as archive:
         return {name: archive[name] for name in archive.files}

@@ -17,10 +17,9 @@ import warp as wp
 from numpy.typing import NDArray
 
 from .body import Body
-from .kernels.assembly import assembly_kernels
+from .elements import PointSet
 from .kernels.elasticity import elasticity_kernels
 from .kernels.tangent import tangent_kernels
-from .linear_solver import LinearSolver
 
 _SCALARS = {torch.float64: wp.float64, torch.float32: wp.float32}
 
@@ -65,51 +64,29 @@ class StepTerms:
         )
 
 
-class BlockPattern:
-    """Which pairs of vertices the Hessian couples, and which cell blocks make up each pair.
+@dataclass(frozen=True)
+class DevicePoints:
+    """A point set as Warp arrays.
 
     Attributes:
-        rows: (E,) row of each block, an index into ``free``.
-        cols: (E,) its column; ``rows >= cols``.
-        free: (F,) vertices that are not fixed.
+        cells: C.
+        points_per_cell: Q.
+        nodes_per_cell: K.
+        n_points: P = C Q.
+        nodes: (C, K).
+        gradients: (P, K) [1/m].
+        start: (N + 1) where a vertex's entries of ``incident`` begin.
+        incident: cell K + local node of every cell that a vertex belongs to.
     """
 
-    def __init__(self, body: Body) -> None:
-        n = body.n_vertices
-        is_free = np.ones(n, dtype=bool)
-        is_free[body.fixed_vertices] = False
-        self.free = np.flatnonzero(is_free)
-        reduced = np.where(is_free, np.cumsum(is_free) - 1, -1)
-        sources: list[NDArray[np.int64]] = []
-        pairs: list[NDArray[np.int64]] = []
-        self.offsets: list[int] = []
-        self.n_cell_blocks = 0
-        for points in body.discretisation.point_sets:
-            a, c = np.tril_indices(points.nodes.shape[1])
-            pair = np.stack([reduced[points.nodes[:, a]], reduced[points.nodes[:, c]]], axis=-1).reshape(-1, 2)
-            used = (np.abs(points.gradients).sum(axis=(1, 3)) > 0.0)[:, a] & (
-                np.abs(points.gradients).sum(axis=(1, 3)) > 0.0
-            )[:, c]
-            keep = (pair >= 0).all(axis=1) & used.ravel()
-            # A padded node repeats its patch's own vertex with a zero gradient and contributes nothing.
-            sources.append(self.n_cell_blocks + np.flatnonzero(keep))
-            pairs.append(pair[keep])
-            self.offsets.append(self.n_cell_blocks)
-            self.n_cell_blocks += len(pair)
-        self._collect(np.concatenate(sources), np.concatenate(pairs))
-
-    def _collect(self, source: NDArray[np.int64], pair: NDArray[np.int64]) -> None:
-        """Sorts the cell blocks by matrix block; a block above the diagonal enters transposed."""
-        n = len(self.free)
-        source = np.where(pair[:, 0] < pair[:, 1], -1 - source, source)
-        diagonal = np.arange(n) * (n + 1)
-        key = pair.max(axis=1) * n + pair.min(axis=1)
-        blocks, inverse = np.unique(np.concatenate([key, diagonal]), return_inverse=True)
-        order = np.argsort(inverse[: len(key)], kind="stable")
-        self.rows, self.cols = blocks // n, blocks % n
-        self.contribution = source[order]
-        self.start = np.searchsorted(inverse[: len(key)][order], np.arange(len(blocks) + 1))
-        self.diagonal_vertex = np.where(self.rows == self.cols, self.free[self.rows], -1)
+    cells: int
+    points_per_cell: int
+    nodes_per_cell: int
+    n_points: int
+    nodes: Any
+    gradients: Any
+    start: Any
+    incident: Any
 
 
 class IncrementalPotential:
@@ -129,119 +106,123 @@ class IncrementalPotential:
         self.body, self.batch, self.device, self.dtype = body, batch, device, dtype
         self._model = model
         scalar = _SCALARS[dtype]
-        self._elastic, self._assembly = elasticity_kernels(scalar), assembly_kernels(scalar)
+        self._elastic = elasticity_kernels(scalar)
         self._second = tangent_kernels(scalar)
-        self._scalar, self._vec3, self._mat33 = scalar, self._elastic.vec3, self._elastic.mat33
+        self.scalar, self.vec3, self.mat33 = scalar, self._elastic.vec3, self._elastic.mat33
         self.n_vertices = body.n_vertices
         self.n_points = sum(points.n_points for points in body.discretisation.point_sets)
-        self._sets = [self._upload(points) for points in body.discretisation.point_sets]
-        self._slices = self._point_slices()
+        self.uploaded_sets = [self._upload_points(points) for points in body.discretisation.point_sets]
+        self.point_slices = self._point_slices()
         norms = [np.sqrt((points.gradients**2).sum(axis=(2, 3))).ravel() for points in body.discretisation.point_sets]
         self._gradient_norms = torch.as_tensor(np.concatenate(norms), device=device, dtype=dtype)  # (P,) [1/m]
         self.free_mask = torch.ones(body.n_vertices, device=device, dtype=dtype)
         self.free_mask[torch.as_tensor(body.fixed_vertices, device=device)] = 0.0
-        self._terms = self._allocate_terms()
-        self.positions = self._zeros(self.n_vertices, 3)
-        self.residual = self._zeros(self.n_vertices, 3)
-        self._stress = self._zeros(self.n_points, 3, 3)
-        self._point_energy = self._zeros(self.n_points)
-        self._vertex_energy = self._zeros(self.n_vertices)
-        self._viscous = False
+        self.terms = self._allocate_terms()
+        self.positions = self.zeros(self.n_vertices, 3)
+        self.residual = self.zeros(self.n_vertices, 3)
+        self._stress = self.zeros(self.n_points, 3, 3)
+        self._point_energy = self.zeros(self.n_points)
+        self._vertex_energy = self.zeros(self.n_vertices)
         self._record_evaluation()
         self._tangent: torch.Tensor | None = None
-        self._direction = self._zeros(self.n_vertices, 3)
+        self._direction = self.zeros(self.n_vertices, 3)
         self._adjoint_commands: list[Any] = []
 
-    def _zeros(self, *shape: int) -> torch.Tensor:
+    def zeros(self, *shape: int) -> torch.Tensor:
+        """(B, *shape) on the potential's device, in its type."""
         return torch.zeros(self.batch, *shape, device=self.device, dtype=self.dtype)
 
-    def _array(self, values: NDArray[Any], dtype: Any) -> Any:
+    def upload(self, values: NDArray[Any], dtype: Any) -> Any:
+        """A Warp array with a copy of the values."""
         return wp.array(np.ascontiguousarray(values), dtype=dtype, device=str(self.device))
 
-    def _upload(self, points: Any) -> dict[str, Any]:
+    def _upload_points(self, points: PointSet) -> DevicePoints:
         c, q, k, _ = points.gradients.shape
         owner = points.nodes.ravel()
-        used = np.repeat((np.abs(points.gradients).sum(axis=(1, 3)) > 0.0).ravel(), 1)
-        entries = np.flatnonzero(used)
+        # A padded node repeats its patch's own vertex with a zero gradient and contributes nothing.
+        entries = np.flatnonzero(np.abs(points.gradients).sum(axis=(1, 3)).ravel() > 0.0)
         order = entries[np.argsort(owner[entries], kind="stable")]
         start = np.searchsorted(owner[order], np.arange(self.n_vertices + 1))
-        return {
-            "cells": c,
-            "points_per_cell": q,
-            "n_points": points.n_points,
-            "k": k,
-            "nodes": self._array(points.nodes.astype(np.int32), int),
-            "gradients": self._array(points.gradients.reshape(c * q, k, 3), self._vec3),
-            "start": self._array(start.astype(np.int32), int),
-            "incident": self._array(order.astype(np.int32), int),
-        }
+        return DevicePoints(
+            cells=c,
+            points_per_cell=q,
+            nodes_per_cell=k,
+            n_points=points.n_points,
+            nodes=self.upload(points.nodes.astype(np.int32), int),
+            gradients=self.upload(points.gradients.reshape(c * q, k, 3), self.vec3),
+            start=self.upload(start.astype(np.int32), int),
+            incident=self.upload(order.astype(np.int32), int),
+        )
 
     def _point_slices(self) -> list[slice]:
-        ends = np.cumsum([s["n_points"] for s in self._sets])
-        return [slice(int(end) - s["n_points"], int(end)) for s, end in zip(self._sets, ends, strict=True)]
+        ends = np.cumsum([s.n_points for s in self.uploaded_sets])
+        return [slice(int(end) - s.n_points, int(end)) for s, end in zip(self.uploaded_sets, ends, strict=True)]
 
     def _allocate_terms(self) -> StepTerms:
         n, p = self.n_vertices, self.n_points
         return StepTerms(
-            target=self._zeros(n, 3),
-            inertia=self._zeros(n),
-            force=self._zeros(n, 3),
-            shape_stiffness=self._zeros(p),
-            volume_stiffness=self._zeros(p),
-            viscosity=self._zeros(),
-            reference_strain=self._zeros(p, 3, 3),
+            target=self.zeros(n, 3),
+            inertia=self.zeros(n),
+            force=self.zeros(n, 3),
+            shape_stiffness=self.zeros(p),
+            volume_stiffness=self.zeros(p),
+            viscosity=self.zeros(),
+            reference_strain=self.zeros(p, 3, 3),
         )
 
-    def _points(self, tensor: torch.Tensor, part: slice, dtype: Any) -> Any:
+    def points_view(self, tensor: torch.Tensor, part: slice, dtype: Any) -> Any:
+        """Warp array on the points of one set."""
         return warp_view(tensor[:, part], dtype)
 
-    def _energy_arguments(self, s: dict[str, Any], part: slice) -> list[Any]:
-        t = self._terms
+    def _energy_arguments(self, s: DevicePoints, part: slice) -> list[Any]:
+        t = self.terms
         return [
             self._model,
-            s["nodes"],
-            s["gradients"],
-            self._points(t.shape_stiffness, part, self._scalar),
-            self._points(t.volume_stiffness, part, self._scalar),
-            warp_view(t.viscosity, self._scalar),
-            self._points(t.reference_strain, part, self._mat33) if t.reference_strain is not None else None,
-            s["points_per_cell"],
-            warp_view(self.positions, self._vec3),
+            s.nodes,
+            s.gradients,
+            self.points_view(t.shape_stiffness, part, self.scalar),
+            self.points_view(t.volume_stiffness, part, self.scalar),
+            warp_view(t.viscosity, self.scalar),
+            self.points_view(t.reference_strain, part, self.mat33) if t.reference_strain is not None else None,
+            s.points_per_cell,
+            warp_view(self.positions, self.vec3),
         ]
 
-    def _record(self, kernel: Any, dim: tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> Any:
+    def record(self, kernel: Any, dim: tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> Any:
+        """A launch to be made by `launch`, as often as needed."""
         return wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=str(self.device), record_cmd=True)
 
-    def _gather(self, s: dict[str, Any], stress: torch.Tensor, part: slice, out: torch.Tensor) -> Any:
+    def _gather(self, s: DevicePoints, stress: torch.Tensor, part: slice, out: torch.Tensor) -> Any:
         """Recorded launch that adds a point set's transposed gradient of the stress to (B, N, 3)."""
         k = self._elastic
-        inputs = [s["nodes"], s["gradients"], s["points_per_cell"], s["start"], s["incident"]]
-        inputs.append(self._points(stress, part, self._mat33))
-        return self._record(k.gather, (self.batch, self.n_vertices), inputs, [warp_view(out, self._vec3)])
+        inputs = [s.nodes, s.gradients, s.points_per_cell, s.start, s.incident]
+        inputs.append(self.points_view(stress, part, self.mat33))
+        return self.record(k.gather, (self.batch, self.n_vertices), inputs, [warp_view(out, self.vec3)])
 
     def _record_evaluation(self) -> None:
-        t, k, b = self._terms, self._elastic, self.batch
-        self._inertia_command = self._record(
+        t, k, b = self.terms, self._elastic, self.batch
+        self._inertia_command = self.record(
             k.inertia_residual,
             (b, self.n_vertices),
             [
-                warp_view(t.inertia, self._scalar),
-                warp_view(t.target, self._vec3),
-                warp_view(t.force, self._vec3),
-                warp_view(self.positions, self._vec3),
+                warp_view(t.inertia, self.scalar),
+                warp_view(t.target, self.vec3),
+                warp_view(t.force, self.vec3),
+                warp_view(self.positions, self.vec3),
             ],
-            [warp_view(self.residual, self._vec3), warp_view(self._vertex_energy, self._scalar)],
+            [warp_view(self.residual, self.vec3), warp_view(self._vertex_energy, self.scalar)],
         )
         self._elastic_commands = []
-        for s, part in zip(self._sets, self._slices, strict=True):
+        for s, part in zip(self.uploaded_sets, self.point_slices, strict=True):
             outputs = [
-                self._points(self._stress, part, self._mat33),
-                self._points(self._point_energy, part, self._scalar),
+                self.points_view(self._stress, part, self.mat33),
+                self.points_view(self._point_energy, part, self.scalar),
             ]
-            step = self._record(k.local_step, (b, s["n_points"]), self._energy_arguments(s, part), outputs)
+            step = self.record(k.local_step, (b, s.n_points), self._energy_arguments(s, part), outputs)
             self._elastic_commands += [step, self._gather(s, self._stress, part, self.residual)]
 
-    def _launch(self, *commands: Any) -> None:
+    def launch(self, *commands: Any) -> None:
+        """Makes recorded launches, on torch's stream."""
         if self.device.type == "cpu":
             for command in commands:
                 command.launch()
@@ -252,35 +233,34 @@ class IncrementalPotential:
 
     def set_terms(self, terms: StepTerms) -> None:
         """Copies a step's terms into the buffers; fixed vertices get neither inertia nor load."""
-        t = self._terms
+        t = self.terms
         t.target.copy_(terms.target.detach())
         torch.mul(terms.inertia.detach(), self.free_mask, out=t.inertia)
         torch.mul(terms.force.detach(), self.free_mask[:, None], out=t.force)
         t.shape_stiffness.copy_(terms.shape_stiffness.detach())
         t.volume_stiffness.copy_(terms.volume_stiffness.detach())
         t.viscosity.copy_(terms.viscosity.detach())
-        self._viscous = terms.reference_strain is not None
         if terms.reference_strain is not None and t.reference_strain is not None:
             t.reference_strain.copy_(terms.reference_strain.detach())
 
     @property
     def force(self) -> torch.Tensor:
         """(B, N, 3) loads of the current terms [N]."""
-        return self._terms.force
+        return self.terms.force
 
     @property
     def inertia(self) -> torch.Tensor:
         """(B, N) inertia of the current terms [N/m], zero at fixed vertices."""
-        return self._terms.inertia
+        return self.terms.inertia
 
     def evaluate(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Energy (B,) [J] and the norm of inertia less loads (B,) [N] at ``positions``; sets ``residual`` [N].
 
         The residual is the potential's gradient, zero at fixed vertices.
         """
-        self._launch(self._inertia_command)
+        self.launch(self._inertia_command)
         balance = torch.linalg.vector_norm(self.residual.view(self.batch, -1), dim=1)
-        self._launch(*self._elastic_commands)
+        self.launch(*self._elastic_commands)
         self.residual.mul_(self.free_mask[:, None])
         return self._point_energy.sum(1).add_(self._vertex_energy.sum(1)), balance
 
@@ -289,7 +269,7 @@ class IncrementalPotential:
 
         Terms of the size of the stiffness cancel in the energy of a small strain.
         """
-        t = self._terms
+        t = self.terms
         stiffness = t.shape_stiffness.sum(1) + t.volume_stiffness.sum(1)
         energy = self._point_energy.sum(1) + self._vertex_energy.abs().sum(1)
         return 8.0 * torch.finfo(self.dtype).eps * (stiffness + 100.0 * energy)
@@ -300,7 +280,7 @@ class IncrementalPotential:
         A relative error eps of positions and stresses errs by eps (1 + |x| |grad N|) in a point's stress over its
         stiffness, and |grad N| carries that to the force. Residuals at rest are a fiftieth to a half of the result.
         """
-        t = self._terms
+        t = self.terms
         stiffness = (2.0 * t.shape_stiffness + t.volume_stiffness.abs()) * (1.0 + t.viscosity[:, None])
         reach = self.positions.abs().amax(dim=(1, 2))[:, None]
         forces = stiffness * self._gradient_norms * (1.0 + reach * self._gradient_norms)
@@ -312,39 +292,49 @@ class IncrementalPotential:
         Args:
             positive: (B,) environments whose eigenvalues are clamped at zero; none where left out.
         """
-        if self._tangent is None:
-            self._record_tangent()
+        self._prepare_tangent()
         self._positive.zero_()
         if positive is not None:
             self._positive.copy_(positive)
-        self._launch(*self._tangent_commands)
+        self.launch(*self._tangent_commands)
 
-    def _record_tangent(self) -> None:
-        self._tangent = self._zeros(self.n_points, 6, 3, 3)
+    @property
+    def tangent(self) -> torch.Tensor:
+        """(B, P, 6, 3, 3) blocks of dP/dF of the last `update_tangent` [J]; see ``kernels.tangent``."""
+        return self._prepare_tangent()
+
+    def _prepare_tangent(self) -> torch.Tensor:
+        """Buffers and launches of second derivatives, made at their first use."""
+        if self._tangent is None:
+            self._tangent = self.zeros(self.n_points, 6, 3, 3)
+            self._record_tangent(self._tangent)
+        return self._tangent
+
+    def _record_tangent(self, blocks: torch.Tensor) -> None:
         self._positive = torch.zeros(self.batch, device=self.device, dtype=torch.int32)
-        self._product_stress = self._zeros(self.n_points, 3, 3)
-        self._product = self._zeros(self.n_vertices, 3)
+        self._product_stress = self.zeros(self.n_points, 3, 3)
+        self._product = self.zeros(self.n_vertices, 3)
         self._tangent_commands, self._product_commands = [], []
         k = self._second
-        for s, part in zip(self._sets, self._slices, strict=True):
-            tangent = self._points(self._tangent, part, self._mat33)
+        for s, part in zip(self.uploaded_sets, self.point_slices, strict=True):
+            tangent = self.points_view(blocks, part, self.mat33)
             inputs = [*self._energy_arguments(s, part), warp_view(self._positive, wp.int32)]
-            self._tangent_commands.append(self._record(k.tangent, (self.batch, s["n_points"]), inputs, [tangent]))
-            inputs = [s["nodes"], s["gradients"], s["points_per_cell"], tangent]
-            inputs.append(warp_view(self._direction, self._vec3))
-            product = [self._points(self._product_stress, part, self._mat33)]
-            launch = self._record(k.tangent_product, (self.batch, s["n_points"]), inputs, product)
+            self._tangent_commands.append(self.record(k.tangent, (self.batch, s.n_points), inputs, [tangent]))
+            inputs = [s.nodes, s.gradients, s.points_per_cell, tangent]
+            inputs.append(warp_view(self._direction, self.vec3))
+            product = [self.points_view(self._product_stress, part, self.mat33)]
+            launch = self.record(k.tangent_product, (self.batch, s.n_points), inputs, product)
             self._product_commands += [launch, self._gather(s, self._product_stress, part, self._product)]
 
     def _record_adjoint(self) -> None:
-        scalars = [self._zeros(self.n_points) for _ in range(3)]
-        self._adjoints = [*scalars, self._zeros(self.n_points, 3, 3)]
-        types = [self._scalar] * 3 + [self._mat33]
-        for s, part in zip(self._sets, self._slices, strict=True):
-            outputs = [self._points(o, part, t) for o, t in zip(self._adjoints, types, strict=True)]
-            inputs = [*self._energy_arguments(s, part), warp_view(self._direction, self._vec3)]
-            dim = (self.batch, s["n_points"])
-            self._adjoint_commands.append(self._record(self._elastic.stiffness_adjoint, dim, inputs, outputs))
+        scalars = [self.zeros(self.n_points) for _ in range(3)]
+        self._adjoints = [*scalars, self.zeros(self.n_points, 3, 3)]
+        types = [self.scalar] * 3 + [self.mat33]
+        for s, part in zip(self.uploaded_sets, self.point_slices, strict=True):
+            outputs = [self.points_view(o, part, t) for o, t in zip(self._adjoints, types, strict=True)]
+            inputs = [*self._energy_arguments(s, part), warp_view(self._direction, self.vec3)]
+            dim = (self.batch, s.n_points)
+            self._adjoint_commands.append(self.record(self._elastic.stiffness_adjoint, dim, inputs, outputs))
 
     def stiffness_product(self, direction: torch.Tensor) -> torch.Tensor:
         """(B, N, 3) product of the internal forces' stiffness with a displacement, all vertices included [N].
@@ -353,18 +343,8 @@ class IncrementalPotential:
         """
         self._direction.copy_(direction)
         self._product.zero_()
-        self._launch(*self._product_commands)
+        self.launch(*self._product_commands)
         return self._product.clone()
-
-    def hessian_values(self, solver: LinearSolver, pattern: BlockPattern) -> torch.Tensor:
-        """(B, n_values) the Hessian in a solver's layout, from the last `update_tangent`."""
-        return self.scatterer(solver, pattern)()
-
-    def scatterer(self, solver: LinearSolver, pattern: BlockPattern) -> "HessianAssembly":
-        """Recorded launches that assemble for a solver."""
-        if self._tangent is None:
-            self._record_tangent()
-        return HessianAssembly(self, solver, pattern)
 
     def parameter_adjoint(self, adjoint: torch.Tensor) -> dict[str, torch.Tensor]:
         """-z . d residual / d theta at ``positions`` for the terms of the last `set_terms`.
@@ -378,7 +358,7 @@ class IncrementalPotential:
         if not self._adjoint_commands:
             self._record_adjoint()
         self._direction.copy_(adjoint)
-        self._launch(*self._adjoint_commands)
+        self.launch(*self._adjoint_commands)
         out = [values.clone() for values in self._adjoints]
         names = ("shape_stiffness", "volume_stiffness", "viscosity", "reference_strain")
         result = dict(zip(names, out, strict=True))
@@ -387,56 +367,24 @@ class IncrementalPotential:
 
     def strain(self, positions: torch.Tensor) -> torch.Tensor:
         """(B, P, 3, 3) Green strain of (B, N, 3) positions."""
-        out = self._zeros(self.n_points, 3, 3)
-        x = warp_view(positions.contiguous(), self._vec3)
-        for s, part in zip(self._sets, self._slices, strict=True):
-            inputs = [s["nodes"], s["gradients"], s["points_per_cell"], x]
-            outputs = [self._points(out, part, self._mat33)]
-            self._launch(self._record(self._elastic.strain, (self.batch, s["n_points"]), inputs, outputs))
+        out = self.zeros(self.n_points, 3, 3)
+        x = warp_view(positions.contiguous(), self.vec3)
+        for s, part in zip(self.uploaded_sets, self.point_slices, strict=True):
+            inputs = [s.nodes, s.gradients, s.points_per_cell, x]
+            outputs = [self.points_view(out, part, self.mat33)]
+            self.launch(self.record(self._elastic.strain, (self.batch, s.n_points), inputs, outputs))
         return out
 
     def strain_adjoint(self, positions: torch.Tensor, adjoint: torch.Tensor) -> torch.Tensor:
         """(B, N, 3) transposed derivative of `strain` applied to (B, P, 3, 3)."""
-        out = self._zeros(self.n_vertices, 3)
-        stress = self._zeros(self.n_points, 3, 3)
-        x = warp_view(positions.contiguous(), self._vec3)
+        out = self.zeros(self.n_vertices, 3)
+        stress = self.zeros(self.n_points, 3, 3)
+        x = warp_view(positions.contiguous(), self.vec3)
         adjoint = adjoint.contiguous()
-        for s, part in zip(self._sets, self._slices, strict=True):
-            inputs = [s["nodes"], s["gradients"], s["points_per_cell"], x]
-            inputs.append(self._points(adjoint, part, self._mat33))
-            outputs = [self._points(stress, part, self._mat33)]
-            launch = self._record(self._elastic.strain_adjoint, (self.batch, s["n_points"]), inputs, outputs)
-            self._launch(launch, self._gather(s, stress, part, out))
+        for s, part in zip(self.uploaded_sets, self.point_slices, strict=True):
+            inputs = [s.nodes, s.gradients, s.points_per_cell, x]
+            inputs.append(self.points_view(adjoint, part, self.mat33))
+            outputs = [self.points_view(stress, part, self.mat33)]
+            launch = self.record(self._elastic.strain_adjoint, (self.batch, s.n_points), inputs, outputs)
+            self.launch(launch, self._gather(s, stress, part, out))
         return out
-
-
-class HessianAssembly:
-    """Recorded launches from the tangent of a potential to the value array of a linear solver."""
-
-    def __init__(self, potential: IncrementalPotential, solver: LinearSolver, pattern: BlockPattern) -> None:
-        p, k = potential, potential._assembly
-        self._potential = p
-        blocks = p._zeros(pattern.n_cell_blocks, 3, 3)
-        self._values = p._zeros(solver.n_values)
-        self._commands = []
-        for s, part, offset in zip(p._sets, p._slices, pattern.offsets, strict=True):
-            inputs = [s["gradients"], s["points_per_cell"]]
-            inputs += [p._points(p._tangent, part, p._mat33), offset]
-            self._commands.append(
-                p._record(k.cell_blocks, (p.batch, s["cells"], s["k"]), inputs, [warp_view(blocks, p._mat33)])
-            )
-        inputs = [
-            p._array(pattern.start.astype(np.int32), int),
-            p._array(pattern.contribution.astype(np.int32), int),
-            p._array(pattern.diagonal_vertex.astype(np.int32), int),
-            p._array(solver.address, int),
-            warp_view(blocks, p._mat33),
-            warp_view(p._terms.inertia, p._scalar),
-        ]
-        dim = (p.batch, len(pattern.rows))
-        self._commands.append(p._record(k.scatter_blocks, dim, inputs, [warp_view(self._values, p._scalar)]))
-
-    def __call__(self) -> torch.Tensor:
-        """(B, n_values) from the potential's last `update_tangent`; overwritten by the next call."""
-        self._potential._launch(*self._commands)
-        return self._values

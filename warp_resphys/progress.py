@@ -115,9 +115,7 @@ class Progress:
             self._bars.update(self._task, completed=self.done, status=self.status())
             self._next = now + _BAR_SECONDS
         else:
-            self._console.print(
-                f"{self.description}: {self.status()}", markup=False, highlight=False, soft_wrap=True
-            )
+            self._console.print(f"{self.description}: {self.status()}", markup=False, highlight=False, soft_wrap=True)
             self._next = now + _LINE_SECONDS
 
 

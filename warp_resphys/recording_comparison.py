@@ -137,8 +137,7 @@ def measured_swing(
         release = Release(release_frame, (max(0, int(release_frame) - _HELD_FRAMES), int(release_frame)))
     else:
         raise InputError(
-            f"recording.release_frame is {release_frame:g}: set it to one of the {len(positions)} frames "
-            "recorded."
+            f"recording.release_frame is {release_frame:g}: set it to one of the {len(positions)} frames recorded."
         )
     held = np.median(positions[slice(*release.rest)], axis=0)
     motion = kabsch(held, nominal)
@@ -248,9 +247,7 @@ def compare_recording(config: Mapping[str, Any], folder: Path) -> dict[str, Any]
     _check_numbers(config)
     settings, registration, comparison = config["recording"], config["registration"], config["comparison"]
     if settings["path"] is None:
-        raise InputError(
-            "No recording given: set recording.path to a C3D file, as in recording.path=swing.c3d."
-        )
+        raise InputError("No recording given: set recording.path to a C3D file, as in recording.path=swing.c3d.")
     tip, base = ([Marker(**marker) for marker in config["markers"][part]] for part in ("tip", "base"))
     measured = measured_swing(
         read_c3d(settings["path"]),
@@ -315,9 +312,7 @@ def draw_comparison(measured: Swing, simulated: Swing, result: Mapping[str, Any]
 
 def _check_numbers(config: Mapping[str, Any]) -> None:
     """Raises InputError for the first number that is not one or out of range."""
-    names = [
-        f"{group}.{key}" for group in ("material", "registration", "comparison") for key in config[group]
-    ]
+    names = [f"{group}.{key}" for group in ("material", "registration", "comparison") for key in config[group]]
     names += ["recording.hung_weight", "simulation.time_step", "simulation.gravity"]
     if config["recording"]["release_frame"] is not None:
         names.append("recording.release_frame")
@@ -358,14 +353,10 @@ def _write_numbers(axes: "Axes", result: Mapping[str, Any]) -> None:
         f"Released in frame {result['release_frame']:.1f}; registered to nominal markers\n"
         f"with {result['registration_residual_mm']:.2f} mm left (root mean square)."
     )
-    axes.text(
-        0.0, 0.46, notes, transform=axes.transAxes, verticalalignment="top", fontsize=8, linespacing=1.5
-    )
+    axes.text(0.0, 0.46, notes, transform=axes.transAxes, verticalalignment="top", fontsize=8, linespacing=1.5)
 
 
-def _summary(
-    measured: MeasuredSwing, oscillations: Mapping[str, Oscillation], error: float
-) -> dict[str, Any]:
+def _summary(measured: MeasuredSwing, oscillations: Mapping[str, Oscillation], error: float) -> dict[str, Any]:
     """The content of comparison.json, in millimetres and seconds."""
     return {
         "release_frame": measured.release.frame,

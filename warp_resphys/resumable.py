@@ -104,9 +104,7 @@ class ResumableHDF5:
         self.fields = dict(fields)
         self.done = 0
         self.journal = self.path.with_name(self.path.name + ".journal")
-        layout = {
-            name: [f.shape, np.dtype(f.dtype).str, f.units, f.batch_axes] for name, f in self.fields.items()
-        }
+        layout = {name: [f.shape, np.dtype(f.dtype).str, f.units, f.batch_axes] for name, f in self.fields.items()}
         header = {"format": "warp_resphys journal 1", "kind": kind, "fingerprint": fingerprint}
         self._header = (json.dumps({**header, "steps": self.step_axes, "fields": layout}) + "\n").encode()
         sizes = [math.prod(f.shape) * np.dtype(f.dtype).itemsize for f in self.fields.values()]
@@ -227,8 +225,7 @@ class ResumableHDF5:
     def _assemble(self, file: h5py.File) -> None:
         """Fills the final datasets, one field after the other."""
         collected = {
-            name: np.empty((self.steps, *field.shape), dtype=field.dtype)
-            for name, field in self.fields.items()
+            name: np.empty((self.steps, *field.shape), dtype=field.dtype) for name, field in self.fields.items()
         }
         for step in range(self.done):
             for name, values in self.read(step).items():

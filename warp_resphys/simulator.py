@@ -7,12 +7,13 @@ import numpy as np
 import scipy.sparse
 import torch
 
+from .assembly import BlockPattern
 from .body import Body
 from .equilibrium import Equilibrium, GreenStrain, Workspace
 from .errors import InputError
 from .integrator import ImplicitStage, State, make_integrator
 from .material import MODELS, Material, as_parameter
-from .potential import BlockPattern, StepTerms
+from .potential import StepTerms
 from .solver import SolveReport, SolverSettings
 
 GRAVITY = (0.0, 0.0, -9.80709)

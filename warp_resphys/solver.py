@@ -17,11 +17,12 @@ from dataclasses import dataclass
 
 import torch
 
+from .assembly import BlockPattern
 from .errors import ConvergenceError, InputError
 from .lbfgs import InverseHessianUpdate
 from .linear_solver import make_linear_solver
 from .metric import HessianMetric, Metric, ProjectiveMetric
-from .potential import BlockPattern, IncrementalPotential
+from .potential import IncrementalPotential
 
 SOLVERS = ("projective_dynamics", "quasi_newton", "newton")
 _ARMIJO = 1e-4
@@ -127,7 +128,8 @@ class NonlinearSolver:
             raise ConvergenceError(
                 f"the {self.settings.name} solver stopped after {int(run.iterations[worst])} iterations with a "
                 f"relative residual of {float(run.relative_residual[worst]):.2e} in environment {worst} of "
-                f"{len(run.converged)}: take a smaller time step or loads, raise solver.max_iterations, or choose solver.name=newton.",
+                f"{len(run.converged)}: take a smaller time step or loads, raise solver.max_iterations, or choose "
+                "solver.name=newton.",
                 self.potential.positions.clone(),
                 report,
             )

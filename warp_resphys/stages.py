@@ -114,9 +114,7 @@ def run_stages(stages: Sequence[Stage], run_dir: str | Path) -> dict[str, float]
     with run_lock(run_dir):
         for stage in stages:
             if stage.name in known or not known.keys() >= set(stage.upstream):
-                raise ValueError(
-                    f"stage '{stage.name}' is there twice or stands before a stage it reads from"
-                )
+                raise ValueError(f"stage '{stage.name}' is there twice or stands before a stage it reads from")
             known[stage.name] = fingerprint(stage, known)
             context = StageContext(stage.name, run_dir, known[stage.name], stage.settings)
             record = _valid_record(stage, context)
@@ -202,9 +200,7 @@ def _valid_record(stage: Stage, context: StageContext) -> dict[str, Any] | None:
         if record["fingerprint"] != context.fingerprint:
             log.info("%s: settings changed", stage.name)
             return None
-        changed = [
-            name for name in stage.outputs if not _is_same(context.run_dir / name, record["outputs"][name])
-        ]
+        changed = [name for name in stage.outputs if not _is_same(context.run_dir / name, record["outputs"][name])]
         float(record["seconds"])
     except (DataFileError, KeyError, TypeError, ValueError) as error:
         log.warning("%s: its record cannot be used (%s: %s)", stage.name, type(error).__name__, error)

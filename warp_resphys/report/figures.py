@@ -51,9 +51,7 @@ LABELS: Final[Mapping[str, str]] = {
     "resphys": "Corrected (ResPhys)",
 }
 LARGEST_SHOWN: Final = 1e5  # Of an error [mm], or a loss.
-FONT: Final = (
-    "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, 'DejaVu Sans', sans-serif"
-)
+FONT: Final = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, 'DejaVu Sans', sans-serif"
 ROUND_STEPS: Final = (1, 2, 5, 10)  # Between two ticks, times a power of ten.
 WIDE: Final = 7.3  # [in]
 NARROW: Final = 3.7  # [in]
@@ -229,9 +227,7 @@ def themed_svg(figure: Figure, name: str) -> bytes:
     """
     buffer = io.StringIO()
     with mpl.rc_context({**_STYLE, "svg.hashsalt": name}):
-        figure.savefig(
-            buffer, format="svg", dpi=240, transparent=True, metadata={"Date": None, "Creator": None}
-        )
+        figure.savefig(buffer, format="svg", dpi=240, transparent=True, metadata={"Date": None, "Creator": None})
     foreign = r"<\?xml.*?\?>|<!DOCTYPE.*?>|<metadata>.*?</metadata>"
     svg = re.sub(foreign, "", buffer.getvalue(), flags=re.DOTALL)
     svg = re.sub(r"'DejaVu Sans'(, [^;\"]*)?", FONT, svg)
@@ -251,9 +247,7 @@ def _figure(height: float, narrow_height: float, *, narrow: bool) -> Figure:
 def _legend(figure: Figure, axes: Axes, *, narrow: bool) -> None:
     """The legend above the figure, in one row, or one below the other where there is no room."""
     handles, labels = axes.get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="outside upper left", ncols=2 if narrow else len(labels), columnspacing=1.6
-    )
+    figure.legend(handles, labels, loc="outside upper left", ncols=2 if narrow else len(labels), columnspacing=1.6)
 
 
 def _measured(records: Sequence[Mapping[str, Any]], key: str) -> tuple[FloatArray, FloatArray]:

@@ -101,9 +101,7 @@ class ReportData:
         for model in ("target", "simulation", "resphys"):
             shape = getattr(self.example, model).shape
             if shape != wanted:
-                raise InputError(
-                    f"the example's {model} trajectory is {shape}, but the mesh asks for {wanted}"
-                )
+                raise InputError(f"the example's {model} trajectory is {shape}, but the mesh asks for {wanted}")
         for model, rows in self.errors_mm.items():
             if rows.ndim != 2 or rows.size == 0:
                 raise InputError(f"the errors of {model} are {rows.shape}, not (trajectories, steps)")
@@ -150,9 +148,7 @@ def _draw(data: ReportData, folder: Path) -> tuple[dict[str, Picture], dict[str,
     def both(name: str, draw: "Callable[..., Figure]", alt: str) -> Picture:
         wide, narrow = draw(narrow=False), draw(narrow=True)
         figures.save_png(wide, folder / f"{name}.png")
-        return Picture(
-            _address(figures.themed_svg(wide, name)), _address(figures.themed_svg(narrow, name)), alt
-        )
+        return Picture(_address(figures.themed_svg(wide, name)), _address(figures.themed_svg(narrow, name)), alt)
 
     motion = _tip_motion(data)
     state = worst_state(data.example)
@@ -207,9 +203,7 @@ def _render_page(data: ReportData, pictures: Mapping[str, Picture], missing: Map
         verdict=verdict(metrics["errors_mm"], data.published, data.simulator, data.reality),
         measured={model: error_parts(each) for model, each in metrics["errors_mm"].items()},
         published={model: _published_parts(each) for model, each in data.published.items()},
-        reconstructed={
-            model: error_parts(each) for model, each in metrics["errors_vs_reconstruction_mm"].items()
-        },
+        reconstructed={model: error_parts(each) for model, each in metrics["errors_vs_reconstruction_mm"].items()},
         number=number_text,
         duration=duration_text,
         settings=list(_flatten(data.settings)),
@@ -220,9 +214,7 @@ def _render_page(data: ReportData, pictures: Mapping[str, Picture], missing: Map
     )
 
 
-def verdict(
-    errors: Mapping[str, Any], published: Mapping[str, PublishedError], simulator: str, reality: str
-) -> str:
+def verdict(errors: Mapping[str, Any], published: Mapping[str, PublishedError], simulator: str, reality: str) -> str:
     """Say in a sentence or two how far the learned force brings the simulator to its target.
 
     Args:
@@ -294,9 +286,7 @@ def duration_text(seconds: float) -> str:
 
 
 def _times_power(exponent: int) -> str:
-    return " \N{MULTIPLICATION SIGN} 10" + str(exponent).translate(
-        str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-    )
+    return " \N{MULTIPLICATION SIGN} 10" + str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
 
 
 def _decimals(value: float) -> int:
@@ -355,9 +345,7 @@ def _describe_shapes(shapes: Mapping[str, FloatArray], target: FloatArray) -> st
 
 
 def _describe_errors(errors: Mapping[str, FloatArray]) -> str:
-    largest = (
-        f"{_MODELS[model][0]} reaches {_largest(rows[..., None] / 1e3)}" for model, rows in errors.items()
-    )
+    largest = (f"{_MODELS[model][0]} reaches {_largest(rows[..., None] / 1e3)}" for model, rows in errors.items())
     return f"Mean vertex error over time, on a logarithmic axis. {'; '.join(largest)}."
 
 

@@ -17,6 +17,7 @@ import scipy.optimize
 import torch
 from typing_extensions import override
 
+from ..assembly import HessianAssembly
 from ..errors import ConvergenceError, InputError
 from ..integrator import State
 from ..linear_solver import Factor, make_linear_solver
@@ -188,7 +189,7 @@ class GaussNewton(Reconstructor):
             diagonal = linear.address[pattern.rows == pattern.cols][:, [0, 4, 8]].ravel()
             self._diagonal = torch.as_tensor(diagonal.astype(np.int64), device=p.device)
             self._free = torch.as_tensor(pattern.free, device=p.device)
-            self._assemble = p.scatterer(linear, pattern)
+            self._assemble = HessianAssembly(p, linear, pattern)
             self._linear = linear
             self._assembled = p
 

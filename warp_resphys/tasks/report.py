@@ -85,6 +85,6 @@ def config_order(seconds: dict[str, float]) -> list[str]:
 
 
 def _in_words(material: dict[str, Any]) -> str:
-    """Such as "E 215 kPa, ν 0.45"."""
+    """Young's modulus and Poisson's ratio, and the model where it is not the usual one."""
     words = f"E {material['youngs_modulus'] / 1e3:g} kPa, ν {material['poissons_ratio']:g}"  # noqa: RUF001
     return words if material["model"] == "corotated" else f"{words}, {material['model'].replace('_', ' ')}"

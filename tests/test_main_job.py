@@ -349,33 +349,33 @@ class TestInterruption:
         with read_hdf5("run/reconstruction.h5", "reconstruction") as file:
             np.testing.assert_array_equal(np.stack(guesses, axis=1), file["force"][:, :-1])
 
-    def test_a_real_process(self, finished, folder):
+    @staticmethod
+    def start(until):
+        """The command in a process of its own, once a file is there."""
         program = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         program += "from warp_resphys.cli import main\nmain()"
         command = [sys.executable, "-c", program, *TINY, IN_RUN]
         environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
         child = subprocess.Popen(command, env=environment, text=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-        deadline = time.monotonic() + 60.0
-        while not Path("run/trajectories.h5.journal").exists() and time.monotonic() < deadline:
+        while not Path(until).exists() and child.poll() is None:
             time.sleep(0.002)
+        return child
+
+    def test_ctrl_c_in_a_real_process(self, finished, folder):
+        child = self.start("run/trajectories.h5.journal")
         child.send_signal(signal.SIGINT)
         err = child.communicate(timeout=60)[1]
-        assert child.returncode == 130
+        assert child.returncode == 130, err
         assert "interrupted in stage" in err
         assert "Traceback" not in err
         assert run(*TINY, IN_RUN)[0] == 0
         same_errors(errors(), errors(finished[0]))
 
     def test_killed_without_warning(self, finished, folder):
-        program = "from warp_resphys.cli import main\nmain()"
-        command = [sys.executable, "-c", program, *TINY, IN_RUN]
-        environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
-        child = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        deadline = time.monotonic() + 60.0
-        while not Path("run/reconstruction.h5.journal").exists() and time.monotonic() < deadline:
-            time.sleep(0.002)
+        child = self.start("run/reconstruction.h5.journal")
         child.kill()
-        child.wait(timeout=60)
+        err = child.communicate(timeout=60)[1]
+        assert child.returncode == -signal.SIGKILL, err
         assert run(*TINY, IN_RUN)[0] == 0
         same_errors(errors(), errors(finished[0]))
 

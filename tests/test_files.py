@@ -287,8 +287,9 @@ class TestResumable:
         content = bytearray(path.read_bytes())
         content[content.index(force(7).tobytes())] ^= 1
         path.write_bytes(content)
-        with resumable(path) as file:
-            assert file.done == 0
+        with pytest.raises(DataFileError, match=r"forces\.h5 is damaged"), resumable(path):
+            pass
+        assert path.read_bytes() == content
 
     def test_other_inputs_start_afresh_and_keep_the_old_file_until_the_end(self, tmp_path, caplog):
         path = tmp_path / "forces.h5"

@@ -407,7 +407,7 @@ class TestBadInput:
             ("integrator=rk4", "integrator is 'rk4': choose one of implicit_euler, bdf2, midpoint."),
             ("device=tpu", "device is 'tpu': choose auto, cpu or cuda."),
             ("device=mps", "device is 'mps': choose auto, cpu or cuda."),
-            ("dtype=float16", "dtype is 'float16': choose float64 or float32."),
+            ("dtype=float16", "dtype is 'float16': experiments need float64"),
             ("seed=-1", "seed is -1: it must lie between 0 and 2^63 - 1."),
             ("gravity=[0,0]", "gravity is [0, 0]: it must be three finite numbers, in m/s^2."),
             ("gravity=[0,0,inf]", "gravity is [0, 0, inf]: it must be three finite numbers, in m/s^2."),
@@ -472,7 +472,7 @@ class TestBadInput:
         assert ran(before) == STAGES  # the file's content counts, not its name
 
     @pytest.mark.parametrize("damage", ["truncated", "foreign", "of another stage", "changed"])
-    def test_a_damaged_file_in_the_run_folder_is_told_of_and_made_again(
+    def test_a_damaged_file_in_the_run_folder_is_an_error_until_it_is_deleted(
         self, finished, copied, no_report, caplog, damage
     ):
         path = Path("run/reconstruction.h5")
@@ -488,6 +488,14 @@ class TestBadInput:
             content = bytearray(path.read_bytes())
             content[len(content) // 2] ^= 0xFF
             path.write_bytes(content)
+        found = path.read_bytes()
+        code, err = run(*TINY, IN_RUN)
+        assert code == 2
+        assert err.splitlines()[-1].startswith("error: ")
+        assert "reconstruction.h5" in err.splitlines()[-1]
+        assert "Traceback" not in err
+        assert path.read_bytes() == found
+        path.unlink()
         assert run(*TINY, IN_RUN)[0] == 0
         assert "reconstruct: missing or changed since they were written: reconstruction.h5" in caplog.text
         assert ran(copied) == ["reconstruct"]  # the same forces as before: what follows is still valid

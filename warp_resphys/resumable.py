@@ -117,7 +117,8 @@ class ResumableHDF5:
         """Opens the journal, or makes one, and counts the steps that are done.
 
         Raises:
-            DataFileError: the disk is full, or the place cannot be written to.
+            DataFileError: the disk is full, the place cannot be written to, or there is a file that is damaged or not
+                ours.
         """
         if self._is_final():
             self.journal.unlink(missing_ok=True)
@@ -237,19 +238,19 @@ class ResumableHDF5:
             create(file, name, values, field.units, time_axis=ahead + counted - 1)
 
     def _is_final(self) -> bool:
-        """Whether the final file exists, belongs to the same computation and matches its checksums."""
+        """Whether the final file exists, belongs to the same computation and matches its checksums.
+
+        Raises:
+            DataFileError: there is a file that is damaged or not ours; it is not overwritten.
+        """
         if not self.path.is_file():
             return False
-        try:
-            with read_hdf5(self.path, self.kind) as file:
-                if str(file.attrs.get("fingerprint")) != self.fingerprint:
-                    return False
-                for name in self.fields:
-                    read_array(file, name)
-            return True
-        except DataFileError as error:
-            log.warning("computing %s again: %s", self.path.name, error)
-            return False
+        with read_hdf5(self.path, self.kind) as file:
+            if str(file.attrs.get("fingerprint")) != self.fingerprint:
+                return False
+            for name in self.fields:
+                read_array(file, name)
+        return True
 
     def _resume(self) -> int:
         """Counts the whole records of the journal and cuts off the rest; starts it anew if it is not ours."""

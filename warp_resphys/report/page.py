@@ -3,7 +3,6 @@
 import base64
 import logging
 import math
-import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warp_resphys.errors import DataFileError, InputError
+from warp_resphys.files import disk_full_error, is_disk_full, write_text
 from warp_resphys.mesh import Mesh
 from warp_resphys.metrics import PublishedError, trajectory_errors
 
@@ -129,15 +129,15 @@ def write_report(path: Path, data: ReportData) -> None:
     Raises:
         DataFileError: A file could not be written.
     """
+    folder = path.parent / "figures"
     try:
-        folder = path.parent / "figures"
         folder.mkdir(parents=True, exist_ok=True)
         page = _render_page(data, *_draw(data, folder))
-        draft = path.with_name(path.name + ".part")
-        draft.write_text(page, encoding="utf-8")
-        os.replace(draft, path)
     except OSError as error:
-        raise DataFileError(f"cannot write the report {path}: {error.strerror or error}") from error
+        if is_disk_full(error):
+            raise disk_full_error(folder) from error
+        raise DataFileError(f"cannot write figures to {folder}: {error.strerror or error}") from error
+    write_text(path, page)
     _LOG.info("report written: %s", path)
 
 

@@ -7,14 +7,15 @@ import torch
 from ..integrator import State
 from ..simulator import Simulator
 
+FURTHEST = 10.0  # No robot moves ten times its own length from its clamp; a roll-out that does has diverged.
 Predictor = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 
 
 class HybridSimulator:
     """A simulator and the force that is added to it.
 
-    An environment in which the solver fails, or whose state is no longer finite, has diverged: from then on it stands
-    at rest, and is reported as lost.
+    An environment in which the solver fails, or a vertex of which is further than `FURTHEST` body lengths from its rest
+    position, has diverged: from then on it stands at rest, and is reported as lost.
 
     Args:
         simulator: one whose solver settings count failures rather than raise them.
@@ -25,6 +26,8 @@ class HybridSimulator:
     def __init__(self, simulator: Simulator, predict: Predictor | None, lost: torch.Tensor | None = None) -> None:
         self.simulator, self.predict, self.lost = simulator, predict, lost
         self._tensors = simulator.prepare()
+        self._rest = simulator.rest_positions
+        self._length = float((self._rest.amax(0) - self._rest.amin(0)).max())
 
     @torch.no_grad()
     def step(self, state: State) -> State:
@@ -37,7 +40,8 @@ class HybridSimulator:
             self.lost |= ~torch.isfinite(force).flatten(1).all(1)
             force = torch.where(self.lost[:, None, None], 0.0, force)
         new, report = self.simulator.step(state, force, material=self._tensors)
-        self.lost |= ~report.converged | ~torch.isfinite(new.q).flatten(1).all(1)
+        distance = (new.q - self._rest).abs().flatten(1).amax(1)
+        self.lost |= ~report.converged | ~(distance < FURTHEST * self._length)
         return self._reset(new) if bool(self.lost.any()) else new
 
     def _reset(self, state: State) -> State:

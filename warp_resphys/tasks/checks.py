@@ -80,6 +80,8 @@ def check_configuration(config: Mapping[str, Any]) -> None:
             raise InputError(f"{key} is {group!r}: it must be a group of settings.")
     for key, value in _leaves(config):
         _check_kind(key, value)
+    if config["dtype"] != "float64":
+        raise InputError(f"dtype is {config['dtype']!r}: experiments need float64; float32 is for roll-outs in Python.")
     if len(config["gravity"]) != 3 or not all(map(math.isfinite, config["gravity"])):
         raise InputError(f"gravity is {config['gravity']}: it must be three finite numbers, in m/s^2.")
     if not 0 <= config["seed"] < 2**63:

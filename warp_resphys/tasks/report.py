@@ -15,6 +15,7 @@ from .trajectories import (
     RECONSTRUCTION,
     REPORT,
     ROLLOUTS,
+    STAGES,
     TRAINING,
     TRAJECTORIES,
     read_fields,
@@ -72,16 +73,10 @@ def collect_metrics(context: StageContext, config: dict[str, Any]) -> dict[str, 
     seconds = {r.stem: read_json(r)["seconds"] for r in records if not r.name.endswith(".progress.json")}
     return {
         **read_json(context.run_dir / ERRORS),
-        "seconds": {k: seconds[k] for k in config_order(seconds)},
+        "seconds": {name: seconds[name] for name in STAGES if name in seconds},
         "versions": package_versions(),
         "device": str(choose_device(config["device"])),
     }
-
-
-def config_order(seconds: dict[str, float]) -> list[str]:
-    """Stage names in the order in which they run."""
-    order = ["generate", "reconstruct", "train", "evaluate", "report"]
-    return [name for name in order if name in seconds]
 
 
 def _in_words(material: dict[str, Any]) -> str:

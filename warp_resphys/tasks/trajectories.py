@@ -15,6 +15,7 @@ from ..integrator import State
 from ..resumable import Field, ResumableHDF5
 
 SPLITS = ("train", "validation", "test")
+STAGES = ("generate", "reconstruct", "train", "evaluate", "report")
 
 TRAJECTORIES = "trajectories.h5"
 RECONSTRUCTION = "reconstruction.h5"

@@ -32,7 +32,9 @@ from warp_resphys.tasks import experiment
 from warp_resphys.tasks.checks import check_configuration
 
 REPOSITORY = Path(__file__).parents[1]
-STAGES = ["generate", "reconstruct", "train", "evaluate", "report"]
+STAGES = ["generate", "reconstruct", "train", "train_simfree", "evaluate", "time", "report"]
+LEARNED = ["train", "train_simfree", "evaluate", "time", "report"]
+CORRECTED = ["reconstruct", "train", "evaluate", "time", "report"]
 MODELS = ("simulation", "resphys", "reconstruction")
 SMALL = ["mesh.divisions=[4,2,2]"]
 SHORT = [
@@ -129,14 +131,16 @@ class TestCompleteRun:
         names = set(finished[1]) - {f"stages/{name}.json" for name in STAGES}
         names = {name for name in names if not name.startswith("figures/")}
         data = {"trajectories.h5", "reconstruction.h5", "rollouts.h5", "model.safetensors", "training.json"}
+        data |= {"simfree.safetensors", "simfree_training.json", "times.json"}
         assert names == data | {"errors.json", "metrics.json", "report.html"}
 
     def test_metrics(self, finished):
         found = metrics(finished[0])
-        keys = ["errors_mm", "errors_vs_reconstruction_mm", "per_trajectory", "seconds", "versions", "device"]
-        assert list(found) == keys
-        assert set(found["errors_mm"]) == {"simulation", "reconstruction", "resphys"}
-        assert set(found["errors_vs_reconstruction_mm"]) == {"simulation", "resphys"}
+        keys = ["errors_mm", "errors_vs_reconstruction_mm", "per_trajectory"]
+        assert list(found) == [*keys, "seconds_per_test_trajectory", "seconds", "versions", "device"]
+        assert set(found["seconds_per_test_trajectory"]) == {"simulation", "true_parameters", "resphys", "inference"}
+        assert set(found["errors_mm"]) == {"simulation", "reconstruction", "resphys", "simfree"}
+        assert set(found["errors_vs_reconstruction_mm"]) == {"simulation", "resphys", "simfree"}
         assert list(found["seconds"]) == STAGES
         assert all(0.0 < s < 600.0 for s in found["seconds"].values())
         assert found["versions"] == package_versions()
@@ -158,7 +162,7 @@ class TestCompleteRun:
             assert file["q"].shape == (6, 13, 45, 3)
             assert file["q"].attrs["units"] == "m"
         with read_hdf5(finished[0] / "rollouts.h5", "rollouts") as file:
-            stored = {model: file[f"{model}_q"][:, 1:] for model in ("simulation", "resphys")}
+            stored = {model: file[f"{model}_q"][:, 1:] for model in ("simulation", "resphys", "simfree")}
         with read_hdf5(finished[0] / "reconstruction.h5", "reconstruction") as file:
             stored["reconstruction"] = file["q"][4:, 1:]
             assert not file["force"][:, 0].any()
@@ -207,11 +211,11 @@ class TestChanges:
     @pytest.mark.parametrize(
         ("override", "expected"),
         [
-            ("trainer.epochs=30", ["train", "evaluate", "report"]),
-            ("network.blocks=2", ["train", "evaluate", "report"]),
-            ("seed=3", ["train", "evaluate", "report"]),
-            ("reconstruction.regularisation=1e-9", ["reconstruct", "train", "evaluate", "report"]),
-            ("simulation.youngs_modulus=220e3", ["reconstruct", "train", "evaluate", "report"]),
+            ("trainer.epochs=30", LEARNED),
+            ("network.blocks=2", LEARNED),
+            ("seed=3", LEARNED),
+            ("reconstruction.regularisation=1e-9", CORRECTED),
+            ("simulation.youngs_modulus=220e3", CORRECTED),
             ("reality.youngs_modulus=270e3", STAGES),
             ("data.weights_g.test=[60]", STAGES),
             ("title=Another", ["report"]),
@@ -306,7 +310,7 @@ class TestInterruption:
         arguments = [*TINY, f"integrator={integrator}"]
         assert run(*arguments, "hydra.run.dir=whole")[0] == 0
         whole = Counter(interruption.done)
-        assert whole == {"trajectories": 13, "reconstruction": 13, "epochs": 40, "rollouts": 13}
+        assert whole == {"trajectories": 13, "reconstruction": 13, "epochs": 80, "rollouts": 13}
         interruption.done.clear()
         cuts = {"trajectories": ("generate", 1), "reconstruction": ("reconstruct", 7), "epochs": ("train", 25)}
         for kind, (stage, at) in {**cuts, "rollouts": ("evaluate", 5)}.items():
@@ -324,7 +328,7 @@ class TestInterruption:
         assert sorted(repeated.elements()) in ([], ["epochs"])  # the epoch that the signal fell into
         same_errors(errors(), errors("whole"))
         assert not list(Path("run").glob("*.journal"))
-        assert not Path("run/training.safetensors").exists()
+        assert not list(Path("run").glob("train*.safetensors"))
 
     def test_twice_in_one_stage_and_before_the_first_frame(self, finished, folder, interruption):
         for at in (1, 2, 9):
@@ -415,13 +419,13 @@ class TestBadInput:
             ("fixed.x=0.5", "no vertex lies within 1e-09 m of x = 0.5 m"),
             ("data.load.x=0.5", "no vertex lies within 1e-09 m of x = 0.5 m"),
             ("data.steps=0", "data.steps is 0: it must be positive."),
-            ("data.weights_g.train=[]", "data.weights_g.train is empty: give the split at least one weight."),
+            ("data.weights_g.train=[]", "data.weights_g.train is empty: give the split at least one value."),
             ("data.weights_g.validation=[]", "data.weights_g.validation is empty"),
             ("data.weights_g.test=[]", "data.weights_g.test is empty"),
-            ("data.weights_g.test=[90]", "data.weights_g names 90 g twice: every trajectory belongs to one split."),
-            ("data.weights_g.test=[-4]", "data.weights_g.test holds a weight that is not positive, in grams: [-4.0]."),
+            ("data.weights_g.test=[90]", "data.weights_g names 90 g twice: every trajectory is in one split."),
+            ("data.weights_g.test=[-4]", "data.weights_g.test holds a value that is not positive: [-4.0]."),
             ("data.weights_g.test=70", "data.weights_g.test is 70: it must be a list of numbers."),
-            ("data.kind=drop", "data.kind is 'drop': choose release_from_load."),
+            ("data.kind=drop", "data.kind is 'drop': choose one of release_from_load, release_from_twist."),
             ("solver.max_iterations=1", "the newton solver stopped after 1 iterations"),
             ("reconstruction.max_iterations=1", "Gauss-Newton reconstruction moved by"),
         ],

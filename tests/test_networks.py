@@ -5,7 +5,7 @@ from torch import nn
 
 from warp_resphys.errors import InputError
 from warp_resphys.files import read_checkpoint, write_checkpoint
-from warp_resphys.residual.networks import SkipMLP, build_model, nodal_coder, pod_coder, restore
+from warp_resphys.residual.networks import ResidualForce, SkipMLP, build_model, nodal_coder, pod_coder, restore
 
 REDUCED = {"kind": "reduced", "position_modes": 3, "velocity_modes": 4, "force_modes": 5}
 ARCHITECTURE = {"blocks": 2, "layers": 1, "width": 16}
@@ -139,24 +139,24 @@ class TestResidualForce:
         model, q, v, force = built(kind)
         inputs = model.encode(q, v)
         sizes = {"reduced": (7, 5), "nodal": (36, 18)}[kind]
-        assert (inputs.shape[1], model.force.size) == sizes
+        assert (inputs.shape[1], model.coders[0].size) == sizes
         assert inputs.dtype == torch.float32
         np.testing.assert_allclose(inputs[:, : sizes[0] // 2].std(0), 1.0, rtol=0.05)
         # With a linear part that is exact, the force comes back.
         with torch.no_grad():
-            model.linear.copy_(torch.linalg.lstsq(inputs, model.force.encode(force).float()).solution)
+            model.linear.copy_(torch.linalg.lstsq(inputs, model.encode_outputs(force)).solution)
             model.remainder.zero_()
             found = model(q, v)
-        wanted = model.force.decode((inputs @ model.linear).double())
+        wanted = model.coders[0].decode((inputs @ model.linear).double())
         assert found.dtype == torch.float64
         np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-12)
 
     @pytest.mark.parametrize("kind", KINDS)
     def test_saved_and_restored_it_gives_identical_forces(self, kind, tmp_path):
         model, q, v, force = built(kind)
-        model.fit_linear(model.encode(q, v), model.force.encode(force).float(), 1e-2)
+        model.fit_linear(model.encode(q, v), model.encode_outputs(force), 1e-2)
         write_checkpoint(tmp_path / "model.safetensors", "residual force", model.state_dict(), model.description())
-        again = restore(*read_checkpoint(tmp_path / "model.safetensors", "residual force"))
+        again = restore(ResidualForce, *read_checkpoint(tmp_path / "model.safetensors", "residual force"))
         assert again.state_dict().keys() == model.state_dict().keys()
         assert not again.training
         with torch.no_grad():

@@ -27,7 +27,7 @@ def samples(count, seed):
     """A force that depends on the state in part linearly."""
     random = torch.Generator().manual_seed(seed)
     q, v = (torch.randn(count, 4, 3, generator=random, dtype=torch.float64) for _ in range(2))
-    return Samples(q, v, 0.5 * q - 0.2 * v.flip(1) + torch.sin(2.0 * q) * v)
+    return Samples(q, v, (0.5 * q - 0.2 * v.flip(1) + torch.sin(2.0 * q) * v,))
 
 
 TRAIN, VALIDATION = samples(70, 1), samples(20, 2)
@@ -36,12 +36,12 @@ TRAIN, VALIDATION = samples(70, 1), samples(20, 2)
 def rollout_error(model):
     """Depends on the weights, like the real one."""
     with torch.no_grad():
-        return float((model(VALIDATION.q, VALIDATION.v) - VALIDATION.force).abs().mean())
+        return float((model(VALIDATION.q, VALIDATION.v) - VALIDATION.outputs[0]).abs().mean())
 
 
 def trainer(seed=0, error=rollout_error, **settings):
     torch.manual_seed(seed)
-    model = build_model(NETWORK, torch.zeros(4, 3, dtype=torch.float64), TRAIN.q, TRAIN.v, TRAIN.force)
+    model = build_model(NETWORK, torch.zeros(4, 3, dtype=torch.float64), TRAIN.q, TRAIN.v, TRAIN.outputs[0])
     return Trainer(model, TRAIN, VALIDATION, error, {**CONFIG, **settings}, seed)
 
 
@@ -143,8 +143,8 @@ class TestLearning:
     def test_losses_are_mean_squared_errors_of_the_standardised_force(self):
         run = finish(trainer(epochs=1))
         with torch.no_grad():
-            wanted = run.model.force.encode(VALIDATION.force)
-            found = run.model.force.encode(run.model(VALIDATION.q, VALIDATION.v))
+            wanted = run.model.coders[0].encode(VALIDATION.outputs[0])
+            found = run.model.coders[0].encode(run.model(VALIDATION.q, VALIDATION.v))
         expected = float((found - wanted).square().mean())
         assert run.state.history[0]["validation_loss"] == pytest.approx(expected, rel=1e-5)
 
@@ -162,7 +162,8 @@ class TestLearning:
 
 @pytest.mark.parametrize("name", ["training", "validation"])
 def test_empty_split(name):
-    empty = Samples(*(torch.zeros(0, 4, 3) for _ in range(3)))
+    nothing = torch.zeros(0, 4, 3)
+    empty = Samples(nothing, nothing, (nothing,))
     splits = {"training": TRAIN, "validation": VALIDATION, name: replace(empty)}
     model = trainer().model
     with pytest.raises(InputError, match=f"the {name} split is empty"):

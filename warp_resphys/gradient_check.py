@@ -11,6 +11,7 @@ from .configured import build_simulator
 from .errors import InputError
 from .integrator import State
 from .material import Material
+from .poses import twisted
 from .simulator import Simulator
 
 POSES = ("rest", "bent", "twisted")
@@ -52,19 +53,15 @@ def pose(simulator: Simulator, name: str, batch: int) -> State:
     if name == "rest":
         return state
     q = state.q
+    scale = 1.0 + 0.1 * torch.arange(batch, device=q.device, dtype=q.dtype)
+    if name == "twisted":
+        turned = twisted(simulator.rest_positions, 0.5 * torch.pi / scale)
+        return State(turned, torch.zeros_like(turned))
     low, high = q[0].min(0).values, q[0].max(0).values
     s = (q[..., :1] - low[0]) / (high[0] - low[0])
-    scale = 1.0 + 0.1 * torch.arange(batch, device=q.device, dtype=q.dtype)[:, None, None]
-    if name == "bent":
-        offset = torch.zeros_like(q)
-        offset[..., 2:] = -0.15 * (high[0] - low[0]) * scale * s**2
-        return State(q + offset, 0.3 * offset)
-    angle = (0.5 * torch.pi / scale * s)[..., 0]
-    y, z = (q[..., i] - 0.5 * (low[i] + high[i]) for i in (1, 2))
-    turned = q.clone()
-    turned[..., 1] += torch.cos(angle) * y - torch.sin(angle) * z - y
-    turned[..., 2] += torch.sin(angle) * y + torch.cos(angle) * z - z
-    return State(turned, torch.zeros_like(q))
+    offset = torch.zeros_like(q)
+    offset[..., 2:] = -0.15 * (high[0] - low[0]) * scale[:, None, None] * s**2
+    return State(q + offset, 0.3 * offset)
 
 
 def check_gradients(

@@ -36,6 +36,13 @@ _MODELS = {  # In the order of the tables: a name, and what it means.
     "resphys": ("ResPhys", "the simulator with the learned force, which sees only the simulated state"),
 }
 
+_TIMED = {
+    "simulation": "Uncorrected simulation",
+    "true_parameters": "Simulation with the true parameters",
+    "resphys": "Simulation with the learned force",
+    "inference": "of it, the network alone",
+}
+
 
 @dataclass(frozen=True, eq=False)
 class Example:
@@ -200,6 +207,7 @@ def _render_page(data: ReportData, pictures: Mapping[str, Picture], missing: Map
         missing=missing,
         names=_MODELS,
         models=models,
+        timed=_TIMED,
         verdict=verdict(metrics["errors_mm"], data.published, data.simulator, data.reality),
         measured={model: error_parts(each) for model, each in metrics["errors_mm"].items()},
         published={model: _published_parts(each) for model, each in data.published.items()},

@@ -1,11 +1,11 @@
-"""Networks that predict the residual force from the state.
+"""Networks that predict a residual force, or the next state, from the state.
 
 A model is a coder around a multi-layer perceptron: the coder turns (q, v) into standardised inputs and standardised
 outputs into forces. Its constants come from the training split and are saved with the weights.
 """
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import nn
@@ -112,15 +112,21 @@ def nodal_coder(samples: torch.Tensor) -> Coder:
     return Coder(x.mean(0), None, torch.where(deviation > 0.0, deviation, torch.ones_like(deviation)))
 
 
-class ResidualForce(nn.Module):
-    """Residual force of a state.
+class StateMap(nn.Module):
+    """Fields predicted from a state, in standardised coordinates: a linear part and a network for what it leaves.
+
+    Attributes:
+        fields: names of the predicted fields, in order.
 
     Args:
         rest: (N, 3) rest positions [m].
-        position, velocity, force: coders.
+        position: coder of positions less the rest shape.
+        velocity: coder of velocities.
+        outputs: coder of each predicted field.
         architecture: ``blocks``, ``layers`` and ``width``.
     """
 
+    fields: tuple[str, ...]
     rest: torch.Tensor
     linear: torch.Tensor
     remainder: torch.Tensor
@@ -130,17 +136,24 @@ class ResidualForce(nn.Module):
         rest: torch.Tensor,
         position: Coder,
         velocity: Coder,
-        force: Coder,
+        outputs: Mapping[str, Coder],
         architecture: Mapping[str, int],
     ) -> None:
         super().__init__()
         self.register_buffer("rest", rest)
-        self.position, self.velocity, self.force = position, velocity, force
+        self.position, self.velocity = position, velocity
+        self.outputs = nn.ModuleDict(outputs)
         self.architecture = {key: int(architecture[key]) for key in ("blocks", "layers", "width")}
-        n_in = position.size + velocity.size
-        self.network = SkipMLP(n_in, force.size, **self.architecture).to(rest.device)
-        self.register_buffer("linear", torch.zeros(n_in, force.size, device=rest.device))
+        self._sizes = [coder.size for coder in outputs.values()]
+        n_in, n_out = position.size + velocity.size, sum(self._sizes)
+        self.network = SkipMLP(n_in, n_out, **self.architecture).to(rest.device)
+        self.register_buffer("linear", torch.zeros(n_in, n_out, device=rest.device))
         self.register_buffer("remainder", torch.ones((), device=rest.device))
+
+    @property
+    def coders(self) -> list[Coder]:
+        """Coders of the predicted fields, in order."""
+        return [coder for coder in self.outputs.values() if isinstance(coder, Coder)]
 
     def fit_linear(self, inputs: torch.Tensor, outputs: torch.Tensor, noise: float) -> None:
         """Sets the linear part by least squares, as if the inputs had noise of that deviation (ridge regression).
@@ -157,20 +170,47 @@ class ResidualForce(nn.Module):
         self.remainder.copy_((y - x @ linear).square().mean().sqrt())
 
     def standardised(self, inputs: torch.Tensor) -> torch.Tensor:
-        """(S, n_out) standardised force from (S, n_in) standardised inputs: linear part and network."""
+        """(S, n_out) standardised fields from (S, n_in) standardised inputs: linear part and network."""
         return inputs @ self.linear + self.remainder * self.network(inputs)
 
     def encode(self, q: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
-        """(S, M) standardised inputs in float32 from (S, N, 3) positions [m] and velocities [m/s]."""
+        """(S, n_in) standardised inputs in float32 from (S, N, 3) positions [m] and velocities [m/s]."""
         return torch.cat([self.position.encode(q - self.rest), self.velocity.encode(v)], dim=1).float()
 
-    def forward(self, q: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
-        """(S, N, 3) residual force [N]."""
-        return self.force.decode(self.standardised(self.encode(q, v)).to(q.dtype))
+    def encode_outputs(self, *fields: torch.Tensor) -> torch.Tensor:
+        """(S, n_out) standardised outputs in float32 from (S, N, 3) fields in the order of the coders."""
+        pairs = zip(self.coders, fields, strict=True)
+        return torch.cat([coder.encode(field) for coder, field in pairs], dim=1).float()
+
+    def predict(self, q: torch.Tensor, v: torch.Tensor) -> list[torch.Tensor]:
+        """(S, N, 3) fields in the order of the coders."""
+        parts = self.standardised(self.encode(q, v)).to(q.dtype).split(self._sizes, dim=1)
+        return [coder.decode(part) for coder, part in zip(self.coders, parts, strict=True)]
 
     def description(self) -> dict[str, Any]:
         """What `restore` needs beside the tensors."""
         return {"architecture": self.architecture, "reduced": self.position.basis is not None}
+
+
+class ResidualForce(StateMap):
+    """Residual force of a state (the published method's network)."""
+
+    fields = ("force",)
+
+    def forward(self, q: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
+        """(S, N, 3) residual force [N]."""
+        return self.predict(q, v)[0]
+
+
+class NextState(StateMap):
+    """The next state of a state: the purely data-driven baseline (SimFree)."""
+
+    fields = ("next_position", "next_velocity")
+
+    def forward(self, q: torch.Tensor, v: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """(S, N, 3) positions [m] and velocities [m/s] one time step on."""
+        displacement, velocity = self.predict(q, v)
+        return self.rest + displacement, velocity
 
 
 def build_model(
@@ -180,7 +220,7 @@ def build_model(
     v: torch.Tensor,
     force: torch.Tensor,
 ) -> ResidualForce:
-    """A network with coders from training samples.
+    """A residual force with coders from training samples.
 
     Args:
         config: the group ``network``.
@@ -192,16 +232,34 @@ def build_model(
     Raises:
         InputError: an unknown kind, or sizes that do not fit the samples.
     """
+    position, velocity = _state_coders(config, q - rest, v)
+    coder = pod_coder(force, config["force_modes"]) if config["kind"] == "reduced" else nodal_coder(force)
+    return ResidualForce(rest, position, velocity, {"force": coder}, config)
+
+
+def build_next_state(config: Mapping[str, Any], rest: torch.Tensor, q: torch.Tensor, v: torch.Tensor) -> NextState:
+    """A data-driven baseline of the same family: in- and outputs share their coders.
+
+    Args:
+        config: the group ``network``.
+        rest: (N, 3) rest positions [m].
+        q: (S, N, 3) positions [m].
+        v: (S, N, 3) velocities [m/s].
+
+    Raises:
+        InputError: an unknown kind, or sizes that do not fit the samples.
+    """
+    position, velocity = _state_coders(config, q - rest, v)
+    outputs = dict(zip(NextState.fields, _state_coders(config, q - rest, v), strict=True))
+    return NextState(rest, position, velocity, outputs, config)
+
+
+def _state_coders(config: Mapping[str, Any], u: torch.Tensor, v: torch.Tensor) -> tuple[Coder, Coder]:
+    """Coders of displacements and velocities."""
     check_network(config)
     if config["kind"] == "reduced":
-        coders = (
-            pod_coder(q - rest, config["position_modes"]),
-            pod_coder(v, config["velocity_modes"]),
-            pod_coder(force, config["force_modes"]),
-        )
-    else:
-        coders = (nodal_coder(q - rest), nodal_coder(v), nodal_coder(force))
-    return ResidualForce(rest, *coders, config)
+        return pod_coder(u, config["position_modes"]), pod_coder(v, config["velocity_modes"])
+    return nodal_coder(u), nodal_coder(v)
 
 
 def check_network(config: Mapping[str, Any]) -> None:
@@ -218,14 +276,23 @@ def check_network(config: Mapping[str, Any]) -> None:
             raise InputError(f"network.{key} is {config[key]}: it must be positive.")
 
 
-def restore(tensors: Mapping[str, torch.Tensor], description: Mapping[str, Any]) -> ResidualForce:
-    """A model from its ``state_dict`` and `ResidualForce.description`."""
+Model = TypeVar("Model", bound=StateMap)
+
+
+def restore(kind: type[Model], tensors: Mapping[str, torch.Tensor], description: Mapping[str, Any]) -> Model:
+    """A model from its ``state_dict`` and `StateMap.description`.
+
+    Args:
+        kind: `ResidualForce` or `NextState`.
+        tensors: the ``state_dict``.
+        description: what `StateMap.description` returned.
+    """
 
     def coder(name: str) -> Coder:
         basis = tensors[f"{name}.basis"] if description["reduced"] else None
         return Coder(tensors[f"{name}.mean"], basis, tensors[f"{name}.scale"])
 
-    coders = (coder("position"), coder("velocity"), coder("force"))
-    model = ResidualForce(tensors["rest"], *coders, description["architecture"])
+    outputs = {name: coder(f"outputs.{name}") for name in kind.fields}
+    model = kind(tensors["rest"], coder("position"), coder("velocity"), outputs, description["architecture"])
     model.load_state_dict(tensors)
     return model.eval()

@@ -1,23 +1,23 @@
-"""Supervised training of a residual force, with the model chosen by its roll-outs."""
+"""Supervised training of a model, which is chosen by its roll-outs."""
 
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Generic
 
 import torch
 
 from ..errors import InputError
-from .networks import ResidualForce
+from .networks import Model
 
 
 @dataclass(frozen=True)
 class Samples:
-    """States and the residual forces that belong to them, each (S, N, 3)."""
+    """States and the fields that belong to them, each (S, N, 3)."""
 
     q: torch.Tensor
     v: torch.Tensor
-    force: torch.Tensor
+    outputs: tuple[torch.Tensor, ...]
 
 
 @dataclass
@@ -38,8 +38,8 @@ class TrainingState:
     best: dict[str, torch.Tensor] = field(default_factory=dict)
 
 
-class Trainer:
-    """Adam on the mean squared error of the standardised force, with a cosine schedule.
+class Trainer(Generic[Model]):
+    """Adam on the mean squared error of the standardised outputs, with a cosine schedule.
 
     Args:
         model: to train; on the device of the samples.
@@ -55,10 +55,10 @@ class Trainer:
 
     def __init__(
         self,
-        model: ResidualForce,
+        model: Model,
         train: Samples,
         validation: Samples,
-        rollout_error: Callable[[ResidualForce], float],
+        rollout_error: Callable[[Model], float],
         config: Mapping[str, Any],
         seed: int,
     ) -> None:
@@ -69,10 +69,10 @@ class Trainer:
         self.model, self.config, self.rollout_error = model, config, rollout_error
         self.state = TrainingState()
         with torch.no_grad():
-            self._train = (model.encode(train.q, train.v), model.force.encode(train.force).float())
+            self._train = (model.encode(train.q, train.v), model.encode_outputs(*train.outputs))
             self._validation = (
                 model.encode(validation.q, validation.v),
-                model.force.encode(validation.force).float(),
+                model.encode_outputs(*validation.outputs),
             )
             if config["linear_noise"] is not None:
                 model.fit_linear(*self._train, config["linear_noise"])
@@ -130,7 +130,7 @@ class Trainer:
             return float(self._loss(x, y)) * float(self.model.remainder) ** 2
 
     def _loss(self, inputs: torch.Tensor, outputs: torch.Tensor) -> torch.Tensor:
-        """Mean squared error of the standardised force, in units of what the linear part leaves."""
+        """Mean squared error of the standardised outputs, in units of what the linear part leaves."""
         error = self.model.standardised(inputs) - outputs
         return (error / self.model.remainder).square().mean()
 
@@ -169,7 +169,7 @@ class Trainer:
             slots.setdefault(int(index), {})[name] = tensor
         self._optimiser.load_state_dict({**self._optimiser.state_dict(), "state": slots})
 
-    def use_best(self) -> ResidualForce:
+    def use_best(self) -> Model:
         """The model with the weights of the smallest roll-out error."""
         self.model.network.load_state_dict(self.state.best)
         return self.model.eval()

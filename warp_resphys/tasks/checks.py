@@ -15,6 +15,7 @@ from ..residual.networks import check_network
 from ..residual.reconstruction import make_reconstructor
 from ..residual.training import check_trainer
 from ..solver import SolverSettings
+from .trajectories import variation_of
 
 _GROUPS = (
     "mesh",
@@ -27,13 +28,23 @@ _GROUPS = (
     "simulation",
     "reality",
     "data",
-    "data.load",
-    "data.weights_g",
+    "tip",
 )
-_WORDS = ("dtype", "device", "integrator", "*.kind", "*.model", "*.name", "*.method", "solver.linear_solver")
+_WORDS = (
+    "dtype",
+    "device",
+    "integrator",
+    "data.twist_axis",
+    "*.kind",
+    "*.model",
+    "*.name",
+    "*.method",
+    "solver.linear_solver",
+)
 _WHOLE_NUMBERS = (
     "seed",
     "data.steps",
+    "data.limit.*",
     "*.max_iterations",
     "solver.memory",
     "solver.refactor_after",
@@ -45,6 +56,7 @@ _WHOLE_NUMBERS = (
 _NUMBERS = (
     "time_step",
     "fixed.*",
+    "tip.*",
     "data.load.*",
     "simulation.*",
     "reality.*",
@@ -53,7 +65,7 @@ _NUMBERS = (
     "reconstruction.*",
     "trainer.*",
 )
-_LISTS = ("gravity", "data.weights_g.*")
+_LISTS = ("gravity", "data.weights_g.*", "data.angles_deg.*")
 _OPTIONAL = ("trainer.linear_noise",)
 # Groups that are handed on as keyword arguments.
 _TAKEN_BY: Mapping[str, Callable[..., Any]] = {
@@ -62,6 +74,7 @@ _TAKEN_BY: Mapping[str, Callable[..., Any]] = {
     "solver": SolverSettings,
     "reconstruction": make_reconstructor,
     "fixed": select_vertices,
+    "tip": select_vertices,
 }
 
 
@@ -78,6 +91,11 @@ def check_configuration(config: Mapping[str, Any]) -> None:
         group = _value(config, key)
         if not isinstance(group, Mapping):
             raise InputError(f"{key} is {group!r}: it must be a group of settings.")
+    kind = variation_of(config["data"])
+    for key in (kind.key, *(["load"] if config["data"]["kind"] == "release_from_load" else [])):
+        group = config["data"].get(key)
+        if not isinstance(group, Mapping):
+            raise InputError(f"data.{key} is {group!r}: it must be a group of settings.")
     for key, value in _leaves(config):
         _check_kind(key, value)
     if config["dtype"] != "float64":

@@ -1,5 +1,7 @@
-"""Stage: roll-outs of the test split, without and with the learned force, and their errors."""
+"""Stage: roll-outs of the test split, by every model, and their errors."""
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,27 +13,29 @@ from ..files import write_json
 from ..integrator import State
 from ..metrics import summarise, summarise_each, trajectory_errors
 from ..progress import Progress
-from ..residual.rollout import HybridSimulator, Predictor
+from ..residual.rollout import DataDrivenRollout, HybridRollout, Rollout
 from ..resumable import Field, ResumableHDF5
+from ..simulator import Simulator
 from ..stages import StageContext
-from .train import load_model, predictor
+from .train import force_predictor, load_model, load_simfree, state_predictor
 from .trajectories import (
     ERRORS,
     MODEL,
     RECONSTRUCTION,
     ROLLOUTS,
+    SIMFREE,
     TRAJECTORIES,
     read_fields,
-    weight_split,
+    split_of,
 )
 
-MODELS = ("simulation", "resphys")
+MODELS = ("simulation", "resphys", "simfree")
 
 
 def evaluate(context: StageContext) -> None:
     """Writes rollouts.h5, (R, T + 1, N, 3) positions a model and the target, and errors.json."""
     settings = context.settings
-    split, _ = weight_split(settings["data"])
+    split, _ = split_of(settings["data"])
     part = split.indices("test")
     (target, velocity) = read_fields(context.run_dir / TRAJECTORIES, "trajectories", "q", "v")
     (reconstruction,) = read_fields(context.run_dir / RECONSTRUCTION, "reconstruction", "q")
@@ -56,12 +60,9 @@ def _errors(positions: NDArray[np.float64], target: NDArray[np.float64]) -> list
 
 
 def _roll_out(context: StageContext, q: NDArray[np.float64], v: NDArray[np.float64], frames: int) -> None:
-    """Both models over all frames; frame 0 is the start."""
+    """Every model over all frames; frame 0 is the start."""
     simulator = build_simulator(context.settings, on_failure="count")
-    predict: dict[str, Predictor | None] = {
-        "simulation": None,
-        "resphys": predictor(load_model(context.run_dir / MODEL)),
-    }
+    make = model_rollouts(context, simulator)
     batch, vertices, _ = q.shape
     fields = {}
     for m in MODELS:
@@ -72,14 +73,25 @@ def _roll_out(context: StageContext, q: NDArray[np.float64], v: NDArray[np.float
         ResumableHDF5(path, "rollouts", context.fingerprint, frames, fields) as file,
         Progress("evaluate", frames, "frames", file.done) as progress,
     ):
-        runs = {m: _Run(simulator, predict[m], m, file, q, v) for m in MODELS}
+        runs = {m: _Run(simulator, make[m], m, file, q, v) for m in MODELS}
         while file.done < file.steps:
             arrays: dict[str, NDArray[np.float64]] = {}
             for run in runs.values():
                 arrays |= run.frame(file.done)
             file.append(**arrays)
             progress.advance()
-        file.finish({"names": list(weight_split(context.settings["data"])[0].test)})
+        file.finish({"names": list(split_of(context.settings["data"])[0].test)})
+
+
+def model_rollouts(context: StageContext, simulator: Simulator) -> dict[str, Callable[[torch.Tensor | None], Rollout]]:
+    """For each model, what makes its roll-out from the environments that are lost already."""
+    force = force_predictor(load_model(context.run_dir / MODEL))
+    following = state_predictor(load_simfree(context.run_dir / SIMFREE))
+    return {
+        "simulation": partial(HybridRollout, simulator, None),
+        "resphys": partial(HybridRollout, simulator, force),
+        "simfree": partial(DataDrivenRollout, simulator, following),
+    }
 
 
 class _Run:
@@ -87,8 +99,8 @@ class _Run:
 
     def __init__(
         self,
-        simulator: Any,
-        predict: Predictor | None,
+        simulator: Simulator,
+        make: Callable[[torch.Tensor | None], Rollout],
         name: str,
         file: ResumableHDF5,
         q: NDArray[np.float64],
@@ -99,19 +111,21 @@ class _Run:
         if file.done > 0 and file.done < file.steps:
             q, v = (file.read(file.done - 1)[f"{name}_{key}"] for key in "qv")
             if file.done > 1:
-                previous = tuple(
-                    simulator.tensor(np.nan_to_num(file.read(file.done - 2)[f"{name}_{key}"])) for key in "qv"
+                back = file.read(file.done - 2)
+                previous = (
+                    simulator.tensor(np.nan_to_num(back[f"{name}_q"])),
+                    simulator.tensor(back[f"{name}_v"]),
                 )
         positions = simulator.tensor(q)
         lost = ~torch.isfinite(positions).flatten(1).all(1)
         rest = simulator.rest_state(len(positions)).q
         start = torch.where(lost[:, None, None], rest, positions)
-        self.hybrid = HybridSimulator(simulator, predict, lost)
+        self.rollout = make(lost)
         self.state = State(start, simulator.tensor(v), previous)
 
     def frame(self, index: int) -> dict[str, NDArray[np.float64]]:
         """Positions and velocities of the next frame; the first is the start."""
         if index > 0:
-            self.state = self.hybrid.step(self.state)
-        q = self.hybrid.positions(self.state)
+            self.state = self.rollout.step(self.state)
+        q = self.rollout.positions(self.state)
         return {f"{self.name}_q": q.cpu().numpy(), f"{self.name}_v": self.state.v.cpu().numpy()}

@@ -18,7 +18,8 @@ from .evaluate import evaluate
 from .generate import generate
 from .reconstruct import reconstruct
 from .report import collect_metrics, make_report
-from .train import train
+from .timing import time_models
+from .train import train, train_simfree
 from .trajectories import (
     ERRORS,
     METRICS,
@@ -26,6 +27,9 @@ from .trajectories import (
     RECONSTRUCTION,
     REPORT,
     ROLLOUTS,
+    SIMFREE,
+    SIMFREE_TRAINING,
+    TIMES,
     TRAINING,
     TRAJECTORIES,
 )
@@ -51,8 +55,22 @@ def stages(config: dict[str, Any]) -> list[Stage]:
             ("generate",),
         ),
         Stage("train", train, (MODEL, TRAINING), {**learned, **network}, ("generate", "reconstruct")),
-        Stage("evaluate", evaluate, (ROLLOUTS, ERRORS), learned, ("generate", "reconstruct", "train")),
-        Stage("report", make_report, (REPORT,), {"config": config}, ("train", "evaluate")),
+        Stage(
+            "train_simfree",
+            train_simfree,
+            (SIMFREE, SIMFREE_TRAINING),
+            {**base, **_pick(config, "reality", "data"), **network},
+            ("generate",),
+        ),
+        Stage(
+            "evaluate",
+            evaluate,
+            (ROLLOUTS, ERRORS),
+            learned,
+            ("generate", "reconstruct", "train", "train_simfree"),
+        ),
+        Stage("time", time_models, (TIMES,), {**learned, **_pick(config, "reality")}, ("generate", "train")),
+        Stage("report", make_report, (REPORT,), {"config": config}, ("train", "evaluate", "time")),
     ]
 
 

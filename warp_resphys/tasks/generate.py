@@ -1,33 +1,37 @@
 """Stage: trajectories of the simulation that plays the real robot."""
 
 import logging
+from collections.abc import Mapping
+from typing import Any
 
 import torch
+from numpy.typing import NDArray
 
 from ..configured import build_simulator
 from ..errors import InputError
 from ..integrator import State
 from ..mesh import select_vertices
+from ..poses import twisted
 from ..progress import Progress
 from ..resumable import ResumableHDF5
 from ..simulator import Simulator
 from ..stages import StageContext
-from .trajectories import TRAJECTORIES, last_state, state_fields, weight_split
+from .trajectories import TRAJECTORIES, last_state, split_of, state_fields
 
 log = logging.getLogger(__name__)
+
+_AXES = ("x", "y", "z")
 
 
 def generate(context: StageContext) -> None:
     """Writes trajectories.h5: q, v (B, T + 1, N, 3), the held state first."""
     settings = context.settings
     data = settings["data"]
-    if data["kind"] != "release_from_load":
-        raise InputError(f"data.kind is {data['kind']!r}: choose release_from_load.")
     if not data["steps"] > 0:
         raise InputError(f"data.steps is {data['steps']}: it must be positive.")
     simulator = build_simulator(settings, "reality")
-    split, weights = weight_split(data)
-    batch, frames = len(weights), data["steps"] + 1
+    split, values = split_of(data)
+    batch, frames = len(values), data["steps"] + 1
     fields = state_fields(batch, simulator.body.n_vertices)
     path = context.run_dir / TRAJECTORIES
     with (
@@ -41,7 +45,7 @@ def generate(context: StageContext) -> None:
             if state is None and file.done > 0:
                 state = last_state(file, simulator.rest_positions)
             if state is None:
-                state = held_state(simulator, data["load"], weights)
+                state = initial_state(simulator, data, values)
             else:
                 state, _ = simulator.step(state, material=tensors)
             file.append(q=state.q.cpu().numpy(), v=state.v.cpu().numpy())
@@ -49,7 +53,27 @@ def generate(context: StageContext) -> None:
         file.finish({"time_step": settings["time_step"], "names": list(split.names)})
 
 
-def held_state(simulator: Simulator, load: dict[str, float], weights: "torch.Tensor | object") -> State:
+def initial_state(simulator: Simulator, data: Mapping[str, Any], values: NDArray[Any]) -> State:
+    """The states from which a batch is let go.
+
+    Args:
+        simulator: of the body.
+        data: the group ``data``.
+        values: (B,) weights [kg] or angles [rad], by the kind of data.
+
+    Raises:
+        InputError: an unknown axis or face.
+    """
+    if data["kind"] == "release_from_twist":
+        if data["twist_axis"] not in _AXES:
+            raise InputError(f"data.twist_axis is {data['twist_axis']!r}: choose one of {', '.join(_AXES)}.")
+        axis = _AXES.index(data["twist_axis"])
+        q = twisted(simulator.rest_positions, simulator.tensor(values), axis)
+        return State(q, torch.zeros_like(q))
+    return held_state(simulator, data["load"], values)
+
+
+def held_state(simulator: Simulator, load: Mapping[str, float], weights: NDArray[Any]) -> State:
     """The body at rest under weights on a face, in equal shares.
 
     Args:

@@ -16,10 +16,11 @@ from .trajectories import (
     REPORT,
     ROLLOUTS,
     STAGES,
+    TIMES,
     TRAINING,
     TRAJECTORIES,
     read_fields,
-    weight_split,
+    split_of,
 )
 
 _AS_PUBLISHED = "The published errors are measured against the reconstructed trajectories, ours against the target."
@@ -36,12 +37,19 @@ def make_report(context: StageContext) -> None:
     """Writes report.html and its figures."""
     settings = context.settings
     config = settings["config"]
-    split, _ = weight_split(config["data"])
+    split, _ = split_of(config["data"])
     part = split.indices("test")
     (target,) = read_fields(context.run_dir / TRAJECTORIES, "trajectories", "q")
     (reconstruction,) = read_fields(context.run_dir / RECONSTRUCTION, "reconstruction", "q")
-    simulation, resphys = read_fields(context.run_dir / ROLLOUTS, "rollouts", "simulation_q", "resphys_q")
-    positions = {"simulation": simulation, "reconstruction": reconstruction[part], "resphys": resphys}
+    simulation, resphys, simfree = read_fields(
+        context.run_dir / ROLLOUTS, "rollouts", "simulation_q", "resphys_q", "simfree_q"
+    )
+    positions = {
+        "simulation": simulation,
+        "reconstruction": reconstruction[part],
+        "simfree": simfree,
+        "resphys": resphys,
+    }
     target = target[part]
     errors = {
         m: np.stack([trajectory_errors(a, b) for a, b in zip(q, target, strict=True)]) for m, q in positions.items()
@@ -59,7 +67,7 @@ def make_report(context: StageContext) -> None:
         published_note=_AS_PUBLISHED + _PHYSICS[config["physics"]["mass"]],
         time_step=config["time_step"],
         mesh=mesh,
-        tip=select_vertices(mesh, **config["data"]["load"]),
+        tip=select_vertices(mesh, **config["tip"]),
         example=Example(split.test[worst], target[worst], simulation[worst], resphys[worst]),
         errors_mm=errors,
         training=read_json(context.run_dir / TRAINING),
@@ -73,6 +81,7 @@ def collect_metrics(context: StageContext, config: dict[str, Any]) -> dict[str, 
     seconds = {r.stem: read_json(r)["seconds"] for r in records if not r.name.endswith(".progress.json")}
     return {
         **read_json(context.run_dir / ERRORS),
+        "seconds_per_test_trajectory": read_json(context.run_dir / TIMES)["seconds"],
         "seconds": {name: seconds[name] for name in STAGES if name in seconds},
         "versions": package_versions(),
         "device": str(choose_device(config["device"])),

@@ -1,4 +1,4 @@
-"""Stage: the network that predicts the residual force."""
+"""Stages: the network that predicts the residual force, and the data-driven baseline."""
 
 import logging
 import time
@@ -12,19 +12,28 @@ from ..files import read_checkpoint, write_checkpoint, write_json
 from ..integrator import State
 from ..metrics import summarise, trajectory_errors
 from ..progress import Progress
-from ..residual.networks import ResidualForce, build_model, restore
-from ..residual.rollout import Predictor, closed_loop
+from ..residual.networks import Model, NextState, ResidualForce, build_model, build_next_state, restore
+from ..residual.rollout import (
+    DataDrivenRollout,
+    ForcePredictor,
+    HybridRollout,
+    Rollout,
+    StatePredictor,
+    closed_loop,
+)
 from ..residual.training import Samples, Trainer
 from ..resumable import resume_checkpoint
 from ..stages import StageContext
 from .trajectories import (
     MODEL,
     RECONSTRUCTION,
+    SIMFREE,
+    SIMFREE_TRAINING,
     TRAINING,
     TRAJECTORIES,
     Split,
     read_fields,
-    weight_split,
+    split_of,
 )
 
 log = logging.getLogger(__name__)
@@ -32,40 +41,69 @@ _CHECKPOINT_SECONDS = 10.0
 
 
 def train(context: StageContext) -> None:
-    """Writes model.safetensors, the weights with the smallest validation roll-out error, and training.json."""
+    """Trains the residual force: model.safetensors, with the smallest validation roll-out error, and training.json."""
     settings = context.settings
-    split, _ = weight_split(settings["data"])
+    split, _ = split_of(settings["data"])
     device = choose_device(settings["device"])
     torch.manual_seed(settings["seed"])
-    samples = _samples(context.run_dir, split, device)
-    rest = samples["train"].q.new_tensor(build_simulator(settings).body.mesh.vertices)
+    q, v, force = _read(context.run_dir / RECONSTRUCTION, "reconstruction", device, "q", "v", "force")
+    samples = {name: _samples(q, v, (force,), split.indices(name)) for name in ("train", "validation")}
+    validation = Validation(context, split, "simulation")
+    rest = q.new_tensor(validation.simulator.body.mesh.vertices)
     pick = samples["train"]
-    model = build_model(settings["network"], rest, pick.q, pick.v, pick.force)
-    error = ValidationError(context, split)
+    model = build_model(settings["network"], rest, pick.q, pick.v, pick.outputs[0])
+
+    def error(candidate: ResidualForce) -> float:
+        return validation.error_mm(HybridRollout(validation.simulator, force_predictor(candidate)))
+
     trainer = Trainer(model, pick, samples["validation"], error, settings["trainer"], settings["seed"])
-    checkpoint = context.run_dir / "training.safetensors"
+    _train(context, trainer, MODEL, TRAINING, "residual force")
+
+
+def train_simfree(context: StageContext) -> None:
+    """Trains the data-driven baseline on the same trajectories: simfree.safetensors and simfree_training.json."""
+    settings = context.settings
+    split, _ = split_of(settings["data"])
+    device = choose_device(settings["device"])
+    torch.manual_seed(settings["seed"])
+    q, v = _read(context.run_dir / TRAJECTORIES, "trajectories", device, "q", "v")
+    validation = Validation(context, split, "reality")
+    rest = q.new_tensor(validation.simulator.body.mesh.vertices)
+    samples = {name: _samples(q, v, (q - rest, v), split.indices(name)) for name in ("train", "validation")}
+    model = build_next_state(settings["network"], rest, samples["train"].q, samples["train"].v)
+
+    def error(candidate: NextState) -> float:
+        return validation.error_mm(DataDrivenRollout(validation.simulator, state_predictor(candidate)))
+
+    trainer = Trainer(model, samples["train"], samples["validation"], error, settings["trainer"], settings["seed"])
+    _train(context, trainer, SIMFREE, SIMFREE_TRAINING, "next state")
+
+
+def _train(context: StageContext, trainer: Trainer[Model], model: str, history: str, kind: str) -> None:
+    """Trains, going on from an interrupted run, and writes the best weights and the history."""
+    checkpoint = context.run_dir / f"{context.name}.safetensors"
     found = resume_checkpoint(checkpoint, "training", context.fingerprint)
     if found is not None:
         trainer.resume(*found)
-    _run_epochs(trainer, checkpoint, context.fingerprint)
+    _run_epochs(context.name, trainer, checkpoint, context.fingerprint)
     best = trainer.use_best()
     error_mm = trainer.state.best_error
-    write_json(context.run_dir / TRAINING, trainer.state.history)
+    write_json(context.run_dir / history, trainer.state.history)
     write_checkpoint(
-        context.run_dir / MODEL,
-        "residual force",
+        context.run_dir / model,
+        kind,
         best.state_dict(),
         {**best.description(), "validation_rollout_error_mm": error_mm, "fingerprint": context.fingerprint},
     )
     checkpoint.unlink(missing_ok=True)
 
 
-def _run_epochs(trainer: Trainer, checkpoint: Path, fingerprint: str) -> None:
+def _run_epochs(name: str, trainer: Trainer[Model], checkpoint: Path, fingerprint: str) -> None:
     """Trains to the end; on the way, and however it ends, keeps the last whole epoch."""
     epochs = trainer.config["epochs"]
     saved = time.monotonic()
     kept = _copy(trainer.snapshot())
-    with Progress("train", epochs, "epochs", trainer.state.epoch) as progress:
+    with Progress(name, epochs, "epochs", trainer.state.epoch) as progress:
         try:
             while not trainer.finished:
                 record = trainer.run_epoch()
@@ -96,48 +134,68 @@ def _save(checkpoint: Path, kept: tuple[dict[str, torch.Tensor], dict[str, Any]]
     write_checkpoint(checkpoint, "training", kept[0], {**kept[1], "fingerprint": fingerprint})
 
 
-def _samples(run_dir: Path, split: Split, device: torch.device) -> dict[str, Samples]:
-    """States and the forces that lead on from them, by split."""
-    arrays = read_fields(run_dir / RECONSTRUCTION, "reconstruction", "q", "v", "force")
-    q, v, force = (torch.as_tensor(a, device=device) for a in arrays)
-    samples = {}
-    for name in ("train", "validation"):
-        part = split.indices(name)
-        samples[name] = Samples(q[part, :-1].flatten(0, 1), v[part, :-1].flatten(0, 1), force[part, 1:].flatten(0, 1))
-    return samples
+def _read(path: Path, kind: str, device: torch.device, *names: str) -> list[torch.Tensor]:
+    return [torch.as_tensor(a, device=device) for a in read_fields(path, kind, *names)]
 
 
-class ValidationError:
-    """Mean roll-out error on the validation split [mm], infinite where a roll-out diverged."""
+def _samples(q: torch.Tensor, v: torch.Tensor, outputs: tuple[torch.Tensor, ...], part: slice) -> Samples:
+    """The states of a split, and the fields at the next frame of each."""
+    now, following = (part, slice(None, -1)), (part, slice(1, None))
+    return Samples(
+        q[now].flatten(0, 1), v[now].flatten(0, 1), tuple(field[following].flatten(0, 1) for field in outputs)
+    )
 
-    def __init__(self, context: StageContext, split: Split) -> None:
-        self.simulator = build_simulator(context.settings, on_failure="count")
+
+class Validation:
+    """Roll-outs of the validation split.
+
+    Args:
+        context: of the stage.
+        split: of the trajectories.
+        material: the simulator's, ``simulation`` or ``reality``.
+    """
+
+    def __init__(self, context: StageContext, split: Split, material: str) -> None:
+        self.simulator = build_simulator(context.settings, material, on_failure="count")
         q, v = read_fields(context.run_dir / TRAJECTORIES, "trajectories", "q", "v")
         part = split.indices("validation")
         self._target = q[part]
         self._start = State(self.simulator.tensor(q[part, 0]), self.simulator.tensor(v[part, 0]))
 
-    def __call__(self, model: ResidualForce) -> float:
-        """Rolls the model out."""
-        steps = self._target.shape[1] - 1
-        positions = closed_loop(self.simulator, predictor(model), self._start, steps).cpu().numpy()
+    def error_mm(self, rollout: Rollout) -> float:
+        """Mean error [mm], infinite where a roll-out diverged."""
+        positions = closed_loop(rollout, self._start, self._target.shape[1] - 1).cpu().numpy()
         pairs = zip(positions, self._target, strict=True)
         mean = summarise([trajectory_errors(q, target) for q, target in pairs])["mean"]
         return float("inf") if mean is None else mean
 
 
-def predictor(model: ResidualForce) -> Predictor:
+def force_predictor(model: ResidualForce) -> ForcePredictor:
     """The model as a function on the simulator's device, wherever its weights are."""
-    device = model.rest.device
+    device, dtype = model.rest.device, model.rest.dtype
 
     def predict(q: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
-        dtype = model.rest.dtype
         return model(q.to(device, dtype), v.to(device, dtype)).to(q.device, q.dtype)
 
     return predict
 
 
+def state_predictor(model: NextState) -> StatePredictor:
+    """The model as a function on the simulator's device, wherever its weights are."""
+    device, dtype = model.rest.device, model.rest.dtype
+
+    def predict(q: torch.Tensor, v: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        positions, velocities = model(q.to(device, dtype), v.to(device, dtype))
+        return positions.to(q.device, q.dtype), velocities.to(q.device, q.dtype)
+
+    return predict
+
+
 def load_model(path: Path) -> ResidualForce:
-    """A model that `train` wrote."""
-    tensors, metadata = read_checkpoint(path, "residual force")
-    return restore(tensors, metadata)
+    """A residual force that `train` wrote."""
+    return restore(ResidualForce, *read_checkpoint(path, "residual force"))
+
+
+def load_simfree(path: Path) -> NextState:
+    """A data-driven model that `train_simfree` wrote."""
+    return restore(NextState, *read_checkpoint(path, "next state"))

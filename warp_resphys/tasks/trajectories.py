@@ -15,14 +15,17 @@ from ..integrator import State
 from ..resumable import Field, ResumableHDF5
 
 SPLITS = ("train", "validation", "test")
-STAGES = ("generate", "reconstruct", "train", "evaluate", "report")
+STAGES = ("generate", "reconstruct", "train", "train_simfree", "evaluate", "time", "report")
 
 TRAJECTORIES = "trajectories.h5"
 RECONSTRUCTION = "reconstruction.h5"
 MODEL = "model.safetensors"
 TRAINING = "training.json"
+SIMFREE = "simfree.safetensors"
+SIMFREE_TRAINING = "simfree_training.json"
 ROLLOUTS = "rollouts.h5"
 ERRORS = "errors.json"
+TIMES = "times.json"
 METRICS = "metrics.json"
 REPORT = "report.html"
 
@@ -46,24 +49,68 @@ class Split:
         return slice(start[name], start[name] + len(getattr(self, name)))
 
 
-def weight_split(data: Mapping[str, Any]) -> tuple[Split, NDArray[np.float64]]:
-    """The trajectories of an experiment with one weight each, and the weights (B,) [kg].
+@dataclass(frozen=True)
+class Variation:
+    """What sets the trajectories of an experiment apart.
+
+    Attributes:
+        key: under ``data``, with a list for each split.
+        unit: of the configured values.
+        factor: from there to SI units.
+    """
+
+    key: str
+    unit: str
+    factor: float
+
+
+VARIATIONS = {
+    "release_from_load": Variation("weights_g", "g", 1e-3),
+    "release_from_twist": Variation("angles_deg", "°", np.pi / 180.0),
+}
+
+
+def variation_of(data: Mapping[str, Any]) -> Variation:
+    """What sets the trajectories of this kind of data apart.
 
     Raises:
-        InputError: an empty split, a weight that is not positive, or one in two splits.
+        InputError: an unknown kind.
     """
-    weights = {name: [float(w) for w in data["weights_g"][name]] for name in SPLITS}
-    for name, values in weights.items():
-        if not values:
-            raise InputError(f"data.weights_g.{name} is empty: give the split at least one weight.")
-        if not all(np.isfinite(w) and w > 0.0 for w in values):
-            raise InputError(f"data.weights_g.{name} holds a weight that is not positive, in grams: {values}.")
-    everything = [w for values in weights.values() for w in values]
-    twice = sorted({w for w in everything if everything.count(w) > 1})
+    if data["kind"] not in VARIATIONS:
+        raise InputError(f"data.kind is {data['kind']!r}: choose one of {', '.join(VARIATIONS)}.")
+    return VARIATIONS[data["kind"]]
+
+
+def split_of(data: Mapping[str, Any]) -> tuple[Split, NDArray[np.float64]]:
+    """The trajectories of an experiment and the value (B,) that sets each apart, in SI units.
+
+    Raises:
+        InputError: an empty split, a value that is not positive, or one in two splits.
+    """
+    kind = variation_of(data)
+    values = {name: [float(x) for x in data[kind.key][name]] for name in SPLITS}
+    for name, row in values.items():
+        if not row:
+            raise InputError(f"data.{kind.key}.{name} is empty: give the split at least one value.")
+        if not all(np.isfinite(x) and x > 0.0 for x in row):
+            raise InputError(f"data.{kind.key}.{name} holds a value that is not positive: {row}.")
+    everything = [x for row in values.values() for x in row]
+    twice = sorted({x for x in everything if everything.count(x) > 1})
     if twice:
-        raise InputError(f"data.weights_g names {twice[0]:g} g twice: every trajectory belongs to one split.")
-    split = Split(*(tuple(f"{w:g} g" for w in weights[name]) for name in SPLITS))
-    return split, 1e-3 * np.array(everything)
+        raise InputError(f"data.{kind.key} names {twice[0]:g} {kind.unit} twice: every trajectory is in one split.")
+    space = "" if kind.unit == "°" else " "
+    if data["limit"] is not None:
+        values = {name: _evenly(row, data["limit"][name]) for name, row in values.items()}
+    split = Split(*(tuple(f"{x:g}{space}{kind.unit}" for x in values[name]) for name in SPLITS))
+    return split, kind.factor * np.concatenate([values[name] for name in SPLITS])
+
+
+def _evenly(row: list[float], limit: int) -> list[float]:
+    """At most that many values of a row, spread over it."""
+    if limit < 1:
+        raise InputError(f"data.limit is {limit} for a split: it must be at least 1.")
+    places = np.linspace(0, len(row) - 1, min(limit, len(row))).round().astype(int)
+    return [row[i] for i in places]
 
 
 def state_fields(batch: int, vertices: int) -> dict[str, Field]:

@@ -1,0 +1,26 @@
+"""Deformed shapes given by a formula."""
+
+import torch
+
+
+def twisted(positions: torch.Tensor, angles: torch.Tensor, axis: int = 0) -> torch.Tensor:
+    """A body twisted about the centre line of its bounding box.
+
+    Every cross-section turns as a whole, by an angle that grows linearly along the axis from zero at the low end.
+
+    Args:
+        positions: (N, 3) [m].
+        angles: (B,) of the high end [rad].
+        axis: 0, 1 or 2.
+
+    Returns:
+        (B, N, 3) [m].
+    """
+    low, high = positions.amin(0), positions.amax(0)
+    centred = positions - 0.5 * (low + high)
+    phi = angles[:, None] * (positions[:, axis] - low[axis]) / (high[axis] - low[axis])  # (B, N)
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    turned = positions.expand(len(angles), -1, -1).clone()
+    turned[..., i] += torch.cos(phi) * centred[:, i] - torch.sin(phi) * centred[:, j] - centred[:, i]
+    turned[..., j] += torch.sin(phi) * centred[:, i] + torch.cos(phi) * centred[:, j] - centred[:, j]
+    return turned

@@ -100,10 +100,13 @@ def test_body(options, message):
     [
         (PointMass(-0.1, [0]), "a point mass of -0.1 kg: its mass must be zero or more"),
         (PointMass(NAN, [0]), "a point mass of nan kg"),
-        (PointMass(0.1, []), f"a point mass must hang on vertices 0 to {VERTICES - 1}"),
-        (PointMass(0.1, [VERTICES]), f"a point mass must hang on vertices 0 to {VERTICES - 1}"),
-        (PointMass(0.1, [0, 1], [0.5]), "a point mass on 2 vertices needs 2 weights that sum to one"),
-        (PointMass(0.1, [0, 1], [0.5, 0.6]), "a point mass on 2 vertices needs 2 weights that sum to one"),
+        (PointMass(0.1, []), "a point mass must hang on at least one vertex"),
+        (PointMass(0.1, [VERTICES]), f"a point mass's vertices must lie between 0 and {VERTICES - 1}"),
+        (PointMass(0.1, [True, False]), "a point mass's vertices must be vertex numbers"),
+        (PointMass(0.1, [0, 1], [0.5]), "a point mass on 2 vertices needs 2 weights, zero or more, that sum to one"),
+        (PointMass(0.1, [0, 1], [2.0, -1.0]), "a point mass on 2 vertices needs 2 weights, zero or more"),
+        (PointMass(0.1, [0, 1], [NAN, 1.0]), "a point mass on 2 vertices needs 2 weights, zero or more"),
+        (PointMass(0.1, [0, 1], [0.5, 0.6]), "a point mass on 2 vertices needs 2 weights, zero or more"),
     ],
 )
 def test_point_mass(mass, message):

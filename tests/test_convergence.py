@@ -17,8 +17,9 @@ from warp_resphys import (
     quadratic,
     select_vertices,
 )
-from warp_resphys.elements import gauss_hexahedron, hexahedron_shape, physical_gradients
+from warp_resphys.elements import physical_gradients
 from warp_resphys.material import small_strain_poissons_ratio
+from warp_resphys.shape_functions import gauss_hexahedron, hexahedron_shape
 
 BEAM = (0.1, 0.03, 0.03)
 SILICONE = {"youngs_modulus": 264e3, "density": 1070.0}

@@ -18,19 +18,18 @@ from warp_resphys import (
     box_tetrahedra,
     quadratic,
 )
-from warp_resphys.elements import (
+from warp_resphys.elements import discretise, physical_gradients
+from warp_resphys.errors import InputError
+from warp_resphys.mesh import surface_vertices
+from warp_resphys.shape_functions import (
     TETRAHEDRON_EDGES,
     degree_four_tetrahedron,
-    discretise,
     gauss_hexahedron,
     gauss_tetrahedron,
     hexahedron_shape,
-    physical_gradients,
     tetrahedron10_shape,
     tetrahedron_shape,
 )
-from warp_resphys.errors import InputError
-from warp_resphys.mesh import surface_vertices
 
 SIZE, DIVISIONS = (0.03, 0.02, 0.02), (3, 2, 2)
 HEXAHEDRON_NODES = np.array(

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import math
 import runpy
 import sys
 from dataclasses import replace
@@ -146,6 +147,42 @@ def test_gradient_through_a_hundred_and_twenty_steps(integrator):
     assert derivative(of_velocity, state.v, 1e-3 * noise(*state.v.shape)).relative_error <= 1e-6
 
 
+def moving_clamp(s, steps):
+    """(T, 2, D, 3) targets of two clamps: one turns about x by 0.1 rad a step, both are carried off and shaken."""
+    clamp = s.rest_positions[s.fixed]
+    time = torch.arange(1, steps + 1, dtype=torch.float64)
+    shift = 1e-3 * torch.stack([time, 0.5 * time**2, 2.0 * (-1.0) ** time], dim=1)[:, None]
+    turn = torch.zeros(steps, 3, 3, dtype=torch.float64)
+    turn[:, 2, 1], turn[:, 1, 2] = 0.1 * time, -0.1 * time
+    centre = clamp.mean(0)
+    turned = centre + (clamp - centre) @ torch.linalg.matrix_exp(turn).mT
+    return torch.stack([turned + shift, clamp - 0.5 * shift], dim=1)
+
+
+@pytest.mark.parametrize("kind", MESHES)
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_a_clamp_that_moves(integrator, kind):
+    s = simulator(kind, integrator=integrator)
+    state, steps = pose(s, "bent", 2), 4
+    targets = moving_clamp(s, steps)
+    weights = noise(steps + 1, *state.q.shape, seed=1), s.time_step * noise(steps + 1, *state.q.shape, seed=2)
+
+    def loss(targets=targets, q=state.q, v=state.v, **constants):
+        moved = s.rollout(State(q, v), steps, fixed_positions=targets, material=replace(DAMPED, **constants))
+        return (weights[0] * moved.q).sum() + (weights[1] * moved.v).sum()
+
+    one = torch.ones(1, dtype=torch.float64)
+    cases = {
+        "targets": (lambda x: loss(targets=x), targets, 1e-6 * noise(*targets.shape, seed=3)),
+        "positions": (lambda x: loss(q=x), state.q, 1e-6 * noise(*state.q.shape, seed=4)),
+        "velocities": (lambda x: loss(v=x), state.v, 1e-4 * noise(*state.v.shape, seed=5)),
+        "E": (lambda x: loss(youngs_modulus=x), 264e3 * one, 2e3 * one),
+        "damping": (lambda x: loss(stiffness_damping=x), 2e-3 * one, 1e-5 * one),
+    }
+    errors = {name: derivative(*case).relative_error for name, case in cases.items()}
+    assert {name: error for name, error in errors.items() if not error <= 1e-6} == {}
+
+
 @pytest.mark.parametrize("kind", MESHES)
 def test_static_equilibrium(kind):
     s = simulator(kind)
@@ -221,17 +258,54 @@ def test_table_shows_what_differs():
     console.print(gradient_table(rows, "nu = 0.45, bent", 1e-6))
     lines = console.file.getvalue().splitlines()
     red = [line for line in lines if "\x1b[31m" in line]
-    assert len(red) == 1
+    assert len(red) == 2
     assert "density" in red[0]
     assert "4.8e-02" in red[0]
+    assert "v " in red[1]
+    assert "inf" in red[1]
+
+
+@pytest.mark.parametrize(
+    ("adjoint", "difference", "error"),
+    [
+        (2.0, 1.0, 0.5),
+        (0.0, 1e-9, 1.0),
+        (0.0, 0.0, math.inf),  # vanishing in both tells nothing
+        (math.nan, 1.0, math.inf),
+        (1.0, math.nan, math.inf),
+        (math.inf, math.inf, math.inf),
+    ],
+)
+def test_a_row_that_compares_nothing_is_an_infinite_error(adjoint, difference, error):
+    assert GradientRow("", adjoint, difference).relative_error == error
+
+
+def run_script(tmp_path, monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["gradcheck.py", *arguments, f"hydra.run.dir={tmp_path}"])
+    runpy.run_path(str(Path(__file__).parents[1] / "scripts" / "gradcheck.py"))["main"]()
+
+
+@pytest.mark.parametrize("values", [(0.0, 0.0), (math.nan, 1.0), (1.0, math.nan)])
+def test_script_fails_where_a_row_compares_nothing(values, tmp_path, monkeypatch, capsys):
+    rows = [GradientRow("v", *values), GradientRow("E, scalar", 1.0, 1.0)]
+    monkeypatch.setattr("warp_resphys.gradient_check.check_configured", lambda config: iter([(0.45, "rest", rows)]))
+    with pytest.raises(SystemExit) as ended:
+        run_script(tmp_path, monkeypatch)
+    assert ended.value.code == 1
+    assert "Largest relative error: inf" in capsys.readouterr().out
+
+
+def test_a_body_without_a_clamp_has_no_row_for_it():
+    free = Simulator(Body(MESHES["hexahedron"]), DAMPED, solver=TIGHT)
+    rows = check_gradients(free, "bent", steps=1, batch=1)
+    assert [row.parameter for row in rows] == [kind for kind in KINDS if kind != "fixed positions"]
+    assert all(row.relative_error <= 1e-6 for row in rows)
 
 
 @pytest.mark.parametrize(("tolerance", "code"), [(1e-6, 0), (1e-16, 1)])
 def test_script_fails_beyond_the_tolerance(tolerance, code, tmp_path, monkeypatch, capsys):
     arguments = [*SMALL, "gradcheck.poissons_ratios=[0.45]", f"gradcheck.tolerance={tolerance}"]
-    monkeypatch.setattr(sys, "argv", ["gradcheck.py", *arguments, f"hydra.run.dir={tmp_path}"])
-    script = runpy.run_path(str(Path(__file__).parents[1] / "scripts" / "gradcheck.py"))
     with pytest.raises(SystemExit) if code else contextlib.nullcontext() as ended:
-        script["main"]()
+        run_script(tmp_path, monkeypatch, *arguments)
     assert ended is None or ended.value.code == code
     assert "Largest relative error" in capsys.readouterr().out

@@ -8,7 +8,7 @@ import torch
 from warp_resphys import Body, Material, Simulator, SolverSettings, State, box_hexahedra, select_vertices
 from warp_resphys.errors import ConvergenceError, InputError
 from warp_resphys.residual.reconstruction import conjugate_gradients, make_reconstructor
-from warp_resphys.residual.rollout import closed_loop
+from warp_resphys.residual.rollout import HybridRollout, closed_loop
 
 INTEGRATORS = ("implicit_euler", "bdf2", "midpoint")
 H = 0.01
@@ -264,7 +264,7 @@ class TestClosedLoop:
         sim = simulator()
         _, force = reconstruct("gauss_newton", sim, start, observed, 0.0)
         steps = iter(force)
-        positions = closed_loop(sim, lambda q, v: next(steps), start, 5)
+        positions = closed_loop(HybridRollout(sim, lambda q, v: next(steps)), start, 5)
         np.testing.assert_allclose(positions, observed.transpose(0, 1), rtol=0, atol=1e-9)
 
     def test_what_diverges_is_marked_and_does_not_touch_the_others(self):
@@ -282,7 +282,7 @@ class TestClosedLoop:
             return force
 
         predict.calls = 0
-        positions = closed_loop(counting, predict, start, 5)
+        positions = closed_loop(HybridRollout(counting, predict), start, 5)
         lost = torch.isnan(positions).all(3).all(2)
         assert lost.tolist() == [
             [False, False, True, True, True, True],

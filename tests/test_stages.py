@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 from rich.console import Console
+from rich.progress import Progress as Bars
 
 from warp_resphys.errors import DataFileError, InputError
 from warp_resphys.files import write_json
@@ -276,15 +277,29 @@ class TestProgress:
             advance_and_stop(bar)
         assert stream.getvalue().splitlines() == ["fit: 1/9 runs, 30:00 each, 4:00:00 left"]
 
-    def test_a_terminal_gets_a_bar_and_a_call_costs_little(self):
+    @pytest.mark.parametrize(("terminal", "most"), [(True, 201), (False, 2)], ids=["terminal", "log"])
+    def test_most_calls_only_count(self, clock, monkeypatch, terminal, most):
+        """In 20 s a bar is drawn every 0.1 s at most, a line printed every 10 s."""
+        described, shown, update, out = [], [], Bars.update, Console.print
+
+        class Observed(Progress):
+            def status(self) -> str:
+                described.append(self.done)
+                return super().status()
+
+        def updated(*arguments, **options):
+            shown.append(arguments)
+            return (update if terminal else out)(*arguments, **options)
+
         stream = io.StringIO()
-        console = Console(file=stream, force_terminal=True, width=120)
-        calls = 20_000
-        with Progress("roll out", calls, "steps", console=console) as bar:
-            start = time.perf_counter()
-            for step in range(calls):
+        console = Console(file=stream, force_terminal=terminal, width=120)
+        monkeypatch.setattr(*((Bars, "update") if terminal else (Console, "print")), updated)
+        with Observed("roll out", 20_000, "steps", console=console) as bar:
+            described.clear()
+            for step in range(20_000):
+                clock[0] += 1e-3
                 bar.advance(error=0.5 * step)
-            spent = time.perf_counter() - start
-        assert spent / calls < 20e-6
-        assert f"{calls}/{calls} steps" in stream.getvalue()
+            assert len(described) == len(shown)
+            assert 0.9 * most <= len(shown) <= most
+        assert "20000/20000 steps" in stream.getvalue()
         assert "error 1e+04" in stream.getvalue()

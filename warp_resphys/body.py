@@ -15,6 +15,20 @@ from .mesh import Mesh
 MASS_MODES = ("row_sum", "per_vertex")
 
 
+def _vertex_indices(values: ArrayLike, n_vertices: int, what: str) -> NDArray[np.int64]:
+    """(n,) indices of vertices that the mesh has.
+
+    Raises:
+        InputError: values that are no whole numbers, such as a mask, or that no vertex has.
+    """
+    indices = np.asarray(values).ravel()
+    if indices.size and indices.dtype.kind not in "iu":
+        raise InputError(f"{what} must be vertex numbers: turn a mask into them with np.flatnonzero.")
+    if indices.size and (indices.min() < 0 or indices.max() >= n_vertices):
+        raise InputError(f"{what} must lie between 0 and {n_vertices - 1}.")
+    return indices.astype(np.int64)
+
+
 @dataclass(frozen=True)
 class PointMass:
     """A weight that moves with the body: it has inertia, and hangs in gravity.
@@ -35,15 +49,15 @@ class PointMass:
         Raises:
             InputError: a negative mass, a vertex that the mesh does not have, or weights that do not sum to one.
         """
-        vertices = np.asarray(self.vertices, dtype=np.int64).ravel()
+        vertices = _vertex_indices(self.vertices, n_vertices, "a point mass's vertices")
         n = len(vertices)
         weights = np.full(n, 1.0 / max(n, 1)) if self.weights is None else np.asarray(self.weights, dtype=float)
         if not np.isfinite(self.mass) or self.mass < 0.0:
             raise InputError(f"a point mass of {self.mass:g} kg: its mass must be zero or more.")
-        if n == 0 or vertices.min() < 0 or vertices.max() >= n_vertices:
-            raise InputError(f"a point mass must hang on vertices 0 to {n_vertices - 1} of the mesh.")
-        if weights.shape != (n,) or abs(weights.sum() - 1.0) > 1e-9:
-            raise InputError(f"a point mass on {n} vertices needs {n} weights that sum to one.")
+        if n == 0:
+            raise InputError("a point mass must hang on at least one vertex.")
+        if weights.shape != (n,) or not (weights >= 0.0).all() or not abs(weights.sum() - 1.0) <= 1e-9:
+            raise InputError(f"a point mass on {n} vertices needs {n} weights, zero or more, that sum to one.")
         mass = np.zeros(n_vertices)
         np.add.at(mass, vertices, weights * self.mass)
         return mass
@@ -55,7 +69,8 @@ class Body:
 
     Attributes:
         mesh: the rest shape.
-        fixed: (D,) vertices with prescribed positions (Dirichlet); they rest where they are unless moved.
+        fixed: vertices with prescribed positions (Dirichlet); they rest where they are unless moved. Their positions
+            are given in the order of ``fixed_vertices``.
         mass: ``row_sum`` lumps each element's own mass on its vertices (HRZ for 10-node tetrahedra). ``per_vertex``
             gives every vertex the density times the mean element volume, which is wrong by a factor of two on the
             published beam and serves for comparison with the published code alone.
@@ -77,9 +92,7 @@ class Body:
         """
         if self.mass not in MASS_MODES:
             raise InputError(f"mass is {self.mass!r}: choose one of {', '.join(MASS_MODES)}.")
-        fixed = np.unique(np.asarray(self.fixed, dtype=np.int64))
-        if len(fixed) and (fixed[0] < 0 or fixed[-1] >= self.n_vertices):
-            raise InputError(f"fixed vertices must lie between 0 and {self.n_vertices - 1}.")
+        fixed = np.unique(_vertex_indices(self.fixed, self.n_vertices, "fixed vertices"))
         if len(fixed) == self.n_vertices:
             raise InputError("every vertex is fixed: leave some free to move.")
         object.__setattr__(self, "fixed", fixed)
@@ -91,7 +104,7 @@ class Body:
 
     @property
     def fixed_vertices(self) -> NDArray[np.int64]:
-        """(D,) sorted vertices with prescribed positions."""
+        """(D,) vertices with prescribed positions, in ascending order."""
         return np.asarray(self.fixed)
 
     @cached_property

@@ -7,6 +7,7 @@ from typing_extensions import override
 
 from .assembly import BlockPattern
 from .body import Body
+from .errors import ConvergenceError
 from .linear_solver import make_linear_solver
 from .metric import HessianMetric
 from .potential import IncrementalPotential, StepTerms
@@ -111,6 +112,7 @@ class Equilibrium(torch.autograd.Function):
         with threads_for(x.numel()):
             metric.refactor_exact()
             z = metric.apply(gradient.reshape(len(x), -1)).view_as(x)
+        _check_adjoint(potential, z, gradient)
         needs = dict(zip(_INPUTS, ctx.needs_input_grad, strict=True))
         grads: dict[str, torch.Tensor | None] = dict.fromkeys(_INPUTS)
         grads["target"] = terms.inertia[..., None] * z * potential.free_mask[:, None]
@@ -144,6 +146,25 @@ _INPUTS = (
     "viscosity",
     "reference_strain",
 )
+
+
+def _check_adjoint(potential: IncrementalPotential, z: torch.Tensor, gradient: torch.Tensor) -> None:
+    """Refuses an adjoint that does not solve its system.
+
+    Raises:
+        ConvergenceError: the Hessian is singular, as where a body can turn about its only fixed vertex.
+    """
+    right = gradient * potential.free_mask[:, None]
+    left = (potential.stiffness_product(z) + potential.inertia[..., None] * z) * potential.free_mask[:, None]
+    error = (left - right).flatten(1).norm(dim=1)
+    loose = 1e-6 if z.dtype == torch.float64 else 1e-2
+    if not bool((error <= loose * right.flatten(1).norm(dim=1)).all()):
+        raise ConvergenceError(
+            "the adjoint system is singular at a state of the roll-out, so that there is no gradient: fix the body so "
+            "that it cannot move freely, or keep away from the point where it buckles.",
+            potential.positions.clone(),
+            None,
+        )
 
 
 class GreenStrain(torch.autograd.Function):

@@ -27,6 +27,7 @@ from .errors import InputError
 
 LINEAR_SOLVERS = ("auto", "banded", "dense", "sparse")
 Indices = NDArray[np.int64]
+_MOST_VALUES = 2**31 // 8 - 1  # Warp's strides are 32-bit numbers of bytes.
 
 
 class Factor(ABC):
@@ -54,6 +55,9 @@ class LinearSolver(ABC):
         device: where values and right-hand sides live.
         dtype: their type.
 
+    Raises:
+        InputError: a matrix too large for the layout.
+
     Attributes:
         address: (E, block^2) place of each block's entries in the value array, -1 where not stored.
         n_values: length of the value array.
@@ -70,6 +74,11 @@ class LinearSolver(ABC):
         self.device = device
         self.dtype = dtype
         self._lay_out(rows, cols, n_nodes)
+        if self.n_values > _MOST_VALUES:
+            raise InputError(
+                f"a {type(self).__name__} for {self.n} unknowns needs {self.n_values:.1e} numbers, beyond the "
+                f"{_MOST_VALUES:.1e} that a kernel addresses: choose solver.linear_solver=sparse."
+            )
 
     @abstractmethod
     def _lay_out(self, rows: Indices, cols: Indices, n_nodes: int) -> None:
@@ -104,8 +113,8 @@ class BandedSolver(LinearSolver):
         diagonal_upper = (rows == cols)[:, None] & swap
         i, j = np.where(swap, j, i), np.where(swap, i, j)
         self.bandwidth = int((i - j).max())
-        self.address = np.where(diagonal_upper, -1, j * (self.bandwidth + 1) + (i - j)).astype(np.int32)
         self.n_values = self.n * (self.bandwidth + 1)
+        self.address = np.where(diagonal_upper, -1, j * (self.bandwidth + 1) + (i - j)).astype(np.int32)
         dofs = (order[:, None] * self.block + np.arange(self.block)).ravel()
         self._order = torch.as_tensor(dofs)
         self._place = torch.argsort(self._order)
@@ -269,7 +278,9 @@ class _SparseFactor(Factor):
         columns = rhs.permute(1, 0, 2).reshape(1, n, b * m) if shared else rhs
         solutions = []
         for factor, right in zip(self._factors, columns, strict=True):
-            if self._cholmod:
+            if factor is None:
+                solution = torch.full_like(right, torch.nan)
+            elif self._cholmod:
                 right = right.to(torch.float64).contiguous()
                 solution = torch.empty_like(right)
                 # CHOLMOD's GPU solve takes at most 128 columns at once.

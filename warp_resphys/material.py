@@ -92,7 +92,10 @@ def small_strain_poissons_ratio(poissons_ratio: float) -> float:
 
 
 def _check(name: str, value: Parameter, low: float, high: float, wanted: str, closed: bool = False) -> None:
-    values = torch.as_tensor(value, dtype=torch.float64).detach().cpu()
+    try:
+        values = torch.as_tensor(value, dtype=torch.float64).detach().cpu()
+    except (TypeError, ValueError, RuntimeError):
+        raise InputError(f"{name} is {value!r}: it must be {wanted}.") from None
     inside = (values >= low if closed else values > low) & (values < high) & torch.isfinite(values)
     if values.numel() == 0 or values.ndim > 2:
         raise InputError(f"{name} has shape {tuple(values.shape)}: give a number, (M,), (B, 1) or (B, M) values.")

@@ -6,12 +6,21 @@ Nodes are numbered as VTK numbers them. Lengths are metres; conversion from othe
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
 from warp_resphys.errors import MeshError
+from warp_resphys.shape_functions import (
+    HEXAHEDRON_NODES,
+    TETRAHEDRON10_NODES,
+    TETRAHEDRON_EDGES,
+    gauss_hexahedron,
+    gauss_tetrahedron,
+    hexahedron_shape,
+    tetrahedron10_shape,
+    tetrahedron_shape,
+)
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -78,53 +87,42 @@ def _tetrahedron_type() -> _CellType:
     """4 nodes; the map is affine, so one point tells all."""
     return _CellType(
         name="tetrahedron",
-        edges=np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]]),
+        edges=TETRAHEDRON_EDGES,
         faces=np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]),
         triangles=np.array([[0, 1, 2]]),
-        gradients=np.vstack([-np.ones(3), np.eye(3)])[None],
+        gradients=tetrahedron_shape(np.zeros((1, 3)))[1],
         weights=np.array([1 / 6]),
     )
 
 
 def _tetrahedron10_type() -> _CellType:
-    """4 corners, then the midpoints of the edges in the order of `edges`.
-
-    The points are those of the 4-point rule of degree 2 (Hammer, Marlowe and Stroud 1956), then the nodes.
-    """
-    linear = _tetrahedron_type()
-    first, second = linear.edges.T
-    corners = np.eye(4)
-    inner = (5 - sqrt(5)) / 20
-    points = np.vstack([inner + (1 - 4 * inner) * corners, corners, (corners[first] + corners[second]) / 2])
-    slopes = linear.gradients[0]  # (4, 3) of the barycentric coordinates
-    at_corners = (4 * points - 1)[:, :, None] * slopes
-    at_edges = 4 * (points[:, first, None] * slopes[second] + points[:, second, None] * slopes[first])
+    """4 corners, then the midpoints of the edges; the points are those of the 4-point rule, then the nodes."""
+    points, weights = gauss_tetrahedron()
     return _CellType(
         name="tetrahedron10",
-        edges=linear.edges,
+        edges=TETRAHEDRON_EDGES,
         faces=np.array([[0, 2, 1, 6, 5, 4], [0, 1, 3, 4, 8, 7], [1, 2, 3, 5, 9, 8], [0, 3, 2, 7, 9, 6]]),
         triangles=np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]]),
-        gradients=np.concatenate([at_corners, at_edges], axis=1),
-        weights=np.repeat([1 / 24, 0.0], [4, 10]),
+        gradients=tetrahedron10_shape(np.concatenate([points, TETRAHEDRON10_NODES]))[1],
+        weights=np.concatenate([weights, np.zeros(len(TETRAHEDRON10_NODES))]),
     )
 
 
 def _hexahedron_type() -> _CellType:
     """8 nodes, trilinear; the points are the 2x2x2 Gauss points, then the corners."""
-    corners = 2.0 * _BRICK_CORNERS - 1.0
-    points = np.concatenate([corners / sqrt(3), corners])
-    x, y, z = np.moveaxis(1 + points[:, None] * corners, 2, 0)  # each (16, 8)
+    points, weights = gauss_hexahedron()
+    sides = np.linalg.norm(HEXAHEDRON_NODES[:, None] - HEXAHEDRON_NODES, axis=2)
     return _CellType(
         name="hexahedron",
-        edges=np.argwhere(np.triu(np.linalg.norm(corners[:, None] - corners, axis=2) == 2)),
+        edges=np.argwhere(np.triu(sides == 2)),
         faces=np.array([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]]),
         triangles=np.array([[0, 1, 2], [0, 2, 3]]),
-        gradients=corners * np.stack([y * z, z * x, x * y], axis=2) / 8,
-        weights=np.repeat([1.0, 0.0], 8),
+        gradients=hexahedron_shape(np.concatenate([points, HEXAHEDRON_NODES]))[1],
+        weights=np.concatenate([weights, np.zeros(len(HEXAHEDRON_NODES))]),
     )
 
 
-_BRICK_CORNERS = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))])
+_BRICK_CORNERS = (HEXAHEDRON_NODES.astype(np.int64) + 1) // 2  # steps along x, y and z from the lowest corner
 # Kuhn's six tetrahedra around the diagonal from corner 0 to corner 6. The diagonals of opposite faces are
 # parallel, so that neighbouring bricks fit.
 _BRICK_TETRAHEDRA = np.array([[0, a, b, 6] for a, b in ((1, 2), (2, 3), (3, 7), (7, 4), (4, 5), (5, 1))])

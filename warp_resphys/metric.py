@@ -7,6 +7,7 @@ import torch
 from typing_extensions import override
 
 from .assembly import BlockPattern, HessianAssembly
+from .elements import PointSet
 from .linear_solver import Factor, LinearSolver
 from .potential import IncrementalPotential
 
@@ -15,10 +16,11 @@ class Metric(ABC):
     """A factorised approximation of the potential's Hessian.
 
     Attributes:
-        clamped: whether some environment's eigenvalues were clamped in the last factorisation.
+        clamped: (B,) environments whose matrix is positive definite by force or by construction: a line search that
+            fails with it gets no further try.
     """
 
-    clamped = False
+    clamped: torch.Tensor
 
     @abstractmethod
     def ready(self) -> bool:
@@ -48,6 +50,7 @@ class HessianMetric(Metric):
         free = torch.as_tensor(pattern.free, device=potential.device)
         self._dofs = (3 * free[:, None] + torch.arange(3, device=potential.device)).reshape(-1)
         self._factor: Factor | None = None
+        self.clamped = torch.zeros(potential.batch, dtype=torch.bool, device=potential.device)
 
     @override
     def ready(self) -> bool:
@@ -55,21 +58,19 @@ class HessianMetric(Metric):
 
     @override
     def refactor(self, clamp: bool = False) -> None:
-        self.clamped = clamp
-        everywhere = np.ones(self._potential.batch, dtype=bool)
-        self._factor = self._factorise(everywhere if clamp else None)
+        self.clamped.fill_(clamp)
+        self._factor = self._factorise()
         if self._factor.failed.any() and not clamp:
-            self.clamped = True
-            self._factor = self._factorise(self._factor.failed)
+            self.clamped = torch.as_tensor(self._factor.failed, device=self.clamped.device)
+            self._factor = self._factorise()
 
-    def _factorise(self, positive: np.ndarray | None) -> Factor:
-        p = self._potential
-        p.update_tangent(None if positive is None else torch.as_tensor(positive, device=p.device))
+    def _factorise(self) -> Factor:
+        self._potential.update_tangent(self.clamped)
         return self._linear.factor(self._assemble())
 
     def refactor_exact(self) -> None:
         """Factorises the Hessian as it is, indefinite or not: for adjoints."""
-        self.clamped = False
+        self.clamped.zero_()
         self._potential.update_tangent()
         self._factor = self._linear.factor(self._assemble())
         if self._factor.failed.any():
@@ -81,14 +82,6 @@ class HessianMetric(Metric):
             raise RuntimeError("refactor before apply")
         out = torch.zeros_like(residual)
         out[:, self._dofs] = self._factor.solve(residual[:, self._dofs, None])[:, :, 0]
-        return out
-
-    def solve(self, right: torch.Tensor) -> torch.Tensor:
-        """(B, 3 N, m) solutions for (B, 3 N, m) right-hand sides; zero at fixed vertices."""
-        if self._factor is None:
-            raise RuntimeError("refactor before solve")
-        out = torch.zeros_like(right)
-        out[:, self._dofs] = self._factor.solve(right[:, self._dofs])
         return out
 
 
@@ -105,11 +98,12 @@ class ProjectiveMetric(Metric):
         self._address = torch.as_tensor(linear.address[:, 0], device=potential.device, dtype=torch.int64)
         self._products = [self._gradient_products(s) for s in potential.body.discretisation.point_sets]
         self._key: tuple[torch.Tensor, ...] | None = None
+        self.clamped = torch.ones(potential.batch, dtype=torch.bool, device=potential.device)
         self._factor: Factor | None = None
 
-    def _gradient_products(self, points: object) -> torch.Tensor:
+    def _gradient_products(self, points: PointSet) -> torch.Tensor:
         """(C, Q, pairs) scalar products of the gradients of every node pair a >= c of a cell."""
-        gradients = np.asarray(points.gradients)  # type: ignore[attr-defined]
+        gradients = points.gradients
         a, c = np.tril_indices(gradients.shape[2])
         products = np.einsum("cqpi,cqpi->cqp", gradients[:, :, a], gradients[:, :, c])
         return torch.as_tensor(products, device=self._potential.device, dtype=self._potential.dtype)

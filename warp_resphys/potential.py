@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from .body import Body
 from .elements import PointSet
+from .kernels.assembly import assembly_kernels
 from .kernels.elasticity import elasticity_kernels
 from .kernels.tangent import tangent_kernels
 
@@ -108,6 +109,9 @@ class IncrementalPotential:
         scalar = _SCALARS[dtype]
         self._elastic = elasticity_kernels(scalar)
         self._second = tangent_kernels(scalar)
+        assembly_kernels(
+            scalar
+        )  # Joins the Warp module before its first load, which would be compiled twice otherwise.
         self.scalar, self.vec3, self.mat33 = scalar, self._elastic.vec3, self._elastic.mat33
         self.n_vertices = body.n_vertices
         self.n_points = sum(points.n_points for points in body.discretisation.point_sets)

@@ -73,6 +73,23 @@ class Trajectory:
     final: State
 
 
+def _device(name: str | torch.device) -> torch.device:
+    """A device that the kernels run on.
+
+    Raises:
+        InputError: an unknown device, or CUDA without a CUDA device.
+    """
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        raise InputError(f"device is {name!r}: choose cpu or cuda.") from None
+    if device.type not in ("cpu", "cuda"):
+        raise InputError(f"device is {name!r}: choose cpu or cuda.")
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise InputError(f"device is {name!r}, but torch finds no CUDA device: choose device=cpu.")
+    return device
+
+
 @dataclass
 class Simulator:
     """Steps a body through time.
@@ -109,9 +126,7 @@ class Simulator:
             raise InputError(f"time_step is {self.time_step:g}: it must be positive, in seconds.")
         if self.dtype not in (torch.float64, torch.float32):
             raise InputError(f"dtype is {self.dtype}: choose torch.float64 or torch.float32.")
-        self.device = torch.device(self.device)
-        if self.device.type == "cuda" and not torch.cuda.is_available():
-            raise InputError("device is 'cuda', but torch finds no CUDA device: choose device=cpu.")
+        self.device = _device(self.device)
         settings = SolverSettings(name=self.solver) if isinstance(self.solver, str) else self.solver
         if self.relative_tolerance is not None:
             settings = replace(settings, relative_tolerance=self.relative_tolerance)
@@ -130,6 +145,17 @@ class Simulator:
         self._mass_volume = self._sparse(self.body.mass_volume)
         self._load_volume = self._sparse(self.body.load_volume)
         self._attached_mass = self.tensor(self.body.attached_mass)
+        self._built = True
+
+    def __setattr__(self, name: str, value: object) -> None:
+        """Refuses changes: what was uploaded would not follow them.
+
+        Raises:
+            AttributeError: always, once the simulator is built.
+        """
+        if getattr(self, "_built", False):
+            raise AttributeError(f"cannot set {name}: a simulator is constant; dataclasses.replace makes another one.")
+        object.__setattr__(self, name, value)
 
     def tensor(self, values: object) -> torch.Tensor:
         """Values on the simulator's device, in its type."""
@@ -202,7 +228,8 @@ class Simulator:
         Args:
             state: where it is.
             external_force: (B, N, 3) held during the step, gravity not included [N]; zero where left out.
-            fixed_positions: (B, D, 3) of the fixed vertices at the end of the step [m]; where they are, if left out.
+            fixed_positions: (B, D, 3) of the fixed vertices at the end of the step, in the order of
+                ``body.fixed_vertices`` [m]; where they are, if left out.
             material: another material than the simulator's, or one already prepared.
 
         Returns:
@@ -224,7 +251,12 @@ class Simulator:
         reports: list[SolveReport] = []
         solver = workspace.solver("dynamics", self.settings)
         x = Equilibrium.apply(workspace, solver, reports, stage.target, at_stage, *terms.tensors())
-        return self.method.finish(state, x, self.time_step), reports[0]
+        new = self.method.finish(state, x, self.time_step)
+        if stage.end < 1.0 and len(self.fixed):
+            # A prescribed motion has a velocity of its own; extrapolated from mid-step it would ring.
+            velocity = (fixed_positions - state.q[:, self.fixed]) / self.time_step
+            new = replace(new, v=new.v.index_copy(1, self.fixed, velocity))
+        return new, reports[0]
 
     def step_terms(
         self,
@@ -286,7 +318,7 @@ class Simulator:
             fixed_positions = state.q[:, self.fixed]
         force = tensors.weight if external_force is None else tensors.weight + external_force
         workspace = self.workspace(batch, tensors.model)
-        settings = replace(self.settings, name="newton")
+        settings = replace(self.settings, name="newton", on_failure="raise")
         x = Equilibrium.apply(
             workspace,
             workspace.solver("statics", settings),
@@ -313,19 +345,22 @@ class Simulator:
     ) -> Trajectory:
         """Steps many times.
 
-        Memory grows by the states alone: the adjoint of a step rebuilds its Hessian from the state it led to.
+        Memory grows by the states and terms of each step, never by factors: the adjoint of a step rebuilds its Hessian
+        from the state it led to.
 
         Args:
             state: the start.
             steps: T.
             external_forces: (T, B, N, 3) for each step, or (B, N, 3) throughout [N].
-            fixed_positions: (T, B, D, 3) for each step [m].
+            fixed_positions: (T, B, D, 3) for each step, in the order of ``body.fixed_vertices`` [m].
             material: another material than the simulator's.
 
         Raises:
             InputError: wrong shapes, or values that are not finite.
             ConvergenceError: see `step`.
         """
+        if not steps >= 1:
+            raise InputError(f"steps is {steps}: it must be at least 1.")
         for name, values in (("external_forces", external_forces), ("fixed_positions", fixed_positions)):
             if values is not None and values.ndim == 4 and len(values) != steps:
                 raise InputError(f"{name} has {len(values)} time steps, but {steps} are to be simulated.")
@@ -361,6 +396,13 @@ class Simulator:
         for name, (values, shape, unit) in wanted.items():
             if values is None:
                 continue
+            if not isinstance(values, torch.Tensor):
+                raise InputError(f"{name} is a {type(values).__name__}: it must be a torch tensor.")
+            if values.device.type != self.rest_positions.device.type or values.dtype != self.dtype:
+                raise InputError(
+                    f"{name} is {values.dtype} on {values.device}: it must be {self.dtype} on {self.device}; "
+                    "Simulator.tensor converts."
+                )
             if tuple(values.shape) != shape:
                 raise InputError(f"{name} has shape {tuple(values.shape)}: it must be {shape} in {unit}.")
             if not bool(torch.isfinite(values).all()):

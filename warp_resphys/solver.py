@@ -20,7 +20,7 @@ import torch
 from .assembly import BlockPattern
 from .errors import ConvergenceError, InputError
 from .lbfgs import InverseHessianUpdate
-from .linear_solver import make_linear_solver
+from .linear_solver import LINEAR_SOLVERS, make_linear_solver
 from .metric import HessianMetric, Metric, ProjectiveMetric
 from .potential import IncrementalPotential
 
@@ -64,6 +64,10 @@ class SolverSettings:
             raise InputError(f"solver is {self.name!r}: choose one of {', '.join(SOLVERS)}.")
         if self.on_failure not in ("raise", "count"):
             raise InputError(f"solver.on_failure is {self.on_failure!r}: choose raise or count.")
+        if self.linear_solver not in LINEAR_SOLVERS:
+            raise InputError(
+                f"solver.linear_solver is {self.linear_solver!r}: choose one of {', '.join(LINEAR_SOLVERS)}."
+            )
         for key in ("relative_tolerance", "max_iterations", "memory", "refactor_after"):
             if not getattr(self, key) > 0:
                 raise InputError(f"solver.{key} is {getattr(self, key)}: it must be positive.")
@@ -175,7 +179,8 @@ class _Run:
         self.stalls = torch.where(norm < 0.5 * self.smallest, 0, self.stalls + 1)
         self.smallest = torch.minimum(self.smallest, norm)
         at_rounding = (norm <= self.rounding) & (self.stalls >= _STALLS)
-        self.converged = (norm <= s.relative_tolerance * scale) | (norm <= s.absolute_tolerance) | at_rounding
+        small = (norm <= s.relative_tolerance * scale) | (norm <= s.absolute_tolerance) | at_rounding
+        self.converged = small & torch.isfinite(norm) & torch.isfinite(scale)
 
     def advance(self) -> bool:
         """One global step and line search; False when every environment is done."""
@@ -232,6 +237,5 @@ class _Run:
         """Stays where it was; a clamped Hessian gets one more try before the environment counts as stuck."""
         step.masked_fill_(failed, 0.0)
         self.potential.positions.copy_(start).add_((step[:, None] * direction).view_as(start))
-        if self.solver.metric.clamped or self.solver.settings.name == "projective_dynamics":
-            self.stuck |= failed
+        self.stuck |= failed & self.solver.metric.clamped
         self.clamp = True

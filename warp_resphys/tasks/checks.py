@@ -3,6 +3,7 @@
 import inspect
 import math
 import numbers
+import re
 from collections.abc import Callable, Iterator, Mapping
 from fnmatch import fnmatchcase
 from typing import Any
@@ -66,7 +67,7 @@ _NUMBERS = (
     "trainer.*",
 )
 _LISTS = ("gravity", "data.weights_g.*", "data.angles_deg.*")
-_OPTIONAL = ("trainer.linear_noise",)
+_OPTIONAL = ("trainer.linear_noise", "fixed.*", "tip.*", "data.load.*", "data.limit")
 # Groups that are handed on as keyword arguments.
 _TAKEN_BY: Mapping[str, Callable[..., Any]] = {
     "simulation": Material,
@@ -98,6 +99,8 @@ def check_configuration(config: Mapping[str, Any]) -> None:
             raise InputError(f"data.{key} is {group!r}: it must be a group of settings.")
     for key, value in _leaves(config):
         _check_kind(key, value)
+    if not isinstance(config["name"], str) or not re.fullmatch(r"[\w-]+", config["name"]):
+        raise InputError(f"name is {config['name']!r}: a folder is named so: use letters, digits, _ and - alone.")
     if config["dtype"] != "float64":
         raise InputError(f"dtype is {config['dtype']!r}: experiments need float64; float32 is for roll-outs in Python.")
     if len(config["gravity"]) != 3 or not all(map(math.isfinite, config["gravity"])):
@@ -131,7 +134,7 @@ def _leaves(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
 
 def _check_kind(key: str, value: Any) -> None:
     """Compares a value with the first kind that its key belongs to; other keys may hold anything."""
-    if value is None and key in _OPTIONAL:
+    if value is None and any(fnmatchcase(key, pattern) for pattern in _OPTIONAL):
         return
     for patterns, fits, wanted in _KINDS:
         if any(fnmatchcase(key, pattern) for pattern in patterns):

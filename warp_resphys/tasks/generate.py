@@ -4,6 +4,7 @@ import logging
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 
@@ -82,6 +83,8 @@ def held_state(simulator: Simulator, load: Mapping[str, float], weights: NDArray
         weights: (B,) [kg].
     """
     face = torch.as_tensor(select_vertices(simulator.body.mesh, **load), device=simulator.rest_positions.device)
+    if np.isin(face.cpu().numpy(), simulator.body.fixed_vertices).all():
+        raise InputError("data.load names fixed vertices alone: hang the weights on vertices that can move.")
     shares = simulator.tensor(weights)[:, None, None] * simulator.tensor(simulator.gravity) / len(face)
     force = simulator.rest_positions.new_zeros(len(shares), simulator.body.n_vertices, 3)
     force[:, face] = shares

@@ -43,7 +43,7 @@ def main() -> None:
     finest = parser.parse_args().finest
     wp.config.log_level = wp.LOG_WARNING
     table = Table("element", "volume term", "vertices", *(f"nu {nu:g}" for nu in POISSONS_RATIOS))
-    table.title = f"Static sag [mm], E {YOUNGS_MODULUS / 1e3:g} kPa"
+    table.title = f"Static sag in mm, E {YOUNGS_MODULUS / 1e3:g} kPa"
     for refinement in range(1, finest + 1):
         for element, mesh in meshes(refinement).items():
             for integration in ("centre", "full"):

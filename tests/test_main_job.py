@@ -18,6 +18,7 @@ import h5py
 import meshio
 import numpy as np
 import pytest
+import torch
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
@@ -28,7 +29,7 @@ from warp_resphys.residual.reconstruction import LBFGSB
 from warp_resphys.residual.training import Trainer
 from warp_resphys.resumable import ResumableHDF5
 from warp_resphys.stages import package_versions
-from warp_resphys.tasks import experiment
+from warp_resphys.tasks import evaluate, experiment
 from warp_resphys.tasks.checks import check_configuration
 
 REPOSITORY = Path(__file__).parents[1]
@@ -262,13 +263,52 @@ class TestChanges:
         assert found["reconstruction"]["mean"] < 0.1 * found["simulation"]["mean"]
         assert found["resphys"]["mean"] < 0.5 * found["simulation"]["mean"]
 
-    def test_the_published_network_runs_and_a_diverged_roll_out_is_no_number(self, folder):
+    def test_the_published_network_runs(self, folder):
         short = [option for option in TINY if not option.startswith("network")]
         small = ["network=published", "network.width=16", "trainer.epochs=2", "trainer.rollout_every=1"]
-        assert run(*short, *small, "data.steps=60", IN_RUN)[0] == 0
-        found = metrics()["errors_mm"]["resphys"]
-        assert (found["mean"] is None) == (found["diverged"] > 0)
-        assert metrics()["errors_mm"]["simulation"]["diverged"] == 0
+        assert run(*short, *small, IN_RUN)[0] == 0
+        for name, history, kind in (
+            ("model", "training", "residual force"),
+            ("simfree", "simfree_training", "next state"),
+        ):
+            _, metadata = read_checkpoint(f"run/{name}.safetensors", kind)
+            assert metadata["architecture"] == {"blocks": 5, "layers": 3, "width": 16}
+            assert not metadata["reduced"]
+            records = json.loads(Path(f"run/{history}.json").read_text())
+            assert [r["epoch"] for r in records if "rollout_error_mm" in r] == [1, 2]
+        assert metrics()["errors_mm"].keys() == {*MODELS, "simfree"}
+
+    def test_a_diverged_roll_out_is_counted_and_is_no_number(self, finished, copied, monkeypatch):
+        """The second of two test trajectories gets a force that is not finite at its fifth step."""
+        whole = evaluate.force_predictor
+
+        def diverging(model):
+            predict, calls = whole(model), []
+
+            def force(q, v):
+                calls.append(None)
+                found = predict(q, v)
+                found[1] *= torch.nan if len(calls) == 5 else 1.0
+                return found
+
+            return force
+
+        monkeypatch.setattr(evaluate, "force_predictor", diverging)
+        Path("run/rollouts.h5").unlink()
+        assert run(*TINY, IN_RUN)[0] == 0
+        found, before = metrics(), metrics(finished[0])
+        for group in ("errors_mm", "errors_vs_reconstruction_mm"):
+            lost = {"mean": None, "std": None, "trajectories": 2, "diverged": 1}
+            expected = {model: pytest.approx(summary, rel=1e-6) for model, summary in before[group].items()}
+            assert found[group] == {**expected, "resphys": lost}
+        rows, expected = ([each["errors_mm"] for each in m["per_trajectory"]] for m in (found, before))
+        assert rows[0] == pytest.approx(expected[0], rel=1e-6)
+        assert rows[1].pop("resphys") is None
+        assert expected[1].pop("resphys") is not None
+        assert rows[1] == pytest.approx(expected[1], rel=1e-6)
+        with read_hdf5("run/rollouts.h5", "rollouts") as file:
+            assert np.isnan(file["resphys_q"][:]).all((2, 3)).tolist() == [13 * [False], 5 * [False] + 8 * [True]]
+            assert np.isfinite(file["resphys_q"][1, :5]).all()
 
 
 class Interruption:
@@ -535,7 +575,7 @@ class TestBadInput:
         assert code == 2
         assert re.fullmatch(rf"error: [^\n]*{Path.cwd()}/run/report\.html[^\n]*\n", err)
         assert not Path("run/report.html").exists()
-        assert not Path("run/stages/report.json").exists() or ran(copied) == []
+        assert ran(copied) == []  # no record says that there is a report
         assert run(*TINY, IN_RUN)[0] == 0
         assert ran(copied) == ["report"]
         assert Path("run/report.html").stat().st_size > 300_000

@@ -220,6 +220,39 @@ def test_a_diverged_rollout_is_said_and_does_not_hide_the_rest(
     assert len(page.images) == (2 if why_no_drawing else 3)  # Nothing was trained.
 
 
+def test_errors_of_exactly_zero_are_a_report(report_data: ReportData, tmp_path: Path, why_no_drawing: str) -> None:
+    errors = {model: np.zeros((2, STEPS)) for model in report_data.errors_mm}
+    metrics = {
+        **report_data.metrics,
+        "errors_mm": {model: summarise(each) for model, each in errors.items()},
+        "per_trajectory": summarise_each(["a", "b"], errors),
+    }
+    target = report_data.example.target
+    data = dataclasses.replace(
+        report_data,
+        metrics=metrics,
+        errors_mm=errors,
+        example=dataclasses.replace(report_data.example, simulation=target, resphys=target),
+        training=[{"epoch": 1, "train_loss": 0.0, "validation_loss": 0.0, "rollout_error_mm": 0.0}],
+    )
+    write_report(tmp_path / "report.html", data)
+    page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
+    assert "0.000 ± 0.000" in page.text.replace("\u00a0", " ")
+    assert len(page.images) == (3 if why_no_drawing else 4)
+    svgs = [base64.b64decode(link.partition(",")[2]).decode() for link in page.links if "svg+xml" in link]
+    assert sum("zero, or diverged, throughout" in svg for svg in svgs) >= 3
+
+
+def test_a_model_without_error_does_not_hide_the_others() -> None:
+    rows = np.full((2, 5), 0.5)
+    figure = figures.error_over_time({"simulation": rows, "resphys": 0.0 * rows}, TIME_STEP, narrow=False)
+    (axes,) = figure.axes
+    low, high = axes.get_ylim()
+    assert axes.get_yscale() == "log"
+    assert low <= 0.5 <= high
+    assert not axes.texts
+
+
 @pytest.mark.parametrize(
     ("before", "after", "said"),
     [

@@ -164,18 +164,19 @@ def _cases(config: Mapping[str, Any], settings: Mapping[str, Any], refinement: i
                     "max_iterations": settings["max_iterations"],
                 },
             }
-            for batch in limits.get("batches", settings["batches"][kind]):
+            batches = limits.get("batches", settings["batches"][kind])
+            for batch in (b for b in batches if b <= _at(settings["largest_batch"], refinement)):
                 simulator = build_simulator(changed, body=body)
                 start = released(simulator, settings["tip_mass"], batch)
                 simulator.rollout(start, 2)
-                steps = limits.get("steps", _steps(settings["steps"], refinement))
+                steps = limits.get("steps", _at(settings["steps"], refinement))
                 cases.append(Case(solver, material, refinement, batch, steps, simulator, start))
     return cases
 
 
-def _steps(steps: Mapping[Any, int], refinement: int) -> int:
-    """The steps of a refinement, or of the largest one that is named."""
-    named = {int(r): n for r, n in steps.items()}
+def _at(values: Mapping[Any, int], refinement: int) -> int:
+    """The value for a refinement, or for the largest one that is named."""
+    named = {int(r): n for r, n in values.items()}
     return int(named.get(refinement, named[max(named)]))
 
 

@@ -273,7 +273,14 @@ def _positive(values: FloatArray) -> FloatArray:
 
 
 def _logarithmic(axes: Axes) -> None:
-    """A logarithmic axis of at least a decade, labelled 0.1, 1, 10 where that is short, else as powers."""
+    """A logarithmic axis of at least a decade, labelled 0.1, 1, 10 where that is short, else as powers.
+
+    Where there is nothing that it can show, such as errors that are all zero, the axis says so.
+    """
+    if not np.isfinite(axes.dataLim.minposy):
+        axes.set(yticks=[], ylim=(0.0, 1.0))
+        axes.text(0.5, 0.5, "zero, or diverged, throughout", ha="center", va="center", transform=axes.transAxes)
+        return
     axes.set_yscale("log")
     low, high = axes.get_ylim()
     if high < 10.0 * low:

@@ -132,9 +132,10 @@ class ProjectiveMetric(Metric):
         source = torch.as_tensor(self._pattern.contribution, device=blocks.device)
         source = torch.where(source < 0, -1 - source, source)
         counts = torch.as_tensor(np.diff(self._pattern.start), device=blocks.device)
-        target = torch.repeat_interleave(self._address, counts)
+        # Sums in a fixed order, unlike index_add_ on a GPU.
+        sums = torch.segment_reduce(blocks[:, source].mT.contiguous(), "sum", lengths=counts, axis=0)
         values = torch.zeros(batch, self._linear.n_values, device=blocks.device, dtype=blocks.dtype)
-        values.index_add_(1, target, blocks[:, source])
+        values[:, self._address] = sums.mT
         diagonal = torch.as_tensor(self._pattern.rows == self._pattern.cols, device=blocks.device)
         vertex = torch.as_tensor(self._pattern.diagonal_vertex, device=blocks.device)[diagonal]
         values[:, self._address[diagonal]] += inertia[:, vertex]

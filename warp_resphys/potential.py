@@ -22,7 +22,7 @@ from .kernels.assembly import assembly_kernels
 from .kernels.elasticity import elasticity_kernels
 from .kernels.tangent import tangent_kernels
 
-_SCALARS = {torch.float64: wp.float64, torch.float32: wp.float32}
+SCALARS = {torch.float64: wp.float64, torch.float32: wp.float32}
 
 
 def warp_view(tensor: torch.Tensor, dtype: Any) -> Any:
@@ -106,7 +106,7 @@ class IncrementalPotential:
     def __init__(self, body: Body, model: int, batch: int, device: torch.device, dtype: torch.dtype) -> None:
         self.body, self.batch, self.device, self.dtype = body, batch, device, dtype
         self._model = model
-        scalar = _SCALARS[dtype]
+        scalar = SCALARS[dtype]
         self._elastic = elasticity_kernels(scalar)
         self._second = tangent_kernels(scalar)
         assembly_kernels(
@@ -131,6 +131,7 @@ class IncrementalPotential:
         self._tangent: torch.Tensor | None = None
         self._direction = self.zeros(self.n_vertices, 3)
         self._adjoint_commands: list[Any] = []
+        self._stream: tuple[torch.cuda.Stream, Any] | None = None
 
     def zeros(self, *shape: int) -> torch.Tensor:
         """(B, *shape) on the potential's device, in its type."""
@@ -231,7 +232,10 @@ class IncrementalPotential:
             for command in commands:
                 command.launch()
             return
-        stream = wp.stream_from_torch(torch.cuda.current_stream(self.device))
+        handle = torch.cuda.current_stream(self.device)
+        if self._stream is None or self._stream[0] != handle:
+            self._stream = (handle, wp.stream_from_torch(handle))
+        stream = self._stream[1]
         for command in commands:
             command.launch(stream)
 

@@ -22,7 +22,7 @@ from .kernels.assembly import assembly_kernels
 from .kernels.elasticity import elasticity_kernels
 from .kernels.tangent import tangent_kernels
 
-SCALARS = {torch.float64: wp.float64, torch.float32: wp.float32}
+SCALARS: dict[torch.dtype, Any] = {torch.float64: wp.float64, torch.float32: wp.float32}
 
 
 def warp_view(tensor: torch.Tensor, dtype: Any) -> Any:

@@ -22,12 +22,12 @@ import warp as wp
 
 from .errors import InputError
 from .integrator import State
+from .potential import SCALARS
 from .simulator import Simulator
 from .solver import SolveReport
 
 PARAMETERS = ("youngs_modulus", "poissons_ratio", "density", "mass_damping", "stiffness_damping")
 _VECTORS = {torch.float64: wp.vec3d, torch.float32: wp.vec3f}
-_SCALARS = {torch.float64: wp.float64, torch.float32: wp.float32}
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ class _Leaves:
 
     def scalars(self, name: str, array: wp.array) -> torch.Tensor:
         """Leaf of an array of numbers."""
-        return self._leaf(name, array, _SCALARS[self.dtype])
+        return self._leaf(name, array, SCALARS[self.dtype])
 
     def _leaf(self, name: str, array: wp.array, dtype: type) -> torch.Tensor:
         if not isinstance(array, wp.array) or array.dtype != dtype or array.device != self._warp_device:

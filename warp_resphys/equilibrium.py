@@ -103,33 +103,38 @@ class Equilibrium(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        x, *saved = ctx.saved_tensors
-        terms = StepTerms(*saved)
-        potential = ctx.workspace.potential
-        potential.set_terms(terms)
-        potential.positions.copy_(x)
-        metric = ctx.workspace.adjoint_metric(ctx.linear_solver)
-        with threads_for(x.numel()):
-            metric.refactor_exact()
-            z = metric.apply(gradient.reshape(len(x), -1)).view_as(x)
-        _check_adjoint(potential, z, gradient)
-        needs = dict(zip(_INPUTS, ctx.needs_input_grad, strict=True))
-        grads: dict[str, torch.Tensor | None] = dict.fromkeys(_INPUTS)
-        grads["target"] = terms.inertia[..., None] * z * potential.free_mask[:, None]
-        grads["inertia"] = -(z * (x - terms.target)).sum(-1) * potential.free_mask
-        grads["force"] = z
-        if needs["fixed_positions"]:
-            fixed = ctx.workspace.fixed
-            grads["fixed_positions"] = (gradient - potential.stiffness_product(z))[:, fixed]
-        if any(needs[k] for k in ("shape_stiffness", "volume_stiffness", "viscosity", "reference_strain")):
-            adjoints = potential.parameter_adjoint(z)
-            for name in ("shape_stiffness", "volume_stiffness"):
-                if getattr(terms, name).shape[0] == 1:
-                    adjoints[name] = adjoints[name].sum(0, keepdim=True)
-            grads.update(adjoints)
-            if terms.reference_strain is None:
-                grads["reference_strain"] = None
-        return tuple(grads[name] if needs[name] else None for name in _INPUTS)
+        with threads_for(gradient.numel()):
+            return _adjoint(ctx, gradient)
+
+
+def _adjoint(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    """Gradients of the inputs of `Equilibrium.forward`; the equations are in its docstring."""
+    x, *saved = ctx.saved_tensors
+    terms = StepTerms(*saved)
+    potential = ctx.workspace.potential
+    potential.set_terms(terms)
+    potential.positions.copy_(x)
+    metric = ctx.workspace.adjoint_metric(ctx.linear_solver)
+    metric.refactor_exact()
+    z = metric.apply(gradient.reshape(len(x), -1)).view_as(x)
+    product = potential.stiffness_product(z)
+    _check_adjoint(potential, z, product, gradient)
+    needs = dict(zip(_INPUTS, ctx.needs_input_grad, strict=True))
+    grads: dict[str, torch.Tensor | None] = dict.fromkeys(_INPUTS)
+    grads["target"] = terms.inertia[..., None] * z * potential.free_mask[:, None]
+    grads["inertia"] = -(z * (x - terms.target)).sum(-1) * potential.free_mask
+    grads["force"] = z
+    if needs["fixed_positions"]:
+        grads["fixed_positions"] = (gradient - product)[:, ctx.workspace.fixed]
+    if any(needs[k] for k in ("shape_stiffness", "volume_stiffness", "viscosity", "reference_strain")):
+        adjoints = potential.parameter_adjoint(z)
+        for name in ("shape_stiffness", "volume_stiffness"):
+            if getattr(terms, name).shape[0] == 1:
+                adjoints[name] = adjoints[name].sum(0, keepdim=True)
+        grads.update(adjoints)
+        if terms.reference_strain is None:
+            grads["reference_strain"] = None
+    return tuple(grads[name] if needs[name] else None for name in _INPUTS)
 
 
 _INPUTS = (
@@ -148,14 +153,16 @@ _INPUTS = (
 )
 
 
-def _check_adjoint(potential: IncrementalPotential, z: torch.Tensor, gradient: torch.Tensor) -> None:
+def _check_adjoint(
+    potential: IncrementalPotential, z: torch.Tensor, product: torch.Tensor, gradient: torch.Tensor
+) -> None:
     """Refuses an adjoint that does not solve its system.
 
     Raises:
         ConvergenceError: the Hessian is singular, as where a body can turn about its only fixed vertex.
     """
     right = gradient * potential.free_mask[:, None]
-    left = (potential.stiffness_product(z) + potential.inertia[..., None] * z) * potential.free_mask[:, None]
+    left = (product + potential.inertia[..., None] * z) * potential.free_mask[:, None]
     error = (left - right).flatten(1).norm(dim=1)
     loose = 1e-6 if z.dtype == torch.float64 else 1e-2
     if not bool((error <= loose * right.flatten(1).norm(dim=1)).all()):

@@ -162,7 +162,7 @@ class TestModes:
         sim = simulator()
         slowest = vibration_modes(sim, 2).view(12, 3, 2)
         assert float(slowest[:, 0].norm()) < float(slowest[:, 1:].norm())
-        np.testing.assert_allclose(slowest[TIP].sum((0, 1)).abs() > 0.5, True)
+        assert bool((slowest[TIP].sum((0, 1)).abs() > 0.5).all())
         everything = vibration_modes(sim, 24)
         assert np.linalg.matrix_rank(everything.numpy()) == 24
 

@@ -165,15 +165,16 @@ class SparseGaussNewton(Reconstructor):
         metric.refactor_exact()
         residual = workspace.potential.residual.reshape(len(x), -1, 1)
         basis, transposed = self._basis, self._transposed
+        columns = transposed
         by_mode = basis is not None and basis.shape[1] < transposed.shape[2]
-        columns = basis.expand(len(x), -1, -1) if basis is not None and by_mode else transposed
+        if basis is not None and by_mode:
+            columns = basis.expand(len(x), -1, -1)
         solved = metric.solve(torch.cat([columns, residual], dim=2))
         response = solved[:, :, :-1]
         unforced = x - solved[:, :, -1].view_as(x)
-        if by_mode:
-            jacobian = transposed.mT @ response
-        else:
-            jacobian = response.mT if basis is None else response.mT @ basis
+        jacobian = response.mT
+        if basis is not None:
+            jacobian = transposed.mT @ response if by_mode else response.mT @ basis
         missing = (target - self.markers(unforced)).reshape(len(x), -1, 1)
         coefficients = ridge(jacobian, missing, weight)
         force = coefficients if basis is None else basis @ coefficients

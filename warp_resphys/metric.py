@@ -78,10 +78,14 @@ class HessianMetric(Metric):
 
     @override
     def apply(self, residual: torch.Tensor) -> torch.Tensor:
+        return self.solve(residual[:, :, None])[:, :, 0]
+
+    def solve(self, right: torch.Tensor) -> torch.Tensor:
+        """(B, 3 N, m) solutions for (B, 3 N, m) right-hand sides; zero at fixed vertices."""
         if self._factor is None:
-            raise RuntimeError("refactor before apply")
-        out = torch.zeros_like(residual)
-        out[:, self._dofs] = self._factor.solve(residual[:, self._dofs, None])[:, :, 0]
+            raise RuntimeError("refactor before solve")
+        out = torch.zeros_like(right)
+        out[:, self._dofs] = self._factor.solve(right[:, self._dofs])
         return out
 
 

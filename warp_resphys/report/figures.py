@@ -182,6 +182,48 @@ def training_curves(records: Sequence[Mapping[str, Any]], *, narrow: bool) -> Fi
     return figure
 
 
+def marker_boxes(errors: Mapping[int, FloatArray], uncorrected: float, *, narrow: bool) -> Figure:
+    """Draw a box for each number of markers: median, quartiles, and whiskers to the smallest and largest draw.
+
+    Args:
+        errors: (D,) errors [mm] of the draws, by number of markers.
+        uncorrected: Error without any correction [mm].
+        narrow: Whether the figure is for a narrow page.
+    """
+    ink, strong = {"color": TONES["ink"].light, "linewidth": 0.9}, TONES["simulation"].light
+    with mpl.rc_context(_STYLE):
+        figure = _figure(3.6, 3.4, narrow=narrow)
+        axes = figure.subplots()
+        places = range(1, len(errors) + 1)
+        axes.boxplot(
+            [*errors.values()],
+            positions=places,
+            widths=0.55,
+            whis=(0, 100),
+            boxprops=ink,
+            whiskerprops=ink,
+            capprops=ink,
+            medianprops={"color": strong, "linewidth": 2.0},
+        )
+        axes.axhline(uncorrected, color=TONES["muted"].light, linewidth=1.1, linestyle="--")
+        axes.annotate(
+            "uncorrected simulation",
+            (1.0, uncorrected),
+            (-2, 3),
+            xycoords=("axes fraction", "data"),
+            textcoords="offset points",
+            ha="right",
+            color=TONES["muted"].light,
+        )
+        axes.set_xticks([*places], [str(count) for count in errors])
+        axes.set_yscale("log")
+        axes.set_ylim(top=1.6 * max(uncorrected, *(row.max() for row in errors.values())))
+        _logarithmic(axes)
+        axes.grid(visible=False, axis="x")
+        axes.set(xlabel="number of markers", ylabel="mean vertex error [mm]")
+    return figure
+
+
 def shape_comparison(bodies: Mapping[str, Body | None], *, narrow: bool) -> Figure:
     """Show each model's deformed body side by side, coloured by the distance from the target's vertices.
 

@@ -155,7 +155,7 @@ def _draw(data: ReportData, folder: Path) -> tuple[dict[str, Picture], dict[str,
     def both(name: str, draw: "Callable[..., Figure]", alt: str) -> Picture:
         wide, narrow = draw(narrow=False), draw(narrow=True)
         figures.save_png(wide, folder / f"{name}.png")
-        return Picture(_address(figures.themed_svg(wide, name)), _address(figures.themed_svg(narrow, name)), alt)
+        return Picture(svg_address(figures.themed_svg(wide, name)), svg_address(figures.themed_svg(narrow, name)), alt)
 
     motion = _tip_motion(data)
     state = worst_state(data.example)
@@ -189,7 +189,8 @@ def worst_state(example: Example) -> int:
     return 1 + int(np.argmax(np.where(np.isfinite(errors), errors, -1.0)))
 
 
-def _render_page(data: ReportData, pictures: Mapping[str, Picture], missing: Mapping[str, str]) -> str:
+def page_template(name: str) -> jinja2.Template:
+    """Return one of the templates in this package."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("warp_resphys", "report"),
         undefined=jinja2.StrictUndefined,
@@ -197,10 +198,14 @@ def _render_page(data: ReportData, pictures: Mapping[str, Picture], missing: Map
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    return environment.get_template(name)
+
+
+def _render_page(data: ReportData, pictures: Mapping[str, Picture], missing: Mapping[str, str]) -> str:
     metrics = data.metrics
     models = [model for model in _MODELS if model in metrics["errors_mm"] or model in data.published]
     trajectories, steps = next(iter(data.errors_mm.values())).shape
-    return environment.get_template("template.html").render(
+    return page_template("template.html").render(
         data=data,
         metrics=metrics,
         pictures=pictures,
@@ -214,7 +219,7 @@ def _render_page(data: ReportData, pictures: Mapping[str, Picture], missing: Map
         reconstructed={model: error_parts(each) for model, each in metrics["errors_vs_reconstruction_mm"].items()},
         number=number_text,
         duration=duration_text,
-        settings=list(_flatten(data.settings)),
+        settings=list(flatten(data.settings)),
         trajectories=trajectories,
         steps=steps,
         rollouts=any(record.get("rollout_error_mm") is not None for record in data.training),
@@ -315,11 +320,11 @@ def _published_parts(error: PublishedError) -> tuple[str, str]:
     return f"{error.mean:.{decimals}f}", f"± {error.std:.{decimals}f}"
 
 
-def _flatten(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """The settings as the dotted keys by which the command line sets them, with their values."""
+def flatten(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Return the settings as the dotted keys by which the command line sets them, with their values."""
     for key, value in settings.items():
         if isinstance(value, Mapping) and value:
-            yield from _flatten(value, f"{prefix}{key}.")
+            yield from flatten(value, f"{prefix}{key}.")
         elif isinstance(value, list | tuple):
             yield f"{prefix}{key}", f"[{', '.join(str(each) for each in value)}]"
         else:
@@ -364,5 +369,6 @@ def _largest(differences: FloatArray) -> str:
     return f"{number_text(1e3 * float(np.linalg.norm(differences, axis=-1).max()))} mm"
 
 
-def _address(svg: bytes) -> str:
+def svg_address(svg: bytes) -> str:
+    """Return a picture as a data address, for a page that needs no other file."""
     return "data:image/svg+xml;base64," + base64.b64encode(svg).decode("ascii")

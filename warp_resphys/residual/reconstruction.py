@@ -214,22 +214,30 @@ class LBFGSB(Reconstructor):
 
     @override
     def step(self, state: State, observed: torch.Tensor, first_guess: torch.Tensor | None = None) -> Reconstruction:
-        sim = self.simulator
-        free = torch.ones(sim.body.n_vertices, 1, device=observed.device, dtype=observed.dtype)
-        free[sim.fixed] = 0.0
+        free = self._free()
+        return self._minimise(state, lambda q: ((q - observed) * free).square().sum(), first_guess)
+
+    def _free(self) -> torch.Tensor:
+        """(N, 1) zero at fixed vertices, else one."""
+        free = self.simulator.rest_positions.new_ones(self.simulator.body.n_vertices, 1)
+        free[self.simulator.fixed] = 0.0
+        return free
+
+    def _minimise(self, state: State, misfit_of: LinearMap, first_guess: torch.Tensor | None) -> Reconstruction:
+        """The force of least misfit, a scalar function of the next positions (B, N, 3), plus lambda |f|^2."""
+        sim, free, like = self.simulator, self._free(), state.q
 
         def objective(values: np.ndarray) -> tuple[float, np.ndarray]:
-            force = torch.as_tensor(values, device=observed.device, dtype=observed.dtype).reshape(observed.shape)
+            force = torch.as_tensor(values, device=like.device, dtype=like.dtype).reshape(like.shape)
             force.requires_grad_(True)
             new, _ = sim.step(state, free * force, material=self._tensors)
-            misfit = ((new.q - observed) * free).square().sum()
-            value = misfit + self.regularisation * force.square().sum()
+            value = misfit_of(new.q) + self.regularisation * force.square().sum()
             (gradient,) = torch.autograd.grad(value, force)
             # In units of lambda both the objective and its change are of the size of f^2.
             scale = 1.0 / max(self.regularisation, 1e-12)
             return scale * float(value.detach()), scale * gradient.cpu().double().numpy().ravel()
 
-        start = torch.zeros_like(observed) if first_guess is None else first_guess
+        start = torch.zeros_like(like) if first_guess is None else first_guess
         result = scipy.optimize.minimize(
             objective,
             start.cpu().double().numpy().ravel(),
@@ -241,10 +249,10 @@ class LBFGSB(Reconstructor):
             raise ConvergenceError(
                 f"L-BFGS-B found no minimum in {result.nit} iterations: raise reconstruction.max_iterations, "
                 "reconstruction.tolerance or reconstruction.regularisation.",
-                observed,
+                like,
                 None,
             )
-        force = free * sim.tensor(result.x.reshape(observed.shape))
+        force = free * sim.tensor(result.x.reshape(like.shape))
         with torch.no_grad():
             new, _ = sim.step(state, force, material=self._tensors)
         return Reconstruction(new, force, int(result.nit))

@@ -13,6 +13,7 @@ from rich.table import Table
 from ..files import digest, write_json
 from ..report.page import number_text
 from ..stages import Stage, StageContext, run_stages
+from .ablation import run_ablation
 from .checks import check_configuration
 from .evaluate import evaluate
 from .generate import generate
@@ -37,11 +38,17 @@ from .trajectories import (
 _SIMULATED = ("mesh", "physics", "fixed", "gravity", "time_step", "integrator", "solver", "device", "dtype")
 
 
-def stages(config: dict[str, Any]) -> list[Stage]:
-    """The stages of an experiment, each with the settings that it depends on."""
+def simulated(config: dict[str, Any]) -> dict[str, Any]:
+    """The settings that every simulation of an experiment depends on."""
     base = {key: config[key] for key in _SIMULATED}
     if config["mesh"]["kind"] == "file":
         base["mesh_digest"] = digest(config["mesh"]["path"])
+    return base
+
+
+def stages(config: dict[str, Any]) -> list[Stage]:
+    """The stages of an experiment, each with the settings that it depends on."""
+    base = simulated(config)
     corrected = {**base, "simulation": config["simulation"]}
     learned = {**corrected, "data": config["data"]}
     network = {key: config[key] for key in ("network", "trainer", "seed")}
@@ -86,6 +93,9 @@ def run_experiment(config: DictConfig) -> None:
     plain: dict[str, Any] = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)  # type: ignore[assignment]
     check_configuration(plain)
     folder = Path(HydraConfig.get().runtime.output_dir)
+    if "markers" in plain:
+        run_ablation(plain, simulated(plain), folder)
+        return
     run_stages(stages(plain), folder)
     metrics = collect_metrics(StageContext("metrics", folder, "", {}), plain)
     write_json(folder / METRICS, metrics)

@@ -1,0 +1,126 @@
+"""The report of the marker ablation: one HTML page that needs nothing beside it, and its figure as a PNG file."""
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warp_resphys.errors import DataFileError
+from warp_resphys.files import disk_full_error, is_disk_full, write_text
+from warp_resphys.report.page import (
+    NO_BREAK_SPACE,
+    Picture,
+    duration_text,
+    flatten,
+    number_text,
+    page_template,
+    svg_address,
+)
+
+_LOG = logging.getLogger(__name__)
+_FIGURE = "marker_ablation"
+
+
+@dataclass(frozen=True)
+class AblationReport:
+    """Everything that the page shows.
+
+    Attributes:
+        title: The page's heading.
+        experiment: Name of the experiment.
+        metrics: What `metrics.json` holds: `uncorrected_mm`, `by_markers` (a row a number of markers), `seconds`,
+            `versions` and `device`.
+        settings: The run's configuration, nested.
+        vertices: Vertices of the mesh.
+        surface: Those on its surface.
+        free_surface: Those of them that are not clamped.
+    """
+
+    title: str
+    experiment: str
+    metrics: Mapping[str, Any]
+    settings: Mapping[str, Any]
+    vertices: int
+    surface: int
+    free_surface: int
+
+
+def write_ablation_report(path: Path, data: AblationReport) -> None:
+    """Write the page, and its figure into `figures/` beside it.
+
+    Args:
+        path: The page's file, such as `report.html`; missing folders are made.
+        data: What to show.
+
+    Raises:
+        DataFileError: A file could not be written.
+    """
+    folder = path.parent / "figures"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        picture = _draw(data, folder)
+    except OSError as error:
+        if is_disk_full(error):
+            raise disk_full_error(folder) from error
+        raise DataFileError(f"cannot write figures to {folder}: {error.strerror or error}") from error
+    rows = data.metrics["by_markers"]
+    page = page_template("ablation.html").render(
+        data=data,
+        metrics=data.metrics,
+        picture=picture,
+        verdict=verdict(rows, data.metrics["uncorrected_mm"]),
+        clamped=[row["markers"] for row in rows if row["markers"] > data.free_surface],
+        number=number_text,
+        duration=duration_text,
+        settings=list(flatten(data.settings)),
+    )
+    write_text(path, page)
+    _LOG.info("report written: %s", path)
+
+
+def verdict(rows: Sequence[Mapping[str, Any]], uncorrected: float) -> str:
+    """Say from how many markers on the error stays below the published thresholds.
+
+    Args:
+        rows: `by_markers` of the metrics.
+        uncorrected: Error without any correction [mm].
+    """
+    enough = _from_here_on(rows, "median_mm", 0.1)
+    said = (
+        "With none of these numbers of markers does the median error stay below 0.1 mm."
+        if enough is None
+        else f"From {enough} marker{'s' if enough > 1 else ''} on, the median error stays below 0.1 mm, that of the "
+        f"published reconstruction from 4 markers on. The uncorrected simulation is {number_text(uncorrected)} mm off."
+    )
+    narrow = _from_here_on(rows, "interquartile_range_mm", 0.05)
+    if narrow is not None:
+        said += f" The quartiles lie less than 0.05 mm apart from {narrow} marker{'s' if narrow > 1 else ''} on."
+    return said.replace(" mm", f"{NO_BREAK_SPACE}mm")
+
+
+def _from_here_on(rows: Sequence[Mapping[str, Any]], key: str, below: float) -> int | None:
+    """The smallest number of markers from which on a value stays below a threshold."""
+    found = None
+    for row in sorted(rows, key=lambda row: -int(row["markers"])):
+        if not row[key] < below:
+            break
+        found = int(row["markers"])
+    return found
+
+
+def _draw(data: AblationReport, folder: Path) -> Picture:
+    from warp_resphys.report import figures
+
+    rows = data.metrics["by_markers"]
+    errors = {int(row["markers"]): np.array(row["errors_mm"]) for row in rows}
+    draw = partial(figures.marker_boxes, errors, data.metrics["uncorrected_mm"])
+    wide, narrow = draw(narrow=False), draw(narrow=True)
+    figures.save_png(wide, folder / f"{_FIGURE}.png")
+    medians = "; ".join(f"{row['markers']}: {number_text(row['median_mm'])} mm" for row in rows)
+    alt = f"Box plot of the mean vertex error by number of markers, on a logarithmic axis. Medians: {medians}."
+    wide_svg, narrow_svg = (figures.themed_svg(figure, _FIGURE) for figure in (wide, narrow))
+    return Picture(svg_address(wide_svg), svg_address(narrow_svg), alt)

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from warp_resphys.errors import DataFileError
-from warp_resphys.files import disk_full_error, is_disk_full, write_text
+from warp_resphys.files import write_text
 from warp_resphys.report.page import (
     NO_BREAK_SPACE,
     Picture,
     duration_text,
+    figures_beside,
     flatten,
     number_text,
     page_template,
@@ -59,14 +59,8 @@ def write_ablation_report(path: Path, data: AblationReport) -> None:
     Raises:
         DataFileError: A file could not be written.
     """
-    folder = path.parent / "figures"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
+    with figures_beside(path) as folder:
         picture = _draw(data, folder)
-    except OSError as error:
-        if is_disk_full(error):
-            raise disk_full_error(folder) from error
-        raise DataFileError(f"cannot write figures to {folder}: {error.strerror or error}") from error
     rows = data.metrics["by_markers"]
     page = page_template("ablation.html").render(
         data=data,

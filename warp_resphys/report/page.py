@@ -5,6 +5,7 @@ import logging
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -122,6 +123,23 @@ class Picture(NamedTuple):
     alt: str
 
 
+@contextmanager
+def figures_beside(path: Path) -> Iterator[Path]:
+    """Give the folder `figures` beside a page, made where it is missing.
+
+    Raises:
+        DataFileError: A figure could not be written there.
+    """
+    folder = path.parent / "figures"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield folder
+    except OSError as error:
+        if is_disk_full(error):
+            raise disk_full_error(folder) from error
+        raise DataFileError(f"cannot write figures to {folder}: {error.strerror or error}") from error
+
+
 def write_report(path: Path, data: ReportData) -> None:
     """Write the page, and its figures as PNG files into `figures/` beside it.
 
@@ -136,14 +154,8 @@ def write_report(path: Path, data: ReportData) -> None:
     Raises:
         DataFileError: A file could not be written.
     """
-    folder = path.parent / "figures"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
+    with figures_beside(path) as folder:
         page = _render_page(data, *_draw(data, folder))
-    except OSError as error:
-        if is_disk_full(error):
-            raise disk_full_error(folder) from error
-        raise DataFileError(f"cannot write figures to {folder}: {error.strerror or error}") from error
     write_text(path, page)
     _LOG.info("report written: %s", path)
 

@@ -177,21 +177,36 @@ class Simulator:
             )
         return torch.sparse.mm(operator, values.expand(-1, m).mT).mT
 
-    def prepare(self, material: Material | None = None) -> MaterialTensors:
-        """Turns a material into stiffness, mass and weight; pass the result to `step` when stepping one by one."""
+    def prepare(
+        self,
+        material: Material | MaterialTensors | None = None,
+        attached_mass: torch.Tensor | None = None,
+        gravity: torch.Tensor | None = None,
+    ) -> MaterialTensors:
+        """Turns a material into stiffness, mass and weight; pass the result to `step` when stepping one by one.
+
+        Args:
+            material: another material than the simulator's; what is prepared already is returned as it is.
+            attached_mass: (1 or B, N) in place of the body's, other weights in every environment [kg].
+            gravity: (1 or B, 3) in place of the simulator's [m/s^2].
+        """
+        if isinstance(material, MaterialTensors):
+            return material
         material = self.material if material is None else material
+        attached = self._attached_mass if attached_mass is None else attached_mass
+        acceleration = self._gravity if gravity is None else gravity[:, None, :]
         device = torch.device(self.device)
         mu, lame_lambda = material.lame(device, self.dtype)
         density = as_parameter(material.density, device, self.dtype)
-        mass = self._spread(self._mass_volume, density) + self._attached_mass
-        loaded = self._spread(self._load_volume, density) + self._attached_mass
+        mass = self._spread(self._mass_volume, density) + attached
+        loaded = self._spread(self._load_volume, density) + attached
         damping = self.tensor(material.stiffness_damping).reshape(-1)
         damped = bool((damping > 0).any()) or damping.requires_grad
         return MaterialTensors(
             shape_stiffness=self._spread(self._shape_volume, mu.broadcast_to(self._common(mu, lame_lambda))),
             volume_stiffness=self._spread(self._volume_volume, lame_lambda),
             mass=mass,
-            weight=loaded[..., None] * self._gravity,
+            weight=loaded[..., None] * acceleration,
             mass_damping=self.tensor(material.mass_damping).reshape(-1, 1),
             stiffness_damping=damping,
             damped=damped,
@@ -239,7 +254,7 @@ class Simulator:
             InputError: wrong shapes, or values that are not finite.
             ConvergenceError: see `solver.SolverSettings.on_failure`.
         """
-        tensors = material if isinstance(material, MaterialTensors) else self.prepare(material)
+        tensors = self.prepare(material)
         self._check(state, external_force, fixed_positions)
         tensors.check_batch(state.batch)
         stage = self.method.stage(state, self.time_step)
@@ -289,7 +304,7 @@ class Simulator:
         self,
         external_force: torch.Tensor | None = None,
         fixed_positions: torch.Tensor | None = None,
-        material: Material | None = None,
+        material: Material | MaterialTensors | None = None,
         start: torch.Tensor | None = None,
         batch: int | None = None,
     ) -> State:
@@ -298,7 +313,7 @@ class Simulator:
         Args:
             external_force: (B, N, 3) [N].
             fixed_positions: (B, D, 3) of the fixed vertices [m].
-            material: another material than the simulator's.
+            material: another material than the simulator's, or one already prepared.
             start: (B, N, 3) first guess [m]; the rest shape where left out.
             batch: environments, where no other argument tells.
 
@@ -341,7 +356,7 @@ class Simulator:
         steps: int,
         external_forces: torch.Tensor | None = None,
         fixed_positions: torch.Tensor | None = None,
-        material: Material | None = None,
+        material: Material | MaterialTensors | None = None,
     ) -> Trajectory:
         """Steps many times.
 
@@ -353,7 +368,7 @@ class Simulator:
             steps: T.
             external_forces: (T, B, N, 3) for each step, or (B, N, 3) throughout [N].
             fixed_positions: (T, B, D, 3) for each step, in the order of ``body.fixed_vertices`` [m].
-            material: another material than the simulator's.
+            material: another material than the simulator's, or one already prepared.
 
         Raises:
             InputError: wrong shapes, or values that are not finite.

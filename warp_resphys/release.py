@@ -1,0 +1,166 @@
+"""How an observed motion begins: the body that is held, and how it was let go.
+
+The body is at rest under gravity, its weights and a virtual force that brings its markers to where they were held
+(the published method finds such forces by steps through time; a static equilibrium has none to wait for). The hand lets
+go between two frames, and not without a push: the delay, and a velocity in a few slow modes, are what best explains the
+first frames.
+"""
+
+from dataclasses import dataclass
+
+import torch
+
+from .errors import InputError
+from .integrator import State
+from .modes import vibration_modes
+from .replay import Markers, Motions, Release, Replay
+from .simulator import MaterialTensors, Simulator
+
+_HOLD_ITERATIONS = 30
+_HOLD_TOLERANCE = 1e-7  # m, change of the markers in an iteration
+
+
+@dataclass(frozen=True)
+class ReleaseSettings:
+    """How the beginning of a motion is estimated.
+
+    Attributes:
+        hold_modes: vibration modes whose inertial forces hold the body; 0 lets it go from where gravity leaves it.
+        velocity_modes: vibration modes that the velocity at the release is made of; 0 for none.
+        window: how much of the motion after the release is used [s].
+        noise: what a marker may be off for reasons that no release explains [m].
+        delay: expected deviation of the moment of release from the one found in the frames [s]; 0 keeps that one.
+        speed: expected size of the velocity of the fastest vertex [m/s].
+        iterations: Gauss-Newton steps.
+    """
+
+    hold_modes: int = 6
+    velocity_modes: int = 3
+    window: float = 0.08
+    noise: float = 3e-4
+    delay: float = 0.01
+    speed: float = 0.05
+    iterations: int = 4
+
+    def __post_init__(self) -> None:
+        """Checks the ranges.
+
+        Raises:
+            InputError: a number out of range.
+        """
+        for name in ("window", "noise", "speed", "iterations"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"release.{name} is {getattr(self, name)}: it must be positive.")
+        for name in ("hold_modes", "velocity_modes", "delay"):
+            if not getattr(self, name) >= 0:
+                raise InputError(f"release.{name} is {getattr(self, name)}: it must be zero or more.")
+
+
+def estimate_release(simulator: Simulator, markers: Markers, motions: Motions, settings: ReleaseSettings) -> Release:
+    """The beginning of every motion, as this simulator would have it.
+
+    Args:
+        simulator: of the body.
+        markers: (B, N, 3) positions of the vertices to (B, M, 3) markers [m].
+        motions: what was observed.
+        settings: see the class.
+
+    Raises:
+        ConvergenceError: the body cannot be held, or a step of the simulation fails.
+    """
+    replay = Replay(simulator, markers, motions)
+    with torch.no_grad():
+        tensors = replay.tensors()
+    q = hold(simulator, markers, motions, tensors, settings.hold_modes)
+    release = Release(State(q, torch.zeros_like(q)), torch.zeros_like(motions.times[:, 0]))
+    return _let_go(simulator, markers, motions.first(settings.window), release, settings)
+
+
+def hold(
+    simulator: Simulator, markers: Markers, motions: Motions, tensors: MaterialTensors, modes: int
+) -> torch.Tensor:
+    """(R, N, 3) positions at rest under gravity, weights and the virtual force that holds the markers best [m].
+
+    Gauss-Newton on |m(q(a)) - y|^2 + w |a|^2 with q(a) the equilibrium under the force B a, and w so small that it only
+    keeps what no marker sees from moving.
+
+    Args:
+        simulator: of the body.
+        markers: positions of the vertices to markers.
+        motions: tell where the markers were held.
+        tensors: of the R environments.
+        modes: columns of B, the inertial forces of the slowest vibrations.
+
+    Raises:
+        ConvergenceError: no equilibrium was found.
+    """
+    count = len(motions.names)
+    target = torch.where(torch.isfinite(motions.held), motions.held, torch.nan)
+    if modes == 0:
+        with torch.no_grad():
+            return simulator.static_equilibrium(material=tensors, batch=count).q
+    basis = vibration_modes(simulator, modes)
+    force = simulator.rest_positions.new_zeros(count, modes)
+    q, last = simulator.rest_state(count).q, None
+    for _ in range(_HOLD_ITERATIONS):
+        a = force.clone().requires_grad_()
+        load = (a @ basis.mT).unflatten(1, (-1, 3))
+        held = simulator.static_equilibrium(load, material=tensors, start=q)
+        seen = markers(held.q)
+        q = held.q.detach()
+        missing = torch.nan_to_num(target - seen.detach()).flatten(1)
+        if last is not None and float((seen.detach() - last).abs().max()) < _HOLD_TOLERANCE:
+            break
+        last = seen.detach()
+        flat = torch.where(torch.isfinite(target), seen, 0.0).flatten(1)
+        rows = [torch.autograd.grad(flat[:, i].sum(), a, retain_graph=True)[0] for i in range(flat.shape[1])]
+        jacobian = torch.stack(rows, 1)  # (R, 3 M, modes)
+        gram = jacobian.mT @ jacobian
+        weight = 1e-6 * gram.diagonal(dim1=1, dim2=2).amax(1)[:, None, None]
+        right = jacobian.mT @ missing[..., None] - weight * force[..., None]
+        identity = torch.eye(modes, dtype=gram.dtype, device=gram.device)
+        force = force + torch.linalg.solve(gram + weight * identity, right)[..., 0]
+    return q
+
+
+def _let_go(
+    simulator: Simulator, markers: Markers, motions: Motions, held: Release, settings: ReleaseSettings
+) -> Release:
+    """Delay and velocity that explain the first frames, by Gauss-Newton with differences over a batch."""
+    count, shapes = len(motions.names), velocity_shapes(simulator, settings.velocity_modes)
+    deviation = simulator.tensor([settings.delay] * (settings.delay > 0.0) + [settings.speed] * len(shapes))
+    if not len(deviation):
+        return held
+    parameters = simulator.rest_positions.new_zeros(count, len(deviation))  # in expected deviations
+
+    def begin(values: torch.Tensor) -> Release:
+        scaled, repeats = values * deviation, len(values) // count
+        delay = scaled[:, 0] if settings.delay > 0.0 else torch.zeros_like(values[:, 0])
+        amplitudes = scaled[:, int(settings.delay > 0.0) :]
+        velocity = torch.einsum("bk,knc->bnc", amplitudes, shapes)
+        return Release(State(held.state.q.repeat(repeats, 1, 1), velocity), delay)
+
+    size = 1 + len(deviation)
+    replay = Replay(simulator, markers, motions.select(list(range(count)) * size))
+    step = 0.05
+    offsets = torch.cat([torch.zeros_like(deviation)[None], step * torch.eye(len(deviation), dtype=deviation.dtype)])
+    offsets = offsets.to(deviation.device).repeat_interleave(count, 0)
+    with torch.no_grad():
+        for _ in range(settings.iterations):
+            simulated = replay(begin(parameters.repeat(size, 1) + offsets), seconds=settings.window)
+            residual = replay.errors(simulated)[0].flatten(1).unflatten(0, (size, count)) / settings.noise
+            jacobian = ((residual[1:] - residual[0]) / step).permute(1, 2, 0)
+            identity = torch.eye(len(deviation), dtype=deviation.dtype, device=deviation.device)
+            right = jacobian.mT @ residual[0][..., None] + parameters[..., None]
+            change = torch.linalg.solve(jacobian.mT @ jacobian + identity, right)[..., 0]
+            parameters = parameters - change.clamp(-3.0, 3.0)
+    return begin(parameters)
+
+
+def velocity_shapes(simulator: Simulator, modes: int) -> torch.Tensor:
+    """(modes, N, 3) shapes of the slowest vibrations, each with its fastest vertex at one."""
+    if modes == 0:
+        return simulator.rest_positions.new_zeros(0, *simulator.rest_positions.shape)
+    inertial = vibration_modes(simulator, modes).mT.unflatten(1, (-1, 3))
+    shapes = inertial / simulator.prepare().mass[..., None]
+    return shapes / shapes.norm(dim=2).amax(1)[:, None, None]

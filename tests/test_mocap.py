@@ -6,10 +6,9 @@ from pathlib import Path
 import ezc3d
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
-from warp_resphys.errors import DataFileError, InputError
-from warp_resphys.mocap import Recording, fill_gaps, find_release, kabsch, read_c3d, root_mean_square
+from warp_resphys.errors import DataFileError
+from warp_resphys.mocap import Recording, fill_gaps, find_release, read_c3d
 
 TIP = ["Tip - 1", "Tip - 2", "Tip - 3"]
 
@@ -157,42 +156,6 @@ def test_no_release():
         find_release(swinging, 100.0)
     with pytest.raises(DataFileError, match="No release"):
         find_release(still[:1], 100.0)
-
-
-def test_kabsch_finds_a_batch_of_rigid_motions():
-    generator = np.random.default_rng(1)
-    rotation = Rotation.random(5, random_state=2).as_matrix()
-    translation = generator.normal(size=(5, 3))
-    source = generator.normal(size=(6, 3))
-    target = source @ rotation.transpose(0, 2, 1) + translation[:, None]
-    motion = kabsch(np.broadcast_to(source, target.shape), target)
-    np.testing.assert_allclose(motion.rotation, rotation, atol=1e-12)
-    np.testing.assert_allclose(motion.translation, translation, atol=1e-12)
-    np.testing.assert_allclose(motion.apply(source), target, atol=1e-12)
-
-
-def test_kabsch_of_a_mirror_image_is_a_rotation():
-    source = np.random.default_rng(4).normal(size=(7, 3))
-    motion = kabsch(source, source * [1.0, 1.0, -1.0])
-    assert np.linalg.det(motion.rotation) == pytest.approx(1.0)
-
-
-def test_kabsch_works_for_points_of_a_plane():
-    face = np.array([[0, 0, 0], [0, 1, 0], [0, 0, 1], [0, 1, 1.0]])
-    rotation = Rotation.from_euler("xyz", [0.3, -0.8, 2.0]).as_matrix()
-    np.testing.assert_allclose(kabsch(face, face @ rotation.T).rotation, rotation, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    "points", [np.zeros((2, 3)), np.outer(np.arange(4.0), [1.0, 2.0, 3.0]), np.full((4, 3), np.nan)]
-)
-def test_kabsch_refuses(points):
-    with pytest.raises(InputError, match="Registration needs"):
-        kabsch(points, points)
-
-
-def test_root_mean_square():
-    assert root_mean_square(np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 0.0]])) == pytest.approx(5.0 / np.sqrt(2.0))
 
 
 def test_recording_is_frozen(trajectory):

@@ -1,4 +1,4 @@
-"""Motion capture: reading C3D recordings, occlusions, the moment of release, rigid registration.
+"""Motion capture: reading C3D recordings, occlusions, the moment of release.
 
 Positions are (T, M, 3) in metres, T frames of M labelled markers, NaN where a marker was not seen.
 Nothing here knows about a body or a simulator.
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import median_filter
 
-from warp_resphys.errors import DataFileError, InputError
+from warp_resphys.errors import DataFileError
 
 FloatArray = NDArray[np.float64]
 
@@ -89,24 +89,6 @@ class Release:
 
     frame: float
     rest: tuple[int, int]
-
-
-@dataclasses.dataclass(frozen=True)
-class RigidTransform:
-    """The map p -> R p + t.
-
-    Attributes:
-        rotation: (..., 3, 3), determinant +1.
-        translation: (..., 3) [m].
-    """
-
-    rotation: FloatArray
-    translation: FloatArray
-
-    def apply(self, points: ArrayLike) -> FloatArray:
-        """Transforms points (..., N, 3) [m]."""
-        rotated: FloatArray = np.asarray(points, dtype=np.float64) @ np.swapaxes(self.rotation, -1, -2)
-        return rotated + self.translation[..., None, :]
 
 
 def read_c3d(path: str | Path) -> Recording:
@@ -207,40 +189,6 @@ def find_release(path: FloatArray, rate: float, *, quiet: float = 0.2, least_dro
         f"No release found: the tip is not still for {length} frames before it first moves fast, "
         f"in frame {fast}; give a recording that begins with the body held at rest."
     )
-
-
-def kabsch(source: ArrayLike, target: ArrayLike) -> RigidTransform:
-    """The rigid motion that carries source points onto target points with the least sum of squares.
-
-    Kabsch, A solution for the best rotation to relate two sets of vectors, Acta Cryst. A32 (1976) 922;
-    leading axes of either argument are a batch.
-
-    Args:
-        source: (..., N, 3) [m].
-        target: (..., N, 3) [m].
-
-    Raises:
-        InputError: Fewer than three points, points on a line, unequal numbers of them, or a value not finite.
-    """
-    a, b = np.asarray(source, dtype=np.float64), np.asarray(target, dtype=np.float64)
-    if a.shape[-2:] != b.shape[-2:] or a.shape[-1] != 3 or a.shape[-2] < 3:
-        raise InputError(f"Registration needs three or more pairs of points, not {a.shape} with {b.shape}.")
-    if not (np.isfinite(a).all() and np.isfinite(b).all()):
-        raise InputError("Registration needs finite points: leave occluded markers and frames out.")
-    centre_a, centre_b = a.mean(axis=-2, keepdims=True), b.mean(axis=-2, keepdims=True)
-    covariance = np.swapaxes(b - centre_b, -1, -2) @ (a - centre_a)
-    u, singular, vt = np.linalg.svd(covariance)
-    if (singular[..., 1] <= 1e-9 * singular[..., 0]).any():
-        raise InputError("Registration needs points that do not all lie on one line.")
-    u[..., :, 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
-    rotation = u @ vt
-    translation = centre_b[..., 0, :] - (rotation @ centre_a[..., 0, :, None])[..., 0]
-    return RigidTransform(rotation, translation)
-
-
-def root_mean_square(residual: FloatArray) -> float:
-    """Root of the mean squared length of vectors (..., 3)."""
-    return float(np.sqrt(np.mean(np.sum(np.square(residual), axis=-1))))
 
 
 def _declared_frames(path: Path) -> int:

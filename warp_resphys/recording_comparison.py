@@ -15,16 +15,9 @@ from scipy.interpolate import CubicSpline
 
 from warp_resphys.errors import DataFileError, InputError
 from warp_resphys.files import atomic_path, write_json
-from warp_resphys.mocap import (
-    Recording,
-    Release,
-    fill_gaps,
-    find_release,
-    kabsch,
-    read_c3d,
-    root_mean_square,
-)
+from warp_resphys.mocap import Recording, Release, fill_gaps, find_release, read_c3d
 from warp_resphys.oscillation import Oscillation, measure_oscillation
+from warp_resphys.registration import kabsch, root_mean_square
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

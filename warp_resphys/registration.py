@@ -341,8 +341,8 @@ def _why_not(
     rms, off_worst, worst = min(fits)
     return (
         f"{source}: the markers at rest do not fit their nominal positions to {_MILLI * largest_residual:.1f} mm: "
-        f"'{worst}' is {-_MILLI * off_worst:.1f} mm off ({'all three' if three else 'the others'}: {_MILLI * rms:.1f} mm "
-        "root mean square); check its name, its nominal position and the unit."
+        f"'{worst}' is {-_MILLI * off_worst:.1f} mm off ({'all three' if three else 'the others'}: "
+        f"{_MILLI * rms:.1f} mm root mean square); check its name, its nominal position and the unit."
     )
 
 

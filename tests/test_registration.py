@@ -93,6 +93,14 @@ class TestRegisterMarkers:
         assert found.residual[astray] == pytest.approx(0.1)
         assert found.rms < 1e-12
 
+    def test_swapped_names_are_left_out(self):
+        points = measured()[[0, 4, 2, 3, 1, 5]]
+        found = register_markers(points, NOMINAL, NAMES, source=SOURCE)
+        assert_inverse(found.transform)
+        assert found.outliers == ("Tip - 2", "Base - 2")
+        with pytest.raises(DataFileError, match=r"swing\.c3d: the markers at rest do not fit"):
+            register_markers(points, NOMINAL, NAMES, source=SOURCE, most_outliers=1)
+
     def test_seven_of_fifteen_may_be_anywhere(self):
         random = np.random.default_rng(0)
         nominal = random.normal(scale=0.1, size=(15, 3))
@@ -232,6 +240,16 @@ class TestRegisterToSurface:
         )
         assert found.rms < 1e-6
         np.testing.assert_allclose(found.positions, points, rtol=0, atol=2e-5)
+
+    def test_stems_of_different_lengths(self):
+        lengths = np.linspace(0.002, 0.009, 8)
+        points = self.stems(lengths[:, None])
+        points[6] = np.nan
+        start = RigidTransform(Rotation.from_rotvec([0.02, 0.01, -0.02]).as_matrix(), np.array([1e-3, 1e-3, 0.0]))
+        found = register_to_surface(points, self.mesh, start, self.names, source=SOURCE, stem=lengths, hold=1e-9)
+        np.testing.assert_allclose(found.positions, points, rtol=0, atol=2e-5)
+        assert np.isnan(found.residual[6])
+        assert not found.inliers[6]
 
     def test_what_slides_along_the_surface_stays_where_it_starts(self):
         points = self.stems(0.006)[:4] + [2e-3, 0.0, 1e-3]  # None of these four sees x.

@@ -111,7 +111,7 @@ def register_markers(
     The fit is the least-squares one (Kabsch) to the largest set of markers of which none is left with more than
     `largest_residual`; among sets of one size, to that with the least sum of squares. All sets are tried, up to 20 000
     of them, so that no unlucky start can miss the best. The set is more than half of the markers and at least four:
-    one of six markers or seven of fifteen may be anywhere, and three markers that do not fit are an error. Markers
+    two of six markers or seven of fifteen may be anywhere, and three markers that do not fit are an error. Markers
     that are NaN are left out and do not count.
 
     Args:
@@ -150,7 +150,7 @@ def register_to_surface(
     names: Sequence[str],
     *,
     source: str | Path,
-    stem: float | None = 0.0,
+    stem: ArrayLike | None = 0.0,
     hold: float = 0.01,
     largest_residual: float = 0.004,
     use: Sequence[str] | None = None,
@@ -167,7 +167,8 @@ def register_to_surface(
         start: A registration that is near, such as that of `register_markers`.
         names: M names.
         source: The file that they come from, for messages.
-        stem: Distance of every marker from the surface [m]; one that is common to all is found if None.
+        stem: Distance of the markers from the surface [m], one for all or one for each (M,); one for all is found if
+            None.
         hold: Weight of the start, relative to that of the surface.
         largest_residual: How far a marker may be from its stem's end, measured along the normal [m].
         use: The markers to fit; all if None.
@@ -183,45 +184,48 @@ def register_to_surface(
     seen = np.isfinite(a).all(axis=1)
     used = seen & _named(names, use)
     _check_seen(used, names, use, source)
-    motion, length = _slide(a[used], mesh, start, stem, hold, source)
+    stems = None if stem is None else np.broadcast_to(np.asarray(stem, dtype=np.float64), len(a))
+    motion, found = _slide(a[used], mesh, start, None if stems is None else stems[used], hold, source)
+    stems = np.full(len(a), found[0]) if stems is None else stems
     moved = motion.apply(a)
     residual = np.full(len(a), np.nan)
-    residual[seen] = np.abs(closest_points(mesh, moved[seen]).distances - length)
+    residual[seen] = np.abs(closest_points(mesh, moved[seen]).distances - stems[seen])
     worst = int(np.argmax(np.where(used, residual, -1.0)))
     if residual[worst] > largest_residual:
         raise DataFileError(
             f"{source}: marker '{names[worst]}' is {_MILLI * residual[worst]:.1f} mm off a stem of "
-            f"{_MILLI * length:.1f} mm on the surface, more than {_MILLI * largest_residual:.1f} mm: check the mesh, "
-            "its unit and the registration that this one starts from."
+            f"{_MILLI * stems[worst]:.1f} mm on the surface, more than {_MILLI * largest_residual:.1f} mm: check the "
+            "mesh, its unit and the registration that this one starts from."
         )
     return _registration(names, motion, moved, residual, used, np.zeros_like(used))
 
 
 def _slide(
-    points: FloatArray, mesh: Mesh, start: RigidTransform, stem: float | None, hold: float, source: str | Path
-) -> tuple[RigidTransform, float]:
-    """The motion of `register_to_surface`, and the length of the stems [m]."""
+    points: FloatArray, mesh: Mesh, start: RigidTransform, stems: FloatArray | None, hold: float, source: str | Path
+) -> tuple[RigidTransform, FloatArray]:
+    """The motion of `register_to_surface` for P points, and the lengths (P,) of their stems [m]."""
     triangles = boundary_triangles(mesh)
     origin = start.apply(points)
     found = closest_points(mesh, origin, triangles)
 
-    def objective(moved: FloatArray, length: float, found: ClosestPoints) -> float:
+    def objective(moved: FloatArray, length: FloatArray, found: ClosestPoints) -> float:
         return float(np.sum((found.distances - length) ** 2) + hold * np.sum((moved - origin) ** 2))
 
-    moved, length = origin, float(found.distances.mean()) if stem is None else stem
+    moved = origin
+    length = np.full(len(points), found.distances.mean()) if stems is None else stems
     value = objective(moved, length, found)
     for _ in range(_SURFACE_ITERATIONS):
-        twist = _surface_step(moved, origin, found, length, stem is None, hold)
+        twist = _surface_step(moved, origin, found, length, stems is None, hold)
         for halving in range(_HALVINGS):
             share = 0.5**halving
             trial = kabsch(points, moved + share * (np.cross(twist[:3], moved - moved.mean(axis=0)) + twist[3:6]))
-            trial_length = length + share * float(twist[6])
+            trial_length = length + share * twist[6]
             trial_moved = trial.apply(points)
             found = closest_points(mesh, trial_moved, triangles)
             trial_value = objective(trial_moved, trial_length, found)
             if trial_value <= value:
                 break
-        change = max(float(np.abs(trial_moved - moved).max()), abs(trial_length - length))
+        change = max(float(np.abs(trial_moved - moved).max()), float(np.abs(trial_length - length).max()))
         moved, length, value = trial_moved, trial_length, trial_value
         if change <= _SURFACE_TOLERANCE:
             return trial, length
@@ -231,7 +235,7 @@ def _slide(
 
 
 def _surface_step(
-    moved: FloatArray, origin: FloatArray, found: ClosestPoints, length: float, free_length: bool, hold: float
+    moved: FloatArray, origin: FloatArray, found: ClosestPoints, length: FloatArray, free_length: bool, hold: float
 ) -> FloatArray:
     """(7,) Gauss-Newton step: a rotation vector about the centre of the points, a translation, a change of length."""
     offset = moved - found.points

@@ -31,7 +31,7 @@ _DPI: Final = 160
 _FINER: Final = 2  # Drawn so many times finer and averaged, as smooth rims and translucency do not go together.
 _LONGER_SIDE: Final = 6.6  # Of a view [inch].
 _LETTER: Final = 0.088  # Widest that the letters of a name are on average [inch].
-_HEAD, _STRIP, _LEGEND, _PAD = 0.42, 0.7, 0.42, 0.12  # [inch] above and below a view, and for the legend and rims.
+_HEAD, _STRIP, _LEGEND, _PAD = 0.42, 0.9, 0.42, 0.12  # [inch] above and below a view, and for the legend and rims.
 _LABEL_HEIGHT: Final = 0.36  # [inch]
 _RADIUS: Final = 0.016  # Of a marker, over the longest side of the body.
 _RING: Final = 1.55  # Radius of a nominal position's ring, in radii of a marker.
@@ -65,6 +65,12 @@ class _View:
     def project(self, points: FloatArray) -> FloatArray:
         """(..., 2) coordinates of points (..., 3) [m] in the picture, to the right and up."""
         return _project(points, self.axes, self.focus, self.distance)
+
+    def shown(self, length: float, point: FloatArray) -> float:
+        """How long a length [m] across the view at a point (3,) [m] is in the picture."""
+        return (
+            length if np.isinf(self.distance) else length / (self.distance - float((point - self.focus) @ self.axes[2]))
+        )
 
 
 def draw_registration(
@@ -116,7 +122,7 @@ def _within(triangles: IntArray, vertices: IntArray) -> IntArray:
 
 def _view(title: str, towards: Sequence[float], perspective: bool, points: FloatArray, margin: float) -> _View:
     """The camera that sees all points (P, 3), with a margin [m] around them."""
-    axes = _axes(np.asarray(towards))
+    axes = render.view_axes(towards)
     turned = points @ axes.T
     middle = 0.5 * (turned.min(axis=0) + turned.max(axis=0))
     diagonal = float(np.linalg.norm(np.ptp(turned, axis=0)))
@@ -125,14 +131,6 @@ def _view(title: str, towards: Sequence[float], perspective: bool, points: Float
     at = _project(points, axes, focus, distance)
     around = margin / distance if perspective else margin
     return _View(title, axes, focus, distance, at.min(axis=0) - around, at.max(axis=0) + around)
-
-
-def _axes(towards: FloatArray) -> FloatArray:
-    """(3, 3) orthonormal rows: to the right, up, towards the viewer; z points up."""
-    towards = towards / np.linalg.norm(towards)
-    right = np.cross([0.0, 0.0, 1.0], towards)
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(towards, right), towards])
 
 
 def _project(points: FloatArray, axes: FloatArray, focus: FloatArray, distance: float) -> FloatArray:
@@ -195,7 +193,8 @@ def _compose(
 
     sizes = _sizes(views)
     stacked = sizes[0][0] + sizes[1][0] > 1.6 * max(size[1] for size in sizes)
-    margin = _LETTER * max(len("00.00 mm, left out"), *map(len, registration.names)) + 0.1  # [inch]
+    longest = max(len(text) for each in range(len(registration.names)) for text in _label(registration, each))
+    margin = _LETTER * max(longest, 9) + 0.15  # [inch]
     cells = [size + [2.0 * margin, _HEAD + _STRIP] for size in sizes]
     width, height = (max(cell[0] for cell in cells), sum(cell[1] for cell in cells))
     if not stacked:
@@ -240,7 +239,7 @@ def _show(axes: "Axes", view: _View, picture: NDArray[np.float32], size: FloatAr
             arrow = {"arrowstyle": "-|>", "color": _GREY, "linewidth": 1.1, "shrinkA": 0, "shrinkB": 0}
             axes.annotate("", end, origin, arrowprops=arrow, annotation_clip=False)
             at = origin + 0.36 * inch * direction + 0.11 * inch * direction / np.linalg.norm(direction)
-            axes.text(*at, name, ha="center", va="center", color=_GREY, fontsize=9, clip_on=False)
+            axes.text(at[0], at[1], name, ha="center", va="center", color=_GREY, fontsize=9, clip_on=False)
     if np.isinf(view.distance):
         length = _round_length(0.3 * view.extent[0])
         right, low = view.high[0] + (margin - 0.25) * inch, view.low[1] - (_STRIP - 0.2) * inch
@@ -273,35 +272,34 @@ def _mark(
     if nominal is not None:
         for marker, point in enumerate(nominal):
             ring = view.project(point)
-            depth = 1.0 if np.isinf(view.distance) else view.distance - float((point - view.focus) @ view.axes[2])
-            axes.add_patch(
-                Circle((ring[0], ring[1]), _RING * radius / depth, fill=False, edgecolor=NOMINAL, linewidth=1.5)
-            )
-            if marker in at and np.linalg.norm(at[marker] - ring) > _RING * radius / depth:
+            around = view.shown(_RING * radius, point)
+            axes.add_patch(Circle((ring[0], ring[1]), around, fill=False, edgecolor=NOMINAL, linewidth=1.5))
+            if marker in at and np.linalg.norm(at[marker] - ring) > around:
                 axes.plot(*np.stack([ring, at[marker]]).T, color=NOMINAL, linewidth=1.0, linestyle=(0, (3, 2)))
     middle = float(np.median([each[0] for each in at.values()]))
     for side in (-1.0, 1.0):
-        group = sorted((each for each in at if (at[each][0] < middle) == (side < 0.0)), key=lambda each: at[each][1])
+        group = sorted(
+            (each for each in at if (at[each][0] < middle) == (side < 0.0)), key=lambda each: float(at[each][1])
+        )
         heights = _spread(np.array([at[each][1] for each in group]), _LABEL_HEIGHT * inch)
         edge = view.low[0] if side < 0.0 else view.high[0]
         for each, height in zip(group, heights, strict=True):
             text = edge + side * 0.1 * inch
             end = np.array([edge + side * 0.05 * inch, height])
-            away = 1.2 * _shown(view, registration.positions[each], radius) / np.linalg.norm(end - at[each])
+            away = view.shown(1.2 * radius, registration.positions[each]) / float(np.linalg.norm(end - at[each]))
             start = at[each] + min(away, 1.0) * (end - at[each])
             axes.plot(*np.stack([start, end]).T, color=_GREY, linewidth=0.7, clip_on=False)
             align = "right" if side < 0.0 else "left"
-            name, out = registration.names[each], registration.names[each] in registration.outliers
+            name, note = _label(registration, each)
+            colour = MEASURED if name in registration.outliers else _GREY
             axes.text(text, height, name, ha=align, va="bottom", fontweight="bold", clip_on=False)
-            note = f"{1e3 * registration.residual[each]:.2f} mm" + (", left out" if out else "")
-            axes.text(
-                text, height, note, ha=align, va="top", fontsize=8, color=MEASURED if out else _GREY, clip_on=False
-            )
+            axes.text(text, height, note, ha=align, va="top", fontsize=8, color=colour, clip_on=False)
 
 
-def _shown(view: _View, point: FloatArray, radius: float) -> float:
-    """The radius of a ball at a point, as it appears in the picture."""
-    return radius if np.isinf(view.distance) else radius / (view.distance - float((point - view.focus) @ view.axes[2]))
+def _label(registration: Registration, marker: int) -> tuple[str, str]:
+    """Name of a marker, and how well it fits."""
+    name = registration.names[marker]
+    return name, f"{1e3 * registration.residual[marker]:.2f} mm" + (", left out" * (name in registration.outliers))
 
 
 def _spread(heights: FloatArray, least: float) -> FloatArray:

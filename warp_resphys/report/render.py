@@ -171,7 +171,7 @@ def main(source: str, picture: str) -> None:
     with np.load(source, allow_pickle=False) as arrays:
         scene: dict[str, Any] = dict(arrays)
     bodies = scene["positions"]
-    axes = _view_axes()
+    axes = view_axes(TOWARDS_VIEWER)
     seen = np.concatenate([scene["rest"], *bodies]) @ axes.T  # (P, 3) [m] to the right, up, towards the viewer
     lower, upper = seen.min(axis=0), seen.max(axis=0)
     extent = upper[:2] - lower[:2]
@@ -206,9 +206,9 @@ def main(source: str, picture: str) -> None:
         raise RuntimeError("the picture is empty")
 
 
-def _view_axes() -> FloatArray:
+def view_axes(towards_viewer: Sequence[float]) -> FloatArray:
     """(3, 3) orthonormal rows: to the right, up, towards the viewer; z points up."""
-    towards = np.asarray(TOWARDS_VIEWER) / np.linalg.norm(TOWARDS_VIEWER)
+    towards = np.asarray(towards_viewer) / np.linalg.norm(towards_viewer)
     right = np.cross([0.0, 0.0, 1.0], towards)
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(towards, right), towards])

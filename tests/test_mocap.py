@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 
 from warp_resphys.errors import DataFileError
-from warp_resphys.mocap import Recording, fill_gaps, find_release, read_c3d
+from warp_resphys.recordings.c3d import read_c3d
+from warp_resphys.recordings.processing import fill_gaps
+from warp_resphys.recordings.recording import Recording
+from warp_resphys.recordings.release import find_release
 
 TIP = ["Tip - 1", "Tip - 2", "Tip - 3"]
 
@@ -76,11 +79,11 @@ def test_truncated_file(tmp_path, trajectory, part):
 
 def test_damaged_file_that_crashes_the_decoder(tmp_path, trajectory, monkeypatch):
     path = write_c3d(tmp_path / "whole.c3d", trajectory, "abc")
-    monkeypatch.setattr("warp_resphys.mocap._DECODE_PROGRAM", "import os; os.abort()")
+    monkeypatch.setattr("warp_resphys.recordings.c3d._DECODE_PROGRAM", "import os; os.abort()")
     with pytest.raises(DataFileError, match="damaged or truncated"):
         read_c3d(path)
-    monkeypatch.setattr("warp_resphys.mocap._DECODE_PROGRAM", "while True: pass")
-    monkeypatch.setattr("warp_resphys.mocap._DECODE_SECONDS", 0.3)
+    monkeypatch.setattr("warp_resphys.recordings.c3d._DECODE_PROGRAM", "while True: pass")
+    monkeypatch.setattr("warp_resphys.recordings.c3d._DECODE_SECONDS", 0.3)
     with pytest.raises(DataFileError, match="does not end"):
         read_c3d(path)
 
@@ -120,7 +123,7 @@ def test_fill_gaps_interpolates_a_swing_and_refuses_a_long_gap():
 
 def test_never_seen_marker_is_refused():
     positions = np.full((10, 1, 3), np.nan)
-    with pytest.raises(DataFileError, match="frames 0 to 9"):
+    with pytest.raises(DataFileError, match=r"x\.c3d: marker a is seen in 0 of 10 frames"):
         fill_gaps(Recording(("a",), positions, 100.0, Path("x.c3d")), longest=20)
 
 

@@ -7,7 +7,9 @@ from scipy.spatial.transform import Rotation
 
 from warp_resphys.errors import DataFileError, InputError
 from warp_resphys.mesh import boundary_triangles, box_hexahedra, box_tetrahedra
-from warp_resphys.mocap import fill_gaps, find_release, read_c3d
+from warp_resphys.recordings.c3d import read_c3d
+from warp_resphys.recordings.processing import fill_gaps
+from warp_resphys.recordings.release import find_release
 from warp_resphys.registration import RigidTransform, kabsch, register_markers, register_to_surface, root_mean_square
 from warp_resphys.surface import closest_points
 

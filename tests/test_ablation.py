@@ -75,7 +75,7 @@ def test_more_markers_leave_less_error_and_spread(finished):
     found = json.loads((finished / "metrics.json").read_text())
     assert found["uncorrected_mm"] > 0.3
     medians = [row["median_mm"] for row in rows(finished)]
-    assert medians == sorted(medians, reverse=True)
+    assert np.diff(medians).max() <= 1e-9 * medians[0]  # The last count only adds markers that cannot move.
     assert medians[1] < 0.2 * found["uncorrected_mm"]
     assert rows(finished)[2]["interquartile_range_mm"] < 0.1 * rows(finished)[0]["interquartile_range_mm"]
     assert list(found["seconds"]) == ["generate", "ablation", "report"]

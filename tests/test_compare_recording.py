@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from warp_resphys import recording_comparison
 from warp_resphys.errors import DataFileError, InputError
-from warp_resphys.mocap import Recording, fill_gaps
 from warp_resphys.recording_comparison import (
     Marker,
     Swing,
@@ -21,6 +20,8 @@ from warp_resphys.recording_comparison import (
     measured_swing,
     simulate_swing,
 )
+from warp_resphys.recordings.processing import fill_gaps
+from warp_resphys.recordings.recording import Recording
 
 ROOT = Path(__file__).parents[1]
 TIP = [Marker("a", (0.1, 0.015, 0.036)), Marker("b", (0.1, -0.006, 0.024)), Marker("c", (0.1, 0.036, 0.006))]
@@ -132,7 +133,7 @@ def test_comparison_of_a_simulation_with_its_own_recording(tmp_path, monkeypatch
     recording = recorded(truth.displacement, release=50)
     labels = [marker["name"] for part in ("tip", "base") for marker in config["markers"][part]]
     recording = Recording(tuple(labels), recording.positions, 100.0, recording.source)
-    monkeypatch.setattr(recording_comparison, "read_c3d", lambda path: recording)
+    monkeypatch.setattr(recording_comparison, "read_recording", lambda path: recording)
     result = compare_recording(config, tmp_path)
     assert result["release_frame"] == pytest.approx(50.0, abs=0.3)
     difference = result["relative_difference"]
@@ -176,7 +177,7 @@ def test_hung_weight_lengthens_the_period():
 @pytest.mark.parametrize(
     ("override", "sentence"),
     [
-        ("recording.path=null", "set recording.path to a C3D file"),
+        ("recording.path=null", "set recording.path to one"),
         ("recording.path=absent.c3d", "Cannot read absent.c3d: No such file"),
         ("recording.hung_weight=-1", "recording.hung_weight is -1: set it to a number, not below zero"),
         ("simulation.gravity=0", "simulation.gravity is 0: set it to a number, more than zero"),

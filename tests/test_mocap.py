@@ -6,10 +6,12 @@ from pathlib import Path
 import ezc3d
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
-from warp_resphys.errors import DataFileError, InputError
-from warp_resphys.mocap import Recording, fill_gaps, find_release, kabsch, read_c3d, root_mean_square
+from warp_resphys.errors import DataFileError
+from warp_resphys.recordings.c3d import read_c3d
+from warp_resphys.recordings.processing import fill_gaps
+from warp_resphys.recordings.recording import Recording
+from warp_resphys.recordings.release import find_release
 
 TIP = ["Tip - 1", "Tip - 2", "Tip - 3"]
 
@@ -77,11 +79,11 @@ def test_truncated_file(tmp_path, trajectory, part):
 
 def test_damaged_file_that_crashes_the_decoder(tmp_path, trajectory, monkeypatch):
     path = write_c3d(tmp_path / "whole.c3d", trajectory, "abc")
-    monkeypatch.setattr("warp_resphys.mocap._DECODE_PROGRAM", "import os; os.abort()")
+    monkeypatch.setattr("warp_resphys.recordings.c3d._DECODE_PROGRAM", "import os; os.abort()")
     with pytest.raises(DataFileError, match="damaged or truncated"):
         read_c3d(path)
-    monkeypatch.setattr("warp_resphys.mocap._DECODE_PROGRAM", "while True: pass")
-    monkeypatch.setattr("warp_resphys.mocap._DECODE_SECONDS", 0.3)
+    monkeypatch.setattr("warp_resphys.recordings.c3d._DECODE_PROGRAM", "while True: pass")
+    monkeypatch.setattr("warp_resphys.recordings.c3d._DECODE_SECONDS", 0.3)
     with pytest.raises(DataFileError, match="does not end"):
         read_c3d(path)
 
@@ -121,7 +123,7 @@ def test_fill_gaps_interpolates_a_swing_and_refuses_a_long_gap():
 
 def test_never_seen_marker_is_refused():
     positions = np.full((10, 1, 3), np.nan)
-    with pytest.raises(DataFileError, match="frames 0 to 9"):
+    with pytest.raises(DataFileError, match=r"x\.c3d: marker a is seen in 0 of 10 frames"):
         fill_gaps(Recording(("a",), positions, 100.0, Path("x.c3d")), longest=20)
 
 
@@ -157,42 +159,6 @@ def test_no_release():
         find_release(swinging, 100.0)
     with pytest.raises(DataFileError, match="No release"):
         find_release(still[:1], 100.0)
-
-
-def test_kabsch_finds_a_batch_of_rigid_motions():
-    generator = np.random.default_rng(1)
-    rotation = Rotation.random(5, random_state=2).as_matrix()
-    translation = generator.normal(size=(5, 3))
-    source = generator.normal(size=(6, 3))
-    target = source @ rotation.transpose(0, 2, 1) + translation[:, None]
-    motion = kabsch(np.broadcast_to(source, target.shape), target)
-    np.testing.assert_allclose(motion.rotation, rotation, atol=1e-12)
-    np.testing.assert_allclose(motion.translation, translation, atol=1e-12)
-    np.testing.assert_allclose(motion.apply(source), target, atol=1e-12)
-
-
-def test_kabsch_of_a_mirror_image_is_a_rotation():
-    source = np.random.default_rng(4).normal(size=(7, 3))
-    motion = kabsch(source, source * [1.0, 1.0, -1.0])
-    assert np.linalg.det(motion.rotation) == pytest.approx(1.0)
-
-
-def test_kabsch_works_for_points_of_a_plane():
-    face = np.array([[0, 0, 0], [0, 1, 0], [0, 0, 1], [0, 1, 1.0]])
-    rotation = Rotation.from_euler("xyz", [0.3, -0.8, 2.0]).as_matrix()
-    np.testing.assert_allclose(kabsch(face, face @ rotation.T).rotation, rotation, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    "points", [np.zeros((2, 3)), np.outer(np.arange(4.0), [1.0, 2.0, 3.0]), np.full((4, 3), np.nan)]
-)
-def test_kabsch_refuses(points):
-    with pytest.raises(InputError, match="Registration needs"):
-        kabsch(points, points)
-
-
-def test_root_mean_square():
-    assert root_mean_square(np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 0.0]])) == pytest.approx(5.0 / np.sqrt(2.0))
 
 
 def test_recording_is_frozen(trajectory):

@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 
 from warp_resphys.errors import InputError
-from warp_resphys.mocap import find_release, read_c3d
 from warp_resphys.oscillation import measure_oscillation, turning_points
+from warp_resphys.recordings.c3d import read_c3d
+from warp_resphys.recordings.release import find_release
 
 
 def swing(period, decay_rate, sag, *, rate=100.0, seconds=4.0, drift=0.0):

@@ -15,16 +15,12 @@ from scipy.interpolate import CubicSpline
 
 from warp_resphys.errors import DataFileError, InputError
 from warp_resphys.files import atomic_path, write_json
-from warp_resphys.mocap import (
-    Recording,
-    Release,
-    fill_gaps,
-    find_release,
-    kabsch,
-    read_c3d,
-    root_mean_square,
-)
 from warp_resphys.oscillation import Oscillation, measure_oscillation
+from warp_resphys.recordings.processing import fill_gaps
+from warp_resphys.recordings.reading import read_recording
+from warp_resphys.recordings.recording import Recording
+from warp_resphys.recordings.release import Release, find_release
+from warp_resphys.registration import kabsch, root_mean_square
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -132,7 +128,7 @@ def measured_swing(
     recording = fill_gaps(recording.select([marker.name for marker in markers]), longest_gap)
     positions = recording.positions
     if release_frame is None:
-        release = find_release(positions[:, : len(tip)].mean(axis=1), recording.rate)
+        release = find_release(positions[:, : len(tip)].mean(axis=1), recording.rate, source=recording.source)
     elif 1.0 <= release_frame < len(positions) - 1:
         release = Release(release_frame, (max(0, int(release_frame) - _HELD_FRAMES), int(release_frame)))
     else:
@@ -247,10 +243,10 @@ def compare_recording(config: Mapping[str, Any], folder: Path) -> dict[str, Any]
     _check_numbers(config)
     settings, registration, comparison = config["recording"], config["registration"], config["comparison"]
     if settings["path"] is None:
-        raise InputError("No recording given: set recording.path to a C3D file, as in recording.path=swing.c3d.")
+        raise InputError("No recording given: set recording.path to one, as in recording.path=swing.c3d.")
     tip, base = ([Marker(**marker) for marker in config["markers"][part]] for part in ("tip", "base"))
     measured = measured_swing(
-        read_c3d(settings["path"]),
+        read_recording(settings["path"]),
         tip,
         base,
         longest_gap=registration["longest_gap"],

@@ -9,7 +9,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final, NamedTuple
@@ -76,25 +76,43 @@ def draw_bodies(mesh: Mesh, positions: Mapping[str, FloatArray], target: FloatAr
         return dict.fromkeys(positions)
     errors = np.stack([np.linalg.norm(q - target, axis=1) for q in shown.values()])  # (B, N) [m]
     largest = np.maximum(errors.max(axis=1), 1e-15)
-    sides = boundary_faces(mesh)
-    rims = sides[:, _RINGS[sides.shape[1]]]
-    edges = np.sort(np.stack([rims, np.roll(rims, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
-    picture = _run(
+    picture = run(
+        COMMAND,
         {
             "rest": mesh.vertices,
             "positions": np.stack(list(shown.values())),
             "values": errors / largest[:, None],
             "triangles": boundary_triangles(mesh),
-            "edges": np.unique(edges, axis=0),
-        }
+            "edges": face_edges(mesh),
+        },
     )
     pixels = np.split(picture, len(shown), axis=1)
     drawn = {name: Body(*each) for name, *each in zip(shown, pixels, largest.tolist(), strict=True)}
     return {name: drawn.get(name) for name in positions}
 
 
-def _run(scene: Mapping[str, Any]) -> NDArray[np.float32]:
-    """(H, B x W, 4) the pictures that another process draws, side by side."""
+def face_edges(mesh: Mesh) -> IntArray:
+    """(E, 2) vertices of the lines around the faces of the boundary, each line once."""
+    sides = boundary_faces(mesh)
+    rims = sides[:, _RINGS[sides.shape[1]]]
+    edges = np.sort(np.stack([rims, np.roll(rims, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
+    found: IntArray = np.unique(edges, axis=0)
+    return found
+
+
+def run(command: Sequence[str], scene: Mapping[str, Any]) -> NDArray[np.float32]:
+    """The picture that another process draws.
+
+    Args:
+        command: What to run; the files of the scene and of the picture follow as its arguments.
+        scene: Arrays by name.
+
+    Returns:
+        (H, W, 3 | 4) red, green, blue and perhaps opacity in [0, 1].
+
+    Raises:
+        DrawingError: There is no pyvista, or no OpenGL driver that works off screen.
+    """
     from matplotlib.image import imread
 
     environment = dict(os.environ)
@@ -105,7 +123,7 @@ def _run(scene: Mapping[str, Any]) -> NDArray[np.float32]:
         np.savez(source, **scene)
         try:
             done = subprocess.run(
-                [*COMMAND, str(source), str(picture)],
+                [*command, str(source), str(picture)],
                 env=environment,
                 timeout=TIME_OUT,
                 stdin=subprocess.DEVNULL,
@@ -153,7 +171,7 @@ def main(source: str, picture: str) -> None:
     with np.load(source, allow_pickle=False) as arrays:
         scene: dict[str, Any] = dict(arrays)
     bodies = scene["positions"]
-    axes = _view_axes()
+    axes = view_axes(TOWARDS_VIEWER)
     seen = np.concatenate([scene["rest"], *bodies]) @ axes.T  # (P, 3) [m] to the right, up, towards the viewer
     lower, upper = seen.min(axis=0), seen.max(axis=0)
     extent = upper[:2] - lower[:2]
@@ -188,9 +206,9 @@ def main(source: str, picture: str) -> None:
         raise RuntimeError("the picture is empty")
 
 
-def _view_axes() -> FloatArray:
+def view_axes(towards_viewer: Sequence[float]) -> FloatArray:
     """(3, 3) orthonormal rows: to the right, up, towards the viewer; z points up."""
-    towards = np.asarray(TOWARDS_VIEWER) / np.linalg.norm(TOWARDS_VIEWER)
+    towards = np.asarray(towards_viewer) / np.linalg.norm(towards_viewer)
     right = np.cross([0.0, 0.0, 1.0], towards)
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(towards, right), towards])

@@ -4,11 +4,9 @@ For each step of a motion of which m markers y were observed, find the force f t
 
     |C q+(f) - y|^2 + lambda |f|^2
 
-with q+ the simulator's next positions and C the map from positions to markers. Most of f is left to the second term:
-what no marker sees stays at zero.
+with q+ the simulator's next positions and C the map from positions to markers, linear or not. Most of f is left to the
+second term: what no marker sees stays at zero.
 """
-
-from dataclasses import dataclass
 
 import torch
 from typing_extensions import override
@@ -16,57 +14,11 @@ from typing_extensions import override
 from ..equilibrium import Workspace
 from ..errors import ConvergenceError, InputError
 from ..integrator import State
+from ..markers import Markers
 from ..modes import vibration_modes
 from ..simulator import Simulator
 from ..threads import threads_for
 from .reconstruction import LBFGSB, Reconstruction, Reconstructor
-
-
-@dataclass(frozen=True)
-class MarkerMap:
-    """Markers as weighted sums of vertices, other ones in every environment.
-
-    Attributes:
-        vertices: (B, m, k) the vertices of each marker.
-        weights: (B, m, k) their weights; a marker whose weights are all zero is none.
-    """
-
-    vertices: torch.Tensor
-    weights: torch.Tensor
-
-    def __post_init__(self) -> None:
-        """Checks that the shapes agree.
-
-        Raises:
-            InputError: they do not, or there is no marker.
-        """
-        if self.vertices.ndim != 3 or self.vertices.shape != self.weights.shape or not self.vertices.numel():
-            raise InputError(
-                f"marker vertices of shape {tuple(self.vertices.shape)} with weights of shape "
-                f"{tuple(self.weights.shape)}: both must be (environments, markers, vertices a marker)."
-            )
-
-    @classmethod
-    def at_vertices(cls, vertices: torch.Tensor, dtype: torch.dtype = torch.float64) -> "MarkerMap":
-        """One marker on each of (B, m) vertices."""
-        return cls(vertices[..., None], torch.ones_like(vertices[..., None], dtype=dtype))
-
-    def __call__(self, fields: torch.Tensor) -> torch.Tensor:
-        """C: (B, N, ...) values at the vertices to (B, m, ...) values at the markers."""
-        batch = torch.arange(len(self.vertices), device=fields.device)[:, None, None]
-        weights = self.weights.reshape(*self.weights.shape, *[1] * (fields.ndim - 2))
-        return (fields[batch, self.vertices] * weights).sum(2)
-
-    def transposed(self, n_vertices: int) -> torch.Tensor:
-        """(B, 3 N, 3 m) matrix of C^T."""
-        b, m, _ = self.vertices.shape
-        out = self.weights.new_zeros(b, n_vertices, 3, m, 3)
-        batch = torch.arange(b, device=out.device)[:, None, None]
-        marker = torch.arange(m, device=out.device)[:, None]
-        for axis in range(3):
-            where = (batch, self.vertices, torch.full_like(marker, axis), marker, torch.full_like(marker, axis))
-            out.index_put_(where, self.weights, accumulate=True)
-        return out.reshape(b, 3 * n_vertices, 3 * m)
 
 
 class SparseGaussNewton(Reconstructor):
@@ -77,13 +29,14 @@ class SparseGaussNewton(Reconstructor):
 
         x+ = x - H^-1 g + H^-1 f
 
-    so that f solves a ridge regression with J = C H^-1 and r = y - C (x - H^-1 g): f = J^T (J J^T + lambda I)^-1 r. One
-    factorisation and 3 m + 2 back-substitutions an iteration, no inner solve, and at convergence f = g(x) holds as it
-    does for a step of the simulator. Restricted to forces B a with orthonormal columns B (see `vibration_modes`), J is
-    C H^-1 B, which takes a back-substitution a column where these are fewer.
+    so that f solves a ridge regression with J = C' H^-1 and r = y - C(x) + C' H^-1 g, C' being the derivative of C:
+    f = J^T (J J^T + lambda I)^-1 r. One factorisation and 3 m + 2 back-substitutions an iteration, no inner solve, and
+    at convergence f = g(x) holds as it does for a step of the simulator. Restricted to forces B a with orthonormal
+    columns B (see `vibration_modes`), J is C' H^-1 B, which takes a back-substitution a column where these are fewer.
 
-    ``tolerance`` is the last change of any position [m]. Where x stands at a fraction e of the time step, |C q+ - y| is
-    that of x over e, and lambda e^2 takes the place of lambda. No first guess is needed.
+    ``tolerance`` is the last change of any position [m]. Where x stands at a fraction e of the time step, q+ moves 1/e
+    times as far as x, so that e (y - C(q+)) takes the place of y - C(x), and lambda e^2 that of lambda. No first guess
+    is needed.
 
     Args:
         simulator: the one to correct.
@@ -100,7 +53,7 @@ class SparseGaussNewton(Reconstructor):
     def __init__(
         self,
         simulator: Simulator,
-        markers: MarkerMap,
+        markers: Markers,
         regularisation: float,
         tolerance: float,
         max_iterations: int,
@@ -108,9 +61,11 @@ class SparseGaussNewton(Reconstructor):
     ) -> None:
         super().__init__(simulator, regularisation, tolerance, max_iterations)
         check_sparse(regularisation, markers, simulator)
-        self.markers = markers
+        self.markers = markers.to(simulator.rest_positions)
         self._basis = None if modes is None else vibration_modes(simulator, modes)
-        self._transposed = markers.transposed(simulator.body.n_vertices)
+        self._constant = (
+            self.markers.transposed_jacobian(simulator.rest_positions[None]) if self.markers.linear else None
+        )
 
     @override
     @torch.no_grad()
@@ -131,7 +86,6 @@ class SparseGaussNewton(Reconstructor):
         p = workspace.potential
         stage = sim.method.stage(state, sim.time_step)
         p.set_terms(sim.step_terms(stage, state.batch, None, self._tensors, workspace))
-        target = stage.end * observed + (1.0 - stage.end) * self.markers(state.q)
         x = stage.target.clone()
         x[:, sim.fixed] = state.q[:, sim.fixed]
         force = torch.zeros_like(x)
@@ -140,7 +94,9 @@ class SparseGaussNewton(Reconstructor):
             for iteration in range(1, self.max_iterations + 1):
                 p.positions.copy_(x)
                 p.evaluate()
-                new, new_force = self._iterate(workspace, x, target, self.regularisation * stage.end**2)
+                end = sim.method.finish(state, x, sim.time_step).q
+                missing = stage.end * (observed - self.markers(end))
+                new, new_force = self._iterate(workspace, x, end, missing, self.regularisation * stage.end**2)
                 change = (new - x).abs().amax((1, 2))
                 x = torch.where(active[:, None, None], new, x)
                 force = torch.where(active[:, None, None], new_force, force)
@@ -155,27 +111,36 @@ class SparseGaussNewton(Reconstructor):
         )
 
     def _iterate(
-        self, workspace: Workspace, x: torch.Tensor, target: torch.Tensor, weight: float
+        self, workspace: Workspace, x: torch.Tensor, end: torch.Tensor, missing: torch.Tensor, weight: float
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Next positions and force (B, N, 3) from the residual at x; see the class's equations."""
+        """Next positions and force (B, N, 3); see the class's equations.
+
+        Args:
+            workspace: with the residual at x.
+            x: (B, N, 3) the iterate [m].
+            end: (B, N, 3) q+ for it [m].
+            missing: (B, m, 3) e (y - C(q+)) [m].
+            weight: lambda e^2.
+        """
         metric = workspace.adjoint_metric(self.simulator.settings.linear_solver)
         metric.refactor_exact()
         residual = workspace.potential.residual.reshape(len(x), -1, 1)
-        basis, transposed = self._basis, self._transposed
+        transposed = self.markers.transposed_jacobian(end) if self._constant is None else self._constant
+        basis = self._basis
         columns = transposed
         by_mode = basis is not None and basis.shape[1] < transposed.shape[2]
         if basis is not None and by_mode:
             columns = basis.expand(len(x), -1, -1)
         solved = metric.solve(torch.cat([columns, residual], dim=2))
         response = solved[:, :, :-1]
-        unforced = x - solved[:, :, -1].view_as(x)
+        settling = solved[:, :, -1:]
         jacobian = response.mT
         if basis is not None:
             jacobian = transposed.mT @ response if by_mode else response.mT @ basis
-        missing = (target - self.markers(unforced)).reshape(len(x), -1, 1)
-        coefficients = ridge(jacobian, missing, weight)
+        right = missing.reshape(len(x), -1, 1) + transposed.mT @ settling
+        coefficients = ridge(jacobian, right, weight)
         force = coefficients if basis is None else basis @ coefficients
-        return unforced + metric.solve(force).view_as(x), force.view_as(x)
+        return x + (metric.solve(force) - settling).view_as(x), force.view_as(x)
 
 
 class SparseLBFGSB(LBFGSB):
@@ -195,14 +160,14 @@ class SparseLBFGSB(LBFGSB):
     def __init__(
         self,
         simulator: Simulator,
-        markers: MarkerMap,
+        markers: Markers,
         regularisation: float,
         tolerance: float,
         max_iterations: int,
     ) -> None:
         super().__init__(simulator, regularisation, tolerance, max_iterations)
         check_sparse(regularisation, markers, simulator)
-        self.markers = markers
+        self.markers = markers.to(simulator.rest_positions)
 
     @override
     def step(self, state: State, observed: torch.Tensor, first_guess: torch.Tensor | None = None) -> Reconstruction:
@@ -225,7 +190,7 @@ def ridge(matrix: torch.Tensor, right: torch.Tensor, weight: float) -> torch.Ten
     return torch.linalg.solve(matrix.mT @ matrix + weight * identity, matrix.mT @ right)
 
 
-def check_sparse(regularisation: float, markers: MarkerMap, simulator: Simulator) -> None:
+def check_sparse(regularisation: float, markers: Markers, simulator: Simulator) -> None:
     """Checks what sparse markers ask for beyond the full state.
 
     Raises:
@@ -237,13 +202,13 @@ def check_sparse(regularisation: float, markers: MarkerMap, simulator: Simulator
             "force open."
         )
     last = simulator.body.n_vertices - 1
-    if int(markers.vertices.min()) < 0 or int(markers.vertices.max()) > last:
+    if int(markers.used.min()) < 0 or int(markers.used.max()) > last:
         raise InputError(f"a marker is on a vertex that the body does not have: its vertices are 0 to {last}.")
 
 
 def make_sparse_reconstructor(
     simulator: Simulator,
-    markers: MarkerMap,
+    markers: Markers,
     method: str,
     regularisation: float,
     tolerance: float,

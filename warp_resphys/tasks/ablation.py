@@ -18,11 +18,12 @@ from ..configured import build_mesh, build_simulator, choose_device
 from ..errors import InputError
 from ..files import atomic_hdf5, create, read_json, write_json, write_text
 from ..integrator import State
+from ..markers import MarkerMap
 from ..mesh import surface_vertices
 from ..progress import Progress
 from ..report.ablation_page import AblationReport, write_ablation_report
 from ..report.page import number_text
-from ..residual.sparse_reconstruction import MarkerMap, make_sparse_reconstructor
+from ..residual.sparse_reconstruction import make_sparse_reconstructor
 from ..resumable import Field, ResumableHDF5
 from ..stages import Stage, StageContext, package_versions, run_stages
 from .generate import held_state

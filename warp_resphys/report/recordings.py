@@ -1,0 +1,219 @@
+"""The quality of a recording as a picture, and the command that makes it."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+from warp_resphys.errors import InputError
+from warp_resphys.files import atomic_path, write_json
+from warp_resphys.recordings.processing import fill_gaps, release_of
+from warp_resphys.recordings.quality import BaseMotion, Quality, check_base, compare_base, quality, quality_table
+from warp_resphys.recordings.reading import read_recording
+from warp_resphys.recordings.recording import Recording
+from warp_resphys.report.figures import _STYLE, NARROW, TONES, WIDE
+
+FloatArray = NDArray[np.float64]
+
+# Okabe and Ito (2008), without yellow: everyone can tell them apart.
+MARKER_COLOURS: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#1c2127")
+_STATES: Final = {"seen": "#dde1e6", "filled": "#e69f00", "masked": "#c4481b"}
+_MILLI: Final = 1e3
+_ROW: Final = 0.16  # [in] of a marker in the raster
+_LEGEND_COLUMNS: Final = {False: 6, True: 3}
+
+
+def recording_quality(recording: Recording, result: Quality, *, narrow: bool) -> Figure:
+    """Draw markers over time from their median place, what jumped, and what was hidden.
+
+    Markers that should stand still have a panel of their own, with their distance from the median place. A line
+    breaks where a gap is masked; where it was filled, the line is thin. A triangle marks the first frame after a jump.
+
+    Args:
+        recording: As it was measured.
+        result: What `quality` found in it.
+        narrow: Whether the figure is for a narrow page.
+    """
+    bridged = fill_gaps(_visible(recording), result.longest_gap, mask_long=True)
+    still = [marker.label for marker in result.markers if marker.still]
+    moving = [marker.label for marker in result.markers if not marker.still]
+    panels = [*("xyz" if moving else ""), *(["still"] if still else []), "raster"]
+    heights = [{"still": 1.2, "raster": _ROW * len(recording.labels) + 0.1}.get(panel, 1.5) for panel in panels]
+    with mpl.rc_context(_STYLE):
+        width = NARROW if narrow else WIDE
+        figure = Figure(figsize=(width, sum(heights) + (1.3 if narrow else 1.0)), layout="constrained")
+        rows = figure.subplots(len(panels), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
+        colours = {label: MARKER_COLOURS[at % len(MARKER_COLOURS)] for at, label in enumerate(recording.labels)}
+        for axes, panel in zip(rows, panels, strict=True):
+            if panel == "raster":
+                _raster(axes, recording, bridged, result)
+                axes.set_title("" if narrow else "Seen by the cameras")
+                continue
+            for label in still if panel == "still" else moving:
+                if label in bridged.labels:
+                    path = _path(recording, bridged, label, panel)
+                    _line(axes, recording, result, label, path, colours[label])
+            name = "distance" if panel == "still" else panel
+            axes.set_ylabel(f"{name} [mm]")
+            axes.yaxis.set_major_locator(MaxNLocator(4))
+            title = {"x": "Markers, from their median place", "still": "Markers that should not move"}.get(panel)
+            if title:
+                axes.set_title(title)
+            if result.release is not None:
+                axes.axvline(
+                    result.release.frame / result.rate, color=TONES["ink"].light, linewidth=0.9, linestyle="--"
+                )
+        rows[-1].set_xlabel("time [s]; dashed: release" if result.release is not None else "time [s]")
+        rows[-1].set_xlim(0.0, len(recording.positions) / recording.rate)
+        _legend(figure, colours, narrow=narrow)
+        figure.align_ylabels(rows[:-1])
+    return figure
+
+
+def inspect_recording(config: Mapping[str, Any], folder: Path) -> str:
+    """Examines a recording, and writes quality.json and quality.png.
+
+    Args:
+        config: With the keys of conf/inspect_recording.yaml.
+        folder: Where to write.
+
+    Returns:
+        The table, and what a user should look at, as text.
+
+    Raises:
+        DataFileError: A recording cannot be read, or a marker on the base was moved between two of them.
+        InputError: A value in the configuration cannot be used.
+    """
+    _check(config)
+    settings = config["recording"]
+    given = (settings["units"], settings["rate"], settings["labels"])
+    recording = read_recording(settings["path"], *given)
+    still = config["still"]
+    release = release_of(recording, config["moving"], config["longest_gap"]) if config["moving"] else None
+    result = quality(recording, still, release, longest_gap=config["longest_gap"], least_jump=config["least_jump"])
+    trials = [recording, *(read_recording(path, *given) for path in config["compare_with"])]
+    motions = compare_base(trials, still) if len(trials) > 1 else []
+    figure = recording_quality(recording, result, narrow=False)
+    write_json(folder / "quality.json", {**result.to_plain(), "base": [_plain(motion, still) for motion in motions]})
+    with atomic_path(folder / "quality.png") as partial:
+        figure.savefig(partial, format="png", dpi=160, facecolor="white")
+    if len(trials) > 1:
+        check_base(trials, still, largest_distortion=config["largest_distortion"])
+    return _text(result, motions)
+
+
+def _check(config: Mapping[str, Any]) -> None:
+    """Raises InputError for the first value of the configuration that cannot be used."""
+    for key in ("still", "moving", "compare_with"):
+        if not (isinstance(config[key], list) and all(isinstance(value, str) for value in config[key])):
+            raise InputError(f"{key} is {config[key]!r}: set it to a list, as in {key}='[Base - 1,Base - 2]'.")
+    for key, least in (("longest_gap", 0), ("least_jump", 0.0), ("largest_distortion", 0.0)):
+        value = config[key]
+        if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value < np.inf:
+            raise InputError(f"{key} is {value!r}: set it to a number, not below zero.")
+    rate, labels, path = (config["recording"][key] for key in ("rate", "labels", "path"))
+    if not isinstance(path, str):
+        raise InputError(f"recording.path is {path!r}: set it to a file, as in recording.path=swing.c3d.")
+    if rate is not None and (isinstance(rate, bool) or not isinstance(rate, int | float)):
+        raise InputError(f"recording.rate is {rate!r}: set it to the frames a second.")
+    if labels is not None and not isinstance(labels, list):
+        raise InputError(f"recording.labels is {labels!r}: set it to a list of names.")
+    if config["compare_with"] and len(config["still"]) < 2:
+        raise InputError("compare_with needs two or more markers on the base to compare: name them in still.")
+
+
+def _visible(recording: Recording) -> Recording:
+    """Without the markers that are seen in fewer than two frames, which cannot be drawn as a line."""
+    counts = recording.seen.sum(axis=0)
+    return recording.select([label for label, count in zip(recording.labels, counts, strict=True) if count > 1])
+
+
+def _path(recording: Recording, bridged: Recording, label: str, panel: str) -> FloatArray:
+    """(T,) [mm] what a panel shows of a marker."""
+    measured = recording.positions[:, recording.labels.index(label)]
+    moved = bridged.positions[:, bridged.labels.index(label)] - np.nanmedian(measured, axis=0)
+    return _MILLI * (np.linalg.norm(moved, axis=1) if panel == "still" else moved[:, "xyz".index(panel)])
+
+
+def _line(axes: Axes, recording: Recording, result: Quality, label: str, path: FloatArray, colour: str) -> None:
+    """One marker: thin where it is filled, with a triangle above each jump."""
+    time = np.arange(len(path)) / recording.rate
+    seen = recording.seen[:, recording.labels.index(label)]
+    axes.plot(time, path, color=colour, linewidth=0.5)
+    axes.plot(time, np.where(seen, path, np.nan), color=colour, linewidth=1.1)
+    frames = [jump.frame for marker in result.markers if marker.label == label for jump in marker.jumps]
+    axes.plot(
+        time[frames], path[frames], "v", color=colour, markersize=4.5, markeredgecolor="white", markeredgewidth=0.4
+    )
+
+
+def _raster(axes: Axes, recording: Recording, bridged: Recording, result: Quality) -> None:
+    """A row for each marker: seen, filled or masked, and its jumps."""
+    height = len(recording.labels)
+    states = np.full((height, len(recording.positions)), 2)
+    states[recording.seen.T] = 0
+    for label in bridged.labels:
+        row = recording.labels.index(label)
+        was_filled = bridged.seen[:, bridged.labels.index(label)] & (states[row] == 2)
+        states[row, was_filled] = 1
+    image = np.array([mpl.colors.to_rgb(colour) for colour in _STATES.values()])[states]
+    extent = (0.0, len(recording.positions) / recording.rate, height - 0.5, -0.5)
+    axes.imshow(image, extent=extent, aspect="auto", interpolation="nearest")
+    for row, marker in enumerate(result.markers):
+        at = [(jump.frame + 0.5) / recording.rate for jump in marker.jumps]
+        axes.plot(at, [row] * len(at), "|", color=TONES["ink"].light, markersize=6, markeredgewidth=0.9)
+    for row in range(1, height):
+        axes.axhline(row - 0.5, color="white", linewidth=1.2)
+    axes.set_yticks(range(height), recording.labels)
+    axes.tick_params(axis="y", length=0)
+    axes.grid(visible=False)
+    handles: list[Artist] = [Patch(color=colour, label=name) for name, colour in _STATES.items()]
+    handles.append(axes.plot([], [], "|", color=TONES["ink"].light, markersize=6, label="jump")[0])
+    axes.legend(handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, handlelength=1.0)
+
+
+def _legend(figure: Figure, colours: Mapping[str, str], *, narrow: bool) -> None:
+    """Markers by colour, above the figure."""
+    handles = [mpl.lines.Line2D([], [], color=colour, label=label) for label, colour in colours.items()]
+    columns = min(len(handles), _LEGEND_COLUMNS[narrow])
+    figure.legend(handles=handles, loc="outside upper left", ncols=columns, columnspacing=1.4)
+
+
+def _text(result: Quality, motions: Sequence[BaseMotion]) -> str:
+    """The table with a column for each quantity, then the warnings."""
+    rows = quality_table(result)
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    lines = [
+        "  ".join(
+            [row[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True))]
+        )
+        for row in rows
+    ]
+    seconds = result.frames / result.rate
+    lines.append(f"{result.source}: {result.frames} frames, {seconds:.2f} s at {result.rate:g} Hz")
+    if result.release is not None:
+        held = result.release.rest
+        lines.append(f"Let go in frame {result.release.frame:.2f}; held still in frames {held[0]} to {held[1] - 1}.")
+    lines += result.warnings
+    for motion in motions:
+        lines.append(
+            f"{motion.source}: the base stands up to {_MILLI * motion.shift.max():.2f} mm from its place here; its "
+            f"markers moved by up to {_MILLI * motion.distortion.max():.2f} mm against each other."
+        )
+    return "\n".join(lines)
+
+
+def _plain(motion: BaseMotion, labels: Sequence[str]) -> dict[str, Any]:
+    return {
+        "source": motion.source,
+        "shift_mm": dict(zip(labels, _MILLI * motion.shift, strict=True)),
+        "distortion_mm": dict(zip(labels, _MILLI * motion.distortion, strict=True)),
+    }

@@ -29,7 +29,7 @@ from warp_resphys.residual.reconstruction import LBFGSB
 from warp_resphys.residual.training import Trainer
 from warp_resphys.resumable import ResumableHDF5
 from warp_resphys.stages import package_versions
-from warp_resphys.tasks import evaluate, experiment
+from warp_resphys.tasks import evaluate, experiment, train
 from warp_resphys.tasks.checks import check_configuration
 
 REPOSITORY = Path(__file__).parents[1]
@@ -137,7 +137,7 @@ class TestCompleteRun:
 
     def test_metrics(self, finished):
         found = metrics(finished[0])
-        keys = ["errors_mm", "errors_vs_reconstruction_mm", "per_trajectory"]
+        keys = ["errors_mm", "errors_vs_reconstruction_mm", "per_trajectory", "networks"]
         assert list(found) == [*keys, "seconds_per_test_trajectory", "seconds", "versions", "device"]
         assert set(found["seconds_per_test_trajectory"]) == {"simulation", "true_parameters", "resphys", "inference"}
         assert set(found["errors_mm"]) == {"simulation", "reconstruction", "resphys", "simfree"}
@@ -189,10 +189,14 @@ class TestCompleteRun:
         assert record["settings"]["trainer"]["epochs"] == 40
         saved = OmegaConf.load(finished[0] / ".hydra" / "config.yaml")
         assert saved.network.width == 32
-        history = json.loads((finished[0] / "training.json").read_text())
+        training = json.loads((finished[0] / "training.json").read_text())
+        history, kept = training["epochs"], training["kept"]
         assert [r["epoch"] for r in history if "rollout_error_mm" in r] == [10, 20, 30, 40]
+        assert kept["validation_rollout_error_mm"] == min(r.get("rollout_error_mm", 1e9) for r in history)
+        assert history[kept["epoch"] - 1]["rollout_error_mm"] == kept["validation_rollout_error_mm"]
         _, metadata = read_checkpoint(finished[0] / "model.safetensors", "residual force")
-        assert metadata["validation_rollout_error_mm"] == min(r.get("rollout_error_mm", 1e9) for r in history)
+        assert metadata.items() >= kept.items()
+        assert metrics(finished[0])["networks"]["resphys"] == kept
 
     def test_the_report_is_self_contained(self, finished):
         page = (finished[0] / "report.html").read_text()
@@ -274,9 +278,19 @@ class TestChanges:
             _, metadata = read_checkpoint(f"run/{name}.safetensors", kind)
             assert metadata["architecture"] == {"blocks": 5, "layers": 3, "width": 16}
             assert not metadata["reduced"]
-            records = json.loads(Path(f"run/{history}.json").read_text())
+            records = json.loads(Path(f"run/{history}.json").read_text())["epochs"]
             assert [r["epoch"] for r in records if "rollout_error_mm" in r] == [1, 2]
         assert metrics()["errors_mm"].keys() == {*MODELS, "simfree"}
+
+    def test_kept_weights_that_diverge_are_no_secret(self, folder, monkeypatch, caplog):
+        monkeypatch.setattr(train.Validation, "error_mm", lambda self, rollout: float("inf"))
+        assert run(*TINY, IN_RUN, "trainer.selection=validation_loss", "trainer.epochs=3")[0] == 0
+        assert "train: the weights that are kept diverge on the validation split" in caplog.text
+        for name in ("resphys", "simfree"):
+            kept = metrics()["networks"][name]
+            assert (kept["selection"], kept["validation_rollout_error_mm"]) == ("validation_loss", None)
+        history = json.loads(Path("run/training.json").read_text())["epochs"]
+        assert min(history, key=lambda r: r["validation_loss"])["epoch"] == metrics()["networks"]["resphys"]["epoch"]
 
     def test_a_diverged_roll_out_is_counted_and_is_no_number(self, finished, copied, monkeypatch):
         """The second of two test trajectories gets a force that is not finite at its fifth step."""
@@ -616,4 +630,6 @@ class TestConfiguration:
         assert [config["network"][k] for k in ("blocks", "layers", "width")] == [5, 3, 512]
         keys = ("epochs", "batch_size", "learning_rate", "weight_decay")
         assert [config["trainer"][k] for k in keys] == [1000, 256, 1e-3, 1e-5]
+        keys = ("schedule", "gamma", "step_epochs", "selection")
+        assert [config["trainer"][k] for k in keys] == ["step", 0.83, 100, "validation_loss"]
         assert config["physics"] == {"mass": "per_vertex", "volume_integration": "full"}

@@ -1,4 +1,4 @@
-"""Supervised training of a model, which is chosen by its roll-outs."""
+"""Supervised training of a model, chosen by its roll-outs or, as published, by its validation loss."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -9,6 +9,9 @@ import torch
 
 from ..errors import InputError
 from .networks import Model
+
+SCHEDULES = ("cosine", "step")
+SELECTIONS = ("rollout", "validation_loss")
 
 
 @dataclass(frozen=True)
@@ -27,19 +30,24 @@ class TrainingState:
     Attributes:
         epoch: epochs done.
         history: one record an epoch: ``epoch``, ``train_loss``, ``validation_loss``, ``learning_rate``, and
-            ``rollout_error_mm`` where it was measured.
-        best_error: smallest roll-out error so far [mm].
+            ``rollout_error_mm`` where it was measured; infinite where a roll-out diverged.
+        best_score: smallest so far of what models are selected by, a roll-out error [mm] or a validation loss.
+        best_epoch: after which it was reached.
         best: weights that had it.
     """
 
     epoch: int = 0
     history: list[dict[str, float]] = field(default_factory=list)
-    best_error: float = math.inf
+    best_score: float = math.inf
+    best_epoch: int = 0
     best: dict[str, torch.Tensor] = field(default_factory=dict)
 
 
 class Trainer(Generic[Model]):
-    """Adam on the mean squared error of the standardised outputs, with a cosine schedule.
+    """Adam on the mean squared error of the standardised outputs.
+
+    The weights that are kept have the smallest roll-out error on the validation split, measured every so many epochs,
+    or the smallest validation loss of all epochs. In either case `use_best` leaves their roll-out error in the history.
 
     Args:
         model: to train; on the device of the samples.
@@ -87,8 +95,10 @@ class Trainer(Generic[Model]):
         return self.state.epoch >= self.config["epochs"]
 
     def learning_rate(self, epoch: int) -> float:
-        """Cosine from the first to the final rate."""
+        """Cosine from the first to the final rate, or a factor gamma every so many epochs."""
         first, last = self.config["learning_rate"], self.config["final_learning_rate"]
+        if self.config["schedule"] == "step":
+            return float(first * self.config["gamma"] ** (epoch // self.config["step_epochs"]))
         phase = epoch / max(self.config["epochs"] - 1, 1)
         return float(last + 0.5 * (first - last) * (1.0 + math.cos(math.pi * phase)))
 
@@ -119,8 +129,9 @@ class Trainer(Generic[Model]):
             "learning_rate": rate,
         }
         if self.state.epoch % self.config["rollout_every"] == 0 or self.finished:
-            record["rollout_error_mm"] = self._select()
+            record["rollout_error_mm"] = self.rollout_error(self.model)
         self.state.history.append(record)
+        self._select(record)
         return record
 
     def _validate(self) -> float:
@@ -134,13 +145,18 @@ class Trainer(Generic[Model]):
         error = self.model.standardised(inputs) - outputs
         return (error / self.model.remainder).square().mean()
 
-    def _select(self) -> float:
-        """Rolls out, and keeps the weights if they are the best so far."""
-        error = self.rollout_error(self.model)
-        if error < self.state.best_error or not self.state.best:
-            self.state.best_error = error
+    def _select(self, record: dict[str, float]) -> None:
+        """Keeps the weights if they are the best so far, or the first that could be compared."""
+        score = record.get("rollout_error_mm" if self.config["selection"] == "rollout" else "validation_loss")
+        if score is not None and (score < self.state.best_score or not self.state.best):
+            self.state.best_score, self.state.best_epoch = score, self.state.epoch
             self.state.best = {k: t.detach().clone() for k, t in self.model.network.state_dict().items()}
-        return error
+
+    @property
+    def best_error(self) -> float:
+        """Roll-out error of the kept weights [mm]; infinite where one diverged, NaN where none was measured yet."""
+        history = self.state.history
+        return history[self.state.best_epoch - 1].get("rollout_error_mm", math.nan) if self.state.best else math.nan
 
     def snapshot(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
         """Tensors and metadata from which `resume` goes on exactly."""
@@ -149,17 +165,23 @@ class Trainer(Generic[Model]):
         tensors["random"] = self._random.get_state()
         for i, slot in self._optimiser.state_dict()["state"].items():
             tensors |= {f"adam.{i}.{k}": t for k, t in slot.items()}
-        best = self.state.best_error if math.isfinite(self.state.best_error) else None
-        return tensors, {"epoch": self.state.epoch, "best_error": best, "history": self.state.history}
+        best = self.state.best_score if math.isfinite(self.state.best_score) else None
+        return tensors, {
+            "epoch": self.state.epoch,
+            "best_score": best,
+            "best_epoch": self.state.best_epoch,
+            "history": self.state.history,
+        }
 
     def resume(self, tensors: Mapping[str, torch.Tensor], metadata: Mapping[str, Any]) -> None:
         """Goes on from a `snapshot`."""
         self.model.load_state_dict(_part(tensors, "model."))
-        best = metadata["best_error"]
+        best = metadata["best_score"]
         self.state = TrainingState(
             metadata["epoch"],
             list(metadata["history"]),
             math.inf if best is None else best,
+            metadata["best_epoch"],
             _part(tensors, "best."),
         )
         self._random.set_state(tensors["random"])
@@ -170,8 +192,11 @@ class Trainer(Generic[Model]):
         self._optimiser.load_state_dict({**self._optimiser.state_dict(), "state": slots})
 
     def use_best(self) -> Model:
-        """The model with the weights of the smallest roll-out error."""
+        """The model with the weights that are kept; completes the history by their roll-out error."""
         self.model.network.load_state_dict(self.state.best)
+        record = self.state.history[self.state.best_epoch - 1]
+        if "rollout_error_mm" not in record:
+            record["rollout_error_mm"] = self.rollout_error(self.model.eval())
         return self.model.eval()
 
 
@@ -181,9 +206,14 @@ def check_trainer(config: Mapping[str, Any]) -> None:
     Raises:
         InputError: a setting out of range.
     """
-    for key in ("epochs", "batch_size", "learning_rate", "final_learning_rate", "rollout_every"):
+    for key, known in (("schedule", SCHEDULES), ("selection", SELECTIONS)):
+        if config[key] not in known:
+            raise InputError(f"trainer.{key} is {config[key]!r}: choose one of {', '.join(known)}.")
+    for key in ("epochs", "batch_size", "learning_rate", "final_learning_rate", "step_epochs", "rollout_every"):
         if not config[key] > 0:
             raise InputError(f"trainer.{key} is {config[key]}: it must be positive.")
+    if not 0.0 < config["gamma"] <= 1.0:
+        raise InputError(f"trainer.gamma is {config['gamma']}: it must be greater than 0 and at most 1.")
     for key in ("weight_decay", "noise"):
         if not config[key] >= 0:
             raise InputError(f"trainer.{key} is {config[key]}: it must be zero or more.")

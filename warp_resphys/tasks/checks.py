@@ -41,6 +41,8 @@ _WORDS = (
     "*.name",
     "*.method",
     "solver.linear_solver",
+    "trainer.schedule",
+    "trainer.selection",
 )
 _WHOLE_NUMBERS = (
     "seed",
@@ -52,6 +54,7 @@ _WHOLE_NUMBERS = (
     "network.*",
     "trainer.epochs",
     "trainer.batch_size",
+    "trainer.step_epochs",
     "trainer.rollout_every",
 )
 _NUMBERS = (

@@ -15,6 +15,7 @@ from .trajectories import (
     RECONSTRUCTION,
     REPORT,
     ROLLOUTS,
+    SIMFREE_TRAINING,
     STAGES,
     TIMES,
     TRAINING,
@@ -23,6 +24,7 @@ from .trajectories import (
     split_of,
 )
 
+_HISTORIES = {"resphys": TRAINING, "simfree": SIMFREE_TRAINING}
 _AS_PUBLISHED = "The published errors are measured against the reconstructed trajectories, ours against the target."
 _PHYSICS = {
     "per_vertex": " This run computes masses and volumes as the published code does.",
@@ -70,17 +72,18 @@ def make_report(context: StageContext) -> None:
         tip=select_vertices(mesh, **config["tip"]),
         example=Example(split.test[worst], target[worst], simulation[worst], resphys[worst]),
         errors_mm=errors,
-        training=read_json(context.run_dir / TRAINING),
+        training=read_json(context.run_dir / TRAINING)["epochs"],
     )
     write_report(context.run_dir / REPORT, data)
 
 
 def collect_metrics(context: StageContext, config: dict[str, Any]) -> dict[str, Any]:
-    """Errors, seconds of the stages that are done, versions and device."""
+    """Errors, which weights were kept, seconds of the stages that are done, versions and device."""
     records = sorted((context.run_dir / "stages").glob("*.json"))
     seconds = {r.stem: read_json(r)["seconds"] for r in records if not r.name.endswith(".progress.json")}
     return {
         **read_json(context.run_dir / ERRORS),
+        "networks": {m: read_json(context.run_dir / f)["kept"] for m, f in _HISTORIES.items()},
         "seconds_per_test_trajectory": read_json(context.run_dir / TIMES)["seconds"],
         "seconds": {name: seconds[name] for name in STAGES if name in seconds},
         "versions": package_versions(),

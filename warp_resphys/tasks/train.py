@@ -1,6 +1,7 @@
 """Stages: the network that predicts the residual force, and the data-driven baseline."""
 
 import logging
+import math
 import time
 from pathlib import Path
 from typing import Any
@@ -41,7 +42,7 @@ _CHECKPOINT_SECONDS = 10.0
 
 
 def train(context: StageContext) -> None:
-    """Trains the residual force: model.safetensors, with the smallest validation roll-out error, and training.json."""
+    """Trains the residual force: model.safetensors, with the weights that are selected, and training.json."""
     settings = context.settings
     split, _ = split_of(settings["data"])
     device = choose_device(settings["device"])
@@ -87,13 +88,19 @@ def _train(context: StageContext, trainer: Trainer[Model], model: str, history: 
         trainer.resume(*found)
     _run_epochs(context.name, trainer, checkpoint, context.fingerprint)
     best = trainer.use_best()
-    error_mm = trainer.state.best_error
-    write_json(context.run_dir / history, trainer.state.history)
+    kept = {
+        "selection": trainer.config["selection"],
+        "epoch": trainer.state.best_epoch,
+        "validation_rollout_error_mm": trainer.best_error if math.isfinite(trainer.best_error) else None,
+    }
+    if kept["validation_rollout_error_mm"] is None:
+        log.warning("%s: the weights that are kept diverge on the validation split", context.name)
+    write_json(context.run_dir / history, {"kept": kept, "epochs": trainer.state.history})
     write_checkpoint(
         context.run_dir / model,
         kind,
         best.state_dict(),
-        {**best.description(), "validation_rollout_error_mm": error_mm, "fingerprint": context.fingerprint},
+        {**best.description(), **kept, "fingerprint": context.fingerprint},
     )
     checkpoint.unlink(missing_ok=True)
 
@@ -112,8 +119,8 @@ def _run_epochs(name: str, trainer: Trainer[Model], checkpoint: Path, fingerprin
                     _save(checkpoint, kept, fingerprint)
                     saved = time.monotonic()
                 shown: dict[str, object] = {"loss": f"{record['train_loss']:.2e}"}
-                if trainer.state.best:
-                    shown["rollout"] = f"{trainer.state.best_error:.2g} mm"
+                if not math.isnan(trainer.best_error):
+                    shown["rollout"] = f"{trainer.best_error:.2g} mm"
                 progress.advance(1, **shown)
         finally:
             _save(checkpoint, kept, fingerprint)

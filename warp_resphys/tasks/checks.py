@@ -14,6 +14,7 @@ from ..material import Material
 from ..mesh import select_vertices
 from ..residual.networks import check_network
 from ..residual.reconstruction import make_reconstructor
+from ..residual.refinement import check_refinement
 from ..residual.training import check_trainer
 from ..solver import SolverSettings
 from .trajectories import variation_of
@@ -25,6 +26,7 @@ _GROUPS = (
     "reconstruction",
     "network",
     "trainer",
+    "refinement",
     "fixed",
     "simulation",
     "reality",
@@ -56,6 +58,11 @@ _WHOLE_NUMBERS = (
     "trainer.batch_size",
     "trainer.step_epochs",
     "trainer.rollout_every",
+    "refinement.window",
+    "refinement.epochs",
+    "refinement.batch_size",
+    "refinement.memory",
+    "refinement.rollout_every",
 )
 _NUMBERS = (
     "time_step",
@@ -117,6 +124,7 @@ def check_configuration(config: Mapping[str, Any]) -> None:
                 raise InputError(f"unknown key '{key}.{name}': {key} has {', '.join(known)}.")
     check_network(config["network"])
     check_trainer(config["trainer"])
+    check_refinement(config["refinement"], config["data"]["steps"])
     make_reconstructor(build_simulator(config), **config["reconstruction"])
 
 

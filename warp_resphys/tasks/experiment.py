@@ -18,6 +18,7 @@ from .checks import check_configuration
 from .evaluate import evaluate
 from .generate import generate
 from .reconstruct import reconstruct
+from .refine import refine
 from .report import collect_metrics, make_report
 from .timing import time_models
 from .train import train, train_simfree
@@ -26,6 +27,8 @@ from .trajectories import (
     METRICS,
     MODEL,
     RECONSTRUCTION,
+    REFINED,
+    REFINEMENT,
     REPORT,
     ROLLOUTS,
     SIMFREE,
@@ -51,7 +54,16 @@ def stages(config: dict[str, Any]) -> list[Stage]:
     base = simulated(config)
     corrected = {**base, "simulation": config["simulation"]}
     learned = {**corrected, "data": config["data"]}
-    network = {key: config[key] for key in ("network", "trainer", "seed")}
+    network = _pick(config, "network", "trainer", "seed")
+    refined = config["refinement"]["kind"] != "none"
+    force, force_file = ("refine", REFINED) if refined else ("train", MODEL)
+    refinement = Stage(
+        "refine",
+        refine,
+        (REFINED, REFINEMENT),
+        {**learned, **_pick(config, "refinement")},
+        ("generate", "train"),
+    )
     return [
         Stage("generate", generate, (TRAJECTORIES,), {**base, **_pick(config, "reality", "data")}),
         Stage(
@@ -62,6 +74,7 @@ def stages(config: dict[str, Any]) -> list[Stage]:
             ("generate",),
         ),
         Stage("train", train, (MODEL, TRAINING), {**learned, **network}, ("generate", "reconstruct")),
+        *([refinement] if refined else []),
         Stage(
             "train_simfree",
             train_simfree,
@@ -73,11 +86,17 @@ def stages(config: dict[str, Any]) -> list[Stage]:
             "evaluate",
             evaluate,
             (ROLLOUTS, ERRORS),
-            learned,
-            ("generate", "reconstruct", "train", "train_simfree"),
+            {**learned, "force": force_file},
+            ("generate", "reconstruct", force, "train_simfree"),
         ),
-        Stage("time", time_models, (TIMES,), {**learned, **_pick(config, "reality")}, ("generate", "train")),
-        Stage("report", make_report, (REPORT,), {"config": config}, ("train", "evaluate", "time")),
+        Stage(
+            "time",
+            time_models,
+            (TIMES,),
+            {**learned, **_pick(config, "reality"), "force": force_file},
+            ("generate", force),
+        ),
+        Stage("report", make_report, (REPORT,), {"config": config}, (force, "train_simfree", "evaluate", "time")),
     ]
 
 

@@ -22,7 +22,7 @@ from ..residual.rollout import (
     StatePredictor,
     closed_loop,
 )
-from ..residual.training import Samples, Trainer
+from ..residual.training import EpochTrainer, Samples, Trainer
 from ..resumable import resume_checkpoint
 from ..stages import StageContext
 from .trajectories import (
@@ -58,7 +58,7 @@ def train(context: StageContext) -> None:
         return validation.error_mm(HybridRollout(validation.simulator, force_predictor(candidate)))
 
     trainer = Trainer(model, pick, samples["validation"], error, settings["trainer"], settings["seed"])
-    _train(context, trainer, MODEL, TRAINING, "residual force")
+    fit(context, trainer, MODEL, TRAINING, "residual force")
 
 
 def train_simfree(context: StageContext) -> None:
@@ -77,11 +77,11 @@ def train_simfree(context: StageContext) -> None:
         return validation.error_mm(DataDrivenRollout(validation.simulator, state_predictor(candidate)))
 
     trainer = Trainer(model, samples["train"], samples["validation"], error, settings["trainer"], settings["seed"])
-    _train(context, trainer, SIMFREE, SIMFREE_TRAINING, "next state")
+    fit(context, trainer, SIMFREE, SIMFREE_TRAINING, "next state")
 
 
-def _train(context: StageContext, trainer: Trainer[Model], model: str, history: str, kind: str) -> None:
-    """Trains, going on from an interrupted run, and writes the best weights and the history."""
+def fit(context: StageContext, trainer: EpochTrainer[Model], model: str, history: str, kind: str) -> None:
+    """Trains, going on from an interrupted run, and writes the selected weights and the history."""
     checkpoint = context.run_dir / f"{context.name}.safetensors"
     found = resume_checkpoint(checkpoint, "training", context.fingerprint)
     if found is not None:
@@ -89,7 +89,7 @@ def _train(context: StageContext, trainer: Trainer[Model], model: str, history: 
     _run_epochs(context.name, trainer, checkpoint, context.fingerprint)
     best = trainer.use_best()
     kept = {
-        "selection": trainer.config["selection"],
+        "selection": trainer.selection,
         "epoch": trainer.state.best_epoch,
         "validation_rollout_error_mm": trainer.best_error if math.isfinite(trainer.best_error) else None,
     }
@@ -105,7 +105,7 @@ def _train(context: StageContext, trainer: Trainer[Model], model: str, history: 
     checkpoint.unlink(missing_ok=True)
 
 
-def _run_epochs(name: str, trainer: Trainer[Model], checkpoint: Path, fingerprint: str) -> None:
+def _run_epochs(name: str, trainer: EpochTrainer[Model], checkpoint: Path, fingerprint: str) -> None:
     """Trains to the end; on the way, and however it ends, keeps the last whole epoch."""
     epochs = trainer.config["epochs"]
     saved = time.monotonic()

@@ -15,12 +15,14 @@ from ..integrator import State
 from ..resumable import Field, ResumableHDF5
 
 SPLITS = ("train", "validation", "test")
-STAGES = ("generate", "reconstruct", "train", "train_simfree", "evaluate", "time", "report")
+STAGES = ("generate", "reconstruct", "train", "refine", "train_simfree", "evaluate", "time", "report")
 
 TRAJECTORIES = "trajectories.h5"
 RECONSTRUCTION = "reconstruction.h5"
 MODEL = "model.safetensors"
 TRAINING = "training.json"
+REFINED = "refined.safetensors"
+REFINEMENT = "refinement.json"
 SIMFREE = "simfree.safetensors"
 SIMFREE_TRAINING = "simfree_training.json"
 ROLLOUTS = "rollouts.h5"

@@ -102,9 +102,55 @@ class TestRunFolder:
         assert cli.run_label(["device=cuda", "+extra.device=cpu"], ["device", "extra.device"]) == "default"
         assert cli.run_label(["b=2", "a.c=1e-3", "~d"]) == "a.c=1e-3,b=2,~d"
         assert cli.run_label(["a=2", "a=1"]) == "a=1"
+        tuning = ["task=tune", "tune.trials=3", "~tune.space.trainer.gamma", "tune=mine", "tuned=best"]
+        assert cli.run_label(tuning, ["task", "tune"]) == "tuned=best"
         awkward = [cli.run_label([f"a={value}"]) for value in ("x/y", "x y", "x" * 300, "x" * 301)]
         assert len(set(awkward)) == 4
         assert all(set(label) <= set("axy=-0123456789abcdef") and len(label) < 120 for label in awkward)
+
+
+class TestOwnOptions:
+    @pytest.fixture
+    def own(self, command, tmp_path):
+        for name, text in {
+            "configs/experiment/my_robot.yaml": "# @package _global_\nname: my_robot",
+            "elsewhere/experiment/other_robot.yaml": "# @package _global_\nname: other_robot",
+        }.items():
+            path = tmp_path / name
+            path.parent.mkdir(parents=True)
+            path.write_text(text)
+        return tmp_path / "configs"
+
+    def test_they_lie_in_the_working_directory(self, command, own):
+        assert command("experiment=my_robot", "seed=1") == (0, "")
+        assert command.outputs == ["runs/my_robot/seed=1"]
+        code, errors = command("experiment=my_robt")
+        assert (code, errors.partition(";")[0]) == (2, "error: unknown experiment 'my_robt', did you mean 'my_robot'?")
+        assert command("experiment=zzz")[1].endswith("known are beam, beam_twist, my_robot\n")
+
+    def test_help_names_them(self, command, own, capsys):
+        command.monkeypatch.setattr(sys, "argv", [*command.arguments, "--help"])
+        with pytest.raises(SystemExit):
+            cli.main()
+        out, err = capsys.readouterr()
+        assert "experiment: beam, beam_twist, my_robot" in out
+        assert err == ""
+
+    def test_another_folder_takes_their_place(self, command, own):
+        assert command("--config-dir", "elsewhere", "experiment=other_robot") == (0, "")
+        assert command("--config-dir", "elsewhere", "experiment=my_robot")[0] == 2
+
+    def test_the_package_wins_and_says_so(self, command, own):
+        (own / "config.yaml").write_text("name: of something else")
+        (own / "trainer").mkdir()
+        (own / "trainer" / "default.yaml").write_text("epochs: 1")
+        warning = "warning: configs/trainer/default.yaml is not used: the package has an option of that name\n"
+        assert command("experiment=my_robot") == (0, warning)
+        assert command.outputs == ["runs/my_robot/default"]
+
+    def test_the_command_line_is_left_as_it_was(self, command, own):
+        command("seed=1")
+        assert sys.argv == [*command.arguments, "seed=1"]
 
 
 class TestUserErrors:

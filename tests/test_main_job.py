@@ -26,14 +26,16 @@ from warp_resphys import box_hexahedra, cli
 from warp_resphys.configured import build_simulator
 from warp_resphys.files import read_checkpoint, read_hdf5
 from warp_resphys.residual.reconstruction import LBFGSB
-from warp_resphys.residual.training import Trainer
+from warp_resphys.residual.training import EpochTrainer
 from warp_resphys.resumable import ResumableHDF5
 from warp_resphys.stages import package_versions
-from warp_resphys.tasks import evaluate, experiment
+from warp_resphys.tasks import evaluate, experiment, train
 from warp_resphys.tasks.checks import check_configuration
 
 REPOSITORY = Path(__file__).parents[1]
 STAGES = ["generate", "reconstruct", "train", "train_simfree", "evaluate", "time", "report"]
+REFINED = ["generate", "reconstruct", "train", "refine", "train_simfree", "evaluate", "time", "report"]
+REFINE = ["refinement=solver_in_the_loop", "refinement.window=4", "refinement.epochs=3"]
 LEARNED = ["train", "train_simfree", "evaluate", "time", "report"]
 CORRECTED = ["reconstruct", "train", "evaluate", "time", "report"]
 MODELS = ("simulation", "resphys", "reconstruction")
@@ -94,7 +96,9 @@ def files(folder="run"):
 def ran(before):
     """Stages whose record is another than before."""
     now = files()
-    return [s for s in STAGES if now[f"stages/{s}.json"] != before.get(f"stages/{s}.json")]
+    return [
+        s for s in REFINED if f"stages/{s}.json" in now and now[f"stages/{s}.json"] != before.get(f"stages/{s}.json")
+    ]
 
 
 @pytest.fixture
@@ -137,7 +141,7 @@ class TestCompleteRun:
 
     def test_metrics(self, finished):
         found = metrics(finished[0])
-        keys = ["errors_mm", "errors_vs_reconstruction_mm", "per_trajectory"]
+        keys = ["errors_mm", "errors_vs_reconstruction_mm", "per_trajectory", "networks"]
         assert list(found) == [*keys, "seconds_per_test_trajectory", "seconds", "versions", "device"]
         assert set(found["seconds_per_test_trajectory"]) == {"simulation", "true_parameters", "resphys", "inference"}
         assert set(found["errors_mm"]) == {"simulation", "reconstruction", "resphys", "simfree"}
@@ -189,10 +193,14 @@ class TestCompleteRun:
         assert record["settings"]["trainer"]["epochs"] == 40
         saved = OmegaConf.load(finished[0] / ".hydra" / "config.yaml")
         assert saved.network.width == 32
-        history = json.loads((finished[0] / "training.json").read_text())
+        training = json.loads((finished[0] / "training.json").read_text())
+        history, kept = training["epochs"], training["kept"]
         assert [r["epoch"] for r in history if "rollout_error_mm" in r] == [10, 20, 30, 40]
+        assert kept["validation_rollout_error_mm"] == min(r.get("rollout_error_mm", 1e9) for r in history)
+        assert history[kept["epoch"] - 1]["rollout_error_mm"] == kept["validation_rollout_error_mm"]
         _, metadata = read_checkpoint(finished[0] / "model.safetensors", "residual force")
-        assert metadata["validation_rollout_error_mm"] == min(r.get("rollout_error_mm", 1e9) for r in history)
+        assert metadata.items() >= kept.items()
+        assert metrics(finished[0])["networks"]["resphys"] == kept
 
     def test_the_report_is_self_contained(self, finished):
         page = (finished[0] / "report.html").read_text()
@@ -274,9 +282,49 @@ class TestChanges:
             _, metadata = read_checkpoint(f"run/{name}.safetensors", kind)
             assert metadata["architecture"] == {"blocks": 5, "layers": 3, "width": 16}
             assert not metadata["reduced"]
-            records = json.loads(Path(f"run/{history}.json").read_text())
+            records = json.loads(Path(f"run/{history}.json").read_text())["epochs"]
             assert [r["epoch"] for r in records if "rollout_error_mm" in r] == [1, 2]
         assert metrics()["errors_mm"].keys() == {*MODELS, "simfree"}
+
+    def test_kept_weights_that_diverge_are_no_secret(self, folder, monkeypatch, caplog):
+        monkeypatch.setattr(train.Validation, "error_mm", lambda self, rollout: float("inf"))
+        assert run(*TINY, IN_RUN, "trainer.selection=validation_loss", "trainer.epochs=3")[0] == 0
+        assert "train: the weights that are kept diverge on the validation split" in caplog.text
+        for name in ("resphys", "simfree"):
+            kept = metrics()["networks"][name]
+            assert (kept["selection"], kept["validation_rollout_error_mm"]) == ("validation_loss", None)
+        history = json.loads(Path("run/training.json").read_text())["epochs"]
+        assert min(history, key=lambda r: r["validation_loss"])["epoch"] == metrics()["networks"]["resphys"]["epoch"]
+
+    def test_refinement_is_never_worse_on_the_validation_split(self, finished, copied):
+        """Here it overfits three short trajectories, so that the weights from before it are taken."""
+        assert run(*TINY, *REFINE, IN_RUN)[0] == 0
+        assert ran(copied) == ["refine", "evaluate", "time", "report"]
+        history = json.loads(Path("run/refinement.json").read_text())["epochs"]
+        assert [r["epoch"] for r in history] == [0, 1, 2, 3]
+        assert history[3]["train_loss"] < history[0]["train_loss"]
+        found, before = metrics()["networks"], metrics(finished[0])["networks"]
+        assert found["resphys"] == before["resphys"]
+        assert found["refinement"]["epoch"] == 0
+        start = found["resphys"]["validation_rollout_error_mm"]
+        assert found["refinement"]["validation_rollout_error_mm"] == pytest.approx(start, rel=1e-6)
+        same_errors(errors(), errors(finished[0]))
+        before = files()
+        assert run(*TINY, *REFINE, IN_RUN, "refinement.epochs=1")[0] == 0
+        assert ran(before) == ["refine", "evaluate", "time", "report"]
+
+    def test_refinement_helps_a_poor_network(self, folder):
+        poor = [*TINY, "trainer.epochs=3", "trainer.linear_noise=null"]
+        assert run(*poor, *REFINE, "hydra.run.dir=run")[0] == 0
+        found, refined = metrics(), files()
+        assert found["networks"]["refinement"]["epoch"] > 0
+        start = found["networks"]["resphys"]["validation_rollout_error_mm"]
+        assert found["networks"]["refinement"]["validation_rollout_error_mm"] < 0.9 * start
+        assert list(found["seconds"]) == REFINED
+        assert run(*poor, IN_RUN)[0] == 0  # without it again
+        assert ran(refined) == ["evaluate", "time", "report"]
+        assert list(metrics()["seconds"]) == STAGES
+        assert found["errors_mm"]["resphys"]["mean"] < 0.9 * metrics()["errors_mm"]["resphys"]["mean"]
 
     def test_a_diverged_roll_out_is_counted_and_is_no_number(self, finished, copied, monkeypatch):
         """The second of two test trajectories gets a force that is not finite at its fifth step."""
@@ -317,7 +365,7 @@ class Interruption:
     def __init__(self, monkeypatch):
         self.at = None
         self.done = Counter()
-        append, run_epoch = ResumableHDF5.append, Trainer.run_epoch
+        append, run_epoch = ResumableHDF5.append, EpochTrainer.run_epoch
 
         def interrupted_append(file, **arrays):
             append(file, **arrays)
@@ -329,7 +377,7 @@ class Interruption:
             return record
 
         monkeypatch.setattr(ResumableHDF5, "append", interrupted_append)
-        monkeypatch.setattr(Trainer, "run_epoch", interrupted_epoch)
+        monkeypatch.setattr(EpochTrainer, "run_epoch", interrupted_epoch)
 
     def count(self, kind):
         self.done[kind] += 1
@@ -369,6 +417,23 @@ class TestInterruption:
         same_errors(errors(), errors("whole"))
         assert not list(Path("run").glob("*.journal"))
         assert not list(Path("run").glob("train*.safetensors"))
+
+    def test_ctrl_c_while_refining(self, finished, folder, interruption):
+        shutil.copytree(finished[0], "run")
+        shutil.copytree(finished[0], "whole")
+        assert run(*TINY, *REFINE, "hydra.run.dir=whole")[0] == 0
+        assert interruption.done["epochs"] == 3
+        interruption.done.clear()
+        interruption.at = ("epochs", 2)
+        code, err = run(*TINY, *REFINE, IN_RUN)
+        assert (code, "interrupted in stage 'refine'" in err) == (130, True)
+        interruption.at = None
+        assert run(*TINY, *REFINE, IN_RUN)[0] == 0
+        assert interruption.done["epochs"] in (3, 4)
+        first, second = (json.loads(Path(f"{name}/refinement.json").read_text()) for name in ("run", "whole"))
+        losses = [[r["train_loss"] for r in found["epochs"]] for found in (first, second)]
+        assert losses[0] == losses[1]
+        same_errors(errors(), errors("whole"))
 
     def test_twice_in_one_stage_and_before_the_first_frame(self, finished, folder, interruption):
         for at in (1, 2, 9):
@@ -444,6 +509,10 @@ class TestBadInput:
             ("simulation.youngs_modulus=soft", "simulation.youngs_modulus is 'soft': it must be a number."),
             ("trainer.epochs=2.5", "trainer.epochs is 2.5: it must be a whole number."),
             ("trainer.learning_rate=0", "trainer.learning_rate is 0: it must be positive."),
+            ("trainer.schedule=2", "trainer.schedule is 2: it must be a word."),
+            ("trainer.step_epochs=1.5", "trainer.step_epochs is 1.5: it must be a whole number."),
+            ("refinement=solver", "unknown refinement 'solver'; known are none, solver_in_the_loop"),
+            ("refinement.kind=solver", "refinement.kind is 'solver': choose one of none, solver_in_the_loop."),
             ("reconstruction.regularisation=-1", "reconstruction.regularisation is -1: it must be zero or more."),
             ("network.kind=graph", "network.kind is 'graph': choose one of reduced, nodal."),
             ("network.force_modes=1000", "1000 modes were asked for, but 36 samples give 1 to 36."),
@@ -585,7 +654,7 @@ def options(group):
     return sorted(path.stem for path in (REPOSITORY / "conf" / group).glob("*.yaml"))
 
 
-GROUPS = ("mesh", "physics", "solver", "reconstruction", "network", "trainer", "budget")
+GROUPS = ("mesh", "physics", "solver", "reconstruction", "network", "trainer", "refinement", "budget")
 CHOICES = [(name, group, option) for name in options("experiment") for group in GROUPS for option in options(group)]
 
 
@@ -606,7 +675,8 @@ class TestConfiguration:
         check_configuration(config)
         real, wrong = (build_simulator(config, which) for which in ("reality", "simulation"))
         assert real.material != wrong.material
-        assert [stage.name for stage in experiment.stages(config)] == STAGES
+        wanted = REFINED if option == "solver_in_the_loop" else STAGES
+        assert [stage.name for stage in experiment.stages(config)] == wanted
 
     def test_published_sizes_and_settings(self):
         config = self.composed("physics=published", "network=published", "trainer=published")
@@ -616,4 +686,6 @@ class TestConfiguration:
         assert [config["network"][k] for k in ("blocks", "layers", "width")] == [5, 3, 512]
         keys = ("epochs", "batch_size", "learning_rate", "weight_decay")
         assert [config["trainer"][k] for k in keys] == [1000, 256, 1e-3, 1e-5]
+        keys = ("schedule", "gamma", "step_epochs", "selection")
+        assert [config["trainer"][k] for k in keys] == ["step", 0.83, 100, "validation_loss"]
         assert config["physics"] == {"mass": "per_vertex", "volume_integration": "full"}

@@ -13,7 +13,9 @@ import matplotlib.colors
 import matplotlib.image
 import numpy as np
 import pytest
+from hydra import compose, initialize_config_module
 from matplotlib import colormaps
+from omegaconf import OmegaConf
 
 from warp_resphys.errors import DataFileError, InputError
 from warp_resphys.mesh import Mesh, box_hexahedra, box_tetrahedra
@@ -29,6 +31,7 @@ from warp_resphys.report.page import (
     worst_state,
     write_report,
 )
+from warp_resphys.tasks.report import kept_in_words, network_in_words
 
 STEPS = 40
 TIME_STEP = 0.01
@@ -218,6 +221,69 @@ def test_a_diverged_rollout_is_said_and_does_not_hide_the_rest(
     assert "1 of 2 diverged" in page.text
     assert "1 of 2 test roll-outs diverged" in page.text.replace("\u00a0", " ")
     assert len(page.images) == (2 if why_no_drawing else 3)  # Nothing was trained.
+
+
+def test_refinement_and_networks_are_named(report_data: ReportData, tmp_path: Path, why_no_drawing: str) -> None:
+    refinement = [
+        {
+            "epoch": epoch,
+            "train_loss": 1e-6 / (1 + epoch),
+            "validation_loss": None,
+            "rollout_error_mm": 1e-3 / (1 + epoch),
+        }
+        for epoch in range(4)
+    ]
+    data = dataclasses.replace(report_data, refinement=refinement, network_note="Net <1>.", kept_note="Epoch 3.")
+    write_report(tmp_path / "report.html", data)
+    page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
+    assert "Net <1>." in page.text
+    assert "Epoch 3." in page.text
+    assert len(page.images) == (4 if why_no_drawing else 5)
+    assert (tmp_path / "figures" / "refinement.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (
+            ["network=published", "trainer=published"],
+            "ResPhys: the published network, in force, positions and velocities of every vertex, 5 blocks of 3 hidden "
+            "layers of 512; trained as published, 1000 epochs, weights chosen by validation loss.",
+        ),
+        (
+            [],
+            "ResPhys: our network, in a reduced basis of 6 position, 6 velocity and 12 force modes, 1 block of 3 "
+            "hidden layers of 256, beside a linear part from ridge regression; trained our way, 300 epochs, weights "
+            "chosen by roll-out error.",
+        ),
+        (
+            ["network=published", "network.width=64", "trainer=published", "trainer.epochs=10"],
+            "ResPhys: our network, in force, positions and velocities of every vertex, 5 blocks of 3 hidden layers of "
+            "64; trained our way, 10 epochs, weights chosen by validation loss.",
+        ),
+    ],
+)
+def test_it_is_said_whose_network_it_is(options: list[str], said: str) -> None:
+    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
+        config = OmegaConf.to_container(compose("config", options), resolve=True)
+        refined = OmegaConf.to_container(compose("config", [*options, "refinement=solver_in_the_loop"]), resolve=True)
+    assert network_in_words(config) == said
+    assert network_in_words(refined) == f"{said} Then refined through the simulator, over windows of 10 steps."
+
+
+def test_it_is_said_which_weights_were_taken() -> None:
+    kept = {"selection": "rollout", "epoch": 30, "validation_rollout_error_mm": 0.25}
+    lost = {"selection": "validation_loss", "epoch": 9, "validation_rollout_error_mm": None}
+    first = "Kept: epoch 30, by roll-out error; its mean roll-out error on the validation split is 0.250 mm."
+    assert kept_in_words({"resphys": kept}) == first
+    said = kept_in_words({"resphys": lost})
+    assert said == "Kept: epoch 9, by validation loss; its roll-outs of the validation split diverge."
+    worse, better = {**kept, "epoch": 0}, {**kept, "epoch": 4, "validation_rollout_error_mm": 0.125}
+    said = kept_in_words({"resphys": kept, "refinement": worse})
+    assert said == f"{first} No epoch of the refinement was better: the weights are those from before it."
+    assert kept_in_words({"resphys": kept, "refinement": better}).endswith(
+        "Taken in the end: epoch 4 of the refinement; its mean roll-out error on the validation split is 0.125 mm."
+    )
 
 
 def test_errors_of_exactly_zero_are_a_report(report_data: ReportData, tmp_path: Path, why_no_drawing: str) -> None:

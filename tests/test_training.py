@@ -15,10 +15,14 @@ CONFIG = {
     "epochs": 6,
     "batch_size": 16,
     "learning_rate": 5e-3,
+    "schedule": "cosine",
     "final_learning_rate": 1e-4,
+    "gamma": 0.5,
+    "step_epochs": 2,
     "weight_decay": 1e-5,
     "noise": 0.01,
     "linear_noise": 0.01,
+    "selection": "rollout",
     "rollout_every": 2,
 }
 
@@ -57,21 +61,23 @@ def same(a, b):
 
 class TestResume:
     @pytest.mark.parametrize("after", [1, 2, 3, 5])
-    def test_a_snapshot_goes_on_exactly(self, after, tmp_path):
-        whole = finish(trainer())
-        first = trainer()
+    @pytest.mark.parametrize("settings", [{}, {"schedule": "step", "selection": "validation_loss"}])
+    def test_a_snapshot_goes_on_exactly(self, after, settings, tmp_path):
+        whole = finish(trainer(**settings))
+        first = trainer(**settings)
         for _ in range(after):
             first.run_epoch()
         path = tmp_path / "training.safetensors"
         write_checkpoint(path, "training", *first.snapshot())
-        second = trainer(seed=17)  # nothing of its own start may remain
+        second = trainer(seed=17, **settings)  # nothing of its own start may remain
         second.resume(*read_checkpoint(path, "training"))
         finish(second)
-        assert second.state.history == whole.state.history
-        assert second.state.best_error == whole.state.best_error
-        assert same(second.state.best, whole.state.best)
         assert same(second.model.state_dict(), whole.model.state_dict())
         assert same(second.use_best().state_dict(), whole.use_best().state_dict())
+        assert second.state.history == whole.state.history
+        assert (second.state.best_score, second.state.best_epoch) == (whole.state.best_score, whole.state.best_epoch)
+        assert second.best_error == whole.best_error
+        assert same(second.state.best, whole.state.best)
 
     def test_with_nothing_but_diverged_roll_outs(self, tmp_path):
         first = trainer(error=lambda model: math.inf)
@@ -81,9 +87,9 @@ class TestResume:
         write_checkpoint(path, "training", *first.snapshot())
         second = trainer(error=lambda model: 1.0)
         second.resume(*read_checkpoint(path, "training"))
-        assert (second.state.best_error, same(second.state.best, first.state.best)) == (math.inf, True)
+        assert (second.best_error, same(second.state.best, first.state.best)) == (math.inf, True)
         finish(second)
-        assert second.state.best_error == 1.0
+        assert second.best_error == 1.0
 
 
 class TestSelection:
@@ -101,15 +107,37 @@ class TestSelection:
         run = finish(trainer(error=error))
         losses = [record["validation_loss"] for record in run.state.history]
         assert losses == sorted(losses, reverse=True)  # the last epoch has the best loss
-        assert run.state.best_error == errors[best]
+        assert (run.best_error, run.state.best_epoch) == (errors[best], 2 * (best + 1))
         assert not same(weights[0], weights[2])
         assert same(dict(run.use_best().network.state_dict()), weights[best])
         assert not run.model.training
 
     def test_diverged_alone_still_give_a_model(self):
         run = finish(trainer(error=lambda model: math.inf))
-        assert run.state.best_error == math.inf
+        assert run.best_error == math.inf
         assert all(torch.isfinite(t).all() for t in run.use_best().state_dict().values())
+
+    @pytest.mark.parametrize("measured", [3.0, math.inf])
+    def test_the_smallest_validation_loss_wins_whatever_the_roll_outs(self, monkeypatch, measured):
+        losses, weights, asked = [5.0, 4.0, 2.0, 3.0, math.nan, 6.0], [], []
+        run = trainer(selection="validation_loss", error=lambda model: asked.append(model) or measured)
+
+        def validate():
+            weights.append({k: t.clone() for k, t in run.model.network.state_dict().items()})
+            return losses[len(weights) - 1]
+
+        monkeypatch.setattr(run, "_validate", validate)
+        finish(run)
+        assert run.state.best_epoch == 3
+        assert not same(weights[2], weights[-1])
+        assert len(asked) == 3  # after epochs 2, 4 and 6
+        assert math.isnan(run.best_error)  # of epoch 3, nothing is known yet
+        assert same(dict(run.use_best().network.state_dict()), weights[2])
+        assert (run.best_error, len(asked)) == (measured, 4)
+        assert run.state.history[2]["rollout_error_mm"] == measured
+        run.use_best()
+        assert len(asked) == 4
+        assert not run.model.training
 
     def test_roll_outs_at_the_configured_epochs_and_at_the_end(self):
         run = finish(trainer(epochs=7, rollout_every=3))
@@ -159,6 +187,10 @@ class TestLearning:
         assert rates[2] == pytest.approx((5e-3 + 1e-4) / 2)
         assert rates == sorted(rates, reverse=True)
 
+    def test_step_schedule(self):
+        rates = [r["learning_rate"] for r in finish(trainer(schedule="step")).state.history]
+        assert rates == [5e-3, 5e-3, 2.5e-3, 2.5e-3, 1.25e-3, 1.25e-3]
+
 
 @pytest.mark.parametrize("name", ["training", "validation"])
 def test_empty_split(name):
@@ -181,6 +213,11 @@ def test_empty_split(name):
         ({"rollout_every": 0}, "trainer.rollout_every is 0: it must be positive."),
         ({"weight_decay": -1.0}, "trainer.weight_decay is -1.0: it must be zero or more."),
         ({"noise": -1.0}, "trainer.noise is -1.0: it must be zero or more."),
+        ({"schedule": "linear"}, "trainer.schedule is 'linear': choose one of cosine, step."),
+        ({"selection": "test"}, "trainer.selection is 'test': choose one of rollout, validation_loss."),
+        ({"gamma": 0.0}, "trainer.gamma is 0.0: it must be greater than 0 and at most 1."),
+        ({"gamma": 1.1}, "trainer.gamma is 1.1: it must be greater than 0 and at most 1."),
+        ({"step_epochs": 0}, "trainer.step_epochs is 0: it must be positive."),
         ({"linear_noise": 0.0}, "trainer.linear_noise is 0.0: it must be positive, or null."),
     ],
 )

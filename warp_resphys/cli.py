@@ -10,6 +10,8 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from importlib import resources
+from pathlib import Path
 from typing import Any
 
 import hydra
@@ -25,7 +27,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from warp_resphys.errors import ResphysError
-from warp_resphys.files import is_disk_full
+from warp_resphys.files import OWN_OPTIONS, is_disk_full
 
 CONFIG_PACKAGE = "pkg://warp_resphys.conf"
 USER_ERROR = 2
@@ -84,6 +86,7 @@ def _run_command(job: Callable[[DictConfig], Any], config_name: str) -> None:
             raise
 
     full_error = os.environ.get("HYDRA_FULL_ERROR") == "1"
+    arguments = sys.argv
     raise_exceptions = logging.raiseExceptions
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra hands errors on instead of printing them and leaving
     logging.raiseExceptions = False  # a log file on a full disk must not fill the screen with tracebacks
@@ -91,6 +94,7 @@ def _run_command(job: Callable[[DictConfig], Any], config_name: str) -> None:
     try:
         if any(argument.startswith("--experimental-rerun") for argument in sys.argv[1:]):
             raise HydraException("--experimental-rerun reads a pickle, which can run code: use overrides")
+        sys.argv = [arguments[0], *_own_options(), *arguments[1:]]
         hydra.main(version_base="1.3", config_path=CONFIG_PACKAGE, config_name=config_name)(reporting_job)()
     except KeyboardInterrupt as error:
         print(f"\n{error}" if str(error) else "\ninterrupted", file=sys.stderr, flush=True)
@@ -103,9 +107,26 @@ def _run_command(job: Callable[[DictConfig], Any], config_name: str) -> None:
             print(f"error: {sentence}", file=sys.stderr, flush=True)
         raise SystemExit(USER_ERROR) from None
     finally:
+        sys.argv = arguments
         logging.raiseExceptions = raise_exceptions
         if not full_error:
             del os.environ["HYDRA_FULL_ERROR"]
+
+
+def _own_options() -> list[str]:
+    """The arguments that add the user's own options to those of the package, if there are any.
+
+    Given first, they give way to a --config-dir of the user.
+    """
+    folder = Path.cwd() / OWN_OPTIONS
+    if not folder.is_dir():
+        return []
+    packaged = resources.files(CONFIG_PACKAGE.removeprefix("pkg://"))
+    for path in sorted(folder.glob("*/*.yaml")):
+        if packaged.joinpath(path.parent.name, path.name).is_file():
+            name = path.relative_to(Path.cwd())
+            print(f"warning: {name} is not used: the package has an option of that name", file=sys.stderr)
+    return ["--config-dir", str(folder)]
 
 
 def _explain(error: BaseException, started: bool) -> str | None:
@@ -190,7 +211,8 @@ def run_label(overrides: Sequence[str], excluded: Sequence[str] = ()) -> str:
 
     Args:
         overrides: Hydra's task overrides, such as "material.density=900".
-        excluded: Keys that do not change the results, or that the folder is named after elsewhere.
+        excluded: Keys that do not change the results, or that the folder is named after elsewhere, with all that
+            is below them.
 
     Returns:
         "key=value,key=value" sorted by key, "default" where nothing is left. Long names, and names with
@@ -199,7 +221,8 @@ def run_label(overrides: Sequence[str], excluded: Sequence[str] = ()) -> str:
     settings = {}
     for override in overrides:
         key, _, value = override.partition("=")
-        if key.lstrip("+~") not in excluded:
+        bare = key.lstrip("+~")
+        if not any(bare == name or bare.startswith(f"{name}.") for name in excluded):
             settings[key] = f"{key}={value}" if value else key
     whole = ",".join(settings[key] for key in sorted(settings))
     if not whole:

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 FORMAT = "warp_resphys"
 FORMAT_VERSION = 1
 CHUNK_STEPS = 64
+OWN_OPTIONS = "configs"  # In the working directory: the user's configuration groups and their options.
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 

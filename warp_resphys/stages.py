@@ -93,12 +93,13 @@ def fingerprint(stage: Stage, upstream_fingerprints: Mapping[str, str]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def run_stages(stages: Sequence[Stage], run_dir: str | Path) -> dict[str, float]:
+def run_stages(stages: Sequence[Stage], run_dir: str | Path, wait: bool = False) -> dict[str, float]:
     """Runs those of the stages whose outputs are missing, damaged or made from other settings.
 
     Args:
         stages: In the order in which they run; a stage comes after those it reads from.
         run_dir: The run folder, made where it is missing; one process at a time may use it.
+        wait: Whether to wait for another process that uses it, in place of raising.
 
     Returns:
         The seconds that each stage took, summed over interrupted runs.
@@ -111,7 +112,7 @@ def run_stages(stages: Sequence[Stage], run_dir: str | Path) -> dict[str, float]
     run_dir = Path(run_dir)
     known: dict[str, str] = {}
     seconds: dict[str, float] = {}
-    with run_lock(run_dir):
+    with run_lock(run_dir, wait):
         for stage in stages:
             if stage.name in known or not known.keys() >= set(stage.upstream):
                 raise ValueError(f"stage '{stage.name}' is there twice or stands before a stage it reads from")
@@ -219,8 +220,12 @@ def _is_same(path: Path, identity: Mapping[str, Any]) -> bool:
 
 
 @contextmanager
-def run_lock(run_dir: str | Path) -> Iterator[None]:
+def run_lock(run_dir: str | Path, wait: bool = False) -> Iterator[None]:
     """Holds a run folder for this process; the operating system lets go of it however the process ends.
+
+    Args:
+        run_dir: The run folder, made where it is missing.
+        wait: Whether to wait for another process that holds it, in place of raising.
 
     Raises:
         InputError: another process holds it.
@@ -238,9 +243,12 @@ def run_lock(run_dir: str | Path) -> Iterator[None]:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise InputError(
-                f"another process is writing the run folder {run_dir}: wait for it or choose another one"
-            ) from error
+            if not wait:
+                raise InputError(
+                    f"another process is writing the run folder {run_dir}: wait for it or choose another one"
+                ) from error
+            log.info("waiting for another process that is writing the run folder %s", run_dir)
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
         except OSError as error:
             raise DataFileError(
                 f"cannot lock the run folder {run_dir} ({error.strerror}): choose one on another disk"

@@ -55,7 +55,7 @@ FONT: Final = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', A
 ROUND_STEPS: Final = (1, 2, 5, 10)  # Between two ticks, times a power of ten.
 WIDE: Final = 7.3  # [in]
 NARROW: Final = 3.7  # [in]
-_STYLE: Final[dict[Any, Any]] = {
+STYLE: Final[dict[Any, Any]] = {
     "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans"],
     "font.size": 9,
@@ -97,8 +97,8 @@ def tip_displacement(displacements: Mapping[str, FloatArray], time_step: float, 
     target = displacements["target"]
     axis = int(np.argmax(np.ptp(target, axis=0)))
     time = np.arange(len(target)) * time_step
-    with mpl.rc_context(_STYLE):
-        figure = _figure(3.9, 4.2, narrow=narrow)
+    with mpl.rc_context(STYLE):
+        figure = new_figure(3.9, 4.2, narrow=narrow)
         motion, distance = figure.subplots(2, 1, sharex=True, height_ratios=[2, 1])
         motion.plot(time, 1e3 * target[:, axis], color=TONES["target"].light, linewidth=4.0, label="Target")
         for model in ("simulation", "resphys"):
@@ -113,7 +113,7 @@ def tip_displacement(displacements: Mapping[str, FloatArray], time_step: float, 
         motion.set_ylim(max(lowest - margin, bottom), min(highest + margin, top))
         motion.set_ylabel(f"tip displacement\nalong {'xyz'[axis]} [mm]")
         motion.yaxis.set_major_locator(MaxNLocator(5, steps=ROUND_STEPS))
-        _logarithmic(distance)
+        use_logarithm(distance)
         distance.set(xlabel="time [s]", ylabel="off target\n[mm]", xlim=(0.0, time[-1]))
         _legend(figure, motion, narrow=narrow)
     return figure
@@ -127,8 +127,8 @@ def error_over_time(errors: Mapping[str, FloatArray], time_step: float, *, narro
         time_step: Time between two states [s].
         narrow: Whether the figure is for a narrow page.
     """
-    with mpl.rc_context(_STYLE):
-        figure = _figure(3.2, 3.4, narrow=narrow)
+    with mpl.rc_context(STYLE):
+        figure = new_figure(3.2, 3.4, narrow=narrow)
         axes = figure.subplots()
         for model, rows in errors.items():
             tone = TONES[model].light
@@ -137,7 +137,7 @@ def error_over_time(errors: Mapping[str, FloatArray], time_step: float, *, narro
             axes.fill_between(time, low, high, color=tone, alpha=0.18, linewidth=0)
             axes.plot(time, _positive(rows.mean(axis=0)), color=tone, label=LABELS[model])
             axes.set_xlim(0.0, time[-1])
-        _logarithmic(axes)
+        use_logarithm(axes)
         axes.set(xlabel="time [s]", ylabel="mean vertex error [mm]")
         _legend(figure, axes, narrow=narrow)
     return figure
@@ -154,9 +154,9 @@ def training_curves(records: Sequence[Mapping[str, Any]], *, narrow: bool) -> Fi
     heights = {"losses": 3, "rollout_error_mm": 3, "learning_rate": 1}
     panels = [key for key in heights if key == "losses" or len(_measured(records, key)[0])]
     muted, strong = TONES["muted"].light, TONES["resphys"].light
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         height = 0.6 + 0.57 * sum(heights[key] for key in panels)
-        figure = _figure(height, height + 0.2, narrow=narrow)
+        figure = new_figure(height, height + 0.2, narrow=narrow)
         rows = figure.subplots(
             len(panels), 1, sharex=True, squeeze=False, height_ratios=[heights[key] for key in panels]
         )
@@ -175,7 +175,7 @@ def training_curves(records: Sequence[Mapping[str, Any]], *, narrow: bool) -> Fi
             axes["learning_rate"].plot(*rates, color=muted, linewidth=1.1, drawstyle="steps-mid")
             axes["learning_rate"].set_ylabel("learning\nrate")
         for each in axes.values():
-            _logarithmic(each)
+            use_logarithm(each)
         rows[-1, 0].set_xlabel("epoch")
         rows[-1, 0].xaxis.set_major_locator(MaxNLocator(6, integer=True))
         figure.align_ylabels()
@@ -191,8 +191,8 @@ def marker_boxes(errors: Mapping[int, FloatArray], uncorrected: float, *, narrow
         narrow: Whether the figure is for a narrow page.
     """
     ink, strong = {"color": TONES["ink"].light, "linewidth": 0.9}, TONES["simulation"].light
-    with mpl.rc_context(_STYLE):
-        figure = _figure(3.6, 3.4, narrow=narrow)
+    with mpl.rc_context(STYLE):
+        figure = new_figure(3.6, 3.4, narrow=narrow)
         axes = figure.subplots()
         places = range(1, len(errors) + 1)
         axes.boxplot(
@@ -218,7 +218,7 @@ def marker_boxes(errors: Mapping[int, FloatArray], uncorrected: float, *, narrow
         axes.set_xticks([*places], [str(count) for count in errors])
         axes.set_yscale("log")
         axes.set_ylim(top=1.6 * max(uncorrected, *(row.max() for row in errors.values())))
-        _logarithmic(axes)
+        use_logarithm(axes)
         axes.grid(visible=False, axis="x")
         axes.set(xlabel="number of markers", ylabel="mean vertex error [mm]")
     return figure
@@ -234,8 +234,8 @@ def shape_comparison(bodies: Mapping[str, Body | None], *, narrow: bool) -> Figu
     shapes = [body.pixels.shape for body in bodies.values() if body]
     rise = shapes[0][0] / shapes[0][1] if shapes else 0.5  # Height over width.
     height = (NARROW if narrow else WIDE / len(bodies)) * rise + 0.75
-    with mpl.rc_context(_STYLE):
-        figure = _figure(height, height * len(bodies), narrow=narrow)
+    with mpl.rc_context(STYLE):
+        figure = new_figure(height, height * len(bodies), narrow=narrow)
         grid = (len(bodies), 1) if narrow else (1, len(bodies))
         panels = figure.subplots(*grid, squeeze=False).flat
         for axes, (model, body) in zip(panels, bodies.items(), strict=True):
@@ -268,7 +268,7 @@ def themed_svg(figure: Figure, name: str) -> bytes:
         name: Makes the identifiers in the file the same in every run.
     """
     buffer = io.StringIO()
-    with mpl.rc_context({**_STYLE, "svg.hashsalt": name}):
+    with mpl.rc_context({**STYLE, "svg.hashsalt": name}):
         figure.savefig(buffer, format="svg", dpi=240, transparent=True, metadata={"Date": None, "Creator": None})
     foreign = r"<\?xml.*?\?>|<!DOCTYPE.*?>|<metadata>.*?</metadata>"
     svg = re.sub(foreign, "", buffer.getvalue(), flags=re.DOTALL)
@@ -281,7 +281,8 @@ def themed_svg(figure: Figure, name: str) -> bytes:
     return re.sub(r"(<svg [^>]*>)", rf"\1{style}", svg, count=1).strip().encode()
 
 
-def _figure(height: float, narrow_height: float, *, narrow: bool) -> Figure:
+def new_figure(height: float, narrow_height: float, *, narrow: bool) -> Figure:
+    """An empty figure of one of the two widths, of these heights [in]."""
     size = (NARROW, narrow_height) if narrow else (WIDE, height)
     return Figure(figsize=size, layout="constrained")
 
@@ -314,7 +315,7 @@ def _positive(values: FloatArray) -> FloatArray:
     return np.where((values > 0.0) & (values < LARGEST_SHOWN), values, np.nan)
 
 
-def _logarithmic(axes: Axes) -> None:
+def use_logarithm(axes: Axes) -> None:
     """A logarithmic axis of at least a decade, labelled 0.1, 1, 10 where that is short, else as powers.
 
     Where there is nothing that it can show, such as errors that are all zero, the axis says so.

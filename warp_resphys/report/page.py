@@ -83,6 +83,9 @@ class ReportData:
         example: The trajectory that is drawn.
         errors_mm: For each model (R, T) errors [mm] of the R test trajectories at the steps 1 to T.
         training: One record an epoch, see `warp_resphys.report.figures.training_curves`; may be empty.
+        refinement: The same of the refinement through the simulator; empty where there was none.
+        network_note: Which network ResPhys uses, and how it was trained, in words.
+        kept_note: Which weights were taken, in words.
 
     Raises:
         InputError: The arrays do not fit each other.
@@ -102,6 +105,9 @@ class ReportData:
     example: Example
     errors_mm: Mapping[str, FloatArray]
     training: Sequence[Mapping[str, Any]]
+    refinement: Sequence[Mapping[str, Any]] = ()
+    network_note: str = ""
+    kept_note: str = ""
 
     def __post_init__(self) -> None:
         """Check that the arrays fit each other."""
@@ -189,9 +195,10 @@ def _draw(data: ReportData, folder: Path) -> tuple[dict[str, Picture], dict[str,
     else:
         alt = _describe_shapes(shapes, target)
         pictures["shape"] = both("shape", partial(figures.shape_comparison, bodies), alt)
-    if data.training:
-        alt = f"Losses and validation roll-out error over {len(data.training)} epochs, on logarithmic axes."
-        pictures["training"] = both("training", partial(figures.training_curves, data.training), alt)
+    for name, records in (("training", data.training), ("refinement", data.refinement)):
+        if records:
+            alt = f"Losses and validation roll-out error of the {name}, {len(records)} epochs, on logarithmic axes."
+            pictures[name] = both(name, partial(figures.training_curves, records), alt)
     return pictures, missing
 
 

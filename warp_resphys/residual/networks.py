@@ -174,13 +174,14 @@ class StateMap(nn.Module):
         return inputs @ self.linear + self.remainder * self.network(inputs)
 
     def encode(self, q: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
-        """(S, n_in) standardised inputs in float32 from (S, N, 3) positions [m] and velocities [m/s]."""
-        return torch.cat([self.position.encode(q - self.rest), self.velocity.encode(v)], dim=1).float()
+        """(S, n_in) standardised inputs, as precise as the network, from (S, N, 3) positions [m], velocities [m/s]."""
+        inputs = torch.cat([self.position.encode(q - self.rest), self.velocity.encode(v)], dim=1)
+        return inputs.to(self.linear.dtype)
 
     def encode_outputs(self, *fields: torch.Tensor) -> torch.Tensor:
-        """(S, n_out) standardised outputs in float32 from (S, N, 3) fields in the order of the coders."""
+        """(S, n_out) standardised outputs, as precise as the network, from (S, N, 3) fields in the coders' order."""
         pairs = zip(self.coders, fields, strict=True)
-        return torch.cat([coder.encode(field) for coder, field in pairs], dim=1).float()
+        return torch.cat([coder.encode(field) for coder, field in pairs], dim=1).to(self.linear.dtype)
 
     def predict(self, q: torch.Tensor, v: torch.Tensor) -> list[torch.Tensor]:
         """(S, N, 3) fields in the order of the coders."""

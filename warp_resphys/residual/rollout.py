@@ -37,8 +37,12 @@ class Rollout(ABC):
 
     @torch.no_grad()
     def step(self, state: State) -> State:
-        """Advances a batch by one step."""
-        lost = torch.zeros(state.batch, dtype=torch.bool, device=state.q.device) if self._lost is None else self._lost
+        """Advances a batch by one step, without gradients."""
+        return self.differentiable_step(state)
+
+    def differentiable_step(self, state: State) -> State:
+        """Advances a batch by one step; gradients are meaningless where an environment is lost."""
+        lost = self.lost(state)
         new, failed = self._advance(state, lost)
         distance = (new.q - self._rest).abs().flatten(1).amax(1)
         self._lost = lost | failed | ~(distance < FURTHEST * self._length)
@@ -51,6 +55,10 @@ class Rollout(ABC):
         if back is not None:
             back = (torch.where(where, rest.q, back[0]), torch.where(where, rest.v, back[1]))
         return State(torch.where(where, rest.q, state.q), torch.where(where, rest.v, state.v), back)
+
+    def lost(self, state: State) -> torch.Tensor:
+        """(B,) bool, environments that have diverged."""
+        return torch.zeros(state.batch, dtype=torch.bool, device=state.q.device) if self._lost is None else self._lost
 
     def positions(self, state: State) -> torch.Tensor:
         """(B, N, 3) positions of the last state, NaN where lost [m]."""

@@ -2,9 +2,22 @@
 
 from typing import Any
 
+from ..errors import InputError
+
 
 def run(config: Any) -> None:
-    """Runs every stage of the configured experiment (a Hydra configuration) in Hydra's run folder."""
-    from .experiment import run_experiment
+    """Does the configured task (of a Hydra configuration) in Hydra's run folder.
 
-    run_experiment(config)
+    Raises:
+        InputError: an unknown task.
+    """
+    if config.task == "run":
+        from .experiment import run_experiment
+
+        run_experiment(config)
+    elif config.task == "tune":
+        from .tune import run_tuning
+
+        run_tuning(config)
+    else:
+        raise InputError(f"task is {config.task!r}: choose run or tune.")

@@ -4,7 +4,7 @@ import inspect
 import math
 import numbers
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from fnmatch import fnmatchcase
 from typing import Any
 
@@ -14,9 +14,11 @@ from ..material import Material
 from ..mesh import select_vertices
 from ..residual.networks import check_network
 from ..residual.reconstruction import make_reconstructor
+from ..residual.refinement import check_refinement
 from ..residual.training import check_trainer
 from ..solver import SolverSettings
-from .trajectories import variation_of
+from ..tuning.space import Dimension, dotted, fixed_settings, parse_space, with_settings
+from .trajectories import MODELS, training_settings, variation_of
 
 _GROUPS = (
     "mesh",
@@ -25,9 +27,11 @@ _GROUPS = (
     "reconstruction",
     "network",
     "trainer",
+    "refinement",
     "fixed",
     "simulation",
     "reality",
+    "simfree",
     "data",
     "tip",
 )
@@ -41,6 +45,8 @@ _WORDS = (
     "*.name",
     "*.method",
     "solver.linear_solver",
+    "trainer.schedule",
+    "trainer.selection",
 )
 _WHOLE_NUMBERS = (
     "seed",
@@ -52,7 +58,13 @@ _WHOLE_NUMBERS = (
     "network.*",
     "trainer.epochs",
     "trainer.batch_size",
+    "trainer.step_epochs",
     "trainer.rollout_every",
+    "refinement.window",
+    "refinement.epochs",
+    "refinement.batch_size",
+    "refinement.memory",
+    "refinement.rollout_every",
 )
 _NUMBERS = (
     "time_step",
@@ -67,6 +79,7 @@ _NUMBERS = (
     "trainer.*",
 )
 _LISTS = ("gravity", "data.weights_g.*", "data.angles_deg.*")
+_LEAST = {"trials": 1, "seed": 0}
 _OPTIONAL = ("trainer.linear_noise", "fixed.*", "tip.*", "data.load.*", "data.limit")
 # Groups that are handed on as keyword arguments.
 _TAKEN_BY: Mapping[str, Callable[..., Any]] = {
@@ -97,7 +110,7 @@ def check_configuration(config: Mapping[str, Any]) -> None:
         group = config["data"].get(key)
         if not isinstance(group, Mapping):
             raise InputError(f"data.{key} is {group!r}: it must be a group of settings.")
-    for key, value in _leaves(config):
+    for key, value in dotted({key: value for key, value in config.items() if key != "tune"}):
         _check_kind(key, value)
     if not isinstance(config["name"], str) or not re.fullmatch(r"[\w-]+", config["name"]):
         raise InputError(f"name is {config['name']!r}: a folder is named so: use letters, digits, _ and - alone.")
@@ -112,24 +125,84 @@ def check_configuration(config: Mapping[str, Any]) -> None:
         for name in config[key]:
             if name not in known:
                 raise InputError(f"unknown key '{key}.{name}': {key} has {', '.join(known)}.")
-    check_network(config["network"])
-    check_trainer(config["trainer"])
+    own = config["simfree"]
+    if own.keys() != {"network", "trainer"} or not all(isinstance(each, Mapping) for each in own.values()):
+        raise InputError(f"simfree is {own!r}: it must be a group of the groups network and trainer.")
+    for model in MODELS:
+        _check_training(config, model)
+    check_refinement(config["refinement"], config["data"]["steps"])
     make_reconstructor(build_simulator(config), **config["reconstruction"])
+
+
+def _check_training(config: Mapping[str, Any], model: str) -> None:
+    """Checks the settings that a model is trained with."""
+    settings = training_settings(config, model)
+    try:
+        for group in ("network", "trainer"):
+            for key, value in settings[group].items():
+                _check_kind(f"{group}.{key}", value)
+        check_network(settings["network"])
+        check_trainer(settings["trainer"])
+    except InputError as error:
+        raise (error if model == "resphys" else InputError(f"simfree: {error}")) from error
+
+
+def check_tuning(config: Mapping[str, Any]) -> dict[str, Dimension]:
+    """Checks the group ``tune``; returns its search space.
+
+    Args:
+        config: a configuration that `check_configuration` accepts.
+
+    Raises:
+        InputError: a value of the wrong kind or out of range, also among those that may be tried.
+    """
+    tune = config["tune"]
+    if "markers" in config:
+        raise InputError(f"the experiment {config['name']} trains no network: tune another one.")
+    if tune["model"] not in MODELS:
+        raise InputError(f"tune.model is {tune['model']!r}: choose one of {', '.join(MODELS)}.")
+    for key in ("trials", "seed"):
+        if not _is_whole_number(tune[key]) or tune[key] < (key == "trials"):
+            raise InputError(f"tune.{key} is {tune[key]!r}: it must be a whole number, {_LEAST[key]} or more.")
+    for key in ("stale_after", "trial_seconds"):
+        given = tune[key]
+        if (given is not None or key == "stale_after") and not (_is_number(given) and 0.0 < given < math.inf):
+            raise InputError(f"tune.{key} is {given!r}: it must be positive, in seconds.")
+    if not isinstance(tune["save_as"], str) or not re.fullmatch(r"[\w-]+", tune["save_as"]):
+        raise InputError(f"tune.save_as is {tune['save_as']!r}: use letters, digits, _ and - alone.")
+    space = parse_space(tune["space"])
+    if not isinstance(tune["settings"], Mapping):
+        raise InputError(f"tune.settings is {tune['settings']!r}: it must be a group of settings.")
+    fixed = fixed_settings(tune)
+    for key in fixed.keys() & space.keys():
+        raise InputError(f"tune.settings.{key} and tune.space.{key} exclude each other: take one of them out.")
+    tried = [{key: value} for key, dimension in space.items() for value in dimension.ends]
+    for settings in ({}, *tried):
+        _check_trial(config, {**fixed, **settings})
+    return space
+
+
+def _check_trial(config: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
+    """Checks what a trial of these settings, by dotted key, is trained with."""
+    groups = training_settings(config, config["tune"]["model"])
+    for key in settings:
+        group, _, name = key.partition(".")
+        if name not in groups.get(group, {}):
+            raise InputError(f"unknown key '{key}' in the group tune: it must name a setting of network or trainer.")
+    groups = with_settings(groups, settings)
+    try:
+        for key, value in settings.items():
+            _check_kind(key, value)
+        check_network(groups["network"])
+        check_trainer(groups["trainer"])
+    except InputError as error:
+        raise InputError(f"tune: {error}") from error
 
 
 def _value(config: Mapping[str, Any], key: str) -> Any:
     for name in key.split("."):
         config = config[name]
     return config
-
-
-def _leaves(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted keys and values."""
-    for name, value in config.items():
-        if isinstance(value, Mapping):
-            yield from _leaves(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value
 
 
 def _check_kind(key: str, value: Any) -> None:

@@ -20,7 +20,6 @@ from ..stages import StageContext
 from .train import force_predictor, load_model, load_simfree, state_predictor
 from .trajectories import (
     ERRORS,
-    MODEL,
     RECONSTRUCTION,
     ROLLOUTS,
     SIMFREE,
@@ -85,7 +84,7 @@ def _roll_out(context: StageContext, q: NDArray[np.float64], v: NDArray[np.float
 
 def model_rollouts(context: StageContext, simulator: Simulator) -> dict[str, Callable[[torch.Tensor | None], Rollout]]:
     """For each model, what makes its roll-out from the environments that are lost already."""
-    force = force_predictor(load_model(context.run_dir / MODEL))
+    force = force_predictor(load_model(context.run_dir / context.settings["force"]))
     following = state_predictor(load_simfree(context.run_dir / SIMFREE))
     return {
         "simulation": partial(HybridRollout, simulator, None),

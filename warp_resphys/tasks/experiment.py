@@ -18,6 +18,7 @@ from .checks import check_configuration
 from .evaluate import evaluate
 from .generate import generate
 from .reconstruct import reconstruct
+from .refine import refine
 from .report import collect_metrics, make_report
 from .timing import time_models
 from .train import train, train_simfree
@@ -26,6 +27,8 @@ from .trajectories import (
     METRICS,
     MODEL,
     RECONSTRUCTION,
+    REFINED,
+    REFINEMENT,
     REPORT,
     ROLLOUTS,
     SIMFREE,
@@ -33,6 +36,7 @@ from .trajectories import (
     TIMES,
     TRAINING,
     TRAJECTORIES,
+    training_settings,
 )
 
 _SIMULATED = ("mesh", "physics", "fixed", "gravity", "time_step", "integrator", "solver", "device", "dtype")
@@ -51,7 +55,15 @@ def stages(config: dict[str, Any]) -> list[Stage]:
     base = simulated(config)
     corrected = {**base, "simulation": config["simulation"]}
     learned = {**corrected, "data": config["data"]}
-    network = {key: config[key] for key in ("network", "trainer", "seed")}
+    refined = config["refinement"]["kind"] != "none"
+    force, force_file = ("refine", REFINED) if refined else ("train", MODEL)
+    refinement = Stage(
+        "refine",
+        refine,
+        (REFINED, REFINEMENT),
+        {**learned, **_pick(config, "refinement")},
+        ("generate", "train"),
+    )
     return [
         Stage("generate", generate, (TRAJECTORIES,), {**base, **_pick(config, "reality", "data")}),
         Stage(
@@ -61,23 +73,42 @@ def stages(config: dict[str, Any]) -> list[Stage]:
             {**corrected, **_pick(config, "reconstruction")},
             ("generate",),
         ),
-        Stage("train", train, (MODEL, TRAINING), {**learned, **network}, ("generate", "reconstruct")),
+        Stage(
+            "train",
+            train,
+            (MODEL, TRAINING),
+            {**learned, **training_settings(config, "resphys")},
+            ("generate", "reconstruct"),
+        ),
+        *([refinement] if refined else []),
         Stage(
             "train_simfree",
             train_simfree,
             (SIMFREE, SIMFREE_TRAINING),
-            {**base, **_pick(config, "reality", "data"), **network},
+            {**base, **_pick(config, "reality", "data"), **training_settings(config, "simfree")},
             ("generate",),
         ),
         Stage(
             "evaluate",
             evaluate,
             (ROLLOUTS, ERRORS),
-            learned,
-            ("generate", "reconstruct", "train", "train_simfree"),
+            {**learned, "force": force_file},
+            ("generate", "reconstruct", force, "train_simfree"),
         ),
-        Stage("time", time_models, (TIMES,), {**learned, **_pick(config, "reality")}, ("generate", "train")),
-        Stage("report", make_report, (REPORT,), {"config": config}, ("train", "evaluate", "time")),
+        Stage(
+            "time",
+            time_models,
+            (TIMES,),
+            {**learned, **_pick(config, "reality"), "force": force_file},
+            ("generate", force),
+        ),
+        Stage(
+            "report",
+            make_report,
+            (REPORT,),
+            {"config": shown(config)},
+            (force, "train_simfree", "evaluate", "time"),
+        ),
     ]
 
 
@@ -85,16 +116,30 @@ def _pick(config: dict[str, Any], *keys: str) -> dict[str, Any]:
     return {key: config[key] for key in keys}
 
 
-def run_experiment(config: DictConfig) -> None:
-    """Runs what has changed, writes metrics.json and prints the errors."""
+def shown(config: dict[str, Any]) -> dict[str, Any]:
+    """The configuration without what has no bearing on a run."""
+    return {key: value for key, value in config.items() if key not in ("task", "tune")}
+
+
+def prepare(config: DictConfig) -> tuple[dict[str, Any], Path]:
+    """The checked configuration as plain data, and the run folder.
+
+    Raises:
+        InputError: a value of the wrong kind or out of range, or an unknown key.
+    """
     wp.config.log_level = wp.LOG_WARNING
     if config.device == "cpu" or not torch.cuda.is_available():
         torch.set_num_threads(1)  # The networks are small: see threads.py.
     plain: dict[str, Any] = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)  # type: ignore[assignment]
     check_configuration(plain)
-    folder = Path(HydraConfig.get().runtime.output_dir)
+    return plain, Path(HydraConfig.get().runtime.output_dir)
+
+
+def run_experiment(config: DictConfig) -> None:
+    """Runs what has changed, writes metrics.json and prints the errors."""
+    plain, folder = prepare(config)
     if "markers" in plain:
-        run_ablation(plain, simulated(plain), folder)
+        run_ablation(shown(plain), simulated(plain), folder)
         return
     run_stages(stages(plain), folder)
     metrics = collect_metrics(StageContext("metrics", folder, "", {}), plain)

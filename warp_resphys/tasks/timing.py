@@ -13,7 +13,7 @@ from ..progress import Progress
 from ..residual.rollout import HybridRollout, closed_loop
 from ..stages import StageContext
 from .train import force_predictor, load_model
-from .trajectories import MODEL, TIMES, TRAJECTORIES, read_fields, split_of
+from .trajectories import TIMES, TRAJECTORIES, read_fields, split_of
 
 
 def time_models(context: StageContext) -> None:
@@ -29,7 +29,7 @@ def time_models(context: StageContext) -> None:
     steps = q.shape[1] - 1
     simulator = build_simulator(settings, on_failure="count")
     true = build_simulator(settings, "reality", on_failure="count")
-    predict = force_predictor(load_model(context.run_dir / MODEL))
+    predict = force_predictor(load_model(context.run_dir / settings["force"]))
     starts = [
         State(simulator.tensor(a[None, 0]), simulator.tensor(b[None, 0])) for a, b in zip(q[part], v[part], strict=True)
     ]

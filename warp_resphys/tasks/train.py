@@ -1,9 +1,12 @@
 """Stages: the network that predicts the residual force, and the data-driven baseline."""
 
 import logging
+import math
 import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic
 
 import torch
 
@@ -21,7 +24,7 @@ from ..residual.rollout import (
     StatePredictor,
     closed_loop,
 )
-from ..residual.training import Samples, Trainer
+from ..residual.training import EpochTrainer, Samples, Trainer
 from ..resumable import resume_checkpoint
 from ..stages import StageContext
 from .trajectories import (
@@ -40,88 +43,145 @@ log = logging.getLogger(__name__)
 _CHECKPOINT_SECONDS = 10.0
 
 
-def train(context: StageContext) -> None:
-    """Trains the residual force: model.safetensors, with the smallest validation roll-out error, and training.json."""
-    settings = context.settings
-    split, _ = split_of(settings["data"])
-    device = choose_device(settings["device"])
-    torch.manual_seed(settings["seed"])
+Snapshot = tuple[dict[str, torch.Tensor], dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Learning(Generic[Model]):
+    """What is learned, from what, and how it is judged; the network and the way of training are open.
+
+    Attributes:
+        samples: of the splits ``train`` and ``validation``.
+        build: a model from the group ``network``.
+        rollout_error: mean roll-out error on the validation split [mm]; infinite where a roll-out diverged.
+    """
+
+    samples: Mapping[str, Samples]
+    build: Callable[[Mapping[str, Any]], Model]
+    rollout_error: Callable[[Model], float]
+
+    def trainer(self, network: Mapping[str, Any], trainer: Mapping[str, Any], seed: int) -> Trainer[Model]:
+        """A trainer of a new model; the same settings and seed give the same model.
+
+        Args:
+            network: the group of that name.
+            trainer: the group of that name.
+            seed: of the weights, the batches and the noise.
+
+        Raises:
+            InputError: a setting out of range, or an empty split.
+        """
+        torch.manual_seed(seed)
+        train, validation = (self.samples[name] for name in ("train", "validation"))
+        return Trainer(self.build(network), train, validation, self.rollout_error, trainer, seed)
+
+
+def residual_force_learning(context: StageContext) -> Learning[ResidualForce]:
+    """The residual force, from the reconstruction in the run folder."""
+    split, _ = split_of(context.settings["data"])
+    device = choose_device(context.settings["device"])
     q, v, force = _read(context.run_dir / RECONSTRUCTION, "reconstruction", device, "q", "v", "force")
     samples = {name: _samples(q, v, (force,), split.indices(name)) for name in ("train", "validation")}
     validation = Validation(context, split, "simulation")
     rest = q.new_tensor(validation.simulator.body.mesh.vertices)
     pick = samples["train"]
-    model = build_model(settings["network"], rest, pick.q, pick.v, pick.outputs[0])
 
     def error(candidate: ResidualForce) -> float:
         return validation.error_mm(HybridRollout(validation.simulator, force_predictor(candidate)))
 
-    trainer = Trainer(model, pick, samples["validation"], error, settings["trainer"], settings["seed"])
-    _train(context, trainer, MODEL, TRAINING, "residual force")
+    return Learning(samples, lambda network: build_model(network, rest, pick.q, pick.v, pick.outputs[0]), error)
 
 
-def train_simfree(context: StageContext) -> None:
-    """Trains the data-driven baseline on the same trajectories: simfree.safetensors and simfree_training.json."""
-    settings = context.settings
-    split, _ = split_of(settings["data"])
-    device = choose_device(settings["device"])
-    torch.manual_seed(settings["seed"])
+def next_state_learning(context: StageContext) -> Learning[NextState]:
+    """The data-driven baseline, from the trajectories in the run folder."""
+    split, _ = split_of(context.settings["data"])
+    device = choose_device(context.settings["device"])
     q, v = _read(context.run_dir / TRAJECTORIES, "trajectories", device, "q", "v")
     validation = Validation(context, split, "reality")
     rest = q.new_tensor(validation.simulator.body.mesh.vertices)
     samples = {name: _samples(q, v, (q - rest, v), split.indices(name)) for name in ("train", "validation")}
-    model = build_next_state(settings["network"], rest, samples["train"].q, samples["train"].v)
+    pick = samples["train"]
 
     def error(candidate: NextState) -> float:
         return validation.error_mm(DataDrivenRollout(validation.simulator, state_predictor(candidate)))
 
-    trainer = Trainer(model, samples["train"], samples["validation"], error, settings["trainer"], settings["seed"])
-    _train(context, trainer, SIMFREE, SIMFREE_TRAINING, "next state")
+    return Learning(samples, lambda network: build_next_state(network, rest, pick.q, pick.v), error)
 
 
-def _train(context: StageContext, trainer: Trainer[Model], model: str, history: str, kind: str) -> None:
-    """Trains, going on from an interrupted run, and writes the best weights and the history."""
+def train(context: StageContext) -> None:
+    """Trains the residual force: model.safetensors, with the weights that are selected, and training.json."""
+    fit(context, _configured(context, residual_force_learning(context)), MODEL, TRAINING, "residual force")
+
+
+def train_simfree(context: StageContext) -> None:
+    """Trains the data-driven baseline on the same trajectories: simfree.safetensors and simfree_training.json."""
+    fit(context, _configured(context, next_state_learning(context)), SIMFREE, SIMFREE_TRAINING, "next state")
+
+
+def _configured(context: StageContext, learning: Learning[Model]) -> Trainer[Model]:
+    return learning.trainer(*(context.settings[key] for key in ("network", "trainer", "seed")))
+
+
+def fit(context: StageContext, trainer: EpochTrainer[Model], model: str, history: str, kind: str) -> None:
+    """Trains, going on from an interrupted run, and writes the selected weights and the history."""
     checkpoint = context.run_dir / f"{context.name}.safetensors"
     found = resume_checkpoint(checkpoint, "training", context.fingerprint)
     if found is not None:
         trainer.resume(*found)
-    _run_epochs(context.name, trainer, checkpoint, context.fingerprint)
+    run_epochs(context.name, trainer, lambda kept: save_training(checkpoint, kept, context.fingerprint))
     best = trainer.use_best()
-    error_mm = trainer.state.best_error
-    write_json(context.run_dir / history, trainer.state.history)
+    kept = {
+        "selection": trainer.selection,
+        "epoch": trainer.state.best_epoch,
+        "validation_rollout_error_mm": trainer.best_error if math.isfinite(trainer.best_error) else None,
+    }
+    if kept["validation_rollout_error_mm"] is None:
+        log.warning("%s: the weights that are kept diverge on the validation split", context.name)
+    write_json(context.run_dir / history, {"kept": kept, "epochs": trainer.state.history})
     write_checkpoint(
         context.run_dir / model,
         kind,
         best.state_dict(),
-        {**best.description(), "validation_rollout_error_mm": error_mm, "fingerprint": context.fingerprint},
+        {**best.description(), **kept, "fingerprint": context.fingerprint},
     )
     checkpoint.unlink(missing_ok=True)
 
 
-def _run_epochs(name: str, trainer: Trainer[Model], checkpoint: Path, fingerprint: str) -> None:
-    """Trains to the end; on the way, and however it ends, keeps the last whole epoch."""
-    epochs = trainer.config["epochs"]
+def run_epochs(
+    name: str,
+    trainer: EpochTrainer[Model],
+    save: Callable[[Snapshot], None],
+    watch: Callable[[Mapping[str, float]], None] | None = None,
+) -> None:
+    """Trains to the end; on the way, and however it ends, keeps the last whole epoch.
+
+    Args:
+        name: what is shown beside the progress.
+        trainer: goes on from where it stands.
+        save: keeps a snapshot.
+        watch: is told the record of every epoch; what it raises ends the training.
+    """
     saved = time.monotonic()
     kept = _copy(trainer.snapshot())
-    with Progress(name, epochs, "epochs", trainer.state.epoch) as progress:
+    with Progress(name, trainer.config["epochs"], "epochs", trainer.state.epoch) as progress:
         try:
             while not trainer.finished:
                 record = trainer.run_epoch()
                 kept = _copy(trainer.snapshot())
                 if time.monotonic() - saved > _CHECKPOINT_SECONDS:
-                    _save(checkpoint, kept, fingerprint)
+                    save(kept)
                     saved = time.monotonic()
                 shown: dict[str, object] = {"loss": f"{record['train_loss']:.2e}"}
-                if trainer.state.best:
-                    shown["rollout"] = f"{trainer.state.best_error:.2g} mm"
+                if not math.isnan(trainer.best_error):
+                    shown["rollout"] = f"{trainer.best_error:.2g} mm"
                 progress.advance(1, **shown)
+                if watch is not None:
+                    watch(record)
         finally:
-            _save(checkpoint, kept, fingerprint)
+            save(kept)
 
 
-def _copy(
-    snapshot: tuple[dict[str, torch.Tensor], dict[str, Any]],
-) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+def _copy(snapshot: Snapshot) -> Snapshot:
     """The next epoch changes the tensors in place."""
     tensors, metadata = snapshot
     return {k: t.detach().clone() for k, t in tensors.items()}, {
@@ -130,7 +190,8 @@ def _copy(
     }
 
 
-def _save(checkpoint: Path, kept: tuple[dict[str, torch.Tensor], dict[str, Any]], fingerprint: str) -> None:
+def save_training(checkpoint: Path, kept: Snapshot, fingerprint: str) -> None:
+    """Writes a checkpoint that `resume_checkpoint` reads under the same fingerprint."""
     write_checkpoint(checkpoint, "training", kept[0], {**kept[1], "fingerprint": fingerprint})
 
 

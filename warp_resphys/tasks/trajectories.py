@@ -15,12 +15,16 @@ from ..integrator import State
 from ..resumable import Field, ResumableHDF5
 
 SPLITS = ("train", "validation", "test")
-STAGES = ("generate", "reconstruct", "train", "train_simfree", "evaluate", "time", "report")
+STAGES = ("generate", "reconstruct", "train", "refine", "train_simfree", "evaluate", "time", "report")
+
+MODELS = ("resphys", "simfree")  # that are trained
 
 TRAJECTORIES = "trajectories.h5"
 RECONSTRUCTION = "reconstruction.h5"
 MODEL = "model.safetensors"
 TRAINING = "training.json"
+REFINED = "refined.safetensors"
+REFINEMENT = "refinement.json"
 SIMFREE = "simfree.safetensors"
 SIMFREE_TRAINING = "simfree_training.json"
 ROLLOUTS = "rollouts.h5"
@@ -68,6 +72,18 @@ VARIATIONS = {
     "release_from_load": Variation("weights_g", "g", 1e-3),
     "release_from_twist": Variation("angles_deg", "°", np.pi / 180.0),
 }
+
+
+def training_settings(config: Mapping[str, Any], model: str) -> dict[str, Any]:
+    """The groups ``network`` and ``trainer`` and the seed that a model is trained with.
+
+    Args:
+        config: the whole configuration.
+        model: ``resphys``; or ``simfree``, whose own settings replace the common ones.
+    """
+    own = config["simfree"] if model == "simfree" else {}
+    groups = {key: {**config[key], **own.get(key, {})} for key in ("network", "trainer")}
+    return {**groups, "seed": config["seed"]}
 
 
 def variation_of(data: Mapping[str, Any]) -> Variation:

@@ -183,6 +183,9 @@ def test_wrong_motive_exports(tmp_path, positions):
     edit(path, 1, lambda line: line.replace("Centimeters", "Cubits"))
     with pytest.raises(DataFileError, match="gives positions in 'Cubits'"):
         read_recording(path)
+    edit(path, 4, lambda line: line.replace("beam:Mid", "beam:Tip"))
+    with pytest.raises(DataFileError, match="more than one marker named 'beam:Tip'"):
+        read_recording(path)
     edit(path, 3, lambda line: line.replace("Marker", "Bone"))
     with pytest.raises(DataFileError, match="holds no markers"):
         read_recording(path)
@@ -211,6 +214,7 @@ def test_numpy_archive(tmp_path, positions):
     named = read_recording(archive(tmp_path / "plain.npz", positions, labels=None))
     assert named.labels == ("marker 1", "marker 2", "marker 3")
     assert read_recording(path, labels=["x", "y", "z"]).labels == ("x", "y", "z")
+    assert read_recording(path, labels=["*", "", "*"]).labels == ("* #1", "marker 2", "* #2")
 
 
 @pytest.mark.parametrize(
@@ -222,8 +226,8 @@ def test_numpy_archive(tmp_path, positions):
         ({"positions": np.zeros((40, 9))}, r"positions must be \(frames, markers, 3\), not \(40, 9\)"),
         ({"positions": np.full((40, 3, 3), "x")}, "'positions' does not hold numbers"),
         ({"positions": np.full((40, 3, 3), np.nan)}, "no marker is seen in any frame"),
-        ({"labels": np.array(["a", "b"])}, "names 2 of its 3 markers"),
-        ({"labels": np.array(["a", "b", "a"])}, "more than one marker named 'a'"),
+        ({"labels": np.array(["a", "b"])}, "has 3 markers and 2 labels"),
+        ({"labels": np.array(["a", "b", "c", "d"])}, "has 3 markers and 4 labels"),
         ({"units": "ft"}, "gives positions in 'ft'"),
         (
             {"units": "cm", "positions": np.random.default_rng(0).normal(size=(40, 3, 3)) * 1e5},

@@ -100,6 +100,8 @@ def to_recording(
 ) -> Recording:
     """Brings what was read to metres and seconds, and checks it; what is given goes before what the file says.
 
+    A marker without a name becomes `marker 3`, those that share one `name #1`, `name #2` and so on.
+
     Args:
         raw: The content of the file.
         path: The file, for messages.
@@ -108,8 +110,8 @@ def to_recording(
         labels: A name for each marker, in the file's order.
 
     Raises:
-        DataFileError: The unit or the rate is missing or not known, markers share a name, an array has the wrong
-            shape, or the positions are too large or too small to be in this unit.
+        DataFileError: The unit or the rate is missing or not known, an array has the wrong shape, or the positions are
+            too large or too small to be in this unit.
         InputError: A given unit, rate or list of names cannot be used.
     """
     if units is not None and units not in METRES_PER_UNIT:
@@ -193,12 +195,11 @@ def _names(raw: RawRecording, path: Path, given: Sequence[str] | None, markers: 
         raise InputError(f"labels has {len(given)} names; {path} has {markers} markers: name each of them.")
     names = given if given is not None else raw.labels
     if names is None:
-        return tuple(f"marker {number}" for number in range(1, markers + 1))
-    names = tuple(str(name).strip() for name in names)
-    if len(names) < markers:
-        raise DataFileError(f"{path} names {len(names)} of its {markers} markers: export it with labels.")
-    names = names[:markers]
-    repeated = sorted({name for name in names if names.count(name) > 1})
-    if repeated:
-        raise DataFileError(f"{path} has more than one marker named {listed(repeated)}: set labels to distinct names.")
-    return names
+        names = [""] * markers
+    if len(names) != markers:
+        raise DataFileError(f"{path} has {markers} markers and {len(names)} labels: export it with a label for each.")
+    names = [str(name).strip() or f"marker {number}" for number, name in enumerate(names, start=1)]
+    counts = {name: names.count(name) for name in names}
+    return tuple(
+        name if counts[name] == 1 else f"{name} #{names[: place + 1].count(name)}" for place, name in enumerate(names)
+    )

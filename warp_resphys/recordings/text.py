@@ -20,7 +20,7 @@ Rows = list[list[str]]
 
 _AXES = ("x", "y", "z")
 _OCCLUDED = ("", "nan", "null")
-_COLUMN = re.compile(r"(?P<name>.*?)\s*(?:\[(?P<unit>[^\]]*)\])?\s*")
+_COLUMN = re.compile(r"(?P<name>.*?)\s*(?:\[(?P<unit>[^\]]*)\])?\s*", re.DOTALL)
 _QUALISYS_KEYS = ("FILE_VERSION", "NO_OF_FRAMES", "NO_OF_MARKERS", "FREQUENCY", "MARKER_NAMES")
 _MOTIVE_UNITS = {"meters": "m", "centimeters": "cm", "millimeters": "mm"}
 _UNEVEN = 0.25  # of a frame, that a time stamp may be off
@@ -163,7 +163,10 @@ def _read_motive(rows: Rows, path: Path) -> RawRecording:
     for number, axis in enumerate(axes):
         inside = number < min(len(kinds), len(named[0]))
         if axis in _AXES and inside and kinds[number].strip() == "Marker":
-            places[named[0][number].strip(), axis] = number
+            key = (named[0][number].strip(), axis)
+            if key in places:
+                raise DataFileError(f"{path} has more than one marker named '{key[0]}': rename one in Motive.")
+            places[key] = number
     labels = tuple(dict.fromkeys(label for label, _ in places))
     if sorted(places) != sorted((label, axis) for label in labels for axis in _AXES):
         raise DataFileError(f"{path}: a marker lacks one of its columns X, Y and Z; export it from Motive again.")
@@ -221,13 +224,15 @@ def _numbers(
         numbers = np.full(width, np.nan)
         for column in columns:
             cell = row[column].strip()
-            if cell.lower() not in _OCCLUDED:
-                if not _is_number(cell):
-                    raise DataFileError(
-                        f"{path}, line {number}, column {column + 1}: {cell!r} is not a number; write numbers with "
-                        "a decimal point, and leave the cells of an occluded marker empty."
-                    )
+            if cell.lower() in _OCCLUDED:
+                continue
+            try:
                 numbers[column] = float(cell)
+            except ValueError as error:
+                raise DataFileError(
+                    f"{path}, line {number}, column {column + 1}: {cell!r} is not a number; write numbers with a "
+                    "decimal point, and leave the cells of an occluded marker empty."
+                ) from error
         values.append(numbers)
         lines.append(number)
     if len(values) < 2:

@@ -1,3 +1,4 @@
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -48,8 +49,9 @@ def test_masked_gaps_stay_and_short_ones_are_filled():
 
 
 def test_a_multiple_of_the_rate_is_thinned_exactly():
-    recording = swinging()
+    recording = dataclasses.replace(swinging(), actuation=np.arange(300.0)[:, None])
     thinned = resample(recording, 50.0)
+    np.testing.assert_array_equal(thinned.actuation[:, 0], np.arange(0.0, 300.0, 2.0))
     np.testing.assert_array_equal(thinned.positions, recording.positions[::2])
     assert thinned.rate == 50.0
     np.testing.assert_array_equal(resample(recording, 100.0).positions, recording.positions)
@@ -152,6 +154,12 @@ def test_jumps_are_found_with_frame_and_size(column):
     assert jumps[0].size == pytest.approx(5e-4, abs=1e-4)
     cleaned = mask_spikes(recording, jumps)
     np.testing.assert_array_equal(np.argwhere(~cleaned.seen), [[150, column]])
+    recording = swinging()
+    recording.positions[200:, column] += [0.0, 5e-4, 0.0]
+    recording.positions[203:, column] += [0.0, 5e-4, 0.0]  # on, not back
+    jumps = find_jumps(recording)
+    assert [jump.frame for jump in jumps] == [200, 203]
+    assert mask_spikes(recording, jumps).seen.all()
 
 
 def test_exchanged_labels_are_found():
@@ -187,13 +195,13 @@ def test_noise_is_measured_beside_motion_jumps_and_gaps(noise):
 def test_quality_of_a_recording():
     recording = swinging()
     recording.positions[100:103, 0] = np.nan
-    recording.positions[290:, 0] = np.nan
+    recording.positions[297:, 0] = np.nan
     recording.positions[140:160, 1] = np.nan
     recording.positions[:, 2] += np.linspace(0.0, 1e-3, 300)[:, None] * [0.0, 0.6, 0.8]
     recording.positions[40:, 3] += 1e-3
     result = quality(recording, BASE, longest_gap=5)
     tip, tip2, drifting, jumping, good = result.markers
-    assert (tip.gaps, tip.longest_gap, tip.masked, tip.seen) == (2, 10, 10, pytest.approx(287 / 300))
+    assert (tip.gaps, tip.longest_gap, tip.masked, tip.seen) == (2, 3, 3, pytest.approx(294 / 300))
     assert (tip2.gaps, tip2.longest_gap, tip2.masked) == (1, 20, 20)
     assert drifting.drift == pytest.approx(0.9e-3, rel=0.02)
     assert [jump.frame for jump in jumping.jumps] == [40]
@@ -201,17 +209,26 @@ def test_quality_of_a_recording():
     assert tip.drift is None
     assert tip2.reach > 5e-3
     assert result.warnings == [
-        "tip 1 is hidden for up to 10 frames; 10 frames are masked.",
+        "tip 1 is hidden for up to 3 frames; 3 frames are masked.",
         "tip 2 is hidden for up to 20 frames; 20 frames are masked.",
         "base 1 should not move and drifts by 0.91 mm.",
         "base 2 jumps once, by 1.73 mm, in frame 40.",
         "base 2 should not move and drifts by 1.73 mm.",
     ]
     table = quality_table(result)
-    assert table[1][:5] == ["tip 1", "95.7 %", "2", "10", "10"]
+    assert table[1][:5] == ["tip 1", "98.0 %", "2", "3", "3"]
     assert table[4][5:7] == ["1", "1.73"]
     with pytest.raises(DataFileError, match=r"swing\.c3d has no marker named 'foot'"):
         quality(recording, ["foot"])
+
+
+def test_the_release_is_no_jump_of_the_body_but_may_be_one_of_the_base():
+    """A marker that is alone on its body jerks as it is let go; one on the clamp must not."""
+    recording = swinging().select([TIP[0], *BASE])
+    assert [jump.label for jump in find_jumps(recording)] == [TIP[0]]
+    recording.positions[61:, 1] += 1e-3
+    jumps = [marker.jumps for marker in quality(recording, BASE, Release(RELEASE, (40, 60))).markers]
+    assert [len(each) for each in jumps] == [0, 1, 0, 0]
 
 
 def test_base_markers_that_were_moved():

@@ -211,6 +211,9 @@ def test_numpy_archive(tmp_path, positions):
     np.testing.assert_allclose(recording.positions, positions)
     np.testing.assert_allclose(recording.actuation, 1e3 * pressure)
     np.testing.assert_allclose(recording.rest, positions[0])
+    picked = recording.select(["c", "a"])
+    np.testing.assert_array_equal(picked.rest, recording.rest[[2, 0]])
+    np.testing.assert_array_equal(picked.positions, recording.positions[:, [2, 0]])
     named = read_recording(archive(tmp_path / "plain.npz", positions, labels=None))
     assert named.labels == ("marker 1", "marker 2", "marker 3")
     assert read_recording(path, labels=["x", "y", "z"]).labels == ("x", "y", "z")
@@ -291,6 +294,13 @@ def test_damaged_and_foreign_files(tmp_path, positions):
         read_recording(tmp_path / "empty.csv")
     with pytest.raises(DataFileError, match=r"is no recording that can be read: give a file that ends in \.c3d"):
         read_recording(tmp_path / "swing.mat")
+
+
+def test_a_marker_with_one_coordinate_missing_is_not_seen(tmp_path, positions):
+    positions[4, 1, 2] = np.nan
+    positions[6, 1, 0] = np.inf
+    recording = read_recording(archive(tmp_path / "swing.npz", positions))
+    np.testing.assert_array_equal(np.argwhere(np.isnan(recording.positions[:, 1]).all(axis=1))[:, 0], [4, 6])
 
 
 def test_what_is_given_is_checked(tmp_path, positions):

@@ -140,6 +140,9 @@ def test_wrong_qualisys_exports(tmp_path, positions):
     with pytest.raises(DataFileError, match="does not say how many frames a second"):
         read_recording(path)
     assert read_recording(path, rate=80.0).rate == 80.0
+    edit(path, 4, lambda line: "FREQUENCY")
+    with pytest.raises(DataFileError, match="does not say how many frames a second"):
+        read_recording(path)
     edit(path, 8, lambda line: line.rpartition("\t")[0])
     with pytest.raises(DataFileError, match="numbers do not fit 2 markers"):
         read_recording(path)

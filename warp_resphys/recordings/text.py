@@ -139,7 +139,7 @@ def _read_qualisys(rows: Rows, path: Path) -> RawRecording:
         )
     positions = values[:, leading : leading + 3 * len(labels)].reshape(len(values), len(labels), 3)
     positions[(positions == 0.0).all(axis=2)] = np.nan
-    rate = keys.get("FREQUENCY", [""])[0]
+    rate = "".join(keys.get("FREQUENCY", [])[:1])
     start = float(values[0, 1]) if leading == 2 else 0.0
     return RawRecording(positions, labels, "mm", float(rate) if _is_number(rate) else None, start=start)
 

@@ -19,7 +19,7 @@ from warp_resphys.recordings.processing import fill_gaps, release_of
 from warp_resphys.recordings.quality import BaseMotion, Quality, check_base, compare_base, quality, quality_table
 from warp_resphys.recordings.reading import read_recording
 from warp_resphys.recordings.recording import Recording
-from warp_resphys.report.figures import _STYLE, NARROW, TONES, WIDE
+from warp_resphys.report.figures import NARROW, STYLE, TONES, WIDE
 
 FloatArray = NDArray[np.float64]
 
@@ -47,7 +47,7 @@ def recording_quality(recording: Recording, result: Quality, *, narrow: bool) ->
     moving = [marker.label for marker in result.markers if not marker.still]
     panels = [*("xyz" if moving else ""), *(["still"] if still else []), "raster"]
     heights = [{"still": 1.2, "raster": _ROW * len(recording.labels) + 0.1}.get(panel, 1.5) for panel in panels]
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         width = NARROW if narrow else WIDE
         figure = Figure(figsize=(width, sum(heights) + (1.3 if narrow else 1.0)), layout="constrained")
         rows = figure.subplots(len(panels), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]

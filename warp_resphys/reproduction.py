@@ -92,8 +92,8 @@ def reproduce(config: Mapping[str, Any], folder: Path, overrides: Sequence[str] 
     print(f"Page: {folder / PAGE}")
     if failed := [f"{result.experiment}/{result.variant}" for result in results if result.failure]:
         raise ResphysError(
-            f"{len(failed)} of {len(runs)} runs failed ({', '.join(failed)}): the page says why; mend it and run the same "
-            "command again."
+            f"{len(failed)} of {len(runs)} runs failed ({', '.join(failed)}): the page says why; mend it and run the "
+            "same command again."
         )
 
 

@@ -142,7 +142,7 @@ class TestPage:
 
 class TestPlan:
     def test_the_folders_are_those_of_the_ordinary_command(self):
-        runs = {each.name: each for each in plan(configured("overrides=[seed=1]", "runs=elsewhere"))}
+        runs = {each.name: each for each in plan(configured('overrides=["seed=1"]', "runs=elsewhere"))}
         assert runs["beam_twist/published_physics"].folder == Path("elsewhere/beam_twist/physics=published,seed=1")
         assert runs["beam_twist/published_physics"].arguments == (
             "experiment=beam_twist",
@@ -160,8 +160,9 @@ class TestPlan:
             ),
             "marker_ablation/default",
         ]
+        runs = plan(configured("budget=quick"))
         with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-            for each in plan(configured("budget=quick")):
+            for each in runs:
                 assert compose("config", list(each.arguments)).budget == "quick"
 
     def test_only(self):

@@ -182,10 +182,11 @@ def study_section(config: Mapping[str, Any], name: str, results: Results) -> Sec
         "diverged leaves no mean. Reconstruction: the simulator with forces fitted to the test trajectory itself.",
     )
     drawn = {role: results[variant] for role, variant in group["drawn"].items() if variant in results}
+    drawn.setdefault("models", next(iter(results.values())))
     return Section(
         group["title"],
         tables=[table],
-        figures=_study_figures(config, name, drawn) if "models" in drawn else [],
+        figures=_study_figures(config, name, drawn),
         list_title="Why they differ",
         items=group["deviations"],
     )

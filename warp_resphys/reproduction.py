@@ -259,18 +259,18 @@ def execute(run: Run, log_file: Path, follow: Callable[[str], None]) -> str | No
                     follow(line.strip())
             child.wait()
         except BaseException:
-            _stop(child)
+            written.write(_stop(child))
             raise
     if child.returncode == 0:
         return None
     return sentence or f"it ended with exit code {child.returncode}; what it said is in {log_file}"
 
 
-def _stop(child: "subprocess.Popen[str]") -> None:
-    """Ends a run as Ctrl-C does, and by force if it does not listen."""
+def _stop(child: "subprocess.Popen[str]") -> str:
+    """Ends a run as Ctrl-C does, and by force if it does not listen; what it says at last."""
     child.send_signal(signal.SIGINT)
     try:
-        child.communicate(timeout=_PATIENCE)
+        return child.communicate(timeout=_PATIENCE)[1]
     except subprocess.TimeoutExpired:
         child.kill()
-        child.communicate()
+        return child.communicate()[1]

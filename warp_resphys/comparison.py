@@ -1,5 +1,6 @@
 """What the runs of a reproduction have left, as the sections of its page: published numbers beside ours."""
 
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -21,7 +22,7 @@ from .metrics import (
 from .report import ablation_page, figures
 from .report.page import MODEL_NAMES, duration_text, error_parts, number_text, published_parts
 from .report.reproduction_page import Cell, Figure, Row, Section, Table
-from .tasks.report import TestRollouts, read_rollouts
+from .tasks.report import EvaluatedSplit, read_rollouts
 from .tasks.trajectories import METRICS, variation_of
 
 _NONE = Cell("\N{EN DASH}")
@@ -223,7 +224,7 @@ def _study_figures(config: Mapping[str, Any], name: str, drawn: Mapping[str, Res
     ]
 
 
-def _tip_motion(settings: Mapping[str, Any], test: TestRollouts, paths: Mapping[str, Any]) -> dict[str, Any]:
+def _tip_motion(settings: Mapping[str, Any], test: EvaluatedSplit, paths: Mapping[str, Any]) -> dict[str, Any]:
     """(T + 1, 3) displacement of the tip [m] of the target and the models."""
     mesh = build_mesh(settings["mesh"])
     tip = select_vertices(mesh, **settings["tip"])
@@ -307,13 +308,12 @@ def runs_section(config: Mapping[str, Any], results: Sequence[Result]) -> Sectio
         rows,
         "Time of each stage when it was last run, beside whatever else the machine did. Memory: with that of workers.",
     )
-    commands = [f"warp-resphys {' '.join(each.arguments)}" for each in results]
+    commands = [shlex.join(["warp-resphys", *each.arguments]) for each in results]
     return Section(
         "Runs",
         text=[f"Failed: {sentence}" for sentence in failures],
         tables=[table],
-        list_title="Each by itself",
-        items=commands,
+        commands=commands,
     )
 
 

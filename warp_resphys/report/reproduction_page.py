@@ -1,6 +1,5 @@
 """The page that sets published tables and figures beside ours: as HTML with nothing beside it, and as Markdown."""
 
-import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +10,6 @@ from warp_resphys.report.page import Picture, draw_picture, figures_beside, page
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing
-
-_LOG = logging.getLogger(__name__)
 
 
 class Cell(NamedTuple):
@@ -82,6 +79,7 @@ class Section:
         figures: After the tables.
         list_title: Heading of the list.
         items: Of the list that ends the section; may be empty.
+        commands: That gave what the section shows.
     """
 
     title: str
@@ -90,6 +88,7 @@ class Section:
     figures: Sequence[Figure] = ()
     list_title: str = ""
     items: Sequence[str] = ()
+    commands: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -133,7 +132,6 @@ def write_reproduction(page: Path, data: Reproduction) -> None:
         }
     write_text(page, _render("reproduction.html", data, pictures))
     write_text(page.with_name("results.md"), markdown(data, "figures"))
-    _LOG.info("page written: %s", page)
 
 
 def markdown(data: Reproduction, folder: str) -> str:

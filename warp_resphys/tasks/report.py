@@ -38,7 +38,7 @@ _PHYSICS = {
 
 
 @dataclass(frozen=True, eq=False)
-class TestRollouts:
+class EvaluatedSplit:
     """The test split of a run: what should have happened, and what the models made of it.
 
     Attributes:
@@ -56,7 +56,7 @@ class TestRollouts:
     worst: int
 
 
-def read_rollouts(folder: Path, config: Mapping[str, Any]) -> TestRollouts:
+def read_rollouts(folder: Path, config: Mapping[str, Any]) -> EvaluatedSplit:
     """What an experiment has left in its run folder."""
     split, _ = split_of(config["data"])
     part = split.indices("test")
@@ -73,7 +73,9 @@ def read_rollouts(folder: Path, config: Mapping[str, Any]) -> TestRollouts:
     errors = {
         m: np.stack([trajectory_errors(a, b) for a, b in zip(q, target, strict=True)]) for m, q in positions.items()
     }
-    return TestRollouts(split.test, target, positions, errors, int(np.argmax(np.nanmean(errors["simulation"], axis=1))))
+    return EvaluatedSplit(
+        split.test, target, positions, errors, int(np.argmax(np.nanmean(errors["simulation"], axis=1)))
+    )
 
 
 def make_report(context: StageContext) -> None:

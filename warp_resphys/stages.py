@@ -13,6 +13,7 @@ import json
 import logging
 import os
 import platform
+import re
 import resource
 import sys
 import time
@@ -190,10 +191,16 @@ def _keep_seconds(progress: Path, context: StageContext, seconds: float) -> None
 
 
 def peak_memory_gib(processes: int = 0) -> float:
-    """The most resident memory that this process has had, and as much as its largest child for each worker [GiB]."""
-    own, child = (resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    """The most resident memory that this process has had, and as much as its largest child for each worker [GiB].
+
+    What a child had counts from the memory of its parent on, as the operating system keeps it: an upper bound.
+    """
     unit = 1 if sys.platform == "darwin" else 1024  # bytes
-    return float((own + processes * child) * unit / 2**30)
+    child = unit * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+    status = Path("/proc/self/status")  # Without what the parent had, which getrusage includes.
+    known = re.search(r"^VmHWM:\s+(\d+) kB$", status.read_text(), re.MULTILINE) if status.is_file() else None
+    own = 1024 * int(known[1]) if known else unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return float((own + processes * child) / 2**30)
 
 
 def resources_used(run_dir: str | Path, names: Sequence[str]) -> dict[str, Any]:

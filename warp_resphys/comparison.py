@@ -79,7 +79,8 @@ def compare(config: Mapping[str, Any], results: Sequence[Result]) -> dict[str, A
         if each.failure is None:
             done.setdefault(each.experiment, {})[each.variant] = each
     studies = {name: group for name, group in done.items() if "errors_mm" in next(iter(group.values())).metrics}
-    sections = [setup_section(config, studies)] if studies else []
+    set_up = {name: group for name, group in studies.items() if name in PUBLISHED_SETUP}
+    sections = [setup_section(config, set_up)] if set_up else []
     sections += [study_section(config, name, group) for name, group in studies.items()]
     timing = config["timing"]
     timed = {v: r for v, r in done.get(timing["experiment"], {}).items() if v in timing["variants"]}
@@ -95,7 +96,9 @@ def verdict(config: Mapping[str, Any], done: Mapping[str, Results]) -> str:
     """The first run of each experiment in a sentence."""
     said = []
     for name, group in done.items():
-        title, result = config["experiments"][name]["title"], next(iter(group.values()))
+        result, known = next(iter(group.values())), config["experiments"][name]
+        label = config["variants"][result.variant]["label"].lower()
+        title = known["title"] if result.variant == known["variants"][0] else f"{known['title']} ({label})"
         if "by_markers" in result.metrics:
             said.append(
                 f"{title}: {ablation_page.verdict(result.metrics['by_markers'], result.metrics['uncorrected_mm'])}"
@@ -117,7 +120,7 @@ def setup_section(config: Mapping[str, Any], studies: Mapping[str, Results]) -> 
     columns, published, ours = [], [], []
     for name, group in studies.items():
         columns += [f"{config['experiments'][name]['title']}, published", "here"]
-        published.append(PUBLISHED_SETUP.get(name, {}))
+        published.append(PUBLISHED_SETUP[name])
         ours.append(_setup(next(iter(group.values())).settings))
     rows = []
     for key in ours[0]:

@@ -27,6 +27,11 @@ from .tasks.trajectories import METRICS, variation_of
 
 _NONE = Cell("\N{EN DASH}")
 _SPLITS = {"train": "training", "validation": "validation", "test": "testing"}
+_TITLES = {
+    "beam_real": "Real beam",
+    "sopra": "Pneumatic arm",
+    "sopra_extrapolation": "Pneumatic arm, 10 s after training on 5 s",
+}
 _TIMED = {
     "simulation": "Uncorrected simulation",
     "true_parameters": "Simulation with other parameters",
@@ -221,8 +226,8 @@ def _study_figures(config: Mapping[str, Any], name: str, drawn: Mapping[str, Res
             f"{name}_trajectory",
             partial(figures.tip_displacement, _tip_motion(settings, test, paths), settings["time_step"]),
             "Tip displacement of target and models over time, and their distance from the target.",
-            f"Tip displacement of the test trajectory {test.names[test.worst]} ({label}), the target drawn wide below "
-            "the others. Below: distance of the tip from the target's.",
+            f"Tip displacement of the test trajectory {test.names[test.worst]} ({label}), the target drawn wide "
+            "beneath the others. Lower panel: distance of the tip from the target's.",
         ),
     ]
 
@@ -324,7 +329,7 @@ def missing_section(config: Mapping[str, Any]) -> Section | None:
     """The published experiments that no run reproduces yet."""
     rows = [
         Row(
-            name.replace("_", " "),
+            _TITLES.get(name, name),
             [
                 Cell(*published_parts(errors[model])) if model in errors else _NONE
                 for model in MODEL_NAMES

@@ -51,7 +51,7 @@ LABELS: Final[Mapping[str, str]] = {
     "sysid": "SysID",
     "simfree": "SimFree",
     "resphys": "Corrected (ResPhys)",
-    "published_network": "ResPhys, published network",
+    "published_network": "Published network",
 }
 LARGEST_SHOWN: Final = 1e5  # Of an error [mm], or a loss.
 FONT: Final = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, 'DejaVu Sans', sans-serif"

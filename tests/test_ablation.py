@@ -4,9 +4,12 @@ import contextlib
 import csv
 import io
 import json
+import os
 import re
 import signal
+import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +29,7 @@ TINY = [
     "data.steps=8",
     f"markers.counts={COUNTS}".replace(" ", ""),
     "markers.draws=5",
+    "markers.processes=1",
     "hydra/job_logging=none",
     "hydra/hydra_logging=none",
     "hydra.run.dir=run",
@@ -85,6 +89,7 @@ def test_sets_are_of_free_surface_vertices_unless_these_are_too_few(finished):
     with read_hdf5(finished / "ablation.h5", "marker ablation") as file:
         sets = file["markers"][:]
         assert file["error"].attrs["units"] == "m"
+        assert file["count"][:].tolist() == COUNTS
     assert sets.shape == (4, 5, 42)
     assert len(SURFACE) - len(CLAMPED) == 33
     for count, draws in zip(COUNTS, sets, strict=True):
@@ -146,6 +151,74 @@ def test_an_interrupted_run_goes_on_and_a_set_does_not_depend_on_the_other_count
     assert np.abs(errors() / errors(finished)[1:2] - 1.0).max() > 0.01
 
 
+def test_processes_give_the_same_numbers_in_the_same_order_and_do_not_count_as_a_change(finished, folder):
+    assert run(*TINY, "markers.processes=2")[0] == 0
+    assert rows() == rows(finished)
+    with (
+        read_hdf5("run/ablation.h5", "marker ablation") as file,
+        read_hdf5(finished / "ablation.h5", "marker ablation") as serial,
+    ):
+        for name in ("count", "markers", "error", "misfit"):
+            np.testing.assert_array_equal(file[name][:], serial[name][:])
+    found = json.loads(Path("run/metrics.json").read_text())["peak_memory_gib"]
+    assert found > 2.0 * json.loads((finished / "metrics.json").read_text())["peak_memory_gib"]
+    written = Path("run/ablation.h5").stat().st_mtime_ns
+    assert run(*TINY, "markers.processes=3")[0] == 0
+    assert Path("run/ablation.h5").stat().st_mtime_ns == written
+
+
+def children_of(pid):
+    """Processes that a process has started and that still run."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            state, parent = path.read_text().rpartition(")")[2].split()[:2]
+            if int(parent) == pid and state != "Z":
+                found.append(int(path.parent.name))
+    return found
+
+
+def gone(pids):
+    """Whether all of these processes end within ten seconds."""
+    for _ in range(200):
+        if not any(Path(f"/proc/{pid}").exists() for pid in pids):
+            return True
+        time.sleep(0.05)
+    return False
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes under /proc")
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGKILL], ids=lambda sent: sent.name)
+def test_workers_end_with_their_parent_and_what_they_finished_is_kept(finished, folder, sent):
+    program = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    program += "from warp_resphys.cli import main\nmain()"
+    command = [sys.executable, "-c", program, *TINY, "markers.processes=2"]
+    child = subprocess.Popen(
+        command, text=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True
+    )
+    journal = Path("run/ablation.h5.journal")
+    while child.poll() is None and not (journal.exists() and journal.stat().st_size > 1000):
+        time.sleep(0.002)
+    workers = children_of(child.pid)
+    assert len(workers) >= 2
+    os.killpg(child.pid, sent) if sent == signal.SIGINT else child.kill()
+    err = child.communicate(timeout=60)[1]
+    assert child.returncode == (130 if sent == signal.SIGINT else -signal.SIGKILL), err
+    assert "Traceback" not in err
+    assert gone(workers)
+    kept = journal.read_bytes()
+    assert run(*TINY)[0] == 0
+    assert len(kept) > 1000
+    np.testing.assert_allclose(errors(), errors(finished), rtol=1e-6)
+
+
+def test_an_error_in_a_worker_is_one_sentence(folder):
+    code, err = run(*TINY, "markers.processes=2", "reconstruction.max_iterations=1")
+    assert code == 2
+    assert err.splitlines()[-1].startswith("error: sparse Gauss-Newton reconstruction moved by ")
+    assert "Traceback" not in err
+
+
 @pytest.mark.parametrize(
     "options",
     [["markers.modes=8"], ["budget=quick", "data.steps=4"], ["mesh=beam_tetrahedra", "mesh.divisions=[2,1,1]"]],
@@ -178,8 +251,9 @@ def test_the_published_method_gives_the_same_errors(folder):
         ("markers.draws=0", "markers.draws is 0: it must be a positive whole number."),
         ("markers.modes=-1", "markers.modes is -1: it must be a positive whole number, or null."),
         ("markers.modes=1000", "1000 vibration modes were asked for, but the body has 1 to 108."),
-        ("markers=null", "markers is None: it must be a group of counts, draws and modes."),
-        ("+markers.seeds=3", "it must be a group of counts, draws and modes."),
+        ("markers.processes=0", "markers.processes is 0: it must be a positive whole number, or null."),
+        ("markers=null", "markers is None: it must be a group of counts, draws, modes and processes."),
+        ("+markers.seeds=3", "it must be a group of counts, draws, modes and processes."),
         ("data.steps=0", "data.steps is 0: it must be positive."),
         ("data.weights_g.observed=[50,70]", "data.weights_g.observed is [50, 70]: it must be a list of one positive"),
         ("data.weights_g.observed=[-1]", "data.weights_g.observed is [-1]: it must be a list of one positive"),

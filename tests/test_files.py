@@ -273,6 +273,19 @@ class TestResumable:
             assert (h5["force"].attrs["units"], h5["rest"].attrs["units"]) == ("N", "m")
             assert h5.attrs["solver"] == "newton"
 
+    def test_steps_in_any_order_find_their_places(self, tmp_path):
+        path, order = tmp_path / "forces.h5", [3, 0, 2, 1]
+        with resumable(path, steps=(2, 2)) as file:
+            for step in order:
+                file.append(force=force(step), iterations=step)
+            for wrong in ([0, 1, 2, 2], [0, 1, 2], [1, 2, 3, 4]):
+                with pytest.raises(ValueError, match="each step has a place of its own"):
+                    file.finish(order=wrong)
+            file.finish(order=order)
+        with files.read_hdf5(path, "forces") as h5:
+            assert files.read_array(h5, "iterations").tolist() == [[0, 1], [2, 3]]
+            assert np.array_equal(files.read_array(h5, "force")[1, 1], force(3))
+
     def test_a_finished_file_is_not_computed_again(self, tmp_path):
         path = tmp_path / "forces.h5"
         with resumable(path) as file:

@@ -141,13 +141,14 @@ class TestCompleteRun:
 
     def test_metrics(self, finished):
         found = metrics(finished[0])
-        keys = ["errors_mm", "errors_vs_reconstruction_mm", "per_trajectory", "networks"]
-        assert list(found) == [*keys, "seconds_per_test_trajectory", "seconds", "versions", "device"]
+        keys = ["errors_mm", "errors_vs_reconstruction_mm", "per_trajectory", "networks", "seconds_per_test_trajectory"]
+        assert list(found) == [*keys, "seconds", "peak_memory_gib", "versions", "device"]
         assert set(found["seconds_per_test_trajectory"]) == {"simulation", "true_parameters", "resphys", "inference"}
         assert set(found["errors_mm"]) == {"simulation", "reconstruction", "resphys", "simfree"}
         assert set(found["errors_vs_reconstruction_mm"]) == {"simulation", "resphys", "simfree"}
         assert list(found["seconds"]) == STAGES
         assert all(0.0 < s < 600.0 for s in found["seconds"].values())
+        assert 0.1 < found["peak_memory_gib"] < 4.0
         assert found["versions"] == package_versions()
         assert {"python", "warp-resphys", "warp-lang", "torch"} <= set(found["versions"])
         assert found["device"] in ("cpu", "cuda")

@@ -66,6 +66,7 @@ def report_data() -> ReportData:
         "errors_vs_reconstruction_mm": {model: summaries[model] for model in ("simulation", "resphys")},
         "per_trajectory": summarise_each(["0.07 kg", "0.12 <kg>"], errors),
         "seconds": {"generate": 12.0, "train": 75.4},
+        "peak_memory_gib": 0.523,
         "versions": {"numpy": "9.9.9"},
         "device": "cpu",
     }

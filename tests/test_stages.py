@@ -17,7 +17,16 @@ from rich.progress import Progress as Bars
 from warp_resphys.errors import DataFileError, InputError
 from warp_resphys.files import write_json
 from warp_resphys.progress import Progress
-from warp_resphys.stages import Stage, StageContext, StageInterrupted, fingerprint, run_lock, run_stages
+from warp_resphys.stages import (
+    Stage,
+    StageContext,
+    StageInterrupted,
+    fingerprint,
+    peak_memory_gib,
+    resources_used,
+    run_lock,
+    run_stages,
+)
 
 REPOSITORY = Path(__file__).parents[1]
 
@@ -66,6 +75,31 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 def interrupt(context: StageContext) -> None:
     raise KeyboardInterrupt
+
+
+class TestResources:
+    def test_the_peak_is_that_of_the_stage_that_took_most(self, experiment):
+        experiment.run()
+        found = resources_used(experiment.run_dir, ["generate", "train", "evaluate"])
+        assert found["seconds"] == {name: experiment.seconds[name] for name in ("generate", "train")}
+        assert found["peak_memory_gib"] == pytest.approx(peak_memory_gib(), rel=0.1)
+        for name, peak in (("generate", 3.0), ("train", None)):  # None: as written before memory was recorded
+            path = experiment.run_dir / "stages" / f"{name}.json"
+            record = {key: value for key, value in json.loads(path.read_text()).items() if key != "peak_memory_gib"}
+            write_json(path, record | ({} if peak is None else {"peak_memory_gib": peak}))
+        assert resources_used(experiment.run_dir, ["generate", "train"])["peak_memory_gib"] == 3.0
+        assert resources_used(experiment.run_dir, ["train"])["peak_memory_gib"] is None
+        assert experiment.run() == []
+
+    def test_memory_in_bytes(self):
+        program = "import sys; from warp_resphys.stages import peak_memory_gib; before = peak_memory_gib()\n"
+        program += "held = b'x' * (300 * 2**20); print(peak_memory_gib() - before)"
+        found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+        assert float(found) == pytest.approx(300 / 1024, rel=0.1)
+
+    def test_workers_count_as_the_largest_child_each(self):
+        subprocess.run([sys.executable, "-c", "held = b'x' * (100 * 2**20)"], check=True)
+        assert peak_memory_gib(3) - peak_memory_gib() > 3 * 100 / 1024
 
 
 class TestSkipping:

@@ -15,7 +15,7 @@ import os
 import struct
 import time
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -195,12 +195,14 @@ class ResumableHDF5:
         self,
         attributes: Mapping[str, Any] | None = None,
         constants: Mapping[str, tuple[npt.ArrayLike, str]] | None = None,
+        order: Sequence[int] | None = None,
     ) -> None:
         """Writes the final file, replaces an older one by it, and removes the journal.
 
         Args:
             attributes: Attributes of the final file.
             constants: Arrays that do not depend on the step, each with its units.
+            order: Where each step, as they were appended, stands in the final file; in that order if left out.
 
         Raises:
             DataFileError: the disk is full; all steps are kept in the journal.
@@ -209,12 +211,14 @@ class ResumableHDF5:
             return
         if self.done != self.steps:
             raise ValueError(f"{self.path} cannot be finished: {self.done} of {self.steps} steps are written")
+        if order is not None and sorted(order) != [*range(self.steps)]:
+            raise ValueError(f"{self.path} cannot be finished in the order {order}: each step has a place of its own")
         own = {**(attributes or {}), "fingerprint": self.fingerprint}
         try:
             with atomic_hdf5(self.path, self.kind, own) as file:
                 for name, (array, units) in (constants or {}).items():
                     create(file, name, array, units)
-                self._assemble(file)
+                self._assemble(file, range(self.steps) if order is None else order)
         except DataFileError as error:
             if error.__cause__ is not None and is_disk_full(error.__cause__):
                 raise disk_full_error(self.path, self.journal) from error
@@ -223,14 +227,14 @@ class ResumableHDF5:
         self._close()
         self.journal.unlink()
 
-    def _assemble(self, file: h5py.File) -> None:
+    def _assemble(self, file: h5py.File, order: Sequence[int]) -> None:
         """Fills the final datasets, one field after the other."""
         collected = {
             name: np.empty((self.steps, *field.shape), dtype=field.dtype) for name, field in self.fields.items()
         }
-        for step in range(self.done):
+        for step, place in enumerate(order):
             for name, values in self.read(step).items():
-                collected[name][step] = values
+                collected[name][place] = values
         for name, field in self.fields.items():
             counted, ahead = len(self.step_axes), field.batch_axes
             values = collected.pop(name).reshape(*self.step_axes, *field.shape)

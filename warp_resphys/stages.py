@@ -13,6 +13,9 @@ import json
 import logging
 import os
 import platform
+import re
+import resource
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -67,6 +70,7 @@ class Stage:
         settings: Plain nested settings that the outputs depend on, and no others.
         upstream: Names of the stages whose outputs it reads.
         format_version: To be raised when the stage's code changes what it writes.
+        processes: Worker processes that run at once, for the memory taken.
     """
 
     name: str
@@ -75,6 +79,7 @@ class Stage:
     settings: Mapping[str, Any]
     upstream: tuple[str, ...] = ()
     format_version: int = 1
+    processes: int = 0
 
 
 class StageInterrupted(KeyboardInterrupt):
@@ -158,6 +163,7 @@ def _write_record(stage: Stage, context: StageContext, seconds: float) -> None:
         {
             "fingerprint": context.fingerprint,
             "seconds": seconds,
+            "peak_memory_gib": peak_memory_gib(stage.processes),
             "finished": datetime.now(UTC).isoformat(timespec="seconds"),
             "outputs": {name: _identity(context.run_dir / name) for name in stage.outputs},
             "settings": to_plain(stage.settings),
@@ -183,6 +189,33 @@ def _keep_seconds(progress: Path, context: StageContext, seconds: float) -> None
         write_json(progress, {"fingerprint": context.fingerprint, "seconds": seconds})
     except DataFileError as error:
         log.warning("the time spent in '%s' is not kept: %s", context.name, error)
+
+
+def peak_memory_gib(processes: int = 0) -> float:
+    """The most resident memory that this process has had, and as much as its largest child for each worker [GiB].
+
+    What a child had counts from the memory of its parent on, as the operating system keeps it: an upper bound.
+    """
+    unit = 1 if sys.platform == "darwin" else 1024  # bytes
+    child = unit * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+    status = Path("/proc/self/status")  # Without what the parent had, which getrusage includes.
+    known = re.search(r"^VmHWM:\s+(\d+) kB$", status.read_text(), re.MULTILINE) if status.is_file() else None
+    own = 1024 * int(known[1]) if known else unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return float((own + processes * child) / 2**30)
+
+
+def resources_used(run_dir: str | Path, names: Sequence[str]) -> dict[str, Any]:
+    """What `metrics.json` says of the stages that are done: seconds of each, and the largest of their peaks of memory.
+
+    A stage that was run before its memory was recorded does not count for the peak, which is None if there is no other.
+    """
+    paths = {name: Path(run_dir) / "stages" / f"{name}.json" for name in names}
+    records = {name: read_json(path) for name, path in paths.items() if path.is_file()}
+    peaks = [record["peak_memory_gib"] for record in records.values() if "peak_memory_gib" in record]
+    return {
+        "seconds": {name: record["seconds"] for name, record in records.items()},
+        "peak_memory_gib": max(peaks, default=None),
+    }
 
 
 def _identity(path: Path) -> dict[str, Any]:

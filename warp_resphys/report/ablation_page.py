@@ -8,21 +8,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from warp_resphys.files import write_text
 from warp_resphys.report.page import (
     NO_BREAK_SPACE,
     Picture,
+    draw_picture,
     duration_text,
     figures_beside,
     flatten,
     number_text,
     page_template,
-    svg_address,
 )
 
 _LOG = logging.getLogger(__name__)
-_FIGURE = "marker_ablation"
+FIGURE = "marker_ablation"
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class AblationReport:
         title: The page's heading.
         experiment: Name of the experiment.
         metrics: What `metrics.json` holds: `uncorrected_mm`, `by_markers` (a row a number of markers), `seconds`,
-            `versions` and `device`.
+            `peak_memory_gib`, `versions` and `device`.
         settings: The run's configuration, nested.
         vertices: Vertices of the mesh.
         surface: Those on its surface.
@@ -63,9 +64,10 @@ def write_ablation_report(path: Path, data: AblationReport) -> None:
         picture = _draw(data, folder)
     rows = data.metrics["by_markers"]
     page = page_template("ablation.html").render(
+        title=data.title,
         data=data,
         metrics=data.metrics,
-        picture=picture,
+        pictures={FIGURE: picture},
         verdict=verdict(rows, data.metrics["uncorrected_mm"]),
         clamped=[row["markers"] for row in rows if row["markers"] > data.free_surface],
         number=number_text,
@@ -109,12 +111,20 @@ def _from_here_on(rows: Sequence[Mapping[str, Any]], key: str, below: float) -> 
 def _draw(data: AblationReport, folder: Path) -> Picture:
     from warp_resphys.report import figures
 
-    rows = data.metrics["by_markers"]
-    errors = {int(row["markers"]): np.array(row["errors_mm"]) for row in rows}
-    draw = partial(figures.marker_boxes, errors, data.metrics["uncorrected_mm"])
-    wide, narrow = draw(narrow=False), draw(narrow=True)
-    figures.save_png(wide, folder / f"{_FIGURE}.png")
-    medians = "; ".join(f"{row['markers']}: {number_text(row['median_mm'])} mm" for row in rows)
-    alt = f"Box plot of the mean vertex error by number of markers, on a logarithmic axis. Medians: {medians}."
-    wide_svg, narrow_svg = (figures.themed_svg(figure, _FIGURE) for figure in (wide, narrow))
-    return Picture(svg_address(wide_svg), svg_address(narrow_svg), alt)
+    draw = partial(figures.marker_boxes, box_errors(data.metrics), data.metrics["uncorrected_mm"])
+    return draw_picture(folder, FIGURE, draw, describe_boxes(data.metrics))
+
+
+def box_errors(metrics: Mapping[str, Any]) -> dict[int, NDArray[np.float64]]:
+    """Return the draws' errors [mm] by number of markers."""
+    return {int(row["markers"]): np.array(row["errors_mm"]) for row in metrics["by_markers"]}
+
+
+def describe_boxes(metrics: Mapping[str, Any]) -> str:
+    """Say what the box plot shows.
+
+    Args:
+        metrics: With `by_markers`.
+    """
+    medians = "; ".join(f"{row['markers']}: {number_text(row['median_mm'])} mm" for row in metrics["by_markers"])
+    return f"Box plot of the mean vertex error by number of markers, on a logarithmic axis. Medians: {medians}."

@@ -8,6 +8,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 import matplotlib as mpl
@@ -42,6 +43,7 @@ TONES: Final[Mapping[str, Tone]] = {
     "sysid": Tone("#7a4aa0", "#c9a2ea"),
     "simfree": Tone("#8f6a00", "#e2bd4f"),
     "resphys": Tone("#1a5fb4", "#7fb3f5"),
+    "published_network": Tone("#b0307a", "#f08bc4"),
 }
 LABELS: Final[Mapping[str, str]] = {
     "simulation": "Uncorrected simulation",
@@ -49,6 +51,7 @@ LABELS: Final[Mapping[str, str]] = {
     "sysid": "SysID",
     "simfree": "SimFree",
     "resphys": "Corrected (ResPhys)",
+    "published_network": "Published network",
 }
 LARGEST_SHOWN: Final = 1e5  # Of an error [mm], or a loss.
 FONT: Final = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, 'DejaVu Sans', sans-serif"
@@ -101,7 +104,7 @@ def tip_displacement(displacements: Mapping[str, FloatArray], time_step: float, 
         figure = new_figure(3.9, 4.2, narrow=narrow)
         motion, distance = figure.subplots(2, 1, sharex=True, height_ratios=[2, 1])
         motion.plot(time, 1e3 * target[:, axis], color=TONES["target"].light, linewidth=4.0, label="Target")
-        for model in ("simulation", "resphys"):
+        for model in (name for name in displacements if name != "target"):
             moved = displacements[model]
             motion.plot(time, 1e3 * moved[:, axis], color=TONES[model].light, label=LABELS[model])
             with np.errstate(over="ignore", invalid="ignore"):
@@ -119,12 +122,19 @@ def tip_displacement(displacements: Mapping[str, FloatArray], time_step: float, 
     return figure
 
 
-def error_over_time(errors: Mapping[str, FloatArray], time_step: float, *, narrow: bool) -> Figure:
+def error_over_time(
+    errors: Mapping[str, FloatArray],
+    time_step: float,
+    published: Mapping[str, float] = MappingProxyType({}),
+    *,
+    narrow: bool,
+) -> Figure:
     """Draw each model's mean error over time, and the range of the trajectories around it.
 
     Args:
         errors: For each model (R, T) errors [mm] of R trajectories at the steps 1 to T.
         time_step: Time between two states [s].
+        published: Published errors of models [mm], means over time, drawn as dashed lines.
         narrow: Whether the figure is for a narrow page.
     """
     with mpl.rc_context(STYLE):
@@ -137,6 +147,8 @@ def error_over_time(errors: Mapping[str, FloatArray], time_step: float, *, narro
             axes.fill_between(time, low, high, color=tone, alpha=0.18, linewidth=0)
             axes.plot(time, _positive(rows.mean(axis=0)), color=tone, label=LABELS[model])
             axes.set_xlim(0.0, time[-1])
+        for model, error in published.items():
+            axes.axhline(error, color=TONES[model].light, linewidth=1.1, linestyle=(0, (4, 3)))
         use_logarithm(axes)
         axes.set(xlabel="time [s]", ylabel="mean vertex error [mm]")
         _legend(figure, axes, narrow=narrow)
@@ -182,12 +194,15 @@ def training_curves(records: Sequence[Mapping[str, Any]], *, narrow: bool) -> Fi
     return figure
 
 
-def marker_boxes(errors: Mapping[int, FloatArray], uncorrected: float, *, narrow: bool) -> Figure:
+def marker_boxes(
+    errors: Mapping[int, FloatArray], uncorrected: float, published: tuple[int, float] | None = None, *, narrow: bool
+) -> Figure:
     """Draw a box for each number of markers: median, quartiles, and whiskers to the smallest and largest draw.
 
     Args:
         errors: (D,) errors [mm] of the draws, by number of markers.
         uncorrected: Error without any correction [mm].
+        published: From which number of markers on the published median is below what error [mm].
         narrow: Whether the figure is for a narrow page.
     """
     ink, strong = {"color": TONES["ink"].light, "linewidth": 0.9}, TONES["simulation"].light
@@ -205,16 +220,16 @@ def marker_boxes(errors: Mapping[int, FloatArray], uncorrected: float, *, narrow
             capprops=ink,
             medianprops={"color": strong, "linewidth": 2.0},
         )
-        axes.axhline(uncorrected, color=TONES["muted"].light, linewidth=1.1, linestyle="--")
-        axes.annotate(
-            "uncorrected simulation",
-            (1.0, uncorrected),
-            (-2, 3),
-            xycoords=("axes fraction", "data"),
-            textcoords="offset points",
-            ha="right",
-            color=TONES["muted"].light,
-        )
+        lines = {"uncorrected simulation": (0.5, uncorrected)}
+        if published is not None:
+            start = 0.5 + sum(count < published[0] for count in errors)
+            lines["published median: below" if narrow else "published: the median is below"] = (start, published[1])
+        for text, (start, level) in lines.items():
+            grey = TONES["muted"].light
+            axes.plot([start, len(errors) + 0.5], [level, level], color=grey, linewidth=1.1, linestyle="--")
+            place = (len(errors) + 0.5, level)
+            axes.annotate(text, place, (-2, 3), textcoords="offset points", ha="right", color=grey)
+        axes.set_xlim(0.5, len(errors) + 0.5)
         axes.set_xticks([*places], [str(count) for count in errors])
         axes.set_yscale("log")
         axes.set_ylim(top=1.6 * max(uncorrected, *(row.max() for row in errors.values())))

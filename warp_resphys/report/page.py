@@ -36,6 +36,7 @@ _MODELS = {  # In the order of the tables: a name, and what it means.
     "simfree": ("SimFree", "a network in place of the simulator"),
     "resphys": ("ResPhys", "the simulator with the learned force, which sees only the simulated state"),
 }
+MODEL_NAMES = {model: name for model, (name, _) in _MODELS.items()}
 
 _TIMED = {
     "simulation": "Uncorrected simulation",
@@ -73,7 +74,7 @@ class ReportData:
         reality: What it is brought to, in words.
         metrics: What `metrics.json` holds: `errors_mm`, `errors_vs_reconstruction_mm` (a summary a model, see
             `warp_resphys.metrics.summarise`), `per_trajectory` (see `summarise_each`), `seconds` (a number a
-            stage), `versions` (a text a package) and `device` (a text).
+            stage), `peak_memory_gib` (None where it is not known), `versions` (a text a package) and `device`.
         settings: The run's configuration, nested.
         published: Published errors of the models, empty where there are none.
         published_note: How the published set-up differs from this run's.
@@ -170,11 +171,7 @@ def _draw(data: ReportData, folder: Path) -> tuple[dict[str, Picture], dict[str,
     """Draw the figures in two widths, and save the wide ones; say of those that cannot be drawn why."""
     from warp_resphys.report import figures, render
 
-    def both(name: str, draw: "Callable[..., Figure]", alt: str) -> Picture:
-        wide, narrow = draw(narrow=False), draw(narrow=True)
-        figures.save_png(wide, folder / f"{name}.png")
-        return Picture(svg_address(figures.themed_svg(wide, name)), svg_address(figures.themed_svg(narrow, name)), alt)
-
+    both = partial(draw_picture, folder)
     motion = _tip_motion(data)
     state = worst_state(data.example)
     target = data.example.target[state]
@@ -202,6 +199,22 @@ def _draw(data: ReportData, folder: Path) -> tuple[dict[str, Picture], dict[str,
     return pictures, missing
 
 
+def draw_picture(folder: Path, name: str, draw: "Callable[..., Figure]", alt: str) -> Picture:
+    """Draw a figure in two widths, for a page, and save the wide one as a PNG file.
+
+    Args:
+        folder: Of the PNG file.
+        name: Of the figure, and of the file.
+        draw: Makes the figure; takes the keyword `narrow`.
+        alt: What it shows, in words.
+    """
+    from warp_resphys.report import figures
+
+    wide, narrow = draw(narrow=False), draw(narrow=True)
+    figures.save_png(wide, folder / f"{name}.png")
+    return Picture(svg_address(figures.themed_svg(wide, name)), svg_address(figures.themed_svg(narrow, name)), alt)
+
+
 def worst_state(example: Example) -> int:
     """Return the state at which the uncorrected simulation is farthest from the target, on average."""
     errors = trajectory_errors(example.simulation, example.target)
@@ -213,7 +226,7 @@ def page_template(name: str) -> jinja2.Template:
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("warp_resphys", "report"),
         undefined=jinja2.StrictUndefined,
-        autoescape=True,
+        autoescape=jinja2.select_autoescape(["html"]),
         trim_blocks=True,
         lstrip_blocks=True,
     )
@@ -225,6 +238,7 @@ def _render_page(data: ReportData, pictures: Mapping[str, Picture], missing: Map
     models = [model for model in _MODELS if model in metrics["errors_mm"] or model in data.published]
     trajectories, steps = next(iter(data.errors_mm.values())).shape
     return page_template("template.html").render(
+        title=data.title,
         data=data,
         metrics=metrics,
         pictures=pictures,
@@ -234,7 +248,7 @@ def _render_page(data: ReportData, pictures: Mapping[str, Picture], missing: Map
         timed=_TIMED,
         verdict=verdict(metrics["errors_mm"], data.published, data.simulator, data.reality),
         measured={model: error_parts(each) for model, each in metrics["errors_mm"].items()},
-        published={model: _published_parts(each) for model, each in data.published.items()},
+        published={model: published_parts(each) for model, each in data.published.items()},
         reconstructed={model: error_parts(each) for model, each in metrics["errors_vs_reconstruction_mm"].items()},
         number=number_text,
         duration=duration_text,
@@ -280,7 +294,7 @@ def verdict(errors: Mapping[str, Any], published: Mapping[str, PublishedError], 
             f"trajectories that it never saw, the mean vertex error falls from {old} mm to {new} mm."
         )
     if "resphys" in published:
-        said += f" The published result is {_published_parts(published['resphys'])[0]} mm."
+        said += f" The published result is {published_parts(published['resphys'])[0]} mm."
     number_and_unit, symbol_and_number = r"(?<=\d) (?=(?:mm|kPa)\b)", r"(?<=\b\w) (?=\d)"
     return re.sub(f"{number_and_unit}|{symbol_and_number}", NO_BREAK_SPACE, said)
 
@@ -333,8 +347,8 @@ def _closer(before: float, after: float) -> str:
     return f"{round(before / after, digits):,.{max(0, digits)}f} times closer"
 
 
-def _published_parts(error: PublishedError) -> tuple[str, str]:
-    """The number as it was printed: both parts with the same decimals."""
+def published_parts(error: PublishedError) -> tuple[str, str]:
+    """Return the number as it was printed: both parts with the same decimals."""
     decimals = max(len(repr(float(part)).partition(".")[2]) for part in error)
     return f"{error.mean:.{decimals}f}", f"± {error.std:.{decimals}f}"
 

@@ -4,12 +4,15 @@ One motion is observed through random subsets of the surface vertices alone, and
 """
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+import warp as wp
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
@@ -25,7 +28,8 @@ from ..report.ablation_page import AblationReport, write_ablation_report
 from ..report.page import number_text
 from ..residual.sparse_reconstruction import make_sparse_reconstructor
 from ..resumable import Field, ResumableHDF5
-from ..stages import Stage, StageContext, package_versions, run_stages
+from ..stages import Stage, StageContext, package_versions, resources_used, run_stages
+from ..workers import Advance, available_cores, in_processes
 from .generate import held_state
 from .trajectories import METRICS, REPORT, read_fields
 
@@ -50,14 +54,18 @@ def ablation_stages(config: dict[str, Any], base: dict[str, Any]) -> list[Stage]
     def pick(*keys: str) -> dict[str, Any]:
         return {**base, **{key: config[key] for key in keys}}
 
+    markers = dict(config["markers"])
+    processes = _processes(markers.pop("processes"), config)
     return [
         Stage("generate", generate_motion, (MOTION,), pick("reality", "simulation", "data")),
         Stage(
             "ablation",
-            ablate,
+            partial(ablate, processes=processes),
             (DRAWS, SUMMARY, TABLE),
-            pick("simulation", "reconstruction", "markers", "seed"),
+            {**pick("simulation", "reconstruction", "seed"), "markers": markers},
             ("generate",),
+            format_version=2,
+            processes=processes if processes > 1 else 0,
         ),
         Stage("report", report_ablation, (REPORT,), {"config": config}, ("ablation",)),
     ]
@@ -85,15 +93,16 @@ def check_ablation(config: Mapping[str, Any]) -> None:
         InputError: a value of the wrong kind or out of range, or more markers than surface vertices.
     """
     markers = config["markers"]
-    if not isinstance(markers, Mapping) or set(markers) != {"counts", "draws", "modes"}:
-        raise InputError(f"markers is {markers!r}: it must be a group of counts, draws and modes.")
+    if not isinstance(markers, Mapping) or set(markers) != {"counts", "draws", "modes", "processes"}:
+        raise InputError(f"markers is {markers!r}: it must be a group of counts, draws, modes and processes.")
     counts = markers["counts"]
     if not isinstance(counts, list) or not counts or not all(map(_is_count, counts)) or len({*counts}) < len(counts):
         raise InputError(f"markers.counts is {counts!r}: it must be a list of different positive whole numbers.")
     if not _is_count(markers["draws"]):
         raise InputError(f"markers.draws is {markers['draws']!r}: it must be a positive whole number.")
-    if markers["modes"] is not None and not _is_count(markers["modes"]):
-        raise InputError(f"markers.modes is {markers['modes']!r}: it must be a positive whole number, or null.")
+    for key in ("modes", "processes"):
+        if markers[key] is not None and not _is_count(markers[key]):
+            raise InputError(f"markers.{key} is {markers[key]!r}: it must be a positive whole number, or null.")
     surface = len(surface_vertices(build_mesh(config["mesh"])))
     if max(counts) > surface:
         raise InputError(
@@ -129,14 +138,25 @@ def generate_motion(context: StageContext) -> None:
             create(file, name, q.cpu().numpy(), "m")
 
 
-def ablate(context: StageContext) -> None:
-    """Writes ablation.h5, with the sets of markers and the error of each at every step, and tables of the errors."""
+def _processes(wanted: int | None, config: Mapping[str, Any]) -> int:
+    """How many processes share the counts: unless told, one a core, and a single one on a GPU."""
+    cores = 1 if config["device"].startswith("cuda") else available_cores()
+    return min(cores if wanted is None else wanted, len(config["markers"]["counts"]))
+
+
+def ablate(context: StageContext, processes: int = 1) -> None:
+    """Writes ablation.h5, with the sets of markers and the error of each at every step, and tables of the errors.
+
+    Args:
+        context: of the stage.
+        processes: that share the numbers of markers; 1 for this one alone.
+    """
     settings = context.settings
     counts, draws = settings["markers"]["counts"], settings["markers"]["draws"]
-    simulator = build_simulator(settings, "simulation")
     motion, uncorrected = read_fields(context.run_dir / MOTION, "motion", "q", "uncorrected_q")
     steps = len(motion) - 1
     fields = {
+        "count": Field((), "1", "int64"),
         "markers": Field((draws, max(counts)), "1", "int64"),  # -1 where a set is smaller
         "error": Field((draws, steps), "m"),
         "misfit": Field((draws, steps), "m"),
@@ -145,12 +165,14 @@ def ablate(context: StageContext) -> None:
         ResumableHDF5(context.run_dir / DRAWS, "marker ablation", context.fingerprint, len(counts), fields) as file,
         Progress("ablation", len(counts) * steps, "frames", file.done * steps) as progress,
     ):
-        while file.done < file.steps:
-            vertices = draw_markers(simulator, counts[file.done], draws, settings["seed"])
-            error, misfit = _reconstruct(simulator, settings, vertices, simulator.tensor(motion), progress)
-            padding = ((0, 0), (0, max(counts) - vertices.shape[1]))
-            file.append(markers=np.pad(vertices, padding, constant_values=-1), error=error, misfit=misfit)
-        file.finish({"counts": counts})
+        done = [int(file.read(step)["count"]) for step in range(file.done)]
+        left = [(settings, context.run_dir / MOTION, count) for count in counts if count not in done]
+        with closing(_each_count(left, processes, progress.advance)) as results:
+            for count, (vertices, error, misfit) in results:
+                padded = np.pad(vertices, ((0, 0), (0, max(counts) - count)), constant_values=-1)
+                file.append(count=count, markers=padded, error=error, misfit=misfit)
+                done.append(count)
+        file.finish(order=[counts.index(count) for count in done])
     error, misfit = (_MM * values.mean(-1) for values in read_fields(file.path, "marker ablation", "error", "misfit"))
     distance = np.linalg.norm(uncorrected[1:] - motion[1:], axis=-1).mean()
     rows = [summarise_draws(count, e, m) for count, e, m in zip(counts, error, misfit, strict=True)]
@@ -159,6 +181,38 @@ def ablate(context: StageContext) -> None:
     for count, e, m in zip(counts, error, misfit, strict=True):
         lines += [f"{count},{i},{a:.9g},{b:.9g}" for i, (a, b) in enumerate(zip(e, m, strict=True))]
     write_text(context.run_dir / TABLE, "\n".join(lines) + "\n")
+
+
+_Task = tuple[Mapping[str, Any], Path, int]
+
+
+def _each_count(tasks: Sequence[_Task], processes: int, advance: Advance) -> Generator[tuple[int, Any], None, None]:
+    """Yields each number of markers with what `reconstruct_count` makes of it, in the order in which they finish."""
+    if processes == 1:
+        for task in tasks:
+            yield task[-1], reconstruct_count(task, advance)
+        return
+    tasks = sorted(tasks, key=lambda task: -task[-1])  # The longest first, so that no process is left with it.
+    with closing(in_processes(reconstruct_count, tasks, processes, advance)) as results:
+        for number, result in results:
+            yield tasks[number][-1], result
+
+
+def reconstruct_count(
+    task: _Task, advance: Advance
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Sets of markers (draws, count), and the mean distances (draws, T) of all vertices and of the markers [m].
+
+    Args:
+        task: settings of the stage, file of the motion, number of markers.
+        advance: told of each step.
+    """
+    settings, path, count = task
+    wp.config.log_level = wp.LOG_WARNING
+    simulator = build_simulator(settings, "simulation")
+    (motion,) = read_fields(path, "motion", "q")
+    vertices = draw_markers(simulator, count, settings["markers"]["draws"], settings["seed"])
+    return vertices, *_reconstruct(simulator, settings, vertices, simulator.tensor(motion), advance)
 
 
 def draw_markers(simulator: Any, count: int, draws: int, seed: int) -> NDArray[np.int64]:
@@ -175,7 +229,7 @@ def draw_markers(simulator: Any, count: int, draws: int, seed: int) -> NDArray[n
 
 
 def _reconstruct(
-    simulator: Any, settings: Mapping[str, Any], vertices: NDArray[np.int64], motion: torch.Tensor, progress: Progress
+    simulator: Any, settings: Mapping[str, Any], vertices: NDArray[np.int64], motion: torch.Tensor, advance: Advance
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Mean distances (draws, T) from the motion (T + 1, N, 3), of all vertices and of the markers [m]."""
     markers = MarkerMap.at_vertices(torch.as_tensor(vertices, device=motion.device), motion.dtype)
@@ -190,7 +244,7 @@ def _reconstruct(
         state, force = result.state.detach(), result.force
         errors.append((state.q - frame).norm(dim=-1).mean(-1))
         misfits.append((markers(state.q) - observed).norm(dim=-1).mean(-1))
-        progress.advance(markers=vertices.shape[1], iterations=result.iterations)
+        advance(markers=vertices.shape[1], iterations=result.iterations)
     return torch.stack(errors, 1).cpu().numpy(), torch.stack(misfits, 1).cpu().numpy()
 
 
@@ -228,11 +282,10 @@ def report_ablation(context: StageContext) -> None:
 
 
 def collect_metrics(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
-    """Errors, seconds of the stages that are done, versions and device."""
-    records = {name: folder / "stages" / f"{name}.json" for name in _STAGES}
+    """Errors, time and memory of the stages that are done, versions and device."""
     return {
         **read_json(folder / SUMMARY),
-        "seconds": {name: read_json(path)["seconds"] for name, path in records.items() if path.is_file()},
+        **resources_used(folder, _STAGES),
         "versions": package_versions(),
         "device": str(choose_device("cpu" if config["device"] == "auto" else config["device"])),
     }

@@ -1,15 +1,19 @@
 """Stage: the report page."""
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..configured import build_mesh, choose_device
 from ..files import read_json
 from ..mesh import select_vertices
 from ..metrics import PUBLISHED_MM, trajectory_errors
 from ..report.page import Example, ReportData, number_text, write_report
-from ..stages import StageContext, package_versions
+from ..stages import StageContext, package_versions, resources_used
 from .trajectories import (
     ERRORS,
     RECONSTRUCTION,
@@ -48,17 +52,32 @@ _PHYSICS = {
 }
 
 
-def make_report(context: StageContext) -> None:
-    """Writes report.html and its figures."""
-    settings = context.settings
-    config = settings["config"]
+@dataclass(frozen=True, eq=False)
+class EvaluatedSplit:
+    """The test split of a run: what should have happened, and what the models made of it.
+
+    Attributes:
+        names: R trajectories.
+        target: (R, T + 1, N, 3) [m].
+        positions: the same of each model.
+        errors_mm: for each model (R, T) mean distances from the target.
+        worst: the trajectory of which the uncorrected simulator makes most errors.
+    """
+
+    names: tuple[str, ...]
+    target: NDArray[np.float64]
+    positions: dict[str, NDArray[np.float64]]
+    errors_mm: dict[str, NDArray[np.float64]]
+    worst: int
+
+
+def read_rollouts(folder: Path, config: Mapping[str, Any]) -> EvaluatedSplit:
+    """What an experiment has left in its run folder."""
     split, _ = split_of(config["data"])
     part = split.indices("test")
-    (target,) = read_fields(context.run_dir / TRAJECTORIES, "trajectories", "q")
-    (reconstruction,) = read_fields(context.run_dir / RECONSTRUCTION, "reconstruction", "q")
-    simulation, resphys, simfree = read_fields(
-        context.run_dir / ROLLOUTS, "rollouts", "simulation_q", "resphys_q", "simfree_q"
-    )
+    (target,) = read_fields(folder / TRAJECTORIES, "trajectories", "q")
+    (reconstruction,) = read_fields(folder / RECONSTRUCTION, "reconstruction", "q")
+    simulation, resphys, simfree = read_fields(folder / ROLLOUTS, "rollouts", "simulation_q", "resphys_q", "simfree_q")
     positions = {
         "simulation": simulation,
         "reconstruction": reconstruction[part],
@@ -69,10 +88,19 @@ def make_report(context: StageContext) -> None:
     errors = {
         m: np.stack([trajectory_errors(a, b) for a, b in zip(q, target, strict=True)]) for m, q in positions.items()
     }
+    return EvaluatedSplit(
+        split.test, target, positions, errors, int(np.argmax(np.nanmean(errors["simulation"], axis=1)))
+    )
+
+
+def make_report(context: StageContext) -> None:
+    """Writes report.html and its figures."""
+    config = context.settings["config"]
+    test = read_rollouts(context.run_dir, config)
     mesh = build_mesh(config["mesh"])
     metrics = collect_metrics(context, config)
     refined = "refinement" in metrics["networks"]
-    worst = int(np.argmax(np.nanmean(errors["simulation"], axis=1)))
+    worst = test.worst
     data = ReportData(
         experiment=config["name"],
         title=config["title"],
@@ -85,8 +113,10 @@ def make_report(context: StageContext) -> None:
         time_step=config["time_step"],
         mesh=mesh,
         tip=select_vertices(mesh, **config["tip"]),
-        example=Example(split.test[worst], target[worst], simulation[worst], resphys[worst]),
-        errors_mm=errors,
+        example=Example(
+            test.names[worst], test.target[worst], test.positions["simulation"][worst], test.positions["resphys"][worst]
+        ),
+        errors_mm=test.errors_mm,
         training=read_json(context.run_dir / TRAINING)["epochs"],
         refinement=read_json(context.run_dir / REFINEMENT)["epochs"] if refined else (),
         network_note=network_in_words(config),
@@ -96,16 +126,15 @@ def make_report(context: StageContext) -> None:
 
 
 def collect_metrics(context: StageContext, config: dict[str, Any]) -> dict[str, Any]:
-    """Errors, which weights were kept, seconds of the stages that are done, versions and device."""
+    """Errors, which weights were kept, time and memory of the stages that are done, versions and device."""
     refined = config["refinement"]["kind"] != "none"
     histories = _HISTORIES | ({"refinement": REFINEMENT} if refined else {})
-    records = sorted((context.run_dir / "stages").glob("*.json"))
-    seconds = {r.stem: read_json(r)["seconds"] for r in records if not r.name.endswith(".progress.json")}
+    ours = [name for name in STAGES if refined or name != "refine"]
     return {
         **read_json(context.run_dir / ERRORS),
         "networks": {m: read_json(context.run_dir / f)["kept"] for m, f in histories.items()},
         "seconds_per_test_trajectory": read_json(context.run_dir / TIMES)["seconds"],
-        "seconds": {name: seconds[name] for name in STAGES if name in seconds and (refined or name != "refine")},
+        **resources_used(context.run_dir, ours),
         "versions": package_versions(),
         "device": str(choose_device(config["device"])),
     }

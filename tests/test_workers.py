@@ -1,0 +1,55 @@
+"""Work in several processes: what comes back, and how it ends."""
+
+import os
+import signal
+from contextlib import closing
+
+import pytest
+import torch
+
+from warp_resphys.errors import InputError
+from warp_resphys.workers import WorkerError, in_processes
+
+
+def work(task, advance):
+    if task == "bad input":
+        raise InputError("this cannot be simulated: take another.")
+    if task == "fault":
+        raise ZeroDivisionError("nothing that a user can mend")
+    if task == "killed":
+        os.kill(os.getpid(), signal.SIGKILL)
+    advance(task, rest=task % 2)
+    return os.getpid(), torch.get_num_threads(), 10 * task
+
+
+def done(tasks, processes):
+    counted = []
+    with closing(in_processes(work, tasks, processes, lambda count, rest: counted.append((count, rest)))) as results:
+        return dict(results), counted
+
+
+def test_each_task_is_done_once_in_other_processes_on_one_thread():
+    results, counted = done([1, 2, 3, 4, 5], 2)
+    assert {number: result[2] for number, result in results.items()} == {0: 10, 1: 20, 2: 30, 3: 40, 4: 50}
+    assert sorted(counted) == [(1, 1), (2, 0), (3, 1), (4, 0), (5, 1)]
+    assert os.getpid() not in {result[0] for result in results.values()}
+    assert len({result[0] for result in results.values()}) == 2
+    assert {result[1] for result in results.values()} == {1}
+
+
+@pytest.mark.parametrize(
+    ("task", "error", "message"),
+    [
+        ("bad input", WorkerError, "^this cannot be simulated: take another.$"),
+        ("fault", RuntimeError, "ZeroDivisionError: nothing that a user can mend"),
+        ("killed", WorkerError, "a worker process was ended from outside .exit code -9., perhaps for want of memory"),
+    ],
+)
+def test_an_error_ends_all_of_them(task, error, message):
+    with pytest.raises(error, match=message) as caught:
+        done([2, task, 4], 2)
+    assert isinstance(caught.value, WorkerError) == (error is WorkerError)
+
+
+def test_nothing_to_do():
+    assert done([], 2) == ({}, [])

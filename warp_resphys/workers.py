@@ -1,0 +1,132 @@
+"""Independent pieces of work in several processes.
+
+Processes are spawned: a fork would copy the threads' locks of torch and Warp in whatever state they are. Each works on
+one thread. Ctrl-C is the parent's to handle; a worker ends with its parent, however that ends, as its pipe is closed.
+"""
+
+import multiprocessing
+import os
+import signal
+import traceback
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager
+from itertools import islice
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from typing import Any
+
+import torch
+from threadpoolctl import threadpool_limits
+
+from .errors import ResphysError
+
+Advance = Callable[..., None]
+
+
+class WorkerError(ResphysError, RuntimeError):
+    """A worker process that could not do its piece of work."""
+
+
+def available_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def in_processes(
+    function: Callable[[Any, Advance], Any], tasks: Sequence[Any], processes: int, advance: Advance
+) -> Generator[tuple[int, Any], None, None]:
+    """Yields a task's number and result as each finishes; close the iterator to end the workers.
+
+    Args:
+        function: of a task and of `advance`; defined at the top of a module, as what it takes and returns is sent.
+        tasks: started in this order.
+        processes: at most so many at once.
+        advance: called here, with the arguments that a worker called its own with.
+
+    Raises:
+        WorkerError: a task raised a ResphysError, whose sentence it has, or a worker was ended from outside.
+        RuntimeError: a task failed in another way.
+    """
+    context = multiprocessing.get_context("spawn")
+    crew: dict[Connection, BaseProcess] = {}
+    busy: dict[Connection, int] = {}
+    waiting = iter(range(len(tasks)))
+    try:
+        for number in islice(waiting, processes):
+            with _interrupts_blocked():
+                ours, theirs = context.Pipe()
+                process = context.Process(target=_work, args=(function, theirs), daemon=True)
+                process.start()
+                crew[ours] = process
+            theirs.close()
+            ours.send(tasks[number])
+            busy[ours] = number
+        while busy:
+            for connection in wait([*busy]):
+                assert isinstance(connection, Connection)
+                kind, content = _receive(connection, crew[connection])
+                if kind == "advance":
+                    advance(content[0], **content[1])
+                    continue
+                number = busy.pop(connection)
+                if (following := next(waiting, None)) is not None:
+                    connection.send(tasks[following])
+                    busy[connection] = following
+                yield number, content
+    finally:
+        for connection, worker in crew.items():
+            connection.close()
+            worker.terminate()
+            worker.join()
+
+
+def _receive(connection: Connection, process: BaseProcess) -> tuple[str, Any]:
+    try:
+        kind, content = connection.recv()
+    except (EOFError, ConnectionError) as error:
+        process.join()
+        raise WorkerError(
+            f"a worker process was ended from outside (exit code {process.exitcode}), perhaps for want of memory: "
+            "run the same command again, with fewer processes."
+        ) from error
+    if kind == "error":
+        raise WorkerError(content)
+    if kind == "fault":
+        raise RuntimeError(f"a worker process failed:\n{content}")
+    return kind, content
+
+
+def _work(function: Callable[[Any, Advance], Any], connection: Connection) -> None:
+    """Does one task after the other until the parent closes the pipe."""
+
+    def advance(count: int = 1, **fields: object) -> None:
+        connection.send(("advance", (count, fields)))
+
+    torch.set_num_threads(1)
+    with threadpool_limits(1):
+        try:
+            while True:
+                connection.send(_outcome(function, connection.recv(), advance))
+        except (EOFError, ConnectionError):
+            return
+
+
+def _outcome(function: Callable[[Any, Advance], Any], task: Any, advance: Advance) -> tuple[str, Any]:
+    try:
+        return "done", function(task, advance)
+    except ConnectionError:
+        raise
+    except ResphysError as error:
+        return "error", str(error)
+    except Exception:
+        return "fault", traceback.format_exc()
+
+
+@contextmanager
+def _interrupts_blocked() -> Iterator[None]:
+    """What starts in here never sees Ctrl-C; this process sees it afterwards."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

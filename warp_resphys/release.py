@@ -17,7 +17,8 @@ from .replay import Markers, Motions, Release, Replay
 from .simulator import MaterialTensors, Simulator
 
 _HOLD_ITERATIONS = 30
-_HOLD_TOLERANCE = 1e-7  # m, change of the markers in an iteration
+_HOLD_TOLERANCE = 1e-7  # m, change of any position in the last iteration
+_HOLD_WEIGHT = 1e-6  # w, in units of the largest diagonal entry of J^T J
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,7 @@ def hold(
 ) -> torch.Tensor:
     """(R, N, 3) positions at rest under gravity, weights and the virtual force that holds the markers best [m].
 
-    Gauss-Newton on |m(q(a)) - y|^2 + w |a|^2 with q(a) the equilibrium under the force B a, and w so small that it only
+    Levenberg-Marquardt on |m(q(a)) - y|^2 + w |a|^2 with q(a) the equilibrium under the force B a, and w so small that it only
     keeps what no marker sees from moving.
 
     Args:
@@ -100,27 +101,37 @@ def hold(
         with torch.no_grad():
             return simulator.static_equilibrium(material=tensors, batch=count).q
     basis = vibration_modes(simulator, modes)
+    identity = torch.eye(modes, dtype=target.dtype, device=target.device)
+
+    def equilibrium(a: torch.Tensor, start: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Positions, and (R, 3 M) distances from where the markers were held."""
+        load = (a @ basis.mT).unflatten(1, (-1, 3))
+        q = simulator.static_equilibrium(load, material=tensors, start=start).q
+        return q, torch.where(torch.isfinite(target), target - markers(q), 0.0).flatten(1)
+
     force = simulator.rest_positions.new_zeros(count, modes)
-    q, last = simulator.rest_state(count).q, None
+    damping = force.new_full((count, 1, 1), 1e-3)  # in units of the largest diagonal entry
+    q, missing = equilibrium(force, simulator.rest_state(count).q)
     for _ in range(_HOLD_ITERATIONS):
         a = force.clone().requires_grad_()
-        load = (a @ basis.mT).unflatten(1, (-1, 3))
-        held = simulator.static_equilibrium(load, material=tensors, start=q)
-        seen = markers(held.q)
-        q = held.q.detach()
-        missing = torch.nan_to_num(target - seen.detach()).flatten(1)
-        if last is not None and float((seen.detach() - last).abs().max()) < _HOLD_TOLERANCE:
-            break
-        last = seen.detach()
-        flat = torch.where(torch.isfinite(target), seen, 0.0).flatten(1)
-        rows = [torch.autograd.grad(flat[:, i].sum(), a, retain_graph=True)[0] for i in range(flat.shape[1])]
-        jacobian = torch.stack(rows, 1)  # (R, 3 M, modes)
+        _, left = equilibrium(a, q)
+        rows = [torch.autograd.grad(left[:, i].sum(), a, retain_graph=True)[0] for i in range(left.shape[1])]
+        jacobian = -torch.stack(rows, 1)  # (R, 3 M, modes)
         gram = jacobian.mT @ jacobian
-        weight = 1e-6 * gram.diagonal(dim1=1, dim2=2).amax(1)[:, None, None]
-        right = jacobian.mT @ missing[..., None] - weight * force[..., None]
-        identity = torch.eye(modes, dtype=gram.dtype, device=gram.device)
-        force = force + torch.linalg.solve(gram + weight * identity, right)[..., 0]
-    return q
+        scale = gram.diagonal(dim1=1, dim2=2).amax(1)[:, None, None]
+        right = jacobian.mT @ missing[..., None] - _HOLD_WEIGHT * scale * force[..., None]
+        change = torch.linalg.solve(gram + (_HOLD_WEIGHT + damping) * scale * identity, right)[..., 0]
+        with torch.no_grad():
+            new_q, new_missing = equilibrium(force + change, q)
+        better = new_missing.square().sum(1) <= missing.square().sum(1)
+        moved = float((new_q - q)[better].abs().max()) if bool(better.any()) else torch.inf
+        force = torch.where(better[:, None], force + change, force)
+        q = torch.where(better[:, None, None], new_q, q)
+        missing = torch.where(better[:, None], new_missing, missing)
+        damping = torch.where(better[:, None, None], 0.2 * damping, 10.0 * damping).clamp(1e-9, 1e6)
+        if moved < _HOLD_TOLERANCE and bool(better.all()):
+            break
+    return q.detach()
 
 
 def _let_go(

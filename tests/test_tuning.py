@@ -319,7 +319,7 @@ with Worker(folder / "workers", 60.0) as worker:
         with pytest.raises(InputError) as refusal:
             join(tmp_path, space=space, conditions=conditions)
         assert sentence in str(refusal.value)
-        assert "delete the folder, or choose another one" in str(refusal.value)
+        assert "delete the folder, or name another study with tune.study=" in str(refusal.value)
 
     def test_importance_finds_the_setting_that_matters(self, tmp_path):
         study = join(tmp_path, trials=30)
@@ -594,6 +594,17 @@ class TestBadInput:
         assert code == 2
         assert err.splitlines()[-1].startswith(f"error: {sentence}")
         assert not Path("run/trajectories.h5").exists()
+
+    def test_the_other_space_is_a_study_of_its_own(self, searched, monkeypatch):
+        monkeypatch.chdir(searched)
+        settings = [option for option in SEARCH if not option.startswith("tune.")]
+        small = ["tune.space.network.width=[8,16]", "tune.settings.trainer.rollout_every=3", "tune.trials=1"]
+        assert run(*settings, IN_RUN, "trainer.epochs=6", "tune=reduced", *small)[0] == 0
+        (row,) = table("run/tune/resphys_reduced")
+        assert row["state"] == "complete"
+        assert 4 <= int(row["network.position_modes"]) <= 12
+        assert "trainer.gamma" not in row
+        assert Path("configs/tuned/beam_oscillation_resphys_reduced.yaml").is_file()
 
     def test_an_experiment_without_training(self, folder):
         code, err = run("experiment=marker_ablation", "task=tune", IN_RUN)

@@ -168,8 +168,9 @@ def check_tuning(config: Mapping[str, Any]) -> dict[str, Dimension]:
         given = tune[key]
         if (given is not None or key == "stale_after") and not (_is_number(given) and 0.0 < given < math.inf):
             raise InputError(f"tune.{key} is {given!r}: it must be positive, in seconds.")
-    if not isinstance(tune["save_as"], str) or not re.fullmatch(r"[\w-]+", tune["save_as"]):
-        raise InputError(f"tune.save_as is {tune['save_as']!r}: use letters, digits, _ and - alone.")
+    for key in ("study", "save_as"):
+        if not isinstance(tune[key], str) or not re.fullmatch(r"[\w-]+", tune[key]):
+            raise InputError(f"tune.{key} is {tune[key]!r}: use letters, digits, _ and - alone.")
     space = parse_space(tune["space"])
     if not isinstance(tune["settings"], Mapping):
         raise InputError(f"tune.settings is {tune['settings']!r}: it must be a group of settings.")

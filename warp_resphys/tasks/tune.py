@@ -75,7 +75,7 @@ def run_tuning(config: DictConfig) -> None:
     conditions = {"model": model, **{k: v for stage in needed for k, v in stage.settings.items()}, **groups}
     for group in ("network", "trainer"):
         conditions[group] = {k: v for k, v in groups[group].items() if f"{group}.{k}" not in space}
-    folder = run_dir / "tune" / model
+    folder = run_dir / "tune" / tune["study"]
     context = StageContext("tune", run_dir, "", needed[-1].settings)
     with Worker(folder / "workers", tune["stale_after"]) as worker:
         watch = Watch(folder / "workers", tune["stale_after"])

@@ -5,6 +5,7 @@ import io
 import logging
 import math
 import os
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -109,7 +110,7 @@ def option_text(tuning: Tuning, best: Outcome, trials: int) -> str:
     found: dict[str, Any] = {key: groups[key] for key in ("network", "trainer")}
     if tuning.config["tune"]["model"] == "simfree":
         found = {"simfree": found}
-    command = " ".join(["warp-resphys", *HydraConfig.get().overrides.task])
+    command = shlex.join(["warp-resphys", *HydraConfig.get().overrides.task])
     head = [
         "# @package _global_",
         f"# Trial {best.number} of {trials} until {datetime.now(UTC).date()}: roll-out error of "

@@ -170,7 +170,7 @@ class SharedStudy:
         what = f"the search space of {key.removeprefix('space.')}" if key.startswith("space.") else key
         raise InputError(
             f"the study in {self.folder} has another setting: {what} was {old}, now it is {new}; go on with the old "
-            f"setting, delete the folder, or choose another one with hydra.run.dir=..."
+            f"setting, delete the folder, or name another study with tune.study=..."
         )
 
     def claim(self) -> Claim | None:

@@ -1,10 +1,10 @@
 """A residual force trained on what markers saw: the loss is what the corrected simulator gets wrong over whole motions.
 
-Few recordings leave most of a residual force open. The force starts from zero, which is the simulator as it is, and every
-weight is paid for, so that it departs from there only as far as the motions ask for.
+Few recordings leave most of a residual force open. The force starts from zero, which is the simulator as it is, and
+every weight is paid for, so that it departs from there only as far as the motions ask for.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -55,7 +55,7 @@ class MotionLoss:
         return (errors.square().sum((1, 2, 3)) * self._weight).sum()
 
     def error_mm(self, model: ResidualForce | None) -> float:
-        """Mean distance of the markers that were seen, over motions of equal weight [mm]; infinite where one diverged."""
+        """Mean distance of the markers that were seen, motions weighing the same [mm]; infinite where one diverged."""
         try:
             with torch.no_grad():
                 errors = self._replay.errors(self.markers(model)[None])[0].norm(dim=-1)

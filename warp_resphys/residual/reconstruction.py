@@ -12,11 +12,12 @@ import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 import scipy.optimize
 import torch
-from typing_extensions import Self, override
+from typing_extensions import override
 
 from ..assembly import HessianAssembly
 from ..errors import ConvergenceError, InputError

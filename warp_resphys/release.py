@@ -82,8 +82,8 @@ def hold(
 ) -> torch.Tensor:
     """(R, N, 3) positions at rest under gravity, weights and the virtual force that holds the markers best [m].
 
-    Levenberg-Marquardt on |m(q(a)) - y|^2 + w |a|^2 with q(a) the equilibrium under the force B a, and w so small that it only
-    keeps what no marker sees from moving.
+    Levenberg-Marquardt on |m(q(a)) - y|^2 + w |a|^2 with q(a) the equilibrium under the force B a; w is so small that
+    it only keeps what no marker sees from moving.
 
     Args:
         simulator: of the body.
@@ -158,7 +158,7 @@ def _let_go(
     offsets = offsets.to(deviation.device).repeat_interleave(count, 0)
     with torch.no_grad():
         for _ in range(settings.iterations):
-            simulated = replay(begin(parameters.repeat(size, 1) + offsets), seconds=settings.window)
+            simulated = replay(begin(parameters.repeat(size, 1) + offsets))
             residual = replay.errors(simulated)[0].flatten(1).unflatten(0, (size, count)) / settings.noise
             jacobian = ((residual[1:] - residual[0]) / step).permute(1, 2, 0)
             identity = torch.eye(len(deviation), dtype=deviation.dtype, device=deviation.device)

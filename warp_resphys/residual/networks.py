@@ -105,6 +105,12 @@ def pod_coder(samples: torch.Tensor, modes: int) -> Coder:
     return Coder(torch.zeros_like(x[0]), basis, deviation.clamp_min(_DEVIATION_FLOOR * float(deviation.max())))
 
 
+def actuation_coder(samples: torch.Tensor) -> Coder:
+    """Each number of (S, A) in units of its root mean square: no actuation stays zero."""
+    size = samples.square().mean(0).sqrt()
+    return Coder(torch.zeros_like(size), None, torch.where(size > 0.0, size, torch.ones_like(size)))
+
+
 def nodal_coder(samples: torch.Tensor) -> Coder:
     """Standardisation of every coordinate of (S, N, 3), as published; constant coordinates stay zero."""
     x = samples.flatten(1)
@@ -256,7 +262,7 @@ def build_model(
     """
     position, velocity = _state_coders(config, q - rest, v)
     coder = pod_coder(force, config["force_modes"]) if config["kind"] == "reduced" else nodal_coder(force)
-    actuated = None if actuation is None else nodal_coder(actuation)
+    actuated = None if actuation is None else actuation_coder(actuation)
     return ResidualForce(rest, position, velocity, {"force": coder}, config, actuated)
 
 
@@ -281,7 +287,7 @@ def build_next_state(
     """
     position, velocity = _state_coders(config, q - rest, v)
     outputs = dict(zip(NextState.fields, _state_coders(config, q - rest, v), strict=True))
-    actuated = None if actuation is None else nodal_coder(actuation)
+    actuated = None if actuation is None else actuation_coder(actuation)
     return NextState(rest, position, velocity, outputs, config, actuated)
 
 

@@ -160,8 +160,8 @@ class SparseLevenbergMarquardt(Reconstructor):
 
         |r - J (f - f0)|^2 + lambda |f|^2 + d |f - f0|^2,
 
-    and is taken if the objective gets smaller; the damping d grows where it does not. ``tolerance`` is the last change of
-    any position [m].
+    and is taken if the objective gets smaller; the damping d grows where it does not. ``tolerance`` is the last change
+    of any position [m].
 
     Args:
         simulator: the one to correct.

@@ -84,7 +84,7 @@ def test_without_noise_the_parameters_are_exact():
 
 
 def test_the_predicted_deviation_is_that_of_repetitions():
-    replay, release = replay_of(simulator(), TRUTH, masses=(0.05,), frames=25)
+    replay, release = replay_of(simulator(), TRUTH, masses=(0.05,), frames=12)
     clean, found, predicted = replay.motions, [], []
     generator = torch.Generator().manual_seed(1)
     for _ in range(10):

@@ -148,6 +148,19 @@ class TestOwnOptions:
         assert command("experiment=my_robot") == (0, warning)
         assert command.outputs == ["runs/my_robot/default"]
 
+    @pytest.mark.parametrize(
+        ("text", "problem"),
+        [("name: a\nname: b\n", "found duplicate key name"), ("name: [a\nseed: 1\n", "expected ',' or ']'")],
+    )
+    def test_one_that_is_no_yaml_is_named_with_its_line(self, command, own, text, problem):
+        (own / "experiment" / "my_robot.yaml").write_text("# @package _global_\n" + text)
+        code, errors = command("experiment=my_robot")
+        assert code == 2
+        assert errors.startswith(
+            f"error: {own / 'experiment' / 'my_robot.yaml'}, line 3 cannot be read as YAML ({problem}"
+        )
+        assert errors.count("\n") == 1
+
     def test_the_command_line_is_left_as_it_was(self, command, own):
         command("seed=1")
         assert sys.argv == [*command.arguments, "seed=1"]

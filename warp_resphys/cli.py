@@ -25,6 +25,7 @@ from hydra.errors import (
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+from yaml import MarkedYAMLError
 
 from warp_resphys.errors import ResphysError
 from warp_resphys.files import OWN_OPTIONS, is_disk_full
@@ -153,6 +154,8 @@ def _explain(error: BaseException, started: bool) -> str | None:
         name = getattr(error, "filename", None)
         place = f" while writing {name}" if name else ""
         return f"disk is full{place}: free some space and run the same command again"
+    if isinstance(error, MarkedYAMLError) and not started:
+        return _explain_yaml(error)
     if isinstance(error, OSError) and not started:
         return f"cannot write {error.filename} ({error.strerror}): choose another run folder"
     if isinstance(error, ValueError) and not started:
@@ -167,6 +170,13 @@ def _explain_missing(error: MissingConfigException) -> str:
     group, _, option = error.missing_cfg_file.rpartition("/")
     known = ", ".join(error.options)
     return f"unknown {group} '{option}'{_did_you_mean(option, error.options)}; known are {known}"
+
+
+def _explain_yaml(error: MarkedYAMLError) -> str:
+    """Names file and line where a configuration is no YAML."""
+    mark = error.problem_mark
+    place = "a configuration" if mark is None else f"{mark.name}, line {mark.line + 1}"
+    return f"{place} cannot be read as YAML ({error.problem}): mend it there or in the lines before"
 
 
 def _explain_key(error: HydraException, cause: OmegaConfBaseException) -> str:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from warp_resphys.errors import DataFileError, InputError
 from warp_resphys.recordings.jumps import LEAST_JUMP, Jump, Swap, find_jumps, find_swaps
-from warp_resphys.recordings.recording import BoolArray, Recording, listed, runs
+from warp_resphys.recordings.recording import Recording, listed, runs
 from warp_resphys.recordings.release import Release
 
 FloatArray = NDArray[np.float64]
@@ -236,12 +236,20 @@ class BaseMotion:
     Attributes:
         source: The file.
         shift: (M,) [m] how far each marker stands from its place in the first recording.
-        distortion: (M,) [m] median change of each marker's distance to the other ones: of the shape they make.
+        changes: (M, M) [m] how much the distance between each two of them differs: of the shape they make.
     """
 
     source: Path
     shift: FloatArray
-    distortion: FloatArray
+    changes: FloatArray
+
+    @property
+    def distortion(self) -> FloatArray:
+        """(M,) [m] median change of each marker's distance to the other ones."""
+        others = ~np.eye(len(self.changes), dtype=np.bool_)
+        return np.array(
+            [np.median(row[use]) if use.any() else 0.0 for row, use in zip(self.changes, others, strict=True)]
+        )
 
 
 def compare_base(recordings: Sequence[Recording], labels: Sequence[str]) -> list[BaseMotion]:
@@ -267,12 +275,11 @@ def compare_base(recordings: Sequence[Recording], labels: Sequence[str]) -> list
             )
         places.append(np.nanmedian(base.positions, axis=0))
     first = _distances(places[0])
-    off = ~np.eye(len(labels), dtype=np.bool_)
     return [
         BaseMotion(
             recording.source,
             np.linalg.norm(place - places[0], axis=1),
-            np.array([np.median(row[use]) if use.any() else 0.0 for row, use in _rows(_distances(place) - first, off)]),
+            np.abs(_distances(place) - first),
         )
         for recording, place in zip(recordings[1:], places[1:], strict=True)
     ]
@@ -290,7 +297,7 @@ def check_base(
     Args:
         recordings: Trials on one set-up.
         labels: The markers on its base.
-        largest_distortion: How much a marker's distance to the others may change [m].
+        largest_distortion: How much the distance between two markers may change [m].
         largest_shift: How far a marker may stand from its place in the first recording [m]; any distance if None,
             which is right where each recording is registered by itself.
 
@@ -302,9 +309,10 @@ def check_base(
         raise InputError(f"The base has {len(labels)} markers: name two or more that sit on the clamp.")
     for motion in compare_base(recordings, labels):
         worst = int(np.argmax(motion.distortion))
-        if motion.distortion[worst] > largest_distortion:
+        largest = motion.changes.max()
+        if largest > largest_distortion:
             raise DataFileError(
-                f"{motion.source}: base marker {labels[worst]} moved by {_MILLI * motion.distortion[worst]:.2f} mm "
+                f"{motion.source}: base marker {labels[worst]} moved by {_MILLI * largest:.2f} mm "
                 f"against the other base markers since {recordings[0].source}; put it back, leave it out, or raise "
                 f"the limit of {_MILLI * largest_distortion:g} mm."
             )
@@ -315,10 +323,6 @@ def check_base(
                 f"place in {recordings[0].source}: the set-up or the cameras' frame was moved; register each recording "
                 f"by itself, or raise the limit of {_MILLI * largest_shift:g} mm."
             )
-
-
-def _rows(values: FloatArray, use: BoolArray) -> list[tuple[FloatArray, BoolArray]]:
-    return [(np.abs(row), chosen) for row, chosen in zip(values, use, strict=True)]
 
 
 def _distances(places: FloatArray) -> FloatArray:

@@ -81,4 +81,6 @@ def _onset(path: FloatArray, rest: tuple[int, int], fast: int, drop: float) -> f
     if len(moving) < 2 or root[-1] <= root[0]:
         return float(last_still)
     slope, intercept = np.polyfit(moving, root, 1)
-    return float(np.clip(-intercept / slope, last_still, last_still + 1))
+    # A frame that noise hides may be the first of the motion: the line tells how long ago it was let go at most.
+    moved = np.sqrt(max(travelled[last_still] + 2.0 * noise, 0.0))
+    return float(np.clip(-intercept / slope, last_still - min(moved / slope, 1.0), last_still + 1))

@@ -2,9 +2,8 @@
 
 import inspect
 import math
-import numbers
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from fnmatch import fnmatchcase
 from typing import Any
 
@@ -18,6 +17,8 @@ from ..residual.refinement import check_refinement
 from ..residual.training import check_trainer
 from ..solver import SolverSettings
 from ..tuning.space import Dimension, dotted, fixed_settings, parse_space, with_settings
+from .kinds import is_list, is_number, is_whole_number, is_word
+from .measured.checks import RECORDINGS, check_measured
 from .trajectories import MODELS, training_settings, variation_of
 
 _GROUPS = (
@@ -30,7 +31,6 @@ _GROUPS = (
     "refinement",
     "fixed",
     "simulation",
-    "reality",
     "simfree",
     "data",
     "tip",
@@ -101,15 +101,14 @@ def check_configuration(config: Mapping[str, Any]) -> None:
     Raises:
         InputError: a value of the wrong kind or out of range, or an unknown key.
     """
-    for key in _GROUPS:
-        group = _value(config, key)
-        if not isinstance(group, Mapping):
-            raise InputError(f"{key} is {group!r}: it must be a group of settings.")
-    kind = variation_of(config["data"])
-    for key in (kind.key, *(["load"] if config["data"]["kind"] == "release_from_load" else [])):
-        group = config["data"].get(key)
-        if not isinstance(group, Mapping):
-            raise InputError(f"data.{key} is {group!r}: it must be a group of settings.")
+    _check_groups(config, _GROUPS)
+    measured = config["data"].get("kind") == RECORDINGS
+    if measured:
+        _check_groups(config, ("markers",))
+    else:
+        kind = variation_of(config["data"])
+        loaded = config["data"]["kind"] == "release_from_load"
+        _check_groups(config, ("reality", f"data.{kind.key}", *(["data.load"] if loaded else [])))
     for key, value in dotted({key: value for key, value in config.items() if key != "tune"}):
         _check_kind(key, value)
     if not isinstance(config["name"], str) or not re.fullmatch(r"[\w-]+", config["name"]):
@@ -121,6 +120,8 @@ def check_configuration(config: Mapping[str, Any]) -> None:
     if not 0 <= config["seed"] < 2**63:
         raise InputError(f"seed is {config['seed']}: it must lie between 0 and 2^63 - 1.")
     for key, function in _TAKEN_BY.items():
+        if key not in config:
+            continue
         known = [name for name in inspect.signature(function).parameters if name not in ("mesh", "simulator")]
         for name in config[key]:
             if name not in known:
@@ -130,8 +131,11 @@ def check_configuration(config: Mapping[str, Any]) -> None:
         raise InputError(f"simfree is {own!r}: it must be a group of the groups network and trainer.")
     for model in MODELS:
         _check_training(config, model)
-    check_refinement(config["refinement"], config["data"]["steps"])
-    make_reconstructor(build_simulator(config), **config["reconstruction"])
+    if measured:
+        check_measured(config)
+    else:
+        check_refinement(config["refinement"], config["data"]["steps"])
+        make_reconstructor(build_simulator(config), **config["reconstruction"])
 
 
 def _check_training(config: Mapping[str, Any], model: str) -> None:
@@ -162,11 +166,11 @@ def check_tuning(config: Mapping[str, Any]) -> dict[str, Dimension]:
     if tune["model"] not in MODELS:
         raise InputError(f"tune.model is {tune['model']!r}: choose one of {', '.join(MODELS)}.")
     for key in ("trials", "seed"):
-        if not _is_whole_number(tune[key]) or tune[key] < (key == "trials"):
+        if not is_whole_number(tune[key]) or tune[key] < (key == "trials"):
             raise InputError(f"tune.{key} is {tune[key]!r}: it must be a whole number, {_LEAST[key]} or more.")
     for key in ("stale_after", "trial_seconds"):
         given = tune[key]
-        if (given is not None or key == "stale_after") and not (_is_number(given) and 0.0 < given < math.inf):
+        if (given is not None or key == "stale_after") and not (is_number(given) and 0.0 < given < math.inf):
             raise InputError(f"tune.{key} is {given!r}: it must be positive, in seconds.")
     for key in ("study", "save_as"):
         if not isinstance(tune[key], str) or not re.fullmatch(r"[\w-]+", tune[key]):
@@ -200,10 +204,14 @@ def _check_trial(config: Mapping[str, Any], settings: Mapping[str, Any]) -> None
         raise InputError(f"tune: {error}") from error
 
 
-def _value(config: Mapping[str, Any], key: str) -> Any:
-    for name in key.split("."):
-        config = config[name]
-    return config
+def _check_groups(config: Mapping[str, Any], keys: Iterable[str]) -> None:
+    """Refuses what should be a group of settings and is none."""
+    for key in keys:
+        group: Any = config
+        for name in key.split("."):
+            group = group.get(name)
+        if not isinstance(group, Mapping):
+            raise InputError(f"{key} is {group!r}: it must be a group of settings.")
 
 
 def _check_kind(key: str, value: Any) -> None:
@@ -217,25 +225,9 @@ def _check_kind(key: str, value: Any) -> None:
             return
 
 
-def _is_word(value: Any) -> bool:
-    return isinstance(value, str)
-
-
-def _is_whole_number(value: Any) -> bool:
-    return isinstance(value, numbers.Integral) and not isinstance(value, bool)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, numbers.Real) and not isinstance(value, bool)
-
-
-def _is_list(value: Any) -> bool:
-    return isinstance(value, list) and all(_is_number(v) for v in value)
-
-
 _KINDS = (
-    (_WORDS, _is_word, "a word"),
-    (_WHOLE_NUMBERS, _is_whole_number, "a whole number"),
-    (_NUMBERS, _is_number, "a number"),
-    (_LISTS, _is_list, "a list of numbers"),
+    (_WORDS, is_word, "a word"),
+    (_WHOLE_NUMBERS, is_whole_number, "a whole number"),
+    (_NUMBERS, is_number, "a number"),
+    (_LISTS, is_list, "a list of numbers"),
 )

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -13,6 +13,8 @@ from ..errors import InputError
 from ..files import read_array, read_hdf5
 from ..integrator import State
 from ..resumable import Field, ResumableHDF5
+
+T = TypeVar("T")
 
 SPLITS = ("train", "validation", "test")
 STAGES = ("generate", "reconstruct", "train", "refine", "train_simfree", "evaluate", "time", "report")
@@ -116,13 +118,17 @@ def split_of(data: Mapping[str, Any]) -> tuple[Split, NDArray[np.float64]]:
         raise InputError(f"data.{kind.key} names {twice[0]:g} {kind.unit} twice: every trajectory is in one split.")
     space = "" if kind.unit == "°" else " "
     if data["limit"] is not None:
-        values = {name: _evenly(row, data["limit"][name]) for name, row in values.items()}
+        values = {name: evenly(row, data["limit"][name]) for name, row in values.items()}
     split = Split(*(tuple(f"{x:g}{space}{kind.unit}" for x in values[name]) for name in SPLITS))
     return split, kind.factor * np.concatenate([values[name] for name in SPLITS])
 
 
-def _evenly(row: list[float], limit: int) -> list[float]:
-    """At most that many values of a row, spread over it."""
+def evenly(row: list[T], limit: int) -> list[T]:
+    """At most that many values of a row, spread over it.
+
+    Raises:
+        InputError: the limit is below one.
+    """
     if limit < 1:
         raise InputError(f"data.limit is {limit} for a split: it must be at least 1.")
     places = np.linspace(0, len(row) - 1, min(limit, len(row))).round().astype(int)

@@ -1,0 +1,468 @@
+"""Recordings of a body, real or simulated, become markers in its frame; what cannot is refused by file and marker."""
+
+import copy
+import json
+import logging
+
+import numpy as np
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+from scipy.spatial.transform import Rotation
+
+from warp_resphys.configured import build_body
+from warp_resphys.errors import DataFileError, InputError, ResphysError
+from warp_resphys.files import read_hdf5
+from warp_resphys.recordings.arrays import write_recording
+from warp_resphys.recordings.reading import read_recording
+from warp_resphys.recordings.recording import Recording
+from warp_resphys.stages import StageContext, fingerprint, run_stages
+from warp_resphys.tasks.checks import check_configuration
+from warp_resphys.tasks.measured.files import MARKERS, QUALITY, REGISTRATION, TRUTH, read_motions, recording_file
+from warp_resphys.tasks.measured.importing import import_recordings
+from warp_resphys.tasks.measured.stages import import_stages
+from warp_resphys.tasks.measured.synthesise import make_scene, reality, simulate
+from warp_resphys.tasks.measured.trials import folds_of, split_of, trials_of, vertical
+
+TIPS, BASES = tuple(f"Tip - {i}" for i in (1, 2, 3)), tuple(f"Base - {i}" for i in (1, 2, 3))
+RATE = 100.0
+SMALL = [
+    "synthetic.mesh.divisions=[6,2,2]",
+    "synthetic.time_step=0.005",
+    "synthetic.seconds=0.6",
+    "data.seconds=0.5",
+    "synthetic.train=[m0,m50]",
+    "synthetic.validation=[]",
+    "synthetic.test=[m90]",
+]
+
+
+def configuration(*overrides):
+    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
+        composed = compose("config", ["experiment=beam_real", *overrides])
+    return OmegaConf.to_container(composed, resolve=True)
+
+
+def read_json(path):
+    return json.loads(path.read_text())
+
+
+@pytest.fixture(scope="module")
+def laboratory(tmp_path_factory):
+    """A run of the first stages without recordings."""
+    folder = tmp_path_factory.mktemp("laboratory")
+    config = configuration(*SMALL)
+    check_configuration(config)
+    run_stages(import_stages(config), folder)
+    return folder, config
+
+
+def test_simulated_markers_come_back_within_noise(laboratory):
+    folder, config = laboratory
+    motions, bound, labels, _ = read_motions(folder / MARKERS, build_body(config), config["data"]["hung_on"])
+    assert motions.names == ("m0", "m50", "m90")
+    assert labels == TIPS
+    np.testing.assert_allclose(motions.attached_mass.sum(1), [0.0, 0.05, 0.09], atol=1e-12)
+    scene = make_scene(config)
+    released = np.array(list(read_json(folder / TRUTH)["released_s"].values()))
+    found = np.array([each["release_frame"] for each in read_json(folder / QUALITY).values()]) / RATE
+    times = motions.times.numpy() + (found - released)[:, None]
+    true = simulate(config, reality(config, scene.gravity), scene, trials_of(config), times)
+    # The nominal places turn the frame by a little; what has to come back is the motion in it.
+    turn, _ = Rotation.align_vectors(bound - bound.mean(0), scene.followed - scene.followed.mean(0))
+    assert np.degrees(turn.magnitude()) < 1.0
+    moved = turn.apply((true - scene.followed).reshape(-1, 3)).reshape(true.shape)
+    off = (motions.markers.numpy() - bound - moved)[motions.seen.numpy()]
+    assert float(motions.amplitude[2]) > 0.01
+    assert np.sqrt(np.mean(off**2)) < 2.5 * config["synthetic"]["noise"]
+    torch.testing.assert_close(motions.held, torch.as_tensor(bound).expand(3, -1, -1), rtol=0.0, atol=1e-12)
+    registration = read_json(folder / REGISTRATION)["m50"]
+    assert 0.2 < registration["rms_mm"] < 0.6  # misplaced by 0.3 mm a coordinate, less what the motion takes up
+    assert max(abs(x) for shift in registration["shift_mm"].values() for x in shift) < 0.1
+
+
+def test_frames_end_with_what_counts(laboratory):
+    folder, config = laboratory
+    with read_hdf5(folder / MARKERS, "markers") as file:
+        times, markers = file["times"][()], file["markers"][()]
+    assert (np.diff(times, axis=1) >= 0.0).all()
+    assert (times[:, 0] >= 0.0).all()
+    assert (times[:, 0] < 1.0 / RATE).all()
+    assert times.max() <= config["data"]["seconds"]
+    assert times[:, -1].min() > config["data"]["seconds"] - 1.0 / RATE
+    ended = np.concatenate([np.zeros((len(times), 1), bool), np.diff(times, axis=1) == 0.0], axis=1)
+    np.testing.assert_array_equal(np.isnan(markers).all((2, 3)), ended)
+
+
+def test_gravity_and_release_are_recovered(laboratory):
+    folder, config = laboratory
+    truth, quality = read_json(folder / TRUTH), read_json(folder / QUALITY)
+    with read_hdf5(folder / MARKERS, "markers") as file:
+        gravity = np.asarray(file.attrs["gravity"])
+    true = np.array(truth["gravity"])
+    lean = np.degrees(np.arccos(gravity @ true / np.linalg.norm(gravity) / np.linalg.norm(true)))
+    assert lean < 0.5
+    assert np.linalg.norm(gravity) == pytest.approx(9.80709)
+    tilt = np.degrees(np.arccos(-true[2] / np.linalg.norm(true)))
+    assert tilt == pytest.approx(config["synthetic"]["tilt"])
+    for name, at in truth["released_s"].items():
+        assert quality[name]["release_frame"] == pytest.approx(RATE * at, abs=0.3)
+        assert 40.0 < RATE * at < 41.0
+
+
+def test_the_recordings_are_in_a_frame_of_their_own(laboratory):
+    folder, config = laboratory
+    recording = read_recording(folder / recording_file("m0"))
+    assert recording.labels == (*TIPS, *BASES)
+    nominal = np.array([*config["markers"]["followed"].values(), *config["markers"]["others"].values()])
+    assert np.linalg.norm(recording.positions[0] - nominal, axis=1).min() > 0.05
+    sag = recording.positions[-1, :3].mean(0) - recording.positions[0, :3].mean(0)
+    assert -sag[0] > 0.99 * np.linalg.norm(sag) - 2e-3  # up is x
+
+
+def test_a_trial_does_not_depend_on_the_others(tmp_path, laboratory):
+    folder, config = laboratory
+    alone = copy.deepcopy(config)
+    alone["synthetic"] |= {"train": ["m90"], "test": ["m50"]}
+    run_stages(import_stages(alone)[:1], tmp_path)
+    one, other = (read_recording(place / recording_file("m90")) for place in (folder, tmp_path))
+    np.testing.assert_allclose(one.positions, other.positions, rtol=0.0, atol=1e-7)
+    again = configuration(*SMALL, "seed=1")
+    assert fingerprint(import_stages(again)[0], {}) != fingerprint(import_stages(config)[0], {})
+    assert np.abs(make_scene(again).translation - make_scene(config).translation).min() > 1e-3
+
+
+def test_without_a_known_vertical_gravity_is_as_configured(tmp_path):
+    config = configuration(*SMALL, "data.up=null", "synthetic.train=[m90]", "synthetic.test=[m50]", "data.seconds=0.1")
+    config["synthetic"]["seconds"] = 0.1
+    run_stages(import_stages(config), tmp_path)
+    with read_hdf5(tmp_path / MARKERS, "markers") as file:
+        np.testing.assert_allclose(file.attrs["gravity"], config["gravity"])
+    assert "vertical_deg" not in read_json(tmp_path / REGISTRATION)["m90"]
+
+
+class Shelf:
+    """Recordings in a folder, made of the simulated ones, and the configuration that names them."""
+
+    def __init__(self, folder, laboratory):
+        made, config = laboratory
+        self.folder, self.config = folder, copy.deepcopy(config)
+        names = {"bare": "m0", "load52": "m50", "load101": "m90"}
+        hung = config["synthetic"]["trials"]
+        self.config["data"] |= {
+            "folder": str(folder),
+            "trials": {name: {"file": f"{name}.h5", "hung": hung[of]["hung"]} for name, of in names.items()},
+        }
+        self.recordings = {name: read_recording(made / recording_file(of)) for name, of in names.items()}
+        for name in names:
+            self.write(name)
+
+    def write(self, name, **changes):
+        recording = self.recordings[name]
+        fields = {"labels": recording.labels, "positions": recording.positions, "rate": recording.rate, **changes}
+        path = self.folder / f"{name}.h5"
+        write_recording(path, Recording(source=path, **fields))
+
+    def move(self, name, label, by, frames=slice(None)):
+        recording = self.recordings[name]
+        positions = recording.positions.copy()
+        positions[frames, recording.labels.index(label)] += by
+        self.write(name, positions=positions)
+
+    def bring_in(self):
+        import_recordings(StageContext("import", self.folder, "", self.config))
+        with read_hdf5(self.folder / MARKERS, "markers") as file:
+            return {name: file[name][()] for name in file} | dict(file.attrs)
+
+
+@pytest.fixture
+def shelf(tmp_path, laboratory):
+    return Shelf(tmp_path, laboratory)
+
+
+def test_recordings_of_a_folder_give_what_the_run_folder_gave(shelf, laboratory):
+    found = shelf.bring_in()
+    with read_hdf5(laboratory[0] / MARKERS, "markers") as file:
+        np.testing.assert_array_equal(found["markers"], file["markers"][()])
+    assert list(found["names"]) == ["bare", "load52", "load101"]
+    np.testing.assert_array_equal(found["load"], [0.0, 0.05, 0.09])
+
+
+def test_short_gaps_are_filled_and_long_ones_masked(shelf):
+    whole = shelf.bring_in()["markers"]
+    positions = shelf.recordings["load52"].positions.copy()
+    positions[50:53, 0] = positions[60:70, 1] = np.nan
+    shelf.write("load52", positions=positions)
+    found = shelf.bring_in()["markers"]
+    np.testing.assert_allclose(found[1, :, 0], whole[1, :, 0], rtol=0.0, atol=1e-3)
+    first = 60 - int(np.ceil(read_json(shelf.folder / QUALITY)["load52"]["release_frame"]))
+    hidden = np.zeros(found.shape[1], bool)
+    hidden[first : first + 10] = True
+    np.testing.assert_array_equal(np.isnan(found[1, :, 1]).all(1), hidden | np.isnan(whole[1, :, 1]).all(1))
+    np.testing.assert_array_equal(found[2], whole[2])
+
+
+def test_a_rate_that_does_not_fit_the_step_keeps_its_frames(shelf, caplog):
+    shelf.write("bare", rate=130.0)
+    with caplog.at_level(logging.INFO):
+        found = shelf.bring_in()
+    assert "bare.h5 has 130 frames a second and the simulation 100 steps" in caplog.text
+    steps = np.diff(found["times"][0])
+    np.testing.assert_allclose(steps[steps > 0.0], 1.0 / 130.0)
+    assert "load52.h5 has" not in caplog.text
+
+
+def test_each_trial_stands_where_the_mean_of_all_does(shelf):
+    shelf.write("load101", positions=shelf.recordings["load101"].positions + [0.002, 0.001, -0.001])
+    whole = shelf.bring_in()
+    shelf.config["data"]["trials"].pop("load101")
+    rest = shelf.bring_in()
+    np.testing.assert_allclose(whole["bound"], rest["bound"], rtol=0.0, atol=3e-5)
+    np.testing.assert_allclose(whole["markers"][2, 0], whole["bound"], rtol=0.0, atol=1e-3)
+    shelf.move("load52", "Tip - 2", [0.0, 0.0012, 0.0])
+    moved = shelf.bring_in()
+    assert moved["held"][1] == pytest.approx(moved["bound"])
+    shift = read_json(shelf.folder / REGISTRATION)["load52"]["shift_mm"]["Tip - 2"]
+    assert np.linalg.norm(shift) == pytest.approx(0.6 * 0.7, abs=0.2)  # half of 1.2 mm, less what the fit takes up
+
+
+def refuse(shelf, message, error=DataFileError):
+    with pytest.raises(error, match=message):
+        shelf.bring_in()
+
+
+def test_a_missing_file_is_named(shelf):
+    (shelf.folder / "load52.h5").unlink()
+    refuse(shelf, r"load52\.h5 does not exist")
+    with pytest.raises(DataFileError, match=r"cannot read .*load52\.h5 .*data\.trials\.load52\.file"):
+        import_stages(shelf.config)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.9])
+def test_a_truncated_file_is_named(shelf, share):
+    path = shelf.folder / "load52.h5"
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    refuse(shelf, r"load52\.h5 is (truncated|damaged)")
+
+
+def test_names_that_do_not_match_are_listed(shelf):
+    shelf.write("load101", labels=("Tip 1", *TIPS[1:], *BASES))
+    refuse(shelf, r"load101\.h5 has no marker named 'Tip - 1'; it has 'Tip 1', 'Tip - 2'.*set the marker names")
+
+
+@pytest.mark.parametrize("label", ["Tip - 2", "Base - 3"])
+def test_a_marker_that_is_never_seen_is_named(shelf, label):
+    shelf.move("load52", label, np.nan)
+    refuse(shelf, rf"load52\.h5: .*{label}.* seen")
+
+
+def test_a_marker_that_is_hidden_while_the_body_is_held_is_named(shelf):
+    shelf.move("load52", "Tip - 2", np.nan, slice(None, 45))
+    refuse(shelf, r"load52\.h5: 'Tip - 2' cannot be seen while the body is held")
+
+
+def test_a_marker_that_is_hidden_after_the_release_is_named(shelf):
+    shelf.move("load52", "Tip - 2", np.nan, slice(41, None))
+    refuse(shelf, r"load52\.h5: 'Tip - 2' cannot be seen in the 0\.5 s after the release")
+
+
+def test_a_base_marker_that_moved_between_trials_is_named(shelf):
+    shelf.move("load52", "Base - 3", [0.002, 0.0, 0.0])
+    refuse(shelf, r"load52\.h5: base marker Base - \d moved by \d\.\d\d mm against .* since .*bare\.h5")
+
+
+def test_a_base_that_moved_as_a_whole_is_named(shelf):
+    shelf.write("load101", positions=shelf.recordings["load101"].positions + [0.02, 0.0, 0.0])
+    refuse(shelf, r"load101\.h5: base marker Base - \d stands 20\.\d\d mm from its place in .*bare\.h5")
+    shelf.config["markers"]["largest_shift"] = None
+    shelf.bring_in()
+
+
+def test_what_moved_after_the_release_alone_is_no_fault_of_the_base(shelf):
+    shelf.move("load52", "Base - 3", [0.0, 0.0, 0.002], slice(45, None))
+    shelf.bring_in()
+
+
+def test_a_residual_above_the_threshold_names_file_and_marker(shelf):
+    for name in shelf.recordings:
+        shelf.move(name, "Tip - 3", [0.0, 0.0, 0.012])
+    shelf.config["markers"]["others"].pop("Base - 3")
+    shelf.config["markers"]["others"].pop("Base - 2")
+    refuse(shelf, r"bare\.h5: the markers at rest do not fit .* 4\.0 mm: 'Tip - 3' is \d+\.\d mm off")
+
+
+def test_one_outlier_among_six_is_left_out_and_named(shelf):
+    whole = shelf.bring_in()
+    for name in shelf.recordings:
+        shelf.move(name, "Base - 3", [0.0, 0.0, 0.012])
+    found = shelf.bring_in()
+    assert read_json(shelf.folder / REGISTRATION)["bare"]["outliers"] == ["Base - 3"]
+    np.testing.assert_allclose(found["bound"], whole["bound"], rtol=0.0, atol=1e-3)
+
+
+def test_a_trial_without_a_release_is_named(shelf):
+    held = np.broadcast_to(shelf.recordings["bare"].positions[:1], (100, 6, 3))
+    shelf.write("load52", positions=held + np.random.default_rng(0).normal(scale=1e-5, size=held.shape))
+    refuse(shelf, r"No release found in .*load52\.h5.* never moves by more than")
+
+
+def test_too_few_frames_a_second_are_refused(shelf):
+    shelf.write("load52", rate=25.0)
+    refuse(shelf, r"load52\.h5 has 25 frames a second, too few .* record 40 or more")
+
+
+@pytest.mark.parametrize("up", ["-x", "y", [0.0, 0.0, 1.0]])
+def test_a_wrong_vertical_is_noticed(shelf, up):
+    shelf.config["data"]["up"] = up
+    refuse(shelf, r"bare\.h5: with data\.up .* degrees from the configured one: set data\.up", InputError)
+
+
+def test_a_marker_far_from_the_body_is_named(shelf):
+    shelf.config["mesh"]["size"] = [0.06, 0.03, 0.03]
+    shelf.config["markers"]["bind"] = "normal"
+    shelf.config["markers"]["bind_to"] = None
+    refuse(shelf, r"Marker 'Tip - \d' is \d\d\.\d mm from the surface", InputError)
+
+
+def test_a_changed_recording_is_imported_again(shelf):
+    before = fingerprint(import_stages(shelf.config)[0], {})
+    assert fingerprint(import_stages(shelf.config)[0], {}) == before
+    shelf.move("load52", "Tip - 1", 1e-6)
+    assert fingerprint(import_stages(shelf.config)[0], {}) != before
+
+
+def test_the_three_beams(shared_data, tmp_path):
+    config = configuration(f"data.folder={shared_data / 'beam_mocap'}")
+    check_configuration(config)
+    run_stages(import_stages(config), tmp_path)
+    registration = read_json(tmp_path / REGISTRATION)
+    rms = {name: round(each["rms_mm"], 2) for name, each in registration.items()}
+    assert rms == {"bare": 0.81, "load52": 0.83, "load101": 1.13}  # docs/registration.md
+    motions, bound, _, gravity = read_motions(tmp_path / MARKERS, build_body(config), config["data"]["hung_on"])
+    assert bool(motions.seen[motions.times < 1.38].all())
+    np.testing.assert_allclose(motions.attached_mass.sum(1) * 9.80709, [0.0, 0.51012, 1.00062], atol=1e-4)
+    assert int((motions.attached_mass[1] > 0.0).sum()) == 4
+    nominal = np.array(list(config["markers"]["followed"].values()))
+    assert np.linalg.norm(bound - nominal, axis=1).max() < 2e-3
+    assert np.degrees(np.arccos(-gravity[2] / np.linalg.norm(gravity))) < 10.0
+    for row, name in enumerate(("gravity", "load52", "load101")):  # a rigid motion keeps every distance
+        tip = read_recording(shared_data / "beam_mocap" / f"beam_{name}_V2_a.c3d").select(TIPS).positions.mean(1)
+        farthest = np.linalg.norm(tip - np.median(tip[15:40], axis=0), axis=1).max()
+        moved = (motions.markers - motions.held[:, None])[row].mean(1).nan_to_num().norm(dim=1).max()
+        assert float(moved) == pytest.approx(farthest, rel=0.02)
+        assert farthest > 0.009
+    quality = read_json(tmp_path / QUALITY)
+    assert any("Base - 1 jumps" in warning for warning in quality["load101"]["warnings"])
+
+
+def changed(config, key, value):
+    *path, last = key.split("/")
+    group = config
+    for name in path:
+        group = group[name]
+    group[last] = value
+    return config
+
+
+TRIALS = {"a": {"file": "a.c3d", "hung": 0.0}, "b": {"file": "b.c3d", "hung": 0.1}}
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("data/seconds", 0.0, "data.seconds is 0.0: it must be a positive number"),
+        ("data/seconds", "long", "data.seconds is 'long': it must be a positive number"),
+        ("data/longest_gap", 2.5, "data.longest_gap is 2.5: it must be a whole number"),
+        ("data/units", "inch", "data.units is 'inch': it must be m, cm or mm"),
+        ("data/units", ["m"], r"data.units is \['m'\]: it must be m, cm or mm"),
+        ("data/folds", "five", "data.folds is 'five': it must be leave_one_out, or null"),
+        ("data/up", "up", "data.up is 'up': give x, -x"),
+        ("data/up", [0.0, 0.0, 0.0], "data.up is .*: give x, -x"),
+        ("data/up", [0.0, 1.0], "data.up is .*: it must be x, -x"),
+        ("data/hung", {"x": 0.1}, "unknown key 'data.hung': data has kind, folder"),
+        ("data/hung_on", {"x": 0.07003}, "no vertex lies within"),
+        ("data/hung_on", {"x": 0.0}, "data.hung_on names fixed vertices alone"),
+        ("data/hung_on", {"w": 0.0}, "unknown key 'data.hung_on.w'"),
+        ("data/hung_on", {"x": "tip"}, "data.hung_on.x is 'tip': it must be a number"),
+        ("data/hung_on", None, "a trial has a load, but data.hung_on is not set"),
+        ("data/trials", {}, "data.trials is empty: name each trial"),
+        ("data/trials", {"a/b": TRIALS["a"]}, "data.trials.a/b: files are named after trials"),
+        ("data/trials", {7: TRIALS["a"]}, "data.trials.7: files are named after trials"),
+        ("data/trials", {"a": {"file": "a.c3d"}}, "data.trials.a is .*: it needs file and hung"),
+        ("data/trials", {"a": {"file": 3, "hung": 0.0}}, "data.trials.a.file is 3: it must be the name of a file"),
+        ("data/trials", {"a": {"file": "a.c3d", "hung": -0.1}}, "data.trials.a.hung is -0.1: it must be a mass"),
+        ("data/trials", {"a": TRIALS["a"], "b": TRIALS["a"]}, "the trials 'a' and 'b' have the same file, a.c3d"),
+        ("data/trials", {"a": TRIALS["a"]}, "data.folds is leave_one_out, which needs two trials"),
+        ("markers/bind", "glue", "markers.bind is 'glue': it must be one of normal, frame, rigid"),
+        ("markers/bind_to", None, "markers.bind is rigid: set markers.bind_to"),
+        ("markers/bind_to", {"x": 0.07003}, "no vertex lies within"),
+        ("markers/followed", {}, "markers.followed is empty"),
+        ("markers/followed/Tip - 1", [0.1, 0.0], r"markers.followed.Tip - 1 is \[0.1, 0.0\]: it must be three numbers"),
+        ("markers/others/Tip - 1", [0.1, 0.0, 0.0], "the marker 'Tip - 1' is in markers.followed and markers.others"),
+        ("markers/others", {"Base - 1": [0, 0, 0], "Base - 2": "x"}, "markers.others.Base - 2 is 'x'"),
+        ("markers/largest_residual", -1.0, "markers.largest_residual is -1.0: it must be a positive number"),
+        ("published/simulation/colour", "red", "unknown key 'published.simulation.colour'"),
+        ("published/simulation/poissons_ratio", 0.6, "published.simulation: poissons_ratio is 0.6"),
+        ("published/physics/mass", "heavy", "published.physics is .*: it needs mass"),
+        ("published/integrator", "euler", "published.integrator is 'euler': it must be one of"),
+    ],
+)
+def test_configuration_of_recordings_is_checked(tmp_path, key, value, message):
+    config = changed(configuration(f"data.folder={tmp_path}"), key, value)
+    with pytest.raises(ResphysError, match=message):
+        check_configuration(config)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("synthetic", None, "data.folder is not set: give the folder of the recordings"),
+        ("synthetic/tilt", 45.0, "synthetic.tilt is 45.0: it must be an angle from 0 to 20 degrees"),
+        ("synthetic/seconds", 1.0, "synthetic.seconds is 1.0, less than data.seconds"),
+        (
+            "synthetic/material/youngs_modulus",
+            "soft",
+            "synthetic.material.youngs_modulus is 'soft': it must be a number",
+        ),
+        ("synthetic/material/stiffness_damping", -1.0, "synthetic.material: stiffness_damping is -1"),
+        ("synthetic/integrator", "rk4", "synthetic.integrator is 'rk4'"),
+        ("synthetic/trials/m0", {"hung": -0.01}, "synthetic.trials.m0.hung is -0.01"),
+        ("synthetic/test", [], "synthetic.test is empty: name one of synthetic.trials"),
+        ("synthetic/test", ["m10", "m99"], "synthetic.test names the trial 'm99', which is not in synthetic.trials"),
+        ("synthetic/test", ["m10", "m20"], "the trial 'm20' is in synthetic.train and synthetic.test"),
+        ("synthetic/test", ["m10", "m10"], "the trial 'm10' is twice in synthetic.test"),
+        ("synthetic/mesh/kind", "sphere", "mesh.kind is 'sphere'"),
+    ],
+)
+def test_configuration_of_a_simulated_laboratory_is_checked(key, value, message):
+    with pytest.raises(ResphysError, match=message):
+        check_configuration(changed(configuration(), key, value))
+
+
+def test_folds_and_splits(tmp_path):
+    config = configuration(f"data.folder={tmp_path}")
+    folds = folds_of(config)
+    assert {name: fold.test for name, fold in folds.items()} == {
+        name: (name,) for name in ("bare", "load52", "load101")
+    }
+    assert folds["load52"].train == ("bare", "load101")
+    config["data"] |= {"folds": None, "train": ["load101", "bare"], "test": ["load52"]}
+    check_configuration(config)
+    assert folds_of(config) is None
+    assert [trial.name for trial in trials_of(config)] == ["load101", "bare", "load52"] == list(split_of(config).names)
+    assert trials_of(config)[1].file == tmp_path / "beam_gravity_V2_a.c3d"
+    config["data"]["train"] = []
+    with pytest.raises(InputError, match=r"data\.train is empty: .* or set data\.folds to leave_one_out"):
+        check_configuration(config)
+
+
+def test_a_budget_takes_fewer_simulated_trials():
+    split = split_of(configuration("budget=quick"))
+    assert [len(part) for part in (split.train, split.validation, split.test)] == [5, 1, 2]
+
+
+def test_vertical():
+    np.testing.assert_array_equal(vertical("-y"), [0.0, -1.0, 0.0])
+    np.testing.assert_array_equal(vertical([0.0, 0.0, 2.0]), vertical("z"))

@@ -39,7 +39,7 @@ def hanging(masses):
     return attached
 
 
-def replay_of(sim, truth, masses=(0.0, 0.05), frames=40, noise=0.0, seed=0):
+def replay_of(sim, truth, masses=(0.0, 0.05), frames=25, noise=0.0, seed=0):
     """Motions from rest under gravity with the true parameters, and their beginning."""
     count = len(masses)
     times = (0.01 * torch.arange(frames, dtype=torch.float64)).expand(count, -1)
@@ -84,7 +84,7 @@ def test_without_noise_the_parameters_are_exact():
 
 
 def test_the_predicted_deviation_is_that_of_repetitions():
-    replay, release = replay_of(simulator(), TRUTH, masses=(0.05,), frames=25)
+    replay, release = replay_of(simulator(), TRUTH, masses=(0.05,), frames=12)
     clean, found, predicted = replay.motions, [], []
     generator = torch.Generator().manual_seed(1)
     for _ in range(10):
@@ -113,7 +113,7 @@ def test_stiffness_and_density_of_a_body_without_weights_cannot_be_told_apart():
 
 def test_a_parameter_outside_its_range_ends_on_the_bound():
     bounds = {"youngs_modulus": Bounds(3e5, 1e6, logarithmic=True)}
-    found = identify(truth={"youngs_modulus": 215e3}, bounds=bounds, first={"youngs_modulus": 6e5})
+    found = identify(truth={"youngs_modulus": 215e3}, bounds=bounds, first={"youngs_modulus": 6e5}, frames=12)
     assert found.at_bounds == ("youngs_modulus",)
     assert found.parameters["youngs_modulus"] == pytest.approx(3e5)
 
@@ -177,13 +177,13 @@ def test_starts_are_the_first_guess_and_the_best_candidates():
 
 
 def test_finished_starts_are_not_done_again():
-    replay, release = replay_of(simulator(), TRUTH, frames=20)
+    replay, release = replay_of(simulator(), TRUTH, frames=10)
     kept, calls = [], []
     starts = [FIRST, {"youngs_modulus": 150e3, "stiffness_damping": 0.01}]
-    whole = Identifier(replay, release, RANGES).run(starts, 20, keep=lambda a: kept.append(json.loads(json.dumps(a))))
+    whole = Identifier(replay, release, RANGES).run(starts, 2, keep=lambda a: kept.append(json.loads(json.dumps(a))))
     assert [len(attempts) for attempts in kept] == [1, 2]
     again = Identifier(replay, release, RANGES).run(
-        starts, 20, report=lambda number, *_: calls.append(number), finished=kept[0]
+        starts, 2, report=lambda number, *_: calls.append(number), finished=kept[0]
     )
     assert set(calls) == {1}
     assert again.parameters == whole.parameters

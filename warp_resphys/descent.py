@@ -22,7 +22,7 @@ _LARGEST_STEP = 0.25  # of the range of a variable
 _RIDGE = 1e-10  # of the trace: keeps directions without influence from moving
 _CLOSE = 0.6  # of a step's curvature to the model's: what an update may mend
 _RELATIVE_DECREASE = 1e-6
-_ABSOLUTE_DECREASE = 1e-13
+_ABSOLUTE_DECREASE = 1e-10
 
 
 def minimise(
@@ -30,7 +30,7 @@ def minimise(
 ) -> tuple[Array, float]:
     """The minimum over the unit box that is downhill from a start.
 
-    It ends where the model promises a decrease of less than a millionth of the objective.
+    It ends where the model promises a decrease of less than a millionth of the objective, or less than 1e-10.
 
     Args:
         objective: (P,) variables to value and gradient; the value is infinite where there is none.

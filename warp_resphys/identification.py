@@ -218,7 +218,8 @@ class Identifier:
         Args:
             starts: a value of each parameter, for each start.
             max_iterations: of `descent.minimise`, a start.
-            report: called with the start's number, the loss and the parameters after every evaluation.
+            report: called after every evaluation with the start's number, the loss (infinite where the simulation
+                failed) and the parameters.
             finished: what an interrupted run with the same starts gave to `keep`; those starts are not done again.
             keep: called after every start with the results of all so far, which can be written as JSON.
 

@@ -3,6 +3,8 @@
 import copy
 import json
 import logging
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -38,9 +40,9 @@ SMALL = [
 ]
 
 
-def configuration(*overrides):
+def configuration(*overrides, experiment="beam_real"):
     with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        composed = compose("config", ["experiment=beam_real", *overrides])
+        composed = compose("config", [f"experiment={experiment}", *overrides])
     return OmegaConf.to_container(composed, resolve=True)
 
 
@@ -355,6 +357,40 @@ def test_the_three_beams(shared_data, tmp_path):
         assert farthest > 0.009
     quality = read_json(tmp_path / QUALITY)
     assert any("Base - 1 jumps" in warning for warning in quality["load101"]["warnings"])
+
+
+TUTORIAL = Path(__file__).parents[1] / "docs" / "bring_your_robot.md"
+
+
+def test_the_tutorial(shared_data, tmp_path, monkeypatch):
+    """Its mesh, its configuration and its output, on the recordings that it was written with."""
+    blocks = re.findall(r"```(\w*)\n(.*?)```", TUTORIAL.read_text(encoding="utf-8"), flags=re.DOTALL)
+    (mesh,), (written,) = ([text for kind, text in blocks if kind == wanted] for wanted in ("python", "yaml"))
+    (log,) = [text.splitlines() for _, text in blocks if text.startswith("import: ")]
+    monkeypatch.chdir(tmp_path)
+    exec(compile(mesh, TUTORIAL.name, "exec"), {})
+    (tmp_path / "recordings").symlink_to(shared_data / "beam_mocap")
+    place = tmp_path / "configs" / "experiment" / "my_robot.yaml"
+    place.parent.mkdir(parents=True)
+    place.write_text(written)
+    assert len(written.splitlines()) < 36
+    config = configuration(f"hydra.searchpath=[file://{tmp_path / 'configs'}]", experiment="my_robot")
+    check_configuration(config)
+    run_stages(import_stages(config), tmp_path)
+    quality, registration = read_json(tmp_path / QUALITY), read_json(tmp_path / REGISTRATION)
+    for line, (name, each) in zip(log, quality.items(), strict=True):
+        rms = registration[name]["rms_mm"]
+        assert line == f"import: {name} is let go in frame {each['release_frame']:.1f}, registered to {rms:.2f} mm"
+
+
+def test_an_experiment_may_set_gravity(tmp_path):
+    place = tmp_path / "experiment" / "hanging.yaml"
+    place.parent.mkdir()
+    place.write_text("# @package _global_\ndefaults: [beam_real, _self_]\nname: hanging\ngravity: [9.81, 0.0, 0.0]\n")
+    config = configuration(f"hydra.searchpath=[file://{tmp_path}]", experiment="hanging")
+    assert config["gravity"] == [9.81, 0.0, 0.0]
+    given = configuration(f"hydra.searchpath=[file://{tmp_path}]", "gravity=[0,0,-1]", experiment="hanging")
+    assert given["gravity"] == [0, 0, -1]
 
 
 def changed(config, key, value):

@@ -176,7 +176,8 @@ class TestResidualForce:
     [
         ({"kind": "graph"}, "network.kind is 'graph': choose one of reduced, nodal."),
         ({"blocks": 0}, "network.blocks is 0: it must be positive."),
-        ({"layers": 0}, "network.layers is 0: it must be positive."),
+        ({"layers": -1}, "network.layers is -1: it must be zero or more."),
+        ({"width": 0}, "network.width is 0: it must be positive."),
         ({"width": -1}, "network.width is -1: it must be positive."),
         ({"force_modes": 0}, "network.force_modes is 0: it must be positive."),
     ],

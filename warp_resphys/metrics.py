@@ -182,6 +182,27 @@ def summarise_each(names: Sequence[str], errors: Mapping[str, Iterable[NDArray[n
     ]
 
 
+def summarise_folds(folds: Sequence[Mapping[str, ErrorSummary]]) -> dict[str, ErrorSummary]:
+    """Return the errors of a cross-validation: the mean of the folds' means, each fold weighing the same.
+
+    Args:
+        folds: The summaries of every model in every fold.
+    """
+    return {model: _over_folds([fold[model] for fold in folds]) for model in folds[0]}
+
+
+def _over_folds(summaries: Sequence[ErrorSummary]) -> ErrorSummary:
+    means = [each["mean"] for each in summaries]
+    known = [mean for mean in means if mean is not None]
+    whole = len(known) == len(means)
+    return {
+        "mean": float(np.mean(known)) if whole else None,
+        "std": float(np.std(known)) if whole else None,
+        "trajectories": sum(each["trajectories"] for each in summaries),
+        "diverged": sum(each["diverged"] for each in summaries),
+    }
+
+
 def _finite_mean(values: NDArray[np.float64]) -> float | None:
     mean = float(np.mean(values))
     return mean if math.isfinite(mean) else None

@@ -82,8 +82,8 @@ def hold(
 ) -> torch.Tensor:
     """(R, N, 3) positions at rest under gravity, weights and the virtual force that holds the markers best [m].
 
-    Levenberg-Marquardt on |m(q(a)) - y|^2 + w |a|^2 with q(a) the equilibrium under the force B a, and w so small that it only
-    keeps what no marker sees from moving.
+    Levenberg-Marquardt on |m(q(a)) - y|^2 + w |a|^2 with q(a) the equilibrium under the force B a. The weight w is so
+    small that it only keeps what no marker sees from moving.
 
     Args:
         simulator: of the body.

@@ -26,7 +26,7 @@ class SkipMLP(nn.Module):
         n_in: inputs.
         n_out: outputs, also the width between blocks.
         blocks: number of blocks.
-        layers: hidden layers a block.
+        layers: hidden layers a block; 0 makes the map affine.
         width: of the hidden layers.
     """
 
@@ -47,7 +47,7 @@ def _perceptron(n_in: int, n_out: int, layers: int, width: int) -> nn.Sequential
     modules: list[nn.Module] = []
     for i in range(layers):
         modules += [nn.Linear(n_in if i == 0 else width, width), nn.LayerNorm(width), nn.ELU()]
-    return nn.Sequential(*modules, nn.Linear(width, n_out))
+    return nn.Sequential(*modules, nn.Linear(width if layers else n_in, n_out))
 
 
 class Coder(nn.Module):
@@ -124,6 +124,7 @@ class StateMap(nn.Module):
         velocity: coder of velocities.
         outputs: coder of each predicted field.
         architecture: ``blocks``, ``layers`` and ``width``.
+        actuation: coder of what acts on the body, such as weights or pressures; None where nothing does.
     """
 
     fields: tuple[str, ...]
@@ -138,14 +139,16 @@ class StateMap(nn.Module):
         velocity: Coder,
         outputs: Mapping[str, Coder],
         architecture: Mapping[str, int],
+        actuation: Coder | None = None,
     ) -> None:
         super().__init__()
         self.register_buffer("rest", rest)
-        self.position, self.velocity = position, velocity
+        self.position, self.velocity, self.actuation = position, velocity, actuation
         self.outputs = nn.ModuleDict(outputs)
         self.architecture = {key: int(architecture[key]) for key in ("blocks", "layers", "width")}
         self._sizes = [coder.size for coder in outputs.values()]
-        n_in, n_out = position.size + velocity.size, sum(self._sizes)
+        n_in = position.size + velocity.size + (0 if actuation is None else actuation.size)
+        n_out = sum(self._sizes)
         self.network = SkipMLP(n_in, n_out, **self.architecture).to(rest.device)
         self.register_buffer("linear", torch.zeros(n_in, n_out, device=rest.device))
         self.register_buffer("remainder", torch.ones((), device=rest.device))
@@ -173,24 +176,38 @@ class StateMap(nn.Module):
         """(S, n_out) standardised fields from (S, n_in) standardised inputs: linear part and network."""
         return inputs @ self.linear + self.remainder * self.network(inputs)
 
-    def encode(self, q: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
-        """(S, n_in) standardised inputs, as precise as the network, from (S, N, 3) positions [m], velocities [m/s]."""
-        inputs = torch.cat([self.position.encode(q - self.rest), self.velocity.encode(v)], dim=1)
-        return inputs.to(self.linear.dtype)
+    def encode(self, q: torch.Tensor, v: torch.Tensor, actuation: torch.Tensor | None = None) -> torch.Tensor:
+        """(S, n_in) standardised inputs, as precise as the network.
+
+        Args:
+            q: (S, N, 3) positions [m].
+            v: (S, N, 3) velocities [m/s].
+            actuation: (S, A), for a model that was built with one.
+        """
+        parts = [self.position.encode(q - self.rest), self.velocity.encode(v)]
+        if self.actuation is not None:
+            if actuation is None:
+                raise ValueError("this model was trained with an actuation: pass one")
+            parts.append(self.actuation.encode(actuation))
+        return torch.cat(parts, dim=1).to(self.linear.dtype)
 
     def encode_outputs(self, *fields: torch.Tensor) -> torch.Tensor:
         """(S, n_out) standardised outputs, as precise as the network, from (S, N, 3) fields in the coders' order."""
         pairs = zip(self.coders, fields, strict=True)
         return torch.cat([coder.encode(field) for coder, field in pairs], dim=1).to(self.linear.dtype)
 
-    def predict(self, q: torch.Tensor, v: torch.Tensor) -> list[torch.Tensor]:
+    def predict(self, q: torch.Tensor, v: torch.Tensor, actuation: torch.Tensor | None = None) -> list[torch.Tensor]:
         """(S, N, 3) fields in the order of the coders."""
-        parts = self.standardised(self.encode(q, v)).to(q.dtype).split(self._sizes, dim=1)
+        parts = self.standardised(self.encode(q, v, actuation)).to(q.dtype).split(self._sizes, dim=1)
         return [coder.decode(part) for coder, part in zip(self.coders, parts, strict=True)]
 
     def description(self) -> dict[str, Any]:
         """What `restore` needs beside the tensors."""
-        return {"architecture": self.architecture, "reduced": self.position.basis is not None}
+        return {
+            "architecture": self.architecture,
+            "reduced": self.position.basis is not None,
+            "actuated": self.actuation is not None,
+        }
 
 
 class ResidualForce(StateMap):
@@ -198,9 +215,9 @@ class ResidualForce(StateMap):
 
     fields = ("force",)
 
-    def forward(self, q: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
+    def forward(self, q: torch.Tensor, v: torch.Tensor, actuation: torch.Tensor | None = None) -> torch.Tensor:
         """(S, N, 3) residual force [N]."""
-        return self.predict(q, v)[0]
+        return self.predict(q, v, actuation)[0]
 
 
 class NextState(StateMap):
@@ -208,9 +225,11 @@ class NextState(StateMap):
 
     fields = ("next_position", "next_velocity")
 
-    def forward(self, q: torch.Tensor, v: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(
+        self, q: torch.Tensor, v: torch.Tensor, actuation: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """(S, N, 3) positions [m] and velocities [m/s] one time step on."""
-        displacement, velocity = self.predict(q, v)
+        displacement, velocity = self.predict(q, v, actuation)
         return self.rest + displacement, velocity
 
 
@@ -220,6 +239,7 @@ def build_model(
     q: torch.Tensor,
     v: torch.Tensor,
     force: torch.Tensor,
+    actuation: torch.Tensor | None = None,
 ) -> ResidualForce:
     """A residual force with coders from training samples.
 
@@ -229,16 +249,24 @@ def build_model(
         q: (S, N, 3) positions [m].
         v: (S, N, 3) velocities [m/s].
         force: (S, N, 3) residual forces [N].
+        actuation: (S, A) what else acts on the body, or None.
 
     Raises:
         InputError: an unknown kind, or sizes that do not fit the samples.
     """
     position, velocity = _state_coders(config, q - rest, v)
     coder = pod_coder(force, config["force_modes"]) if config["kind"] == "reduced" else nodal_coder(force)
-    return ResidualForce(rest, position, velocity, {"force": coder}, config)
+    actuated = None if actuation is None else nodal_coder(actuation)
+    return ResidualForce(rest, position, velocity, {"force": coder}, config, actuated)
 
 
-def build_next_state(config: Mapping[str, Any], rest: torch.Tensor, q: torch.Tensor, v: torch.Tensor) -> NextState:
+def build_next_state(
+    config: Mapping[str, Any],
+    rest: torch.Tensor,
+    q: torch.Tensor,
+    v: torch.Tensor,
+    actuation: torch.Tensor | None = None,
+) -> NextState:
     """A data-driven baseline of the same family: in- and outputs share their coders.
 
     Args:
@@ -246,13 +274,15 @@ def build_next_state(config: Mapping[str, Any], rest: torch.Tensor, q: torch.Ten
         rest: (N, 3) rest positions [m].
         q: (S, N, 3) positions [m].
         v: (S, N, 3) velocities [m/s].
+        actuation: (S, A) what acts on the body, or None.
 
     Raises:
         InputError: an unknown kind, or sizes that do not fit the samples.
     """
     position, velocity = _state_coders(config, q - rest, v)
     outputs = dict(zip(NextState.fields, _state_coders(config, q - rest, v), strict=True))
-    return NextState(rest, position, velocity, outputs, config)
+    actuated = None if actuation is None else nodal_coder(actuation)
+    return NextState(rest, position, velocity, outputs, config, actuated)
 
 
 def _state_coders(config: Mapping[str, Any], u: torch.Tensor, v: torch.Tensor) -> tuple[Coder, Coder]:
@@ -272,9 +302,11 @@ def check_network(config: Mapping[str, Any]) -> None:
     if config["kind"] not in NETWORK_KINDS:
         raise InputError(f"network.kind is {config['kind']!r}: choose one of {', '.join(NETWORK_KINDS)}.")
     modes = ("position_modes", "velocity_modes", "force_modes") if config["kind"] == "reduced" else ()
-    for key in ("blocks", "layers", "width", *modes):
+    for key in ("blocks", "width", *modes):
         if not config[key] > 0:
             raise InputError(f"network.{key} is {config[key]}: it must be positive.")
+    if not config["layers"] >= 0:
+        raise InputError(f"network.layers is {config['layers']}: it must be zero or more.")
 
 
 Model = TypeVar("Model", bound=StateMap)
@@ -290,10 +322,13 @@ def restore(kind: type[Model], tensors: Mapping[str, torch.Tensor], description:
     """
 
     def coder(name: str) -> Coder:
-        basis = tensors[f"{name}.basis"] if description["reduced"] else None
-        return Coder(tensors[f"{name}.mean"], basis, tensors[f"{name}.scale"])
+        return Coder(tensors[f"{name}.mean"], tensors.get(f"{name}.basis"), tensors[f"{name}.scale"])
 
     outputs = {name: coder(f"outputs.{name}") for name in kind.fields}
-    model = kind(tensors["rest"], coder("position"), coder("velocity"), outputs, description["architecture"])
+    actuation = coder("actuation") if description["actuated"] else None
+    state = coder("position"), coder("velocity")
+    model = kind(tensors["rest"], *state, outputs, description["architecture"], actuation)
+    if tensors["linear"].dtype == torch.float64:
+        model.double()
     model.load_state_dict(tensors)
     return model.eval()

@@ -8,9 +8,11 @@ with q+ the simulator's next positions and q* the observed ones. The step goes o
 the observed one, so that the forces reproduce the trajectory in closed loop.
 """
 
+import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 import scipy.optimize
@@ -22,7 +24,7 @@ from ..errors import ConvergenceError, InputError
 from ..integrator import State
 from ..linear_solver import Factor, make_linear_solver
 from ..potential import IncrementalPotential
-from ..simulator import Simulator
+from ..simulator import MaterialTensors, Simulator
 from ..threads import threads_for
 
 LinearMap = Callable[[torch.Tensor], torch.Tensor]
@@ -66,6 +68,12 @@ class Reconstructor(ABC):
         self.simulator = simulator
         self.regularisation, self.tolerance, self.max_iterations = regularisation, tolerance, max_iterations
         self._tensors = simulator.prepare()
+
+    def with_tensors(self, tensors: MaterialTensors) -> Self:
+        """The same method for other constants than the simulator's, such as other weights in every environment."""
+        other = copy.copy(self)
+        other._tensors = tensors
+        return other
 
     @abstractmethod
     def step(self, state: State, observed: torch.Tensor, first_guess: torch.Tensor | None = None) -> Reconstruction:

@@ -15,13 +15,12 @@ from typing_extensions import override
 from ..errors import ConvergenceError, InputError
 from ..integrator import State
 from ..simulator import Simulator
+from .full_batch import FullBatchTrainer
 from .networks import ResidualForce
 from .rollout import FURTHEST, ForcePredictor, HybridRollout
-from .training import EpochTrainer, part_of
 
 REFINEMENTS = ("none", "solver_in_the_loop")
 _SMALLEST_UNIT = 1e-20  # mm^2
-_EVALUATIONS = 12  # of the loss, the most that an epoch takes
 
 
 @dataclass(frozen=True)
@@ -147,12 +146,11 @@ class WindowLoss:
         return squares / self._window, rollout.lost(state)
 
 
-class SolverInTheLoop(EpochTrainer[ResidualForce]):
+class SolverInTheLoop(FullBatchTrainer):
     """Minimises the squared distance from the target over windows of k steps, by L-BFGS.
 
-    The windows lie side by side over the trajectories: the loss is one smooth function of the weights, and an epoch is
-    one iteration with its line search. (Adam's first steps move every weight by its rate, however small the gradient:
-    from a network that is nearly right they lead away.) Losses are mean squared distances of vertices [mm^2].
+    The windows lie side by side over the trajectories: the loss is one smooth function of the weights. Losses are mean
+    squared distances of vertices [mm^2].
 
     The weights that it starts from are the first candidate: what is kept is never worse on the validation split. The
     history starts with their record, of epoch 0. Windows that fail with them are left out; a step of the optimiser with
@@ -183,24 +181,12 @@ class SolverInTheLoop(EpochTrainer[ResidualForce]):
         super().__init__(model, rollout_error, config)
         self._loss, self._train, self._validation = loss, train, validation
         self._windows = loss.side_by_side(train)
-        self._weights = list(model.network.parameters())
-        self._optimiser = torch.optim.LBFGS(
-            self._weights,
-            max_iter=1,
-            max_eval=_EVALUATIONS,
-            history_size=config["memory"],
-            line_search_fn="strong_wolfe",
-            tolerance_grad=0.0,
-            tolerance_change=0.0,
-        )
-        self._last: tuple[list[torch.Tensor], list[torch.Tensor], torch.Tensor] | None = None
 
     @override
     def _run_epoch(self) -> dict[str, float]:
         if not self.state.history:
             self._begin()
-        self._optimiser.step(self._evaluate)
-        return {"train_loss": float(self._evaluate()) * self._unit, **self._validate()}
+        return {"train_loss": self._iterate() * self._unit, **self._validate()}
 
     def _begin(self) -> None:
         """Leaves out the windows that cannot be simulated, and measures the weights that refinement starts from."""
@@ -225,48 +211,20 @@ class SolverInTheLoop(EpochTrainer[ResidualForce]):
         """The first loss [mm^2], which makes one of what the optimiser sees."""
         return max(self.state.history[0]["train_loss"], _SMALLEST_UNIT)
 
-    def _evaluate(self) -> torch.Tensor:
-        """The loss at the current weights, and its gradient; L-BFGS asks twice for that of the weights it accepts."""
-        if self._last is None or not all(map(torch.equal, self._weights, self._last[0])):
-            self._optimiser.zero_grad()
-            loss = self._loss.backward(self._windows, self._train, self._unit)
-            gradients = [torch.zeros_like(w) if w.grad is None else w.grad for w in self._weights]
-            self._last = (
-                [w.detach().clone() for w in self._weights],
-                gradients,
-                torch.tensor(loss, dtype=torch.float64),
-            )
-        for weight, gradient in zip(self._weights, self._last[1], strict=True):
-            weight.grad = gradient.clone()
-        return self._last[2]
+    @override
+    def _backward(self) -> float:
+        return self._loss.backward(self._windows, self._train, self._unit)
 
     @override
     def snapshot(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
         tensors, metadata = super().snapshot()
         tensors |= {"windows.trajectory": self._windows.trajectory, "windows.frame": self._windows.frame}
-        numbers = {}
-        for key, value in self._optimiser.state[self._weights[0]].items():
-            if isinstance(value, torch.Tensor):
-                tensors[f"lbfgs.{key}"] = value
-            elif not isinstance(value, list):
-                numbers[key] = value
-            elif key != "al":  # Scratch.
-                tensors |= {f"lbfgs.{key}.{i:04d}": t for i, t in enumerate(value)}
-        return tensors, {**metadata, "lbfgs": numbers}
+        return tensors, metadata
 
     @override
     def resume(self, tensors: Mapping[str, torch.Tensor], metadata: Mapping[str, Any]) -> None:
         super().resume(tensors, metadata)
         self._windows = Windows(tensors["windows.trajectory"], tensors["windows.frame"])
-        self._last = None
-        state = self._optimiser.state[self._weights[0]]
-        state.update(metadata["lbfgs"], old_dirs=[], old_stps=[], ro=[])
-        for key, tensor in sorted(part_of(tensors, "lbfgs.").items()):
-            name, _, index = key.partition(".")
-            if index:
-                state[name].append(tensor)
-            else:
-                state[name] = tensor
 
 
 def check_refinement(config: Mapping[str, Any], steps: int) -> None:

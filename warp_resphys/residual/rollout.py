@@ -7,7 +7,7 @@ import torch
 from typing_extensions import override
 
 from ..integrator import State
-from ..simulator import Simulator
+from ..simulator import MaterialTensors, Simulator
 
 FURTHEST = 10.0  # No robot moves ten times its own length from its clamp; a roll-out that does has diverged.
 ForcePredictor = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
@@ -72,12 +72,19 @@ class HybridRollout(Rollout):
         simulator: one whose solver settings count failures rather than raise them.
         predict: (B, N, 3) residual force [N] of positions and velocities; None adds no force.
         lost: (B,) bool, environments that diverged before.
+        tensors: other constants than the simulator's, such as other weights in every environment.
     """
 
-    def __init__(self, simulator: Simulator, predict: ForcePredictor | None, lost: torch.Tensor | None = None) -> None:
+    def __init__(
+        self,
+        simulator: Simulator,
+        predict: ForcePredictor | None,
+        lost: torch.Tensor | None = None,
+        tensors: MaterialTensors | None = None,
+    ) -> None:
         super().__init__(simulator, lost)
         self._predict = predict
-        self._tensors = simulator.prepare()
+        self._tensors = simulator.prepare() if tensors is None else tensors
 
     @override
     def _advance(self, state: State, lost: torch.Tensor) -> tuple[State, torch.Tensor]:

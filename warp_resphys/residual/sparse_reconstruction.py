@@ -74,7 +74,7 @@ class SparseGaussNewton(Reconstructor):
 
         Args:
             state: where the step starts.
-            observed: (B, m, 3) [m].
+            observed: (B, m, 3), NaN where a marker was not seen [m].
             first_guess: not used.
 
         Raises:
@@ -89,14 +89,15 @@ class SparseGaussNewton(Reconstructor):
         x = stage.target.clone()
         x[:, sim.fixed] = state.q[:, sim.fixed]
         force = torch.zeros_like(x)
+        seen = torch.isfinite(observed)
         active = torch.ones(state.batch, dtype=torch.bool, device=x.device)
         with threads_for(x.numel()):
             for iteration in range(1, self.max_iterations + 1):
                 p.positions.copy_(x)
                 p.evaluate()
                 end = sim.method.finish(state, x, sim.time_step).q
-                missing = stage.end * (observed - self.markers(end))
-                new, new_force = self._iterate(workspace, x, end, missing, self.regularisation * stage.end**2)
+                missing = torch.where(seen, stage.end * (observed - self.markers(end)), 0.0)
+                new, new_force = self._iterate(workspace, x, end, missing, seen, self.regularisation * stage.end**2)
                 change = (new - x).abs().amax((1, 2))
                 x = torch.where(active[:, None, None], new, x)
                 force = torch.where(active[:, None, None], new_force, force)
@@ -111,7 +112,13 @@ class SparseGaussNewton(Reconstructor):
         )
 
     def _iterate(
-        self, workspace: Workspace, x: torch.Tensor, end: torch.Tensor, missing: torch.Tensor, weight: float
+        self,
+        workspace: Workspace,
+        x: torch.Tensor,
+        end: torch.Tensor,
+        missing: torch.Tensor,
+        seen: torch.Tensor,
+        weight: float,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Next positions and force (B, N, 3); see the class's equations.
 
@@ -119,13 +126,15 @@ class SparseGaussNewton(Reconstructor):
             workspace: with the residual at x.
             x: (B, N, 3) the iterate [m].
             end: (B, N, 3) q+ for it [m].
-            missing: (B, m, 3) e (y - C(q+)) [m].
+            missing: (B, m, 3) e (y - C(q+)), zero where not seen [m].
+            seen: (B, m, 3) bool.
             weight: lambda e^2.
         """
         metric = workspace.adjoint_metric(self.simulator.settings.linear_solver)
         metric.refactor_exact()
         residual = workspace.potential.residual.reshape(len(x), -1, 1)
         transposed = self.markers.transposed_jacobian(end) if self._constant is None else self._constant
+        transposed = transposed * seen.flatten(1)[:, None]
         basis = self._basis
         columns = transposed
         by_mode = basis is not None and basis.shape[1] < transposed.shape[2]

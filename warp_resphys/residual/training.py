@@ -18,11 +18,12 @@ SELECTIONS = ("rollout", "validation_loss")
 
 @dataclass(frozen=True)
 class Samples:
-    """States and the fields that belong to them, each (S, N, 3)."""
+    """States and the fields that belong to them, each (S, N, 3), and (S, A) what else acts on the body, if anything."""
 
     q: torch.Tensor
     v: torch.Tensor
     outputs: tuple[torch.Tensor, ...]
+    actuation: torch.Tensor | None = None
 
 
 @dataclass
@@ -168,9 +169,9 @@ class Trainer(EpochTrainer[Model]):
             model.network.parameters(), lr=config["learning_rate"], weight_decay=config["weight_decay"]
         )
         with torch.no_grad():
-            self._train = (model.encode(train.q, train.v), model.encode_outputs(*train.outputs))
+            self._train = (model.encode(train.q, train.v, train.actuation), model.encode_outputs(*train.outputs))
             self._validation = (
-                model.encode(validation.q, validation.v),
+                model.encode(validation.q, validation.v, validation.actuation),
                 model.encode_outputs(*validation.outputs),
             )
             if config["linear_noise"] is not None:

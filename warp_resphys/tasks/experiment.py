@@ -17,6 +17,8 @@ from .ablation import run_ablation
 from .checks import check_configuration
 from .evaluate import evaluate
 from .generate import generate
+from .measured.checks import RECORDINGS
+from .measured.experiment import run_measured
 from .reconstruct import reconstruct
 from .refine import refine
 from .report import collect_metrics, make_report
@@ -138,6 +140,9 @@ def prepare(config: DictConfig) -> tuple[dict[str, Any], Path]:
 def run_experiment(config: DictConfig) -> None:
     """Runs what has changed, writes metrics.json and prints the errors."""
     plain, folder = prepare(config)
+    if plain["data"]["kind"] == RECORDINGS:
+        run_measured(plain, folder)
+        return
     if "markers" in plain:
         run_ablation(shown(plain), simulated(plain), folder)
         return

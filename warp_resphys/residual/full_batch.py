@@ -1,0 +1,96 @@
+"""Training on one smooth function of the weights: an epoch is one iteration of L-BFGS with its line search.
+
+Adam's first steps move every weight by its rate, however small the gradient: from a network that is nearly right they
+lead away. Where the loss comes out of the simulator, a line search costs less than finding a schedule.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from typing_extensions import override
+
+from .networks import ResidualForce
+from .training import EpochTrainer, part_of
+
+_EVALUATIONS = 12  # of the loss, the most that an epoch takes
+
+
+class FullBatchTrainer(EpochTrainer[ResidualForce]):
+    """Minimises a loss of the network's weights by L-BFGS.
+
+    Args:
+        model: to train.
+        rollout_error: mean roll-out error on the validation split [mm]; infinite where a roll-out diverged.
+        config: with ``epochs``, ``rollout_every`` and ``memory``, the pairs that L-BFGS keeps.
+    """
+
+    def __init__(
+        self,
+        model: ResidualForce,
+        rollout_error: Callable[[ResidualForce], float],
+        config: Mapping[str, Any],
+    ) -> None:
+        super().__init__(model, rollout_error, config)
+        self._weights = list(model.network.parameters())
+        self._optimiser = torch.optim.LBFGS(
+            self._weights,
+            max_iter=1,
+            max_eval=_EVALUATIONS,
+            history_size=config["memory"],
+            line_search_fn="strong_wolfe",
+            tolerance_grad=0.0,
+            tolerance_change=0.0,
+        )
+        self._last: tuple[list[torch.Tensor], list[torch.Tensor], torch.Tensor] | None = None
+
+    @abstractmethod
+    def _backward(self) -> float:
+        """The loss at the current weights; adds its gradient to theirs."""
+
+    def _iterate(self) -> float:
+        """One iteration; returns the loss that it led to."""
+        self._optimiser.step(self._evaluate)
+        return float(self._evaluate())
+
+    def _evaluate(self) -> torch.Tensor:
+        """The loss at the current weights, and its gradient; L-BFGS asks twice for that of the weights it accepts."""
+        if self._last is None or not all(map(torch.equal, self._weights, self._last[0])):
+            self._optimiser.zero_grad()
+            loss = self._backward()
+            gradients = [torch.zeros_like(w) if w.grad is None else w.grad for w in self._weights]
+            self._last = (
+                [w.detach().clone() for w in self._weights],
+                gradients,
+                torch.tensor(loss, dtype=torch.float64),
+            )
+        for weight, gradient in zip(self._weights, self._last[1], strict=True):
+            weight.grad = gradient.clone()
+        return self._last[2]
+
+    @override
+    def snapshot(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+        tensors, metadata = super().snapshot()
+        numbers = {}
+        for key, value in self._optimiser.state[self._weights[0]].items():
+            if isinstance(value, torch.Tensor):
+                tensors[f"lbfgs.{key}"] = value
+            elif not isinstance(value, list):
+                numbers[key] = value
+            elif key != "al":  # Scratch.
+                tensors |= {f"lbfgs.{key}.{i:04d}": t for i, t in enumerate(value)}
+        return tensors, {**metadata, "lbfgs": numbers}
+
+    @override
+    def resume(self, tensors: Mapping[str, torch.Tensor], metadata: Mapping[str, Any]) -> None:
+        super().resume(tensors, metadata)
+        self._last = None
+        state = self._optimiser.state[self._weights[0]]
+        state.update(metadata["lbfgs"], old_dirs=[], old_stps=[], ro=[])
+        for key, tensor in sorted(part_of(tensors, "lbfgs.").items()):
+            name, _, index = key.partition(".")
+            if index:
+                state[name].append(tensor)
+            else:
+                state[name] = tensor

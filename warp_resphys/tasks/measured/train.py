@@ -1,0 +1,80 @@
+"""Stages: the residual force and the data-driven baseline, from what markers saw."""
+
+import torch
+
+from ...residual.markers_in_the_loop import MarkersInTheLoop, MotionLoss
+from ...residual.networks import NextState, build_model, build_next_state
+from ...residual.rollout import DataDrivenRollout
+from ...residual.training import Samples, Trainer
+from ...stages import StageContext
+from ..train import fit
+from ..trajectories import read_fields
+from .evaluate import marker_error_mm, state_predictor_of
+from .files import training_file, weights_file
+from .scene import Scene, loads, parameters_of
+
+
+def _samples(context: StageContext, scene: Scene, model: str, like: torch.Tensor) -> dict[str, torch.Tensor]:
+    """What the reconstruction of the training trials holds, and the loads of its trajectories (R, 1)."""
+    path = context.run_dir / f"reconstruction_{model}.h5"
+    fields = read_fields(path, "reconstruction", "q", "v", "force")
+    found = {name: like.new_tensor(field) for name, field in zip(("q", "v", "force"), fields, strict=True)}
+    found["load"] = loads(scene.pick(tuple(context.settings["split"]["train"]))).to(like)
+    return found
+
+
+def train_on_markers(context: StageContext) -> None:
+    """Trains the residual force of a simulator: <model>.safetensors and training_<model>.json.
+
+    The reconstruction says in which modes bodies move and forces act; the weights come from the markers themselves,
+    through the simulator.
+    """
+    settings = context.settings
+    kind, model = settings["base"]
+    scene = Scene(settings, context.run_dir / settings["shared"])
+    simulator = scene.simulator(kind)
+    parameters = parameters_of(context.run_dir, model, simulator.rest_positions)
+    torch.manual_seed(settings["seed"])
+    found = _samples(context, scene, model, simulator.rest_positions)
+    steps = found["q"].shape[1] - 1
+    residual = build_model(
+        settings["network"],
+        simulator.rest_positions,
+        found["q"][:, :-1].flatten(0, 1),
+        found["v"][:, :-1].flatten(0, 1),
+        found["force"][:, 1:].flatten(0, 1),
+        found["load"].repeat_interleave(steps, 0),
+    ).double()
+    losses = {}
+    for split in ("train", "validation"):
+        names = tuple(settings["split"][split])
+        if names:
+            replay, release = scene.replay(kind, names)
+            losses[split] = MotionLoss(replay, release, parameters, loads(replay.motions))
+    trainer = MarkersInTheLoop(residual, losses["train"], losses.get("validation"), settings["in_the_loop"])
+    fit(context, trainer, weights_file(model), training_file(model), "residual force")
+
+
+def train_simfree_on_markers(context: StageContext) -> None:
+    """Trains the data-driven baseline on the reconstructed states: simfree.safetensors and training_simfree.json."""
+    settings = context.settings
+    scene = Scene(settings, context.run_dir / settings["shared"])
+    simulator = scene.simulator("identified")
+    torch.manual_seed(settings["seed"])
+    found = _samples(context, scene, "resphys", simulator.rest_positions)
+    rest = simulator.rest_positions
+    q, v, steps = found["q"], found["v"], found["q"].shape[1] - 1
+    actuation = found["load"].repeat_interleave(steps, 0)
+    now = (q[:, :-1].flatten(0, 1), v[:, :-1].flatten(0, 1))
+    samples = Samples(*now, ((q[:, 1:] - rest).flatten(0, 1), v[:, 1:].flatten(0, 1)), actuation)
+    model = build_next_state(settings["network"], rest, *now, actuation)
+    judged = tuple(settings["split"]["validation"]) or tuple(settings["split"]["train"])
+    motions = scene.pick(judged)
+    start = scene.release(simulator, motions)
+
+    def error(candidate: NextState) -> float:
+        rollout = DataDrivenRollout(simulator, state_predictor_of(candidate, loads(motions)))
+        return marker_error_mm(rollout, simulator, scene.markers, motions, start)
+
+    trainer = Trainer(model, samples, samples, error, settings["trainer"], settings["seed"])
+    fit(context, trainer, weights_file("simfree"), training_file("simfree"), "next state")

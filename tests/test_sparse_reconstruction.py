@@ -188,7 +188,10 @@ class TestModes:
     ("settings", "sentence"),
     [
         ({"regularisation": 0.0}, "reconstruction.regularisation is 0: it must be positive, as markers leave most"),
-        ({"method": "adam"}, "reconstruction.method is 'adam': choose one of gauss_newton, lbfgsb."),
+        (
+            {"method": "adam"},
+            "reconstruction.method is 'adam': choose one of gauss_newton, levenberg_marquardt, lbfgsb.",
+        ),
         ({"method": "lbfgsb", "modes": 3}, "markers.modes is set, but reconstruction.method=lbfgsb has no modes"),
         ({"modes": 0}, "0 vibration modes were asked for, but the body has 1 to 24."),
         ({"modes": 25}, "25 vibration modes were asked for"),

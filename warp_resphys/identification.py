@@ -1,25 +1,30 @@
 """System identification: the physical parameters with which a simulator comes closest to observed motions.
 
 The loss is the mean square distance of simulated and observed markers, each motion in units of its own amplitude, over
-all motions at once. L-BFGS-B (Byrd, Lu, Nocedal, Zhu, SIAM J. Sci. Comput. 16, 1995) minimises it within bounds, from
-the best of a coarse set of starts, with gradients through the simulator.
+all motions at once. `descent` minimises it within bounds, from the best of a coarse set of starts, with gradients
+through the simulator.
 """
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
+from typing import Any
 
 import numpy as np
-import scipy.optimize
 import scipy.stats
 import torch
 from numpy.typing import NDArray
 
+from .descent import minimise
 from .errors import ConvergenceError, InputError
 from .replay import PARAMETERS, Release, Replay
 
 Report = Callable[[int, float, Mapping[str, float]], None]
+Attempt = dict[str, Any]
+
+_MOST_ITERATIONS = 200  # of a solve; steps take a handful, and parameters that need more have failed
+_DIFFERENCE = 1e-3  # of a range, for derivatives by differences
 
 
 @dataclass(frozen=True)
@@ -83,9 +88,9 @@ class Identification:
     Attributes:
         parameters: the values of the smallest loss.
         loss: that loss, relative to the motions' amplitudes.
-        history: for every start the records ``loss`` and the parameters, one an evaluation.
+        history: for every start the records ``loss`` and the parameters, one an evaluation that did not fail.
         at_bounds: parameters that ended on a bound.
-        uncertainty: see the class.
+        uncertainty: see the class; None if the simulation fails beside the minimum.
     """
 
     parameters: dict[str, float]
@@ -105,7 +110,7 @@ class Identifier:
         seconds: how much of each motion counts; all of it if None.
 
     Raises:
-        InputError: an unknown parameter, or none.
+        InputError: an unknown parameter, or none; or a motion in which nothing moves.
     """
 
     def __init__(
@@ -116,10 +121,19 @@ class Identifier:
         for name in bounds:
             if name not in PARAMETERS:
                 raise InputError(f"there is no parameter {name!r} to identify: choose from {', '.join(PARAMETERS)}.")
-        self.replay, self.release, self.bounds, self.seconds = replay, release, dict(bounds), seconds
-        seen = replay.motions.seen.sum((1, 2))
+        motions = replay.motions if seconds is None else replay.motions.first(seconds)
+        amplitude = motions.amplitude
+        for name, moved in zip(motions.names, amplitude.tolist(), strict=True):
+            if not moved > 0.0:
+                raise InputError(f"the markers of the motion {name!r} stay where they were held: leave it out.")
+        simulator = replay.simulator
+        most = min(simulator.settings.max_iterations, _MOST_ITERATIONS)
+        settings = replace(simulator.settings, max_iterations=most, on_failure="raise")
+        self.replay = Replay(replace(simulator, solver=settings), replay.markers, motions)
+        self.release, self.bounds = release, dict(bounds)
+        seen = motions.seen.sum((1, 2))
         # (R,) so that the sum of squares is the mean over motions of each one's mean square over its amplitude.
-        self._weight = 1.0 / (seen * replay.motions.amplitude**2 * len(seen))
+        self._weight = 1.0 / (seen * amplitude**2 * len(seen))
 
     def losses(self, unit: torch.Tensor) -> torch.Tensor:
         """(E,) losses of (E, P) parameters, each a fraction of its range."""
@@ -127,7 +141,7 @@ class Identifier:
 
     def _residuals(self, unit: torch.Tensor) -> torch.Tensor:
         values = {name: b.from_unit(unit[:, i]) for i, (name, b) in enumerate(self.bounds.items())}
-        return self.replay.errors(self.replay(self.release, values, self.seconds))
+        return self.replay.errors(self.replay(self.release, values))
 
     def grid(self, axes: Mapping[str, int], others: Mapping[str, float], chunk: int = 12) -> NDArray[np.float64]:
         """Losses on a grid over some of the parameters, the others held.
@@ -138,14 +152,15 @@ class Identifier:
             chunk: sets of parameters that are simulated at once.
 
         Returns:
-            Losses in the shape of the grid; infinite where a simulation failed.
+            Losses with an axis for each of `axes`, in their order; infinite where a simulation failed.
         """
         ticks = [
             np.linspace(0.0, 1.0, axes[name]) if name in axes else [self._unit(name, others)] for name in self.bounds
         ]
         points = np.array(list(product(*ticks)))
         losses = np.concatenate([self._losses_safe(points[i : i + chunk]) for i in range(0, len(points), chunk)])
-        return losses.reshape([axes[name] for name in self.bounds if name in axes])
+        inside = [name for name in self.bounds if name in axes]
+        return losses.reshape([axes[name] for name in inside]).transpose([inside.index(name) for name in axes])
 
     def ticks(self, name: str, count: int) -> NDArray[np.float64]:
         """The values of a parameter on `grid`."""
@@ -156,14 +171,16 @@ class Identifier:
         return bounds.to_unit(min(max(values[name], bounds.lower), bounds.upper))
 
     def _losses_safe(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Losses without gradients; one point at a time where a simulation of several fails."""
-        try:
-            with torch.no_grad():
-                return self.losses(self.replay.simulator.tensor(points)).cpu().numpy()
-        except ConvergenceError:
-            if len(points) == 1:
-                return np.array([np.inf])
-            return np.concatenate([self._losses_safe(p[None]) for p in points])
+        """Losses without gradients; where some simulations fail, the others are done again without them."""
+        losses, left = np.full(len(points), np.inf), np.arange(len(points))
+        while len(left):
+            try:
+                with torch.no_grad():
+                    losses[left] = self.losses(self.replay.simulator.tensor(points[left])).cpu().numpy()
+                break
+            except ConvergenceError as error:
+                left = left[error.report.converged.view(len(left), -1).all(1).cpu().numpy()]
+        return losses
 
     def starts(self, first: Mapping[str, float], count: int, candidates: int, seed: int) -> list[dict[str, float]]:
         """The first guess, and the best of random candidates around the ranges.
@@ -184,89 +201,126 @@ class Identifier:
 
     def _values(self, unit: Sequence[float] | NDArray[np.float64]) -> dict[str, float]:
         return {
-            n: float(b.from_unit(torch.tensor(float(u)))) for (n, b), u in zip(self.bounds.items(), unit, strict=True)
+            n: float(b.from_unit(torch.tensor(float(u), dtype=torch.float64)))
+            for (n, b), u in zip(self.bounds.items(), unit, strict=True)
         }
 
     def run(
-        self, starts: Sequence[Mapping[str, float]], max_iterations: int, report: Report | None = None
+        self,
+        starts: Sequence[Mapping[str, float]],
+        max_iterations: int,
+        report: Report | None = None,
+        finished: Sequence[Attempt] = (),
+        keep: Callable[[list[Attempt]], None] | None = None,
     ) -> Identification:
         """Minimises the loss from every start and keeps the best.
 
         Args:
             starts: a value of each parameter, for each start.
-            max_iterations: of L-BFGS-B, a start.
+            max_iterations: of `descent.minimise`, a start.
             report: called with the start's number, the loss and the parameters after every evaluation.
+            finished: what an interrupted run with the same starts gave to `keep`; those starts are not done again.
+            keep: called after every start with the results of all so far, which can be written as JSON.
 
         Raises:
             ConvergenceError: the simulation fails at every start.
         """
-        best: tuple[float, NDArray[np.float64]] | None = None
-        histories = []
-        for number, start in enumerate(starts):
-            history: list[dict[str, float]] = []
-
-            def objective(
-                unit: NDArray[np.float64], history: list[dict[str, float]] = history, number: int = number
-            ) -> tuple[float, NDArray[np.float64]]:
-                loss, gradient = self._loss_and_gradient(unit)
-                values = self._values(unit)
-                history.append({"loss": loss, **values})
-                if report is not None:
-                    report(number, loss, values)
-                return loss, gradient
-
-            x0 = np.array([self._unit(name, start) for name in self.bounds])
-            result = scipy.optimize.minimize(
-                objective,
-                x0,
-                jac=True,
-                method="L-BFGS-B",
-                bounds=[(0.0, 1.0)] * len(x0),
-                options={"maxiter": max_iterations, "ftol": 1e-7, "gtol": 1e-7},
-            )
-            histories.append(history)
-            if np.isfinite(result.fun) and (best is None or result.fun < best[0]):
-                best = (float(result.fun), result.x)
-        if best is None:
+        attempts = list(finished)
+        for number in range(len(attempts), len(starts)):
+            attempts.append(self._descend(number, starts[number], max_iterations, report))
+            if keep is not None:
+                keep(attempts)
+        good = [attempt for attempt in attempts if attempt["loss"] is not None]
+        if not good:
             raise ConvergenceError("the simulation failed at every start of the identification.", None, None)
-        at_bounds = tuple(n for n, u in zip(self.bounds, best[1], strict=True) if min(u, 1.0 - u) < 1e-4)
-        return Identification(self._values(best[1]), best[0], histories, at_bounds, self.uncertainty(best[1]))
+        best = min(good, key=lambda attempt: attempt["loss"])
+        unit = np.array([self._unit(name, best["parameters"]) for name in self.bounds])
+        at_bounds = tuple(n for n, u in zip(self.bounds, unit, strict=True) if min(u, 1.0 - u) < 1e-4)
+        histories = [attempt["history"] for attempt in attempts]
+        return Identification(best["parameters"], best["loss"], histories, at_bounds, self.uncertainty(unit))
+
+    def _descend(self, number: int, start: Mapping[str, float], max_iterations: int, report: Report | None) -> Attempt:
+        """What one start leads to: the parameters, their loss (None if the simulation fails there), the history."""
+        history: list[dict[str, float]] = []
+
+        def objective(unit: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+            loss, gradient = self._loss_and_gradient(unit)
+            if np.isfinite(loss):
+                history.append({"loss": loss, **self._values(unit)})
+            if report is not None:
+                report(number, loss, self._values(unit))
+            return loss, gradient
+
+        def matrix(unit: NDArray[np.float64]) -> NDArray[np.float64] | None:
+            found = self._linearise(unit)
+            return None if found is None else 2.0 * np.einsum("rip,riq->pq", found[1], found[1])
+
+        first = np.array([self._unit(name, start) for name in self.bounds])
+        unit, loss = minimise(objective, first, matrix, max_iterations)
+        return {
+            "parameters": self._values(unit),
+            "loss": loss if np.isfinite(loss) else None,
+            "history": history,
+        }
 
     def _loss_and_gradient(self, unit: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        """Infinite, and zero, where the simulation fails."""
         x = self.replay.simulator.tensor(unit)[None].requires_grad_()
         try:
             loss = self.losses(x)[0]
+            (gradient,) = torch.autograd.grad(loss, x)
         except ConvergenceError:
-            return 1e3, np.zeros_like(unit)  # L-BFGS-B's line search comes back from there
-        (gradient,) = torch.autograd.grad(loss, x)
-        return float(loss.detach()), gradient[0].cpu().numpy()
+            return np.inf, np.zeros_like(unit)
+        return float(loss.detach()), gradient[0].double().cpu().numpy()
 
-    def uncertainty(self, unit: NDArray[np.float64], step: float = 1e-3) -> Uncertainty:
-        """Covariance s^2 (J^T J)^-1 with J from central differences, for residuals that are correlated in time.
+    def _linearise(
+        self, unit: NDArray[np.float64], central: bool = False
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """Weighted residuals (R, T, M, 3) and their derivatives (R, T M 3, P) by the fractions, from differences.
 
-        s^2 is the mean square residual times the number of frames that tell nothing new: the sum of the residuals'
-        autocorrelation up to its first zero.
+        One-sided differences lead into the range; central ones are taken a step inside of it. None where a simulation
+        fails.
         """
-        count = len(unit)
-        inside = np.clip(unit, step, 1.0 - step)
-        points = np.concatenate([inside[None], inside + step * np.eye(count), inside - step * np.eye(count)])
-        with torch.no_grad():
-            residuals = self._residuals(self.replay.simulator.tensor(points)) * self._weight.sqrt()[:, None, None, None]
-        flat = residuals.flatten(1).cpu().numpy()
-        jacobian = (flat[1 : count + 1] - flat[count + 1 :]).T / (2.0 * step)
-        seen = int(self.replay.motions.seen.sum()) * 3
-        variance = float(flat[0] @ flat[0]) / max(seen - count, 1) * _redundancy(residuals[0].cpu().numpy())
-        information = jacobian.T @ jacobian
-        values, vectors = np.linalg.eigh(information)
-        covariance = (vectors / np.maximum(values, 1e-12 * values[-1])) @ vectors.T * variance
-        deviation = np.sqrt(np.diag(covariance))
-        slopes = [self._slope(name, u) for name, u in zip(self.bounds, inside, strict=True)]
+        count, steps = len(unit), np.where(unit < 0.5, _DIFFERENCE, -_DIFFERENCE)
+        if central:
+            unit = np.clip(unit, _DIFFERENCE, 1.0 - _DIFFERENCE)
+        sides = [unit[None], unit + np.diag(steps), unit - np.diag(steps)]
+        try:
+            with torch.no_grad():
+                residuals = self._residuals(self.replay.simulator.tensor(np.concatenate(sides[: 3 if central else 2])))
+        except ConvergenceError:
+            return None
+        weighted = (residuals * self._weight.sqrt()[:, None, None, None]).double().cpu().numpy()
+        flat = weighted.reshape(*weighted.shape[:2], -1)
+        behind, width = (flat[count + 1 :], 2.0 * steps) if central else (flat[:1], steps)
+        return weighted[0], np.moveaxis((flat[1 : count + 1] - behind) / width[:, None, None], 0, -1)
+
+    def uncertainty(self, unit: NDArray[np.float64]) -> Uncertainty | None:
+        """Covariance (J^T J)^-1 (sum_r s_r^2 J_r^T J_r) (J^T J)^-1 at fractions of the ranges, J_r that of a motion.
+
+        s_r^2 is the mean square residual of the motion times the number of frames that tell nothing new: the sum of
+        the residuals' autocorrelation up to its first zero. None if the simulation fails close by.
+        """
+        found = self._linearise(unit, central=True)
+        if found is None:
+            return None
+        residuals, jacobian = found
+        each = 3 * self.replay.motions.seen.sum((1, 2)).cpu().numpy()
+        free = 1.0 - min(len(unit) / each.sum(), 0.5)
+        squares = np.square(residuals).sum((1, 2, 3)) / (each * free)
+        variances = squares * [_redundancy(series) for series in residuals]
+        blocks = np.einsum("rip,riq->rpq", jacobian, jacobian)
+        values, vectors = np.linalg.eigh(blocks.sum(0))
+        inverse = (vectors / np.maximum(values, 1e-12 * max(values[-1], 1e-300))) @ vectors.T
+        covariance = inverse @ np.einsum("r,rpq->pq", variances, blocks) @ inverse
+        deviation = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+        slopes = [self._slope(name, u) for name, u in zip(self.bounds, unit, strict=True)]
         poorest = vectors[:, 0] * np.sign(vectors[np.abs(vectors[:, 0]).argmax(), 0])
         return Uncertainty(
             deviation={n: float(d * s) for n, d, s in zip(self.bounds, deviation, slopes, strict=True)},
             correlation=(covariance / np.outer(deviation, deviation)).tolist(),
             poorest=dict(zip(self.bounds, poorest.tolist(), strict=True)),
-            poorest_deviation=float(np.sqrt(variance / max(values[0], 1e-12 * values[-1]))),
+            poorest_deviation=float(np.sqrt(max(vectors[:, 0] @ covariance @ vectors[:, 0], 0.0))),
         )
 
     def _slope(self, name: str, unit: float) -> float:
@@ -277,8 +331,8 @@ class Identifier:
 
 
 def _redundancy(residuals: NDArray[np.float64]) -> float:
-    """How many frames (R, T, M, 3) weigh as much as one: 1 + 2 sum of the autocorrelation up to its first zero."""
-    series = residuals.transpose(1, 0, 2, 3).reshape(residuals.shape[1], -1)
+    """How many frames (T, M, 3) weigh as much as one: 1 + 2 sum of the autocorrelation up to its first zero."""
+    series = residuals.reshape(len(residuals), -1)
     products = [float((series[lag:] * series[: len(series) - lag]).sum()) for lag in range(len(series) // 2)]
     if products[0] <= 0.0:
         return 1.0

@@ -6,11 +6,12 @@ go between two frames, and not without a push: the delay, and a velocity in a fe
 first frames.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 
-from .errors import InputError
+from .errors import ConvergenceError, InputError
 from .integrator import State
 from .modes import vibration_modes
 from .replay import Markers, Motions, Release, Replay
@@ -18,7 +19,7 @@ from .simulator import MaterialTensors, Simulator
 
 _HOLD_ITERATIONS = 30
 _HOLD_TOLERANCE = 1e-7  # m, change of any position in the last iteration
-_HOLD_WEIGHT = 1e-6  # w, in units of the largest diagonal entry of J^T J
+_HOLD_WEIGHT = 1e-6  # w, in units of the largest diagonal entry of the first J^T J
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,7 @@ def hold(
         ConvergenceError: no equilibrium was found.
     """
     count = len(motions.names)
-    target = torch.where(torch.isfinite(motions.held), motions.held, torch.nan)
+    target = motions.held
     if modes == 0:
         with torch.no_grad():
             return simulator.static_equilibrium(material=tensors, batch=count).q
@@ -111,27 +112,47 @@ def hold(
 
     force = simulator.rest_positions.new_zeros(count, modes)
     damping = force.new_full((count, 1, 1), 1e-3)  # in units of the largest diagonal entry
-    q, missing = equilibrium(force, simulator.rest_state(count).q)
+    weight = None
+    with torch.no_grad():
+        q, missing = equilibrium(force, simulator.rest_state(count).q)
     for _ in range(_HOLD_ITERATIONS):
-        a = force.clone().requires_grad_()
-        _, left = equilibrium(a, q)
-        rows = [torch.autograd.grad(left[:, i].sum(), a, retain_graph=True)[0] for i in range(left.shape[1])]
-        jacobian = -torch.stack(rows, 1)  # (R, 3 M, modes)
+        jacobian = -_derivatives(equilibrium, force, q)
         gram = jacobian.mT @ jacobian
         scale = gram.diagonal(dim1=1, dim2=2).amax(1)[:, None, None]
-        right = jacobian.mT @ missing[..., None] - _HOLD_WEIGHT * scale * force[..., None]
-        change = torch.linalg.solve(gram + (_HOLD_WEIGHT + damping) * scale * identity, right)[..., 0]
-        with torch.no_grad():
-            new_q, new_missing = equilibrium(force + change, q)
-        better = new_missing.square().sum(1) <= missing.square().sum(1)
-        moved = float((new_q - q)[better].abs().max()) if bool(better.any()) else torch.inf
+        weight = _HOLD_WEIGHT * scale if weight is None else weight
+        right = jacobian.mT @ missing[..., None] - weight * force[..., None]
+        change = torch.linalg.solve(gram + (weight + damping * scale) * identity, right)[..., 0]
+        try:
+            with torch.no_grad():
+                new_q, new_missing = equilibrium(force + change, q)
+        except ConvergenceError:
+            damping = 10.0 * damping
+            continue
+        before, after = (
+            y.square().sum(1) + weight[:, 0, 0] * a.square().sum(1)
+            for y, a in ((missing, force), (new_missing, force + change))
+        )
+        better = after <= before
+        moved = float((new_q - q).abs().max())
         force = torch.where(better[:, None], force + change, force)
         q = torch.where(better[:, None, None], new_q, q)
         missing = torch.where(better[:, None], new_missing, missing)
         damping = torch.where(better[:, None, None], 0.2 * damping, 10.0 * damping).clamp(1e-9, 1e6)
-        if moved < _HOLD_TOLERANCE and bool(better.all()):
+        if moved < _HOLD_TOLERANCE:
             break
-    return q.detach()
+    return q
+
+
+def _derivatives(
+    equilibrium: Callable[[torch.Tensor, torch.Tensor], tuple[torch.Tensor, torch.Tensor]],
+    force: torch.Tensor,
+    q: torch.Tensor,
+) -> torch.Tensor:
+    """(R, 3 M, modes) of what is missing by the (R, modes) force, at its equilibrium q."""
+    a = force.clone().requires_grad_()
+    _, missing = equilibrium(a, q)
+    rows = [torch.autograd.grad(missing[:, i].sum(), a, retain_graph=True)[0] for i in range(missing.shape[1])]
+    return torch.stack(rows, 1)
 
 
 def _let_go(
@@ -154,18 +175,22 @@ def _let_go(
     size = 1 + len(deviation)
     replay = Replay(simulator, markers, motions.select(list(range(count)) * size))
     step = 0.05
-    offsets = torch.cat([torch.zeros_like(deviation)[None], step * torch.eye(len(deviation), dtype=deviation.dtype)])
-    offsets = offsets.to(deviation.device).repeat_interleave(count, 0)
+    identity = torch.eye(len(deviation), dtype=deviation.dtype, device=deviation.device)
+    offsets = torch.cat([torch.zeros_like(deviation)[None], step * identity]).repeat_interleave(count, 0)
+    best, least = parameters, torch.full_like(parameters[:, 0], torch.inf)
     with torch.no_grad():
-        for _ in range(settings.iterations):
-            simulated = replay(begin(parameters.repeat(size, 1) + offsets), seconds=settings.window)
+        for _ in range(settings.iterations + 1):  # The last one only tells whether the step before was good.
+            simulated = replay(begin(parameters.repeat(size, 1) + offsets))
             residual = replay.errors(simulated)[0].flatten(1).unflatten(0, (size, count)) / settings.noise
+            objective = residual[0].square().sum(1) + parameters.square().sum(1)
+            better = objective < least
+            best, least = torch.where(better[:, None], parameters, best), torch.where(better, objective, least)
             jacobian = ((residual[1:] - residual[0]) / step).permute(1, 2, 0)
-            identity = torch.eye(len(deviation), dtype=deviation.dtype, device=deviation.device)
             right = jacobian.mT @ residual[0][..., None] + parameters[..., None]
-            change = torch.linalg.solve(jacobian.mT @ jacobian + identity, right)[..., 0]
-            parameters = parameters - change.clamp(-3.0, 3.0)
-    return begin(parameters)
+            change = torch.linalg.solve(jacobian.mT @ jacobian + identity, right)[..., 0].clamp(-3.0, 3.0)
+            # Back half way to the best so far where a step was too long.
+            parameters = torch.where(better[:, None], parameters - change, 0.5 * (parameters + best))
+    return begin(best)
 
 
 def velocity_shapes(simulator: Simulator, modes: int) -> torch.Tensor:

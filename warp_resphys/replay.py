@@ -4,6 +4,7 @@ A replay simulates every motion from its own release, with its own attached weig
 parameters at once, and reads the markers off at the times of the frames. All of it is differentiable.
 """
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -72,9 +73,9 @@ class Motions:
 
     def first(self, seconds: float) -> "Motions":
         """The frames of the first seconds; those past them count as not seen."""
-        inside = (self.times <= seconds + 1e-9)[..., None, None]
-        last = int(inside.any(0).nonzero()[-1, 0]) + 1
-        markers = torch.where(inside, self.markers, torch.nan)
+        inside = self.times <= seconds + 1e-9
+        last = int(inside.any(0).sum())
+        markers = torch.where(inside[..., None, None], self.markers, torch.nan)
         return replace(self, times=self.times[:, :last], markers=markers[:, :last])
 
 
@@ -137,15 +138,13 @@ class Replay:
         self,
         release: Release,
         parameters: Mapping[str, torch.Tensor] | None = None,
-        seconds: float | None = None,
         force: StepForce | None = None,
     ) -> torch.Tensor:
-        """(E, R, T, M, 3) markers at the times of the frames [m]; frames past the simulated seconds hold still.
+        """(E, R, T, M, 3) markers at the times of the frames [m]; before its release a body holds still.
 
         Args:
             release: of the R motions.
             parameters: (E,) values of any of `PARAMETERS`; one set without any, if left out.
-            seconds: how long to simulate; to the last frame if left out.
             force: (B, N, 3) added force [N] of positions and velocities.
 
         Raises:
@@ -153,8 +152,8 @@ class Replay:
         """
         each = len(next(iter(parameters.values()))) if parameters else 1
         times = (self.motions.times - release.delay[:, None]).clamp_min(0.0)
-        until = float(times.max()) if seconds is None else min(seconds, float(times.max()))
-        steps = max(int(until / self.simulator.time_step) + 2, 2)
+        # One step past the last frame, for the slope there.
+        steps = max(math.ceil(float(times.max()) / self.simulator.time_step - 1e-6) + 1, 2)
         tensors = self.tensors(parameters)
         state = State(release.state.q.repeat(each, 1, 1), release.state.v.repeat(each, 1, 1))
         series = [self.markers(state.q)]
@@ -178,11 +177,16 @@ def tilted_gravity(simulator: Simulator, first: torch.Tensor | None, second: tor
         simulator: gives the gravity that is turned, and its strength.
         first: (B,) component of the direction along the first axis across gravity (the one of lowest number), or None.
         second: (B,) along the second.
+
+    Raises:
+        InputError: there is no gravity to turn.
     """
     gravity = simulator.tensor(simulator.gravity)
     strength = gravity.norm()
-    if not float(strength) > 0.0:
+    if first is None and second is None:
         return gravity[None]
+    if not float(strength) > 0.0:
+        raise InputError("without gravity its tilt cannot be identified: leave gravity_tilt_1 and gravity_tilt_2 out.")
     down = gravity / strength
     axes = torch.eye(3, dtype=gravity.dtype, device=gravity.device)
     along = int(down.abs().argmax())

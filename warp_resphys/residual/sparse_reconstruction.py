@@ -152,6 +152,112 @@ class SparseGaussNewton(Reconstructor):
         return x + (metric.solve(force) - settling).view_as(x), force.view_as(x)
 
 
+class SparseLevenbergMarquardt(Reconstructor):
+    """Levenberg-Marquardt in the forces, for motions that Gauss-Newton does not follow, such as jerks of real bodies.
+
+    Every trial force is followed by a whole step of the simulator, with its line search, so that an iterate is always a
+    state that the simulator reaches. With J = C' H^-1 there, the next force minimises
+
+        |r - J (f - f0)|^2 + lambda |f|^2 + d |f - f0|^2,
+
+    and is taken if the objective gets smaller; the damping d grows where it does not. ``tolerance`` is the last change of
+    any position [m].
+
+    Args:
+        simulator: the one to correct.
+        markers: C, for as many environments as the states have.
+        regularisation: lambda, positive [m^2/N^2].
+        tolerance: see above.
+        max_iterations: after which a step has failed.
+
+    Raises:
+        InputError: a number out of range, or a marker on a vertex that the body does not have.
+    """
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        markers: Markers,
+        regularisation: float,
+        tolerance: float,
+        max_iterations: int,
+    ) -> None:
+        super().__init__(simulator, regularisation, tolerance, max_iterations)
+        check_sparse(regularisation, markers, simulator)
+        self.markers = markers.to(simulator.rest_positions)
+
+    @override
+    @torch.no_grad()
+    def step(self, state: State, observed: torch.Tensor, first_guess: torch.Tensor | None = None) -> Reconstruction:
+        """See `SparseGaussNewton.step`; the first guess is a force (B, N, 3) [N]."""
+        force = torch.zeros_like(state.q) if first_guess is None else first_guess
+        seen = torch.isfinite(observed)
+        new, objective = self._try(state, force, observed)
+        if not bool(torch.isfinite(objective).all()):
+            force = torch.zeros_like(force)
+            new, objective = self._try(state, force, observed)
+        damping = torch.zeros_like(objective)
+        for iteration in range(1, self.max_iterations + 1):
+            candidate = self._next_force(state, new, force, observed, seen, damping)
+            reached, value = self._try(state, candidate, observed)
+            better = value <= objective
+            moved = (reached.q - new.q).abs().amax((1, 2))
+            settled = moved <= self.tolerance
+            where = (better & ~(settled & (damping > 0.0)))[:, None, None]
+            force = torch.where(where, candidate, force)
+            new = State(torch.where(where, reached.q, new.q), torch.where(where, reached.v, new.v), reached.previous)
+            objective = torch.where(better, value, objective)
+            damping = torch.where(better, 0.1 * damping, (10.0 * damping).clamp_min(self.regularisation))
+            if bool((settled & (better | (damping > 0.0))).all()):
+                return Reconstruction(new, force, iteration)
+        raise ConvergenceError(
+            f"sparse Levenberg-Marquardt reconstruction moved by {float(moved.max()):.1e} m in its last iteration, the "
+            f"{self.max_iterations}th: raise reconstruction.regularisation or reconstruction.max_iterations.",
+            new.q,
+            None,
+        )
+
+    def _try(self, state: State, force: torch.Tensor, observed: torch.Tensor) -> tuple[State, torch.Tensor]:
+        """Where a force leads, and the objective (B,) there; infinite where the simulator fails."""
+        try:
+            new, _ = self.simulator.step(state, force, material=self._tensors)
+        except ConvergenceError:
+            return state, torch.full_like(state.q[:, 0, 0], torch.inf)
+        missing = torch.nan_to_num(observed - self.markers(new.q))
+        misfit = torch.where(torch.isfinite(observed), missing, 0.0).square().sum((1, 2))
+        return new, misfit + self.regularisation * force.square().sum((1, 2))
+
+    def _next_force(
+        self,
+        state: State,
+        new: State,
+        force: torch.Tensor,
+        observed: torch.Tensor,
+        seen: torch.Tensor,
+        damping: torch.Tensor,
+    ) -> torch.Tensor:
+        """(B, N, 3) the minimiser of the linearised objective; see the class's equations."""
+        sim = self.simulator
+        workspace = sim.workspace(state.batch)
+        p = workspace.potential
+        stage = sim.method.stage(state, sim.time_step)
+        p.set_terms(sim.step_terms(stage, state.batch, None, self._tensors, workspace))
+        p.positions.copy_(sim.method.solution_for(state, new.q))
+        p.evaluate()
+        metric = workspace.adjoint_metric(sim.settings.linear_solver)
+        metric.refactor_exact()
+        transposed = self.markers.transposed_jacobian(new.q) * seen.flatten(1)[:, None]
+        jacobian = metric.solve(transposed).mT / stage.end  # q+ moves 1 / end times as far as the solution
+        old = force.flatten(1)[..., None]
+        missing = torch.where(seen, observed - self.markers(new.q), 0.0).flatten(1)[..., None]
+        weight = (self.regularisation + damping)[:, None, None]
+        centre = (damping[:, None, None] / weight) * old
+        gram = jacobian @ jacobian.mT
+        identity = torch.eye(gram.shape[1], device=gram.device, dtype=gram.dtype)
+        right = missing + jacobian @ (old - centre)
+        return (centre + jacobian.mT @ torch.linalg.solve(gram + weight * identity, right)).view_as(force)
+
+
 class SparseLBFGSB(LBFGSB):
     """The published method on sparse markers: L-BFGS-B on the forces, with gradients through the simulator.
 
@@ -232,8 +338,10 @@ def make_sparse_reconstructor(
     settings = (simulator, markers, regularisation, tolerance, max_iterations)
     if method == "gauss_newton":
         return SparseGaussNewton(*settings, modes)
-    if method != "lbfgsb":
-        raise InputError(f"reconstruction.method is {method!r}: choose one of gauss_newton, lbfgsb.")
+    methods = {"levenberg_marquardt": SparseLevenbergMarquardt, "lbfgsb": SparseLBFGSB}
+    if method not in methods:
+        known = ", ".join(("gauss_newton", *methods))
+        raise InputError(f"reconstruction.method is {method!r}: choose one of {known}.")
     if modes is not None:
-        raise InputError("markers.modes is set, but reconstruction.method=lbfgsb has no modes: choose gauss_newton.")
-    return SparseLBFGSB(*settings)
+        raise InputError(f"markers.modes is set, but reconstruction.method={method} has no modes: choose gauss_newton.")
+    return methods[method](*settings)

@@ -135,7 +135,7 @@ def check_configuration(config: Mapping[str, Any]) -> None:
         check_measured(config)
     else:
         check_refinement(config["refinement"], config["data"]["steps"])
-    make_reconstructor(build_simulator(config), **config["reconstruction"])
+        make_reconstructor(build_simulator(config), **config["reconstruction"])
 
 
 def _check_training(config: Mapping[str, Any], model: str) -> None:

@@ -7,18 +7,23 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 
 from ...body import MASS_MODES
-from ...configured import build_body, build_mesh
+from ...configured import build_body, build_mesh, build_simulator
 from ...elements import VOLUME_INTEGRATIONS
 from ...errors import InputError
 from ...integrator import INTEGRATORS
-from ...markers import KINDS
+from ...markers import KINDS, MarkerMap
 from ...material import Material
 from ...mesh import select_vertices
 from ...recordings.recording import METRES_PER_UNIT
+from ...release import ReleaseSettings
+from ...residual.markers_in_the_loop import check_in_the_loop
+from ...residual.sparse_reconstruction import make_sparse_reconstructor
 from ..kinds import is_finite, is_number, is_whole_number, is_word
 from .files import attached_mass
+from .identify import check_identification
 from .trials import FOLDS, folds_of, is_synthetic, split_of, trials_of, vertical
 
 RECORDINGS = "recordings"  # this kind of data
@@ -131,6 +136,23 @@ def check_measured(config: Mapping[str, Any]) -> None:
     if config["markers"]["bind_to"] is not None:
         select_vertices(body.mesh, **config["markers"]["bind_to"])
     attached_mass(body, config["data"]["hung_on"], np.array([trial.hung for trial in trials_of(config)]))
+    _check_learning(config)
+
+
+def _check_learning(config: Mapping[str, Any]) -> None:
+    """What the stages after the import are set to."""
+    for group in ("release", "identify", "in_the_loop"):
+        if not isinstance(config.get(group), Mapping):
+            raise InputError(f"{group} is {config.get(group)!r}: it must be a group of settings.")
+    try:
+        ReleaseSettings(**config["release"])
+    except TypeError as error:
+        raise InputError(f"release: {error}; see conf/measured/default.yaml for its keys.") from error
+    check_identification(config["identify"])
+    check_in_the_loop(config["in_the_loop"])
+    simulator = build_simulator(config)
+    probe = MarkerMap.at_vertices(torch.zeros(1, 1, dtype=torch.int64))
+    make_sparse_reconstructor(simulator, probe, **config["reconstruction"])
 
 
 def _check_group(config: Mapping[str, Any], group: str) -> None:

@@ -22,7 +22,7 @@ def reconstruct_markers(context: StageContext) -> None:
     names = tuple(settings["split"]["train"])
     simulator, motions = scene.simulator(kind), scene.pick(names)
     if simulator.integrator == "midpoint":
-        # Its velocities ring where positions are prescribed step by step: v+ = 2 (q+ - q) / h - v keeps every deviation.
+        # Its velocities ring where positions are prescribed: v+ = 2 (q+ - q) / h - v keeps every deviation.
         simulator = dataclasses.replace(simulator, integrator="bdf2")
     parameters = parameters_of(context.run_dir, model, simulator.rest_positions)
     tensors = Replay(simulator, scene.markers, motions).tensors(parameters)

@@ -1,9 +1,11 @@
 """Recordings of a body, real or simulated, become markers in its frame; what cannot is refused by file and marker."""
 
 import copy
+import functools
 import json
 import logging
 import re
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 from scipy.spatial.transform import Rotation
 
+from warp_resphys import cli
 from warp_resphys.configured import build_body
 from warp_resphys.errors import DataFileError, InputError, ResphysError
 from warp_resphys.files import read_hdf5
@@ -40,10 +43,14 @@ SMALL = [
 ]
 
 
-def configuration(*overrides, experiment="beam_real"):
+@functools.cache
+def composed(*overrides):
     with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        composed = compose("config", [f"experiment={experiment}", *overrides])
-    return OmegaConf.to_container(composed, resolve=True)
+        return OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
+
+
+def configuration(*overrides, experiment="beam_real"):
+    return copy.deepcopy(composed(f"experiment={experiment}", *overrides))
 
 
 def read_json(path):
@@ -359,6 +366,47 @@ def test_the_three_beams(shared_data, tmp_path):
     assert any("Base - 1 jumps" in warning for warning in quality["load101"]["warnings"])
 
 
+class TestCommand:
+    @pytest.fixture
+    def command(self, shelf, monkeypatch, capsys):
+        """Runs the experiment on the shelf's recordings, through the command line."""
+
+        def run(*overrides):
+            trials = [f"++data.trials.{name}={{file: {name}.h5, hung: 0.0}}" for name in shelf.recordings]
+            quiet = ["hydra/job_logging=none", "hydra/hydra_logging=none"]
+            places = [f"data.folder={shelf.folder}", f"hydra.run.dir={shelf.folder / 'run'}"]
+            arguments = ["warp-resphys", "experiment=beam_real", *places, *quiet, *trials, *overrides]
+            monkeypatch.setattr(sys, "argv", arguments)
+            with pytest.raises(SystemExit) as ended:
+                cli.main()
+            err = capsys.readouterr().err
+            assert ended.value.code == 2
+            assert "Traceback" not in err
+            return err
+
+        return run
+
+    def test_a_marker_that_moved(self, shelf, command):
+        shelf.move("load52", "Base - 3", [0.002, 0.0, 0.0])
+        sentence = r"^error: .*load52\.h5: base marker Base - 3 moved by 2\.00 mm .*\n$"
+        assert re.search(sentence, command(), flags=re.MULTILINE)
+        assert not (shelf.folder / "run" / MARKERS).exists()
+
+    def test_names_that_do_not_match(self, shelf, command):
+        shelf.write("bare", labels=("a", *TIPS[1:], *BASES))
+        assert "bare.h5 has no marker named 'Tip - 1'; it has 'a'" in command()
+
+    def test_a_file_that_is_not_there(self, shelf, command):
+        err = command("data.trials.bare.file=gone.c3d")
+        assert "gone.c3d (No such file or directory): check data.folder and data.trials.bare.file." in err
+
+    def test_a_trial_in_two_splits(self, shelf, command):
+        err = command("data.folds=null", "data.train=[bare]", "data.test=[bare,load52]")
+        assert err.endswith(
+            "error: the trial 'bare' is in data.train and data.test: every trial is in one split, once.\n"
+        )
+
+
 TUTORIAL = Path(__file__).parents[1] / "docs" / "bring_your_robot.md"
 
 
@@ -463,8 +511,8 @@ TRIALS = {"a": {"file": "a.c3d", "hung": 0.0}, "b": {"file": "b.c3d", "hung": 0.
         ("published/integrator", "euler", "published.integrator is 'euler': it must be one of"),
     ],
 )
-def test_configuration_of_recordings_is_checked(tmp_path, key, value, message):
-    config = changed(configuration(f"data.folder={tmp_path}"), key, value)
+def test_configuration_of_recordings_is_checked(key, value, message):
+    config = changed(configuration("data.folder=recordings"), key, value)
     with pytest.raises(ResphysError, match=message):
         check_configuration(config)
 

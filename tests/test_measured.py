@@ -231,9 +231,40 @@ def test_each_trial_stands_where_the_mean_of_all_does(shelf):
     np.testing.assert_allclose(whole["markers"][2, 0], whole["bound"], rtol=0.0, atol=1e-3)
     shelf.move("load52", "Tip - 2", [0.0, 0.0012, 0.0])
     moved = shelf.bring_in()
+    swing, same = (found["markers"][1] - found["bound"] for found in (rest, moved))
+    np.testing.assert_allclose(swing, same, rtol=0.0, atol=4e-4)  # a registration that is turned a little
     assert moved["held"][1] == pytest.approx(moved["bound"])
     shift = read_json(shelf.folder / REGISTRATION)["load52"]["shift_mm"]["Tip - 2"]
     assert np.linalg.norm(shift) == pytest.approx(0.6 * 0.7, abs=0.2)  # half of 1.2 mm, less what the fit takes up
+
+
+def published_layout(shelf, name, first):
+    """The recording from a frame on, with the places of its markers on the undeformed body."""
+    positions = shelf.recordings[name].positions
+    shelf.write(name, positions=positions[first:], rest=np.median(positions[:40], axis=0))
+
+
+def test_recordings_that_begin_with_the_release_of_a_deformed_body(shelf):
+    """As the published ones do: a loaded beam at rest, whose weight is cut off."""
+    whole = shelf.bring_in()
+    for name in shelf.recordings:
+        published_layout(shelf, name, first=44)
+    shelf.config["data"] |= {"begins": "released", "rest": "file", "seconds": 0.4}
+    found = shelf.bring_in()
+    np.testing.assert_allclose(found["bound"], whole["bound"], rtol=0.0, atol=2e-5)
+    np.testing.assert_allclose(found["held"], found["markers"][:, 0], rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(found["times"], np.broadcast_to(np.arange(41) / RATE, (3, 41)), atol=1e-9)
+    np.testing.assert_allclose(found["markers"][2], whole["markers"][2, 3:44], rtol=0.0, atol=5e-5)
+    assert np.linalg.norm(found["held"] - found["bound"], axis=2).min() > 5e-4
+
+
+def test_a_recording_without_its_rest_is_named(shelf):
+    shelf.config["data"]["rest"] = "file"
+    refuse(shelf, r"bare\.h5 has no array 'rest' .* or set data\.rest to held")
+    rest = np.median(shelf.recordings["bare"].positions[:40], axis=0)
+    rest[1] = np.nan
+    shelf.write("bare", rest=rest)
+    refuse(shelf, r"bare\.h5: 'rest' has no place of 'Tip - 2'")
 
 
 def refuse(shelf, message, error=DataFileError):
@@ -465,6 +496,7 @@ TRIALS = {"a": {"file": "a.c3d", "hung": 0.0}, "b": {"file": "b.c3d", "hung": 0.
         ("data/up", "up", "data.up is 'up': give x, -x"),
         ("data/up", [0.0, 0.0, 0.0], "data.up is .*: give x, -x"),
         ("data/up", [0.0, 1.0], "data.up is .*: it must be x, -x"),
+        ("data/begins", "later", "data.begins is 'later': it must be one of held, released"),
         ("data/hung", {"x": 0.1}, "unknown key 'data.hung': data has kind, folder"),
         ("data/hung_on", {"x": 0.07003}, "no vertex lies within"),
         ("data/hung_on", {"x": 0.0}, "data.hung_on names fixed vertices alone"),
@@ -521,6 +553,7 @@ def test_configuration_of_recordings_is_checked(key, value, message):
     ("key", "value", "message"),
     [
         ("synthetic", None, "data.folder is not set: give the folder of the recordings"),
+        ("data/rest", "file", "data.rest is file, but simulated bodies are held undeformed"),
         ("synthetic/tilt", 45.0, "synthetic.tilt is 45.0: it must be an angle from 0 to 20 degrees"),
         ("synthetic/seconds", 1.0, "synthetic.seconds is 1.0, less than data.seconds"),
         (

@@ -66,6 +66,8 @@ _KEYS: Mapping[str, Mapping[str, Kind]] = {
         "trials": GROUP,
         "hung_on": optional(GROUP),
         "up": _UP,
+        "begins": one_of("held", "released"),
+        "rest": one_of("held", "file"),
         "seconds": POSITIVE,
         "longest_gap": COUNT,
         "folds": optional(one_of(*FOLDS)),
@@ -237,6 +239,11 @@ def _check_synthetic(config: Mapping[str, Any]) -> None:
         raise InputError("data.folder is not set: give the folder of the recordings.")
     _check_trials(config, "synthetic")
     _check_material(synthetic["material"], "synthetic.material")
+    for key in ("begins", "rest"):
+        if config["data"][key] != "held":
+            raise InputError(
+                f"data.{key} is {config['data'][key]}, but simulated bodies are held undeformed: set it to held."
+            )
     if synthetic["seconds"] < config["data"]["seconds"]:
         raise InputError(
             f"synthetic.seconds is {synthetic['seconds']}, less than data.seconds ({config['data']['seconds']}): "

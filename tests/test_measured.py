@@ -30,6 +30,7 @@ from warp_resphys.tasks.measured.stages import import_stages
 from warp_resphys.tasks.measured.synthesise import make_scene, reality, simulate
 from warp_resphys.tasks.measured.trials import folds_of, split_of, trials_of, vertical
 
+ROOT = Path(__file__).parents[1]
 TIPS, BASES = tuple(f"Tip - {i}" for i in (1, 2, 3)), tuple(f"Base - {i}" for i in (1, 2, 3))
 RATE = 100.0
 SMALL = [
@@ -438,7 +439,7 @@ class TestCommand:
         )
 
 
-TUTORIAL = Path(__file__).parents[1] / "docs" / "bring_your_robot.md"
+TUTORIAL = ROOT / "docs" / "bring_your_robot.md"
 
 
 def test_the_tutorial(shared_data, tmp_path, monkeypatch):
@@ -574,6 +575,20 @@ def test_configuration_of_recordings_is_checked(key, value, message):
 def test_configuration_of_a_simulated_laboratory_is_checked(key, value, message):
     with pytest.raises(ResphysError, match=message):
         check_configuration(changed(configuration(), key, value))
+
+
+GROUPS = ("physics", "solver", "reconstruction", "network", "trainer", "budget")
+OPTIONS = [(group, path.stem) for group in GROUPS for path in sorted((ROOT / "conf" / group).glob("*.yaml"))]
+
+
+@pytest.mark.parametrize(("group", "option"), OPTIONS)
+def test_every_option_goes_with_recordings(group, option):
+    check_configuration(configuration(f"{group}={option}"))
+
+
+def test_refinement_is_refused():
+    with pytest.raises(InputError, match="refinement is for simulated experiments"):
+        check_configuration(configuration("refinement=solver_in_the_loop"))
 
 
 def test_folds_and_splits(tmp_path):

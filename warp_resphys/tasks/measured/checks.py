@@ -160,6 +160,8 @@ def check_measured(config: Mapping[str, Any]) -> None:
 
 def _check_learning(config: Mapping[str, Any]) -> None:
     """What the stages after the import are set to."""
+    if config["refinement"]["kind"] != "none":
+        raise InputError("refinement is for simulated experiments: recordings train through the simulator anyhow.")
     check_in_the_loop(config["in_the_loop"])
     _check_identification(config["identify"])
     simulator = build_simulator(config)

@@ -1,8 +1,12 @@
 """Recordings of a body, real or simulated, become markers in its frame; what cannot is refused by file and marker."""
 
 import copy
+import functools
 import json
 import logging
+import re
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +15,7 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 from scipy.spatial.transform import Rotation
 
+from warp_resphys import cli
 from warp_resphys.configured import build_body
 from warp_resphys.errors import DataFileError, InputError, ResphysError
 from warp_resphys.files import read_hdf5
@@ -25,6 +30,7 @@ from warp_resphys.tasks.measured.stages import import_stages
 from warp_resphys.tasks.measured.synthesise import make_scene, reality, simulate
 from warp_resphys.tasks.measured.trials import folds_of, split_of, trials_of, vertical
 
+ROOT = Path(__file__).parents[1]
 TIPS, BASES = tuple(f"Tip - {i}" for i in (1, 2, 3)), tuple(f"Base - {i}" for i in (1, 2, 3))
 RATE = 100.0
 SMALL = [
@@ -38,10 +44,14 @@ SMALL = [
 ]
 
 
-def configuration(*overrides):
+@functools.cache
+def composed(*overrides):
     with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        composed = compose("config", ["experiment=beam_real", *overrides])
-    return OmegaConf.to_container(composed, resolve=True)
+        return OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
+
+
+def configuration(*overrides, experiment="beam_real"):
+    return copy.deepcopy(composed(f"experiment={experiment}", *overrides))
 
 
 def read_json(path):
@@ -222,9 +232,40 @@ def test_each_trial_stands_where_the_mean_of_all_does(shelf):
     np.testing.assert_allclose(whole["markers"][2, 0], whole["bound"], rtol=0.0, atol=1e-3)
     shelf.move("load52", "Tip - 2", [0.0, 0.0012, 0.0])
     moved = shelf.bring_in()
+    swing, same = (found["markers"][1] - found["bound"] for found in (rest, moved))
+    np.testing.assert_allclose(swing, same, rtol=0.0, atol=4e-4)  # a registration that is turned a little
     assert moved["held"][1] == pytest.approx(moved["bound"])
     shift = read_json(shelf.folder / REGISTRATION)["load52"]["shift_mm"]["Tip - 2"]
     assert np.linalg.norm(shift) == pytest.approx(0.6 * 0.7, abs=0.2)  # half of 1.2 mm, less what the fit takes up
+
+
+def published_layout(shelf, name, first):
+    """The recording from a frame on, with the places of its markers on the undeformed body."""
+    positions = shelf.recordings[name].positions
+    shelf.write(name, positions=positions[first:], rest=np.median(positions[:40], axis=0))
+
+
+def test_recordings_that_begin_with_the_release_of_a_deformed_body(shelf):
+    """As the published ones do: a loaded beam at rest, whose weight is cut off."""
+    whole = shelf.bring_in()
+    for name in shelf.recordings:
+        published_layout(shelf, name, first=44)
+    shelf.config["data"] |= {"begins": "released", "rest": "file", "seconds": 0.4}
+    found = shelf.bring_in()
+    np.testing.assert_allclose(found["bound"], whole["bound"], rtol=0.0, atol=2e-5)
+    np.testing.assert_allclose(found["held"], found["markers"][:, 0], rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(found["times"], np.broadcast_to(np.arange(41) / RATE, (3, 41)), atol=1e-9)
+    np.testing.assert_allclose(found["markers"][2], whole["markers"][2, 3:44], rtol=0.0, atol=5e-5)
+    assert np.linalg.norm(found["held"] - found["bound"], axis=2).min() > 5e-4
+
+
+def test_a_recording_without_its_rest_is_named(shelf):
+    shelf.config["data"]["rest"] = "file"
+    refuse(shelf, r"bare\.h5 has no array 'rest' .* or set data\.rest to held")
+    rest = np.median(shelf.recordings["bare"].positions[:40], axis=0)
+    rest[1] = np.nan
+    shelf.write("bare", rest=rest)
+    refuse(shelf, r"bare\.h5: 'rest' has no place of 'Tip - 2'")
 
 
 def refuse(shelf, message, error=DataFileError):
@@ -357,6 +398,81 @@ def test_the_three_beams(shared_data, tmp_path):
     assert any("Base - 1 jumps" in warning for warning in quality["load101"]["warnings"])
 
 
+class TestCommand:
+    @pytest.fixture
+    def command(self, shelf, monkeypatch, capsys):
+        """Runs the experiment on the shelf's recordings, through the command line."""
+
+        def run(*overrides):
+            trials = [f"++data.trials.{name}={{file: {name}.h5, hung: 0.0}}" for name in shelf.recordings]
+            quiet = ["hydra/job_logging=none", "hydra/hydra_logging=none"]
+            places = [f"data.folder={shelf.folder}", f"hydra.run.dir={shelf.folder / 'run'}"]
+            arguments = ["warp-resphys", "experiment=beam_real", *places, *quiet, *trials, *overrides]
+            monkeypatch.setattr(sys, "argv", arguments)
+            with pytest.raises(SystemExit) as ended:
+                cli.main()
+            err = capsys.readouterr().err
+            assert ended.value.code == 2
+            assert "Traceback" not in err
+            return err
+
+        return run
+
+    def test_a_marker_that_moved(self, shelf, command):
+        shelf.move("load52", "Base - 3", [0.002, 0.0, 0.0])
+        sentence = r"^error: .*load52\.h5: base marker Base - 3 moved by 2\.00 mm .*\n$"
+        assert re.search(sentence, command(), flags=re.MULTILINE)
+        assert not (shelf.folder / "run" / MARKERS).exists()
+
+    def test_names_that_do_not_match(self, shelf, command):
+        shelf.write("bare", labels=("a", *TIPS[1:], *BASES))
+        assert "bare.h5 has no marker named 'Tip - 1'; it has 'a'" in command()
+
+    def test_a_file_that_is_not_there(self, shelf, command):
+        err = command("data.trials.bare.file=gone.c3d")
+        assert "gone.c3d (No such file or directory): check data.folder and data.trials.bare.file." in err
+
+    def test_a_trial_in_two_splits(self, shelf, command):
+        err = command("data.folds=null", "data.train=[bare]", "data.test=[bare,load52]")
+        assert err.endswith(
+            "error: the trial 'bare' is in data.train and data.test: every trial is in one split, once.\n"
+        )
+
+
+TUTORIAL = ROOT / "docs" / "bring_your_robot.md"
+
+
+def test_the_tutorial(shared_data, tmp_path, monkeypatch):
+    """Its mesh, its configuration and its output, on the recordings that it was written with."""
+    blocks = re.findall(r"```(\w*)\n(.*?)```", TUTORIAL.read_text(encoding="utf-8"), flags=re.DOTALL)
+    (mesh,), (written,) = ([text for kind, text in blocks if kind == wanted] for wanted in ("python", "yaml"))
+    (log,) = [text.splitlines() for _, text in blocks if text.startswith("import: ")]
+    monkeypatch.chdir(tmp_path)
+    exec(compile(mesh, TUTORIAL.name, "exec"), {})
+    (tmp_path / "recordings").symlink_to(shared_data / "beam_mocap")
+    place = tmp_path / "configs" / "experiment" / "my_robot.yaml"
+    place.parent.mkdir(parents=True)
+    place.write_text(written)
+    assert len(written.splitlines()) < 36
+    config = configuration(f"hydra.searchpath=[file://{tmp_path / 'configs'}]", experiment="my_robot")
+    check_configuration(config)
+    run_stages(import_stages(config), tmp_path)
+    quality, registration = read_json(tmp_path / QUALITY), read_json(tmp_path / REGISTRATION)
+    for line, (name, each) in zip(log, quality.items(), strict=True):
+        rms = registration[name]["rms_mm"]
+        assert line == f"import: {name} is let go in frame {each['release_frame']:.1f}, registered to {rms:.2f} mm"
+
+
+def test_an_experiment_may_set_gravity(tmp_path):
+    place = tmp_path / "experiment" / "hanging.yaml"
+    place.parent.mkdir()
+    place.write_text("# @package _global_\ndefaults: [beam_real, _self_]\nname: hanging\ngravity: [9.81, 0.0, 0.0]\n")
+    config = configuration(f"hydra.searchpath=[file://{tmp_path}]", experiment="hanging")
+    assert config["gravity"] == [9.81, 0.0, 0.0]
+    given = configuration(f"hydra.searchpath=[file://{tmp_path}]", "gravity=[0,0,-1]", experiment="hanging")
+    assert given["gravity"] == [0, 0, -1]
+
+
 def changed(config, key, value):
     *path, last = key.split("/")
     group = config
@@ -375,12 +491,13 @@ TRIALS = {"a": {"file": "a.c3d", "hung": 0.0}, "b": {"file": "b.c3d", "hung": 0.
         ("data/seconds", 0.0, "data.seconds is 0.0: it must be a positive number"),
         ("data/seconds", "long", "data.seconds is 'long': it must be a positive number"),
         ("data/longest_gap", 2.5, "data.longest_gap is 2.5: it must be a whole number"),
-        ("data/units", "inch", "data.units is 'inch': it must be m, cm or mm"),
-        ("data/units", ["m"], r"data.units is \['m'\]: it must be m, cm or mm"),
-        ("data/folds", "five", "data.folds is 'five': it must be leave_one_out, or null"),
+        ("data/units", "inch", "data.units is 'inch': it must be one of m, cm, mm"),
+        ("data/units", ["m"], r"data.units is \['m'\]: it must be one of m, cm, mm"),
+        ("data/folds", "five", "data.folds is 'five': it must be one of leave_one_out"),
         ("data/up", "up", "data.up is 'up': give x, -x"),
         ("data/up", [0.0, 0.0, 0.0], "data.up is .*: give x, -x"),
         ("data/up", [0.0, 1.0], "data.up is .*: it must be x, -x"),
+        ("data/begins", "later", "data.begins is 'later': it must be one of held, released"),
         ("data/hung", {"x": 0.1}, "unknown key 'data.hung': data has kind, folder"),
         ("data/hung_on", {"x": 0.07003}, "no vertex lies within"),
         ("data/hung_on", {"x": 0.0}, "data.hung_on names fixed vertices alone"),
@@ -405,12 +522,30 @@ TRIALS = {"a": {"file": "a.c3d", "hung": 0.0}, "b": {"file": "b.c3d", "hung": 0.
         ("markers/largest_residual", -1.0, "markers.largest_residual is -1.0: it must be a positive number"),
         ("published/simulation/colour", "red", "unknown key 'published.simulation.colour'"),
         ("published/simulation/poissons_ratio", 0.6, "published.simulation: poissons_ratio is 0.6"),
-        ("published/physics/mass", "heavy", "published.physics is .*: it needs mass"),
+        ("published/physics/mass", "heavy", "published.physics.mass is 'heavy': it must be one of row_sum"),
+        ("published/physics", {"mass": "row_sum"}, "published.physics.volume_integration is missing"),
+        ("release", None, "release is None: it must be a group of settings"),
+        ("release/window", "x", "release.window is 'x': it must be a positive number"),
+        ("release/colour", 1, "unknown key 'release.colour': release has hold_modes"),
+        ("in_the_loop/epochs", 0, "in_the_loop.epochs is 0: it must be a whole number, one or more"),
+        ("identify/starts", "two", "identify.starts is 'two': it must be a whole number"),
+        ("identify/parameters", {}, "identify.parameters is empty"),
+        ("identify/parameters/colour", {"lower": 0.0, "upper": 1.0}, "identify.parameters names 'colour'"),
+        ("identify/parameters/density", {"lower": 0.0}, "identify.parameters.density.upper is missing"),
+        (
+            "identify/parameters/density",
+            {"lower": 2.0, "upper": 1.0},
+            "identify.parameters.density: the bounds 2 and 1",
+        ),
+        ("identify/grid/youngs_modulus/points", 0, "identify.grid.youngs_modulus.points is 0"),
+        ("identify/grid/youngs_modulus/lower", 1e9, "identify.grid.youngs_modulus: the bounds"),
+        ("identify/first_guess/mass_damping", 50.0, "identify.first_guess.mass_damping is 50.0: .* from 0 to 10"),
+        ("identify/first_guess/colour", 1.0, "identify.first_guess names 'colour'"),
         ("published/integrator", "euler", "published.integrator is 'euler': it must be one of"),
     ],
 )
-def test_configuration_of_recordings_is_checked(tmp_path, key, value, message):
-    config = changed(configuration(f"data.folder={tmp_path}"), key, value)
+def test_configuration_of_recordings_is_checked(key, value, message):
+    config = changed(configuration("data.folder=recordings"), key, value)
     with pytest.raises(ResphysError, match=message):
         check_configuration(config)
 
@@ -419,6 +554,7 @@ def test_configuration_of_recordings_is_checked(tmp_path, key, value, message):
     ("key", "value", "message"),
     [
         ("synthetic", None, "data.folder is not set: give the folder of the recordings"),
+        ("data/rest", "file", "data.rest is file, but simulated bodies are held undeformed"),
         ("synthetic/tilt", 45.0, "synthetic.tilt is 45.0: it must be an angle from 0 to 20 degrees"),
         ("synthetic/seconds", 1.0, "synthetic.seconds is 1.0, less than data.seconds"),
         (
@@ -439,6 +575,20 @@ def test_configuration_of_recordings_is_checked(tmp_path, key, value, message):
 def test_configuration_of_a_simulated_laboratory_is_checked(key, value, message):
     with pytest.raises(ResphysError, match=message):
         check_configuration(changed(configuration(), key, value))
+
+
+GROUPS = ("physics", "solver", "reconstruction", "network", "trainer", "budget")
+OPTIONS = [(group, path.stem) for group in GROUPS for path in sorted((ROOT / "conf" / group).glob("*.yaml"))]
+
+
+@pytest.mark.parametrize(("group", "option"), OPTIONS)
+def test_every_option_goes_with_recordings(group, option):
+    check_configuration(configuration(f"{group}={option}"))
+
+
+def test_refinement_is_refused():
+    with pytest.raises(InputError, match="refinement is for simulated experiments"):
+        check_configuration(configuration("refinement=solver_in_the_loop"))
 
 
 def test_folds_and_splits(tmp_path):

@@ -1,9 +1,8 @@
-"""Checks of the groups that experiments on recordings have: data, markers, synthetic and published."""
+"""Checks of the groups that experiments on recordings have, before any of them is read."""
 
 import inspect
 import re
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,15 +12,33 @@ from ...body import MASS_MODES
 from ...configured import build_body, build_mesh, build_simulator
 from ...elements import VOLUME_INTEGRATIONS
 from ...errors import InputError
+from ...identification import Bounds
 from ...integrator import INTEGRATORS
 from ...markers import KINDS, MarkerMap
 from ...material import Material
 from ...mesh import select_vertices
 from ...recordings.recording import METRES_PER_UNIT
-from ...release import ReleaseSettings
+from ...replay import PARAMETERS
 from ...residual.markers_in_the_loop import check_in_the_loop
 from ...residual.sparse_reconstruction import make_sparse_reconstructor
-from ..kinds import is_finite, is_number, is_whole_number, is_word
+from ..kinds import (
+    COUNT,
+    FINITE,
+    GROUP,
+    NATURAL,
+    NOT_NEGATIVE,
+    POSITIVE,
+    TRUTH_VALUE,
+    WORD,
+    Kind,
+    check_keys,
+    is_finite,
+    is_number,
+    is_word,
+    one_of,
+    optional,
+)
+from ..trajectories import SPLITS
 from .files import attached_mass
 from .identify import check_identification
 from .trials import FOLDS, folds_of, is_synthetic, split_of, trials_of, vertical
@@ -30,74 +47,79 @@ RECORDINGS = "recordings"  # this kind of data
 _NAME = r"[\w-]+"
 
 
-@dataclass(frozen=True)
-class _Kind:
-    fits: Callable[[Any], bool]
-    wanted: str
-
-
 def _is_place(value: Any) -> bool:
     return isinstance(value, list) and len(value) == 3 and all(map(is_finite, value))
 
 
-_WORD = _Kind(is_word, "a word")
-_GROUP = _Kind(lambda value: isinstance(value, Mapping), "a group of settings")
-_POSITIVE = _Kind(lambda value: is_finite(value) and value > 0.0, "a positive number")
-_NOT_NEGATIVE = _Kind(lambda value: is_finite(value) and value >= 0.0, "a number, zero or more")
-_COUNT = _Kind(lambda value: is_whole_number(value) and value >= 0, "a whole number, zero or more")
-_NAMES = _Kind(lambda value: isinstance(value, list) and all(map(is_word, value)), "a list of names of trials")
-_SPLIT = {"train": _NAMES, "validation": _NAMES, "test": _NAMES}
-_UP = _Kind(lambda value: is_word(value) or _is_place(value), "x, -x, y, -y, z, -z, three numbers, or null")
+_NAMES = Kind(lambda value: isinstance(value, list) and all(map(is_word, value)), "a list of names of trials")
+_SPLIT = dict.fromkeys(SPLITS, _NAMES)
+_UP = Kind(
+    lambda value: is_word(value) or _is_place(value), "x, -x, y, -y, z, -z, three numbers, or null", optional=True
+)
 
-# Keys of each group; those in _OPTIONAL may be null.
-_KEYS: Mapping[str, Mapping[str, _Kind]] = {
+_KEYS: Mapping[str, Mapping[str, Kind]] = {
     "data": {
-        "kind": _WORD,
-        "folder": _WORD,
-        "units": _Kind(lambda value: is_word(value) and value in METRES_PER_UNIT, "m, cm or mm"),
-        "rate": _POSITIVE,
-        "trials": _GROUP,
-        "hung_on": _GROUP,
+        "kind": WORD,
+        "folder": optional(WORD),
+        "units": optional(one_of(*METRES_PER_UNIT)),
+        "rate": optional(POSITIVE),
+        "trials": GROUP,
+        "hung_on": optional(GROUP),
         "up": _UP,
-        "seconds": _POSITIVE,
-        "longest_gap": _COUNT,
-        "folds": _Kind(lambda value: value in FOLDS, f"{' or '.join(FOLDS)}, or null"),
+        "begins": one_of("held", "released"),
+        "rest": one_of("held", "file"),
+        "seconds": POSITIVE,
+        "longest_gap": COUNT,
+        "folds": optional(one_of(*FOLDS)),
         **_SPLIT,
     },
     "markers": {
-        "followed": _GROUP,
-        "others": _GROUP,
-        "bind": _Kind(lambda value: value in KINDS, f"one of {', '.join(KINDS)}"),
-        "bind_to": _GROUP,
-        "largest_residual": _POSITIVE,
-        "largest_distance": _POSITIVE,
-        "largest_distortion": _POSITIVE,
-        "largest_shift": _POSITIVE,
+        "followed": GROUP,
+        "others": GROUP,
+        "bind": one_of(*KINDS),
+        "bind_to": optional(GROUP),
+        "largest_residual": POSITIVE,
+        "largest_distance": POSITIVE,
+        "largest_distortion": POSITIVE,
+        "largest_shift": optional(POSITIVE),
     },
     "synthetic": {
-        "mesh": _GROUP,
-        "time_step": _POSITIVE,
-        "integrator": _Kind(lambda value: value in INTEGRATORS, f"one of {', '.join(INTEGRATORS)}"),
-        "material": _GROUP,
-        "rate": _POSITIVE,
-        "noise": _NOT_NEGATIVE,
-        "misplaced": _NOT_NEGATIVE,
-        "tilt": _Kind(lambda value: is_finite(value) and 0.0 <= value <= 20.0, "an angle from 0 to 20 degrees"),
-        "held_seconds": _Kind(lambda value: is_finite(value) and value >= 0.25, "0.25 s or more"),
-        "seconds": _POSITIVE,
-        "trials": _GROUP,
+        "mesh": GROUP,
+        "time_step": POSITIVE,
+        "integrator": one_of(*INTEGRATORS),
+        "material": GROUP,
+        "rate": POSITIVE,
+        "noise": NOT_NEGATIVE,
+        "misplaced": NOT_NEGATIVE,
+        "tilt": Kind(lambda value: is_finite(value) and 0.0 <= value <= 20.0, "an angle from 0 to 20 degrees"),
+        "held_seconds": Kind(lambda value: is_finite(value) and value >= 0.25, "0.25 s or more"),
+        "seconds": POSITIVE,
+        "trials": GROUP,
         **_SPLIT,
     },
-    "published": {
-        "simulation": _GROUP,
-        "physics": _GROUP,
-        "integrator": _Kind(lambda value: value in INTEGRATORS, f"one of {', '.join(INTEGRATORS)}"),
+    "published": {"simulation": GROUP, "physics": GROUP, "integrator": one_of(*INTEGRATORS)},
+    "published.physics": {"mass": one_of(*MASS_MODES), "volume_integration": one_of(*VOLUME_INTEGRATIONS)},
+    "release": {
+        "hold_modes": COUNT,
+        "velocity_modes": COUNT,
+        "window": POSITIVE,
+        "noise": POSITIVE,
+        "delay": NOT_NEGATIVE,
+        "speed": POSITIVE,
+        "iterations": NATURAL,
     },
+    "identify": {
+        "integrator": one_of(*INTEGRATORS),
+        "parameters": GROUP,
+        "first_guess": GROUP,
+        "starts": NATURAL,
+        "candidates": COUNT,
+        "max_iterations": NATURAL,
+        "grid": GROUP,
+    },
+    "in_the_loop": {"epochs": NATURAL, "penalty": NOT_NEGATIVE, "memory": NATURAL, "rollout_every": NATURAL},
 }
-_OPTIONAL = (
-    *("data.folder", "data.units", "data.rate", "data.hung_on", "data.up", "data.folds"),
-    *("markers.bind_to", "markers.largest_shift"),
-)
+_RANGE = {"lower": FINITE, "upper": FINITE}
 _OF_THE_BUDGET = ("limit", "steps")  # keys of `data` that the group budget sets for every experiment
 
 
@@ -111,11 +133,12 @@ def check_measured(config: Mapping[str, Any]) -> None:
         InputError: a value of the wrong kind or out of range, or an unknown key.
         MeshError: a place where no vertex lies.
     """
-    for group in ("data", "markers"):
-        _check_group(config, group)
+    check_keys("data", config["data"], _KEYS["data"], _OF_THE_BUDGET)
+    for group in ("markers", "release", "identify", "in_the_loop"):
+        check_keys(group, config.get(group), _KEYS[group])
     for group in ("synthetic", "published"):
         if config[group] is not None:
-            _check_group(config, group)
+            check_keys(group, config[group], _KEYS[group])
     _check_trials(config, "data")
     _check_markers(config)
     vertical(config["data"]["up"])
@@ -123,11 +146,7 @@ def check_measured(config: Mapping[str, Any]) -> None:
         _check_synthetic(config)
     if config["published"] is not None:
         _check_material(config["published"]["simulation"], "published.simulation")
-        physics = config["published"]["physics"]
-        wanted = {"mass": MASS_MODES, "volume_integration": VOLUME_INTEGRATIONS}
-        if physics.keys() != wanted.keys() or any(physics[key] not in known for key, known in wanted.items()):
-            known = " and ".join(f"{key} ({' or '.join(names)})" for key, names in wanted.items())
-            raise InputError(f"published.physics is {dict(physics)}: it needs {known}.")
+        check_keys("published.physics", config["published"]["physics"], _KEYS["published.physics"])
     if folds_of(config) is None:
         split_of(config)
     body = build_body(config)
@@ -141,35 +160,37 @@ def check_measured(config: Mapping[str, Any]) -> None:
 
 def _check_learning(config: Mapping[str, Any]) -> None:
     """What the stages after the import are set to."""
-    for group in ("release", "identify", "in_the_loop"):
-        if not isinstance(config.get(group), Mapping):
-            raise InputError(f"{group} is {config.get(group)!r}: it must be a group of settings.")
-    try:
-        ReleaseSettings(**config["release"])
-    except TypeError as error:
-        raise InputError(f"release: {error}; see conf/measured/default.yaml for its keys.") from error
-    check_identification(config["identify"])
+    if config["refinement"]["kind"] != "none":
+        raise InputError("refinement is for simulated experiments: recordings train through the simulator anyhow.")
     check_in_the_loop(config["in_the_loop"])
+    _check_identification(config["identify"])
     simulator = build_simulator(config)
     probe = MarkerMap.at_vertices(torch.zeros(1, 1, dtype=torch.int64))
     make_sparse_reconstructor(simulator, probe, **config["reconstruction"])
 
 
-def _check_group(config: Mapping[str, Any], group: str) -> None:
-    settings = config[group]
-    if not isinstance(settings, Mapping):
-        raise InputError(f"{group} is {settings!r}: it must be a group of settings.")
-    known = _KEYS[group]
-    allowed = (*known, *(_OF_THE_BUDGET if group == "data" else ()))
-    for key in settings:
-        if key not in allowed:
-            raise InputError(f"unknown key '{group}.{key}': {group} has {', '.join(known)}.")
-    for key, kind in known.items():
-        if key not in settings:
-            raise InputError(f"{group}.{key} is missing: set it, or begin with the defaults of the group measured.")
-        value = settings[key]
-        if not (value is None and f"{group}.{key}" in _OPTIONAL) and not kind.fits(value):
-            raise InputError(f"{group}.{key} is {value!r}: it must be {kind.wanted}.")
+def _check_identification(identify: Mapping[str, Any]) -> None:
+    if not identify["parameters"]:
+        raise InputError(f"identify.parameters is empty: give a range of one or more of {', '.join(PARAMETERS)}.")
+    for group, needed, others in (
+        ("parameters", _RANGE, ("logarithmic",)),
+        ("grid", {**_RANGE, "logarithmic": TRUTH_VALUE, "points": NATURAL}, ()),
+    ):
+        for name, settings in identify[group].items():
+            check_keys(f"identify.{group}.{name}", settings, needed, others)
+    check_identification(identify)
+    for name, each in identify["grid"].items():
+        try:
+            Bounds(each["lower"], each["upper"], each["logarithmic"])
+        except InputError as error:
+            raise InputError(f"identify.grid.{name}: {error}") from error
+    for name, value in identify["first_guess"].items():
+        if name not in PARAMETERS:
+            raise InputError(f"identify.first_guess names '{name}': choose from {', '.join(PARAMETERS)}.")
+        within = identify["parameters"].get(name)
+        if not is_finite(value) or (within is not None and not within["lower"] <= value <= within["upper"]):
+            wanted = "" if within is None else f" from {within['lower']:g} to {within['upper']:g}, its range"
+            raise InputError(f"identify.first_guess.{name} is {value!r}: it must be a number{wanted}.")
 
 
 def _check_trials(config: Mapping[str, Any], group: str) -> None:
@@ -185,7 +206,7 @@ def _check_trials(config: Mapping[str, Any], group: str) -> None:
             raise InputError(f"{at}: files are named after trials: use letters, digits, _ and -, not digits alone.")
         if not isinstance(trial, Mapping) or set(trial) != set(keys):
             raise InputError(f"{at} is {trial!r}: it needs {' and '.join(keys)}, and nothing else.")
-        if not _NOT_NEGATIVE.fits(trial["hung"]):
+        if not NOT_NEGATIVE.fits(trial["hung"]):
             raise InputError(f"{at}.hung is {trial['hung']!r}: it must be a mass, zero or more, in kg.")
         if "file" in trial:
             file = trial["file"]
@@ -220,6 +241,11 @@ def _check_synthetic(config: Mapping[str, Any]) -> None:
         raise InputError("data.folder is not set: give the folder of the recordings.")
     _check_trials(config, "synthetic")
     _check_material(synthetic["material"], "synthetic.material")
+    for key in ("begins", "rest"):
+        if config["data"][key] != "held":
+            raise InputError(
+                f"data.{key} is {config['data'][key]}, but simulated bodies are held undeformed: set it to held."
+            )
     if synthetic["seconds"] < config["data"]["seconds"]:
         raise InputError(
             f"synthetic.seconds is {synthetic['seconds']}, less than data.seconds ({config['data']['seconds']}): "

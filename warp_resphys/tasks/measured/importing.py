@@ -35,6 +35,7 @@ FloatArray = NDArray[np.float64]
 _LEAST_RATE = 40.0  # Hz; the first tenth of a second tells how a body was let go, and four frames are few for that
 _LARGEST_LEAN = 30.0  # degrees between the vertical of a recording and the configured gravity
 _MILLI = 1e3
+_START = Release(0.0, (0, 1))  # of a recording that begins with it
 
 
 @dataclass(frozen=True)
@@ -45,13 +46,15 @@ class Observed:
         trial: its name and load.
         recording: the configured markers, the followed ones first, as measured.
         release: when the body was let go.
-        registration: of its markers while it was held.
+        registration: of its markers on the undeformed body.
+        held: (M, 3) where its markers were while it was held, in the frame of the recording [m].
     """
 
     trial: Trial
     recording: Recording
     release: Release
     registration: Registration
+    held: FloatArray
 
 
 def import_recordings(context: StageContext) -> None:
@@ -76,6 +79,7 @@ def import_recordings(context: StageContext) -> None:
     frames = max(len(each.positions) for each in moving)
     times = np.stack([np.pad(each.time, (0, frames - len(each.time)), mode="edge") for each in moving])
     positions = np.full((len(moving), frames, len(followed), 3), np.nan)
+    held = np.stack([each.registration.transform.apply(each.held[columns]) for each in observed]) + shifts
     for row, (each, swing) in enumerate(zip(observed, moving, strict=True)):
         seen = each.registration.transform.apply(swing.positions.reshape(-1, 3)).reshape(swing.positions.shape)
         positions[row, : len(seen)] = seen + shifts[row]
@@ -94,7 +98,7 @@ def import_recordings(context: StageContext) -> None:
     with atomic_hdf5(context.run_dir / MARKERS, "markers", attributes) as file:
         create(file, "times", times, units="s", time_axis=1)
         create(file, "markers", positions, units="m", time_axis=1)
-        create(file, "held", places + shifts, units="m")
+        create(file, "held", held, units="m")
         create(file, "bound", bound, units="m")
         create(file, "load", [each.trial.hung for each in observed], units="kg")
     write_json(context.run_dir / QUALITY, {name: found.to_plain() for name, found in quality_of.items()})
@@ -123,7 +127,11 @@ def observe(settings: Mapping[str, Any], run_dir: Path) -> list[Observed]:
     trials = trials_of(settings)
     recordings = [_read(trial, data, run_dir, is_synthetic(settings)).select(list(nominal)) for trial in trials]
     _check_rates(recordings, settings["time_step"])
-    releases = [release_of(each, list(markers["followed"]), data["longest_gap"]) for each in recordings]
+    followed = list(markers["followed"])
+    releases = [
+        _START if data["begins"] == "released" else release_of(each, followed, data["longest_gap"])
+        for each in recordings
+    ]
     held = [
         replace(each, positions=each.positions[slice(*at.rest)]) for each, at in zip(recordings, releases, strict=True)
     ]
@@ -136,8 +144,9 @@ def observe(settings: Mapping[str, Any], run_dir: Path) -> list[Observed]:
         )
     found = []
     for trial, recording, release, still in zip(trials, recordings, releases, held, strict=True):
+        places = _places(still, followed)
         registration = register_markers(
-            _places(still, list(markers["followed"])),
+            places if data["rest"] == "held" else _rest(recording, followed),
             list(nominal.values()),
             list(nominal),
             source=recording.source,
@@ -148,7 +157,7 @@ def observe(settings: Mapping[str, Any], run_dir: Path) -> list[Observed]:
             "import: %s is let go in frame %.1f, registered to %.2f mm%s",
             *(trial.name, release.frame, _MILLI * registration.rms, off),
         )
-        found.append(Observed(trial, recording, release, registration))
+        found.append(Observed(trial, recording, release, registration, places))
     return found
 
 
@@ -188,6 +197,19 @@ def _places(held: Recording, followed: Sequence[str]) -> FloatArray:
     known = [label not in hidden for label in held.labels]
     places[known] = np.nanmedian(held.positions[:, known], axis=0)
     return places
+
+
+def _rest(recording: Recording, followed: Sequence[str]) -> FloatArray:
+    """(M, 3) the markers on the undeformed body, as the file has them [m]."""
+    if recording.rest is None:
+        raise DataFileError(
+            f"{recording.source} has no array 'rest' that tells where its markers are on the undeformed body: add it "
+            "(docs/recordings.md), or set data.rest to held if the body is held undeformed."
+        )
+    lost = [label for label in followed if not np.isfinite(recording.rest[recording.labels.index(label)]).all()]
+    if lost:
+        raise DataFileError(f"{recording.source}: 'rest' has no place of {listed(lost)}; leave it out of the markers.")
+    return recording.rest
 
 
 def _moving(each: Observed, followed: Sequence[str], data: Mapping[str, Any]) -> Recording:

@@ -113,7 +113,7 @@ def write_recordings(folder: Path, trials=TRIALS):
             "rms_mm": 0.82 + 0.1 * number,
             "residual_mm": residual,
             "outliers": ["Base - 3"] if number == 2 else [],
-            "shift_mm": dict.fromkeys(FOLLOWED, [0.2, 0.2, 0.2]),
+            "shift_mm": {label: [0.2, 0.2, 0.2] for label in FOLLOWED},
             "positions": dict(zip(labels, np.concatenate([bound + 2e-4, base + 5e-4]).tolist(), strict=True)),
         }
     write_json(folder / "quality.json", quality)

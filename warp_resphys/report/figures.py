@@ -55,9 +55,6 @@ LABELS: Final[Mapping[str, str]] = {
     "simfree": "SimFree",
     "resphys": "Corrected (ResPhys)",
     "published_network": "Published network",
-    "published": "Published setting",
-    "sysid_elastic": "SysID, E and ν",  # noqa: RUF001
-    "resphys_uncorrected": "ResPhys, data sheet",
 }
 LARGEST_SHOWN: Final = 1e5  # Of an error [mm], or a loss.
 FONT: Final = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, 'DejaVu Sans', sans-serif"
@@ -310,7 +307,7 @@ def new_figure(height: float, narrow_height: float, *, narrow: bool) -> Figure:
 
 
 def legend_above(figure: Figure, axes: Axes, *, narrow: bool) -> None:
-    """The legend above the figure: in rows of four, or of two where there is less room."""
+    """Put the legend above the figure: in rows of four, or of two where there is less room."""
     handles, labels = axes.get_legend_handles_labels()
     columns = 2 if narrow else len(labels) if len(labels) <= _LEGEND_ROW else _LEGEND_ROW - 1
     figure.legend(handles, labels, loc="outside upper left", ncols=columns, columnspacing=1.6)
@@ -334,7 +331,7 @@ def _rollout_curve(axes: Axes, epochs: FloatArray, errors: FloatArray) -> None:
 
 
 def positive(values: FloatArray) -> FloatArray:
-    """What a logarithmic axis can show; the rest, and what a blown-up roll-out reaches, becomes a gap."""
+    """Return what a logarithmic axis can show; the rest, and what a blown-up roll-out reaches, becomes a gap."""
     return np.where((values > 0.0) & (values < LARGEST_SHOWN), values, np.nan)
 
 

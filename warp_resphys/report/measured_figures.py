@@ -11,7 +11,6 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
 from warp_resphys.report.figures import (
-    LABELS,
     NARROW,
     ROUND_STEPS,
     STYLE,
@@ -22,11 +21,13 @@ from warp_resphys.report.figures import (
     positive,
     use_logarithm,
 )
+from warp_resphys.report.measured_tables import MODELS
 
 FloatArray = NDArray[np.float64]
 
 _DASHED: Final = {"published": (0, (1, 1.2)), "sysid_elastic": (0, (4, 2)), "resphys_uncorrected": (0, (4, 2))}
 _LEVELS: Final = 14  # Of a landscape.
+_LEAST_SPAN: Final = 0.08  # Of a coordinate's axis, over the largest motion of the trial.
 _KILO: Final = 1e-3
 _MILLI: Final = 1e3
 
@@ -36,7 +37,8 @@ def errors_over_time(times: FloatArray, errors: Mapping[str, FloatArray], *, nar
 
     Args:
         times: (T,) of the frames since the release [s].
-        errors: For each model (R, T) errors [mm] of R trials; NaN where nothing was seen or the model diverged.
+        errors: For each model (R, T) errors [mm] of R trials; NaN where nothing was seen,
+            infinite where the model diverged.
         narrow: Whether the figure is for a narrow page.
     """
     with mpl.rc_context(STYLE):
@@ -46,12 +48,12 @@ def errors_over_time(times: FloatArray, errors: Mapping[str, FloatArray], *, nar
             tone = TONES[model].light
             mean = _mean(rows)
             if len(rows) > 1:
-                spread = np.sqrt(_mean((rows - mean) ** 2))
+                spread = np.sqrt(_mean((rows - np.where(np.isfinite(mean), mean, np.nan)) ** 2))
                 low = np.maximum(mean - spread, 0.05 * mean)
                 axes.fill_between(times, positive(low), positive(mean + spread), color=tone, alpha=0.12, linewidth=0)
             style: Any = _DASHED.get(model, "-")
             width = 2.0 if model == "resphys" else 1.2
-            axes.plot(times, positive(mean), color=tone, linestyle=style, linewidth=width, label=LABELS[model])
+            axes.plot(times, positive(mean), color=tone, linestyle=style, linewidth=width, label=MODELS[model][0])
         use_logarithm(axes)
         axes.set(xlabel="time since the release [s]", ylabel="mean marker error [mm]", xlim=(0.0, times[-1]))
         legend_above(figure, axes, narrow=narrow)
@@ -59,10 +61,10 @@ def errors_over_time(times: FloatArray, errors: Mapping[str, FloatArray], *, nar
 
 
 def _mean(rows: FloatArray) -> FloatArray:
-    """(T,) mean of the trials that have a value; NaN where none has."""
-    held = np.isfinite(rows)
-    with np.errstate(invalid="ignore", over="ignore"):
-        mean: FloatArray = np.where(held, rows, 0.0).sum(axis=0) / np.where(held.any(axis=0), held.sum(axis=0), np.nan)
+    """(T,) mean of the trials that have a value; infinite where one has diverged, NaN where none has a value."""
+    held = ~np.isnan(rows)
+    count = held.sum(axis=0)
+    mean: FloatArray = np.where(count > 0, np.where(held, rows, 0.0).sum(axis=0) / np.maximum(count, 1), np.nan)
     return mean
 
 
@@ -90,16 +92,15 @@ def marker_paths(
         shape = (3 * count, 1) if narrow else (count, 3)
         figure = new_figure(0.9 + 1.25 * count, 1.2 + 1.05 * 3 * count, narrow=narrow)
         panels = figure.subplots(*shape, sharex=True, squeeze=False)
+        moved = np.nan_to_num(_MILLI * (measured - start))  # (T, M, 3) [mm]
+        least = _LEAST_SPAN * float(np.ptp(moved, axis=0).max())
         for marker, label in enumerate(labels):
             for axis in range(3):
                 axes = panels[3 * marker + axis, 0] if narrow else panels[marker, axis]
-                seen = _MILLI * (measured[:, marker, axis] - start[marker, axis])
-                _path(
-                    axes,
-                    times,
-                    seen,
-                    {m: _MILLI * (q[:, marker, axis] - start[marker, axis]) for m, q in models.items()},
+                seen, *rest = (
+                    _MILLI * (q[:, marker, axis] - start[marker, axis]) for q in (measured, *models.values())
                 )
+                _path(axes, times, seen, least, dict(zip(models, rest, strict=True)))
                 if narrow:
                     axes.set_title(f"{label}, {'xyz'[axis]} [mm]")
                 elif axis == 0:
@@ -107,25 +108,35 @@ def marker_paths(
                 if not narrow and marker == 0:
                     axes.set_title("xyz"[axis])
         for axes in panels[-1]:
-            axes.set(xlabel="time [s]" if not narrow else "time since the release [s]", xlim=(0.0, times[-1]))
+            axes.set(xlabel="time [s]", xlim=(0.0, times[-1]))
         figure.align_ylabels(panels[:, 0])
         legend_above(figure, panels[0, 0], narrow=narrow)
     return figure
 
 
-def _path(axes: Axes, times: FloatArray, measured: FloatArray, models: Mapping[str, FloatArray]) -> None:
-    """One coordinate [mm]; the measured motion sets the scale, so that a model that runs away does not."""
+def _path(axes: Axes, times: FloatArray, measured: FloatArray, least: float, models: Mapping[str, FloatArray]) -> None:
+    """One coordinate [mm]; the measured motion sets the scale, so that a model that runs away does not.
+
+    Args:
+        axes: Where to draw.
+        times: (T,) [s].
+        measured: (T,).
+        least: The shortest range that is shown, so that noise does not look like motion.
+        models: (T,) by model.
+    """
     axes.plot(times, measured, ".", color=TONES["ink"].light, markersize=3.2, label="Measured", zorder=1.5)
     for model, values in models.items():
         tone = TONES[model].light
         kept = np.where(np.abs(values) < 1e6, values, np.nan)
         style: Any = _DASHED.get(model, "-")
-        axes.plot(times, kept, color=tone, linestyle=style, linewidth=1.1, label=LABELS[model])
+        axes.plot(times, kept, color=tone, linestyle=style, linewidth=1.1, label=MODELS[model][0])
     if np.isfinite(measured).any():
         low, high = np.nanmin(measured), np.nanmax(measured)
         margin = 0.6 * (high - low) + 0.02
         bottom, top = axes.get_ylim()
-        axes.set_ylim(max(low - margin, bottom), min(high + margin, top))
+        bottom, top = max(low - margin, bottom), min(high + margin, top)
+        more = max(0.0, 0.5 * (least - (top - bottom)))
+        axes.set_ylim(bottom - more, top + more)
     axes.yaxis.set_major_locator(MaxNLocator(4, steps=ROUND_STEPS))
 
 
@@ -149,7 +160,7 @@ def loss_histories(histories: Mapping[str, Sequence[Sequence[Mapping[str, float]
                 count = np.arange(1, len(losses) + 1)
                 axes.plot(count, positive(losses), ".-", color=tone, linewidth=1.8 if best else 0.9, markersize=3.5)
             use_logarithm(axes)
-            axes.set_title(LABELS[name])
+            axes.set_title(MODELS[name][0])
             axes.set_xlabel("evaluation")
             axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
             if narrow or name == next(iter(histories)):
@@ -210,9 +221,9 @@ def _contours(figure: Figure, axes: Axes, modulus: FloatArray, ratio: FloatArray
     """Filled levels, evenly spaced in the logarithm of the loss, with lines between them."""
     level = np.log10(loss)
     low, high = float(np.nanmin(level)), float(np.nanmax(level))
-    levels = np.linspace(low, high if high > low else low + 1.0, _LEVELS)
+    levels = np.linspace(low - 1e-9, (high if high > low else low + 1.0) + 1e-9, _LEVELS)
     masked = np.ma.masked_invalid(level.T)
-    filled = axes.contourf(modulus, ratio, masked, levels=levels, cmap="viridis", extend="both")
+    filled = axes.contourf(modulus, ratio, masked, levels=levels, cmap="viridis")
     axes.contour(modulus, ratio, masked, levels=levels, colors="white", linewidths=0.5, alpha=0.55)
     axes.set_ylabel("Poisson's ratio")
     axes.grid(visible=False)

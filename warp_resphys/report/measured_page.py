@@ -2,8 +2,7 @@
 
 import base64
 import logging
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -12,9 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warp_resphys.files import write_text
-from warp_resphys.mesh import Mesh
-from warp_resphys.metrics import PublishedError
-from warp_resphys.registration import Registration
+from warp_resphys.report.measured_data import (
+    FoldsReport,
+    MeasuredReport,
+    Trials,
+    at_times,
+    best_and_worst,
+    mean_distance,
+    shown_models,
+)
 from warp_resphys.report.measured_tables import (
     MODELS,
     against,
@@ -45,128 +50,6 @@ IntArray = NDArray[np.int64]
 
 _DRAWN = ("simulation", "sysid", "simfree", "resphys")  # Marker by marker, where all would hide each other.
 _MOST_MARKERS: Final = 6  # That are drawn coordinate by coordinate.
-
-
-@dataclass(frozen=True, eq=False)
-class Recordings:
-    """How the recordings are, and how they were registered.
-
-    Attributes:
-        quality: By trial, as `warp_resphys.recordings.quality.Quality.to_plain` gives it.
-        residuals: By trial: `rms_mm`, `residual_mm` and `shift_mm` by label, `outliers`.
-        registration: Of the trial that fits worst, for the picture.
-        drawn: That trial's name.
-        nominal: (M, 3) [m] where its markers should be.
-        feet: (M, 3) [m] the closest points of the body.
-    """
-
-    quality: Mapping[str, Any]
-    residuals: Mapping[str, Any]
-    registration: Registration
-    drawn: str
-    nominal: FloatArray
-    feet: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class TestTrials:
-    """What was measured in the R test trials, and what the models made of them.
-
-    Attributes:
-        names: Of the trials.
-        labels: Of the M markers.
-        times: (R, T) of the frames since the release [s]; those that count.
-        measured: (R, T, M, 3) [m], NaN where a marker was not seen.
-        bound: (M, 3) [m] the markers on the body at rest.
-        gravity: (3,) [m/s^2].
-        markers: (R, T, M, 3) [m] by model.
-        positions: (R, K + 1, N, 3) [m] by model, at multiples of the time step.
-        time_step: [s].
-    """
-
-    names: tuple[str, ...]
-    labels: tuple[str, ...]
-    times: FloatArray
-    measured: FloatArray
-    bound: FloatArray
-    gravity: FloatArray
-    markers: Mapping[str, FloatArray]
-    positions: Mapping[str, FloatArray]
-    time_step: float
-
-    def errors_mm(self) -> dict[str, FloatArray]:
-        """(R, T) mean distance [mm] of the markers that were seen, by model; NaN where there is none."""
-        return {model: _mean_distance(markers, self.measured) for model, markers in self.markers.items()}
-
-
-@dataclass(frozen=True, eq=False)
-class MeasuredReport:
-    """Everything that the page of a split shows.
-
-    Attributes:
-        experiment: Its name.
-        title: The page's heading.
-        metrics: `errors_mm`, `per_trajectory`, `per_marker`, `seconds`, `peak_memory_gib`, `versions` and `device`.
-        settings: The run's configuration, nested.
-        published: Published errors, empty where there are none.
-        published_note: Why they are not measured on the same data.
-        mesh: The body at rest.
-        fixed: Vertices of the clamped region.
-        trials: The test trials.
-        recordings: Quality and registration of all trials.
-        identification: What identification.json holds.
-        start: The values of the data sheet, by parameter.
-        truth: The true ones, where they are known.
-        training: Records of the epochs, by learned model.
-        seconds: How much of each trial counts; None for all of it.
-    """
-
-    experiment: str
-    title: str
-    metrics: Mapping[str, Any]
-    settings: Mapping[str, Any]
-    published: Mapping[str, PublishedError]
-    published_note: str
-    mesh: Mesh
-    fixed: IntArray
-    trials: TestTrials
-    recordings: Recordings
-    identification: Mapping[str, Any]
-    start: Mapping[str, float]
-    truth: Mapping[str, float]
-    training: Mapping[str, Sequence[Mapping[str, Any]]]
-    seconds: float | None
-
-
-@dataclass(frozen=True, eq=False)
-class FoldsReport:
-    """Everything that the page over the folds shows.
-
-    Attributes:
-        experiment: Its name.
-        title: The page's heading.
-        metrics: `folds` (a fold's metrics by its test trial) and `errors_mm` over all of them.
-        pages: Address of each fold's page, by its test trial.
-        settings: The run's configuration, nested.
-        published: Published errors, empty where there are none.
-        published_note: Why they are not measured on the same data.
-        mesh: The body at rest.
-        fixed: Vertices of the clamped region.
-        recordings: Quality and registration of all trials.
-        seconds: How much of each trial counts; None for all of it.
-    """
-
-    experiment: str
-    title: str
-    metrics: Mapping[str, Any]
-    pages: Mapping[str, str]
-    settings: Mapping[str, Any]
-    published: Mapping[str, PublishedError]
-    published_note: str
-    mesh: Mesh
-    fixed: IntArray
-    recordings: Recordings
-    seconds: float | None
 
 
 def write_measured_report(path: Path, data: MeasuredReport) -> None:
@@ -257,26 +140,6 @@ def _common(
     }
 
 
-def _mean_distance(markers: FloatArray, measured: FloatArray) -> FloatArray:
-    """(R, T) mean distance [mm] of the markers that were seen; NaN where none was, infinite where one diverged."""
-    with np.errstate(invalid="ignore", over="ignore"):
-        distance = 1e3 * np.linalg.norm(markers - measured, axis=3)
-        seen = np.isfinite(measured).all(axis=3)
-        distance = np.where(seen, np.where(np.isfinite(distance), distance, np.inf), 0.0)
-        count = seen.sum(axis=2)
-        mean: FloatArray = np.where(count > 0, distance.sum(axis=2) / np.maximum(count, 1), np.nan)
-    return mean
-
-
-def best_and_worst(trials: TestTrials) -> list[int]:
-    """The trials in which the best model of all is farthest off, and closest; one where there is one only."""
-    errors = trials.errors_mm()
-    model = next(m for m in reversed(MODELS) if m in errors)
-    each = np.array([row[~np.isnan(row)].mean() if (~np.isnan(row)).any() else np.inf for row in errors[model]])
-    worst, best = int(np.argmax(each)), int(np.argmin(each))
-    return [worst] if worst == best else [worst, best]
-
-
 def _draw(data: MeasuredReport, folder: Path) -> tuple[dict[str, Picture], dict[str, str]]:
     """Draw the figures; say of those that cannot be drawn why."""
     from warp_resphys.report import figures, measured_figures
@@ -286,10 +149,9 @@ def _draw(data: MeasuredReport, folder: Path) -> tuple[dict[str, Picture], dict[
     both = partial(draw_picture, folder)
     trials = data.trials
     times = np.nanmean(trials.times, axis=0)
-    finite = {m: np.where(np.isfinite(rows), rows, np.nan) for m, rows in trials.errors_mm().items()}
     pictures["error_over_time"] = both(
         "error_over_time",
-        partial(measured_figures.errors_over_time, times, finite),
+        partial(measured_figures.errors_over_time, times, trials.errors_mm()),
         "Mean marker error of the models over time, on a logarithmic axis.",
     )
     for place, trial in zip(("worst", "best"), best_and_worst(trials), strict=False):
@@ -321,7 +183,7 @@ def _attempt(name: str, path: Path, draw: Callable[[Path], T], missing: dict[str
         return None
 
 
-def _paths(trials: TestTrials, trial: int) -> Callable[..., Any]:
+def _paths(trials: Trials, trial: int) -> Callable[..., Any]:
     """The figure of one trial, marker by marker."""
     from warp_resphys.report import measured_figures
 
@@ -338,8 +200,9 @@ def _paths(trials: TestTrials, trial: int) -> Callable[..., Any]:
     )
 
 
-def _describe_paths(trials: TestTrials, trial: int) -> str:
-    return f"Coordinates of the markers over time in the trial {trials.names[trial]}: measured as dots, the models as lines."
+def _describe_paths(trials: Trials, trial: int) -> str:
+    name = trials.names[trial]
+    return f"Coordinates of the markers over time in the trial {name}: measured as dots, the models as lines."
 
 
 def _draw_identification(data: MeasuredReport, both: Callable[..., Picture], pictures: dict[str, Picture]) -> None:
@@ -397,13 +260,6 @@ def _draw_registration(
         pictures["registration"] = Picture(address, address, alt)
 
 
-def shown_models(markers: Mapping[str, FloatArray]) -> list[str]:
-    """The models that are drawn as bodies: the uncorrected one, and last the best that there is."""
-    plain = next((m for m in ("simulation", "published") if m in markers), None)
-    solid = next((m for m in ("resphys", "resphys_uncorrected", "sysid", "sysid_elastic") if m in markers), None)
-    return [m for m in (plain, solid) if m is not None]
-
-
 def _motion(data: MeasuredReport) -> Any:
     """The worst test trial, the simulated bodies brought to the times of the frames."""
     from warp_resphys.report.video import Motion
@@ -418,29 +274,35 @@ def _motion(data: MeasuredReport) -> Any:
     return Motion(data.mesh, times, trials.measured[worst][kept], positions, markers, trials.bound, trials.gravity)
 
 
-def at_times(positions: FloatArray, time_step: float, times: FloatArray) -> FloatArray:
-    """(T, N, 3) positions at some times, from those (K + 1, N, 3) at multiples of the time step; linear between."""
-    at = np.clip(times / time_step, 0.0, len(positions) - 1.0)
-    low = np.minimum(at.astype(int), max(len(positions) - 2, 0))
-    share = (at - low)[:, None, None]
-    with np.errstate(invalid="ignore", over="ignore"):
-        between: FloatArray = (1.0 - share) * positions[low] + share * positions[
-            np.minimum(low + 1, len(positions) - 1)
-        ]
-    return between
-
-
 def _instants(data: MeasuredReport, _: Path) -> tuple[NDArray[np.uint8], list[str]]:
-    """Pictures at the largest deflection, where the uncorrected model is farthest off, and at the end."""
+    """Pictures of three instants: see `instants`."""
     from warp_resphys.report.video import draw_instants
 
     motion = _motion(data)
-    distance = np.linalg.norm(motion.measured - motion.bound, axis=2)
-    moved = np.where(np.isfinite(distance), distance, 0.0).mean(axis=1)
-    off = _mean_distance(next(iter(motion.markers.values()))[None], motion.measured[None])[0]
-    worst = int(np.argmax(np.where(np.isfinite(off), off, -1.0)))
-    frames = sorted({int(np.argmax(moved)), worst, len(motion.times) - 1})
+    frames = instants(motion.measured, motion.bound, next(iter(motion.markers.values())))
     return draw_instants(motion.at(frames)), [f"{motion.times[frame]:.2f} s" for frame in frames]
+
+
+def instants(measured: FloatArray, bound: FloatArray, simulated: FloatArray) -> list[int]:
+    """Return three frames that lie apart, or fewer of a short motion.
+
+    They are where the simulation is farthest off, where the markers have moved most, and the last one; where two of
+    these are close to each other, one from between is taken.
+
+    Args:
+        measured: (T, M, 3) [m], NaN where a marker was not seen.
+        bound: (M, 3) [m] at rest.
+        simulated: (T, M, 3) [m].
+    """
+    count = len(measured)
+    moved = np.nan_to_num(np.linalg.norm(measured - bound, axis=2)).mean(axis=1)
+    off = mean_distance(simulated[None], measured[None])[0]
+    worst = int(np.argmax(np.where(np.isfinite(off), off, -1.0)))
+    chosen: list[int] = []
+    for frame in (worst, int(np.argmax(moved)), count - 1, count // 2, count // 4):
+        if len(chosen) < 3 and all(abs(frame - other) > count // 10 for other in chosen):
+            chosen.append(frame)
+    return sorted(chosen)
 
 
 def _write_video(data: MeasuredReport, path: Path) -> Path:

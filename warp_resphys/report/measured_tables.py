@@ -15,16 +15,15 @@ MINUS: Final = "\N{MINUS SIGN}"
 MODELS: Final[Mapping[str, tuple[str, str]]] = {
     "published": ("Published setting", "the simulator as the published code sets it up"),
     "simulation": ("Uncorrected simulation", "the simulator with the values of the data sheet"),
-    "sysid_elastic": ("SysID, E and ν", "elastic parameters that fit best"),  # noqa: RUF001
+    "sysid_elastic": ("SysID of E and ν", "the elastic parameters that fit best"),  # noqa: RUF001
     "sysid": ("SysID", "all parameters that fit best, damping among them"),
     "simfree": ("SimFree", "a network in place of the simulator"),
     "resphys_uncorrected": ("ResPhys, data sheet", "the learned force on the uncorrected simulator"),
     "resphys": ("ResPhys", "the learned force on the identified simulator"),
 }
 _PUBLISHED_BESIDE = {"published": "simulation", "sysid_elastic": "sysid"}  # Where these exist, they are what was meant.
-_PARAMETERS: Final[
-    Mapping[str, tuple[str, str, float]]
-] = {  # A name, the unit it is written in, how many in an SI unit.
+# A name, the unit that it is written in, and how many of these make an SI unit.
+_PARAMETERS: Final[Mapping[str, tuple[str, str, float]]] = {
     "youngs_modulus": ("Young's modulus", "kPa", 1e-3),
     "poissons_ratio": ("Poisson's ratio", "", 1.0),
     "density": ("Density", "kg/m³", 1.0),
@@ -74,7 +73,7 @@ def verdict(errors: Mapping[str, Any], trials: Sequence[str], seconds: float | N
 
 
 def against(errors: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
-    """The model that the others are compared with, and by how many per cent each is above or below it."""
+    """Return the model that the others are compared with, and by how many per cent each is above or below it."""
     base = next((m for m in ("sysid_elastic", "sysid") if m in errors and errors[m]["mean"]), "")
     if not base:
         return "", {}
@@ -85,13 +84,13 @@ def against(errors: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
 
 
 def published_beside(published: Mapping[str, PublishedError], models: Sequence[str]) -> dict[str, tuple[str, str]]:
-    """The published errors by the model that they stand beside."""
+    """Return the published errors by the model that they stand beside."""
     taken = {theirs: ours for ours, theirs in _PUBLISHED_BESIDE.items() if ours in models}
     return {taken.get(model, model): published_parts(each) for model, each in published.items()}
 
 
 def residual_rows(residuals: Mapping[str, Any]) -> tuple[list[str], list[tuple[str, str, list[tuple[str, str]]]]]:
-    """Labels, and for each trial its root mean square and the markers' residuals [mm], with what stands below them."""
+    """Return the labels, and for each trial its root mean square and each residual [mm] with what stands below it."""
     labels = list(dict.fromkeys(label for each in residuals.values() for label in each["residual_mm"]))
     rows = []
     for trial, each in residuals.items():
@@ -104,7 +103,7 @@ def residual_rows(residuals: Mapping[str, Any]) -> tuple[list[str], list[tuple[s
 
 
 def quality_rows(quality: Mapping[str, Any]) -> dict[str, list[list[str]]]:
-    """A table's rows for each trial: a marker, how much was seen, gaps, the longest, masked, jumps, noise, drift."""
+    """Return the rows of each trial's table: marker, share seen, gaps, longest, masked, jumps, noise, drift."""
     rows: dict[str, list[list[str]]] = {}
     for trial, each in quality.items():
         rows[trial] = []
@@ -184,8 +183,9 @@ def uncertainty_text(name: str, found: Mapping[str, Any]) -> str:
     correlation = np.array(known["correlation"], dtype=np.float64)
     tied = [
         f"{words[names[i]]} and {words[names[j]]} ({correlation[i, j]:+.2f})".replace("-", MINUS)
-        for i in range(len(names))
-        for j in range(i)
+        for j in range(len(names))
+        for i in range(j)
         if abs(correlation[i, j]) > _TIED
     ]
-    return f"{said}; they cannot tell apart {', '.join(tied)}, by correlation." if tied else f"{said}."
+    said += f"; they cannot tell apart {', '.join(tied)}, by their correlation." if tied else "."
+    return said.replace(" %", f"{NO_BREAK_SPACE}%")

@@ -15,7 +15,6 @@ from warp_resphys.report.render_markers import INK, MEASURED
 
 FloatArray = NDArray[np.float64]
 
-RADIUS: Final = 0.013  # Of a measured marker's dot, over the height of a view.
 _RING: Final = 1.9  # Radius of a simulated marker's ring, over that of a dot.
 _TOWARDS_LIGHT: Final = (0.15, -0.75, 1.0)
 _FEATURE_ANGLE: Final = 30.0  # [degrees]
@@ -31,10 +30,11 @@ def main(source: str, target: str) -> None:
 
     Args:
         source: An .npz file with, for F frames and B bodies, positions (B, F, N, 3) [m] (a body that is not finite in a
-            frame is not drawn in it), triangles (S, 3) and edges (E, 2) of the surface, rest (N, 3), colours and rings (B,),
-            simulated (B, F, M, 3) and measured (F, M, 3) markers, feet (F, M, 3) of the last body's markers, axes
-            (3, 3) of the view (to the right, up, towards the viewer), for V views focus (V, F, 3) and half_height
-            (V,) [m], size (2,) of a view [px], texts (F,) and legend (B + 1,), both perhaps empty, and fps.
+            frame is not drawn in it), rest (N, 3), triangles (S, 3) and edges (E, 2) of the surface, colours of bodies
+            and rings (B,), simulated (B, F, M, 3) and measured (F, M, 3) markers, feet (F, M, 3) of the last body's
+            markers, axes (3, 3) of the view (to the right, up, towards the viewer), for V views focus (V, F, 3) and
+            half_height (V,) [m], size (2,) of a view [px], radius of a measured marker's dot over the height of a
+            view, texts (F,) and legend (B + 1,), both perhaps empty, and fps.
         target: Where to write: frames (F, H, W, 4) as .npy on nothing, or a film on white as .mp4.
     """
     with np.load(source, allow_pickle=False) as arrays:
@@ -78,19 +78,22 @@ def _frames(scene: dict[str, Any], transparent: bool) -> Iterator[NDArray[np.uin
     plotter.enable_anti_aliasing("msaa", multi_samples=4, all_renderers=True)
     plotter.set_background("white", all_renderers=True)
     plotter.add_light(pyvista.Light(position=_TOWARDS_LIGHT, focal_point=(0.0, 0.0, 0.0), light_type="scene light"))
-    bodies = [_Body(scene, each) for each in range(len(scene["positions"]))]
-    markers = []
+    bodies: list[_Body] = [_Body(scene, each) for each in range(len(scene["positions"]))]
+    markers: list[_Markers] = []
     for view in range(views):
         plotter.subplot(0, view)
         markers.append(_Markers(scene, view))
-        for part in (*bodies, markers[-1]):
-            part.add(plotter)
+        for body in bodies:
+            body.add(plotter)
+        markers[-1].add(plotter)
         plotter.enable_parallel_projection()
         plotter.camera.parallel_scale = float(scene["half_height"][view])
     text = _add_texts(plotter, scene) if len(scene["texts"]) else None
     for frame in range(scene["positions"].shape[1]):
-        for part in (*bodies, *markers):
-            part.move(frame)
+        for body in bodies:
+            body.move(frame)
+        for each in markers:
+            each.move(frame)
         if text is not None:
             text.input = str(scene["texts"][frame])
         for view in range(views):
@@ -153,11 +156,11 @@ class _Markers:
         self.measured, self.simulated, self.feet = scene["measured"], scene["simulated"], scene["feet"]
         self.colours = [str(colour) for colour in scene["rings"]]
         self.nearer = 5.0 * half * scene["axes"][2]
-        radius = 2.0 * half * RADIUS
+        radius = 2.0 * half * float(scene["radius"])
         ball = pyvista.Sphere(radius, theta_resolution=20, phi_resolution=20)
         count = self.measured.shape[1]
         self.ball = np.asarray(ball.points, dtype=np.float64)
-        faces = ball.faces.reshape(-1, 4)[:, 1:]
+        faces = np.asarray(ball.faces, dtype=np.int64).reshape(-1, 4)[:, 1:]
         self.balls = pyvista.PolyData.from_regular_faces(
             np.tile(self.ball, (count, 1)), np.concatenate([faces + len(self.ball) * m for m in range(count)])
         )
@@ -189,21 +192,20 @@ class _Markers:
 
     def _around(self, places: FloatArray, shape: FloatArray, steps: float) -> FloatArray:
         """(M P, 3) a shape (P, 3) around each of (M, 3) places."""
-        whole = np.isfinite(places).all(axis=1)[:, None, None]
+        whole = np.asarray(np.isfinite(places).all(axis=1))[:, None, None]
         points = np.where(whole, places[:, None] + shape + 0.5 * steps * self.nearer, 0.0)
         return points.reshape(-1, 3)
 
 
 def _add_texts(plotter: Any, scene: dict[str, Any]) -> Any:
-    """The legend below the first view, and above it the time, which is returned."""
+    """The time, which is returned, and the legend beside it, where no player's controls hide them."""
     plotter.subplot(0, 0)
-    names = [str(name) for name in scene["legend"]]
-    left = 14
-    for name, colour in zip(names, (*scene["rings"], MEASURED), strict=True):
-        plotter.add_text(name, position=(left, 10), font_size=9, color=str(colour))
-        left += 30 + 9 * len(name)
-    height = int(scene["size"][1])
-    return plotter.add_text(str(scene["texts"][0]), position=(14, height - 34), font_size=11, color=INK)
+    top = int(scene["size"][1]) - 32
+    left = 90
+    for name, colour in zip(scene["legend"], (*scene["rings"], MEASURED), strict=True):
+        plotter.add_text(str(name), position=(left, top), font_size=9, color=str(colour))
+        left += 24 + 9 * len(str(name))
+    return plotter.add_text(str(scene["texts"][0]), position=(14, top), font_size=10, color=INK)
 
 
 if __name__ == "__main__":

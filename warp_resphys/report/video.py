@@ -32,7 +32,8 @@ RINGS: Final = ("#6b7580", "#1a5fb4")  # Of their markers.
 _MARGIN: Final = 0.06  # Around what is seen, over its longer side.
 _TILT: Final = (0.30, 0.30)  # From the right and from above.
 _FILM_VIEW: Final = (560, 480)  # [px] of each of two.
-_PICTURE_VIEW: Final = (720, 620)
+_PICTURE_VIEW: Final = (640, 544)
+_RADII: Final = {_FILM_VIEW: 0.013, _PICTURE_VIEW: 0.02}  # Of a dot, over the height of a view; pictures are small.
 _DIVERGED: Final = 10.0  # Distance from rest, over the body's size, beyond which nothing is drawn.
 
 
@@ -179,6 +180,7 @@ def _scene(motion: Motion, size: tuple[int, int]) -> dict[str, Any]:
         "focus": np.stack([np.broadcast_to(middle, near.shape), near]),
         "half_height": np.array([half, near_half]),
         "size": np.array(size),
+        "radius": np.array(_RADII[size]),
         "texts": np.array([], dtype=str),
         "legend": np.array([], dtype=str),
         "fps": np.array(LARGEST_RATE),

@@ -13,14 +13,8 @@ from ...files import read_array, read_hdf5, read_json
 from ...mesh import Mesh, select_vertices
 from ...metrics import PUBLISHED_MM
 from ...registration import Registration, RigidTransform
-from ...report.measured_page import (
-    FoldsReport,
-    MeasuredReport,
-    Recordings,
-    TestTrials,
-    write_folds_report,
-    write_measured_report,
-)
+from ...report.measured_data import FoldsReport, MeasuredReport, Recordings, Trials
+from ...report.measured_page import write_folds_report, write_measured_report
 from ...report.measured_tables import MODELS
 from ...stages import StageContext, package_versions, resources_used
 from ...surface import closest_points
@@ -28,10 +22,9 @@ from ...surface import closest_points
 FloatArray = NDArray[np.float64]
 
 PUBLISHED_NOTE = (
-    "The published errors belong to other data: eighteen recordings in which the weight is cut off at the release, ten "
-    "markers on the sides of the beam, and their distance from trajectories that were reconstructed, so that the two "
-    "columns do not measure the same. The published uncorrected simulation had the published setting, the published "
-    "SysID elastic parameters only."
+    "The published errors are those of other data: recordings with ten markers on the beam's sides, whose weight is "
+    "cut off at the release, compared with trajectories reconstructed from them; the published uncorrected simulation "
+    "has the published setting, the published SysID elastic parameters only."
 )
 _LEARNED = ("simfree", "resphys_uncorrected", "resphys")
 
@@ -111,7 +104,7 @@ def _metrics(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def read_trials(folder: Path, config: Mapping[str, Any]) -> TestTrials:
+def read_trials(folder: Path, config: Mapping[str, Any]) -> Trials:
     """What was measured in the test trials and what the models made of them, as long as it counts."""
     path = _common(folder) / "markers.h5"
     with read_hdf5(path, "markers") as file:
@@ -134,7 +127,7 @@ def read_trials(folder: Path, config: Mapping[str, Any]) -> TestTrials:
     if seconds is not None:
         measured = np.where((times <= seconds)[..., None, None], measured, np.nan)
         length = max(1, int((times <= seconds).any(axis=0).sum()))
-    return TestTrials(
+    return Trials(
         names=tuple(test),
         labels=tuple(labels),
         times=times[:, :length],

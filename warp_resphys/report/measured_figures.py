@@ -33,7 +33,7 @@ _MILLI: Final = 1e3
 
 
 def errors_over_time(times: FloatArray, errors: Mapping[str, FloatArray], *, narrow: bool) -> Figure:
-    """Draw each model's mean marker error over time, and the standard deviation of the trials around it.
+    """Draw each model's mean marker error over time, and around the main ones the standard deviation of the trials.
 
     Args:
         times: (T,) of the frames since the release [s].
@@ -47,7 +47,7 @@ def errors_over_time(times: FloatArray, errors: Mapping[str, FloatArray], *, nar
         for model, rows in errors.items():
             tone = TONES[model].light
             mean = _mean(rows)
-            if len(rows) > 1:
+            if len(rows) > 1 and model not in _DASHED:
                 spread = np.sqrt(_mean((rows - np.where(np.isfinite(mean), mean, np.nan)) ** 2))
                 low = np.maximum(mean - spread, 0.05 * mean)
                 axes.fill_between(times, positive(low), positive(mean + spread), color=tone, alpha=0.12, linewidth=0)

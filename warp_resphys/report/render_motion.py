@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from warp_resphys.report.render import OUTLINE
 from warp_resphys.report.render_markers import INK, MEASURED
 
 FloatArray = NDArray[np.float64]
@@ -177,7 +178,7 @@ class _Markers:
 
     def add(self, plotter: Any) -> None:
         """Shows them in the current view."""
-        plotter.add_mesh(self.stems, color=INK, lighting=False, line_width=2.0)
+        plotter.add_mesh(self.stems, color=OUTLINE, lighting=False, line_width=2.0)
         for colour, ring in zip(self.colours, self.rings, strict=True):
             plotter.add_mesh(ring, color=colour, lighting=False, line_width=2.5)
         plotter.add_mesh(self.balls, color=MEASURED, lighting=False)

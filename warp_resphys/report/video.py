@@ -30,6 +30,8 @@ LARGEST_RATE: Final = 25.0  # Frames a second, of the film.
 BODIES: Final = ("#6b7580", "#8db4e8")  # Of the bodies behind, and of the last one.
 RINGS: Final = ("#6b7580", "#1a5fb4")  # Of their markers.
 _MARGIN: Final = 0.06  # Around what is seen, over its longer side.
+_HEADROOM: Final = 0.12  # For the text above a film's first view, over half its height.
+_MOST_NEAR: Final = 1.6  # How far the other models' markers may widen the view from nearby.
 _TILT: Final = (0.30, 0.30)  # From the right and from above.
 _FILM_VIEW: Final = (560, 480)  # [px] of each of two.
 _PICTURE_VIEW: Final = (640, 544)
@@ -111,6 +113,9 @@ def write_video(path: Path, motion: Motion, names: Mapping[str, str]) -> None:
     texts = [f"{time:.2f} s" for time in shown.times]
     scene = _scene(shown, _FILM_VIEW) | {"texts": np.array(texts), "legend": np.array(legend)}
     scene["fps"] = np.array(1.0 / (SLOWER * step * every))
+    room = _HEADROOM * scene["half_height"][0]
+    scene["half_height"][0] += room
+    scene["focus"][0] += room * scene["axes"][1]
     with TemporaryDirectory() as folder, Progress("video", len(shown.times), "frames") as progress:
         target = Path(folder) / "motion.mp4"
         _run(scene, target, Path(folder) / "scene.npz", progress)
@@ -164,7 +169,7 @@ def _scene(motion: Motion, size: tuple[int, int]) -> dict[str, Any]:
     axes = view_axes(motion.gravity, seen)
     everything = np.concatenate([seen.reshape(-1, 3), simulated.reshape(-1, 3), motion.measured.reshape(-1, 3)])
     middle, half = _frame(everything, axes, size)
-    near, near_half = _follow(motion.measured, simulated[-1], axes, size)
+    near, near_half = _follow(motion.measured, simulated, axes, size)
     near = np.where(np.isfinite(near), near, middle)
     return {
         "positions": positions,
@@ -230,15 +235,20 @@ def _frame(points: FloatArray, axes: FloatArray, size: tuple[int, int]) -> tuple
 def _follow(
     measured: FloatArray, simulated: FloatArray, axes: FloatArray, size: tuple[int, int]
 ) -> tuple[FloatArray, float]:
-    """(T, 3) middle of the markers in each frame, and half the height of a view that always holds them [m].
+    """(T, 3) middle of the markers in each frame, and half the height of a view that holds them [m].
 
-    Where not all markers were seen, the simulated ones say where the middle is.
+    Where not all markers were seen, those of the last model say where the middle is. The other models' markers are in
+    the view unless they are far off.
     """
-    places = np.where(np.isfinite(measured).all(axis=(1, 2), keepdims=True), measured, simulated)
+    places = np.where(np.isfinite(measured).all(axis=(1, 2), keepdims=True), measured, simulated[-1])
     middle = places.mean(axis=1)
-    spread = (np.concatenate([measured, simulated], axis=1) - middle[:, None]) @ axes[:2].T
-    reach = np.nanmax(np.abs(spread), axis=(0, 1))
-    return middle, float(1.25 * max(reach[1], reach[0] * size[1] / size[0], 1e-4))
+
+    def half(points: FloatArray) -> float:
+        reach = np.nanmax(np.abs((points - middle[:, None]) @ axes[:2].T), axis=(0, 1))
+        return float(max(reach[1], reach[0] * size[1] / size[0], 1e-4))
+
+    least = half(measured)
+    return middle, 1.25 * min(half(np.concatenate([measured, *simulated], axis=1)), _MOST_NEAR * least)
 
 
 def _feet(mesh: Mesh, bound: FloatArray, positions: FloatArray) -> FloatArray:

@@ -88,6 +88,7 @@ class MeasuredReport:
         truth: The true ones, where they are known.
         training: Records of the epochs, by learned model.
         seconds: How much of each trial counts; None for all of it.
+        synthetic: Whether what is called measured was simulated, as there are no recordings.
     """
 
     experiment: str
@@ -105,6 +106,7 @@ class MeasuredReport:
     truth: Mapping[str, float]
     training: Mapping[str, Sequence[Mapping[str, Any]]]
     seconds: float | None
+    synthetic: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +125,7 @@ class FoldsReport:
         fixed: Vertices of the clamped region.
         recordings: Quality and registration of all trials.
         seconds: How much of each trial counts; None for all of it.
+        synthetic: Whether what is called measured was simulated, as there are no recordings.
     """
 
     experiment: str
@@ -136,6 +139,7 @@ class FoldsReport:
     fixed: IntArray
     recordings: Recordings
     seconds: float | None
+    synthetic: bool
 
 
 def mean_distance(markers: FloatArray, measured: FloatArray) -> FloatArray:

@@ -27,6 +27,7 @@ FloatArray = NDArray[np.float64]
 
 _DASHED: Final = {"published": (0, (1, 1.2)), "sysid_elastic": (0, (4, 2)), "resphys_uncorrected": (0, (4, 2))}
 _LEVELS: Final = 14  # Of a landscape.
+_MOST_DOTS: Final = 75  # Along an axis of time.
 _LEAST_SPAN: Final = 0.08  # Of a coordinate's axis, over the largest motion of the trial.
 _KILO: Final = 1e-3
 _MILLI: Final = 1e3
@@ -124,7 +125,10 @@ def _path(axes: Axes, times: FloatArray, measured: FloatArray, least: float, mod
         least: The shortest range that is shown, so that noise does not look like motion.
         models: (T,) by model.
     """
-    axes.plot(times, measured, ".", color=TONES["ink"].light, markersize=3.2, label="Measured", zorder=1.5)
+    every = -(-len(times) // _MOST_DOTS)
+    axes.plot(
+        times[::every], measured[::every], ".", color=TONES["ink"].light, markersize=3.2, label="Measured", zorder=1.5
+    )
     for model, values in models.items():
         tone = TONES[model].light
         kept = np.where(np.abs(values) < 1e6, values, np.nan)

@@ -34,7 +34,7 @@ _HEADROOM: Final = 0.12  # For the text above a film's first view, over half its
 _MOST_NEAR: Final = 1.6  # How far the other models' markers may widen the view from nearby.
 _TILT: Final = (0.30, 0.30)  # From the right and from above.
 _FILM_VIEW: Final = (560, 480)  # [px] of each of two.
-_PICTURE_VIEW: Final = (640, 544)
+_PICTURE_VIEW: Final = (480, 408)
 _RADII: Final = {_FILM_VIEW: 0.013, _PICTURE_VIEW: 0.02}  # Of a dot, over the height of a view; pictures are small.
 _DIVERGED: Final = 10.0  # Distance from rest, over the body's size, beyond which nothing is drawn.
 

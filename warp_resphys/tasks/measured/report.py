@@ -53,6 +53,7 @@ def report_measured(context: StageContext) -> None:
         truth=_read_if_there(_common(folder) / "truth.json"),
         training={m: read_json(path)["epochs"] for m in _LEARNED if (path := folder / f"training_{m}.json").is_file()},
         seconds=config["data"]["seconds"],
+        synthetic=config["data"]["folder"] is None,
     )
     write_measured_report(folder / "report.html", data)
 
@@ -79,6 +80,7 @@ def report_folds(context: StageContext) -> None:
         fixed=select_vertices(mesh, **config["fixed"]),
         recordings=read_recordings(folder, config, mesh),
         seconds=config["data"]["seconds"],
+        synthetic=config["data"]["folder"] is None,
     )
     write_folds_report(folder / "report.html", data)
 

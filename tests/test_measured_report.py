@@ -264,7 +264,10 @@ def test_parameters_and_what_the_data_cannot_tell():
     }
     modulus, damping = parameter_rows(found, {"youngs_modulus": 264e3}, {"youngs_modulus": 250e3})
     assert list(modulus.values()) == ["Young's modulus [kPa]", "264", "250", "251.3", "± 2.5", ""]
-    assert list(damping.values()) == ["Damping by stiffness [ms]", *["\N{EN DASH}"] * 2, "2.9", "± 0.1", "yes"]
+    assert list(damping.values()) == ["Damping by stiffness [ms]", *["\N{EN DASH}"] * 2, "2.90", "± 0.10", "yes"]
+    found["parameters"]["youngs_modulus"] = -3.0
+    assert parameter_rows(found, {}, {})[0]["identified"] == "0.0"
+    assert parameter_rows({**found, "uncertainty": None}, {}, {})[0]["identified"] == "\N{MINUS SIGN}0.003"
     said = uncertainty_text("sysid", found).replace("\u00a0", " ")
     assert said == "SysID: the data tell least about damping by stiffness, to 3.4 % of the range."
     assert uncertainty_text("sysid", {**found, "uncertainty": None}) == ""
@@ -321,7 +324,7 @@ def test_start_that_was_kept_is_bold():
     histories = {"sysid": [[{"loss": 1.0}, {"loss": 3.0}, {"loss": 0.5}], [{"loss": 2.0}, {"loss": 0.1}], []]}
     (axes,) = measured_figures.loss_histories(histories, narrow=False).axes
     colours = [line.get_color() for line in axes.lines]
-    assert colours == [TONES["muted"].light, TONES["sysid"].light, TONES["muted"].light]
+    assert colours == [TONES["muted"].light, TONES["sysid"].light]
     np.testing.assert_allclose(axes.lines[0].get_ydata(), [1.0, 1.0, 0.5])
 
 

@@ -181,7 +181,9 @@ def training_curves(records: Sequence[Mapping[str, Any]], *, narrow: bool) -> Fi
             ("train_loss", "Training loss", muted),
             ("validation_loss", "Validation loss", strong),
         ):
-            axes["losses"].plot(*_measured(records, key), color=colour, label=label, linewidth=1.1)
+            epochs, losses = _measured(records, key)
+            if len(epochs):
+                axes["losses"].plot(epochs, losses, color=colour, label=label, linewidth=1.1)
         axes["losses"].set_ylabel("loss")
         axes["losses"].legend(loc="lower right", bbox_to_anchor=(1.0, 1.02), ncols=2)
         if "rollout_error_mm" in axes:

@@ -156,9 +156,9 @@ def loss_histories(histories: Mapping[str, Sequence[Sequence[Mapping[str, float]
         figure = new_figure(2.6, 0.4 + 2.1 * len(histories), narrow=narrow)
         panels = figure.subplots(*shape, sharey=True, squeeze=False).flat
         for axes, (name, starts) in zip(panels, histories.items(), strict=True):
-            ends = [min(record["loss"] for record in start) for start in starts if start]
-            for start in starts:
-                losses = np.minimum.accumulate([record["loss"] for record in start] or [np.nan])
+            ends = [each["loss"] for start in starts for each in start if each["loss"] is not None]
+            for start in (each for each in starts if each):
+                losses = np.fmin.accumulate(np.array([record["loss"] for record in start], dtype=np.float64))
                 best = bool(ends) and losses[-1] <= min(ends)
                 tone = TONES["sysid" if best else "muted"].light
                 count = np.arange(1, len(losses) + 1)

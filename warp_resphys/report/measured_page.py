@@ -229,9 +229,9 @@ def _draw_identification(data: MeasuredReport, both: Callable[..., Picture], pic
     keys = ("youngs_modulus", "poissons_ratio")
     if all(key in data.start for key in keys):
         points["data sheet"] = (data.start[keys[0]], data.start[keys[1]])
-    elastic = found.get("sysid_elastic", {}).get("parameters", {})
-    if keys[0] in elastic:
-        points["identified"] = (elastic[keys[0]], elastic.get(keys[1], data.start.get(keys[1], 0.0)))
+    identified = found.get("sysid", {}).get("parameters", {})
+    if keys[0] in identified:
+        points["identified"] = (identified[keys[0]], identified.get(keys[1], data.start.get(keys[1], 0.0)))
     marked = "; ".join(f"{name} at {1e-3 * e:.4g} kPa" for name, (e, _) in points.items())
     pictures["landscape"] = both(
         "landscape",

@@ -1,5 +1,6 @@
 """What the reports of measured motions say in words and in tables."""
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
@@ -30,8 +31,8 @@ _PARAMETERS: Final[Mapping[str, tuple[str, str, float]]] = {
     "mass_damping": ("Damping by mass", "1/s", 1.0),
     "stiffness_damping": ("Damping by stiffness", "ms", 1e3),
     "attached_mass_factor": ("Factor of the attached masses", "", 1.0),
-    "gravity_tilt_1": ("Tilt of gravity, first axis", "°", 180.0 / np.pi),
-    "gravity_tilt_2": ("Tilt of gravity, second axis", "°", 180.0 / np.pi),
+    "gravity_tilt_1": ("First tilt of gravity", "°", 180.0 / np.pi),
+    "gravity_tilt_2": ("Second tilt of gravity", "°", 180.0 / np.pi),
 }
 _TIED: Final = 0.9  # From this correlation on, two parameters are named as not told apart.
 
@@ -78,9 +79,12 @@ def against(errors: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
     if not base:
         return "", {}
     ratios = {m: each["mean"] / errors[base]["mean"] - 1.0 for m, each in errors.items() if each["mean"] is not None}
-    return base, {
-        m: NONE if m == base else f"{100.0 * ratio:+.0f} %".replace("-", MINUS) for m, ratio in ratios.items()
-    }
+    return base, {m: NONE if m == base else _per_cent(ratio) for m, ratio in ratios.items()}
+
+
+def _per_cent(ratio: float) -> str:
+    rounded = round(100.0 * ratio)
+    return f"{rounded:+d} %".replace("-", MINUS) if rounded else "0 %"
 
 
 def published_beside(published: Mapping[str, PublishedError], models: Sequence[str]) -> dict[str, tuple[str, str]]:
@@ -149,16 +153,32 @@ def parameter_rows(
                 "name": f"{words} [{unit}]" if unit else words,
                 "start": _digits(start.get(parameter), factor),
                 "truth": _digits(truth.get(parameter), factor),
-                "identified": _digits(value, factor),
-                "deviation": "" if deviation is None else f"± {factor * deviation:.2g}",
+                "identified": _digits(value, factor, deviation),
+                "deviation": _deviation(deviation, factor),
                 "bound": "yes" if parameter in found["at_bounds"] else "",
             }
         )
     return rows
 
 
-def _digits(value: float | None, factor: float) -> str:
-    return NONE if value is None else f"{factor * value:.4g}"
+def _digits(value: float | None, factor: float, deviation: float | None = None) -> str:
+    """A value in its unit, with as many decimals as its standard deviation deserves, or four digits."""
+    if value is None:
+        return NONE
+    scaled = factor * value
+    if not deviation:
+        return f"{scaled:.4g}".replace("-", MINUS)
+    text = f"{scaled:.{_decimals(factor * deviation)}f}"
+    return text.replace("-", MINUS) if float(text) else text.lstrip("-")
+
+
+def _deviation(deviation: float | None, factor: float) -> str:
+    return f"± {factor * deviation:.{_decimals(factor * deviation)}f}" if deviation else ""
+
+
+def _decimals(deviation: float) -> int:
+    """For two digits of a standard deviation."""
+    return max(0, 1 - math.floor(math.log10(deviation)))
 
 
 def uncertainty_text(name: str, found: Mapping[str, Any]) -> str:
@@ -173,9 +193,11 @@ def uncertainty_text(name: str, found: Mapping[str, Any]) -> str:
         return ""
     names = list(found["parameters"])
     words = {parameter: _PARAMETERS.get(parameter, (parameter, "", 1.0))[0] for parameter in names}
+    words = {
+        p: each if each.startswith(("Young", "Poisson")) else each[0].lower() + each[1:] for p, each in words.items()
+    }
     largest = max(abs(weight) for weight in known["poorest"].values())
-    along = [words[p].lower() if words[p] != p else p for p, w in known["poorest"].items() if abs(w) > 0.4 * largest]
-    along = [each.replace("young's", "Young's").replace("poisson's", "Poisson's") for each in along]
+    along = [words[p] for p, weight in known["poorest"].items() if abs(weight) > 0.4 * largest]
     said = (
         f"{MODELS[name][0]}: the data tell least about {' together with '.join(along)}, to "
         f"{100.0 * known['poorest_deviation']:.2g} % of the range"

@@ -11,13 +11,30 @@ from ...configured import build_mesh, choose_device
 from ...errors import DataFileError
 from ...files import read_array, read_hdf5, read_json
 from ...mesh import Mesh, select_vertices
-from ...metrics import PUBLISHED_MM
+from ...metrics import PUBLISHED_MM, PublishedError
 from ...registration import Registration, RigidTransform
+from ...replay import PARAMETERS
 from ...report.measured_data import FoldsReport, MeasuredReport, Recordings, Trials
 from ...report.measured_page import write_folds_report, write_measured_report
 from ...report.measured_tables import MODELS
 from ...stages import StageContext, package_versions, resources_used
 from ...surface import closest_points
+from .files import (
+    ERRORS,
+    IDENTIFICATION,
+    MARKERS,
+    METRICS,
+    QUALITY,
+    REGISTRATION,
+    REPORT,
+    ROLLOUTS,
+    TRAINED,
+    TRUTH,
+    fold_folder,
+    training_file,
+)
+from .identify import first_guess
+from .trials import is_synthetic
 
 FloatArray = NDArray[np.float64]
 
@@ -26,7 +43,6 @@ PUBLISHED_NOTE = (
     "cut off at the release, compared with trajectories reconstructed from them; the published uncorrected simulation "
     "has the published setting, the published SysID elastic parameters only."
 )
-_LEARNED = ("simfree", "resphys_uncorrected", "resphys")
 
 
 def report_measured(context: StageContext) -> None:
@@ -42,20 +58,20 @@ def report_measured(context: StageContext) -> None:
         title=config["title"],
         metrics=_metrics(folder, config),
         settings=config,
-        published=PUBLISHED_MM.get(config["name"], {}),
+        published=_published(config["name"]),
         published_note=PUBLISHED_NOTE,
         mesh=mesh,
         fixed=select_vertices(mesh, **config["fixed"]),
         trials=read_trials(folder, config),
         recordings=read_recordings(_common(folder), config, mesh),
-        identification=_read_if_there(folder / "identification.json"),
-        start={key: value for key, value in config["simulation"].items() if isinstance(value, int | float)},
-        truth=_read_if_there(_common(folder) / "truth.json"),
-        training={m: read_json(path)["epochs"] for m in _LEARNED if (path := folder / f"training_{m}.json").is_file()},
+        identification=_read_if_there(folder / IDENTIFICATION),
+        start=first_guess(config, PARAMETERS),
+        truth=_read_if_there(_common(folder) / TRUTH),
+        training={m: read_json(path)["epochs"] for m in TRAINED if (path := folder / training_file(m)).is_file()},
         seconds=config["data"]["seconds"],
-        synthetic=config["data"]["folder"] is None,
+        synthetic=is_synthetic(config),
     )
-    write_measured_report(folder / "report.html", data)
+    write_measured_report(folder / REPORT, data)
 
 
 def report_folds(context: StageContext) -> None:
@@ -67,27 +83,32 @@ def report_folds(context: StageContext) -> None:
     folder, config = context.run_dir, context.settings["config"]
     mesh = build_mesh(config["mesh"])
     metrics = {"versions": package_versions(), "device": str(choose_device(config["device"]))}
-    metrics |= read_json(folder / "metrics.json")
+    metrics |= read_json(folder / METRICS)
     data = FoldsReport(
         experiment=config["name"],
         title=config["title"],
         metrics=metrics,
-        pages={trial: f"fold_{trial}/report.html" for trial in metrics["folds"]},
+        pages={trial: f"{fold_folder(trial)}/{REPORT}" for trial in metrics["folds"]},
         settings=config,
-        published=PUBLISHED_MM.get(config["name"], {}),
+        published=_published(config["name"]),
         published_note=PUBLISHED_NOTE,
         mesh=mesh,
         fixed=select_vertices(mesh, **config["fixed"]),
         recordings=read_recordings(folder, config, mesh),
         seconds=config["data"]["seconds"],
-        synthetic=config["data"]["folder"] is None,
+        synthetic=is_synthetic(config),
     )
-    write_folds_report(folder / "report.html", data)
+    write_folds_report(folder / REPORT, data)
+
+
+def _published(name: str) -> Mapping[str, PublishedError]:
+    """The published errors of the experiment, or of the one that it is a variant of."""
+    return next((errors for known, errors in PUBLISHED_MM.items() if name.startswith(known)), {})
 
 
 def _common(folder: Path) -> Path:
     """Where the files lie that do not depend on the fold: here, or beside the folders of the folds."""
-    return folder if (folder / "markers.h5").is_file() else folder.parent
+    return folder if (folder / MARKERS).is_file() else folder.parent
 
 
 def _read_if_there(path: Path) -> dict[str, Any]:
@@ -99,7 +120,7 @@ def _metrics(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
     """Errors, time and memory of the stages that are done, in the order of their end, versions and device."""
     records = sorted((folder / "stages").glob("*.json"), key=lambda path: path.stat().st_mtime_ns)
     return {
-        **read_json(folder / "errors.json"),
+        **read_json(folder / ERRORS),
         **resources_used(folder, [path.stem for path in records]),
         "versions": package_versions(),
         "device": str(choose_device(config["device"])),
@@ -108,12 +129,12 @@ def _metrics(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
 
 def read_trials(folder: Path, config: Mapping[str, Any]) -> Trials:
     """What was measured in the test trials and what the models made of them, as long as it counts."""
-    path = _common(folder) / "markers.h5"
+    path = _common(folder) / MARKERS
     with read_hdf5(path, "markers") as file:
         names, labels = ([str(each) for each in file.attrs[key]] for key in ("names", "labels"))
         gravity = np.asarray(file.attrs["gravity"], dtype=np.float64)
         times, markers, bound = (read_array(file, key) for key in ("times", "markers", "bound"))
-    with read_hdf5(folder / "rollouts.h5", "rollouts") as file:
+    with read_hdf5(folder / ROLLOUTS, "rollouts") as file:
         test = [str(each) for each in file.attrs["names"]]
         models = [model for model in MODELS if f"{model}_markers" in file]
         simulated = {model: read_array(file, f"{model}_markers") for model in models}
@@ -144,9 +165,11 @@ def read_trials(folder: Path, config: Mapping[str, Any]) -> Trials:
 
 def read_recordings(folder: Path, config: Mapping[str, Any], mesh: Mesh) -> Recordings:
     """Quality and registration of all trials; the picture is of the one that fits worst."""
-    residuals = read_json(folder / "registration.json")
+    residuals = read_json(folder / REGISTRATION)
     worst = max(residuals, key=lambda trial: residuals[trial]["rms_mm"])
     each = residuals[worst]
+    if "positions" not in each:
+        raise DataFileError(f"{folder / REGISTRATION} has no positions: delete it and run the same command again.")
     nominal: dict[str, Any] = {**config["markers"]["followed"], **(config["markers"]["others"] or {})}
     labels = [label for label in each["positions"] if label in nominal]
     places = np.array([_numbers(each["positions"][label]) for label in labels])
@@ -164,7 +187,7 @@ def read_recordings(folder: Path, config: Mapping[str, Any], mesh: Mesh) -> Reco
     feet = np.full_like(places, np.nan)
     feet[seen] = closest_points(mesh, places[seen]).points
     return Recordings(
-        quality=read_json(folder / "quality.json"),
+        quality=read_json(folder / QUALITY),
         residuals=residuals,
         registration=registration,
         drawn=worst,

@@ -181,6 +181,11 @@ def _decimals(deviation: float) -> int:
     return max(0, 1 - math.floor(math.log10(deviation)))
 
 
+def _in_a_sentence(parameter: str) -> str:
+    words = _PARAMETERS.get(parameter, (parameter, "", 1.0))[0]
+    return words if words.startswith(("Young", "Poisson")) else words[0].lower() + words[1:]
+
+
 def uncertainty_text(name: str, found: Mapping[str, Any]) -> str:
     """Say which parameters the data cannot tell apart; empty where nothing is known about that.
 
@@ -192,10 +197,7 @@ def uncertainty_text(name: str, found: Mapping[str, Any]) -> str:
     if not known:
         return ""
     names = list(found["parameters"])
-    words = {parameter: _PARAMETERS.get(parameter, (parameter, "", 1.0))[0] for parameter in names}
-    words = {
-        p: each if each.startswith(("Young", "Poisson")) else each[0].lower() + each[1:] for p, each in words.items()
-    }
+    words = {parameter: _in_a_sentence(parameter) for parameter in names}
     largest = max(abs(weight) for weight in known["poorest"].values())
     along = [words[p] for p, weight in known["poorest"].items() if abs(weight) > 0.4 * largest]
     said = (

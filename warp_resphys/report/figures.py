@@ -44,6 +44,9 @@ TONES: Final[Mapping[str, Tone]] = {
     "simfree": Tone("#8f6a00", "#e2bd4f"),
     "resphys": Tone("#1a5fb4", "#7fb3f5"),
     "published_network": Tone("#b0307a", "#f08bc4"),
+    "published": Tone("#b0307b", "#f08bc5"),
+    "sysid_elastic": Tone("#a57cc4", "#d9bdf0"),
+    "resphys_uncorrected": Tone("#1f93b0", "#6fd0e8"),
 }
 LABELS: Final[Mapping[str, str]] = {
     "simulation": "Uncorrected simulation",
@@ -57,6 +60,7 @@ LARGEST_SHOWN: Final = 1e5  # Of an error [mm], or a loss.
 FONT: Final = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, 'DejaVu Sans', sans-serif"
 ROUND_STEPS: Final = (1, 2, 5, 10)  # Between two ticks, times a power of ten.
 WIDE: Final = 7.3  # [in]
+_LEGEND_ROW: Final = 5  # Most names in one row.
 NARROW: Final = 3.7  # [in]
 STYLE: Final[dict[Any, Any]] = {
     "font.family": "sans-serif",
@@ -109,7 +113,7 @@ def tip_displacement(displacements: Mapping[str, FloatArray], time_step: float, 
             motion.plot(time, 1e3 * moved[:, axis], color=TONES[model].light, label=LABELS[model])
             with np.errstate(over="ignore", invalid="ignore"):
                 gap = 1e3 * np.linalg.norm(moved - target, axis=1)
-            distance.plot(time, _positive(gap), color=TONES[model].light)
+            distance.plot(time, positive(gap), color=TONES[model].light)
         lowest, highest = 1e3 * target[:, axis].min(), 1e3 * target[:, axis].max()
         margin = 0.8 * (highest - lowest)  # Keeps a diverging roll-out from setting the scale.
         bottom, top = motion.get_ylim()
@@ -118,7 +122,7 @@ def tip_displacement(displacements: Mapping[str, FloatArray], time_step: float, 
         motion.yaxis.set_major_locator(MaxNLocator(5, steps=ROUND_STEPS))
         use_logarithm(distance)
         distance.set(xlabel="time [s]", ylabel="off target\n[mm]", xlim=(0.0, time[-1]))
-        _legend(figure, motion, narrow=narrow)
+        legend_above(figure, motion, narrow=narrow)
     return figure
 
 
@@ -143,15 +147,15 @@ def error_over_time(
         for model, rows in errors.items():
             tone = TONES[model].light
             time = np.arange(1, rows.shape[1] + 1) * time_step
-            low, high = _positive(rows.min(axis=0)), _positive(rows.max(axis=0))
+            low, high = positive(rows.min(axis=0)), positive(rows.max(axis=0))
             axes.fill_between(time, low, high, color=tone, alpha=0.18, linewidth=0)
-            axes.plot(time, _positive(rows.mean(axis=0)), color=tone, label=LABELS[model])
+            axes.plot(time, positive(rows.mean(axis=0)), color=tone, label=LABELS[model])
             axes.set_xlim(0.0, time[-1])
         for model, error in published.items():
             axes.axhline(error, color=TONES[model].light, linewidth=1.1, linestyle=(0, (4, 3)))
         use_logarithm(axes)
         axes.set(xlabel="time [s]", ylabel="mean vertex error [mm]")
-        _legend(figure, axes, narrow=narrow)
+        legend_above(figure, axes, narrow=narrow)
     return figure
 
 
@@ -177,7 +181,9 @@ def training_curves(records: Sequence[Mapping[str, Any]], *, narrow: bool) -> Fi
             ("train_loss", "Training loss", muted),
             ("validation_loss", "Validation loss", strong),
         ):
-            axes["losses"].plot(*_measured(records, key), color=colour, label=label, linewidth=1.1)
+            epochs, losses = _measured(records, key)
+            if len(epochs):
+                axes["losses"].plot(epochs, losses, color=colour, label=label, linewidth=1.1)
         axes["losses"].set_ylabel("loss")
         axes["losses"].legend(loc="lower right", bbox_to_anchor=(1.0, 1.02), ncols=2)
         if "rollout_error_mm" in axes:
@@ -302,17 +308,18 @@ def new_figure(height: float, narrow_height: float, *, narrow: bool) -> Figure:
     return Figure(figsize=size, layout="constrained")
 
 
-def _legend(figure: Figure, axes: Axes, *, narrow: bool) -> None:
-    """The legend above the figure, in one row, or one below the other where there is no room."""
+def legend_above(figure: Figure, axes: Axes, *, narrow: bool) -> None:
+    """Put the legend above the figure: in rows of four, or of two where there is less room."""
     handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper left", ncols=2 if narrow else len(labels), columnspacing=1.6)
+    columns = 2 if narrow else len(labels) if len(labels) <= _LEGEND_ROW else _LEGEND_ROW - 1
+    figure.legend(handles, labels, loc="outside upper left", ncols=columns, columnspacing=1.6)
 
 
 def _measured(records: Sequence[Mapping[str, Any]], key: str) -> tuple[FloatArray, FloatArray]:
     """The epochs in which a quantity was measured, and its values."""
     measured = [(record["epoch"], record[key]) for record in records if record.get(key) is not None]
     epochs, values = np.asarray(measured, dtype=np.float64).reshape(-1, 2).T
-    return epochs, _positive(values)
+    return epochs, positive(values)
 
 
 def _rollout_curve(axes: Axes, epochs: FloatArray, errors: FloatArray) -> None:
@@ -325,8 +332,8 @@ def _rollout_curve(axes: Axes, epochs: FloatArray, errors: FloatArray) -> None:
         axes.set_title(f"lowest: {errors[best]:.2g} mm, epoch {epochs[best]:.0f}", loc="right")
 
 
-def _positive(values: FloatArray) -> FloatArray:
-    """What a logarithmic axis can show; the rest, and what a blown-up roll-out reaches, becomes a gap."""
+def positive(values: FloatArray) -> FloatArray:
+    """Return what a logarithmic axis can show; the rest, and what a blown-up roll-out reaches, becomes a gap."""
     return np.where((values > 0.0) & (values < LARGEST_SHOWN), values, np.nan)
 
 

@@ -115,16 +115,13 @@ def run(command: Sequence[str], scene: Mapping[str, Any]) -> NDArray[np.float32]
     """
     from matplotlib.image import imread
 
-    environment = dict(os.environ)
-    if sys.platform == "linux":  # Neither X nor OSMesa is looked for where there is none.
-        environment.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
     with TemporaryDirectory() as folder:
         source, picture = Path(folder) / "scene.npz", Path(folder) / "picture.png"
         np.savez(source, **scene)
         try:
             done = subprocess.run(
                 [*command, str(source), str(picture)],
-                env=environment,
+                env=drawing_environment(),
                 timeout=TIME_OUT,
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
@@ -132,24 +129,33 @@ def run(command: Sequence[str], scene: Mapping[str, Any]) -> NDArray[np.float32]
                 errors="replace",
             )
         except subprocess.TimeoutExpired as error:
-            raise _failure(f"not done after {TIME_OUT:g} s") from error
+            raise failure(f"not done after {TIME_OUT:g} s") from error
         except OSError as error:
-            raise _failure(error.strerror or str(error)) from error
+            raise failure(error.strerror or str(error)) from error
         if done.returncode:
             _LOG.debug("the drawing process wrote: %s", done.stderr)
-            raise _failure(_last_words(done.returncode, done.stderr))
+            raise failure(last_words(done.returncode, done.stderr))
         return np.asarray(imread(picture))
 
 
-def _failure(reason: str) -> DrawingError:
+def drawing_environment() -> dict[str, str]:
+    """Return the environment of a process that draws."""
+    environment = dict(os.environ)
+    if sys.platform == "linux":  # Neither X nor OSMesa is looked for where there is none.
+        environment.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
+    return environment
+
+
+def failure(reason: str) -> DrawingError:
+    """Return the error for a body that cannot be drawn for this reason."""
     return DrawingError(
         f"pyvista cannot draw the deformed body on this machine ({reason}): install the Python package pyvista and "
         "an OpenGL driver that works without a display, such as libegl1 and libgl1-mesa-dri on Debian and Ubuntu"
     )
 
 
-def _last_words(code: int, stderr: str) -> str:
-    """Why a process ended: the signal, which tells more than VTK does before it, or the last line it wrote."""
+def last_words(code: int, stderr: str) -> str:
+    """Return why a process ended: the signal, which tells more than VTK does before it, or the last line it wrote."""
     if code < 0:
         return signal.strsignal(-code) or f"signal {-code}"
     return (stderr.strip().splitlines() or [f"exit code {code}"])[-1].rstrip(".")

@@ -16,6 +16,7 @@ from .evaluate import evaluate_markers
 from .files import ERRORS, IDENTIFICATION, METRICS, REPORT, ROLLOUTS, fold_folder, training_file, weights_file
 from .identify import identify
 from .reconstruct import reconstruct_markers
+from .report import report_folds, report_measured
 from .stages import import_stages
 from .train import train_on_markers, train_simfree_on_markers
 from .trials import folds_of, split_of
@@ -65,7 +66,14 @@ def learning_stages(config: Mapping[str, Any], split: Split, shared: str, import
     )
     trained = ("train_resphys_uncorrected", "train_resphys", "train_simfree")
     stages.append(Stage("evaluate", evaluate_markers, (ROLLOUTS, ERRORS), base, ("identify", *trained)))
+    shown = {"config": _shown(config), "imported": imported}
+    stages.append(Stage("report", report_measured, (REPORT,), shown, ("evaluate",)))
     return stages
+
+
+def _shown(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The configuration without what has no bearing on a run."""
+    return {key: value for key, value in config.items() if key not in ("task", "tune")}
 
 
 def run_measured(config: dict[str, Any], folder: Path) -> None:
@@ -93,6 +101,10 @@ def run_measured(config: dict[str, Any], folder: Path) -> None:
             "versions": package_versions(),
         }
     write_json(folder / METRICS, metrics)
+    if folds is not None:
+        each = {trial: fold["errors_mm"] for trial, fold in metrics["folds"].items()}
+        shown = {"config": _shown(config), "folds": each}
+        run_stages([*first, Stage("report", report_folds, (REPORT,), shown, ("import",))], folder)
     _print(metrics, folder)
 
 

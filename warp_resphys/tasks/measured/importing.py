@@ -276,9 +276,10 @@ def _angle(a: FloatArray, b: FloatArray) -> float:
 
 
 def _registration_summary(registration: Registration, followed: Sequence[str], shift: FloatArray) -> dict[str, Any]:
-    """For registration.json: lengths in millimetres."""
+    """For registration.json: lengths in millimetres, but for the positions in the frame of the body, in metres."""
     residual = dict(zip(registration.names, _MILLI * registration.residual, strict=True))
     return {
+        "positions": dict(zip(registration.names, registration.positions.tolist(), strict=True)),
         "rms_mm": _MILLI * registration.rms,
         "residual_mm": residual,
         "outliers": list(registration.outliers),

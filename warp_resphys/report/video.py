@@ -1,0 +1,262 @@
+"""A moving body with measured and simulated markers: pictures of a few instants, and a film."""
+
+import subprocess
+import sys
+import threading
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warp_resphys.files import atomic_path
+from warp_resphys.mesh import Mesh, boundary_triangles
+from warp_resphys.progress import Progress
+from warp_resphys.report import render
+from warp_resphys.surface import closest_points
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+COMMAND: Final = (sys.executable, "-P", "-m", "warp_resphys.report.render_motion")
+TIME_OUT: Final = 300.0  # [s]
+SLOWER: Final = 4.0  # Than what was measured.
+LONGEST: Final = 1.5  # [s] of the motion.
+LARGEST_RATE: Final = 25.0  # Frames a second, of the film.
+BODIES: Final = ("#6b7580", "#8db4e8")  # Of the bodies behind, and of the last one.
+RINGS: Final = ("#6b7580", "#1a5fb4")  # Of their markers.
+_MARGIN: Final = 0.06  # Around what is seen, over its longer side.
+_HEADROOM: Final = 0.12  # For the text above a film's first view, over half its height.
+_MOST_NEAR: Final = 1.6  # How far the other models' markers may widen the view from nearby.
+_TILT: Final = (0.30, 0.30)  # From the right and from above.
+_FILM_VIEW: Final = (560, 480)  # [px] of each of two.
+_PICTURE_VIEW: Final = (480, 408)
+_RADII: Final = {_FILM_VIEW: 0.013, _PICTURE_VIEW: 0.02}  # Of a dot, over the height of a view; pictures are small.
+_DIVERGED: Final = 10.0  # Distance from rest, over the body's size, beyond which nothing is drawn.
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A measured motion and simulations of it, at the same T times.
+
+    Attributes:
+        mesh: The body at rest.
+        times: (T,) since the release [s].
+        measured: (T, M, 3) markers [m], NaN where they were not seen.
+        positions: (T, N, 3) [m] of the vertices, by the model's name; the last is drawn solid.
+        markers: (T, M, 3) [m] of the same models.
+        bound: (M, 3) [m] markers on the body at rest.
+        gravity: (3,) which way is down.
+    """
+
+    mesh: Mesh
+    times: FloatArray
+    measured: FloatArray
+    positions: Mapping[str, FloatArray]
+    markers: Mapping[str, FloatArray]
+    bound: FloatArray
+    gravity: FloatArray
+
+    def at(self, frames: Sequence[int] | IntArray) -> "Motion":
+        """Some of the frames."""
+        chosen = np.asarray(frames, dtype=np.int64)
+        return Motion(
+            self.mesh,
+            self.times[chosen],
+            self.measured[chosen],
+            {name: q[chosen] for name, q in self.positions.items()},
+            {name: m[chosen] for name, m in self.markers.items()},
+            self.bound,
+            self.gravity,
+        )
+
+
+def draw_instants(motion: Motion) -> NDArray[np.uint8]:
+    """Draw a motion's frames: the whole body, and beside it the markers from nearby.
+
+    Args:
+        motion: Few frames.
+
+    Returns:
+        (T, 2, H, W, 4) red, green, blue and opacity, 0 to 255, of both views.
+
+    Raises:
+        DrawingError: There is no pyvista, or no OpenGL driver that works off screen.
+    """
+    with TemporaryDirectory() as folder:
+        target = Path(folder) / "frames.npy"
+        _run(_scene(motion, _PICTURE_VIEW), target, Path(folder) / "scene.npz", None)
+        frames: NDArray[np.uint8] = np.load(target, allow_pickle=False)
+    return np.stack(np.split(frames, 2, axis=2), axis=1)
+
+
+def write_video(path: Path, motion: Motion, names: Mapping[str, str]) -> None:
+    """Write a film (MP4, H.264) of the first seconds of a motion, slowed down, and show how far it is.
+
+    Args:
+        path: The file to write.
+        motion: All frames.
+        names: What the legend says, by model.
+
+    Raises:
+        DrawingError: There is no pyvista, no OpenGL driver that works off screen, or no encoder.
+        DataFileError: The file cannot be written.
+    """
+    step = float(np.median(np.diff(motion.times)))
+    every = max(1, round(1.0 / (SLOWER * step * LARGEST_RATE)))
+    shown = motion.at(np.flatnonzero(motion.times <= LONGEST)[::every])
+    legend = [*(names[model] for model in shown.positions), "measured"]
+    texts = [f"{time:.2f} s" for time in shown.times]
+    scene = _scene(shown, _FILM_VIEW) | {"texts": np.array(texts), "legend": np.array(legend)}
+    scene["fps"] = np.array(1.0 / (SLOWER * step * every))
+    room = _HEADROOM * scene["half_height"][0]
+    scene["half_height"][0] += room
+    scene["focus"][0] += room * scene["axes"][1]
+    with TemporaryDirectory() as folder, Progress("video", len(shown.times), "frames") as progress:
+        target = Path(folder) / "motion.mp4"
+        _run(scene, target, Path(folder) / "scene.npz", progress)
+        with atomic_path(path) as partial:
+            partial.write_bytes(target.read_bytes())
+
+
+def _run(scene: Mapping[str, Any], target: Path, source: Path, progress: Progress | None) -> None:
+    """Have another process draw, and count the frames that it says are done."""
+    np.savez(source, **scene)
+    try:
+        process = subprocess.Popen(
+            [*COMMAND, str(source), str(target)],
+            env=render.drawing_environment(),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            errors="replace",
+        )
+    except OSError as error:
+        raise render.failure(error.strerror or str(error)) from error
+    late = threading.Timer(TIME_OUT, process.kill)
+    late.start()
+    try:
+        with process:
+            said: list[str] = []
+            listener = threading.Thread(target=lambda: said.append(process.stderr.read() if process.stderr else ""))
+            listener.start()
+            for line in process.stdout or ():
+                if progress is not None and line.startswith("frame"):
+                    progress.advance()
+            listener.join()
+    except BaseException:
+        with suppress(ProcessLookupError):
+            process.kill()
+        raise
+    finally:
+        late.cancel()
+    if process.returncode:
+        raise render.failure(render.last_words(process.returncode, "".join(said)))
+
+
+def _scene(motion: Motion, size: tuple[int, int]) -> dict[str, Any]:
+    """What `warp_resphys.report.render_motion` asks for, without texts."""
+    models = list(motion.positions)
+    body = float(np.ptp(motion.mesh.vertices, axis=0).max())
+    positions = np.stack([_whole(q, motion.mesh.vertices, _DIVERGED * body) for q in motion.positions.values()])
+    simulated = np.stack([_whole(motion.markers[model], motion.bound, _DIVERGED * body) for model in models])
+    seen = np.concatenate([motion.mesh.vertices[None], *positions])
+    axes = view_axes(motion.gravity, seen)
+    everything = np.concatenate([seen.reshape(-1, 3), simulated.reshape(-1, 3), motion.measured.reshape(-1, 3)])
+    middle, half = _frame(everything, axes, size)
+    near, near_half = _follow(motion.measured, simulated, axes, size)
+    near = np.where(np.isfinite(near), near, middle)
+    return {
+        "positions": positions,
+        "rest": motion.mesh.vertices,
+        "triangles": boundary_triangles(motion.mesh),
+        "edges": render.face_edges(motion.mesh),
+        "colours": np.array([*[BODIES[0]] * (len(models) - 1), BODIES[1]]),
+        "rings": np.array([*[RINGS[0]] * (len(models) - 1), RINGS[1]]),
+        "simulated": simulated,
+        "measured": motion.measured,
+        "feet": _feet(motion.mesh, motion.bound, positions[-1]),
+        "axes": axes,
+        "focus": np.stack([np.broadcast_to(middle, near.shape), near]),
+        "half_height": np.array([half, near_half]),
+        "size": np.array(size),
+        "radius": np.array(_RADII[size]),
+        "texts": np.array([], dtype=str),
+        "legend": np.array([], dtype=str),
+        "fps": np.array(LARGEST_RATE),
+    }
+
+
+def _whole(points: FloatArray, rest: FloatArray, largest: float) -> FloatArray:
+    """(T, P, 3) points, NaN in the frames in which one of them is not finite or farther than this from rest."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        kept = (np.abs(points - rest) < largest).all(axis=(1, 2), keepdims=True)
+    return np.where(kept, points, np.nan)
+
+
+def view_axes(gravity: FloatArray, positions: FloatArray) -> FloatArray:
+    """(3, 3) to the right, up, towards the viewer: what extends or moves most across gravity goes to the right.
+
+    Args:
+        gravity: (3,) which way is down; along -z where it is zero.
+        positions: (T, N, 3) [m], the first frame at rest; NaN is left out.
+    """
+    length = float(np.linalg.norm(gravity))
+    up = -gravity / length if length > 0.0 else np.array([0.0, 0.0, 1.0])
+    points = positions[np.isfinite(positions).all(axis=2)]
+    flat = points - np.outer(points @ up, up)
+    _, _, directions = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)
+    right = directions[0] - (directions[0] @ up) * up
+    right /= np.linalg.norm(right)
+    moved = np.nanmax(np.linalg.norm(positions - positions[0], axis=2), axis=0)  # (N,)
+    towards_end = (positions[0] * moved[:, None]).sum(axis=0) - positions[0].mean(axis=0) * moved.sum()
+    if towards_end @ right < 0.0:
+        right = -right
+    towards = np.cross(right, up) + _TILT[0] * right + _TILT[1] * up
+    towards /= np.linalg.norm(towards)
+    right = np.cross(up, towards)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(towards, right), towards])
+
+
+def _frame(points: FloatArray, axes: FloatArray, size: tuple[int, int]) -> tuple[FloatArray, float]:
+    """The middle (3,) of what is seen of points (P, 3), and half the height of a view that holds it all [m]."""
+    turned = points[np.isfinite(points).all(axis=1)] @ axes.T
+    low, high = turned.min(axis=0), turned.max(axis=0)
+    extent = (high - low)[:2] + 2.0 * _MARGIN * (high - low)[:2].max()
+    return 0.5 * (low + high) @ axes, 0.5 * max(extent[1], extent[0] * size[1] / size[0])
+
+
+def _follow(
+    measured: FloatArray, simulated: FloatArray, axes: FloatArray, size: tuple[int, int]
+) -> tuple[FloatArray, float]:
+    """(T, 3) middle of the markers in each frame, and half the height of a view that holds them [m].
+
+    Where not all markers were seen, those of the last model say where the middle is. The other models' markers are in
+    the view unless they are far off.
+    """
+    places = np.where(np.isfinite(measured).all(axis=(1, 2), keepdims=True), measured, simulated[-1])
+    middle = places.mean(axis=1)
+
+    def half(points: FloatArray) -> float:
+        reach = np.nanmax(np.abs((points - middle[:, None]) @ axes[:2].T), axis=(0, 1))
+        return float(max(reach[1], reach[0] * size[1] / size[0], 1e-4))
+
+    least = half(measured)
+    return middle, 1.25 * min(half(np.concatenate([measured, *simulated], axis=1)), _MOST_NEAR * least)
+
+
+def _feet(mesh: Mesh, bound: FloatArray, positions: FloatArray) -> FloatArray:
+    """(T, M, 3) [m] the points of a moving body that are closest to its markers at rest."""
+    found = closest_points(mesh, bound)
+    corners = mesh.vertices[found.triangles]  # (M, 3, 3)
+    matrix = np.concatenate([corners.transpose(0, 2, 1), np.full((len(bound), 1, 3), corners.max() or 1.0)], axis=1)
+    right = np.concatenate([found.points, np.full((len(bound), 1), corners.max() or 1.0)], axis=1)
+    weights = (np.linalg.pinv(matrix) @ right[..., None])[..., 0]  # (M, 3), their sum one
+    feet: FloatArray = np.einsum("tmki,mk->tmi", positions[:, found.triangles], weights)
+    return feet

@@ -2,12 +2,13 @@
 
 import dataclasses
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import torch
 
 from ...errors import InputError
-from ...files import write_json
+from ...files import read_json, write_json
 from ...identification import Bounds, Identification, Identifier
 from ...progress import Progress
 from ...replay import PARAMETERS, Release, Replay
@@ -16,6 +17,7 @@ from .files import IDENTIFICATION
 from .scene import Scene
 
 _ELASTIC = ("youngs_modulus", "poissons_ratio")
+_KINDS = ("identified", "simulation")
 
 
 def identify(context: StageContext) -> None:
@@ -31,13 +33,15 @@ def identify(context: StageContext) -> None:
     bounds = {name: Bounds(**b) for name, b in config["parameters"].items()}
     elastic = {name: bounds[name] for name in _ELASTIC if name in bounds}
     with Progress("identify", 2 * config["starts"] * config["max_iterations"], "evaluations at most") as progress:
-        identified, replay, release = _search(scene, "identified", train, bounds, settings, progress)
+        identified, replay, release = _search(scene, "identified", train, bounds, context, progress)
         results = {"sysid": identified}
         if elastic:
-            results["sysid_elastic"], *_ = _search(scene, "simulation", train, elastic, settings, progress)
+            results["sysid_elastic"], *_ = _search(scene, "simulation", train, elastic, context, progress)
     found: dict[str, Any] = {name: dataclasses.asdict(result) for name, result in results.items()}
     found["landscape"] = _landscape(replay, release, bounds, identified, config["grid"])
     write_json(context.run_dir / IDENTIFICATION, found)
+    for kind in _KINDS:
+        _attempts_file(context, kind).unlink(missing_ok=True)
 
 
 def first_guess(settings: Mapping[str, Any], names: Any) -> dict[str, float]:
@@ -52,9 +56,10 @@ def _search(
     kind: str,
     train: tuple[str, ...],
     bounds: Mapping[str, Bounds],
-    settings: Mapping[str, Any],
+    context: StageContext,
     progress: Progress,
 ) -> tuple[Identification, Replay, Release]:
+    settings = context.settings
     config = settings["identify"]
     replay, release = scene.replay(kind, train)
     identifier = Identifier(replay, release, bounds, settings["data"]["seconds"])
@@ -64,7 +69,19 @@ def _search(
     def report(start: int, loss: float, values: Mapping[str, float]) -> None:
         progress.advance(1, start=start, loss=f"{loss:.3g}", E=f"{values.get('youngs_modulus', 0.0) / 1e3:.4g} kPa")
 
-    return identifier.run(starts, config["max_iterations"], report), replay, release
+    path = _attempts_file(context, kind)
+
+    def keep(attempts: list[Any]) -> None:
+        write_json(path, {"fingerprint": context.fingerprint, "attempts": attempts})
+
+    kept = read_json(path) if path.is_file() else {}
+    finished = kept["attempts"] if kept.get("fingerprint") == context.fingerprint else []
+    return identifier.run(starts, config["max_iterations"], report, finished, keep), replay, release
+
+
+def _attempts_file(context: StageContext, kind: str) -> Path:
+    """Where finished starts are kept until the stage is done."""
+    return context.run_dir / f"identify_{kind}.json"
 
 
 def _landscape(

@@ -18,7 +18,7 @@ from .checks import check_configuration
 from .evaluate import evaluate
 from .generate import generate
 from .measured.checks import RECORDINGS
-from .measured.experiment import run_measured, shown
+from .measured.experiment import run_measured
 from .reconstruct import reconstruct
 from .refine import refine
 from .report import collect_metrics, make_report
@@ -116,6 +116,11 @@ def stages(config: dict[str, Any]) -> list[Stage]:
 
 def _pick(config: dict[str, Any], *keys: str) -> dict[str, Any]:
     return {key: config[key] for key in keys}
+
+
+def shown(config: dict[str, Any]) -> dict[str, Any]:
+    """The configuration without what has no bearing on a run."""
+    return {key: value for key, value in config.items() if key not in ("task", "tune")}
 
 
 def prepare(config: DictConfig) -> tuple[dict[str, Any], Path]:

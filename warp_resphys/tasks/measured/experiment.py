@@ -17,7 +17,6 @@ from .files import ERRORS, IDENTIFICATION, METRICS, REPORT, ROLLOUTS, fold_folde
 from .identify import identify
 from .reconstruct import reconstruct_markers
 from .report import report_folds, report_measured
-from .report import report_folds, report_measured
 from .stages import import_stages
 from .train import train_on_markers, train_simfree_on_markers
 from .trials import folds_of, split_of

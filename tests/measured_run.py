@@ -118,7 +118,8 @@ def write_recordings(folder: Path, trials=TRIALS):
         }
     write_json(folder / "quality.json", quality)
     write_json(folder / "registration.json", registration)
-    write_json(folder / "truth.json", {"youngs_modulus": 250e3, "poissons_ratio": 0.49, "mass_damping": 1.0})
+    material = {"model": "stable_neo_hookean", "youngs_modulus": 250e3, "poissons_ratio": 0.49, "mass_damping": 1.0}
+    write_json(folder / "truth.json", {"material": material})
 
 
 def write_split(folder: Path, test: Sequence[str], models=MODELS, trials=TRIALS, diverged=()):

@@ -106,6 +106,7 @@ def test_page_of_a_split(tmp_path):
         "5.46 ± 1.78",
         "The published errors are those of other data",
         "251.3 ± 2.5",
+        "whose material is stable neo hookean",
         "they cannot tell apart Young's modulus and Poisson's ratio (\N{MINUS SIGN}0.96)",
         "left out",
         "bare: Base - 1 jumps once, by 0.31 mm, in frame 80.",
@@ -271,6 +272,8 @@ def test_parameters_and_what_the_data_cannot_tell():
     said = uncertainty_text("sysid", found).replace("\u00a0", " ")
     assert said == "SysID: the data tell least about damping by stiffness, to 3.4 % of the range."
     assert uncertainty_text("sysid", {**found, "uncertainty": None}) == ""
+    found["uncertainty"]["poorest_deviation"] = 1.9
+    assert uncertainty_text("sysid", found).endswith("damping by stiffness, and leave that open over the whole range.")
 
 
 def test_rows_of_markers_that_were_never_seen():

@@ -85,7 +85,7 @@ class MeasuredReport:
         recordings: Quality and registration of all trials.
         identification: What identification.json holds.
         start: The values of the data sheet, by parameter.
-        truth: The true ones, where they are known.
+        truth: Those of the simulated reality, where there is one.
         training: Records of the epochs, by learned model.
         seconds: How much of each trial counts; None for all of it.
         synthetic: Whether what is called measured was simulated, as there are no recordings.
@@ -103,7 +103,7 @@ class MeasuredReport:
     recordings: Recordings
     identification: Mapping[str, Any]
     start: Mapping[str, float]
-    truth: Mapping[str, float]
+    truth: Mapping[str, Any]
     training: Mapping[str, Sequence[Mapping[str, Any]]]
     seconds: float | None
     synthetic: bool

@@ -232,6 +232,8 @@ def _draw_identification(data: MeasuredReport, both: Callable[..., Picture], pic
     identified = found.get("sysid", {}).get("parameters", {})
     if keys[0] in identified:
         points["identified"] = (identified[keys[0]], identified.get(keys[1], data.start.get(keys[1], 0.0)))
+    if all(key in data.truth for key in keys):
+        points["true"] = (data.truth[keys[0]], data.truth[keys[1]])
     marked = "; ".join(f"{name} at {1e-3 * e:.4g} kPa" for name, (e, _) in points.items())
     pictures["landscape"] = both(
         "landscape",

@@ -34,6 +34,7 @@ _PARAMETERS: Final[Mapping[str, tuple[str, str, float]]] = {
     "gravity_tilt_1": ("First tilt of gravity", "°", 180.0 / np.pi),
     "gravity_tilt_2": ("Second tilt of gravity", "°", 180.0 / np.pi),
 }
+_WHOLE: Final = 99.5  # [%] of a parameter's range.
 _TIED: Final = 0.9  # From this correlation on, two parameters are named as not told apart.
 
 
@@ -134,7 +135,7 @@ def identifications(identification: Mapping[str, Any]) -> list[str]:
 
 
 def parameter_rows(
-    found: Mapping[str, Any], start: Mapping[str, float], truth: Mapping[str, float]
+    found: Mapping[str, Any], start: Mapping[str, float], truth: Mapping[str, Any]
 ) -> list[dict[str, str]]:
     """Return a row a parameter: name and unit, the data sheet's value, what was identified, and whether at a bound.
 
@@ -200,10 +201,9 @@ def uncertainty_text(name: str, found: Mapping[str, Any]) -> str:
     words = {parameter: _in_a_sentence(parameter) for parameter in names}
     largest = max(abs(weight) for weight in known["poorest"].values())
     along = [words[p] for p, weight in known["poorest"].items() if abs(weight) > 0.4 * largest]
-    said = (
-        f"{MODELS[name][0]}: the data tell least about {' together with '.join(along)}, to "
-        f"{100.0 * known['poorest_deviation']:.2g} % of the range"
-    )
+    said = f"{MODELS[name][0]}: the data tell least about {' together with '.join(along)}, "
+    share = 100.0 * known["poorest_deviation"]
+    said += f"to {share:.2g} % of the range" if share < _WHOLE else "and leave that open over the whole range"
     correlation = np.array(known["correlation"], dtype=np.float64)
     tied = [
         f"{words[names[i]]} and {words[names[j]]} ({correlation[i, j]:+.2f})".replace("-", MINUS)

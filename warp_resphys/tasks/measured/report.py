@@ -66,7 +66,7 @@ def report_measured(context: StageContext) -> None:
         recordings=read_recordings(_common(folder), config, mesh),
         identification=_read_if_there(folder / IDENTIFICATION),
         start=first_guess(config, PARAMETERS),
-        truth=_read_if_there(_common(folder) / TRUTH),
+        truth=_read_if_there(_common(folder) / TRUTH).get("material", {}),
         training={m: read_json(path)["epochs"] for m in TRAINED if (path := folder / training_file(m)).is_file()},
         seconds=config["data"]["seconds"],
         synthetic=is_synthetic(config),

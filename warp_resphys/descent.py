@@ -21,37 +21,42 @@ _TRIALS = 10
 _LARGEST_STEP = 0.25  # of the range of a variable
 _RIDGE = 1e-10  # of the trace: keeps directions without influence from moving
 _CLOSE = 0.6  # of a step's curvature to the model's: what an update may mend
-_RELATIVE_DECREASE = 1e-6
 _ABSOLUTE_DECREASE = 1e-10
 
 
 def minimise(
-    objective: Objective, start: Array, matrix: Callable[[Array], Array | None], max_iterations: int
+    objective: Objective,
+    start: Array,
+    matrix: Callable[[Array], Array | None],
+    max_evaluations: int,
+    tolerance: float = 1e-6,
 ) -> tuple[Array, float]:
     """The minimum over the unit box that is downhill from a start.
 
-    It ends where the model promises a decrease of less than a millionth of the objective, or less than 1e-10.
+    It ends where the model promises a relative decrease below the tolerance, or one of less than 1e-10.
 
     Args:
         objective: (P,) variables to value and gradient; the value is infinite where there is none.
         start: (P,) between 0 and 1.
         matrix: (P,) variables to the (P, P) Gauss-Newton matrix 2 J^T J, or None where it cannot be had.
-        max_iterations: steps; each takes one evaluation, or a few.
+        max_evaluations: of the objective; a matrix costs about as much as two.
+        tolerance: relative decrease that is still worth a step.
 
     Returns:
         The variables and the value; infinite if it was so at the start.
     """
+    counted = _Counted(objective, max_evaluations)
     x = np.clip(start, 0.0, 1.0)
-    value, gradient = objective(x)
+    value, gradient = counted(x)
     if not np.isfinite(value):
         return x, np.inf
     model, fresh = _model(matrix(x), gradient), True
-    for _ in range(max_iterations):
+    while counted.left > 0:
         step = _box_step(model, gradient, x)
         promised = -float(gradient @ step + 0.5 * step @ model @ step)
         found = None
-        if promised > max(_RELATIVE_DECREASE * value, _ABSOLUTE_DECREASE):
-            found = _search(objective, x, value, gradient, step, model)
+        if promised > max(tolerance * value, _ABSOLUTE_DECREASE):
+            found = _search(counted, x, value, gradient, step, model)
         if found is None:
             if fresh:
                 break
@@ -65,6 +70,17 @@ def minimise(
         else:  # The valley bends.
             model, fresh = _model(matrix(x), gradient), True
     return x, value
+
+
+class _Counted:
+    """An objective that knows how often it may still be evaluated."""
+
+    def __init__(self, objective: Objective, most: int) -> None:
+        self._objective, self.left = objective, most
+
+    def __call__(self, x: Array) -> tuple[float, Array]:
+        self.left -= 1
+        return self._objective(x)
 
 
 def _model(matrix: Array | None, gradient: Array) -> Array:
@@ -83,7 +99,7 @@ def _box_step(model: Array, gradient: Array, x: Array) -> Array:
 
 
 def _search(
-    objective: Objective, x: Array, value: float, gradient: Array, step: Array, model: Array
+    objective: "_Counted", x: Array, value: float, gradient: Array, step: Array, model: Array
 ) -> tuple[Array, float, Array] | None:
     """Variables, value and gradient of the first sufficient decrease; None if there is none.
 
@@ -95,6 +111,8 @@ def _search(
         trial, at_trial = objective(new)
         if trial <= value + _ARMIJO * length * slope:
             return new, trial, at_trial
+        if objective.left <= 0:
+            return None
         if length == 1.0 and np.isfinite(trial):
             back = np.clip(new + _box_step(model, at_trial, new), 0.0, 1.0)
             second, at_second = objective(back)
@@ -104,6 +122,8 @@ def _search(
         if np.isfinite(trial):  # Where the parabola through what is known has its minimum.
             lowest = -0.5 * slope * length / (trial - value - slope * length)
         length *= min(max(lowest, 0.1), 0.5)
+        if objective.left <= 0:
+            return None
     return None
 
 

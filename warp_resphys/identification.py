@@ -208,16 +208,18 @@ class Identifier:
     def run(
         self,
         starts: Sequence[Mapping[str, float]],
-        max_iterations: int,
+        max_evaluations: int,
         report: Report | None = None,
         finished: Sequence[Attempt] = (),
         keep: Callable[[list[Attempt]], None] | None = None,
+        tolerance: float = 1e-6,
     ) -> Identification:
         """Minimises the loss from every start and keeps the best.
 
         Args:
             starts: a value of each parameter, for each start.
-            max_iterations: of `descent.minimise`, a start.
+            max_evaluations: of the loss and its gradient, a start.
+            tolerance: relative decrease of the loss that is still worth a step.
             report: called after every evaluation with the start's number, the loss (infinite where the simulation
                 failed) and the parameters.
             finished: what an interrupted run with the same starts gave to `keep`; those starts are not done again.
@@ -228,7 +230,7 @@ class Identifier:
         """
         attempts = list(finished)
         for number in range(len(attempts), len(starts)):
-            attempts.append(self._descend(number, starts[number], max_iterations, report))
+            attempts.append(self._descend(number, starts[number], max_evaluations, tolerance, report))
             if keep is not None:
                 keep(attempts)
         good = [attempt for attempt in attempts if attempt["loss"] is not None]
@@ -240,7 +242,9 @@ class Identifier:
         histories = [attempt["history"] for attempt in attempts]
         return Identification(best["parameters"], best["loss"], histories, at_bounds, self.uncertainty(unit))
 
-    def _descend(self, number: int, start: Mapping[str, float], max_iterations: int, report: Report | None) -> Attempt:
+    def _descend(
+        self, number: int, start: Mapping[str, float], max_evaluations: int, tolerance: float, report: Report | None
+    ) -> Attempt:
         """What one start leads to: the parameters, their loss (None if the simulation fails there), the history."""
         history: list[dict[str, float]] = []
 
@@ -257,7 +261,7 @@ class Identifier:
             return None if found is None else 2.0 * np.einsum("rip,riq->pq", found[1], found[1])
 
         first = np.array([self._unit(name, start) for name in self.bounds])
-        unit, loss = minimise(objective, first, matrix, max_iterations)
+        unit, loss = minimise(objective, first, matrix, max_evaluations, tolerance)
         return {
             "parameters": self._values(unit),
             "loss": loss if np.isfinite(loss) else None,

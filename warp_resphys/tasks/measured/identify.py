@@ -32,7 +32,7 @@ def identify(context: StageContext) -> None:
     train = tuple(settings["split"]["train"])
     bounds = {name: Bounds(**b) for name, b in config["parameters"].items()}
     elastic = {name: bounds[name] for name in _ELASTIC if name in bounds}
-    with Progress("identify", 2 * config["starts"] * config["max_iterations"], "evaluations at most") as progress:
+    with Progress("identify", 2 * config["starts"] * config["max_evaluations"], "evaluations at most") as progress:
         identified, replay, release = _search(scene, "identified", train, bounds, context, progress)
         results = {"sysid": identified}
         if elastic:
@@ -76,7 +76,11 @@ def _search(
 
     kept = read_json(path) if path.is_file() else {}
     finished = kept["attempts"] if kept.get("fingerprint") == context.fingerprint else []
-    return identifier.run(starts, config["max_iterations"], report, finished, keep), replay, release
+    return (
+        identifier.run(starts, config["max_evaluations"], report, finished, keep, config["tolerance"]),
+        replay,
+        release,
+    )
 
 
 def _attempts_file(context: StageContext, kind: str) -> Path:
@@ -115,7 +119,7 @@ def check_identification(config: Mapping[str, Any]) -> None:
             Bounds(**each)
         except (TypeError, InputError) as error:
             raise InputError(f"identify.parameters.{name}: {error}") from error
-    for key in ("starts", "max_iterations"):
+    for key in ("starts", "max_evaluations", "tolerance"):
         if not config[key] > 0:
             raise InputError(f"identify.{key} is {config[key]}: it must be positive.")
     if "youngs_modulus" not in config["grid"] or not set(config["grid"]) <= set(_ELASTIC):

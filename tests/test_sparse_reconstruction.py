@@ -10,6 +10,7 @@ from warp_resphys.errors import ConvergenceError, InputError
 from warp_resphys.markers import KINDS, MarkerMap, bind_markers
 from warp_resphys.residual.sparse_reconstruction import (
     SparseGaussNewton,
+    SparseLevenbergMarquardt,
     make_sparse_reconstructor,
     ridge,
     vibration_modes,
@@ -157,6 +158,79 @@ class TestGaussNewton:
         solver = SparseGaussNewton(simulator(), markers_at([8]), 1e-6, tolerance=1e-12, max_iterations=1)
         with pytest.raises(ConvergenceError, match=r"the 1th: raise reconstruction\.regularisation"):
             solver.step(start, solver.markers(observed[1]))
+
+
+class TestLevenbergMarquardt:
+    @pytest.mark.parametrize("integrator", INTEGRATORS)
+    def test_gauss_newton_finds_the_same_minimum(self, integrator):
+        """With stems that turn, and with a marker that one of the environments did not see."""
+        observed, start = observation(3, (0.1, 0.5), integrator=integrator)
+        stems = [[0.06, 0.012, 0.045], [0.075, 0.02, 0.01]]
+        sim, markers = simulator(integrator=integrator), bind_markers(MESH, stems, "ab", kind="rigid", vertices=TIP)
+        states, first = [start, start], None
+        for target in observed[1:]:
+            seen = markers(target)
+            seen[1, 0] = torch.nan
+            damped, plain = (
+                solver(sim, markers, 1e-6, **TIGHT).step(state, seen, first_guess=first)
+                for solver, state in zip((SparseLevenbergMarquardt, SparseGaussNewton), states, strict=True)
+            )
+            scale = float(plain.force.abs().max())
+            np.testing.assert_allclose(damped.force, plain.force, rtol=0, atol=1e-6 * scale)
+            np.testing.assert_allclose(damped.state.q, plain.state.q, rtol=0, atol=1e-9)
+            states, first = [damped.state, plain.state], damped.force
+        assert (damped.state.previous is None) == (plain.state.previous is None)
+
+    def test_it_follows_a_jerk_to_a_minimum(self):
+        """Where full steps overshoot: no small change of the force makes the objective smaller."""
+        _, start = observation(1, (0.1, 0.1))
+        sim, markers = simulator(), markers_at([6, 11], [6, 11])
+        target = markers(start.q) + torch.tensor([[[-0.03, 0.0, 0.05]], [[0.0, 0.0, 1e-3]]], dtype=torch.float64)
+        found = SparseLevenbergMarquardt(sim, markers, 1e-5, 1e-10, 200).step(start, target)
+        force = found.force.clone().requires_grad_(True)
+        new, _ = sim.step(start, force)
+        objective = (markers(new.q) - target).square().sum() + 1e-5 * force.square().sum()
+        (gradient,) = torch.autograd.grad(objective, force)
+        np.testing.assert_allclose(new.q.detach(), found.state.q, rtol=0, atol=1e-9)
+        free = [i for i in range(12) if i not in BODY.fixed_vertices]
+        assert float(gradient[:, free].abs().max()) < 1e-4 * 2e-5 * float(found.force.abs().max())
+
+    def test_a_first_guess_that_fails_is_left(self, monkeypatch):
+        observed, start = observation()
+        sim, markers = simulator(), markers_at([8])
+        solver = SparseLevenbergMarquardt(sim, markers, 1e-6, **TIGHT)
+        expected = solver.step(start, markers(observed[1]))
+        step = Simulator.step
+
+        def fragile(self, state, force=None, **options):
+            if force is not None and float(force.abs().max()) > 50.0:
+                raise ConvergenceError("too much", state.q, None)
+            return step(self, state, force, **options)
+
+        monkeypatch.setattr(Simulator, "step", fragile)
+        found = solver.step(start, markers(observed[1]), first_guess=torch.full_like(start.q, 100.0))
+        np.testing.assert_allclose(found.force, expected.force, rtol=0, atol=1e-9)
+
+    def test_a_simulator_that_never_gets_there_is_no_result(self, monkeypatch):
+        observed, start = observation()
+        solver = SparseLevenbergMarquardt(simulator(), markers_at([8]), 1e-6, 1e-6, 5)
+
+        def failing(*_, **__):
+            raise ConvergenceError("no", start.q, None)
+
+        monkeypatch.setattr(Simulator, "step", failing)
+        with pytest.raises(ConvergenceError, match=r"the 5th: raise reconstruction\.regularisation"):
+            solver.step(start, solver.markers(observed[1]))
+
+
+def test_the_published_method_leaves_out_markers_that_were_not_seen():
+    observed, start = observation(1, (0.1, 0.3))
+    sim, markers = simulator(), markers_at([6, 11], [5, 10])
+    seen = markers(observed[1])
+    seen[0, 1] = torch.nan
+    published = make_sparse_reconstructor(sim, markers, "lbfgsb", 1e-5, 1e-15, 3000).step(start, seen)
+    ours = SparseGaussNewton(sim, markers, 1e-5, **TIGHT).step(start, seen)
+    np.testing.assert_allclose(published.force, ours.force, rtol=0, atol=2e-3 * float(ours.force.abs().max()))
 
 
 @pytest.mark.parametrize("shape", [(3, 7), (7, 3)])

@@ -160,8 +160,9 @@ class SparseLevenbergMarquardt(Reconstructor):
 
         |r - J (f - f0)|^2 + lambda |f|^2 + d |f - f0|^2,
 
-    and is taken if the objective gets smaller; the damping d grows where it does not. ``tolerance`` is the last change
-    of any position [m].
+    and is taken if the objective gets smaller; the damping d grows where it does not, and fades where it does. An
+    environment is done, and left alone, when such a step moves no position by more than ``tolerance`` [m] and either
+    is hardly damped or leads nowhere.
 
     Args:
         simulator: the one to correct.
@@ -196,19 +197,24 @@ class SparseLevenbergMarquardt(Reconstructor):
         if not bool(torch.isfinite(objective).all()):
             force = torch.zeros_like(force)
             new, objective = self._try(state, force, observed)
-        damping = torch.zeros_like(objective)
+        damping, done = torch.zeros_like(objective), torch.zeros_like(objective, dtype=torch.bool)
         for iteration in range(1, self.max_iterations + 1):
             candidate = self._next_force(state, new, force, observed, seen, damping)
-            reached, value = self._try(state, candidate, observed)
-            better = value <= objective
-            moved = (reached.q - new.q).abs().amax((1, 2))
-            settled = moved <= self.tolerance
-            where = (better & ~(settled & (damping > 0.0)))[:, None, None]
+            reached, value = self._try(state, torch.where(done[:, None, None], force, candidate), observed)
+            simulated = torch.isfinite(value)
+            better = simulated & (value <= objective)
+            moved = torch.where(simulated, (reached.q - new.q).abs().amax((1, 2)), torch.inf)
+            settled = (moved <= self.tolerance) & (~better | (damping <= self.regularisation))
+            where = (better & ~done)[:, None, None]
             force = torch.where(where, candidate, force)
-            new = State(torch.where(where, reached.q, new.q), torch.where(where, reached.v, new.v), reached.previous)
-            objective = torch.where(better, value, objective)
+            if bool(simulated.all()):
+                new = State(
+                    torch.where(where, reached.q, new.q), torch.where(where, reached.v, new.v), reached.previous
+                )
+            objective = torch.where(better & ~done, value, objective)
             damping = torch.where(better, 0.1 * damping, (10.0 * damping).clamp_min(self.regularisation))
-            if bool((settled & (better | (damping > 0.0))).all()):
+            done |= settled
+            if bool(done.all()):
                 return Reconstruction(new, force, iteration)
         raise ConvergenceError(
             f"sparse Levenberg-Marquardt reconstruction moved by {float(moved.max()):.1e} m in its last iteration, the "
@@ -287,7 +293,10 @@ class SparseLBFGSB(LBFGSB):
     @override
     def step(self, state: State, observed: torch.Tensor, first_guess: torch.Tensor | None = None) -> Reconstruction:
         """See `SparseGaussNewton.step`; the first guess is a force (B, N, 3) [N]."""
-        return self._minimise(state, lambda q: (self.markers(q) - observed).square().sum(), first_guess)
+        seen = torch.isfinite(observed)
+        return self._minimise(
+            state, lambda q: torch.where(seen, self.markers(q) - observed, 0.0).square().sum(), first_guess
+        )
 
 
 def ridge(matrix: torch.Tensor, right: torch.Tensor, weight: float) -> torch.Tensor:

@@ -65,12 +65,12 @@ class MotionLoss:
 
 
 class MarkersInTheLoop(FullBatchTrainer):
-    """Minimises a `MotionLoss` and a penalty on the mean square of the weights, by L-BFGS from no force at all.
+    """Minimises a `MotionLoss` and a penalty on the squares of the weights, by L-BFGS from no force at all.
 
     Args:
-        model: whose network's weights are trained; they are set to zero.
+        model: whose network's weights are trained; those of its last layers are set to zero, as is the mean force.
         train: loss on the training motions.
-        validation: loss on the validation motions, or None: then the last weights are kept.
+        validation: loss on the validation motions, by which the weights are chosen; None: the training motions are.
         config: the group ``in_the_loop``.
 
     Raises:
@@ -85,7 +85,7 @@ class MarkersInTheLoop(FullBatchTrainer):
         super().__init__(model, judge.error_mm, config)
         self._train = train
         with torch.no_grad():
-            _zero_last_layers(model)
+            _remove_force(model)
 
     @override
     def _run_epoch(self) -> dict[str, float]:
@@ -96,7 +96,7 @@ class MarkersInTheLoop(FullBatchTrainer):
 
     def _loss_without_gradient(self) -> float:
         with torch.no_grad():
-            return float(self._train(self.model))
+            return float(self._train(self.model) + self._penalty())
 
     def _penalty(self) -> torch.Tensor:
         squares = [w.square().sum() for w in self.model.network.parameters()]
@@ -113,8 +113,10 @@ class MarkersInTheLoop(FullBatchTrainer):
         return float(loss.detach())
 
 
-def _zero_last_layers(model: ResidualForce) -> None:
-    """Makes the force vanish, and leaves the layers before as they are, so that gradients reach them."""
+def _remove_force(model: ResidualForce) -> None:
+    """Makes the force vanish, and leaves the first layers as they are, so that gradients reach the last ones."""
+    for coder in model.coders:
+        coder.mean.zero_()
     for block in model.network.blocks:
         last = block[-1]  # type: ignore[index]
         last.weight.zero_()

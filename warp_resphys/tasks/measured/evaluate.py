@@ -78,18 +78,19 @@ def _roll_out(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(R, K + 1, N, 3) positions at the steps and (R, T, M, 3) markers at the frames [m]."""
     simulator = scene.simulator(SIMULATORS[model], on_failure="count")
+    device = simulator.rest_positions.device
     release = scene.release(scene.simulator(SIMULATORS[model]), motions)
     parameters = parameters_of(context.run_dir, model, simulator.rest_positions)
     tensors = Replay(simulator, scene.markers, motions).tensors(parameters)
     rollout: Rollout
     if model == "simfree":
         network = restore(NextState, *read_checkpoint(context.run_dir / weights_file(model), "next state"))
-        rollout = DataDrivenRollout(simulator, state_predictor_of(network, loads(motions)))
+        rollout = DataDrivenRollout(simulator, state_predictor_of(network.to(device), loads(motions)))
     else:
         force = None
         if model in TRAINED:
             learned = restore(ResidualForce, *read_checkpoint(context.run_dir / weights_file(model), "residual force"))
-            force = force_predictor_of(learned, loads(motions))
+            force = force_predictor_of(learned.to(device), loads(motions))
         rollout = HybridRollout(simulator, force, tensors=tensors)
     q = roll_out_to_the_end(rollout, simulator, motions, release)
     markers = markers_at_frames(q, simulator, scene.markers, motions, release)

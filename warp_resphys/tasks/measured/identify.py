@@ -32,7 +32,8 @@ def identify(context: StageContext) -> None:
     train = tuple(settings["split"]["train"])
     bounds = {name: Bounds(**b) for name, b in config["parameters"].items()}
     elastic = {name: bounds[name] for name in _ELASTIC if name in bounds}
-    with Progress("identify", 2 * config["starts"] * config["max_evaluations"], "evaluations at most") as progress:
+    evaluations = (2 if elastic else 1) * config["starts"] * config["max_evaluations"]
+    with Progress("identify", evaluations, "evaluations at most") as progress:
         identified, replay, release = _search(scene, "identified", train, bounds, context, progress)
         results = {"sysid": identified}
         if elastic:

@@ -28,7 +28,8 @@ def reconstruct_markers(context: StageContext) -> None:
     tensors = Replay(simulator, scene.markers, motions).tensors(parameters)
     reconstructor = make_sparse_reconstructor(simulator, scene.markers, **settings["reconstruction"])
     reconstructor = reconstructor.with_tensors(tensors)
-    observed = simulator.tensor(at_steps(motions, simulator.time_step))
+    release = scene.release(simulator, motions)
+    observed = simulator.tensor(at_steps(motions, simulator.time_step, release.delay))
     batch, steps = observed.shape[:2]
     fields = state_fields(batch, simulator.body.n_vertices)
     fields["force"] = Field((batch, simulator.body.n_vertices, 3), "N", batch_axes=1)
@@ -37,7 +38,7 @@ def reconstruct_markers(context: StageContext) -> None:
         ResumableHDF5(path, "reconstruction", context.fingerprint, steps, fields) as file,
         Progress(context.name, steps, "steps", file.done) as progress,
     ):
-        state: State = scene.release(simulator, motions).state
+        state: State = release.state
         force, iterations = torch.zeros_like(state.q), 0
         if file.done > 0:
             state = last_state(file, simulator.rest_positions)

@@ -48,7 +48,7 @@ class Scene:
     def _imported(self) -> tuple[Motions, NDArray[np.float64], tuple[str, ...], NDArray[np.float64]]:
         return read_motions(self.shared / MARKERS, build_body(self.config), self.config["data"]["hung_on"])
 
-    @property
+    @cached_property
     def motions(self) -> Motions:
         """All trials, on the simulators' device."""
         motions, *_ = self._imported
@@ -77,12 +77,12 @@ class Scene:
         )
         return found.to(self.simulator("simulation").rest_positions)
 
-    def simulator(self, kind: str, on_failure: str | None = None) -> Simulator:
+    def simulator(self, kind: str, on_failure: str = "raise") -> Simulator:
         """A simulator under the gravity of the recordings.
 
         Args:
             kind: ``simulation`` (uncorrected), ``published``, or ``identified``, which steps with another integrator.
-            on_failure: in place of the configured one.
+            on_failure: whether a step that fails raises, or is counted, whatever is configured.
         """
         config = {**self.config, "gravity": self._imported[3].tolist()}
         if kind == "published":
@@ -120,7 +120,7 @@ def parameters_of(folder: Path, model: str, like: torch.Tensor) -> dict[str, tor
     return {name: like.new_tensor([value]) for name, value in values.items()}
 
 
-def at_steps(motions: Motions, step: float) -> NDArray[np.float64]:
+def at_steps(motions: Motions, step: float, delay: torch.Tensor | None = None) -> NDArray[np.float64]:
     """(R, K + 1, M, 3) markers at the steps of a simulation [m], NaN after a motion's end and in long occlusions.
 
     Cubic splines through the frames in which a marker was seen, with where it was held at time zero. Steps further than
@@ -129,8 +129,10 @@ def at_steps(motions: Motions, step: float) -> NDArray[np.float64]:
     Args:
         motions: observed.
         step: h [s].
+        delay: (R,) by which the bodies were let go later than the time zero of the frames [s]; none if left out.
     """
-    times, markers, held = (t.cpu().numpy() for t in (motions.times, motions.markers, motions.held))
+    since = motions.times if delay is None else (motions.times - delay[:, None]).clamp_min(0.0)
+    times, markers, held = (t.cpu().numpy() for t in (since, motions.markers, motions.held))
     steps = step * np.arange(int(times.max() / step + 1e-6) + 1)
     found = np.full((len(times), len(steps), *markers.shape[2:]), np.nan)
     for r, m in np.ndindex(len(times), markers.shape[2]):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from warp_resphys.errors import InputError
-from warp_resphys.metrics import PUBLISHED_MM, summarise, summarise_each, trajectory_errors
+from warp_resphys.metrics import PUBLISHED_MM, summarise, summarise_each, summarise_folds, trajectory_errors
 
 
 def two_vertices(*distances: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
@@ -69,3 +69,13 @@ def test_published_numbers() -> None:
     assert PUBLISHED_MM["beam_oscillation"]["simulation"] == (4.488, 1.468)
     assert PUBLISHED_MM["beam_oscillation"]["resphys"] == (0.004, 0.010)
     assert PUBLISHED_MM["sopra"]["resphys"] == (5.77, 3.00)
+
+
+def test_folds_weigh_the_same_whatever_their_length() -> None:
+    folds = [
+        {"resphys": summarise([np.array([1.0, 1.0, 1.0])]), "simfree": summarise([np.array([2.0])])},
+        {"resphys": summarise([np.array([3.0]), np.array([5.0])]), "simfree": summarise([np.array([np.nan])])},
+    ]
+    found = summarise_folds(folds)
+    assert found["resphys"] == {"mean": 2.5, "std": 1.5, "trajectories": 3, "diverged": 0}
+    assert found["simfree"] == {"mean": None, "std": None, "trajectories": 2, "diverged": 1}

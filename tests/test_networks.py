@@ -5,7 +5,17 @@ from torch import nn
 
 from warp_resphys.errors import InputError
 from warp_resphys.files import read_checkpoint, write_checkpoint
-from warp_resphys.residual.networks import ResidualForce, SkipMLP, build_model, nodal_coder, pod_coder, restore
+from warp_resphys.residual.networks import (
+    NextState,
+    ResidualForce,
+    SkipMLP,
+    actuation_coder,
+    build_model,
+    build_next_state,
+    nodal_coder,
+    pod_coder,
+    restore,
+)
 
 REDUCED = {"kind": "reduced", "position_modes": 3, "velocity_modes": 4, "force_modes": 5}
 ARCHITECTURE = {"blocks": 2, "layers": 1, "width": 16}
@@ -187,3 +197,44 @@ def test_bad_settings(settings, sentence):
     with pytest.raises(InputError) as error:
         build_model({**KINDS["reduced"], **settings}, samples[0], samples, samples, samples)
     assert str(error.value) == sentence
+
+
+class TestActuation:
+    LOADS = torch.tensor([[0.0, 0.0], [0.05, 0.0], [0.1, 0.0]], dtype=torch.float64).repeat(14, 1)[:40]
+
+    def built(self, build=build_model, **changes):
+        torch.manual_seed(0)
+        rest, q, v = field(1, seed=5)[0], field(40, seed=1), field(40, seed=2)
+        fields = (rest, rest + q, v, *([field(40, seed=3)] if build is build_model else []))
+        return build({**KINDS["reduced"], **changes}, *fields, self.LOADS), rest + q, v
+
+    def test_it_is_in_units_of_its_size_and_none_stays_zero(self):
+        coded = actuation_coder(self.LOADS).encode(self.LOADS)
+        assert float(coded[:, 0].square().mean()) == pytest.approx(1.0)
+        assert not coded[0].any()
+        assert not coded[:, 1].any()
+
+    @pytest.mark.parametrize(("kind", "build"), [(ResidualForce, build_model), (NextState, build_next_state)])
+    def test_round_trip_in_double_precision(self, tmp_path, kind, build):
+        model, q, v = self.built(build)
+        model = model.double().eval()
+        write_checkpoint(tmp_path / "model.safetensors", "test", model.state_dict(), model.description())
+        again = restore(kind, *read_checkpoint(tmp_path / "model.safetensors", "test"))
+        with torch.no_grad():
+            for one, other in zip(model.predict(q, v, self.LOADS), again.predict(q, v, self.LOADS), strict=True):
+                assert torch.equal(one, other)
+            assert not torch.equal(model.predict(q, v, self.LOADS)[0], model.predict(q, v, 2.0 * self.LOADS)[0])
+
+    def test_without_hidden_layers_it_is_affine(self):
+        model, q, v = self.built(layers=0, blocks=1)
+        model = model.double()
+        with torch.no_grad():
+            ends = [model(q[pick], v[pick], self.LOADS[pick]) for pick in (slice(0, 10), slice(10, 20))]
+            halfway = [0.5 * (x[:10] + x[10:20]) for x in (q, v, self.LOADS)]
+            middle = model(*halfway)
+        torch.testing.assert_close(middle, 0.5 * (ends[0] + ends[1]), rtol=1e-12, atol=1e-12)
+
+    def test_it_must_be_given(self):
+        model, q, v = self.built()
+        with pytest.raises(ValueError, match="trained with an actuation"):
+            model(q, v)

@@ -267,6 +267,7 @@ def test_an_interrupted_identification_goes_on_with_the_next_start(finished, tmp
         (["identify.parameters.youngs_modulus.upper=1.0"], "identify.parameters.youngs_modulus: the bounds 50000 and"),
         (["in_the_loop.epochs=0"], "in_the_loop.epochs is 0: it must be a whole number, one or more"),
         (["network.kind=other"], "network.kind is 'other'"),
+        (["synthetic.trials={a: {hung: 0.0}}"], "unknown key 'synthetic.trials.a', did you mean"),
     ],
 )
 def test_bad_input_is_one_sentence(tmp_path, monkeypatch, overrides, sentence):

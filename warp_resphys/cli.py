@@ -185,6 +185,8 @@ def _explain_key(error: HydraException, cause: OmegaConfBaseException) -> str:
     wanted = named.group(1) if named else str(cause.full_key)
     root = {} if cause.parent_node is None else OmegaConf.to_container(cause.parent_node._get_root())
     known = [key for key in _keys(root) if key.partition(".")[0] != "hydra"]
+    if wanted in known:  # The value has a key of its own that does not exist.
+        wanted = str(cause.full_key)
     same_name = [key for key in known if key.rpartition(".")[2] == wanted.rpartition(".")[2]]
     hint = _did_you_mean(wanted, known, preferred=same_name)
     return f"unknown key '{wanted}'{hint} (--cfg job lists all keys, +{wanted}=... adds a new one)"

@@ -18,7 +18,7 @@ _EVALUATIONS = 12  # of the loss, the most that an epoch takes
 
 
 class FullBatchTrainer(EpochTrainer[ResidualForce]):
-    """Minimises a loss of the network's weights by L-BFGS.
+    """Minimises a loss of the network's weights, of those that require a gradient, by L-BFGS.
 
     Args:
         model: to train.
@@ -33,7 +33,7 @@ class FullBatchTrainer(EpochTrainer[ResidualForce]):
         config: Mapping[str, Any],
     ) -> None:
         super().__init__(model, rollout_error, config)
-        self._weights = list(model.network.parameters())
+        self._weights = [w for w in model.network.parameters() if w.requires_grad]
         self._optimiser = torch.optim.LBFGS(
             self._weights,
             max_iter=1,

@@ -67,6 +67,9 @@ class MotionLoss:
 class MarkersInTheLoop(FullBatchTrainer):
     """Minimises a `MotionLoss` and a penalty on the squares of the weights, by L-BFGS from no force at all.
 
+    The last layers have no bias: a constant force would make up for how a trial was held, which the next one does not
+    share.
+
     Args:
         model: whose network's weights are trained; those of its last layers are set to zero, as is the mean force.
         train: loss on the training motions.
@@ -82,10 +85,10 @@ class MarkersInTheLoop(FullBatchTrainer):
     ) -> None:
         check_in_the_loop(config)
         judge = train if validation is None else validation
-        super().__init__(model, judge.error_mm, config)
-        self._train = train
         with torch.no_grad():
             _remove_force(model)
+        super().__init__(model, judge.error_mm, config)
+        self._train = train
 
     @override
     def _run_epoch(self) -> dict[str, float]:
@@ -121,6 +124,7 @@ def _remove_force(model: ResidualForce) -> None:
         last = block[-1]  # type: ignore[index]
         last.weight.zero_()
         last.bias.zero_()
+        last.bias.requires_grad_(False)
 
 
 def check_in_the_loop(config: Mapping[str, Any]) -> None:

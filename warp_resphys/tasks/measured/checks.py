@@ -118,7 +118,13 @@ _KEYS: Mapping[str, Mapping[str, Kind]] = {
         "tolerance": POSITIVE,
         "grid": GROUP,
     },
-    "in_the_loop": {"epochs": NATURAL, "penalty": NOT_NEGATIVE, "memory": NATURAL, "rollout_every": NATURAL},
+    "in_the_loop": {
+        "epochs": NATURAL,
+        "penalty": NOT_NEGATIVE,
+        "sees_loads": TRUTH_VALUE,
+        "memory": NATURAL,
+        "rollout_every": NATURAL,
+    },
 }
 _RANGE = {"lower": FINITE, "upper": FINITE}
 _OF_THE_BUDGET = ("limit", "steps")  # keys of `data` that the group budget sets for every experiment

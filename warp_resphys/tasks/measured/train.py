@@ -43,7 +43,7 @@ def train_on_markers(context: StageContext) -> None:
         found["q"][:, :-1].flatten(0, 1),
         found["v"][:, :-1].flatten(0, 1),
         found["force"][:, 1:].flatten(0, 1),
-        found["load"].repeat_interleave(steps, 0),
+        found["load"].repeat_interleave(steps, 0) if settings["in_the_loop"]["sees_loads"] else None,
     ).double()
     losses = {}
     for split in ("train", "validation"):

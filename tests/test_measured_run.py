@@ -35,7 +35,7 @@ TINY = [
     "~identify.parameters.mass_damping",
     "~identify.first_guess.mass_damping",
     "identify.starts=1",
-    "identify.max_iterations=4",
+    "identify.max_evaluations=6",
     "identify.grid.youngs_modulus.points=2",
     "identify.grid.poissons_ratio.points=1",
     "in_the_loop.epochs=2",
@@ -60,7 +60,7 @@ FOLDS = [
     "data.trials.bare.file=m0.h5",
     "data.trials.load52={file: m50.h5, hung: 0.05}",
     "~data.trials.load101",
-    "identify.max_iterations=2",
+    "identify.max_evaluations=3",
     "in_the_loop.epochs=1",
 ]
 STAGES = [
@@ -148,6 +148,7 @@ class TestCompleteRun:
         for each in (found["sysid"], found["sysid_elastic"]):
             losses = [record["loss"] for record in each["history"][0]]
             assert each["loss"] == min(losses) < losses[0]
+            assert len(losses) <= 6
         assert np.isfinite(found["landscape"]["loss"]).all()
         assert np.shape(found["landscape"]["loss"]) == (2, 1)
         assert np.shape(found["sysid"]["uncertainty"]["correlation"]) == (3, 3)
@@ -242,7 +243,7 @@ def test_an_interrupted_identification_goes_on_with_the_next_start(finished, tmp
     (stage, *_) = learning_stages(config, split_of(config), ".", "imported")
     descents, at = [], 2
 
-    def descend(self, number, start, max_iterations, report):
+    def descend(self, number, start, max_evaluations, tolerance, report):
         descents.append((self.replay.simulator.integrator, number))
         if len(descents) == at:
             raise KeyboardInterrupt

@@ -9,7 +9,7 @@ from warp_resphys.errors import ConvergenceError, InputError
 from warp_resphys.files import read_checkpoint, write_checkpoint
 from warp_resphys.markers import bind_markers
 from warp_resphys.replay import Motions, Release, Replay
-from warp_resphys.residual.markers_in_the_loop import MarkersInTheLoop, MotionLoss
+from warp_resphys.residual.markers_in_the_loop import MarkersInTheLoop, MotionLoss, epochs_that_hold_up
 from warp_resphys.residual.networks import build_model
 from warp_resphys.tasks.measured.evaluate import marker_errors, markers_at_frames
 from warp_resphys.tasks.measured.scene import at_steps
@@ -230,6 +230,28 @@ class TestMarkersInTheLoop:
 
         monkeypatch.setattr(Replay, "__call__", failing)
         assert loss.error_mm(None) == float("inf")
+
+    def test_no_constant_force_is_learned(self, loss):
+        model = finish(MarkersInTheLoop(network(), loss, None, {**CONFIG, "epochs": 2})).model
+        rest = simulator().rest_state(2)
+        assert model(rest.q + 1e-3, rest.v, 0.0 * LOADS).any()
+        assert not model(rest.q, rest.v, 0.0 * LOADS).any()
+
+    def test_epochs_are_those_that_serve_motions_held_out(self, loss):
+        """Here the held-out motions are those of training, there such as the simulator makes without a force."""
+        motions, release = observed_motions()
+        sim = simulator()
+        with torch.no_grad():
+            exact = Replay(sim, MARKERS, motions)(release)[0]
+        other = MotionLoss(Replay(sim, MARKERS, motions_of(motions.times, exact)), release, {}, LOADS)
+        config, seen = {**CONFIG, "epochs": 3}, []
+        assert epochs_that_hold_up(network, [(loss, loss)], config, lambda: seen.append(1)) == 3
+        assert len(seen) == 3
+        assert epochs_that_hold_up(network, [(loss, other)], config, lambda: None) == 0
+        trainer = MarkersInTheLoop(network(), loss, None, config, epochs=0)
+        trainer.begin()
+        assert trainer.finished
+        assert loss.error_mm(trainer.use_best()) == pytest.approx(loss.error_mm(None), rel=1e-9)
 
     @pytest.mark.parametrize(("key", "value"), [("epochs", 0), ("memory", 0), ("penalty", -1.0)])
     def test_bad_settings(self, loss, key, value):

@@ -4,9 +4,10 @@ Few recordings leave most of a residual force open. The force starts from zero, 
 every weight is paid for, so that it departs from there only as far as the motions ask for.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from typing_extensions import override
 
@@ -75,26 +76,36 @@ class MarkersInTheLoop(FullBatchTrainer):
         train: loss on the training motions.
         validation: loss on the validation motions, by which the weights are chosen; None: the training motions are.
         config: the group ``in_the_loop``.
+        epochs: in place of the configured ones; 0 keeps the simulator as it is.
 
     Raises:
         InputError: a setting out of range.
     """
 
     def __init__(
-        self, model: ResidualForce, train: MotionLoss, validation: MotionLoss | None, config: Mapping[str, Any]
+        self,
+        model: ResidualForce,
+        train: MotionLoss,
+        validation: MotionLoss | None,
+        config: Mapping[str, Any],
+        epochs: int | None = None,
     ) -> None:
         check_in_the_loop(config)
         judge = train if validation is None else validation
         with torch.no_grad():
             _remove_force(model)
-        super().__init__(model, judge.error_mm, config)
+        super().__init__(model, judge.error_mm, config if epochs is None else {**config, "epochs": epochs})
         self._train = train
 
-    @override
-    def _run_epoch(self) -> dict[str, float]:
+    def begin(self) -> None:
+        """Keeps the simulator as it is, without a force, as the first candidate; a trainer that has begun stays."""
         if not self.state.history:
             error = self.rollout_error(self.model)
             self._keep({"epoch": 0.0, "train_loss": self._loss_without_gradient(), "rollout_error_mm": error})
+
+    @override
+    def _run_epoch(self) -> dict[str, float]:
+        self.begin()
         return {"train_loss": self._iterate()}
 
     def _loss_without_gradient(self) -> float:
@@ -114,6 +125,34 @@ class MarkersInTheLoop(FullBatchTrainer):
             self._optimiser.zero_grad()
             return _FAILURE
         return float(loss.detach())
+
+
+def epochs_that_hold_up(
+    make_model: Callable[[], ResidualForce],
+    parts: Sequence[tuple[MotionLoss, MotionLoss]],
+    config: Mapping[str, Any],
+    advance: Callable[[], None],
+) -> int:
+    """How many epochs serve motions that training did not see: those with the smallest mean error over the parts.
+
+    Args:
+        make_model: an untrained model, the same every time.
+        parts: losses of the motions to train on, and of those that are held out.
+        config: the group ``in_the_loop``; its epochs are the most that are tried.
+        advance: called after every epoch.
+
+    Returns:
+        0 where no training is better than the simulator as it is.
+    """
+    errors = []
+    for train, held_out in parts:
+        trainer = MarkersInTheLoop(make_model(), train, held_out, {**config, "rollout_every": 1})
+        trainer.begin()
+        while not trainer.finished:
+            trainer.run_epoch()
+            advance()
+        errors.append([record["rollout_error_mm"] for record in trainer.state.history])
+    return int(np.argmin(np.mean(errors, axis=0)))
 
 
 def _remove_force(model: ResidualForce) -> None:

@@ -122,6 +122,7 @@ _KEYS: Mapping[str, Mapping[str, Kind]] = {
         "epochs": NATURAL,
         "penalty": NOT_NEGATIVE,
         "sees_loads": TRUTH_VALUE,
+        "hold_out": TRUTH_VALUE,
         "memory": NATURAL,
         "rollout_every": NATURAL,
     },

@@ -1,9 +1,13 @@
 """Stages: the residual force and the data-driven baseline, from what markers saw."""
 
+import logging
+from collections.abc import Sequence
+
 import torch
 
-from ...residual.markers_in_the_loop import MarkersInTheLoop, MotionLoss
-from ...residual.networks import NextState, build_model, build_next_state
+from ...progress import Progress
+from ...residual.markers_in_the_loop import MarkersInTheLoop, MotionLoss, epochs_that_hold_up
+from ...residual.networks import NextState, ResidualForce, build_model, build_next_state
 from ...residual.rollout import DataDrivenRollout
 from ...residual.training import Samples, Trainer
 from ...stages import StageContext
@@ -12,6 +16,8 @@ from ..trajectories import read_fields
 from .evaluate import marker_error_mm, state_predictor_of
 from .files import training_file, weights_file
 from .scene import Scene, loads, parameters_of
+
+log = logging.getLogger(__name__)
 
 
 def _samples(context: StageContext, scene: Scene, model: str, like: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -27,31 +33,43 @@ def train_on_markers(context: StageContext) -> None:
     """Trains the residual force of a simulator: <model>.safetensors and training_<model>.json.
 
     The reconstruction says in which modes bodies move and forces act; the weights come from the markers themselves,
-    through the simulator.
+    through the simulator. Without validation trials, each training trial is held out once to find how long training
+    serves others; no epoch at all is one of the choices.
     """
     settings = context.settings
     kind, model = settings["base"]
     scene = Scene(settings, context.run_dir / settings["shared"])
     simulator = scene.simulator(kind)
     parameters = parameters_of(context.run_dir, model, simulator.rest_positions)
-    torch.manual_seed(settings["seed"])
     found = _samples(context, scene, model, simulator.rest_positions)
     steps = found["q"].shape[1] - 1
-    residual = build_model(
-        settings["network"],
-        simulator.rest_positions,
-        found["q"][:, :-1].flatten(0, 1),
-        found["v"][:, :-1].flatten(0, 1),
-        found["force"][:, 1:].flatten(0, 1),
-        found["load"].repeat_interleave(steps, 0) if settings["in_the_loop"]["sees_loads"] else None,
-    ).double()
-    losses = {}
-    for split in ("train", "validation"):
-        names = tuple(settings["split"][split])
-        if names:
-            replay, release = scene.replay(kind, names)
-            losses[split] = MotionLoss(replay, release, parameters, loads(replay.motions))
-    trainer = MarkersInTheLoop(residual, losses["train"], losses.get("validation"), settings["in_the_loop"])
+    config = settings["in_the_loop"]
+
+    def make_model() -> ResidualForce:
+        torch.manual_seed(settings["seed"])
+        return build_model(
+            settings["network"],
+            simulator.rest_positions,
+            found["q"][:, :-1].flatten(0, 1),
+            found["v"][:, :-1].flatten(0, 1),
+            found["force"][:, 1:].flatten(0, 1),
+            found["load"].repeat_interleave(steps, 0) if config["sees_loads"] else None,
+        ).double()
+
+    def loss(names: Sequence[str]) -> MotionLoss:
+        replay, release = scene.replay(kind, tuple(names))
+        return MotionLoss(replay, release, parameters, loads(replay.motions))
+
+    train, validation = (settings["split"][name] for name in ("train", "validation"))
+    epochs = None
+    if config["hold_out"] and not validation and len(train) > 1:
+        parts = [(loss([name for name in train if name != out]), loss([out])) for out in train]
+        with Progress(f"{context.name}: held out", len(train) * config["epochs"], "epochs") as progress:
+            epochs = epochs_that_hold_up(make_model, parts, config, progress.advance)
+        log.info("%s: %d epochs serve trials that are held out best", context.name, epochs)
+    judged = loss(validation) if validation else None
+    trainer = MarkersInTheLoop(make_model(), loss(train), judged, config, epochs)
+    trainer.begin()
     fit(context, trainer, weights_file(model), training_file(model), "residual force")
 
 

@@ -30,8 +30,6 @@ TINY = [
     "experiment=beam_real",
     "mesh.divisions=[4,1,1]",
     "data.seconds=0.2",
-    "~identify.parameters.gravity_tilt_1",
-    "~identify.parameters.gravity_tilt_2",
     "~identify.parameters.mass_damping",
     "~identify.first_guess.mass_damping",
     "identify.starts=1",

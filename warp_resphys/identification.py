@@ -122,8 +122,7 @@ class Identifier:
             if name not in PARAMETERS:
                 raise InputError(f"there is no parameter {name!r} to identify: choose from {', '.join(PARAMETERS)}.")
         motions = replay.motions if seconds is None else replay.motions.first(seconds)
-        amplitude = motions.amplitude
-        for name, moved in zip(motions.names, amplitude.tolist(), strict=True):
+        for name, moved in zip(motions.names, motions.amplitude.tolist(), strict=True):
             if not moved > 0.0:
                 raise InputError(f"the markers of the motion {name!r} stay where they were held: leave it out.")
         simulator = replay.simulator
@@ -131,9 +130,7 @@ class Identifier:
         settings = replace(simulator.settings, max_iterations=most, on_failure="raise")
         self.replay = Replay(replace(simulator, solver=settings), replay.markers, motions)
         self.release, self.bounds = release, dict(bounds)
-        seen = motions.seen.sum((1, 2))
-        # (R,) so that the sum of squares is the mean over motions of each one's mean square over its amplitude.
-        self._weight = 1.0 / (seen * amplitude**2 * len(seen))
+        self._weight = motions.loss_weight
 
     def losses(self, unit: torch.Tensor) -> torch.Tensor:
         """(E,) losses of (E, P) parameters, each a fraction of its range."""

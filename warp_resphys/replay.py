@@ -65,6 +65,11 @@ class Motions:
         square = (self.markers - self.held[:, None]).square().sum(-1)
         return square.nanmean((1, 2)).sqrt()
 
+    @property
+    def loss_weight(self) -> torch.Tensor:
+        """(R,) with which sums of squares become the mean over motions of each one's mean square over its amplitude."""
+        return 1.0 / (self.seen.sum((1, 2)) * self.amplitude**2 * len(self.names))
+
     def select(self, indices: list[int]) -> "Motions":
         """Some of the motions."""
         pick = torch.as_tensor(indices, device=self.times.device)

@@ -37,9 +37,7 @@ class MotionLoss:
         loads: torch.Tensor,
     ) -> None:
         self._replay, self._release, self._parameters, self._loads = replay, release, parameters, loads
-        motions = replay.motions
-        seen = motions.seen.sum((1, 2))
-        self._weight = 1.0 / (seen * motions.amplitude**2 * len(seen))
+        self._weight = replay.motions.loss_weight
 
     def markers(self, model: ResidualForce | None) -> torch.Tensor:
         """(R, T, M, 3) at the frames [m], with the force of the model or without any.

@@ -21,7 +21,34 @@ from ..threads import threads_for
 from .reconstruction import LBFGSB, Reconstruction, Reconstructor
 
 
-class SparseGaussNewton(Reconstructor):
+class _OnMarkers(Reconstructor):
+    """A method that sees markers alone.
+
+    Args:
+        simulator: the one to correct.
+        markers: C, for as many environments as the states have.
+        regularisation: lambda, positive [m^2/N^2].
+        tolerance: see the methods.
+        max_iterations: after which a step has failed.
+
+    Raises:
+        InputError: a number out of range, or a marker on a vertex that the body does not have.
+    """
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        markers: Markers,
+        regularisation: float,
+        tolerance: float,
+        max_iterations: int,
+    ) -> None:
+        super().__init__(simulator, regularisation, tolerance, max_iterations)
+        check_sparse(regularisation, markers, simulator)
+        self.markers = markers.to(simulator.rest_positions)
+
+
+class SparseGaussNewton(_OnMarkers):
     """Gauss-Newton in positions and forces at once.
 
     The step with a force f ends where the residual g of the step without it equals f. Linearised at an iterate x, with
@@ -59,9 +86,7 @@ class SparseGaussNewton(Reconstructor):
         max_iterations: int,
         modes: int | None = None,
     ) -> None:
-        super().__init__(simulator, regularisation, tolerance, max_iterations)
-        check_sparse(regularisation, markers, simulator)
-        self.markers = markers.to(simulator.rest_positions)
+        super().__init__(simulator, markers, regularisation, tolerance, max_iterations)
         self._basis = None if modes is None else vibration_modes(simulator, modes)
         self._constant = (
             self.markers.transposed_jacobian(simulator.rest_positions[None]) if self.markers.linear else None
@@ -152,7 +177,7 @@ class SparseGaussNewton(Reconstructor):
         return x + (metric.solve(force) - settling).view_as(x), force.view_as(x)
 
 
-class SparseLevenbergMarquardt(Reconstructor):
+class SparseLevenbergMarquardt(_OnMarkers):
     """Levenberg-Marquardt in the forces, for motions that Gauss-Newton does not follow, such as jerks of real bodies.
 
     Every trial force is followed by a whole step of the simulator, with its line search, so that an iterate is always a
@@ -163,29 +188,7 @@ class SparseLevenbergMarquardt(Reconstructor):
     and is taken if the objective gets smaller; the damping d grows where it does not, and fades where it does. An
     environment is done, and left alone, when such a step moves no position by more than ``tolerance`` [m] and either
     is hardly damped or leads nowhere.
-
-    Args:
-        simulator: the one to correct.
-        markers: C, for as many environments as the states have.
-        regularisation: lambda, positive [m^2/N^2].
-        tolerance: see above.
-        max_iterations: after which a step has failed.
-
-    Raises:
-        InputError: a number out of range, or a marker on a vertex that the body does not have.
     """
-
-    def __init__(
-        self,
-        simulator: Simulator,
-        markers: Markers,
-        regularisation: float,
-        tolerance: float,
-        max_iterations: int,
-    ) -> None:
-        super().__init__(simulator, regularisation, tolerance, max_iterations)
-        check_sparse(regularisation, markers, simulator)
-        self.markers = markers.to(simulator.rest_positions)
 
     @override
     @torch.no_grad()
@@ -264,31 +267,11 @@ class SparseLevenbergMarquardt(Reconstructor):
         return (centre + jacobian.mT @ torch.linalg.solve(gram + weight * identity, right)).view_as(force)
 
 
-class SparseLBFGSB(LBFGSB):
+class SparseLBFGSB(_OnMarkers, LBFGSB):
     """The published method on sparse markers: L-BFGS-B on the forces, with gradients through the simulator.
 
-    Args:
-        simulator: the one to correct.
-        markers: C, for as many environments as the states have.
-        regularisation: lambda, positive [m^2/N^2].
-        tolerance: relative change of the objective.
-        max_iterations: after which a step has failed.
-
-    Raises:
-        InputError: a number out of range, or a marker on a vertex that the body does not have.
+    ``tolerance`` is the relative change of the objective.
     """
-
-    def __init__(
-        self,
-        simulator: Simulator,
-        markers: Markers,
-        regularisation: float,
-        tolerance: float,
-        max_iterations: int,
-    ) -> None:
-        super().__init__(simulator, regularisation, tolerance, max_iterations)
-        check_sparse(regularisation, markers, simulator)
-        self.markers = markers.to(simulator.rest_positions)
 
     @override
     def step(self, state: State, observed: torch.Tensor, first_guess: torch.Tensor | None = None) -> Reconstruction:

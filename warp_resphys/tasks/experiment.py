@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.table import Table
 
-from ..files import digest, write_json
+from ..files import write_json
 from ..report.page import number_text
 from ..stages import Stage, StageContext, run_stages
 from .ablation import run_ablation
@@ -38,18 +38,10 @@ from .trajectories import (
     TIMES,
     TRAINING,
     TRAJECTORIES,
+    shown,
+    simulated,
     training_settings,
 )
-
-_SIMULATED = ("mesh", "physics", "fixed", "gravity", "time_step", "integrator", "solver", "device", "dtype")
-
-
-def simulated(config: dict[str, Any]) -> dict[str, Any]:
-    """The settings that every simulation of an experiment depends on."""
-    base = {key: config[key] for key in _SIMULATED}
-    if config["mesh"]["kind"] == "file":
-        base["mesh_digest"] = digest(config["mesh"]["path"])
-    return base
 
 
 def stages(config: dict[str, Any]) -> list[Stage]:
@@ -116,11 +108,6 @@ def stages(config: dict[str, Any]) -> list[Stage]:
 
 def _pick(config: dict[str, Any], *keys: str) -> dict[str, Any]:
     return {key: config[key] for key in keys}
-
-
-def shown(config: dict[str, Any]) -> dict[str, Any]:
-    """The configuration without what has no bearing on a run."""
-    return {key: value for key, value in config.items() if key not in ("task", "tune")}
 
 
 def prepare(config: DictConfig) -> tuple[dict[str, Any], Path]:

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..files import read_array, read_hdf5
+from ..files import digest, read_array, read_hdf5
 from ..integrator import State
 from ..resumable import Field, ResumableHDF5
 
@@ -20,6 +20,7 @@ SPLITS = ("train", "validation", "test")
 STAGES = ("generate", "reconstruct", "train", "refine", "train_simfree", "evaluate", "time", "report")
 
 MODELS = ("resphys", "simfree")  # that are trained
+_SIMULATED = ("mesh", "physics", "fixed", "gravity", "time_step", "integrator", "solver", "device", "dtype")
 
 TRAJECTORIES = "trajectories.h5"
 RECONSTRUCTION = "reconstruction.h5"
@@ -34,6 +35,19 @@ ERRORS = "errors.json"
 TIMES = "times.json"
 METRICS = "metrics.json"
 REPORT = "report.html"
+
+
+def simulated(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings that every simulation of an experiment depends on."""
+    base = {key: config[key] for key in _SIMULATED}
+    if config["mesh"]["kind"] == "file":
+        base["mesh_digest"] = digest(config["mesh"]["path"])
+    return base
+
+
+def shown(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The configuration without what has no bearing on a run."""
+    return {key: value for key, value in config.items() if key not in ("task", "tune")}
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Stage: roll-outs of the test trials, by every model, and the errors of their markers."""
 
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -29,10 +30,13 @@ def evaluate_markers(context: StageContext) -> None:
     motions = scene.pick(names)
     models = [m for m in MODELS if m != "published" or settings["published"] is not None]
     models = [m for m in models if m != "sysid_elastic" or "youngs_modulus" in settings["identify"]["parameters"]]
+    releases = {
+        kind: scene.release(scene.simulator(kind), motions) for kind in dict.fromkeys(SIMULATORS[m] for m in models)
+    }
     positions, markers = {}, {}
     with Progress("evaluate", len(models), "models") as progress:
         for model in models:
-            positions[model], markers[model] = _roll_out(context, scene, model, motions)
+            positions[model], markers[model] = _roll_out(context, scene, model, motions, releases)
             progress.advance(1, model=model)
     with atomic_hdf5(context.run_dir / ROLLOUTS, "rollouts", {"names": list(names)}) as file:
         for model in models:
@@ -74,12 +78,12 @@ def _per_marker(
 
 
 def _roll_out(
-    context: StageContext, scene: Scene, model: str, motions: Motions
+    context: StageContext, scene: Scene, model: str, motions: Motions, releases: Mapping[str, Release]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(R, K + 1, N, 3) positions at the steps and (R, T, M, 3) markers at the frames [m]."""
     simulator = scene.simulator(SIMULATORS[model], on_failure="count")
     device = simulator.rest_positions.device
-    release = scene.release(scene.simulator(SIMULATORS[model]), motions)
+    release = releases[SIMULATORS[model]]
     parameters = parameters_of(context.run_dir, model, simulator.rest_positions)
     tensors = Replay(simulator, scene.markers, motions).tensors(parameters)
     rollout: Rollout

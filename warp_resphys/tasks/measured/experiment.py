@@ -7,11 +7,11 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from ...files import digest, read_json, write_json
+from ...files import read_json, write_json
 from ...metrics import summarise_folds
 from ...report.page import number_text
 from ...stages import Stage, package_versions, resources_used, run_stages
-from ..trajectories import Split, training_settings
+from ..trajectories import Split, shown, simulated, training_settings
 from .evaluate import evaluate_markers
 from .files import ERRORS, IDENTIFICATION, METRICS, REPORT, ROLLOUTS, fold_folder, training_file, weights_file
 from .identify import identify
@@ -21,7 +21,6 @@ from .stages import import_stages
 from .train import train_on_markers, train_simfree_on_markers
 from .trials import folds_of, split_of
 
-_SIMULATED = ("mesh", "physics", "fixed", "gravity", "time_step", "integrator", "solver", "device", "dtype")
 _SHARED = ("data", "markers", "published", "simulation", "identify", "release")
 _CORRECTED = {"resphys_uncorrected": "simulation", "resphys": "identified"}  # model: simulator
 
@@ -35,11 +34,9 @@ def learning_stages(config: Mapping[str, Any], split: Split, shared: str, import
         shared: the folder of markers.h5, relative to that of the split.
         imported: fingerprint of markers.h5.
     """
-    base: dict[str, Any] = {key: config[key] for key in (*_SIMULATED, *_SHARED, "seed")}
+    base = {**simulated(config), **{key: config[key] for key in (*_SHARED, "seed")}}
     base |= {"shared": shared, "imported": imported}
     base["split"] = {name: list(getattr(split, name)) for name in ("train", "validation", "test")}
-    if config["mesh"]["kind"] == "file":
-        base["mesh_digest"] = digest(config["mesh"]["path"])
     stages = [Stage("identify", identify, (IDENTIFICATION,), base)]
     for model, kind in _CORRECTED.items():
         settings = {**base, "base": [kind, model]}
@@ -66,14 +63,9 @@ def learning_stages(config: Mapping[str, Any], split: Split, shared: str, import
     )
     trained = ("train_resphys_uncorrected", "train_resphys", "train_simfree")
     stages.append(Stage("evaluate", evaluate_markers, (ROLLOUTS, ERRORS), base, ("identify", *trained)))
-    shown = {"config": _shown(config), "imported": imported}
-    stages.append(Stage("report", report_measured, (REPORT,), shown, ("evaluate",)))
+    reported = {"config": shown(config), "imported": imported}
+    stages.append(Stage("report", report_measured, (REPORT,), reported, ("evaluate",)))
     return stages
-
-
-def _shown(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The configuration without what has no bearing on a run."""
-    return {key: value for key, value in config.items() if key not in ("task", "tune")}
 
 
 def run_measured(config: dict[str, Any], folder: Path) -> None:
@@ -103,8 +95,8 @@ def run_measured(config: dict[str, Any], folder: Path) -> None:
     write_json(folder / METRICS, metrics)
     if folds is not None:
         each = {trial: fold["errors_mm"] for trial, fold in metrics["folds"].items()}
-        shown = {"config": _shown(config), "folds": each}
-        run_stages([*first, Stage("report", report_folds, (REPORT,), shown, ("import",))], folder)
+        reported = {"config": shown(config), "folds": each}
+        run_stages([*first, Stage("report", report_folds, (REPORT,), reported, ("import",))], folder)
     _print(metrics, folder)
 
 

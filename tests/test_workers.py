@@ -2,7 +2,10 @@
 
 import os
 import signal
+import subprocess
+import sys
 from contextlib import closing
+from pathlib import Path
 
 import pytest
 import torch
@@ -53,3 +56,16 @@ def test_an_error_ends_all_of_them(task, error, message):
 
 def test_nothing_to_do():
     assert done([], 2) == ({}, [])
+
+
+def ignores_interrupts(task, advance):
+    return signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+
+
+def test_no_worker_sees_an_interrupt():
+    program = "from test_workers import *\n"
+    program += "print(sorted(in_processes(ignores_interrupts, [0, 1, 2], 3, print)))"
+    found = subprocess.run(
+        [sys.executable, "-c", program], cwd=Path(__file__).parent, capture_output=True, text=True, check=True
+    )
+    assert found.stdout.splitlines()[-1] == "[(0, True), (1, True), (2, True)]"

@@ -11,6 +11,7 @@ import traceback
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import islice
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any
@@ -125,6 +126,7 @@ def _outcome(function: Callable[[Any, Advance], Any], task: Any, advance: Advanc
 @contextmanager
 def _interrupts_blocked() -> Iterator[None]:
     """What starts in here never sees Ctrl-C; this process sees it afterwards."""
+    resource_tracker.ensure_running()  # Else it is started with the first process, and unblocks them before that.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

@@ -11,7 +11,7 @@ from warp_resphys.errors import ConvergenceError, InputError
 from warp_resphys.integrator import State
 from warp_resphys.markers import bind_markers
 from warp_resphys.mesh import box_hexahedra, select_vertices
-from warp_resphys.release import ReleaseSettings, estimate_release, hold, velocity_shapes
+from warp_resphys.release import ReleaseSettings, estimate_release, hold, sideways_shapes, velocity_shapes
 from warp_resphys.replay import PARAMETERS, Motions, Release, Replay, sample, tilted_gravity
 
 MESH = box_hexahedra(divisions=(4, 1, 1))
@@ -224,6 +224,36 @@ def test_the_delay_and_the_push_of_a_release_are_recovered():
     assert float(kept.delay.abs().max() + kept.state.v.abs().max()) == 0.0
 
 
+def test_a_body_held_sideways_shows_it_once_it_is_let_go():
+    sim, motions = simulator(), blank(frames=16)
+    replay, shapes = Replay(sim, MARKERS, motions), sideways_shapes(sim)
+    q = hold(sim, MARKERS, motions, replay.tensors(), 6)
+    bends = double([[0.002, 0.0], [-0.003, 0.0]])
+    bent = q + torch.einsum("bk,knc->bnc", bends, shapes)
+    truth = Release(State(bent, torch.zeros_like(q)), torch.zeros(2).double(), MARKERS(q) - MARKERS(bent))
+    seen = replay(truth)[0]
+    torch.testing.assert_close(seen[:, 0], MARKERS(q), rtol=0.0, atol=1e-12)
+    settings = ReleaseSettings(velocity_modes=0, delay=0.0, sideways=0.002, window=0.1, noise=1e-5)
+    found = estimate_release(sim, MARKERS, replace(motions, markers=seen), settings)
+    torch.testing.assert_close(found.state.q, bent, rtol=0.0, atol=2e-5)
+    torch.testing.assert_close(replay(found)[0], seen, rtol=0.0, atol=1e-5)
+    torch.testing.assert_close(found.select([1]).shift, found.shift[1:])
+    torch.testing.assert_close(found.bound(found.shifted(seen)), seen)
+    straight = estimate_release(sim, MARKERS, replace(motions, markers=seen), replace(settings, sideways=0.0))
+    assert straight.shift is None
+    assert float((replay(straight)[0] - seen).norm(dim=-1).mean()) > 1e-3
+
+
+def test_bodies_bend_sideways_across_gravity():
+    shapes = sideways_shapes(simulator())
+    assert float(shapes[0].norm(dim=1).max()) == pytest.approx(1.0)
+    assert float(shapes[0, TIP, 1].abs().min()) > 0.95
+    assert float(shapes[:, :, 2].abs().max()) < 0.01  # what Poisson's ratio leaves
+    assert 0.001 < float(shapes[1, TIP, 0].abs().max()) < 0.05  # along the beam, which is far stiffer
+    loaded = sideways_shapes(simulator(masses=(0.3,)))
+    torch.testing.assert_close(loaded.abs(), shapes.abs(), rtol=0.0, atol=1e-6)
+
+
 def test_a_body_that_cannot_be_held_says_so(monkeypatch):
     sim = simulator()
     replay = Replay(sim, MARKERS, blank())
@@ -236,7 +266,9 @@ def test_a_body_that_cannot_be_held_says_so(monkeypatch):
         hold(sim, MARKERS, replay.motions, replay.tensors(), 3)
 
 
-@pytest.mark.parametrize("wrong", [{"window": 0.0}, {"noise": -1.0}, {"delay": -0.1}, {"velocity_modes": -1}])
+@pytest.mark.parametrize(
+    "wrong", [{"window": 0.0}, {"noise": -1.0}, {"delay": -0.1}, {"velocity_modes": -1}, {"sideways": -1.0}]
+)
 def test_settings_out_of_range_are_refused(wrong):
     with pytest.raises(InputError, match=f"release.{next(iter(wrong))}"):
         ReleaseSettings(**wrong)

@@ -2,12 +2,12 @@
 
 The body is at rest under gravity, its weights and a virtual force that brings its markers to where they were held
 (the published method finds such forces by steps through time; a static equilibrium has none to wait for). The hand lets
-go between two frames, and not without a push: the delay, and a velocity in a few slow modes, are what best explains the
-first frames.
+go between two frames, and not without a push, of a body that it may have bent sideways: the delay, a velocity in a few
+slow modes, and a sideways displacement are what best explains the first frames.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -33,6 +33,9 @@ class ReleaseSettings:
         noise: what a marker may be off for reasons that no release explains [m].
         delay: expected deviation of the moment of release from the one found in the frames [s]; 0 keeps that one.
         speed: expected size of the velocity of the fastest vertex [m/s].
+        sideways: expected displacement, across gravity, of a body that seems to be held undeformed [m]: as a sideways
+            acceleration bends it, at the vertex that moves furthest; 0 for none. Along gravity it would be mistaken for
+            a weight or a stiffness.
         iterations: Gauss-Newton steps.
     """
 
@@ -42,6 +45,7 @@ class ReleaseSettings:
     noise: float = 3e-4
     delay: float = 0.01
     speed: float = 0.05
+    sideways: float = 0.0
     iterations: int = 4
 
     def __post_init__(self) -> None:
@@ -53,7 +57,7 @@ class ReleaseSettings:
         for name in ("window", "noise", "speed", "iterations"):
             if not getattr(self, name) > 0:
                 raise InputError(f"release.{name} is {getattr(self, name)}: it must be positive.")
-        for name in ("hold_modes", "velocity_modes", "delay"):
+        for name in ("hold_modes", "velocity_modes", "delay", "sideways"):
             if not getattr(self, name) >= 0:
                 raise InputError(f"release.{name} is {getattr(self, name)}: it must be zero or more.")
 
@@ -158,29 +162,21 @@ def _derivatives(
 def _let_go(
     simulator: Simulator, markers: Markers, motions: Motions, held: Release, settings: ReleaseSettings
 ) -> Release:
-    """Delay and velocity that explain the first frames, by Gauss-Newton with differences over a batch."""
-    count, shapes = len(motions.names), velocity_shapes(simulator, settings.velocity_modes)
-    deviation = simulator.tensor([settings.delay] * (settings.delay > 0.0) + [settings.speed] * len(shapes))
-    if not len(deviation):
+    """What explains the first frames (`_Beginning`), by Gauss-Newton with differences over a batch."""
+    beginning = _Beginning(simulator, markers, held, settings)
+    count, unknowns = len(motions.names), len(beginning.deviation)
+    if not unknowns:
         return held
-    parameters = simulator.rest_positions.new_zeros(count, len(deviation))  # in expected deviations
-
-    def begin(values: torch.Tensor) -> Release:
-        scaled, repeats = values * deviation, len(values) // count
-        delay = scaled[:, 0] if settings.delay > 0.0 else torch.zeros_like(values[:, 0])
-        amplitudes = scaled[:, int(settings.delay > 0.0) :]
-        velocity = torch.einsum("bk,knc->bnc", amplitudes, shapes)
-        return Release(State(held.state.q.repeat(repeats, 1, 1), velocity), delay)
-
-    size = 1 + len(deviation)
+    parameters = simulator.rest_positions.new_zeros(count, unknowns)  # in expected deviations
+    size = 1 + unknowns
     replay = Replay(simulator, markers, motions.select(list(range(count)) * size))
     step = 0.05
-    identity = torch.eye(len(deviation), dtype=deviation.dtype, device=deviation.device)
-    offsets = torch.cat([torch.zeros_like(deviation)[None], step * identity]).repeat_interleave(count, 0)
+    identity = torch.eye(unknowns, dtype=parameters.dtype, device=parameters.device)
+    offsets = torch.cat([torch.zeros_like(identity[:1]), step * identity]).repeat_interleave(count, 0)
     best, least = parameters, torch.full_like(parameters[:, 0], torch.inf)
     with torch.no_grad():
         for _ in range(settings.iterations + 1):  # The last one only tells whether the step before was good.
-            simulated = replay(begin(parameters.repeat(size, 1) + offsets))
+            simulated = replay(beginning(parameters.repeat(size, 1) + offsets))
             residual = replay.errors(simulated)[0].flatten(1).unflatten(0, (size, count)) / settings.noise
             objective = residual[0].square().sum(1) + parameters.square().sum(1)
             better = objective < least
@@ -190,7 +186,55 @@ def _let_go(
             change = torch.linalg.solve(jacobian.mT @ jacobian + identity, right)[..., 0].clamp(-3.0, 3.0)
             # Back half way to the best so far where a step was too long.
             parameters = torch.where(better[:, None], parameters - change, 0.5 * (parameters + best))
-    return begin(best)
+        return beginning(best)
+
+
+class _Beginning:
+    """Releases of given delays, velocities and sideways displacements, each in units of its expected deviation.
+
+    Args:
+        simulator: of the body.
+        markers: positions of the vertices to markers.
+        held: the release at the time of the frames, at rest, of a body that is held undeformed.
+        settings: tell what is looked for.
+    """
+
+    def __init__(self, simulator: Simulator, markers: Markers, held: Release, settings: ReleaseSettings) -> None:
+        self._markers, self._held = markers, held
+        velocities = velocity_shapes(simulator, settings.velocity_modes)
+        sideways = sideways_shapes(simulator) if settings.sideways > 0.0 else velocities[:0]
+        self._shapes = (velocities, sideways)
+        self._sizes = (int(settings.delay > 0.0), len(velocities), len(sideways))
+        deviations = (settings.delay, settings.speed, settings.sideways)
+        self.deviation = simulator.tensor([d for d, n in zip(deviations, self._sizes, strict=True) for _ in range(n)])
+
+    def __call__(self, values: torch.Tensor) -> Release:
+        """The releases of (k R, unknowns) values, the R motions running fastest."""
+        delay, speeds, bends = (values * self.deviation).split(self._sizes, 1)
+        repeats = len(values) // len(self._held.delay)
+        held = self._held.state.q.repeat(repeats, 1, 1)
+        velocity, bend = (torch.einsum("bk,knc->bnc", a, b) for a, b in zip((speeds, bends), self._shapes, strict=True))
+        shift = self._markers(held) - self._markers(held + bend)
+        return Release(State(held + bend, velocity), delay.sum(1), shift)
+
+
+def sideways_shapes(simulator: Simulator) -> torch.Tensor:
+    """(2, N, 3) displacements by accelerations across gravity, about rest; the furthest vertex of all moves by one.
+
+    The second, stiffer direction keeps its small share. Weights that hang on the body take no part.
+    """
+    size = 0.1  # m/s^2, small enough for a linear answer
+    gravity = simulator.tensor(simulator.gravity)
+    directions = torch.linalg.svd(gravity[None])[2][1:]
+    directions = simulator.tensor(directions)
+    with torch.no_grad():
+        tensors = simulator.prepare(attached_mass=torch.zeros_like(simulator.rest_positions[None, :, 0]))
+        weightless = replace(tensors, weight=torch.zeros_like(tensors.weight).expand(2, -1, -1))
+        load = size * tensors.mass[..., None] * directions[:, None]
+        bent = simulator.static_equilibrium(load, material=weightless).q - simulator.rest_positions
+    turn, *_ = torch.linalg.svd(bent.flatten(1), full_matrices=False)  # Of the two, the stiffest and the softest.
+    shapes = torch.einsum("ij,inc->jnc", turn, bent)
+    return shapes / shapes.norm(dim=2).max()
 
 
 def velocity_shapes(simulator: Simulator, modes: int) -> torch.Tensor:

@@ -91,15 +91,27 @@ class Release:
     Attributes:
         state: (R, N, 3) positions [m] and velocities [m/s] at the release.
         delay: (R,) by which the body was let go later than the time zero of the frames [s].
+        shift: (R, M, 3) from where the markers are bound to where they sit, on a body that only seemed to be held
+            undeformed [m]; None for no shift.
     """
 
     state: State
     delay: torch.Tensor
+    shift: torch.Tensor | None = None
 
     def select(self, indices: list[int]) -> "Release":
         """That of some of the motions."""
         pick = torch.as_tensor(indices, device=self.delay.device)
-        return Release(State(self.state.q[pick], self.state.v[pick]), self.delay[pick])
+        shift = None if self.shift is None else self.shift[pick]
+        return Release(State(self.state.q[pick], self.state.v[pick]), self.delay[pick], shift)
+
+    def shifted(self, markers: torch.Tensor) -> torch.Tensor:
+        """(..., R, T, M, 3) markers where they sit, of those where they are bound [m]."""
+        return markers if self.shift is None else markers + self.shift[:, None]
+
+    def bound(self, markers: torch.Tensor) -> torch.Tensor:
+        """(R, T, M, 3) markers where they are bound, of those where they sit [m]."""
+        return markers if self.shift is None else markers - self.shift[:, None]
 
 
 class Replay:
@@ -167,7 +179,7 @@ class Replay:
             state, _ = self.simulator.step(state, added, material=tensors)
             series.append(self.markers(state.q))
         sampled = sample(torch.stack(series, 1), times.repeat(each, 1), self.simulator.time_step)
-        return sampled.unflatten(0, (each, -1))
+        return release.shifted(sampled.unflatten(0, (each, -1)))
 
     def errors(self, simulated: torch.Tensor) -> torch.Tensor:
         """(E, R, T, M, 3) simulated less observed markers [m], zero where nothing was seen."""

@@ -106,6 +106,7 @@ _KEYS: Mapping[str, Mapping[str, Kind]] = {
         "noise": POSITIVE,
         "delay": NOT_NEGATIVE,
         "speed": POSITIVE,
+        "sideways": NOT_NEGATIVE,
         "iterations": NATURAL,
     },
     "identify": {

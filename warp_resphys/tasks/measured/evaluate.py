@@ -116,7 +116,7 @@ def markers_at_frames(
     series = markers(followed.flatten(0, 1)).unflatten(0, q.shape[:2])
     series = torch.where(lost[..., None, None], torch.nan, series)
     times = (motions.times - release.delay[:, None]).clamp_min(0.0)
-    return sample(series, times, simulator.time_step)
+    return release.shifted(sample(series, times, simulator.time_step))
 
 
 def marker_error_mm(

@@ -29,7 +29,7 @@ def reconstruct_markers(context: StageContext) -> None:
     reconstructor = make_sparse_reconstructor(simulator, scene.markers, **settings["reconstruction"])
     reconstructor = reconstructor.with_tensors(tensors)
     release = scene.release(simulator, motions)
-    observed = simulator.tensor(at_steps(motions, simulator.time_step, release.delay))
+    observed = release.bound(simulator.tensor(at_steps(motions, simulator.time_step, release.delay)))
     batch, steps = observed.shape[:2]
     fields = state_fields(batch, simulator.body.n_vertices)
     fields["force"] = Field((batch, simulator.body.n_vertices, 3), "N", batch_axes=1)

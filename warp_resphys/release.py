@@ -219,22 +219,22 @@ class _Beginning:
 
 
 def sideways_shapes(simulator: Simulator) -> torch.Tensor:
-    """(2, N, 3) displacements by accelerations across gravity, about rest; the furthest vertex of all moves by one.
+    """(1 or 2, N, 3) displacements by accelerations across gravity, about rest, each with its furthest vertex at one.
 
-    The second, stiffer direction keeps its small share. Weights that hang on the body take no part.
+    Of the two directions the stiffer one is left out if it bends the body less than half as far: what little it moves
+    may well be along gravity. Weights that hang on the body take no part.
     """
     size = 0.1  # m/s^2, small enough for a linear answer
-    gravity = simulator.tensor(simulator.gravity)
-    directions = torch.linalg.svd(gravity[None])[2][1:]
-    directions = simulator.tensor(directions)
+    directions = torch.linalg.svd(simulator.tensor(simulator.gravity)[None])[2][1:]
     with torch.no_grad():
         tensors = simulator.prepare(attached_mass=torch.zeros_like(simulator.rest_positions[None, :, 0]))
         weightless = replace(tensors, weight=torch.zeros_like(tensors.weight).expand(2, -1, -1))
         load = size * tensors.mass[..., None] * directions[:, None]
         bent = simulator.static_equilibrium(load, material=weightless).q - simulator.rest_positions
-    turn, *_ = torch.linalg.svd(bent.flatten(1), full_matrices=False)  # Of the two, the stiffest and the softest.
+    turn, *_ = torch.linalg.svd(bent.flatten(1), full_matrices=False)  # To the softest direction and the stiffest.
     shapes = torch.einsum("ij,inc->jnc", turn, bent)
-    return shapes / shapes.norm(dim=2).max()
+    furthest = shapes.norm(dim=2).amax(1)
+    return (shapes / furthest[:, None, None])[furthest >= 0.5 * furthest[0]]
 
 
 def velocity_shapes(simulator: Simulator, modes: int) -> torch.Tensor:

@@ -111,6 +111,7 @@ _KEYS: Mapping[str, Mapping[str, Kind]] = {
     },
     "identify": {
         "integrator": one_of(*INTEGRATORS),
+        "substeps": NATURAL,
         "parameters": GROUP,
         "first_guess": GROUP,
         "starts": NATURAL,

@@ -80,7 +80,7 @@ def _per_marker(
 def _roll_out(
     context: StageContext, scene: Scene, model: str, motions: Motions, releases: Mapping[str, Release]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(R, K + 1, N, 3) positions at the steps and (R, T, M, 3) markers at the frames [m]."""
+    """(R, K + 1, N, 3) positions at whole time steps and (R, T, M, 3) markers at the frames [m]."""
     simulator = scene.simulator(SIMULATORS[model], on_failure="count")
     device = simulator.rest_positions.device
     release = releases[SIMULATORS[model]]
@@ -98,7 +98,8 @@ def _roll_out(
         rollout = HybridRollout(simulator, force, tensors=tensors)
     q = roll_out_to_the_end(rollout, simulator, motions, release)
     markers = markers_at_frames(q, simulator, scene.markers, motions, release)
-    return q.cpu().numpy(), markers.cpu().numpy()
+    substeps = round(scene.config["time_step"] / simulator.time_step)
+    return q[:, ::substeps].cpu().numpy(), markers.cpu().numpy()
 
 
 def roll_out_to_the_end(rollout: Rollout, simulator: Simulator, motions: Motions, release: Release) -> torch.Tensor:

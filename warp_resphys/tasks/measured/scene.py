@@ -81,14 +81,16 @@ class Scene:
         """A simulator under the gravity of the recordings.
 
         Args:
-            kind: ``simulation`` (uncorrected), ``published``, or ``identified``, which steps with another integrator.
+            kind: ``simulation`` (uncorrected), ``published``, or ``identified``, which steps with another integrator,
+                and may take shorter steps.
             on_failure: whether a step that fails raises, or is counted, whatever is configured.
         """
         config = {**self.config, "gravity": self._imported[3].tolist()}
         if kind == "published":
             config |= self.config["published"]
         elif kind == "identified":
-            config |= {"integrator": self.config["identify"]["integrator"]}
+            identify = self.config["identify"]
+            config |= {"integrator": identify["integrator"], "time_step": config["time_step"] / identify["substeps"]}
         return build_simulator(config, "simulation", on_failure=on_failure)
 
     def pick(self, names: tuple[str, ...]) -> Motions:

@@ -611,6 +611,15 @@ class TestBadInput:
         assert code == 2
         assert "error: the experiment marker_ablation trains no network: tune another one." in err
 
+    @pytest.mark.parametrize("name", ["beam_real", "beam_real_repeated"])
+    def test_an_experiment_on_recordings(self, folder, name):
+        code, err = run(f"experiment={name}", "task=tune", "data.folder=recordings", IN_RUN)
+        assert code == 2
+        assert err.strip().splitlines()[-1] == (
+            f"error: task=tune does not search the networks of the experiment {name}, which learns from recordings: "
+            "set network and in_the_loop, and simfree and trainer for the baseline, and compare runs with --multirun."
+        )
+
     def test_settings_that_the_data_do_not_allow_end_the_search_and_the_trial_does_not_count(self, folder):
         code, err = run(*SEARCH, IN_RUN, "+tune.space.network.force_modes=[500,1000]")
         assert code == 2

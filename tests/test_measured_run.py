@@ -294,7 +294,9 @@ def test_an_interrupted_landscape_goes_on_and_loses_no_identification(finished, 
     assert "identify: landscape: 6/10 points" in capsys.readouterr().err
     run_stages([stage], tmp_path)
     assert calls == once
-    assert "identify: landscape: 10/10 points" in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert "identify: 4/24 evaluations at most" in err
+    assert "identify: landscape: 10/10 points" in err
     found = read(tmp_path / "identification.json")
     assert found["landscape"]["loss"] == [[0, None], [2, 3], [4, 5], [6, 7], [8, 9]]
     np.testing.assert_allclose(moduli, np.repeat(np.linspace(0.0, 1.0, 5), 2))

@@ -38,7 +38,8 @@ def identify(context: StageContext) -> None:
     elastic = {name: bounds[name] for name in _ELASTIC if name in bounds}
     evaluations = (2 if elastic else 1) * config["starts"] * config["max_evaluations"]
     replays = cache(partial(scene.replay, names=train))
-    with Progress("identify", evaluations, "evaluations at most") as progress:
+    done = sum(_evaluations(_kept(context, kind)) for kind in ("identified", "simulation"))
+    with Progress("identify", evaluations, "evaluations at most", done) as progress:
         found = {"sysid": _search(context, replays, "identified", bounds, progress)}
         if elastic:
             found["sysid_elastic"] = _search(context, replays, "simulation", elastic, progress)
@@ -80,6 +81,12 @@ def _search(
         kept["starts"], config["max_evaluations"], report, kept["attempts"], keep, config["tolerance"]
     )
     return dict(_keep(context, kind, {"found": asdict(found)})["found"])
+
+
+def _evaluations(kept: Mapping[str, Any]) -> int:
+    """How many went into what is kept of a search."""
+    attempts = [each["history"] for each in kept.get("attempts", ())]
+    return sum(map(len, kept["found"]["history"] if "found" in kept else attempts))
 
 
 def _landscape(

@@ -1,9 +1,14 @@
+import contextlib
 import os
+import shutil
 from pathlib import Path
 
 import pytest
 import torch
 import warp as wp
+from main_job import IN_RUN, TINY, files, run
+
+from warp_resphys.tasks import experiment
 
 wp.config.log_level = wp.LOG_WARNING
 torch.set_num_threads(1)
@@ -34,3 +39,33 @@ def reference_data() -> Path:
     if not folder.is_dir():
         pytest.skip("no reference trajectories: set WARP_RESPHYS_REFERENCE to a folder with their .npz files")
     return folder
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def no_report(monkeypatch):
+    """The report takes most of a tiny run's time, and has tests of its own."""
+    monkeypatch.setattr(experiment, "make_report", lambda context: (context.run_dir / "report.html").write_text("-"))
+
+
+@pytest.fixture(scope="session")
+def finished(tmp_path_factory):
+    """A complete run with its report, and one more of the same command."""
+    root = tmp_path_factory.mktemp("finished")
+    with contextlib.chdir(root):
+        assert run(*TINY, IN_RUN)[0] == 0
+        first = files()
+        assert run(*TINY, IN_RUN)[0] == 0
+        return root / "run", first, files()
+
+
+@pytest.fixture
+def copied(finished, folder):
+    """A copy of the complete run, to change."""
+    shutil.copytree(finished[0], "run")
+    return files()

@@ -1,5 +1,7 @@
 """A made-up run of an experiment with measured motions: every file that its report reads."""
 
+import copy
+import functools
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -29,10 +31,20 @@ _OFF = {  # Period, damping and level of a model, over those of the reality.
 }
 
 
+@functools.cache
+def composed(*overrides):
+    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
+        return OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
+
+
+def configuration(*overrides, experiment="beam_real"):
+    """Settings of an experiment as the command line would compose them."""
+    return copy.deepcopy(composed(f"experiment={experiment}", *overrides))
+
+
 def config(**data):
     """Settings of the experiment, as its stages get them."""
-    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        plain = OmegaConf.to_container(compose("config", ["mesh.divisions=[6,2,2]"]), resolve=True)
+    plain = configuration("mesh.divisions=[6,2,2]", experiment="beam_oscillation")
     plain |= {
         "name": "beam_real",
         "title": "Real beam",

@@ -232,6 +232,7 @@ def test_words():
 
     means = {"simulation": 0.9, "sysid_elastic": 0.8, "sysid": None, "resphys": 0.2}
     errors = {model: summary(mean) for model, mean in means.items()}
+    assert verdict(errors, ["a"], 1.4, folds=True) == verdict(errors, ["a"], 1.4)
     said = verdict(errors, ["a"], 1.4).replace("\u00a0", " ")
     assert "On trial a, " in said
     assert "0.200 mm from the measured ones over the first 1.4 s with ResPhys; diverged with SysID, " in said

@@ -258,6 +258,52 @@ def test_an_interrupted_identification_goes_on_with_the_next_start(finished, tmp
     assert not list(tmp_path.glob("identify_*.json"))
 
 
+def test_an_interrupted_landscape_goes_on_and_loses_no_identification(finished, tmp_path, monkeypatch, capsys):
+    """The searches are left out; the losses of the landscape count its points, and the second is a failure."""
+    shutil.copy(finished / "markers.h5", tmp_path)
+    grid = ["identify.starts=2", "identify.grid.youngs_modulus.points=5", "identify.grid.poissons_ratio.points=2"]
+    config = configuration(*[each for each in SYNTHETIC if "hydra" not in each], *grid)
+    (stage, *_) = learning_stages(config, split_of(config), ".", "imported")
+    calls, moduli, interrupt_at = [], [], [6]
+
+    def starts(self, first, count, candidates, seed):
+        calls.append("starts")
+        return [first] * count
+
+    def descend(self, number, start, max_evaluations, tolerance, report):
+        calls.append("descent")
+        return {"parameters": dict(start), "loss": float(number + 1), "history": [{"loss": 1.0, **start}]}
+
+    def losses(self, points):
+        if len(moduli) in interrupt_at:
+            interrupt_at.clear()
+            raise KeyboardInterrupt
+        before = len(moduli)
+        moduli.extend(points[:, 0])
+        return np.array([np.inf if place == 1 else float(place) for place in range(before, len(moduli))])
+
+    monkeypatch.setattr(Identifier, "starts", starts)
+    monkeypatch.setattr(Identifier, "_descend", descend)
+    monkeypatch.setattr(Identifier, "uncertainty", lambda *_: calls.append("uncertainty"))
+    monkeypatch.setattr(Identifier, "_losses_safe", losses)
+    monkeypatch.setattr("warp_resphys.tasks.measured.identify._AT_ONCE", 2)
+    with pytest.raises(StageInterrupted, match="interrupted in stage 'identify'"):
+        run_stages([stage], tmp_path)
+    once = ["starts", "descent", "descent", "uncertainty"] * 2
+    assert calls == once
+    assert "identify: landscape: 6/10 points" in capsys.readouterr().err
+    run_stages([stage], tmp_path)
+    assert calls == once
+    err = capsys.readouterr().err
+    assert "identify: 4/24 evaluations at most" in err
+    assert "identify: landscape: 10/10 points" in err
+    found = read(tmp_path / "identification.json")
+    assert found["landscape"]["loss"] == [[0, None], [2, 3], [4, 5], [6, 7], [8, 9]]
+    np.testing.assert_allclose(moduli, np.repeat(np.linspace(0.0, 1.0, 5), 2))
+    assert found["sysid_elastic"]["loss"] == 1.0
+    assert not list(tmp_path.glob("identify_*.json"))
+
+
 @pytest.mark.parametrize(
     ("overrides", "sentence"),
     [

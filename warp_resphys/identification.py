@@ -140,13 +140,22 @@ class Identifier:
         values = {name: b.from_unit(unit[:, i]) for i, (name, b) in enumerate(self.bounds.items())}
         return self.replay.errors(self.replay(self.release, values))
 
-    def grid(self, axes: Mapping[str, int], others: Mapping[str, float], chunk: int = 12) -> NDArray[np.float64]:
+    def grid(
+        self,
+        axes: Mapping[str, int],
+        others: Mapping[str, float],
+        chunk: int = 12,
+        finished: Sequence[float] = (),
+        report: Callable[[list[float]], None] | None = None,
+    ) -> NDArray[np.float64]:
         """Losses on a grid over some of the parameters, the others held.
 
         Args:
             axes: number of points of each parameter of the grid, over its whole range.
             others: values of the remaining parameters.
             chunk: sets of parameters that are simulated at once.
+            finished: what an interrupted call with the same arguments told last; those losses are not computed again.
+            report: is told the losses so far, in the order of the grid's points, after every chunk.
 
         Returns:
             Losses with an axis for each of `axes`, in their order; infinite where a simulation failed.
@@ -155,9 +164,15 @@ class Identifier:
             np.linspace(0.0, 1.0, axes[name]) if name in axes else [self._unit(name, others)] for name in self.bounds
         ]
         points = np.array(list(product(*ticks)))
-        losses = np.concatenate([self._losses_safe(points[i : i + chunk]) for i in range(0, len(points), chunk)])
+        losses = list(finished)
+        while len(losses) < len(points):
+            losses += self._losses_safe(points[len(losses) : len(losses) + chunk]).tolist()
+            if report is not None:
+                report(losses)
         inside = [name for name in self.bounds if name in axes]
-        return losses.reshape([axes[name] for name in inside]).transpose([inside.index(name) for name in axes])
+        return (
+            np.array(losses).reshape([axes[name] for name in inside]).transpose([inside.index(name) for name in axes])
+        )
 
     def ticks(self, name: str, count: int) -> NDArray[np.float64]:
         """The values of a parameter on `grid`."""

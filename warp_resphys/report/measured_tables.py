@@ -48,7 +48,7 @@ def verdict(errors: Mapping[str, Any], trials: Sequence[str], seconds: float | N
         folds: Whether each trial was the test of a fold of its own.
     """
     who = f"trial {trials[0]}" if len(trials) == 1 else f"{len(trials)} trials"
-    held = "each of them kept back once" if folds else "which no training or identification saw"
+    held = "each of them kept back once" if folds and len(trials) > 1 else "which no training or identification saw"
     span = "" if seconds is None else f" over the first {seconds:g} s"
     main = next(
         (m for m in ("resphys", "resphys_uncorrected", "sysid", "sysid_elastic", "simulation") if m in errors), ""

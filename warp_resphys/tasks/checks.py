@@ -161,6 +161,11 @@ def check_tuning(config: Mapping[str, Any]) -> dict[str, Dimension]:
         InputError: a value of the wrong kind or out of range, also among those that may be tried.
     """
     tune = config["tune"]
+    if config["data"]["kind"] == RECORDINGS:
+        raise InputError(
+            f"task=tune does not search the networks of the experiment {config['name']}, which learns from recordings: "
+            "set network and in_the_loop, and simfree and trainer for the baseline, and compare runs with --multirun."
+        )
     if "markers" in config:
         raise InputError(f"the experiment {config['name']} trains no network: tune another one.")
     if tune["model"] not in MODELS:

@@ -1,15 +1,15 @@
 """Stage: the physical parameters that explain the training trials."""
 
-import dataclasses
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from ...errors import InputError
 from ...files import read_json, write_json
-from ...identification import Bounds, Identification, Identifier
+from ...identification import Bounds, Identifier
 from ...progress import Progress
 from ...replay import PARAMETERS, Release, Replay
 from ...stages import StageContext
@@ -17,14 +17,18 @@ from .files import IDENTIFICATION
 from .scene import Scene
 
 _ELASTIC = ("youngs_modulus", "poissons_ratio")
-_KINDS = ("identified", "simulation")
+_LANDSCAPE = "landscape"
+_AT_ONCE = 4  # points of the landscape
+_PARTS = ("identified", "simulation", _LANDSCAPE)
+
+Replays = Callable[[str], tuple[Replay, Release]]
 
 
 def identify(context: StageContext) -> None:
     """Writes identification.json: all configured parameters, E and nu alone, and the landscape over these two.
 
     E and nu alone belong to the uncorrected simulator, with its integrator, as published; all parameters belong to the
-    identified one.
+    identified one. What an interrupted run has finished is not done again: starts, searches, points of the landscape.
     """
     settings = context.settings
     config = settings["identify"]
@@ -33,16 +37,16 @@ def identify(context: StageContext) -> None:
     bounds = {name: Bounds(**b) for name, b in config["parameters"].items()}
     elastic = {name: bounds[name] for name in _ELASTIC if name in bounds}
     evaluations = (2 if elastic else 1) * config["starts"] * config["max_evaluations"]
-    with Progress("identify", evaluations, "evaluations at most") as progress:
-        identified, replay, release = _search(scene, "identified", train, bounds, context, progress)
-        results = {"sysid": identified}
+    replays = cache(partial(scene.replay, names=train))
+    done = sum(_evaluations(_kept(context, kind)) for kind in ("identified", "simulation"))
+    with Progress("identify", evaluations, "evaluations at most", done) as progress:
+        found = {"sysid": _search(context, replays, "identified", bounds, progress)}
         if elastic:
-            results["sysid_elastic"], *_ = _search(scene, "simulation", train, elastic, context, progress)
-    found: dict[str, Any] = {name: dataclasses.asdict(result) for name, result in results.items()}
-    found["landscape"] = _landscape(replay, release, bounds, identified, config["grid"])
+            found["sysid_elastic"] = _search(context, replays, "simulation", elastic, progress)
+    found[_LANDSCAPE] = _landscape(context, *replays("identified"), bounds, found["sysid"]["parameters"])
     write_json(context.run_dir / IDENTIFICATION, found)
-    for kind in _KINDS:
-        _attempts_file(context, kind).unlink(missing_ok=True)
+    for part in _PARTS:
+        _kept_file(context, part).unlink(missing_ok=True)
 
 
 def first_guess(settings: Mapping[str, Any], names: Any) -> dict[str, float]:
@@ -53,58 +57,78 @@ def first_guess(settings: Mapping[str, Any], names: Any) -> dict[str, float]:
 
 
 def _search(
-    scene: Scene,
-    kind: str,
-    train: tuple[str, ...],
-    bounds: Mapping[str, Bounds],
-    context: StageContext,
-    progress: Progress,
-) -> tuple[Identification, Replay, Release]:
-    settings = context.settings
-    config = settings["identify"]
-    replay, release = scene.replay(kind, train)
-    identifier = Identifier(replay, release, bounds, settings["data"]["seconds"])
-    guess = {**first_guess(settings, bounds), **{k: v for k, v in config["first_guess"].items() if k in bounds}}
-    starts = identifier.starts(guess, config["starts"], config["candidates"], settings["seed"])
+    context: StageContext, replays: Replays, kind: str, bounds: Mapping[str, Bounds], progress: Progress
+) -> dict[str, Any]:
+    """The `Identification` of a simulator, as plain data."""
+    kept = _kept(context, kind)
+    if "found" in kept:
+        return dict(kept["found"])
+    config = context.settings["identify"]
+    identifier = Identifier(*replays(kind), bounds, context.settings["data"]["seconds"])
+    if "starts" not in kept:
+        guess = first_guess(context.settings, bounds)
+        guess |= {name: value for name, value in config["first_guess"].items() if name in bounds}
+        starts = identifier.starts(guess, config["starts"], config["candidates"], context.settings["seed"])
+        kept = _keep(context, kind, {"starts": starts, "attempts": []})
 
     def report(start: int, loss: float, values: Mapping[str, float]) -> None:
         progress.advance(1, start=start, loss=f"{loss:.3g}", E=f"{values.get('youngs_modulus', 0.0) / 1e3:.4g} kPa")
 
-    path = _attempts_file(context, kind)
-
     def keep(attempts: list[Any]) -> None:
-        write_json(path, {"fingerprint": context.fingerprint, "attempts": attempts})
+        _keep(context, kind, {**kept, "attempts": attempts})
 
-    kept = read_json(path) if path.is_file() else {}
-    finished = kept["attempts"] if kept.get("fingerprint") == context.fingerprint else []
-    return (
-        identifier.run(starts, config["max_evaluations"], report, finished, keep, config["tolerance"]),
-        replay,
-        release,
+    found = identifier.run(
+        kept["starts"], config["max_evaluations"], report, kept["attempts"], keep, config["tolerance"]
     )
+    return dict(_keep(context, kind, {"found": asdict(found)})["found"])
 
 
-def _attempts_file(context: StageContext, kind: str) -> Path:
-    """Where finished starts are kept until the stage is done."""
-    return context.run_dir / f"identify_{kind}.json"
+def _evaluations(kept: Mapping[str, Any]) -> int:
+    """How many went into what is kept of a search."""
+    attempts = [each["history"] for each in kept.get("attempts", ())]
+    return sum(map(len, kept["found"]["history"] if "found" in kept else attempts))
 
 
 def _landscape(
+    context: StageContext,
     replay: Replay,
     release: Release,
     bounds: Mapping[str, Bounds],
-    found: Identification,
-    grid: Mapping[str, Mapping[str, Any]],
+    found: Mapping[str, float],
 ) -> dict[str, Any]:
     """Losses around the identified parameters: a range and a number of points for E, and for nu if that is wanted."""
+    grid = context.settings["identify"]["grid"]
     axes = {name: Bounds(each["lower"], each["upper"], each["logarithmic"]) for name, each in grid.items()}
     others = {name: b for name, b in bounds.items() if name not in axes}
     identifier = Identifier(replay, release, {**axes, **others})
     counts = {name: int(each["points"]) for name, each in grid.items()}
-    with torch.no_grad():
-        losses = identifier.grid(counts, found.parameters)
+    finished = [math.inf if loss is None else loss for loss in _kept(context, _LANDSCAPE).get("losses", [])]
+    with Progress(f"{context.name}: landscape", math.prod(counts.values()), "points", len(finished)) as progress:
+
+        def report(losses: list[float]) -> None:
+            _keep(context, _LANDSCAPE, {"losses": losses})
+            progress.advance(len(losses) - progress.done)
+
+        losses = identifier.grid(counts, found, _AT_ONCE, finished, report)
     ticks = {name: identifier.ticks(name, count).tolist() for name, count in counts.items()}
     return {**ticks, "loss": losses.tolist()}
+
+
+def _kept_file(context: StageContext, part: str) -> Path:
+    """Where what is finished of a part is kept until the stage is done."""
+    return context.run_dir / f"identify_{part}.json"
+
+
+def _keep(context: StageContext, part: str, content: dict[str, Any]) -> dict[str, Any]:
+    write_json(_kept_file(context, part), {"fingerprint": context.fingerprint, **content})
+    return content
+
+
+def _kept(context: StageContext, part: str) -> dict[str, Any]:
+    """What an interrupted run kept of a part; nothing if it had other settings."""
+    path = _kept_file(context, part)
+    kept: dict[str, Any] = read_json(path) if path.is_file() else {}
+    return kept if kept.get("fingerprint") == context.fingerprint else {}
 
 
 def check_identification(config: Mapping[str, Any]) -> None:

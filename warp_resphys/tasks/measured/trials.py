@@ -90,7 +90,8 @@ def split_of(config: Mapping[str, Any]) -> Split:
 def folds_of(config: Mapping[str, Any]) -> dict[str, Split] | None:
     """By the name of the trial that is tested: the splits of a cross-validation; None where there is one split.
 
-    A fold trains on all other trials and has none to validate with.
+    A fold trains on all other trials and has none to validate with. With ``data.limit`` there are fewer folds, and each
+    trains on fewer trials, evenly picked.
 
     Raises:
         InputError: fewer than two trials.
@@ -100,7 +101,9 @@ def folds_of(config: Mapping[str, Any]) -> dict[str, Split] | None:
     names = [trial.name for trial in trials_of(config)]
     if len(names) < 2:
         raise InputError("data.folds is leave_one_out, which needs two trials or more in data.trials.")
-    return {name: Split(tuple(each for each in names if each != name), (), (name,)) for name in names}
+    limit = config["data"].get("limit") or {"train": len(names), "test": len(names)}
+    others = {name: [each for each in names if each != name] for name in evenly(names, limit["test"])}
+    return {name: Split(tuple(evenly(row, limit["train"])), (), (name,)) for name, row in others.items()}
 
 
 def vertical(up: str | Sequence[float] | None) -> NDArray[np.float64] | None:

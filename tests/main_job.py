@@ -1,0 +1,79 @@
+"""A small main job through its command line: its settings, and what it leaves in the run folder."""
+
+import contextlib
+import io
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from warp_resphys import cli
+
+REPOSITORY = Path(__file__).parents[1]
+STAGES = ["generate", "reconstruct", "train", "train_simfree", "evaluate", "time", "report"]
+REFINED = ["generate", "reconstruct", "train", "refine", "train_simfree", "evaluate", "time", "report"]
+REFINE = ["refinement=solver_in_the_loop", "refinement.window=4", "refinement.epochs=3"]
+LEARNED = ["train", "train_simfree", "evaluate", "time", "report"]
+CORRECTED = ["reconstruct", "train", "evaluate", "time", "report"]
+MODELS = ("simulation", "resphys", "reconstruction")
+SMALL = ["mesh.divisions=[4,2,2]"]
+SHORT = [
+    "data.steps=12",
+    "data.weights_g.train=[50,90,130]",
+    "data.weights_g.validation=[110]",
+    "data.weights_g.test=[70,150]",
+    "trainer.epochs=40",
+    "trainer.rollout_every=10",
+    "network.width=32",
+    "hydra/job_logging=none",
+    "hydra/hydra_logging=none",
+]
+TINY = [*SMALL, *SHORT]
+IN_RUN = "hydra.run.dir=run"
+
+
+def run(*arguments):
+    """Exit code of the command in this process, and what it wrote to stderr."""
+    out, err, argv = io.StringIO(), io.StringIO(), sys.argv
+    sys.argv = ["warp-resphys", *arguments]
+    code = 0
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            cli.main()
+        except SystemExit as end:
+            code = end.code
+        finally:
+            sys.argv = argv
+    return code, err.getvalue()
+
+
+def metrics(folder="run"):
+    return json.loads((Path(folder) / "metrics.json").read_text())
+
+
+def errors(folder="run"):
+    """All errors [mm] of a run, flat."""
+    found = metrics(folder)
+    groups = [found["errors_mm"], found["errors_vs_reconstruction_mm"]]
+    values = [group[model][key] for group in groups for model in sorted(group) for key in ("mean", "std")]
+    return values + [each["errors_mm"][model] for each in found["per_trajectory"] for model in MODELS]
+
+
+def same_errors(a, b):
+    np.testing.assert_allclose(a, b, rtol=1e-6)
+
+
+def files(folder="run"):
+    """Content of everything in the run folder but Hydra's own, by name."""
+    root = Path(folder)
+    paths = [p for p in root.rglob("*") if p.is_file() and ".hydra" not in p.parts and p.name != ".lock"]
+    return {str(p.relative_to(root)): (p.stat().st_mtime_ns, p.read_bytes()) for p in paths}
+
+
+def ran(before):
+    """Stages whose record is another than before."""
+    now = files()
+    return [
+        s for s in REFINED if f"stages/{s}.json" in now and now[f"stages/{s}.json"] != before.get(f"stages/{s}.json")
+    ]

@@ -1,0 +1,175 @@
+"""The main job with settings, meshes, files and disks that it cannot use: one sentence, exit code 2."""
+
+import re
+import resource
+import shutil
+from pathlib import Path
+
+import h5py
+import meshio
+import numpy as np
+import pytest
+from main_job import IN_RUN, SHORT, STAGES, TINY, errors, files, ran, run, same_errors
+
+from warp_resphys import box_hexahedra
+
+
+class TestBadInput:
+    @pytest.mark.parametrize(
+        ("overrides", "sentence"),
+        [
+            ("simulation.youngs_modulus=0", "simulation: youngs_modulus is 0: it must be positive, in pascals."),
+            ("reality.youngs_modulus=-1e5", "reality: youngs_modulus is -100000: it must be positive, in pascals."),
+            ("simulation.youngs_modulus=nan", "simulation: youngs_modulus is nan: it must be positive, in pascals."),
+            ("simulation.poissons_ratio=0.5", "simulation: poissons_ratio is 0.5: it must be greater than -1 and less"),
+            (
+                "reality.poissons_ratio=-1",
+                "reality: poissons_ratio is -1: it must be greater than -1 and less than 0.5.",
+            ),
+            ("time_step=0", "time_step is 0: it must be positive, in seconds."),
+            ("time_step=-0.01", "time_step is -0.01: it must be positive, in seconds."),
+            ("experiment=beam_oscilation", "unknown experiment 'beam_oscilation', did you mean 'beam_oscillation'"),
+            ("trainer.epoch=5", "unknown key 'trainer.epoch', did you mean 'trainer.epochs'"),
+            ("+simulation.stiffness=5", "unknown key 'simulation.stiffness': simulation has youngs_modulus, "),
+            ("simulation.youngs_modulus=soft", "simulation.youngs_modulus is 'soft': it must be a number."),
+            ("trainer.epochs=2.5", "trainer.epochs is 2.5: it must be a whole number."),
+            ("trainer.learning_rate=0", "trainer.learning_rate is 0: it must be positive."),
+            ("trainer.schedule=2", "trainer.schedule is 2: it must be a word."),
+            ("trainer.step_epochs=1.5", "trainer.step_epochs is 1.5: it must be a whole number."),
+            ("refinement=solver", "unknown refinement 'solver'; known are none, solver_in_the_loop"),
+            ("refinement.kind=solver", "refinement.kind is 'solver': choose one of none, solver_in_the_loop."),
+            ("reconstruction.regularisation=-1", "reconstruction.regularisation is -1: it must be zero or more."),
+            ("network.kind=graph", "network.kind is 'graph': choose one of reduced, nodal."),
+            ("network.force_modes=1000", "1000 modes were asked for, but 36 samples give 1 to 36."),
+            ("solver.name=gradient_descent", "solver is 'gradient_descent': choose one of"),
+            ("integrator=rk4", "integrator is 'rk4': choose one of implicit_euler, bdf2, midpoint."),
+            ("device=tpu", "device is 'tpu': choose auto, cpu or cuda."),
+            ("device=mps", "device is 'mps': choose auto, cpu or cuda."),
+            ("dtype=float16", "dtype is 'float16': experiments need float64"),
+            ("seed=-1", "seed is -1: it must lie between 0 and 2^63 - 1."),
+            ("gravity=[0,0]", "gravity is [0, 0]: it must be three finite numbers, in m/s^2."),
+            ("gravity=[0,0,inf]", "gravity is [0, 0, inf]: it must be three finite numbers, in m/s^2."),
+            ("fixed=null", "fixed is None: it must be a group of settings."),
+            ("fixed.x=0.5", "no vertex lies within 1e-09 m of x = 0.5 m"),
+            ("data.load.x=0.5", "no vertex lies within 1e-09 m of x = 0.5 m"),
+            ("data.steps=0", "data.steps is 0: it must be positive."),
+            ("data.weights_g.train=[]", "data.weights_g.train is empty: give the split at least one value."),
+            ("data.weights_g.validation=[]", "data.weights_g.validation is empty"),
+            ("data.weights_g.test=[]", "data.weights_g.test is empty"),
+            ("data.weights_g.test=[90]", "data.weights_g names 90 g twice: every trajectory is in one split."),
+            ("data.weights_g.test=[-4]", "data.weights_g.test holds a value that is not positive: [-4.0]."),
+            ("data.weights_g.test=70", "data.weights_g.test is 70: it must be a list of numbers."),
+            ("data.kind=drop", "data.kind is 'drop': choose one of release_from_load, release_from_twist."),
+            ("solver.max_iterations=1", "the newton solver stopped after 1 iterations"),
+            ("reconstruction.max_iterations=1", "Gauss-Newton reconstruction moved by"),
+        ],
+    )
+    def test_settings(self, folder, overrides, sentence):
+        code, err = run(*TINY, IN_RUN, overrides)
+        self.check(code, err, sentence)
+
+    @pytest.mark.parametrize("content", [None, b"", b"not a mesh", b"\x89HDF\r\n\x1a\n", "truncated", "surface"])
+    def test_mesh(self, folder, content):
+        box = box_hexahedra((0.1, 0.03, 0.03), (4, 2, 2))
+        name = "box.vtu"
+        if content in ("truncated", "surface"):
+            faces = [("quad", box.cells[:, :4])] if content == "surface" else [("hexahedron", box.cells)]
+            meshio.write(name, meshio.Mesh(box.vertices, faces))
+            if content == "truncated":
+                Path(name).write_bytes(Path(name).read_bytes()[:-300])
+        elif content is not None:
+            Path(name).write_bytes(content)
+        code, err = run(*SHORT, IN_RUN, "mesh=file", f"mesh.path={name}")
+        self.check(code, err, "box.vtu: ")
+
+    def test_mesh_without_path(self, folder):
+        code, err = run(*SHORT, IN_RUN, "mesh=file")
+        self.check(code, err, "Missing mandatory value: path (at mesh.path)")
+
+    @staticmethod
+    def check(code, err, sentence):
+        lines = [line for line in err.splitlines() if not line.startswith(tuple(f"{stage}: " for stage in STAGES))]
+        assert code == 2
+        assert len(lines) == 1
+        assert lines[0].startswith(f"error: {sentence}")
+        written = {path.name for path in Path("run").rglob("*") if path.is_file()} if Path("run").exists() else set()
+        assert not written & {"metrics.json", "report.html", "model.safetensors", "rollouts.h5"}
+        assert not [name for name in written if name.endswith(".partial")]
+
+    def test_a_file_mesh_runs(self, folder, no_report, finished):
+        box = box_hexahedra((0.1, 0.03, 0.03), (4, 2, 2))
+        meshio.write("box.vtu", meshio.Mesh(100.0 * box.vertices, [("hexahedron", box.cells)]))
+        tolerance = ["+fixed.tolerance=1e-6", "+data.load.tolerance=1e-6"]
+        arguments = [*SHORT, IN_RUN, "mesh=file", "mesh.path=box.vtu", "mesh.units=cm", *tolerance]
+        assert run(*arguments)[0] == 0
+        np.testing.assert_allclose(errors()[:2], errors(finished[0])[:2], rtol=0.05)
+        before = files()
+        box = box_hexahedra((0.1, 0.03, 0.03), (3, 2, 2))
+        meshio.write("box.vtu", meshio.Mesh(100.0 * box.vertices, [("hexahedron", box.cells)]))
+        assert run(*arguments)[0] == 0
+        assert ran(before) == STAGES  # the file's content counts, not its name
+
+    @pytest.mark.parametrize("damage", ["truncated", "foreign", "of another stage", "changed"])
+    def test_a_damaged_file_in_the_run_folder_is_an_error_until_it_is_deleted(
+        self, finished, copied, no_report, caplog, damage
+    ):
+        path = Path("run/reconstruction.h5")
+        if damage == "truncated":
+            path.write_bytes(path.read_bytes()[:-1000])
+        elif damage == "foreign":
+            path.unlink()
+            with h5py.File(path, "w") as file:
+                file["q"] = np.zeros(3)
+        elif damage == "of another stage":
+            shutil.copy("run/trajectories.h5", path)
+        else:
+            content = bytearray(path.read_bytes())
+            content[len(content) // 2] ^= 0xFF
+            path.write_bytes(content)
+        found = path.read_bytes()
+        code, err = run(*TINY, IN_RUN)
+        assert code == 2
+        assert err.splitlines()[-1].startswith("error: ")
+        assert "reconstruction.h5" in err.splitlines()[-1]
+        assert "Traceback" not in err
+        assert path.read_bytes() == found
+        path.unlink()
+        assert run(*TINY, IN_RUN)[0] == 0
+        assert "reconstruct: missing or changed since they were written: reconstruction.h5" in caplog.text
+        assert ran(copied) == ["reconstruct"]  # the same forces as before: what follows is still valid
+        same_errors(errors(), errors(finished[0]))
+
+    @staticmethod
+    def run_with_files_up_to(kilobytes):
+        limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1000 * kilobytes, limits[1]))
+        try:
+            return run(*TINY, IN_RUN)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+    @pytest.mark.parametrize(
+        ("kilobytes", "full"),
+        [(10, "trajectories.h5.journal"), (172, "trajectories.h5"), (230, "reconstruction.h5.journal")],
+    )
+    def test_full_disk(self, finished, folder, no_report, kilobytes, full):
+        code, err = self.run_with_files_up_to(kilobytes)
+        line = err.splitlines()[-1]
+        assert code == 2
+        assert line.startswith(f"error: disk is full while writing {folder}/run/{full}: free some space and run the")
+        assert "Traceback" not in err
+        assert not Path("run/metrics.json").exists()
+        assert not list(Path("run").rglob("*.partial"))
+        assert run(*TINY, IN_RUN)[0] == 0
+        same_errors(errors(), errors(finished[0]))
+
+    def test_full_disk_while_the_report_is_written(self, copied):
+        Path("run/report.html").unlink()
+        code, err = self.run_with_files_up_to(300)
+        assert code == 2
+        assert re.fullmatch(rf"error: [^\n]*{Path.cwd()}/run/report\.html[^\n]*\n", err)
+        assert not Path("run/report.html").exists()
+        assert ran(copied) == []  # no record says that there is a report
+        assert run(*TINY, IN_RUN)[0] == 0
+        assert ran(copied) == ["report"]
+        assert Path("run/report.html").stat().st_size > 300_000

@@ -73,6 +73,11 @@ TRIALS = {"a": {"file": "a.c3d", "hung": 0.0}, "b": {"file": "b.c3d", "hung": 0.
         ("identify/starts", "two", "identify.starts is 'two': it must be a whole number"),
         ("identify/parameters", {}, "identify.parameters is empty"),
         ("identify/parameters/colour", {"lower": 0.0, "upper": 1.0}, "identify.parameters names 'colour'"),
+        (
+            "identify/elastic/density",
+            {"lower": 0.0, "upper": 1.0},
+            "identify.elastic names .density.: choose from youngs",
+        ),
         ("identify/parameters/density", {"lower": 0.0}, "identify.parameters.density.upper is missing"),
         (
             "identify/parameters/density",

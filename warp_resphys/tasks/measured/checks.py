@@ -113,6 +113,7 @@ _KEYS: Mapping[str, Mapping[str, Kind]] = {
         "integrator": one_of(*INTEGRATORS),
         "substeps": NATURAL,
         "parameters": GROUP,
+        "elastic": GROUP,
         "first_guess": GROUP,
         "starts": NATURAL,
         "candidates": COUNT,
@@ -184,6 +185,7 @@ def _check_identification(identify: Mapping[str, Any]) -> None:
         raise InputError(f"identify.parameters is empty: give a range of one or more of {', '.join(PARAMETERS)}.")
     for group, needed, others in (
         ("parameters", _RANGE, ("logarithmic",)),
+        ("elastic", _RANGE, ("logarithmic",)),
         ("grid", {**_RANGE, "logarithmic": TRUTH_VALUE, "points": NATURAL}, ()),
     ):
         for name, settings in identify[group].items():

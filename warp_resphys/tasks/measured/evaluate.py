@@ -29,7 +29,7 @@ def evaluate_markers(context: StageContext) -> None:
     names = tuple(settings["split"]["test"])
     motions = scene.pick(names)
     models = [m for m in MODELS if m != "published" or settings["published"] is not None]
-    models = [m for m in models if m != "sysid_elastic" or "youngs_modulus" in settings["identify"]["parameters"]]
+    models = [m for m in models if m != "sysid_elastic" or settings["identify"]["elastic"]]
     releases = {
         kind: scene.release(scene.simulator(kind), motions) for kind in dict.fromkeys(SIMULATORS[m] for m in models)
     }
@@ -96,15 +96,20 @@ def _roll_out(
             learned = restore(ResidualForce, *read_checkpoint(context.run_dir / weights_file(model), "residual force"))
             force = force_predictor_of(learned.to(device), loads(motions))
         rollout = HybridRollout(simulator, force, tensors=tensors)
-    q = roll_out_to_the_end(rollout, simulator, motions, release)
-    markers = markers_at_frames(q, simulator, scene.markers, motions, release)
     substeps = round(scene.config["time_step"] / simulator.time_step)
+    q = roll_out_to_the_end(rollout, simulator, motions, release, substeps)
+    markers = markers_at_frames(q, simulator, scene.markers, motions, release)
     return q[:, ::substeps].cpu().numpy(), markers.cpu().numpy()
 
 
-def roll_out_to_the_end(rollout: Rollout, simulator: Simulator, motions: Motions, release: Release) -> torch.Tensor:
-    """(R, K + 1, N, 3) positions from the releases to the last frame [m]; NaN from where a roll-out diverged."""
-    steps = max(int(float(motions.times.max()) / simulator.time_step) + 2, 2)
+def roll_out_to_the_end(
+    rollout: Rollout, simulator: Simulator, motions: Motions, release: Release, substeps: int = 1
+) -> torch.Tensor:
+    """(R, K + 1, N, 3) positions from the releases to past the last frame [m]; NaN from where a roll-out diverged.
+
+    K is a multiple of ``substeps``, the simulator's steps that make a time step of the experiment.
+    """
+    steps = substeps * max(int(float(motions.times.max()) / (substeps * simulator.time_step)) + 2, 2)
     return closed_loop(rollout, State(release.state.q, release.state.v), steps)
 
 

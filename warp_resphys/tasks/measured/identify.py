@@ -25,17 +25,16 @@ Replays = Callable[[str], tuple[Replay, Release]]
 
 
 def identify(context: StageContext) -> None:
-    """Writes identification.json: all configured parameters, E and nu alone, and the landscape over these two.
+    """Writes identification.json: the configured parameters, E and nu alone, and the landscape over these two.
 
-    E and nu alone belong to the uncorrected simulator, with its integrator, as published; all parameters belong to the
+    E and nu alone belong to the uncorrected simulator, with its integrator, as published; the parameters belong to the
     identified one. What an interrupted run has finished is not done again: starts, searches, points of the landscape.
     """
     settings = context.settings
     config = settings["identify"]
     scene = Scene(settings, context.run_dir / settings["shared"])
     train = tuple(settings["split"]["train"])
-    bounds = {name: Bounds(**b) for name, b in config["parameters"].items()}
-    elastic = {name: bounds[name] for name in _ELASTIC if name in bounds}
+    bounds, elastic = ({name: Bounds(**b) for name, b in config[key].items()} for key in ("parameters", "elastic"))
     evaluations = (2 if elastic else 1) * config["starts"] * config["max_evaluations"]
     replays = cache(partial(scene.replay, names=train))
     done = sum(_evaluations(_kept(context, kind)) for kind in ("identified", "simulation"))
@@ -137,13 +136,14 @@ def check_identification(config: Mapping[str, Any]) -> None:
     Raises:
         InputError: a value out of range, or an unknown parameter.
     """
-    for name, each in config["parameters"].items():
-        if name not in PARAMETERS:
-            raise InputError(f"identify.parameters names '{name}': choose from {', '.join(PARAMETERS)}.")
-        try:
-            Bounds(**each)
-        except (TypeError, InputError) as error:
-            raise InputError(f"identify.parameters.{name}: {error}") from error
+    for key, known in (("parameters", PARAMETERS), ("elastic", _ELASTIC)):
+        for name, each in config[key].items():
+            if name not in known:
+                raise InputError(f"identify.{key} names '{name}': choose from {', '.join(known)}.")
+            try:
+                Bounds(**each)
+            except (TypeError, InputError) as error:
+                raise InputError(f"identify.{key}.{name}: {error}") from error
     for key in ("starts", "max_evaluations", "tolerance"):
         if not config[key] > 0:
             raise InputError(f"identify.{key} is {config[key]}: it must be positive.")

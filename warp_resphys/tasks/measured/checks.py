@@ -173,6 +173,11 @@ def _check_learning(config: Mapping[str, Any]) -> None:
     """What the stages after the import are set to."""
     if config["refinement"]["kind"] != "none":
         raise InputError("refinement is for simulated experiments: recordings train through the simulator anyhow.")
+    if config["release"]["sideways"] > 0.0 and config["data"]["rest"] != "held":
+        raise InputError(
+            f"release.sideways is {config['release']['sideways']:g} m, but data.rest is {config['data']['rest']}: that "
+            "tells where the markers are on the undeformed body, so set release.sideways to 0."
+        )
     check_in_the_loop(config["in_the_loop"])
     _check_identification(config["identify"])
     simulator = build_simulator(config)

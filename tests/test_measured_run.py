@@ -159,6 +159,7 @@ class TestCompleteRun:
         assert errors["sysid"] < 0.5 * errors["simulation"] < 0.5 * errors["published"]
         assert [each["name"] for each in found["per_trajectory"]] == ["m50"]
         assert found["parameters"].keys() == {"sysid", "sysid_elastic"}
+        assert found["noise_mm"] == pytest.approx(0.05 * np.sqrt(8.0 / np.pi), rel=0.05)  # Maxwell's distribution
         for model, each in found["per_marker"].items():
             assert np.mean(list(each.values())) == pytest.approx(errors[model])
 

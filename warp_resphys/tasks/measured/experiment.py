@@ -13,7 +13,7 @@ from ...report.page import number_text
 from ...stages import Stage, package_versions, resources_used, run_stages
 from ..trajectories import Split, shown, simulated, training_settings
 from .evaluate import evaluate_markers
-from .files import ERRORS, IDENTIFICATION, METRICS, REPORT, ROLLOUTS, fold_folder, training_file, weights_file
+from .files import ERRORS, IDENTIFICATION, METRICS, REPORT, ROLLOUTS, TRUTH, fold_folder, training_file, weights_file
 from .identify import identify
 from .reconstruct import reconstruct_markers
 from .report import report_folds, report_measured
@@ -101,10 +101,12 @@ def run_measured(config: dict[str, Any], folder: Path) -> None:
 
 
 def collect_metrics(folder: Path, stages: list[Stage]) -> dict[str, Any]:
-    """Errors, identified parameters, time and memory of the stages, and versions."""
+    """Errors, the noise in them where known, identified parameters, time and memory of the stages, and versions."""
     identified = read_json(folder / IDENTIFICATION)
+    simulated_reality = "synthesise" in [stage.name for stage in stages]
     return {
         **read_json(folder / ERRORS),
+        **({"noise_mm": read_json(folder / TRUTH)["noise_mm"]} if simulated_reality else {}),
         "parameters": {
             name: identified[name]["parameters"] for name in ("sysid", "sysid_elastic") if name in identified
         },
@@ -122,4 +124,6 @@ def _print(metrics: Mapping[str, Any], folder: Path) -> None:
         table.add_row(model, number_text(summary["mean"]), *each)
     console = Console()
     console.print(table)
+    if "noise_mm" in metrics:
+        console.print(f"of which the noise of the markers is {number_text(metrics['noise_mm'])} mm")
     console.print(f"Report: {folder / REPORT}", soft_wrap=True)

@@ -81,9 +81,12 @@ def synthesise(context: StageContext) -> None:
     moving = simulate(settings, simulator, scene, trials, times[None] - released[:, None])
     labels = (*settings["markers"]["followed"], *settings["markers"]["others"])
     standing = np.broadcast_to(scene.others, (len(times), *scene.others.shape))
+    distances = []  # of the followed markers from where they would be seen without noise, (T, M) a trial [m]
     for trial, draw, swing in zip(trials, draws, moving, strict=True):
         positions = scene.recorded(np.concatenate([swing, standing], axis=1))
-        positions += synthetic["noise"] * draw.standard_normal(positions.shape)
+        noise = synthetic["noise"] * draw.standard_normal(positions.shape)
+        positions += noise
+        distances.append(np.linalg.norm(noise[:, : swing.shape[1]], axis=-1))
         path = context.run_dir / recording_file(trial.name)
         write_recording(path, Recording(labels, positions, rate, path), {"hung_kg": trial.hung})
     write_json(
@@ -94,6 +97,7 @@ def synthesise(context: StageContext) -> None:
             "rotation": scene.rotation.as_matrix(),
             "translation": scene.translation,
             "bound": dict(zip(settings["markers"]["followed"], scene.followed, strict=True)),
+            "noise_mm": 1e3 * float(np.mean(distances)),
             "released_s": {trial.name: at for trial, at in zip(trials, released, strict=True)},
         },
     )

@@ -29,7 +29,7 @@ NETWORK = {
     "layers": 0,
     "width": 8,
 }
-CONFIG = {"epochs": 4, "penalty": 1e-3, "memory": 5, "rollout_every": 1}
+CONFIG = {"epochs": 4, "penalty": 1e-3, "memory": 5, "rollout_every": 1, "patience": 3}
 
 
 def simulator():
@@ -247,13 +247,18 @@ class TestMarkersInTheLoop:
         config, seen = {**CONFIG, "epochs": 3}, []
         assert epochs_that_hold_up(network, [(loss, loss)], config, lambda: seen.append(1)) == 3
         assert len(seen) == 3
-        assert epochs_that_hold_up(network, [(loss, other)], config, lambda: None) == 0
+        for patience, spent in ((2, 2), (9, 3)):
+            seen.clear()
+            chosen = epochs_that_hold_up(
+                network, [(loss, other)], {**config, "patience": patience}, lambda: seen.append(1)
+            )
+            assert (chosen, len(seen)) == (0, spent)
         trainer = MarkersInTheLoop(network(), loss, None, config, epochs=0)
         trainer.begin()
         assert trainer.finished
         assert loss.error_mm(trainer.use_best()) == pytest.approx(loss.error_mm(None), rel=1e-9)
 
-    @pytest.mark.parametrize(("key", "value"), [("epochs", 0), ("memory", 0), ("penalty", -1.0)])
+    @pytest.mark.parametrize(("key", "value"), [("epochs", 0), ("memory", 0), ("patience", 0), ("penalty", -1.0)])
     def test_bad_settings(self, loss, key, value):
         with pytest.raises(InputError, match=rf"in_the_loop\.{key} is {value}: it must be"):
             MarkersInTheLoop(network(), loss, None, {**CONFIG, key: value})

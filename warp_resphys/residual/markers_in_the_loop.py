@@ -136,21 +136,25 @@ def epochs_that_hold_up(
     Args:
         make_model: an untrained model, the same every time.
         parts: losses of the motions to train on, and of those that are held out.
-        config: the group ``in_the_loop``; its epochs are the most that are tried.
-        advance: called after every epoch.
+        config: the group ``in_the_loop``; its epochs are the most that are tried, and its patience is after how many
+            without any gain the search ends.
+        advance: called after every epoch of every part.
 
     Returns:
         0 where no training is better than the simulator as it is.
     """
-    errors = []
-    for train, held_out in parts:
-        trainer = MarkersInTheLoop(make_model(), train, held_out, {**config, "rollout_every": 1})
+    config = {**config, "rollout_every": 1}
+    trainers = [MarkersInTheLoop(make_model(), train, held_out, config) for train, held_out in parts]
+    for trainer in trainers:
         trainer.begin()
-        while not trainer.finished:
+    while True:
+        means = np.mean([[record["rollout_error_mm"] for record in t.state.history] for t in trainers], axis=0)
+        best = int(np.argmin(means))
+        if trainers[0].finished or len(means) - 1 - best >= config["patience"]:
+            return best
+        for trainer in trainers:
             trainer.run_epoch()
             advance()
-        errors.append([record["rollout_error_mm"] for record in trainer.state.history])
-    return int(np.argmin(np.mean(errors, axis=0)))
 
 
 def _remove_force(model: ResidualForce) -> None:
@@ -170,7 +174,7 @@ def check_in_the_loop(config: Mapping[str, Any]) -> None:
     Raises:
         InputError: a setting out of range.
     """
-    for key in ("epochs", "memory", "rollout_every"):
+    for key in ("epochs", "memory", "rollout_every", "patience"):
         if not config[key] > 0:
             raise InputError(f"in_the_loop.{key} is {config[key]}: it must be positive.")
     if not config["penalty"] >= 0.0:

@@ -126,6 +126,7 @@ _KEYS: Mapping[str, Mapping[str, Kind]] = {
         "penalty": NOT_NEGATIVE,
         "sees_loads": TRUTH_VALUE,
         "hold_out": TRUTH_VALUE,
+        "patience": NATURAL,
         "memory": NATURAL,
         "rollout_every": NATURAL,
     },

@@ -195,7 +195,7 @@ def test_the_quick_budget_of_recordings_is_not_that_of_simulations(experiment):
     assert full.keys() - quick.keys() == {"data.limit"}
 
 
-@pytest.mark.parametrize("experiment", ["beam_real", "beam_real_repeated"])
+@pytest.mark.parametrize("experiment", ["beam_real", "beam_real_repeated", "beam_synthetic"])
 @pytest.mark.parametrize(
     ("group", "option"), [("network", "published"), ("network", "reduced"), ("trainer", "published")]
 )
@@ -208,12 +208,16 @@ def test_a_network_or_trainer_on_the_command_line_is_taken_whole(experiment, gro
     assert config[other] == configuration(experiment=experiment)[other]
 
 
-@pytest.mark.parametrize(("experiment", "modes"), [("beam_real", [2, 2, 2]), ("beam_real_repeated", [3, 3, 6])])
-def test_without_a_choice_few_recordings_train_a_small_network(experiment, modes):
+@pytest.mark.parametrize(
+    ("experiment", "modes", "layers"),
+    [("beam_real", [2, 2, 2], 0), ("beam_real_repeated", [3, 3, 6], 0), ("beam_synthetic", [3, 3, 4], 2)],
+)
+def test_without_a_choice_few_recordings_train_a_small_network(experiment, modes, layers):
     config = configuration(experiment=experiment)
+    check_configuration(config | {"data": config["data"] | ({} if layers else {"folder": "recordings"})})
     names = ("position_modes", "velocity_modes", "force_modes")
-    affine = {"kind": "reduced", "blocks": 1, "layers": 0, "width": 16}
-    assert config["network"] == affine | dict(zip(names, modes, strict=True))
+    small = {"kind": "reduced", "blocks": 1, "layers": layers, "width": 16}
+    assert config["network"] == small | dict(zip(names, modes, strict=True))
     simfree = training_settings(config, "simfree")
     own = {"position_modes": 6, "velocity_modes": 6, "layers": 3, "width": 128}
     assert simfree["network"] == config["network"] | own

@@ -6,6 +6,7 @@ Reports are made of these files in test_measured_report.py; here they read them,
 import contextlib
 import io
 import json
+import re
 import shutil
 import signal
 import sys
@@ -159,6 +160,7 @@ class TestCompleteRun:
         assert errors["sysid"] < 0.5 * errors["simulation"] < 0.5 * errors["published"]
         assert [each["name"] for each in found["per_trajectory"]] == ["m50"]
         assert found["parameters"].keys() == {"sysid", "sysid_elastic"}
+        assert 0.0 < found["sideways_mm"]["m50"] < 0.5  # The simulated beam is held straight.
         assert found["noise_mm"] == pytest.approx(0.05 * np.sqrt(8.0 / np.pi), rel=0.05)  # Maxwell's distribution
         for model, each in found["per_marker"].items():
             assert np.mean(list(each.values())) == pytest.approx(errors[model])
@@ -191,6 +193,11 @@ class TestCompleteRun:
     def test_the_report_can_read_all_of_it(self, finished, pages):
         shown = pages["run"]
         assert shown.truth is not None
+        assert re.match(
+            r"The body was held sideways by 0\.\d mm \(m50\), as the first 0\.13 s of its motion tell; .*"
+            r"The noise of the markers alone is 0\.08 mm\. The published errors",
+            shown.published_note,
+        )
         assert set(shown.training) == set(TRAINED)
         assert len(shown.identification["sysid"]["history"]) == 1
 

@@ -49,6 +49,9 @@ def evaluate_markers(context: StageContext) -> None:
         "per_trajectory": summarise_each(names, errors),
         "per_marker": {m: _per_marker(markers[m], observed, scene.labels) for m in models},
     }
+    shift = releases["identified"].shift
+    if shift is not None:
+        summary["sideways_mm"] = dict(zip(names, (1e3 * shift.norm(dim=2).mean(1)).tolist(), strict=True))
     write_json(context.run_dir / ERRORS, summary)
 
 

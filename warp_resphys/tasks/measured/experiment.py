@@ -125,5 +125,5 @@ def _print(metrics: Mapping[str, Any], folder: Path) -> None:
     console = Console()
     console.print(table)
     if "noise_mm" in metrics:
-        console.print(f"of which the noise of the markers is {number_text(metrics['noise_mm'])} mm")
+        console.print(f"The noise of the markers alone is {number_text(metrics['noise_mm'])} mm.")
     console.print(f"Report: {folder / REPORT}", soft_wrap=True)

@@ -53,20 +53,21 @@ def report_measured(context: StageContext) -> None:
     """
     folder, config = context.run_dir, context.settings["config"]
     mesh = build_mesh(config["mesh"])
+    metrics, truth = _metrics(folder, config), _read_if_there(_common(folder) / TRUTH)
     data = MeasuredReport(
         experiment=config["name"],
         title=config["title"],
-        metrics=_metrics(folder, config),
+        metrics=metrics,
         settings=config,
         published=_published(config["name"]),
-        published_note=PUBLISHED_NOTE,
+        published_note=_notes(metrics, truth, config),
         mesh=mesh,
         fixed=select_vertices(mesh, **config["fixed"]),
         trials=read_trials(folder, config),
         recordings=read_recordings(_common(folder), config, mesh),
         identification=_read_if_there(folder / IDENTIFICATION),
         start=first_guess(config, PARAMETERS),
-        truth=_read_if_there(_common(folder) / TRUTH).get("material", {}),
+        truth=truth.get("material", {}),
         training={m: read_json(path)["epochs"] for m in TRAINED if (path := folder / training_file(m)).is_file()},
         seconds=config["data"]["seconds"],
         synthetic=is_synthetic(config),
@@ -125,6 +126,21 @@ def _metrics(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
         "versions": package_versions(),
         "device": str(choose_device(config["device"])),
     }
+
+
+def _notes(metrics: Mapping[str, Any], truth: Mapping[str, Any], config: Mapping[str, Any]) -> str:
+    """What stands below the errors: how bodies were held, what of the errors is noise, and how the published differ."""
+    notes = []
+    if held := metrics.get("sideways_mm"):
+        each = ", ".join(f"{distance:.1f} mm ({trial})" for trial, distance in held.items())
+        window = config["release"]["window"]
+        notes.append(
+            f"The body was held sideways by {each}, as the first {window:g} s of its motion tell; "
+            "all models begin there."
+        )
+    if "noise_mm" in truth:
+        notes.append(f"The noise of the markers alone is {truth['noise_mm']:.2f} mm.")
+    return " ".join([*notes, PUBLISHED_NOTE])
 
 
 def read_trials(folder: Path, config: Mapping[str, Any]) -> Trials:

@@ -272,7 +272,7 @@ def options(group):
 
 GROUPS = ("mesh", "physics", "solver", "reconstruction", "network", "trainer", "refinement", "budget")
 SIMULATED = [
-    name for name in options("experiment") if not name.startswith("beam_real")
+    name for name in options("experiment") if not name.startswith(("beam_real", "beam_synthetic"))
 ]  # others: test_measured_configuration.py
 CHOICES = [(name, group, option) for name in SIMULATED for group in GROUPS for option in options(group)]
 

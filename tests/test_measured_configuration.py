@@ -69,6 +69,9 @@ TRIALS = {"a": {"file": "a.c3d", "hung": 0.0}, "b": {"file": "b.c3d", "hung": 0.
         ("release", None, "release is None: it must be a group of settings"),
         ("release/window", "x", "release.window is 'x': it must be a positive number"),
         ("data/rest", "file", "release.sideways is 0.002 m, but data.rest is file"),
+        ("gravity", [0.0, 0.0, 0.0], "release.sideways is across gravity, but gravity is zero"),
+        ("data/limit", {"train": 2}, "data.limit.validation is missing"),
+        ("data/limit", 2, "data.limit is 2: it must be a group of settings"),
         ("release/sideways", -1.0, "release.sideways is -1.0: it must be a number, zero or more"),
         ("identify/substeps", 0, "identify.substeps is 0: it must be a whole number, one or more"),
         ("release/colour", 1, "unknown key 'release.colour': release has hold_modes"),
@@ -224,6 +227,13 @@ def test_without_a_choice_few_recordings_train_a_small_network(experiment, modes
     default = configuration(experiment="beam_oscillation")["trainer"]
     assert simfree["trainer"] == default | {"epochs": 200, "rollout_every": 20}
     assert config["trainer"] == default
+
+
+def test_the_identification_of_e_and_nu_alone_can_be_left_out():
+    config = configuration("identify.elastic=null", "~identify.parameters.mass_damping", "data.folder=recordings")
+    check_configuration(config)
+    assert config["identify"]["elastic"] is None
+    assert list(config["identify"]["parameters"]) == ["youngs_modulus", "stiffness_damping"]
 
 
 def test_an_experiment_may_choose_its_network(tmp_path):

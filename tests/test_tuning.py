@@ -347,7 +347,7 @@ class TestBadInput:
         assert code == 2
         assert "error: the experiment marker_ablation trains no network: tune another one." in err
 
-    @pytest.mark.parametrize("name", ["beam_real", "beam_real_repeated"])
+    @pytest.mark.parametrize("name", ["beam_real", "beam_real_repeated", "beam_synthetic"])
     def test_an_experiment_on_recordings(self, folder, name):
         code, err = run(f"experiment={name}", "task=tune", "data.folder=recordings", IN_RUN)
         assert code == 2

@@ -19,6 +19,7 @@ from .simulator import MaterialTensors, Simulator
 
 _HOLD_ITERATIONS = 30
 _HOLD_TOLERANCE = 1e-7  # m, change of any position in the last iteration
+_SIDEWAYS_STRAIN = 1e-3  # of the body's extent: how far it is bent to find how it bends
 _HOLD_WEIGHT = 1e-6  # w, in units of the largest diagonal entry of the first J^T J
 
 
@@ -40,10 +41,10 @@ class ReleaseSettings:
     """
 
     hold_modes: int = 6
-    velocity_modes: int = 3
-    window: float = 0.08
+    velocity_modes: int = 0
+    window: float = 0.13
     noise: float = 3e-4
-    delay: float = 0.01
+    delay: float = 0.0
     speed: float = 0.05
     sideways: float = 0.0
     iterations: int = 4
@@ -214,7 +215,7 @@ class _Beginning:
         repeats = len(values) // len(self._held.delay)
         held = self._held.state.q.repeat(repeats, 1, 1)
         velocity, bend = (torch.einsum("bk,knc->bnc", a, b) for a, b in zip((speeds, bends), self._shapes, strict=True))
-        shift = self._markers(held) - self._markers(held + bend)
+        shift = self._markers(held) - self._markers(held + bend) if len(self._shapes[1]) else None
         return Release(State(held + bend, velocity), delay.sum(1), shift)
 
 
@@ -224,13 +225,16 @@ def sideways_shapes(simulator: Simulator) -> torch.Tensor:
     Of the two directions the stiffer one is left out if it bends the body less than half as far: what little it moves
     may well be along gravity. Weights that hang on the body take no part.
     """
-    size = 0.1  # m/s^2, small enough for a linear answer
     directions = torch.linalg.svd(simulator.tensor(simulator.gravity)[None])[2][1:]
+    extent = float((simulator.rest_positions.amax(0) - simulator.rest_positions.amin(0)).max())
+    size = 0.1  # m/s^2
     with torch.no_grad():
         tensors = simulator.prepare(attached_mass=torch.zeros_like(simulator.rest_positions[None, :, 0]))
         weightless = replace(tensors, weight=torch.zeros_like(tensors.weight).expand(2, -1, -1))
-        load = size * tensors.mass[..., None] * directions[:, None]
-        bent = simulator.static_equilibrium(load, material=weightless).q - simulator.rest_positions
+        for _ in range(3):  # Small enough for a linear answer, and well above rounding, however stiff the body is.
+            load = size * tensors.mass[..., None] * directions[:, None]
+            bent = simulator.static_equilibrium(load, material=weightless).q - simulator.rest_positions
+            size *= _SIDEWAYS_STRAIN * extent / float(bent.norm(dim=2).max())
     turn, *_ = torch.linalg.svd(bent.flatten(1), full_matrices=False)  # To the softest direction and the stiffest.
     shapes = torch.einsum("ij,inc->jnc", turn, bent)
     furthest = shapes.norm(dim=2).amax(1)

@@ -79,6 +79,7 @@ class MeasuredReport:
         settings: The run's configuration, nested.
         published: Published errors, empty where there are none.
         published_note: Why they are not measured on the same data.
+        notes: Sentences on the errors of this run.
         mesh: The body at rest.
         fixed: Vertices of the clamped region.
         trials: The test trials.
@@ -97,6 +98,7 @@ class MeasuredReport:
     settings: Mapping[str, Any]
     published: Mapping[str, PublishedError]
     published_note: str
+    notes: Sequence[str]
     mesh: Mesh
     fixed: IntArray
     trials: Trials
@@ -121,6 +123,7 @@ class FoldsReport:
         settings: The run's configuration, nested.
         published: Published errors, empty where there are none.
         published_note: Why they are not measured on the same data.
+        notes: Sentences on the errors of this run.
         mesh: The body at rest.
         fixed: Vertices of the clamped region.
         recordings: Quality and registration of all trials.
@@ -135,6 +138,7 @@ class FoldsReport:
     settings: Mapping[str, Any]
     published: Mapping[str, PublishedError]
     published_note: str
+    notes: Sequence[str]
     mesh: Mesh
     fixed: IntArray
     recordings: Recordings

@@ -113,7 +113,7 @@ _KEYS: Mapping[str, Mapping[str, Kind]] = {
         "integrator": one_of(*INTEGRATORS),
         "substeps": NATURAL,
         "parameters": GROUP,
-        "elastic": GROUP,
+        "elastic": optional(GROUP),
         "first_guess": GROUP,
         "starts": NATURAL,
         "candidates": COUNT,
@@ -146,6 +146,8 @@ def check_measured(config: Mapping[str, Any]) -> None:
         MeshError: a place where no vertex lies.
     """
     check_keys("data", config["data"], _KEYS["data"], _OF_THE_BUDGET)
+    if config["data"].get("limit") is not None:
+        check_keys("data.limit", config["data"]["limit"], dict.fromkeys(SPLITS, NATURAL))
     for group in ("markers", "release", "identify", "in_the_loop"):
         check_keys(group, config.get(group), _KEYS[group])
     for group in ("synthetic", "published"):
@@ -179,6 +181,8 @@ def _check_learning(config: Mapping[str, Any]) -> None:
             f"release.sideways is {config['release']['sideways']:g} m, but data.rest is {config['data']['rest']}: that "
             "tells where the markers are on the undeformed body, so set release.sideways to 0."
         )
+    if config["release"]["sideways"] > 0.0 and not np.any(config["gravity"]):
+        raise InputError("release.sideways is across gravity, but gravity is zero: set release.sideways to 0.")
     check_in_the_loop(config["in_the_loop"])
     _check_identification(config["identify"])
     simulator = build_simulator(config)
@@ -194,7 +198,7 @@ def _check_identification(identify: Mapping[str, Any]) -> None:
         ("elastic", _RANGE, ("logarithmic",)),
         ("grid", {**_RANGE, "logarithmic": TRUTH_VALUE, "points": NATURAL}, ()),
     ):
-        for name, settings in identify[group].items():
+        for name, settings in (identify[group] or {}).items():
             check_keys(f"identify.{group}.{name}", settings, needed, others)
     check_identification(identify)
     for name, each in identify["grid"].items():

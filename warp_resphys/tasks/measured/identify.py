@@ -34,7 +34,9 @@ def identify(context: StageContext) -> None:
     config = settings["identify"]
     scene = Scene(settings, context.run_dir / settings["shared"])
     train = tuple(settings["split"]["train"])
-    bounds, elastic = ({name: Bounds(**b) for name, b in config[key].items()} for key in ("parameters", "elastic"))
+    bounds, elastic = (
+        {name: Bounds(**b) for name, b in (config[key] or {}).items()} for key in ("parameters", "elastic")
+    )
     evaluations = (2 if elastic else 1) * config["starts"] * config["max_evaluations"]
     replays = cache(partial(scene.replay, names=train))
     done = sum(_evaluations(_kept(context, kind)) for kind in ("identified", "simulation"))
@@ -137,7 +139,7 @@ def check_identification(config: Mapping[str, Any]) -> None:
         InputError: a value out of range, or an unknown parameter.
     """
     for key, known in (("parameters", PARAMETERS), ("elastic", _ELASTIC)):
-        for name, each in config[key].items():
+        for name, each in (config[key] or {}).items():
             if name not in known:
                 raise InputError(f"identify.{key} names '{name}': choose from {', '.join(known)}.")
             try:

@@ -60,7 +60,8 @@ def report_measured(context: StageContext) -> None:
         metrics=metrics,
         settings=config,
         published=_published(config["name"]),
-        published_note=_notes(metrics, truth, config),
+        published_note=PUBLISHED_NOTE,
+        notes=_notes(metrics.get("sideways_mm", {}), truth),
         mesh=mesh,
         fixed=select_vertices(mesh, **config["fixed"]),
         trials=read_trials(folder, config),
@@ -83,8 +84,9 @@ def report_folds(context: StageContext) -> None:
     """
     folder, config = context.run_dir, context.settings["config"]
     mesh = build_mesh(config["mesh"])
-    metrics = {"versions": package_versions(), "device": str(choose_device(config["device"]))}
+    metrics: dict[str, Any] = {"versions": package_versions(), "device": str(choose_device(config["device"]))}
     metrics |= read_json(folder / METRICS)
+    sideways = {k: v for fold in metrics["folds"].values() for k, v in fold.get("sideways_mm", {}).items()}
     data = FoldsReport(
         experiment=config["name"],
         title=config["title"],
@@ -93,6 +95,7 @@ def report_folds(context: StageContext) -> None:
         settings=config,
         published=_published(config["name"]),
         published_note=PUBLISHED_NOTE,
+        notes=_notes(sideways, {}),
         mesh=mesh,
         fixed=select_vertices(mesh, **config["fixed"]),
         recordings=read_recordings(folder, config, mesh),
@@ -128,19 +131,18 @@ def _metrics(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _notes(metrics: Mapping[str, Any], truth: Mapping[str, Any], config: Mapping[str, Any]) -> str:
-    """What stands below the errors: how bodies were held, what of the errors is noise, and how the published differ."""
+def _notes(sideways: Mapping[str, float], truth: Mapping[str, Any]) -> list[str]:
+    """How the bodies of the test trials were held, and what of the errors is noise, as far as these are known."""
     notes = []
-    if held := metrics.get("sideways_mm"):
-        each = ", ".join(f"{distance:.1f} mm ({trial})" for trial, distance in held.items())
-        window = config["release"]["window"]
+    if sideways:
+        each = ", ".join(f"{distance:.1f} mm ({trial})" for trial, distance in sideways.items())
         notes.append(
-            f"The body was held sideways by {each}, as the first {window:g} s of its motion tell; "
-            "all models begin there."
+            "The first frames of a trial tell how far sideways its body was held: the markers by "
+            f"{each}, as the identified simulator has it. Every simulator begins with its own estimate."
         )
     if "noise_mm" in truth:
         notes.append(f"The noise of the markers alone is {truth['noise_mm']:.2f} mm.")
-    return " ".join([*notes, PUBLISHED_NOTE])
+    return notes
 
 
 def read_trials(folder: Path, config: Mapping[str, Any]) -> Trials:

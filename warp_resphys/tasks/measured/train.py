@@ -64,7 +64,7 @@ def train_on_markers(context: StageContext) -> None:
     epochs = None
     if config["hold_out"] and not validation and len(train) > 1:
         parts = [(loss([name for name in train if name != out]), loss([out])) for out in train]
-        with Progress(f"{context.name}: held out", len(train) * config["epochs"], "epochs") as progress:
+        with Progress(f"{context.name}: held out", len(train) * config["epochs"], "epochs at most") as progress:
             epochs = epochs_that_hold_up(make_model, parts, config, progress.advance)
         log.info("%s: %d epochs serve trials that are held out best", context.name, epochs)
     judged = loss(validation) if validation else None

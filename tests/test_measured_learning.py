@@ -253,6 +253,13 @@ class TestMarkersInTheLoop:
                 network, [(loss, other)], {**config, "patience": patience}, lambda: seen.append(1)
             )
             assert (chosen, len(seen)) == (0, spent)
+        histories = []
+        for held_out in (loss, other):
+            alone = finish(MarkersInTheLoop(network(), loss, held_out, config))
+            histories.append([record["rollout_error_mm"] for record in alone.state.history])
+        parts = [(loss, loss), (loss, loss), (loss, other)]  # The mean over them decides.
+        mean = np.average(histories, axis=0, weights=[2, 1])
+        assert 0 < np.argmin(mean) == epochs_that_hold_up(network, parts, config, lambda: None)
         trainer = MarkersInTheLoop(network(), loss, None, config, epochs=0)
         trainer.begin()
         assert trainer.finished

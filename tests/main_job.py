@@ -33,19 +33,23 @@ TINY = [*SMALL, *SHORT]
 IN_RUN = "hydra.run.dir=run"
 
 
-def run(*arguments):
-    """Exit code of the command in this process, and what it wrote to stderr."""
-    out, err, argv = io.StringIO(), io.StringIO(), sys.argv
-    sys.argv = ["warp-resphys", *arguments]
-    code = 0
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+def end_of(program, *arguments):
+    """Exit code of a program in this process, and what it wrote to stderr; its name is the first argument."""
+    err, argv, code = io.StringIO(), sys.argv, 0
+    sys.argv = list(arguments)
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(err):
         try:
-            cli.main()
+            program()
         except SystemExit as end:
             code = end.code
         finally:
             sys.argv = argv
     return code, err.getvalue()
+
+
+def run(*arguments):
+    """Exit code of the command in this process, and what it wrote to stderr."""
+    return end_of(cli.main, "warp-resphys", *arguments)
 
 
 def metrics(folder="run"):

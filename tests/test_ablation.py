@@ -2,7 +2,6 @@
 
 import contextlib
 import csv
-import io
 import json
 import os
 import re
@@ -15,8 +14,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from main_job import run
 
-from warp_resphys import box_hexahedra, cli, select_vertices
+from warp_resphys import box_hexahedra, select_vertices
 from warp_resphys.files import read_hdf5
 from warp_resphys.mesh import surface_vertices
 from warp_resphys.report.ablation_page import verdict
@@ -39,33 +39,12 @@ SURFACE = surface_vertices(box_hexahedra((0.1, 0.03, 0.03), (4, 2, 2)))
 CLAMPED = select_vertices(box_hexahedra((0.1, 0.03, 0.03), (4, 2, 2)), x=0.0)
 
 
-def run(*arguments):
-    """Exit code of the command in this process, and what it wrote to stderr."""
-    err, argv = io.StringIO(), sys.argv
-    sys.argv = ["warp-resphys", *arguments]
-    code = 0
-    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(err):
-        try:
-            cli.main()
-        except SystemExit as end:
-            code = end.code
-        finally:
-            sys.argv = argv
-    return code, err.getvalue()
-
-
 def rows(folder="run"):
     return json.loads((Path(folder) / "metrics.json").read_text())["by_markers"]
 
 
 def errors(folder="run"):
     return np.array([row["errors_mm"] for row in rows(folder)])
-
-
-@pytest.fixture
-def folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
 
 
 @pytest.fixture(scope="module")

@@ -4,19 +4,17 @@ Reports are made of these files in test_measured_report.py; here they read them,
 """
 
 import contextlib
-import io
 import json
 import re
 import shutil
 import signal
-import sys
 
 import numpy as np
 import pytest
 from hydra import compose, initialize_config_module
+from main_job import run
 from omegaconf import OmegaConf
 
-from warp_resphys import cli
 from warp_resphys.files import read_checkpoint, read_hdf5
 from warp_resphys.identification import Identifier
 from warp_resphys.residual.networks import NextState, ResidualForce, restore
@@ -72,20 +70,6 @@ STAGES = [
     "evaluate",
     "report",
 ]
-
-
-def run(*arguments):
-    """Exit code of the command in this process, and what it wrote to stderr."""
-    err, argv, code = io.StringIO(), sys.argv, 0
-    sys.argv = ["warp-resphys", *arguments]
-    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(err):
-        try:
-            cli.main()
-        except SystemExit as end:
-            code = end.code
-        finally:
-            sys.argv = argv
-    return code, err.getvalue()
 
 
 def configuration(*overrides):

@@ -1,7 +1,6 @@
 """The reproduction: which runs it makes, what its page says of them, and how it ends. Small beams, few steps."""
 
 import contextlib
-import io
 import json
 import os
 import re
@@ -11,10 +10,12 @@ import subprocess
 import sys
 import time
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_module
+from main_job import end_of
 from omegaconf import OmegaConf
 
 from warp_resphys.errors import InputError
@@ -42,22 +43,7 @@ def configured(*overrides):
 
 def run(*arguments):
     """Exit code of the script in this process, and what it wrote to stderr."""
-    err, argv, code = io.StringIO(), sys.argv, 0
-    sys.argv = ["reproduce.py", *arguments]
-    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(err):
-        try:
-            runpy.run_path(str(SCRIPT), run_name="__main__")
-        except SystemExit as end:
-            code = end.code
-        finally:
-            sys.argv = argv
-    return code, err.getvalue()
-
-
-@pytest.fixture
-def folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+    return end_of(partial(runpy.run_path, str(SCRIPT), run_name="__main__"), "reproduce.py", *arguments)
 
 
 @pytest.fixture(scope="module")

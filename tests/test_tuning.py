@@ -44,12 +44,6 @@ WIDTHS = {"network.width": Choice((8, 16, 32)), "trainer.gamma": Range(0.8, 1.0,
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
-@pytest.fixture
 def no_pictures(monkeypatch):
     """Pictures take most of a tiny search's time, and the report of a tiny run's."""
     monkeypatch.setattr(tune, "write_pictures", lambda tuning, study: None)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import torch
 
 from ...progress import Progress
+from ...replay import Replay
 from ...residual.markers_in_the_loop import MarkersInTheLoop, MotionLoss, epochs_that_hold_up
 from ...residual.networks import NextState, ResidualForce, build_model, build_next_state
 from ...residual.rollout import DataDrivenRollout
@@ -56,11 +57,16 @@ def train_on_markers(context: StageContext) -> None:
             found["load"].repeat_interleave(steps, 0) if config["sees_loads"] else None,
         ).double()
 
-    def loss(names: Sequence[str]) -> MotionLoss:
-        replay, release = scene.replay(kind, tuple(names))
-        return MotionLoss(replay, release, parameters, loads(replay.motions))
-
     train, validation = (settings["split"][name] for name in ("train", "validation"))
+    everyone = (*train, *validation)
+    replay, release = scene.replay(kind, everyone)
+
+    def loss(names: Sequence[str]) -> MotionLoss:
+        rows = [everyone.index(name) for name in names]
+        motions = replay.motions.select(rows)
+        part = Replay(replay.simulator, replay.markers, motions)
+        return MotionLoss(part, release.select(rows), parameters, loads(motions))
+
     epochs = None
     if config["hold_out"] and not validation and len(train) > 1:
         parts = [(loss([name for name in train if name != out]), loss([out])) for out in train]

@@ -9,7 +9,8 @@ from warp_resphys import Body, Mesh, box_hexahedra, box_tetrahedra, select_verti
 from warp_resphys.assembly import BlockPattern, HessianAssembly
 from warp_resphys.linear_solver import make_linear_solver
 from warp_resphys.material import MODELS
-from warp_resphys.potential import IncrementalPotential, StepTerms
+from warp_resphys.point_terms import StepTerms
+from warp_resphys.potential import IncrementalPotential
 
 UNIT = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 TETRAHEDRON = Body(Mesh(UNIT, np.array([[0, 1, 2, 3]])), volume_integration="full")

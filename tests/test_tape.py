@@ -10,7 +10,7 @@ import warp as wp
 
 from warp_resphys import Body, Material, Simulator, State, box_hexahedra
 from warp_resphys.errors import InputError
-from warp_resphys.potential import warp_view
+from warp_resphys.launcher import warp_view
 from warp_resphys.tape import record_rollout
 
 BATCH, STEPS = 2, 3

@@ -6,8 +6,9 @@ from numpy.typing import NDArray
 
 from .body import Body
 from .kernels.assembly import assembly_kernels
+from .launcher import warp_view
 from .linear_solver import LinearSolver
-from .potential import IncrementalPotential, warp_view
+from .potential import IncrementalPotential
 
 
 class BlockPattern:
@@ -34,7 +35,7 @@ class BlockPattern:
         pairs: list[NDArray[np.int64]] = []
         self.offsets: list[int] = []
         self.n_cell_blocks = 0
-        for points in body.discretisation.point_sets:
+        for points in body.point_sets:
             a, c = np.tril_indices(points.nodes.shape[1])
             pair = np.stack([reduced[points.nodes[:, a]], reduced[points.nodes[:, c]]], axis=-1).reshape(-1, 2)
             # A padded node repeats its patch's own vertex with a zero gradient and contributes nothing.
@@ -69,9 +70,9 @@ class HessianAssembly:
         blocks = p.zeros(pattern.n_cell_blocks, 3, 3)
         self._values = p.zeros(solver.n_values)
         self._commands = []
-        for s, part, offset in zip(p.uploaded_sets, p.point_slices, pattern.offsets, strict=True):
+        for s, offset in zip(p.sets, pattern.offsets, strict=True):
             inputs = [s.gradients, s.points_per_cell]
-            inputs += [p.points_view(p.tangent, part, p.mat33), offset]
+            inputs += [p.points_view(p.tangent, s.part, p.mat33), offset]
             self._commands.append(
                 p.record(k.cell_blocks, (p.batch, s.cells, s.nodes_per_cell), inputs, [warp_view(blocks, p.mat33)])
             )

@@ -8,9 +8,11 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import ArrayLike, NDArray
 
-from .elements import Discretisation, discretise
+from .chambers import Chamber, check_chambers
+from .elements import Discretisation, Points, discretise
 from .errors import InputError
 from .mesh import Mesh
+from .surface_elements import Fibres, SurfacePoints, fibre_points, pressure_points
 
 MASS_MODES = ("row_sum", "per_vertex")
 
@@ -76,6 +78,8 @@ class Body:
             published beam and serves for comparison with the published code alone.
         volume_integration: ``centre`` or ``full`` (see `elements.discretise`).
         point_masses: attached weights.
+        chambers: closed surfaces under pressure (`chambers.find_chambers`).
+        fibres: thread around the chambers, or None; how stiff it is says the material.
     """
 
     mesh: Mesh
@@ -83,12 +87,15 @@ class Body:
     mass: str = "row_sum"
     volume_integration: str = "centre"
     point_masses: Sequence[PointMass] = field(default=())
+    chambers: Sequence[Chamber] = field(default=())
+    fibres: Fibres | None = None
 
     def __post_init__(self) -> None:
-        """Checks the fixed vertices and the mass mode.
+        """Checks the fixed vertices, the mass mode and the chambers.
 
         Raises:
-            InputError: an unknown mass mode, or fixed vertices that the mesh does not have.
+            InputError: an unknown mass mode, fixed vertices that the mesh does not have, or fibres without chambers.
+            MeshError: an open chamber.
         """
         if self.mass not in MASS_MODES:
             raise InputError(f"mass is {self.mass!r}: choose one of {', '.join(MASS_MODES)}.")
@@ -96,6 +103,9 @@ class Body:
         if len(fixed) == self.n_vertices:
             raise InputError("every vertex is fixed: leave some free to move.")
         object.__setattr__(self, "fixed", fixed)
+        if self.fibres is not None and not self.chambers:
+            raise InputError("fibres are wound around chambers, but the body has none: leave the fibres out.")
+        check_chambers(self.chambers, self.mesh)
 
     @property
     def n_vertices(self) -> int:
@@ -111,6 +121,22 @@ class Body:
     def discretisation(self) -> Discretisation:
         """Integration points and volumes."""
         return discretise(self.mesh, self.volume_integration)
+
+    @cached_property
+    def pressure_points(self) -> SurfacePoints | None:
+        """Points of the chambers' surfaces, on which pressure acts; None without chambers."""
+        return pressure_points(self.chambers) if self.chambers else None
+
+    @cached_property
+    def fibre_points(self) -> SurfacePoints | None:
+        """Points of the fibres; None without fibres."""
+        return None if self.fibres is None else fibre_points(self.mesh, self.chambers, self.fibres)
+
+    @property
+    def point_sets(self) -> tuple[Points, ...]:
+        """Every set of points that carries energy: the solid's, then pressure's and the fibres'."""
+        surface = (self.pressure_points, self.fibre_points)
+        return (*self.discretisation.point_sets, *(points for points in surface if points is not None))
 
     @cached_property
     def mass_volume(self) -> scipy.sparse.csr_array:

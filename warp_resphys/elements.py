@@ -28,20 +28,16 @@ VOLUME_INTEGRATIONS = ("centre", "full")
 
 
 @dataclass(frozen=True)
-class PointSet:
-    """Cells with the same number of nodes and of points.
+class Points:
+    """Cells with the same number of nodes and of points, each point with the matrix F = sum_a x_a g_a^T.
 
     Attributes:
         nodes: (C, K) vertex of each node of a cell.
-        gradients: (C, Q, K, 3) gradients of the shape functions in rest space [1/m].
-        shape_volume: (C Q, M) sparse; volume of each element that the point carries for the shape term [m^3].
-        volume_volume: (C Q, M) sparse; the same for the volume term [m^3].
+        gradients: (C, Q, K, 3) operators g_a; in a solid, gradients of the shape functions in rest space [1/m].
     """
 
     nodes: NDArray[np.int64]
     gradients: Array
-    shape_volume: scipy.sparse.csr_array
-    volume_volume: scipy.sparse.csr_array
 
     @property
     def points_per_cell(self) -> int:
@@ -52,6 +48,19 @@ class PointSet:
     def n_points(self) -> int:
         """P = C Q."""
         return self.gradients.shape[0] * self.gradients.shape[1]
+
+
+@dataclass(frozen=True)
+class PointSet(Points):
+    """Points of a solid.
+
+    Attributes:
+        shape_volume: (C Q, M) sparse; volume of each element that the point carries for the shape term [m^3].
+        volume_volume: (C Q, M) sparse; the same for the volume term [m^3].
+    """
+
+    shape_volume: scipy.sparse.csr_array
+    volume_volume: scipy.sparse.csr_array
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,8 @@ from .body import Body
 from .errors import ConvergenceError
 from .linear_solver import make_linear_solver
 from .metric import HessianMetric
-from .potential import IncrementalPotential, StepTerms
+from .point_terms import StepTerms
+from .potential import IncrementalPotential
 from .solver import NonlinearSolver, SolveReport, SolverSettings
 from .threads import threads_for
 
@@ -85,10 +86,10 @@ class Equilibrium(torch.autograd.Function):
         shape_stiffness: torch.Tensor,
         volume_stiffness: torch.Tensor,
         viscosity: torch.Tensor,
-        reference_strain: torch.Tensor | None,
+        *constants: torch.Tensor | None,
     ) -> torch.Tensor:
-        terms = (target, inertia, force, shape_stiffness, volume_stiffness, viscosity, reference_strain)
-        workspace.potential.set_terms(StepTerms(*terms))
+        terms = StepTerms(target, inertia, force, shape_stiffness, volume_stiffness, viscosity, *constants)
+        workspace.potential.set_terms(terms)
         if len(workspace.fixed):
             start = start.detach().clone()
             start[:, workspace.fixed] = fixed_positions.detach()
@@ -96,7 +97,7 @@ class Equilibrium(torch.autograd.Function):
             reports.append(solver.solve(start.detach()))
         x = workspace.potential.positions.clone()
         ctx.workspace, ctx.linear_solver = workspace, solver.settings.linear_solver
-        ctx.save_for_backward(x, *terms)
+        ctx.save_for_backward(x, *terms.tensors())
         return x
 
     @override
@@ -126,17 +127,17 @@ def _adjoint(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...
     grads["force"] = z
     if needs["fixed_positions"]:
         grads["fixed_positions"] = (gradient - product)[:, ctx.workspace.fixed]
-    if any(needs[k] for k in ("shape_stiffness", "volume_stiffness", "viscosity", "reference_strain")):
+    if any(needs[k] for k in _CONSTANTS):
         adjoints = potential.parameter_adjoint(z)
-        for name in ("shape_stiffness", "volume_stiffness"):
-            if getattr(terms, name).shape[0] == 1:
+        for name in ("shape_stiffness", "volume_stiffness", "fibre_stiffness"):
+            values = getattr(terms, name)
+            if values is not None and len(values) == 1:
                 adjoints[name] = adjoints[name].sum(0, keepdim=True)
-        grads.update(adjoints)
-        if terms.reference_strain is None:
-            grads["reference_strain"] = None
+        grads.update({name: adjoints[name] for name in _CONSTANTS if getattr(terms, name) is not None})
     return tuple(grads[name] if needs[name] else None for name in _INPUTS)
 
 
+_CONSTANTS = ("shape_stiffness", "volume_stiffness", "viscosity", "reference_strain", "pressure", "fibre_stiffness")
 _INPUTS = (
     "workspace",
     "solver",
@@ -146,10 +147,7 @@ _INPUTS = (
     "target",
     "inertia",
     "force",
-    "shape_stiffness",
-    "volume_stiffness",
-    "viscosity",
-    "reference_strain",
+    *_CONSTANTS,
 )
 
 

@@ -15,6 +15,7 @@ from .material import Material
 from .poses import twisted
 from .simulator import Simulator
 
+_PRESSURE = 1e4  # [Pa] in the chambers, about
 POSES = ("rest", "bent", "twisted")
 # Seven-point stencil: its error is of sixth order in the step, so that steps of a percent, which drown the rounding of
 # the solves, still leave a truncation of 1e-10.
@@ -85,7 +86,8 @@ def check_gradients(
 
     Returns:
         One row a parameter: initial positions and velocities, external forces, Dirichlet targets where the body has
-        any, and E and nu (scalar, per element, per environment), density, mass and stiffness damping.
+        any, E and nu (scalar, per element, per environment), density, mass and stiffness damping; and the chambers'
+        pressures and their fibres' stiffness (the same for all, per chamber) where the body has any.
     """
     problem = _Problem(simulator, pose_name, steps, batch, seed)
     return [problem.compare(name, *case) for name, case in problem.cases().items()]
@@ -101,6 +103,8 @@ class _Problem:
         n = simulator.body.n_vertices
         self.forces = 1e-3 * self.noise(steps, batch, n, 3)
         self.targets = self.state.q[:, simulator.fixed].expand(steps, -1, -1, -1).clone()
+        chambers = len(simulator.body.chambers)
+        self.pressures = _PRESSURE * (1.0 + 0.3 * self.noise(steps, batch, chambers)) if chambers else None
         h = simulator.time_step
         self.weights = self.noise(steps + 1, batch, n, 3), h * self.noise(steps + 1, batch, n, 3)
 
@@ -114,6 +118,7 @@ class _Problem:
         forces: torch.Tensor | None = None,
         targets: torch.Tensor | None = None,
         material: Material | None = None,
+        pressures: torch.Tensor | None = None,
     ) -> torch.Tensor:
         state = State(self.state.q if q is None else q, self.state.v if v is None else v)
         trajectory = self.simulator.rollout(
@@ -122,6 +127,7 @@ class _Problem:
             self.forces if forces is None else forces,
             self.targets if targets is None else targets,
             material,
+            self.pressures if pressures is None else pressures,
         )
         return (self.weights[0] * trajectory.q).sum() + (self.weights[1] * trajectory.v).sum()
 
@@ -147,6 +153,13 @@ class _Problem:
         for key, change in (("density", 1e-2), ("mass_damping", 0.25), ("stiffness_damping", 5e-3)):
             value = full(float(getattr(m, key))).reshape(1)
             cases[key.replace("_", " ")] = (self._vary(key), value, change * float(value))
+        if self.pressures is not None:
+            cases["pressure"] = (lambda x: self.loss(pressures=x), self.pressures, 0.1 * _PRESSURE)
+        if self.simulator.body.fibres is not None:
+            stiffness = full(m.fibre_stiffness).mean()
+            for kind, count in (("scalar", 1), ("per chamber", len(self.simulator.body.chambers))):
+                value = stiffness.expand(count).clone()
+                cases[f"fibre stiffness, {kind}"] = (self._vary("fibre_stiffness"), value, 1e-2 * float(stiffness))
         return cases
 
     def _vary(self, key: str) -> Callable[[torch.Tensor], torch.Tensor]:

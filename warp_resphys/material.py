@@ -46,6 +46,8 @@ class Material:
         model: ``corotated`` or ``stable_neo_hookean``.
         mass_damping: force -alpha M v [1/s].
         stiffness_damping: Kelvin-Voigt viscosity of retardation time beta [s]; for small strains the force -beta K v.
+        fibre_stiffness: of the thread around the chambers, per distance of its turns [N/m] (`surface_elements.Fibres`):
+            a number, (C,) values with one for each chamber, (B, 1), or (B, C).
     """
 
     youngs_modulus: Parameter = 264e3
@@ -54,6 +56,7 @@ class Material:
     model: str = "corotated"
     mass_damping: Parameter = 0.0
     stiffness_damping: Parameter = 0.0
+    fibre_stiffness: Parameter = 0.0
 
     def __post_init__(self) -> None:
         """Checks every constant.
@@ -68,6 +71,7 @@ class Material:
         _check("density", self.density, 0.0, np.inf, "positive, in kg/m^3")
         _check("mass_damping", self.mass_damping, -0.0, np.inf, "zero or more, in 1/s", closed=True)
         _check("stiffness_damping", self.stiffness_damping, -0.0, np.inf, "zero or more, in s", closed=True)
+        _check("fibre_stiffness", self.fibre_stiffness, -0.0, np.inf, "zero or more, in N/m", closed=True)
 
     def lame(self, device: torch.device, dtype: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:
         """Lame constants mu and lambda [Pa], each (1 or B, 1 or M)."""

@@ -7,8 +7,8 @@ import torch
 from typing_extensions import override
 
 from .assembly import BlockPattern, HessianAssembly
-from .elements import PointSet
 from .linear_solver import Factor, LinearSolver
+from .point_terms import PointTerm
 from .potential import IncrementalPotential
 
 
@@ -90,7 +90,9 @@ class HessianMetric(Metric):
 
 
 class ProjectiveMetric(Metric):
-    """Inertia plus ``(2 mu + lambda) V G G^T`` at every point, the same in each coordinate.
+    """Inertia plus ``(2 mu + lambda) V G G^T`` at every point of the solid, the same in each coordinate.
+
+    Fibres enter with their stiffness, pressure not at all.
 
     This is the Hessian of the distances to fixed projections (Bouaziz et al. 2014, equation 10). It does not depend on
     the positions: one factor serves until inertia or stiffness change, and the whole batch where these are shared.
@@ -100,21 +102,21 @@ class ProjectiveMetric(Metric):
         self._potential, self._pattern, self._linear = potential, pattern, linear
         self._free = torch.as_tensor(pattern.free, device=potential.device)
         self._address = torch.as_tensor(linear.address[:, 0], device=potential.device, dtype=torch.int64)
-        self._products = [self._gradient_products(s) for s in potential.body.discretisation.point_sets]
+        self._products = [self._gradient_products(s) for s in potential.sets]
         self._key: tuple[torch.Tensor, ...] | None = None
         self.clamped = torch.ones(potential.batch, dtype=torch.bool, device=potential.device)
         self._factor: Factor | None = None
 
-    def _gradient_products(self, points: PointSet) -> torch.Tensor:
+    def _gradient_products(self, points: PointTerm) -> torch.Tensor:
         """(C, Q, pairs) scalar products of the gradients of every node pair a >= c of a cell."""
-        gradients = points.gradients
+        gradients = points.operators
         a, c = np.tril_indices(gradients.shape[2])
         products = np.einsum("cqpi,cqpi->cqp", gradients[:, :, a], gradients[:, :, c])
         return torch.as_tensor(products, device=self._potential.device, dtype=self._potential.dtype)
 
     def _terms(self) -> tuple[torch.Tensor, ...]:
         t = self._potential.terms
-        return t.inertia, t.shape_stiffness, t.volume_stiffness
+        return t.inertia, *(s.curvature(t) for s in self._potential.sets)
 
     @override
     def ready(self) -> bool:
@@ -125,12 +127,11 @@ class ProjectiveMetric(Metric):
     def refactor(self, clamp: bool = False) -> None:
         del clamp  # The matrix is positive definite as it is.
         self._key = tuple(t.clone() for t in self._terms())
-        inertia, shape, volume = (t[:1] if bool((t == t[:1]).all()) else t for t in self._key)
-        batch = max(len(inertia), len(shape), len(volume))
-        weights = (2.0 * shape + volume).expand(batch, -1)
+        inertia, *weights = (t[:1] if bool((t == t[:1]).all()) else t for t in self._key)
+        batch = max(len(t) for t in (inertia, *weights))
         parts = []
-        for products, part in zip(self._products, self._potential.point_slices, strict=True):
-            w = weights[:, part].reshape(batch, *products.shape[:2])
+        for products, weight in zip(self._products, weights, strict=True):
+            w = weight.expand(batch, -1).reshape(batch, *products.shape[:2])
             parts.append(torch.einsum("bcq,cqp->bcp", w, products).reshape(batch, -1))
         blocks = torch.cat(parts, dim=1)
         source = torch.as_tensor(self._pattern.contribution, device=blocks.device)

@@ -2,95 +2,29 @@
 
 One time step of every integrator, and a static equilibrium too, is the minimum over x of
 
-    sum_i k_i / 2 |x_i - y_i|^2 - f . x + E(x) + c/2 sum_p |E_p(x) - E_p^ref|^2_C
+    sum_i k_i / 2 |x_i - y_i|^2 - f . x + E(x) - sum_c p_c V_c(x) + c/2 sum_p |E_p(x) - E_p^ref|^2_C
 
 with k the inertia over the square of the effective time step, y where inertia alone would go, f the loads, E the
-elastic energy, and the last term the Kelvin-Voigt dissipation potential of the Green strain E_p with viscosity c.
+elastic energy of the solid and of fibres, p_c and V_c the gauge pressure in each chamber and its volume, and the last
+term the Kelvin-Voigt dissipation potential of the Green strain E_p with viscosity c.
 """
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 import warp as wp
-from numpy.typing import NDArray
 
 from .body import Body
-from .elements import PointSet
 from .kernels.assembly import assembly_kernels
 from .kernels.elasticity import elasticity_kernels
+from .kernels.surface import surface_kernels
 from .kernels.tangent import tangent_kernels
-
-SCALARS: dict[torch.dtype, Any] = {torch.float64: wp.float64, torch.float32: wp.float32}
-
-
-def warp_view(tensor: torch.Tensor, dtype: Any) -> Any:
-    """A Warp array on a tensor's own memory, without a gradient."""
-    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
+from .launcher import Launcher, warp_view
+from .point_terms import PointTerm, Pressure, Solid, StepTerms, SurfaceTerm, point_terms
 
 
-@dataclass(frozen=True)
-class StepTerms:
-    """What distinguishes one step's potential from the next; see the module's equation.
-
-    Attributes:
-        target: (B, N, 3) y [m].
-        inertia: (B, N) k [N/m].
-        force: (B, N, 3) f [N].
-        shape_stiffness: (1 or B, P) mu times volume [J].
-        volume_stiffness: (1 or B, P) lambda times volume [J].
-        viscosity: (B,) stiffness damping over the effective time step.
-        reference_strain: (B, P, 3, 3) strain that the strain rate starts from; None without viscosity.
-    """
-
-    target: torch.Tensor
-    inertia: torch.Tensor
-    force: torch.Tensor
-    shape_stiffness: torch.Tensor
-    volume_stiffness: torch.Tensor
-    viscosity: torch.Tensor
-    reference_strain: torch.Tensor | None = None
-
-    def tensors(self) -> tuple[torch.Tensor | None, ...]:
-        """The terms in the order of their declaration."""
-        return (
-            self.target,
-            self.inertia,
-            self.force,
-            self.shape_stiffness,
-            self.volume_stiffness,
-            self.viscosity,
-            self.reference_strain,
-        )
-
-
-@dataclass(frozen=True)
-class DevicePoints:
-    """A point set as Warp arrays.
-
-    Attributes:
-        cells: C.
-        points_per_cell: Q.
-        nodes_per_cell: K.
-        n_points: P = C Q.
-        nodes: (C, K).
-        gradients: (P, K) [1/m].
-        start: (N + 1) where a vertex's entries of ``incident`` begin.
-        incident: cell K + local node of every cell that a vertex belongs to.
-    """
-
-    cells: int
-    points_per_cell: int
-    nodes_per_cell: int
-    n_points: int
-    nodes: Any
-    gradients: Any
-    start: Any
-    incident: Any
-
-
-class IncrementalPotential:
+class IncrementalPotential(Launcher):
     """Energy, residual, Hessian and adjoint products of a batch of one body.
 
     Holds the buffers that its recorded kernel launches work on. Evaluations refer to the last `set_terms`.
@@ -101,70 +35,46 @@ class IncrementalPotential:
         batch: environments B.
         device: of every buffer.
         dtype: ``torch.float64`` or ``torch.float32``.
+
+    Attributes:
+        n_points: P of the solid, which come first among all points.
+        sets: the energies, each on its own points; solids first.
     """
 
     def __init__(self, body: Body, model: int, batch: int, device: torch.device, dtype: torch.dtype) -> None:
-        self.body, self.batch, self.device, self.dtype = body, batch, device, dtype
-        self._model = model
-        scalar = SCALARS[dtype]
-        self._elastic = elasticity_kernels(scalar)
-        self._second = tangent_kernels(scalar)
-        assembly_kernels(
-            scalar
-        )  # Joins the Warp module before its first load, which would be compiled twice otherwise.
-        self.scalar, self.vec3, self.mat33 = scalar, self._elastic.vec3, self._elastic.mat33
+        super().__init__(batch, device, dtype)
+        self.body = body
+        self._elastic = elasticity_kernels(self.scalar)
+        self._second = tangent_kernels(self.scalar)
+        # All kernels join their Warp module before its first load: it would be compiled again otherwise.
+        surface_kernels(self.scalar)
+        assembly_kernels(self.scalar)
         self.n_vertices = body.n_vertices
-        self.n_points = sum(points.n_points for points in body.discretisation.point_sets)
-        self.uploaded_sets = [self._upload_points(points) for points in body.discretisation.point_sets]
-        self.point_slices = self._point_slices()
-        norms = [np.sqrt((points.gradients**2).sum(axis=(2, 3))).ravel() for points in body.discretisation.point_sets]
+        self.sets = point_terms(body, model, self)
+        self.n_points = sum(s.n_points for s in self.solids)
+        self._n_all_points = sum(s.n_points for s in self.sets)
+        norms = [np.sqrt((s.operators**2).sum(axis=(2, 3))).ravel() for s in self.solids]
         self._gradient_norms = torch.as_tensor(np.concatenate(norms), device=device, dtype=dtype)  # (P,) [1/m]
         self.free_mask = torch.ones(body.n_vertices, device=device, dtype=dtype)
         self.free_mask[torch.as_tensor(body.fixed_vertices, device=device)] = 0.0
         self.terms = self._allocate_terms()
         self.positions = self.zeros(self.n_vertices, 3)
         self.residual = self.zeros(self.n_vertices, 3)
-        self._stress = self.zeros(self.n_points, 3, 3)
-        self._point_energy = self.zeros(self.n_points)
+        self._stress = self.zeros(self._n_all_points, 3, 3)
+        self._point_energy = self.zeros(self._n_all_points)
         self._vertex_energy = self.zeros(self.n_vertices)
         self._record_evaluation()
         self._tangent: torch.Tensor | None = None
         self._direction = self.zeros(self.n_vertices, 3)
         self._adjoint_commands: list[Any] = []
-        self._stream: tuple[torch.cuda.Stream, Any] | None = None
 
-    def zeros(self, *shape: int) -> torch.Tensor:
-        """(B, *shape) on the potential's device, in its type."""
-        return torch.zeros(self.batch, *shape, device=self.device, dtype=self.dtype)
-
-    def upload(self, values: NDArray[Any], dtype: Any) -> Any:
-        """A Warp array with a copy of the values."""
-        return wp.array(np.ascontiguousarray(values), dtype=dtype, device=str(self.device))
-
-    def _upload_points(self, points: PointSet) -> DevicePoints:
-        c, q, k, _ = points.gradients.shape
-        owner = points.nodes.ravel()
-        # A padded node repeats its patch's own vertex with a zero gradient and contributes nothing.
-        entries = np.flatnonzero(np.abs(points.gradients).sum(axis=(1, 3)).ravel() > 0.0)
-        order = entries[np.argsort(owner[entries], kind="stable")]
-        start = np.searchsorted(owner[order], np.arange(self.n_vertices + 1))
-        return DevicePoints(
-            cells=c,
-            points_per_cell=q,
-            nodes_per_cell=k,
-            n_points=points.n_points,
-            nodes=self.upload(points.nodes.astype(np.int32), int),
-            gradients=self.upload(points.gradients.reshape(c * q, k, 3), self.vec3),
-            start=self.upload(start.astype(np.int32), int),
-            incident=self.upload(order.astype(np.int32), int),
-        )
-
-    def _point_slices(self) -> list[slice]:
-        ends = np.cumsum([s.n_points for s in self.uploaded_sets])
-        return [slice(int(end) - s.n_points, int(end)) for s, end in zip(self.uploaded_sets, ends, strict=True)]
+    @property
+    def solids(self) -> list[Solid]:
+        """The energies of the solid."""
+        return [s for s in self.sets if isinstance(s, Solid)]
 
     def _allocate_terms(self) -> StepTerms:
-        n, p = self.n_vertices, self.n_points
+        n, p, chambers = self.n_vertices, self.n_points, len(self.body.chambers)
         return StepTerms(
             target=self.zeros(n, 3),
             inertia=self.zeros(n),
@@ -173,36 +83,16 @@ class IncrementalPotential:
             volume_stiffness=self.zeros(p),
             viscosity=self.zeros(),
             reference_strain=self.zeros(p, 3, 3),
+            pressure=self.zeros(chambers) if chambers else None,
+            fibre_stiffness=self.zeros(chambers) if self.body.fibres is not None else None,
         )
 
-    def points_view(self, tensor: torch.Tensor, part: slice, dtype: Any) -> Any:
-        """Warp array on the points of one set."""
-        return warp_view(tensor[:, part], dtype)
-
-    def _energy_arguments(self, s: DevicePoints, part: slice) -> list[Any]:
-        t = self.terms
-        return [
-            self._model,
-            s.nodes,
-            s.gradients,
-            self.points_view(t.shape_stiffness, part, self.scalar),
-            self.points_view(t.volume_stiffness, part, self.scalar),
-            warp_view(t.viscosity, self.scalar),
-            self.points_view(t.reference_strain, part, self.mat33) if t.reference_strain is not None else None,
-            s.points_per_cell,
-            warp_view(self.positions, self.vec3),
-        ]
-
-    def record(self, kernel: Any, dim: tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> Any:
-        """A launch to be made by `launch`, as often as needed."""
-        return wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=str(self.device), record_cmd=True)
-
-    def _gather(self, s: DevicePoints, stress: torch.Tensor, part: slice, out: torch.Tensor) -> Any:
-        """Recorded launch that adds a point set's transposed gradient of the stress to (B, N, 3)."""
-        k = self._elastic
+    def gather(self, s: PointTerm, stress: torch.Tensor, out: torch.Tensor) -> Any:
+        """Recorded launch that adds a point set's transposed operator of its stress (B, all points) to (B, N, 3)."""
         inputs = [s.nodes, s.gradients, s.points_per_cell, s.start, s.incident]
-        inputs.append(self.points_view(stress, part, self.mat33))
-        return self.record(k.gather, (self.batch, self.n_vertices), inputs, [warp_view(out, self.vec3)])
+        inputs.append(self.points_view(stress, s.part, self.mat33))
+        kernel = self._elastic.gather
+        return self.record(kernel, (self.batch, self.n_vertices), inputs, [warp_view(out, self.vec3)])
 
     def _record_evaluation(self) -> None:
         t, k, b = self.terms, self._elastic, self.batch
@@ -217,39 +107,21 @@ class IncrementalPotential:
             ],
             [warp_view(self.residual, self.vec3), warp_view(self._vertex_energy, self.scalar)],
         )
-        self._elastic_commands = []
-        for s, part in zip(self.uploaded_sets, self.point_slices, strict=True):
+        self._elastic_commands: list[Any] = []
+        self._pressure_commands: list[Any] = []
+        for s in self.sets:
             outputs = [
-                self.points_view(self._stress, part, self.mat33),
-                self.points_view(self._point_energy, part, self.scalar),
+                self.points_view(self._stress, s.part, self.mat33),
+                self.points_view(self._point_energy, s.part, self.scalar),
             ]
-            step = self.record(k.local_step, (b, s.n_points), self._energy_arguments(s, part), outputs)
-            self._elastic_commands += [step, self._gather(s, self._stress, part, self.residual)]
-
-    def launch(self, *commands: Any) -> None:
-        """Makes recorded launches, on torch's stream."""
-        if self.device.type == "cpu":
-            for command in commands:
-                command.launch()
-            return
-        handle = torch.cuda.current_stream(self.device)
-        if self._stream is None or self._stream[0] != handle:
-            self._stream = (handle, wp.stream_from_torch(handle))
-        stream = self._stream[1]
-        for command in commands:
-            command.launch(stream)
+            kernel, inputs = s.step(t, warp_view(self.positions, self.vec3))
+            step = self.record(kernel, (b, s.n_points), inputs, outputs)
+            commands = self._pressure_commands if isinstance(s, Pressure) else self._elastic_commands
+            commands += [step, self.gather(s, self._stress, self.residual)]
 
     def set_terms(self, terms: StepTerms) -> None:
         """Copies a step's terms into the buffers; fixed vertices get neither inertia nor load."""
-        t = self.terms
-        t.target.copy_(terms.target.detach())
-        torch.mul(terms.inertia.detach(), self.free_mask, out=t.inertia)
-        torch.mul(terms.force.detach(), self.free_mask[:, None], out=t.force)
-        t.shape_stiffness.copy_(terms.shape_stiffness.detach())
-        t.volume_stiffness.copy_(terms.volume_stiffness.detach())
-        t.viscosity.copy_(terms.viscosity.detach())
-        if terms.reference_strain is not None and t.reference_strain is not None:
-            t.reference_strain.copy_(terms.reference_strain.detach())
+        self.terms.set_to(terms, self.free_mask)
 
     @property
     def force(self) -> torch.Tensor:
@@ -262,11 +134,13 @@ class IncrementalPotential:
         return self.terms.inertia
 
     def evaluate(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Energy (B,) [J] and the norm of inertia less loads (B,) [N] at ``positions``; sets ``residual`` [N].
+        """Energy (B,) [J] and norm of inertia less loads and pressure (B,) [N] at ``positions``; sets ``residual`` [N].
 
         The residual is the potential's gradient, zero at fixed vertices.
         """
-        self.launch(self._inertia_command)
+        self.launch(self._inertia_command, *self._pressure_commands)
+        if self._pressure_commands:
+            self.residual.mul_(self.free_mask[:, None])
         balance = torch.linalg.vector_norm(self.residual.view(self.batch, -1), dim=1)
         self.launch(*self._elastic_commands)
         self.residual.mul_(self.free_mask[:, None])
@@ -279,7 +153,7 @@ class IncrementalPotential:
         """
         t = self.terms
         stiffness = t.shape_stiffness.sum(1) + t.volume_stiffness.sum(1)
-        energy = self._point_energy.sum(1) + self._vertex_energy.abs().sum(1)
+        energy = self._point_energy.abs().sum(1) + self._vertex_energy.abs().sum(1)
         return 8.0 * torch.finfo(self.dtype).eps * (stiffness + 100.0 * energy)
 
     def residual_rounding(self) -> torch.Tensor:
@@ -314,33 +188,38 @@ class IncrementalPotential:
     def _prepare_tangent(self) -> torch.Tensor:
         """Buffers and launches of second derivatives, made at their first use."""
         if self._tangent is None:
-            self._tangent = self.zeros(self.n_points, 6, 3, 3)
+            self._tangent = self.zeros(self._n_all_points, 6, 3, 3)
             self._record_tangent(self._tangent)
         return self._tangent
 
     def _record_tangent(self, blocks: torch.Tensor) -> None:
         self._positive = torch.zeros(self.batch, device=self.device, dtype=torch.int32)
-        self._product_stress = self.zeros(self.n_points, 3, 3)
+        self._product_stress = self.zeros(self._n_all_points, 3, 3)
         self._product = self.zeros(self.n_vertices, 3)
         self._tangent_commands, self._product_commands = [], []
-        k = self._second
-        for s, part in zip(self.uploaded_sets, self.point_slices, strict=True):
-            tangent = self.points_view(blocks, part, self.mat33)
-            inputs = [*self._energy_arguments(s, part), warp_view(self._positive, wp.int32)]
-            self._tangent_commands.append(self.record(k.tangent, (self.batch, s.n_points), inputs, [tangent]))
-            inputs = [s.nodes, s.gradients, s.points_per_cell, tangent]
-            inputs.append(warp_view(self._direction, self.vec3))
-            product = [self.points_view(self._product_stress, part, self.mat33)]
-            launch = self.record(k.tangent_product, (self.batch, s.n_points), inputs, product)
-            self._product_commands += [launch, self._gather(s, self._product_stress, part, self._product)]
+        positive = warp_view(self._positive, wp.int32)
+        for s in self.sets:
+            tangent = self.points_view(blocks, s.part, self.mat33)
+            kernel, inputs = s.tangent(self.terms, warp_view(self.positions, self.vec3), positive)
+            self._tangent_commands.append(self.record(kernel, (self.batch, s.n_points), inputs, [tangent]))
+            self._product_commands += self._product_launches(s, blocks)
+
+    def _product_launches(self, s: PointTerm, blocks: torch.Tensor) -> list[Any]:
+        """Recorded launches that add a set's part of the stiffness product with ``_direction`` to ``_product``."""
+        inputs = [s.nodes, s.gradients, s.points_per_cell, self.points_view(blocks, s.part, self.mat33)]
+        inputs.append(warp_view(self._direction, self.vec3))
+        product = [self.points_view(self._product_stress, s.part, self.mat33)]
+        launch = self.record(self._second.tangent_product, (self.batch, s.n_points), inputs, product)
+        return [launch, self.gather(s, self._product_stress, self._product)]
 
     def _record_adjoint(self) -> None:
         scalars = [self.zeros(self.n_points) for _ in range(3)]
         self._adjoints = [*scalars, self.zeros(self.n_points, 3, 3)]
         types = [self.scalar] * 3 + [self.mat33]
-        for s, part in zip(self.uploaded_sets, self.point_slices, strict=True):
-            outputs = [self.points_view(o, part, t) for o, t in zip(self._adjoints, types, strict=True)]
-            inputs = [*self._energy_arguments(s, part), warp_view(self._direction, self.vec3)]
+        for s in self.solids:
+            outputs = [self.points_view(o, s.part, t) for o, t in zip(self._adjoints, types, strict=True)]
+            inputs = [*s.arguments(self.terms, warp_view(self.positions, self.vec3))]
+            inputs.append(warp_view(self._direction, self.vec3))
             dim = (self.batch, s.n_points)
             self._adjoint_commands.append(self.record(self._elastic.stiffness_adjoint, dim, inputs, outputs))
 
@@ -361,7 +240,8 @@ class IncrementalPotential:
             adjoint: (B, N, 3) z = H^-1 dL/dx, zero at fixed vertices [m].
 
         Returns:
-            ``shape_stiffness`` and ``volume_stiffness`` (B, P), ``viscosity`` (B,), ``reference_strain`` (B, P, 3, 3).
+            ``shape_stiffness`` and ``volume_stiffness`` (B, P), ``viscosity`` (B,), ``reference_strain`` (B, P, 3, 3),
+            and ``pressure`` and ``fibre_stiffness`` (B, C) where there are chambers and fibres.
         """
         if not self._adjoint_commands:
             self._record_adjoint()
@@ -371,15 +251,18 @@ class IncrementalPotential:
         names = ("shape_stiffness", "volume_stiffness", "viscosity", "reference_strain")
         result = dict(zip(names, out, strict=True))
         result["viscosity"] = result["viscosity"].sum(1)
+        for s in self.sets:
+            if isinstance(s, SurfaceTerm):
+                result[s.parameter] = s.parameter_adjoint(self.positions, self._direction)
         return result
 
     def strain(self, positions: torch.Tensor) -> torch.Tensor:
         """(B, P, 3, 3) Green strain of (B, N, 3) positions."""
         out = self.zeros(self.n_points, 3, 3)
         x = warp_view(positions.contiguous(), self.vec3)
-        for s, part in zip(self.uploaded_sets, self.point_slices, strict=True):
+        for s in self.solids:
             inputs = [s.nodes, s.gradients, s.points_per_cell, x]
-            outputs = [self.points_view(out, part, self.mat33)]
+            outputs = [self.points_view(out, s.part, self.mat33)]
             self.launch(self.record(self._elastic.strain, (self.batch, s.n_points), inputs, outputs))
         return out
 
@@ -389,10 +272,10 @@ class IncrementalPotential:
         stress = self.zeros(self.n_points, 3, 3)
         x = warp_view(positions.contiguous(), self.vec3)
         adjoint = adjoint.contiguous()
-        for s, part in zip(self.uploaded_sets, self.point_slices, strict=True):
+        for s in self.solids:
             inputs = [s.nodes, s.gradients, s.points_per_cell, x]
-            inputs.append(self.points_view(adjoint, part, self.mat33))
-            outputs = [self.points_view(stress, part, self.mat33)]
+            inputs.append(self.points_view(adjoint, s.part, self.mat33))
+            outputs = [self.points_view(stress, s.part, self.mat33)]
             launch = self.record(self._elastic.strain_adjoint, (self.batch, s.n_points), inputs, outputs)
-            self.launch(launch, self._gather(s, stress, part, out))
+            self.launch(launch, self.gather(s, stress, out))
         return out

@@ -13,10 +13,12 @@ from .equilibrium import Equilibrium, GreenStrain, Workspace
 from .errors import InputError
 from .integrator import ImplicitStage, State, make_integrator
 from .material import MODELS, Material, as_parameter
-from .potential import StepTerms
+from .point_terms import StepTerms
+from .pressure import ChamberPressure
 from .solver import SolveReport, SolverSettings
 
 GRAVITY = (0.0, 0.0, -9.80709)
+PRESSURE_COUPLINGS = ("implicit", "explicit")
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,7 @@ class MaterialTensors:
         stiffness_damping: (1 or B,) [s].
         damped: whether stiffness damping acts at all.
         model: the material's.
+        fibre_stiffness: (1 or B, C) [N/m]; None without fibres.
     """
 
     shape_stiffness: torch.Tensor
@@ -42,6 +45,7 @@ class MaterialTensors:
     stiffness_damping: torch.Tensor
     damped: bool
     model: str
+    fibre_stiffness: torch.Tensor | None = None
 
     def check_batch(self, batch: int) -> None:
         """Refuses constants of another number of environments.
@@ -49,8 +53,9 @@ class MaterialTensors:
         Raises:
             InputError: some constant has neither one value nor one for each environment.
         """
-        for tensor in (self.shape_stiffness, self.mass, self.mass_damping, self.stiffness_damping):
-            if len(tensor) not in (1, batch):
+        constants = (self.shape_stiffness, self.mass, self.mass_damping, self.stiffness_damping, self.fibre_stiffness)
+        for tensor in constants:
+            if tensor is not None and len(tensor) not in (1, batch):
                 raise InputError(
                     f"a material parameter has values for {len(tensor)} environments, but the state has {batch}."
                 )
@@ -104,10 +109,12 @@ class Simulator:
         relative_tolerance: shorthand for that field of the settings.
         device: a torch device.
         dtype: ``torch.float64`` or ``torch.float32``.
+        pressure_coupling: ``implicit``, pressure acts on the chambers as they are at the end of a step (in its middle,
+            for ``midpoint``); or ``explicit``, as they are at its start, as published.
 
     Raises:
-        InputError: a time step that is not positive, an unknown integrator or solver, or a CUDA device that is not
-            there.
+        InputError: a time step that is not positive, an unknown integrator, solver or coupling, or a CUDA device that
+            is not there.
     """
 
     body: Body
@@ -119,6 +126,7 @@ class Simulator:
     relative_tolerance: float | None = None
     device: str | torch.device = "cpu"
     dtype: torch.dtype = torch.float64
+    pressure_coupling: str = "implicit"
 
     def __post_init__(self) -> None:
         """Uploads what is constant."""
@@ -126,6 +134,10 @@ class Simulator:
             raise InputError(f"time_step is {self.time_step:g}: it must be positive, in seconds.")
         if self.dtype not in (torch.float64, torch.float32):
             raise InputError(f"dtype is {self.dtype}: choose torch.float64 or torch.float32.")
+        if self.pressure_coupling not in PRESSURE_COUPLINGS:
+            raise InputError(
+                f"pressure_coupling is {self.pressure_coupling!r}: choose one of {', '.join(PRESSURE_COUPLINGS)}."
+            )
         self.device = _device(self.device)
         settings = SolverSettings(name=self.solver) if isinstance(self.solver, str) else self.solver
         if self.relative_tolerance is not None:
@@ -139,6 +151,7 @@ class Simulator:
         self.rest_positions = self.tensor(self.body.mesh.vertices)  # (N, 3) [m]
         self.fixed = torch.as_tensor(self.body.fixed_vertices, device=self.device)
         self._workspaces: dict[tuple[int, str], Workspace] = {}
+        self._chambers: dict[int, ChamberPressure] = {}
         sets = self.body.discretisation.point_sets
         self._shape_volume = self._sparse(scipy.sparse.vstack([s.shape_volume for s in sets]))
         self._volume_volume = self._sparse(scipy.sparse.vstack([s.volume_volume for s in sets]))
@@ -211,7 +224,24 @@ class Simulator:
             stiffness_damping=damping,
             damped=damped,
             model=material.model,
+            fibre_stiffness=self._fibre_stiffness(material),
         )
+
+    def _fibre_stiffness(self, material: Material) -> torch.Tensor | None:
+        stiffness = as_parameter(material.fibre_stiffness, torch.device(self.device), self.dtype)
+        chambers = len(self.body.chambers)
+        if self.body.fibres is None:
+            if bool((stiffness > 0.0).any()):
+                raise InputError(
+                    "the material has a fibre_stiffness, but the body has no fibres: give it some, or leave that out."
+                )
+            return None
+        if stiffness.shape[1] not in (1, chambers):
+            raise InputError(
+                f"fibre_stiffness has {stiffness.shape[1]} values for {chambers} chambers: give one value, or one for "
+                "each chamber."
+            )
+        return stiffness.expand(-1, chambers)
 
     @staticmethod
     def _common(*tensors: torch.Tensor) -> torch.Size:
@@ -226,6 +256,17 @@ class Simulator:
             )
         return self._workspaces[key]
 
+    def chambers(self, batch: int) -> ChamberPressure:
+        """Volumes of the chambers, and the force of pressure in a given state, for a batch size.
+
+        Raises:
+            InputError: the body has no chambers.
+        """
+        if batch not in self._chambers:
+            device = torch.device(self.device)
+            self._chambers[batch] = ChamberPressure(self.body, batch, device, self.dtype)
+        return self._chambers[batch]
+
     def rest_state(self, batch: int = 1) -> State:
         """The undeformed body at rest."""
         q = self.rest_positions.expand(batch, -1, -1).clone()
@@ -237,6 +278,7 @@ class Simulator:
         external_force: torch.Tensor | None = None,
         fixed_positions: torch.Tensor | None = None,
         material: Material | MaterialTensors | None = None,
+        pressure: torch.Tensor | None = None,
     ) -> tuple[State, SolveReport]:
         """Advances a batch by one time step.
 
@@ -246,6 +288,7 @@ class Simulator:
             fixed_positions: (B, D, 3) of the fixed vertices at the end of the step, in the order of
                 ``body.fixed_vertices`` [m]; where they are, if left out.
             material: another material than the simulator's, or one already prepared.
+            pressure: (B, C) gauge pressure in each chamber during the step [Pa]; none where left out.
 
         Returns:
             The new state, differentiable, and the solver's report.
@@ -255,14 +298,15 @@ class Simulator:
             ConvergenceError: see `solver.SolverSettings.on_failure`.
         """
         tensors = self.prepare(material)
-        self._check(state, external_force, fixed_positions)
+        self._check(state, external_force, fixed_positions, pressure=pressure)
         tensors.check_batch(state.batch)
         stage = self.method.stage(state, self.time_step)
         if fixed_positions is None:
             fixed_positions = state.q[:, self.fixed]
         at_stage = state.q[:, self.fixed] + stage.end * (fixed_positions - state.q[:, self.fixed])
         workspace = self.workspace(state.batch, tensors.model)
-        terms = self.step_terms(stage, state.batch, external_force, tensors, workspace)
+        external_force, pressure = self.coupled(state, external_force, pressure)
+        terms = self.step_terms(stage, state.batch, external_force, tensors, workspace, pressure)
         reports: list[SolveReport] = []
         solver = workspace.solver("dynamics", self.settings)
         x = Equilibrium.apply(workspace, solver, reports, stage.target, at_stage, *terms.tensors())
@@ -273,6 +317,15 @@ class Simulator:
             new = replace(new, v=new.v.index_copy(1, self.fixed, velocity))
         return new, reports[0]
 
+    def coupled(
+        self, state: State, external_force: torch.Tensor | None, pressure: torch.Tensor | None
+    ) -> tuple[torch.Tensor | None, torch.Tensor | None]:
+        """External force (B, N, 3) and pressure (B, C) as they enter a step's potential: see ``pressure_coupling``."""
+        if pressure is None or self.pressure_coupling == "implicit":
+            return external_force, pressure
+        push = self.chambers(state.batch).force(state.q, pressure)
+        return push if external_force is None else external_force + push, None
+
     def step_terms(
         self,
         stage: ImplicitStage,
@@ -280,6 +333,7 @@ class Simulator:
         external_force: torch.Tensor | None,
         tensors: MaterialTensors,
         workspace: Workspace,
+        pressure: torch.Tensor | None = None,
     ) -> StepTerms:
         """The incremental potential of a step, differentiable in everything that it depends on."""
         h = stage.step
@@ -298,6 +352,8 @@ class Simulator:
             volume_stiffness=tensors.volume_stiffness,
             viscosity=(tensors.stiffness_damping / h).expand(batch),
             reference_strain=strain,
+            pressure=pressure,
+            fibre_stiffness=tensors.fibre_stiffness,
         )
 
     def static_equilibrium(
@@ -307,6 +363,7 @@ class Simulator:
         material: Material | MaterialTensors | None = None,
         start: torch.Tensor | None = None,
         batch: int | None = None,
+        pressure: torch.Tensor | None = None,
     ) -> State:
         """The state of rest under gravity and constant loads, differentiable like a step.
 
@@ -316,6 +373,7 @@ class Simulator:
             material: another material than the simulator's, or one already prepared.
             start: (B, N, 3) first guess [m]; the rest shape where left out.
             batch: environments, where no other argument tells.
+            pressure: (B, C) gauge pressure in each chamber [Pa].
 
         Raises:
             InputError: wrong shapes, values that are not finite, or a body without fixed vertices.
@@ -323,11 +381,11 @@ class Simulator:
         """
         if not len(self.fixed):
             raise InputError("a body without fixed vertices has no static equilibrium: fix some vertices.")
-        given = [t for t in (external_force, fixed_positions, start) if t is not None]
+        given = [t for t in (external_force, fixed_positions, start, pressure) if t is not None]
         tensors = self.prepare(material)
         batch = batch or max([len(t) for t in given] + [len(tensors.shape_stiffness), len(tensors.weight)])
         state = self.rest_state(batch)
-        self._check(state, external_force, fixed_positions, start)
+        self._check(state, external_force, fixed_positions, start, pressure)
         tensors.check_batch(batch)
         if fixed_positions is None:
             fixed_positions = state.q[:, self.fixed]
@@ -347,6 +405,8 @@ class Simulator:
             tensors.volume_stiffness,
             torch.zeros(batch, device=self.device, dtype=self.dtype),
             None,
+            pressure,
+            tensors.fibre_stiffness,
         )
         return State(x, torch.zeros_like(x))
 
@@ -357,6 +417,7 @@ class Simulator:
         external_forces: torch.Tensor | None = None,
         fixed_positions: torch.Tensor | None = None,
         material: Material | MaterialTensors | None = None,
+        pressures: torch.Tensor | None = None,
     ) -> Trajectory:
         """Steps many times.
 
@@ -369,6 +430,7 @@ class Simulator:
             external_forces: (T, B, N, 3) for each step, or (B, N, 3) throughout [N].
             fixed_positions: (T, B, D, 3) for each step, in the order of ``body.fixed_vertices`` [m].
             material: another material than the simulator's, or one already prepared.
+            pressures: (T, B, C) gauge pressure in each chamber during each step, or (B, C) throughout [Pa].
 
         Raises:
             InputError: wrong shapes, or values that are not finite.
@@ -376,8 +438,9 @@ class Simulator:
         """
         if not steps >= 1:
             raise InputError(f"steps is {steps}: it must be at least 1.")
-        for name, values in (("external_forces", external_forces), ("fixed_positions", fixed_positions)):
-            if values is not None and values.ndim == 4 and len(values) != steps:
+        series = (("external_forces", external_forces, 4), ("fixed_positions", fixed_positions, 4))
+        for name, values, axes in (*series, ("pressures", pressures, 3)):
+            if values is not None and values.ndim == axes and len(values) != steps:
                 raise InputError(f"{name} has {len(values)} time steps, but {steps} are to be simulated.")
         tensors = self.prepare(material)
         states, reports = [state], []
@@ -386,7 +449,10 @@ class Simulator:
             if external_forces is not None and external_forces.ndim == 4:
                 force = external_forces[t]
             moved = None if fixed_positions is None else fixed_positions[t]
-            state, report = self.step(state, force, moved, tensors)
+            pressure = pressures
+            if pressures is not None and pressures.ndim == 3:
+                pressure = pressures[t]
+            state, report = self.step(state, force, moved, tensors, pressure)
             states.append(state)
             reports.append(report)
         q, v = (torch.stack([getattr(s, name) for s in states]) for name in ("q", "v"))
@@ -398,19 +464,23 @@ class Simulator:
         external_force: torch.Tensor | None,
         fixed_positions: torch.Tensor | None,
         start: torch.Tensor | None = None,
+        pressure: torch.Tensor | None = None,
     ) -> None:
         """One sentence on the first argument that cannot be simulated."""
-        b, n, d = state.batch, self.body.n_vertices, len(self.fixed)
+        b, n, d, c = state.batch, self.body.n_vertices, len(self.fixed), len(self.body.chambers)
         wanted = {
             "state.q": (state.q, (b, n, 3), "m"),
             "state.v": (state.v, (b, n, 3), "m/s"),
             "external_force": (external_force, (b, n, 3), "N"),
             "fixed_positions": (fixed_positions, (b, d, 3), "m"),
             "start": (start, (b, n, 3), "m"),
+            "pressure": (pressure, (b, c), "Pa"),
         }
         for name, (values, shape, unit) in wanted.items():
             if values is None:
                 continue
+            if name == "pressure" and not c:
+                raise InputError("there is a pressure, but the body has no chambers: name or find its chambers.")
             if not isinstance(values, torch.Tensor):
                 raise InputError(f"{name} is a {type(values).__name__}: it must be a torch tensor.")
             if values.device.type != self.rest_positions.device.type or values.dtype != self.dtype:
@@ -422,6 +492,7 @@ class Simulator:
                 raise InputError(f"{name} has shape {tuple(values.shape)}: it must be {shape} in {unit}.")
             if not bool(torch.isfinite(values).all()):
                 where = (~torch.isfinite(values)).nonzero()[0].tolist()
+                place = "chamber" if name == "pressure" else "vertex"
                 raise InputError(
-                    f"{name} is not finite in environment {where[0]}, vertex {where[1]}: check what computes it."
+                    f"{name} is not finite in environment {where[0]}, {place} {where[1]}: check what computes it."
                 )

@@ -22,11 +22,11 @@ import warp as wp
 
 from .errors import InputError
 from .integrator import State
-from .potential import SCALARS
+from .launcher import SCALARS
 from .simulator import Simulator
 from .solver import SolveReport
 
-PARAMETERS = ("youngs_modulus", "poissons_ratio", "density", "mass_damping", "stiffness_damping")
+PARAMETERS = ("youngs_modulus", "poissons_ratio", "density", "mass_damping", "stiffness_damping", "fibre_stiffness")
 _VECTORS = {torch.float64: wp.vec3d, torch.float32: wp.vec3f}
 
 
@@ -56,6 +56,7 @@ def record_rollout(
     external_forces: wp.array | None = None,
     fixed_positions: wp.array | None = None,
     parameters: Mapping[str, wp.array] | None = None,
+    pressures: wp.array | None = None,
 ) -> RecordedRollout:
     """Steps many times, and records on a tape how to differentiate that.
 
@@ -73,6 +74,7 @@ def record_rollout(
         external_forces: (T, B, N) vec3 for each step, or (B, N) vec3 throughout [N].
         fixed_positions: (T, B, D) vec3 of the fixed vertices at the end of each step [m].
         parameters: values in place of the material's, by a name of `PARAMETERS`, shaped as `Material` says.
+        pressures: (T, B, C) gauge pressure in each chamber during each step, or (B, C) throughout [Pa].
 
     Raises:
         InputError: an unknown parameter, an array of another type or device than the simulator's, wrong
@@ -86,13 +88,14 @@ def record_rollout(
     state = State(leaves.vectors("q", q), leaves.vectors("v", v), back)
     forces = None if external_forces is None else leaves.vectors("external_forces", external_forces)
     fixed = None if fixed_positions is None else leaves.vectors("fixed_positions", fixed_positions)
+    pressed = None if pressures is None else leaves.scalars("pressures", pressures)
     values: dict[str, Any] = {}
     for name, array in (parameters or {}).items():
         if name not in PARAMETERS:
             raise InputError(f"{name!r} is no parameter of a material: choose from {', '.join(PARAMETERS)}.")
         values[name] = leaves.scalars(name, array)
     with leaves.stream(), torch.enable_grad():
-        trajectory = simulator.rollout(state, steps, forces, fixed, replace(simulator.material, **values))
+        trajectory = simulator.rollout(state, steps, forces, fixed, replace(simulator.material, **values), pressed)
     results = [trajectory.q, trajectory.v]
     arrays = [leaves.result(tensor) for tensor in results]
     if leaves.pairs:

@@ -1,0 +1,30 @@
+"""Small bodies with closed chambers."""
+
+import numpy as np
+
+from warp_resphys import Body, Mesh, box_hexahedra, box_tetrahedra, select_vertices
+from warp_resphys.chambers import find_chambers
+from warp_resphys.mesh import quadratic
+
+SIZE, DIVISIONS = (0.06, 0.03, 0.02), (6, 3, 3)
+# The bricks that are left out, as (i, j, k): a chamber of two and one of a single brick.
+HOLLOW = [(1, 1, 1), (2, 1, 1), (4, 1, 1)]
+BRICK = np.prod(SIZE) / np.prod(DIVISIONS)  # m^3
+KINDS = ("hexahedron", "tetrahedron", "tetrahedron10")
+
+
+def hollow_box(kind: str) -> Mesh:
+    """A box along x with a chamber of two bricks and one of a single brick."""
+    make = box_hexahedra if kind == "hexahedron" else box_tetrahedra
+    full = make(SIZE, DIVISIONS)
+    centres = full.vertices[full.cells].mean(axis=1)
+    brick = np.floor(centres / (np.array(SIZE) / DIVISIONS)).astype(int)
+    solid = np.array([tuple(b) not in HOLLOW for b in brick])
+    mesh = Mesh(full.vertices, full.cells[solid])
+    return quadratic(mesh) if kind == "tetrahedron10" else mesh
+
+
+def chambered(kind: str, **options) -> Body:
+    """The same as a body that is clamped at x = 0."""
+    mesh = hollow_box(kind)
+    return Body(mesh, fixed=select_vertices(mesh, x=0.0), chambers=find_chambers(mesh, (1.0, 0.0, 0.0)), **options)

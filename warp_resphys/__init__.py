@@ -7,19 +7,23 @@ import importlib
 from typing import Any
 
 _MODULES = {
+    "ArmGeometry": "arm",
     "Body": "body",
     "PointMass": "body",
     "Material": "material",
     "Mesh": "mesh",
     "box_hexahedra": "mesh",
     "box_tetrahedra": "mesh",
+    "mesh_arm": "arm",
     "quadratic": "mesh",
     "read_mesh": "mesh_io",
+    "read_surfaces": "mesh_io",
     "select_vertices": "mesh",
     "Simulator": "simulator",
     "SolverSettings": "solver",
     "State": "integrator",
     "Trajectory": "simulator",
+    "write_mesh": "mesh_io",
 }
 
 __all__ = sorted(_MODULES)

@@ -1,18 +1,23 @@
 """Builds meshes, bodies, materials and simulators from configurations."""
 
 from collections.abc import Mapping
+from importlib import resources
 from typing import Any
 
 import torch
 
+from .arm import arm_geometry, mesh_arm
 from .body import Body, PointMass
+from .chambers import Chamber, find_chambers
 from .errors import InputError
 from .material import Material
-from .mesh import Mesh, box_hexahedra, box_tetrahedra, check_mesh, select_vertices
+from .mesh import Mesh, box_hexahedra, box_tetrahedra, check_mesh, quadratic, select_vertices
 from .mesh_io import read_mesh
 from .simulator import Simulator
 from .solver import SolverSettings
+from .surface_elements import Fibres
 
+_MESH_KINDS = ("box_hexahedra", "box_tetrahedra", "file", "arm", "arm_generated")
 _DTYPES = {"float64": torch.float64, "float32": torch.float32}
 
 
@@ -52,17 +57,56 @@ def build_mesh(config: Mapping[str, Any]) -> Mesh:
         mesh = box_tetrahedra(config["size"], config["divisions"], config.get("order", 1))
     elif kind == "file":
         mesh = read_mesh(config["path"], config["units"], config["order"], config["drop_unreferenced"])
+    elif kind == "arm":
+        mesh = shipped_arm(config["name"])
+    elif kind == "arm_generated":
+        mesh, _ = mesh_arm(arm_geometry(config), config["size"], config["cells"], config["layers"])
+        mesh = quadratic(mesh) if config["order"] == 2 else mesh
     else:
-        raise InputError(f"mesh.kind is {kind!r}: choose box_hexahedra, box_tetrahedra or file.")
+        raise InputError(f"mesh.kind is {kind!r}: choose {', '.join(_MESH_KINDS[:-1])} or {_MESH_KINDS[-1]}.")
     check_mesh(mesh)
     return mesh
 
 
+def shipped_arm(name: str) -> Mesh:
+    """One of the meshes that come with the package.
+
+    Raises:
+        InputError: there is none of that name.
+    """
+    folder = resources.files("warp_resphys") / "meshes"
+    known = sorted(each.name.removesuffix(".msh") for each in folder.iterdir() if each.name.endswith(".msh"))
+    if name not in known:
+        raise InputError(f"mesh.name is {name!r}: the arms that come with the package are {', '.join(known)}.")
+    with resources.as_file(folder / f"{name}.msh") as path:
+        return read_mesh(path)
+
+
+def build_chambers(config: Mapping[str, Any] | None, mesh: Mesh) -> tuple[Chamber, ...]:
+    """The closed chambers of a mesh, from the group ``chambers``; none without the group.
+
+    Raises:
+        InputError: the mesh has another number of them.
+    """
+    if config is None:
+        return ()
+    found = find_chambers(mesh, config["axis"])
+    if len(found) != config["count"]:
+        raise InputError(
+            f"the mesh has {len(found)} closed chambers, but chambers.count is {config['count']}: a chamber that is "
+            "open to the outside is none, so close it in the mesh, or set chambers.count."
+        )
+    return found
+
+
 def build_body(config: Mapping[str, Any], point_masses: tuple[PointMass, ...] = ()) -> Body:
-    """A body from the groups ``mesh`` and ``physics`` and the key ``fixed``."""
+    """A body from the groups ``mesh``, ``physics``, ``fixed``, and, where it has any, ``chambers`` and ``fibres``."""
     mesh = build_mesh(config["mesh"])
+    fibres = config.get("fibres")
     return Body(
         mesh,
+        chambers=build_chambers(config.get("chambers"), mesh),
+        fibres=None if fibres is None else Fibres(**fibres),
         fixed=select_vertices(mesh, **config["fixed"]),
         mass=config["physics"]["mass"],
         volume_integration=config["physics"]["volume_integration"],
@@ -106,4 +150,5 @@ def build_simulator(
         solver=SolverSettings(**settings),
         device=choose_device(device),
         dtype=_DTYPES[config["dtype"]],
+        pressure_coupling=config.get("pressure_coupling", "implicit"),
     )

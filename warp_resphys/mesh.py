@@ -255,7 +255,13 @@ def boundary_triangles(mesh: Mesh) -> IntArray:
 
     A face with 3 nodes is one triangle, with 4 nodes two, with 6 nodes four; those of a face are consecutive.
     """
-    return boundary_faces(mesh)[:, _CELL_TYPES[mesh.cells.shape[1]].triangles].reshape(-1, 3)
+    return face_triangles(boundary_faces(mesh))
+
+
+def face_triangles(faces: IntArray) -> IntArray:
+    """Triangles (T, 3) that faces (F, 3 | 4 | 6) are split into, counter-clockwise as they are; see above."""
+    kinds = {cell_type.faces.shape[1]: cell_type for cell_type in _CELL_TYPES.values()}
+    return faces[:, kinds[faces.shape[1]].triangles].reshape(-1, 3)
 
 
 def surface_vertices(mesh: Mesh) -> IntArray:

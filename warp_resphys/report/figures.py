@@ -56,6 +56,8 @@ LABELS: Final[Mapping[str, str]] = {
     "resphys": "Corrected (ResPhys)",
     "published_network": "Published network",
 }
+# Okabe and Ito (2008): everyone can tell them apart.
+CHAMBER_COLOURS: Final = ("#e69f00", "#56b4e9", "#009e73", "#d55e00", "#0072b2", "#cc79a7", "#f0e442", "#7f7f7f")
 LARGEST_SHOWN: Final = 1e5  # Of an error [mm], or a loss.
 FONT: Final = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, 'DejaVu Sans', sans-serif"
 ROUND_STEPS: Final = (1, 2, 5, 10)  # Between two ticks, times a power of ten.

@@ -1,6 +1,7 @@
 """Converts the recordings published beside the paper to the HDF5 layout of docs/recordings.md.
 
 python scripts/convert_recordings.py layout=beam source=FOLDER
+python scripts/convert_recordings.py layout=segment source=pressure_steps.npz
 """
 
 from pathlib import Path
@@ -15,10 +16,11 @@ from warp_resphys.errors import InputError
 def main(config: DictConfig) -> None:
     """Writes one file for each trial, and index.json."""
     from warp_resphys.recordings.published import convert_arm, convert_beam
+    from warp_resphys.recordings.segment import convert_segment
 
-    converters = {"arm": convert_arm, "beam": convert_beam}
+    converters = {"arm": convert_arm, "beam": convert_beam, "segment": convert_segment}
     if config.layout not in converters:
-        raise InputError(f"layout is {config.layout!r}: set it to arm or beam.")
+        raise InputError(f"layout is {config.layout!r}: set it to {', '.join(converters)}.")
     folder = Path(config.output)
     index = converters[config.layout](config.source, folder)
     residuals = [entry["registration_residual_mm"] for entry in index if entry["registration_residual_mm"] is not None]

@@ -143,3 +143,17 @@ def _unexplained(recording: Recording) -> tuple[FloatArray, FloatArray]:
         if others.shape[1]:
             size[:, column] = np.minimum(size[:, column], others.min(axis=1))
     return left, size
+
+
+def mask_repeats(recording: Recording) -> Recording:
+    """Makes NaN the frames in which every marker that is seen stands exactly where it stood in the frame before.
+
+    Measured positions always differ by their noise. Equal ones are a stream that was read faster than it was updated:
+    the frame says nothing new, and less than that of a body that moves.
+    """
+    positions = recording.positions
+    equal = (positions[1:] == positions[:-1]) | (np.isnan(positions[1:]) & np.isnan(positions[:-1]))
+    repeated = np.flatnonzero(equal.all(axis=(1, 2))) + 1
+    masked = positions.copy()
+    masked[repeated] = np.nan
+    return dataclasses.replace(recording, positions=masked)

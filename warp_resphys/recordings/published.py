@@ -106,10 +106,10 @@ def read_published_beam(folder: str | Path) -> dict[int, Recording]:
     if not files:
         raise DataFileError(f"{folder} holds no file qs_real0_reorder.npy or the like: check the path.")
     rest_file = folder / _TRIAL_ARRAYS
-    rests = _load(rest_file) if rest_file.exists() else {}
+    rests = load_arrays(rest_file) if rest_file.exists() else {}
     recordings = {}
     for trial, file in sorted(files.items()):
-        frames = _beam_frames(_load(file)[""], file)
+        frames = _beam_frames(load_arrays(file)[""], file)
         rest = _beam_frames(rests[f"arr_{trial}"], rest_file)[-1] if f"arr_{trial}" in rests else None
         recordings[trial] = to_recording(RawRecording(frames, BEAM_LABELS, "mm", RATE, rest=rest), file)
     return recordings
@@ -121,7 +121,7 @@ def convert_arm(path: str | Path, folder: Path) -> list[dict[str, Any]]:
     trials: list[tuple[int, Recording, dict[str, Any]]] = [
         (trial, recording, {}) for trial, recording in enumerate(recordings)
     ]
-    return _write(folder, "arm", trials, ARM_NOMINAL)
+    return write_trials(folder, "arm", trials, ARM_NOMINAL)
 
 
 def convert_beam(source: str | Path, folder: Path) -> list[dict[str, Any]]:
@@ -131,10 +131,10 @@ def convert_beam(source: str | Path, folder: Path) -> list[dict[str, Any]]:
         split = next((name for name, members in SPLITS.items() if trial in members), "none")
         weight = {"weight_kg": WEIGHTS[trial]} if trial < len(WEIGHTS) else {}
         trials.append((trial, recording, {"split": split, **weight}))
-    return _write(folder, "beam", trials, BEAM_NOMINAL)
+    return write_trials(folder, "beam", trials, BEAM_NOMINAL)
 
 
-def _write(
+def write_trials(
     folder: Path, name: str, trials: list[tuple[int, Recording, dict[str, Any]]], nominal: FloatArray
 ) -> list[dict[str, Any]]:
     """Writes the recordings, and how far their rest shape is from the nominal markers: large if the order is wrong."""
@@ -155,7 +155,7 @@ def _write(
     return index
 
 
-def _load(path: Path) -> dict[str, NDArray[Any]]:
+def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """The arrays of a .npz file by name, or that of a .npy file by no name; nothing in it is run."""
     try:
         with open(path, "rb") as file:

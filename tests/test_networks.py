@@ -3,8 +3,10 @@ import pytest
 import torch
 from torch import nn
 
+from warp_resphys import Body, Material, Simulator, box_hexahedra, select_vertices
 from warp_resphys.errors import InputError
 from warp_resphys.files import read_checkpoint, write_checkpoint
+from warp_resphys.modes import RestStiffness
 from warp_resphys.residual.networks import (
     NextState,
     ResidualForce,
@@ -12,6 +14,7 @@ from warp_resphys.residual.networks import (
     actuation_coder,
     build_model,
     build_next_state,
+    displacement_coder,
     nodal_coder,
     pod_coder,
     restore,
@@ -238,3 +241,54 @@ class TestActuation:
         model, q, v = self.built()
         with pytest.raises(ValueError, match="trained with an actuation"):
             model(q, v)
+
+
+def clamped_beam():
+    mesh = box_hexahedra((0.1, 0.02, 0.02), (5, 1, 1))
+    return Simulator(Body(mesh, fixed=select_vertices(mesh, x=0.0)), Material(2e5, 0.3), gravity=(0.0, 0.0, 0.0))
+
+
+def test_rest_stiffness_is_that_of_a_small_load_and_its_own_inverse():
+    simulator = clamped_beam()
+    stiffness = RestStiffness(simulator)
+    force = torch.zeros(1, simulator.body.n_vertices, 3, dtype=torch.float64)
+    force[:, -1, 2] = 1e-5
+    moved = simulator.static_equilibrium(force).q - simulator.rest_positions
+    found = stiffness.displacements(force.reshape(-1, 1).numpy())
+    np.testing.assert_allclose(found[:, 0], moved.reshape(-1).numpy(), atol=1e-4 * float(moved.abs().max()))
+    np.testing.assert_allclose(stiffness.forces(found), force.reshape(-1, 1).numpy(), atol=1e-15)
+
+
+def test_modes_of_displacements_keep_the_weak_force_that_bends_and_drop_the_strong_one_that_does_not():
+    simulator = clamped_beam()
+    stiffness, n = RestStiffness(simulator), simulator.body.n_vertices
+    random = torch.Generator().manual_seed(0)
+    bend, squeeze = (torch.zeros(n, 3, dtype=torch.float64) for _ in range(2))
+    tip = np.flatnonzero(simulator.body.mesh.vertices[:, 0] > 0.099)
+    bend[tip, 2] = 1e-3
+    squeeze[tip, 1] = 1e-2 * torch.tensor([1.0, 1.0, -1.0, -1.0], dtype=torch.float64)  # cancels
+    amounts = torch.randn(50, 2, generator=random, dtype=torch.float64)
+    forces = amounts[:, :1, None] * bend + amounts[:, 1:, None] * squeeze
+    coder = displacement_coder(forces, stiffness, 1)
+    kept = coder.decode(coder.encode(forces))
+    moved = stiffness.displacements((kept - forces).flatten(1).T.numpy())
+    assert np.abs(moved).max() < 0.05 * np.abs(stiffness.displacements(forces.flatten(1).T.numpy())).max()
+    assert float((kept - forces).norm()) > 0.9 * float((amounts[:, 1:, None] * squeeze).norm())
+    plain = pod_coder(forces, 1)
+    assert float((plain.decode(plain.encode(forces)) - forces).norm()) < 0.2 * float(forces.norm())
+    both = displacement_coder(forces, stiffness, 2)
+    torch.testing.assert_close(both.decode(both.encode(forces)), forces, rtol=0.0, atol=1e-12)
+
+
+def test_a_network_may_be_blind_for_velocities_and_is_restored_with_its_dual_modes():
+    simulator = clamped_beam()
+    rest, n = simulator.rest_positions, simulator.body.n_vertices
+    random = torch.Generator().manual_seed(0)
+    q, v, force = (1e-3 * torch.randn(20, n, 3, generator=random, dtype=torch.float64) for _ in range(3))
+    config = {"kind": "reduced", "position_modes": 3, "velocity_modes": 0, "force_modes": 2}
+    config |= {"blocks": 1, "layers": 1, "width": 8}
+    model = build_model(config, rest, rest + q, v, force, stiffness=RestStiffness(simulator)).double().eval()
+    torch.testing.assert_close(model(rest + q, v), model(rest + q, 10.0 * v))
+    assert not torch.equal(model(rest + 2.0 * q, v), model(rest + q, v))
+    again = restore(ResidualForce, model.state_dict(), model.description())
+    torch.testing.assert_close(again(rest + q, v), model(rest + q, v))

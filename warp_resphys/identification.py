@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from .descent import minimise
 from .errors import ConvergenceError, InputError
-from .replay import PARAMETERS, Release, Replay
+from .replay import Release, Replay
 
 Report = Callable[[int, float, Mapping[str, float]], None]
 Attempt = dict[str, Any]
@@ -119,8 +119,8 @@ class Identifier:
         if not bounds:
             raise InputError("there is nothing to identify: name a parameter under identify.parameters.")
         for name in bounds:
-            if name not in PARAMETERS:
-                raise InputError(f"there is no parameter {name!r} to identify: choose from {', '.join(PARAMETERS)}.")
+            if name not in replay.known:
+                raise InputError(f"there is no parameter {name!r} to identify: choose from {', '.join(replay.known)}.")
         motions = replay.motions if seconds is None else replay.motions.first(seconds)
         for name, moved in zip(motions.names, motions.amplitude.tolist(), strict=True):
             if not moved > 0.0:
@@ -128,7 +128,7 @@ class Identifier:
         simulator = replay.simulator
         most = min(simulator.settings.max_iterations, _MOST_ITERATIONS)
         settings = replace(simulator.settings, max_iterations=most, on_failure="raise")
-        self.replay = Replay(replace(simulator, solver=settings), replay.markers, motions)
+        self.replay = type(replay)(replace(simulator, solver=settings), replay.markers, motions)
         self.release, self.bounds = release, dict(bounds)
         self._weight = motions.loss_weight
 

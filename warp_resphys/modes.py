@@ -2,12 +2,19 @@
 
 import numpy as np
 import scipy.linalg
+import scipy.sparse
+import scipy.sparse.linalg
 import torch
+from numpy.typing import NDArray
 
 from .assembly import HessianAssembly
 from .errors import InputError
 from .linear_solver import make_linear_solver
 from .simulator import Simulator
+
+FloatArray = NDArray[np.float64]
+
+_DENSE = 600  # unknowns, beyond which all eigenvalues of a dense matrix take too long to find a few of them
 
 
 def vibration_modes(simulator: Simulator, count: int) -> torch.Tensor:
@@ -18,11 +25,30 @@ def vibration_modes(simulator: Simulator, count: int) -> torch.Tensor:
     Raises:
         InputError: no mode, or more modes than there are free coordinates.
     """
+    stiffness, inertia, free = _about_rest(simulator)
+    unknowns = len(inertia)
+    if not 1 <= count <= unknowns:
+        raise InputError(f"{count} vibration modes were asked for, but the body has 1 to {unknowns}.")
+    root = np.sqrt(inertia)
+    scaled = stiffness / np.outer(root, root)
+    if unknowns <= _DENSE:
+        _, shapes = scipy.linalg.eigh(scaled, subset_by_index=[0, count - 1])
+    else:
+        # Lanczos about zero, from the same start every time.
+        matrix = scipy.sparse.csc_array(scaled)
+        values, shapes = scipy.sparse.linalg.eigsh(matrix, count, sigma=0.0, v0=np.ones(unknowns))
+        shapes = shapes[:, np.argsort(values)]
+    basis = simulator.rest_positions.new_zeros(simulator.body.n_vertices, 3, count)
+    orthonormal = np.linalg.qr(root[:, None] * shapes)[0]
+    basis[free] = simulator.tensor(orthonormal.reshape(-1, 3, count))
+    return basis.flatten(0, 1)
+
+
+def _about_rest(simulator: Simulator) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
+    """Stiffness (3 F, 3 F) [N/m] and inertia (3 F,) of the F free vertices at rest, and these vertices."""
     workspace = simulator.workspace(1)
     p, pattern = workspace.potential, workspace.pattern
     unknowns = 3 * len(pattern.free)
-    if not 1 <= count <= unknowns:
-        raise InputError(f"{count} vibration modes were asked for, but the body has 1 to {unknowns}.")
     rest = simulator.rest_state()
     stage = simulator.method.stage(rest, simulator.time_step)
     p.set_terms(simulator.step_terms(stage, 1, None, simulator.prepare(), workspace))
@@ -31,10 +57,31 @@ def vibration_modes(simulator: Simulator, count: int) -> torch.Tensor:
     linear = make_linear_solver("dense", pattern.rows, pattern.cols, len(pattern.free), 3, p.device, p.dtype)
     lower = HessianAssembly(p, linear, pattern)().reshape(unknowns, unknowns).cpu().numpy()
     inertia = np.repeat(p.inertia[0].cpu().numpy()[pattern.free], 3)
-    stiffness = np.tril(lower) + np.tril(lower, -1).T - np.diag(inertia)
-    root = np.sqrt(inertia)
-    _, shapes = scipy.linalg.eigh(stiffness / np.outer(root, root), subset_by_index=[0, count - 1])
-    basis = simulator.rest_positions.new_zeros(simulator.body.n_vertices, 3, count)
-    orthonormal = np.linalg.qr(root[:, None] * shapes)[0]
-    basis[pattern.free] = simulator.tensor(orthonormal.reshape(-1, 3, count))
-    return basis.flatten(0, 1)
+    return np.tril(lower) + np.tril(lower, -1).T - np.diag(inertia), inertia, pattern.free
+
+
+class RestStiffness:
+    """The stiffness K of a body at rest: what forces displace it by, and which forces a displacement takes.
+
+    Args:
+        simulator: of a body that is clamped.
+    """
+
+    def __init__(self, simulator: Simulator) -> None:
+        stiffness, _, free = _about_rest(simulator)
+        self._matrix = scipy.sparse.csc_array(stiffness)
+        self._factor = scipy.sparse.linalg.splu(self._matrix)
+        self._dofs = (3 * free[:, None] + np.arange(3)).ravel()
+        self._size = 3 * simulator.body.n_vertices
+
+    def displacements(self, forces: FloatArray) -> FloatArray:
+        """(3 N, m) K^-1 f of (3 N, m) [m]; zero at fixed vertices."""
+        out = np.zeros((self._size, forces.shape[1]))
+        out[self._dofs] = self._factor.solve(forces[self._dofs])
+        return out
+
+    def forces(self, displacements: FloatArray) -> FloatArray:
+        """(3 N, m) K u of (3 N, m) [N]; zero at fixed vertices."""
+        out = np.zeros((self._size, displacements.shape[1]))
+        out[self._dofs] = self._matrix @ displacements[self._dofs]
+        return out

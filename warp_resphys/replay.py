@@ -7,7 +7,7 @@ parameters at once, and reads the markers off at the times of the frames. All of
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 
@@ -16,7 +16,9 @@ from .integrator import State
 from .material import Material
 from .simulator import MaterialTensors, Simulator
 
-MATERIAL_PARAMETERS = ("youngs_modulus", "poissons_ratio", "density", "mass_damping", "stiffness_damping")
+MATERIAL_PARAMETERS = (
+    *("youngs_modulus", "poissons_ratio", "density", "mass_damping", "stiffness_damping", "fibre_stiffness"),
+)
 PARAMETERS = (*MATERIAL_PARAMETERS, "attached_mass_factor", "gravity_tilt_1", "gravity_tilt_2")
 Markers = Callable[[torch.Tensor], torch.Tensor]
 StepForce = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
@@ -121,7 +123,12 @@ class Replay:
         simulator: of the body; its material gives the constants that no parameter sets.
         markers: (B, N, 3) positions of the vertices to (B, M, 3) markers [m].
         motions: what was observed.
+
+    Attributes:
+        known: the parameters that it takes.
     """
+
+    known: ClassVar[tuple[str, ...]] = PARAMETERS
 
     def __init__(self, simulator: Simulator, markers: Markers, motions: Motions) -> None:
         self.simulator, self.markers, self.motions = simulator, markers, motions

@@ -11,10 +11,13 @@ import torch
 from torch import nn
 
 from ..errors import InputError
+from ..modes import RestStiffness
 
 NETWORK_KINDS = ("reduced", "nodal")
 # Modes and coordinates that vary less than this fraction of the largest are not amplified to unit deviation.
 _DEVIATION_FLOOR = 3e-3
+_SAMPLES_FOR_MODES = 2_000
+_MANY_SAMPLES = 10_000  # whose singular value decomposition takes minutes
 
 
 class SkipMLP(nn.Module):
@@ -55,19 +58,28 @@ class Coder(nn.Module):
 
     Args:
         mean: (D,) flattened field of the origin.
-        basis: (D, M) orthonormal columns; None for the coordinates themselves.
+        basis: (D, M) columns; None for the coordinates themselves.
         scale: (M,) deviation of each coordinate.
+        dual: (D, M) columns with dual^T basis = 1, by which fields are decoded; None: the basis, which is orthonormal.
     """
 
     mean: torch.Tensor
     scale: torch.Tensor
     basis: torch.Tensor | None
+    dual: torch.Tensor | None
 
-    def __init__(self, mean: torch.Tensor, basis: torch.Tensor | None, scale: torch.Tensor) -> None:
+    def __init__(
+        self,
+        mean: torch.Tensor,
+        basis: torch.Tensor | None,
+        scale: torch.Tensor,
+        dual: torch.Tensor | None = None,
+    ) -> None:
         super().__init__()
         self.register_buffer("mean", mean)
         self.register_buffer("basis", basis)
         self.register_buffer("scale", scale)
+        self.register_buffer("dual", dual)
 
     @property
     def size(self) -> int:
@@ -82,7 +94,8 @@ class Coder(nn.Module):
     def decode(self, coordinates: torch.Tensor) -> torch.Tensor:
         """(S, M) to (S, N, 3)."""
         x = coordinates * self.scale
-        x = x if self.basis is None else x @ self.basis.mT
+        if self.basis is not None:
+            x = x @ (self.basis if self.dual is None else self.dual).mT
         return (x + self.mean).unflatten(1, (-1, 3))
 
 
@@ -99,10 +112,40 @@ def pod_coder(samples: torch.Tensor, modes: int) -> Coder:
     x = samples.flatten(1)
     if not 1 <= modes <= min(x.shape):
         raise InputError(f"{modes} modes were asked for, but {len(x)} samples give 1 to {min(x.shape)}.")
-    _, _, directions = torch.linalg.svd(x, full_matrices=False)
+    if len(x) > _MANY_SAMPLES:
+        # The same directions from a matrix of the coordinates alone, with half of the digits: enough for main modes.
+        _, ascending = torch.linalg.eigh(x.mT @ x)
+        directions = ascending.flip(1).mT
+    else:
+        _, _, directions = torch.linalg.svd(x, full_matrices=False)
     basis = directions[:modes].mT.contiguous()
     deviation = (x @ basis).square().mean(0).sqrt()
     return Coder(torch.zeros_like(x[0]), basis, deviation.clamp_min(_DEVIATION_FLOOR * float(deviation.max())))
+
+
+def displacement_coder(samples: torch.Tensor, stiffness: RestStiffness, modes: int) -> Coder:
+    """Forces by the displacements that they would cause: their main modes Psi, with f = K Psi c and c = Psi^T K^-1 f.
+
+    A slender body is moved most by forces that are small beside those that cancel. In the modes of the forces
+    themselves, a small error of the large ones moves it more than the small ones do; in those of K^-1 f, the error of a
+    coordinate is the error of the body.
+
+    Args:
+        samples: (S, N, 3) forces [N], of which some thousand tell.
+        stiffness: K, of the body at rest.
+        modes: M.
+
+    Raises:
+        InputError: more modes than samples or coordinates.
+    """
+    every = max(len(samples) // _SAMPLES_FOR_MODES, 1)
+    forces = samples[::every].flatten(1).double().cpu().numpy()
+    moved = torch.as_tensor(stiffness.displacements(forces.T).T.copy()).to(samples)
+    coder = pod_coder(moved.unflatten(1, (-1, 3)), modes)
+    assert coder.basis is not None
+    psi = coder.basis.cpu().numpy()
+    basis, dual = (torch.as_tensor(part).to(samples) for part in (stiffness.displacements(psi), stiffness.forces(psi)))
+    return Coder(torch.zeros_like(samples[0].flatten()), basis, coder.scale, dual)
 
 
 def actuation_coder(samples: torch.Tensor) -> Coder:
@@ -246,6 +289,7 @@ def build_model(
     v: torch.Tensor,
     force: torch.Tensor,
     actuation: torch.Tensor | None = None,
+    stiffness: RestStiffness | None = None,
 ) -> ResidualForce:
     """A residual force with coders from training samples.
 
@@ -256,12 +300,18 @@ def build_model(
         v: (S, N, 3) velocities [m/s].
         force: (S, N, 3) residual forces [N].
         actuation: (S, A) what else acts on the body, or None.
+        stiffness: of the body at rest, for a ``reduced`` network whose modes are those of the displacements that forces
+            would cause; of the forces themselves if None.
 
     Raises:
         InputError: an unknown kind, or sizes that do not fit the samples.
     """
     position, velocity = _state_coders(config, q - rest, v)
-    coder = pod_coder(force, config["force_modes"]) if config["kind"] == "reduced" else nodal_coder(force)
+    if config["kind"] == "reduced":
+        modes = config["force_modes"]
+        coder = pod_coder(force, modes) if stiffness is None else displacement_coder(force, stiffness, modes)
+    else:
+        coder = nodal_coder(force)
     actuated = None if actuation is None else actuation_coder(actuation)
     return ResidualForce(rest, position, velocity, {"force": coder}, config, actuated)
 
@@ -295,8 +345,16 @@ def _state_coders(config: Mapping[str, Any], u: torch.Tensor, v: torch.Tensor) -
     """Coders of displacements and velocities."""
     check_network(config)
     if config["kind"] == "reduced":
-        return pod_coder(u, config["position_modes"]), pod_coder(v, config["velocity_modes"])
+        pairs = ((u, config["position_modes"]), (v, config["velocity_modes"]))
+        found = [pod_coder(field, modes) if modes else _blind_coder(field) for field, modes in pairs]
+        return found[0], found[1]
     return nodal_coder(u), nodal_coder(v)
+
+
+def _blind_coder(samples: torch.Tensor) -> Coder:
+    """No coordinates at all: for what a network is not to see."""
+    empty = samples.new_zeros(0)
+    return Coder(torch.zeros_like(samples[0].flatten()), samples.new_zeros(samples[0].numel(), 0), empty)
 
 
 def check_network(config: Mapping[str, Any]) -> None:
@@ -307,12 +365,13 @@ def check_network(config: Mapping[str, Any]) -> None:
     """
     if config["kind"] not in NETWORK_KINDS:
         raise InputError(f"network.kind is {config['kind']!r}: choose one of {', '.join(NETWORK_KINDS)}.")
-    modes = ("position_modes", "velocity_modes", "force_modes") if config["kind"] == "reduced" else ()
-    for key in ("blocks", "width", *modes):
+    reduced = config["kind"] == "reduced"
+    for key in ("blocks", "width", *(("force_modes",) if reduced else ())):
         if not config[key] > 0:
             raise InputError(f"network.{key} is {config[key]}: it must be positive.")
-    if not config["layers"] >= 0:
-        raise InputError(f"network.layers is {config['layers']}: it must be zero or more.")
+    for key in ("layers", *(("position_modes", "velocity_modes") if reduced else ())):
+        if not config[key] >= 0:
+            raise InputError(f"network.{key} is {config[key]}: it must be zero or more.")
 
 
 Model = TypeVar("Model", bound=StateMap)
@@ -328,7 +387,10 @@ def restore(kind: type[Model], tensors: Mapping[str, torch.Tensor], description:
     """
 
     def coder(name: str) -> Coder:
-        return Coder(tensors[f"{name}.mean"], tensors.get(f"{name}.basis"), tensors[f"{name}.scale"])
+        parts = [tensors.get(f"{name}.{part}") for part in ("mean", "basis", "scale", "dual")]
+        assert parts[0] is not None
+        assert parts[2] is not None
+        return Coder(parts[0], parts[1], parts[2], parts[3])
 
     outputs = {name: coder(f"outputs.{name}") for name in kind.fields}
     actuation = coder("actuation") if description["actuated"] else None

@@ -20,9 +20,11 @@ import torch
 from typing_extensions import override
 
 from ..assembly import HessianAssembly
+from ..equilibrium import Workspace
 from ..errors import ConvergenceError, InputError
-from ..integrator import State
+from ..integrator import ImplicitStage, State
 from ..linear_solver import Factor, make_linear_solver
+from ..point_terms import StepTerms
 from ..potential import IncrementalPotential
 from ..simulator import MaterialTensors, Simulator
 from ..threads import threads_for
@@ -75,14 +77,29 @@ class Reconstructor(ABC):
         other._tensors = tensors
         return other
 
+    def _terms(
+        self, stage: ImplicitStage, state: State, workspace: Workspace, pressure: torch.Tensor | None
+    ) -> StepTerms:
+        """The potential of the step without a residual force."""
+        sim = self.simulator
+        force, inside = sim.coupled(state, None, pressure)
+        return sim.step_terms(stage, state.batch, force, self._tensors, workspace, inside)
+
     @abstractmethod
-    def step(self, state: State, observed: torch.Tensor, first_guess: torch.Tensor | None = None) -> Reconstruction:
+    def step(
+        self,
+        state: State,
+        observed: torch.Tensor,
+        first_guess: torch.Tensor | None = None,
+        pressure: torch.Tensor | None = None,
+    ) -> Reconstruction:
         """Reconstructs the step from a state to observed positions.
 
         Args:
             state: where the step starts.
             observed: (B, N, 3) [m].
             first_guess: (B, N, 3) force to start from, such as that of the step before [N].
+            pressure: (B, C) gauge pressure in each chamber during the step [Pa].
 
         Raises:
             ConvergenceError: no minimum was found.
@@ -106,13 +123,19 @@ class GaussNewton(Reconstructor):
     _assembled: IncrementalPotential | None = None
 
     @override
-    def step(self, state: State, observed: torch.Tensor, first_guess: torch.Tensor | None = None) -> Reconstruction:
+    def step(
+        self,
+        state: State,
+        observed: torch.Tensor,
+        first_guess: torch.Tensor | None = None,
+        pressure: torch.Tensor | None = None,
+    ) -> Reconstruction:
         del first_guess
         sim, batch = self.simulator, state.batch
         workspace = sim.workspace(batch)
         p = workspace.potential
         stage = sim.method.stage(state, sim.time_step)
-        p.set_terms(sim.step_terms(stage, batch, None, self._tensors, workspace))
+        p.set_terms(self._terms(stage, state, workspace, pressure))
         self._weight = self.regularisation * stage.end**2
         target = sim.method.solution_for(state, observed).clone()
         target[:, sim.fixed] = state.q[:, sim.fixed]
@@ -221,9 +244,15 @@ class LBFGSB(Reconstructor):
     """
 
     @override
-    def step(self, state: State, observed: torch.Tensor, first_guess: torch.Tensor | None = None) -> Reconstruction:
+    def step(
+        self,
+        state: State,
+        observed: torch.Tensor,
+        first_guess: torch.Tensor | None = None,
+        pressure: torch.Tensor | None = None,
+    ) -> Reconstruction:
         free = self._free()
-        return self._minimise(state, lambda q: ((q - observed) * free).square().sum(), first_guess)
+        return self._minimise(state, lambda q: ((q - observed) * free).square().sum(), first_guess, pressure)
 
     def _free(self) -> torch.Tensor:
         """(N, 1) zero at fixed vertices, else one."""
@@ -231,14 +260,20 @@ class LBFGSB(Reconstructor):
         free[self.simulator.fixed] = 0.0
         return free
 
-    def _minimise(self, state: State, misfit_of: LinearMap, first_guess: torch.Tensor | None) -> Reconstruction:
+    def _minimise(
+        self,
+        state: State,
+        misfit_of: LinearMap,
+        first_guess: torch.Tensor | None,
+        pressure: torch.Tensor | None,
+    ) -> Reconstruction:
         """The force of least misfit, a scalar function of the next positions (B, N, 3), plus lambda |f|^2."""
         sim, free, like = self.simulator, self._free(), state.q
 
         def objective(values: np.ndarray) -> tuple[float, np.ndarray]:
             force = torch.as_tensor(values, device=like.device, dtype=like.dtype).reshape(like.shape)
             force.requires_grad_(True)
-            new, _ = sim.step(state, free * force, material=self._tensors)
+            new, _ = sim.step(state, free * force, material=self._tensors, pressure=pressure)
             value = misfit_of(new.q) + self.regularisation * force.square().sum()
             (gradient,) = torch.autograd.grad(value, force)
             # In units of lambda both the objective and its change are of the size of f^2.
@@ -262,7 +297,7 @@ class LBFGSB(Reconstructor):
             )
         force = free * sim.tensor(result.x.reshape(like.shape))
         with torch.no_grad():
-            new, _ = sim.step(state, force, material=self._tensors)
+            new, _ = sim.step(state, force, material=self._tensors, pressure=pressure)
         return Reconstruction(new, force, int(result.nit))
 
 

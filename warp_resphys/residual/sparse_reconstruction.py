@@ -94,13 +94,20 @@ class SparseGaussNewton(_OnMarkers):
 
     @override
     @torch.no_grad()
-    def step(self, state: State, observed: torch.Tensor, first_guess: torch.Tensor | None = None) -> Reconstruction:
+    def step(
+        self,
+        state: State,
+        observed: torch.Tensor,
+        first_guess: torch.Tensor | None = None,
+        pressure: torch.Tensor | None = None,
+    ) -> Reconstruction:
         """Reconstructs the step from a state to observed markers.
 
         Args:
             state: where the step starts.
             observed: (B, m, 3), NaN where a marker was not seen [m].
             first_guess: not used.
+            pressure: (B, C) gauge pressure in each chamber during the step [Pa].
 
         Raises:
             ConvergenceError: the iterates did not settle.
@@ -110,7 +117,7 @@ class SparseGaussNewton(_OnMarkers):
         workspace = sim.workspace(state.batch)
         p = workspace.potential
         stage = sim.method.stage(state, sim.time_step)
-        p.set_terms(sim.step_terms(stage, state.batch, None, self._tensors, workspace))
+        p.set_terms(self._terms(stage, state, workspace, pressure))
         x = stage.target.clone()
         x[:, sim.fixed] = state.q[:, sim.fixed]
         force = torch.zeros_like(x)
@@ -192,18 +199,24 @@ class SparseLevenbergMarquardt(_OnMarkers):
 
     @override
     @torch.no_grad()
-    def step(self, state: State, observed: torch.Tensor, first_guess: torch.Tensor | None = None) -> Reconstruction:
+    def step(
+        self,
+        state: State,
+        observed: torch.Tensor,
+        first_guess: torch.Tensor | None = None,
+        pressure: torch.Tensor | None = None,
+    ) -> Reconstruction:
         """See `SparseGaussNewton.step`; the first guess is a force (B, N, 3) [N]."""
         force = torch.zeros_like(state.q) if first_guess is None else first_guess
         seen = torch.isfinite(observed)
-        new, objective = self._try(state, force, observed)
+        new, objective = self._try(state, force, observed, pressure)
         if not bool(torch.isfinite(objective).all()):
             force = torch.zeros_like(force)
-            new, objective = self._try(state, force, observed)
+            new, objective = self._try(state, force, observed, pressure)
         damping, done = torch.zeros_like(objective), torch.zeros_like(objective, dtype=torch.bool)
         for iteration in range(1, self.max_iterations + 1):
-            candidate = self._next_force(state, new, force, observed, seen, damping)
-            reached, value = self._try(state, torch.where(done[:, None, None], force, candidate), observed)
+            candidate = self._next_force(state, new, force, observed, seen, damping, pressure)
+            reached, value = self._try(state, torch.where(done[:, None, None], force, candidate), observed, pressure)
             simulated = torch.isfinite(value)
             better = simulated & (value <= objective)
             moved = torch.where(simulated, (reached.q - new.q).abs().amax((1, 2)), torch.inf)
@@ -226,10 +239,12 @@ class SparseLevenbergMarquardt(_OnMarkers):
             None,
         )
 
-    def _try(self, state: State, force: torch.Tensor, observed: torch.Tensor) -> tuple[State, torch.Tensor]:
+    def _try(
+        self, state: State, force: torch.Tensor, observed: torch.Tensor, pressure: torch.Tensor | None
+    ) -> tuple[State, torch.Tensor]:
         """Where a force leads, and the objective (B,) there; infinite where the simulator fails."""
         try:
-            new, _ = self.simulator.step(state, force, material=self._tensors)
+            new, _ = self.simulator.step(state, force, material=self._tensors, pressure=pressure)
         except ConvergenceError:
             return state, torch.full_like(state.q[:, 0, 0], torch.inf)
         missing = torch.nan_to_num(observed - self.markers(new.q))
@@ -244,13 +259,14 @@ class SparseLevenbergMarquardt(_OnMarkers):
         observed: torch.Tensor,
         seen: torch.Tensor,
         damping: torch.Tensor,
+        pressure: torch.Tensor | None,
     ) -> torch.Tensor:
         """(B, N, 3) the minimiser of the linearised objective; see the class's equations."""
         sim = self.simulator
         workspace = sim.workspace(state.batch)
         p = workspace.potential
         stage = sim.method.stage(state, sim.time_step)
-        p.set_terms(sim.step_terms(stage, state.batch, None, self._tensors, workspace))
+        p.set_terms(self._terms(stage, state, workspace, pressure))
         p.positions.copy_(sim.method.solution_for(state, new.q))
         p.evaluate()
         metric = workspace.adjoint_metric(sim.settings.linear_solver)
@@ -274,11 +290,17 @@ class SparseLBFGSB(_OnMarkers, LBFGSB):
     """
 
     @override
-    def step(self, state: State, observed: torch.Tensor, first_guess: torch.Tensor | None = None) -> Reconstruction:
+    def step(
+        self,
+        state: State,
+        observed: torch.Tensor,
+        first_guess: torch.Tensor | None = None,
+        pressure: torch.Tensor | None = None,
+    ) -> Reconstruction:
         """See `SparseGaussNewton.step`; the first guess is a force (B, N, 3) [N]."""
         seen = torch.isfinite(observed)
         return self._minimise(
-            state, lambda q: torch.where(seen, self.markers(q) - observed, 0.0).square().sum(), first_guess
+            state, lambda q: torch.where(seen, self.markers(q) - observed, 0.0).square().sum(), first_guess, pressure
         )
 
 

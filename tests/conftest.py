@@ -8,6 +8,8 @@ import torch
 import warp as wp
 from main_job import IN_RUN, TINY, files, run
 
+from warp_resphys.mesh import box_hexahedra
+from warp_resphys.report import render
 from warp_resphys.tasks import experiment
 
 wp.config.log_level = wp.LOG_WARNING
@@ -39,6 +41,16 @@ def reference_data() -> Path:
     if not folder.is_dir():
         pytest.skip("no reference trajectories: set WARP_RESPHYS_REFERENCE to a folder with their .npz files")
     return folder
+
+
+@pytest.fixture(scope="session")
+def can_draw() -> None:
+    """Skips where bodies cannot be drawn."""
+    mesh = box_hexahedra(divisions=(1, 1, 1))
+    try:
+        render.draw_bodies(mesh, {"box": mesh.vertices}, mesh.vertices)
+    except render.DrawingError as error:
+        pytest.skip(str(error))
 
 
 @pytest.fixture

@@ -70,6 +70,49 @@ def sag(rest, times, hung, model=None):
     return moved
 
 
+def describe_recordings(trials, followed, others, rng, release=61.3):
+    """What quality.json and registration.json hold, from the places of the registered markers by label [m]."""
+    labels, places = [*followed, *others], np.array([*followed.values(), *others.values()])
+    second, first_other, last = labels[1 % len(followed)], next(iter(others)), labels[-1]
+    quality, registration = {}, {}
+    for number, trial in enumerate(trials):
+        rows = [
+            {
+                "label": label,
+                "still": label in others,
+                "seen": 0.99 if number == 0 and label == second else 1.0,
+                "gaps": int(number == 0 and label == second),
+                "longest_gap_frames": 7,
+                "masked_frames": 7,
+                "jumps": [{"frame": 80, "mm": 0.31}] if label == first_other else [],
+                "noise_mm": 0.0071,
+                "drift_mm": 0.02 if label in others else None,
+                "reach_mm": 7.0,
+            }
+            for label in labels
+        ]
+        quality[trial] = {
+            "source": f"recordings/{trial}.c3d",
+            "rate_hz": 100.0,
+            "frames": 300,
+            "release_frame": release,
+            "held_frames": [10, 58],
+            "longest_gap_filled": 5,
+            "markers": rows,
+            "swaps": [],
+            "warnings": [f"{first_other} jumps once, by 0.31 mm, in frame 80."] if number < 2 else [],
+        }
+        residual = dict(zip(labels, (0.8 + 0.1 * number) * rng.uniform(0.5, 1.5, len(labels)), strict=True))
+        registration[trial] = {
+            "rms_mm": 0.82 + 0.1 * number,
+            "residual_mm": residual,
+            "outliers": [last] if number == 2 else [],
+            "shift_mm": {label: [0.2, 0.2, 0.2] for label in followed},
+            "positions": dict(zip(labels, places.tolist(), strict=True)),
+        }
+    return quality, registration
+
+
 def write_recordings(folder: Path, trials=TRIALS):
     """markers.h5, quality.json, registration.json and truth.json."""
     bound = np.array(list(FOLLOWED.values())) + 1e-4
@@ -91,43 +134,9 @@ def write_recordings(folder: Path, trials=TRIALS):
         create(file, "held", np.repeat(bound[None], len(trials), 0) + 2e-4, "m", 0)
         create(file, "bound", bound, "m", 0)
         create(file, "load", list(trials.values()), "kg", 0)
-    labels = [*FOLLOWED, *OTHERS]
-    quality, registration = {}, {}
-    for number, trial in enumerate(trials):
-        rows = [
-            {
-                "label": label,
-                "still": label in OTHERS,
-                "seen": 0.99 if number == 0 and label == "Tip - 2" else 1.0,
-                "gaps": int(number == 0 and label == "Tip - 2"),
-                "longest_gap_frames": 7,
-                "masked_frames": 7,
-                "jumps": [{"frame": 80, "mm": 0.31}] if label == "Base - 1" else [],
-                "noise_mm": 0.0071,
-                "drift_mm": 0.02 if label in OTHERS else None,
-                "reach_mm": 7.0,
-            }
-            for label in labels
-        ]
-        quality[trial] = {
-            "source": f"recordings/{trial}.c3d",
-            "rate_hz": 100.0,
-            "frames": 300,
-            "release_frame": 61.3,
-            "held_frames": [10, 58],
-            "longest_gap_filled": 5,
-            "markers": rows,
-            "swaps": [],
-            "warnings": ["Base - 1 jumps once, by 0.31 mm, in frame 80."] if number < 2 else [],
-        }
-        residual = dict(zip(labels, (0.8 + 0.1 * number) * rng.uniform(0.5, 1.5, len(labels)), strict=True))
-        registration[trial] = {
-            "rms_mm": 0.82 + 0.1 * number,
-            "residual_mm": residual,
-            "outliers": ["Base - 3"] if number == 2 else [],
-            "shift_mm": {label: [0.2, 0.2, 0.2] for label in FOLLOWED},
-            "positions": dict(zip(labels, np.concatenate([bound + 2e-4, base + 5e-4]).tolist(), strict=True)),
-        }
+    quality, registration = describe_recordings(
+        trials, dict(zip(FOLLOWED, bound + 2e-4, strict=True)), dict(zip(OTHERS, base + 5e-4, strict=True)), rng
+    )
     write_json(folder / "quality.json", quality)
     write_json(folder / "registration.json", registration)
     material = {"model": "stable_neo_hookean", "youngs_modulus": 250e3, "poissons_ratio": 0.49, "mass_damping": 1.0}

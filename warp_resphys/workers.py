@@ -17,6 +17,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any
 
 import torch
+import warp as wp
 from threadpoolctl import threadpool_limits
 
 from .errors import ResphysError
@@ -104,6 +105,7 @@ def _work(function: Callable[[Any, Advance], Any], connection: Connection) -> No
         connection.send(("advance", (count, fields)))
 
     torch.set_num_threads(1)
+    wp.config.log_level = wp.LOG_WARNING  # As in the parent: every worker would greet otherwise.
     with threadpool_limits(1):
         try:
             while True:

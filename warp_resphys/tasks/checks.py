@@ -14,9 +14,11 @@ from ..mesh import select_vertices
 from ..residual.networks import check_network
 from ..residual.reconstruction import make_reconstructor
 from ..residual.refinement import check_refinement
+from ..residual.sparse_reconstruction import make_sparse_reconstructor
 from ..residual.training import check_trainer
 from ..solver import SolverSettings
 from ..tuning.space import Dimension, dotted, fixed_settings, parse_space, with_settings
+from .actuated.checks import PRESSURE, check_driven
 from .kinds import is_list, is_number, is_whole_number, is_word
 from .measured.checks import RECORDINGS, check_measured
 from .trajectories import MODELS, training_settings, variation_of
@@ -40,6 +42,9 @@ _WORDS = (
     "device",
     "integrator",
     "data.twist_axis",
+    "mesh.cells",
+    "mesh.profile",
+    "mesh.outline",
     "*.kind",
     "*.model",
     "*.name",
@@ -52,6 +57,8 @@ _WHOLE_NUMBERS = (
     "seed",
     "data.steps",
     "data.limit.*",
+    "mesh.chambers",
+    "mesh.order",
     "*.max_iterations",
     "solver.memory",
     "solver.refactor_after",
@@ -71,6 +78,10 @@ _NUMBERS = (
     "fixed.*",
     "tip.*",
     "data.load.*",
+    "mesh.wall",
+    "mesh.web",
+    "mesh.core",
+    "mesh.layers",
     "simulation.*",
     "reality.*",
     "*.relative_tolerance",
@@ -78,9 +89,26 @@ _NUMBERS = (
     "reconstruction.*",
     "trainer.*",
 )
-_LISTS = ("gravity", "data.weights_g.*", "data.angles_deg.*")
+_LISTS = (
+    "gravity",
+    "data.weights_g.*",
+    "data.angles_deg.*",
+    "mesh.chamber_lengths",
+    "mesh.caps",
+    "mesh.radii",
+    "mesh.rotations",
+)
 _LEAST = {"trials": 1, "seed": 0}
-_OPTIONAL = ("trainer.linear_noise", "fixed.*", "tip.*", "data.load.*", "data.limit")
+_OPTIONAL = (
+    "reconstruction.modes",
+    "trainer.linear_noise",
+    "fixed.*",
+    "tip.*",
+    "data.load.*",
+    "data.limit",
+    "mesh.core",
+    "mesh.layers",
+)
 # Groups that are handed on as keyword arguments.
 _TAKEN_BY: Mapping[str, Callable[..., Any]] = {
     "simulation": Material,
@@ -102,7 +130,8 @@ def check_configuration(config: Mapping[str, Any]) -> None:
         InputError: a value of the wrong kind or out of range, or an unknown key.
     """
     _check_groups(config, _GROUPS)
-    measured = config["data"].get("kind") == RECORDINGS
+    kind_of_data = config["data"].get("kind")
+    measured = kind_of_data in (RECORDINGS, PRESSURE)
     if measured:
         _check_groups(config, ("markers",))
     else:
@@ -122,7 +151,10 @@ def check_configuration(config: Mapping[str, Any]) -> None:
     for key, function in _TAKEN_BY.items():
         if key not in config:
             continue
-        known = [name for name in inspect.signature(function).parameters if name not in ("mesh", "simulator")]
+        if key == "reconstruction" and kind_of_data == PRESSURE:
+            function = make_sparse_reconstructor
+        own_names = inspect.signature(function).parameters
+        known = [name for name in own_names if name not in ("mesh", "simulator", "markers")]
         for name in config[key]:
             if name not in known:
                 raise InputError(f"unknown key '{key}.{name}': {key} has {', '.join(known)}.")
@@ -131,7 +163,9 @@ def check_configuration(config: Mapping[str, Any]) -> None:
         raise InputError(f"simfree is {own!r}: it must be a group of the groups network and trainer.")
     for model in MODELS:
         _check_training(config, model)
-    if measured:
+    if kind_of_data == PRESSURE:
+        check_driven(config)
+    elif measured:
         check_measured(config)
     else:
         check_refinement(config["refinement"], config["data"]["steps"])
@@ -161,7 +195,7 @@ def check_tuning(config: Mapping[str, Any]) -> dict[str, Dimension]:
         InputError: a value of the wrong kind or out of range, also among those that may be tried.
     """
     tune = config["tune"]
-    if config["data"]["kind"] == RECORDINGS:
+    if config["data"]["kind"] in (RECORDINGS, PRESSURE):
         raise InputError(
             f"task=tune does not search the networks of the experiment {config['name']}, which learns from recordings: "
             "set network and in_the_loop, and simfree and trainer for the baseline, and compare runs with --multirun."

@@ -14,6 +14,8 @@ from ..files import write_json
 from ..report.page import number_text
 from ..stages import Stage, StageContext, run_stages
 from .ablation import run_ablation
+from .actuated.checks import PRESSURE
+from .actuated.experiment import run_driven
 from .checks import check_configuration
 from .evaluate import evaluate
 from .generate import generate
@@ -129,6 +131,9 @@ def run_experiment(config: DictConfig) -> None:
     plain, folder = prepare(config)
     if plain["data"]["kind"] == RECORDINGS:
         run_measured(plain, folder)
+        return
+    if plain["data"]["kind"] == PRESSURE:
+        run_driven(plain, folder)
         return
     if "markers" in plain:
         run_ablation(shown(plain), simulated(plain), folder)

@@ -19,6 +19,8 @@ T = TypeVar("T")
 SPLITS = ("train", "validation", "test")
 STAGES = ("generate", "reconstruct", "train", "refine", "train_simfree", "evaluate", "time", "report")
 
+_OF_CHAMBERS = ("chambers", "fibres", "pressure_coupling")
+
 MODELS = ("resphys", "simfree")  # that are trained
 _SIMULATED = ("mesh", "physics", "fixed", "gravity", "time_step", "integrator", "solver", "device", "dtype")
 
@@ -40,6 +42,7 @@ REPORT = "report.html"
 def simulated(config: Mapping[str, Any]) -> dict[str, Any]:
     """The settings that every simulation of an experiment depends on."""
     base = {key: config[key] for key in _SIMULATED}
+    base |= {key: config[key] for key in _OF_CHAMBERS if key in config}
     if config["mesh"]["kind"] == "file":
         base["mesh_digest"] = digest(config["mesh"]["path"])
     return base

@@ -47,7 +47,7 @@ def evaluate_markers(context: StageContext) -> None:
     summary: dict[str, Any] = {
         "errors_mm": {m: summarise(rows) for m, rows in errors.items()},
         "per_trajectory": summarise_each(names, errors),
-        "per_marker": {m: _per_marker(markers[m], observed, scene.labels) for m in models},
+        "per_marker": {m: per_marker(markers[m], observed, scene.labels) for m in models},
     }
     shift = releases["identified"].shift
     if shift is not None:
@@ -68,7 +68,7 @@ def marker_errors(simulated: NDArray[np.float64], observed: NDArray[np.float64])
     return np.asarray(1e3 * distance.sum(1)[any_seen] / seen.sum(1)[any_seen])
 
 
-def _per_marker(
+def per_marker(
     simulated: NDArray[np.float64], observed: NDArray[np.float64], labels: tuple[str, ...]
 ) -> dict[str, float | None]:
     """Mean error of each marker [mm]; None where a roll-out diverged."""

@@ -1,12 +1,13 @@
 """Stage: the physical parameters that explain the training trials."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
+from ...driven import DRIVEN_PARAMETERS
 from ...errors import InputError
 from ...files import read_json, write_json
 from ...identification import Bounds, Identifier
@@ -39,33 +40,47 @@ def identify(context: StageContext) -> None:
     )
     evaluations = (2 if elastic else 1) * config["starts"] * config["max_evaluations"]
     replays = cache(partial(scene.replay, names=train))
-    done = sum(_evaluations(_kept(context, kind)) for kind in ("identified", "simulation"))
+    done = sum(evaluations_done(kept_of(context, kind)) for kind in ("identified", "simulation"))
     with Progress("identify", evaluations, "evaluations at most", done) as progress:
-        found = {"sysid": _search(context, replays, "identified", bounds, progress)}
+        seconds = settings["data"]["seconds"]
+        found = {"sysid": search(context, "identified", bounds, replays, seconds, progress)}
         if elastic:
-            found["sysid_elastic"] = _search(context, replays, "simulation", elastic, progress)
-    found[_LANDSCAPE] = _landscape(context, *replays("identified"), bounds, found["sysid"]["parameters"])
+            found["sysid_elastic"] = search(context, "simulation", elastic, replays, seconds, progress)
+    found[_LANDSCAPE] = landscape(context, *replays("identified"), bounds, found["sysid"]["parameters"])
     write_json(context.run_dir / IDENTIFICATION, found)
-    for part in _PARTS:
-        _kept_file(context, part).unlink(missing_ok=True)
+    remove_kept(context)
 
 
 def first_guess(settings: Mapping[str, Any], names: Any) -> dict[str, float]:
     """What the parameters are before anything is known: those of the uncorrected simulation."""
-    values = {**dict.fromkeys(PARAMETERS, 0.0), "attached_mass_factor": 1.0}
+    values = {**dict.fromkeys(DRIVEN_PARAMETERS, 0.0), "attached_mass_factor": 1.0}
     values |= {key: value for key, value in settings["simulation"].items() if key != "model"}
     return {name: values[name] for name in names}
 
 
-def _search(
-    context: StageContext, replays: Replays, kind: str, bounds: Mapping[str, Bounds], progress: Progress
+def search(
+    context: StageContext,
+    kind: str,
+    bounds: Mapping[str, Bounds],
+    replays: Replays,
+    seconds: float | None,
+    progress: Progress,
 ) -> dict[str, Any]:
-    """The `Identification` of a simulator, as plain data."""
-    kept = _kept(context, kind)
+    """The `Identification` of a simulator, as plain data; goes on from where an interrupted one ended.
+
+    Args:
+        context: of the stage, with the group ``identify``.
+        kind: of the simulator.
+        bounds: ranges of the parameters.
+        replays: of a kind of simulator, and how their motions begin.
+        seconds: how much of each motion counts.
+        progress: of the evaluations.
+    """
+    kept = kept_of(context, kind)
     if "found" in kept:
         return dict(kept["found"])
     config = context.settings["identify"]
-    identifier = Identifier(*replays(kind), bounds, context.settings["data"]["seconds"])
+    identifier = Identifier(*replays(kind), bounds, seconds)
     if "starts" not in kept:
         guess = first_guess(context.settings, bounds)
         guess |= {name: value for name, value in config["first_guess"].items() if name in bounds}
@@ -84,26 +99,27 @@ def _search(
     return dict(_keep(context, kind, {"found": asdict(found)})["found"])
 
 
-def _evaluations(kept: Mapping[str, Any]) -> int:
+def evaluations_done(kept: Mapping[str, Any]) -> int:
     """How many went into what is kept of a search."""
     attempts = [each["history"] for each in kept.get("attempts", ())]
     return sum(map(len, kept["found"]["history"] if "found" in kept else attempts))
 
 
-def _landscape(
+def landscape(
     context: StageContext,
     replay: Replay,
     release: Release,
     bounds: Mapping[str, Bounds],
     found: Mapping[str, float],
+    seconds: float | None = None,
 ) -> dict[str, Any]:
     """Losses around the identified parameters: a range and a number of points for E, and for nu if that is wanted."""
     grid = context.settings["identify"]["grid"]
     axes = {name: Bounds(each["lower"], each["upper"], each["logarithmic"]) for name, each in grid.items()}
     others = {name: b for name, b in bounds.items() if name not in axes}
-    identifier = Identifier(replay, release, {**axes, **others})
+    identifier = Identifier(replay, release, {**axes, **others}, seconds)
     counts = {name: int(each["points"]) for name, each in grid.items()}
-    finished = [math.inf if loss is None else loss for loss in _kept(context, _LANDSCAPE).get("losses", [])]
+    finished = [math.inf if loss is None else loss for loss in kept_of(context, _LANDSCAPE).get("losses", [])]
     with Progress(f"{context.name}: landscape", math.prod(counts.values()), "points", len(finished)) as progress:
 
         def report(losses: list[float]) -> None:
@@ -113,6 +129,12 @@ def _landscape(
         losses = identifier.grid(counts, found, _AT_ONCE, finished, report)
     ticks = {name: identifier.ticks(name, count).tolist() for name, count in counts.items()}
     return {**ticks, "loss": losses.tolist()}
+
+
+def remove_kept(context: StageContext) -> None:
+    """Removes what was kept of the parts, once all is done."""
+    for part in _PARTS:
+        _kept_file(context, part).unlink(missing_ok=True)
 
 
 def _kept_file(context: StageContext, part: str) -> Path:
@@ -125,21 +147,25 @@ def _keep(context: StageContext, part: str, content: dict[str, Any]) -> dict[str
     return content
 
 
-def _kept(context: StageContext, part: str) -> dict[str, Any]:
+def kept_of(context: StageContext, part: str) -> dict[str, Any]:
     """What an interrupted run kept of a part; nothing if it had other settings."""
     path = _kept_file(context, part)
     kept: dict[str, Any] = read_json(path) if path.is_file() else {}
     return kept if kept.get("fingerprint") == context.fingerprint else {}
 
 
-def check_identification(config: Mapping[str, Any]) -> None:
+def check_identification(config: Mapping[str, Any], known_parameters: Sequence[str] = PARAMETERS) -> None:
     """Checks the group ``identify``.
+
+    Args:
+        config: the group.
+        known_parameters: that may be identified.
 
     Raises:
         InputError: a value out of range, or an unknown parameter.
     """
-    for key, known in (("parameters", PARAMETERS), ("elastic", _ELASTIC)):
-        for name, each in (config[key] or {}).items():
+    for key, known in (("parameters", known_parameters), ("elastic", _ELASTIC)):
+        for name, each in (config.get(key) or {}).items():
             if name not in known:
                 raise InputError(f"identify.{key} names '{name}': choose from {', '.join(known)}.")
             try:

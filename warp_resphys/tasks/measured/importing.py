@@ -103,7 +103,7 @@ def import_recordings(context: StageContext) -> None:
         create(file, "load", [each.trial.hung for each in observed], units="kg")
     write_json(context.run_dir / QUALITY, {name: found.to_plain() for name, found in quality_of.items()})
     registrations = {
-        each.trial.name: _registration_summary(each.registration, followed, -shifts[row])
+        each.trial.name: registration_summary(each.registration, followed, -shifts[row])
         for row, each in enumerate(observed)
     }
     if verticals is not None:
@@ -275,7 +275,7 @@ def _angle(a: FloatArray, b: FloatArray) -> float:
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
 
 
-def _registration_summary(registration: Registration, followed: Sequence[str], shift: FloatArray) -> dict[str, Any]:
+def registration_summary(registration: Registration, followed: Sequence[str], shift: FloatArray) -> dict[str, Any]:
     """For registration.json: lengths in millimetres, but for the positions in the frame of the body, in metres."""
     residual = dict(zip(registration.names, _MILLI * registration.residual, strict=True))
     return {

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from ...configured import build_mesh, choose_device
 from ...errors import DataFileError
 from ...files import read_array, read_hdf5, read_json
 from ...mesh import Mesh, select_vertices
-from ...metrics import PUBLISHED_MM, PublishedError
+from ...metrics import published_errors
 from ...registration import Registration, RigidTransform
 from ...replay import PARAMETERS
 from ...report.measured_data import FoldsReport, MeasuredReport, Recordings, Trials
@@ -53,20 +54,20 @@ def report_measured(context: StageContext) -> None:
     """
     folder, config = context.run_dir, context.settings["config"]
     mesh = build_mesh(config["mesh"])
-    metrics, truth = _metrics(folder, config), _read_if_there(_common(folder) / TRUTH)
+    metrics, truth = read_metrics(folder, config), read_if_there(_common(folder) / TRUTH)
     data = MeasuredReport(
         experiment=config["name"],
         title=config["title"],
         metrics=metrics,
         settings=config,
-        published=_published(config["name"]),
+        published=published_errors(config["name"]),
         published_note=PUBLISHED_NOTE,
-        notes=_notes(metrics.get("sideways_mm", {}), truth),
+        notes=error_notes(metrics.get("sideways_mm", {}), truth),
         mesh=mesh,
         fixed=select_vertices(mesh, **config["fixed"]),
         trials=read_trials(folder, config),
         recordings=read_recordings(_common(folder), config, mesh),
-        identification=_read_if_there(folder / IDENTIFICATION),
+        identification=read_if_there(folder / IDENTIFICATION),
         start=first_guess(config, PARAMETERS),
         truth=truth.get("material", {}),
         training={m: read_json(path)["epochs"] for m in TRAINED if (path := folder / training_file(m)).is_file()},
@@ -93,9 +94,9 @@ def report_folds(context: StageContext) -> None:
         metrics=metrics,
         pages={trial: f"{fold_folder(trial)}/{REPORT}" for trial in metrics["folds"]},
         settings=config,
-        published=_published(config["name"]),
+        published=published_errors(config["name"]),
         published_note=PUBLISHED_NOTE,
-        notes=_notes(sideways, {}),
+        notes=error_notes(sideways, {}),
         mesh=mesh,
         fixed=select_vertices(mesh, **config["fixed"]),
         recordings=read_recordings(folder, config, mesh),
@@ -105,22 +106,18 @@ def report_folds(context: StageContext) -> None:
     write_folds_report(folder / REPORT, data)
 
 
-def _published(name: str) -> Mapping[str, PublishedError]:
-    """The published errors of the experiment, or of the one that it is a variant of."""
-    return next((errors for known, errors in PUBLISHED_MM.items() if name.startswith(known)), {})
-
-
 def _common(folder: Path) -> Path:
     """Where the files lie that do not depend on the fold: here, or beside the folders of the folds."""
     return folder if (folder / MARKERS).is_file() else folder.parent
 
 
-def _read_if_there(path: Path) -> dict[str, Any]:
+def read_if_there(path: Path) -> dict[str, Any]:
+    """What a JSON file holds; nothing where there is none."""
     content: dict[str, Any] = read_json(path) if path.is_file() else {}
     return content
 
 
-def _metrics(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
+def read_metrics(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
     """Errors, time and memory of the stages that are done, in the order of their end, versions and device."""
     records = sorted((folder / "stages").glob("*.json"), key=lambda path: path.stat().st_mtime_ns)
     return {
@@ -131,7 +128,7 @@ def _metrics(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _notes(sideways: Mapping[str, float], truth: Mapping[str, Any]) -> list[str]:
+def error_notes(sideways: Mapping[str, float], truth: Mapping[str, Any]) -> list[str]:
     """How the bodies of the test trials were held, and what of the errors is noise, as far as these are known."""
     notes = []
     if sideways:
@@ -181,8 +178,20 @@ def read_trials(folder: Path, config: Mapping[str, Any]) -> Trials:
     )
 
 
-def read_recordings(folder: Path, config: Mapping[str, Any], mesh: Mesh) -> Recordings:
-    """Quality and registration of all trials; the picture is of the one that fits worst."""
+def read_recordings(
+    folder: Path, config: Mapping[str, Any], mesh: Mesh, moved: Mapping[str, FloatArray] = MappingProxyType({})
+) -> Recordings:
+    """Quality and registration of all trials; the picture is of the one that fits worst.
+
+    Args:
+        folder: of the run.
+        config: with the group ``markers``.
+        mesh: the body as it is at rest.
+        moved: (3,) how far nominal places, which are on the undeformed body, move until it is at rest, by label [m].
+
+    Raises:
+        DataFileError: a file is missing or damaged.
+    """
     residuals = read_json(folder / REGISTRATION)
     worst = max(residuals, key=lambda trial: residuals[trial]["rms_mm"])
     each = residuals[worst]
@@ -209,8 +218,9 @@ def read_recordings(folder: Path, config: Mapping[str, Any], mesh: Mesh) -> Reco
         residuals=residuals,
         registration=registration,
         drawn=worst,
-        nominal=np.array([nominal[label] for label in labels], dtype=np.float64),
+        nominal=np.array([np.add(nominal[label], moved.get(label, 0.0)) for label in labels], dtype=np.float64),
         feet=feet,
+        mesh=mesh,
     )
 
 

@@ -1,0 +1,1 @@
+"""Experiments on bodies that pressure drives, recorded or simulated."""

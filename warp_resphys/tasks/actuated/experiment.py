@@ -1,0 +1,179 @@
+"""An experiment with pressures: its stages in order, from a configuration."""
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from ...errors import DataFileError
+from ...files import digest, read_json, write_json
+from ...report.page import number_text
+from ...stages import Stage, package_versions, resources_used, run_stages
+from ..measured.files import (
+    ERRORS,
+    IDENTIFICATION,
+    METRICS,
+    QUALITY,
+    REGISTRATION,
+    REPORT,
+    ROLLOUTS,
+    TRUTH,
+    recording_file,
+    training_file,
+    weights_file,
+)
+from ..trajectories import shown, simulated, training_settings
+from .evaluate import evaluate_driven
+from .files import LEARNED, MOTIONS, RECONSTRUCTED, RECONSTRUCTION
+from .identify import identify_driven
+from .importing import import_driven
+from .parts import processes_for
+from .reconstruct import reconstruct_driven
+from .report import report_driven
+from .synthesise import synthesise_driven
+from .train import train_driven, train_simfree_driven
+from .trials import groups_of, is_synthetic, split_of, trials_of
+
+_TRIALS = ("folder", "trials", "sequences", "train", "validation", "test", "factors", "limit")
+_SYNTHESISED = (
+    "synthetic",
+    "fixed",
+    "chambers",
+    "gravity",
+    "time_step",
+    "solver",
+    "device",
+    "dtype",
+    "seed",
+)
+_SYNTHESISED_MARKERS = ("followed", "others", "bind", "bind_to", "largest_distance")
+_LEARNED = ("markers", "simulation", "actuation")
+
+
+def driven_stages(config: Mapping[str, Any]) -> list[Stage]:
+    """The stages of an experiment.
+
+    Args:
+        config: that `check_configuration` accepts.
+
+    Raises:
+        DataFileError: a recording that is not there.
+    """
+    trials, split = trials_of(config), split_of(config)
+    processes = processes_for(config)
+    base = {**simulated(config), **{key: config[key] for key in _LEARNED}, "batch": config["parallel"]["batch"]}
+    later = ("windows", "train_fraction")
+    imported = {**base, "data": {key: value for key, value in config["data"].items() if key not in later}}
+    stages = []
+    if is_synthetic(config):
+        data = {key: config["data"][key] for key in (*_TRIALS, "steps", "pressure_limit")}
+        markers = {key: config["markers"][key] for key in _SYNTHESISED_MARKERS}
+        own = {**{key: config[key] for key in _SYNTHESISED}, "data": data, "markers": markers, "batch": base["batch"]}
+        if config["synthetic"]["mesh"]["kind"] == "file":
+            own["mesh_digest"] = digest(config["synthetic"]["mesh"]["path"])
+        files = (*(recording_file(trial.name) for trial in trials), TRUTH)
+        stages.append(
+            Stage("synthesise", partial(synthesise_driven, processes=processes), files, own, processes=processes)
+        )
+    else:
+        imported["recordings"] = {trial.name: _digest(trial.file) for trial in trials}
+    needs = tuple(stage.name for stage in stages)
+    imported["split"] = {name: list(getattr(split, name)) for name in ("train", "validation")}
+    stages.append(Stage("import", import_driven, (MOTIONS, QUALITY, REGISTRATION), imported, needs))
+    data = {key: config["data"][key] for key in ("train_fraction",)}
+    learned = {**base, "data": data, "split": {name: list(getattr(split, name)) for name in ("train", "validation")}}
+    stages += [
+        Stage(
+            "identify",
+            identify_driven,
+            (IDENTIFICATION,),
+            {**learned, **_pick(config, "identify", "seed")},
+            ("import",),
+        ),
+        Stage(
+            "reconstruct",
+            partial(reconstruct_driven, processes=processes),
+            (RECONSTRUCTED, RECONSTRUCTION),
+            {**learned, **_pick(config, "reconstruction")},
+            ("import", "identify"),
+            processes=processes,
+        ),
+    ]
+    for model, function in zip(LEARNED, (train_simfree_driven, train_driven), strict=True):
+        settings = {**learned, **training_settings(dict(config), model)}
+        outputs = (weights_file(model), training_file(model))
+        stages.append(Stage(f"train_{model}", function, outputs, settings, ("import", "identify", "reconstruct")))
+    tested = {**base, "data": {"windows": config["data"]["windows"]}, "tip": config["tip"], "groups": groups_of(config)}
+    trained = tuple(f"train_{model}" for model in LEARNED)
+    stages += [
+        Stage(
+            "evaluate",
+            partial(evaluate_driven, processes=processes),
+            (ROLLOUTS, ERRORS),
+            tested,
+            ("import", "identify", *trained),
+            processes=processes,
+        ),
+        Stage("report", report_driven, (REPORT,), {"config": shown(config)}, ("evaluate",)),
+    ]
+    return stages
+
+
+def _pick(config: Mapping[str, Any], *keys: str) -> dict[str, Any]:
+    return {key: config[key] for key in keys}
+
+
+def _digest(path: Path | None) -> str:
+    try:
+        return digest(str(path))
+    except OSError as error:
+        raise DataFileError(f"cannot read {path} ({error.strerror}): check data.folder and data.trials.") from error
+
+
+def run_driven(config: dict[str, Any], folder: Path) -> None:
+    """Runs what has changed, writes metrics.json, and prints the errors."""
+    stages = driven_stages(config)
+    *before, report = stages
+    run_stages(before, folder)
+    write_json(folder / METRICS, collect_metrics(folder, before))
+    run_stages([*before, report], folder)
+    metrics = collect_metrics(folder, stages)
+    write_json(folder / METRICS, metrics)
+    _print(metrics, folder)
+
+
+def collect_metrics(folder: Path, stages: list[Stage]) -> dict[str, Any]:
+    """Errors, the noise in them where known, identified parameters, time and memory of the stages, and versions."""
+    names = [stage.name for stage in stages]
+    return {
+        **read_json(folder / ERRORS),
+        **({"noise_mm": read_json(folder / TRUTH)["noise_mm"]} if "synthesise" in names else {}),
+        "reconstruction": read_json(folder / RECONSTRUCTION),
+        "parameters": {"sysid": read_json(folder / IDENTIFICATION)["sysid"]["parameters"]},
+        **resources_used(folder, names),
+        "versions": package_versions(),
+    }
+
+
+def _print(metrics: Mapping[str, Any], folder: Path) -> None:
+    """Errors as a table, a column for every window and pressure factor, and where the report is."""
+    windows, factors = metrics["windows"], metrics.get("overpressure", {})
+    columns = [*(f"first {seconds} s" for seconds in windows), *(f"{factor} x pressure" for factor in factors)]
+    table = Table("model", "mean [mm]", *columns, "diverged", title="Error of the markers, test split")
+    for model, summary in metrics["errors_mm"].items():
+        each = [number_text(group[model]["mean"]) for group in (*windows.values(), *factors.values())]
+        table.add_row(model, number_text(summary["mean"]), *each, str(summary["diverged"]))
+    console = Console()
+    console.print(table)
+    for model, found in metrics["range"].items():
+        if found["left"]:
+            first = min(found["first_s"].values())
+            console.print(
+                f"{model}: {found['left']} test trials leave the states of the training, from {first:.2f} s on."
+            )
+    if "noise_mm" in metrics:
+        console.print(f"The noise of the markers alone is {number_text(metrics['noise_mm'])} mm.")
+    console.print(f"Report: {folder / REPORT}", soft_wrap=True)

@@ -1,0 +1,75 @@
+"""Stage: the forces that bring the identified simulator to the markers it should have learned from."""
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ...files import atomic_hdf5, create, write_json
+from ...residual.sparse_reconstruction import make_sparse_reconstructor
+from ...stages import StageContext
+from ...workers import Advance
+from ..measured.evaluate import marker_errors
+from .files import RECONSTRUCTED, RECONSTRUCTION
+from .parts import Made, Part, read_parts, remove_parts, split_into_parts, work_on
+from .scene import DrivenScene
+
+_UNITS = {"q": "m", "v": "m/s", "force": "N"}
+
+
+def reconstruct_driven(context: StageContext, processes: int = 1) -> None:
+    """Writes reconstruction.h5: q, v and force (R, K + 1, N, 3) of the trials of training and validation.
+
+    They are kept in single precision, which rounds positions to 1e-8 m. And reconstruction.json: how far the
+    reconstructed markers are from those that were seen.
+    """
+    settings = context.settings
+    names = tuple(settings["split"]["train"]) + tuple(settings["split"]["validation"])
+    parts = split_into_parts(context, names, settings["batch"])
+    work_on(parts, reconstruct_part, processes, DrivenScene(settings, context.run_dir).learned_steps)
+    with atomic_hdf5(context.run_dir / RECONSTRUCTED, "reconstruction", {"names": list(names)}) as file:
+        for name, unit in _UNITS.items():
+            create(file, name, read_parts(parts, name), unit, time_axis=1)
+    errors = read_parts(parts, "error")  # (R, K + 1) [mm], NaN where no marker was seen
+    summary = {"mean_mm": float(np.nanmean(errors)), "max_mm": float(np.nanmax(errors))}
+    write_json(context.run_dir / RECONSTRUCTION, summary)
+    remove_parts(context)
+
+
+def reconstruct_part(part: Part, advance: Advance) -> dict[str, Made]:
+    """q, v, force (B, K + 1, N, 3) and the distance of the markers (B, K + 1) [mm] of some trials.
+
+    Raises:
+        ConvergenceError: a step fails.
+    """
+    settings = part.context.settings
+    scene = DrivenScene(settings, part.context.run_dir)
+    simulator, observed = scene.simulator, scene.smoothed(part.names)
+    tensors, drive = scene.tensors("resphys", part.names), scene.drive("resphys", part.names)
+    reconstructor = make_sparse_reconstructor(simulator, scene.markers, **settings["reconstruction"])
+    reconstructor = reconstructor.with_tensors(tensors)
+    batch = len(part.names)
+    state = simulator.static_equilibrium(material=tensors, batch=batch)
+    force = torch.zeros_like(state.q)
+    fields: dict[str, list[NDArray[np.float32]]] = {name: [] for name in (*_UNITS, "error")}
+
+    def keep(target: torch.Tensor) -> None:
+        for name, value in (("q", state.q), ("v", state.v), ("force", force)):
+            fields[name].append(value.cpu().numpy().astype(np.float32))
+        reached = scene.markers(state.q).cpu().numpy()
+        errors = [_error(x, y) for x, y in zip(reached, target.cpu().numpy(), strict=True)]
+        fields["error"].append(np.array(errors, dtype=np.float32))
+
+    with torch.no_grad():
+        keep(observed[:, 0])
+        for k in range(1, scene.learned_steps + 1):
+            result = reconstructor.step(state, observed[:, k], force, drive.pressure[:, k - 1])
+            state, force = result.state.detach(), result.force
+            keep(observed[:, k])
+            advance(batch)
+    return {name: (np.stack(values, axis=1), _UNITS.get(name, "mm")) for name, values in fields.items()}
+
+
+def _error(reached: NDArray[np.float64], observed: NDArray[np.float64]) -> float:
+    """Mean distance of the markers of a frame that were seen [mm]; NaN if none was."""
+    found = marker_errors(reached[None], observed[None])
+    return float(found[0]) if len(found) else float("nan")

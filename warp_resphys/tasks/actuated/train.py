@@ -1,0 +1,151 @@
+"""Stages: the residual force and the data-driven baseline, from the reconstructed training trials."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from ...configured import choose_device
+from ...files import read_array, read_checkpoint, read_hdf5, write_checkpoint
+from ...metrics import summarise
+from ...modes import RestStiffness
+from ...residual.driven_rollout import DrivenDataRollout, DrivenHybridRollout, Range, WatchedModel
+from ...residual.networks import NextState, StateMap, build_model, build_next_state
+from ...residual.rollout import Rollout
+from ...residual.training import Samples, Trainer
+from ...stages import StageContext
+from ..measured.evaluate import marker_errors
+from ..measured.files import training_file, weights_file
+from ..train import fit
+from .files import RECONSTRUCTED
+from .scene import DrivenScene
+
+_MARGIN = 0.25  # of the width of the training range, by which a roll-out may exceed it on either side
+
+
+@dataclass(frozen=True)
+class Reconstructed:
+    """The states and forces that networks learn from.
+
+    Attributes:
+        now: (S, N, 3) positions and velocities.
+        following: those one step on.
+        force: (S, N, 3) that leads there.
+        inputs: (S, A) what the networks are told of the pressures.
+    """
+
+    now: tuple[torch.Tensor, torch.Tensor]
+    following: tuple[torch.Tensor, torch.Tensor]
+    force: torch.Tensor
+    inputs: torch.Tensor
+
+
+def read_reconstructed(context: StageContext, scene: DrivenScene, device: torch.device) -> dict[str, Reconstructed]:
+    """What the stage ``reconstruct`` left of each split, in double precision."""
+    with read_hdf5(context.run_dir / RECONSTRUCTED, "reconstruction") as file:
+        found = {name: torch.as_tensor(read_array(file, name)) for name in ("q", "v", "force")}
+    split, first, parts = context.settings["split"], 0, {}
+    for name in ("train", "validation"):
+        rows = slice(first, first + len(split[name]))
+        first = rows.stop
+        fields = [found[key][rows].to(device, torch.float64) for key in ("q", "v", "force")]
+        steps = fields[0].shape[1] - 1
+        inputs = scene.drive("resphys", tuple(split[name])).inputs[:, :steps].flatten(0, 1).to(device)
+        # What no marker saw has no force to learn.
+        seen = torch.isfinite(scene.smoothed(tuple(split[name]))[:, 1 : steps + 1]).all(-1).any(-1).flatten().to(device)
+        now, following = (
+            [f[:, part].flatten(0, 1)[seen] for f in fields] for part in (slice(None, -1), slice(1, None))
+        )
+        parts[name] = Reconstructed((now[0], now[1]), (following[0], following[1]), following[2], inputs[seen])
+    return parts
+
+
+def train_driven(context: StageContext) -> None:
+    """Trains the residual force: resphys.safetensors and training_resphys.json."""
+    scene = DrivenScene(context.settings, context.run_dir, "count")
+    found = read_reconstructed(context, scene, choose_device(context.settings["device"]))
+    train = found["train"]
+    rest = scene.simulator.rest_positions.to(train.force.device)
+    torch.manual_seed(context.settings["seed"])
+    stiffness = RestStiffness(scene.simulator)
+    model = build_model(context.settings["network"], rest, *train.now, train.force, train.inputs, stiffness)
+    samples = {name: Samples(*each.now, (each.force,), each.inputs) for name, each in found.items()}
+    _fit(context, scene, model, samples, "resphys", "residual force")
+
+
+def train_simfree_driven(context: StageContext) -> None:
+    """Trains the data-driven baseline on the same states: simfree.safetensors and training_simfree.json."""
+    scene = DrivenScene(context.settings, context.run_dir, "count")
+    found = read_reconstructed(context, scene, choose_device(context.settings["device"]))
+    train = found["train"]
+    rest = scene.simulator.rest_positions.to(train.force.device)
+    torch.manual_seed(context.settings["seed"])
+    model = build_next_state(context.settings["network"], rest, *train.now, train.inputs)
+    samples = {
+        name: Samples(*each.now, (each.following[0] - rest, each.following[1]), each.inputs)
+        for name, each in found.items()
+    }
+    _fit(context, scene, model, samples, "simfree", "next state")
+
+
+def _fit(
+    context: StageContext, scene: DrivenScene, model: Any, samples: Mapping[str, Samples], name: str, kind: str
+) -> None:
+    """Trains, chooses by roll-outs of the validation trials, and keeps the range of the training beside the weights."""
+    settings, train = context.settings, samples["train"]
+    error = validation_error(scene, name, tuple(settings["split"]["validation"]))
+    trainer: Trainer[Any] = Trainer(model, train, samples["validation"], error, settings["trainer"], settings["seed"])
+    with torch.no_grad():
+        inputs = model.encode(train.q, train.v, train.actuation)
+    fit(context, trainer, weights_file(name), training_file(name), kind)
+    path = context.run_dir / weights_file(name)
+    tensors, description = read_checkpoint(path, kind)
+    write_checkpoint(path, kind, tensors, {**description, "range": Range.of(inputs, _MARGIN).description()})
+
+
+def rollout_of(
+    scene: DrivenScene,
+    name: str,
+    model: StateMap | None,
+    trials: tuple[str, ...],
+    predict: WatchedModel | None = None,
+) -> Rollout:
+    """A roll-out of a model of that name, over some trials.
+
+    Args:
+        scene: of the experiment.
+        name: one of `files.MODELS`.
+        model: what it has learned; None for a simulator alone.
+        trials: their names.
+        predict: the model as a predictor that is watched; one that is not, if None.
+    """
+    drive = scene.drive(name, trials)
+    if predict is None and model is not None:
+        predict = WatchedModel(model)
+    if isinstance(model, NextState):
+        assert predict is not None
+        return DrivenDataRollout(scene.simulator, predict, drive)
+    return DrivenHybridRollout(scene.simulator, predict, drive, scene.tensors(name, trials))
+
+
+def validation_error(scene: DrivenScene, name: str, trials: tuple[str, ...]) -> Callable[[StateMap], float]:
+    """The mean error of a model's markers over what is learned from [mm]; infinite where a roll-out diverged."""
+    motions = scene.pick(trials)
+    observed = motions.markers[:, : scene.learned_steps + 1].cpu().numpy()
+    start = scene.simulator.static_equilibrium(material=scene.tensors(name, trials), batch=len(trials))
+
+    def error(model: StateMap) -> float:
+        rollout, state = rollout_of(scene, name, model, trials), start
+        series = [scene.markers(state.q)]
+        for _ in range(observed.shape[1] - 1):
+            state = rollout.step(state)
+            lost = rollout.lost(state)[:, None, None]
+            if bool(lost.all()):
+                return float("inf")
+            series.append(torch.where(lost, torch.nan, scene.markers(state.q)))
+        found = torch.stack(series, 1).cpu().numpy()
+        mean = summarise([marker_errors(x, y) for x, y in zip(found, observed, strict=True)])["mean"]
+        return float("inf") if mean is None else mean
+
+    return error

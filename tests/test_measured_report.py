@@ -2,7 +2,6 @@
 
 import re
 import sys
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +19,7 @@ from measured_run import (
     write_recordings,
     write_split,
 )
+from report_page import FAILING, Page
 
 from warp_resphys.errors import DataFileError
 from warp_resphys.files import read_json, write_json
@@ -43,27 +43,7 @@ from warp_resphys.stages import StageContext
 from warp_resphys.tasks.measured.report import read_recordings, read_trials, report_folds, report_measured
 
 SETTINGS = config()
-FAILING = (sys.executable, "-c", "raise SystemExit('no OpenGL here')")
 DOWN = np.array([0.0, 0.0, -9.8])
-
-
-class Page(HTMLParser):
-    """What a page refers to, its images' descriptions, and its text."""
-
-    def __init__(self, path):
-        super().__init__()
-        self.links, self.images, self.text = [], [], ""
-        self.source = path.read_text(encoding="utf-8")
-        self.feed(self.source)
-        self.text = " ".join(self.text.replace("\u00a0", " ").split())
-
-    def handle_starttag(self, tag, attrs):
-        self.links += [value or "" for name, value in attrs if name in ("src", "href", "srcset", "data")]
-        if tag == "img":
-            self.images.append(dict(attrs))
-
-    def handle_data(self, data):
-        self.text += data
 
 
 @pytest.fixture
@@ -71,15 +51,6 @@ def no_drawing(monkeypatch):
     """Nothing is drawn in other processes, which takes seconds."""
     for module in (video, registration_picture):
         monkeypatch.setattr(module, "COMMAND", FAILING)
-
-
-@pytest.fixture(scope="module")
-def can_draw():
-    mesh = box_hexahedra(divisions=(1, 1, 1))
-    try:
-        render.draw_bodies(mesh, {"box": mesh.vertices}, mesh.vertices)
-    except render.DrawingError as error:
-        pytest.skip(str(error))
 
 
 def report(folder, settings=SETTINGS):

@@ -63,6 +63,17 @@ PUBLISHED_MM: Final[Mapping[str, Mapping[str, PublishedError]]] = {
         "resphys": PublishedError(6.10, 3.22),
     },
 }
+# The extrapolation's errors at the length that was trained on [s]; those at 10 s stand above.
+PUBLISHED_WINDOWS_MM: Final[Mapping[str, Mapping[str, Mapping[str, PublishedError]]]] = {
+    "sopra_extrapolation": {
+        "5": {
+            "sysid": PublishedError(7.51, 3.63),
+            "simfree": PublishedError(9.54, 5.60),
+            "resphys": PublishedError(5.79, 3.09),
+        },
+        "10": PUBLISHED_MM["sopra_extrapolation"],
+    },
+}
 # The same paper's tables of parameters, which the first two experiments share but for their trajectories.
 _PUBLISHED_BEAMS: Final[Mapping[str, float]] = {
     "degrees of freedom": 528,
@@ -189,6 +200,38 @@ def summarise_folds(folds: Sequence[Mapping[str, ErrorSummary]]) -> dict[str, Er
         folds: The summaries of every model in every fold.
     """
     return {model: _over_folds([fold[model] for fold in folds]) for model in folds[0]}
+
+
+def published_errors(name: str) -> Mapping[str, PublishedError]:
+    """Return the published errors of an experiment, or of the one that it is a variant of, as its name says."""
+    known = [each for each in PUBLISHED_MM if name.startswith(each)]
+    return PUBLISHED_MM[max(known, key=len)] if known else {}
+
+
+def median_filter(values: ArrayLike, time_step: float, window: float = 1.0) -> NDArray[np.float64]:
+    """Return the median over a window of time around each step, as the published figures of the arm have it.
+
+    The window is cut at both ends, and holds as many steps before the current one as after it. NaN is left out, and
+    stays where there is nothing else; an infinite value is larger than all others.
+
+    Args:
+        values: (..., T) at equal steps.
+        time_step: Between two of them [s].
+        window: Length of the window [s].
+
+    Raises:
+        InputError: The step or the window is not positive.
+    """
+    if not (time_step > 0.0 and window > 0.0):
+        raise InputError(f"a median filter of {window} s at steps of {time_step} s: both must be positive")
+    rows = np.asarray(values, dtype=np.float64)
+    half = int(0.5 * window / time_step + 1e-9)
+    blank = np.full((*rows.shape[:-1], half), np.nan)
+    windows = np.lib.stride_tricks.sliding_window_view(np.concatenate([blank, rows, blank], axis=-1), 2 * half + 1, -1)
+    ordered = np.sort(windows, axis=-1)  # NaN comes last
+    count = (~np.isnan(ordered)).sum(axis=-1, keepdims=True)
+    low, high = (np.take_along_axis(ordered, np.maximum(count - 1 + up, 0) // 2, axis=-1)[..., 0] for up in (0, 1))
+    return np.where(low == high, low, 0.5 * (low + high))
 
 
 def _over_folds(summaries: Sequence[ErrorSummary]) -> ErrorSummary:

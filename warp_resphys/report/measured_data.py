@@ -27,6 +27,7 @@ class Recordings:
         drawn: That trial's name.
         nominal: (M, 3) [m] where its markers should be.
         feet: (M, 3) [m] the closest points of the body.
+        mesh: The body as it is at rest.
     """
 
     quality: Mapping[str, Any]
@@ -35,6 +36,7 @@ class Recordings:
     drawn: str
     nominal: FloatArray
     feet: FloatArray
+    mesh: Mesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,82 +70,82 @@ class Trials:
         return {model: mean_distance(markers, self.measured) for model, markers in self.markers.items()}
 
 
-@dataclass(frozen=True, eq=False)
-class MeasuredReport:
-    """Everything that the page of a split shows.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RunReport:
+    """What every page on recordings shows.
 
     Attributes:
         experiment: Its name.
         title: The page's heading.
-        metrics: `errors_mm`, `per_trajectory`, `per_marker`, `seconds`, `peak_memory_gib`, `versions` and `device`.
+        metrics: `errors_mm`, `versions` and `device`, and what else the page asks for.
         settings: The run's configuration, nested.
         published: Published errors, empty where there are none.
         published_note: Why they are not measured on the same data.
         notes: Sentences on the errors of this run.
         mesh: The body at rest.
         fixed: Vertices of the clamped region.
-        trials: The test trials.
         recordings: Quality and registration of all trials.
+        synthetic: Whether what is called measured was simulated, as there are no recordings.
+    """
+
+    experiment: str
+    title: str
+    metrics: Mapping[str, Any]
+    settings: Mapping[str, Any]
+    published: Mapping[str, PublishedError]
+    published_note: str
+    notes: Sequence[str]
+    mesh: Mesh
+    fixed: IntArray
+    recordings: Recordings
+    synthetic: bool
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SplitReport(RunReport):
+    """Besides, what every page of a split shows.
+
+    Attributes:
+        trials: The test trials.
         identification: What identification.json holds.
         start: The values of the data sheet, by parameter.
         truth: Those of the simulated reality, where there is one.
         training: Records of the epochs, by learned model.
-        seconds: How much of each trial counts; None for all of it.
-        synthetic: Whether what is called measured was simulated, as there are no recordings.
     """
 
-    experiment: str
-    title: str
-    metrics: Mapping[str, Any]
-    settings: Mapping[str, Any]
-    published: Mapping[str, PublishedError]
-    published_note: str
-    notes: Sequence[str]
-    mesh: Mesh
-    fixed: IntArray
     trials: Trials
-    recordings: Recordings
     identification: Mapping[str, Any]
     start: Mapping[str, float]
     truth: Mapping[str, Any]
     training: Mapping[str, Sequence[Mapping[str, Any]]]
-    seconds: float | None
-    synthetic: bool
 
 
-@dataclass(frozen=True, eq=False)
-class FoldsReport:
-    """Everything that the page over the folds shows.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MeasuredReport(SplitReport):
+    """Everything that the page of a split of motions without actuation shows.
+
+    Its metrics have `per_trajectory`, `per_marker`, `seconds` and `peak_memory_gib` too.
 
     Attributes:
-        experiment: Its name.
-        title: The page's heading.
-        metrics: `folds` (a fold's metrics by its test trial) and `errors_mm` over all of them.
-        pages: Address of each fold's page, by its test trial.
-        settings: The run's configuration, nested.
-        published: Published errors, empty where there are none.
-        published_note: Why they are not measured on the same data.
-        notes: Sentences on the errors of this run.
-        mesh: The body at rest.
-        fixed: Vertices of the clamped region.
-        recordings: Quality and registration of all trials.
         seconds: How much of each trial counts; None for all of it.
-        synthetic: Whether what is called measured was simulated, as there are no recordings.
     """
 
-    experiment: str
-    title: str
-    metrics: Mapping[str, Any]
-    pages: Mapping[str, str]
-    settings: Mapping[str, Any]
-    published: Mapping[str, PublishedError]
-    published_note: str
-    notes: Sequence[str]
-    mesh: Mesh
-    fixed: IntArray
-    recordings: Recordings
     seconds: float | None
-    synthetic: bool
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FoldsReport(RunReport):
+    """Everything that the page over the folds shows.
+
+    Its metrics are `folds` (a fold's metrics by its test trial) and `errors_mm` over all of them.
+
+    Attributes:
+        pages: Address of each fold's page, by its test trial.
+        seconds: How much of each trial counts; None for all of it.
+    """
+
+    pages: Mapping[str, str]
+    seconds: float | None
 
 
 def mean_distance(markers: FloatArray, measured: FloatArray) -> FloatArray:

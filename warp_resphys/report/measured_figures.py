@@ -28,7 +28,7 @@ FloatArray = NDArray[np.float64]
 _DASHED: Final = {"published": (0, (1, 1.2)), "sysid_elastic": (0, (4, 2)), "resphys_uncorrected": (0, (4, 2))}
 _LEVELS: Final = 14  # Of a landscape.
 _MOST_DOTS: Final = 75  # Along an axis of time.
-_LEAST_SPAN: Final = 0.08  # Of a coordinate's axis, over the largest motion of the trial.
+LEAST_SPAN: Final = 0.08  # Of a coordinate's axis, over the largest motion of the trial.
 _KILO: Final = 1e-3
 _MILLI: Final = 1e3
 
@@ -47,9 +47,9 @@ def errors_over_time(times: FloatArray, errors: Mapping[str, FloatArray], *, nar
         axes = figure.subplots()
         for model, rows in errors.items():
             tone = TONES[model].light
-            mean = _mean(rows)
+            mean = mean_of_trials(rows)
             if len(rows) > 1 and model not in _DASHED:
-                spread = np.sqrt(_mean((rows - np.where(np.isfinite(mean), mean, np.nan)) ** 2))
+                spread = np.sqrt(mean_of_trials((rows - np.where(np.isfinite(mean), mean, np.nan)) ** 2))
                 low = np.maximum(mean - spread, 0.05 * mean)
                 axes.fill_between(times, positive(low), positive(mean + spread), color=tone, alpha=0.12, linewidth=0)
             style: Any = _DASHED.get(model, "-")
@@ -61,8 +61,12 @@ def errors_over_time(times: FloatArray, errors: Mapping[str, FloatArray], *, nar
     return figure
 
 
-def _mean(rows: FloatArray) -> FloatArray:
-    """(T,) mean of the trials that have a value; infinite where one has diverged, NaN where none has a value."""
+def mean_of_trials(rows: FloatArray) -> FloatArray:
+    """Return the mean of the trials that have a value; infinite where one has diverged, NaN where none has a value.
+
+    Args:
+        rows: (R, T) of R trials.
+    """
     held = ~np.isnan(rows)
     count = held.sum(axis=0)
     mean: FloatArray = np.where(count > 0, np.where(held, rows, 0.0).sum(axis=0) / np.maximum(count, 1), np.nan)
@@ -94,14 +98,14 @@ def marker_paths(
         figure = new_figure(0.9 + 1.25 * count, 1.2 + 1.05 * 3 * count, narrow=narrow)
         panels = figure.subplots(*shape, sharex=True, squeeze=False)
         moved = np.nan_to_num(_MILLI * (measured - start))  # (T, M, 3) [mm]
-        least = _LEAST_SPAN * float(np.ptp(moved, axis=0).max())
+        least = LEAST_SPAN * float(np.ptp(moved, axis=0).max())
         for marker, label in enumerate(labels):
             for axis in range(3):
                 axes = panels[3 * marker + axis, 0] if narrow else panels[marker, axis]
                 seen, *rest = (
                     _MILLI * (q[:, marker, axis] - start[marker, axis]) for q in (measured, *models.values())
                 )
-                _path(axes, times, seen, least, dict(zip(models, rest, strict=True)))
+                path_panel(axes, times, seen, least, dict(zip(models, rest, strict=True)))
                 if narrow:
                     axes.set_title(f"{label}, {'xyz'[axis]} [mm]")
                 elif axis == 0:
@@ -115,8 +119,10 @@ def marker_paths(
     return figure
 
 
-def _path(axes: Axes, times: FloatArray, measured: FloatArray, least: float, models: Mapping[str, FloatArray]) -> None:
-    """One coordinate [mm]; the measured motion sets the scale, so that a model that runs away does not.
+def path_panel(
+    axes: Axes, times: FloatArray, measured: FloatArray, least: float, models: Mapping[str, FloatArray]
+) -> None:
+    """Draw one coordinate [mm]; the measured motion sets the scale, so that a model that runs away does not.
 
     Args:
         axes: Where to draw.

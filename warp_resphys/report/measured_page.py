@@ -14,6 +14,8 @@ from warp_resphys.files import write_text
 from warp_resphys.report.measured_data import (
     FoldsReport,
     MeasuredReport,
+    RunReport,
+    SplitReport,
     Trials,
     at_times,
     best_and_worst,
@@ -68,24 +70,20 @@ def write_measured_report(path: Path, data: MeasuredReport) -> None:
     errors = metrics["errors_mm"]
     with figures_beside(path) as folder:
         pictures, missing = _draw(data, folder)
-        video = _attempt("video", folder / "motion.mp4", partial(_write_video, data), missing)
+        video = attempt("video", folder / "motion.mp4", partial(_write_video, data), missing)
     models = [model for model in MODELS if model in errors]
-    identified = {name: data.identification[name] for name in identifications(data.identification)}
     page = page_template("measured.html").render(
-        **_common(data, pictures, missing),
+        **common_parts(data, pictures, missing),
         verdict=verdict(errors, data.trials.names, data.seconds),
         models=models,
         against=against(errors),
         measured={model: error_parts(each) for model, each in errors.items()},
         published=published_beside(data.published, models),
-        identified={name: parameter_rows(found, data.start, data.truth) for name, found in identified.items()},
-        uncertainty=[said for name, found in identified.items() if (said := uncertainty_text(name, found))],
         shown=shown_models(data.trials.markers),
-        histories=[model for model in MODELS if f"training_{model}" in pictures],
         best_and_worst=best_and_worst(data.trials),
         hidden=len(data.trials.labels) - _MOST_MARKERS,
-        video=None if video is None else _address(video, "video/mp4"),
-        truth=data.truth,
+        video=None if video is None else file_address(video, "video/mp4"),
+        **split_parts(data, pictures),
     )
     write_text(path, page)
     _LOG.info("report written: %s", path)
@@ -104,11 +102,11 @@ def write_folds_report(path: Path, data: FoldsReport) -> None:
     pictures: dict[str, Picture] = {}
     missing: dict[str, str] = {}
     with figures_beside(path) as folder:
-        _draw_registration(data, folder, pictures, missing)
+        draw_registration_picture(data, folder, pictures, missing)
     errors = data.metrics["errors_mm"]
     models = [model for model in MODELS if model in errors]
     page = page_template("measured_folds.html").render(
-        **_common(data, pictures, missing),
+        **common_parts(data, pictures, missing),
         verdict=verdict(errors, tuple(data.pages), data.seconds, folds=True),
         models=models,
         against=against(errors),
@@ -120,10 +118,8 @@ def write_folds_report(path: Path, data: FoldsReport) -> None:
     _LOG.info("report written: %s", path)
 
 
-def _common(
-    data: MeasuredReport | FoldsReport, pictures: Mapping[str, Picture], missing: Mapping[str, str]
-) -> dict[str, Any]:
-    """What both pages ask for."""
+def common_parts(data: RunReport, pictures: Mapping[str, Picture], missing: Mapping[str, str]) -> dict[str, Any]:
+    """Return what every page on recordings asks for."""
     return {
         "title": data.title,
         "data": data,
@@ -140,9 +136,20 @@ def _common(
     }
 
 
+def split_parts(data: SplitReport, pictures: Mapping[str, Picture]) -> dict[str, Any]:
+    """Return what the sections on identification and training ask for."""
+    identified = {name: data.identification[name] for name in identifications(data.identification)}
+    return {
+        "identified": {name: parameter_rows(found, data.start, data.truth) for name, found in identified.items()},
+        "uncertainty": [said for name, found in identified.items() if (said := uncertainty_text(name, found))],
+        "histories": [model for model in MODELS if f"training_{model}" in pictures],
+        "truth": data.truth,
+    }
+
+
 def _draw(data: MeasuredReport, folder: Path) -> tuple[dict[str, Picture], dict[str, str]]:
     """Draw the figures; say of those that cannot be drawn why."""
-    from warp_resphys.report import figures, measured_figures
+    from warp_resphys.report import measured_figures
 
     pictures: dict[str, Picture] = {}
     missing: dict[str, str] = {}
@@ -156,12 +163,10 @@ def _draw(data: MeasuredReport, folder: Path) -> tuple[dict[str, Picture], dict[
     )
     for place, trial in zip(("worst", "best"), best_and_worst(trials), strict=False):
         pictures[f"paths_{place}"] = both(f"paths_{place}", _paths(trials, trial), _describe_paths(trials, trial))
-    for model, records in data.training.items():
-        alt = f"Losses and validation roll-out error of {MODELS[model][0]}, {len(records)} epochs, on logarithmic axes."
-        pictures[f"training_{model}"] = both(f"training_{model}", partial(figures.training_curves, records), alt)
-    _draw_identification(data, both, pictures)
-    _draw_registration(data, folder, pictures, missing)
-    frames = _attempt("motion", folder / "motion.png", partial(_instants, data), missing)
+    draw_training(data, both, pictures)
+    draw_identification(data, both, pictures)
+    draw_registration_picture(data, folder, pictures, missing)
+    frames = attempt("motion", folder / "motion.png", partial(_instants, data), missing)
     if frames is not None:
         images, titles = frames
         pictures["motion"] = both(
@@ -172,8 +177,8 @@ def _draw(data: MeasuredReport, folder: Path) -> tuple[dict[str, Picture], dict[
     return pictures, missing
 
 
-def _attempt(name: str, path: Path, draw: Callable[[Path], T], missing: dict[str, str]) -> T | None:
-    """What a drawing gives, or None with the reason under its name; an earlier report's file is then removed."""
+def attempt(name: str, path: Path, draw: Callable[[Path], T], missing: dict[str, str]) -> T | None:
+    """Return what a drawing gives, or None with the reason under its name; an earlier report's file is then removed."""
     try:
         return draw(path)
     except DrawingError as error:
@@ -205,7 +210,17 @@ def _describe_paths(trials: Trials, trial: int) -> str:
     return f"Coordinates of the markers over time in the trial {name}: measured as dots, the models as lines."
 
 
-def _draw_identification(data: MeasuredReport, both: Callable[..., Picture], pictures: dict[str, Picture]) -> None:
+def draw_training(data: SplitReport, both: Callable[..., Picture], pictures: dict[str, Picture]) -> None:
+    """Draw how the training of each learned model went."""
+    from warp_resphys.report import figures
+
+    for model, records in data.training.items():
+        alt = f"Losses and validation roll-out error of {MODELS[model][0]}, {len(records)} epochs, on logarithmic axes."
+        pictures[f"training_{model}"] = both(f"training_{model}", partial(figures.training_curves, records), alt)
+
+
+def draw_identification(data: SplitReport, both: Callable[..., Picture], pictures: dict[str, Picture]) -> None:
+    """Draw the losses of an identification over its evaluations, and over a grid, where they are known."""
     from warp_resphys.report import measured_figures
 
     found = data.identification
@@ -242,22 +257,29 @@ def _draw_identification(data: MeasuredReport, both: Callable[..., Picture], pic
     )
 
 
-def _draw_registration(
-    data: MeasuredReport | FoldsReport, folder: Path, pictures: dict[str, Picture], missing: dict[str, str]
+def draw_registration_picture(
+    data: RunReport, folder: Path, pictures: dict[str, Picture], missing: dict[str, str]
 ) -> None:
+    """Draw the body at rest with the registered markers."""
     from warp_resphys.report.registration_picture import draw_registration
 
     recordings = data.recordings
 
     def draw(path: Path) -> Path:
         draw_registration(
-            path, data.mesh, recordings.registration, recordings.nominal, recordings.feet, data.fixed, recordings.drawn
+            path,
+            recordings.mesh,
+            recordings.registration,
+            recordings.nominal,
+            recordings.feet,
+            data.fixed,
+            recordings.drawn,
         )
         return path
 
-    path = _attempt("registration", folder / "registration.png", draw, missing)
+    path = attempt("registration", folder / "registration.png", draw, missing)
     if path is not None:
-        address = _address(path, "image/png")
+        address = file_address(path, "image/png")
         alt = f"The body at rest with the registered markers of the trial {recordings.drawn}, from two sides."
         pictures["registration"] = Picture(address, address, alt)
 
@@ -314,6 +336,6 @@ def _write_video(data: MeasuredReport, path: Path) -> Path:
     return path
 
 
-def _address(path: Path, kind: str) -> str:
-    """A file as a data address."""
+def file_address(path: Path, kind: str) -> str:
+    """Return a file as a data address."""
     return f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode('ascii')}"

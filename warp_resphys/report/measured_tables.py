@@ -31,6 +31,7 @@ _PARAMETERS: Final[Mapping[str, tuple[str, str, float]]] = {
     "mass_damping": ("Damping by mass", "1/s", 1.0),
     "stiffness_damping": ("Damping by stiffness", "ms", 1e3),
     "attached_mass_factor": ("Factor of the attached masses", "", 1.0),
+    "pressure_rise": ("Time constant of the pressures", "ms", 1e3),
     "gravity_tilt_1": ("First tilt of gravity", "°", 180.0 / np.pi),
     "gravity_tilt_2": ("Second tilt of gravity", "°", 180.0 / np.pi),
 }
@@ -80,12 +81,13 @@ def against(errors: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
     if not base:
         return "", {}
     ratios = {m: each["mean"] / errors[base]["mean"] - 1.0 for m, each in errors.items() if each["mean"] is not None}
-    return base, {m: NONE if m == base else _per_cent(ratio) for m, ratio in ratios.items()}
+    return base, {m: NONE if m == base else per_cent(ratio) for m, ratio in ratios.items()}
 
 
-def _per_cent(ratio: float) -> str:
-    rounded = round(100.0 * ratio)
-    return f"{rounded:+d} %".replace("-", MINUS) if rounded else "0 %"
+def per_cent(ratio: float, decimals: int = 0) -> str:
+    """Return a share with its sign, in per cent."""
+    text = f"{100.0 * ratio:+.{decimals}f}"
+    return f"{text.replace('-', MINUS) if float(text) else '0'} %"
 
 
 def published_beside(published: Mapping[str, PublishedError], models: Sequence[str]) -> dict[str, tuple[str, str]]:

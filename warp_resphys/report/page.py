@@ -250,6 +250,7 @@ def _render_page(data: ReportData, pictures: Mapping[str, Picture], missing: Map
         measured={model: error_parts(each) for model, each in metrics["errors_mm"].items()},
         published={model: published_parts(each) for model, each in data.published.items()},
         reconstructed={model: error_parts(each) for model, each in metrics["errors_vs_reconstruction_mm"].items()},
+        each_trajectory={row["name"]: row["errors_mm"] for row in metrics["per_trajectory"]},
         number=number_text,
         duration=duration_text,
         settings=list(flatten(data.settings)),

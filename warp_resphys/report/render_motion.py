@@ -33,7 +33,7 @@ def main(source: str, target: str) -> None:
         source: An .npz file with, for F frames and B bodies, positions (B, F, N, 3) [m] (a body that is not finite in a
             frame is not drawn in it), rest (N, 3), triangles (S, 3) and edges (E, 2) of the surface, colours of bodies
             and rings (B,), simulated (B, F, M, 3) and measured (F, M, 3) markers, feet (F, M, 3) of the last body's
-            markers, axes (3, 3) of the view (to the right, up, towards the viewer), for V views focus (V, F, 3) and
+            markers, for V views axes (V, 3, 3) (to the right, up, towards the viewer), focus (V, F, 3) and
             half_height (V,) [m], size (2,) of a view [px], radius of a measured marker's dot over the height of a
             view, texts (F,) and legend (B + 1,), both perhaps empty, and fps.
         target: Where to write: frames (F, H, W, 4) as .npy on nothing, or a film on white as .mp4.
@@ -79,12 +79,13 @@ def _frames(scene: dict[str, Any], transparent: bool) -> Iterator[NDArray[np.uin
     plotter.enable_anti_aliasing("msaa", multi_samples=4, all_renderers=True)
     plotter.set_background("white", all_renderers=True)
     plotter.add_light(pyvista.Light(position=_TOWARDS_LIGHT, focal_point=(0.0, 0.0, 0.0), light_type="scene light"))
-    bodies: list[_Body] = [_Body(scene, each) for each in range(len(scene["positions"]))]
+    bodies: list[_Body] = []
     markers: list[_Markers] = []
     for view in range(views):
         plotter.subplot(0, view)
         markers.append(_Markers(scene, view))
-        for body in bodies:
+        bodies += [_Body(scene, each, view) for each in range(len(scene["positions"]))]
+        for body in bodies[-len(scene["positions"]) :]:
             body.add(plotter)
         markers[-1].add(plotter)
         plotter.enable_parallel_projection()
@@ -107,22 +108,22 @@ def _frames(scene: dict[str, Any], transparent: bool) -> Iterator[NDArray[np.uin
 
 
 def _aim(camera: Any, scene: dict[str, Any], view: int, frame: int) -> None:
-    towards, focus, half = scene["axes"][2], scene["focus"][view, frame], float(scene["half_height"][view])
+    towards, focus, half = scene["axes"][view, 2], scene["focus"][view, frame], float(scene["half_height"][view])
     camera.focal_point = focus
     camera.position = focus + _FAR * half * towards
-    camera.up = scene["axes"][1]
+    camera.up = scene["axes"][view, 1]
     camera.clipping_range = (0.05 * _FAR * half, 2.0 * _FAR * half)
 
 
 class _Body:
     """One body's surface: the last one solid with the lines around its faces, the others seen through."""
 
-    def __init__(self, scene: dict[str, Any], index: int) -> None:
+    def __init__(self, scene: dict[str, Any], index: int, view: int) -> None:
         import pyvista
 
         self.positions, self.colour = scene["positions"][index], str(scene["colours"][index])
         self.solid = index == len(scene["positions"]) - 1
-        self.nudge = _NUDGE * float(scene["half_height"][0]) * scene["axes"][2]
+        self.nudge = _NUDGE * float(scene["half_height"][0]) * scene["axes"][view, 2]
         surface = pyvista.PolyData.from_regular_faces(scene["rest"], scene["triangles"])
         surface["vertex"] = np.arange(len(scene["rest"]))
         self.surface = surface
@@ -156,7 +157,7 @@ class _Markers:
         half = float(scene["half_height"][view])
         self.measured, self.simulated, self.feet = scene["measured"], scene["simulated"], scene["feet"]
         self.colours = [str(colour) for colour in scene["rings"]]
-        self.nearer = 5.0 * half * scene["axes"][2]
+        self.nearer = 5.0 * half * scene["axes"][view, 2]
         radius = 2.0 * half * float(scene["radius"])
         ball = pyvista.Sphere(radius, theta_resolution=20, phi_resolution=20)
         count = self.measured.shape[1]
@@ -166,7 +167,7 @@ class _Markers:
             np.tile(self.ball, (count, 1)), np.concatenate([faces + len(self.ball) * m for m in range(count)])
         )
         angle = 2.0 * np.pi * np.arange(_CORNERS) / _CORNERS
-        circle = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ scene["axes"][:2]
+        circle = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ scene["axes"][view, :2]
         self.circles = [
             (_RING + 0.35 * (len(self.colours) - 1 - b)) * radius * circle for b in range(len(self.colours))
         ]

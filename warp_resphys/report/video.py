@@ -51,6 +51,7 @@ class Motion:
         markers: (T, M, 3) [m] of the same models.
         bound: (M, 3) [m] markers on the body at rest.
         gravity: (3,) which way is down.
+        from_below: Whether the second view is from below, where a hanging body moves, and not from nearby.
     """
 
     mesh: Mesh
@@ -60,6 +61,7 @@ class Motion:
     markers: Mapping[str, FloatArray]
     bound: FloatArray
     gravity: FloatArray
+    from_below: bool = False
 
     def at(self, frames: Sequence[int] | IntArray) -> "Motion":
         """Some of the frames."""
@@ -72,6 +74,7 @@ class Motion:
             {name: m[chosen] for name, m in self.markers.items()},
             self.bound,
             self.gravity,
+            self.from_below,
         )
 
 
@@ -94,28 +97,32 @@ def draw_instants(motion: Motion) -> NDArray[np.uint8]:
     return np.stack(np.split(frames, 2, axis=2), axis=1)
 
 
-def write_video(path: Path, motion: Motion, names: Mapping[str, str]) -> None:
+def write_video(
+    path: Path, motion: Motion, names: Mapping[str, str], slower: float = SLOWER, longest: float = LONGEST
+) -> None:
     """Write a film (MP4, H.264) of the first seconds of a motion, slowed down, and show how far it is.
 
     Args:
         path: The file to write.
         motion: All frames.
         names: What the legend says, by model.
+        slower: Than the motion was, by this factor.
+        longest: What is shown of the motion [s].
 
     Raises:
         DrawingError: There is no pyvista, no OpenGL driver that works off screen, or no encoder.
         DataFileError: The file cannot be written.
     """
     step = float(np.median(np.diff(motion.times)))
-    every = max(1, round(1.0 / (SLOWER * step * LARGEST_RATE)))
-    shown = motion.at(np.flatnonzero(motion.times <= LONGEST)[::every])
+    every = max(1, round(1.0 / (slower * step * LARGEST_RATE)))
+    shown = motion.at(np.flatnonzero(motion.times <= longest + 1e-9)[::every])
     legend = [*(names[model] for model in shown.positions), "measured"]
     texts = [f"{time:.2f} s" for time in shown.times]
     scene = _scene(shown, _FILM_VIEW) | {"texts": np.array(texts), "legend": np.array(legend)}
-    scene["fps"] = np.array(1.0 / (SLOWER * step * every))
+    scene["fps"] = np.array(1.0 / (slower * step * every))
     room = _HEADROOM * scene["half_height"][0]
     scene["half_height"][0] += room
-    scene["focus"][0] += room * scene["axes"][1]
+    scene["focus"][0] += room * scene["axes"][0, 1]
     with TemporaryDirectory() as folder, Progress("video", len(shown.times), "frames") as progress:
         target = Path(folder) / "motion.mp4"
         _run(scene, target, Path(folder) / "scene.npz", progress)
@@ -169,8 +176,14 @@ def _scene(motion: Motion, size: tuple[int, int]) -> dict[str, Any]:
     axes = view_axes(motion.gravity, seen)
     everything = np.concatenate([seen.reshape(-1, 3), simulated.reshape(-1, 3), motion.measured.reshape(-1, 3)])
     middle, half = _frame(everything, axes, size)
-    near, near_half = _follow(motion.measured, simulated, axes, size)
-    near = np.where(np.isfinite(near), near, middle)
+    if motion.from_below:
+        second = axes_from_below(axes, motion.gravity)
+        near, near_half = _frame(everything, second, size)
+        near = np.broadcast_to(near, (len(motion.times), 3))
+    else:
+        second = axes
+        near, near_half = _follow(motion.measured, simulated, axes, size)
+        near = np.where(np.isfinite(near), near, middle)
     return {
         "positions": positions,
         "rest": motion.mesh.vertices,
@@ -181,7 +194,7 @@ def _scene(motion: Motion, size: tuple[int, int]) -> dict[str, Any]:
         "simulated": simulated,
         "measured": motion.measured,
         "feet": _feet(motion.mesh, motion.bound, positions[-1]),
-        "axes": axes,
+        "axes": np.stack([axes, second]),
         "focus": np.stack([np.broadcast_to(middle, near.shape), near]),
         "half_height": np.array([half, near_half]),
         "size": np.array(size),
@@ -222,6 +235,18 @@ def view_axes(gravity: FloatArray, positions: FloatArray) -> FloatArray:
     right = np.cross(up, towards)
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(towards, right), towards])
+
+
+def axes_from_below(axes: FloatArray, gravity: FloatArray) -> FloatArray:
+    """Return (3, 3) as `view_axes`, of a view from below with the same direction to the right.
+
+    Args:
+        axes: (3, 3) of a view that has gravity along its second row, or behind it.
+        gravity: (3,) which way is down; along -z where it is zero.
+    """
+    length = float(np.linalg.norm(gravity))
+    towards = gravity / length if length > 0.0 else np.array([0.0, 0.0, -1.0])
+    return np.stack([axes[0], np.cross(towards, axes[0]), towards])
 
 
 def _frame(points: FloatArray, axes: FloatArray, size: tuple[int, int]) -> tuple[FloatArray, float]:

@@ -1,0 +1,216 @@
+"""A made-up run of an experiment with pressures: every file that its report reads."""
+
+from pathlib import Path
+
+import numpy as np
+from measured_run import configuration, describe_recordings
+
+from warp_resphys.configured import build_mesh
+from warp_resphys.files import atomic_hdf5, create, read_json, write_json
+from warp_resphys.metrics import median_filter, summarise, summarise_each
+from warp_resphys.report.measured_data import mean_distance
+
+MODELS = ("simulation", "sysid", "simfree", "resphys")
+STEP, LIMIT = 0.02, 20e3
+BASE = {"Base - 1": [-0.03, -0.02, -0.005], "Base - 2": [-0.03, 0.02, -0.005], "Base - 3": [0.03, 0.0, -0.005]}
+_OFF = {
+    None: (1.0, 0.0),
+    "simulation": (1.35, 0.08),
+    "sysid": (1.15, 0.05),
+    "simfree": (0.9, 0.3),
+    "resphys": (1.02, 0.01),
+}
+
+
+def data(**changes):
+    """The group of that name."""
+    return {"kind": "pressure", "folder": None, "pressure_limit": LIMIT, "train_fraction": 1.0, **changes}
+
+
+def arm_settings(name="sopra", chambers=6, **changes):
+    """Settings of an experiment on the arm that comes with the package."""
+    ring = {f"Ring {level + 1} - {at + 1}": (level, at) for level in range(3) for at in range(4)}
+    heights, radii = (-0.13, -0.15, -0.27), (0.022, 0.022, 0.018)
+    followed = {
+        label: [radii[k] * np.cos(0.3 + 1.6 * at), radii[k] * np.sin(0.3 + 1.6 * at), heights[k]]
+        for label, (k, at) in ring.items()
+    }
+    plain = configuration("mesh=arm_coarse", experiment="beam_oscillation")
+    plain |= {
+        "name": name,
+        "title": "Pneumatic arm",
+        "fixed": {"z": 0.0},
+        "markers": {"followed": followed, "others": BASE},
+        "chambers": {"count": chambers, "axis": [0.0, 0.0, -1.0]},
+        "data": data(),
+        "time_step": STEP,
+    }
+    return {**plain, **changes}
+
+
+def pressures(trials, steps, chambers, factor=1.0):
+    """(K, C) [Pa] by trial: smooth, between zero and the limit."""
+    times = STEP * np.arange(steps)
+    rows = {}
+    for number, trial in enumerate(trials):
+        phase = np.arange(chambers) * 2.4 + number
+        waves = np.sin(times[:, None] * (2.0 + 0.3 * np.arange(chambers)) + phase) + 0.5 * np.sin(
+            5.0 * times[:, None] + phase
+        )
+        rest = np.minimum(1.0, times / 0.3)[:, None]
+        rows[trial] = factor * np.clip(12e3 * waves * rest, 0.0, LIMIT)
+    return rows
+
+
+def bent(points, pressure, model=None, sag=0.0):
+    """(K + 1, P, 3) [m] where points (P, 3) of a hanging arm are, driven by pressures (K, C)."""
+    level, lag = _OFF[model]
+    angle = 2.0 * np.pi / 3.0 * np.arange(pressure.shape[1])
+    push = pressure / LIMIT @ np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    tip = np.zeros((len(push) + 1, 2))
+    rate = STEP / (0.1 + lag)
+    for k, each in enumerate(push):
+        tip[k + 1] = tip[k] + rate * (0.03 * level * each - tip[k])
+    along = (points[:, 2] / points[:, 2].min()) ** 2
+    moved = np.repeat(points[None], len(tip), axis=0)
+    moved[..., :2] += tip[:, None] * along[:, None]
+    moved[..., 2] += (8.0 * (tip**2).sum(axis=1)[:, None] - sag) * along
+    return moved
+
+
+def write_run(
+    folder: Path,
+    settings,
+    *,
+    train=2,
+    test=3,
+    steps=100,
+    chambers=6,
+    models=MODELS,
+    factors=(),
+    windows=(),
+    diverged=(),
+    synthetic=True,
+    sag=0.0,
+):
+    """All files of a run; bodies hang longer by the sag [m]."""
+    mesh = build_mesh(settings["mesh"])
+    labels = list(settings["markers"]["followed"])
+    bound = np.array(list(settings["markers"]["followed"].values())) + 1e-4
+    nominal = [f"test_{number:02d}" for number in range(test)]
+    driven = pressures([*(f"train_{n:02d}" for n in range(train)), *nominal], steps, chambers)
+    for factor in factors:
+        driven |= pressures([f"{name}_{factor:g}" for name in nominal], steps, chambers, factor)
+    rng = np.random.default_rng(0)
+    markers = np.stack([bent(bound, each, None, sag) for each in driven.values()])
+    markers += rng.normal(0.0, 5e-5, markers.shape)
+    markers[:, 30:36, min(1, len(labels) - 1)] = np.nan
+    attributes = {
+        "names": list(driven),
+        "labels": labels,
+        "chambers": [f"chamber_{number + 1}" for number in range(chambers)],
+        "gravity": np.array([0.0, 0.0, -9.80709]),
+        "time_step": STEP,
+    }
+    with atomic_hdf5(folder / "motions.h5", "motions", attributes) as file:
+        create(file, "markers", markers, "m", 1)
+        create(file, "pressure", np.stack(list(driven.values())), "Pa", 1)
+        create(file, "bound", bound, "m", 0)
+    rolled = list(driven)[train:]
+    film = np.arange(0, steps + 1, 2)
+    simulated = {}
+    with atomic_hdf5(folder / "rollouts.h5", "rollouts", {"names": rolled, "time_step": STEP}) as file:
+        create(file, "film_steps", film, "1", 0)
+        for model in models:
+            each = np.stack([bent(bound, driven[name], model, sag) for name in rolled])
+            body = bent(mesh.vertices, driven[rolled[0]], model, sag)[film]
+            if model in diverged:
+                each[0, 60:] = np.nan
+                body[film >= 60] = np.nan
+            simulated[model] = each
+            create(file, f"{model}_markers", each.astype(np.float32), "m", 1)
+            create(file, f"{model}_tip", each.mean(axis=2).astype(np.float32), "m", 1)
+            create(file, f"{model}_film", body.astype(np.float32), "m", 0)
+    write_json(folder / "errors.json", _errors(simulated, markers[train:], rolled, test, labels, factors, windows))
+    _write_rest(folder, settings, dict(zip(labels, bound, strict=True)), list(driven)[:2], rng, models, synthetic)
+
+
+def _errors(simulated, measured, names, test, labels, factors, windows):
+    each = {model: mean_distance(markers, measured)[:, 1:] for model, markers in simulated.items()}
+    for rows in each.values():
+        rows[np.isinf(rows)] = np.nan
+    nominal = {model: rows[:test] for model, rows in each.items()}
+
+    def part(rows, first=0, last=None):
+        return {model: summarise(values[first:last]) for model, values in rows.items()}
+
+    found = {
+        "errors_mm": part(nominal),
+        "per_trajectory": summarise_each(names[:test], nominal),
+        "per_marker": {
+            model: dict(zip(labels, np.nanmean(1e3 * np.linalg.norm(m - measured, axis=3), axis=(0, 1)), strict=True))
+            for model, m in simulated.items()
+        },
+        "median_filtered": {model: median_filter(rows.mean(axis=0), STEP).max() for model, rows in nominal.items()},
+        "range": {
+            model: {
+                "left": 2 if model == "simfree" else 0,
+                "first_s": {"test_01": 1.2, "test_00": 0.84} if model == "simfree" else {},
+            }
+            for model in ("simfree", "resphys")
+        },
+    }
+    if windows:
+        found["windows"] = {
+            f"{w:g}": part({m: rows[:, : round(w / STEP)] for m, rows in nominal.items()}) for w in windows
+        }
+        first, *_, last = found["windows"].values()
+        found["growth"] = {
+            m: None if last[m]["mean"] is None else last[m]["mean"] / first[m]["mean"] - 1.0 for m in first
+        }
+    if factors:
+        found["overpressure"] = {"1": found["errors_mm"]} | {
+            f"{factor:g}": part(each, test * (k + 1), test * (k + 2)) for k, factor in enumerate(factors)
+        }
+        late = {"1": {}, f"{factors[0]:g}": {}, f"{factors[-1]:g}": {names[-1]: 0.4, names[-2]: 0.52}}
+        found["overpressure_range"] = {
+            factor: {m: {"left": len(first), "first_s": first} for m in ("simfree", "resphys")}
+            for factor, first in late.items()
+        }
+    return found
+
+
+def _write_rest(folder, settings, followed, registered, rng, models, synthetic):
+    """Everything but motions, roll-outs and errors."""
+    quality, registration = describe_recordings(registered, followed, settings["markers"]["others"], rng, None)
+    write_json(folder / "quality.json", quality)
+    write_json(folder / "registration.json", registration)
+    if synthetic:
+        material = {"model": "stable_neo_hookean", "youngs_modulus": 250e3, "poissons_ratio": 0.49}
+        write_json(folder / "truth.json", {"material": material, "noise_mm": 0.08})
+    found = {"youngs_modulus": 237e3, "poissons_ratio": 0.42}
+    history = [[{"loss": 0.3 * 0.6**k + 0.02, **found} for k in range(9)]]
+    moduli, ratios = np.geomspace(100e3, 500e3, 9), np.linspace(0.3, 0.499, 5)
+    loss = 0.02 + np.log(moduli / 237e3)[:, None] ** 2 + 3.0 * (ratios - 0.42) ** 2
+    if "sysid" in models:
+        identified = {"parameters": found, "loss": 0.02, "history": history, "at_bounds": [], "uncertainty": None}
+        grid = {"youngs_modulus": moduli, "poissons_ratio": ratios, "loss": loss}
+        write_json(folder / "identification.json", {"sysid": identified, "landscape": grid})
+    for model in {"simfree", "resphys"} & set(models):
+        epochs = [
+            {
+                "epoch": e,
+                "train_loss": 1.0 / e,
+                "validation_loss": 1.3 / e,
+                "rollout_error_mm": 4.0 / e if e % 5 == 0 else None,
+            }
+            for e in range(1, 31)
+        ]
+        write_json(folder / f"training_{model}.json", {"kept": {"epoch": 30}, "epochs": epochs})
+    write_json(folder / "reconstruction.json", {"mean_mm": 0.12, "max_mm": 0.61})
+    write_json(folder / "stages" / "import.json", {"seconds": 75.0, "peak_memory_gib": 0.8})
+
+
+def errors_of(folder):
+    """What errors.json holds."""
+    return read_json(folder / "errors.json")

@@ -38,7 +38,7 @@ _YARDSTICK_SIZE = 480
 
 @dataclass
 class Case:
-    """One row of the benchmark: a simulator at its released state, and what was measured of it.
+    """One row of the benchmark: a simulator at the state it starts from, and what was measured of it.
 
     Attributes:
         solver: its name.
@@ -46,6 +46,7 @@ class Case:
         refinement: of the configured box.
         batch: environments.
         steps: of a roll-out.
+        pressures: (T, B, C) in its chambers, if it has any [Pa].
         forward: seconds of each roll-out.
         backward: seconds of each adjoint.
         iterations: mean a step.
@@ -59,6 +60,7 @@ class Case:
     steps: int
     simulator: Simulator
     start: State
+    pressures: torch.Tensor | None = None
     forward: list[float] = field(default_factory=list)
     backward: list[float] = field(default_factory=list)
     iterations: float = 0.0
@@ -72,7 +74,7 @@ class Case:
         modulus = sim.tensor(self.material["youngs_modulus"]).reshape(1).requires_grad_(True)
         material = replace(sim.material, youngs_modulus=modulus)
         began = _now(q.device)
-        trajectory = sim.rollout(State(q, v), self.steps, forces, material=material)
+        trajectory = sim.rollout(State(q, v), self.steps, forces, material=material, pressures=self.pressures)
         done = _now(q.device)
         loss = trajectory.q[-1].square().sum() + trajectory.v[-1].square().sum()
         turned = _now(q.device)
@@ -141,12 +143,8 @@ def _quick(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _cases(config: Mapping[str, Any], settings: Mapping[str, Any], refinement: int) -> list[Case]:
-    """Every combination of solver, material and batch, released and warmed up."""
-    mesh = dict(config["mesh"])
-    if "divisions" not in mesh:
-        raise InputError("the benchmark refines a box: choose mesh=beam_hexahedra or mesh=beam_tetrahedra.")
-    mesh["divisions"] = [refinement * int(d) for d in mesh["divisions"]]
-    body = build_body({**config, "mesh": mesh})
+    """Every combination of solver, material and batch, at its start and warmed up."""
+    body = build_body({**config, "mesh": _refined(config, refinement)})
     kind = "cuda" if str(config["device"]).startswith("cuda") else "cpu"
     cases = []
     for solver in settings["solvers"]:
@@ -167,11 +165,41 @@ def _cases(config: Mapping[str, Any], settings: Mapping[str, Any], refinement: i
             batches = limits.get("batches", settings["batches"][kind])
             for batch in (b for b in batches if b <= _at(settings["largest_batch"], refinement)):
                 simulator = build_simulator(changed, body=body)
-                start = released(simulator, settings["tip_mass"], batch)
-                simulator.rollout(start, 2)
                 steps = limits.get("steps", _at(settings["steps"], refinement))
-                cases.append(Case(solver, material, refinement, batch, steps, simulator, start))
+                case = _at_start(
+                    Case(solver, material, refinement, batch, steps, simulator, simulator.rest_state()), settings
+                )
+                simulator.rollout(case.start, 2, pressures=None if case.pressures is None else case.pressures[:2])
+                cases.append(case)
     return cases
+
+
+def _refined(config: Mapping[str, Any], refinement: int) -> dict[str, Any]:
+    """The group ``mesh`` of a refined box, or of a body with chambers, which has one refinement."""
+    mesh = dict(config["mesh"])
+    if "divisions" in mesh:
+        mesh["divisions"] = [refinement * int(d) for d in mesh["divisions"]]
+    elif config.get("chambers") is None:
+        raise InputError(
+            "the benchmark refines a box, or drives a body with chambers: choose mesh=beam_hexahedra or "
+            "mesh=beam_tetrahedra, or experiment=sopra."
+        )
+    elif refinement != 1:
+        raise InputError("a body with chambers is taken as it is: set benchmark.refinements=[1].")
+    return mesh
+
+
+def _at_start(case: Case, settings: Mapping[str, Any]) -> Case:
+    """The case at its start: let go from a weight, or at rest before the pressures of its chambers come."""
+    simulator, batch = case.simulator, case.batch
+    chambers = len(simulator.body.chambers)
+    if not chambers:
+        return replace(case, start=released(simulator, settings["tip_mass"], batch))
+    phase = simulator.tensor(np.arange(case.steps)[:, None, None] / case.steps)
+    shift = simulator.tensor(np.arange(chambers) / chambers + 0.1 * np.arange(batch)[:, None])
+    pressures = 0.5 * settings["pressure"] * (1.0 - torch.cos(2.0 * torch.pi * (phase + shift)))
+    start = simulator.static_equilibrium(batch=batch, pressure=pressures[0]).detach()
+    return replace(case, start=start, pressures=pressures)
 
 
 def _at(values: Mapping[Any, int], refinement: int) -> int:

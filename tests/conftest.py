@@ -13,6 +13,7 @@ from warp_resphys.report import render
 from warp_resphys.tasks import experiment
 
 wp.config.log_level = wp.LOG_WARNING
+wp.init()
 torch.set_num_threads(1)
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]

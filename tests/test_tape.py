@@ -194,7 +194,7 @@ def test_nothing_is_copied(device: str, monkeypatch: pytest.MonkeyPatch) -> None
     seen = {}
     rollout_in_torch = simulator.rollout
 
-    def spy(state: State, steps: int, forces: torch.Tensor, fixed: None, material: Material) -> object:
+    def spy(state: State, steps: int, forces: torch.Tensor, fixed: None, material: Material, _: None) -> object:
         trajectory = rollout_in_torch(state, steps, forces, fixed, material)
         seen.update(q=state.q, v=state.v, force=forces, modulus=material.youngs_modulus)
         seen.update(q_out=trajectory.q, v_out=trajectory.v)

@@ -17,7 +17,7 @@ from .integrator import State
 from .replay import PARAMETERS, Motions, Release, Replay, StepForce
 from .simulator import MaterialTensors
 
-DRIVEN_PARAMETERS = (*PARAMETERS, "pressure_rise")
+DRIVEN_PARAMETERS = (*PARAMETERS, "fibre_stiffness", "pressure_rise")
 
 
 @dataclass(frozen=True)

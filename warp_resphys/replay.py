@@ -16,9 +16,7 @@ from .integrator import State
 from .material import Material
 from .simulator import MaterialTensors, Simulator
 
-MATERIAL_PARAMETERS = (
-    *("youngs_modulus", "poissons_ratio", "density", "mass_damping", "stiffness_damping", "fibre_stiffness"),
-)
+MATERIAL_PARAMETERS = ("youngs_modulus", "poissons_ratio", "density", "mass_damping", "stiffness_damping")
 PARAMETERS = (*MATERIAL_PARAMETERS, "attached_mass_factor", "gravity_tilt_1", "gravity_tilt_2")
 Markers = Callable[[torch.Tensor], torch.Tensor]
 StepForce = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
@@ -144,12 +142,12 @@ class Replay:
         """
         parameters = {} if parameters is None else parameters
         for name in parameters:
-            if name not in PARAMETERS:
-                raise InputError(f"there is no parameter {name!r} to identify: choose from {', '.join(PARAMETERS)}.")
+            if name not in self.known:
+                raise InputError(f"there is no parameter {name!r} to identify: choose from {', '.join(self.known)}.")
         count, each = len(self.motions.names), len(next(iter(parameters.values()))) if parameters else 1
         spread = {name: value.repeat_interleave(count) for name, value in parameters.items()}
         constants: dict[str, Any] = {}
-        for name in set(MATERIAL_PARAMETERS) & set(spread):
+        for name in {*MATERIAL_PARAMETERS, "fibre_stiffness"} & set(spread):
             constants[name] = spread[name] if name.endswith("damping") else spread[name][:, None]
         material: Material = replace(self.simulator.material, **constants)
         attached = self.motions.attached_mass.repeat(each, 1)

@@ -1,12 +1,14 @@
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
 from torch import nn
 
-from warp_resphys import Body, Material, Simulator, box_hexahedra, select_vertices
+from warp_resphys import Body, Material, Simulator, box_hexahedra, modes, select_vertices
 from warp_resphys.errors import InputError
 from warp_resphys.files import read_checkpoint, write_checkpoint
-from warp_resphys.modes import RestStiffness
+from warp_resphys.modes import RestStiffness, vibration_modes
 from warp_resphys.residual.networks import (
     NextState,
     ResidualForce,
@@ -292,3 +294,26 @@ def test_a_network_may_be_blind_for_velocities_and_is_restored_with_its_dual_mod
     assert not torch.equal(model(rest + 2.0 * q, v), model(rest + q, v))
     again = restore(ResidualForce, model.state_dict(), model.description())
     torch.testing.assert_close(again(rest + q, v), model(rest + q, v))
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_modes_of_large_bodies_are_those_of_small_ones(monkeypatch, held):
+    """Lanczos and the dense solver span the same forces, also of a body that nothing holds."""
+    mesh = box_hexahedra((0.1, 0.02, 0.03), (5, 1, 1))
+    fixed = select_vertices(mesh, x=0.0) if held else ()
+    simulator = Simulator(Body(mesh, fixed=fixed), Material(2e5, 0.3, stiffness_damping=1e-3))
+    dense = vibration_modes(simulator, 8).numpy()
+    monkeypatch.setattr(modes, "_DENSE", 0)
+    cosines = np.linalg.svd(dense.T @ vibration_modes(simulator, 8).numpy())[1]
+    np.testing.assert_allclose(cosines, 1.0, atol=1e-7)
+
+
+def test_rest_stiffness_knows_no_viscosity_and_wants_a_body_that_is_held():
+    plain, damped = (
+        RestStiffness(dataclasses.replace(clamped_beam(), material=Material(2e5, 0.3, stiffness_damping=beta)))
+        for beta in (0.0, 0.01)
+    )
+    force = np.random.default_rng(0).standard_normal((3 * 24, 2))
+    np.testing.assert_allclose(damped.displacements(force), plain.displacements(force), rtol=1e-9)
+    with pytest.raises(InputError, match="fix some vertices"):
+        RestStiffness(Simulator(Body(box_hexahedra())))

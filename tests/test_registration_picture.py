@@ -14,14 +14,6 @@ NAMES = ["Tip - 1", "Tip - 2", "Tip - 3", "Base - 1", "Base - 2", "a marker with
 POINTS = np.array([[0.1, 0.01, 0.04], [0.1, -0.01, 0.02], [0.1, 0.04, 0], [0, -0.01, 0], [0, 0.04, 0.03], [0, 0.04, 0]])
 
 
-@pytest.fixture(scope="module")
-def can_draw():
-    try:
-        render.draw_bodies(MESH, {"box": MESH.vertices}, MESH.vertices)
-    except render.DrawingError as error:
-        pytest.skip(str(error))
-
-
 @pytest.mark.usefixtures("can_draw")
 def test_markers_are_drawn_where_labels_and_rings_are_put():
     """Off the body and alone, a marker's pixels lie around its projection, in both views."""

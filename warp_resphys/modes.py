@@ -1,5 +1,7 @@
 """Vibration modes of a body about its rest shape."""
 
+from dataclasses import replace
+
 import numpy as np
 import scipy.linalg
 import scipy.sparse
@@ -31,12 +33,13 @@ def vibration_modes(simulator: Simulator, count: int) -> torch.Tensor:
         raise InputError(f"{count} vibration modes were asked for, but the body has 1 to {unknowns}.")
     root = np.sqrt(inertia)
     scaled = stiffness / np.outer(root, root)
-    if unknowns <= _DENSE:
+    if unknowns <= max(_DENSE, count):
         _, shapes = scipy.linalg.eigh(scaled, subset_by_index=[0, count - 1])
     else:
-        # Lanczos about zero, from the same start every time.
+        # Lanczos about a little less than zero, where a body that nothing holds is regular too, always from one start.
+        below = -1e-8 * float(scaled.diagonal().max())
         matrix = scipy.sparse.csc_array(scaled)
-        values, shapes = scipy.sparse.linalg.eigsh(matrix, count, sigma=0.0, v0=np.ones(unknowns))
+        values, shapes = scipy.sparse.linalg.eigsh(matrix, count, sigma=below, v0=np.ones(unknowns))
         shapes = shapes[:, np.argsort(values)]
     basis = simulator.rest_positions.new_zeros(simulator.body.n_vertices, 3, count)
     orthonormal = np.linalg.qr(root[:, None] * shapes)[0]
@@ -45,13 +48,14 @@ def vibration_modes(simulator: Simulator, count: int) -> torch.Tensor:
 
 
 def _about_rest(simulator: Simulator) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
-    """Stiffness (3 F, 3 F) [N/m] and inertia (3 F,) of the F free vertices at rest, and these vertices."""
+    """Elastic stiffness (3 F, 3 F) [N/m] and inertia (3 F,) of the F free vertices at rest, and these vertices."""
     workspace = simulator.workspace(1)
     p, pattern = workspace.potential, workspace.pattern
     unknowns = 3 * len(pattern.free)
     rest = simulator.rest_state()
     stage = simulator.method.stage(rest, simulator.time_step)
-    p.set_terms(simulator.step_terms(stage, 1, None, simulator.prepare(), workspace))
+    elastic = simulator.prepare(replace(simulator.material, stiffness_damping=0.0))
+    p.set_terms(simulator.step_terms(stage, 1, None, elastic, workspace))
     p.positions.copy_(rest.q)
     p.update_tangent()
     linear = make_linear_solver("dense", pattern.rows, pattern.cols, len(pattern.free), 3, p.device, p.dtype)
@@ -65,9 +69,14 @@ class RestStiffness:
 
     Args:
         simulator: of a body that is clamped.
+
+    Raises:
+        InputError: nothing holds the body.
     """
 
     def __init__(self, simulator: Simulator) -> None:
+        if not len(simulator.fixed):
+            raise InputError("a body without fixed vertices follows any force without end: fix some vertices.")
         stiffness, _, free = _about_rest(simulator)
         self._matrix = scipy.sparse.csc_array(stiffness)
         self._factor = scipy.sparse.linalg.splu(self._matrix)

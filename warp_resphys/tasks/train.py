@@ -122,8 +122,24 @@ def _configured(context: StageContext, learning: Learning[Model]) -> Trainer[Mod
     return learning.trainer(*(context.settings[key] for key in ("network", "trainer", "seed")))
 
 
-def fit(context: StageContext, trainer: EpochTrainer[Model], model: str, history: str, kind: str) -> None:
-    """Trains, going on from an interrupted run, and writes the selected weights and the history."""
+def fit(
+    context: StageContext,
+    trainer: EpochTrainer[Model],
+    model: str,
+    history: str,
+    kind: str,
+    known: Mapping[str, Any] | None = None,
+) -> None:
+    """Trains, going on from an interrupted run, and writes the selected weights and the history.
+
+    Args:
+        context: of the stage.
+        trainer: of the model.
+        model: the file of the weights.
+        history: the file of the epochs' records.
+        kind: of the weights.
+        known: what else is to be known of the model, beside its weights.
+    """
     checkpoint = context.run_dir / f"{context.name}.safetensors"
     found = resume_checkpoint(checkpoint, "training", context.fingerprint)
     if found is not None:
@@ -142,7 +158,7 @@ def fit(context: StageContext, trainer: EpochTrainer[Model], model: str, history
         context.run_dir / model,
         kind,
         best.state_dict(),
-        {**best.description(), **kept, "fingerprint": context.fingerprint},
+        {**best.description(), **(known or {}), **kept, "fingerprint": context.fingerprint},
     )
     checkpoint.unlink(missing_ok=True)
 

@@ -64,14 +64,14 @@ def driven_stages(config: Mapping[str, Any]) -> list[Stage]:
     """
     trials, split = trials_of(config), split_of(config)
     processes = processes_for(config)
-    base = {**simulated(config), **{key: config[key] for key in _LEARNED}, "batch": config["parallel"]["batch"]}
+    base = {**simulated(config), **_pick(config, *_LEARNED), "batch": config["parallel"]["batch"]}
     later = ("windows", "train_fraction")
     imported = {**base, "data": {key: value for key, value in config["data"].items() if key not in later}}
     stages = []
     if is_synthetic(config):
-        data = {key: config["data"][key] for key in (*_TRIALS, "steps", "pressure_limit")}
-        markers = {key: config["markers"][key] for key in _SYNTHESISED_MARKERS}
-        own = {**{key: config[key] for key in _SYNTHESISED}, "data": data, "markers": markers, "batch": base["batch"]}
+        data = _pick(config["data"], *_TRIALS, "steps", "pressure_limit")
+        markers = _pick(config["markers"], *_SYNTHESISED_MARKERS)
+        own = {**_pick(config, *_SYNTHESISED), "data": data, "markers": markers, "batch": base["batch"]}
         if config["synthetic"]["mesh"]["kind"] == "file":
             own["mesh_digest"] = digest(config["synthetic"]["mesh"]["path"])
         files = (*(recording_file(trial.name) for trial in trials), TRUTH)
@@ -81,10 +81,9 @@ def driven_stages(config: Mapping[str, Any]) -> list[Stage]:
     else:
         imported["recordings"] = {trial.name: _digest(trial.file) for trial in trials}
     needs = tuple(stage.name for stage in stages)
-    imported["split"] = {name: list(getattr(split, name)) for name in ("train", "validation")}
+    imported["split"] = known = {name: list(getattr(split, name)) for name in ("train", "validation")}
     stages.append(Stage("import", import_driven, (MOTIONS, QUALITY, REGISTRATION), imported, needs))
-    data = {key: config["data"][key] for key in ("train_fraction",)}
-    learned = {**base, "data": data, "split": {name: list(getattr(split, name)) for name in ("train", "validation")}}
+    learned = {**base, "data": _pick(config["data"], "train_fraction"), "split": known}
     stages += [
         Stage(
             "identify",
@@ -106,7 +105,7 @@ def driven_stages(config: Mapping[str, Any]) -> list[Stage]:
         settings = {**learned, **training_settings(dict(config), model)}
         outputs = (weights_file(model), training_file(model))
         stages.append(Stage(f"train_{model}", function, outputs, settings, ("import", "identify", "reconstruct")))
-    tested = {**base, "data": {"windows": config["data"]["windows"]}, "tip": config["tip"], "groups": groups_of(config)}
+    tested = {**base, "data": _pick(config["data"], "windows"), "tip": config["tip"], "groups": groups_of(config)}
     trained = tuple(f"train_{model}" for model in LEARNED)
     stages += [
         Stage(
@@ -136,10 +135,7 @@ def _digest(path: Path | None) -> str:
 def run_driven(config: dict[str, Any], folder: Path) -> None:
     """Runs what has changed, writes metrics.json, and prints the errors."""
     stages = driven_stages(config)
-    *before, report = stages
-    run_stages(before, folder)
-    write_json(folder / METRICS, collect_metrics(folder, before))
-    run_stages([*before, report], folder)
+    run_stages(stages, folder)
     metrics = collect_metrics(folder, stages)
     write_json(folder / METRICS, metrics)
     _print(metrics, folder)

@@ -20,11 +20,11 @@ from ...recordings.valve import valve_opening
 from ...registration import Registration, register_markers
 from ...simulator import Simulator
 from ...stages import StageContext
+from ..binding import bound_markers
 from ..measured.files import QUALITY, REGISTRATION, recording_file
 from ..measured.importing import registration_summary
 from ..trajectories import evenly
 from .files import MOTIONS
-from .scene import bound_markers
 from .trials import Trial, is_synthetic, trials_of
 
 log = logging.getLogger(__name__)
@@ -78,7 +78,7 @@ def import_driven(context: StageContext) -> None:
     mean = np.nanmean(places[:known], axis=0)
     bound = nominal[: len(followed)] + (mean - hanging)
     shifts = mean - places if settings["data"]["rest"] == "own" else np.zeros_like(places)
-    bound_markers(settings, simulator, bound, tuple(followed))
+    bound_markers(markers, simulator.body.mesh, bound, followed)  # Refuses a marker that is far off the body.
     steps = settings["data"]["steps"]
     moving = np.full((len(observed), steps + 1, len(followed), 3), np.nan)
     smoothed = moving.copy()
@@ -109,8 +109,9 @@ def import_driven(context: StageContext) -> None:
 
 def _hanging(settings: Mapping[str, Any], simulator: Simulator, places: FloatArray) -> FloatArray:
     """(M, 3) where markers at places on the undeformed body are while it hangs at rest [m]."""
-    read = bound_markers(settings, simulator, places, tuple(settings["markers"]["followed"]))
-    hanging: FloatArray = read(simulator.static_equilibrium().q)[0].cpu().numpy()
+    markers = settings["markers"]
+    read = bound_markers(markers, simulator.body.mesh, places, tuple(markers["followed"]))
+    hanging: FloatArray = read.to(simulator.rest_positions)(simulator.static_equilibrium().q)[0].cpu().numpy()
     return hanging
 
 

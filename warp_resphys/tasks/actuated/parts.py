@@ -89,10 +89,8 @@ def work_on(
         DataFileError: a part could not be written.
     """
     left = [part for part in parts if not _is_done(part)]
-    total, done = (
-        steps * sum(len(part.names) for part in some) for some in (parts, [p for p in parts if p not in left])
-    )
-    with Progress(parts[0].context.name, total, "steps", done) as progress:
+    total, missing = (steps * sum(len(part.names) for part in some) for some in (parts, left))
+    with Progress(parts[0].context.name, total, "steps", total - missing) as progress:
         work = partial(_work_on_one, function)
         if processes == 1:
             with threadpool_limits(1):  # As in a worker process: the same numbers, however many there are.

@@ -12,11 +12,11 @@ from ...actuation import lagged, remembered
 from ...configured import build_mesh, build_simulator
 from ...driven import DrivenMotions, DrivenReplay, at_rest
 from ...files import read_json
-from ...markers import Markers, bind_markers
-from ...mesh import select_vertices
+from ...markers import Markers
 from ...replay import Release
 from ...residual.driven_rollout import Drive
 from ...simulator import MaterialTensors, Simulator
+from ..binding import bound_markers
 from ..measured.files import IDENTIFICATION
 from .files import MOTIONS, Imported, read_imported
 
@@ -63,7 +63,8 @@ class DrivenScene:
     @cached_property
     def markers(self) -> Markers:
         """The followed markers on the body."""
-        return bound_markers(self.config, self.simulator, self._imported.bound, self.labels)
+        found = bound_markers(self.config["markers"], self.simulator.body.mesh, self._imported.bound, self.labels)
+        return found.to(self.simulator.rest_positions)
 
     def pick(self, names: tuple[str, ...]) -> DrivenMotions:
         """Some of the trials."""
@@ -105,18 +106,3 @@ class DrivenScene:
         if rise is not None:
             pressure = lagged(pressure, rise.expand(len(pressure)), step)
         return Drive(pressure, remembered(pressure, self.config["actuation"]["memory"], step))
-
-
-def bound_markers(config: Mapping[str, Any], simulator: Simulator, places: Any, labels: tuple[str, ...]) -> Markers:
-    """Markers at places (M, 3) on the undeformed body [m]."""
-    settings, mesh = config["markers"], simulator.body.mesh
-    vertices = None if settings["bind_to"] is None else select_vertices(mesh, **settings["bind_to"])
-    found = bind_markers(
-        mesh,
-        places,
-        labels,
-        kind=settings["bind"],
-        vertices=vertices,
-        largest_distance=settings["largest_distance"],
-    )
-    return found.to(simulator.rest_positions)

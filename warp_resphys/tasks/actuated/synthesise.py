@@ -21,10 +21,10 @@ from ...recordings.recording import Recording
 from ...simulator import Simulator
 from ...stages import StageContext
 from ...workers import Advance
+from ..binding import bound_markers
 from ..measured.files import TRUTH, recording_file
 from ..measured.synthesise import Scene, make_scene
 from .parts import Made, Part, read_parts, remove_parts, split_into_parts, work_on
-from .scene import bound_markers
 from .trials import Trial, trials_of
 
 FloatArray = NDArray[np.float64]
@@ -108,7 +108,9 @@ def simulate_part(part: Part, advance: Advance) -> dict[str, Made]:
     """
     settings = part.context.settings
     simulator, scene = reality(settings), level_scene(settings)
-    read = bound_markers(settings, simulator, scene.followed, tuple(settings["markers"]["followed"]))
+    markers = settings["markers"]
+    read = bound_markers(markers, simulator.body.mesh, scene.followed, tuple(markers["followed"]))
+    read = read.to(simulator.rest_positions)
     substeps = substeps_of(settings)
     known = {trial.name: trial for trial in trials_of(settings)}
     chambers = len(simulator.body.chambers)

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from ...configured import choose_device
-from ...files import read_array, read_checkpoint, read_hdf5, write_checkpoint
+from ...files import read_array, read_hdf5
 from ...metrics import summarise
 from ...modes import RestStiffness
 from ...residual.driven_rollout import DrivenDataRollout, DrivenHybridRollout, Range, WatchedModel
@@ -98,10 +98,8 @@ def _fit(
     trainer: Trainer[Any] = Trainer(model, train, samples["validation"], error, settings["trainer"], settings["seed"])
     with torch.no_grad():
         inputs = model.encode(train.q, train.v, train.actuation)
-    fit(context, trainer, weights_file(name), training_file(name), kind)
-    path = context.run_dir / weights_file(name)
-    tensors, description = read_checkpoint(path, kind)
-    write_checkpoint(path, kind, tensors, {**description, "range": Range.of(inputs, _MARGIN).description()})
+    known = {"range": Range.of(inputs, _MARGIN).description()}
+    fit(context, trainer, weights_file(name), training_file(name), kind, known)
 
 
 def rollout_of(

@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from ...configured import build_mesh
 from ...errors import DataFileError, InputError
 from ...files import atomic_hdf5, create, write_json
-from ...markers import bind_markers
-from ...mesh import select_vertices
 from ...recordings.processing import fill_gaps, release_of, trim_to_release
 from ...recordings.quality import check_base, quality
 from ...recordings.reading import read_recording
@@ -25,6 +23,7 @@ from ...recordings.recording import Recording, listed
 from ...recordings.release import Release
 from ...registration import Registration, register_markers
 from ...stages import StageContext
+from ..binding import bound_markers
 from .files import MARKERS, QUALITY, REGISTRATION, recording_file
 from .trials import Trial, is_synthetic, trials_of, vertical
 
@@ -73,7 +72,8 @@ def import_recordings(context: StageContext) -> None:
     columns = [labels.index(label) for label in followed]
     places = np.stack([each.registration.positions[columns] for each in observed])  # (R, M, 3) [m]
     bound = places.mean(axis=0)
-    _check_binding(settings, bound)
+    # Refuses a marker that is far off the body.
+    bound_markers(markers, build_mesh(settings["mesh"]), bound, followed)
     moving = [_moving(each, followed, settings["data"]) for each in observed]
     shifts = bound - places
     frames = max(len(each.positions) for each in moving)
@@ -223,20 +223,6 @@ def _moving(each: Observed, followed: Sequence[str], data: Mapping[str, Any]) ->
             "out of markers.followed."
         )
     return moving
-
-
-def _check_binding(settings: Mapping[str, Any], bound: FloatArray) -> None:
-    """Binds the markers as the simulator will, so that one far off the body is refused here."""
-    markers, mesh = settings["markers"], build_mesh(settings["mesh"])
-    follow = None if markers["bind_to"] is None else select_vertices(mesh, **markers["bind_to"])
-    bind_markers(
-        mesh,
-        bound,
-        list(markers["followed"]),
-        kind=markers["bind"],
-        vertices=follow,
-        largest_distance=markers["largest_distance"],
-    )
 
 
 def _verticals(observed: Sequence[Observed], settings: Mapping[str, Any]) -> FloatArray | None:

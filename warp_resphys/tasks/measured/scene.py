@@ -13,11 +13,11 @@ from scipy.interpolate import CubicSpline
 
 from ...configured import build_body, build_simulator
 from ...files import read_json
-from ...markers import Markers, bind_markers
-from ...mesh import select_vertices
+from ...markers import Markers
 from ...release import ReleaseSettings, estimate_release
 from ...replay import Motions, Release, Replay
 from ...simulator import Simulator
+from ..binding import bound_markers
 from .files import IDENTIFICATION, MARKERS, read_motions
 
 # The simulator that a model corrects or is.
@@ -65,16 +65,7 @@ class Scene:
     def markers(self) -> Markers:
         """The followed markers on the body."""
         _, bound, labels, _ = self._imported
-        settings, mesh = self.config["markers"], build_body(self.config).mesh
-        vertices = None if settings["bind_to"] is None else select_vertices(mesh, **settings["bind_to"])
-        found = bind_markers(
-            mesh,
-            bound,
-            labels,
-            kind=settings["bind"],
-            vertices=vertices,
-            largest_distance=settings["largest_distance"],
-        )
+        found = bound_markers(self.config["markers"], build_body(self.config).mesh, bound, labels)
         return found.to(self.simulator("simulation").rest_positions)
 
     def simulator(self, kind: str, on_failure: str = "raise") -> Simulator:

@@ -18,14 +18,13 @@ from scipy.spatial.transform import Rotation
 from ...configured import build_simulator
 from ...files import write_json
 from ...integrator import State
-from ...markers import bind_markers
-from ...mesh import select_vertices
 from ...progress import Progress
 from ...recordings.arrays import write_recording
 from ...recordings.recording import Recording
 from ...replay import sample
 from ...simulator import Simulator
 from ...stages import StageContext
+from ..binding import bound_markers
 from .files import TRUTH, attached_mass, recording_file
 from .trials import Trial, trials_of, vertical
 
@@ -152,16 +151,9 @@ def simulate(
     Raises:
         ConvergenceError: a step fails.
     """
-    markers, mesh = settings["markers"], simulator.body.mesh
-    follow = None if markers["bind_to"] is None else select_vertices(mesh, **markers["bind_to"])
-    read = bind_markers(
-        mesh,
-        scene.followed,
-        list(markers["followed"]),
-        kind=markers["bind"],
-        vertices=follow,
-        largest_distance=markers["largest_distance"],
-    ).to(simulator.rest_positions)
+    markers = settings["markers"]
+    read = bound_markers(markers, simulator.body.mesh, scene.followed, list(markers["followed"]))
+    read = read.to(simulator.rest_positions)
     loads = np.array([trial.hung for trial in trials])
     masses = attached_mass(simulator.body, settings["data"]["hung_on"], loads)
     steps = max(int(times.max() / simulator.time_step) + 1, 2)

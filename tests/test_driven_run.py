@@ -3,6 +3,7 @@
 The report has tests of its own.
 """
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -24,9 +25,11 @@ from warp_resphys.mesh import select_vertices
 from warp_resphys.recordings.arrays import write_recording
 from warp_resphys.recordings.reading import read_recording
 from warp_resphys.residual.driven_rollout import Range
+from warp_resphys.stages import StageContext
 from warp_resphys.tasks.actuated import experiment
 from warp_resphys.tasks.actuated.checks import check_driven
 from warp_resphys.tasks.actuated.evaluate import summary
+from warp_resphys.tasks.actuated.importing import import_driven
 from warp_resphys.tasks.checks import check_configuration
 
 # A short segment with two chambers of some 70 vertices, on which everything takes seconds.
@@ -204,8 +207,6 @@ def test_bad_configurations_cost_one_sentence(finished, monkeypatch, overrides, 
 
 
 def test_bad_recordings_cost_one_sentence(finished, monkeypatch, tmp_path):
-    import dataclasses
-
     def with_pressures(values):
         return lambda recording: dataclasses.replace(recording, actuation=values(recording.actuation))
 
@@ -221,6 +222,21 @@ def test_bad_recordings_cost_one_sentence(finished, monkeypatch, tmp_path):
     for name, (change, message) in cases.items():
         (tmp_path / name).mkdir()
         assert message in refused(finished, monkeypatch, *recorded(tmp_path / name, finished, change))
+
+
+def test_a_short_recording_is_named_and_its_rest_counts_as_not_seen(finished, monkeypatch, tmp_path, caplog):
+    def shortened(recording):
+        return dataclasses.replace(recording, positions=recording.positions[:9], actuation=recording.actuation[:9])
+
+    monkeypatch.chdir(finished)
+    path = f"hydra.searchpath=[file://{finished / 'configs'}]"
+    config = configuration(path, FOLLOWED, *recorded(tmp_path, finished, shortened), experiment="tiny")
+    stages = {stage.name: stage for stage in experiment.driven_stages(config)}
+    import_driven(StageContext("import", tmp_path, "", stages["import"].settings))
+    with read_hdf5(tmp_path / "motions.h5", "motions") as file:
+        seen = np.isfinite(read_array(file, "markers")).all(axis=(2, 3))
+    assert seen.sum(axis=1).tolist() == [9, 13, 13, 13]
+    assert "t000.h5 ends after 8 of the 12 steps" in caplog.text
 
 
 def test_the_number_of_processes_is_no_setting_of_the_results(finished, monkeypatch):

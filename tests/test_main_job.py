@@ -187,7 +187,7 @@ class TestChanges:
             ("simfree", "simfree_training", "next state"),
         ):
             _, metadata = read_checkpoint(f"run/{name}.safetensors", kind)
-            assert metadata["architecture"] == {"blocks": 5, "layers": 3, "width": 16}
+            assert metadata["architecture"] == {"blocks": 5, "layers": 3, "width": 16, "activation": "normalised_elu"}
             assert not metadata["reduced"]
             records = json.loads(Path(f"run/{history}.json").read_text())["epochs"]
             assert [r["epoch"] for r in records if "rollout_error_mm" in r] == [1, 2]

@@ -26,6 +26,7 @@ NETWORK = {
     "velocity_modes": 2,
     "force_modes": 2,
     "blocks": 1,
+    "activation": "normalised_elu",
     "layers": 0,
     "width": 8,
 }

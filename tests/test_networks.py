@@ -23,7 +23,7 @@ from warp_resphys.residual.networks import (
 )
 
 REDUCED = {"kind": "reduced", "position_modes": 3, "velocity_modes": 4, "force_modes": 5}
-ARCHITECTURE = {"blocks": 2, "layers": 1, "width": 16}
+ARCHITECTURE = {"blocks": 2, "layers": 1, "width": 16, "activation": "normalised_elu"}
 KINDS = {"reduced": {**REDUCED, **ARCHITECTURE}, "nodal": {"kind": "nodal", **ARCHITECTURE}}
 
 
@@ -46,7 +46,7 @@ def built(kind):
 
 class TestSkipMLP:
     def test_published_structure(self):
-        network = SkipMLP(30, 12, blocks=5, layers=3, width=512)
+        network = SkipMLP(30, 12, blocks=5, layers=3, width=512, activation="normalised_elu")
         assert len(network.blocks) == 5
         for i, block in enumerate(network.blocks):
             hidden = [nn.Linear, nn.LayerNorm, nn.ELU]
@@ -55,9 +55,13 @@ class TestSkipMLP:
             assert sizes == [(30 if i == 0 else 12, 512), (512, 512), (512, 512), (512, 12)]
             assert all(m.normalized_shape == (512,) for m in block if isinstance(m, nn.LayerNorm))
 
+    def test_a_smooth_network_has_no_normalisation(self):
+        (block,) = SkipMLP(5, 2, blocks=1, layers=2, width=8, activation="silu").blocks
+        assert [type(m) for m in block] == [nn.Linear, nn.SiLU, nn.Linear, nn.SiLU, nn.Linear]
+
     def test_blocks_after_the_first_add_to_their_input(self):
         torch.manual_seed(0)
-        network = SkipMLP(4, 3, blocks=3, layers=1, width=8)
+        network = SkipMLP(4, 3, blocks=3, layers=1, width=8, activation="normalised_elu")
         x = torch.randn(5, 4)
         first = network.blocks[0](x)
         second = first + network.blocks[1](first)
@@ -190,6 +194,7 @@ class TestResidualForce:
     ("settings", "sentence"),
     [
         ({"kind": "graph"}, "network.kind is 'graph': choose one of reduced, nodal."),
+        ({"activation": "relu"}, "network.activation is 'relu': choose one of normalised_elu, silu."),
         ({"blocks": 0}, "network.blocks is 0: it must be positive."),
         ({"layers": -1}, "network.layers is -1: it must be zero or more."),
         ({"width": 0}, "network.width is 0: it must be positive."),
@@ -288,7 +293,7 @@ def test_a_network_may_be_blind_for_velocities_and_is_restored_with_its_dual_mod
     random = torch.Generator().manual_seed(0)
     q, v, force = (1e-3 * torch.randn(20, n, 3, generator=random, dtype=torch.float64) for _ in range(3))
     config = {"kind": "reduced", "position_modes": 3, "velocity_modes": 0, "force_modes": 2}
-    config |= {"blocks": 1, "layers": 1, "width": 8}
+    config |= {"blocks": 1, "layers": 1, "width": 8, "activation": "silu"}
     model = build_model(config, rest, rest + q, v, force, stiffness=RestStiffness(simulator)).double().eval()
     torch.testing.assert_close(model(rest + q, v), model(rest + q, 10.0 * v))
     assert not torch.equal(model(rest + 2.0 * q, v), model(rest + q, v))

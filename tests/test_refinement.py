@@ -42,7 +42,7 @@ def network(seed=0):
     torch.manual_seed(seed)
     rest = simulator().rest_positions
     force = 1e-3 * torch.randn(FRAMES * 2, *rest.shape, dtype=torch.float64)
-    sizes = {"kind": "nodal", "blocks": 2, "layers": 1, "width": 8}
+    sizes = {"kind": "nodal", "blocks": 2, "layers": 1, "width": 8, "activation": "normalised_elu"}
     return build_model(sizes, rest, TRAIN.q.flatten(0, 1), TRAIN.v.flatten(0, 1), force)
 
 

@@ -13,7 +13,7 @@ MESH = box_hexahedra((0.1, 0.03, 0.03), (2, 1, 1))
 SIMULATOR = Simulator(Body(MESH, fixed=select_vertices(MESH, x=0.0)), Material(215e3, 0.45))
 REST = SIMULATOR.rest_positions
 MODES, SAMPLES = 3, 60
-ARCHITECTURE = {"blocks": 2, "layers": 1, "width": 8}
+ARCHITECTURE = {"blocks": 2, "layers": 1, "width": 8, "activation": "silu"}
 SIZES = {"position_modes": MODES, "velocity_modes": MODES, "force_modes": MODES, **ARCHITECTURE}
 NETWORKS = {kind: {"kind": kind, **SIZES} for kind in ("reduced", "nodal")}
 

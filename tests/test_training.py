@@ -10,7 +10,7 @@ from warp_resphys.files import read_checkpoint, write_checkpoint
 from warp_resphys.residual.networks import build_model
 from warp_resphys.residual.training import Samples, Trainer
 
-NETWORK = {"kind": "nodal", "blocks": 2, "layers": 1, "width": 16}
+NETWORK = {"kind": "nodal", "blocks": 2, "layers": 1, "width": 16, "activation": "normalised_elu"}
 CONFIG = {
     "epochs": 6,
     "batch_size": 16,
@@ -22,6 +22,7 @@ CONFIG = {
     "weight_decay": 1e-5,
     "noise": 0.01,
     "linear_noise": 0.01,
+    "scale_weight": 0.0,
     "selection": "rollout",
     "rollout_every": 2,
 }
@@ -202,6 +203,24 @@ def test_empty_split(name):
         Trainer(model, splits["training"], splits["validation"], rollout_error, CONFIG, 0)
 
 
+@pytest.mark.parametrize(("exponent", "smallest"), [(0.0, 1.0), (1.0, 0.1)])
+def test_outputs_weigh_by_their_deviation(exponent, smallest):
+    """With the power one, the validation loss is the squared error of the forces themselves, in units of theirs."""
+    forces = TRAIN.outputs[0] * torch.tensor([1.0, 1.0, 1.0, 0.1])[:, None]
+    torch.manual_seed(0)
+    model = build_model(NETWORK, torch.zeros(4, 3, dtype=torch.float64), TRAIN.q, TRAIN.v, forces)
+    data = [replace(each, outputs=(forces[: len(each.q)],)) for each in (TRAIN, VALIDATION)]
+    run = Trainer(model, *data, rollout_error, {**CONFIG, "scale_weight": exponent}, 0)
+    loss = run.run_epoch()["validation_loss"]
+    (coder,) = model.coders
+    with torch.no_grad():
+        error = model(VALIDATION.q, VALIDATION.v) - data[1].outputs[0]
+    weighed = error.flatten(1) if exponent else error.flatten(1) / coder.scale
+    unit = coder.scale.square().mean() if exponent else 1.0
+    assert loss == pytest.approx(float(weighed.square().mean() / unit), rel=1e-4)
+    assert float(coder.scale.min() / coder.scale.max()) ** exponent == pytest.approx(smallest, rel=0.5)
+
+
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
@@ -213,6 +232,7 @@ def test_empty_split(name):
         ({"rollout_every": 0}, "trainer.rollout_every is 0: it must be positive."),
         ({"weight_decay": -1.0}, "trainer.weight_decay is -1.0: it must be zero or more."),
         ({"noise": -1.0}, "trainer.noise is -1.0: it must be zero or more."),
+        ({"scale_weight": -1.0}, "trainer.scale_weight is -1.0: it must be zero or more."),
         ({"schedule": "linear"}, "trainer.schedule is 'linear': choose one of cosine, step."),
         ({"selection": "test"}, "trainer.selection is 'test': choose one of rollout, validation_loss."),
         ({"gamma": 0.0}, "trainer.gamma is 0.0: it must be greater than 0 and at most 1."),

@@ -231,8 +231,19 @@ class SparseSolver(LinearSolver):
         i, j = self._entries(rows, cols)
         keep = ~((rows == cols)[:, None] & (i < j))
         self.address = np.where(keep, (np.cumsum(keep) - 1).reshape(keep.shape), -1).astype(np.int32)
-        self._rows, self._cols = np.maximum(i, j)[keep], np.minimum(i, j)[keep]
-        self.n_values = len(self._rows)
+        lower, upper = np.maximum(i, j)[keep], np.minimum(i, j)[keep]
+        self.n_values = len(lower)
+        self._off = lower != upper
+        self._rows, self._cols = np.append(lower, upper[self._off]), np.append(upper, lower[self._off])
+
+    def mirrored(self, values: torch.Tensor) -> torch.Tensor:
+        """(B, E') entries of both triangles from (B, n_values)."""
+        return torch.cat([values, values[:, torch.as_tensor(self._off, device=values.device)]], dim=1)
+
+    def matrix(self, entries: torch.Tensor) -> scipy.sparse.csc_array:
+        """(n, n) the matrix of one environment's `mirrored` entries (E',)."""
+        data = entries.detach().cpu().numpy()
+        return scipy.sparse.csc_array((data, (self._rows, self._cols)), shape=(self.n, self.n))
 
     @override
     def factor(self, values: torch.Tensor, definite: bool = True) -> Factor:
@@ -244,21 +255,15 @@ class _SparseFactor(Factor):
         self._device, self._dtype = solver.device, solver.dtype
         self.failed = np.zeros(len(values), dtype=bool)
         cholmod = _cholespy() if definite else None
-        off = solver._rows != solver._cols
-        rows = np.concatenate([solver._rows, solver._cols[off]])
-        cols = np.concatenate([solver._cols, solver._rows[off]])
         self._factors: list[Any] = []
         self._cholmod = cholmod is not None
-        mirrored = torch.cat([values, values[:, torch.as_tensor(off, device=values.device)]], dim=1)
-        for i, entries in enumerate(mirrored):
+        for i, entries in enumerate(solver.mirrored(values)):
             try:
                 if cholmod is not None:
-                    self._factors.append(_cholmod_factor(cholmod, solver, rows, cols, entries))
+                    self._factors.append(_cholmod_factor(cholmod, solver, entries))
                     continue
-                data = entries.detach().cpu().numpy()
-                matrix = scipy.sparse.csc_array((data, (rows, cols)), shape=(solver.n, solver.n))
                 lu = scipy.sparse.linalg.splu(
-                    matrix,
+                    solver.matrix(entries),
                     permc_spec="MMD_AT_PLUS_A",
                     diag_pivot_thresh=0.0 if definite else 1.0,
                     options={"SymmetricMode": definite},
@@ -305,9 +310,8 @@ def _cholespy() -> Any:
     return cholespy
 
 
-def _cholmod_factor(cholmod: Any, solver: SparseSolver, rows: Indices, cols: Indices, entries: torch.Tensor) -> Any:
-    i = torch.as_tensor(rows, dtype=torch.int32, device=solver.device)
-    j = torch.as_tensor(cols, dtype=torch.int32, device=solver.device)
+def _cholmod_factor(cholmod: Any, solver: SparseSolver, entries: torch.Tensor) -> Any:
+    i, j = (torch.as_tensor(x, dtype=torch.int32, device=solver.device) for x in (solver._rows, solver._cols))
     return cholmod.CholeskySolverD(solver.n, i, j, entries.detach().to(torch.float64), cholmod.MatrixType.COO)
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from .assembly import HessianAssembly
 from .errors import InputError
-from .linear_solver import make_linear_solver
+from .linear_solver import SparseSolver
 from .simulator import Simulator
 
 FloatArray = NDArray[np.float64]
@@ -32,14 +32,14 @@ def vibration_modes(simulator: Simulator, count: int) -> torch.Tensor:
     if not 1 <= count <= unknowns:
         raise InputError(f"{count} vibration modes were asked for, but the body has 1 to {unknowns}.")
     root = np.sqrt(inertia)
-    scaled = stiffness / np.outer(root, root)
+    unscale = scipy.sparse.diags_array(1.0 / root)
+    scaled = (unscale @ stiffness @ unscale).tocsc()
     if unknowns <= max(_DENSE, count):
-        _, shapes = scipy.linalg.eigh(scaled, subset_by_index=[0, count - 1])
+        _, shapes = scipy.linalg.eigh(scaled.toarray(), subset_by_index=[0, count - 1])
     else:
         # Lanczos about a little less than zero, where a body that nothing holds is regular too, always from one start.
         below = -1e-8 * float(scaled.diagonal().max())
-        matrix = scipy.sparse.csc_array(scaled)
-        values, shapes = scipy.sparse.linalg.eigsh(matrix, count, sigma=below, v0=np.ones(unknowns))
+        values, shapes = scipy.sparse.linalg.eigsh(scaled, count, sigma=below, v0=np.ones(unknowns))
         shapes = shapes[:, np.argsort(values)]
     basis = simulator.rest_positions.new_zeros(simulator.body.n_vertices, 3, count)
     orthonormal = np.linalg.qr(root[:, None] * shapes)[0]
@@ -47,21 +47,20 @@ def vibration_modes(simulator: Simulator, count: int) -> torch.Tensor:
     return basis.flatten(0, 1)
 
 
-def _about_rest(simulator: Simulator) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
+def _about_rest(simulator: Simulator) -> tuple[scipy.sparse.csc_array, FloatArray, NDArray[np.int64]]:
     """Elastic stiffness (3 F, 3 F) [N/m] and inertia (3 F,) of the F free vertices at rest, and these vertices."""
     workspace = simulator.workspace(1)
     p, pattern = workspace.potential, workspace.pattern
-    unknowns = 3 * len(pattern.free)
     rest = simulator.rest_state()
     stage = simulator.method.stage(rest, simulator.time_step)
     elastic = simulator.prepare(replace(simulator.material, stiffness_damping=0.0))
     p.set_terms(simulator.step_terms(stage, 1, None, elastic, workspace))
     p.positions.copy_(rest.q)
     p.update_tangent()
-    linear = make_linear_solver("dense", pattern.rows, pattern.cols, len(pattern.free), 3, p.device, p.dtype)
-    lower = HessianAssembly(p, linear, pattern)().reshape(unknowns, unknowns).cpu().numpy()
+    solver = SparseSolver(pattern.rows, pattern.cols, len(pattern.free), 3, p.device, p.dtype)
+    (entries,) = solver.mirrored(HessianAssembly(p, solver, pattern)())
     inertia = np.repeat(p.inertia[0].cpu().numpy()[pattern.free], 3)
-    return np.tril(lower) + np.tril(lower, -1).T - np.diag(inertia), inertia, pattern.free
+    return (solver.matrix(entries) - scipy.sparse.diags_array(inertia)).tocsc(), inertia, pattern.free
 
 
 class RestStiffness:
@@ -78,8 +77,8 @@ class RestStiffness:
         if not len(simulator.fixed):
             raise InputError("a body without fixed vertices follows any force without end: fix some vertices.")
         stiffness, _, free = _about_rest(simulator)
-        self._matrix = scipy.sparse.csc_array(stiffness)
-        self._factor = scipy.sparse.linalg.splu(self._matrix)
+        self._matrix = stiffness
+        self._factor = scipy.sparse.linalg.splu(stiffness)
         self._dofs = (3 * free[:, None] + np.arange(3)).ravel()
         self._size = 3 * simulator.body.n_vertices
 

@@ -14,6 +14,7 @@ from ..errors import InputError
 from ..modes import RestStiffness
 
 NETWORK_KINDS = ("reduced", "nodal")
+ACTIVATIONS = ("normalised_elu", "silu")
 # Modes and coordinates that vary less than this fraction of the largest are not amplified to unit deviation.
 _DEVIATION_FLOOR = 3e-3
 _SAMPLES_FOR_MODES = 2_000
@@ -23,7 +24,8 @@ _MANY_SAMPLES = 10_000  # whose singular value decomposition takes minutes
 class SkipMLP(nn.Module):
     """Blocks of perceptrons with skip connections between blocks.
 
-    Every linear layer but a block's last is followed by LayerNorm and ELU. Blocks after the first add to their input.
+    Every linear layer but a block's last is followed by LayerNorm and ELU, as published, or by SiLU alone, which makes
+    a smoother function. Blocks after the first add to their input.
 
     Args:
         n_in: inputs.
@@ -31,11 +33,13 @@ class SkipMLP(nn.Module):
         blocks: number of blocks.
         layers: hidden layers a block; 0 makes the map affine.
         width: of the hidden layers.
+        activation: one of `ACTIVATIONS`.
     """
 
-    def __init__(self, n_in: int, n_out: int, blocks: int, layers: int, width: int) -> None:
+    def __init__(self, n_in: int, n_out: int, blocks: int, layers: int, width: int, activation: str) -> None:
         super().__init__()
-        self.blocks = nn.ModuleList(_perceptron(n_in if i == 0 else n_out, n_out, layers, width) for i in range(blocks))
+        sizes = [n_in if i == 0 else n_out for i in range(blocks)]
+        self.blocks = nn.ModuleList(_perceptron(size, n_out, layers, width, activation) for size in sizes)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """(S, n_in) to (S, n_out)."""
@@ -46,10 +50,11 @@ class SkipMLP(nn.Module):
         return x
 
 
-def _perceptron(n_in: int, n_out: int, layers: int, width: int) -> nn.Sequential:
+def _perceptron(n_in: int, n_out: int, layers: int, width: int, activation: str) -> nn.Sequential:
     modules: list[nn.Module] = []
     for i in range(layers):
-        modules += [nn.Linear(n_in if i == 0 else width, width), nn.LayerNorm(width), nn.ELU()]
+        modules.append(nn.Linear(n_in if i == 0 else width, width))
+        modules += [nn.SiLU()] if activation == "silu" else [nn.LayerNorm(width), nn.ELU()]
     return nn.Sequential(*modules, nn.Linear(width if layers else n_in, n_out))
 
 
@@ -172,7 +177,7 @@ class StateMap(nn.Module):
         position: coder of positions less the rest shape.
         velocity: coder of velocities.
         outputs: coder of each predicted field.
-        architecture: ``blocks``, ``layers`` and ``width``.
+        architecture: ``blocks``, ``layers``, ``width`` and ``activation``.
         actuation: coder of what acts on the body, such as weights or pressures; None where nothing does.
     """
 
@@ -187,14 +192,14 @@ class StateMap(nn.Module):
         position: Coder,
         velocity: Coder,
         outputs: Mapping[str, Coder],
-        architecture: Mapping[str, int],
+        architecture: Mapping[str, Any],
         actuation: Coder | None = None,
     ) -> None:
         super().__init__()
         self.register_buffer("rest", rest)
         self.position, self.velocity, self.actuation = position, velocity, actuation
         self.outputs = nn.ModuleDict(outputs)
-        self.architecture = {key: int(architecture[key]) for key in ("blocks", "layers", "width")}
+        self.architecture = {key: architecture[key] for key in ("blocks", "layers", "width", "activation")}
         self._sizes = [coder.size for coder in outputs.values()]
         n_in = position.size + velocity.size + (0 if actuation is None else actuation.size)
         n_out = sum(self._sizes)
@@ -361,10 +366,12 @@ def check_network(config: Mapping[str, Any]) -> None:
     """Checks the ranges of the group ``network``.
 
     Raises:
-        InputError: an unknown kind, or a size that is not positive.
+        InputError: an unknown kind or activation, or a size that is not positive.
     """
     if config["kind"] not in NETWORK_KINDS:
         raise InputError(f"network.kind is {config['kind']!r}: choose one of {', '.join(NETWORK_KINDS)}.")
+    if config["activation"] not in ACTIVATIONS:
+        raise InputError(f"network.activation is {config['activation']!r}: choose one of {', '.join(ACTIVATIONS)}.")
     reduced = config["kind"] == "reduced"
     for key in ("blocks", "width", *(("force_modes",) if reduced else ())):
         if not config[key] > 0:

@@ -10,7 +10,7 @@ import torch
 from typing_extensions import override
 
 from ..errors import InputError
-from .networks import Model
+from .networks import Model, StateMap
 
 SCHEDULES = ("cosine", "step")
 SELECTIONS = ("rollout", "validation_loss")
@@ -176,6 +176,7 @@ class Trainer(EpochTrainer[Model]):
             )
             if config["linear_noise"] is not None:
                 model.fit_linear(*self._train, config["linear_noise"])
+            self._weights = scale_weights(model, config["scale_weight"])
 
     def learning_rate(self, epoch: int) -> float:
         """Cosine from the first to the final rate, or a factor gamma every so many epochs."""
@@ -215,8 +216,8 @@ class Trainer(EpochTrainer[Model]):
             return float(self._loss(x, y)) * float(self.model.remainder) ** 2
 
     def _loss(self, inputs: torch.Tensor, outputs: torch.Tensor) -> torch.Tensor:
-        """Mean squared error of the standardised outputs, in units of what the linear part leaves."""
-        error = self.model.standardised(inputs) - outputs
+        """Weighted mean squared error of the standardised outputs, in units of what the linear part leaves."""
+        error = self._weights * (self.model.standardised(inputs) - outputs)
         return (error / self.model.remainder).square().mean()
 
     @override
@@ -238,6 +239,19 @@ class Trainer(EpochTrainer[Model]):
         self._optimiser.load_state_dict({**self._optimiser.state_dict(), "state": slots})
 
 
+def scale_weights(model: StateMap, exponent: float) -> torch.Tensor:
+    """(n_out,) weights of the standardised outputs in the loss: their deviations to a power, mean square one a field.
+
+    Standardised outputs are all alike to a loss. With the power one it is the squared error of the fields themselves,
+    where a few modes hold nearly everything; a half lets the small ones be learned too.
+    """
+    weights = []
+    for coder in model.coders:
+        powers = coder.scale**exponent
+        weights.append(powers / powers.square().mean().sqrt())
+    return torch.cat(weights).to(model.linear.dtype)
+
+
 def check_trainer(config: Mapping[str, Any]) -> None:
     """Checks the ranges of the group ``trainer``.
 
@@ -252,7 +266,7 @@ def check_trainer(config: Mapping[str, Any]) -> None:
             raise InputError(f"trainer.{key} is {config[key]}: it must be positive.")
     if not 0.0 < config["gamma"] <= 1.0:
         raise InputError(f"trainer.gamma is {config['gamma']}: it must be greater than 0 and at most 1.")
-    for key in ("weight_decay", "noise"):
+    for key in ("weight_decay", "noise", "scale_weight"):
         if not config[key] >= 0:
             raise InputError(f"trainer.{key} is {config[key]}: it must be zero or more.")
     if config["linear_noise"] is not None and not config["linear_noise"] > 0:

@@ -50,6 +50,7 @@ _WORDS = (
     "*.name",
     "*.method",
     "solver.linear_solver",
+    "network.activation",
     "trainer.schedule",
     "trainer.selection",
 )

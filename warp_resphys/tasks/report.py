@@ -31,7 +31,7 @@ from .trajectories import (
 
 _HISTORIES = {"resphys": TRAINING, "simfree": SIMFREE_TRAINING}
 _SELECTED_BY = {"rollout": "roll-out error", "validation_loss": "validation loss"}
-_PUBLISHED_NETWORK = {"kind": "nodal", "blocks": 5, "layers": 3, "width": 512}
+_PUBLISHED_NETWORK = {"kind": "nodal", "blocks": 5, "layers": 3, "width": 512, "activation": "normalised_elu"}
 _PUBLISHED_TRAINER = {
     "epochs": 1000,
     "batch_size": 256,
@@ -40,6 +40,7 @@ _PUBLISHED_TRAINER = {
     "weight_decay": 1e-5,
     "noise": 0.0,
     "linear_noise": None,
+    "scale_weight": 0.0,
     "selection": "validation_loss",
 }
 _AS_PUBLISHED = "The published errors are measured against the reconstructed trajectories, ours against the target."

@@ -92,6 +92,13 @@ def import_driven(context: StageContext) -> None:
         series = each.pressure[1 : steps + 1]
         pressure[row, : len(series)] = series
         pressure[row, len(series) :] = each.pressure[-1]
+        if len(series) < steps:
+            log.warning(
+                "import: %s ends after %d of the %d steps of data.steps; the rest counts as not seen.",
+                each.recording.source.name,
+                len(series),
+                steps,
+            )
     attributes = {
         "names": [each.trial.name for each in observed],
         "labels": followed,

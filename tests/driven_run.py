@@ -24,7 +24,14 @@ _OFF = {
 
 def data(**changes):
     """The group of that name."""
-    return {"kind": "pressure", "folder": None, "pressure_limit": LIMIT, "train_fraction": 1.0, **changes}
+    return {
+        "kind": "pressure",
+        "folder": None,
+        "pressure_limit": LIMIT,
+        "train_fraction": 1.0,
+        "factors": [],
+        **changes,
+    }
 
 
 def arm_settings(name="sopra", chambers=6, **changes):
@@ -106,16 +113,18 @@ def write_run(
     markers += rng.normal(0.0, 5e-5, markers.shape)
     markers[:, 30:36, min(1, len(labels) - 1)] = np.nan
     attributes = {
-        "names": list(driven),
         "labels": labels,
         "chambers": [f"chamber_{number + 1}" for number in range(chambers)],
         "gravity": np.array([0.0, 0.0, -9.80709]),
         "time_step": STEP,
     }
-    with atomic_hdf5(folder / "motions.h5", "motions", attributes) as file:
-        create(file, "markers", markers, "m", 1)
-        create(file, "pressure", np.stack(list(driven.values())), "Pa", 1)
-        create(file, "bound", bound, "m", 0)
+    drawn, count = np.stack(list(driven.values())), train + test
+    parts = {"motions.h5": slice(None, count)} | ({"motions_raised.h5": slice(count, None)} if factors else {})
+    for name, rows in parts.items():
+        with atomic_hdf5(folder / name, "motions", {**attributes, "names": list(driven)[rows]}) as file:
+            create(file, "markers", markers[rows], "m", 1)
+            create(file, "pressure", drawn[rows], "Pa", 1)
+            create(file, "bound", bound, "m", 0)
     rolled = list(driven)[train:]
     film = np.arange(0, steps + 1, 2)
     simulated = {}

@@ -136,7 +136,7 @@ def test_page_of_longer_rollouts_of_which_one_diverged(tmp_path):
 
 @pytest.mark.usefixtures("no_figures")
 def test_page_of_higher_pressures(tmp_path):
-    settings = arm_settings("sopra_overpressure")
+    settings = arm_settings("sopra_overpressure", data=data(factors=[1.25, 1.75]))
     write_run(tmp_path, settings, test=2, factors=(1.25, 1.75))
     page = report(tmp_path, settings)
     found = errors_of(tmp_path)["overpressure"]
@@ -146,7 +146,8 @@ def test_page_of_higher_pressures(tmp_path):
     assert "At higher pressures it is none of 2 (1.25 times), 2 of 2 (1.75 times), the first after 0.40 s" in text
     assert "ResPhys: none of 2 roll-outs" in text
     assert (tmp_path / "figures" / "error_over_factor.png").is_file()
-    trials, beyond, _ = read_rollouts(tmp_path, errors_of(tmp_path), STEP)
+    known = read_actuation([tmp_path / "motions.h5", tmp_path / "motions_raised.h5"], LIMIT).pressure
+    trials, beyond, _ = read_rollouts(tmp_path, errors_of(tmp_path), STEP, [*known])
     assert trials.names == ("test_00", "test_01")
     assert len(beyond) == 4
     rows = trials.errors_mm()["resphys"]
@@ -199,7 +200,7 @@ def test_files_that_do_not_belong_together_are_refused(tmp_path):
     write_run(other, settings, test=3, steps=40, models=("resphys",))
     (other / "rollouts.h5").replace(tmp_path / "rollouts.h5")
     with pytest.raises(DataFileError, match=r"rollouts.h5 names trials that .* does not hold \(test_02\)"):
-        read_rollouts(tmp_path, metrics, STEP)
+        read_rollouts(tmp_path, metrics, STEP, ["test_00", "test_01"])
     write_run(tmp_path, settings, test=2, steps=40, models=("resphys",), chambers=7)
     with pytest.raises(DataFileError, match=r"pressures of chamber_7, but the body's chambers are chamber_1, "):
         report(tmp_path, settings)
@@ -208,7 +209,8 @@ def test_files_that_do_not_belong_together_are_refused(tmp_path):
 def test_what_is_read(tmp_path):
     settings = arm_settings()
     write_run(tmp_path, settings, diverged=("simfree",))
-    trials, beyond, film = read_rollouts(tmp_path, errors_of(tmp_path), STEP)
+    actuation = read_actuation([tmp_path / "motions.h5"], LIMIT)
+    trials, beyond, film = read_rollouts(tmp_path, errors_of(tmp_path), STEP, [*actuation.pressure])
     assert beyond == ()
     assert trials.times[0, [0, -1]].tolist() == [0.0, pytest.approx(2.0)]
     assert np.isnan(trials.measured[0, 30:36, 1]).all()
@@ -218,7 +220,6 @@ def test_what_is_read(tmp_path):
     for model in ("sysid", "resphys"):
         assert rows[model][:, 1:].mean() == pytest.approx(expected[model]["mean"], rel=1e-5)
     assert film.positions["resphys"].shape[0] == len(film.steps) == 51
-    actuation = read_actuation(tmp_path, LIMIT)
     assert list(actuation.pressure) == ["train_00", "train_01", "test_00", "test_01", "test_02"]
     assert actuation.pressure["test_00"].shape == (100, 6)
 

@@ -60,6 +60,7 @@ FOLLOWED = "markers.followed={T1:[0.02,0.0,-0.1],T2:[0.0,0.02,-0.1],T3:[-0.02,-0
 QUIET = ["hydra/job_logging=none", "hydra/hydra_logging=none", IN_RUN]
 COMMAND = ["experiment=tiny", FOLLOWED, *QUIET]
 STAGES = ["synthesise", "import", "identify", "reconstruct", "train_simfree", "train_resphys", "evaluate", "report"]
+RAISED = ["synthesise_raised", "import_raised"]
 
 
 def place_experiment(folder):
@@ -75,15 +76,31 @@ def configuration(*overrides, experiment="sopra"):
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    """A complete run, in one process, with test trials at higher pressure too."""
+    """A complete run, in one process, that was tested at a higher pressure later."""
     folder = tmp_path_factory.mktemp("driven")
     place_experiment(folder)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.setattr(experiment, "report_driven", lambda context: (context.run_dir / "report.html").write_text("-"))
+        code, err = run(*COMMAND)
+        assert (code, err[-500:] if code else "") == (0, "")
+        before = {path: path.stat().st_mtime_ns for path in (folder / "run").rglob("*.h5")}
         code, err = run(*COMMAND, "data.factors=[1.5]")
     assert (code, err[-500:] if code else "") == (0, "")
+    changed = [path.name for path, at in before.items() if path.stat().st_mtime_ns != at]
+    assert changed == ["rollouts.h5"]  # Nothing but the new trials is simulated again, and nothing learned.
     return folder
+
+
+def motions(folder):
+    """Names, markers and pressures of all trials, those at higher pressures last."""
+    found = []
+    for name in ("motions.h5", "motions_raised.h5"):
+        with read_hdf5(folder / "run" / name, "motions") as file:
+            names = [str(each) for each in file.attrs["names"]]
+            found.append((names, read_array(file, "markers"), read_array(file, "pressure")))
+    (a, b) = found
+    return a[0] + b[0], np.concatenate([a[1], b[1]]), np.concatenate([a[2], b[2]])
 
 
 def metrics(folder):
@@ -91,12 +108,10 @@ def metrics(folder):
 
 
 def test_every_stage_leaves_its_files_and_the_errors_are_those_of_the_roll_outs(finished):
-    assert sorted(path.stem for path in (finished / "run" / "stages").glob("*.json")) == sorted(STAGES)
+    assert sorted(path.stem for path in (finished / "run" / "stages").glob("*.json")) == sorted([*STAGES, *RAISED])
     assert not list((finished / "run").glob("*_parts"))
     found = metrics(finished)
-    with read_hdf5(finished / "run" / "motions.h5", "motions") as file:
-        names = [str(name) for name in file.attrs["names"]]
-        observed = read_array(file, "markers")
+    names, observed, _ = motions(finished)
     with read_hdf5(finished / "run" / "rollouts.h5", "rollouts") as file:
         tested = [str(name) for name in file.attrs["names"]]
         markers = {model: read_array(file, f"{model}_markers") for model in found["errors_mm"]}
@@ -117,8 +132,9 @@ def test_recordings_are_seen_by_cameras_and_registered_back(finished):
     truth = json.loads((finished / "run" / "truth.json").read_text())
     recording = read_recording(finished / "run" / "recordings" / "t000.h5")
     assert np.linalg.norm(recording.positions[0, 0] - truth["bound"]["T1"]) > 0.01
+    _, _, pressure = motions(finished)
     with read_hdf5(finished / "run" / "motions.h5", "motions") as file:
-        pressure, bound = read_array(file, "pressure"), read_array(file, "bound")
+        bound = read_array(file, "bound")
     np.testing.assert_allclose(bound, np.array(list(truth["bound"].values())), atol=1e-3)
     assert 0.0 < pressure[:4].max() <= 20e3
     np.testing.assert_allclose(pressure[4], 1.5 * pressure[3])

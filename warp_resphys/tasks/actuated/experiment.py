@@ -27,15 +27,15 @@ from ..measured.files import (
 )
 from ..trajectories import shown, simulated, training_settings
 from .evaluate import evaluate_driven
-from .files import LEARNED, MOTIONS, RECONSTRUCTED, RECONSTRUCTION
+from .files import LEARNED, MOTIONS, RAISED_MOTIONS, RECONSTRUCTED, RECONSTRUCTION
 from .identify import identify_driven
-from .importing import import_driven
+from .importing import import_driven, import_raised
 from .parts import processes_for
 from .reconstruct import reconstruct_driven
 from .report import report_driven
 from .synthesise import synthesise_driven
 from .train import train_driven, train_simfree_driven
-from .trials import groups_of, is_synthetic, split_of, trials_of
+from .trials import groups_of, is_synthetic, raised_trials_of, split_of, trials_of
 
 _TRIALS = ("folder", "trials", "sequences", "train", "validation", "test", "factors", "limit")
 _SYNTHESISED = (
@@ -66,18 +66,13 @@ def driven_stages(config: Mapping[str, Any]) -> list[Stage]:
     processes = processes_for(config)
     base = {**simulated(config), **_pick(config, *_LEARNED), "batch": config["parallel"]["batch"]}
     later = ("windows", "train_fraction")
-    imported = {**base, "data": {key: value for key, value in config["data"].items() if key not in later}}
+    nominal = {**config["data"], "factors": []}  # what is learned from does not depend on what else is tested
+    imported = {**base, "data": {key: value for key, value in nominal.items() if key not in later}}
     stages = []
     if is_synthetic(config):
-        data = _pick(config["data"], *_TRIALS, "steps", "pressure_limit")
-        markers = _pick(config["markers"], *_SYNTHESISED_MARKERS)
-        own = {**_pick(config, *_SYNTHESISED), "data": data, "markers": markers, "batch": base["batch"]}
-        if config["synthetic"]["mesh"]["kind"] == "file":
-            own["mesh_digest"] = digest(config["synthetic"]["mesh"]["path"])
         files = (*(recording_file(trial.name) for trial in trials), TRUTH)
-        stages.append(
-            Stage("synthesise", partial(synthesise_driven, processes=processes), files, own, processes=processes)
-        )
+        simulate = partial(synthesise_driven, processes=processes)
+        stages.append(Stage("synthesise", simulate, files, _synthesised(config, nominal), processes=processes))
     else:
         imported["recordings"] = {trial.name: _digest(trial.file) for trial in trials}
     needs = tuple(stage.name for stage in stages)
@@ -106,19 +101,53 @@ def driven_stages(config: Mapping[str, Any]) -> list[Stage]:
         outputs = (weights_file(model), training_file(model))
         stages.append(Stage(f"train_{model}", function, outputs, settings, ("import", "identify", "reconstruct")))
     tested = {**base, "data": _pick(config["data"], "windows"), "tip": config["tip"], "groups": groups_of(config)}
-    trained = tuple(f"train_{model}" for model in LEARNED)
+    needs = ("import", "identify", *(f"train_{model}" for model in LEARNED))
+    if config["data"]["factors"]:
+        stages += _raised_stages(config, imported, processes)
+        needs = (*needs, stages[-1].name)
     stages += [
         Stage(
             "evaluate",
             partial(evaluate_driven, processes=processes),
             (ROLLOUTS, ERRORS),
             tested,
-            ("import", "identify", *trained),
+            needs,
             processes=processes,
         ),
         Stage("report", report_driven, (REPORT,), {"config": shown(config)}, ("evaluate",)),
     ]
     return stages
+
+
+def _raised_stages(config: Mapping[str, Any], imported: Mapping[str, Any], processes: int) -> list[Stage]:
+    """Those that make and import the test trials at higher pressures, as ``imported`` says of the others."""
+    files = tuple(recording_file(trial.name) for trial in raised_trials_of(config))
+    function = partial(synthesise_driven, processes=processes, higher=True)
+    settings = _synthesised(config, config["data"])
+    data = {**imported["data"], "factors": config["data"]["factors"]}
+    return [
+        Stage("synthesise_raised", function, files, settings, ("synthesise",), processes=processes),
+        Stage(
+            "import_raised",
+            import_raised,
+            (RAISED_MOTIONS,),
+            {**imported, "data": data},
+            ("import", "synthesise_raised"),
+        ),
+    ]
+
+
+def _synthesised(config: Mapping[str, Any], data: Mapping[str, Any]) -> dict[str, Any]:
+    """What simulated recordings depend on, with the group ``data``."""
+    own: dict[str, Any] = {
+        **_pick(config, *_SYNTHESISED),
+        "data": _pick(data, *_TRIALS, "steps", "pressure_limit"),
+        "markers": _pick(config["markers"], *_SYNTHESISED_MARKERS),
+        "batch": config["parallel"]["batch"],
+    }
+    if config["synthetic"]["mesh"]["kind"] == "file":
+        own["mesh_digest"] = digest(config["synthetic"]["mesh"]["path"])
+    return own
 
 
 def _pick(config: Mapping[str, Any], *keys: str) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """Names of the files of an experiment with pressures, and the reader of the imported motions."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ from ...driven import DrivenMotions
 from ...files import read_array, read_hdf5
 
 MOTIONS = "motions.h5"
+RAISED_MOTIONS = "motions_raised.h5"
 RECONSTRUCTED = "reconstruction.h5"
 RECONSTRUCTION = "reconstruction.json"
 MODELS = ("simulation", "sysid", "simfree", "resphys")
@@ -35,9 +36,16 @@ class Imported:
     labels: tuple[str, ...]
     gravity: NDArray[np.float64]
 
+    def and_those_of(self, other: "Imported") -> "Imported":
+        """These motions and others of the same body after them."""
+        a, b = self.motions, other.motions
+        fields = ("times", "markers", "held", "attached_mass", "pressure")
+        joined = DrivenMotions((*a.names, *b.names), *(torch.cat([getattr(a, f), getattr(b, f)]) for f in fields))
+        return replace(self, motions=joined, smoothed=torch.cat([self.smoothed, other.smoothed]))
+
 
 def read_imported(path: Path, vertices: int) -> Imported:
-    """Reads motions.h5.
+    """Reads motions.h5, or the same of the trials at higher pressures.
 
     Args:
         path: the file.

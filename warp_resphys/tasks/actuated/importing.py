@@ -24,8 +24,8 @@ from ..binding import bound_markers
 from ..measured.files import QUALITY, REGISTRATION, recording_file
 from ..measured.importing import registration_summary
 from ..trajectories import evenly
-from .files import MOTIONS
-from .trials import Trial, is_synthetic, trials_of
+from .files import MOTIONS, RAISED_MOTIONS, read_imported
+from .trials import Trial, is_synthetic, raised_trials_of, trials_of
 
 log = logging.getLogger(__name__)
 
@@ -65,21 +65,79 @@ def import_driven(context: StageContext) -> None:
         InputError: a configured value that does not fit.
     """
     settings = context.settings
-    markers, simulator = settings["markers"], build_simulator(settings)
-    followed = list(markers["followed"])
-    # Recordings show the body at rest under gravity: the nominal places, which are those on the undeformed body, hang.
-    nominal = np.array([*markers["followed"].values(), *markers["others"].values()], dtype=np.float64)
-    hanging = _hanging(settings, simulator, nominal[: len(followed)])
-    expected = np.concatenate([hanging, nominal[len(followed) :]])
-    observed = [_observe(trial, context, simulator, expected) for trial in trials_of(settings)]
-    _check_others(observed, settings)
-    places = np.stack([each.registration.positions[: len(followed)] for each in observed])  # (R, M, 3) [m]
+    simulator, followed = build_simulator(settings), list(settings["markers"]["followed"])
+    nominal, hanging = _hanging(settings, simulator)
+    observed = _observe_all(trials_of(settings), context, simulator, hanging)
+    places = _resting_places(observed, followed)
     known = len(settings["split"]["train"]) + len(settings["split"]["validation"])  # which come first
     mean = np.nanmean(places[:known], axis=0)
-    bound = nominal[: len(followed)] + (mean - hanging)
-    shifts = mean - places if settings["data"]["rest"] == "own" else np.zeros_like(places)
-    bound_markers(markers, simulator.body.mesh, bound, followed)  # Refuses a marker that is far off the body.
-    steps = settings["data"]["steps"]
+    bound = nominal + (mean - hanging[: len(followed)])
+    bound_markers(settings["markers"], simulator.body.mesh, bound, followed)  # Refuses a marker that is far off.
+    shifts = _shifts(settings, mean, places)
+    _write_motions(context, MOTIONS, observed, bound, shifts, simulator)
+    _write_quality(context, observed, followed, -shifts)
+
+
+def import_raised(context: StageContext) -> None:
+    """Writes motions_raised.h5, of the trials at higher pressures; markers sit where they sit in motions.h5.
+
+    Raises:
+        DataFileError: a recording that cannot be read or used.
+    """
+    settings = context.settings
+    simulator, followed = build_simulator(settings), list(settings["markers"]["followed"])
+    bound = read_imported(context.run_dir / MOTIONS, simulator.body.n_vertices).bound
+    nominal, hanging = _hanging(settings, simulator)
+    observed = _observe_all(raised_trials_of(settings), context, simulator, hanging)
+    mean = hanging[: len(followed)] + (bound - nominal)
+    shifts = _shifts(settings, mean, _resting_places(observed, followed))
+    _write_motions(context, RAISED_MOTIONS, observed, bound, shifts, simulator)
+
+
+def _hanging(settings: Mapping[str, Any], simulator: Simulator) -> tuple[FloatArray, FloatArray]:
+    """(M, 3) nominal places of the followed markers, and (M', 3) where all markers are while the body hangs [m].
+
+    Recordings show the body at rest under gravity; the nominal places are those on the undeformed body.
+    """
+    markers = settings["markers"]
+    nominal, others = (
+        np.array([*markers[key].values()], dtype=np.float64).reshape(-1, 3) for key in ("followed", "others")
+    )
+    read = bound_markers(markers, simulator.body.mesh, nominal, tuple(markers["followed"]))
+    moved: FloatArray = read.to(simulator.rest_positions)(simulator.static_equilibrium().q)[0].cpu().numpy()
+    return nominal, np.concatenate([moved, others])
+
+
+def _observe_all(
+    trials: Sequence[Trial], context: StageContext, simulator: Simulator, expected: FloatArray
+) -> list[Observed]:
+    """Reads and registers trials, whose standing markers must not have moved against each other."""
+    observed = [_observe(trial, context, simulator, expected) for trial in trials]
+    _check_others(observed, context.settings)
+    return observed
+
+
+def _resting_places(observed: Sequence[Observed], followed: Sequence[str]) -> FloatArray:
+    """(R, M, 3) where the followed markers of each trial rest, in the frame of the body [m]."""
+    return np.stack([each.registration.positions[: len(followed)] for each in observed])
+
+
+def _shifts(settings: Mapping[str, Any], mean: FloatArray, places: FloatArray) -> FloatArray:
+    """(R, M, 3) by which each trial's markers are moved [m]: to where they rest on the whole, if they drift."""
+    return mean - places if settings["data"]["rest"] == "own" else np.zeros_like(places)
+
+
+def _write_motions(
+    context: StageContext,
+    name: str,
+    observed: Sequence[Observed],
+    bound: FloatArray,
+    shifts: FloatArray,
+    simulator: Simulator,
+) -> None:
+    """Markers and pressures of trials at the steps of the simulation."""
+    settings = context.settings
+    steps, followed = settings["data"]["steps"], list(settings["markers"]["followed"])
     moving = np.full((len(observed), steps + 1, len(followed), 3), np.nan)
     smoothed = moving.copy()
     pressure = np.zeros((len(observed), steps, len(simulator.body.chambers)))
@@ -106,20 +164,11 @@ def import_driven(context: StageContext) -> None:
         "gravity": settings["gravity"],
         "time_step": settings["time_step"],
     }
-    with atomic_hdf5(context.run_dir / MOTIONS, "motions", attributes) as file:
+    with atomic_hdf5(context.run_dir / name, "motions", attributes) as file:
         create(file, "markers", moving, units="m", time_axis=1)
         create(file, "smoothed", smoothed, units="m", time_axis=1)
         create(file, "pressure", pressure, units="Pa", time_axis=1)
         create(file, "bound", bound, units="m")
-    _write_quality(context, observed, followed, -shifts)
-
-
-def _hanging(settings: Mapping[str, Any], simulator: Simulator, places: FloatArray) -> FloatArray:
-    """(M, 3) where markers at places on the undeformed body are while it hangs at rest [m]."""
-    markers = settings["markers"]
-    read = bound_markers(markers, simulator.body.mesh, places, tuple(markers["followed"]))
-    hanging: FloatArray = read.to(simulator.rest_positions)(simulator.static_equilibrium().q)[0].cpu().numpy()
-    return hanging
 
 
 def _observe(trial: Trial, context: StageContext, simulator: Simulator, expected: FloatArray) -> Observed:

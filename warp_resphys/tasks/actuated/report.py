@@ -1,6 +1,6 @@
 """Stage: the report of a split of trials that pressure drives."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from ...stages import StageContext
 from ..measured.files import IDENTIFICATION, REPORT, ROLLOUTS, TRUTH, training_file
 from ..measured.identify import first_guess
 from ..measured.report import error_notes, read_if_there, read_metrics, read_recordings
-from .files import LEARNED, MOTIONS, RECONSTRUCTION
+from .files import LEARNED, MOTIONS, RAISED_MOTIONS, RECONSTRUCTION
 from .trials import is_synthetic
 
 _NOTES = {
@@ -40,8 +40,9 @@ def report_driven(context: StageContext) -> None:
     mesh = build_mesh(config["mesh"])
     synthetic = is_synthetic(config)
     metrics, truth = read_metrics(folder, config), read_json(folder / TRUTH) if synthetic else {}
-    trials, beyond, film = read_rollouts(folder, metrics, config["time_step"])
-    actuation = read_actuation(folder, config["data"]["pressure_limit"])
+    files = [folder / name for name in (MOTIONS, *((RAISED_MOTIONS,) if config["data"]["factors"] else ()))]
+    actuation = read_actuation(files, config["data"]["pressure_limit"])
+    trials, beyond, film = read_rollouts(folder, metrics, config["time_step"], [*actuation.pressure])
     data = DrivenReport(
         experiment=config["name"],
         title=config["title"],
@@ -89,23 +90,29 @@ def _chambers(chambers: tuple[Chamber, ...], names: tuple[str, ...]) -> tuple[Ch
     return tuple(found[name] for name in names)
 
 
-def read_actuation(folder: Path, limit: float | None) -> Actuation:
+def read_actuation(files: Sequence[Path], limit: float | None) -> Actuation:
     """The pressures of all trials.
 
     Args:
-        folder: of the run.
+        files: with the motions of the trials.
         limit: that none may exceed [Pa].
 
     Raises:
-        DataFileError: motions.h5 is missing or damaged.
+        DataFileError: a file is missing or damaged.
     """
-    with read_hdf5(folder / MOTIONS, "motions") as file:
-        names, chambers = ([str(each) for each in file.attrs[key]] for key in ("names", "chambers"))
-        pressure = read_array(file, "pressure", (len(names), None, len(chambers)))
-    return Actuation(tuple(chambers), dict(zip(names, pressure, strict=True)), limit)
+    chambers: tuple[str, ...] = ()
+    pressures: dict[str, Any] = {}
+    for path in files:
+        with read_hdf5(path, "motions") as file:
+            names, labels = ([str(each) for each in file.attrs[key]] for key in ("names", "chambers"))
+            chambers = tuple(labels)
+            pressures |= dict(zip(names, read_array(file, "pressure", (len(names), None, len(labels))), strict=True))
+    return Actuation(chambers, pressures, limit)
 
 
-def read_rollouts(folder: Path, metrics: Mapping[str, Any], time_step: float) -> tuple[Trials, tuple[str, ...], Film]:
+def read_rollouts(
+    folder: Path, metrics: Mapping[str, Any], time_step: float, known: Sequence[str]
+) -> tuple[Trials, tuple[str, ...], Film]:
     """What was measured in the test trials and what the models made of them.
 
     Args:
@@ -113,6 +120,7 @@ def read_rollouts(folder: Path, metrics: Mapping[str, Any], time_step: float) ->
         metrics: with the number of trials that the errors are of; the roll-outs after these are at higher
             pressure.
         time_step: [s].
+        known: names of all trials that were imported.
 
     Returns:
         The test trials, the names of the roll-outs at higher pressure, and the bodies of the film.
@@ -134,7 +142,7 @@ def read_rollouts(folder: Path, metrics: Mapping[str, Any], time_step: float) ->
         simulated = {m: read_array(file, f"{m}_markers", shape)[:count].astype(np.float64) for m in models}
         steps = read_array(file, "film_steps", (None,)).astype(np.int64)
         filmed = {m: read_array(file, f"{m}_film", (len(steps), None, 3)) for m in models if f"{m}_film" in file}
-    unknown = sorted(set(rolled) - set(names))
+    unknown = sorted(set(rolled) - set(known))
     if unknown or not models:
         what = f"names trials that {path} does not hold ({', '.join(unknown)})" if unknown else "holds no model"
         raise DataFileError(f"{folder / ROLLOUTS} {what}: delete it and run the same command again.")

@@ -18,7 +18,7 @@ from ...residual.driven_rollout import Drive
 from ...simulator import MaterialTensors, Simulator
 from ..binding import bound_markers
 from ..measured.files import IDENTIFICATION
-from .files import MOTIONS, Imported, read_imported
+from .files import MOTIONS, RAISED_MOTIONS, Imported, read_imported
 
 # Models whose simulator, or whose states to learn from, have the identified parameters.
 IDENTIFIED = ("sysid", "simfree", "resphys")
@@ -46,7 +46,12 @@ class DrivenScene:
 
     @cached_property
     def _imported(self) -> Imported:
-        return read_imported(self.folder / MOTIONS, len(build_mesh(self.config["mesh"]).vertices))
+        """The motions, and those at higher pressures where the stage tests them."""
+        vertices = len(build_mesh(self.config["mesh"]).vertices)
+        found = read_imported(self.folder / MOTIONS, vertices)
+        if len(self.config.get("groups", ())) > 1:
+            found = found.and_those_of(read_imported(self.folder / RAISED_MOTIONS, vertices))
+        return found
 
     @property
     def labels(self) -> tuple[str, ...]:

@@ -25,20 +25,25 @@ from ..binding import bound_markers
 from ..measured.files import TRUTH, recording_file
 from ..measured.synthesise import Scene, make_scene
 from .parts import Made, Part, read_parts, remove_parts, split_into_parts, work_on
-from .trials import Trial, trials_of
+from .trials import Trial, raised_trials_of, trials_of
 
 FloatArray = NDArray[np.float64]
 
 
-def synthesise_driven(context: StageContext, processes: int = 1) -> None:
+def synthesise_driven(context: StageContext, processes: int = 1, higher: bool = False) -> None:
     """Writes recordings/<trial>.h5 for every trial, and truth.json.
+
+    Args:
+        context: of the stage.
+        processes: that share the trials.
+        higher: whether the trials are those at higher pressures; truth.json is there then.
 
     Raises:
         InputError: a configured value that does not fit.
         WorkerError: a step of the simulation fails.
     """
     settings = context.settings
-    trials = trials_of(settings)
+    trials = raised_trials_of(settings) if higher else trials_of(settings)
     names, steps = [trial.name for trial in trials], settings["data"]["steps"]
     parts = split_into_parts(context, names, settings["batch"])
     work_on(parts, simulate_part, processes, steps)
@@ -57,7 +62,8 @@ def synthesise_driven(context: StageContext, processes: int = 1) -> None:
         pressures = pressures_of(settings, trial, len(simulator.body.chambers))
         rate = 1.0 / settings["time_step"]
         write_recording(path, Recording(labels, positions + noise, rate, path, actuation=pressures))
-    write_json(context.run_dir / TRUTH, _truth(settings, scene, float(np.mean(distances))))
+    if not higher:
+        write_json(context.run_dir / TRUTH, _truth(settings, scene, float(np.mean(distances))))
     remove_parts(context)
 
 
@@ -112,7 +118,7 @@ def simulate_part(part: Part, advance: Advance) -> dict[str, Made]:
     read = bound_markers(markers, simulator.body.mesh, scene.followed, tuple(markers["followed"]))
     read = read.to(simulator.rest_positions)
     substeps = substeps_of(settings)
-    known = {trial.name: trial for trial in trials_of(settings)}
+    known = {trial.name: trial for trial in (*trials_of(settings), *raised_trials_of(settings))}
     chambers = len(simulator.body.chambers)
     drawn = np.stack([pressures_of(settings, known[name], chambers) for name in part.names])
     pressures = simulator.tensor(drawn)  # (B, K + 1, C) [Pa]

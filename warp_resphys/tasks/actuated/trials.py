@@ -84,7 +84,7 @@ def groups_of(config: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
 
 
 def trials_of(config: Mapping[str, Any]) -> tuple[Trial, ...]:
-    """All trials, in the order of the files: training, validation, test, test at higher pressures.
+    """The trials of training, validation and test, in this order.
 
     Raises:
         InputError: see `split_of`.
@@ -96,12 +96,21 @@ def trials_of(config: Mapping[str, Any]) -> tuple[Trial, ...]:
     else:
         files = _files(config["data"])
         found = {name: Trial(name, files[name]) for name in split.names}
-    higher = [
-        replace(found[name], name=raised(name, float(factor)), factor=float(factor))
+    return tuple(found.values())
+
+
+def raised_trials_of(config: Mapping[str, Any]) -> tuple[Trial, ...]:
+    """The test trials at higher pressures, factor by factor.
+
+    Raises:
+        InputError: see `split_of`.
+    """
+    test = {trial.name: trial for trial in trials_of(config) if trial.name in split_of(config).test}
+    return tuple(
+        replace(trial, name=raised(name, float(factor)), factor=float(factor))
         for factor in config["data"]["factors"]
-        for name in split.test
-    ]
-    return (*found.values(), *higher)
+        for name, trial in test.items()
+    )
 
 
 def _known(config: Mapping[str, Any]) -> list[str]:

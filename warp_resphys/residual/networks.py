@@ -17,8 +17,8 @@ NETWORK_KINDS = ("reduced", "nodal")
 ACTIVATIONS = ("normalised_elu", "silu")
 # Modes and coordinates that vary less than this fraction of the largest are not amplified to unit deviation.
 _DEVIATION_FLOOR = 3e-3
+# Samples that modes are taken from, evenly picked: neighbours in time tell the same, and more take minutes.
 _SAMPLES_FOR_MODES = 2_000
-_MANY_SAMPLES = 10_000  # whose singular value decomposition takes minutes
 
 
 class SkipMLP(nn.Module):
@@ -114,18 +114,18 @@ def pod_coder(samples: torch.Tensor, modes: int) -> Coder:
     Raises:
         InputError: more modes than samples or coordinates.
     """
-    x = samples.flatten(1)
+    x = _some(samples).flatten(1).double()
     if not 1 <= modes <= min(x.shape):
         raise InputError(f"{modes} modes were asked for, but {len(x)} samples give 1 to {min(x.shape)}.")
-    if len(x) > _MANY_SAMPLES:
-        # The same directions from a matrix of the coordinates alone, with half of the digits: enough for main modes.
-        _, ascending = torch.linalg.eigh(x.mT @ x)
-        directions = ascending.flip(1).mT
-    else:
-        _, _, directions = torch.linalg.svd(x, full_matrices=False)
+    _, _, directions = torch.linalg.svd(x, full_matrices=False)
     basis = directions[:modes].mT.contiguous()
     deviation = (x @ basis).square().mean(0).sqrt()
     return Coder(torch.zeros_like(x[0]), basis, deviation.clamp_min(_DEVIATION_FLOOR * float(deviation.max())))
+
+
+def _some(samples: torch.Tensor) -> torch.Tensor:
+    """At most so many of (S, ...) samples as modes are taken from."""
+    return samples[:: -(-len(samples) // _SAMPLES_FOR_MODES)]
 
 
 def displacement_coder(samples: torch.Tensor, stiffness: RestStiffness, modes: int) -> Coder:
@@ -136,21 +136,20 @@ def displacement_coder(samples: torch.Tensor, stiffness: RestStiffness, modes: i
     coordinate is the error of the body.
 
     Args:
-        samples: (S, N, 3) forces [N], of which some thousand tell.
+        samples: (S, N, 3) forces [N].
         stiffness: K, of the body at rest.
         modes: M.
 
     Raises:
         InputError: more modes than samples or coordinates.
     """
-    every = max(len(samples) // _SAMPLES_FOR_MODES, 1)
-    forces = samples[::every].flatten(1).double().cpu().numpy()
-    moved = torch.as_tensor(stiffness.displacements(forces.T).T.copy()).to(samples)
+    forces = _some(samples).flatten(1).double()
+    moved = torch.as_tensor(stiffness.displacements(forces.cpu().numpy().T).T.copy()).to(forces)
     coder = pod_coder(moved.unflatten(1, (-1, 3)), modes)
     assert coder.basis is not None
     psi = coder.basis.cpu().numpy()
-    basis, dual = (torch.as_tensor(part).to(samples) for part in (stiffness.displacements(psi), stiffness.forces(psi)))
-    return Coder(torch.zeros_like(samples[0].flatten()), basis, coder.scale, dual)
+    basis, dual = (torch.as_tensor(part).to(forces) for part in (stiffness.displacements(psi), stiffness.forces(psi)))
+    return Coder(torch.zeros_like(forces[0]), basis, coder.scale, dual)
 
 
 def actuation_coder(samples: torch.Tensor) -> Coder:

@@ -26,38 +26,51 @@ _MARGIN = 0.25  # of the width of the training range, by which a roll-out may ex
 
 @dataclass(frozen=True)
 class Reconstructed:
-    """The states and forces that networks learn from.
+    """The states and forces of some trials that networks learn from, in single precision, as they are kept.
 
     Attributes:
-        now: (S, N, 3) positions and velocities.
-        following: those one step on.
-        force: (S, N, 3) that leads there.
-        inputs: (S, A) what the networks are told of the pressures.
+        q: (R, K + 1, N, 3) positions [m].
+        v: (R, K + 1, N, 3) velocities [m/s].
+        force: (R, K + 1, N, 3) that leads to each state [N].
+        inputs: (R, K, A) what the networks are told of the pressures.
+        seen: (R, K) whether a marker saw where a step ends: what none saw has no force to learn.
     """
 
-    now: tuple[torch.Tensor, torch.Tensor]
-    following: tuple[torch.Tensor, torch.Tensor]
+    q: torch.Tensor
+    v: torch.Tensor
     force: torch.Tensor
     inputs: torch.Tensor
+    seen: torch.Tensor
+
+    def starts(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Positions, velocities (S, N, 3) and what is told of the pressures (S, A) where steps begin."""
+        return self._of(self.q[:, :-1]), self._of(self.v[:, :-1]), self._of(self.inputs)
+
+    def ends(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Positions and velocities (S, N, 3) where they end."""
+        return self._of(self.q[:, 1:]), self._of(self.v[:, 1:])
+
+    def forces(self) -> torch.Tensor:
+        """(S, N, 3) that lead there."""
+        return self._of(self.force[:, 1:])
+
+    def _of(self, field: torch.Tensor) -> torch.Tensor:
+        return field.flatten(0, 1) if bool(self.seen.all()) else field[self.seen]
 
 
 def read_reconstructed(context: StageContext, scene: DrivenScene, device: torch.device) -> dict[str, Reconstructed]:
-    """What the stage ``reconstruct`` left of each split, in double precision."""
+    """What the stage ``reconstruct`` left of each split."""
     with read_hdf5(context.run_dir / RECONSTRUCTED, "reconstruction") as file:
         found = {name: torch.as_tensor(read_array(file, name)) for name in ("q", "v", "force")}
     split, first, parts = context.settings["split"], 0, {}
     for name in ("train", "validation"):
         rows = slice(first, first + len(split[name]))
         first = rows.stop
-        fields = [found[key][rows].to(device, torch.float64) for key in ("q", "v", "force")]
-        steps = fields[0].shape[1] - 1
-        inputs = scene.drive("resphys", tuple(split[name])).inputs[:, :steps].flatten(0, 1).to(device)
-        # What no marker saw has no force to learn.
-        seen = torch.isfinite(scene.smoothed(tuple(split[name]))[:, 1 : steps + 1]).all(-1).any(-1).flatten().to(device)
-        now, following = (
-            [f[:, part].flatten(0, 1)[seen] for f in fields] for part in (slice(None, -1), slice(1, None))
-        )
-        parts[name] = Reconstructed((now[0], now[1]), (following[0], following[1]), following[2], inputs[seen])
+        q, v, force = (found[key][rows].to(device) for key in ("q", "v", "force"))
+        steps = q.shape[1] - 1
+        inputs = scene.drive("resphys", tuple(split[name])).inputs[:, :steps].to(device)
+        seen = torch.isfinite(scene.smoothed(tuple(split[name]))[:, 1 : steps + 1]).all(-1).any(-1).to(device)
+        parts[name] = Reconstructed(q, v, force, inputs, seen)
     return parts
 
 
@@ -65,12 +78,16 @@ def train_driven(context: StageContext) -> None:
     """Trains the residual force: resphys.safetensors and training_resphys.json."""
     scene = DrivenScene(context.settings, context.run_dir, "count")
     found = read_reconstructed(context, scene, choose_device(context.settings["device"]))
-    train = found["train"]
-    rest = scene.simulator.rest_positions.to(train.force.device)
+    samples = {}
+    for name, each in found.items():
+        q, v, inputs = each.starts()
+        samples[name] = Samples(q, v, (each.forces(),), inputs)
+    train = samples["train"]
+    rest = scene.simulator.rest_positions.to(train.q.device)
     torch.manual_seed(context.settings["seed"])
     stiffness = RestStiffness(scene.simulator)
-    model = build_model(context.settings["network"], rest, *train.now, train.force, train.inputs, stiffness)
-    samples = {name: Samples(*each.now, (each.force,), each.inputs) for name, each in found.items()}
+    fields = train.q, train.v, train.outputs[0]
+    model = build_model(context.settings["network"], rest, *fields, train.actuation, stiffness)
     _fit(context, scene, model, samples, "resphys", "residual force")
 
 
@@ -78,14 +95,15 @@ def train_simfree_driven(context: StageContext) -> None:
     """Trains the data-driven baseline on the same states: simfree.safetensors and training_simfree.json."""
     scene = DrivenScene(context.settings, context.run_dir, "count")
     found = read_reconstructed(context, scene, choose_device(context.settings["device"]))
-    train = found["train"]
-    rest = scene.simulator.rest_positions.to(train.force.device)
+    rest = scene.simulator.rest_positions.to(found["train"].q.device)
+    samples = {}
+    for name, each in found.items():
+        q, v, inputs = each.starts()
+        following, speed = each.ends()
+        samples[name] = Samples(q, v, (following - rest.to(following), speed), inputs)
+    train = samples["train"]
     torch.manual_seed(context.settings["seed"])
-    model = build_next_state(context.settings["network"], rest, *train.now, train.inputs)
-    samples = {
-        name: Samples(*each.now, (each.following[0] - rest, each.following[1]), each.inputs)
-        for name, each in found.items()
-    }
+    model = build_next_state(context.settings["network"], rest, train.q, train.v, train.actuation)
     _fit(context, scene, model, samples, "simfree", "next state")
 
 

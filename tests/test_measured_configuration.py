@@ -219,7 +219,7 @@ def test_without_a_choice_few_recordings_train_a_small_network(experiment, modes
     config = configuration(experiment=experiment)
     check_configuration(config | {"data": config["data"] | ({} if layers else {"folder": "recordings"})})
     names = ("position_modes", "velocity_modes", "force_modes")
-    small = {"kind": "reduced", "blocks": 1, "layers": layers, "width": 16, "activation": "silu"}
+    small = {"kind": "reduced", "blocks": 1, "layers": layers, "width": 16, "activation": "normalised_elu"}
     assert config["network"] == small | dict(zip(names, modes, strict=True))
     simfree = training_settings(config, "simfree")
     own = {"position_modes": 6, "velocity_modes": 6, "layers": 3, "width": 128}

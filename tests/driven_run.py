@@ -216,7 +216,7 @@ def _write_rest(folder, settings, followed, registered, rng, models, synthetic):
             for e in range(1, 31)
         ]
         write_json(folder / f"training_{model}.json", {"kept": {"epoch": 30}, "epochs": epochs})
-    write_json(folder / "reconstruction.json", {"mean_mm": 0.12, "max_mm": 0.61})
+    write_json(folder / "reconstruction.json", {"mean_mm": 0.12, "max_mm": 0.61, "replayed_mm": 0.17})
     write_json(folder / "stages" / "import.json", {"seconds": 75.0, "peak_memory_gib": 0.8})
 
 

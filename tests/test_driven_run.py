@@ -5,6 +5,7 @@ The report has tests of its own.
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -26,10 +27,12 @@ from warp_resphys.recordings.arrays import write_recording
 from warp_resphys.recordings.reading import read_recording
 from warp_resphys.residual.driven_rollout import Range
 from warp_resphys.stages import StageContext
-from warp_resphys.tasks.actuated import experiment
+from warp_resphys.tasks.actuated import experiment, reconstruct
 from warp_resphys.tasks.actuated.checks import check_driven
 from warp_resphys.tasks.actuated.evaluate import summary
 from warp_resphys.tasks.actuated.importing import import_driven
+from warp_resphys.tasks.actuated.reconstruct import replayed_errors
+from warp_resphys.tasks.actuated.scene import DrivenScene
 from warp_resphys.tasks.checks import check_configuration
 
 # A short segment with two chambers of some 70 vertices, on which everything takes seconds.
@@ -147,6 +150,27 @@ def test_the_reconstruction_reaches_the_smoothed_markers(finished):
     with read_hdf5(finished / "run" / "reconstruction.h5", "reconstruction") as file:
         assert [str(name) for name in file.attrs["names"]] == ["t000", "t001", "t002"]
         assert read_array(file, "force").shape == (3, 13, read_array(file, "q").shape[2], 3)
+
+
+def test_forces_that_do_not_hold_the_body_are_named(finished, monkeypatch, tmp_path, caplog):
+    """Replayed, the forces lead where they were found; a simulation that goes elsewhere with them is reported."""
+    summary = json.loads((finished / "run" / "reconstruction.json").read_text())
+    with read_hdf5(finished / "run" / "reconstruction.h5", "reconstruction") as file:
+        forces = read_array(file, "force")[2:]
+    settings = json.loads((finished / "run" / "stages" / "reconstruct.json").read_text())["settings"]
+    scene, trial = DrivenScene(settings, finished / "run"), ("t002",)
+    tensors, drive, observed = scene.tensors("resphys", trial), scene.drive("resphys", trial), scene.smoothed(trial)
+    start = scene.simulator.static_equilibrium(material=tensors, batch=1)
+    found = replayed_errors(scene, start, tensors, drive, forces, observed)
+    assert found.mean() == pytest.approx(summary["replayed_mm"], rel=1e-3)
+    assert found.mean() < 0.2
+    assert replayed_errors(scene, start, tensors, drive, 0.0 * forces, observed).mean() > 2.0 * found.mean()
+    for name in ("motions.h5", "identification.json"):
+        shutil.copy(finished / "run" / name, tmp_path)
+    monkeypatch.setattr(reconstruct, "replayed_errors", lambda *rest: np.full(rest[4].shape[:2], np.inf))
+    reconstruct.reconstruct_driven(StageContext("reconstruct", tmp_path, "", settings))
+    assert "the forces lead inf mm away from the markers" in caplog.text
+    assert json.loads((tmp_path / "reconstruction.json").read_text())["replayed_mm"] is None
 
 
 def test_the_same_command_does_nothing_again_and_other_windows_only_evaluate(finished, monkeypatch):

@@ -59,7 +59,8 @@ class DrivenReport(SplitReport):
         film: What the video shows.
         beyond: Names of the roll-outs at higher pressure than that of the training.
         published_windows: Published errors by length of the roll-out [s] and model.
-        reconstruction: `mean_mm` and `max_mm` of the reconstructed training trials; empty where not known.
+        reconstruction: `mean_mm` and `max_mm` of the reconstructed training trials, and `replayed_mm` of those for
+            validation with their forces replayed, None where the simulator failed; empty where not known.
     """
 
     chambers: tuple[Chamber, ...]

@@ -1,11 +1,17 @@
 """Stage: the forces that bring the identified simulator to the markers it should have learned from."""
 
+import logging
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ...errors import ConvergenceError
 from ...files import atomic_hdf5, create, write_json
+from ...integrator import State
+from ...residual.driven_rollout import Drive
 from ...residual.sparse_reconstruction import make_sparse_reconstructor
+from ...simulator import MaterialTensors
 from ...stages import StageContext
 from ...workers import Advance
 from ..measured.evaluate import marker_errors
@@ -13,14 +19,19 @@ from .files import RECONSTRUCTED, RECONSTRUCTION
 from .parts import Made, Part, read_parts, remove_parts, split_into_parts, work_on
 from .scene import DrivenScene
 
+log = logging.getLogger(__name__)
+
 _UNITS = {"q": "m", "v": "m/s", "force": "N"}
+_UNHELD = 0.1  # mm, by which replayed markers may be further off than reconstructed ones
 
 
 def reconstruct_driven(context: StageContext, processes: int = 1) -> None:
     """Writes reconstruction.h5: q, v and force (R, K + 1, N, 3) of the trials of training and validation.
 
     They are kept in single precision, which rounds positions to 1e-8 m. And reconstruction.json: how far the
-    reconstructed markers are from those that were seen.
+    reconstructed markers are from those that were seen, and how far they are where the forces of validation are
+    replayed. Forces can lead along equilibria that are not stable, such as those of a chamber's wall that is about to
+    buckle: step by step the markers are met, but nothing that learns these forces will go there.
     """
     settings = context.settings
     names = tuple(settings["split"]["train"]) + tuple(settings["split"]["validation"])
@@ -30,13 +41,28 @@ def reconstruct_driven(context: StageContext, processes: int = 1) -> None:
         for name, unit in _UNITS.items():
             create(file, name, read_parts(parts, name), unit, time_axis=1)
     errors = read_parts(parts, "error")  # (R, K + 1) [mm], NaN where no marker was seen
-    summary = {"mean_mm": float(np.nanmean(errors)), "max_mm": float(np.nanmax(errors))}
-    write_json(context.run_dir / RECONSTRUCTION, summary)
+    count = len(settings["split"]["validation"])
+    replayed = float(np.nanmean(read_parts(parts, "replayed")[-count:]))
+    summary = {"mean_mm": float(np.nanmean(errors)), "max_mm": float(np.nanmax(errors)), "replayed_mm": replayed}
+    write_json(context.run_dir / RECONSTRUCTION, {key: _finite(value) for key, value in summary.items()})
+    if not replayed <= float(np.nanmean(errors[-count:])) + _UNHELD:
+        log.warning(
+            "reconstruct: replayed, the forces lead %.2f mm away from the markers, %.2f mm when they were found: raise "
+            "reconstruction.regularisation, or set reconstruction.modes.",
+            replayed,
+            float(np.nanmean(errors[-count:])),
+        )
     remove_parts(context)
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None
 
 
 def reconstruct_part(part: Part, advance: Advance) -> dict[str, Made]:
     """q, v, force (B, K + 1, N, 3) and the distance of the markers (B, K + 1) [mm] of some trials.
+
+    Also that distance with the forces replayed, if one of the trials is for validation; NaN otherwise.
 
     Raises:
         ConvergenceError: a step fails.
@@ -48,7 +74,7 @@ def reconstruct_part(part: Part, advance: Advance) -> dict[str, Made]:
     reconstructor = make_sparse_reconstructor(simulator, scene.markers, **settings["reconstruction"])
     reconstructor = reconstructor.with_tensors(tensors)
     batch = len(part.names)
-    state = simulator.static_equilibrium(material=tensors, batch=batch)
+    start = state = simulator.static_equilibrium(material=tensors, batch=batch)
     force = torch.zeros_like(state.q)
     fields: dict[str, list[NDArray[np.float32]]] = {name: [] for name in (*_UNITS, "error")}
 
@@ -66,7 +92,44 @@ def reconstruct_part(part: Part, advance: Advance) -> dict[str, Made]:
             state, force = result.state.detach(), result.force
             keep(observed[:, k])
             advance(batch)
-    return {name: (np.stack(values, axis=1), _UNITS.get(name, "mm")) for name, values in fields.items()}
+    made = {name: np.stack(values, axis=1) for name, values in fields.items()}
+    made["replayed"] = np.full_like(made["error"], np.nan)
+    if {*part.names} & {*settings["split"]["validation"]}:
+        made["replayed"] = replayed_errors(scene, start, tensors, drive, made["force"], observed)
+    return {name: (values, _UNITS.get(name, "mm")) for name, values in made.items()}
+
+
+def replayed_errors(
+    scene: DrivenScene,
+    start: State,
+    tensors: MaterialTensors,
+    drive: Drive,
+    forces: NDArray[np.float32],
+    observed: torch.Tensor,
+) -> NDArray[np.float32]:
+    """(B, K + 1) distance of the markers [mm] of a simulation with given forces; infinite from where it fails.
+
+    Args:
+        scene: of the experiment.
+        start: the states of rest.
+        tensors: constants of the simulator.
+        drive: the pressures.
+        forces: (B, K + 1, N, 3) that lead to each state [N].
+        observed: (B, K + 1, M, 3) [m].
+    """
+    state = start
+    errors: NDArray[np.float32] = np.full(forces.shape[:2], np.inf, dtype=np.float32)
+    with torch.no_grad():
+        for k in range(forces.shape[1]):
+            if k > 0:
+                force = torch.from_numpy(forces[:, k]).to(state.q)
+                try:
+                    state, _ = scene.simulator.step(state, force, material=tensors, pressure=drive.pressure[:, k - 1])
+                except ConvergenceError:
+                    break
+            reached, seen = scene.markers(state.q).cpu().numpy(), observed[:, k].cpu().numpy()
+            errors[:, k] = [_error(x, y) for x, y in zip(reached, seen, strict=True)]
+    return errors
 
 
 def _error(reached: NDArray[np.float64], observed: NDArray[np.float64]) -> float:

@@ -15,12 +15,14 @@ import numpy as np
 import pytest
 from hydra import compose, initialize_config_module
 from matplotlib import colormaps
+from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 
 from warp_resphys.errors import DataFileError, InputError
 from warp_resphys.mesh import Mesh, box_hexahedra, box_tetrahedra
 from warp_resphys.metrics import PUBLISHED_MM, summarise, summarise_each, trajectory_errors
 from warp_resphys.report import figures, render
+from warp_resphys.report.figures import use_logarithm
 from warp_resphys.report.page import (
     Example,
     ReportData,
@@ -488,3 +490,21 @@ def test_only_what_has_not_diverged_is_drawn() -> None:
     mesh = box_hexahedra(divisions=(1, 1, 1))
     diverged = {"far": mesh.vertices + 2.0, "gone": np.full_like(mesh.vertices, np.nan)}
     assert render.draw_bodies(mesh, diverged, mesh.vertices) == {"far": None, "gone": None}
+
+
+@pytest.mark.parametrize(
+    ("errors", "labels"),
+    [
+        ((0.3, 6.0), ["0.5", "1", "2", "5"]),
+        ((2.0, 3.0), ["1", "2", "5", "10"]),
+        ((1e-3, 50.0), ["0.001", "0.01", "0.1", "1", "10"]),
+    ],
+)
+def test_a_logarithmic_axis_has_enough_labels(errors, labels):
+    axes = Figure().subplots()
+    axes.plot(errors)
+    use_logarithm(axes)
+    axes.figure.canvas.draw()
+    low, high = axes.get_ylim()
+    inside = [tick.get_text() for tick in axes.get_yticklabels() if low <= tick.get_position()[1] <= high]
+    assert inside == labels

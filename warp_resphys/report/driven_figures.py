@@ -19,6 +19,7 @@ from warp_resphys.report.figures import (
     ROUND_STEPS,
     STYLE,
     TONES,
+    label_logarithm,
     legend_above,
     new_figure,
     positive,
@@ -67,6 +68,7 @@ def filtered_errors(
         use_logarithm(axes)
         if lowest:  # Models begin close to the measured rest; that is not what the axis is for.
             axes.set_ylim(bottom=max(0.4 * min(lowest), axes.get_ylim()[0]))
+            label_logarithm(axes)
         axes.set(xlabel="time [s]", ylabel="mean marker error [mm]")
         legend_above(figure, axes, narrow=narrow)
     return figure

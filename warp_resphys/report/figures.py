@@ -340,7 +340,7 @@ def positive(values: FloatArray) -> FloatArray:
 
 
 def use_logarithm(axes: Axes) -> None:
-    """A logarithmic axis of at least a decade, labelled 0.1, 1, 10 where that is short, else as powers.
+    """A logarithmic axis of at least a decade, labelled 0.1, 1, 10 where that is short, else as powers; see its ticks.
 
     Where there is nothing that it can show, such as errors that are all zero, the axis says so.
     """
@@ -353,15 +353,22 @@ def use_logarithm(axes: Axes) -> None:
     if high < 10.0 * low:
         low, high = 10.0 ** math.floor(math.log10(low)), 10.0 ** math.ceil(math.log10(high) + 1e-9)
         axes.set_ylim(low, high)
+    label_logarithm(axes)
+
+
+def label_logarithm(axes: Axes) -> None:
+    """Labels the ticks of a logarithmic axis with limits, also 2 and 5 where there would be a label or two."""
+    low, high = axes.get_ylim()
     plain = low >= 5e-5 and high <= 2e4
-    axes.yaxis.set_major_locator(LogLocator(numticks=6))
+    decades = math.floor(math.log10(high) + 1e-9) - math.ceil(math.log10(low) - 1e-9) + 1
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if decades < 3 else (1.0,), numticks=6))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: _power(value, plain=plain)))
     axes.yaxis.set_minor_formatter(NullFormatter())
     axes.tick_params(which="minor", left=False)
 
 
 def _power(value: float, *, plain: bool) -> str:
-    exponent = round(math.log10(value))
     if plain:
-        return f"{value:.{max(0, -exponent)}f}"
+        return f"{value:g}"
+    exponent = round(math.log10(value))
     return "10" + str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))

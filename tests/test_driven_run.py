@@ -52,7 +52,7 @@ markers:
 parallel: {processes: 1, batch: 2}
 identify:
   {trials: 1, seconds: 0.05, max_evaluations: 3, grid: {youngs_modulus: {points: 2}, poissons_ratio: {points: 1}}}
-network: {position_modes: 2, velocity_modes: 2, force_modes: 2, width: 8}
+network: {position_modes: 2, velocity_modes: 0, force_modes: 2, width: 8}
 trainer: {epochs: 4, rollout_every: 2, batch_size: 16}
 synthetic:
   mesh: {chamber_lengths: [0.09], caps: [0.005, 0.005], radii: [0.0222, 0.0222], chambers: 2, outline: round,

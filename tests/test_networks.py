@@ -301,6 +301,26 @@ def test_a_network_may_be_blind_for_velocities_and_is_restored_with_its_dual_mod
     torch.testing.assert_close(again(rest + q, v), model(rest + q, v))
 
 
+@pytest.mark.parametrize("changes", [{"kind": "nodal"}, {"velocity_modes": 0}, {}])
+def test_networks_from_samples_in_single_precision_take_states_in_double_precision(changes):
+    simulator = clamped_beam()
+    rest, n = simulator.rest_positions, simulator.body.n_vertices
+    random = torch.Generator().manual_seed(0)
+    u, v, force = (1e-3 * torch.randn(20, n, 3, generator=random, dtype=torch.float64) for _ in range(3))
+    config = {"kind": "reduced", "position_modes": 3, "velocity_modes": 2, "force_modes": 2}
+    config |= {"blocks": 1, "layers": 1, "width": 8, "activation": "silu", **changes}
+    models = []
+    for dtype in (torch.float32, torch.float64):
+        torch.manual_seed(0)
+        samples = [x.to(dtype) for x in (rest + u, v, force)]
+        models.append(build_model(config, rest, *samples, stiffness=RestStiffness(simulator)).eval())
+        models[-1].fit_linear(models[-1].encode(*samples[:2]), models[-1].encode_outputs(samples[2]), 0.1)
+    with torch.no_grad():
+        single, double = (model(rest + u, v) for model in models)
+    assert single.dtype == torch.float64
+    torch.testing.assert_close(single, double, rtol=1e-3, atol=1e-3 * float(double.abs().max()))
+
+
 @pytest.mark.parametrize("held", [True, False])
 def test_modes_of_large_bodies_are_those_of_small_ones(monkeypatch, held):
     """Lanczos and the dense solver span the same forces, also of a body that nothing holds."""

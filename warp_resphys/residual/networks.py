@@ -161,8 +161,8 @@ def actuation_coder(samples: torch.Tensor) -> Coder:
 def nodal_coder(samples: torch.Tensor) -> Coder:
     """Standardisation of every coordinate of (S, N, 3), as published; constant coordinates stay zero."""
     x = samples.flatten(1)
-    deviation = x.std(0)
-    return Coder(x.mean(0), None, torch.where(deviation > 0.0, deviation, torch.ones_like(deviation)))
+    deviation = x.std(0).double()
+    return Coder(x.mean(0).double(), None, torch.where(deviation > 0.0, deviation, torch.ones_like(deviation)))
 
 
 class StateMap(nn.Module):
@@ -357,8 +357,8 @@ def _state_coders(config: Mapping[str, Any], u: torch.Tensor, v: torch.Tensor) -
 
 def _blind_coder(samples: torch.Tensor) -> Coder:
     """No coordinates at all: for what a network is not to see."""
-    empty = samples.new_zeros(0)
-    return Coder(torch.zeros_like(samples[0].flatten()), samples.new_zeros(samples[0].numel(), 0), empty)
+    nothing = samples.new_zeros(samples[0].numel(), dtype=torch.float64)
+    return Coder(nothing, nothing.new_zeros(len(nothing), 0), nothing.new_zeros(0))
 
 
 def check_network(config: Mapping[str, Any]) -> None:

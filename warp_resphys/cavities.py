@@ -3,10 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse
 
 from warp_resphys.chambers import find_chambers
-from warp_resphys.mesh import FloatArray, IntArray, Mesh, boundary_triangles
+from warp_resphys.mesh import FloatArray, IntArray, Mesh, boundary_triangles, connected_parts
 
 MOST_TRIANGLES = 10_000  # of a surface that is looked at
 _DIRECTIONS = 24  # from each triangle, over the half of all directions that it faces
@@ -47,13 +46,11 @@ def open_cavities(mesh: Mesh) -> list[OpenCavity] | None:
     inner = np.concatenate([np.empty(0, dtype=np.int64), *(chamber.vertices for chamber in find_chambers(mesh))])
     outer = triangles[~np.isin(triangles[:, 0], inner)]
     corners = mesh.vertices[outer]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = _normals(corners)
     areas = 0.5 * np.linalg.norm(normals, axis=1)
     normals = normals / (2.0 * areas[:, None])
     starts = corners.mean(axis=1) + _LIFT * np.linalg.norm(np.ptp(mesh.vertices, axis=0)) * normals
-    candidates = np.flatnonzero(
-        _blocked(starts, normals, corners)
-    )  # whoever sees the outside straight ahead is not hidden
+    candidates = np.flatnonzero(_blocked(starts, normals, corners))  # who sees the outside straight ahead is not hidden
     if not len(candidates):
         return []
     directions = _half_sphere(normals[candidates])  # (C, D, 3)
@@ -64,17 +61,19 @@ def open_cavities(mesh: Mesh) -> list[OpenCavity] | None:
 
 def _joined(mesh: Mesh, triangles: IntArray, least: float) -> list[OpenCavity]:
     """Triangles (T, 3) that touch as one cavity each, those of a least area [m^2]."""
-    ends = triangles.ravel(), np.roll(triangles, 1, axis=1).ravel()
-    graph = scipy.sparse.coo_array((np.ones(len(ends[0])), ends), shape=(len(mesh.vertices),) * 2)
-    _, labels = scipy.sparse.csgraph.connected_components(graph, directed=False)
     corners = mesh.vertices[triangles]
-    areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    found = []
-    for label in np.unique(labels[triangles[:, 0]]):
-        own = labels[triangles[:, 0]] == label
+    areas = 0.5 * np.linalg.norm(_normals(corners), axis=1)
+    parts, found = connected_parts(triangles), []
+    for part in np.unique(parts):
+        own = parts == part
         centre = np.average(corners[own].mean(axis=1), axis=0, weights=areas[own])
         found.append(OpenCavity(centre, float(areas[own].sum())))
     return sorted((each for each in found if each.area >= least), key=lambda each: -each.area)
+
+
+def _normals(corners: FloatArray) -> FloatArray:
+    """(T, 3) normals of triangles (T, 3, 3), twice as long as their areas."""
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 def _half_sphere(normals: FloatArray) -> FloatArray:

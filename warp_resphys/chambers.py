@@ -4,11 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse
 from numpy.typing import NDArray
 
 from .errors import MeshError
-from .mesh import Mesh, boundary_faces, boundary_triangles
+from .mesh import Mesh, boundary_faces, connected_parts, face_triangles
 
 _SAME_HEIGHT = 0.05  # of the body's length: chambers whose centres are closer than that along it are side by side
 
@@ -47,16 +46,10 @@ def find_chambers(mesh: Mesh, axis: Sequence[float] = (0.0, 0.0, -1.0)) -> tuple
         The chambers, named ``chamber_1`` and so on.
     """
     faces = boundary_faces(mesh)
-    triangles = boundary_triangles(mesh)
-    per_face = len(triangles) // len(faces)
-    n = len(mesh.vertices)
-    ends = triangles.ravel(), np.roll(triangles, 1, axis=1).ravel()
-    graph = scipy.sparse.coo_array((np.ones(len(ends[0]), dtype=np.int8), ends), shape=(n, n))
-    _, component = scipy.sparse.csgraph.connected_components(graph, directed=False)
-    labels, owner = np.unique(component[faces[:, 0]], return_inverse=True)
-    corners = mesh.vertices[triangles] - mesh.vertices.mean(axis=0)
-    signed = np.linalg.det(corners).reshape(-1, per_face).sum(axis=1)
-    volumes = np.bincount(owner, weights=signed, minlength=len(labels))
+    owner = connected_parts(faces)
+    corners = mesh.vertices[face_triangles(faces)] - mesh.vertices.mean(axis=0)
+    signed = np.linalg.det(corners).reshape(len(faces), -1).sum(axis=1)
+    volumes = np.bincount(owner, weights=signed)
     inner = [faces[owner == i] for i in np.flatnonzero(volumes < 0.0)]
     order = _along(mesh, inner, np.asarray(axis, dtype=np.float64)) if inner else []
     return tuple(Chamber(f"chamber_{number}", inner[i]) for number, i in enumerate(order, start=1))

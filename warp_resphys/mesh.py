@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse
+import scipy.sparse.csgraph
 from numpy.typing import NDArray
 
 from warp_resphys.errors import MeshError
@@ -248,6 +250,15 @@ def boundary_faces(mesh: Mesh) -> IntArray:
     single[order[1:][repeated]] = False
     single[order[:-1][repeated]] = False
     return faces[single]
+
+
+def connected_parts(cells: IntArray) -> IntArray:
+    """Which of the parts that do not touch each cell or face (M, K) belongs to, (M,) numbered from 0."""
+    count = int(cells.max(initial=-1)) + 1
+    ends = cells.ravel(), np.roll(cells, 1, axis=1).ravel()
+    graph = scipy.sparse.coo_array((np.ones(cells.size, dtype=np.int8), ends), shape=(count, count))
+    _, labels = scipy.sparse.csgraph.connected_components(graph, directed=False)
+    return np.unique(labels[cells[:, 0]], return_inverse=True)[1]
 
 
 def boundary_triangles(mesh: Mesh) -> IntArray:

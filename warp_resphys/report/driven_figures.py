@@ -19,7 +19,6 @@ from warp_resphys.report.figures import (
     ROUND_STEPS,
     STYLE,
     TONES,
-    label_logarithm,
     legend_above,
     new_figure,
     positive,
@@ -65,10 +64,7 @@ def filtered_errors(
             axes.set_xlim(0.0, times[-1])
             settled = smooth[len(smooth) // 10 :]
             lowest += [float(np.nanmin(settled))] if np.isfinite(settled).any() else []
-        use_logarithm(axes)
-        if lowest:  # Models begin close to the measured rest; that is not what the axis is for.
-            axes.set_ylim(bottom=max(0.4 * min(lowest), axes.get_ylim()[0]))
-            label_logarithm(axes)
+        use_logarithm(axes, 0.4 * min(lowest, default=0.0))  # Models begin close to the measured rest: not shown.
         axes.set(xlabel="time [s]", ylabel="mean marker error [mm]")
         legend_above(figure, axes, narrow=narrow)
     return figure

@@ -339,10 +339,15 @@ def positive(values: FloatArray) -> FloatArray:
     return np.where((values > 0.0) & (values < LARGEST_SHOWN), values, np.nan)
 
 
-def use_logarithm(axes: Axes) -> None:
-    """A logarithmic axis of at least a decade, labelled 0.1, 1, 10 where that is short, else as powers; see its ticks.
+def use_logarithm(axes: Axes, least: float = 0.0) -> None:
+    """A logarithmic axis of at least a decade, labelled 0.1, 1, 10 where that is short, else as powers.
 
-    Where there is nothing that it can show, such as errors that are all zero, the axis says so.
+    It is labelled at 2 and 5 as well where there would be a label or two. Where there is nothing that it can show, such
+    as errors that are all zero, the axis says so.
+
+    Args:
+        axes: With everything drawn.
+        least: That it begins with, at least.
     """
     if not np.isfinite(axes.dataLim.minposy):
         axes.set(yticks=[], ylim=(0.0, 1.0))
@@ -352,13 +357,8 @@ def use_logarithm(axes: Axes) -> None:
     low, high = axes.get_ylim()
     if high < 10.0 * low:
         low, high = 10.0 ** math.floor(math.log10(low)), 10.0 ** math.ceil(math.log10(high) + 1e-9)
-        axes.set_ylim(low, high)
-    label_logarithm(axes)
-
-
-def label_logarithm(axes: Axes) -> None:
-    """Labels the ticks of a logarithmic axis with limits, also 2 and 5 where there would be a label or two."""
-    low, high = axes.get_ylim()
+    low = max(low, least)
+    axes.set_ylim(low, high)
     plain = low >= 5e-5 and high <= 2e4
     decades = math.floor(math.log10(high) + 1e-9) - math.ceil(math.log10(low) - 1e-9) + 1
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if decades < 3 else (1.0,), numticks=6))

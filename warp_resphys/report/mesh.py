@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import scipy.sparse
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
@@ -19,7 +18,15 @@ from warp_resphys.cavities import MOST_TRIANGLES, open_cavities
 from warp_resphys.chambers import Chamber, find_chambers
 from warp_resphys.errors import InputError, MeshError
 from warp_resphys.files import atomic_path
-from warp_resphys.mesh import IntArray, Mesh, boundary_triangles, face_triangles, quadratic, select_vertices
+from warp_resphys.mesh import (
+    IntArray,
+    Mesh,
+    boundary_triangles,
+    connected_parts,
+    face_triangles,
+    quadratic,
+    select_vertices,
+)
 from warp_resphys.mesh_io import read_mesh, read_surfaces, read_vertices, write_mesh
 from warp_resphys.mesh_quality import cell_volumes, scaled_jacobian
 from warp_resphys.report import render
@@ -67,7 +74,8 @@ class MeshSummary:
 
     def pieces(self) -> tuple[int, int]:
         """Numbers of pieces that do not touch: of the body, and of its boundary."""
-        return _pieces(self.mesh.cells), _pieces(boundary_triangles(self.mesh))
+        body, boundary = (connected_parts(cells) for cells in (self.mesh.cells, boundary_triangles(self.mesh)))
+        return int(body.max()) + 1, int(boundary.max()) + 1
 
     def rows(self) -> list[tuple[str, str]]:
         """Names and values of a table."""
@@ -166,15 +174,6 @@ def _cavities(mesh: Mesh) -> str:
         for cavity in found
     ]
     return f"{'; '.join(places)}: pressure needs a closed chamber" if places else "none"
-
-
-def _pieces(cells: IntArray) -> int:
-    """Number of pieces that cells (M, K) form which do not touch."""
-    count = int(cells.max()) + 1
-    ends = cells.ravel(), np.roll(cells, 1, axis=1).ravel()
-    graph = scipy.sparse.coo_array((np.ones(cells.size), ends), shape=(count, count))
-    _, labels = scipy.sparse.csgraph.connected_components(graph, directed=False)
-    return len(np.unique(labels[cells[:, 0]]))
 
 
 def draw_mesh(path: Path, summary: MeshSummary, markers: FloatArray | None = None) -> None:

@@ -42,15 +42,15 @@ def reconstruct_driven(context: StageContext, processes: int = 1) -> None:
             create(file, name, read_parts(parts, name), unit, time_axis=1)
     errors = read_parts(parts, "error")  # (R, K + 1) [mm], NaN where no marker was seen
     count = len(settings["split"]["validation"])
-    replayed = float(np.nanmean(read_parts(parts, "replayed")[-count:]))
+    met, replayed = (float(np.nanmean(rows[-count:])) for rows in (errors, read_parts(parts, "replayed")))
     summary = {"mean_mm": float(np.nanmean(errors)), "max_mm": float(np.nanmax(errors)), "replayed_mm": replayed}
     write_json(context.run_dir / RECONSTRUCTION, {key: _finite(value) for key, value in summary.items()})
-    if not replayed <= float(np.nanmean(errors[-count:])) + _UNHELD:
+    if not replayed <= met + _UNHELD:
         log.warning(
             "reconstruct: replayed, the forces lead %.2f mm away from the markers, %.2f mm when they were found: raise "
             "reconstruction.regularisation, or set reconstruction.modes.",
             replayed,
-            float(np.nanmean(errors[-count:])),
+            met,
         )
     remove_parts(context)
 

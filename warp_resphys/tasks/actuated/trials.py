@@ -105,11 +105,12 @@ def raised_trials_of(config: Mapping[str, Any]) -> tuple[Trial, ...]:
     Raises:
         InputError: see `split_of`.
     """
-    test = {trial.name: trial for trial in trials_of(config) if trial.name in split_of(config).test}
+    names = split_of(config).test
+    test = [trial for trial in trials_of(config) if trial.name in names]
     return tuple(
-        replace(trial, name=raised(name, float(factor)), factor=float(factor))
+        replace(trial, name=raised(trial.name, float(factor)), factor=float(factor))
         for factor in config["data"]["factors"]
-        for name, trial in test.items()
+        for trial in test
     )
 
 

@@ -361,7 +361,7 @@ def test_the_replays_gradient_is_that_of_differences():
 
 def test_leaving_the_range_of_the_training_is_noticed():
     inputs = torch.tensor([[0.0, 1.0], [2.0, 3.0]])
-    watched = Range.restore(Range.of(inputs, 0.25).description(), inputs)
+    watched = Range.restore(Range.of(inputs).description(), inputs)
     probe = torch.tensor([[2.4, 2.0], [2.6, 2.0], [1.0, 0.4], [1.0, torch.nan]])
     assert watched.left(probe).tolist() == [False, True, True, False]
 

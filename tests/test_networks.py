@@ -9,6 +9,7 @@ from warp_resphys import Body, Material, Simulator, box_hexahedra, modes, select
 from warp_resphys.errors import InputError
 from warp_resphys.files import read_checkpoint, write_checkpoint
 from warp_resphys.modes import RestStiffness, vibration_modes
+from warp_resphys.residual.driven_rollout import Range, WatchedModel
 from warp_resphys.residual.networks import (
     NextState,
     ResidualForce,
@@ -342,3 +343,19 @@ def test_rest_stiffness_knows_no_viscosity_and_wants_a_body_that_is_held():
     np.testing.assert_allclose(damped.displacements(force), plain.displacements(force), rtol=1e-9)
     with pytest.raises(InputError, match="fix some vertices"):
         RestStiffness(Simulator(Body(box_hexahedra())))
+
+    @pytest.mark.parametrize("build", [build_model, build_next_state])
+    def test_outside_its_training_a_model_is_held_at_the_edge(self, build):
+        model, q, v = self.built(build)
+        model = model.double().eval()
+        with torch.no_grad():
+            held = Range.of(model.encode(q, v, self.LOADS))
+        watched = WatchedModel(model, held)
+        inside = watched(q[:5], v[:5], self.LOADS[:5])
+        for one, other in zip(inside, model.predict(q[:5], v[:5], self.LOADS[:5]), strict=True):
+            torch.testing.assert_close(one, other)
+        assert watched.left_at.tolist() == [-1] * 5
+        far = [watched(model.rest + size * (q[:5] - model.rest), size * v[:5], self.LOADS[:5]) for size in (1e3, 1e6)]
+        for one, other in zip(*far, strict=True):
+            torch.testing.assert_close(one, other)
+        assert watched.left_at.tolist() == [1] * 5

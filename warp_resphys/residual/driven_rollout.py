@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from typing_extensions import override
@@ -14,6 +13,8 @@ from .rollout import Rollout
 
 # Fields of positions, velocities and what the network is told of the pressures.
 Predictor = Callable[[torch.Tensor, torch.Tensor, torch.Tensor], list[torch.Tensor]]
+
+_MARGIN = 0.25  # of the width of the training range, by which a roll-out may exceed it on either side
 
 
 @dataclass(frozen=True)
@@ -86,9 +87,10 @@ class DrivenDataRollout(Rollout):
 
 
 class Range:
-    """The box that a model's standardised inputs fill in training, with a margin.
+    """The box that a model's standardised inputs fill in training.
 
-    A network says little about what it never saw: a roll-out that leaves this box is to be reported.
+    A network says little about what it never saw, and what it says there may drive a body on for good. So the model is
+    told of no more than the edge of the box, and a roll-out that leaves it by far is to be reported.
 
     Args:
         low: (A,) of the standardised inputs.
@@ -99,15 +101,18 @@ class Range:
         self.low, self.high = low, high
 
     @classmethod
-    def of(cls, inputs: torch.Tensor, margin: float) -> "Range":
-        """The box of (S, A) standardised inputs, wider by a fraction of its width on every side."""
-        low, high = inputs.amin(0), inputs.amax(0)
-        wider = margin * (high - low)
-        return cls(low - wider, high + wider)
+    def of(cls, inputs: torch.Tensor) -> "Range":
+        """The box of (S, A) standardised inputs."""
+        return cls(inputs.amin(0), inputs.amax(0))
+
+    def hold(self, inputs: torch.Tensor) -> torch.Tensor:
+        """(B, A) standardised inputs, those outside at the edge."""
+        return inputs.clamp(self.low, self.high)
 
     def left(self, inputs: torch.Tensor) -> torch.Tensor:
-        """(B,) bool, whether (B, A) standardised inputs are outside."""
-        return ((inputs < self.low) | (inputs > self.high)).any(1)
+        """(B,) bool, whether (B, A) standardised inputs are outside by more than a quarter of the box's width."""
+        margin = _MARGIN * (self.high - self.low)
+        return ((inputs < self.low - margin) | (inputs > self.high + margin)).any(1)
 
     def description(self) -> dict[str, list[float]]:
         """Plain data, for a checkpoint's metadata."""
@@ -120,17 +125,17 @@ class Range:
 
 
 class WatchedModel:
-    """A model as a predictor, and when each environment first left the range of its training.
+    """A model as a predictor that is held in the range of its training, and when each environment first left it.
 
     Args:
         model: that predicts.
-        range_: of its inputs; None watches nothing.
+        range_: of its inputs in training.
 
     Attributes:
         left_at: (B,) step at which an environment left the range, -1 where it has not; None before the first step.
     """
 
-    def __init__(self, model: StateMap, range_: Range | None = None) -> None:
+    def __init__(self, model: StateMap, range_: Range) -> None:
         self.model, self._range, self._step = model, range_, 0
         self.left_at: torch.Tensor | None = None
 
@@ -141,10 +146,8 @@ class WatchedModel:
         state = [t.to(like.device, like.dtype) for t in (q, v, actuation)]
         if self.left_at is None:
             self.left_at = torch.full((len(q),), -1, dtype=torch.int64, device=q.device)
-        if self._range is not None:
-            outside = self._range.left(self.model.encode(*state)).to(q.device)
-            self.left_at = torch.where(outside & (self.left_at < 0), self._step, self.left_at)
+        inputs = self.model.encode(*state)
+        outside = self._range.left(inputs).to(q.device)
+        self.left_at = torch.where(outside & (self.left_at < 0), self._step, self.left_at)
         self._step += 1
-        fields: Any = self.model(*state)
-        fields = (fields,) if isinstance(fields, torch.Tensor) else fields
-        return [field.to(q.device, q.dtype) for field in fields]
+        return [field.to(q.device, q.dtype) for field in self.model.decode(self._range.hold(inputs))]

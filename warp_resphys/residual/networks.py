@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 import torch
 from torch import nn
+from typing_extensions import override
 
 from ..errors import InputError
 from ..modes import RestStiffness
@@ -61,6 +62,8 @@ def _perceptron(n_in: int, n_out: int, layers: int, width: int, activation: str)
 class Coder(nn.Module):
     """An affine map between a field on the vertices and standardised coordinates: c = (x - mean) basis / scale.
 
+    Its constants are in double precision, as states of simulations are, whatever the samples were that it is from.
+
     Args:
         mean: (D,) flattened field of the origin.
         basis: (D, M) columns; None for the coordinates themselves.
@@ -81,10 +84,8 @@ class Coder(nn.Module):
         dual: torch.Tensor | None = None,
     ) -> None:
         super().__init__()
-        self.register_buffer("mean", mean)
-        self.register_buffer("basis", basis)
-        self.register_buffer("scale", scale)
-        self.register_buffer("dual", dual)
+        for name, values in (("mean", mean), ("basis", basis), ("scale", scale), ("dual", dual)):
+            self.register_buffer(name, None if values is None else values.double())
 
     @property
     def size(self) -> int:
@@ -161,8 +162,8 @@ def actuation_coder(samples: torch.Tensor) -> Coder:
 def nodal_coder(samples: torch.Tensor) -> Coder:
     """Standardisation of every coordinate of (S, N, 3), as published; constant coordinates stay zero."""
     x = samples.flatten(1)
-    deviation = x.std(0).double()
-    return Coder(x.mean(0).double(), None, torch.where(deviation > 0.0, deviation, torch.ones_like(deviation)))
+    deviation = x.std(0)
+    return Coder(x.mean(0), None, torch.where(deviation > 0.0, deviation, torch.ones_like(deviation)))
 
 
 class StateMap(nn.Module):
@@ -249,10 +250,14 @@ class StateMap(nn.Module):
         pairs = zip(self.coders, fields, strict=True)
         return torch.cat([coder.encode(field) for coder, field in pairs], dim=1).to(self.linear.dtype)
 
-    def predict(self, q: torch.Tensor, v: torch.Tensor, actuation: torch.Tensor | None = None) -> list[torch.Tensor]:
-        """(S, N, 3) fields in the order of the coders."""
-        parts = self.standardised(self.encode(q, v, actuation)).to(q.dtype).split(self._sizes, dim=1)
+    def decode(self, inputs: torch.Tensor) -> list[torch.Tensor]:
+        """(S, N, 3) fields in order, from (S, n_in) standardised inputs."""
+        parts = self.standardised(inputs).split(self._sizes, dim=1)
         return [coder.decode(part) for coder, part in zip(self.coders, parts, strict=True)]
+
+    def predict(self, q: torch.Tensor, v: torch.Tensor, actuation: torch.Tensor | None = None) -> list[torch.Tensor]:
+        """(S, N, 3) fields in order, from a state as `encode` takes it."""
+        return self.decode(self.encode(q, v, actuation))
 
     def description(self) -> dict[str, Any]:
         """What `restore` needs beside the tensors."""
@@ -282,8 +287,14 @@ class NextState(StateMap):
         self, q: torch.Tensor, v: torch.Tensor, actuation: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """(S, N, 3) positions [m] and velocities [m/s] one time step on."""
-        displacement, velocity = self.predict(q, v, actuation)
-        return self.rest + displacement, velocity
+        position, velocity = self.predict(q, v, actuation)
+        return position, velocity
+
+    @override
+    def decode(self, inputs: torch.Tensor) -> list[torch.Tensor]:
+        """(S, N, 3) positions [m] and velocities [m/s], from (S, n_in) standardised inputs."""
+        displacement, velocity = super().decode(inputs)
+        return [self.rest + displacement, velocity]
 
 
 def build_model(
@@ -357,7 +368,7 @@ def _state_coders(config: Mapping[str, Any], u: torch.Tensor, v: torch.Tensor) -
 
 def _blind_coder(samples: torch.Tensor) -> Coder:
     """No coordinates at all: for what a network is not to see."""
-    nothing = samples.new_zeros(samples[0].numel(), dtype=torch.float64)
+    nothing = samples.new_zeros(samples[0].numel())
     return Coder(nothing, nothing.new_zeros(len(nothing), 0), nothing.new_zeros(0))
 
 

@@ -135,13 +135,13 @@ def roll_out_part(part: Part, advance: Advance) -> dict[str, Made]:
     settings, name = part.context.settings, part.more
     scene = DrivenScene(settings, part.context.run_dir, "count")
     simulator, motions = scene.simulator, scene.pick(part.names)
-    model, watched = None, None
+    watched = None
     if name in LEARNED:
         path = part.context.run_dir / weights_file(name)
         tensors, description = read_checkpoint(path, _KIND_NAMES[name])
         model = restore(_KINDS[name], tensors, description).to(simulator.rest_positions.device)
         watched = WatchedModel(model, Range.restore(description["range"], model.linear))
-    rollout = rollout_of(scene, name, model, part.names, predict=watched)
+    rollout = rollout_of(scene, name, watched, part.names)
     batch, steps = motions.pressure.shape[:2]
     state = simulator.static_equilibrium(material=scene.tensors(name, part.names), batch=batch)
     tip = torch.as_tensor(select_vertices(simulator.body.mesh, **settings["tip"]), device=state.q.device)

@@ -21,8 +21,6 @@ from ..train import fit
 from .files import RECONSTRUCTED
 from .scene import DrivenScene
 
-_MARGIN = 0.25  # of the width of the training range, by which a roll-out may exceed it on either side
-
 
 @dataclass(frozen=True)
 class Reconstructed:
@@ -112,47 +110,45 @@ def _fit(
 ) -> None:
     """Trains, chooses by roll-outs of the validation trials, and keeps the range of the training beside the weights."""
     settings, train = context.settings, samples["train"]
-    error = validation_error(scene, name, tuple(settings["split"]["validation"]))
-    trainer: Trainer[Any] = Trainer(model, train, samples["validation"], error, settings["trainer"], settings["seed"])
     with torch.no_grad():
-        inputs = model.encode(train.q, train.v, train.actuation)
-    known = {"range": Range.of(inputs, _MARGIN).description()}
-    fit(context, trainer, weights_file(name), training_file(name), kind, known)
+        range_ = Range.of(model.encode(train.q, train.v, train.actuation))
+    error = validation_error(scene, name, tuple(settings["split"]["validation"]), range_)
+    trainer: Trainer[Any] = Trainer(model, train, samples["validation"], error, settings["trainer"], settings["seed"])
+    fit(context, trainer, weights_file(name), training_file(name), kind, {"range": range_.description()})
 
 
-def rollout_of(
-    scene: DrivenScene,
-    name: str,
-    model: StateMap | None,
-    trials: tuple[str, ...],
-    predict: WatchedModel | None = None,
-) -> Rollout:
+def rollout_of(scene: DrivenScene, name: str, predict: WatchedModel | None, trials: tuple[str, ...]) -> Rollout:
     """A roll-out of a model of that name, over some trials.
 
     Args:
         scene: of the experiment.
         name: one of `files.MODELS`.
-        model: what it has learned; None for a simulator alone.
+        predict: what it has learned; None for a simulator alone.
         trials: their names.
-        predict: the model as a predictor that is watched; one that is not, if None.
     """
     drive = scene.drive(name, trials)
-    if predict is None and model is not None:
-        predict = WatchedModel(model)
-    if isinstance(model, NextState):
-        assert predict is not None
+    if predict is not None and isinstance(predict.model, NextState):
         return DrivenDataRollout(scene.simulator, predict, drive)
     return DrivenHybridRollout(scene.simulator, predict, drive, scene.tensors(name, trials))
 
 
-def validation_error(scene: DrivenScene, name: str, trials: tuple[str, ...]) -> Callable[[StateMap], float]:
-    """The mean error of a model's markers over what is learned from [mm]; infinite where a roll-out diverged."""
+def validation_error(
+    scene: DrivenScene, name: str, trials: tuple[str, ...], range_: Range
+) -> Callable[[StateMap], float]:
+    """The mean error of a model's markers over what is learned from [mm]; infinite where a roll-out diverged.
+
+    Args:
+        scene: of the experiment.
+        name: one of `files.MODELS`, that learns.
+        trials: their names.
+        range_: of the model's inputs in training.
+    """
     motions = scene.pick(trials)
     observed = motions.markers[:, : scene.learned_steps + 1].cpu().numpy()
     start = scene.simulator.static_equilibrium(material=scene.tensors(name, trials), batch=len(trials))
 
     def error(model: StateMap) -> float:
-        rollout, state = rollout_of(scene, name, model, trials), start
+        rollout, state = rollout_of(scene, name, WatchedModel(model, range_), trials), start
         series = [scene.markers(state.q)]
         for _ in range(observed.shape[1] - 1):
             state = rollout.step(state)

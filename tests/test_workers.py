@@ -62,6 +62,10 @@ def ignores_interrupts(task, advance):
     return signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, [])
 
 
+def takes_memory(task, advance):
+    return len(b"x" * int(task * 2**30))
+
+
 def test_no_worker_sees_an_interrupt():
     program = "from test_workers import *\n"
     program += "print(sorted(in_processes(ignores_interrupts, [0, 1, 2], 3, print)))"
@@ -69,3 +73,17 @@ def test_no_worker_sees_an_interrupt():
         [sys.executable, "-c", program], cwd=Path(__file__).parent, capture_output=True, text=True, check=True
     )
     assert found.stdout.splitlines()[-1] == "[(0, True), (1, True), (2, True)]"
+
+
+def test_a_worker_tells_its_own_memory_not_that_of_its_parent():
+    program = "from warp_resphys.memory import peak_memory_gib, peak_of_workers_gib\n"
+    program += "from test_workers import *\n"
+    program += "held = b'x' * 3 * 2**30; del held\n"
+    program += "list(in_processes(takes_memory, [0.1, 0.5, 0.2], 1, print))\n"
+    program += "print(peak_memory_gib(), peak_of_workers_gib())"
+    found = subprocess.run(
+        [sys.executable, "-c", program], cwd=Path(__file__).parent, capture_output=True, text=True, check=True
+    )
+    own, workers = map(float, found.stdout.splitlines()[-1].split())
+    assert own > 3.0
+    assert 0.5 < workers < 2.0

@@ -13,9 +13,6 @@ import json
 import logging
 import os
 import platform
-import re
-import resource
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -27,6 +24,7 @@ from typing import Any
 
 from warp_resphys.errors import DataFileError, InputError
 from warp_resphys.files import digest, read_json, to_plain, write_json
+from warp_resphys.memory import peak_memory_gib, peak_of_workers_gib
 
 log = logging.getLogger(__name__)
 
@@ -163,7 +161,7 @@ def _write_record(stage: Stage, context: StageContext, seconds: float) -> None:
         {
             "fingerprint": context.fingerprint,
             "seconds": seconds,
-            "peak_memory_gib": peak_memory_gib(stage.processes),
+            "peak_memory_gib": peak_memory_gib() + stage.processes * peak_of_workers_gib(),
             "finished": datetime.now(UTC).isoformat(timespec="seconds"),
             "outputs": {name: _identity(context.run_dir / name) for name in stage.outputs},
             "settings": to_plain(stage.settings),
@@ -189,19 +187,6 @@ def _keep_seconds(progress: Path, context: StageContext, seconds: float) -> None
         write_json(progress, {"fingerprint": context.fingerprint, "seconds": seconds})
     except DataFileError as error:
         log.warning("the time spent in '%s' is not kept: %s", context.name, error)
-
-
-def peak_memory_gib(processes: int = 0) -> float:
-    """The most resident memory that this process has had, and as much as its largest child for each worker [GiB].
-
-    What a child had counts from the memory of its parent on, as the operating system keeps it: an upper bound.
-    """
-    unit = 1 if sys.platform == "darwin" else 1024  # bytes
-    child = unit * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
-    status = Path("/proc/self/status")  # Without what the parent had, which getrusage includes.
-    known = re.search(r"^VmHWM:\s+(\d+) kB$", status.read_text(), re.MULTILINE) if status.is_file() else None
-    own = 1024 * int(known[1]) if known else unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return float((own + processes * child) / 2**30)
 
 
 def resources_used(run_dir: str | Path, names: Sequence[str]) -> dict[str, Any]:

@@ -21,6 +21,7 @@ import warp as wp
 from threadpoolctl import threadpool_limits
 
 from .errors import ResphysError
+from .memory import count_worker, peak_memory_gib
 
 Advance = Callable[..., None]
 
@@ -70,11 +71,13 @@ def in_processes(
                 if kind == "advance":
                     advance(content[0], **content[1])
                     continue
+                result, peak = content
+                count_worker(peak)
                 number = busy.pop(connection)
                 if (following := next(waiting, None)) is not None:
                     connection.send(tasks[following])
                     busy[connection] = following
-                yield number, content
+                yield number, result
     finally:
         for connection, worker in crew.items():
             connection.close()
@@ -116,7 +119,7 @@ def _work(function: Callable[[Any, Advance], Any], connection: Connection) -> No
 
 def _outcome(function: Callable[[Any, Advance], Any], task: Any, advance: Advance) -> tuple[str, Any]:
     try:
-        return "done", function(task, advance)
+        return "done", (function(task, advance), peak_memory_gib())
     except ConnectionError:
         raise
     except ResphysError as error:

@@ -99,7 +99,8 @@ def driven_stages(config: Mapping[str, Any]) -> list[Stage]:
     for model, function in zip(LEARNED, (train_simfree_driven, train_driven), strict=True):
         settings = {**learned, **training_settings(dict(config), model)}
         outputs = (weights_file(model), training_file(model))
-        stages.append(Stage(f"train_{model}", function, outputs, settings, ("import", "identify", "reconstruct")))
+        needs = ("import", "identify", "reconstruct")
+        stages.append(Stage(f"train_{model}", function, outputs, settings, needs, format_version=2))
     tested = {**base, "data": _pick(config["data"], "windows"), "tip": config["tip"], "groups": groups_of(config)}
     needs = ("import", "identify", *(f"train_{model}" for model in LEARNED))
     if config["data"]["factors"]:
@@ -112,6 +113,7 @@ def driven_stages(config: Mapping[str, Any]) -> list[Stage]:
             (ROLLOUTS, ERRORS),
             tested,
             needs,
+            format_version=2,
             processes=processes,
         ),
         Stage("report", report_driven, (REPORT,), {"config": shown(config)}, ("evaluate",)),

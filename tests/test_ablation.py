@@ -243,7 +243,7 @@ def test_the_published_method_gives_the_same_errors(folder):
         ("data.weights_g.observed=[50,70]", "data.weights_g.observed is [50, 70]: it must be a list of one positive"),
         ("data.weights_g.observed=[-1]", "data.weights_g.observed is [-1]: it must be a list of one positive"),
         ("reconstruction.regularisation=0", "reconstruction.regularisation is 0: it must be positive, as markers"),
-        ("reconstruction=lbfgsb markers.modes=4", "markers.modes is set, but reconstruction.method=lbfgsb has no"),
+        ("reconstruction=lbfgsb markers.modes=4", "4 modes are asked for, but reconstruction.method=lbfgsb has none"),
     ],
 )
 def test_bad_input(folder, overrides, sentence):

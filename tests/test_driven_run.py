@@ -6,6 +6,7 @@ The report has tests of its own.
 import dataclasses
 import json
 import shutil
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,6 @@ from warp_resphys.tasks.actuated.checks import check_driven
 from warp_resphys.tasks.actuated.evaluate import summary
 from warp_resphys.tasks.actuated.importing import import_driven
 from warp_resphys.tasks.actuated.reconstruct import replayed_errors
-from warp_resphys.tasks.actuated.scene import DrivenScene
 from warp_resphys.tasks.checks import check_configuration
 
 # A short segment with two chambers of some 70 vertices, on which everything takes seconds.
@@ -158,16 +158,16 @@ def test_forces_that_do_not_hold_the_body_are_named(finished, monkeypatch, tmp_p
     with read_hdf5(finished / "run" / "reconstruction.h5", "reconstruction") as file:
         forces = read_array(file, "force")[2:]
     settings = json.loads((finished / "run" / "stages" / "reconstruct.json").read_text())["settings"]
-    scene, trial = DrivenScene(settings, finished / "run"), ("t002",)
-    tensors, drive, observed = scene.tensors("resphys", trial), scene.drive("resphys", trial), scene.smoothed(trial)
-    start = scene.simulator.static_equilibrium(material=tensors, batch=1)
-    found = replayed_errors(scene, start, tensors, drive, forces, observed)
+    replay = partial(replayed_errors, settings, finished / "run", ("t002",))
+    found = replay(forces)
     assert found.mean() == pytest.approx(summary["replayed_mm"], rel=1e-3)
     assert found.mean() < 0.2
-    assert replayed_errors(scene, start, tensors, drive, 0.0 * forces, observed).mean() > 2.0 * found.mean()
+    assert replay(0.0 * forces).mean() > 2.0 * found.mean()
+    forces[0, 6:] = np.nan
+    assert np.isfinite(replay(forces)).sum() == 6  # Only until then, and without an end of the others.
     for name in ("motions.h5", "identification.json"):
         shutil.copy(finished / "run" / name, tmp_path)
-    monkeypatch.setattr(reconstruct, "replayed_errors", lambda *rest: np.full(rest[4].shape[:2], np.inf))
+    monkeypatch.setattr(reconstruct, "replayed_errors", lambda *rest: np.full(rest[3].shape[:2], np.inf))
     reconstruct.reconstruct_driven(StageContext("reconstruct", tmp_path, "", settings))
     assert "the forces lead inf mm away from the markers" in caplog.text
     assert json.loads((tmp_path / "reconstruction.json").read_text())["replayed_mm"] is None
@@ -185,7 +185,9 @@ def test_the_same_command_does_nothing_again_and_other_windows_only_evaluate(fin
 
 
 def test_recordings_in_a_folder_give_what_the_simulation_that_made_them_gave(finished, monkeypatch, tmp_path):
-    """The same trials from files, in two processes; the trial at higher pressure is no more among those at rest."""
+    """The same trials from files, in two processes; those at higher pressures are not among them."""
+    assert {path.stem for path in (finished / "run" / "recordings").iterdir()} == {"t000", "t001", "t002", "t003"}
+    assert [path.stem for path in (finished / "run" / "recordings_raised").iterdir()] == ["t003_x1.5"]
     place_experiment(tmp_path)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(experiment, "report_driven", lambda context: (context.run_dir / "report.html").write_text("-"))
@@ -240,6 +242,12 @@ def recorded(tmp_path, finished, change):
         (["data.factors=[1.5]", "data.folder=run/recordings", "data.test=[t003]"], "recordings have their own"),
         (["synthetic.time_step=0.003"], "the first must be a multiple of the second"),
         (["+identify.parameters.fibre_stiffness={lower:1.0,upper:2.0}"], "but fibres is null"),
+        (["data.chambers=[]"], "data.chambers is []: it must be a list of different chambers, from 1"),
+        (["synthetic.sequences.mean=high"], "synthetic.sequences.mean is 'high': it must be a finite number"),
+        (["synthetic.sequences.correlation=[[1.0],[0.0]]"], "it must be a finite number, or a matrix of them"),
+        (["+identify.first_guess.youngs_modulus=soft"], "identify.first_guess.youngs_modulus is 'soft'"),
+        (["+identify.first_guess.pressure_rise=0.04"], "identify.first_guess.pressure_rise is of no use"),
+        (["reconstruction=lbfgsb", "+reconstruction.modes=4"], "reconstruction.method=lbfgsb has none"),
     ],
 )
 def test_bad_configurations_cost_one_sentence(finished, monkeypatch, overrides, message):
@@ -262,6 +270,24 @@ def test_bad_recordings_cost_one_sentence(finished, monkeypatch, tmp_path):
     for name, (change, message) in cases.items():
         (tmp_path / name).mkdir()
         assert message in refused(finished, monkeypatch, *recorded(tmp_path / name, finished, change))
+
+
+def test_pressures_in_another_unit_and_two_files_of_one_name_cost_one_sentence(finished, monkeypatch, tmp_path):
+    def in_kilopascal(recording):
+        return dataclasses.replace(recording, actuation=1e-3 * recording.actuation)
+
+    places = recorded(tmp_path, finished, in_kilopascal)
+    for name in ("t001", "t002", "t003"):
+        write_recording(tmp_path / f"{name}.h5", in_kilopascal(read_recording(tmp_path / f"{name}.h5")))
+    assert "the pressures of all 4 recordings stay below" in refused(finished, monkeypatch, *places)
+    (tmp_path / "t001.csv").touch()
+    assert "t001.csv and t001.h5, two recordings of one name" in refused(finished, monkeypatch, *places)
+
+
+def test_another_method_of_reconstruction_is_taken_as_a_whole():
+    for name in ("sopra", "segment_real", "beam_real"):
+        chosen = configuration("reconstruction=lbfgsb", experiment=name)["reconstruction"]
+        assert (chosen["method"], chosen["regularisation"]) == ("lbfgsb", 1e-4)
 
 
 def test_a_short_recording_is_named_and_its_rest_counts_as_not_seen(finished, monkeypatch, tmp_path, caplog):

@@ -235,11 +235,29 @@ def test_winding_angles_turn_the_fibres():
     np.testing.assert_allclose(np.abs(along.ravel()[points.weights > 0.0]), 0.5, atol=1e-12)
 
 
+def test_fibres_go_around_the_given_direction_where_a_chamber_is_wider_than_long():
+    """The chamber of two bricks is longest along x; wound around y, its faces across y are ends."""
+    wound = {}
+    for axis in (None, (1.0, 0.1, 0.0), (0.1, 1.0, 0.0)):
+        body = chambered("hexahedron", fibres=Fibres(axis=axis))
+        points = fibre_points(body.mesh, body.chambers[:1], body.fibres)
+        faces = body.mesh.vertices[points.nodes[points.weights.reshape(len(points.nodes), -1)[:, 0] > 0.0]]
+        wound[axis] = set(np.flatnonzero(np.ptp(faces, axis=1).min(axis=0) < 1e-9))
+    assert wound == {None: {1, 2}, (1.0, 0.1, 0.0): {1, 2}, (0.1, 1.0, 0.0): {0, 2}}
+    across = Fibres(axis=[1.0, 1.0, 0.0])
+    with pytest.raises(MeshError, match=r"chamber_1 has no direction near \[1.0, 1.0, 0.0\]"):
+        fibre_points(body.mesh, body.chambers, across)
+
+
 def test_bad_input():
     mesh = hollow_box("hexahedron")
     chamber = find_chambers(mesh, (1.0, 0.0, 0.0))[0]
     with pytest.raises(MeshError, match=r"lid is open: 4 edges of its surface belong to one face alone.*close"):
         check_chambers([Chamber("lid", chamber.faces[1:])], mesh)
+    with pytest.raises(MeshError, match="the faces of turned look into the chamber, or it is the outer surface"):
+        check_chambers([Chamber("turned", chamber.faces[:, ::-1])], mesh)
+    with pytest.raises(MeshError, match="again and first share a face"):
+        check_chambers([Chamber("first", chamber.faces), Chamber("again", chamber.faces)], mesh)
     with pytest.raises(MeshError, match="is open"):
         Body(mesh, chambers=[Chamber("lid", chamber.faces[1:])])
     with pytest.raises(InputError, match="fibres are wound around chambers"):

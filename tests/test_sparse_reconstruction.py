@@ -266,7 +266,7 @@ class TestModes:
             {"method": "adam"},
             "reconstruction.method is 'adam': choose one of gauss_newton, levenberg_marquardt, lbfgsb.",
         ),
-        ({"method": "lbfgsb", "modes": 3}, "markers.modes is set, but reconstruction.method=lbfgsb has no modes"),
+        ({"method": "lbfgsb", "modes": 3}, "3 modes are asked for, but reconstruction.method=lbfgsb has none"),
         ({"modes": 0}, "0 vibration modes were asked for, but the body has 1 to 24."),
         ({"modes": 25}, "25 vibration modes were asked for"),
         ({"markers": markers_at([12])}, "a marker is on a vertex that the body does not have: its vertices are 0 to"),

@@ -76,11 +76,11 @@ def test_no_worker_sees_an_interrupt():
 
 
 def test_a_worker_tells_its_own_memory_not_that_of_its_parent():
-    program = "from warp_resphys.memory import peak_memory_gib, peak_of_workers_gib\n"
+    program = "from warp_resphys.memory import *\n"
     program += "from test_workers import *\n"
     program += "held = b'x' * 3 * 2**30; del held\n"
-    program += "list(in_processes(takes_memory, [0.1, 0.5, 0.2], 1, print))\n"
-    program += "print(peak_memory_gib(), peak_of_workers_gib())"
+    program += "memory = WorkersMemory(); list(in_processes(takes_memory, [0.1, 0.5, 0.2], 1, print, memory))\n"
+    program += "print(peak_memory_gib(), memory.gib)"
     found = subprocess.run(
         [sys.executable, "-c", program], cwd=Path(__file__).parent, capture_output=True, text=True, check=True
     )

@@ -144,7 +144,7 @@ def check_pressures(pressures: ArrayLike, chambers: int, limit: float, source: s
         found = values.shape[1] if values.ndim == 2 else "no"
         raise DataFileError(
             f"{source} has pressures of {found} chambers, but the body has {chambers}: take the mesh of that robot, or "
-            "set data.chambers to the columns of the file in the order of the mesh's chambers."
+            "set data.chambers to the mesh's chamber of each column of the file."
         )
     if not np.isfinite(values).all():
         frame, chamber = np.argwhere(~np.isfinite(values))[0]

@@ -78,8 +78,10 @@ def check_chambers(chambers: Sequence[Chamber], mesh: Mesh) -> None:
     """Checks that pressure in each chamber has no net force.
 
     Raises:
-        MeshError: a chamber has no faces, faces of vertices that the mesh does not have, or an edge on its rim.
+        MeshError: a chamber has no faces, faces of vertices that the mesh does not have, an edge on its rim, faces that
+            look the wrong way, or a face of another chamber.
     """
+    owners: dict[frozenset[int], str] = {}
     for chamber in chambers:
         faces = chamber.faces
         if not len(faces):
@@ -99,3 +101,14 @@ def check_chambers(chambers: Sequence[Chamber], mesh: Mesh) -> None:
                 f"{chamber.name} is open: {len(rim)} edges of its surface belong to one face alone, one of them at "
                 f"({where}) mm; close the surface, or the pressure would push the body away."
             )
+        triangles = face_triangles(faces)
+        volume = -float(np.linalg.det(mesh.vertices[triangles] - mesh.vertices[triangles[0, 0]]).sum()) / 6.0
+        if volume <= 0.0:
+            raise MeshError(
+                f"the faces of {chamber.name} look into the chamber, or it is the outer surface of the body: list the "
+                "vertices of each face counter-clockwise as seen from inside the chamber."
+            )
+        for face in map(frozenset, faces.tolist()):
+            other = owners.setdefault(face, chamber.name)
+            if other != chamber.name:
+                raise MeshError(f"{chamber.name} and {other} share a face: every face belongs to one chamber.")

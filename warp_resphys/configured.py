@@ -102,11 +102,11 @@ def build_chambers(config: Mapping[str, Any] | None, mesh: Mesh) -> tuple[Chambe
 def build_body(config: Mapping[str, Any], point_masses: tuple[PointMass, ...] = ()) -> Body:
     """A body from the groups ``mesh``, ``physics``, ``fixed``, and, where it has any, ``chambers`` and ``fibres``."""
     mesh = build_mesh(config["mesh"])
-    fibres = config.get("fibres")
+    fibres, chambers = config.get("fibres"), config.get("chambers")
     return Body(
         mesh,
-        chambers=build_chambers(config.get("chambers"), mesh),
-        fibres=None if fibres is None else Fibres(**fibres),
+        chambers=build_chambers(chambers, mesh),
+        fibres=None if fibres is None else Fibres(**fibres, axis=None if chambers is None else chambers["axis"]),
         fixed=select_vertices(mesh, **config["fixed"]),
         mass=config["physics"]["mass"],
         volume_integration=config["physics"]["volume_integration"],

@@ -1,11 +1,26 @@
-"""The most memory that this process and its workers have taken."""
+"""The most memory that a process and its workers have taken."""
 
 import re
 import resource
 import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
-_largest_worker = 0.0  # [GiB]
+
+@dataclass
+class WorkersMemory:
+    """What the workers of a piece of work took.
+
+    Attributes:
+        gib: the peaks of those that ran at once, added up [GiB]; 0 without any.
+    """
+
+    gib: float = 0.0
+
+    def count(self, peaks: Iterable[float]) -> None:
+        """Keeps what workers that run at once say of their own `peak_memory_gib`, if it is more than before."""
+        self.gib = max(self.gib, sum(peaks))
 
 
 def peak_memory_gib() -> float:
@@ -15,14 +30,3 @@ def peak_memory_gib() -> float:
     if known:
         return int(known[1]) / 2**20
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**30 if sys.platform == "darwin" else 2**20)
-
-
-def count_worker(peak: float) -> None:
-    """Keeps what a worker says of its own `peak_memory_gib`."""
-    global _largest_worker
-    _largest_worker = max(_largest_worker, peak)
-
-
-def peak_of_workers_gib() -> float:
-    """The most that any worker has said [GiB], 0 without any."""
-    return _largest_worker

@@ -16,7 +16,7 @@ import platform
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -24,7 +24,7 @@ from typing import Any
 
 from warp_resphys.errors import DataFileError, InputError
 from warp_resphys.files import digest, read_json, to_plain, write_json
-from warp_resphys.memory import peak_memory_gib, peak_of_workers_gib
+from warp_resphys.memory import WorkersMemory, peak_memory_gib
 
 log = logging.getLogger(__name__)
 
@@ -49,12 +49,14 @@ class StageContext:
         run_dir: The run folder; outputs are written there.
         fingerprint: Identifies everything the outputs depend on; resumable files are marked with it.
         settings: The settings that the stage declared.
+        memory: Of its worker processes, which it is to count.
     """
 
     name: str
     run_dir: Path
     fingerprint: str
     settings: Mapping[str, Any]
+    memory: WorkersMemory = field(default_factory=WorkersMemory)
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,6 @@ class Stage:
         settings: Plain nested settings that the outputs depend on, and no others.
         upstream: Names of the stages whose outputs it reads.
         format_version: To be raised when the stage's code changes what it writes.
-        processes: Worker processes that run at once, for the memory taken.
     """
 
     name: str
@@ -77,7 +78,6 @@ class Stage:
     settings: Mapping[str, Any]
     upstream: tuple[str, ...] = ()
     format_version: int = 1
-    processes: int = 0
 
 
 class StageInterrupted(KeyboardInterrupt):
@@ -161,7 +161,7 @@ def _write_record(stage: Stage, context: StageContext, seconds: float) -> None:
         {
             "fingerprint": context.fingerprint,
             "seconds": seconds,
-            "peak_memory_gib": peak_memory_gib() + stage.processes * peak_of_workers_gib(),
+            "peak_memory_gib": peak_memory_gib() + context.memory.gib,
             "finished": datetime.now(UTC).isoformat(timespec="seconds"),
             "outputs": {name: _identity(context.run_dir / name) for name in stage.outputs},
             "settings": to_plain(stage.settings),

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from .chambers import Chamber
 from .elements import Points
-from .errors import InputError
+from .errors import InputError, MeshError
 from .mesh import Mesh
 from .shape_functions import (
     Array,
@@ -30,6 +30,7 @@ from .shape_functions import (
 )
 
 _CAP = 0.7  # cosine between a face's normal and the chamber's axis from which on the face is an end, without fibres
+_ALIGNED = 0.8  # cosine between a chamber's axis and the direction that fibres are wound around, at least
 _LARGEST_ANGLE = 85.0  # degrees
 
 
@@ -45,10 +46,13 @@ class Fibres:
         angles: (A,) of each family of windings from the direction around the chamber, in degrees; two opposite ones
             make a double helix.
         toe: strain over which a thread tightens.
+        axis: about along the chambers, which are wound around the one of their principal directions that is nearest to
+            it; None for that in which each reaches furthest.
     """
 
     angles: Sequence[float] = (0.0,)
     toe: float = 1e-3
+    axis: Sequence[float] | None = None
 
     def __post_init__(self) -> None:
         """Checks the angles and the strain.
@@ -95,13 +99,17 @@ def pressure_points(chambers: Sequence[Chamber]) -> SurfacePoints:
 
 
 def fibre_points(mesh: Mesh, chambers: Sequence[Chamber], fibres: Fibres) -> SurfacePoints:
-    """The points at which the energy of fibres is integrated; the ends of chambers have none."""
+    """The points at which the energy of fibres is integrated; the ends of chambers have none.
+
+    Raises:
+        MeshError: a chamber that has no direction near that of the fibres.
+    """
     shape, (points, weights) = _face_rule(chambers, 2)
     _, gradients = shape(points)
     operators, areas = [], []
     for chamber in chambers:
         x = mesh.vertices[chamber.faces]
-        axis = _long_axis(mesh.vertices[chamber.vertices])
+        axis = _long_axis(chamber, mesh, fibres.axis)
         t1, t2 = np.einsum("fki,qkj->jfqi", x, gradients)
         normal = np.cross(t1, t2)
         area = np.linalg.norm(normal, axis=-1)
@@ -141,7 +149,16 @@ def _owners(chambers: Sequence[Chamber], points: int) -> NDArray[np.int64]:
     return np.repeat(np.arange(len(chambers)), [len(chamber.faces) * points for chamber in chambers])
 
 
-def _long_axis(vertices: Array) -> Array:
-    """(3,) the direction in which they reach furthest."""
-    axis: Array = np.linalg.svd(vertices - vertices.mean(axis=0), full_matrices=False)[2][0]
-    return axis
+def _long_axis(chamber: Chamber, mesh: Mesh, near: Sequence[float] | None) -> Array:
+    """(3,) the principal direction of a chamber that is nearest to one, or in which it reaches furthest."""
+    vertices = mesh.vertices[chamber.vertices]
+    directions: Array = np.linalg.svd(vertices - vertices.mean(axis=0), full_matrices=False)[2]
+    if near is None:
+        return directions[0]
+    aligned = np.abs(directions @ np.asarray(near, dtype=np.float64)) / np.linalg.norm(near)
+    if aligned.max() < _ALIGNED:
+        raise MeshError(
+            f"{chamber.name} has no direction near {list(near)}, around which fibres could be wound: give the "
+            "direction of the chambers (chambers.axis)."
+        )
+    return directions[aligned.argmax()]

@@ -21,7 +21,7 @@ import warp as wp
 from threadpoolctl import threadpool_limits
 
 from .errors import ResphysError
-from .memory import count_worker, peak_memory_gib
+from .memory import WorkersMemory, peak_memory_gib
 
 Advance = Callable[..., None]
 
@@ -36,7 +36,11 @@ def available_cores() -> int:
 
 
 def in_processes(
-    function: Callable[[Any, Advance], Any], tasks: Sequence[Any], processes: int, advance: Advance
+    function: Callable[[Any, Advance], Any],
+    tasks: Sequence[Any],
+    processes: int,
+    advance: Advance,
+    memory: WorkersMemory | None = None,
 ) -> Generator[tuple[int, Any], None, None]:
     """Yields a task's number and result as each finishes; close the iterator to end the workers.
 
@@ -45,6 +49,7 @@ def in_processes(
         tasks: started in this order.
         processes: at most so many at once.
         advance: called here, with the arguments that a worker called its own with.
+        memory: that counts what the workers take.
 
     Raises:
         WorkerError: a task raised a ResphysError, whose sentence it has, or a worker was ended from outside.
@@ -53,6 +58,7 @@ def in_processes(
     context = multiprocessing.get_context("spawn")
     crew: dict[Connection, BaseProcess] = {}
     busy: dict[Connection, int] = {}
+    peaks: dict[Connection, float] = {}
     waiting = iter(range(len(tasks)))
     try:
         for number in islice(waiting, processes):
@@ -71,14 +77,15 @@ def in_processes(
                 if kind == "advance":
                     advance(content[0], **content[1])
                     continue
-                result, peak = content
-                count_worker(peak)
+                result, peaks[connection] = content
                 number = busy.pop(connection)
                 if (following := next(waiting, None)) is not None:
                     connection.send(tasks[following])
                     busy[connection] = following
                 yield number, result
     finally:
+        if memory is not None:
+            memory.count(peaks.values())
         for connection, worker in crew.items():
             connection.close()
             worker.terminate()

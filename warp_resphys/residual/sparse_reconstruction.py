@@ -357,5 +357,7 @@ def make_sparse_reconstructor(
         known = ", ".join(("gauss_newton", *methods))
         raise InputError(f"reconstruction.method is {method!r}: choose one of {known}.")
     if modes is not None:
-        raise InputError(f"markers.modes is set, but reconstruction.method={method} has no modes: choose gauss_newton.")
+        raise InputError(
+            f"{modes} modes are asked for, but reconstruction.method={method} has none: take gauss_newton."
+        )
     return methods[method](*settings)

@@ -22,6 +22,7 @@ from ..errors import InputError
 from ..files import atomic_hdf5, create, read_json, write_json, write_text
 from ..integrator import State
 from ..markers import MarkerMap
+from ..memory import WorkersMemory
 from ..mesh import surface_vertices
 from ..progress import Progress
 from ..report.ablation_page import AblationReport, write_ablation_report
@@ -65,7 +66,6 @@ def ablation_stages(config: dict[str, Any], base: dict[str, Any]) -> list[Stage]
             {**pick("simulation", "reconstruction", "seed"), "markers": markers},
             ("generate",),
             format_version=2,
-            processes=processes if processes > 1 else 0,
         ),
         Stage("report", report_ablation, (REPORT,), {"config": config}, ("ablation",)),
     ]
@@ -167,7 +167,7 @@ def ablate(context: StageContext, processes: int = 1) -> None:
     ):
         done = [int(file.read(step)["count"]) for step in range(file.done)]
         left = [(settings, context.run_dir / MOTION, count) for count in counts if count not in done]
-        with closing(_each_count(left, processes, progress.advance)) as results:
+        with closing(_each_count(left, processes, progress.advance, context.memory)) as results:
             for count, (vertices, error, misfit) in results:
                 padded = np.pad(vertices, ((0, 0), (0, max(counts) - count)), constant_values=-1)
                 file.append(count=count, markers=padded, error=error, misfit=misfit)
@@ -186,14 +186,16 @@ def ablate(context: StageContext, processes: int = 1) -> None:
 _Task = tuple[Mapping[str, Any], Path, int]
 
 
-def _each_count(tasks: Sequence[_Task], processes: int, advance: Advance) -> Generator[tuple[int, Any], None, None]:
+def _each_count(
+    tasks: Sequence[_Task], processes: int, advance: Advance, memory: WorkersMemory
+) -> Generator[tuple[int, Any], None, None]:
     """Yields each number of markers with what `reconstruct_count` makes of it, in the order in which they finish."""
     if processes == 1:
         for task in tasks:
             yield task[-1], reconstruct_count(task, advance)
         return
     tasks = sorted(tasks, key=lambda task: -task[-1])  # The longest first, so that no process is left with it.
-    with closing(in_processes(reconstruct_count, tasks, processes, advance)) as results:
+    with closing(in_processes(reconstruct_count, tasks, processes, advance, memory)) as results:
         for number, result in results:
             yield tasks[number][-1], result
 

@@ -152,7 +152,7 @@ def check_configuration(config: Mapping[str, Any]) -> None:
     for key, function in _TAKEN_BY.items():
         if key not in config:
             continue
-        if key == "reconstruction" and kind_of_data == PRESSURE:
+        if key == "reconstruction" and measured:
             function = make_sparse_reconstructor
         own_names = inspect.signature(function).parameters
         known = [name for name in own_names if name not in ("mesh", "simulator", "markers")]

@@ -11,7 +11,6 @@ from ...actuation import PressureSequences
 from ...configured import build_body, build_simulator
 from ...driven import DRIVEN_PARAMETERS
 from ...errors import InputError
-from ...identification import Bounds
 from ...markers import KINDS, MarkerMap
 from ...material import Material
 from ...mesh import select_vertices
@@ -23,22 +22,27 @@ from ..kinds import (
     NATURAL,
     NOT_NEGATIVE,
     POSITIVE,
-    TRUTH_VALUE,
     WORD,
     Kind,
     check_keys,
+    is_finite,
     is_list,
     is_whole_number,
     one_of,
     optional,
 )
-from ..measured.identify import check_identification
+from ..measured.checks import check_identification
 from ..trajectories import SPLITS
 from .synthesise import reality_settings, substeps_of
 from .trials import is_synthetic, split_of
 
 PRESSURE = "pressure"
 _LONGEST_STRETCH = 0.3  # rho g L / E from which on the size of a body is not believed
+
+
+def _is_matrix(value: Any) -> bool:
+    return isinstance(value, list) and all(is_list(row) and len(row) == len(value) for row in value)
+
 
 _POSITIVE_LIST = Kind(lambda value: is_list(value) and all(x > 0.0 for x in value), "a list of positive numbers")
 _TRIALS = Kind(
@@ -47,12 +51,22 @@ _TRIALS = Kind(
 )
 _COLUMNS = Kind(
     lambda value: (
-        isinstance(value, list) and all(is_whole_number(x) and x > 0 for x in value) and len({*value}) == len(value)
+        isinstance(value, list)
+        and bool(value)
+        and all(is_whole_number(x) and x > 0 for x in value)
+        and len({*value}) == len(value)
     ),
     "a list of different chambers, from 1",
     optional=True,
 )
 _RANGE = {"lower": FINITE, "upper": FINITE}
+_SEQUENCES = {
+    "mean": FINITE,
+    "deviation": POSITIVE,
+    "correlation_time": POSITIVE,
+    "correlation": Kind(lambda value: is_finite(value) or _is_matrix(value), "a finite number, or a matrix of them"),
+    "rest": NOT_NEGATIVE,
+}
 _KEYS: dict[str, dict[str, Kind]] = {
     "data": {
         "kind": WORD,
@@ -147,7 +161,12 @@ def check_driven(config: Mapping[str, Any]) -> None:
     check_size(body.mesh.vertices, simulator.material, config["gravity"])
     probe = MarkerMap.at_vertices(torch.zeros(1, 1, dtype=torch.int64))
     make_sparse_reconstructor(simulator, probe, **config["reconstruction"])
-    _check_identification(config["identify"])
+    check_identification(config["identify"], DRIVEN_PARAMETERS)
+    for name in config["identify"]["first_guess"]:
+        if name not in config["identify"]["parameters"]:
+            raise InputError(
+                f"identify.first_guess.{name} is of no use: give it a range in identify.parameters, or leave it out."
+            )
     chambers = config["data"]["chambers"]
     if chambers is not None and max(chambers) > len(body.chambers):
         raise InputError(f"data.chambers names chamber {max(chambers)}, but the mesh has {len(body.chambers)}.")
@@ -211,33 +230,15 @@ def _check_synthetic(config: Mapping[str, Any]) -> None:
             raise InputError(f"unknown key 'synthetic.material.{key}': a material has other constants.")
     if synthetic["fibres"] is not None:
         check_keys("synthetic.fibres", synthetic["fibres"], _KEYS["fibres"])
-    known = [name for name in inspect.signature(PressureSequences).parameters if name != "limit"]
-    for key in synthetic["sequences"]:
-        if key not in known:
-            raise InputError(f"unknown key 'synthetic.sequences.{key}': it has {', '.join(known)}.")
-    sequences = PressureSequences(limit=data["pressure_limit"], **synthetic["sequences"])
+    given = synthetic["sequences"]
+    for key in given:
+        if key not in _SEQUENCES:
+            raise InputError(f"unknown key 'synthetic.sequences.{key}': it has {', '.join(_SEQUENCES)}.")
+    check_keys("synthetic.sequences", given, {key: _SEQUENCES[key] for key in given})
+    sequences = PressureSequences(limit=data["pressure_limit"], **given)
     sequences.draw(data["steps"], config["time_step"], config["chambers"]["count"], np.random.default_rng(0))
     try:
         body, material = build_body(reality_settings(config)), Material(**synthetic["material"])
     except InputError as error:
         raise InputError(f"synthetic: {error}") from error
     check_size(body.mesh.vertices, material, config["gravity"])
-
-
-def _check_identification(identify: Mapping[str, Any]) -> None:
-    if not identify["parameters"]:
-        raise InputError(
-            f"identify.parameters is empty: give a range of one or more of {', '.join(DRIVEN_PARAMETERS)}."
-        )
-    for group, needed, others in (
-        ("parameters", _RANGE, ("logarithmic",)),
-        ("grid", {**_RANGE, "logarithmic": TRUTH_VALUE, "points": NATURAL}, ()),
-    ):
-        for name, settings in identify[group].items():
-            check_keys(f"identify.{group}.{name}", settings, needed, others)
-            if group == "grid":
-                Bounds(settings["lower"], settings["upper"], settings["logarithmic"])
-    check_identification(identify, DRIVEN_PARAMETERS)
-    for name in identify["first_guess"]:
-        if name not in DRIVEN_PARAMETERS:
-            raise InputError(f"identify.first_guess names '{name}': choose from {', '.join(DRIVEN_PARAMETERS)}.")

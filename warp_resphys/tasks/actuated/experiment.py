@@ -21,7 +21,6 @@ from ..measured.files import (
     REPORT,
     ROLLOUTS,
     TRUTH,
-    recording_file,
     training_file,
     weights_file,
 )
@@ -70,9 +69,9 @@ def driven_stages(config: Mapping[str, Any]) -> list[Stage]:
     imported = {**base, "data": {key: value for key, value in nominal.items() if key not in later}}
     stages = []
     if is_synthetic(config):
-        files = (*(recording_file(trial.name) for trial in trials), TRUTH)
+        files = (*(trial.made for trial in trials), TRUTH)
         simulate = partial(synthesise_driven, processes=processes)
-        stages.append(Stage("synthesise", simulate, files, _synthesised(config, nominal), processes=processes))
+        stages.append(Stage("synthesise", simulate, files, _synthesised(config, nominal)))
     else:
         imported["recordings"] = {trial.name: _digest(trial.file) for trial in trials}
     needs = tuple(stage.name for stage in stages)
@@ -93,7 +92,6 @@ def driven_stages(config: Mapping[str, Any]) -> list[Stage]:
             (RECONSTRUCTED, RECONSTRUCTION),
             {**learned, **_pick(config, "reconstruction")},
             ("import", "identify"),
-            processes=processes,
         ),
     ]
     for model, function in zip(LEARNED, (train_simfree_driven, train_driven), strict=True):
@@ -114,7 +112,6 @@ def driven_stages(config: Mapping[str, Any]) -> list[Stage]:
             tested,
             needs,
             format_version=2,
-            processes=processes,
         ),
         Stage("report", report_driven, (REPORT,), {"config": shown(config)}, ("evaluate",)),
     ]
@@ -123,12 +120,12 @@ def driven_stages(config: Mapping[str, Any]) -> list[Stage]:
 
 def _raised_stages(config: Mapping[str, Any], imported: Mapping[str, Any], processes: int) -> list[Stage]:
     """Those that make and import the test trials at higher pressures, as ``imported`` says of the others."""
-    files = tuple(recording_file(trial.name) for trial in raised_trials_of(config))
+    files = tuple(trial.made for trial in raised_trials_of(config))
     function = partial(synthesise_driven, processes=processes, higher=True)
     settings = _synthesised(config, config["data"])
     data = {**imported["data"], "factors": config["data"]["factors"]}
     return [
-        Stage("synthesise_raised", function, files, settings, ("synthesise",), processes=processes),
+        Stage("synthesise_raised", function, files, settings, ("synthesise",)),
         Stage(
             "import_raised",
             import_raised,

@@ -12,6 +12,7 @@ from ...files import read_array, read_hdf5
 
 MOTIONS = "motions.h5"
 RAISED_MOTIONS = "motions_raised.h5"
+RAISED_RECORDINGS = "recordings_raised"  # not beside the others: that folder may become another experiment's data
 RECONSTRUCTED = "reconstruction.h5"
 RECONSTRUCTION = "reconstruction.json"
 MODELS = ("simulation", "sysid", "simfree", "resphys")

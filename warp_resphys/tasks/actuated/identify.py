@@ -31,7 +31,8 @@ def identify_driven(context: StageContext) -> None:
         del kind  # There is one simulator.
         return scene.replay(train)
 
-    evaluations, seconds = config["starts"] * config["max_evaluations"], config["seconds"]
+    evaluations = config["starts"] * config["max_evaluations"]
+    seconds = min(config["seconds"], scene.learned_steps * scene.simulator.time_step)
     with Progress(
         "identify", evaluations, "evaluations at most", evaluations_done(kept_of(context, _KIND))
     ) as progress:

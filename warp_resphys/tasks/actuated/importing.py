@@ -21,7 +21,7 @@ from ...registration import Registration, register_markers
 from ...simulator import Simulator
 from ...stages import StageContext
 from ..binding import bound_markers
-from ..measured.files import QUALITY, REGISTRATION, recording_file
+from ..measured.files import QUALITY, REGISTRATION
 from ..measured.importing import registration_summary
 from ..trajectories import evenly
 from .files import MOTIONS, RAISED_MOTIONS, read_imported
@@ -68,6 +68,7 @@ def import_driven(context: StageContext) -> None:
     simulator, followed = build_simulator(settings), list(settings["markers"]["followed"])
     nominal, hanging = _hanging(settings, simulator)
     observed = _observe_all(trials_of(settings), context, simulator, hanging)
+    _check_unit([each.pressure for each in observed], settings["data"]["pressure_limit"])
     places = _resting_places(observed, followed)
     known = len(settings["split"]["train"]) + len(settings["split"]["validation"])  # which come first
     mean = np.nanmean(places[:known], axis=0)
@@ -177,7 +178,7 @@ def _observe(trial: Trial, context: StageContext, simulator: Simulator, expected
     data, markers = settings["data"], settings["markers"]
     labels = [*markers["followed"], *markers["others"]]
     if is_synthetic(settings) or trial.file is None:
-        recording = read_recording(context.run_dir / recording_file(trial.name))
+        recording = read_recording(context.run_dir / trial.made)
     else:
         recording = read_recording(trial.file, data["units"], data["rate"])
     recording = resample(recording.select(labels), 1.0 / settings["time_step"], interpolate=True)
@@ -220,6 +221,21 @@ def _pressure(recording: Recording, settings: Mapping[str, Any], simulator: Simu
         opening = valve_opening(recording, list(settings["markers"]["followed"]))
         values = _from_opening(values, (opening - recording.start) * recording.rate)
     return values
+
+
+def _check_unit(pressures: Sequence[FloatArray], limit: float) -> None:
+    """Refuses recordings under which the body would hardly move, as those do whose unit was mistaken.
+
+    Raises:
+        DataFileError: no pressure is near the limit.
+    """
+    highest = max(float(np.abs(each).max()) for each in pressures)
+    if highest < _REST_PRESSURE * limit:
+        raise DataFileError(
+            f"the pressures of all {len(pressures)} recordings stay below {highest:.3g} Pa, and data.pressure_limit is "
+            f"{limit:.3g} Pa: name their unit in the files (actuation_units, or the header of the column), or set the "
+            "limit to what the robot takes."
+        )
 
 
 def _from_opening(values: FloatArray, frame: float) -> FloatArray:

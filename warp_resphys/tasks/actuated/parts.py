@@ -97,7 +97,8 @@ def work_on(
                 for part in left:
                     work(part, progress.advance)
             return
-        with closing(in_processes(work, left, max(min(processes, len(left)), 1), progress.advance)) as results:
+        crew, memory = max(min(processes, len(left)), 1), parts[0].context.memory
+        with closing(in_processes(work, left, crew, progress.advance, memory)) as results:
             for _ in results:
                 pass
 

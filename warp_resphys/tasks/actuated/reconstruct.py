@@ -1,17 +1,17 @@
 """Stage: the forces that bring the identified simulator to the markers it should have learned from."""
 
 import logging
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...errors import ConvergenceError
 from ...files import atomic_hdf5, create, write_json
-from ...integrator import State
-from ...residual.driven_rollout import Drive
+from ...residual.driven_rollout import DrivenHybridRollout
 from ...residual.sparse_reconstruction import make_sparse_reconstructor
-from ...simulator import MaterialTensors
 from ...stages import StageContext
 from ...workers import Advance
 from ..measured.evaluate import marker_errors
@@ -62,7 +62,7 @@ def _finite(value: float) -> float | None:
 def reconstruct_part(part: Part, advance: Advance) -> dict[str, Made]:
     """q, v, force (B, K + 1, N, 3) and the distance of the markers (B, K + 1) [mm] of some trials.
 
-    Also that distance with the forces replayed, if one of the trials is for validation; NaN otherwise.
+    Also that distance with the forces replayed, of those for validation; NaN for the others.
 
     Raises:
         ConvergenceError: a step fails.
@@ -74,7 +74,7 @@ def reconstruct_part(part: Part, advance: Advance) -> dict[str, Made]:
     reconstructor = make_sparse_reconstructor(simulator, scene.markers, **settings["reconstruction"])
     reconstructor = reconstructor.with_tensors(tensors)
     batch = len(part.names)
-    start = state = simulator.static_equilibrium(material=tensors, batch=batch)
+    state = simulator.static_equilibrium(material=tensors, batch=batch)
     force = torch.zeros_like(state.q)
     fields: dict[str, list[NDArray[np.float32]]] = {name: [] for name in (*_UNITS, "error")}
 
@@ -94,41 +94,35 @@ def reconstruct_part(part: Part, advance: Advance) -> dict[str, Made]:
             advance(batch)
     made = {name: np.stack(values, axis=1) for name, values in fields.items()}
     made["replayed"] = np.full_like(made["error"], np.nan)
-    if {*part.names} & {*settings["split"]["validation"]}:
-        made["replayed"] = replayed_errors(scene, start, tensors, drive, made["force"], observed)
+    rows = [row for row, name in enumerate(part.names) if name in settings["split"]["validation"]]
+    if rows:
+        names = tuple(part.names[row] for row in rows)
+        made["replayed"][rows] = replayed_errors(settings, part.context.run_dir, names, made["force"][rows])
     return {name: (values, _UNITS.get(name, "mm")) for name, values in made.items()}
 
 
 def replayed_errors(
-    scene: DrivenScene,
-    start: State,
-    tensors: MaterialTensors,
-    drive: Drive,
-    forces: NDArray[np.float32],
-    observed: torch.Tensor,
+    settings: Mapping[str, Any], run_dir: Path, names: tuple[str, ...], forces: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """(B, K + 1) distance of the markers [mm] of a simulation with given forces; infinite from where it fails.
+    """(B, K + 1) distance of the markers [mm] of simulations with given forces; infinite from where one fails.
 
     Args:
-        scene: of the experiment.
-        start: the states of rest.
-        tensors: constants of the simulator.
-        drive: the pressures.
+        settings: of the stage.
+        run_dir: with the imported motions and the identified parameters.
+        names: of the trials.
         forces: (B, K + 1, N, 3) that lead to each state [N].
-        observed: (B, K + 1, M, 3) [m].
     """
-    state = start
+    scene = DrivenScene(settings, run_dir, "count")
+    tensors, drive, observed = scene.tensors("resphys", names), scene.drive("resphys", names), scene.smoothed(names)
+    state = scene.simulator.static_equilibrium(material=tensors, batch=len(names))
+    coming = iter(torch.from_numpy(forces[:, 1:]).to(state.q).unbind(1))
+    rollout = DrivenHybridRollout(scene.simulator, lambda q, v, inputs: [next(coming)], drive, tensors)
     errors: NDArray[np.float32] = np.full(forces.shape[:2], np.inf, dtype=np.float32)
-    with torch.no_grad():
-        for k in range(forces.shape[1]):
-            if k > 0:
-                force = torch.from_numpy(forces[:, k]).to(state.q)
-                try:
-                    state, _ = scene.simulator.step(state, force, material=tensors, pressure=drive.pressure[:, k - 1])
-                except ConvergenceError:
-                    break
-            reached, seen = scene.markers(state.q).cpu().numpy(), observed[:, k].cpu().numpy()
-            errors[:, k] = [_error(x, y) for x, y in zip(reached, seen, strict=True)]
+    for k in range(forces.shape[1]):
+        state = rollout.step(state) if k > 0 else state
+        reached, seen = scene.markers(state.q).cpu().numpy(), observed[:, k].cpu().numpy()
+        for row in np.flatnonzero(~rollout.lost(state).cpu().numpy()):
+            errors[row, k] = _error(reached[row], seen[row])
     return errors
 
 

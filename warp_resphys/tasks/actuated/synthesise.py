@@ -22,7 +22,7 @@ from ...simulator import Simulator
 from ...stages import StageContext
 from ...workers import Advance
 from ..binding import bound_markers
-from ..measured.files import TRUTH, recording_file
+from ..measured.files import TRUTH
 from ..measured.synthesise import Scene, make_scene
 from .parts import Made, Part, read_parts, remove_parts, split_into_parts, work_on
 from .trials import Trial, raised_trials_of, trials_of
@@ -58,7 +58,7 @@ def synthesise_driven(context: StageContext, processes: int = 1, higher: bool = 
         positions = scene.recorded(np.concatenate([found[trial.name], standing], axis=1))
         noise = synthetic["noise"] * draw.standard_normal(positions.shape)
         distances.append(np.linalg.norm(noise[:, : len(scene.followed)], axis=-1).mean())
-        path = context.run_dir / recording_file(trial.name)
+        path = context.run_dir / trial.made
         pressures = pressures_of(settings, trial, len(simulator.body.chambers))
         rate = 1.0 / settings["time_step"]
         write_recording(path, Recording(labels, positions + noise, rate, path, actuation=pressures))

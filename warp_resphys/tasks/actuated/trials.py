@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import DataFileError, InputError
+from ..measured.files import recording_file
 from ..trajectories import SPLITS, Split, evenly
+from .files import RAISED_RECORDINGS
 
 _SUFFIXES = (".h5", ".hdf5", ".npz", ".c3d", ".tsv", ".csv")
 
@@ -26,6 +28,11 @@ class Trial:
     file: Path | None = None
     sequence: int = 0
     factor: float = 1.0
+
+    @property
+    def made(self) -> str:
+        """Its recording in the run folder, where it is simulated; those at higher pressures have their own."""
+        return recording_file(self.name) if self.factor == 1.0 else f"{RAISED_RECORDINGS}/{self.name}.h5"
 
 
 def is_synthetic(config: Mapping[str, Any]) -> bool:
@@ -133,7 +140,15 @@ def _files(data: Mapping[str, Any]) -> dict[str, Path]:
         raise DataFileError(f"{folder} is no folder: set data.folder to that of the recordings.")
     if data["trials"]:
         return {str(name): folder / file for name, file in data["trials"].items()}
-    found = {path.stem: path for path in sorted(folder.iterdir()) if path.suffix.lower() in _SUFFIXES}
-    if not found:
+    paths = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in _SUFFIXES]
+    if not paths:
         raise DataFileError(f"{folder} holds no recording ({', '.join(_SUFFIXES)}): set data.folder to that of yours.")
+    found: dict[str, Path] = {}
+    for path in paths:
+        other = found.setdefault(path.stem, path)
+        if other != path:
+            raise DataFileError(
+                f"{folder} has {other.name} and {path.name}, two recordings of one name: list the trials in "
+                "data.trials."
+            )
     return found

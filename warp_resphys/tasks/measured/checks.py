@@ -2,7 +2,7 @@
 
 import inspect
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -40,7 +40,7 @@ from ..kinds import (
 )
 from ..trajectories import SPLITS
 from .files import attached_mass
-from .identify import check_identification
+from .identify import ELASTIC
 from .trials import FOLDS, folds_of, is_synthetic, split_of, trials_of, vertical
 
 RECORDINGS = "recordings"  # this kind of data
@@ -184,31 +184,43 @@ def _check_learning(config: Mapping[str, Any]) -> None:
     if config["release"]["sideways"] > 0.0 and not np.any(config["gravity"]):
         raise InputError("release.sideways is across gravity, but gravity is zero: set release.sideways to 0.")
     check_in_the_loop(config["in_the_loop"])
-    _check_identification(config["identify"])
+    check_identification(config["identify"])
     simulator = build_simulator(config)
     probe = MarkerMap.at_vertices(torch.zeros(1, 1, dtype=torch.int64))
     make_sparse_reconstructor(simulator, probe, **config["reconstruction"])
 
 
-def _check_identification(identify: Mapping[str, Any]) -> None:
+def check_identification(identify: Mapping[str, Any], known: Sequence[str] = PARAMETERS) -> None:
+    """Checks the group ``identify``, of which ``elastic`` is optional.
+
+    Args:
+        identify: the group, with its own keys checked.
+        known: parameters that may be identified.
+
+    Raises:
+        InputError: no parameter, an unknown one, a value out of range, or a first guess out of its range.
+    """
     if not identify["parameters"]:
-        raise InputError(f"identify.parameters is empty: give a range of one or more of {', '.join(PARAMETERS)}.")
+        raise InputError(f"identify.parameters is empty: give a range of one or more of {', '.join(known)}.")
     for group, needed, others in (
         ("parameters", _RANGE, ("logarithmic",)),
         ("elastic", _RANGE, ("logarithmic",)),
         ("grid", {**_RANGE, "logarithmic": TRUTH_VALUE, "points": NATURAL}, ()),
     ):
-        for name, settings in (identify[group] or {}).items():
+        for name, settings in (identify.get(group) or {}).items():
+            choice = known if group == "parameters" else ELASTIC
+            if name not in choice:
+                raise InputError(f"identify.{group} names '{name}': choose from {', '.join(choice)}.")
             check_keys(f"identify.{group}.{name}", settings, needed, others)
-    check_identification(identify)
-    for name, each in identify["grid"].items():
-        try:
-            Bounds(each["lower"], each["upper"], each["logarithmic"])
-        except InputError as error:
-            raise InputError(f"identify.grid.{name}: {error}") from error
+            try:
+                Bounds(**{key: value for key, value in settings.items() if key != "points"})
+            except (TypeError, InputError) as error:
+                raise InputError(f"identify.{group}.{name}: {error}") from error
+    if "youngs_modulus" not in identify["grid"]:
+        raise InputError("identify.grid must have a range of youngs_modulus, and may have one of poissons_ratio.")
     for name, value in identify["first_guess"].items():
-        if name not in PARAMETERS:
-            raise InputError(f"identify.first_guess names '{name}': choose from {', '.join(PARAMETERS)}.")
+        if name not in known:
+            raise InputError(f"identify.first_guess names '{name}': choose from {', '.join(known)}.")
         within = identify["parameters"].get(name)
         if not is_finite(value) or (within is not None and not within["lower"] <= value <= within["upper"]):
             wanted = "" if within is None else f" from {within['lower']:g} to {within['upper']:g}, its range"

@@ -1,23 +1,22 @@
 """Stage: the physical parameters that explain the training trials."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 from ...driven import DRIVEN_PARAMETERS
-from ...errors import InputError
 from ...files import read_json, write_json
 from ...identification import Bounds, Identifier
 from ...progress import Progress
-from ...replay import PARAMETERS, Release, Replay
+from ...replay import Release, Replay
 from ...stages import StageContext
 from .files import IDENTIFICATION
 from .scene import Scene
 
-_ELASTIC = ("youngs_modulus", "poissons_ratio")
+ELASTIC = ("youngs_modulus", "poissons_ratio")
 _LANDSCAPE = "landscape"
 _AT_ONCE = 4  # points of the landscape
 _PARTS = ("identified", "simulation", _LANDSCAPE)
@@ -152,28 +151,3 @@ def kept_of(context: StageContext, part: str) -> dict[str, Any]:
     path = _kept_file(context, part)
     kept: dict[str, Any] = read_json(path) if path.is_file() else {}
     return kept if kept.get("fingerprint") == context.fingerprint else {}
-
-
-def check_identification(config: Mapping[str, Any], known_parameters: Sequence[str] = PARAMETERS) -> None:
-    """Checks the group ``identify``.
-
-    Args:
-        config: the group.
-        known_parameters: that may be identified.
-
-    Raises:
-        InputError: a value out of range, or an unknown parameter.
-    """
-    for key, known in (("parameters", known_parameters), ("elastic", _ELASTIC)):
-        for name, each in (config.get(key) or {}).items():
-            if name not in known:
-                raise InputError(f"identify.{key} names '{name}': choose from {', '.join(known)}.")
-            try:
-                Bounds(**each)
-            except (TypeError, InputError) as error:
-                raise InputError(f"identify.{key}.{name}: {error}") from error
-    for key in ("starts", "max_evaluations", "tolerance"):
-        if not config[key] > 0:
-            raise InputError(f"identify.{key} is {config[key]}: it must be positive.")
-    if "youngs_modulus" not in config["grid"] or not set(config["grid"]) <= set(_ELASTIC):
-        raise InputError("identify.grid must have a range of youngs_modulus, and may have one of poissons_ratio.")

@@ -156,18 +156,18 @@ def test_forces_that_do_not_hold_the_body_are_named(finished, monkeypatch, tmp_p
     """Replayed, the forces lead where they were found; a simulation that goes elsewhere with them is reported."""
     summary = json.loads((finished / "run" / "reconstruction.json").read_text())
     with read_hdf5(finished / "run" / "reconstruction.h5", "reconstruction") as file:
-        forces = read_array(file, "force")[2:]
+        states = {name: read_array(file, name)[2:] for name in ("q", "v", "force")}
     settings = json.loads((finished / "run" / "stages" / "reconstruct.json").read_text())["settings"]
     replay = partial(replayed_errors, settings, finished / "run", ("t002",))
-    found = replay(forces)
+    found = replay(states)
     assert found.mean() == pytest.approx(summary["replayed_mm"], rel=1e-3)
     assert found.mean() < 0.2
-    assert replay(0.0 * forces).mean() > 2.0 * found.mean()
-    forces[0, 6:] = np.nan
-    assert np.isfinite(replay(forces)).sum() == 6  # Only until then, and without an end of the others.
+    assert replay({**states, "force": 0.0 * states["force"]}).mean() > 2.0 * found.mean()
+    states["force"][0, 6:] = np.nan
+    assert np.isfinite(replay(states)).sum() == 6
     for name in ("motions.h5", "identification.json"):
         shutil.copy(finished / "run" / name, tmp_path)
-    monkeypatch.setattr(reconstruct, "replayed_errors", lambda *rest: np.full(rest[3].shape[:2], np.inf))
+    monkeypatch.setattr(reconstruct, "replayed_errors", lambda *rest: np.full(rest[3]["force"].shape[:2], np.inf))
     reconstruct.reconstruct_driven(StageContext("reconstruct", tmp_path, "", settings))
     assert "the forces lead inf mm away from the markers" in caplog.text
     assert json.loads((tmp_path / "reconstruction.json").read_text())["replayed_mm"] is None
@@ -225,6 +225,7 @@ def recorded(tmp_path, finished, change):
         (["data.folder=nowhere"], "nowhere is no folder"),
         (["data.train=0"], "data.train is 0: it must be a number of trials, or a list"),
         (["pressure_coupling=weak"], "pressure_coupling is 'weak'"),
+        (["force_frame=rest"], "force_frame is 'rest': choose one of corotated, world."),
         (["actuation.memory=[-1.0]"], "actuation.memory"),
         (["synthetic.sequences.rest=1.0"], "leave no time between two rests"),
         (["synthetic.sequences.limit=1.0"], "unknown key 'synthetic.sequences.limit'"),

@@ -186,21 +186,38 @@ def _linear_tetrahedra(mesh: Mesh, full: bool) -> Discretisation:
     return Discretisation(sets, volumes[:, 0], quarter, quarter)
 
 
-def _vertex_patches(mesh: Mesh, gradients: Array, quarter: scipy.sparse.csr_array) -> PointSet:
-    """One point a vertex with the mean gradient operator of the cells around it, padded to the largest patch."""
-    n = len(mesh.vertices)
-    shares = quarter.tocoo()
-    vertex, cell = shares.row, shares.col
-    share = shares.data / np.asarray(quarter.sum(axis=1)).ravel()[vertex]
-    node = mesh.cells[cell].ravel()
-    keys, inverse = np.unique(np.repeat(vertex, 4) * n + node, return_inverse=True)
+def mean_gradients(
+    cells: NDArray[np.int64], gradients: Array, shares: scipy.sparse.csr_array
+) -> tuple[NDArray[np.int64], Array]:
+    """The mean gradient operator of the cells around each vertex, padded to the largest patch.
+
+    Args:
+        cells: (M, K) vertices of each cell.
+        gradients: (M, K, 3) of its shape functions in rest space [1/m].
+        shares: (N, M) sparse; volume of each cell that counts at each vertex [m^3].
+
+    Returns:
+        (N, W) vertices of each patch and (N, W, 3) their operators [1/m].
+    """
+    n, k = shares.shape[0], cells.shape[1]
+    parts = shares.tocoo()
+    vertex, cell = parts.row, parts.col
+    share = parts.data / np.asarray(shares.sum(axis=1)).ravel()[vertex]
+    node = cells[cell].ravel()
+    keys, inverse = np.unique(np.repeat(vertex, k) * n + node, return_inverse=True)
     operator = np.zeros((len(keys), 3))
     np.add.at(operator, inverse, (share[:, None, None] * gradients[cell]).reshape(-1, 3))
     row, column = keys // n, keys % n
     place = np.arange(len(keys)) - np.searchsorted(row, np.arange(n))[row]
     width = int(place.max()) + 1
     nodes = np.repeat(np.arange(n)[:, None], width, axis=1)
-    padded = np.zeros((n, 1, width, 3))
+    padded = np.zeros((n, width, 3))
     nodes[row, place] = column
-    padded[row, 0, place] = operator
-    return PointSet(nodes, padded, scipy.sparse.csr_array((n, len(mesh.cells))), quarter)
+    padded[row, place] = operator
+    return nodes, padded
+
+
+def _vertex_patches(mesh: Mesh, gradients: Array, quarter: scipy.sparse.csr_array) -> PointSet:
+    """One point a vertex with the mean gradient operator of the cells around it."""
+    nodes, operator = mean_gradients(mesh.cells, gradients, quarter)
+    return PointSet(nodes, operator[:, None], scipy.sparse.csr_array((len(nodes), len(mesh.cells))), quarter)

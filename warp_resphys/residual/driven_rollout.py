@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import torch
 from typing_extensions import override
 
+from ..frames import VertexFrames
 from ..integrator import State
 from ..simulator import MaterialTensors, Simulator
 from .networks import StateMap
@@ -130,13 +131,14 @@ class WatchedModel:
     Args:
         model: that predicts.
         range_: of its inputs in training.
+        frames: with which what it predicts turns; None if it does not.
 
     Attributes:
         left_at: (B,) step at which an environment left the range, -1 where it has not; None before the first step.
     """
 
-    def __init__(self, model: StateMap, range_: Range) -> None:
-        self.model, self._range, self._step = model, range_, 0
+    def __init__(self, model: StateMap, range_: Range, frames: VertexFrames | None = None) -> None:
+        self.model, self._range, self._frames, self._step = model, range_, frames, 0
         self.left_at: torch.Tensor | None = None
 
     @torch.no_grad()
@@ -150,4 +152,5 @@ class WatchedModel:
         outside = self._range.left(inputs).to(q.device)
         self.left_at = torch.where(outside & (self.left_at < 0), self._step, self.left_at)
         self._step += 1
-        return [field.to(q.device, q.dtype) for field in self.model.decode(self._range.hold(inputs))]
+        fields = [field.to(q.device, q.dtype) for field in self.model.decode(self._range.hold(inputs))]
+        return fields if self._frames is None else [self._frames.to_world(q, v, field) for field in fields]

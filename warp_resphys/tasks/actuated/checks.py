@@ -33,6 +33,7 @@ from ..kinds import (
 )
 from ..measured.checks import check_identification
 from ..trajectories import SPLITS
+from .files import FORCE_FRAMES
 from .synthesise import reality_settings, substeps_of
 from .trials import is_synthetic, split_of
 
@@ -153,6 +154,8 @@ def check_driven(config: Mapping[str, Any]) -> None:
         raise InputError("refinement is for experiments without pressures: set refinement=none.")
     if not config["markers"]["followed"]:
         raise InputError("markers.followed is empty: name the markers that errors are measured on, with their places.")
+    if config["force_frame"] not in FORCE_FRAMES:
+        raise InputError(f"force_frame is {config['force_frame']!r}: choose one of {', '.join(FORCE_FRAMES)}.")
     _check_times(config)
     split_of(config)
     body = build_body(config)

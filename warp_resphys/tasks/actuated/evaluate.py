@@ -140,7 +140,8 @@ def roll_out_part(part: Part, advance: Advance) -> dict[str, Made]:
         path = part.context.run_dir / weights_file(name)
         tensors, description = read_checkpoint(path, _KIND_NAMES[name])
         model = restore(_KINDS[name], tensors, description).to(simulator.rest_positions.device)
-        watched = WatchedModel(model, Range.restore(description["range"], model.linear))
+        range_ = Range.restore(description["range"], model.linear)
+        watched = WatchedModel(model, range_, scene.frames(description["force_frame"]))
     rollout = rollout_of(scene, name, watched, part.names)
     batch, steps = motions.pressure.shape[:2]
     state = simulator.static_equilibrium(material=scene.tensors(name, part.names), batch=batch)

@@ -90,12 +90,14 @@ def driven_stages(config: Mapping[str, Any]) -> list[Stage]:
             "reconstruct",
             partial(reconstruct_driven, processes=processes),
             (RECONSTRUCTED, RECONSTRUCTION),
-            {**learned, **_pick(config, "reconstruction")},
+            {**learned, **_pick(config, "reconstruction", "force_frame")},
             ("import", "identify"),
         ),
     ]
     for model, function in zip(LEARNED, (train_simfree_driven, train_driven), strict=True):
         settings = {**learned, **training_settings(dict(config), model)}
+        if model == "resphys":
+            settings["force_frame"] = config["force_frame"]
         outputs = (weights_file(model), training_file(model))
         needs = ("import", "identify", "reconstruct")
         stages.append(Stage(f"train_{model}", function, outputs, settings, needs, format_version=2))

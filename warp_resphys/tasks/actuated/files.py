@@ -16,6 +16,7 @@ RAISED_RECORDINGS = "recordings_raised"  # not beside the others: that folder ma
 RECONSTRUCTED = "reconstruction.h5"
 RECONSTRUCTION = "reconstruction.json"
 MODELS = ("simulation", "sysid", "simfree", "resphys")
+FORCE_FRAMES = COROTATED, WORLD = ("corotated", "world")
 LEARNED = ("simfree", "resphys")
 
 

@@ -97,28 +97,38 @@ def reconstruct_part(part: Part, advance: Advance) -> dict[str, Made]:
     rows = [row for row, name in enumerate(part.names) if name in settings["split"]["validation"]]
     if rows:
         names = tuple(part.names[row] for row in rows)
-        made["replayed"][rows] = replayed_errors(settings, part.context.run_dir, names, made["force"][rows])
+        found = {key: made[key][rows] for key in _UNITS}
+        made["replayed"][rows] = replayed_errors(settings, part.context.run_dir, names, found)
     return {name: (values, _UNITS.get(name, "mm")) for name, values in made.items()}
 
 
 def replayed_errors(
-    settings: Mapping[str, Any], run_dir: Path, names: tuple[str, ...], forces: NDArray[np.float32]
+    settings: Mapping[str, Any], run_dir: Path, names: tuple[str, ...], found: Mapping[str, NDArray[np.float32]]
 ) -> NDArray[np.float32]:
-    """(B, K + 1) distance of the markers [mm] of simulations with given forces; infinite from where one fails.
+    """(B, K + 1) distance of the markers [mm] of simulations with reconstructed forces; infinite from where one fails.
+
+    The forces turn with the body, from where it was to where it is, if those that are learned do (``force_frame``).
 
     Args:
         settings: of the stage.
         run_dir: with the imported motions and the identified parameters.
         names: of the trials.
-        forces: (B, K + 1, N, 3) that lead to each state [N].
+        found: q [m], v [m/s] and the force [N] that leads there, each (B, K + 1, N, 3).
     """
     scene = DrivenScene(settings, run_dir, "count")
     tensors, drive, observed = scene.tensors("resphys", names), scene.drive("resphys", names), scene.smoothed(names)
     state = scene.simulator.static_equilibrium(material=tensors, batch=len(names))
-    coming = iter(torch.from_numpy(forces[:, 1:]).to(state.q).unbind(1))
-    rollout = DrivenHybridRollout(scene.simulator, lambda q, v, inputs: [next(coming)], drive, tensors)
-    errors: NDArray[np.float32] = np.full(forces.shape[:2], np.inf, dtype=np.float32)
-    for k in range(forces.shape[1]):
+    frames = scene.frames(settings["force_frame"])
+    steps = (found["q"][:, :-1], found["v"][:, :-1], found["force"][:, 1:])
+    known = zip(*(torch.from_numpy(each).to(state.q).unbind(1) for each in steps), strict=True)
+
+    def predict(q: torch.Tensor, v: torch.Tensor, inputs: torch.Tensor) -> list[torch.Tensor]:
+        q0, v0, force = next(known)
+        return [force if frames is None else frames.to_world(q, v, frames.to_rest(q0, v0, force))]
+
+    rollout = DrivenHybridRollout(scene.simulator, predict, drive, tensors)
+    errors: NDArray[np.float32] = np.full(observed.shape[:2], np.inf, dtype=np.float32)
+    for k in range(observed.shape[1]):
         state = rollout.step(state) if k > 0 else state
         reached, seen = scene.markers(state.q).cpu().numpy(), observed[:, k].cpu().numpy()
         for row in np.flatnonzero(~rollout.lost(state).cpu().numpy()):

@@ -12,13 +12,14 @@ from ...actuation import lagged, remembered
 from ...configured import build_mesh, build_simulator
 from ...driven import DrivenMotions, DrivenReplay, at_rest
 from ...files import read_json
+from ...frames import VertexFrames
 from ...markers import Markers
 from ...replay import Release
 from ...residual.driven_rollout import Drive
 from ...simulator import MaterialTensors, Simulator
 from ..binding import bound_markers
 from ..measured.files import IDENTIFICATION
-from .files import MOTIONS, RAISED_MOTIONS, Imported, read_imported
+from .files import COROTATED, MOTIONS, RAISED_MOTIONS, Imported, read_imported
 
 # Models whose simulator, or whose states to learn from, have the identified parameters.
 IDENTIFIED = ("sysid", "simfree", "resphys")
@@ -70,6 +71,13 @@ class DrivenScene:
         """The followed markers on the body."""
         found = bound_markers(self.config["markers"], self.simulator.body.mesh, self._imported.bound, self.labels)
         return found.to(self.simulator.rest_positions)
+
+    def frames(self, kind: str) -> VertexFrames | None:
+        """With which residual forces turn; None where they keep their directions (``force_frame: world``)."""
+        simulator = self.simulator
+        return (
+            VertexFrames(simulator.body, simulator.time_step, simulator.rest_positions) if kind == COROTATED else None
+        )
 
     def pick(self, names: tuple[str, ...]) -> DrivenMotions:
         """Some of the trials."""

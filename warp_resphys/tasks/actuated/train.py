@@ -8,6 +8,7 @@ import torch
 
 from ...configured import choose_device
 from ...files import read_array, read_hdf5
+from ...frames import VertexFrames
 from ...metrics import summarise
 from ...modes import RestStiffness
 from ...residual.driven_rollout import DrivenDataRollout, DrivenHybridRollout, Range, WatchedModel
@@ -18,7 +19,7 @@ from ...stages import StageContext
 from ..measured.evaluate import marker_errors
 from ..measured.files import training_file, weights_file
 from ..train import fit
-from .files import RECONSTRUCTED
+from .files import RECONSTRUCTED, WORLD
 from .scene import DrivenScene
 
 
@@ -75,18 +76,20 @@ def read_reconstructed(context: StageContext, scene: DrivenScene, device: torch.
 def train_driven(context: StageContext) -> None:
     """Trains the residual force: resphys.safetensors and training_resphys.json."""
     scene = DrivenScene(context.settings, context.run_dir, "count")
-    found = read_reconstructed(context, scene, choose_device(context.settings["device"]))
-    samples = {}
+    device = choose_device(context.settings["device"])
+    found = read_reconstructed(context, scene, device)
+    frames, samples = scene.frames(context.settings["force_frame"]), {}
     for name, each in found.items():
         q, v, inputs = each.starts()
-        samples[name] = Samples(q, v, (each.forces(),), inputs)
+        force = each.forces() if frames is None else frames.to_rest(q, v, each.forces())
+        samples[name] = Samples(q, v, (force,), inputs)
     train = samples["train"]
     rest = scene.simulator.rest_positions.to(train.q.device)
     torch.manual_seed(context.settings["seed"])
     stiffness = RestStiffness(scene.simulator)
     fields = train.q, train.v, train.outputs[0]
     model = build_model(context.settings["network"], rest, *fields, train.actuation, stiffness)
-    _fit(context, scene, model, samples, "resphys", "residual force")
+    _fit(context, scene, model, samples, "resphys", "residual force", context.settings["force_frame"])
 
 
 def train_simfree_driven(context: StageContext) -> None:
@@ -106,15 +109,28 @@ def train_simfree_driven(context: StageContext) -> None:
 
 
 def _fit(
-    context: StageContext, scene: DrivenScene, model: Any, samples: Mapping[str, Samples], name: str, kind: str
+    context: StageContext,
+    scene: DrivenScene,
+    model: Any,
+    samples: Mapping[str, Samples],
+    name: str,
+    kind: str,
+    frame: str = WORLD,
 ) -> None:
     """Trains, chooses by roll-outs of the validation trials, and keeps the range of the training beside the weights."""
     settings, train = context.settings, samples["train"]
     with torch.no_grad():
         range_ = Range.of(model.encode(train.q, train.v, train.actuation))
-    error = validation_error(scene, name, tuple(settings["split"]["validation"]), range_)
+    error = validation_error(scene, name, tuple(settings["split"]["validation"]), range_, scene.frames(frame))
     trainer: Trainer[Any] = Trainer(model, train, samples["validation"], error, settings["trainer"], settings["seed"])
-    fit(context, trainer, weights_file(name), training_file(name), kind, {"range": range_.description()})
+    fit(
+        context,
+        trainer,
+        weights_file(name),
+        training_file(name),
+        kind,
+        {"range": range_.description(), "force_frame": frame},
+    )
 
 
 def rollout_of(scene: DrivenScene, name: str, predict: WatchedModel | None, trials: tuple[str, ...]) -> Rollout:
@@ -133,7 +149,7 @@ def rollout_of(scene: DrivenScene, name: str, predict: WatchedModel | None, tria
 
 
 def validation_error(
-    scene: DrivenScene, name: str, trials: tuple[str, ...], range_: Range
+    scene: DrivenScene, name: str, trials: tuple[str, ...], range_: Range, frames: VertexFrames | None = None
 ) -> Callable[[StateMap], float]:
     """The mean error of a model's markers over what is learned from [mm]; infinite where a roll-out diverged.
 
@@ -142,13 +158,14 @@ def validation_error(
         name: one of `files.MODELS`, that learns.
         trials: their names.
         range_: of the model's inputs in training.
+        frames: with which what it predicts turns; None if it does not.
     """
     motions = scene.pick(trials)
     observed = motions.markers[:, : scene.learned_steps + 1].cpu().numpy()
     start = scene.simulator.static_equilibrium(material=scene.tensors(name, trials), batch=len(trials))
 
     def error(model: StateMap) -> float:
-        rollout, state = rollout_of(scene, name, WatchedModel(model, range_), trials), start
+        rollout, state = rollout_of(scene, name, WatchedModel(model, range_, frames), trials), start
         series = [scene.markers(state.q)]
         for _ in range(observed.shape[1] - 1):
             state = rollout.step(state)

@@ -88,10 +88,10 @@ class DrivenDataRollout(Rollout):
 
 
 class Range:
-    """The box that a model's standardised inputs fill in training.
+    """The box that a model's standardised inputs fill in training, and a quarter of its width around it.
 
     A network says little about what it never saw, and what it says there may drive a body on for good. So the model is
-    told of no more than the edge of the box, and a roll-out that leaves it by far is to be reported.
+    told of no more than that, and a roll-out that goes further is to be reported.
 
     Args:
         low: (A,) of the standardised inputs.
@@ -108,12 +108,16 @@ class Range:
 
     def hold(self, inputs: torch.Tensor) -> torch.Tensor:
         """(B, A) standardised inputs, those outside at the edge."""
-        return inputs.clamp(self.low, self.high)
+        return inputs.clamp(*self._edges())
 
     def left(self, inputs: torch.Tensor) -> torch.Tensor:
-        """(B,) bool, whether (B, A) standardised inputs are outside by more than a quarter of the box's width."""
+        """(B,) bool, whether (B, A) standardised inputs are outside."""
+        low, high = self._edges()
+        return ((inputs < low) | (inputs > high)).any(1)
+
+    def _edges(self) -> tuple[torch.Tensor, torch.Tensor]:
         margin = _MARGIN * (self.high - self.low)
-        return ((inputs < self.low - margin) | (inputs > self.high + margin)).any(1)
+        return self.low - margin, self.high + margin
 
     def description(self) -> dict[str, list[float]]:
         """Plain data, for a checkpoint's metadata."""

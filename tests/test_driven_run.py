@@ -20,7 +20,7 @@ from warp_resphys.actuation import PressureSequences
 from warp_resphys.configured import build_simulator
 from warp_resphys.driven import DrivenMotions, DrivenReplay, at_rest
 from warp_resphys.errors import InputError
-from warp_resphys.files import read_array, read_hdf5
+from warp_resphys.files import read_array, read_checkpoint, read_hdf5
 from warp_resphys.identification import Bounds, Identifier
 from warp_resphys.markers import bind_markers
 from warp_resphys.mesh import select_vertices
@@ -28,11 +28,12 @@ from warp_resphys.recordings.arrays import write_recording
 from warp_resphys.recordings.reading import read_recording
 from warp_resphys.residual.driven_rollout import Range
 from warp_resphys.stages import StageContext
-from warp_resphys.tasks.actuated import experiment, reconstruct
+from warp_resphys.tasks.actuated import experiment, reconstruct, train
 from warp_resphys.tasks.actuated.checks import check_driven
 from warp_resphys.tasks.actuated.evaluate import summary
 from warp_resphys.tasks.actuated.importing import import_driven
 from warp_resphys.tasks.actuated.reconstruct import replayed_errors
+from warp_resphys.tasks.actuated.scene import DrivenScene
 from warp_resphys.tasks.checks import check_configuration
 
 # A short segment with two chambers of some 70 vertices, on which everything takes seconds.
@@ -171,6 +172,23 @@ def test_forces_that_do_not_hold_the_body_are_named(finished, monkeypatch, tmp_p
     reconstruct.reconstruct_driven(StageContext("reconstruct", tmp_path, "", settings))
     assert "the forces lead inf mm away from the markers" in caplog.text
     assert json.loads((tmp_path / "reconstruction.json").read_text())["replayed_mm"] is None
+
+
+def test_forces_are_learned_as_they_are_in_the_rest_shape(finished, monkeypatch):
+    settings = json.loads((finished / "run" / "stages" / "train_resphys.json").read_text())["settings"]
+    assert settings["force_frame"] == "corotated"
+    assert read_checkpoint(finished / "run" / "resphys.safetensors", "residual force")[1]["force_frame"] == "corotated"
+    learned = {}
+    for frame in ("corotated", "world"):
+        keep = lambda context, scene, model, samples, *rest: learned.update({rest[-1]: samples})  # noqa: E731
+        monkeypatch.setattr(train, "_fit", keep)
+        train.train_driven(StageContext("train_resphys", finished / "run", "", {**settings, "force_frame": frame}))
+    turned, kept = (learned[frame]["train"] for frame in ("corotated", "world"))
+    scene = DrivenScene(settings, finished / "run")
+    back = scene.frames("corotated").to_world(turned.q, turned.v, turned.outputs[0])
+    size = float(kept.outputs[0].abs().max())
+    np.testing.assert_allclose(back, kept.outputs[0], atol=1e-5 * size)
+    assert float((turned.outputs[0] - kept.outputs[0]).abs().max()) > 1e-3 * size
 
 
 def test_the_same_command_does_nothing_again_and_other_windows_only_evaluate(finished, monkeypatch):

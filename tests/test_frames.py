@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from warp_resphys import Body, Material, Simulator, box_hexahedra, select_vertices
 from warp_resphys.frames import VertexFrames
+from warp_resphys.residual.driven_rollout import Range, WatchedModel
 
 
 def deformed(body, stretch):
@@ -65,3 +66,29 @@ def test_forces_that_press_from_the_sides_wring_a_beam_unless_they_turn_with_it(
         twists[follows] = float(np.abs(Rotation.from_matrix(turned).as_euler("xyz", degrees=True)[:, 0]).mean())
     assert twists[False] > 30.0
     assert twists[True] < 2.0
+
+
+class Constant:
+    """A model that sees nothing and always predicts the same force."""
+
+    def __init__(self, rest, force):
+        self.rest, self.force = rest, force
+
+    def encode(self, q, v, actuation):
+        return q.new_zeros(len(q), 1)
+
+    def decode(self, inputs):
+        return [self.force.expand(len(inputs), -1, -1)]
+
+
+def test_what_a_model_predicts_turns_with_the_body_in_a_roll_out():
+    body = chambered("hexahedron")
+    rest = deformed(body, np.eye(3))
+    force = torch.randn(rest.shape, dtype=rest.dtype, generator=torch.Generator().manual_seed(1))
+    turn = Rotation.from_euler("z", 90.0, degrees=True).as_matrix()
+    q, nothing = deformed(body, turn), torch.zeros(1, 0)
+    range_ = Range.of(torch.zeros(2, 1, dtype=rest.dtype))
+    (kept,) = WatchedModel(Constant(rest[0], force), range_)(q, 0.0 * q, nothing)
+    (turned,) = WatchedModel(Constant(rest[0], force), range_, VertexFrames(body, 0.01, q))(q, 0.0 * q, nothing)
+    assert torch.equal(kept, force)
+    np.testing.assert_allclose(turned[0].numpy(), force[0].numpy() @ turn.T, atol=1e-12)

@@ -8,7 +8,8 @@ import pytest
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
-from warp_resphys.arm import ArmGeometry, arm_geometry, mesh_arm
+from warp_resphys.arm import mesh_arm
+from warp_resphys.arm_geometry import ArmGeometry, arm_geometry
 from warp_resphys.chambers import check_chambers, find_chambers
 from warp_resphys.configured import build_mesh
 from warp_resphys.errors import InputError, MeshError

@@ -10,7 +10,8 @@ from hydra import compose, initialize_config_module
 from matplotlib.image import imread
 from omegaconf import OmegaConf
 
-from warp_resphys.arm import ArmGeometry, mesh_arm, name_surfaces
+from warp_resphys.arm import mesh_arm, name_surfaces
+from warp_resphys.arm_geometry import ArmGeometry
 from warp_resphys.cavities import open_cavities
 from warp_resphys.errors import InputError, MeshError
 from warp_resphys.mesh import Mesh, boundary_faces, box_hexahedra, box_tetrahedra, quadratic

@@ -7,7 +7,8 @@ import pytest
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
-from warp_resphys.arm import ArmGeometry, mesh_arm
+from warp_resphys.arm import mesh_arm
+from warp_resphys.arm_geometry import ArmGeometry
 from warp_resphys.errors import InputError
 from warp_resphys.files import read_json
 from warp_resphys.locking import HEXAHEDRA, LINEAR, QUADRATIC, cases, cheapest, converged, measure

@@ -7,7 +7,7 @@ import importlib
 from typing import Any
 
 _MODULES = {
-    "ArmGeometry": "arm",
+    "ArmGeometry": "arm_geometry",
     "Body": "body",
     "PointMass": "body",
     "Material": "material",

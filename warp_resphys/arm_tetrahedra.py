@@ -4,21 +4,19 @@ import cmath
 import math
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from warp_resphys.arm_geometry import ArmGeometry
 from warp_resphys.arm_section import ComplexArray
 from warp_resphys.errors import MeshError
 from warp_resphys.mesh import Mesh
 
-if TYPE_CHECKING:
-    from warp_resphys.arm import ArmGeometry
-
 _TETRAHEDRON = 4  # gmsh's number of the 4-node tetrahedron
 
 
-def tetrahedra(geometry: "ArmGeometry", size: float) -> Mesh:
+def tetrahedra(geometry: ArmGeometry, size: float) -> Mesh:
     """Meshes an arm: the body, lofted along each cap and segment, less its chambers.
 
     Args:
@@ -72,7 +70,7 @@ def _import_gmsh() -> Any:
     return gmsh
 
 
-def _build(occ: Any, geometry: "ArmGeometry", size: float) -> None:
+def _build(occ: Any, geometry: ArmGeometry, size: float) -> None:
     """Builds the body with its chambers cut out in the current model."""
     heights = geometry.stations
     divisions = geometry.section(0.5 * (geometry.radii[0] + geometry.radii[-1])).divisions(size)

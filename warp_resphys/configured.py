@@ -6,7 +6,8 @@ from typing import Any
 
 import torch
 
-from .arm import arm_geometry, mesh_arm
+from .arm import mesh_arm
+from .arm_geometry import arm_geometry
 from .body import Body, PointMass
 from .chambers import Chamber, find_chambers
 from .errors import InputError

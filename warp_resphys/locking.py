@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from .arm import arm_geometry, mesh_arm
+from .arm import mesh_arm
+from .arm_geometry import arm_geometry
 from .body import Body
 from .chambers import find_chambers
 from .errors import InputError

@@ -13,7 +13,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from warp_resphys.arm import arm_geometry, mesh_arm, name_surfaces
+from warp_resphys.arm import mesh_arm, name_surfaces
+from warp_resphys.arm_geometry import arm_geometry
 from warp_resphys.cavities import MOST_TRIANGLES, open_cavities
 from warp_resphys.chambers import Chamber, find_chambers
 from warp_resphys.errors import InputError, MeshError

@@ -127,8 +127,8 @@ def replayed_errors(
         return [force if frames is None else frames.to_world(q, v, frames.to_rest(q0, v0, force))]
 
     rollout = DrivenHybridRollout(scene.simulator, predict, drive, tensors)
-    errors: NDArray[np.float32] = np.full(observed.shape[:2], np.inf, dtype=np.float32)
-    for k in range(observed.shape[1]):
+    errors: NDArray[np.float32] = np.full(found["q"].shape[:2], np.inf, dtype=np.float32)
+    for k in range(errors.shape[1]):
         state = rollout.step(state) if k > 0 else state
         reached, seen = scene.markers(state.q).cpu().numpy(), observed[:, k].cpu().numpy()
         for row in np.flatnonzero(~rollout.lost(state).cpu().numpy()):

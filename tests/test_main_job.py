@@ -31,6 +31,7 @@ from omegaconf import OmegaConf
 
 from warp_resphys import box_hexahedra
 from warp_resphys.configured import build_simulator
+from warp_resphys.errors import InputError
 from warp_resphys.files import read_checkpoint, read_hdf5
 from warp_resphys.stages import package_versions
 from warp_resphys.tasks import evaluate, experiment, train
@@ -274,7 +275,14 @@ GROUPS = ("mesh", "physics", "solver", "reconstruction", "network", "trainer", "
 SIMULATED = [
     name for name in options("experiment") if name.startswith(("beam_oscillation", "beam_twist", "marker_ablation"))
 ]  # others: test_measured_configuration.py
-CHOICES = [(name, group, option) for name in SIMULATED for group in GROUPS for option in options(group)]
+FROM_MARKERS = ("levenberg_marquardt", "pressure", "pressure_steps")  # reconstructions
+CHOICES = [
+    (name, group, option)
+    for name in SIMULATED
+    for group in GROUPS
+    for option in options(group)
+    if not (group == "reconstruction" and option in FROM_MARKERS)
+]
 
 
 class TestConfiguration:
@@ -296,6 +304,11 @@ class TestConfiguration:
         assert real.material != wrong.material
         wanted = REFINED if option == "solver_in_the_loop" else STAGES
         assert [stage.name for stage in experiment.stages(config)] == wanted
+
+    @pytest.mark.parametrize("option", FROM_MARKERS)
+    def test_reconstructions_from_markers_are_refused_where_whole_states_are_known(self, option):
+        with pytest.raises(InputError, match=r"reconstruction.(method is 'levenberg_marquardt': choose one of|modes)"):
+            check_configuration(self.composed(f"reconstruction={option}"))
 
     def test_published_sizes_and_settings(self):
         config = self.composed("physics=published", "network=published", "trainer=published")

@@ -185,12 +185,15 @@ def collect_metrics(folder: Path, stages: list[Stage]) -> dict[str, Any]:
 
 
 def _print(metrics: Mapping[str, Any], folder: Path) -> None:
-    """Errors as a table, a column for every window and pressure factor, and where the report is."""
-    windows, factors = metrics["windows"], metrics.get("overpressure", {})
-    columns = [*(f"first {seconds} s" for seconds in windows), *(f"{factor} x pressure" for factor in factors)]
-    table = Table("model", "mean [mm]", *columns, "diverged", title="Error of the markers, test split")
-    for model, summary in metrics["errors_mm"].items():
-        each = [number_text(group[model]["mean"]) for group in (*windows.values(), *factors.values())]
+    """Errors as a table, a column for every window and pressure factor that tells more, and where the report is."""
+    whole = metrics["errors_mm"]
+    groups = {f"first {seconds} s": found for seconds, found in metrics["windows"].items()}
+    groups |= {f"{factor} x": found for factor, found in metrics.get("overpressure", {}).items()}
+    groups = {name: found for name, found in groups.items() if found != whole}
+    title = "Error of the markers, test split" + "; x: times the pressure" * ("overpressure" in metrics)
+    table = Table("model", "mean [mm]", *groups, "diverged", title=title)
+    for model, summary in whole.items():
+        each = [number_text(found[model]["mean"]) for found in groups.values()]
         table.add_row(model, number_text(summary["mean"]), *each, str(summary["diverged"]))
     console = Console()
     console.print(table)

@@ -254,7 +254,7 @@ def test_bad_input():
     chamber = find_chambers(mesh, (1.0, 0.0, 0.0))[0]
     with pytest.raises(MeshError, match=r"lid is open: 4 edges of its surface belong to one face alone.*close"):
         check_chambers([Chamber("lid", chamber.faces[1:])], mesh)
-    with pytest.raises(MeshError, match="the faces of turned look into the chamber, or it is the outer surface"):
+    with pytest.raises(MeshError, match="the faces of turned look into the solid, or it is the outer surface"):
         check_chambers([Chamber("turned", chamber.faces[:, ::-1])], mesh)
     with pytest.raises(MeshError, match="again and first share a face"):
         check_chambers([Chamber("first", chamber.faces), Chamber("again", chamber.faces)], mesh)

@@ -105,7 +105,7 @@ def check_chambers(chambers: Sequence[Chamber], mesh: Mesh) -> None:
         volume = -float(np.linalg.det(mesh.vertices[triangles] - mesh.vertices[triangles[0, 0]]).sum()) / 6.0
         if volume <= 0.0:
             raise MeshError(
-                f"the faces of {chamber.name} look into the chamber, or it is the outer surface of the body: list the "
+                f"the faces of {chamber.name} look into the solid, or it is the outer surface of the body: list the "
                 "vertices of each face counter-clockwise as seen from inside the chamber."
             )
         for face in map(frozenset, faces.tolist()):

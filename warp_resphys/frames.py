@@ -18,7 +18,8 @@ class VertexFrames:
     """The rotations R of the mean deformation gradients F = R S of the cells around each vertex.
 
     Forces of a step are turned as the body will be at its end, if it goes on as it does: those that turn a step later
-    than the body feed its swings where they would have buckled it.
+    than the body feed its swings where they would have buckled it. Where the mean gradient is turned inside out, R is a
+    reflection.
 
     Args:
         body: with N vertices.

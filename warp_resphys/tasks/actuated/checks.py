@@ -60,7 +60,6 @@ _COLUMNS = Kind(
     "a list of different chambers, from 1",
     optional=True,
 )
-_RANGE = {"lower": FINITE, "upper": FINITE}
 _SEQUENCES = {
     "mean": FINITE,
     "deviation": POSITIVE,

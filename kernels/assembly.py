@@ -6,13 +6,13 @@ from types import SimpleNamespace
 import warp as wp
 
 from .matrices import matrix_functions
+from .modules import decorators
 
 
 @functools.cache
 def assembly_kernels(scalar: type) -> SimpleNamespace:
     """Kernels that build the Hessian for one scalar type (``wp.float64`` or ``wp.float32``)."""
-    module = f"warp_resphys.{scalar.__name__}"
-    kernel = functools.partial(wp.kernel, module=module, enable_backward=False)
+    kernel, _ = decorators(scalar)
     functions = matrix_functions(scalar)
     mat33, vec3 = functions.mat33, functions.vec3
     zero = scalar(0.0)

@@ -5,12 +5,13 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from .modules import decorators
+
 
 @functools.cache
 def matrix_functions(scalar: type) -> SimpleNamespace:
     """The ``wp.func``s for one scalar type (``wp.float64`` or ``wp.float32``)."""
-    module = f"warp_resphys.{scalar.__name__}"
-    function = functools.partial(wp.func, module=module)
+    _, function = decorators(scalar)
     mat33 = wp.types.matrix((3, 3), scalar)
     vec3 = wp.types.vector(3, scalar)
     # Squared size of the last update at which an iteration has converged to rounding: Newton's squares its error.

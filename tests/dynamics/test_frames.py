@@ -5,10 +5,11 @@ import pytest
 import torch
 from chambered import KINDS, chambered
 from scipy.spatial.transform import Rotation
-
-from warp_resphys import Body, Material, Simulator, box_hexahedra, select_vertices
-from warp_resphys.dynamics.frames import VertexFrames
 from warp_resphys.learning.driven_rollout import Range, WatchedModel
+
+from warp_resphys import Body, Corotated, Simulator, box_hexahedra, select_vertices
+from warp_resphys.dynamics.frames import VertexFrames
+from warp_resphys.dynamics.inputs import Inputs
 
 
 def deformed(body, stretch):
@@ -48,7 +49,7 @@ def test_forces_that_press_from_the_sides_wring_a_beam_unless_they_turn_with_it(
     """Dead loads do work when the body twists under them; the same loads that turn with it do not."""
     mesh = box_hexahedra((0.1, 0.02, 0.02), (10, 2, 2))
     body = Body(mesh, fixed=select_vertices(mesh, x=0.0))
-    material = Material(youngs_modulus=1e5, poissons_ratio=0.4, density=1e3, mass_damping=5.0)
+    material = Corotated(youngs_modulus=1e5, poissons_ratio=0.4, density=1e3, mass_damping=5.0)
     simulator = Simulator(body, material, time_step=0.005, gravity=(0.0, 0.0, 0.0))
     frames = VertexFrames(body, simulator.time_step, simulator.rest_positions)
     centred = simulator.rest_positions - simulator.tensor([0.0, 0.01, 0.01])
@@ -60,7 +61,7 @@ def test_forces_that_press_from_the_sides_wring_a_beam_unless_they_turn_with_it(
         with torch.no_grad():
             for k in range(120):
                 force = frames.to_world(state.q, state.v, inward[None]) if follows else inward[None]
-                state, _ = simulator.step(state, force + (1e-2 * nudge if k < 5 else 0.0))
+                state, _ = simulator.step(state, Inputs(force + (1e-2 * nudge if k < 5 else 0.0)))
         tip = select_vertices(mesh, x=0.1)
         turned = frames.rotations(state.q)[0, tip].numpy()
         twists[follows] = float(np.abs(Rotation.from_matrix(turned).as_euler("xyz", degrees=True)[:, 0]).mean())

@@ -16,7 +16,7 @@ from rich.console import Console
 
 from warp_resphys import (
     Body,
-    Material,
+    Corotated,
     Simulator,
     SolverSettings,
     State,
@@ -24,6 +24,7 @@ from warp_resphys import (
     box_tetrahedra,
     select_vertices,
 )
+from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.dynamics.integrator import INTEGRATORS
 from warp_resphys.studies.gradient_check import (
     POSES,
@@ -40,7 +41,7 @@ MESHES = {
     "tetrahedron": box_tetrahedra(SIZE, (3, 1, 1)),
     "tetrahedron10": box_tetrahedra(SIZE, (2, 1, 1), order=2),
 }
-DAMPED = Material(264e3, 0.45, 1070.0, mass_damping=0.5, stiffness_damping=2e-3)
+DAMPED = Corotated(264e3, 0.45, density=1070.0, mass_damping=0.5, stiffness_damping=2e-3)
 TIGHT = SolverSettings("newton", relative_tolerance=1e-10)
 KINDS = [
     "initial positions",
@@ -121,7 +122,7 @@ def test_poissons_ratio_of_zero_has_a_derivative():
     weights = noise(*state.q.shape)
 
     def loss(nu):
-        return (weights * s.rollout(state, 2, material=replace(DAMPED, poissons_ratio=nu)).q[-1]).sum()
+        return (weights * s.rollout(state, 2, parameters={"poissons_ratio": nu}).q[-1]).sum()
 
     row = derivative(loss, torch.zeros(1, dtype=torch.float64), torch.full((1,), 1e-2, dtype=torch.float64))
     assert row.relative_error <= 1e-6
@@ -129,7 +130,7 @@ def test_poissons_ratio_of_zero_has_a_derivative():
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_gradient_through_a_hundred_and_twenty_steps(integrator):
-    s = simulator(integrator=integrator, material=replace(DAMPED, youngs_modulus=3e4))
+    s = simulator(integrator=integrator, parameters={"youngs_modulus": 3e4})
     state, steps = pose(s, "bent", 1), 120
     tip = torch.as_tensor(select_vertices(MESHES["hexahedron"], x=SIZE[0]))
 
@@ -137,7 +138,7 @@ def test_gradient_through_a_hundred_and_twenty_steps(integrator):
         return trajectory.q[-1, 0, tip, 2].mean() + 0.01 * trajectory.v[60:, 0, tip, 0].mean()
 
     def of_modulus(e):
-        return end(s.rollout(state, steps, material=replace(s.material, youngs_modulus=e)))
+        return end(s.rollout(state, steps, parameters={"youngs_modulus": e}))
 
     def of_velocity(v):
         return end(s.rollout(State(state.q, v), steps))
@@ -168,7 +169,7 @@ def test_a_clamp_that_moves(integrator, kind):
     weights = noise(steps + 1, *state.q.shape, seed=1), s.time_step * noise(steps + 1, *state.q.shape, seed=2)
 
     def loss(targets=targets, q=state.q, v=state.v, **constants):
-        moved = s.rollout(State(q, v), steps, fixed_positions=targets, material=replace(DAMPED, **constants))
+        moved = s.rollout(State(q, v), steps, Inputs(fixed_positions=targets), constants)
         return (weights[0] * moved.q).sum() + (weights[1] * moved.v).sum()
 
     one = torch.ones(1, dtype=torch.float64)
@@ -234,7 +235,7 @@ def test_gradients_add_up_over_a_shared_parameter():
     weights = noise(*state.q.shape)
     gradients = []
     for e in (shared, each):
-        q = s.rollout(state, 2, material=replace(DAMPED, youngs_modulus=e)).q[-1]
+        q = s.rollout(state, 2, parameters={"youngs_modulus": e}).q[-1]
         gradients.append(torch.autograd.grad((weights * q).sum(), e)[0])
     torch.testing.assert_close(gradients[0], gradients[1].sum(), rtol=1e-9, atol=0.0)
 

@@ -8,7 +8,7 @@ import torch
 
 from warp_resphys import (
     Body,
-    Material,
+    Corotated,
     PointMass,
     Simulator,
     SolverSettings,
@@ -17,10 +17,11 @@ from warp_resphys import (
     box_tetrahedra,
     select_vertices,
 )
+from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.dynamics.integrator import INTEGRATORS
 from warp_resphys.io.errors import InputError
 
-SOFT = Material(2e4, 0.3, 1000.0, mass_damping=1.0, stiffness_damping=3e-3)
+SOFT = Corotated(2e4, 0.3, 1000.0, mass_damping=1.0, stiffness_damping=3e-3)
 MESH = box_hexahedra((0.04, 0.02, 0.02), (2, 1, 1))
 CLAMPED = Body(MESH, fixed=select_vertices(MESH, x=0.0))
 TIGHT = SolverSettings("newton", relative_tolerance=1e-10)
@@ -38,7 +39,7 @@ def swing(integrator, steps, material=SOFT, duration=0.04, moving=False):
         time = torch.linspace(0, duration, steps + 1, dtype=torch.float64)[1:]
         shift = 5e-3 * torch.sin(time / duration * np.pi / 2) ** 3
         targets = state.q[:, simulator.fixed] + shift[:, None, None, None] * torch.tensor([0.0, 1.0, 0.0])
-    trajectory = simulator.rollout(State(state.q, v), steps, fixed_positions=targets)
+    trajectory = simulator.rollout(State(state.q, v), steps, Inputs(fixed_positions=targets))
     return trajectory.q[-1], trajectory.v[-1]
 
 
@@ -81,7 +82,7 @@ def bdf2_decay(a, n):
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_mass_damping_of_a_translation_is_exact(integrator, device):
     h, alpha, steps = 0.02, 5.0, 6
-    material = Material(1e5, 0.4, 1000.0, mass_damping=alpha)
+    material = Corotated(1e5, 0.4, 1000.0, mass_damping=alpha)
     simulator = Simulator(
         Body(MESH), material, h, gravity=WEIGHTLESS, integrator=integrator, solver=TIGHT, device=device
     )
@@ -139,7 +140,7 @@ def test_midpoint_keeps_the_energy_of_small_vibrations_and_the_others_lose_some(
         tip = torch.as_tensor(select_vertices(MESH, x=0.04))
         force = torch.zeros_like(simulator.rest_state().q)
         force[:, tip, 2] = 1e-4
-        state = simulator.static_equilibrium(force)
+        state = simulator.static_equilibrium(Inputs(force))
         q = simulator.rollout(state, 200).q[:, 0, tip, 2].mean(-1) - float(state.q[0, tip, 2].mean())
         centre = -(float(state.q[0, tip, 2].mean()) - float(simulator.rest_positions[tip, 2].mean()))
         swings = (q - centre).abs()
@@ -191,7 +192,7 @@ def test_clamp_moves_as_told_and_takes_the_body_along():
         simulator = Simulator(CLAMPED, SOFT, 0.01, WEIGHTLESS, integrator, solver=TIGHT)
         state = simulator.rest_state()
         targets = state.q[:, simulator.fixed] + 1e-3 * torch.arange(1, 61)[:, None, None, None].clamp(max=20)
-        trajectory = simulator.rollout(state, 60, fixed_positions=targets)
+        trajectory = simulator.rollout(state, 60, Inputs(fixed_positions=targets))
         torch.testing.assert_close(trajectory.q[1:, :, simulator.fixed], targets, rtol=0.0, atol=1e-12)
         shift = trajectory.q[-1, 0] - simulator.rest_positions
         assert float((shift - 0.02).abs().max()) < 2e-3
@@ -202,7 +203,7 @@ def test_point_mass_weighs_and_slows(mesh):
     """A body of no weight of its own with a mass on its tip face is a spring: omega^2 = k / m."""
     tip, grams = select_vertices(mesh, x=0.04), 0.05
     body = Body(mesh, fixed=select_vertices(mesh, x=0.0), point_masses=[PointMass(grams, tip)])
-    light = Material(2e4, 0.3, 1e-3)
+    light = Corotated(2e4, 0.3, 1e-3)
     g, h = 1e-2, 1e-3
     simulator = Simulator(body, light, h, (0.0, 0.0, -g), "midpoint", solver=TIGHT)
     np.testing.assert_allclose(simulator.prepare().mass.sum() - grams, 1e-3 * 1.6e-5, rtol=1e-6)
@@ -210,7 +211,7 @@ def test_point_mass_weighs_and_slows(mesh):
     bare = Simulator(Body(mesh, fixed=body.fixed), light, h, WEIGHTLESS, solver=TIGHT)
     force = torch.zeros_like(bare.rest_state().q)
     force[:, tip, 2] = -grams * g / len(tip)
-    pulled = -float((bare.static_equilibrium(force).q[0] - bare.rest_positions)[tip, 2].mean())
+    pulled = -float((bare.static_equilibrium(Inputs(force)).q[0] - bare.rest_positions)[tip, 2].mean())
     assert sag == pytest.approx(pulled, rel=1e-4)
     omega = np.sqrt(g / sag)  # k / m
     quarter = round(np.pi / omega / h)

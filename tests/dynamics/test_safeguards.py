@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import Body, Material, Simulator, SolverSettings, State, box_hexahedra, select_vertices
+from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, box_hexahedra, select_vertices
+from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.linalg.linear_solver import make_linear_solver
 
 MESH = box_hexahedra((0.06, 0.03, 0.03), (2, 1, 1))
 CLAMPED = Body(MESH, fixed=select_vertices(MESH, x=0.0))
-RUBBER = Material(264e3, 0.45)
+RUBBER = Corotated(264e3, 0.45)
 
 
 @pytest.mark.parametrize("fixed", [MESH.vertices[:, 0] == 0.0, [0.7], "abc"])
@@ -34,7 +35,7 @@ def test_a_clamp_moved_at_constant_speed_has_that_velocity_with_every_integrator
         shift = sim.time_step * torch.arange(1, 5)[:, None, None, None] * speed
         start = sim.rest_state()
         start = State(start.q, speed.expand_as(start.q).clone())
-        trajectory = sim.rollout(start, 4, fixed_positions=start.q[:, sim.fixed] + shift)
+        trajectory = sim.rollout(start, 4, Inputs(fixed_positions=start.q[:, sim.fixed] + shift))
         torch.testing.assert_close(trajectory.v[:, :, sim.fixed], speed.expand(5, 1, len(sim.fixed), 3))
 
 
@@ -57,7 +58,7 @@ def test_a_singular_system_is_a_convergence_error_with_every_linear_solver(linea
 def test_a_singular_adjoint_is_an_error():
     sim = Simulator(Body(MESH, fixed=[0]), RUBBER, gravity=(0.0, 0.0, 0.0))
     force = torch.zeros(1, len(MESH.vertices), 3, dtype=torch.float64, requires_grad=True)
-    state = sim.static_equilibrium(force)
+    state = sim.static_equilibrium(Inputs(force))
     with pytest.raises(ConvergenceError, match="adjoint system is singular"):
         state.q[0, -1, 2].backward()
 

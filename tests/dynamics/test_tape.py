@@ -8,7 +8,7 @@ import pytest
 import torch
 import warp as wp
 
-from warp_resphys import Body, Material, Simulator, State, box_hexahedra
+from warp_resphys import Body, Corotated, Simulator, State, box_hexahedra
 from warp_resphys.dynamics.tape import record_rollout
 from warp_resphys.energies.launcher import warp_view
 from warp_resphys.io.errors import InputError
@@ -34,7 +34,7 @@ def add_squares(q: wp.array3d[wp.vec3d], rest: wp.array2d[wp.vec3d], loss: wp.ar
 
 def make_simulator(device: str, integrator: str = "implicit_euler") -> Simulator:
     mesh = box_hexahedra((0.04, 0.02, 0.02), (2, 1, 1))
-    material = Material(1e5, 0.4, 1000.0, mass_damping=0.5, stiffness_damping=0.001)
+    material = Corotated(1e5, 0.4, 1000.0, mass_damping=0.5, stiffness_damping=0.001)
     clamped = np.flatnonzero(mesh.vertices[:, 0] == 0.0)
     return Simulator(Body(mesh, clamped), material, integrator=integrator, relative_tolerance=1e-11, device=device)
 
@@ -194,7 +194,7 @@ def test_nothing_is_copied(device: str, monkeypatch: pytest.MonkeyPatch) -> None
     seen = {}
     rollout_in_torch = simulator.rollout
 
-    def spy(state: State, steps: int, forces: torch.Tensor, fixed: None, material: Material, _: None) -> object:
+    def spy(state: State, steps: int, forces: torch.Tensor, fixed: None, material: Corotated, _: None) -> object:
         trajectory = rollout_in_torch(state, steps, forces, fixed, material)
         seen.update(q=state.q, v=state.v, force=forces, modulus=material.youngs_modulus)
         seen.update(q_out=trajectory.q, v_out=trajectory.v)

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import scipy.optimize
 import torch
+from warp_resphys.energies.terms import StepTerms
 
 from warp_resphys import Body, Mesh, box_hexahedra, box_tetrahedra, select_vertices
 from warp_resphys.dynamics.assembly import BlockPattern, HessianAssembly
-from warp_resphys.energies.material import MODELS
+from warp_resphys.energies.materials import MODELS
 from warp_resphys.energies.potential import IncrementalPotential
-from warp_resphys.energies.terms import StepTerms
 from warp_resphys.linalg.linear_solver import make_linear_solver
 
 UNIT = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])

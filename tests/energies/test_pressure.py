@@ -8,7 +8,8 @@ import torch
 import warp as wp
 from chambered import BRICK, KINDS, chambered, hollow_box
 
-from warp_resphys import Body, Material, Mesh, Simulator, SolverSettings, select_vertices
+from warp_resphys.dynamics.inputs import Inputs
+from warp_resphys import Body, Corotated, Mesh, Simulator, SolverSettings, select_vertices
 from warp_resphys.dynamics.integrator import State
 from warp_resphys.dynamics.tape import record_rollout
 from warp_resphys.fem.surface_elements import Fibres, fibre_points
@@ -16,7 +17,7 @@ from warp_resphys.io.errors import InputError, MeshError
 from warp_resphys.mesh.chambers import Chamber, check_chambers, find_chambers
 from warp_resphys.studies.gradient_check import check_gradients
 
-SOFT = Material(100e3, 0.45, 1070.0, mass_damping=0.5, stiffness_damping=2e-3)
+SOFT = Corotated(100e3, 0.45, density=1070.0, mass_damping=0.5, stiffness_damping=2e-3)
 SEVEN = [(s * k, s * w) for s in (1, -1) for k, w in ((1, 3 / 4), (2, -3 / 20), (3, 1 / 60))]  # a stencil
 TIGHT = SolverSettings("newton", relative_tolerance=1e-10)
 
@@ -95,10 +96,10 @@ def test_force_and_volume_have_exact_derivatives(kind):
 
 def test_static_inflation_balances_pressure_by_virtual_work():
     """At rest under pressure p, p dV = dE for any displacement: compare E along the way with the work of p."""
-    s = simulator(gravity=(0.0, 0.0, 0.0), material=Material(100e3, 0.45))
+    s = simulator(gravity=(0.0, 0.0, 0.0), material=Corotated(100e3, 0.45))
     steps = np.linspace(0.0, 2e4, 21)
     pressure = torch.tensor(np.stack([steps, np.zeros_like(steps)], 1))
-    rest = s.static_equilibrium(pressure=pressure)
+    rest = s.static_equilibrium(Inputs(pressure=pressure))
     volumes = s.chambers(21).volumes(rest.q)[:, 0].numpy()
     assert volumes[-1] > 1.02 * volumes[0]
     work = np.trapezoid(steps, volumes)
@@ -169,22 +170,22 @@ def test_explicit_coupling_is_that_of_the_state_before_and_meets_the_implicit_on
     for coupling in ("implicit", "explicit"):
         for h in steps:
             s = simulator(pressure_coupling=coupling, time_step=h)
-            ends[coupling, h] = s.rollout(s.rest_state(), round(0.04 / h), pressures=pressure).q[-1]
+            ends[coupling, h] = s.rollout(s.rest_state(), round(0.04 / h), Inputs(pressure=pressure)).q[-1]
     apart = [float((ends["implicit", h] - ends["explicit", h]).norm()) for h in steps]
     assert 0.0 < apart[1] < 0.6 * apart[0]
     s = simulator(pressure_coupling="explicit")
     state = State(moved(s, 1), 0.1 * noise(1, s.body.n_vertices, 3, seed=4))
     force = s.chambers(1).force(state.q, pressure)
-    by_hand, _ = s.step(state, force)
-    torch.testing.assert_close(s.step(state, pressure=pressure)[0].q, by_hand.q, rtol=0, atol=1e-14)
+    by_hand, _ = s.step(state, Inputs(force))
+    torch.testing.assert_close(s.step(state, Inputs(pressure=pressure))[0].q, by_hand.q, rtol=0, atol=1e-14)
 
 
 def test_batch_under_pressure_equals_single_runs():
     s = simulator(material=replace(SOFT, fibre_stiffness=1e3), fibres=Fibres())
     pressure = torch.tensor([[2e4, 0.0], [0.0, 1e4], [5e3, 5e3]], dtype=torch.float64)
-    together = s.rollout(s.rest_state(3), 5, pressures=pressure).q
+    together = s.rollout(s.rest_state(3), 5, Inputs(pressure=pressure)).q
     for i in range(3):
-        alone = s.rollout(s.rest_state(1), 5, pressures=pressure[i : i + 1]).q
+        alone = s.rollout(s.rest_state(1), 5, Inputs(pressure=pressure[i : i + 1])).q
         torch.testing.assert_close(together[:, i : i + 1], alone, rtol=0, atol=1e-10)
 
 
@@ -194,7 +195,7 @@ def test_every_solver_finds_the_same_step(solver):
     pressure = torch.tensor([[2e4, 1e4]], dtype=torch.float64)
     settings = SolverSettings(solver, relative_tolerance=1e-9)
     ends = [
-        s.rollout(s.rest_state(), 3, pressures=pressure).q[-1]
+        s.rollout(s.rest_state(), 3, Inputs(pressure=pressure)).q[-1]
         for s in (simulator(material=material, fibres=fibres, solver=which) for which in (TIGHT, settings))
     ]
     torch.testing.assert_close(ends[1], ends[0], rtol=0, atol=1e-8)
@@ -218,10 +219,10 @@ def test_fibres_hold_a_chamber_from_growing_wide_and_do_not_push():
     pressure = torch.tensor([[2e4, 2e4]], dtype=torch.float64)
     widths = {}
     for stiffness in (0.0, 1e3, 1e5):
-        material = Material(50e3, 0.45, fibre_stiffness=stiffness)
+        material = Corotated(50e3, 0.45, fibre_stiffness=stiffness)
         s = simulator(material=material, fibres=Fibres(), gravity=(0.0, 0.0, 0.0))
         for sign in (1.0, -1.0):
-            q = s.static_equilibrium(pressure=sign * pressure).q
+            q = s.static_equilibrium(Inputs(pressure=sign * pressure)).q
             widths[stiffness, sign] = float(s.chambers(1).volumes(q)[0, 0] / (2 * BRICK) - 1.0)
     assert widths[0.0, 1.0] > 1.5 * widths[1e3, 1.0] > 2.0 * widths[1e5, 1.0] > 0.0
     assert widths[1e5, -1.0] == pytest.approx(widths[0.0, -1.0], rel=0.1)
@@ -269,11 +270,11 @@ def test_bad_input():
     with pytest.raises(InputError, match="pressure_coupling is 'weak'"):
         simulator(pressure_coupling="weak")
     with pytest.raises(InputError, match=r"pressure has shape \(1, 3\): it must be \(1, 2\) in Pa"):
-        simulator().step(simulator().rest_state(), pressure=torch.zeros(1, 3, dtype=torch.float64))
+        simulator().step(simulator().rest_state(), Inputs(pressure=torch.zeros(1, 3, dtype=torch.float64)))
     with pytest.raises(InputError, match="no chambers"):
-        Simulator(Body(mesh)).step(Simulator(Body(mesh)).rest_state(), pressure=torch.zeros(1, 1, dtype=torch.float64))
+        Simulator(Body(mesh)).step(Simulator(Body(mesh)).rest_state(), Inputs(pressure=torch.zeros(1, 1, dtype=torch.float64)))
     with pytest.raises(InputError, match="environment 0, chamber 1"):
-        simulator().step(simulator().rest_state(), pressure=torch.tensor([[0.0, torch.nan]], dtype=torch.float64))
+        simulator().step(simulator().rest_state(), Inputs(pressure=torch.tensor([[0.0, torch.nan]], dtype=torch.float64)))
     for angles, toe in (((), 1e-3), ((90.0,), 1e-3), ((0.0,), 0.0)):
         with pytest.raises(InputError, match="fibre"):
             Fibres(angles, toe)
@@ -285,7 +286,7 @@ def test_pressures_on_a_tape_have_the_gradient_of_torch(device):
     values = {"pressures": s.tensor(1e4 * (1 + 0.1 * noise(3, 2, 2))), "fibre_stiffness": s.tensor([1e3, 2e3])}
     leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
     material = replace(s.material, fibre_stiffness=leaves["fibre_stiffness"])
-    trajectory = s.rollout(state, 3, material=material, pressures=leaves["pressures"])
+    trajectory = s.rollout(state, 3, material=material, Inputs(pressure=leaves["pressures"]))
     expected = torch.autograd.grad((weights * trajectory.q).sum(), list(leaves.values()))
     where, tape = wp.device_from_torch(s.rest_positions.device), wp.Tape()
     arrays = {

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import Body, Material, Mesh, PointMass, Simulator, State, box_hexahedra, select_vertices
+from warp_resphys import Body, Corotated, Mesh, PointMass, Simulator, State, box_hexahedra, select_vertices
+from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.io.errors import InputError, MeshError, ResphysError
 from warp_resphys.studies.gradient_check import check_configured
 
@@ -15,7 +16,7 @@ ELEMENTS, VERTICES, FIXED = len(MESH.cells), len(MESH.vertices), len(BODY.fixed_
 
 @pytest.fixture(scope="module")
 def simulator():
-    return Simulator(BODY, Material(1e5, 0.4, 1000.0))
+    return Simulator(BODY, Corotated(1e5, 0.4, 1000.0))
 
 
 def refused(message, error=InputError):
@@ -54,7 +55,7 @@ NAN, INF = float("nan"), float("inf")
 )
 def test_material(constants, message):
     with refused(message):
-        Material(**constants)
+        Corotated(**constants)
 
 
 @pytest.mark.parametrize(
@@ -167,7 +168,7 @@ def test_rollout_with_the_wrong_number_of_steps(simulator):
     with refused("external_forces has 3 time steps, but 4 are to be simulated"):
         simulator.rollout(state, 4, forces)
     with refused("fixed_positions has 3 time steps, but 4 are to be simulated"):
-        simulator.rollout(state, 4, fixed_positions=forces[:, :, simulator.fixed])
+        simulator.rollout(state, 4, Inputs(fixed_positions=forces[:, :, simulator.fixed]))
 
 
 @pytest.mark.parametrize(
@@ -180,7 +181,7 @@ def test_rollout_with_the_wrong_number_of_steps(simulator):
 )
 def test_material_of_another_mesh(constants, simulator):
     with refused(f"a material parameter has {ELEMENTS + 1} values for {ELEMENTS} elements"):
-        simulator.step(simulator.rest_state(1), material=Material(**constants))
+        simulator.step(simulator.rest_state(1), material=Corotated(**constants))
 
 
 @pytest.mark.parametrize(
@@ -195,7 +196,7 @@ def test_material_of_another_mesh(constants, simulator):
 )
 def test_material_of_another_batch(constants, simulator):
     with refused("3 environments"):
-        simulator.step(simulator.rest_state(2), material=Material(**constants))
+        simulator.step(simulator.rest_state(2), material=Corotated(**constants))
 
 
 def test_static_equilibrium_of_a_free_body():

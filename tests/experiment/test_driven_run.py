@@ -15,6 +15,8 @@ import torch
 from hydra import compose, initialize_config_module
 from main_job import IN_RUN, run
 from omegaconf import OmegaConf
+from warp_resphys.learning.driven import DrivenMotions, DrivenReplay, at_rest
+from warp_resphys.learning.driven_rollout import Range
 
 from warp_resphys.data.actuation import PressureSequences
 from warp_resphys.data.markers import bind_markers
@@ -31,8 +33,6 @@ from warp_resphys.experiment.checks import check_configuration
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_array, read_checkpoint, read_hdf5
 from warp_resphys.io.stages import StageContext
-from warp_resphys.learning.driven import DrivenMotions, DrivenReplay, at_rest
-from warp_resphys.learning.driven_rollout import Range
 from warp_resphys.learning.identification import Bounds, Identifier
 from warp_resphys.mesh.mesh import select_vertices
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from warp_resphys import (
     Body,
-    Material,
+    Corotated,
     Mesh,
     Simulator,
     SolverSettings,
@@ -194,7 +194,7 @@ def test_patch(name, model, integration):
     """A linear displacement of the boundary is that of the interior too."""
     mesh = MESHES[name]
     boundary = surface_vertices(mesh)
-    material = Material(1e5, 0.45, 1000.0, model=model)
+    material = Corotated(1e5, 0.45, 1000.0, model=model)
     settings = SolverSettings("newton", relative_tolerance=1e-12, absolute_tolerance=1e-12)
     body = Body(mesh, fixed=boundary, volume_integration=integration)
     simulator = Simulator(body, material, gravity=(0.0, 0.0, 0.0), solver=settings)
@@ -209,7 +209,7 @@ def test_patch(name, model, integration):
 @pytest.mark.parametrize("name", MESHES)
 def test_rigid_motions_give_no_force(name, model, device):
     mesh = MESHES[name]
-    material = Material(1e5, 0.45, 1000.0, model=model)
+    material = Corotated(1e5, 0.45, 1000.0, model=model)
     simulator = Simulator(Body(mesh), material, gravity=(0.0, 0.0, 0.0), device=device)
     potential = simulator.workspace(1).potential
     rotation = Rotation.from_rotvec([0.4, -1.0, 2.0]).as_matrix()

@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 import torch
 from torch import nn
+from warp_resphys.learning.driven_rollout import Range, WatchedModel
 
-from warp_resphys import Body, Material, Simulator, box_hexahedra, select_vertices
+from warp_resphys import Body, Corotated, Simulator, box_hexahedra, select_vertices
 from warp_resphys.dynamics import modes
+from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.dynamics.modes import RestStiffness, vibration_modes
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_checkpoint, write_checkpoint
-from warp_resphys.learning.driven_rollout import Range, WatchedModel
 from warp_resphys.learning.networks import (
     NextState,
     ResidualForce,
@@ -270,7 +271,7 @@ class TestActuation:
 
 def clamped_beam():
     mesh = box_hexahedra((0.1, 0.02, 0.02), (5, 1, 1))
-    return Simulator(Body(mesh, fixed=select_vertices(mesh, x=0.0)), Material(2e5, 0.3), gravity=(0.0, 0.0, 0.0))
+    return Simulator(Body(mesh, fixed=select_vertices(mesh, x=0.0)), Corotated(2e5, 0.3), gravity=(0.0, 0.0, 0.0))
 
 
 def test_rest_stiffness_is_that_of_a_small_load_and_its_own_inverse():
@@ -278,7 +279,7 @@ def test_rest_stiffness_is_that_of_a_small_load_and_its_own_inverse():
     stiffness = RestStiffness(simulator)
     force = torch.zeros(1, simulator.body.n_vertices, 3, dtype=torch.float64)
     force[:, -1, 2] = 1e-5
-    moved = simulator.static_equilibrium(force).q - simulator.rest_positions
+    moved = simulator.static_equilibrium(Inputs(force)).q - simulator.rest_positions
     found = stiffness.displacements(force.reshape(-1, 1).numpy())
     np.testing.assert_allclose(found[:, 0], moved.reshape(-1).numpy(), atol=1e-4 * float(moved.abs().max()))
     np.testing.assert_allclose(stiffness.forces(found), force.reshape(-1, 1).numpy(), atol=1e-15)
@@ -344,7 +345,7 @@ def test_modes_of_large_bodies_are_those_of_small_ones(monkeypatch, held):
     """Lanczos and the dense solver span the same forces, also of a body that nothing holds."""
     mesh = box_hexahedra((0.1, 0.02, 0.03), (5, 1, 1))
     fixed = select_vertices(mesh, x=0.0) if held else ()
-    simulator = Simulator(Body(mesh, fixed=fixed), Material(2e5, 0.3, stiffness_damping=1e-3))
+    simulator = Simulator(Body(mesh, fixed=fixed), Corotated(2e5, 0.3, stiffness_damping=1e-3))
     dense = vibration_modes(simulator, 8).numpy()
     monkeypatch.setattr(modes, "_DENSE", 0)
     cosines = np.linalg.svd(dense.T @ vibration_modes(simulator, 8).numpy())[1]
@@ -353,7 +354,7 @@ def test_modes_of_large_bodies_are_those_of_small_ones(monkeypatch, held):
 
 def test_rest_stiffness_knows_no_viscosity_and_wants_a_body_that_is_held():
     plain, damped = (
-        RestStiffness(dataclasses.replace(clamped_beam(), material=Material(2e5, 0.3, stiffness_damping=beta)))
+        RestStiffness(dataclasses.replace(clamped_beam(), material=Corotated(2e5, 0.3, stiffness_damping=beta)))
         for beta in (0.0, 0.01)
     )
     force = np.random.default_rng(0).standard_normal((3 * 24, 2))

@@ -5,7 +5,8 @@ import pytest
 import scipy.optimize
 import torch
 
-from warp_resphys import Body, Material, Simulator, SolverSettings, State, box_hexahedra, select_vertices
+from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, box_hexahedra, select_vertices
+from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.learning.reconstruction import conjugate_gradients, make_reconstructor
 from warp_resphys.learning.rollout import HybridRollout, closed_loop
@@ -17,7 +18,7 @@ MESH = box_hexahedra((0.06, 0.03, 0.03), (2, 1, 1))
 BODY = Body(MESH, fixed=select_vertices(MESH, x=0.0))
 FREE = np.setdiff1d(np.arange(12), BODY.fixed_vertices)
 TIP = select_vertices(MESH, x=0.06)
-MODEL = Material(215e3, 0.45)
+MODEL = Corotated(215e3, 0.45)
 SETTINGS = {"tolerance": 1e-12, "max_iterations": 50}
 
 
@@ -98,10 +99,10 @@ def simulator(material=MODEL, **settings):
 
 def observation(steps=1, weights=(0.1,), damping=0.0, **settings):
     """Positions (T + 1, B, 12, 3) of the beam let go from weights at its tip, and its first state."""
-    real = simulator(Material(264e3, 0.499, stiffness_damping=damping), **settings)
+    real = simulator(Corotated(264e3, 0.499, stiffness_damping=damping), **settings)
     force = torch.zeros(len(weights), 12, 3, dtype=torch.float64)
     force[:, TIP, 2] = -9.80709 * torch.tensor(weights, dtype=torch.float64)[:, None] / len(TIP)
-    start = real.static_equilibrium(force)
+    start = real.static_equilibrium(Inputs(force))
     return real.rollout(start, steps).q, start
 
 
@@ -209,7 +210,7 @@ class TestMethodsAgree:
     def test_minimum(self, integrator, stiffness_damping):
         regularisation = 1e-4
         observed, start = observation(2, integrator=integrator)
-        sim = simulator(Material(215e3, 0.45, stiffness_damping=stiffness_damping), integrator=integrator)
+        sim = simulator(Corotated(215e3, 0.45, stiffness_damping=stiffness_damping), integrator=integrator)
         q, force = reconstruct("gauss_newton", sim, start, observed, regularisation)
         other = {"tolerance": 1e-15, "max_iterations": 2000}
         q_other, force_other = reconstruct("lbfgsb", sim, start, observed, regularisation, **other)
@@ -243,7 +244,7 @@ class TestTrajectory:
         observed, start = observation(6, (0.05, 0.2), integrator=integrator)
         sim = simulator(integrator=integrator)
         q, force = reconstruct(method, sim, start, observed, 1e-5, max_iterations=500)
-        replayed = sim.rollout(start, 6, external_forces=force).q[1:]
+        replayed = sim.rollout(start, 6, Inputs(force)).q[1:]
         uncorrected = sim.rollout(start, 6).q[1:]
         np.testing.assert_allclose(replayed, q, rtol=0, atol=1e-9)
         assert float((q - observed[1:]).abs().max()) < 0.2 * float((uncorrected - observed[1:]).abs().max())
@@ -252,7 +253,7 @@ class TestTrajectory:
     def test_errors_of_the_steps_do_not_add_up(self, integrator):
         damping = 1e-3 if integrator == "midpoint" else 0.0  # undamped, it rings
         observed, start = observation(40, damping=damping, integrator=integrator)
-        sim = simulator(Material(215e3, 0.45, stiffness_damping=damping), integrator=integrator)
+        sim = simulator(Corotated(215e3, 0.45, stiffness_damping=damping), integrator=integrator)
         q, _ = reconstruct("gauss_newton", sim, start, observed, 1e-9)
         missed = (q - observed[1:]).abs().amax((1, 2, 3))
         assert float(missed[20:].max()) < float(missed[:20].max())

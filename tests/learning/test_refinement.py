@@ -6,7 +6,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from warp_resphys import Body, Material, Simulator, box_hexahedra, select_vertices
+from warp_resphys import Body, Corotated, Simulator, box_hexahedra, select_vertices
+from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.dynamics.nonlinear_solver import SolverSettings
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_checkpoint, write_checkpoint
@@ -15,7 +16,7 @@ from warp_resphys.learning.refinement import Motion, SolverInTheLoop, WindowLoss
 
 MESH = box_hexahedra((0.06, 0.02, 0.02), (3, 1, 1))
 BODY = Body(MESH, fixed=select_vertices(MESH, x=0.0))
-REALITY, WRONG = Material(264e3, 0.45), Material(215e3, 0.45)
+REALITY, WRONG = Corotated(264e3, 0.45), Corotated(215e3, 0.45)
 CONFIG = {"kind": "solver_in_the_loop", "window": 3, "epochs": 4, "batch_size": 4, "memory": 5, "rollout_every": 1}
 FRAMES = 11
 
@@ -31,7 +32,7 @@ def motion(integrator="implicit_euler", seed=0):
     load = torch.zeros(2, len(MESH.vertices), 3, dtype=torch.float64)
     random = torch.Generator().manual_seed(seed)
     load[:, select_vertices(MESH, x=0.06)] = 0.1 * torch.rand(2, 1, 3, generator=random, dtype=torch.float64) - 0.05
-    found = real.rollout(real.static_equilibrium(load), FRAMES - 1)
+    found = real.rollout(real.static_equilibrium(Inputs(load)), FRAMES - 1)
     return Motion(found.q.transpose(0, 1).contiguous(), found.v.transpose(0, 1).contiguous())
 
 

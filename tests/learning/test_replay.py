@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import Body, Material, PointMass, Simulator
+from warp_resphys import Body, Corotated, PointMass, Simulator
 from warp_resphys.data.markers import bind_markers
 from warp_resphys.dynamics.integrator import State
 from warp_resphys.io.errors import ConvergenceError, InputError
@@ -22,7 +22,7 @@ MASSES = (0.0, 0.05)
 
 
 def simulator(masses=(), **options):
-    options = {"integrator": "bdf2", "material": Material(215e3, 0.45)} | options
+    options = {"integrator": "bdf2", "material": Corotated(215e3, 0.45)} | options
     body = Body(MESH, select_vertices(MESH, x=0.0), point_masses=[PointMass(m, TIP) for m in masses])
     return Simulator(body, time_step=0.01, **options)
 
@@ -264,7 +264,7 @@ def test_bodies_bend_sideways_across_gravity(gravity):
 def test_the_shape_of_bending_is_found_in_single_precision_and_for_stiff_bodies():
     exact = sideways_shapes(simulator())
     for modulus in (215e3, 1e9):
-        sim = simulator(material=Material(modulus, 0.45), dtype=torch.float32, relative_tolerance=1e-4)
+        sim = simulator(material=Corotated(modulus, 0.45), dtype=torch.float32, relative_tolerance=1e-4)
         rough = sideways_shapes(sim).double()
         assert len(rough) == 1
         sign = torch.sign((rough * exact).sum())

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import Body, Material, Simulator, State, box_hexahedra, select_vertices
+from warp_resphys import Body, Corotated, Simulator, State, box_hexahedra, select_vertices
 from warp_resphys.io.files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.networks import NextState, build_next_state, restore
 from warp_resphys.learning.rollout import FURTHEST, DataDrivenRollout, closed_loop
 
 MESH = box_hexahedra((0.1, 0.03, 0.03), (2, 1, 1))
-SIMULATOR = Simulator(Body(MESH, fixed=select_vertices(MESH, x=0.0)), Material(215e3, 0.45))
+SIMULATOR = Simulator(Body(MESH, fixed=select_vertices(MESH, x=0.0)), Corotated(215e3, 0.45))
 REST = SIMULATOR.rest_positions
 MODES, SAMPLES = 3, 60
 ARCHITECTURE = {"blocks": 2, "layers": 1, "width": 8, "activation": "silu"}

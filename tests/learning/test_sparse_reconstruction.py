@@ -5,8 +5,9 @@ import pytest
 import scipy.optimize
 import torch
 
-from warp_resphys import Body, Material, Simulator, State, box_hexahedra, select_vertices
+from warp_resphys import Body, Corotated, Simulator, State, box_hexahedra, select_vertices
 from warp_resphys.data.markers import KINDS, MarkerMap, bind_markers
+from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.learning.sparse_reconstruction import (
     SparseGaussNewton,
@@ -24,7 +25,7 @@ TIGHT = {"tolerance": 1e-12, "max_iterations": 40}
 
 
 def simulator(youngs_modulus=215e3, poissons_ratio=0.45, **settings):
-    return Simulator(BODY, Material(youngs_modulus, poissons_ratio), **{"relative_tolerance": 1e-11, **settings})
+    return Simulator(BODY, Corotated(youngs_modulus, poissons_ratio), **{"relative_tolerance": 1e-11, **settings})
 
 
 def observation(steps=1, weights=(0.1,), **settings):
@@ -33,7 +34,7 @@ def observation(steps=1, weights=(0.1,), **settings):
     force = torch.zeros(len(weights), 12, 3, dtype=torch.float64)
     force[:, TIP, 2] = -9.80709 * torch.tensor(weights, dtype=torch.float64)[:, None] / len(TIP)
     with torch.no_grad():
-        start = real.static_equilibrium(force)
+        start = real.static_equilibrium(Inputs(force))
         return real.rollout(start, steps).q, start
 
 
@@ -94,7 +95,7 @@ class TestGaussNewton:
 
         def residuals(coefficients):
             force = basis @ torch.as_tensor(coefficients)
-            new, _ = sim.step(start, force.view(1, 12, 3))
+            new, _ = sim.step(start, Inputs(force.view(1, 12, 3)))
             misfit = (markers(new.q) - markers(observed[1])).ravel()
             return np.concatenate([misfit, np.sqrt(regularisation) * force])
 
@@ -112,7 +113,7 @@ class TestGaussNewton:
         q, force = reconstruct(solver, start, observed)
         assert not force[:, :, BODY.fixed_vertices].any()
         with torch.no_grad():
-            replayed = sim.rollout(start, 6, external_forces=force).q[1:]
+            replayed = sim.rollout(start, 6, Inputs(force)).q[1:]
             uncorrected = sim.rollout(start, 6).q[1:]
         np.testing.assert_allclose(replayed, q, rtol=0, atol=1e-9)
         assert float((q - observed[1:]).norm()) < 0.3 * float((uncorrected - observed[1:]).norm())
@@ -150,7 +151,7 @@ class TestGaussNewton:
         np.testing.assert_allclose(force, force_other, rtol=0, atol=2e-3 * float(force.abs().max()))
         np.testing.assert_allclose(ours.state.q, published.state.q, rtol=0, atol=1e-7)
         with torch.no_grad():
-            replayed, _ = sim.step(start, force)
+            replayed, _ = sim.step(start, Inputs(force))
         np.testing.assert_allclose(replayed.q, ours.state.q, rtol=0, atol=1e-9)
 
     def test_it_says_when_it_did_not_settle(self):
@@ -188,7 +189,7 @@ class TestLevenbergMarquardt:
         target = markers(start.q) + torch.tensor([[[-0.03, 0.0, 0.05]], [[0.0, 0.0, 1e-3]]], dtype=torch.float64)
         found = SparseLevenbergMarquardt(sim, markers, 1e-5, 1e-10, 200).step(start, target)
         force = found.force.clone().requires_grad_(True)
-        new, _ = sim.step(start, force)
+        new, _ = sim.step(start, Inputs(force))
         objective = (markers(new.q) - target).square().sum() + 1e-5 * force.square().sum()
         (gradient,) = torch.autograd.grad(objective, force)
         np.testing.assert_allclose(new.q.detach(), found.state.q, rtol=0, atol=1e-9)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warp_resphys import Body, Material, Simulator, SolverSettings, State, box_hexahedra, select_vertices
+from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, box_hexahedra, select_vertices
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.studies.verification import box_of_vertices, compare_with_reference, read_reference
 
@@ -51,7 +51,7 @@ def trajectory(mesh, steps=3):
     fixed = select_vertices(mesh, x=mesh.vertices[:, 0].min())
     body = Body(mesh, fixed=fixed, mass="per_vertex", volume_integration="full")
     settings = SolverSettings("newton", relative_tolerance=1e-10)
-    simulator = Simulator(body, Material(**constants), h, gravity, solver=settings)
+    simulator = Simulator(body, Corotated(**constants), h, gravity, solver=settings)
     forces = 1e-3 * np.random.default_rng(0).normal(size=(steps, len(mesh.vertices), 3))
     rest = simulator.rest_state()
     v = 0.1 * (rest.q - rest.q[:, :1]) * (rest.q[..., :1] > mesh.vertices[:, 0].min())

@@ -160,33 +160,36 @@ def check_pressures(pressures: ArrayLike, chambers: int, limit: float, source: s
     return values
 
 
-def lagged(pressure: torch.Tensor, rise: torch.Tensor, step: float) -> torch.Tensor:
-    """(B, K, C) pressures behind a valve, which follow the commanded ones with a time constant.
+def lagged(commands: torch.Tensor, rise: torch.Tensor, step: float) -> torch.Tensor:
+    """(K, B, C) inputs, such as pressures behind a valve, which follow the commanded ones with a time constant.
 
-    Exact for commands that are constant during steps: a first-order lag, from no pressure.
+    Exact for commands that are constant during steps: a first-order lag, from zero.
 
     Args:
-        pressure: (B, K, C) commanded during each step [Pa].
+        commands: (K, B, C) during each step, or (B, C) throughout, which is taken as it is.
         rise: (B,) time constant [s], differentiable.
         step: h [s].
     """
+    if commands.ndim == 2:
+        return commands
     keep = torch.exp(-step / rise.clamp_min(1e-2 * step))[:, None]
-    behind, series = torch.zeros_like(pressure[:, 0]), []
-    for command in pressure.unbind(1):
+    behind, series = torch.zeros_like(commands[0]), []
+    for command in commands.unbind():
         behind = command + keep * (behind - command)
         series.append(behind)
-    return torch.stack(series, 1)
+    return torch.stack(series)
 
 
-def remembered(pressure: torch.Tensor, seconds: Sequence[float], step: float) -> torch.Tensor:
-    """(B, K, C (1 + n)) pressures, and what a memory of each time constant keeps of them: exponential means.
+def remembered(inputs: torch.Tensor, time_constants: Sequence[float], step: float) -> torch.Tensor:
+    """(K, B, C (1 + n)) inputs, and the exponential means of each time constant of what they were.
 
     A viscoelastic body creeps under a constant pressure: where it goes next depends on how long that has lasted, which
-    its state tells badly. These are the internal variables of n Maxwell elements that the pressure drives.
+    its state tells badly. These are the internal variables of n Maxwell elements that the inputs drive.
 
     Args:
-        pressure: (B, K, C) [Pa].
-        seconds: n time constants [s].
+        inputs: (K, B, C).
+        time_constants: n [s].
         step: h [s].
     """
-    return torch.cat([pressure, *(lagged(pressure, pressure.new_full((len(pressure),), s), step) for s in seconds)], -1)
+    batch = inputs.shape[1]
+    return torch.cat([inputs, *(lagged(inputs, inputs.new_full((batch,), s), step) for s in time_constants)], -1)

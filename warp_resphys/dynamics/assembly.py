@@ -1,18 +1,25 @@
 """The Hessian: which vertices it couples, and its assembly in the layout of a linear solver."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from ..energies.launcher import warp_view
 from ..energies.potential import IncrementalPotential
-from ..fem.body import Body
+from ..fem.elements import Points
 from ..kernels.assembly import assembly_kernels
 from ..linalg.linear_solver import LinearSolver
 
 
 class BlockPattern:
     """Which pairs of vertices the Hessian couples, and which cell blocks make up each pair.
+
+    Args:
+        n_vertices: N.
+        fixed: (D,) fixed vertices.
+        sets: every set of points that carries energy.
 
     Attributes:
         free: (F,) vertices that are not fixed.
@@ -25,17 +32,16 @@ class BlockPattern:
         n_cell_blocks: of all point sets.
     """
 
-    def __init__(self, body: Body) -> None:
-        n = body.n_vertices
-        is_free = np.ones(n, dtype=bool)
-        is_free[body.fixed_vertices] = False
+    def __init__(self, n_vertices: int, fixed: NDArray[np.int64], sets: Sequence[Points]) -> None:
+        is_free = np.ones(n_vertices, dtype=bool)
+        is_free[fixed] = False
         self.free = np.flatnonzero(is_free)
         reduced = np.where(is_free, np.cumsum(is_free) - 1, -1)
         sources: list[NDArray[np.int64]] = []
         pairs: list[NDArray[np.int64]] = []
         self.offsets: list[int] = []
         self.n_cell_blocks = 0
-        for points in body.point_sets:
+        for points in sets:
             a, c = np.tril_indices(points.nodes.shape[1])
             pair = np.stack([reduced[points.nodes[:, a]], reduced[points.nodes[:, c]]], axis=-1).reshape(-1, 2)
             # A padded node repeats its patch's own vertex with a zero gradient and contributes nothing.

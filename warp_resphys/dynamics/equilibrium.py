@@ -1,27 +1,33 @@
 """The differentiable solve: minimiser of an incremental potential, with its implicit adjoint."""
 
-from typing import Any
+from collections.abc import Callable, Hashable, Sequence
+from typing import Any, TypeVar
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from typing_extensions import override
 
-from ..energies.potential import IncrementalPotential
-from ..energies.terms import StepTerms
-from ..fem.body import Body
+from ..energies.base import Energy
+from ..energies.potential import IncrementalPotential, StepTerms
+from ..fem.elements import Points
 from ..io.errors import ConvergenceError
-from ..linalg.linear_solver import make_linear_solver
+from ..linalg.linear_solver import LinearSolver, make_linear_solver
 from ..linalg.threads import threads_for
 from .assembly import BlockPattern
 from .metric import HessianMetric
 from .nonlinear_solver import NonlinearSolver, SolveReport, SolverSettings
+
+T = TypeVar("T")
 
 
 class Workspace:
     """Buffers, launches and factors for one batch size of a body.
 
     Args:
-        body: the body.
-        model: material model (an integer of ``kernels.elasticity``).
+        energies: of the body, the solid's first, each with its sets of points.
+        n_vertices: N.
+        fixed: (D,) fixed vertices.
         pattern: block structure of the Hessian.
         batch: environments.
         device: of every buffer.
@@ -30,36 +36,71 @@ class Workspace:
 
     def __init__(
         self,
-        body: Body,
-        model: int,
+        energies: Sequence[tuple[Energy, Sequence[Points]]],
+        n_vertices: int,
+        fixed: NDArray[np.int64],
         pattern: BlockPattern,
         batch: int,
         device: torch.device,
         dtype: torch.dtype,
     ) -> None:
-        self.potential = IncrementalPotential(body, model, batch, device, dtype)
+        self.fixed = torch.as_tensor(fixed, device=device)
+        self.potential = IncrementalPotential(energies, n_vertices, self.fixed, batch, device, dtype)
         self.pattern = pattern
-        self.fixed = torch.as_tensor(body.fixed_vertices, device=device)
-        self._solvers: dict[tuple[str, SolverSettings], NonlinearSolver] = {}
-        self._adjoint: HessianMetric | None = None
+        self._made: dict[Any, Any] = {}
+
+    def once(self, key: Hashable, make: Callable[[], T]) -> T:
+        """What belongs to this batch, made at its first use."""
+        if key not in self._made:
+            self._made[key] = make()
+        made: T = self._made[key]
+        return made
 
     def solver(self, purpose: str, settings: SolverSettings) -> NonlinearSolver:
-        """The solver for a purpose (dynamics, statics), built at its first use; each keeps its own factor."""
-        key = (purpose, settings)
-        if key not in self._solvers:
-            self._solvers[key] = NonlinearSolver(self.potential, self.pattern, settings)
-        return self._solvers[key]
+        """The solver for a purpose (dynamics, statics); each keeps its own factor."""
+        return self.once((purpose, settings), lambda: NonlinearSolver(self.potential, self.pattern, settings))
 
-    def adjoint_metric(self, linear_solver: str) -> HessianMetric:
-        """The exact Hessian for adjoint solves."""
-        if self._adjoint is None:
-            p, k = self.potential, self.pattern
-            linear = make_linear_solver(linear_solver, k.rows, k.cols, len(k.free), 3, p.device, p.dtype)
-            self._adjoint = HessianMetric(p, k, linear)
-        return self._adjoint
+    def hessian(self, linear_solver: str) -> HessianMetric:
+        """The exact Hessian, for adjoint solves."""
+        return self.once(
+            linear_solver, lambda: HessianMetric(self.potential, self.pattern, self.linear_solver(linear_solver))
+        )
+
+    def linear_solver(self, name: str) -> LinearSolver:
+        """A new solver of the named kind for the Hessian's structure."""
+        p, k = self.potential, self.pattern
+        return make_linear_solver(name, k.rows, k.cols, len(k.free), 3, p.device, p.dtype)
 
 
-class Equilibrium(torch.autograd.Function):
+def equilibrium(
+    workspace: Workspace,
+    solver: NonlinearSolver,
+    terms: StepTerms,
+    start: torch.Tensor,
+    fixed_positions: torch.Tensor,
+) -> tuple[torch.Tensor, SolveReport]:
+    """x* (B, N, 3), the minimiser of a step's potential, differentiable in its terms and the fixed positions.
+
+    Args:
+        workspace: of the batch.
+        solver: of the workspace.
+        terms: of the step.
+        start: (B, N, 3) where the solver begins [m]; without influence on the result, and without a gradient.
+        fixed_positions: (B, D, 3) of the fixed vertices [m].
+
+    Raises:
+        ConvergenceError: see `nonlinear_solver.SolverSettings.on_failure`.
+    """
+    reports: list[SolveReport] = []
+    names = tuple(terms.values)
+    main = (terms.target, terms.inertia, terms.force)
+    x: torch.Tensor = _Equilibrium.apply(
+        workspace, solver, reports, names, start, fixed_positions, *main, *terms.values.values()
+    )
+    return x, reports[0]
+
+
+class _Equilibrium(torch.autograd.Function):
     """x* = argmin of the incremental potential, with x = d at the fixed vertices.
 
     With the residual g(x, theta) = 0 and the Hessian H = dg/dx, the implicit function theorem gives dx = -H^-1
@@ -68,7 +109,7 @@ class Equilibrium(torch.autograd.Function):
 
         dL/dy = k z,  dL/dk = -z . (x - y),  dL/df = z,  dL/dd = w_D - (K z)_D,  dL/dtheta = -z . dg/dtheta
 
-    with K the stiffness. H is exact here, never clamped.
+    with K the stiffness, and theta the values of the energies. H is exact here, never clamped.
     """
 
     @override
@@ -78,26 +119,20 @@ class Equilibrium(torch.autograd.Function):
         workspace: Workspace,
         solver: NonlinearSolver,
         reports: list[SolveReport],
+        names: tuple[str, ...],
         start: torch.Tensor,
         fixed_positions: torch.Tensor,
-        target: torch.Tensor,
-        inertia: torch.Tensor,
-        force: torch.Tensor,
-        shape_stiffness: torch.Tensor,
-        volume_stiffness: torch.Tensor,
-        viscosity: torch.Tensor,
-        *constants: torch.Tensor | None,
+        *terms: torch.Tensor | None,
     ) -> torch.Tensor:
-        terms = StepTerms(target, inertia, force, shape_stiffness, volume_stiffness, viscosity, *constants)
-        workspace.potential.set_terms(terms)
+        workspace.potential.set_terms(_terms(names, terms))
         if len(workspace.fixed):
             start = start.detach().clone()
             start[:, workspace.fixed] = fixed_positions.detach()
         with threads_for(start.numel()):
             reports.append(solver.solve(start.detach()))
         x = workspace.potential.positions.clone()
-        ctx.workspace, ctx.linear_solver = workspace, solver.settings.linear_solver
-        ctx.save_for_backward(x, *terms.tensors())
+        ctx.workspace, ctx.names, ctx.linear_solver = workspace, names, solver.settings.linear_solver
+        ctx.save_for_backward(x, *terms)
         return x
 
     @override
@@ -108,47 +143,40 @@ class Equilibrium(torch.autograd.Function):
             return _adjoint(ctx, gradient)
 
 
+def _terms(names: tuple[str, ...], tensors: Sequence[Any]) -> StepTerms:
+    target, inertia, force, *values = tensors
+    return StepTerms(target, inertia, force, dict(zip(names, values, strict=True)))
+
+
 def _adjoint(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-    """Gradients of the inputs of `Equilibrium.forward`; the equations are in its docstring."""
+    """Gradients of the inputs of `_Equilibrium.forward`; the equations are in its docstring."""
     x, *saved = ctx.saved_tensors
-    terms = StepTerms(*saved)
+    terms = _terms(ctx.names, saved)
     potential = ctx.workspace.potential
     potential.set_terms(terms)
     potential.positions.copy_(x)
-    metric = ctx.workspace.adjoint_metric(ctx.linear_solver)
+    metric = ctx.workspace.hessian(ctx.linear_solver)
     metric.refactor_exact()
     z = metric.apply(gradient.reshape(len(x), -1)).view_as(x)
     product = potential.stiffness_product(z)
     _check_adjoint(potential, z, product, gradient)
-    needs = dict(zip(_INPUTS, ctx.needs_input_grad, strict=True))
-    grads: dict[str, torch.Tensor | None] = dict.fromkeys(_INPUTS)
-    grads["target"] = terms.inertia[..., None] * z * potential.free_mask[:, None]
-    grads["inertia"] = -(z * (x - terms.target)).sum(-1) * potential.free_mask
-    grads["force"] = z
-    if needs["fixed_positions"]:
-        grads["fixed_positions"] = (gradient - product)[:, ctx.workspace.fixed]
-    if any(needs[k] for k in _CONSTANTS):
-        adjoints = potential.parameter_adjoint(z)
-        for name in ("shape_stiffness", "volume_stiffness", "fibre_stiffness"):
-            values = getattr(terms, name)
-            if values is not None and len(values) == 1:
-                adjoints[name] = adjoints[name].sum(0, keepdim=True)
-        grads.update({name: adjoints[name] for name in _CONSTANTS if getattr(terms, name) is not None})
-    return tuple(grads[name] if needs[name] else None for name in _INPUTS)
-
-
-_CONSTANTS = ("shape_stiffness", "volume_stiffness", "viscosity", "reference_strain", "pressure", "fibre_stiffness")
-_INPUTS = (
-    "workspace",
-    "solver",
-    "reports",
-    "start",
-    "fixed_positions",
-    "target",
-    "inertia",
-    "force",
-    *_CONSTANTS,
-)
+    _, _, _, _, _, fixed, target, inertia, force, *values = ctx.needs_input_grad
+    slopes = potential.value_adjoint(z) if any(values) else {}
+    of_values: list[torch.Tensor | None] = []
+    for name, needed in zip(ctx.names, values, strict=True):
+        value, slope = terms.values[name], slopes.get(name)
+        if value is None or slope is None or not needed:
+            of_values.append(None)
+        else:
+            of_values.append(slope.sum(0, keepdim=True) if len(value) < len(slope) else slope)
+    return (
+        *([None] * 5),
+        (gradient - product)[:, ctx.workspace.fixed] if fixed else None,
+        terms.inertia[..., None] * z * potential.free_mask[:, None] if target else None,
+        -(z * (x - terms.target)).sum(-1) * potential.free_mask if inertia else None,
+        z if force else None,
+        *of_values,
+    )
 
 
 def _check_adjoint(
@@ -170,21 +198,3 @@ def _check_adjoint(
             potential.positions.clone(),
             None,
         )
-
-
-class GreenStrain(torch.autograd.Function):
-    """E = (F^T F - I) / 2 at every point, (B, N, 3) to (B, P, 3, 3)."""
-
-    @override
-    @staticmethod
-    def forward(ctx: Any, potential: IncrementalPotential, positions: torch.Tensor) -> torch.Tensor:
-        ctx.potential = potential
-        ctx.save_for_backward(positions)
-        return potential.strain(positions.detach())
-
-    @override
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[None, torch.Tensor]:
-        (positions,) = ctx.saved_tensors
-        return None, ctx.potential.strain_adjoint(positions, gradient)

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from typing_extensions import override
 
+from ..energies.base import PointSet
 from ..energies.potential import IncrementalPotential
-from ..energies.terms import PointTerm
 from ..linalg.linear_solver import Factor, LinearSolver
 from .assembly import BlockPattern, HessianAssembly
 
@@ -107,16 +107,17 @@ class ProjectiveMetric(Metric):
         self.clamped = torch.ones(potential.batch, dtype=torch.bool, device=potential.device)
         self._factor: Factor | None = None
 
-    def _gradient_products(self, points: PointTerm) -> torch.Tensor:
+    def _gradient_products(self, points: PointSet) -> torch.Tensor:
         """(C, Q, pairs) scalar products of the gradients of every node pair a >= c of a cell."""
-        gradients = points.operators
+        gradients = points.source.gradients
         a, c = np.tril_indices(gradients.shape[2])
         products = np.einsum("cqpi,cqpi->cqp", gradients[:, :, a], gradients[:, :, c])
         return torch.as_tensor(products, device=self._potential.device, dtype=self._potential.dtype)
 
     def _terms(self) -> tuple[torch.Tensor, ...]:
         t = self._potential.terms
-        return t.inertia, *(s.curvature(t) for s in self._potential.sets)
+        curvatures = ((term.curvature(t.values), term.sets) for term in self._potential.energies)
+        return t.inertia, *(values[:, s.own] for values, sets in curvatures for s in sets)
 
     @override
     def ready(self) -> bool:

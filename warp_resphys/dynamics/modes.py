@@ -1,7 +1,5 @@
 """Vibration modes of a body about its rest shape."""
 
-from dataclasses import replace
-
 import numpy as np
 import scipy.linalg
 import scipy.sparse
@@ -10,8 +8,6 @@ import torch
 from numpy.typing import NDArray
 
 from ..io.errors import InputError
-from ..linalg.linear_solver import SparseSolver
-from .assembly import HessianAssembly
 from .simulator import Simulator
 
 FloatArray = NDArray[np.float64]
@@ -49,18 +45,11 @@ def vibration_modes(simulator: Simulator, count: int) -> torch.Tensor:
 
 def _about_rest(simulator: Simulator) -> tuple[scipy.sparse.csc_array, FloatArray, NDArray[np.int64]]:
     """Elastic stiffness (3 F, 3 F) [N/m] and inertia (3 F,) of the F free vertices at rest, and these vertices."""
-    workspace = simulator.workspace(1)
-    p, pattern = workspace.potential, workspace.pattern
     rest = simulator.rest_state()
-    stage = simulator.method.stage(rest, simulator.time_step)
-    elastic = simulator.prepare(replace(simulator.material, stiffness_damping=0.0))
-    p.set_terms(simulator.step_terms(stage, 1, None, elastic, workspace))
-    p.positions.copy_(rest.q)
-    p.update_tangent()
-    solver = SparseSolver(pattern.rows, pattern.cols, len(pattern.free), 3, p.device, p.dtype)
-    (entries,) = solver.mirrored(HessianAssembly(p, solver, pattern)())
-    inertia = np.repeat(p.inertia[0].cpu().numpy()[pattern.free], 3)
-    return (solver.matrix(entries) - scipy.sparse.diags_array(inertia)).tocsc(), inertia, pattern.free
+    elastic = simulator.prepare({"stiffness_damping": 0.0})
+    found = simulator.linearise(rest, parameters=elastic)
+    hessian, inertia = found.matrix(rest.q)
+    return (hessian - scipy.sparse.diags_array(inertia)).tocsc(), inertia, found.free.cpu().numpy()
 
 
 class RestStiffness:

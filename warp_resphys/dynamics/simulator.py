@@ -1,51 +1,61 @@
 """Batched, differentiable simulation of one body."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, cast
 
 import numpy as np
-import scipy.sparse
 import torch
 
-from ..energies.material import MODELS, Material, as_parameter
-from ..energies.pressure import ChamberPressure
-from ..energies.terms import StepTerms
+from ..energies.base import Energy, Quantity
+from ..energies.explicit import HeldEnergy
+from ..energies.materials import Corotated, Material
+from ..energies.potential import StepTerms
+from ..energies.solid import GreenStrain, Solid, device_matrix, spread
 from ..fem.body import Body
 from ..io.errors import InputError
 from .assembly import BlockPattern
-from .equilibrium import Equilibrium, GreenStrain, Workspace
+from .equilibrium import Workspace, equilibrium
+from .inputs import Inputs, check_tensor
 from .integrator import ImplicitStage, State, make_integrator
+from .linearisation import Linearisation
 from .nonlinear_solver import SolveReport, SolverSettings
 
 GRAVITY = (0.0, 0.0, -9.80709)
-PRESSURE_COUPLINGS = ("implicit", "explicit")
+COUPLINGS = ("implicit", "explicit")
+_NOTHING = Inputs()
+_GRAVITY = Quantity("gravity", "m/s^2", per="axis")
+
+Parameters = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class MaterialTensors:
-    """What a material makes of a body: differentiable tensors, computed once a roll-out.
+class Constants:
+    """What parameters make of a body: differentiable tensors, computed once a roll-out.
 
     Attributes:
-        shape_stiffness: (1 or B, P) [J].
-        volume_stiffness: (1 or B, P) [J].
         mass: (1 or B, N) [kg].
-        weight: (1 or B, N, 3) force of gravity [N].
+        load_mass: (1 or B, N) what gravity acts on [kg].
+        gravity: (1 or B, 3) [m/s^2].
         mass_damping: (1 or B, 1) [1/s].
         stiffness_damping: (1 or B,) [s].
         damped: whether stiffness damping acts at all.
-        model: the material's.
-        fibre_stiffness: (1 or B, C) [N/m]; None without fibres.
+        values: what the energies need of them, by name.
     """
 
-    shape_stiffness: torch.Tensor
-    volume_stiffness: torch.Tensor
     mass: torch.Tensor
-    weight: torch.Tensor
+    load_mass: torch.Tensor
+    gravity: torch.Tensor
     mass_damping: torch.Tensor
     stiffness_damping: torch.Tensor
     damped: bool
-    model: str
-    fibre_stiffness: torch.Tensor | None = None
+    values: Mapping[str, torch.Tensor]
+
+    @property
+    def batch(self) -> int:
+        """Environments that they are for; 1 where they are the same for all."""
+        return max(len(t) for t in (self.mass, self.gravity, self.mass_damping, *self.values.values()))
 
     def check_batch(self, batch: int) -> None:
         """Refuses constants of another number of environments.
@@ -53,9 +63,8 @@ class MaterialTensors:
         Raises:
             InputError: some constant has neither one value nor one for each environment.
         """
-        constants = (self.shape_stiffness, self.mass, self.mass_damping, self.stiffness_damping, self.fibre_stiffness)
-        for tensor in constants:
-            if tensor is not None and len(tensor) not in (1, batch):
+        for tensor in (self.mass, self.gravity, self.mass_damping, *self.values.values()):
+            if len(tensor) not in (1, batch):
                 raise InputError(
                     f"a material parameter has values for {len(tensor)} environments, but the state has {batch}."
                 )
@@ -101,7 +110,7 @@ class Simulator:
 
     Args:
         body: what is simulated.
-        material: its constants; every method takes another one by keyword.
+        material: its constants; every method takes other values by name (``parameters``).
         time_step: h [s].
         gravity: acceleration (3,) [m/s^2].
         integrator: ``implicit_euler``, ``bdf2`` or ``midpoint``.
@@ -109,16 +118,23 @@ class Simulator:
         relative_tolerance: shorthand for that field of the settings.
         device: a torch device.
         dtype: ``torch.float64`` or ``torch.float32``.
-        pressure_coupling: ``implicit``, pressure acts on the chambers as they are at the end of a step (in its middle,
-            for ``midpoint``); or ``explicit``, as they are at its start, as published.
+        coupling: of the energies that are loads, such as pressure: ``implicit``, they act on the body as it is at the
+            end of a step (in its middle, for ``midpoint``); or ``explicit``, as it is at its start, as published.
 
     Raises:
         InputError: a time step that is not positive, an unknown integrator, solver or coupling, or a CUDA device that
             is not there.
+
+    Attributes:
+        parameters: quantities that every method takes other values of, by name: the material's constants, those of the
+            body's energies, and ``gravity`` (B, 3).
+        inputs: what acts through the body's energies, by name.
+        counts: how many values an input has, and a parameter may have beside the environments, by name.
+        constants: the values of the parameters.
     """
 
     body: Body
-    material: Material = field(default_factory=Material)
+    material: Material = field(default_factory=Corotated)
     time_step: float = 0.01
     gravity: Sequence[float] = GRAVITY
     integrator: str = "implicit_euler"
@@ -126,7 +142,7 @@ class Simulator:
     relative_tolerance: float | None = None
     device: str | torch.device = "cpu"
     dtype: torch.dtype = torch.float64
-    pressure_coupling: str = "implicit"
+    coupling: str = "implicit"
 
     def __post_init__(self) -> None:
         """Uploads what is constant."""
@@ -134,30 +150,40 @@ class Simulator:
             raise InputError(f"time_step is {self.time_step:g}: it must be positive, in seconds.")
         if self.dtype not in (torch.float64, torch.float32):
             raise InputError(f"dtype is {self.dtype}: choose torch.float64 or torch.float32.")
-        if self.pressure_coupling not in PRESSURE_COUPLINGS:
-            raise InputError(
-                f"pressure_coupling is {self.pressure_coupling!r}: choose one of {', '.join(PRESSURE_COUPLINGS)}."
-            )
+        if self.coupling not in COUPLINGS:
+            raise InputError(f"coupling is {self.coupling!r}: choose one of {', '.join(COUPLINGS)}.")
+        if np.shape(self.gravity) != (3,) or not np.isfinite(self.gravity).all():
+            raise InputError(f"gravity is {self.gravity}: it must be three finite accelerations, in m/s^2.")
         self.device = _device(self.device)
         settings = SolverSettings(name=self.solver) if isinstance(self.solver, str) else self.solver
         if self.relative_tolerance is not None:
             settings = replace(settings, relative_tolerance=self.relative_tolerance)
         self.settings = settings
         self.method = make_integrator(self.integrator)
-        self._pattern = BlockPattern(self.body)
-        if np.shape(self.gravity) != (3,) or not np.isfinite(self.gravity).all():
-            raise InputError(f"gravity is {self.gravity}: it must be three finite accelerations, in m/s^2.")
-        self._gravity = self.tensor(self.gravity)
-        self.rest_positions = self.tensor(self.body.mesh.vertices)  # (N, 3) [m]
-        self.fixed = torch.as_tensor(self.body.fixed_vertices, device=self.device)
-        self._workspaces: dict[tuple[int, str], Workspace] = {}
-        self._chambers: dict[int, ChamberPressure] = {}
-        sets = self.body.discretisation.point_sets
-        self._shape_volume = self._sparse(scipy.sparse.vstack([s.shape_volume for s in sets]))
-        self._volume_volume = self._sparse(scipy.sparse.vstack([s.volume_volume for s in sets]))
-        self._mass_volume = self._sparse(self.body.mass_volume)
-        self._load_volume = self._sparse(self.body.load_volume)
-        self._attached_mass = self.tensor(self.body.attached_mass)
+        body = self.body
+        self.rest_positions = self.tensor(body.mesh.vertices)  # (N, 3) [m]
+        self.fixed = torch.as_tensor(body.fixed_vertices, device=self.device)
+        solid = Solid(body.discretisation, self.material, self.device, self.dtype)
+        self._energies: list[tuple[Energy, Any]] = [(solid, solid.points(body.mesh))]
+        own_energies = cast(Sequence[Energy], body.energies)
+        self._energies += list(zip(own_energies, body.energy_points, strict=True))
+        self._pattern = BlockPattern(
+            body.n_vertices, body.fixed_vertices, [points for _, sets in self._energies for points in sets]
+        )
+        own = [quantity for energy in body.energies for quantity in energy.parameters]
+        self.parameters: dict[str, Quantity] = {**self.material.quantities(), **{each.name: each for each in own}}
+        self.parameters["gravity"] = _GRAVITY
+        self.inputs: dict[str, Quantity] = {each.name: each for energy in body.energies for each in energy.inputs}
+        self.constants: dict[str, Any] = {**self.material.constants, "gravity": [list(self.gravity)]}
+        self.counts = dict.fromkeys(self.material.quantities(), len(body.mesh.cells)) | {"gravity": 3}
+        for energy in own_energies:
+            self.constants |= energy.constants
+            self.counts |= {each.name: energy.count for each in (*energy.parameters, *energy.inputs)}
+        self._workspaces: dict[int, Workspace] = {}
+        self._held: dict[tuple[int, str], HeldEnergy] = {}
+        self._mass_volume = device_matrix(body.mass_volume, self.device, self.dtype)
+        self._load_volume = device_matrix(body.load_volume, self.device, self.dtype)
+        self._attached_mass = self.tensor(body.attached_mass)
         self._built = True
 
     def __setattr__(self, name: str, value: object) -> None:
@@ -174,98 +200,60 @@ class Simulator:
         """Values on the simulator's device, in its type."""
         return torch.as_tensor(values, device=self.device, dtype=self.dtype)
 
-    def _sparse(self, matrix: scipy.sparse.sparray) -> torch.Tensor:
-        coo = matrix.tocoo()
-        indices = torch.as_tensor(np.stack([coo.row, coo.col]).astype(np.int64))
-        tensor = torch.sparse_coo_tensor(indices, torch.as_tensor(coo.data), coo.shape, check_invariants=False)
-        return tensor.to(device=self.device, dtype=self.dtype).coalesce()
-
-    def _spread(self, operator: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
-        """(1 or B, rows): a sparse (rows, M) operator applied to (1 or B, 1 or M) element values."""
-        m = operator.shape[1]
-        if values.shape[1] not in (1, m):
-            raise InputError(
-                f"a material parameter has {values.shape[1]} values for {m} elements: give one value, one an element "
-                f"({m}), or one an environment with shape (B, 1)."
-            )
-        return torch.sparse.mm(operator, values.expand(-1, m).mT).mT
-
-    def prepare(
-        self,
-        material: Material | MaterialTensors | None = None,
-        attached_mass: torch.Tensor | None = None,
-        gravity: torch.Tensor | None = None,
-    ) -> MaterialTensors:
-        """Turns a material into stiffness, mass and weight; pass the result to `step` when stepping one by one.
+    def prepare(self, parameters: Parameters | Constants | None = None) -> Constants:
+        """Turns parameters into stiffness, mass and weight; pass the result to `step` when stepping one by one.
 
         Args:
-            material: another material than the simulator's; what is prepared already is returned as it is.
-            attached_mass: (1 or B, N) in place of the body's, other weights in every environment [kg].
-            gravity: (1 or B, 3) in place of the simulator's [m/s^2].
-        """
-        if isinstance(material, MaterialTensors):
-            return material
-        material = self.material if material is None else material
-        attached = self._attached_mass if attached_mass is None else attached_mass
-        acceleration = self._gravity if gravity is None else gravity[:, None, :]
-        device = torch.device(self.device)
-        mu, lame_lambda = material.lame(device, self.dtype)
-        density = as_parameter(material.density, device, self.dtype)
-        mass = self._spread(self._mass_volume, density) + attached
-        loaded = self._spread(self._load_volume, density) + attached
-        damping = self.tensor(material.stiffness_damping).reshape(-1)
-        damped = bool((damping > 0).any()) or damping.requires_grad
-        return MaterialTensors(
-            shape_stiffness=self._spread(self._shape_volume, mu.broadcast_to(self._common(mu, lame_lambda))),
-            volume_stiffness=self._spread(self._volume_volume, lame_lambda),
-            mass=mass,
-            weight=loaded[..., None] * acceleration,
-            mass_damping=self.tensor(material.mass_damping).reshape(-1, 1),
-            stiffness_damping=damping,
-            damped=damped,
-            model=material.model,
-            fibre_stiffness=self._fibre_stiffness(material),
-        )
-
-    def _fibre_stiffness(self, material: Material) -> torch.Tensor | None:
-        stiffness = as_parameter(material.fibre_stiffness, torch.device(self.device), self.dtype)
-        chambers = len(self.body.chambers)
-        if self.body.fibres is None:
-            if bool((stiffness > 0.0).any()):
-                raise InputError(
-                    "the material has a fibre_stiffness, but the body has no fibres: give it some, or leave that out."
-                )
-            return None
-        if stiffness.shape[1] not in (1, chambers):
-            raise InputError(
-                f"fibre_stiffness has {stiffness.shape[1]} values for {chambers} chambers: give one value, or one for "
-                "each chamber."
-            )
-        return stiffness.expand(-1, chambers)
-
-    @staticmethod
-    def _common(*tensors: torch.Tensor) -> torch.Size:
-        return torch.Size(np.broadcast_shapes(*(t.shape for t in tensors)))
-
-    def workspace(self, batch: int, model: str | None = None) -> Workspace:
-        """Buffers for a batch size and material model, made at their first use."""
-        key = (batch, model or self.material.model)
-        if key not in self._workspaces:
-            self._workspaces[key] = Workspace(
-                self.body, MODELS[key[1]], self._pattern, batch, torch.device(self.device), self.dtype
-            )
-        return self._workspaces[key]
-
-    def chambers(self, batch: int) -> ChamberPressure:
-        """Volumes of the chambers, and the force of pressure in a given state, for a batch size.
+            parameters: values in place of the simulator's own, by a name of ``parameters``: numbers, (M,) tensors with
+                a value for each element (or chamber), (B, 1) with one for each environment, or (B, M). What is prepared
+                already is returned as it is.
 
         Raises:
-            InputError: the body has no chambers.
+            InputError: an unknown name, a value out of range, or another number of values than there are elements.
         """
-        if batch not in self._chambers:
+        if isinstance(parameters, Constants):
+            return parameters
+        for name, value in (parameters or {}).items():
+            if name not in self.parameters:
+                raise InputError(f"{name!r} is no parameter of this simulator: it has {', '.join(self.parameters)}.")
+            self.parameters[name].check(value)
+        given = {**self.constants, **(parameters or {})}
+        tensors = {name: self.parameters[name].shaped(self.tensor(value)) for name, value in given.items()}
+        values = {name: v for energy, _ in self._energies for name, v in energy.prepare(tensors).items()}
+        damping = values.pop("stiffness_damping")
+        density = tensors["density"]
+        return Constants(
+            mass=spread(self._mass_volume, density) + self._attached_mass,
+            load_mass=spread(self._load_volume, density) + self._attached_mass,
+            gravity=tensors["gravity"],
+            mass_damping=tensors["mass_damping"],
+            stiffness_damping=damping,
+            damped=bool((damping > 0).any()) or damping.requires_grad,
+            values=values,
+        )
+
+    def workspace(self, batch: int) -> Workspace:
+        """Buffers for a batch size, made at their first use."""
+        if batch not in self._workspaces:
+            n, fixed = self.body.n_vertices, self.body.fixed_vertices
             device = torch.device(self.device)
-            self._chambers[batch] = ChamberPressure(self.body, batch, device, self.dtype)
-        return self._chambers[batch]
+            self._workspaces[batch] = Workspace(self._energies, n, fixed, self._pattern, batch, device, self.dtype)
+        return self._workspaces[batch]
+
+    def held_energy(self, name: str, batch: int) -> HeldEnergy:
+        """The energy with an input of that name, by itself in a given state.
+
+        Raises:
+            InputError: no energy of the body has that input.
+        """
+        if (batch, name) not in self._held:
+            found = [e for e, _ in self._energies for quantity in e.inputs if quantity.name == name]
+            if not found:
+                known = ", ".join(self.inputs) or "none"
+                raise InputError(f"no energy of the body has the input {name}: they have {known}.")
+            device = torch.device(self.device)
+            self._held[batch, name] = HeldEnergy(self.body, found[0], batch, device, self.dtype)
+        return self._held[batch, name]
 
     def rest_state(self, batch: int = 1) -> State:
         """The undeformed body at rest."""
@@ -273,107 +261,136 @@ class Simulator:
         return State(q, torch.zeros_like(q))
 
     def step(
-        self,
-        state: State,
-        external_force: torch.Tensor | None = None,
-        fixed_positions: torch.Tensor | None = None,
-        material: Material | MaterialTensors | None = None,
-        pressure: torch.Tensor | None = None,
+        self, state: State, inputs: Inputs | None = None, parameters: Parameters | Constants | None = None
     ) -> tuple[State, SolveReport]:
         """Advances a batch by one time step.
 
         Args:
             state: where it is.
-            external_force: (B, N, 3) held during the step, gravity not included [N]; zero where left out.
-            fixed_positions: (B, D, 3) of the fixed vertices at the end of the step, in the order of
-                ``body.fixed_vertices`` [m]; where they are, if left out.
-            material: another material than the simulator's, or one already prepared.
-            pressure: (B, C) gauge pressure in each chamber during the step [Pa]; none where left out.
+            inputs: what acts on it during the step.
+            parameters: values in place of the simulator's own (see `prepare`), or prepared ones.
 
         Returns:
             The new state, differentiable, and the solver's report.
 
         Raises:
             InputError: wrong shapes, or values that are not finite.
-            ConvergenceError: see `solver.SolverSettings.on_failure`.
+            ConvergenceError: see `nonlinear_solver.SolverSettings.on_failure`.
         """
-        tensors = self.prepare(material)
-        self._check(state, external_force, fixed_positions, pressure=pressure)
-        tensors.check_batch(state.batch)
+        inputs = _NOTHING if inputs is None else inputs
+        constants = self.prepare(parameters)
+        self._check(state, inputs, constants)
         stage = self.method.stage(state, self.time_step)
-        if fixed_positions is None:
-            fixed_positions = state.q[:, self.fixed]
-        at_stage = state.q[:, self.fixed] + stage.end * (fixed_positions - state.q[:, self.fixed])
-        workspace = self.workspace(state.batch, tensors.model)
-        external_force, pressure = self.coupled(state, external_force, pressure)
-        terms = self.step_terms(stage, state.batch, external_force, tensors, workspace, pressure)
-        reports: list[SolveReport] = []
+        workspace = self.workspace(state.batch)
+        terms = self._terms(state, stage, inputs, constants)
         solver = workspace.solver("dynamics", self.settings)
-        x = Equilibrium.apply(workspace, solver, reports, stage.target, at_stage, *terms.tensors())
+        x, report = equilibrium(workspace, solver, terms, stage.target, self._fixed_at(state, stage, inputs))
+        return self._finish(state, stage, inputs, x), report
+
+    def _fixed_at(self, state: State, stage: ImplicitStage, inputs: Inputs) -> torch.Tensor:
+        """(B, D, 3) where the fixed vertices are at the stage [m]."""
+        now = state.q[:, self.fixed]
+        return now if inputs.fixed_positions is None else now + stage.end * (inputs.fixed_positions - now)
+
+    def _finish(self, state: State, stage: ImplicitStage, inputs: Inputs, x: torch.Tensor) -> State:
+        """The state that the stage's solution leads to."""
         new = self.method.finish(state, x, self.time_step)
-        if stage.end < 1.0 and len(self.fixed):
-            # A prescribed motion has a velocity of its own; extrapolated from mid-step it would ring.
-            velocity = (fixed_positions - state.q[:, self.fixed]) / self.time_step
-            new = replace(new, v=new.v.index_copy(1, self.fixed, velocity))
-        return new, reports[0]
+        if stage.end == 1.0 or not len(self.fixed):
+            return new
+        # A prescribed motion has a velocity of its own; extrapolated from mid-step it would ring.
+        now = state.q[:, self.fixed]
+        moved = torch.zeros_like(now) if inputs.fixed_positions is None else inputs.fixed_positions - now
+        return replace(new, v=new.v.index_copy(1, self.fixed, moved / self.time_step))
 
-    def coupled(
-        self, state: State, external_force: torch.Tensor | None, pressure: torch.Tensor | None
-    ) -> tuple[torch.Tensor | None, torch.Tensor | None]:
-        """External force (B, N, 3) and pressure (B, C) as they enter a step's potential: see ``pressure_coupling``."""
-        if pressure is None or self.pressure_coupling == "implicit":
-            return external_force, pressure
-        push = self.chambers(state.batch).force(state.q, pressure)
-        return push if external_force is None else external_force + push, None
+    def linearise(
+        self, state: State, inputs: Inputs | None = None, parameters: Parameters | Constants | None = None
+    ) -> Linearisation:
+        """The residual of the step from a state, and its derivative, at any positions.
 
-    def step_terms(
-        self,
-        stage: ImplicitStage,
-        batch: int,
-        external_force: torch.Tensor | None,
-        tensors: MaterialTensors,
-        workspace: Workspace,
-        pressure: torch.Tensor | None = None,
-    ) -> StepTerms:
+        Args:
+            state: where the step starts.
+            inputs: what acts during it.
+            parameters: see `prepare`.
+
+        Raises:
+            InputError: wrong shapes, or values that are not finite.
+        """
+        inputs = _NOTHING if inputs is None else inputs
+        constants = self.prepare(parameters)
+        self._check(state, inputs, constants)
+        stage = self.method.stage(state, self.time_step)
+        return Linearisation(
+            self.workspace(state.batch),
+            self._terms(state, stage, inputs, constants),
+            stage,
+            self._fixed_at(state, stage, inputs),
+            partial(self._finish, state, stage, inputs),
+            self.settings.linear_solver,
+        )
+
+    def _terms(self, state: State, stage: ImplicitStage, inputs: Inputs, constants: Constants) -> StepTerms:
         """The incremental potential of a step, differentiable in everything that it depends on."""
-        h = stage.step
+        batch, h = state.batch, stage.step
+        solid = self.workspace(batch).potential.solid
         # Mass damping is linear in x: it joins inertia and moves the target.
-        damping = tensors.mass_damping[..., None] * h  # (1 or B, 1, 1)
-        force = tensors.weight if external_force is None else tensors.weight + external_force
+        damping = constants.mass_damping[..., None] * h  # (1 or B, 1, 1)
         strain = None
-        if tensors.damped:
-            p = workspace.potential
-            strain = sum(w * GreenStrain.apply(p, q) for q, w in stage.strain_weights)
+        if constants.damped:
+            strain = sum(w * GreenStrain.apply(solid, q) for q, w in stage.strain_weights)
+        mass, force = constants.mass, self._loads(inputs, constants)
+        if inputs.attached_mass is not None:
+            mass = mass + inputs.attached_mass
+        values = self._values(constants, inputs, batch, constants.stiffness_damping / h, strain)
+        if self.coupling == "explicit":
+            for energy, _ in self._energies:
+                for quantity in energy.inputs if energy.is_load else ():
+                    force = force + self.held_energy(quantity.name, batch).force(state.q, values[quantity.name])
+                    values[quantity.name] = torch.zeros_like(values[quantity.name])
         return StepTerms(
             target=(stage.target + damping * stage.velocity_reference) / (1.0 + damping),
-            inertia=(tensors.mass / h**2 * (1.0 + damping[..., 0])).expand(batch, -1),
+            inertia=(mass / h**2 * (1.0 + damping[..., 0])).expand(batch, -1),
             force=force.expand(batch, -1, -1),
-            shape_stiffness=tensors.shape_stiffness,
-            volume_stiffness=tensors.volume_stiffness,
-            viscosity=(tensors.stiffness_damping / h).expand(batch),
-            reference_strain=strain,
-            pressure=pressure,
-            fibre_stiffness=tensors.fibre_stiffness,
+            values=values,
         )
+
+    def _values(
+        self,
+        constants: Constants,
+        inputs: Inputs,
+        batch: int,
+        viscosity: torch.Tensor,
+        strain: torch.Tensor | None,
+    ) -> dict[str, Any]:
+        """What the energies' terms need in a step."""
+        values: dict[str, Any] = {**constants.values, "viscosity": viscosity.expand(batch), "reference_strain": strain}
+        for energy, _ in self._energies:
+            for quantity in energy.inputs:
+                given = inputs.actuation.get(quantity.name)
+                values[quantity.name] = self.rest_positions.new_zeros(batch, energy.count) if given is None else given
+        return values
+
+    def _loads(self, inputs: Inputs, constants: Constants) -> torch.Tensor:
+        """(1 or B, N, 3) gravity and external force [N]."""
+        mass = constants.load_mass
+        if inputs.attached_mass is not None:
+            mass = mass + inputs.attached_mass
+        weight = mass[..., None] * constants.gravity[:, None]
+        return weight if inputs.external_force is None else weight + inputs.external_force
 
     def static_equilibrium(
         self,
-        external_force: torch.Tensor | None = None,
-        fixed_positions: torch.Tensor | None = None,
-        material: Material | MaterialTensors | None = None,
+        inputs: Inputs | None = None,
+        parameters: Parameters | Constants | None = None,
         start: torch.Tensor | None = None,
         batch: int | None = None,
-        pressure: torch.Tensor | None = None,
     ) -> State:
-        """The state of rest under gravity and constant loads, differentiable like a step.
+        """The state of rest under gravity and constant inputs, differentiable like a step.
 
         Args:
-            external_force: (B, N, 3) [N].
-            fixed_positions: (B, D, 3) of the fixed vertices [m].
-            material: another material than the simulator's, or one already prepared.
+            inputs: what acts on the body.
+            parameters: see `prepare`.
             start: (B, N, 3) first guess [m]; the rest shape where left out.
             batch: environments, where no other argument tells.
-            pressure: (B, C) gauge pressure in each chamber [Pa].
 
         Raises:
             InputError: wrong shapes, values that are not finite, or a body without fixed vertices.
@@ -381,43 +398,33 @@ class Simulator:
         """
         if not len(self.fixed):
             raise InputError("a body without fixed vertices has no static equilibrium: fix some vertices.")
-        given = [t for t in (external_force, fixed_positions, start, pressure) if t is not None]
-        tensors = self.prepare(material)
-        batch = batch or max([len(t) for t in given] + [len(tensors.shape_stiffness), len(tensors.weight)])
+        inputs = _NOTHING if inputs is None else inputs
+        constants = self.prepare(parameters)
+        given = [*inputs.fields.values(), *([] if start is None else [start])]
+        batch = batch or max([len(t) for t in given] + [constants.batch])
         state = self.rest_state(batch)
-        self._check(state, external_force, fixed_positions, start, pressure)
-        tensors.check_batch(batch)
-        if fixed_positions is None:
-            fixed_positions = state.q[:, self.fixed]
-        force = tensors.weight if external_force is None else tensors.weight + external_force
-        workspace = self.workspace(batch, tensors.model)
-        settings = replace(self.settings, name="newton", on_failure="raise")
-        x = Equilibrium.apply(
-            workspace,
-            workspace.solver("statics", settings),
-            [],
-            state.q if start is None else start.detach(),
-            fixed_positions,
-            state.q,
-            torch.zeros(batch, self.body.n_vertices, device=self.device, dtype=self.dtype),
-            force.expand(batch, -1, -1),
-            tensors.shape_stiffness,
-            tensors.volume_stiffness,
-            torch.zeros(batch, device=self.device, dtype=self.dtype),
-            None,
-            pressure,
-            tensors.fibre_stiffness,
+        self._check(state, inputs, constants)
+        if start is not None:
+            check_tensor("start", start, tuple(state.q.shape), "m", "vertex", state.q)
+        workspace = self.workspace(batch)
+        nothing = self.rest_positions.new_zeros(batch)
+        terms = StepTerms(
+            target=state.q,
+            inertia=self.rest_positions.new_zeros(batch, self.body.n_vertices),
+            force=self._loads(inputs, constants).expand(batch, -1, -1),
+            values=self._values(constants, inputs, batch, nothing, None),
         )
+        solver = workspace.solver("statics", replace(self.settings, name="newton", on_failure="raise"))
+        at = state.q[:, self.fixed] if inputs.fixed_positions is None else inputs.fixed_positions
+        x, _ = equilibrium(workspace, solver, terms, state.q if start is None else start.detach(), at)
         return State(x, torch.zeros_like(x))
 
     def rollout(
         self,
         state: State,
         steps: int,
-        external_forces: torch.Tensor | None = None,
-        fixed_positions: torch.Tensor | None = None,
-        material: Material | MaterialTensors | None = None,
-        pressures: torch.Tensor | None = None,
+        inputs: Inputs | None = None,
+        parameters: Parameters | Constants | None = None,
     ) -> Trajectory:
         """Steps many times.
 
@@ -427,10 +434,8 @@ class Simulator:
         Args:
             state: the start.
             steps: T.
-            external_forces: (T, B, N, 3) for each step, or (B, N, 3) throughout [N].
-            fixed_positions: (T, B, D, 3) for each step, in the order of ``body.fixed_vertices`` [m].
-            material: another material than the simulator's, or one already prepared.
-            pressures: (T, B, C) gauge pressure in each chamber during each step, or (B, C) throughout [Pa].
+            inputs: what acts during all steps, or, with an axis of time, during each of them.
+            parameters: see `prepare`.
 
         Raises:
             InputError: wrong shapes, or values that are not finite.
@@ -438,61 +443,24 @@ class Simulator:
         """
         if not steps >= 1:
             raise InputError(f"steps is {steps}: it must be at least 1.")
-        series = (("external_forces", external_forces, 4), ("fixed_positions", fixed_positions, 4))
-        for name, values, axes in (*series, ("pressures", pressures, 3)):
-            if values is not None and values.ndim == axes and len(values) != steps:
-                raise InputError(f"{name} has {len(values)} time steps, but {steps} are to be simulated.")
-        tensors = self.prepare(material)
+        inputs = _NOTHING if inputs is None else inputs
+        inputs.check_steps(steps)
+        constants = self.prepare(parameters)
         states, reports = [state], []
         for t in range(steps):
-            force = external_forces
-            if external_forces is not None and external_forces.ndim == 4:
-                force = external_forces[t]
-            moved = None if fixed_positions is None else fixed_positions[t]
-            pressure = pressures
-            if pressures is not None and pressures.ndim == 3:
-                pressure = pressures[t]
-            state, report = self.step(state, force, moved, tensors, pressure)
+            state, report = self.step(state, inputs.at(t), constants)
             states.append(state)
             reports.append(report)
         q, v = (torch.stack([getattr(s, name) for s in states]) for name in ("q", "v"))
         return Trajectory(q, v, reports, state)
 
-    def _check(
-        self,
-        state: State,
-        external_force: torch.Tensor | None,
-        fixed_positions: torch.Tensor | None,
-        start: torch.Tensor | None = None,
-        pressure: torch.Tensor | None = None,
-    ) -> None:
+    def _check(self, state: State, inputs: Inputs, constants: Constants) -> None:
         """One sentence on the first argument that cannot be simulated."""
-        b, n, d, c = state.batch, self.body.n_vertices, len(self.fixed), len(self.body.chambers)
-        wanted = {
-            "state.q": (state.q, (b, n, 3), "m"),
-            "state.v": (state.v, (b, n, 3), "m/s"),
-            "external_force": (external_force, (b, n, 3), "N"),
-            "fixed_positions": (fixed_positions, (b, d, 3), "m"),
-            "start": (start, (b, n, 3), "m"),
-            "pressure": (pressure, (b, c), "Pa"),
-        }
-        for name, (values, shape, unit) in wanted.items():
-            if values is None:
-                continue
-            if name == "pressure" and not c:
-                raise InputError("there is a pressure, but the body has no chambers: name or find its chambers.")
-            if not isinstance(values, torch.Tensor):
-                raise InputError(f"{name} is a {type(values).__name__}: it must be a torch tensor.")
-            if values.device.type != self.rest_positions.device.type or values.dtype != self.dtype:
-                raise InputError(
-                    f"{name} is {values.dtype} on {values.device}: it must be {self.dtype} on {self.device}; "
-                    "Simulator.tensor converts."
-                )
-            if tuple(values.shape) != shape:
-                raise InputError(f"{name} has shape {tuple(values.shape)}: it must be {shape} in {unit}.")
-            if not bool(torch.isfinite(values).all()):
-                where = (~torch.isfinite(values)).nonzero()[0].tolist()
-                place = "chamber" if name == "pressure" else "vertex"
-                raise InputError(
-                    f"{name} is not finite in environment {where[0]}, {place} {where[1]}: check what computes it."
-                )
+        batch, n, like = state.batch, self.body.n_vertices, self.rest_positions
+        fields = {"state.q": state.q, "state.v": state.v}
+        if state.previous is not None:
+            fields |= {f"state.previous[{i}]": each for i, each in enumerate(state.previous)}
+        for name, values in fields.items():
+            check_tensor(name, values, (batch, n, 3), "m/s" if name[-1] in "v1" else "m", "vertex", like)
+        inputs.check([energy for energy, _ in self._energies], batch, n, len(self.fixed), like)
+        constants.check_batch(batch)

@@ -3,8 +3,8 @@
 A recorded roll-out stands between its user's kernels on a tape, and ``tape.backward`` differentiates all of it:
 
     with wp.Tape() as tape:
-        wp.launch(forces, dim=..., inputs=[parameters], outputs=[external_forces])
-        rollout = record_rollout(tape, simulator, q, v, steps=60, external_forces=external_forces)
+        wp.launch(forces, dim=..., inputs=[parameters], outputs=[forces])
+        rollout = record_rollout(tape, simulator, q, v, steps=60, inputs={"external_force": forces})
         wp.launch(loss, dim=..., inputs=[rollout.q], outputs=[value])
     tape.backward(value)
 
@@ -14,19 +14,20 @@ that come back see torch's. What a step keeps for its adjoint is what it keeps f
 
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
-from typing import Any, cast
+from dataclasses import dataclass
+from typing import cast
 
 import torch
 import warp as wp
 
 from ..energies.launcher import SCALARS
 from ..io.errors import InputError
+from .inputs import Inputs
 from .integrator import State
 from .nonlinear_solver import SolveReport
 from .simulator import Simulator
 
-PARAMETERS = ("youngs_modulus", "poissons_ratio", "density", "mass_damping", "stiffness_damping", "fibre_stiffness")
+_VECTOR_INPUTS = ("external_force", "fixed_positions")
 _VECTORS = {torch.float64: wp.vec3d, torch.float32: wp.vec3f}
 
 
@@ -53,10 +54,8 @@ def record_rollout(
     steps: int,
     *,
     previous: tuple[wp.array, wp.array] | None = None,
-    external_forces: wp.array | None = None,
-    fixed_positions: wp.array | None = None,
+    inputs: Mapping[str, wp.array] | None = None,
     parameters: Mapping[str, wp.array] | None = None,
-    pressures: wp.array | None = None,
 ) -> RecordedRollout:
     """Steps many times, and records on a tape how to differentiate that.
 
@@ -71,10 +70,11 @@ def record_rollout(
         v: (B, N) vec3 velocities [m/s].
         steps: T.
         previous: (q, v) one step earlier, where an earlier roll-out by BDF2 goes on: its ``(q[-2], v[-2])``.
-        external_forces: (T, B, N) vec3 for each step, or (B, N) vec3 throughout [N].
-        fixed_positions: (T, B, D) vec3 of the fixed vertices at the end of each step [m].
-        parameters: values in place of the material's, by a name of `PARAMETERS`, shaped as `Material` says.
-        pressures: (T, B, C) gauge pressure in each chamber during each step, or (B, C) throughout [Pa].
+        inputs: what acts on the bodies, by a name of `Inputs`: ``external_force`` (B, N) vec3 [N], ``fixed_positions``
+            (B, D) vec3 [m], ``attached_mass`` (B, N) [kg], and those of the body's energies (B, n), each but the masses
+            with an axis of time, T, in front if it changes.
+        parameters: values in place of the simulator's, by a name of ``simulator.parameters``, shaped as for
+            `Simulator.prepare`.
 
     Raises:
         InputError: an unknown parameter, an array of another type or device than the simulator's, wrong
@@ -86,16 +86,13 @@ def record_rollout(
     if previous is not None:
         back = leaves.vectors("previous q", previous[0]), leaves.vectors("previous v", previous[1])
     state = State(leaves.vectors("q", q), leaves.vectors("v", v), back)
-    forces = None if external_forces is None else leaves.vectors("external_forces", external_forces)
-    fixed = None if fixed_positions is None else leaves.vectors("fixed_positions", fixed_positions)
-    pressed = None if pressures is None else leaves.scalars("pressures", pressures)
-    values: dict[str, Any] = {}
-    for name, array in (parameters or {}).items():
-        if name not in PARAMETERS:
-            raise InputError(f"{name!r} is no parameter of a material: choose from {', '.join(PARAMETERS)}.")
-        values[name] = leaves.scalars(name, array)
+    acting = {
+        name: (leaves.vectors if name in _VECTOR_INPUTS else leaves.scalars)(name, array)
+        for name, array in (inputs or {}).items()
+    }
+    values = {name: leaves.scalars(name, array) for name, array in (parameters or {}).items()}
     with leaves.stream(), torch.enable_grad():
-        trajectory = simulator.rollout(state, steps, forces, fixed, replace(simulator.material, **values), pressed)
+        trajectory = simulator.rollout(state, steps, Inputs(**acting), values)
     results = [trajectory.q, trajectory.v]
     arrays = [leaves.result(tensor) for tensor in results]
     if leaves.pairs:

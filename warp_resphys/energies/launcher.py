@@ -7,7 +7,7 @@ import torch
 import warp as wp
 from numpy.typing import NDArray
 
-from ..kernels.matrices import matrix_functions
+from ..kernels.points import point_kernels
 
 SCALARS: dict[torch.dtype, Any] = {torch.float64: wp.float64, torch.float32: wp.float32}
 
@@ -27,13 +27,14 @@ class Launcher:
 
     Attributes:
         scalar: Warp's number type; ``vec3`` and ``mat33`` are its vectors and matrices.
+        points: the kernels of `kernels.points`.
     """
 
     def __init__(self, batch: int, device: torch.device, dtype: torch.dtype) -> None:
         self.batch, self.device, self.dtype = batch, device, dtype
         self.scalar = SCALARS[dtype]
-        functions = matrix_functions(self.scalar)
-        self.vec3, self.mat33 = functions.vec3, functions.mat33
+        self.points = point_kernels(self.scalar)
+        self.vec3, self.mat33 = self.points.vec3, self.points.mat33
         self._stream: tuple[torch.cuda.Stream, Any] | None = None
 
     def zeros(self, *shape: int) -> torch.Tensor:
@@ -51,6 +52,16 @@ class Launcher:
     def record(self, kernel: Any, dim: tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> Any:
         """A launch to be made by `launch`, as often as needed."""
         return wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=str(self.device), record_cmd=True)
+
+    def gather(self, s: Any, stress: Any, out: torch.Tensor) -> Any:
+        """A launch that adds the transposed operator of a set's stress, a view (B, P) mat33, to (B, N, 3)."""
+        inputs = [s.nodes, s.gradients, s.points_per_cell, s.start, s.incident, stress]
+        return self.record(self.points.gather, (self.batch, out.shape[1]), inputs, [warp_view(out, self.vec3)])
+
+    def product(self, s: Any, tangent: Any, direction: Any, stress: Any) -> Any:
+        """A launch of a set's stress (B, P) from its tangent (B, P, 6) mat33 and a direction (B, N) vec3, all views."""
+        inputs = [s.nodes, s.gradients, s.points_per_cell, tangent, direction]
+        return self.record(self.points.tangent_product, (self.batch, s.n_points), inputs, [stress])
 
     def launch(self, *commands: Any) -> None:
         """Makes recorded launches, on torch's stream."""

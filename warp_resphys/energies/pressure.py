@@ -1,130 +1,106 @@
-"""Chambers in a given state: their volumes, and the force of a pressure that is held while the body moves on.
+"""Follower pressure in closed chambers.
 
-The implicit coupling of pressure is part of the incremental potential; this is the explicit one, and a gauge.
+A point of a chamber's surface has an operator g_a for each node of its face that holds the shape function and its two
+reference gradients, so that F = sum_a x_a g_a^T has the columns x, t1 and t2, the place and the tangents of the
+deformed face. The enclosed volume is the sum of -w/3 x . (t1 x t2) = -w/3 det F, as the faces look into the chamber,
+and the potential of a gauge pressure p is -p V (Bonet and Wood 2008, section 8.5.2).
 """
 
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
+import numpy as np
 import torch
-import warp as wp
 from typing_extensions import override
 
-from ..fem.body import Body
+from ..fem.surface_elements import SurfacePoints, face_rule, owners
 from ..io.errors import InputError
-from ..kernels.elasticity import elasticity_kernels
-from ..kernels.surface import surface_kernels
-from ..kernels.tangent import tangent_kernels
+from ..kernels.pressure import pressure_kernels
+from ..mesh.chambers import Chamber, check_chambers
+from ..mesh.mesh import Mesh
+from .base import Energy, PartTerm, PointSet, Quantity, Values
 from .launcher import Launcher, warp_view
-from .terms import Pressure
 
 
-class ChamberPressure(Launcher):
-    """Volumes and forces of a body's chambers, differentiable.
+@dataclass(frozen=True)
+class Pressure(Energy):
+    """-p V of every chamber; its input ``pressure`` has a gauge pressure [Pa] for each.
 
-    Args:
-        body: with chambers.
-        batch: environments B.
-        device: of every tensor.
-        dtype: of every tensor.
+    Attributes:
+        chambers: closed surfaces (`mesh.chambers.find_chambers`).
 
     Raises:
-        InputError: the body has no chambers.
+        InputError: no chamber.
     """
 
-    def __init__(self, body: Body, batch: int, device: torch.device, dtype: torch.dtype) -> None:
-        super().__init__(batch, device, dtype)
-        if body.pressure_points is None:
-            raise InputError("the body has no chambers: find them with chambers.find_chambers, or name their surfaces.")
-        self._n_vertices = body.n_vertices
-        self._points = Pressure(self, body.pressure_points, body.n_vertices, slice(0, body.pressure_points.n_points))
+    inputs: ClassVar[tuple[Quantity, ...]] = (Quantity("pressure", "Pa", per="chamber", typical=1e4),)
+    is_load: ClassVar[bool] = True
 
-    def volumes(self, positions: torch.Tensor) -> torch.Tensor:
-        """(B, C) enclosed volumes [m^3] at positions (B, N, 3) [m]."""
-        volumes: torch.Tensor = _Volumes.apply(self, positions)
-        return volumes
+    chambers: Sequence[Chamber]
 
-    def force(self, positions: torch.Tensor, pressure: torch.Tensor) -> torch.Tensor:
-        """(B, N, 3) force p dV/dx [N] of gauge pressures (B, C) [Pa] at positions (B, N, 3) [m]."""
-        force: torch.Tensor = _Force.apply(self, positions, pressure)
-        return force
+    def __post_init__(self) -> None:
+        """Checks that there is a chamber."""
+        if not self.chambers:
+            raise InputError("pressure acts in chambers, but there are none: find them with find_chambers.")
 
-    def _view(self, field: torch.Tensor) -> Any:
-        return warp_view(field.contiguous(), self.vec3)
+    @property
+    @override
+    def count(self) -> int:
+        return len(self.chambers)
 
-    def enclosed(self, positions: torch.Tensor) -> torch.Tensor:
-        """As `volumes`, without a gradient."""
-        s, out = self._points, self.zeros(self._points.n_points)
-        inputs = [s.nodes, s.gradients, s.weights, s.points_per_cell, self._view(positions)]
-        kernel = surface_kernels(self.scalar).volume
-        self.launch(self.record(kernel, (self.batch, s.n_points), inputs, [warp_view(out, self.scalar)]))
-        return s.by_chamber(out)
+    @override
+    def points(self, mesh: Mesh) -> tuple[SurfacePoints, ...]:
+        """The points at which the volume of the chambers is integrated, exactly.
 
-    def push(self, positions: torch.Tensor, pressure: torch.Tensor) -> torch.Tensor:
-        """As `force`, without a gradient."""
-        s = self._points
-        stress, energy = self.zeros(s.n_points, 3, 3), self.zeros(s.n_points)
-        inputs = s.arguments(pressure.contiguous(), self._view(positions))
-        outputs = [warp_view(stress, self.mat33), warp_view(energy, self.scalar)]
-        step = self.record(surface_kernels(self.scalar).pressure_step, (self.batch, s.n_points), inputs, outputs)
-        return self._gathered(stress, step)
-
-    def push_adjoint(
-        self, positions: torch.Tensor, pressure: torch.Tensor, adjoint: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Transposed derivatives of `push` by positions and pressure, applied to (B, N, 3): (B, N, 3) and (B, C)."""
-        s, dim = self._points, (self.batch, self._points.n_points)
-        blocks, stress = self.zeros(s.n_points, 6, 3, 3), self.zeros(s.n_points, 3, 3)
-        all_of_it = torch.zeros(self.batch, device=self.device, dtype=torch.int32)
-        inputs = [*s.arguments(pressure.contiguous(), self._view(positions)), warp_view(all_of_it, wp.int32)]
-        tangent = warp_view(blocks, self.mat33)
-        product = [s.nodes, s.gradients, s.points_per_cell, tangent, self._view(adjoint)]
-        # The second derivative of p V is symmetric: it is its own transpose.
-        by_positions = self._gathered(
-            stress,
-            self.record(surface_kernels(self.scalar).pressure_tangent, dim, inputs, [tangent]),
-            self.record(tangent_kernels(self.scalar).tangent_product, dim, product, [warp_view(stress, self.mat33)]),
+        Raises:
+            MeshError: an open chamber.
+        """
+        check_chambers(self.chambers, mesh)
+        shape, (points, weights) = face_rule(self.chambers, 4)
+        values, gradients = shape(points)
+        nodes = np.concatenate([chamber.faces for chamber in self.chambers])
+        operator = np.concatenate([values[..., None], gradients], axis=2)  # (Q, K, 3)
+        count = len(nodes)
+        return (
+            SurfacePoints(
+                nodes,
+                np.broadcast_to(operator, (count, *operator.shape)).copy(),
+                np.tile(weights / 3.0, count),
+                owners(self.chambers, len(weights)),
+            ),
         )
-        return by_positions, s.parameter_adjoint(positions.contiguous(), adjoint)
-
-    def _gathered(self, stress: torch.Tensor, *commands: Any) -> torch.Tensor:
-        """(B, N, 3) forces of the stress that commands leave."""
-        s, out = self._points, self.zeros(self._n_vertices, 3)
-        inputs = [s.nodes, s.gradients, s.points_per_cell, s.start, s.incident, warp_view(stress, self.mat33)]
-        kernel, dim = elasticity_kernels(self.scalar).gather, (self.batch, self._n_vertices)
-        self.launch(*commands, self.record(kernel, dim, inputs, [warp_view(out, self.vec3)]))
-        return out.neg_()
-
-
-class _Volumes(torch.autograd.Function):
-    """V(x). A loss with the derivatives w by V has the gradient w dV/dx, the force of pressures w."""
 
     @override
-    @staticmethod
-    def forward(ctx: Any, chambers: ChamberPressure, positions: torch.Tensor) -> torch.Tensor:
-        ctx.chambers = chambers
-        ctx.save_for_backward(positions)
-        return chambers.enclosed(positions.detach())
+    def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "PressureTerm":
+        (s,) = sets
+        assert isinstance(s.source, SurfacePoints)
+        return PressureTerm(launcher, sets, "pressure", s.source.chamber, s.source.weights, self.count)
+
+
+class PressureTerm(PartTerm):
+    """Kernels of pressure."""
 
     @override
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[None, torch.Tensor]:
-        (positions,) = ctx.saved_tensors
-        return None, ctx.chambers.push(positions, gradient)
+    def step(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
+        return pressure_kernels(self.launcher.scalar).local_step, self._arguments(s, values, positions)
 
-
-class _Force(torch.autograd.Function):
-    """p dV/dx."""
-
-    @override
-    @staticmethod
-    def forward(ctx: Any, chambers: ChamberPressure, positions: torch.Tensor, pressure: torch.Tensor) -> torch.Tensor:
-        ctx.chambers = chambers
-        ctx.save_for_backward(positions, pressure)
-        return chambers.push(positions.detach(), pressure.detach())
+    def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
+        pressure = values["pressure"]
+        assert pressure is not None
+        surface = [s.nodes, s.gradients, self.weights, self.part]
+        return [*surface, warp_view(pressure, self.launcher.scalar), s.points_per_cell, positions]
 
     @override
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[None, torch.Tensor, torch.Tensor]:
-        return None, *ctx.chambers.push_adjoint(*ctx.saved_tensors, gradient)
+    def tangent(self, s: PointSet, values: Values, positions: Any, positive: Any) -> tuple[Any, list[Any]]:
+        inputs = [*self._arguments(s, values, positions), positive]
+        return pressure_kernels(self.launcher.scalar).tangent, inputs
+
+    @override
+    def curvature(self, values: Values) -> torch.Tensor:
+        return torch.zeros_like(self.weight)[None]
+
+    @override
+    def slope(self, s: PointSet, positions: Any, direction: Any) -> tuple[Any, list[Any]]:
+        inputs = [s.nodes, s.gradients, self.weights, s.points_per_cell, positions, direction]
+        return pressure_kernels(self.launcher.scalar).adjoint, inputs

@@ -1,6 +1,6 @@
 """Builds meshes, bodies, materials and simulators from configurations."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from typing import Any
 
@@ -8,9 +8,11 @@ import torch
 
 from ..dynamics.nonlinear_solver import SolverSettings
 from ..dynamics.simulator import Simulator
-from ..energies.material import Material
+from ..energies.base import Energy
+from ..energies.fibres import Fibres
+from ..energies.materials import Material, make_material
+from ..energies.pressure import Pressure
 from ..fem.body import Body, PointMass
-from ..fem.surface_elements import Fibres
 from ..io.errors import InputError
 from ..mesh.arm import mesh_arm
 from ..mesh.arm_geometry import arm_geometry
@@ -100,14 +102,42 @@ def build_chambers(config: Mapping[str, Any] | None, mesh: Mesh) -> tuple[Chambe
     return found
 
 
+def build_energies(config: Mapping[str, Any], mesh: Mesh) -> tuple[Energy, ...]:
+    """What acts in or on a body beside its material, from the groups that it has: ``chambers`` and ``fibres``."""
+    fibres, chambers = config.get("fibres"), build_chambers(config.get("chambers"), mesh)
+    if fibres is not None and not chambers:
+        raise InputError("fibres are wound around chambers, but there is no group chambers: leave the fibres out.")
+    energies: list[Energy] = [Pressure(chambers)] if chambers else []
+    if fibres is not None:
+        energies.append(Fibres(chambers, axis=config["chambers"]["axis"], **fibres))
+    return tuple(energies)
+
+
+def chambers_of(body: Body) -> Sequence[Chamber]:
+    """The chambers that pressure acts in; none without any."""
+    return [chamber for energy in body.energies if isinstance(energy, Pressure) for chamber in energy.chambers]
+
+
+def build_material(config: Mapping[str, Any], key: str) -> Material:
+    """The material of a group.
+
+    Raises:
+        InputError: an unknown constant, or one out of range.
+    """
+    if "fibre_stiffness" in config[key]:
+        raise InputError(f"{key}.fibre_stiffness is now stiffness, in the group fibres of the same body.")
+    try:
+        return make_material(**config[key])
+    except InputError as error:
+        raise InputError(f"{key}: {error}") from error
+
+
 def build_body(config: Mapping[str, Any], point_masses: tuple[PointMass, ...] = ()) -> Body:
     """A body from the groups ``mesh``, ``physics``, ``fixed``, and, where it has any, ``chambers`` and ``fibres``."""
     mesh = build_mesh(config["mesh"])
-    fibres, chambers = config.get("fibres"), config.get("chambers")
     return Body(
         mesh,
-        chambers=build_chambers(chambers, mesh),
-        fibres=None if fibres is None else Fibres(**fibres, axis=None if chambers is None else chambers["axis"]),
+        energies=build_energies(config, mesh),
         fixed=select_vertices(mesh, **config["fixed"]),
         mass=config["physics"]["mass"],
         volume_integration=config["physics"]["volume_integration"],
@@ -134,10 +164,7 @@ def build_simulator(
     """
     if config["dtype"] not in _DTYPES:
         raise InputError(f"dtype is {config['dtype']!r}: choose float64 or float32.")
-    try:
-        constants = Material(**config[material])
-    except InputError as error:
-        raise InputError(f"{material}: {error}") from error
+    constants = build_material(config, material)
     settings = dict(config["solver"])
     if on_failure is not None:
         settings["on_failure"] = on_failure
@@ -151,5 +178,5 @@ def build_simulator(
         solver=SolverSettings(**settings),
         device=choose_device(device),
         dtype=_DTYPES[config["dtype"]],
-        pressure_coupling=config.get("pressure_coupling", "implicit"),
+        coupling=config.get("coupling", "implicit"),
     )

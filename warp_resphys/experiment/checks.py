@@ -8,7 +8,6 @@ from fnmatch import fnmatchcase
 from typing import Any
 
 from ..dynamics.nonlinear_solver import SolverSettings
-from ..energies.material import Material
 from ..io.errors import InputError
 from ..learning.networks import check_network
 from ..learning.reconstruction import make_reconstructor
@@ -17,7 +16,7 @@ from ..learning.sparse_reconstruction import make_sparse_reconstructor
 from ..learning.training import check_trainer
 from ..mesh.mesh import select_vertices
 from .actuated.checks import PRESSURE, check_driven
-from .build import build_simulator
+from .build import build_material, build_simulator
 from .kinds import dotted, is_list, is_number, is_whole_number, is_word
 from .measured.checks import RECORDINGS, check_measured
 from .trajectories import MODELS, training_settings, variation_of
@@ -110,8 +109,6 @@ _OPTIONAL = (
 )
 # Groups that are handed on as keyword arguments.
 _TAKEN_BY: Mapping[str, Callable[..., Any]] = {
-    "simulation": Material,
-    "reality": Material,
     "solver": SolverSettings,
     "reconstruction": make_reconstructor,
     "fixed": select_vertices,
@@ -157,6 +154,9 @@ def check_configuration(config: Mapping[str, Any]) -> None:
         for name in config[key]:
             if name not in known:
                 raise InputError(f"unknown key '{key}.{name}': {key} has {', '.join(known)}.")
+    for key in ("simulation", "reality"):
+        if key in config:
+            build_material(config, key)
     own = config["simfree"]
     if own.keys() != {"network", "trainer"} or not all(isinstance(each, Mapping) for each in own.values()):
         raise InputError(f"simfree is {own!r}: it must be a group of the groups network and trainer.")

@@ -15,9 +15,10 @@ from ..io.progress import Progress
 from ..io.resumable import Field, ResumableHDF5
 from ..io.stages import StageContext
 from ..learning.metrics import summarise, summarise_each, trajectory_errors
-from ..learning.rollout import DataDrivenRollout, HybridRollout, Rollout
+from ..learning.predictors import LearnedPredictor
+from ..learning.rollout import Rollout
 from .build import build_simulator
-from .train import force_predictor, load_model, load_simfree, state_predictor
+from .train import load_model, load_simfree
 from .trajectories import (
     ERRORS,
     RECONSTRUCTION,
@@ -84,13 +85,14 @@ def _roll_out(context: StageContext, q: NDArray[np.float64], v: NDArray[np.float
 
 def model_rollouts(context: StageContext, simulator: Simulator) -> dict[str, Callable[[torch.Tensor | None], Rollout]]:
     """For each model, what makes its roll-out from the environments that are lost already."""
-    force = force_predictor(load_model(context.run_dir / context.settings["force"]))
-    following = state_predictor(load_simfree(context.run_dir / SIMFREE))
-    return {
-        "simulation": partial(HybridRollout, simulator, None),
-        "resphys": partial(HybridRollout, simulator, force),
-        "simfree": partial(DataDrivenRollout, simulator, following),
-    }
+    force = LearnedPredictor(load_model(context.run_dir / context.settings["force"]))
+    following = LearnedPredictor(load_simfree(context.run_dir / SIMFREE))
+    predictors = {"simulation": None, "resphys": force, "simfree": following}
+    return {name: partial(_rollout, simulator, predict) for name, predict in predictors.items()}
+
+
+def _rollout(simulator: Simulator, predict: LearnedPredictor | None, lost: torch.Tensor | None) -> Rollout:
+    return Rollout(simulator, predict, lost=lost)
 
 
 class _Run:

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..dynamics.inputs import Inputs
 from ..dynamics.integrator import State
 from ..dynamics.simulator import Simulator
 from ..io.errors import InputError
@@ -41,14 +42,14 @@ def generate(context: StageContext) -> None:
         Progress("generate", frames, "frames", file.done) as progress,
     ):
         state: State | None = None
-        tensors = simulator.prepare()
+        constants = simulator.prepare()
         while file.done < file.steps:
             if state is None and file.done > 0:
                 state = last_state(file, simulator.rest_positions)
             if state is None:
                 state = initial_state(simulator, data, values)
             else:
-                state, _ = simulator.step(state, material=tensors)
+                state, _ = simulator.step(state, parameters=constants)
             file.append(q=state.q.cpu().numpy(), v=state.v.cpu().numpy())
             progress.advance()
         file.finish({"time_step": settings["time_step"], "names": list(split.names)})
@@ -89,4 +90,4 @@ def held_state(simulator: Simulator, load: Mapping[str, float], weights: NDArray
     force = simulator.rest_positions.new_zeros(len(shares), simulator.body.n_vertices, 3)
     force[:, face] = shares
     log.info("generate: finding the equilibrium under %d weights", len(shares))
-    return simulator.static_equilibrium(force)
+    return simulator.static_equilibrium(Inputs(force))

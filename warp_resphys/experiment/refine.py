@@ -4,10 +4,11 @@ import logging
 
 from ..dynamics.simulator import Simulator
 from ..io.stages import StageContext
+from ..learning.predictors import LearnedPredictor
 from ..learning.refinement import Motion, SolverInTheLoop, WindowLoss
-from ..learning.rollout import HybridRollout
+from ..learning.rollout import Rollout
 from .build import build_simulator, choose_device
-from .train import Validation, fit, force_predictor, load_model
+from .train import Validation, fit, load_model
 from .trajectories import MODEL, REFINED, REFINEMENT, TRAJECTORIES, read_fields, split_of
 
 log = logging.getLogger(__name__)
@@ -22,7 +23,6 @@ def refine(context: StageContext) -> None:
     q, v = map(simulator.tensor, read_fields(context.run_dir / TRAJECTORIES, "trajectories", "q", "v"))
     motions = {name: Motion(q[part], v[part]) for name in ("train", "validation") for part in [split.indices(name)]}
     model = load_model(context.run_dir / MODEL).to(choose_device(settings["device"]))
-    predict = force_predictor(model)
 
     def make_simulator() -> Simulator:
         return build_simulator(settings, "simulation", simulator.body, on_failure="count")
@@ -30,10 +30,10 @@ def refine(context: StageContext) -> None:
     config = settings["refinement"]
     trainer = SolverInTheLoop(
         model,
-        WindowLoss(predict, make_simulator, config["window"], config["batch_size"]),
+        WindowLoss(model, make_simulator, config["window"], config["batch_size"]),
         motions["train"],
         motions["validation"],
-        lambda _: validation.error_mm(HybridRollout(simulator, predict)),
+        lambda _: validation.error_mm(Rollout(simulator, LearnedPredictor(model))),
         config,
     )
     fit(context, trainer, REFINED, REFINEMENT, "residual force")

@@ -10,9 +10,10 @@ from ..dynamics.integrator import State
 from ..io.files import write_json
 from ..io.progress import Progress
 from ..io.stages import StageContext
-from ..learning.rollout import HybridRollout, closed_loop
+from ..learning.predictors import LearnedPredictor
+from ..learning.rollout import Rollout, closed_loop
 from .build import build_simulator
-from .train import force_predictor, load_model
+from .train import load_model
 from .trajectories import TIMES, TRAJECTORIES, read_fields, split_of
 
 
@@ -29,7 +30,7 @@ def time_models(context: StageContext) -> None:
     steps = q.shape[1] - 1
     simulator = build_simulator(settings, on_failure="count")
     true = build_simulator(settings, "reality", on_failure="count")
-    predict = force_predictor(load_model(context.run_dir / settings["force"]))
+    predict = LearnedPredictor(load_model(context.run_dir / settings["force"]))
     starts = [
         State(simulator.tensor(a[None, 0]), simulator.tensor(b[None, 0])) for a, b in zip(q[part], v[part], strict=True)
     ]
@@ -37,12 +38,12 @@ def time_models(context: StageContext) -> None:
     def inference(start: State) -> None:
         with torch.no_grad():
             for _ in range(steps):
-                predict(start.q, start.v)
+                predict(start, 0)
 
     rows: dict[str, Callable[[State], object]] = {
-        "simulation": lambda start: closed_loop(HybridRollout(simulator, None), start, steps),
-        "true_parameters": lambda start: closed_loop(HybridRollout(true, None), start, steps),
-        "resphys": lambda start: closed_loop(HybridRollout(simulator, predict), start, steps),
+        "simulation": lambda start: closed_loop(Rollout(simulator), start, steps),
+        "true_parameters": lambda start: closed_loop(Rollout(true), start, steps),
+        "resphys": lambda start: closed_loop(Rollout(simulator, predict), start, steps),
         "inference": inference,
     }
     times: dict[str, dict[str, float]] = {}

@@ -17,14 +17,8 @@ from ..io.resumable import resume_checkpoint
 from ..io.stages import StageContext
 from ..learning.metrics import summarise, trajectory_errors
 from ..learning.networks import Model, NextState, ResidualForce, build_model, build_next_state, restore
-from ..learning.rollout import (
-    DataDrivenRollout,
-    ForcePredictor,
-    HybridRollout,
-    Rollout,
-    StatePredictor,
-    closed_loop,
-)
+from ..learning.predictors import LearnedPredictor
+from ..learning.rollout import Rollout, closed_loop
 from ..learning.training import EpochTrainer, Samples, Trainer
 from .build import build_simulator, choose_device
 from .trajectories import (
@@ -87,7 +81,7 @@ def residual_force_learning(context: StageContext) -> Learning[ResidualForce]:
     pick = samples["train"]
 
     def error(candidate: ResidualForce) -> float:
-        return validation.error_mm(HybridRollout(validation.simulator, force_predictor(candidate)))
+        return validation.error_mm(Rollout(validation.simulator, LearnedPredictor(candidate)))
 
     return Learning(samples, lambda network: build_model(network, rest, pick.q, pick.v, pick.outputs[0]), error)
 
@@ -103,7 +97,7 @@ def next_state_learning(context: StageContext) -> Learning[NextState]:
     pick = samples["train"]
 
     def error(candidate: NextState) -> float:
-        return validation.error_mm(DataDrivenRollout(validation.simulator, state_predictor(candidate)))
+        return validation.error_mm(Rollout(validation.simulator, LearnedPredictor(candidate)))
 
     return Learning(samples, lambda network: build_next_state(network, rest, pick.q, pick.v), error)
 
@@ -245,27 +239,6 @@ class Validation:
         pairs = zip(positions, self._target, strict=True)
         mean = summarise([trajectory_errors(q, target) for q, target in pairs])["mean"]
         return float("inf") if mean is None else mean
-
-
-def force_predictor(model: ResidualForce) -> ForcePredictor:
-    """The model as a function on the simulator's device, wherever its weights are."""
-    device, dtype = model.rest.device, model.rest.dtype
-
-    def predict(q: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
-        return model(q.to(device, dtype), v.to(device, dtype)).to(q.device, q.dtype)
-
-    return predict
-
-
-def state_predictor(model: NextState) -> StatePredictor:
-    """The model as a function on the simulator's device, wherever its weights are."""
-    device, dtype = model.rest.device, model.rest.dtype
-
-    def predict(q: torch.Tensor, v: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        positions, velocities = model(q.to(device, dtype), v.to(device, dtype))
-        return positions.to(q.device, q.dtype), velocities.to(q.device, q.dtype)
-
-    return predict
 
 
 def load_model(path: Path) -> ResidualForce:

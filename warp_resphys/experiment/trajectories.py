@@ -19,7 +19,7 @@ T = TypeVar("T")
 SPLITS = ("train", "validation", "test")
 STAGES = ("generate", "reconstruct", "train", "refine", "train_simfree", "evaluate", "time", "report")
 
-_OF_CHAMBERS = ("chambers", "fibres", "pressure_coupling")
+_OF_CHAMBERS = ("chambers", "fibres", "coupling")
 
 MODELS = ("resphys", "simfree")  # that are trained
 _SIMULATED = ("mesh", "physics", "fixed", "gravity", "time_step", "integrator", "solver", "device", "dtype")

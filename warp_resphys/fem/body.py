@@ -3,18 +3,32 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any, Protocol
 
 import numpy as np
 import scipy.sparse
 from numpy.typing import ArrayLike, NDArray
 
 from ..io.errors import InputError
-from ..mesh.chambers import Chamber, check_chambers
 from ..mesh.mesh import Mesh
 from .elements import Discretisation, Points, discretise
-from .surface_elements import Fibres, SurfacePoints, fibre_points, pressure_points
 
 MASS_MODES = ("row_sum", "per_vertex")
+
+
+class OnBody(Protocol):
+    """What a body needs to know of an energy (`energies.base.Energy`)."""
+
+    @property
+    def parameters(self) -> Sequence[Any]:
+        """Its constants."""
+
+    @property
+    def inputs(self) -> Sequence[Any]:
+        """What acts through it."""
+
+    def points(self, mesh: Mesh) -> tuple[Points, ...]:
+        """Its sets of points on a body's rest shape."""
 
 
 def _vertex_indices(values: ArrayLike, n_vertices: int, what: str) -> NDArray[np.int64]:
@@ -78,8 +92,8 @@ class Body:
             published beam and serves for comparison with the published code alone.
         volume_integration: ``centre`` or ``full`` (see `elements.discretise`).
         point_masses: attached weights.
-        chambers: closed surfaces under pressure (`chambers.find_chambers`).
-        fibres: thread around the chambers, or None; how stiff it is says the material.
+        energies: what acts in or on the body beside its material: pressure, fibres (`energies.base.Energy`).
+        energy_points: the sets of points of each of them.
     """
 
     mesh: Mesh
@@ -87,15 +101,16 @@ class Body:
     mass: str = "row_sum"
     volume_integration: str = "centre"
     point_masses: Sequence[PointMass] = field(default=())
-    chambers: Sequence[Chamber] = field(default=())
-    fibres: Fibres | None = None
+    energies: Sequence[OnBody] = field(default=())
+    energy_points: tuple[tuple[Points, ...], ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Checks the fixed vertices, the mass mode and the chambers.
+        """Checks the fixed vertices, the mass mode and the energies.
 
         Raises:
-            InputError: an unknown mass mode, fixed vertices that the mesh does not have, or fibres without chambers.
-            MeshError: an open chamber.
+            InputError: an unknown mass mode, fixed vertices that the mesh does not have, or two energies that depend on
+                a quantity of the same name.
+            MeshError: a mesh that an energy does not fit, such as an open chamber.
         """
         if self.mass not in MASS_MODES:
             raise InputError(f"mass is {self.mass!r}: choose one of {', '.join(MASS_MODES)}.")
@@ -103,9 +118,11 @@ class Body:
         if len(fixed) == self.n_vertices:
             raise InputError("every vertex is fixed: leave some free to move.")
         object.__setattr__(self, "fixed", fixed)
-        if self.fibres is not None and not self.chambers:
-            raise InputError("fibres are wound around chambers, but the body has none: leave the fibres out.")
-        check_chambers(self.chambers, self.mesh)
+        names = [quantity.name for each in self.energies for quantity in (*each.parameters, *each.inputs)]
+        twice = [name for name in names if names.count(name) > 1]
+        if twice:
+            raise InputError(f"two energies of the body depend on {twice[0]}: put them into one.")
+        object.__setattr__(self, "energy_points", tuple(each.points(self.mesh) for each in self.energies))
 
     @property
     def n_vertices(self) -> int:
@@ -121,22 +138,6 @@ class Body:
     def discretisation(self) -> Discretisation:
         """Integration points and volumes."""
         return discretise(self.mesh, self.volume_integration)
-
-    @cached_property
-    def pressure_points(self) -> SurfacePoints | None:
-        """Points of the chambers' surfaces, on which pressure acts; None without chambers."""
-        return pressure_points(self.chambers) if self.chambers else None
-
-    @cached_property
-    def fibre_points(self) -> SurfacePoints | None:
-        """Points of the fibres; None without fibres."""
-        return None if self.fibres is None else fibre_points(self.mesh, self.chambers, self.fibres)
-
-    @property
-    def point_sets(self) -> tuple[Points, ...]:
-        """Every set of points that carries energy: the solid's, then pressure's and the fibres'."""
-        surface = (self.pressure_points, self.fibre_points)
-        return (*self.discretisation.point_sets, *(points for points in surface if points is not None))
 
     @cached_property
     def mass_volume(self) -> scipy.sparse.csr_array:

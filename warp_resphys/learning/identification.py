@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..io.errors import ConvergenceError, InputError
 from ..linalg.least_squares import minimise
-from .replay import Release, Replay
+from .replay import Replay, Start
 
 Report = Callable[[int, float, Mapping[str, float]], None]
 Attempt = dict[str, Any]
@@ -114,21 +114,21 @@ class Identifier:
     """
 
     def __init__(
-        self, replay: Replay, release: Release, bounds: Mapping[str, Bounds], seconds: float | None = None
+        self, replay: Replay, release: Start, bounds: Mapping[str, Bounds], seconds: float | None = None
     ) -> None:
         if not bounds:
             raise InputError("there is nothing to identify: name a parameter under identify.parameters.")
         for name in bounds:
             if name not in replay.known:
                 raise InputError(f"there is no parameter {name!r} to identify: choose from {', '.join(replay.known)}.")
-        motions = replay.motions if seconds is None else replay.motions.first(seconds)
+        motions = replay.trials if seconds is None else replay.trials.first(seconds)
         for name, moved in zip(motions.names, motions.amplitude.tolist(), strict=True):
             if not moved > 0.0:
-                raise InputError(f"the markers of the motion {name!r} stay where they were held: leave it out.")
+                raise InputError(f"the markers of the trial {name!r} stay where they were held: leave it out.")
         simulator = replay.simulator
         most = min(simulator.settings.max_iterations, _MOST_ITERATIONS)
         settings = replace(simulator.settings, max_iterations=most, on_failure="raise")
-        self.replay = type(replay)(replace(simulator, solver=settings), replay.markers, motions)
+        self.replay = Replay(replace(simulator, solver=settings), replay.observe, motions)
         self.release, self.bounds = release, dict(bounds)
         self._weight = motions.loss_weight
 
@@ -322,7 +322,7 @@ class Identifier:
         if found is None:
             return None
         residuals, jacobian = found
-        each = 3 * self.replay.motions.seen.sum((1, 2)).cpu().numpy()
+        each = 3 * self.replay.trials.seen.sum((1, 2)).cpu().numpy()
         free = 1.0 - min(len(unit) / each.sum(), 0.5)
         squares = np.square(residuals).sum((1, 2, 3)) / (each * free)
         variances = squares * [_redundancy(series) for series in residuals]

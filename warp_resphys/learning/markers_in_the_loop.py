@@ -14,7 +14,8 @@ from typing_extensions import override
 from ..io.errors import ConvergenceError, InputError
 from .full_batch import FullBatchTrainer
 from .networks import ResidualForce
-from .replay import Release, Replay
+from .predictors import LearnedPredictor
+from .replay import Replay, Start
 
 _FAILURE = 1e4  # loss of a simulation that fails: the line search comes back from there
 
@@ -26,18 +27,18 @@ class MotionLoss:
         replay: of the motions.
         release: how they begin.
         parameters: (1,) physical parameters that were identified.
-        loads: (R, A) what acts on the body in each motion.
+        told: what a model is told of the inputs (`LearnedPredictor`); None for nothing.
     """
 
     def __init__(
         self,
         replay: Replay,
-        release: Release,
+        release: Start,
         parameters: Mapping[str, torch.Tensor],
-        loads: torch.Tensor,
+        told: torch.Tensor | None,
     ) -> None:
-        self._replay, self._release, self._parameters, self._loads = replay, release, parameters, loads
-        self._weight = replay.motions.loss_weight
+        self._replay, self._release, self._parameters, self._told = replay, release, parameters, told
+        self._weight = replay.trials.loss_weight
 
     def markers(self, model: ResidualForce | None) -> torch.Tensor:
         """(R, T, M, 3) at the frames [m], with the force of the model or without any.
@@ -45,7 +46,7 @@ class MotionLoss:
         Raises:
             ConvergenceError: the simulation fails.
         """
-        force = None if model is None else (lambda q, v: model(q, v, self._loads).to(q.dtype))
+        force: Any = None if model is None else LearnedPredictor(model, self._told)
         return self._replay(self._release, self._parameters or None, force=force)[0]
 
     def __call__(self, model: ResidualForce | None) -> torch.Tensor:
@@ -60,7 +61,7 @@ class MotionLoss:
                 errors = self._replay.errors(self.markers(model)[None])[0].norm(dim=-1)
         except ConvergenceError:
             return float("inf")
-        return 1e3 * float((errors.sum((1, 2)) / self._replay.motions.seen.sum((1, 2))).mean())
+        return 1e3 * float((errors.sum((1, 2)) / self._replay.trials.seen.sum((1, 2))).mean())
 
 
 class MarkersInTheLoop(FullBatchTrainer):

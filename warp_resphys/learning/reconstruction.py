@@ -19,14 +19,11 @@ import scipy.optimize
 import torch
 from typing_extensions import override
 
-from ..dynamics.assembly import HessianAssembly
-from ..dynamics.equilibrium import Workspace
-from ..dynamics.integrator import ImplicitStage, State
-from ..dynamics.simulator import MaterialTensors, Simulator
-from ..energies.potential import IncrementalPotential
-from ..energies.terms import StepTerms
+from ..dynamics.inputs import Inputs
+from ..dynamics.integrator import State
+from ..dynamics.linearisation import Linearisation
+from ..dynamics.simulator import Constants, Simulator
 from ..io.errors import ConvergenceError, InputError
-from ..linalg.linear_solver import Factor, make_linear_solver
 from ..linalg.threads import threads_for
 
 LinearMap = Callable[[torch.Tensor], torch.Tensor]
@@ -69,37 +66,29 @@ class Reconstructor(ABC):
             raise InputError(f"reconstruction.max_iterations is {max_iterations}: it must be positive.")
         self.simulator = simulator
         self.regularisation, self.tolerance, self.max_iterations = regularisation, tolerance, max_iterations
-        self._tensors = simulator.prepare()
+        self._constants = simulator.prepare()
 
-    def with_tensors(self, tensors: MaterialTensors) -> Self:
-        """The same method for other constants than the simulator's, such as other weights in every environment."""
+    def with_constants(self, constants: Constants) -> Self:
+        """The same method for other constants than the simulator's."""
         other = copy.copy(self)
-        other._tensors = tensors
+        other._constants = constants
         return other
-
-    def _terms(
-        self, stage: ImplicitStage, state: State, workspace: Workspace, pressure: torch.Tensor | None
-    ) -> StepTerms:
-        """The potential of the step without a residual force."""
-        sim = self.simulator
-        force, inside = sim.coupled(state, None, pressure)
-        return sim.step_terms(stage, state.batch, force, self._tensors, workspace, inside)
 
     @abstractmethod
     def step(
         self,
         state: State,
         observed: torch.Tensor,
+        inputs: Inputs | None = None,
         first_guess: torch.Tensor | None = None,
-        pressure: torch.Tensor | None = None,
     ) -> Reconstruction:
         """Reconstructs the step from a state to observed positions.
 
         Args:
             state: where the step starts.
             observed: (B, N, 3) [m].
+            inputs: what acts during the step; an external force adds to the one that is looked for.
             first_guess: (B, N, 3) force to start from, such as that of the step before [N].
-            pressure: (B, C) gauge pressure in each chamber during the step [Pa].
 
         Raises:
             ConvergenceError: no minimum was found.
@@ -120,28 +109,21 @@ class GaussNewton(Reconstructor):
     |x - x*| / e, and lambda e^2 takes the place of lambda. The first guess is x*, and no force is needed.
     """
 
-    _assembled: IncrementalPotential | None = None
-
     @override
     def step(
         self,
         state: State,
         observed: torch.Tensor,
+        inputs: Inputs | None = None,
         first_guess: torch.Tensor | None = None,
-        pressure: torch.Tensor | None = None,
     ) -> Reconstruction:
         del first_guess
-        sim, batch = self.simulator, state.batch
-        workspace = sim.workspace(batch)
-        p = workspace.potential
-        stage = sim.method.stage(state, sim.time_step)
-        p.set_terms(self._terms(stage, state, workspace, pressure))
-        self._weight = self.regularisation * stage.end**2
-        target = sim.method.solution_for(state, observed).clone()
-        target[:, sim.fixed] = state.q[:, sim.fixed]
-        x = target.clone()
-        objective, force = self._evaluate(p, x, target)
-        iterations = 0
+        sim = self.simulator
+        step = sim.linearise(state, inputs, self._constants)
+        weight = self.regularisation * step.stage.end**2
+        target = step.hold(sim.method.solution_for(state, observed))
+        x, iterations = target.clone(), 0
+        objective, force = _objective(step, x, target, weight)
         change = torch.full((), torch.inf) if self.regularisation > 0.0 else torch.zeros(())
         while float(change) > self.tolerance:
             if iterations == self.max_iterations:
@@ -152,89 +134,57 @@ class GaussNewton(Reconstructor):
                     None,
                 )
             iterations += 1
-            p.positions.copy_(x)
-            p.update_tangent()
-            dx = self._direction(p, x - target, force)
-            x, objective, force = self._search(p, x, dx, target, objective)
+            step.update(x)
+            dx = _direction(step, x - target, force, weight)
+            x, objective, force = _search(step, x, dx, target, objective, weight)
             change = dx.abs().max()
-        return Reconstruction(sim.method.finish(state, x, sim.time_step), force, iterations)
+        return Reconstruction(step.finish(x), force, iterations)
 
-    def _evaluate(
-        self, p: IncrementalPotential, x: torch.Tensor, target: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Objective (B,) [m^2] and residual force (B, N, 3) [N] at x."""
-        p.positions.copy_(x)
-        p.evaluate()
-        force = p.residual.clone()
-        return ((x - target) ** 2).sum((1, 2)) + self._weight * (force**2).sum((1, 2)), force
 
-    def _search(
-        self,
-        p: IncrementalPotential,
-        x: torch.Tensor,
-        dx: torch.Tensor,
-        target: torch.Tensor,
-        objective: torch.Tensor,
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Halves the steps of environments whose objective would grow."""
-        scale = torch.ones_like(objective)
-        for _ in range(30):
-            trial = x + scale[:, None, None] * dx
-            value, force = self._evaluate(p, trial, target)
-            worse = value > objective * (1.0 + 1e-9)
-            if not bool(worse.any()):
-                break
-            scale = torch.where(worse, 0.5 * scale, scale)
-        return trial, value, force
+def _objective(
+    step: Linearisation, x: torch.Tensor, target: torch.Tensor, weight: float
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """|x - x*|^2 + w |g|^2 (B,) [m^2] and the residual force g (B, N, 3) [N] at x."""
+    force = step.residual(x)
+    return ((x - target) ** 2).sum((1, 2)) + weight * (force**2).sum((1, 2)), force
 
-    def _direction(self, p: IncrementalPotential, offset: torch.Tensor, force: torch.Tensor) -> torch.Tensor:
-        """(B, N, 3) solution of the Gauss-Newton system by preconditioned conjugate gradients."""
-        inertia = p.inertia[..., None]
-        mask = p.free_mask[:, None]
 
-        def hessian(d: torch.Tensor) -> torch.Tensor:
-            return (p.stiffness_product(d) + inertia * d) * mask
+def _search(
+    step: Linearisation,
+    x: torch.Tensor,
+    dx: torch.Tensor,
+    target: torch.Tensor,
+    objective: torch.Tensor,
+    weight: float,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Halves the steps of environments whose objective would grow."""
+    scale = torch.ones_like(objective)
+    for _ in range(30):
+        trial = x + scale[:, None, None] * dx
+        value, force = _objective(step, trial, target, weight)
+        worse = value > objective * (1.0 + 1e-9)
+        if not bool(worse.any()):
+            break
+        scale = torch.where(worse, 0.5 * scale, scale)
+    return trial, value, force
 
-        def operator(d: torch.Tensor) -> torch.Tensor:
-            return d + self._weight * hessian(hessian(d))
 
-        factor, dofs = self._precondition(p)
+def _direction(step: Linearisation, offset: torch.Tensor, force: torch.Tensor, weight: float) -> torch.Tensor:
+    """(B, N, 3) solution of the Gauss-Newton system by preconditioned conjugate gradients."""
+    factor, free = step.shifted(float(np.sqrt(weight))), step.free
 
-        def preconditioner(r: torch.Tensor) -> torch.Tensor:
-            out = torch.zeros_like(r)
-            right = r[:, dofs].reshape(len(r), -1, 1)
-            out[:, dofs] = factor.solve(factor.solve(right)).reshape(len(r), -1, 3)
-            return out
+    def operator(d: torch.Tensor) -> torch.Tensor:
+        return d + weight * step.product(step.product(d))
 
-        right = -offset - self._weight * hessian(force)
-        with threads_for(right.numel()):
-            return conjugate_gradients(operator, preconditioner, right, tolerance=1e-6)
+    def preconditioner(r: torch.Tensor) -> torch.Tensor:
+        out = torch.zeros_like(r)
+        right = r[:, free].reshape(len(r), -1, 1)
+        out[:, free] = factor.solve(factor.solve(right)).reshape(len(r), -1, 3)
+        return out
 
-    def _precondition(self, p: IncrementalPotential) -> tuple[Factor, torch.Tensor]:
-        """Factor of I + sqrt(lambda) H on the free vertices; H clamped where that is not positive definite."""
-        if self._assembled is not p:
-            pattern = self.simulator.workspace(p.batch).pattern
-            name = self.simulator.settings.linear_solver
-            where = (p.device, p.dtype)
-            linear = make_linear_solver(name, pattern.rows, pattern.cols, len(pattern.free), 3, *where)
-            diagonal = linear.address[pattern.rows == pattern.cols][:, [0, 4, 8]].ravel()
-            self._diagonal = torch.as_tensor(diagonal.astype(np.int64), device=p.device)
-            self._free = torch.as_tensor(pattern.free, device=p.device)
-            self._assemble = HessianAssembly(p, linear, pattern)
-            self._linear = linear
-            self._assembled = p
-
-        def factorise() -> Factor:
-            values = np.sqrt(self._weight) * self._assemble()
-            values[:, self._diagonal] += 1.0
-            return self._linear.factor(values)
-
-        factor = factorise()
-        if factor.failed.any():
-            p.update_tangent(torch.as_tensor(factor.failed, device=p.device))
-            factor = factorise()
-            p.update_tangent()
-        return factor, self._free
+    right = -offset - weight * step.product(force)
+    with threads_for(right.numel()):
+        return conjugate_gradients(operator, preconditioner, right, tolerance=1e-6)
 
 
 class LBFGSB(Reconstructor):
@@ -248,11 +198,11 @@ class LBFGSB(Reconstructor):
         self,
         state: State,
         observed: torch.Tensor,
+        inputs: Inputs | None = None,
         first_guess: torch.Tensor | None = None,
-        pressure: torch.Tensor | None = None,
     ) -> Reconstruction:
         free = self._free()
-        return self._minimise(state, lambda q: ((q - observed) * free).square().sum(), first_guess, pressure)
+        return self._minimise(state, lambda q: ((q - observed) * free).square().sum(), inputs, first_guess)
 
     def _free(self) -> torch.Tensor:
         """(N, 1) zero at fixed vertices, else one."""
@@ -264,16 +214,17 @@ class LBFGSB(Reconstructor):
         self,
         state: State,
         misfit_of: LinearMap,
+        inputs: Inputs | None,
         first_guess: torch.Tensor | None,
-        pressure: torch.Tensor | None,
     ) -> Reconstruction:
         """The force of least misfit, a scalar function of the next positions (B, N, 3), plus lambda |f|^2."""
         sim, free, like = self.simulator, self._free(), state.q
+        acting = inputs or Inputs()
 
         def objective(values: np.ndarray) -> tuple[float, np.ndarray]:
             force = torch.as_tensor(values, device=like.device, dtype=like.dtype).reshape(like.shape)
             force.requires_grad_(True)
-            new, _ = sim.step(state, free * force, material=self._tensors, pressure=pressure)
+            new, _ = sim.step(state, acting.plus(free * force), self._constants)
             value = misfit_of(new.q) + self.regularisation * force.square().sum()
             (gradient,) = torch.autograd.grad(value, force)
             # In units of lambda both the objective and its change are of the size of f^2.
@@ -297,7 +248,7 @@ class LBFGSB(Reconstructor):
             )
         force = free * sim.tensor(result.x.reshape(like.shape))
         with torch.no_grad():
-            new, _ = sim.step(state, force, material=self._tensors, pressure=pressure)
+            new, _ = sim.step(state, acting.plus(force), self._constants)
         return Reconstruction(new, force, int(result.nit))
 
 

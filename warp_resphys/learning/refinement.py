@@ -17,7 +17,8 @@ from ..dynamics.simulator import Simulator
 from ..io.errors import ConvergenceError, InputError
 from .full_batch import FullBatchTrainer
 from .networks import ResidualForce
-from .rollout import FURTHEST, ForcePredictor, HybridRollout
+from .predictors import LearnedPredictor
+from .rollout import FURTHEST, Rollout
 
 REFINEMENTS = ("none", "solver_in_the_loop")
 _SMALLEST_UNIT = 1e-20  # mm^2
@@ -61,7 +62,7 @@ class WindowLoss:
     """Distances from the target over windows of k steps.
 
     Args:
-        predict: residual force, differentiable in the weights of its network.
+        model: residual force, differentiable in the weights of its network.
         make_simulator: a new simulator whose solver settings count failures. Every loss is computed with one: the
             factor that a solver keeps would make it depend on what was computed before.
         window: k.
@@ -69,9 +70,9 @@ class WindowLoss:
     """
 
     def __init__(
-        self, predict: ForcePredictor, make_simulator: Callable[[], Simulator], window: int, batch_size: int
+        self, model: ResidualForce, make_simulator: Callable[[], Simulator], window: int, batch_size: int
     ) -> None:
-        self._predict, self._make_simulator = predict, make_simulator
+        self._model, self._make_simulator = model, make_simulator
         self._window, self._batch_size = window, batch_size
         simulator = make_simulator()
         self._first_frame = 1 if simulator.integrator == "bdf2" else 0  # BDF2 looks back.
@@ -137,7 +138,7 @@ class WindowLoss:
         if self._first_frame:
             previous = (motion.q[run, frame - 1], motion.v[run, frame - 1])
         state = State(motion.q[run, frame], motion.v[run, frame], previous)
-        rollout = HybridRollout(simulator, self._predict)
+        rollout = Rollout(simulator, LearnedPredictor(self._model))
         squares = state.q.new_zeros(len(windows))
         for step in range(1, self._window + 1):
             state = rollout.differentiable_step(state)

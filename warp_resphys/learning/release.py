@@ -7,15 +7,17 @@ slow modes, and a sideways displacement are what best explains the first frames.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 
+from ..data.trials import Trials
+from ..dynamics.inputs import Inputs
 from ..dynamics.integrator import State
 from ..dynamics.modes import vibration_modes
-from ..dynamics.simulator import MaterialTensors, Simulator
+from ..dynamics.simulator import Simulator
 from ..io.errors import ConvergenceError, InputError
-from .replay import Markers, Motions, Release, Replay
+from .replay import Observe, Replay, Start
 
 _HOLD_ITERATIONS = 30
 _HOLD_TOLERANCE = 1e-7  # m, change of any position in the last iteration
@@ -63,7 +65,7 @@ class ReleaseSettings:
                 raise InputError(f"release.{name} is {getattr(self, name)}: it must be zero or more.")
 
 
-def estimate_release(simulator: Simulator, markers: Markers, motions: Motions, settings: ReleaseSettings) -> Release:
+def estimate_release(simulator: Simulator, markers: Observe, motions: Trials, settings: ReleaseSettings) -> Start:
     """The beginning of every motion, as this simulator would have it.
 
     Args:
@@ -75,45 +77,38 @@ def estimate_release(simulator: Simulator, markers: Markers, motions: Motions, s
     Raises:
         ConvergenceError: the body cannot be held, or a step of the simulation fails.
     """
-    replay = Replay(simulator, markers, motions)
-    with torch.no_grad():
-        tensors = replay.tensors()
-    q = hold(simulator, markers, motions, tensors, settings.hold_modes)
-    release = Release(State(q, torch.zeros_like(q)), torch.zeros_like(motions.times[:, 0]))
+    q = hold(Replay(simulator, markers, motions), settings.hold_modes)
+    release = Start(State(q, torch.zeros_like(q)), torch.zeros_like(motions.times[:, 0]))
     return _let_go(simulator, markers, motions.first(settings.window), release, settings)
 
 
-def hold(
-    simulator: Simulator, markers: Markers, motions: Motions, tensors: MaterialTensors, modes: int
-) -> torch.Tensor:
+def hold(replay: Replay, modes: int) -> torch.Tensor:
     """(R, N, 3) positions at rest under gravity, weights and the virtual force that holds the markers best [m].
 
     Levenberg-Marquardt on |m(q(a)) - y|^2 + w |a|^2 with q(a) the equilibrium under the force B a. The weight w is so
     small that it only keeps what no marker sees from moving.
 
     Args:
-        simulator: of the body.
-        markers: positions of the vertices to markers.
-        motions: tell where the markers were held.
-        tensors: of the R environments.
+        replay: of the trials, which tell where the markers were held.
         modes: columns of B, the inertial forces of the slowest vibrations.
 
     Raises:
         ConvergenceError: no equilibrium was found.
     """
-    count = len(motions.names)
-    target = motions.held
+    simulator, count, target = replay.simulator, len(replay.trials.names), replay.trials.held
+    with torch.no_grad():
+        constants, _, resting = replay.setting()
     if modes == 0:
         with torch.no_grad():
-            return simulator.static_equilibrium(material=tensors, batch=count).q
+            return simulator.static_equilibrium(resting, constants, batch=count).q
     basis = vibration_modes(simulator, modes)
     identity = torch.eye(modes, dtype=target.dtype, device=target.device)
 
     def equilibrium(a: torch.Tensor, start: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Positions, and (R, 3 M) distances from where the markers were held."""
         load = (a @ basis.mT).unflatten(1, (-1, 3))
-        q = simulator.static_equilibrium(load, material=tensors, start=start).q
-        return q, torch.where(torch.isfinite(target), target - markers(q), 0.0).flatten(1)
+        q = simulator.static_equilibrium(resting.plus(load), constants, start=start).q
+        return q, torch.where(torch.isfinite(target), target - replay.observe(q), 0.0).flatten(1)
 
     force = simulator.rest_positions.new_zeros(count, modes)
     damping = force.new_full((count, 1, 1), 1e-3)  # in units of the largest diagonal entry
@@ -160,9 +155,7 @@ def _derivatives(
     return torch.stack(rows, 1)
 
 
-def _let_go(
-    simulator: Simulator, markers: Markers, motions: Motions, held: Release, settings: ReleaseSettings
-) -> Release:
+def _let_go(simulator: Simulator, markers: Observe, motions: Trials, held: Start, settings: ReleaseSettings) -> Start:
     """What explains the first frames (`_Beginning`), by Gauss-Newton with differences over a batch."""
     beginning = _Beginning(simulator, markers, held, settings)
     count, unknowns = len(motions.names), len(beginning.deviation)
@@ -200,7 +193,7 @@ class _Beginning:
         settings: tell what is looked for.
     """
 
-    def __init__(self, simulator: Simulator, markers: Markers, held: Release, settings: ReleaseSettings) -> None:
+    def __init__(self, simulator: Simulator, markers: Observe, held: Start, settings: ReleaseSettings) -> None:
         self._markers, self._held = markers, held
         velocities = velocity_shapes(simulator, settings.velocity_modes)
         sideways = sideways_shapes(simulator) if settings.sideways > 0.0 else velocities[:0]
@@ -209,14 +202,14 @@ class _Beginning:
         deviations = (settings.delay, settings.speed, settings.sideways)
         self.deviation = simulator.tensor([d for d, n in zip(deviations, self._sizes, strict=True) for _ in range(n)])
 
-    def __call__(self, values: torch.Tensor) -> Release:
+    def __call__(self, values: torch.Tensor) -> Start:
         """The releases of (k R, unknowns) values, the R motions running fastest."""
         delay, speeds, bends = (values * self.deviation).split(self._sizes, 1)
         repeats = len(values) // len(self._held.delay)
         held = self._held.state.q.repeat(repeats, 1, 1)
         velocity, bend = (torch.einsum("bk,knc->bnc", a, b) for a, b in zip((speeds, bends), self._shapes, strict=True))
         shift = self._markers(held) - self._markers(held + bend) if len(self._shapes[1]) else None
-        return Release(State(held + bend, velocity), delay.sum(1), shift)
+        return Start(State(held + bend, velocity), delay.sum(1), shift)
 
 
 def sideways_shapes(simulator: Simulator) -> torch.Tensor:
@@ -229,11 +222,10 @@ def sideways_shapes(simulator: Simulator) -> torch.Tensor:
     extent = float((simulator.rest_positions.amax(0) - simulator.rest_positions.amin(0)).max())
     size = 0.1  # m/s^2
     with torch.no_grad():
-        tensors = simulator.prepare(attached_mass=torch.zeros_like(simulator.rest_positions[None, :, 0]))
-        weightless = replace(tensors, weight=torch.zeros_like(tensors.weight).expand(2, -1, -1))
+        weightless = simulator.prepare({"gravity": torch.zeros_like(directions)})
         for _ in range(3):  # Small enough for a linear answer, and well above rounding, however stiff the body is.
-            load = size * tensors.mass[..., None] * directions[:, None]
-            bent = simulator.static_equilibrium(load, material=weightless).q - simulator.rest_positions
+            load = size * weightless.mass[..., None] * directions[:, None]
+            bent = simulator.static_equilibrium(Inputs(load), weightless).q - simulator.rest_positions
             size *= _SIDEWAYS_STRAIN * extent / float(bent.norm(dim=2).max())
     turn, *_ = torch.linalg.svd(bent.flatten(1), full_matrices=False)  # To the softest direction and the stiffest.
     shapes = torch.einsum("ij,inc->jnc", turn, bent)

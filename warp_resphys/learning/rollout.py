@@ -1,39 +1,48 @@
-"""Closed loop: a model, with or without the simulator, rolled out from its own states."""
+"""Closed loop: a simulator, a model or both, rolled out from their own states."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 
 import torch
-from typing_extensions import override
 
+from ..dynamics.inputs import Inputs
 from ..dynamics.integrator import State
-from ..dynamics.simulator import MaterialTensors, Simulator
+from ..dynamics.simulator import Constants, Simulator
 
 FURTHEST = 10.0  # No robot moves ten times its own length from its clamp; a roll-out that does has diverged.
-ForcePredictor = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
-StatePredictor = Callable[[torch.Tensor, torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
+
+# Of a state and the number of the step: a residual force (B, N, 3) [N] to add to the simulator, or the next state.
+Predictor = Callable[[State, int], torch.Tensor | State]
 
 
-class Rollout(ABC):
+class Rollout:
     """Steps a batch, and keeps an eye on environments that diverge.
 
     An environment in which a step fails, or a vertex of which is further than `FURTHEST` body lengths from its rest
     position, has diverged: from then on it stands at rest, and is reported as lost.
 
     Args:
-        simulator: of the body.
+        simulator: one whose solver settings count failures rather than raise them.
+        predict: see `Predictor`; None for the simulator as it is. One that gives the next state replaces it.
+        inputs: what acts on the batch, from the first step on.
+        constants: other ones than the simulator's.
         lost: (B,) bool, environments that diverged before.
+        done: steps that were made before.
     """
 
-    def __init__(self, simulator: Simulator, lost: torch.Tensor | None = None) -> None:
-        self.simulator = simulator
-        self._lost = lost
+    def __init__(
+        self,
+        simulator: Simulator,
+        predict: Predictor | None = None,
+        inputs: Inputs | None = None,
+        constants: Constants | None = None,
+        lost: torch.Tensor | None = None,
+        done: int = 0,
+    ) -> None:
+        self.simulator, self._predict, self._lost, self._step = simulator, predict, lost, done
+        self._inputs = Inputs() if inputs is None else inputs
+        self._constants = simulator.prepare() if constants is None else constants
         self._rest = simulator.rest_positions
         self._length = float((self._rest.amax(0) - self._rest.amin(0)).max())
-
-    @abstractmethod
-    def _advance(self, state: State, lost: torch.Tensor) -> tuple[State, torch.Tensor]:
-        """The next state, and which environments (B,) failed."""
 
     @torch.no_grad()
     def step(self, state: State) -> State:
@@ -44,9 +53,28 @@ class Rollout(ABC):
         """Advances a batch by one step; gradients are meaningless where an environment is lost."""
         lost = self.lost(state)
         new, failed = self._advance(state, lost)
+        self._step += 1
         distance = (new.q - self._rest).abs().flatten(1).amax(1)
         self._lost = lost | failed | ~(distance < FURTHEST * self._length)
         return self._reset(new, self._lost) if bool(self._lost.any()) else new
+
+    def _advance(self, state: State, lost: torch.Tensor) -> tuple[State, torch.Tensor]:
+        """The next state, and which environments (B,) failed."""
+        inputs, force, failed = self._inputs.at(self._step), None, lost
+        if self._predict is not None:
+            given = self._predict(state, self._step)
+            if isinstance(given, State):
+                return given, lost
+            failed = lost | ~torch.isfinite(given).flatten(1).all(1)
+            force = torch.where(failed[:, None, None], 0.0, given)
+        if bool(failed.any()):  # An environment that is lost stands at rest: nothing must drive it on.
+            rest = self._rest[self.simulator.fixed]
+            idle = {name: torch.where(failed[:, None], 0.0, value) for name, value in inputs.actuation.items()}
+            if inputs.fixed_positions is not None:
+                idle["fixed_positions"] = torch.where(failed[:, None, None], rest, inputs.fixed_positions)
+            inputs = inputs.replace(**idle)
+        new, report = self.simulator.step(state, inputs.plus(force), self._constants)
+        return new, failed | ~report.converged
 
     def _reset(self, state: State, lost: torch.Tensor) -> State:
         """The state with its lost environments at rest."""
@@ -63,56 +91,6 @@ class Rollout(ABC):
     def positions(self, state: State) -> torch.Tensor:
         """(B, N, 3) positions of the last state, NaN where lost [m]."""
         return state.q if self._lost is None else torch.where(self._lost[:, None, None], torch.nan, state.q)
-
-
-class HybridRollout(Rollout):
-    """A simulator and the force that is added to it.
-
-    Args:
-        simulator: one whose solver settings count failures rather than raise them.
-        predict: (B, N, 3) residual force [N] of positions and velocities; None adds no force.
-        lost: (B,) bool, environments that diverged before.
-        tensors: other constants than the simulator's, such as other weights in every environment.
-    """
-
-    def __init__(
-        self,
-        simulator: Simulator,
-        predict: ForcePredictor | None,
-        lost: torch.Tensor | None = None,
-        tensors: MaterialTensors | None = None,
-    ) -> None:
-        super().__init__(simulator, lost)
-        self._predict = predict
-        self._tensors = simulator.prepare() if tensors is None else tensors
-
-    @override
-    def _advance(self, state: State, lost: torch.Tensor) -> tuple[State, torch.Tensor]:
-        force, failed = None, lost
-        if self._predict is not None:
-            force = self._predict(state.q, state.v)
-            failed = lost | ~torch.isfinite(force).flatten(1).all(1)
-            force = torch.where(failed[:, None, None], 0.0, force)
-        new, report = self.simulator.step(state, force, material=self._tensors)
-        return new, failed | ~report.converged
-
-
-class DataDrivenRollout(Rollout):
-    """A model that predicts the next state by itself.
-
-    Args:
-        simulator: of the body; it does not simulate here.
-        predict: next positions [m] and velocities [m/s] of positions and velocities.
-        lost: (B,) bool, environments that diverged before.
-    """
-
-    def __init__(self, simulator: Simulator, predict: StatePredictor, lost: torch.Tensor | None = None) -> None:
-        super().__init__(simulator, lost)
-        self._predict = predict
-
-    @override
-    def _advance(self, state: State, lost: torch.Tensor) -> tuple[State, torch.Tensor]:
-        return State(*self._predict(state.q, state.v)), lost
 
 
 def closed_loop(rollout: Rollout, start: State, steps: int) -> torch.Tensor:

@@ -12,8 +12,9 @@ import torch
 from typing_extensions import override
 
 from ..data.markers import Markers
-from ..dynamics.equilibrium import Workspace
+from ..dynamics.inputs import Inputs
 from ..dynamics.integrator import State
+from ..dynamics.linearisation import Linearisation
 from ..dynamics.modes import vibration_modes
 from ..dynamics.simulator import Simulator
 from ..io.errors import ConvergenceError, InputError
@@ -98,44 +99,38 @@ class SparseGaussNewton(_OnMarkers):
         self,
         state: State,
         observed: torch.Tensor,
+        inputs: Inputs | None = None,
         first_guess: torch.Tensor | None = None,
-        pressure: torch.Tensor | None = None,
     ) -> Reconstruction:
         """Reconstructs the step from a state to observed markers.
 
         Args:
             state: where the step starts.
             observed: (B, m, 3), NaN where a marker was not seen [m].
+            inputs: what acts during the step.
             first_guess: not used.
-            pressure: (B, C) gauge pressure in each chamber during the step [Pa].
 
         Raises:
             ConvergenceError: the iterates did not settle.
         """
         del first_guess
-        sim = self.simulator
-        workspace = sim.workspace(state.batch)
-        p = workspace.potential
-        stage = sim.method.stage(state, sim.time_step)
-        p.set_terms(self._terms(stage, state, workspace, pressure))
-        x = stage.target.clone()
-        x[:, sim.fixed] = state.q[:, sim.fixed]
+        problem = self.simulator.linearise(state, inputs, self._constants)
+        end_of, weight = problem.stage.end, self.regularisation * problem.stage.end**2
+        x = problem.start
         force = torch.zeros_like(x)
         seen = torch.isfinite(observed)
         active = torch.ones(state.batch, dtype=torch.bool, device=x.device)
         with threads_for(x.numel()):
             for iteration in range(1, self.max_iterations + 1):
-                p.positions.copy_(x)
-                p.evaluate()
-                end = sim.method.finish(state, x, sim.time_step).q
-                missing = torch.where(seen, stage.end * (observed - self.markers(end)), 0.0)
-                new, new_force = self._iterate(workspace, x, end, missing, seen, self.regularisation * stage.end**2)
+                end = problem.finish(x).q
+                missing = torch.where(seen, end_of * (observed - self.markers(end)), 0.0)
+                new, new_force = self._iterate(problem, x, end, missing, seen, weight)
                 change = (new - x).abs().amax((1, 2))
                 x = torch.where(active[:, None, None], new, x)
                 force = torch.where(active[:, None, None], new_force, force)
                 active &= ~(change <= self.tolerance)
                 if not bool(active.any()):
-                    return Reconstruction(sim.method.finish(state, x, sim.time_step), force, iteration)
+                    return Reconstruction(problem.finish(x), force, iteration)
         raise ConvergenceError(
             f"sparse Gauss-Newton reconstruction moved by {float(change.max()):.1e} m in its last iteration, the "
             f"{self.max_iterations}th: raise reconstruction.regularisation or reconstruction.max_iterations.",
@@ -145,7 +140,7 @@ class SparseGaussNewton(_OnMarkers):
 
     def _iterate(
         self,
-        workspace: Workspace,
+        problem: Linearisation,
         x: torch.Tensor,
         end: torch.Tensor,
         missing: torch.Tensor,
@@ -155,16 +150,15 @@ class SparseGaussNewton(_OnMarkers):
         """Next positions and force (B, N, 3); see the class's equations.
 
         Args:
-            workspace: with the residual at x.
+            problem: the step.
             x: (B, N, 3) the iterate [m].
             end: (B, N, 3) q+ for it [m].
             missing: (B, m, 3) e (y - C(q+)), zero where not seen [m].
             seen: (B, m, 3) bool.
             weight: lambda e^2.
         """
-        metric = workspace.adjoint_metric(self.simulator.settings.linear_solver)
-        metric.refactor_exact()
-        residual = workspace.potential.residual.reshape(len(x), -1, 1)
+        residual = problem.residual(x).reshape(len(x), -1, 1)
+        problem.factorise(x)
         transposed = self.markers.transposed_jacobian(end) if self._constant is None else self._constant
         transposed = transposed * seen.flatten(1)[:, None]
         basis = self._basis
@@ -172,7 +166,7 @@ class SparseGaussNewton(_OnMarkers):
         by_mode = basis is not None and basis.shape[1] < transposed.shape[2]
         if basis is not None and by_mode:
             columns = basis.expand(len(x), -1, -1)
-        solved = metric.solve(torch.cat([columns, residual], dim=2))
+        solved = problem.solve(torch.cat([columns, residual], dim=2))
         response = solved[:, :, :-1]
         settling = solved[:, :, -1:]
         jacobian = response.mT
@@ -181,7 +175,7 @@ class SparseGaussNewton(_OnMarkers):
         right = missing.reshape(len(x), -1, 1) + transposed.mT @ settling
         coefficients = ridge(jacobian, right, weight)
         force = coefficients if basis is None else basis @ coefficients
-        return x + (metric.solve(force) - settling).view_as(x), force.view_as(x)
+        return x + (problem.solve(force) - settling).view_as(x), force.view_as(x)
 
 
 class SparseLevenbergMarquardt(_OnMarkers):
@@ -203,20 +197,21 @@ class SparseLevenbergMarquardt(_OnMarkers):
         self,
         state: State,
         observed: torch.Tensor,
+        inputs: Inputs | None = None,
         first_guess: torch.Tensor | None = None,
-        pressure: torch.Tensor | None = None,
     ) -> Reconstruction:
         """See `SparseGaussNewton.step`; the first guess is a force (B, N, 3) [N]."""
         force = torch.zeros_like(state.q) if first_guess is None else first_guess
         seen = torch.isfinite(observed)
-        new, objective = self._try(state, force, observed, pressure)
+        inputs = inputs or Inputs()
+        new, objective = self._try(state, force, observed, inputs)
         if not bool(torch.isfinite(objective).all()):
             force = torch.zeros_like(force)
-            new, objective = self._try(state, force, observed, pressure)
+            new, objective = self._try(state, force, observed, inputs)
         damping, done = torch.zeros_like(objective), torch.zeros_like(objective, dtype=torch.bool)
         for iteration in range(1, self.max_iterations + 1):
-            candidate = self._next_force(state, new, force, observed, seen, damping, pressure)
-            reached, value = self._try(state, torch.where(done[:, None, None], force, candidate), observed, pressure)
+            candidate = self._next_force(state, new, force, observed, seen, damping, inputs)
+            reached, value = self._try(state, torch.where(done[:, None, None], force, candidate), observed, inputs)
             simulated = torch.isfinite(value)
             better = simulated & (value <= objective)
             moved = torch.where(simulated, (reached.q - new.q).abs().amax((1, 2)), torch.inf)
@@ -240,11 +235,11 @@ class SparseLevenbergMarquardt(_OnMarkers):
         )
 
     def _try(
-        self, state: State, force: torch.Tensor, observed: torch.Tensor, pressure: torch.Tensor | None
+        self, state: State, force: torch.Tensor, observed: torch.Tensor, inputs: Inputs
     ) -> tuple[State, torch.Tensor]:
         """Where a force leads, and the objective (B,) there; infinite where the simulator fails."""
         try:
-            new, _ = self.simulator.step(state, force, material=self._tensors, pressure=pressure)
+            new, _ = self.simulator.step(state, inputs.plus(force), self._constants)
         except ConvergenceError:
             return state, torch.full_like(state.q[:, 0, 0], torch.inf)
         missing = torch.nan_to_num(observed - self.markers(new.q))
@@ -259,20 +254,14 @@ class SparseLevenbergMarquardt(_OnMarkers):
         observed: torch.Tensor,
         seen: torch.Tensor,
         damping: torch.Tensor,
-        pressure: torch.Tensor | None,
+        inputs: Inputs,
     ) -> torch.Tensor:
         """(B, N, 3) the minimiser of the linearised objective; see the class's equations."""
         sim = self.simulator
-        workspace = sim.workspace(state.batch)
-        p = workspace.potential
-        stage = sim.method.stage(state, sim.time_step)
-        p.set_terms(self._terms(stage, state, workspace, pressure))
-        p.positions.copy_(sim.method.solution_for(state, new.q))
-        p.evaluate()
-        metric = workspace.adjoint_metric(sim.settings.linear_solver)
-        metric.refactor_exact()
+        problem = sim.linearise(state, inputs, self._constants)
+        problem.factorise(sim.method.solution_for(state, new.q))
         transposed = self.markers.transposed_jacobian(new.q) * seen.flatten(1)[:, None]
-        jacobian = metric.solve(transposed).mT / stage.end  # q+ moves 1 / end times as far as the solution
+        jacobian = problem.solve(transposed).mT / problem.stage.end  # q+ moves 1 / end times as far as the solution
         old = force.flatten(1)[..., None]
         missing = torch.where(seen, observed - self.markers(new.q), 0.0).flatten(1)[..., None]
         weight = (self.regularisation + damping)[:, None, None]
@@ -294,13 +283,13 @@ class SparseLBFGSB(_OnMarkers, LBFGSB):
         self,
         state: State,
         observed: torch.Tensor,
+        inputs: Inputs | None = None,
         first_guess: torch.Tensor | None = None,
-        pressure: torch.Tensor | None = None,
     ) -> Reconstruction:
         """See `SparseGaussNewton.step`; the first guess is a force (B, N, 3) [N]."""
         seen = torch.isfinite(observed)
         return self._minimise(
-            state, lambda q: torch.where(seen, self.markers(q) - observed, 0.0).square().sum(), first_guess, pressure
+            state, lambda q: torch.where(seen, self.markers(q) - observed, 0.0).square().sum(), inputs, first_guess
         )
 
 

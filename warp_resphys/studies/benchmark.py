@@ -24,6 +24,7 @@ from rich.table import Table
 from threadpoolctl import threadpool_limits
 
 from ..dynamics.assembly import HessianAssembly
+from ..dynamics.inputs import Inputs
 from ..dynamics.integrator import State
 from ..dynamics.simulator import Simulator
 from ..experiment.build import build_body, build_simulator
@@ -46,7 +47,7 @@ class Case:
         refinement: of the configured box.
         batch: environments.
         steps: of a roll-out.
-        pressures: (T, B, C) in its chambers, if it has any [Pa].
+        inputs: pressures in its chambers, if it has any.
         forward: seconds of each roll-out.
         backward: seconds of each adjoint.
         iterations: mean a step.
@@ -60,7 +61,7 @@ class Case:
     steps: int
     simulator: Simulator
     start: State
-    pressures: torch.Tensor | None = None
+    inputs: Inputs = field(default_factory=Inputs)
     forward: list[float] = field(default_factory=list)
     backward: list[float] = field(default_factory=list)
     iterations: float = 0.0
@@ -72,9 +73,9 @@ class Case:
         q, v = (t.clone().requires_grad_(True) for t in (self.start.q, self.start.v))
         forces = torch.zeros(self.steps, b, n, 3, device=q.device, dtype=q.dtype, requires_grad=True)
         modulus = sim.tensor(self.material["youngs_modulus"]).reshape(1).requires_grad_(True)
-        material = replace(sim.material, youngs_modulus=modulus)
         began = _now(q.device)
-        trajectory = sim.rollout(State(q, v), self.steps, forces, material=material, pressures=self.pressures)
+        inputs = self.inputs.replace(external_force=forces)
+        trajectory = sim.rollout(State(q, v), self.steps, inputs, {"youngs_modulus": modulus})
         done = _now(q.device)
         loss = trajectory.q[-1].square().sum() + trajectory.v[-1].square().sum()
         turned = _now(q.device)
@@ -169,7 +170,7 @@ def _cases(config: Mapping[str, Any], settings: Mapping[str, Any], refinement: i
                 case = _at_start(
                     Case(solver, material, refinement, batch, steps, simulator, simulator.rest_state()), settings
                 )
-                simulator.rollout(case.start, 2, pressures=None if case.pressures is None else case.pressures[:2])
+                simulator.rollout(case.start, 2, Inputs(**{k: v[:2] for k, v in case.inputs.fields.items()}))
                 cases.append(case)
     return cases
 
@@ -192,14 +193,14 @@ def _refined(config: Mapping[str, Any], refinement: int) -> dict[str, Any]:
 def _at_start(case: Case, settings: Mapping[str, Any]) -> Case:
     """The case at its start: let go from a weight, or at rest before the pressures of its chambers come."""
     simulator, batch = case.simulator, case.batch
-    chambers = len(simulator.body.chambers)
+    chambers = simulator.counts.get("pressure", 0)
     if not chambers:
         return replace(case, start=released(simulator, settings["tip_mass"], batch))
     phase = simulator.tensor(np.arange(case.steps)[:, None, None] / case.steps)
     shift = simulator.tensor(np.arange(chambers) / chambers + 0.1 * np.arange(batch)[:, None])
     pressures = 0.5 * settings["pressure"] * (1.0 - torch.cos(2.0 * torch.pi * (phase + shift)))
-    start = simulator.static_equilibrium(batch=batch, pressure=pressures[0]).detach()
-    return replace(case, start=start, pressures=pressures)
+    start = simulator.static_equilibrium(Inputs(pressure=pressures[0])).detach()
+    return replace(case, start=start, inputs=Inputs(pressure=pressures))
 
 
 def _at(values: Mapping[Any, int], refinement: int) -> int:
@@ -221,7 +222,7 @@ def released(simulator: Simulator, mass: float, batch: int) -> State:
     share = tip.to(simulator.dtype) / tip.sum()  # (N,)
     masses = mass * (1.0 - 0.5 * torch.arange(batch, device=x.device, dtype=simulator.dtype) / batch)
     force = masses[:, None, None] * share[:, None] * simulator.tensor(simulator.gravity)
-    return simulator.static_equilibrium(force).detach()
+    return simulator.static_equilibrium(Inputs(force)).detach()
 
 
 def _take_turns(cases: list[Case], settings: Mapping[str, Any], yardstick: list[float]) -> None:

@@ -3,19 +3,19 @@
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
 from rich.table import Table
 
+from ..dynamics.inputs import Inputs
 from ..dynamics.integrator import State
 from ..dynamics.simulator import Simulator
-from ..energies.material import Material
 from ..experiment.build import build_simulator
 from ..io.errors import InputError
 from ..mesh.poses import twisted
 
-_PRESSURE = 1e4  # [Pa] in the chambers, about
 POSES = ("rest", "bent", "twisted")
 # Seven-point stencil: its error is of sixth order in the step, so that steps of a percent, which drown the rounding of
 # the solves, still leave a truncation of 1e-10.
@@ -75,7 +75,7 @@ def check_gradients(
 ) -> list[GradientRow]:
     """Compares the directional derivatives of a random linear functional of all positions and velocities.
 
-    The material's damping constants should be positive, or their central differences would leave the physical range.
+    Constants on a bound of their range, such as damping of zero, cannot be checked: give the simulator others.
 
     Args:
         simulator: with a tight tolerance, in float64.
@@ -85,9 +85,8 @@ def check_gradients(
         seed: of directions and functional.
 
     Returns:
-        One row a parameter: initial positions and velocities, external forces, Dirichlet targets where the body has
-        any, E and nu (scalar, per element, per environment), density, mass and stiffness damping; and the chambers'
-        pressures and their fibres' stiffness (the same for all, per chamber) where the body has any.
+        A row for each of the initial positions and velocities, the inputs of the body, and its parameters, these as
+        one value, and with one for each environment and for each element or part.
     """
     problem = _Problem(simulator, pose_name, steps, batch, seed)
     return [problem.compare(name, *case) for name, case in problem.cases().items()]
@@ -101,73 +100,62 @@ class _Problem:
         self.random = torch.Generator().manual_seed(seed)
         self.state = pose(simulator, pose_name, batch)
         n = simulator.body.n_vertices
-        self.forces = 1e-3 * self.noise(steps, batch, n, 3)
-        self.targets = self.state.q[:, simulator.fixed].expand(steps, -1, -1, -1).clone()
-        chambers = len(simulator.body.chambers)
-        self.pressures = _PRESSURE * (1.0 + 0.3 * self.noise(steps, batch, chambers)) if chambers else None
+        self.inputs = Inputs(
+            external_force=1e-3 * self.noise(steps, batch, n, 3),
+            fixed_positions=self.state.q[:, simulator.fixed].expand(steps, -1, -1, -1).clone(),
+            attached_mass=1e-4 * (1.0 + self.noise(batch, n).square()),
+            **{
+                name: quantity.typical * (1.0 + 0.3 * self.noise(steps, batch, simulator.counts[name]))
+                for name, quantity in simulator.inputs.items()
+            },
+        )
         h = simulator.time_step
         self.weights = self.noise(steps + 1, batch, n, 3), h * self.noise(steps + 1, batch, n, 3)
 
     def noise(self, *shape: int) -> torch.Tensor:
         return self.simulator.tensor(torch.randn(*shape, generator=self.random, dtype=torch.float64))
 
-    def loss(
-        self,
-        q: torch.Tensor | None = None,
-        v: torch.Tensor | None = None,
-        forces: torch.Tensor | None = None,
-        targets: torch.Tensor | None = None,
-        material: Material | None = None,
-        pressures: torch.Tensor | None = None,
-    ) -> torch.Tensor:
-        state = State(self.state.q if q is None else q, self.state.v if v is None else v)
-        trajectory = self.simulator.rollout(
-            state,
-            self.steps,
-            self.forces if forces is None else forces,
-            self.targets if targets is None else targets,
-            material,
-            self.pressures if pressures is None else pressures,
-        )
+    def loss(self, name: str, value: torch.Tensor) -> torch.Tensor:
+        """Of the roll-out with another value of a state's field, an input or a parameter."""
+        state, inputs, parameters = self.state, self.inputs, {}
+        if name in ("q", "v"):
+            state = State(value, state.v) if name == "q" else State(state.q, value)
+        elif name in inputs.fields:
+            inputs = inputs.replace(**{name: value})
+        else:
+            parameters = {name: value}
+        trajectory = self.simulator.rollout(state, self.steps, inputs, parameters)
         return (self.weights[0] * trajectory.q).sum() + (self.weights[1] * trajectory.v).sum()
 
     def cases(self) -> dict[str, tuple[Callable[[torch.Tensor], torch.Tensor], torch.Tensor, float]]:
-        """Loss, value and typical size of a change, by parameter."""
-        m, b = self.simulator.material, self.batch
-        elements = len(self.simulator.body.mesh.cells)
+        """Loss, value and typical size of a change: of the state, and of every input and parameter of the simulator."""
+        simulator = self.simulator
         length = float((self.state.q[0].max(0).values - self.state.q[0].min(0).values).max())
-        full = self.simulator.tensor
+        fields = {"q": (self.state.q, 1e-5 * length), "v": (self.state.v, 1e-2 * length)}
+        sizes = {"external_force": 1e-3, "fixed_positions": 1e-5 * length, "attached_mass": 1e-4}
+        for name, value in self.inputs.fields.items():
+            size = sizes[name] if name in sizes else 0.1 * simulator.inputs[name].typical
+            if value.numel():
+                fields[name] = value, size
         cases: dict[str, tuple[Callable[[torch.Tensor], torch.Tensor], torch.Tensor, float]] = {
-            "initial positions": (lambda x: self.loss(q=x), self.state.q, 1e-5 * length),
-            "initial velocities": (lambda x: self.loss(v=x), self.state.v, 1e-2 * length),
-            "external forces": (lambda x: self.loss(forces=x), self.forces, 1e-3),
+            name: (partial(self.loss, name), *pair) for name, pair in fields.items()
         }
-        if len(self.simulator.fixed):
-            cases["fixed positions"] = (lambda x: self.loss(targets=x), self.targets, 1e-5 * length)
-        shapes = {"scalar": (1,), "per element": (elements,), "per environment": (b, 1)}
-        for name, key, change, limit in (("E", "youngs_modulus", 1e-2, 0.0), ("nu", "poissons_ratio", 2e-2, 0.5)):
-            constant = float(getattr(m, key))
+        for name, quantity in simulator.parameters.items():
+            constant = simulator.tensor(simulator.constants[name])
+            shapes: dict[str, tuple[int, ...]] = {"environment": (self.batch, 1)}
+            if quantity.per:
+                shapes = {"one": (1,), quantity.per: (simulator.counts[name],), **shapes}
+            if name == "gravity":
+                shapes = {"environment": (self.batch, 3)}
             for kind, shape in shapes.items():
-                value = full(constant).expand(shape).clone()
-                cases[f"{name}, {kind}"] = (self._vary(key), value, change * abs(constant - limit))
-        for key, change in (("density", 1e-2), ("mass_damping", 0.25), ("stiffness_damping", 5e-3)):
-            value = full(float(getattr(m, key))).reshape(1)
-            cases[key.replace("_", " ")] = (self._vary(key), value, change * float(value))
-        if self.pressures is not None:
-            cases["pressure"] = (lambda x: self.loss(pressures=x), self.pressures, 0.1 * _PRESSURE)
-        if self.simulator.body.fibres is not None:
-            stiffness = full(m.fibre_stiffness).mean()
-            for kind, count in (("scalar", 1), ("per chamber", len(self.simulator.body.chambers))):
-                value = stiffness.expand(count).clone()
-                cases[f"fibre stiffness, {kind}"] = (self._vary("fibre_stiffness"), value, 1e-2 * float(stiffness))
+                value = (constant if name == "gravity" else constant.mean()).expand(shape).clone()
+                room = float(value.abs().amax() if name == "gravity" else quantity.room(constant.mean()))
+                cases[f"{name}, each {kind}" if kind != "one" else name] = (
+                    partial(self.loss, name),
+                    value,
+                    1e-2 * room,
+                )
         return cases
-
-    def _vary(self, key: str) -> Callable[[torch.Tensor], torch.Tensor]:
-        def loss(value: torch.Tensor) -> torch.Tensor:
-            changed: dict[str, Any] = {key: value}
-            return self.loss(material=replace(self.simulator.material, **changed))
-
-        return loss
 
     def compare(
         self, name: str, loss: Callable[[torch.Tensor], torch.Tensor], value: torch.Tensor, size: float
@@ -207,7 +195,8 @@ def check_configured(config: Mapping[str, Any]) -> Iterator[tuple[float, str, li
     solver = {**config["solver"], "relative_tolerance": check["relative_tolerance"]}
     simulator = build_simulator({**config, "solver": solver})
     for poissons_ratio in check["poissons_ratios"]:
-        material = replace(simulator.material, poissons_ratio=poissons_ratio, **damping)
+        changed: dict[str, Any] = {"poissons_ratio": poissons_ratio, **damping}
+        material = replace(simulator.material, **changed)
         checked = replace(simulator, material=material)
         for name in check["poses"]:
             yield poissons_ratio, name, check_gradients(checked, name, check["steps"], check["batch"], check["seed"])

@@ -13,11 +13,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from ..dynamics.inputs import Inputs
 from ..dynamics.nonlinear_solver import SolverSettings
 from ..dynamics.simulator import GRAVITY, Simulator
-from ..energies.material import Material
+from ..energies.fibres import Fibres
+from ..energies.materials import make_material
+from ..energies.pressure import Pressure
 from ..fem.body import Body
-from ..fem.surface_elements import Fibres
 from ..io.errors import InputError
 from ..mesh.arm import mesh_arm
 from ..mesh.arm_geometry import arm_geometry
@@ -100,24 +102,23 @@ def measure(mesh: Mesh, study: Mapping[str, Any], timed: bool = True) -> dict[st
     tolerance = 1e-6 * float(np.ptp(heights))
     fixed = np.flatnonzero(heights > heights.max() - tolerance)
     tip = torch.as_tensor(np.flatnonzero(heights < heights.min() + tolerance))
-    bare = Body(mesh, fixed=fixed, chambers=chambers)
-    wound = Body(mesh, fixed=fixed, chambers=chambers, fibres=Fibres(**study["fibres"]))
-    material = dict(study["material"])
+    driven = Pressure(chambers)
+    bare = Body(mesh, fixed=fixed, energies=[driven])
+    wound = Body(mesh, fixed=fixed, energies=[driven, Fibres(chambers, **study["fibres"])])
+    material = make_material(**study["material"])
     pressure = torch.zeros(1, len(chambers), dtype=torch.float64)
     pressure[0, number - 1] = study["pressure"]
     tilt, weight = radians(study["tilt"]), abs(GRAVITY[2])
     solver = SolverSettings(relative_tolerance=study["relative_tolerance"])
-    hanging = Simulator(bare, Material(**material), time_step=study["time_step"], solver=solver)
-    tilted = Simulator(
-        bare, Material(**material), gravity=(weight * sin(tilt), 0.0, -weight * cos(tilt)), solver=solver
-    )
-    reinforced = Simulator(wound, Material(**material, fibre_stiffness=study["fibre_stiffness"]), solver=solver)
+    hanging = Simulator(bare, material, time_step=study["time_step"], solver=solver)
+    tilted = Simulator(bare, material, gravity=(weight * sin(tilt), 0.0, -weight * cos(tilt)), solver=solver)
+    reinforced = Simulator(wound, material, solver=solver)
 
     def deflection(simulator: Simulator, load: torch.Tensor | None) -> float:
-        moved = simulator.static_equilibrium(pressure=load).q - simulator.rest_positions
+        moved = simulator.static_equilibrium(Inputs(pressure=load)).q - simulator.rest_positions
         return 1e3 * float(moved[0, tip, 0].mean())
 
-    volumes = hanging.chambers(1).volumes(hanging.rest_positions[None])
+    volumes = hanging.held_energy("pressure", 1).conjugates(hanging.rest_positions[None])
     result: dict[str, Any] = {
         "vertices": len(mesh.vertices),
         "chamber_cm3": 1e6 * float(volumes[0, number - 1]),
@@ -145,7 +146,7 @@ def step_time(simulator: Simulator, pressure: torch.Tensor, study: Mapping[str, 
             times.append([])
             for share in ramp:
                 began = time.perf_counter()
-                state, report = simulator.step(state, material=prepared, pressure=float(share) * pressure)
+                state, report = simulator.step(state, Inputs(pressure=float(share) * pressure), prepared)
                 times[-1].append(1e3 * (time.perf_counter() - began))
                 iterations.append(float(report.iterations[0]))
     return {"step_ms": float(np.median(times[1:], axis=0).mean()), "iterations": float(np.mean(iterations))}

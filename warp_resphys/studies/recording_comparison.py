@@ -188,7 +188,7 @@ def simulate_swing(config: Mapping[str, Any], rest_markers: FloatArray, seconds:
     import torch
 
     from ..dynamics.simulator import Simulator
-    from ..energies.material import Material
+    from ..energies.materials import make_material
     from ..fem.body import Body, PointMass
     from ..mesh.mesh import box_hexahedra, select_vertices
 
@@ -209,7 +209,7 @@ def simulate_swing(config: Mapping[str, Any], rest_markers: FloatArray, seconds:
     )
     simulator = Simulator(
         body,
-        Material(**config["material"]),
+        make_material(**config["material"]),
         time_step=simulation["time_step"],
         gravity=(0.0, 0.0, -simulation["gravity"]),
         integrator=simulation["integrator"],

@@ -13,10 +13,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..dynamics.inputs import Inputs
 from ..dynamics.integrator import State
 from ..dynamics.nonlinear_solver import SolverSettings
 from ..dynamics.simulator import Simulator
-from ..energies.material import Material
+from ..energies.materials import Corotated, Material
 from ..fem.body import Body
 from ..io.errors import DataFileError, InputError
 from ..mesh.mesh import Mesh, box_hexahedra, select_vertices
@@ -88,7 +89,7 @@ def read_reference(path: Path) -> ReferenceTrajectory:
     if not values["dt"] > 0.0:
         raise DataFileError(f"{path}: dt is {float(values['dt']):g}: it must be positive, in seconds.")
     try:
-        material = Material(
+        material = Corotated(
             youngs_modulus=float(values["youngs_modulus"]),
             poissons_ratio=float(values["poissons_ratio"]),
             density=float(values["density"]),
@@ -214,7 +215,7 @@ def compare_with_reference(
     )
     q, v, forces = (simulator.tensor(x) for x in (reference.q, reference.v, reference.forces))
     with torch.no_grad():
-        trajectory = simulator.rollout(State(q[:1], v[:1]), len(forces), forces[:, None])
+        trajectory = simulator.rollout(State(q[:1], v[:1]), len(forces), Inputs(external_force=forces[:, None]))
     distance = torch.linalg.vector_norm(trajectory.q[:, 0] - q, dim=-1)
     iterations = torch.stack([report.iterations for report in trajectory.reports])
     return Comparison(float(distance.max()), float(iterations.double().mean()))

@@ -1,6 +1,5 @@
 """Checks of the configuration of an experiment with pressures, before anything is computed."""
 
-import inspect
 from collections.abc import Mapping
 from typing import Any
 
@@ -9,12 +8,12 @@ import torch
 
 from ...data.actuation import PressureSequences
 from ...data.markers import KINDS, MarkerMap
-from ...energies.material import Material
+from ...energies.materials import Material
 from ...io.errors import InputError
-from ...learning.driven import DRIVEN_PARAMETERS
+from ...learning.replay import known_parameters
 from ...learning.sparse_reconstruction import make_sparse_reconstructor
 from ...mesh.mesh import select_vertices
-from ..build import build_body, build_simulator
+from ..build import build_body, build_material, build_simulator, chambers_of
 from ..kinds import (
     COUNT,
     FINITE,
@@ -128,7 +127,7 @@ _KEYS: dict[str, dict[str, Kind]] = {
         "count": NATURAL,
         "axis": Kind(lambda value: is_list(value) and len(value) == 3 and any(value), "three numbers, not all zero"),
     },
-    "fibres": {"angles": Kind(is_list, "a list of degrees"), "toe": POSITIVE},
+    "fibres": {"angles": Kind(is_list, "a list of degrees"), "toe": POSITIVE, "stiffness": NOT_NEGATIVE},
 }
 
 
@@ -163,17 +162,15 @@ def check_driven(config: Mapping[str, Any]) -> None:
     check_size(body.mesh.vertices, simulator.material, config["gravity"])
     probe = MarkerMap.at_vertices(torch.zeros(1, 1, dtype=torch.int64))
     make_sparse_reconstructor(simulator, probe, **config["reconstruction"])
-    check_identification(config["identify"], DRIVEN_PARAMETERS)
+    check_identification(config["identify"], known_parameters(simulator))
     for name in config["identify"]["first_guess"]:
         if name not in config["identify"]["parameters"]:
             raise InputError(
                 f"identify.first_guess.{name} is of no use: give it a range in identify.parameters, or leave it out."
             )
     chambers = config["data"]["chambers"]
-    if chambers is not None and max(chambers) > len(body.chambers):
-        raise InputError(f"data.chambers names chamber {max(chambers)}, but the mesh has {len(body.chambers)}.")
-    if "fibre_stiffness" in config["identify"]["parameters"] and config["fibres"] is None:
-        raise InputError("identify.parameters names fibre_stiffness, but fibres is null: give the simulator some.")
+    if chambers is not None and max(chambers) > len(chambers_of(body)):
+        raise InputError(f"data.chambers names chamber {max(chambers)}, but the mesh has {len(chambers_of(body))}.")
     if is_synthetic(config):
         _check_synthetic(config)
 
@@ -214,7 +211,7 @@ def check_size(vertices: Any, material: Material, gravity: Any) -> None:
         InputError: strains of more than a few tenths.
     """
     length = float(np.linalg.norm(np.ptp(np.asarray(vertices), axis=0)))
-    density, stiffness = (float(np.mean(np.asarray(x))) for x in (material.density, material.youngs_modulus))
+    density, stiffness = (float(np.mean(np.asarray(material.constants[x]))) for x in ("density", "youngs_modulus"))
     strain = density * float(np.linalg.norm(gravity)) * length / stiffness
     if strain > _LONGEST_STRETCH:
         raise InputError(
@@ -227,9 +224,6 @@ def _check_synthetic(config: Mapping[str, Any]) -> None:
     check_keys("synthetic", config.get("synthetic"), _KEYS["synthetic"])
     substeps_of(config)
     synthetic, data = config["synthetic"], config["data"]
-    for key in synthetic["material"]:
-        if key not in inspect.signature(Material).parameters:
-            raise InputError(f"unknown key 'synthetic.material.{key}': a material has other constants.")
     if synthetic["fibres"] is not None:
         check_keys("synthetic.fibres", synthetic["fibres"], _KEYS["fibres"])
     given = synthetic["sequences"]
@@ -240,7 +234,8 @@ def _check_synthetic(config: Mapping[str, Any]) -> None:
     sequences = PressureSequences(limit=data["pressure_limit"], **given)
     sequences.draw(data["steps"], config["time_step"], config["chambers"]["count"], np.random.default_rng(0))
     try:
-        body, material = build_body(reality_settings(config)), Material(**synthetic["material"])
+        material = build_material(synthetic, "material")
+        body = build_body(reality_settings(config))
     except InputError as error:
         raise InputError(f"synthetic: {error}") from error
     check_size(body.mesh.vertices, material, config["gravity"])

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from ...io.files import atomic_hdf5, create, read_checkpoint, write_json
 from ...io.processes import Advance
 from ...io.stages import StageContext
-from ...learning.driven_rollout import Range, WatchedModel
 from ...learning.metrics import median_filter, summarise, summarise_each
 from ...learning.networks import NextState, ResidualForce, StateMap, restore
+from ...learning.predictors import Range
 from ...mesh.mesh import select_vertices
 from ..measured.evaluate import marker_errors, per_marker
 from ..measured.files import ERRORS, ROLLOUTS, weights_file
@@ -34,7 +34,7 @@ def evaluate_driven(context: StageContext, processes: int = 1) -> None:
     scene = DrivenScene(settings, context.run_dir)
     groups = {factor: tuple(names) for factor, names in settings["groups"].items()}
     names = [name for group in groups.values() for name in group]
-    batch, steps = settings["batch"], scene.motions.pressure.shape[1]
+    batch, steps = settings["batch"], scene.motions.times.shape[1] - 1
     parts = {model: split_into_parts(context, names, batch, model, model) for model in MODELS}
     work_on([part for some in parts.values() for part in some], roll_out_part, processes, steps)
     markers = {model: read_parts(some, "markers").astype(np.float64) for model, some in parts.items()}
@@ -46,7 +46,7 @@ def evaluate_driven(context: StageContext, processes: int = 1) -> None:
             create(file, f"{model}_film", read_parts(some[:1], "film"), "m")
         create(file, "film_steps", film_steps(steps, step))
     left = {model: read_parts(parts[model], "left") for model in LEARNED}
-    observed = scene.pick(tuple(names)).markers.cpu().numpy()
+    observed = scene.pick(tuple(names)).observed.cpu().numpy()
     write_json(context.run_dir / ERRORS, summary(settings, groups, markers, observed, left, scene.labels, step))
     remove_parts(context)
 
@@ -135,16 +135,16 @@ def roll_out_part(part: Part, advance: Advance) -> dict[str, Made]:
     settings, name = part.context.settings, part.more
     scene = DrivenScene(settings, part.context.run_dir, "count")
     simulator, motions = scene.simulator, scene.pick(part.names)
-    watched = None
+    learned = None
     if name in LEARNED:
         path = part.context.run_dir / weights_file(name)
         tensors, description = read_checkpoint(path, _KIND_NAMES[name])
         model = restore(_KINDS[name], tensors, description).to(simulator.rest_positions.device)
         range_ = Range.restore(description["range"], model.linear)
-        watched = WatchedModel(model, range_, scene.frames(description["force_frame"]))
-    rollout = rollout_of(scene, name, watched, part.names)
-    batch, steps = motions.pressure.shape[:2]
-    state = simulator.static_equilibrium(material=scene.tensors(name, part.names), batch=batch)
+        learned = model, range_, scene.frames(description["force_frame"])
+    rollout, watched = rollout_of(scene, name, learned, part.names)
+    batch, steps = len(motions.names), motions.times.shape[1] - 1
+    state = simulator.static_equilibrium(parameters=scene.setting(name, part.names)[0], batch=batch)
     tip = torch.as_tensor(select_vertices(simulator.body.mesh, **settings["tip"]), device=state.q.device)
     filmed = set(film_steps(steps, simulator.time_step).tolist())
     markers, tips, film = [], [], []

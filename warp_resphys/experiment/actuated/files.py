@@ -7,8 +7,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ...data.trials import Trials
+from ...dynamics.inputs import Inputs
 from ...io.files import read_array, read_hdf5
-from ...learning.driven import DrivenMotions
 
 MOTIONS = "motions.h5"
 RAISED_MOTIONS = "motions_raised.h5"
@@ -32,7 +33,7 @@ class Imported:
         gravity: (3,) [m/s^2].
     """
 
-    motions: DrivenMotions
+    motions: Trials
     smoothed: torch.Tensor
     bound: NDArray[np.float64]
     labels: tuple[str, ...]
@@ -40,18 +41,15 @@ class Imported:
 
     def and_those_of(self, other: "Imported") -> "Imported":
         """These motions and others of the same body after them."""
-        a, b = self.motions, other.motions
-        fields = ("times", "markers", "held", "attached_mass", "pressure")
-        joined = DrivenMotions((*a.names, *b.names), *(torch.cat([getattr(a, f), getattr(b, f)]) for f in fields))
+        joined = self.motions.joined(other.motions)
         return replace(self, motions=joined, smoothed=torch.cat([self.smoothed, other.smoothed]))
 
 
-def read_imported(path: Path, vertices: int) -> Imported:
+def read_imported(path: Path) -> Imported:
     """Reads motions.h5, or the same of the trials at higher pressures.
 
     Args:
         path: the file.
-        vertices: of the body, on which nothing hangs.
 
     Raises:
         DataFileError: the file is missing, damaged or of another kind.
@@ -67,7 +65,7 @@ def read_imported(path: Path, vertices: int) -> Imported:
         pressure = read_array(file, "pressure", (r, markers.shape[1] - 1, None))
         bound = read_array(file, "bound", (m, 3))
     times = np.tile(step * np.arange(markers.shape[1]), (r, 1))
-    masses = np.zeros((r, vertices))
-    arrays = (times, markers, markers[:, 0], masses, pressure)
-    motions = DrivenMotions(names, *map(torch.from_numpy, arrays))
+    acting = Inputs(pressure=torch.from_numpy(np.ascontiguousarray(pressure.swapaxes(0, 1))))
+    seen, places, before = map(torch.from_numpy, (times, markers, markers[:, 0]))
+    motions = Trials(names, seen, places, before, acting)
     return Imported(motions, torch.from_numpy(smoothed), bound, labels, gravity)

@@ -6,7 +6,7 @@ from ...io.files import write_json
 from ...io.progress import Progress
 from ...io.stages import StageContext
 from ...learning.identification import Bounds
-from ...learning.replay import Release, Replay
+from ...learning.replay import Replay, Start
 from ..measured.files import IDENTIFICATION
 from ..measured.identify import evaluations_done, kept_of, landscape, remove_kept, search
 from ..trajectories import evenly
@@ -27,7 +27,7 @@ def identify_driven(context: StageContext) -> None:
     bounds = {name: Bounds(**each) for name, each in config["parameters"].items()}
 
     @cache
-    def replays(kind: str) -> tuple[Replay, Release]:
+    def replays(kind: str) -> tuple[Replay, Start]:
         del kind  # There is one simulator.
         return scene.replay(train)
 

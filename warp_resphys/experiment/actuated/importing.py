@@ -20,7 +20,7 @@ from ...io.errors import DataFileError
 from ...io.files import atomic_hdf5, create, write_json
 from ...io.stages import StageContext
 from ..binding import bound_markers
-from ..build import build_simulator
+from ..build import build_simulator, chambers_of
 from ..measured.files import QUALITY, REGISTRATION
 from ..measured.importing import registration_summary
 from ..trajectories import evenly
@@ -87,7 +87,7 @@ def import_raised(context: StageContext) -> None:
     """
     settings = context.settings
     simulator, followed = build_simulator(settings), list(settings["markers"]["followed"])
-    bound = read_imported(context.run_dir / MOTIONS, simulator.body.n_vertices).bound
+    bound = read_imported(context.run_dir / MOTIONS).bound
     nominal, hanging = _hanging(settings, simulator)
     observed = _observe_all(raised_trials_of(settings), context, simulator, hanging)
     mean = hanging[: len(followed)] + (bound - nominal)
@@ -141,7 +141,7 @@ def _write_motions(
     steps, followed = settings["data"]["steps"], list(settings["markers"]["followed"])
     moving = np.full((len(observed), steps + 1, len(followed), 3), np.nan)
     smoothed = moving.copy()
-    pressure = np.zeros((len(observed), steps, len(simulator.body.chambers)))
+    pressure = np.zeros((len(observed), steps, len(chambers_of(simulator.body))))
     for row, each in enumerate(observed):
         transform, seen = each.registration.transform, each.recording.select(followed)
         cutoff = settings["data"]["cutoff"]
@@ -161,7 +161,7 @@ def _write_motions(
     attributes = {
         "names": [each.trial.name for each in observed],
         "labels": followed,
-        "chambers": [chamber.name for chamber in simulator.body.chambers],
+        "chambers": [chamber.name for chamber in chambers_of(simulator.body)],
         "gravity": settings["gravity"],
         "time_step": settings["time_step"],
     }
@@ -199,7 +199,7 @@ def _pressure(recording: Recording, settings: Mapping[str, Any], simulator: Simu
     Raises:
         DataFileError: no pressures, of another number of chambers, or beyond the limit.
     """
-    data, chambers = settings["data"], len(simulator.body.chambers)
+    data, chambers = settings["data"], len(chambers_of(simulator.body))
     if recording.actuation is None:
         raise DataFileError(
             f"{recording.source} has no array 'actuation' with the pressures of the chambers: add it "

@@ -9,10 +9,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ...dynamics.integrator import State
 from ...io.files import atomic_hdf5, create, write_json
 from ...io.processes import Advance
 from ...io.stages import StageContext
-from ...learning.driven_rollout import DrivenHybridRollout
+from ...learning.rollout import Rollout
 from ...learning.sparse_reconstruction import make_sparse_reconstructor
 from ..measured.evaluate import marker_errors
 from .files import RECONSTRUCTED, RECONSTRUCTION
@@ -70,11 +71,11 @@ def reconstruct_part(part: Part, advance: Advance) -> dict[str, Made]:
     settings = part.context.settings
     scene = DrivenScene(settings, part.context.run_dir)
     simulator, observed = scene.simulator, scene.smoothed(part.names)
-    tensors, drive = scene.tensors("resphys", part.names), scene.drive("resphys", part.names)
+    constants, inputs, _ = scene.setting("resphys", part.names)
     reconstructor = make_sparse_reconstructor(simulator, scene.markers, **settings["reconstruction"])
-    reconstructor = reconstructor.with_tensors(tensors)
+    reconstructor = reconstructor.with_constants(constants)
     batch = len(part.names)
-    state = simulator.static_equilibrium(material=tensors, batch=batch)
+    state = simulator.static_equilibrium(parameters=constants, batch=batch)
     force = torch.zeros_like(state.q)
     fields: dict[str, list[NDArray[np.float32]]] = {name: [] for name in (*_UNITS, "error")}
 
@@ -88,7 +89,7 @@ def reconstruct_part(part: Part, advance: Advance) -> dict[str, Made]:
     with torch.no_grad():
         keep(observed[:, 0])
         for k in range(1, scene.learned_steps + 1):
-            result = reconstructor.step(state, observed[:, k], force, drive.pressure[:, k - 1])
+            result = reconstructor.step(state, observed[:, k], inputs.at(k - 1), force)
             state, force = result.state.detach(), result.force
             keep(observed[:, k])
             advance(batch)
@@ -116,17 +117,17 @@ def replayed_errors(
         found: q [m], v [m/s] and the force [N] that leads there, each (B, K + 1, N, 3).
     """
     scene = DrivenScene(settings, run_dir, "count")
-    tensors, drive, observed = scene.tensors("resphys", names), scene.drive("resphys", names), scene.smoothed(names)
-    state = scene.simulator.static_equilibrium(material=tensors, batch=len(names))
+    (constants, inputs, _), observed = scene.setting("resphys", names), scene.smoothed(names)
+    state = scene.simulator.static_equilibrium(parameters=constants, batch=len(names))
     frames = scene.frames(settings["force_frame"])
     steps = (found["q"][:, :-1], found["v"][:, :-1], found["force"][:, 1:])
-    known = zip(*(torch.from_numpy(each).to(state.q).unbind(1) for each in steps), strict=True)
+    known = [torch.from_numpy(each).to(state.q).unbind(1) for each in steps]
 
-    def predict(q: torch.Tensor, v: torch.Tensor, inputs: torch.Tensor) -> list[torch.Tensor]:
-        q0, v0, force = next(known)
-        return [force if frames is None else frames.to_world(q, v, frames.to_rest(q0, v0, force))]
+    def predict(state: State, step: int) -> torch.Tensor:
+        q, v, force = (series[step] for series in known)
+        return force if frames is None else frames.to_world(state.q, state.v, frames.to_rest(q, v, force))
 
-    rollout = DrivenHybridRollout(scene.simulator, predict, drive, tensors)
+    rollout = Rollout(scene.simulator, predict, inputs, constants)
     errors: NDArray[np.float32] = np.full(found["q"].shape[:2], np.inf, dtype=np.float32)
     for k in range(errors.shape[1]):
         state = rollout.step(state) if k > 0 else state

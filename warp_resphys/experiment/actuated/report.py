@@ -9,7 +9,6 @@ import numpy as np
 from ...io.errors import DataFileError
 from ...io.files import read_array, read_hdf5, read_json
 from ...io.stages import StageContext
-from ...learning.driven import DRIVEN_PARAMETERS
 from ...learning.metrics import PUBLISHED_WINDOWS_MM, published_errors
 from ...mesh.chambers import Chamber
 from ...mesh.mesh import Mesh, select_vertices
@@ -57,7 +56,7 @@ def report_driven(context: StageContext) -> None:
         synthetic=synthetic,
         trials=trials,
         identification=read_if_there(folder / IDENTIFICATION),
-        start=first_guess(config, DRIVEN_PARAMETERS),
+        start=first_guess(config, {*config["identify"]["parameters"], "youngs_modulus", "poissons_ratio"}),
         truth=truth.get("material", {}),
         training={m: read_json(path)["epochs"] for m in LEARNED if (path := folder / training_file(m)).is_file()},
         chambers=_chambers(build_chambers(config["chambers"], mesh), actuation.chambers),

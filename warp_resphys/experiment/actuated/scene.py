@@ -8,16 +8,16 @@ from typing import Any
 
 import torch
 
-from ...data.actuation import lagged, remembered
+from ...data.actuation import remembered
 from ...data.markers import Markers
+from ...data.trials import Trials
 from ...dynamics.frames import VertexFrames
-from ...dynamics.simulator import MaterialTensors, Simulator
+from ...dynamics.inputs import Inputs
+from ...dynamics.simulator import Constants, Simulator
 from ...io.files import read_json
-from ...learning.driven import DrivenMotions, DrivenReplay, at_rest
-from ...learning.driven_rollout import Drive
-from ...learning.replay import Release
+from ...learning.replay import Replay, Start
 from ..binding import bound_markers
-from ..build import build_mesh, build_simulator
+from ..build import build_simulator
 from ..measured.files import IDENTIFICATION
 from .files import COROTATED, MOTIONS, RAISED_MOTIONS, Imported, read_imported
 
@@ -48,10 +48,9 @@ class DrivenScene:
     @cached_property
     def _imported(self) -> Imported:
         """The motions, and those at higher pressures where the stage tests them."""
-        vertices = len(build_mesh(self.config["mesh"]).vertices)
-        found = read_imported(self.folder / MOTIONS, vertices)
+        found = read_imported(self.folder / MOTIONS)
         if len(self.config.get("groups", ())) > 1:
-            found = found.and_those_of(read_imported(self.folder / RAISED_MOTIONS, vertices))
+            found = found.and_those_of(read_imported(self.folder / RAISED_MOTIONS))
         return found
 
     @property
@@ -60,11 +59,9 @@ class DrivenScene:
         return self._imported.labels
 
     @cached_property
-    def motions(self) -> DrivenMotions:
+    def motions(self) -> Trials:
         """All trials, on the simulator's device."""
-        found, like = self._imported.motions, self.simulator.rest_positions
-        fields = (found.times, found.markers, found.held, found.attached_mass, found.pressure)
-        return DrivenMotions(found.names, *(t.to(like) for t in fields))
+        return self._imported.motions.to(self.simulator.rest_positions)
 
     @cached_property
     def markers(self) -> Markers:
@@ -79,25 +76,24 @@ class DrivenScene:
             VertexFrames(simulator.body, simulator.time_step, simulator.rest_positions) if kind == COROTATED else None
         )
 
-    def pick(self, names: tuple[str, ...]) -> DrivenMotions:
+    def pick(self, names: tuple[str, ...]) -> Trials:
         """Some of the trials."""
-        return self.motions.select([self.motions.names.index(name) for name in names])
+        return self.motions.named(names)
 
     @property
     def learned_steps(self) -> int:
         """Steps of a trial that are learned from."""
-        return max(round(self.config["data"]["train_fraction"] * self.motions.pressure.shape[1]), 1)
+        return max(round(self.config["data"]["train_fraction"] * (self.motions.times.shape[1] - 1)), 1)
 
     def smoothed(self, names: tuple[str, ...]) -> torch.Tensor:
         """(R, K + 1, M, 3) the markers of some trials that forces are to explain [m]."""
         rows = [self.motions.names.index(name) for name in names]
         return self._imported.smoothed[rows].to(self.simulator.rest_positions)
 
-    def replay(self, names: tuple[str, ...]) -> tuple[DrivenReplay, Release]:
+    def replay(self, names: tuple[str, ...]) -> tuple[Replay, Start]:
         """The simulator of some of the trials, and how they begin."""
-        motions = self.pick(names)
-        replay = DrivenReplay(self.simulator, self.markers, motions)
-        return replay, at_rest(motions, self.simulator.rest_positions)
+        replay = Replay(self.simulator, self.markers, self.pick(names))
+        return replay, Start.resting(self.simulator.rest_positions.expand(len(names), -1, -1))
 
     def parameters(self, model: str) -> dict[str, torch.Tensor]:
         """(1,) identified parameters of a model; none for one that is not identified."""
@@ -106,16 +102,12 @@ class DrivenScene:
         values = read_json(self.folder / IDENTIFICATION)["sysid"]["parameters"]
         return {name: self.simulator.rest_positions.new_tensor([value]) for name, value in values.items()}
 
-    def tensors(self, model: str, names: tuple[str, ...]) -> MaterialTensors:
-        """The constants of a model's simulator."""
-        replay, _ = self.replay(names)
-        return replay.tensors({k: v for k, v in self.parameters(model).items() if k != "pressure_rise"})
+    def setting(self, model: str, names: tuple[str, ...]) -> tuple[Constants, Inputs, torch.Tensor]:
+        """The constants of a model's simulator, the inputs of some trials, and what networks are told of these.
 
-    def drive(self, model: str, names: tuple[str, ...]) -> Drive:
-        """The pressures of some trials, as a model's simulator has them in its chambers and as its network is told."""
-        pressure = self.pick(names).pressure
-        rise = self.parameters(model).get("pressure_rise")
-        step = self.simulator.time_step
-        if rise is not None:
-            pressure = lagged(pressure, rise.expand(len(pressure)), step)
-        return Drive(pressure, remembered(pressure, self.config["actuation"]["memory"], step))
+        Returns:
+            The last (K, B, A): the pressures and their exponential means.
+        """
+        constants, inputs, _ = self.replay(names)[0].setting(self.parameters(model))
+        told = remembered(inputs.actuation["pressure"], self.config["actuation"]["memory"], self.simulator.time_step)
+        return constants, inputs, told

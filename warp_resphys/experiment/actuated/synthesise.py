@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ...data.actuation import PressureSequences
 from ...data.recordings.arrays import write_recording
 from ...data.recordings.recording import Recording
+from ...dynamics.inputs import Inputs
 from ...dynamics.simulator import Simulator
 from ...io.errors import InputError
 from ...io.files import write_json
@@ -49,7 +50,7 @@ def synthesise_driven(context: StageContext, processes: int = 1, higher: bool = 
     work_on(parts, simulate_part, processes, steps)
     scene = level_scene(settings)
     labels = (*settings["markers"]["followed"], *settings["markers"]["others"])
-    simulator, synthetic = reality(settings), settings["synthetic"]
+    synthetic = settings["synthetic"]
     distances = []  # of the followed markers from where they would be seen without noise [m]
     found = dict(zip(names, read_parts(parts, "markers"), strict=True))
     standing = np.broadcast_to(scene.others, (steps + 1, *scene.others.shape))
@@ -59,7 +60,7 @@ def synthesise_driven(context: StageContext, processes: int = 1, higher: bool = 
         noise = synthetic["noise"] * draw.standard_normal(positions.shape)
         distances.append(np.linalg.norm(noise[:, : len(scene.followed)], axis=-1).mean())
         path = context.run_dir / trial.made
-        pressures = pressures_of(settings, trial, len(simulator.body.chambers))
+        pressures = pressures_of(settings, trial, settings["chambers"]["count"])
         rate = 1.0 / settings["time_step"]
         write_recording(path, Recording(labels, positions + noise, rate, path, actuation=pressures))
     if not higher:
@@ -90,7 +91,7 @@ def reality_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
     """A whole configuration of the body that plays the real one."""
     own = {key: settings["synthetic"][key] for key in ("mesh", "time_step", "integrator", "material", "fibres")}
     physics = {"mass": "row_sum", "volume_integration": "centre"}
-    return {**settings, **own, "physics": physics, "pressure_coupling": "implicit"}
+    return {**settings, **own, "physics": physics, "coupling": "implicit"}
 
 
 def reality(settings: Mapping[str, Any]) -> Simulator:
@@ -119,19 +120,19 @@ def simulate_part(part: Part, advance: Advance) -> dict[str, Made]:
     read = read.to(simulator.rest_positions)
     substeps = substeps_of(settings)
     known = {trial.name: trial for trial in (*trials_of(settings), *raised_trials_of(settings))}
-    chambers = len(simulator.body.chambers)
+    chambers = settings["chambers"]["count"]
     drawn = np.stack([pressures_of(settings, known[name], chambers) for name in part.names])
     pressures = simulator.tensor(drawn)  # (B, K + 1, C) [Pa]
     batch, frames = pressures.shape[:2]
     with torch.no_grad():
-        tensors = simulator.prepare()
+        constants = simulator.prepare()
         state = simulator.static_equilibrium(batch=batch)
         series = [read(state.q)]
         for k in range(1, frames):
             for i in range(1, substeps + 1):
                 share = _share(simulator.integrator, i, substeps)
                 pressure = torch.lerp(pressures[:, k - 1], pressures[:, k], share)
-                state, _ = simulator.step(state, material=tensors, pressure=pressure)
+                state, _ = simulator.step(state, Inputs(pressure=pressure), constants)
             series.append(read(state.q))
             advance(batch)
     return {"markers": (torch.stack(series, 1).cpu().numpy(), "m")}

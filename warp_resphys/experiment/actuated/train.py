@@ -10,9 +10,9 @@ from ...dynamics.frames import VertexFrames
 from ...dynamics.modes import RestStiffness
 from ...io.files import read_array, read_hdf5
 from ...io.stages import StageContext
-from ...learning.driven_rollout import DrivenDataRollout, DrivenHybridRollout, Range, WatchedModel
 from ...learning.metrics import summarise
-from ...learning.networks import NextState, StateMap, build_model, build_next_state
+from ...learning.networks import StateMap, build_model, build_next_state
+from ...learning.predictors import LearnedPredictor, Range
 from ...learning.rollout import Rollout
 from ...learning.training import Samples, Trainer
 from ..build import choose_device
@@ -31,19 +31,19 @@ class Reconstructed:
         q: (R, K + 1, N, 3) positions [m].
         v: (R, K + 1, N, 3) velocities [m/s].
         force: (R, K + 1, N, 3) that leads to each state [N].
-        inputs: (R, K, A) what the networks are told of the pressures.
+        told: (R, K, A) what the networks are told of the pressures.
         seen: (R, K) whether a marker saw where a step ends: what none saw has no force to learn.
     """
 
     q: torch.Tensor
     v: torch.Tensor
     force: torch.Tensor
-    inputs: torch.Tensor
+    told: torch.Tensor
     seen: torch.Tensor
 
     def starts(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Positions, velocities (S, N, 3) and what is told of the pressures (S, A) where steps begin."""
-        return self._of(self.q[:, :-1]), self._of(self.v[:, :-1]), self._of(self.inputs)
+        return self._of(self.q[:, :-1]), self._of(self.v[:, :-1]), self._of(self.told)
 
     def ends(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Positions and velocities (S, N, 3) where they end."""
@@ -67,9 +67,9 @@ def read_reconstructed(context: StageContext, scene: DrivenScene, device: torch.
         first = rows.stop
         q, v, force = (found[key][rows].to(device) for key in ("q", "v", "force"))
         steps = q.shape[1] - 1
-        inputs = scene.drive("resphys", tuple(split[name])).inputs[:, :steps].to(device)
+        told = scene.setting("resphys", tuple(split[name]))[2][:steps].swapaxes(0, 1).to(device)
         seen = torch.isfinite(scene.smoothed(tuple(split[name]))[:, 1 : steps + 1]).all(-1).any(-1).to(device)
-        parts[name] = Reconstructed(q, v, force, inputs, seen)
+        parts[name] = Reconstructed(q, v, force, told, seen)
     return parts
 
 
@@ -80,9 +80,9 @@ def train_driven(context: StageContext) -> None:
     found = read_reconstructed(context, scene, device)
     frames, samples = scene.frames(context.settings["force_frame"]), {}
     for name, each in found.items():
-        q, v, inputs = each.starts()
+        q, v, told = each.starts()
         force = each.forces() if frames is None else frames.to_rest(q, v, each.forces())
-        samples[name] = Samples(q, v, (force,), inputs)
+        samples[name] = Samples(q, v, (force,), told)
     train = samples["train"]
     rest = scene.simulator.rest_positions.to(train.q.device)
     torch.manual_seed(context.settings["seed"])
@@ -99,9 +99,9 @@ def train_simfree_driven(context: StageContext) -> None:
     rest = scene.simulator.rest_positions.to(found["train"].q.device)
     samples = {}
     for name, each in found.items():
-        q, v, inputs = each.starts()
+        q, v, told = each.starts()
         following, speed = each.ends()
-        samples[name] = Samples(q, v, (following - rest.to(following), speed), inputs)
+        samples[name] = Samples(q, v, (following - rest.to(following), speed), told)
     train = samples["train"]
     torch.manual_seed(context.settings["seed"])
     model = build_next_state(context.settings["network"], rest, train.q, train.v, train.actuation)
@@ -133,19 +133,21 @@ def _fit(
     )
 
 
-def rollout_of(scene: DrivenScene, name: str, predict: WatchedModel | None, trials: tuple[str, ...]) -> Rollout:
-    """A roll-out of a model of that name, over some trials.
+def rollout_of(
+    scene: DrivenScene, name: str, learned: tuple[StateMap, Range, VertexFrames | None] | None, trials: tuple[str, ...]
+) -> tuple[Rollout, LearnedPredictor | None]:
+    """A roll-out of a model of that name over some trials, and its predictor.
 
     Args:
         scene: of the experiment.
         name: one of `files.MODELS`.
-        predict: what it has learned; None for a simulator alone.
+        learned: what it has learned, the range of its inputs in training, and the frames that its forces turn with;
+            None for a simulator alone.
         trials: their names.
     """
-    drive = scene.drive(name, trials)
-    if predict is not None and isinstance(predict.model, NextState):
-        return DrivenDataRollout(scene.simulator, predict, drive)
-    return DrivenHybridRollout(scene.simulator, predict, drive, scene.tensors(name, trials))
+    constants, inputs, told = scene.setting(name, trials)
+    predict = None if learned is None else LearnedPredictor(learned[0], told, *learned[1:])
+    return Rollout(scene.simulator, predict, inputs, constants), predict
 
 
 def validation_error(
@@ -160,12 +162,12 @@ def validation_error(
         range_: of the model's inputs in training.
         frames: with which what it predicts turns; None if it does not.
     """
-    motions = scene.pick(trials)
-    observed = motions.markers[:, : scene.learned_steps + 1].cpu().numpy()
-    start = scene.simulator.static_equilibrium(material=scene.tensors(name, trials), batch=len(trials))
+    observed = scene.pick(trials).observed[:, : scene.learned_steps + 1].cpu().numpy()
+    constants = scene.setting(name, trials)[0]
+    start = scene.simulator.static_equilibrium(parameters=constants, batch=len(trials))
 
     def error(model: StateMap) -> float:
-        rollout, state = rollout_of(scene, name, WatchedModel(model, range_, frames), trials), start
+        rollout, state = rollout_of(scene, name, (model, range_, frames), trials)[0], start
         series = [scene.markers(state.q)]
         for _ in range(observed.shape[1] - 1):
             state = rollout.step(state)

@@ -11,16 +11,15 @@ import torch
 from ...data.markers import KINDS, MarkerMap
 from ...data.recordings.recording import METRES_PER_UNIT
 from ...dynamics.integrator import INTEGRATORS
-from ...energies.material import Material
 from ...fem.body import MASS_MODES
 from ...fem.elements import VOLUME_INTEGRATIONS
 from ...io.errors import InputError
 from ...learning.identification import Bounds
 from ...learning.markers_in_the_loop import check_in_the_loop
-from ...learning.replay import PARAMETERS
+from ...learning.replay import known_parameters
 from ...learning.sparse_reconstruction import make_sparse_reconstructor
 from ...mesh.mesh import select_vertices
-from ..build import build_body, build_mesh, build_simulator
+from ..build import build_body, build_material, build_mesh, build_simulator
 from ..kinds import (
     COUNT,
     FINITE,
@@ -159,7 +158,7 @@ def check_measured(config: Mapping[str, Any]) -> None:
     if is_synthetic(config):
         _check_synthetic(config)
     if config["published"] is not None:
-        _check_material(config["published"]["simulation"], "published.simulation")
+        _check_material(config["published"], "simulation", "published")
         check_keys("published.physics", config["published"]["physics"], _KEYS["published.physics"])
     if folds_of(config) is None:
         split_of(config)
@@ -184,13 +183,13 @@ def _check_learning(config: Mapping[str, Any]) -> None:
     if config["release"]["sideways"] > 0.0 and not np.any(config["gravity"]):
         raise InputError("release.sideways is across gravity, but gravity is zero: set release.sideways to 0.")
     check_in_the_loop(config["in_the_loop"])
-    check_identification(config["identify"])
     simulator = build_simulator(config)
+    check_identification(config["identify"], known_parameters(simulator))
     probe = MarkerMap.at_vertices(torch.zeros(1, 1, dtype=torch.int64))
     make_sparse_reconstructor(simulator, probe, **config["reconstruction"])
 
 
-def check_identification(identify: Mapping[str, Any], known: Sequence[str] = PARAMETERS) -> None:
+def check_identification(identify: Mapping[str, Any], known: Sequence[str]) -> None:
     """Checks the group ``identify``, of which ``elastic`` is optional.
 
     Args:
@@ -274,7 +273,7 @@ def _check_synthetic(config: Mapping[str, Any]) -> None:
     if synthetic is None:
         raise InputError("data.folder is not set: give the folder of the recordings.")
     _check_trials(config, "synthetic")
-    _check_material(synthetic["material"], "synthetic.material")
+    _check_material(synthetic, "material", "synthetic")
     for key in ("begins", "rest"):
         if config["data"][key] != "held":
             raise InputError(
@@ -288,17 +287,15 @@ def _check_synthetic(config: Mapping[str, Any]) -> None:
     build_mesh(synthetic["mesh"])
 
 
-def _check_material(material: Any, at: str) -> None:
-    known = inspect.signature(Material).parameters
-    for key, value in material.items():
-        if key not in known:
-            raise InputError(f"unknown key '{at}.{key}': {at} has {', '.join(known)}.")
-        if not (is_word(value) if key == "model" else is_number(value)):
-            raise InputError(f"{at}.{key} is {value!r}: it must be a {'word' if key == 'model' else 'number'}.")
+def _check_material(config: Mapping[str, Any], key: str, group: str) -> None:
+    for name, value in config[key].items():
+        if not (is_word(value) if name == "model" else is_number(value)):
+            wanted = "word" if name == "model" else "number"
+            raise InputError(f"{group}.{key}.{name} is {value!r}: it must be a {wanted}.")
     try:
-        Material(**material)
+        build_material(config, key)
     except InputError as error:
-        raise InputError(f"{at}: {error}") from error
+        raise InputError(f"{group}.{error}") from error
 
 
 def _check_place(place: Any, at: str) -> None:

@@ -1,7 +1,6 @@
 """Stage: roll-outs of the test trials, by every model, and the errors of their markers."""
 
 from collections.abc import Mapping
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -9,6 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from ...data.markers import Markers
+from ...data.trials import Trials
 from ...dynamics.integrator import State
 from ...dynamics.simulator import Simulator
 from ...io.files import atomic_hdf5, create, read_checkpoint, write_json
@@ -16,8 +16,9 @@ from ...io.progress import Progress
 from ...io.stages import StageContext
 from ...learning.metrics import summarise, summarise_each
 from ...learning.networks import NextState, ResidualForce, restore
-from ...learning.replay import Motions, Release, Replay, sample
-from ...learning.rollout import DataDrivenRollout, ForcePredictor, HybridRollout, Rollout, StatePredictor, closed_loop
+from ...learning.predictors import LearnedPredictor
+from ...learning.replay import Replay, Start, sample
+from ...learning.rollout import Rollout, closed_loop
 from .files import ERRORS, MODELS, ROLLOUTS, TRAINED, weights_file
 from .scene import SIMULATORS, Scene, loads, parameters_of
 
@@ -42,7 +43,7 @@ def evaluate_markers(context: StageContext) -> None:
         for model in models:
             create(file, f"{model}_q", positions[model], "m")
             create(file, f"{model}_markers", markers[model], "m")
-    observed = motions.markers.cpu().numpy()
+    observed = motions.observed.cpu().numpy()
     errors = {m: [marker_errors(x, y) for x, y in zip(markers[m], observed, strict=True)] for m in models}
     summary: dict[str, Any] = {
         "errors_mm": {m: summarise(rows) for m, rows in errors.items()},
@@ -81,24 +82,23 @@ def per_marker(
 
 
 def _roll_out(
-    context: StageContext, scene: Scene, model: str, motions: Motions, releases: Mapping[str, Release]
+    context: StageContext, scene: Scene, model: str, motions: Trials, releases: Mapping[str, Start]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(R, K + 1, N, 3) positions at whole time steps and (R, T, M, 3) markers at the frames [m]."""
     simulator = scene.simulator(SIMULATORS[model], on_failure="count")
     device = simulator.rest_positions.device
     release = releases[SIMULATORS[model]]
     parameters = parameters_of(context.run_dir, model, simulator.rest_positions)
-    tensors = Replay(simulator, scene.markers, motions).tensors(parameters)
-    rollout: Rollout
+    constants, inputs, _ = Replay(simulator, scene.markers, motions).setting(parameters)
     if model == "simfree":
         network = restore(NextState, *read_checkpoint(context.run_dir / weights_file(model), "next state"))
-        rollout = DataDrivenRollout(simulator, state_predictor_of(network.to(device), loads(motions)))
+        rollout = Rollout(simulator, LearnedPredictor(network.to(device), loads(motions)))
     else:
         force = None
         if model in TRAINED:
             learned = restore(ResidualForce, *read_checkpoint(context.run_dir / weights_file(model), "residual force"))
-            force = force_predictor_of(learned.to(device), loads(motions))
-        rollout = HybridRollout(simulator, force, tensors=tensors)
+            force = LearnedPredictor(learned.to(device), loads(motions))
+        rollout = Rollout(simulator, force, inputs, constants)
     substeps = round(scene.config["time_step"] / simulator.time_step)
     q = roll_out_to_the_end(rollout, simulator, motions, release, substeps)
     markers = markers_at_frames(q, simulator, scene.markers, motions, release)
@@ -106,7 +106,7 @@ def _roll_out(
 
 
 def roll_out_to_the_end(
-    rollout: Rollout, simulator: Simulator, motions: Motions, release: Release, substeps: int = 1
+    rollout: Rollout, simulator: Simulator, motions: Trials, release: Start, substeps: int = 1
 ) -> torch.Tensor:
     """(R, K + 1, N, 3) positions from the releases to past the last frame [m]; NaN from where a roll-out diverged.
 
@@ -117,7 +117,7 @@ def roll_out_to_the_end(
 
 
 def markers_at_frames(
-    q: torch.Tensor, simulator: Simulator, markers: Markers, motions: Motions, release: Release
+    q: torch.Tensor, simulator: Simulator, markers: Markers, motions: Trials, release: Start
 ) -> torch.Tensor:
     """(R, T, M, 3) markers at the frames [m] of (R, K + 1, N, 3) positions at the steps; NaN where these are."""
     lost = ~torch.isfinite(q).flatten(2).all(2)
@@ -128,34 +128,10 @@ def markers_at_frames(
     return release.shifted(sample(series, times, simulator.time_step))
 
 
-def marker_error_mm(
-    rollout: Rollout, simulator: Simulator, markers: Markers, motions: Motions, release: Release
-) -> float:
+def marker_error_mm(rollout: Rollout, simulator: Simulator, markers: Markers, motions: Trials, release: Start) -> float:
     """Mean error of a roll-out's markers [mm]; infinite where one diverged."""
     q = roll_out_to_the_end(rollout, simulator, motions, release)
     simulated = markers_at_frames(q, simulator, markers, motions, release).cpu().numpy()
-    pairs = zip(simulated, motions.markers.cpu().numpy(), strict=True)
+    pairs = zip(simulated, motions.observed.cpu().numpy(), strict=True)
     mean = summarise([marker_errors(x, y) for x, y in pairs])["mean"]
     return float("inf") if mean is None else mean
-
-
-def force_predictor_of(model: ResidualForce, load: torch.Tensor) -> ForcePredictor:
-    """The force of a model under the loads (R, A) of a batch."""
-    return partial(_predict_force, model, load)
-
-
-def _predict_force(model: ResidualForce, load: torch.Tensor, q: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
-    with torch.no_grad():
-        return model(q, v, load).to(q.dtype)
-
-
-def state_predictor_of(model: NextState, load: torch.Tensor) -> StatePredictor:
-    """The next state by a model under the loads (R, A) of a batch."""
-    return partial(_predict_state, model, load)
-
-
-def _predict_state(
-    model: NextState, load: torch.Tensor, q: torch.Tensor, v: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    positions, velocities = model(q, v, load)
-    return positions.to(q.dtype), velocities.to(q.dtype)

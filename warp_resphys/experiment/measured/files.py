@@ -7,10 +7,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ...data.trials import Trials
+from ...dynamics.inputs import Inputs
 from ...fem.body import Body
 from ...io.errors import InputError
 from ...io.files import read_array, read_hdf5
-from ...learning.replay import Motions
 from ...mesh.mesh import select_vertices
 from ..trajectories import ERRORS, METRICS, REPORT, ROLLOUTS
 
@@ -100,7 +101,7 @@ def attached_mass(body: Body, hung_on: Mapping[str, float] | None, loads: FloatA
 
 def read_motions(
     path: Path, body: Body, hung_on: Mapping[str, float] | None
-) -> tuple[Motions, FloatArray, tuple[str, ...], FloatArray]:
+) -> tuple[Trials, FloatArray, tuple[str, ...], FloatArray]:
     """Reads markers.h5.
 
     Args:
@@ -125,5 +126,5 @@ def read_motions(
         markers = read_array(file, "markers", (r, times.shape[1], m, 3))
         held, bound = read_array(file, "held", (r, m, 3)), read_array(file, "bound", (m, 3))
         masses = attached_mass(body, hung_on, read_array(file, "load", (r,)))
-    motions = Motions(names, *(torch.from_numpy(array) for array in (times, markers, held, masses)))
-    return motions, bound, labels, gravity
+    seen, places, before, hung = (torch.from_numpy(array) for array in (times, markers, held, masses))
+    return Trials(names, seen, places, before, Inputs(attached_mass=hung)), bound, labels, gravity

@@ -10,9 +10,8 @@ from typing import Any
 from ...io.files import read_json, write_json
 from ...io.progress import Progress
 from ...io.stages import StageContext
-from ...learning.driven import DRIVEN_PARAMETERS
 from ...learning.identification import Bounds, Identifier
-from ...learning.replay import Release, Replay
+from ...learning.replay import MASS_FACTOR, Replay, Start
 from .files import IDENTIFICATION
 from .scene import Scene
 
@@ -21,7 +20,7 @@ _LANDSCAPE = "landscape"
 _AT_ONCE = 4  # points of the landscape
 _PARTS = ("identified", "simulation", _LANDSCAPE)
 
-Replays = Callable[[str], tuple[Replay, Release]]
+Replays = Callable[[str], tuple[Replay, Start]]
 
 
 def identify(context: StageContext) -> None:
@@ -52,9 +51,9 @@ def identify(context: StageContext) -> None:
 
 def first_guess(settings: Mapping[str, Any], names: Any) -> dict[str, float]:
     """What the parameters are before anything is known: those of the uncorrected simulation."""
-    values = {**dict.fromkeys(DRIVEN_PARAMETERS, 0.0), "attached_mass_factor": 1.0}
+    values = {MASS_FACTOR: 1.0, "fibre_stiffness": (settings.get("fibres") or {}).get("stiffness", 0.0)}
     values |= {key: value for key, value in settings["simulation"].items() if key != "model"}
-    return {name: values[name] for name in names}
+    return {name: values.get(name, 0.0) for name in names}
 
 
 def search(
@@ -107,7 +106,7 @@ def evaluations_done(kept: Mapping[str, Any]) -> int:
 def landscape(
     context: StageContext,
     replay: Replay,
-    release: Release,
+    release: Start,
     bounds: Mapping[str, Bounds],
     found: Mapping[str, float],
     seconds: float | None = None,

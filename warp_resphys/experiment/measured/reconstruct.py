@@ -25,9 +25,9 @@ def reconstruct_markers(context: StageContext) -> None:
         # Its velocities ring where positions are prescribed: v+ = 2 (q+ - q) / h - v keeps every deviation.
         simulator = dataclasses.replace(simulator, integrator="bdf2")
     parameters = parameters_of(context.run_dir, model, simulator.rest_positions)
-    tensors = Replay(simulator, scene.markers, motions).tensors(parameters)
+    constants, inputs, _ = Replay(simulator, scene.markers, motions).setting(parameters)
     reconstructor = make_sparse_reconstructor(simulator, scene.markers, **settings["reconstruction"])
-    reconstructor = reconstructor.with_tensors(tensors)
+    reconstructor = reconstructor.with_constants(constants)
     release = scene.release(simulator, motions)
     observed = release.bound(simulator.tensor(at_steps(motions, simulator.time_step, release.delay)))
     batch, steps = observed.shape[:2]
@@ -45,7 +45,7 @@ def reconstruct_markers(context: StageContext) -> None:
             force = simulator.tensor(file.read(file.done - 1)["force"])
         while file.done < file.steps:
             if file.done > 0:
-                result = reconstructor.step(state, observed[:, file.done], first_guess=force)
+                result = reconstructor.step(state, observed[:, file.done], inputs.at(file.done - 1), force)
                 state, force, iterations = result.state.detach(), result.force, result.iterations
             file.append(q=state.q.cpu().numpy(), v=state.v.cpu().numpy(), force=force.cpu().numpy())
             progress.advance(iterations=iterations)

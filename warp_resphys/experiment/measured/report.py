@@ -13,7 +13,6 @@ from ...io.errors import DataFileError
 from ...io.files import read_array, read_hdf5, read_json
 from ...io.stages import StageContext, package_versions, resources_used
 from ...learning.metrics import published_errors
-from ...learning.replay import PARAMETERS
 from ...mesh.mesh import Mesh, select_vertices
 from ...mesh.surface import closest_points
 from ...report.measured_data import FoldsReport, MeasuredReport, Recordings, Trials
@@ -68,7 +67,7 @@ def report_measured(context: StageContext) -> None:
         trials=read_trials(folder, config),
         recordings=read_recordings(_common(folder), config, mesh),
         identification=read_if_there(folder / IDENTIFICATION),
-        start=first_guess(config, PARAMETERS),
+        start=first_guess(config, {**config["identify"]["parameters"], **(config["identify"]["elastic"] or {})}),
         truth=truth.get("material", {}),
         training={m: read_json(path)["epochs"] for m in TRAINED if (path := folder / training_file(m)).is_file()},
         seconds=config["data"]["seconds"],

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from ...data.markers import Markers
+from ...data.trials import Trials
 from ...dynamics.simulator import Simulator
 from ...io.files import read_json
 from ...learning.release import ReleaseSettings, estimate_release
-from ...learning.replay import Motions, Release, Replay
+from ...learning.replay import Replay, Start
 from ..binding import bound_markers
 from ..build import build_body, build_simulator
 from .files import IDENTIFICATION, MARKERS, read_motions
@@ -45,16 +46,13 @@ class Scene:
     shared: Path
 
     @cached_property
-    def _imported(self) -> tuple[Motions, NDArray[np.float64], tuple[str, ...], NDArray[np.float64]]:
+    def _imported(self) -> tuple[Trials, NDArray[np.float64], tuple[str, ...], NDArray[np.float64]]:
         return read_motions(self.shared / MARKERS, build_body(self.config), self.config["data"]["hung_on"])
 
     @cached_property
-    def motions(self) -> Motions:
+    def motions(self) -> Trials:
         """All trials, on the simulators' device."""
-        motions, *_ = self._imported
-        like = self.simulator("simulation").rest_positions
-        fields = (motions.times, motions.markers, motions.held, motions.attached_mass)
-        return Motions(motions.names, *(t.to(like) for t in fields))
+        return self._imported[0].to(self.simulator("simulation").rest_positions)
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -84,24 +82,24 @@ class Scene:
             config |= {"integrator": identify["integrator"], "time_step": config["time_step"] / identify["substeps"]}
         return build_simulator(config, "simulation", on_failure=on_failure)
 
-    def pick(self, names: tuple[str, ...]) -> Motions:
+    def pick(self, names: tuple[str, ...]) -> Trials:
         """Some of the trials."""
-        motions = self.motions
-        return motions.select([motions.names.index(name) for name in names])
+        return self.motions.named(names)
 
-    def release(self, simulator: Simulator, motions: Motions) -> Release:
+    def release(self, simulator: Simulator, motions: Trials) -> Start:
         """How motions begin, as a simulator would have it."""
         return estimate_release(simulator, self.markers, motions, ReleaseSettings(**self.config["release"]))
 
-    def replay(self, kind: str, names: tuple[str, ...]) -> tuple[Replay, Release]:
+    def replay(self, kind: str, names: tuple[str, ...]) -> tuple[Replay, Start]:
         """A simulator of some of the trials, and how they begin."""
         simulator, motions = self.simulator(kind), self.pick(names)
         return Replay(simulator, self.markers, motions), self.release(simulator, motions)
 
 
-def loads(motions: Motions) -> torch.Tensor:
+def loads(motions: Trials) -> torch.Tensor:
     """(R, 1) weight that hangs on the body in each motion [kg]."""
-    return motions.attached_mass.sum(1, keepdim=True)
+    assert motions.inputs.attached_mass is not None
+    return motions.inputs.attached_mass.sum(1, keepdim=True)
 
 
 def parameters_of(folder: Path, model: str, like: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -113,7 +111,7 @@ def parameters_of(folder: Path, model: str, like: torch.Tensor) -> dict[str, tor
     return {name: like.new_tensor([value]) for name, value in values.items()}
 
 
-def at_steps(motions: Motions, step: float, delay: torch.Tensor | None = None) -> NDArray[np.float64]:
+def at_steps(motions: Trials, step: float, delay: torch.Tensor | None = None) -> NDArray[np.float64]:
     """(R, K + 1, M, 3) markers at the steps of a simulation [m], NaN after a motion's end and in long occlusions.
 
     Cubic splines through the frames in which a marker was seen, with where it was held at time zero. Steps further than
@@ -125,7 +123,7 @@ def at_steps(motions: Motions, step: float, delay: torch.Tensor | None = None) -
         delay: (R,) by which the bodies were let go later than the time zero of the frames [s]; none if left out.
     """
     since = motions.times if delay is None else (motions.times - delay[:, None]).clamp_min(0.0)
-    times, markers, held = (t.cpu().numpy() for t in (since, motions.markers, motions.held))
+    times, markers, held = (t.cpu().numpy() for t in (since, motions.observed, motions.held))
     steps = step * np.arange(int(times.max() / step + 1e-6) + 1)
     found = np.full((len(times), len(steps), *markers.shape[2:]), np.nan)
     for r, m in np.ndindex(len(times), markers.shape[2]):

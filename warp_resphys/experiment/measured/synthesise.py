@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from ...data.recordings.arrays import write_recording
 from ...data.recordings.recording import Recording
+from ...dynamics.inputs import Inputs
 from ...dynamics.integrator import State
 from ...dynamics.simulator import Simulator
 from ...io.files import write_json
@@ -158,11 +159,11 @@ def simulate(
     masses = attached_mass(simulator.body, settings["data"]["hung_on"], loads)
     steps = max(int(times.max() / simulator.time_step) + 1, 2)
     with torch.no_grad(), Progress("synthesise", steps, "steps") as progress:
-        tensors = simulator.prepare(attached_mass=simulator.tensor(masses))
+        constants, inputs = simulator.prepare(), Inputs(attached_mass=simulator.tensor(masses))
         state: State = simulator.rest_state(len(trials))
         series = [read(state.q)]
         for _ in range(steps):
-            state, _ = simulator.step(state, material=tensors)
+            state, _ = simulator.step(state, inputs, constants)
             series.append(read(state.q))
             progress.advance()
         at = simulator.tensor(np.maximum(times, 0.0))

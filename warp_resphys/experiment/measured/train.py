@@ -9,12 +9,13 @@ from ...io.progress import Progress
 from ...io.stages import StageContext
 from ...learning.markers_in_the_loop import MarkersInTheLoop, MotionLoss, epochs_that_hold_up
 from ...learning.networks import NextState, ResidualForce, build_model, build_next_state
+from ...learning.predictors import LearnedPredictor
 from ...learning.replay import Replay
-from ...learning.rollout import DataDrivenRollout
+from ...learning.rollout import Rollout
 from ...learning.training import Samples, Trainer
 from ..train import fit
 from ..trajectories import read_fields
-from .evaluate import marker_error_mm, state_predictor_of
+from .evaluate import marker_error_mm
 from .files import training_file, weights_file
 from .scene import Scene, loads, parameters_of
 
@@ -63,8 +64,8 @@ def train_on_markers(context: StageContext) -> None:
 
     def loss(names: Sequence[str]) -> MotionLoss:
         rows = [everyone.index(name) for name in names]
-        motions = replay.motions.select(rows)
-        part = Replay(replay.simulator, replay.markers, motions)
+        motions = replay.trials.select(rows)
+        part = Replay(replay.simulator, replay.observe, motions)
         return MotionLoss(part, release.select(rows), parameters, loads(motions))
 
     epochs = None
@@ -97,7 +98,7 @@ def train_simfree_on_markers(context: StageContext) -> None:
     start = scene.release(simulator, motions)
 
     def error(candidate: NextState) -> float:
-        rollout = DataDrivenRollout(simulator, state_predictor_of(candidate, loads(motions)))
+        rollout = Rollout(simulator, LearnedPredictor(candidate, loads(motions)))
         return marker_error_mm(rollout, simulator, scene.markers, motions, start)
 
     trainer = Trainer(model, samples, samples, error, settings["trainer"], settings["seed"])

@@ -1,0 +1,112 @@
+"""An energy by itself in a given state: its value and its force, which may be held while the body moves on.
+
+An energy's implicit coupling is part of the incremental potential; this is the explicit one, and a gauge: the
+derivative of an energy by an input is what that input works on, as the volume of a chamber is for its pressure.
+"""
+
+from typing import Any
+
+import torch
+import warp as wp
+from typing_extensions import override
+
+from ..fem.body import Body
+from .base import Energy, PartTerm, PointSet
+from .launcher import Launcher, warp_view
+
+
+class HeldEnergy(Launcher):
+    """One energy of a body with a value for each of its parts, differentiable by positions and values.
+
+    Args:
+        body: that it is of.
+        energy: such as `pressure.Pressure`.
+        batch: environments B.
+        device: of every tensor.
+        dtype: of every tensor.
+    """
+
+    def __init__(self, body: Body, energy: Energy, batch: int, device: torch.device, dtype: torch.dtype) -> None:
+        super().__init__(batch, device, dtype)
+        (points,) = energy.points(body.mesh)
+        everything = slice(0, points.n_points)
+        self._set = PointSet(self, points, body.n_vertices, everything, everything)
+        term = energy.term(self, [self._set])
+        assert isinstance(term, PartTerm)
+        self.term = term
+
+    def force(self, positions: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+        """(B, N, 3) force [N] at positions (B, N, 3) [m] for (B, count) values."""
+        force: torch.Tensor = _Force.apply(self, positions, values)
+        return force
+
+    def conjugates(self, positions: torch.Tensor) -> torch.Tensor:
+        """(B, count) less the derivatives of the energy by the values: volumes [m^3] of chambers under pressure."""
+        found: torch.Tensor = _Conjugates.apply(self, positions)
+        return found
+
+    def evaluate(self, positions: torch.Tensor, values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Energy of each part (B, count) [J] and force (B, N, 3) [N], without gradients."""
+        s, (stress, energy) = self._set, (self.zeros(self._set.n_points, 3, 3), self.zeros(self._set.n_points))
+        kernel, inputs = self.term.step(s, {self.term.value: values.contiguous()}, self._view(positions))
+        view = warp_view(stress, self.mat33)
+        step = self.record(kernel, (self.batch, s.n_points), inputs, [view, warp_view(energy, self.scalar)])
+        force = torch.zeros_like(positions)
+        self.launch(step, self.gather(s, view, force))
+        return self.term.sum_parts(energy), force.neg_()
+
+    def force_adjoint(
+        self, positions: torch.Tensor, values: torch.Tensor, adjoint: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Transposed derivatives of `force` by positions and values, applied to (B, N, 3): (B, N, 3) and (B, count)."""
+        s, held = self._set, {self.term.value: values.contiguous()}
+        blocks, stress = self.zeros(s.n_points, 6, 3, 3), self.zeros(s.n_points, 3, 3)
+        exact = torch.zeros(self.batch, device=self.device, dtype=torch.int32)
+        kernel, inputs = self.term.tangent(s, held, self._view(positions), warp_view(exact, wp.int32))
+        tangent, view, out = warp_view(blocks, self.mat33), warp_view(stress, self.mat33), torch.zeros_like(positions)
+        self.launch(
+            self.record(kernel, (self.batch, s.n_points), inputs, [tangent]),
+            # The second derivative of an energy is symmetric: it is its own transpose.
+            self.product(s, tangent, self._view(adjoint), view),
+            self.gather(s, view, out),
+        )
+        slopes = self.term.adjoint(held, positions.contiguous(), adjoint.contiguous())()
+        return out.neg_(), slopes[self.term.value]
+
+    def _view(self, field: torch.Tensor) -> Any:
+        return warp_view(field.contiguous(), self.vec3)
+
+
+class _Conjugates(torch.autograd.Function):
+    """-dE/dp of an energy that is linear in p: a loss with derivatives w by it has the force of p = w as gradient."""
+
+    @override
+    @staticmethod
+    def forward(ctx: Any, held: HeldEnergy, positions: torch.Tensor) -> torch.Tensor:
+        ctx.held = held
+        ctx.save_for_backward(positions)
+        return -held.evaluate(positions.detach(), held.zeros(held.term.count) + 1.0)[0]
+
+    @override
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[None, torch.Tensor]:
+        (positions,) = ctx.saved_tensors
+        return None, ctx.held.evaluate(positions, gradient)[1]
+
+
+class _Force(torch.autograd.Function):
+    """-dE/dx."""
+
+    @override
+    @staticmethod
+    def forward(ctx: Any, held: HeldEnergy, positions: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+        ctx.held = held
+        ctx.save_for_backward(positions, values)
+        return held.evaluate(positions.detach(), values.detach())[1]
+
+    @override
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[None, torch.Tensor, torch.Tensor]:
+        return None, *ctx.held.force_adjoint(*ctx.saved_tensors, gradient)

@@ -1,0 +1,180 @@
+"""Threads wound around chambers, in their surface.
+
+A point's operator g_a holds the derivative along a fibre, so that the first column of F = sum_a x_a g_a^T is the
+deformed fibre and its length the stretch.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from typing_extensions import override
+
+from ..fem.surface_elements import SurfacePoints, face_rule
+from ..io.errors import InputError, MeshError
+from ..kernels.fibres import fibre_kernels
+from ..mesh.chambers import Chamber
+from ..mesh.mesh import Mesh
+from .base import Energy, Parameter, PartTerm, PointSet, Quantity, Values
+from .launcher import Launcher, warp_view
+
+_CAP = 0.7  # cosine between a face's normal and the chamber's axis from which on the face is an end, without fibres
+_ALIGNED = 0.8  # cosine between a chamber's axis and the direction that fibres are wound around, at least
+_LARGEST_ANGLE = 85.0  # degrees
+
+
+@dataclass(frozen=True)
+class Fibres(Energy):
+    """Inextensible thread wound around every chamber, in its surface: it holds a chamber from growing wide.
+
+    The energy of an area of the surface is ``k/2 s(lambda - 1)^2`` for each family of windings, lambda being the
+    stretch along it and k the stiffness of one thread [N] over the distance of its turns [m]. A thread cannot push: s
+    is zero for lambda < 1, and reaches its full slope at the strain `toe`.
+
+    Attributes:
+        chambers: that it is wound around.
+        angles: (A,) of each family of windings from the direction around the chamber, in degrees; two opposite ones
+            make a double helix.
+        toe: strain over which a thread tightens.
+        axis: about along the chambers, which are wound around the one of their principal directions that is nearest to
+            it; None for that in which each reaches furthest.
+        stiffness: k [N/m], the parameter ``fibre_stiffness``: a number, (C,) values with one for each chamber, (B, 1),
+            or (B, C).
+    """
+
+    parameters: ClassVar[tuple[Quantity, ...]] = (Quantity("fibre_stiffness", "N/m", 0.0, closed=True, per="chamber"),)
+
+    chambers: Sequence[Chamber]
+    angles: Sequence[float] = (0.0,)
+    toe: float = 1e-3
+    axis: Sequence[float] | None = None
+    stiffness: Parameter = 0.0
+
+    def __post_init__(self) -> None:
+        """Checks the values.
+
+        Raises:
+            InputError: no chamber, no angle, an angle that is not across the chamber, a strain that is not positive, or
+                a negative stiffness.
+        """
+        if not self.chambers:
+            raise InputError("fibres are wound around chambers, but there are none: leave the fibres out.")
+        angles = np.asarray(self.angles, dtype=np.float64)
+        if angles.ndim != 1 or not angles.size or not (np.abs(angles) <= _LARGEST_ANGLE).all():
+            raise InputError(
+                f"fibre angles are {list(self.angles)}: give one or more, within {_LARGEST_ANGLE:g} degrees of the "
+                "direction around the chamber."
+            )
+        if not (np.isfinite(self.toe) and self.toe > 0.0):
+            raise InputError(f"the strain over which fibres tighten is {self.toe:g}: it must be positive.")
+        self.parameters[0].check(self.stiffness)
+
+    @property
+    @override
+    def count(self) -> int:
+        return len(self.chambers)
+
+    @property
+    @override
+    def constants(self) -> Mapping[str, Parameter]:
+        return {"fibre_stiffness": self.stiffness}
+
+    @override
+    def points(self, mesh: Mesh) -> tuple[SurfacePoints, ...]:
+        """The points at which the energy is integrated; the ends of chambers have none.
+
+        Raises:
+            MeshError: a chamber that has no direction near that of the fibres.
+        """
+        shape, (points, weights) = face_rule(self.chambers, 2)
+        _, gradients = shape(points)
+        operators, areas = [], []
+        for chamber in self.chambers:
+            x = mesh.vertices[chamber.faces]
+            axis = _long_axis(chamber, mesh, self.axis)
+            t1, t2 = np.einsum("fki,qkj->jfqi", x, gradients)
+            normal = np.cross(t1, t2)
+            area = np.linalg.norm(normal, axis=-1)
+            normal /= area[..., None]
+            around = np.cross(axis, normal)
+            size = np.linalg.norm(around, axis=-1, keepdims=True)
+            around /= np.maximum(size, 1e-12)
+            along = np.cross(normal, around)
+            wound = np.abs(normal @ axis) < _CAP
+            # Dual tangents: the surface gradient of a shape function is its reference gradient times these.
+            dual = np.stack([np.cross(t2, normal), np.cross(normal, t1)], axis=-1) / area[..., None, None]
+            for angle in np.radians(self.angles):
+                direction = np.cos(angle) * around + np.sin(angle) * along
+                slopes = np.einsum("qkj,fqij,fqi->fqk", gradients, dual, direction)
+                operators.append(np.where(wound[..., None], slopes, 0.0))
+                areas.append(np.where(wound, area * weights, 0.0))
+        slopes = np.concatenate(operators)  # (C, Q, K)
+        operator = np.zeros((*slopes.shape, 3))
+        operator[..., 0] = slopes
+        families = len(self.angles)
+        nodes = np.concatenate([np.tile(chamber.faces, (families, 1)) for chamber in self.chambers])
+        each = [families * len(c.faces) * len(weights) for c in self.chambers]
+        numbers = np.repeat(np.arange(len(self.chambers)), each)
+        return (SurfacePoints(nodes, operator, np.concatenate(areas).ravel(), numbers),)
+
+    @override
+    def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "FibreTerm":
+        (s,) = sets
+        assert isinstance(s.source, SurfacePoints)
+        term = FibreTerm(launcher, sets, "fibre_stiffness", s.source.chamber, s.source.weights, self.count)
+        term.toe = launcher.scalar(self.toe)
+        return term
+
+
+class FibreTerm(PartTerm):
+    """Kernels of the thread around every chamber.
+
+    Attributes:
+        toe: strain over which it tightens.
+    """
+
+    toe: Any
+
+    @override
+    def step(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
+        return fibre_kernels(self.launcher.scalar).local_step, self._arguments(s, values, positions)
+
+    def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
+        stiffness = values["fibre_stiffness"]
+        assert stiffness is not None
+        surface = [s.nodes, s.gradients, self.weights, self.part]
+        return [*surface, warp_view(stiffness, self.launcher.scalar), self.toe, s.points_per_cell, positions]
+
+    @override
+    def tangent(self, s: PointSet, values: Values, positions: Any, positive: Any) -> tuple[Any, list[Any]]:
+        del positive  # A thread only pulls: its tangent has no negative eigenvalues.
+        return fibre_kernels(self.launcher.scalar).tangent, self._arguments(s, values, positions)
+
+    @override
+    def curvature(self, values: Values) -> torch.Tensor:
+        stiffness = values["fibre_stiffness"]
+        assert stiffness is not None
+        return self.weight * stiffness[:, self.part_of]
+
+    @override
+    def slope(self, s: PointSet, positions: Any, direction: Any) -> tuple[Any, list[Any]]:
+        inputs = [s.nodes, s.gradients, self.weights, self.toe, s.points_per_cell, positions, direction]
+        return fibre_kernels(self.launcher.scalar).adjoint, inputs
+
+
+def _long_axis(chamber: Chamber, mesh: Mesh, near: Sequence[float] | None) -> NDArray[np.float64]:
+    """(3,) the principal direction of a chamber that is nearest to one, or in which it reaches furthest."""
+    vertices = mesh.vertices[chamber.vertices]
+    directions: NDArray[np.float64] = np.linalg.svd(vertices - vertices.mean(axis=0), full_matrices=False)[2]
+    if near is None:
+        return directions[0]
+    aligned = np.abs(directions @ np.asarray(near, dtype=np.float64)) / np.linalg.norm(near)
+    if aligned.max() < _ALIGNED:
+        raise MeshError(
+            f"{chamber.name} has no direction near {list(near)}, around which fibres could be wound: give the "
+            "direction of the chambers (chambers.axis)."
+        )
+    return directions[aligned.argmax()]

@@ -1,0 +1,147 @@
+r"""Isotropic elastic materials and their constants.
+
+=======================  ==================================================  ====================================
+material                 shape terms                                         volume term
+=======================  ==================================================  ====================================
+`Corotated`              ``mu ||F - R(F)||^2``                               ``lambda / 2 ||F - D(F)||^2``
+`StableNeoHookean`       ``mu/2 (||F||^2 - 3) - mu (J - 1) + mu/2 (J-1)^2``  ``lambda / 2 (J - 1)^2``
+=======================  ==================================================  ====================================
+
+R is the rotation of the polar decomposition, D the nearest matrix of determinant one, J = det F. The equations and
+their sources are in ``kernels.materials``. Shape and volume terms may be integrated at different points.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
+from types import SimpleNamespace
+from typing import Any, ClassVar
+
+import torch
+from typing_extensions import override
+
+from ..io.errors import InputError
+from ..kernels.materials.corotated import corotated
+from ..kernels.materials.stable_neo_hookean import stable_neo_hookean
+from .base import Parameter, Quantity
+
+
+def constant(default: float, name: str, unit: str, lower: float = 0.0, **more: Any) -> Any:
+    """A field of a material: its default, and the quantity that it is; `density`, say, is a common keyword."""
+    common = more.pop("common", False)
+    quantity = Quantity(name, unit, lower, **{"per": "element", **more})
+    return field(default=default, kw_only=common, metadata={"quantity": quantity})
+
+
+@dataclass(frozen=True)
+class Material(ABC):
+    """Constants of an elastic material with Rayleigh damping.
+
+    The elastic constants and the density are numbers, (M,) tensors with a value for each element, (B, 1) tensors with a
+    value for each environment of a batch, or (B, M) tensors; the damping constants are numbers or (B,) tensors. Tensors
+    that require gradients receive them from every simulated quantity.
+
+    Attributes:
+        density: rho [kg/m^3].
+        mass_damping: force -alpha M v [1/s].
+        stiffness_damping: Kelvin-Voigt viscosity of retardation time beta [s]; for small strains the force -beta K v.
+        law: the factory of ``kernels.materials``.
+        rules: for each modulus of the law, whether it belongs to the ``shape`` or the ``volume`` rule of integration.
+        curvature: for each modulus, an upper bound of what it adds to the tangent's eigenvalues for small strains.
+    """
+
+    law: ClassVar[Callable[[type], SimpleNamespace]]
+    rules: ClassVar[tuple[str, ...]]
+    curvature: ClassVar[tuple[float, ...]]
+
+    density: Parameter = constant(1070.0, "density", "kg/m^3", common=True)
+    mass_damping: Parameter = constant(0.0, "mass_damping", "1/s", closed=True, per="", common=True)
+    stiffness_damping: Parameter = constant(0.0, "stiffness_damping", "s", closed=True, per="", common=True)
+
+    def __post_init__(self) -> None:
+        """Checks every constant.
+
+        Raises:
+            InputError: a constant outside its physical range.
+        """
+        for name, quantity in self.quantities().items():
+            quantity.check(getattr(self, name))
+
+    @classmethod
+    def quantities(cls) -> dict[str, Quantity]:
+        """Its constants by name: those of the law first."""
+        found = {each.name: each.metadata["quantity"] for each in fields(cls)}
+        common = [each.name for each in fields(cls) if each.kw_only]
+        return {name: found[name] for name in sorted(found, key=common.__contains__)}
+
+    @property
+    def constants(self) -> dict[str, Parameter]:
+        """Their values."""
+        return {name: getattr(self, name) for name in self.quantities()}
+
+    @abstractmethod
+    def moduli(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
+        """The law's moduli [Pa], each (1 or B, 1 or M), of constants of that shape."""
+
+
+@dataclass(frozen=True)
+class _Hookean(Material):
+    """A material that is given by Young's modulus and Poisson's ratio.
+
+    Attributes:
+        youngs_modulus: E [Pa].
+        poissons_ratio: nu, between -1 and 0.5.
+    """
+
+    rules: ClassVar[tuple[str, ...]] = ("shape", "volume")
+    curvature: ClassVar[tuple[float, ...]] = (2.0, 1.0)
+
+    youngs_modulus: Parameter = constant(264e3, "youngs_modulus", "Pa")
+    poissons_ratio: Parameter = constant(0.499, "poissons_ratio", "", lower=-1.0, upper=0.5)
+
+    @override
+    def moduli(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
+        """The Lame constants mu and lambda."""
+        e, nu = constants["youngs_modulus"], constants["poissons_ratio"]
+        return e / (2.0 * (1.0 + nu)), e * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
+
+
+@dataclass(frozen=True)
+class Corotated(_Hookean):
+    """The material of projective dynamics; its small-strain Poisson's ratio is `small_strain_poissons_ratio`."""
+
+    law = corotated
+
+
+@dataclass(frozen=True)
+class StableNeoHookean(_Hookean):
+    """A neo-Hookean solid that stays finite where elements invert, and is linear elasticity for small strains."""
+
+    law = stable_neo_hookean
+
+
+MATERIALS: dict[str, type[Material]] = {"corotated": Corotated, "stable_neo_hookean": StableNeoHookean}
+
+
+def make_material(model: str = "corotated", **constants: Any) -> Material:
+    """The named material.
+
+    Raises:
+        InputError: an unknown name, a constant that the material does not have, or one out of range.
+    """
+    if model not in MATERIALS:
+        raise InputError(f"material model is {model!r}: choose one of {', '.join(MATERIALS)}.")
+    known = MATERIALS[model].quantities()
+    for name in constants:
+        if name not in known:
+            raise InputError(f"{model} has no constant {name!r}: it has {', '.join(known)}.")
+    return MATERIALS[model](**constants)
+
+
+def small_strain_poissons_ratio(poissons_ratio: float) -> float:
+    """Poisson's ratio that the corotated model shows for small strains: linear elasticity with lambda / 3.
+
+    It bends a little less stiffly than its nominal constants: nu 0.45 acts as 0.375, nu 0.499 as 0.497.
+    """
+    lame_over_mu = 2.0 * poissons_ratio / (1.0 - 2.0 * poissons_ratio) / 3.0
+    return lame_over_mu / (2.0 * (lame_over_mu + 1.0))

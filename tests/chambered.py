@@ -1,9 +1,11 @@
 """Small bodies with closed chambers."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
-from warp_resphys import Body, Mesh, box_hexahedra, box_tetrahedra, select_vertices
-from warp_resphys.mesh.chambers import find_chambers
+from warp_resphys import Body, Fibres, Mesh, Pressure, box_hexahedra, box_tetrahedra, find_chambers, select_vertices
 from warp_resphys.mesh.mesh import quadratic
 
 SIZE, DIVISIONS = (0.06, 0.03, 0.02), (6, 3, 3)
@@ -24,7 +26,9 @@ def hollow_box(kind: str) -> Mesh:
     return quadratic(mesh) if kind == "tetrahedron10" else mesh
 
 
-def chambered(kind: str, **options) -> Body:
-    """The same as a body that is clamped at x = 0."""
+def chambered(kind: str, fibres: Mapping[str, Any] | None = None) -> Body:
+    """The same as a body that is clamped at x = 0, with fibres of these settings."""
     mesh = hollow_box(kind)
-    return Body(mesh, fixed=select_vertices(mesh, x=0.0), chambers=find_chambers(mesh, (1.0, 0.0, 0.0)), **options)
+    chambers = find_chambers(mesh, (1.0, 0.0, 0.0))
+    energies = [Pressure(chambers), *([] if fibres is None else [Fibres(chambers, **fibres)])]
+    return Body(mesh, fixed=select_vertices(mesh, x=0.0), energies=energies)

@@ -5,11 +5,12 @@ import pytest
 import torch
 from chambered import KINDS, chambered
 from scipy.spatial.transform import Rotation
-from warp_resphys.learning.driven_rollout import Range, WatchedModel
 
 from warp_resphys import Body, Corotated, Simulator, box_hexahedra, select_vertices
 from warp_resphys.dynamics.frames import VertexFrames
 from warp_resphys.dynamics.inputs import Inputs
+from warp_resphys.dynamics.integrator import State
+from warp_resphys.learning.predictors import LearnedPredictor, Range
 
 
 def deformed(body, stretch):
@@ -89,7 +90,8 @@ def test_what_a_model_predicts_turns_with_the_body_in_a_roll_out():
     turn = Rotation.from_euler("z", 90.0, degrees=True).as_matrix()
     q, nothing = deformed(body, turn), torch.zeros(1, 0)
     range_ = Range.of(torch.zeros(2, 1, dtype=rest.dtype))
-    (kept,) = WatchedModel(Constant(rest[0], force), range_)(q, 0.0 * q, nothing)
-    (turned,) = WatchedModel(Constant(rest[0], force), range_, VertexFrames(body, 0.01, q))(q, 0.0 * q, nothing)
+    state, frames = State(q, 0.0 * q), VertexFrames(body, 0.01, q)
+    kept = LearnedPredictor(Constant(rest[0], force), nothing, range_)(state, 0)
+    turned = LearnedPredictor(Constant(rest[0], force), nothing, range_, frames)(state, 0)
     assert torch.equal(kept, force)
     np.testing.assert_allclose(turned[0].numpy(), force[0].numpy() @ turn.T, atol=1e-12)

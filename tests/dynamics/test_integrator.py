@@ -21,7 +21,7 @@ from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.dynamics.integrator import INTEGRATORS
 from warp_resphys.io.errors import InputError
 
-SOFT = Corotated(2e4, 0.3, 1000.0, mass_damping=1.0, stiffness_damping=3e-3)
+SOFT = Corotated(2e4, 0.3, density=1000.0, mass_damping=1.0, stiffness_damping=3e-3)
 MESH = box_hexahedra((0.04, 0.02, 0.02), (2, 1, 1))
 CLAMPED = Body(MESH, fixed=select_vertices(MESH, x=0.0))
 TIGHT = SolverSettings("newton", relative_tolerance=1e-10)
@@ -82,7 +82,7 @@ def bdf2_decay(a, n):
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_mass_damping_of_a_translation_is_exact(integrator, device):
     h, alpha, steps = 0.02, 5.0, 6
-    material = Corotated(1e5, 0.4, 1000.0, mass_damping=alpha)
+    material = Corotated(1e5, 0.4, density=1000.0, mass_damping=alpha)
     simulator = Simulator(
         Body(MESH), material, h, gravity=WEIGHTLESS, integrator=integrator, solver=TIGHT, device=device
     )
@@ -203,7 +203,7 @@ def test_point_mass_weighs_and_slows(mesh):
     """A body of no weight of its own with a mass on its tip face is a spring: omega^2 = k / m."""
     tip, grams = select_vertices(mesh, x=0.04), 0.05
     body = Body(mesh, fixed=select_vertices(mesh, x=0.0), point_masses=[PointMass(grams, tip)])
-    light = Corotated(2e4, 0.3, 1e-3)
+    light = Corotated(2e4, 0.3, density=1e-3)
     g, h = 1e-2, 1e-3
     simulator = Simulator(body, light, h, (0.0, 0.0, -g), "midpoint", solver=TIGHT)
     np.testing.assert_allclose(simulator.prepare().mass.sum() - grams, 1e-3 * 1.6e-5, rtol=1e-6)

@@ -1,19 +1,19 @@
 """The three nonlinear solvers: agreement, failures, batches."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 
 from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, box_hexahedra, select_vertices
+from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.dynamics.nonlinear_solver import SOLVERS
+from warp_resphys.energies.materials import MATERIALS
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.linalg.lbfgs import InverseHessianUpdate
 from warp_resphys.studies.gradient_check import pose
 
 MESH = box_hexahedra((0.06, 0.02, 0.02), (4, 2, 2))
 BODY = Body(MESH, fixed=select_vertices(MESH, x=0.0))
-MATERIAL = Corotated(1e5, 0.45, 1000.0, stiffness_damping=1e-3)
+MATERIAL = Corotated(1e5, 0.45, density=1000.0, stiffness_damping=1e-3)
 
 
 def simulator(name="quasi_newton", material=MATERIAL, body=BODY, device="cpu", **settings):
@@ -24,7 +24,7 @@ def simulator(name="quasi_newton", material=MATERIAL, body=BODY, device="cpu", *
 @pytest.mark.parametrize("start", ["bent", "twisted"])
 @pytest.mark.parametrize("model", ["corotated", "stable_neo_hookean"])
 def test_all_solvers_find_the_same_trajectory(model, start, device):
-    material = replace(MATERIAL, model=model)
+    material = MATERIALS[model](**MATERIAL.constants)
     results = {}
     for name in SOLVERS:
         s = simulator(name, material, device=device, max_iterations=5000)
@@ -103,11 +103,11 @@ def test_batch_of_different_states_and_materials_equals_single_runs(name, device
     s = simulator(name, relative_tolerance=1e-10, max_iterations=20000, device=device)
     start = pose(s, "bent", size)
     forces = s.tensor(1e-3 * torch.randn(steps, *start.q.shape, generator=generator, dtype=torch.float64))
-    together = s.rollout(start, steps, forces, material=Corotated(**constants, **damping))
+    together = s.rollout(start, steps, Inputs(forces), {**constants, **damping})
     for i in range(size):
         own = {key: float(value[i]) for key, value in (constants | damping).items()}
         state = State(start.q[i : i + 1], start.v[i : i + 1])
-        alone = s.rollout(state, steps, forces[:, i : i + 1], material=Corotated(**own))
+        alone = s.rollout(state, steps, Inputs(forces[:, i : i + 1]), own)
         torch.testing.assert_close(together.q[:, i], alone.q[:, 0], rtol=0.0, atol=1e-10)
         torch.testing.assert_close(together.v[:, i], alone.v[:, 0], rtol=0.0, atol=1e-8)
 
@@ -115,14 +115,10 @@ def test_batch_of_different_states_and_materials_equals_single_runs(name, device
 def test_material_per_element_equals_scalar_where_constant():
     s = simulator(relative_tolerance=1e-10)
     elements = len(MESH.cells)
-    spread = replace(
-        MATERIAL,
-        youngs_modulus=torch.full((elements,), 1e5, dtype=torch.float64),
-        poissons_ratio=torch.full((elements,), 0.45, dtype=torch.float64),
-        density=torch.full((elements,), 1000.0, dtype=torch.float64),
-    )
+    constants = {"youngs_modulus": 1e5, "poissons_ratio": 0.45, "density": 1000.0}
+    spread = {name: torch.full((elements,), value, dtype=torch.float64) for name, value in constants.items()}
     state = pose(s, "bent", 1)
-    torch.testing.assert_close(s.step(state, material=spread)[0].q, s.step(state)[0].q, rtol=0.0, atol=1e-12)
+    torch.testing.assert_close(s.step(state, parameters=spread)[0].q, s.step(state)[0].q, rtol=0.0, atol=1e-12)
     stiff_half = 1e5 * torch.where(torch.arange(elements) < elements // 2, 4.0, 1.0)
     tip = select_vertices(MESH, x=0.06)
     sags = [
@@ -189,7 +185,7 @@ def test_recovers_from_inverted_elements(name):
 def test_auxetic_material_runs_with_all_solvers(model):
     results = []
     for name in SOLVERS:
-        s = simulator(name, Corotated(1e5, -0.3, 1000.0, model=model), max_iterations=5000)
+        s = simulator(name, MATERIALS[model](1e5, -0.3, density=1000.0), max_iterations=5000)
         results.append(s.rollout(pose(s, "bent", 1), 3).q)
     torch.testing.assert_close(results[1], results[0], rtol=0.0, atol=1e-9)
     torch.testing.assert_close(results[2], results[0], rtol=0.0, atol=1e-9)

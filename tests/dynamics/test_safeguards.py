@@ -43,7 +43,7 @@ def test_overflow_is_not_convergence():
     sim = Simulator(CLAMPED, RUBBER, solver=SolverSettings(on_failure="count", max_iterations=5))
     force = torch.zeros_like(sim.rest_positions)[None]
     force[0, -1, 0] = 1e200
-    _, report = sim.step(sim.rest_state(), force)
+    _, report = sim.step(sim.rest_state(), Inputs(force))
     assert not report.converged.any()
 
 
@@ -67,7 +67,7 @@ def test_a_simulator_is_constant():
     sim = Simulator(CLAMPED, RUBBER)
     with pytest.raises(AttributeError, match="a simulator is constant"):
         sim.gravity = (0.0, 0.0, 0.0)
-    assert dataclasses.replace(sim, gravity=(0.0, 0.0, 0.0)).prepare().weight.abs().max() == 0.0
+    assert dataclasses.replace(sim, gravity=(0.0, 0.0, 0.0)).prepare().gravity.abs().max() == 0.0
 
 
 def test_states_of_another_type_are_refused():
@@ -79,6 +79,8 @@ def test_states_of_another_type_are_refused():
         sim.step(State(state.q.numpy(), state.v))
     with pytest.raises(InputError, match="steps is -3"):
         sim.rollout(state, -3)
+    with pytest.raises(InputError, match="the inputs are a Tensor: give Inputs"):
+        sim.step(state, torch.zeros_like(state.q))
 
 
 def test_a_matrix_beyond_32_bit_addresses_is_refused():

@@ -1,14 +1,13 @@
 import gc
 import weakref
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 import warp as wp
 
-from warp_resphys import Body, Corotated, Simulator, State, box_hexahedra
+from warp_resphys import Body, Corotated, Inputs, Simulator, State, box_hexahedra
 from warp_resphys.dynamics.tape import record_rollout
 from warp_resphys.energies.launcher import warp_view
 from warp_resphys.io.errors import InputError
@@ -34,7 +33,7 @@ def add_squares(q: wp.array3d[wp.vec3d], rest: wp.array2d[wp.vec3d], loss: wp.ar
 
 def make_simulator(device: str, integrator: str = "implicit_euler") -> Simulator:
     mesh = box_hexahedra((0.04, 0.02, 0.02), (2, 1, 1))
-    material = Corotated(1e5, 0.4, 1000.0, mass_damping=0.5, stiffness_damping=0.001)
+    material = Corotated(1e5, 0.4, density=1000.0, mass_damping=0.5, stiffness_damping=0.001)
     clamped = np.flatnonzero(mesh.vertices[:, 0] == 0.0)
     return Simulator(Body(mesh, clamped), material, integrator=integrator, relative_tolerance=1e-11, device=device)
 
@@ -61,7 +60,7 @@ def test_gradients_equal_those_of_torch(device: str, integrator: str) -> None:
     inputs = {
         "q": state.q,
         "v": state.v,
-        "external_forces": simulator.tensor(1e-3 * torch.randn(shape, generator=random)),
+        "external_force": simulator.tensor(1e-3 * torch.randn(shape, generator=random)),
         "fixed_positions": (state.q[:, simulator.fixed] + 1e-4).expand(STEPS, -1, -1, -1).clone(),
         "youngs_modulus": simulator.tensor([1.1e5, 0.9e5]),  # an element
         "poissons_ratio": simulator.tensor([[0.35], [0.42]]),  # an environment
@@ -72,10 +71,9 @@ def test_gradients_equal_those_of_torch(device: str, integrator: str) -> None:
     weights = simulator.tensor(torch.randn(2, STEPS + 1, *shape[1:], generator=random))
 
     leaves = {name: value.clone().requires_grad_(True) for name, value in inputs.items()}
-    material = replace(simulator.material, **{k: leaves[k] for k in list(inputs)[4:]})
-    trajectory = simulator.rollout(
-        State(leaves["q"], leaves["v"]), STEPS, leaves["external_forces"], leaves["fixed_positions"], material
-    )
+    acting = Inputs(leaves["external_force"], leaves["fixed_positions"])
+    parameters = {k: leaves[k] for k in list(inputs)[4:]}
+    trajectory = simulator.rollout(State(leaves["q"], leaves["v"]), STEPS, acting, parameters)
     loss = (weights[0] * trajectory.q).sum() + (weights[1] * trajectory.v).sum()
     expected = torch.autograd.grad(loss, list(leaves.values()))
 
@@ -87,8 +85,7 @@ def test_gradients_equal_those_of_torch(device: str, integrator: str) -> None:
         arrays["q"],
         arrays["v"],
         STEPS,
-        external_forces=arrays["external_forces"],
-        fixed_positions=arrays["fixed_positions"],
+        inputs={name: arrays[name] for name in ("external_force", "fixed_positions")},
         parameters={name: arrays[name] for name in list(inputs)[4:]},
     )
     assert len(rollout.reports) == STEPS
@@ -111,7 +108,7 @@ def taped_loss(simulator: Simulator, strength: wp.array, modulus: wp.array) -> t
     with wp.Tape() as tape:
         wp.launch(push, dim=force.shape, inputs=[strength], outputs=[force], device=device)
         rollout = record_rollout(
-            tape, simulator, q, v, STEPS, external_forces=force, parameters={"youngs_modulus": modulus}
+            tape, simulator, q, v, STEPS, inputs={"external_force": force}, parameters={"youngs_modulus": modulus}
         )
         wp.launch(add_squares, dim=rollout.q.shape, inputs=[rollout.q, rest], outputs=[loss], device=device)
     return tape, loss
@@ -194,9 +191,9 @@ def test_nothing_is_copied(device: str, monkeypatch: pytest.MonkeyPatch) -> None
     seen = {}
     rollout_in_torch = simulator.rollout
 
-    def spy(state: State, steps: int, forces: torch.Tensor, fixed: None, material: Corotated, _: None) -> object:
-        trajectory = rollout_in_torch(state, steps, forces, fixed, material)
-        seen.update(q=state.q, v=state.v, force=forces, modulus=material.youngs_modulus)
+    def spy(state: State, steps: int, inputs: Inputs, parameters: dict[str, torch.Tensor]) -> object:
+        trajectory = rollout_in_torch(state, steps, inputs, parameters)
+        seen.update(q=state.q, v=state.v, force=inputs.external_force, modulus=parameters["youngs_modulus"])
         seen.update(q_out=trajectory.q, v_out=trajectory.v)
         return trajectory
 
@@ -210,7 +207,7 @@ def test_nothing_is_copied(device: str, monkeypatch: pytest.MonkeyPatch) -> None
         given["q"],
         given["v"],
         1,
-        external_forces=given["force"],
+        inputs={"external_force": given["force"]},
         parameters={"youngs_modulus": given["modulus"]},
     )
     for name, value in {**given, "q_out": rollout.q, "v_out": rollout.v}.items():
@@ -226,7 +223,7 @@ def test_a_dropped_tape_leaves_nothing_behind(device: str) -> None:
     state = simulator.rest_state(BATCH)
     tape = wp.Tape()
     force = array(0.0 * state.q)
-    rollout = record_rollout(tape, simulator, array(state.q), array(state.v), 1, external_forces=force)
+    rollout = record_rollout(tape, simulator, array(state.q), array(state.v), 1, inputs={"external_force": force})
     rollout.q.grad.fill_(1.0)
     tape.backward()
     assert force.grad.numpy().any()
@@ -241,7 +238,7 @@ def wrong_type(simulator: Simulator, q: wp.array, v: wp.array) -> None:
 
 
 def wrong_name(simulator: Simulator, q: wp.array, v: wp.array) -> None:
-    record_rollout(wp.Tape(), simulator, q, v, 1, parameters={"stiffness": v})
+    record_rollout(wp.Tape(), simulator, q, v, 1, parameters={"stiffness": wp.zeros(1, dtype=wp.float64)})
 
 
 def wrong_shape(simulator: Simulator, q: wp.array, v: wp.array) -> None:

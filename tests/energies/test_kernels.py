@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import scipy.optimize
 import torch
-from warp_resphys.energies.terms import StepTerms
 
 from warp_resphys import Body, Mesh, box_hexahedra, box_tetrahedra, select_vertices
 from warp_resphys.dynamics.assembly import BlockPattern, HessianAssembly
-from warp_resphys.energies.materials import MODELS
-from warp_resphys.energies.potential import IncrementalPotential
+from warp_resphys.energies.materials import MATERIALS
+from warp_resphys.energies.potential import IncrementalPotential, StepTerms
+from warp_resphys.energies.solid import Solid
 from warp_resphys.linalg.linear_solver import make_linear_solver
 
 UNIT = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
@@ -32,18 +32,25 @@ GRADIENTS = np.concatenate(
 )
 
 
+def potential_of(body, model, batch, device, dtype):
+    solid = Solid(body.discretisation, MATERIALS[model](), device, dtype)
+    fixed = torch.as_tensor(body.fixed_vertices, device=device)
+    return IncrementalPotential([(solid, solid.points(body.mesh))], body.n_vertices, fixed, batch, device, dtype)
+
+
 def unit_potential(gradients, model="corotated", shape=SHAPE, volume=VOLUME, viscosity=0.0, reference=None, **where):
     """Potential of the unit tetrahedron, whose residual on vertices 1 to 3 is V times the stress's columns."""
     count = len(gradients)
     where = {"device": torch.device("cpu"), "dtype": torch.float64} | where
-    potential = IncrementalPotential(TETRAHEDRON, MODELS[model], count, **where)
+    potential = potential_of(TETRAHEDRON, model, count, **where)
 
     def full(value, *size):
         return torch.full((count, *size), float(value), **where)
 
     strain = None if reference is None else torch.as_tensor(reference, **where).reshape(count, 1, 3, 3)
-    terms = [full(0, 4, 3), full(0, 4), full(0, 4, 3), full(shape, 1), full(volume, 1), full(viscosity)]
-    potential.set_terms(StepTerms(*terms, strain))
+    stiffness = torch.stack([full(shape, 1), full(volume, 1)], dim=-1)
+    values = {"stiffness": stiffness, "viscosity": full(viscosity), "reference_strain": strain}
+    potential.set_terms(StepTerms(full(0, 4, 3), full(0, 4), full(0, 4, 3), values))
     potential.positions.copy_(torch.as_tensor(UNIT @ gradients.transpose(0, 2, 1), **where))
     return potential
 
@@ -100,13 +107,13 @@ def test_nearest_unimodular_matrix_has_determinant_one_and_is_the_nearest(device
     np.testing.assert_allclose(nearest, [reference_unimodular(f) for f in GRADIENTS], atol=1e-6)
 
 
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("model", MATERIALS)
 def test_energies_equal_the_closed_form(model, device):
     _, energy = stress_and_energy(GRADIENTS, model, device=torch.device(device))
     np.testing.assert_allclose(energy, [reference_energy(f, model) for f in GRADIENTS], rtol=1e-9, atol=1e-14)
 
 
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("model", MATERIALS)
 def test_stress_is_the_derivative_of_the_energy(model):
     step, direction = 1e-5, np.random.default_rng(1).normal(size=GRADIENTS.shape)
     stress, _ = stress_and_energy(GRADIENTS, model)
@@ -137,7 +144,7 @@ def test_viscous_stress_is_the_derivative_of_the_dissipation_potential(model, la
 
 
 @pytest.mark.parametrize("viscosity", [0.0, 0.6])
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("model", MATERIALS)
 def test_tangent_is_the_derivative_of_the_stress(model, viscosity):
     rng = np.random.default_rng(3)
     noise = rng.normal(scale=0.1, size=GRADIENTS.shape)
@@ -161,7 +168,7 @@ def dense_tangent(potential, positive=None):
     return torch.stack(columns, dim=-1).numpy()
 
 
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("model", MATERIALS)
 def test_clamped_tangent_is_the_eigenvalue_clamp_at_every_point(model):
     potential = unit_potential(GRADIENTS, model)
     exact = dense_tangent(potential)
@@ -193,7 +200,7 @@ def test_clamped_viscous_tangent_is_positive_semidefinite():
 
 def test_collapsed_elements_stay_finite():
     collapsed = np.stack([np.zeros((3, 3)), np.diag([1.0, 0, 0]), -np.eye(3), np.diag([1e3, 1e-3, -5])])
-    for model in MODELS:
+    for model in MATERIALS:
         stress, energy = stress_and_energy(collapsed, model)
         assert np.isfinite(stress).all()
         assert np.isfinite(energy).all()
@@ -224,18 +231,18 @@ def loaded_potential(mesh):
     def noise(*shape):
         return torch.rand(*shape, generator=generator, dtype=torch.float64)
 
-    potential = IncrementalPotential(body, MODELS["corotated"], b, torch.device("cpu"), torch.float64)
+    potential = potential_of(body, "corotated", b, torch.device("cpu"), torch.float64)
     sets = body.discretisation.point_sets
     volumes = [
         np.concatenate([getattr(s, name).sum(axis=1) for s in sets]) for name in ("shape_volume", "volume_volume")
     ]
     stiffness = [torch.as_tensor(v) * (1.0 + noise(b, 1)) * scale for v, scale in zip(volumes, (1e5, 1e6), strict=True)]
-    strain = 0.01 * noise(b, potential.n_points, 3, 3)
-    potential.set_terms(
-        StepTerms(noise(b, n, 3), 1e4 * (1 + noise(b, n)), noise(b, n, 3), *stiffness, noise(b), strain + strain.mT)
-    )
+    strain = 0.01 * noise(b, potential.solid.n_points, 3, 3)
+    main = noise(b, n, 3), 1e4 * (1 + noise(b, n)), noise(b, n, 3)
+    values = {"viscosity": noise(b), "reference_strain": strain + strain.mT}
+    potential.set_terms(StepTerms(*main, {"stiffness": torch.stack(stiffness, dim=-1), **values}))
     potential.positions.copy_(torch.as_tensor(mesh.vertices) + 1e-3 * noise(b, n, 3))
-    pattern = BlockPattern(body)
+    pattern = BlockPattern(n, body.fixed_vertices, sets)
     dofs = (3 * pattern.free[:, None] + np.arange(3)).ravel()
     return potential, pattern, dofs
 
@@ -282,11 +289,11 @@ def test_float32_agrees_with_float64(kind):
     positions = mesh.vertices + 5e-4 * np.random.default_rng(0).random(mesh.vertices.shape)
     residuals = []
     for dtype in (torch.float64, torch.float32):
-        potential = IncrementalPotential(body, MODELS["corotated"], 1, torch.device("cpu"), dtype)
-        n, p = potential.n_vertices, potential.n_points
+        potential = potential_of(body, "corotated", 1, torch.device("cpu"), dtype)
+        n, p = potential.n_vertices, potential.solid.n_points
         zeros = [torch.zeros(1, *shape, dtype=dtype) for shape in ((n, 3), (n,), (n, 3))]
-        ones = torch.ones(1, p, dtype=dtype)
-        potential.set_terms(StepTerms(*zeros, ones, ones, torch.zeros(1, dtype=dtype)))
+        values = {"stiffness": torch.ones(1, p, 2, dtype=dtype), "viscosity": torch.zeros(1, dtype=dtype)}
+        potential.set_terms(StepTerms(*zeros, {**values, "reference_strain": None}))
         potential.positions.copy_(torch.as_tensor(positions))
         potential.evaluate()
         residuals.append(potential.residual.double())

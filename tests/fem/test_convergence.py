@@ -19,7 +19,7 @@ from warp_resphys import (
     select_vertices,
 )
 from warp_resphys.dynamics.inputs import Inputs
-from warp_resphys.energies.materials import small_strain_poissons_ratio
+from warp_resphys.energies.materials import MATERIALS, small_strain_poissons_ratio
 from warp_resphys.fem.elements import physical_gradients
 from warp_resphys.mesh.shape_functions import gauss_hexahedron, hexahedron_shape
 
@@ -122,7 +122,7 @@ def test_small_strains_are_linear_elasticity(model):
     mesh = box_hexahedra((0.06, 0.02, 0.03), (4, 2, 2))
     fixed = select_vertices(mesh, x=0.0)
     force = 1e-7 * np.random.default_rng(0).normal(size=mesh.vertices.shape)
-    material = Corotated(youngs_modulus, poissons_ratio, 1000.0, model=model)
+    material = MATERIALS[model](youngs_modulus, poissons_ratio, density=1000.0)
     settings = SolverSettings("newton", relative_tolerance=1e-6)
     body = Body(mesh, fixed=fixed, volume_integration="full")
     simulator = Simulator(body, material, gravity=(0.0, 0.0, 0.0), solver=settings)

@@ -462,5 +462,7 @@ class Simulator:
             fields |= {f"state.previous[{i}]": each for i, each in enumerate(state.previous)}
         for name, values in fields.items():
             check_tensor(name, values, (batch, n, 3), "m/s" if name[-1] in "v1" else "m", "vertex", like)
+        if not isinstance(inputs, Inputs):
+            raise InputError(f"the inputs are a {type(inputs).__name__}: give Inputs(external_force=...), say.")
         inputs.check([energy for energy, _ in self._energies], batch, n, len(self.fixed), like)
         constants.check_batch(batch)

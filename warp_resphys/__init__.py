@@ -13,6 +13,7 @@ _MODULES = {
     "Corotated": "energies.materials",
     "Material": "energies.materials",
     "StableNeoHookean": "energies.materials",
+    "MooneyRivlin": "energies.materials",
     "make_material": "energies.materials",
     "Inputs": "dynamics.inputs",
     "Pressure": "energies.pressure",

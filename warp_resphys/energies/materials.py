@@ -5,6 +5,7 @@ material                 shape terms                                         vol
 =======================  ==================================================  ====================================
 `Corotated`              ``mu ||F - R(F)||^2``                               ``lambda / 2 ||F - D(F)||^2``
 `StableNeoHookean`       ``mu/2 (||F||^2 - 3) - mu (J - 1) + mu/2 (J-1)^2``  ``lambda / 2 (J - 1)^2``
+`MooneyRivlin`           that with c10 = mu/2, ``c01 ((I2 - 3) - 4 (J-1))``  ``lambda / 2 (J - 1)^2``
 =======================  ==================================================  ====================================
 
 R is the rotation of the polar decomposition, D the nearest matrix of determinant one, J = det F. The equations and
@@ -22,6 +23,7 @@ from typing_extensions import override
 
 from ..io.errors import InputError
 from ..kernels.materials.corotated import corotated
+from ..kernels.materials.mooney_rivlin import mooney_rivlin
 from ..kernels.materials.stable_neo_hookean import stable_neo_hookean
 from .base import Parameter, Quantity
 
@@ -120,7 +122,36 @@ class StableNeoHookean(_Hookean):
     law = stable_neo_hookean
 
 
-MATERIALS: dict[str, type[Material]] = {"corotated": Corotated, "stable_neo_hookean": StableNeoHookean}
+@dataclass(frozen=True)
+class MooneyRivlin(Material):
+    """Rubber with two elastic constants and a bulk modulus; for small strains mu is 2 (c10 + c01).
+
+    Attributes:
+        c10: of the first invariant [Pa].
+        c01: of the second [Pa].
+        bulk_modulus: [Pa].
+    """
+
+    law = mooney_rivlin
+    rules: ClassVar[tuple[str, ...]] = ("shape", "shape", "volume")
+    curvature: ClassVar[tuple[float, ...]] = (4.0, 4.0, 1.0)
+
+    c10: Parameter = constant(36e3, "c10", "Pa")
+    c01: Parameter = constant(8e3, "c01", "Pa", closed=True)
+    bulk_modulus: Parameter = constant(44e6, "bulk_modulus", "Pa")
+
+    @override
+    def moduli(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
+        """c10, c01 and lambda = K - 2/3 mu."""
+        c10, c01 = constants["c10"], constants["c01"]
+        return c10, c01, constants["bulk_modulus"] - 4.0 / 3.0 * (c10 + c01)
+
+
+MATERIALS: dict[str, type[Material]] = {
+    "corotated": Corotated,
+    "stable_neo_hookean": StableNeoHookean,
+    "mooney_rivlin": MooneyRivlin,
+}
 
 
 def make_material(model: str = "corotated", **constants: Any) -> Material:

@@ -41,6 +41,7 @@ MESHES = {
     "hexahedron": box_hexahedra(SIZE, (3, 1, 2)),
     "tetrahedron": box_tetrahedra(SIZE, (3, 1, 1)),
     "tetrahedron10": box_tetrahedra(SIZE, (2, 1, 1), order=2),
+    "hexahedron27": box_hexahedra(SIZE, (1, 1, 1), nodes=27),
 }
 DAMPED = Corotated(264e3, 0.45, density=1070.0, mass_damping=0.5, stiffness_damping=2e-3)
 TIGHT = SolverSettings("newton", relative_tolerance=1e-10)

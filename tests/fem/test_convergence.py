@@ -1,5 +1,7 @@
 """Static deflections: convergence with refinement, the documented sags, and linear elasticity for small strains."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import scipy.sparse
@@ -21,7 +23,6 @@ from warp_resphys import (
 from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.energies.materials import MATERIALS, small_strain_poissons_ratio
 from warp_resphys.fem.elements import physical_gradients
-from warp_resphys.mesh.shape_functions import gauss_hexahedron, hexahedron_shape
 
 BEAM = (0.1, 0.03, 0.03)
 SILICONE = {"youngs_modulus": 264e3, "density": 1070.0}
@@ -69,6 +70,28 @@ def quadratic_tetrahedra(n):
     return box_tetrahedra(BEAM, (2 * n, n, n), order=2)
 
 
+def quadratic_bricks(n, nodes):
+    return box_hexahedra(BEAM, (2 * n, n, n), nodes=nodes)
+
+
+@pytest.mark.parametrize("nodes", [20, 27])
+def test_quadratic_hexahedra_converge_a_rate_faster(nodes):
+    """Their sags change by an eighth or less from one refinement to the next, towards those of 10-node tetrahedra."""
+    sags = linear_sags(partial(quadratic_bricks, nodes=nodes), (1, 2, 4), 0.0)
+    first, second = np.abs(np.diff(sags))
+    assert second < first / 6.5
+    tetrahedra = linear_sags(quadratic_tetrahedra, (2, 4), 0.0)
+    assert sags[2] == pytest.approx(tetrahedra[1] + (tetrahedra[1] - tetrahedra[0]) / 7, rel=1e-3)
+
+
+@pytest.mark.parametrize(("nodes", "within"), [(20, 0.07), (27, 0.02)])
+def test_quadratic_hexahedra_do_not_lock(nodes, within):
+    """Two elements across a nearly incompressible beam bend as eight layers of 8-node hexahedra do."""
+    fine = linear_sags(bricks, (8,), 0.499)[0]
+    (coarse,) = linear_sags(partial(quadratic_bricks, nodes=nodes), (2,), 0.499)
+    assert coarse == pytest.approx(fine, rel=within)
+
+
 def test_cantilever_converges_at_the_expected_rate():
     """Order 2 for hexahedra and 3 for 10-node tetrahedra (nu = 0 has no singularity at the clamp).
 
@@ -93,8 +116,8 @@ def test_elements_agree_on_the_limit_at_moderate_poissons_ratio():
 
 def linear_elasticity(mesh, fixed, mu, lame_lambda, force):
     """Displacement of full-integrated hexahedra by Hooke's law, assembled from strain matrices."""
-    points, weights = gauss_hexahedron()
-    gradients, determinants = physical_gradients(mesh.vertices, mesh.cells, hexahedron_shape(points)[1])
+    points, weights = mesh.element.rule
+    gradients, determinants = physical_gradients(mesh.vertices, mesh.cells, mesh.element.shape(points)[1])
     hooke = np.zeros((6, 6))
     hooke[:3, :3] = lame_lambda
     hooke += np.diag([2 * mu] * 3 + [mu] * 3)

@@ -55,7 +55,7 @@ def build_mesh(config: Mapping[str, Any]) -> Mesh:
     """
     kind = config["kind"]
     if kind == "box_hexahedra":
-        mesh = box_hexahedra(config["size"], config["divisions"])
+        mesh = box_hexahedra(config["size"], config["divisions"], config.get("nodes", 8))
     elif kind == "box_tetrahedra":
         mesh = box_tetrahedra(config["size"], config["divisions"], config.get("order", 1))
     elif kind == "file":

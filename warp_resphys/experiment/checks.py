@@ -57,6 +57,7 @@ _WHOLE_NUMBERS = (
     "data.steps",
     "data.limit.*",
     "mesh.chambers",
+    "mesh.nodes",
     "mesh.order",
     "*.max_iterations",
     "solver.memory",

@@ -5,7 +5,6 @@ there is ``F = sum_a x_a (grad N_a)^T``, and says how much of each element's vol
 volume term of the energy. Gauss points, element centres and averages over vertex patches are all of this form.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,16 +12,8 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from ..io.errors import InputError
+from ..mesh.elements import Array
 from ..mesh.mesh import Mesh, check_mesh
-from ..mesh.shape_functions import (
-    Array,
-    degree_four_tetrahedron,
-    gauss_hexahedron,
-    gauss_tetrahedron,
-    hexahedron_shape,
-    tetrahedron10_shape,
-    tetrahedron_shape,
-)
 
 VOLUME_INTEGRATIONS = ("centre", "full")
 
@@ -103,11 +94,12 @@ def _per_vertex(cells: NDArray[np.int64], n_vertices: int, values: Array) -> sci
 def discretise(mesh: Mesh, volume_integration: str = "centre") -> Discretisation:
     """The points, masses and loads of a mesh.
 
-    Hexahedra take 2 x 2 x 2 Gauss points, 10-node tetrahedra 4 and 4-node tetrahedra 1 for the shape term. The volume
-    term is under-integrated against locking (``centre``), on a volume-weighted mean deformation gradient: that of each
-    element for hexahedra and 10-node tetrahedra, that of the cells around each vertex for 4-node tetrahedra (Bonet and
-    Burton 1998). The mean is the value at the centre where an element is not distorted, and passes the patch test where
-    it is (Flanagan and Belytschko 1981). ``full`` takes the shape term's points.
+    The shape term takes the points of the element's rule. The volume term is under-integrated against locking
+    (``centre``), on deformation gradients that are projected on few polynomials of each element (Simo and Hughes 1998,
+    section 4.4): on constants, the volume-weighted mean, for 8-node hexahedra and 10-node tetrahedra, on linear ones
+    for quadratic hexahedra; or on the mean over the cells around each vertex, for 4-node tetrahedra (Bonet and Burton
+    1998). Projections pass the patch test on distorted elements too (Flanagan and Belytschko 1981). ``full`` takes the
+    shape term's points.
 
     Args:
         mesh: the rest shape.
@@ -123,34 +115,28 @@ def discretise(mesh: Mesh, volume_integration: str = "centre") -> Discretisation
         )
     check_mesh(mesh)
     full = volume_integration == "full"
-    if mesh.kind == "hexahedron":
-        return _isoparametric(mesh, hexahedron_shape, gauss_hexahedron(), full)
-    if mesh.kind == "tetrahedron10":
-        return _isoparametric(mesh, tetrahedron10_shape, gauss_tetrahedron(), full)
-    return _linear_tetrahedra(mesh, full)
+    if mesh.element.volume_modes is None:
+        return _linear_tetrahedra(mesh, full)
+    return _isoparametric(mesh, full)
 
 
-def _isoparametric(
-    mesh: Mesh,
-    shape: Callable[[Array], tuple[Array, Array]],
-    rule: tuple[Array, Array],
-    full: bool,
-) -> Discretisation:
-    """Gauss points for the shape term; the same, or one point with their mean gradients, for the volume term."""
-    points, weights = rule
-    values, reference = shape(points)
+def _isoparametric(mesh: Mesh, full: bool) -> Discretisation:
+    """The rule's points for the shape term; the same, or those of projected gradients, for the volume term."""
+    element = mesh.element
+    points, weights = element.rule
+    values, reference = element.shape(points)
     gradients, determinants = physical_gradients(mesh.vertices, mesh.cells, reference)
     volumes = determinants * weights
     element_volumes = volumes.sum(axis=1)
     if full:
         shape_volume = volume_volume = volumes
     else:
-        mean = np.einsum("cq,cqki->cki", volumes, gradients) / element_volumes[:, None, None]
-        gradients = np.concatenate([gradients, mean[:, None]], axis=1)
-        shape_volume = np.concatenate([volumes, np.zeros((len(volumes), 1))], axis=1)
-        volume_volume = np.concatenate([np.zeros_like(volumes), element_volumes[:, None]], axis=1)
+        projected, own = _projected(mesh, points, volumes, gradients)
+        gradients = np.concatenate([gradients, projected], axis=1)
+        shape_volume = np.concatenate([volumes, np.zeros_like(own)], axis=1)
+        volume_volume = np.concatenate([np.zeros_like(volumes), own], axis=1)
     load = volumes @ values
-    lumped = load if mesh.kind == "hexahedron" else _hrz_lumping(mesh, element_volumes)
+    lumped = load if element.mass_rule is None else _hrz_lumping(mesh, element_volumes)
     n = len(mesh.vertices)
     return Discretisation(
         (PointSet(mesh.cells, gradients, _one_hot(shape_volume), _one_hot(volume_volume)),),
@@ -160,13 +146,44 @@ def _isoparametric(
     )
 
 
+def _projected(mesh: Mesh, points: Array, volumes: Array, gradients: Array) -> tuple[Array, Array]:
+    """Gradients (M, Q', K, 3) of the volume term [1/m], projected on the element's modes, and (M, Q') volumes [m^3].
+
+    The projection is the least-squares one in the volume at the points of the shape term: sum_n phi_n(x) M^-1_nm sum_q
+    v_q phi_m(x_q) g_q with M_nm = sum_q v_q phi_n(x_q) phi_m(x_q). The volumes are those of the rule, changed as little
+    as it takes to integrate the modes as the shape term's points do, which the patch test asks for.
+
+    Args:
+        mesh: of the elements.
+        points: (Q, 3) of the shape term.
+        volumes: (M, Q) of these [m^3].
+        gradients: (M, Q, K, 3) there [1/m].
+    """
+    element = mesh.element
+    assert element.volume_modes is not None
+    if element.volume_rule is None:
+        mean = np.einsum("cq,cqki->cki", volumes, gradients) / volumes.sum(axis=1)[:, None, None]
+        return mean[:, None], volumes.sum(axis=1, keepdims=True)
+    at, weights = element.volume_rule
+    modes, there = (np.prod(x[:, None, :] ** element.volume_modes, axis=-1) for x in (points, at))
+    gram = np.einsum("cq,qn,qm->cnm", volumes, modes, modes)
+    moments = np.einsum("cq,qm,cqki->cmki", volumes, modes, gradients)
+    coefficients = np.linalg.solve(gram, moments.reshape(*moments.shape[:2], -1)).reshape(moments.shape)
+    _, determinants = physical_gradients(mesh.vertices, mesh.cells, element.shape(at)[1])
+    own = determinants * weights
+    missing = volumes @ modes - own @ there
+    own += np.linalg.solve(there.T @ there, missing.T).T @ there.T
+    return np.einsum("pn,cnki->cpki", there, coefficients), own
+
+
 def _hrz_lumping(mesh: Mesh, element_volumes: Array) -> Array:
     """(M, K) volumes in proportion to the consistent mass matrix's diagonal (Hinton, Rock, Zienkiewicz 1976).
 
-    Row sums of the quadratic tetrahedron are negative at its corners; these are positive and keep the volume.
+    Row sums of quadratic elements may be negative at corners; these are positive and keep the volume.
     """
-    points, weights = degree_four_tetrahedron()
-    values, reference = tetrahedron10_shape(points)
+    assert mesh.element.mass_rule is not None
+    points, weights = mesh.element.mass_rule
+    values, reference = mesh.element.shape(points)
     _, determinants = physical_gradients(mesh.vertices, mesh.cells, reference)
     diagonal = (determinants * weights) @ values**2
     return diagonal * (element_volumes / diagonal.sum(axis=1))[:, None]
@@ -174,9 +191,9 @@ def _hrz_lumping(mesh: Mesh, element_volumes: Array) -> Array:
 
 def _linear_tetrahedra(mesh: Mesh, full: bool) -> Discretisation:
     """One point a cell for the shape term; the same, or vertex patches, for the volume term."""
-    _, reference = tetrahedron_shape(np.full((1, 3), 0.25))
-    gradients, determinants = physical_gradients(mesh.vertices, mesh.cells, reference)
-    volumes = determinants / 6.0  # (M, 1)
+    points, weights = mesh.element.rule
+    gradients, determinants = physical_gradients(mesh.vertices, mesh.cells, mesh.element.shape(points)[1])
+    volumes = determinants * weights  # (M, 1)
     n, m = len(mesh.vertices), len(mesh.cells)
     quarter = _per_vertex(mesh.cells, n, np.repeat(volumes / 4.0, 4, axis=1))
     own = _one_hot(volumes)

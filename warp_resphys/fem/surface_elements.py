@@ -1,20 +1,13 @@
 """Points on the surfaces of chambers, for the energies of pressure and of fibres."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh.chambers import Chamber
-from ..mesh.shape_functions import (
-    Array,
-    gauss_quadrilateral,
-    gauss_triangle,
-    quadrilateral_shape,
-    triangle6_shape,
-    triangle_shape,
-)
+from ..mesh.elements import FACES, Array, Rule, Shape
 from .elements import Points
 
 
@@ -31,14 +24,10 @@ class SurfacePoints(Points):
     chamber: NDArray[np.int64]
 
 
-def face_rule(
-    chambers: Sequence[Chamber], degree: int
-) -> tuple[Callable[[Array], tuple[Array, Array]], tuple[Array, Array]]:
+def face_rule(chambers: Sequence[Chamber], degree: int) -> tuple[Shape, Rule]:
     """Shape functions of the faces, and a rule exact for linear faces and for a polynomial degree on quadratic ones."""
-    corners = chambers[0].faces.shape[1]
-    if corners == 4:
-        return quadrilateral_shape, gauss_quadrilateral()
-    return (triangle_shape, gauss_triangle(1)) if corners == 3 else (triangle6_shape, gauss_triangle(degree))
+    face = FACES[chambers[0].faces.shape[1]]
+    return face.shape, face.rule(degree)
 
 
 def owners(chambers: Sequence[Chamber], points: int) -> NDArray[np.int64]:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..io.errors import MeshError
+from .elements import FACES
 from .mesh import Mesh, boundary_faces, connected_parts, face_triangles
 
 _SAME_HEIGHT = 0.05  # of the body's length: chambers whose centres are closer than that along it are side by side
@@ -90,7 +91,7 @@ def check_chambers(chambers: Sequence[Chamber], mesh: Mesh) -> None:
             raise MeshError(
                 f"{chamber.name} has faces of vertices that the mesh does not have: take both from one file."
             )
-        corners = faces[:, : 4 if faces.shape[1] == 4 else 3]
+        corners = faces[:, : FACES[faces.shape[1]].corners]
         edges = np.stack([corners, np.roll(corners, -1, axis=1)], axis=-1).reshape(-1, 2)
         ahead = edges[:, 0] * len(mesh.vertices) + edges[:, 1]
         back = edges[:, 1] * len(mesh.vertices) + edges[:, 0]

@@ -1,4 +1,4 @@
-"""Volume meshes: boxes, edge midpoints, boundaries, selections and the checks that a simulation relies on.
+"""Volume meshes: boxes, quadratic elements, boundaries, selections and the checks that a simulation relies on.
 
 Nodes are numbered as VTK numbers them. Lengths are metres; conversion from other units belongs to
 `warp_resphys.mesh.readers`, which reads files.
@@ -13,16 +13,7 @@ import scipy.sparse.csgraph
 from numpy.typing import NDArray
 
 from ..io.errors import MeshError
-from .shape_functions import (
-    HEXAHEDRON_NODES,
-    TETRAHEDRON10_NODES,
-    TETRAHEDRON_EDGES,
-    gauss_hexahedron,
-    gauss_tetrahedron,
-    hexahedron_shape,
-    tetrahedron10_shape,
-    tetrahedron_shape,
-)
+from .elements import BY_NODES, ELEMENTS, FACES, Element
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -39,7 +30,7 @@ class Mesh:
 
     Attributes:
         vertices: (N, 3) [m] rest positions.
-        cells: (M, K) vertex indices in VTK's order; K = 4, 8 or 10.
+        cells: (M, K) vertex indices in VTK's order, of one of `elements.ELEMENTS`.
 
     Raises:
         MeshError: An array has the wrong shape, or the indices are not integers.
@@ -53,85 +44,34 @@ class Mesh:
         vertices, cells = np.asarray(self.vertices), np.asarray(self.cells)
         if vertices.ndim != 2 or vertices.shape[1] != 3 or vertices.dtype.kind not in "fiu":
             raise MeshError(f"vertices must be (N, 3) numbers, not {vertices.shape} of {vertices.dtype}")
-        if cells.ndim != 2 or cells.shape[1] not in _CELL_TYPES or cells.dtype.kind not in "iu":
-            raise MeshError(f"cells must be (M, 4 | 8 | 10) integers, not {cells.shape} of {cells.dtype}")
+        if cells.ndim != 2 or cells.shape[1] not in BY_NODES or cells.dtype.kind not in "iu":
+            known = " | ".join(map(str, sorted(BY_NODES)))
+            raise MeshError(f"cells must be (M, {known}) integers, not {cells.shape} of {cells.dtype}")
         object.__setattr__(self, "vertices", np.ascontiguousarray(vertices, dtype=np.float64))
         object.__setattr__(self, "cells", np.ascontiguousarray(cells, dtype=np.int64))
 
     @property
+    def element(self) -> Element:
+        """Kind of the cells."""
+        return BY_NODES[self.cells.shape[1]]
+
+    @property
     def kind(self) -> str:
-        """Kind of the cells: "tetrahedron", "tetrahedron10" or "hexahedron"."""
-        return _CELL_TYPES[self.cells.shape[1]].name
+        """Its name, such as "hexahedron"."""
+        return self.element.name
 
 
-@dataclass(frozen=True, eq=False)
-class _CellType:
-    """What the functions below need to know about one kind of cell.
-
-    Attributes:
-        name: Name of the kind.
-        edges: (E, 2) corner nodes of the edges.
-        faces: (F, 3 | 4 | 6) nodes of the faces, counter-clockwise seen from outside, then midpoints.
-        triangles: (T, 3) triangles that a face is split into, as indices of the face's nodes.
-        gradients: (P, K, 3) derivatives of the K shape functions at the points where the map is checked.
-        weights: (P,) quadrature weights of these points; they sum to the reference cell's volume.
-    """
-
-    name: str
-    edges: IntArray
-    faces: IntArray
-    triangles: IntArray
-    gradients: FloatArray
-    weights: FloatArray
-
-
-def _tetrahedron_type() -> _CellType:
-    """4 nodes; the map is affine, so one point tells all."""
-    return _CellType(
-        name="tetrahedron",
-        edges=TETRAHEDRON_EDGES,
-        faces=np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]),
-        triangles=np.array([[0, 1, 2]]),
-        gradients=tetrahedron_shape(np.zeros((1, 3)))[1],
-        weights=np.array([1 / 6]),
-    )
-
-
-def _tetrahedron10_type() -> _CellType:
-    """4 corners, then the midpoints of the edges; the points are those of the 4-point rule, then the nodes."""
-    points, weights = gauss_tetrahedron()
-    return _CellType(
-        name="tetrahedron10",
-        edges=TETRAHEDRON_EDGES,
-        faces=np.array([[0, 2, 1, 6, 5, 4], [0, 1, 3, 4, 8, 7], [1, 2, 3, 5, 9, 8], [0, 3, 2, 7, 9, 6]]),
-        triangles=np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]]),
-        gradients=tetrahedron10_shape(np.concatenate([points, TETRAHEDRON10_NODES]))[1],
-        weights=np.concatenate([weights, np.zeros(len(TETRAHEDRON10_NODES))]),
-    )
-
-
-def _hexahedron_type() -> _CellType:
-    """8 nodes, trilinear; the points are the 2x2x2 Gauss points, then the corners."""
-    points, weights = gauss_hexahedron()
-    sides = np.linalg.norm(HEXAHEDRON_NODES[:, None] - HEXAHEDRON_NODES, axis=2)
-    return _CellType(
-        name="hexahedron",
-        edges=np.argwhere(np.triu(sides == 2)),
-        faces=np.array([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]]),
-        triangles=np.array([[0, 1, 2], [0, 2, 3]]),
-        gradients=hexahedron_shape(np.concatenate([points, HEXAHEDRON_NODES]))[1],
-        weights=np.concatenate([weights, np.zeros(len(HEXAHEDRON_NODES))]),
-    )
-
-
-_BRICK_CORNERS = (HEXAHEDRON_NODES.astype(np.int64) + 1) // 2  # steps along x, y and z from the lowest corner
+_BRICK_CORNERS = (
+    ELEMENTS["hexahedron"].shape.nodes.astype(np.int64) + 1
+) // 2  # steps along x, y and z from the lowest corner
 # Kuhn's six tetrahedra around the diagonal from corner 0 to corner 6. The diagonals of opposite faces are
 # parallel, so that neighbouring bricks fit.
 _BRICK_TETRAHEDRA = np.array([[0, a, b, 6] for a, b in ((1, 2), (2, 3), (3, 7), (7, 4), (4, 5), (5, 1))])
-_CELL_TYPES = {4: _tetrahedron_type(), 8: _hexahedron_type(), 10: _tetrahedron10_type()}
 
 
-def box_hexahedra(size: Sequence[float] = (0.1, 0.03, 0.03), divisions: Sequence[int] = (10, 3, 3)) -> Mesh:
+def box_hexahedra(
+    size: Sequence[float] = (0.1, 0.03, 0.03), divisions: Sequence[int] = (10, 3, 3), nodes: int = 8
+) -> Mesh:
     """Box of equal bricks with one corner at the origin.
 
     Vertex (i, j, k) has index (i (ny + 1) + j) (nz + 1) + k; cells are numbered the same way.
@@ -139,13 +79,16 @@ def box_hexahedra(size: Sequence[float] = (0.1, 0.03, 0.03), divisions: Sequence
     Args:
         size: Lengths along x, y and z [m].
         divisions: Numbers of bricks (nx, ny, nz) along the axes.
+        nodes: Of a hexahedron: 8, 20 or 27; those beyond the corners are numbered after these.
 
     Returns:
         Mesh of nx ny nz hexahedra.
 
     Raises:
-        MeshError: A length is not positive and finite, or a number is not a positive integer.
+        MeshError: A length is not positive and finite, a number is not a positive integer, or there is no such element.
     """
+    if nodes not in (8, 20, 27):
+        raise MeshError(f"hexahedra have 8, 20 or 27 nodes, not {nodes}")
     sides, counts = np.asarray(size), np.asarray(divisions)
     if sides.shape != (3,) or sides.dtype.kind not in "fiu" or not 0 < sides.min() <= sides.max() < np.inf:
         raise MeshError(f"the size of a box must be three positive lengths in metres, not {size}")
@@ -154,7 +97,8 @@ def box_hexahedra(size: Sequence[float] = (0.1, 0.03, 0.03), divisions: Sequence
     axes = [np.linspace(0.0, length, count + 1) for length, count in zip(sides, counts, strict=True)]
     vertices = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     index = np.arange(len(vertices)).reshape(counts + 1)
-    return Mesh(vertices, index[:-1, :-1, :-1].reshape(-1, 1) + index[tuple(_BRICK_CORNERS.T)])
+    mesh = Mesh(vertices, index[:-1, :-1, :-1].reshape(-1, 1) + index[tuple(_BRICK_CORNERS.T)])
+    return mesh if nodes == 8 else quadratic(mesh, f"hexahedron{nodes}")
 
 
 def box_tetrahedra(
@@ -180,28 +124,32 @@ def box_tetrahedra(
     return quadratic(mesh) if order == 2 else mesh
 
 
-def quadratic(mesh: Mesh) -> Mesh:
-    """Add the midpoints of the edges to 4-node tetrahedra; neighbours share them.
+def quadratic(mesh: Mesh, kind: str = "") -> Mesh:
+    """Add the nodes of an element of second order to a mesh of corners; neighbours share them.
 
     Args:
-        mesh: Mesh of 4-node tetrahedra.
+        mesh: Mesh of linear cells.
+        kind: Name of the element; by default 10-node tetrahedra or 27-node hexahedra.
 
     Returns:
-        Mesh of 10-node tetrahedra; its first vertices are those of `mesh`, unchanged.
+        The mesh of that element; its first vertices are those of `mesh`, unchanged.
 
     Raises:
-        MeshError: The cells are of another kind.
+        MeshError: The cells have more than corners, or other corners than the element's.
     """
-    if mesh.kind != "tetrahedron":
-        raise MeshError(f"edge midpoints can be added to 4-node tetrahedra only, not to {mesh.kind} cells")
+    element = ELEMENTS.get(kind or {"tetrahedron": "tetrahedron10", "hexahedron": "hexahedron27"}.get(mesh.kind, ""))
+    if element is None or element.linear != mesh.kind:
+        raise MeshError(f"the nodes of {kind or 'a quadratic element'} cannot be added to {mesh.kind} cells")
+    vertices, cells = [mesh.vertices], [mesh.cells]
     count = len(mesh.vertices)
-    ends = np.sort(mesh.cells[:, _CELL_TYPES[10].edges].reshape(-1, 2), axis=1)
-    keys, edge_of = np.unique(ends[:, 0] * count + ends[:, 1], return_inverse=True)
-    midpoints = (mesh.vertices[keys // count] + mesh.vertices[keys % count]) / 2
-    return Mesh(
-        np.concatenate([mesh.vertices, midpoints]),
-        np.concatenate([mesh.cells, count + edge_of.reshape(-1, 6)], axis=1),
-    )
+    for size in dict.fromkeys(map(len, element.parents)):
+        corners = np.array([parents for parents in element.parents if len(parents) == size])
+        groups = np.sort(mesh.cells[:, corners].reshape(-1, size), axis=1)
+        found, member = np.unique(groups, axis=0, return_inverse=True)
+        vertices.append(mesh.vertices[found].mean(axis=1))
+        cells.append(count + member.reshape(-1, len(corners)))
+        count += len(found)
+    return Mesh(np.concatenate(vertices), np.concatenate(cells, axis=1))
 
 
 def check_mesh(mesh: Mesh) -> None:
@@ -237,13 +185,12 @@ def boundary_faces(mesh: Mesh) -> IntArray:
         mesh: The mesh.
 
     Returns:
-        (F, 3) vertex indices for 4-node tetrahedra, (F, 4) for hexahedra, (F, 6) for 10-node tetrahedra: the
-        corners, counter-clockwise seen from outside, then the midpoints of the sides. Ordered by cell.
+        (F, n) vertex indices, such as (F, 4) for 8-node hexahedra: the corners, counter-clockwise seen from outside,
+        then the other nodes. Ordered by cell.
     """
-    cell_type = _CELL_TYPES[mesh.cells.shape[1]]
-    faces = mesh.cells[:, cell_type.faces].reshape(-1, cell_type.faces.shape[1])
-    corners = 4 if mesh.kind == "hexahedron" else 3
-    keys = np.sort(faces[:, :corners], axis=1)
+    element = mesh.element
+    faces = mesh.cells[:, element.faces].reshape(-1, element.faces.shape[1])
+    keys = np.sort(faces[:, : element.face.corners], axis=1)
     order = np.lexsort(keys.T)
     repeated = np.all(keys[order[1:]] == keys[order[:-1]], axis=1)
     single = np.ones(len(faces), dtype=bool)
@@ -264,15 +211,14 @@ def connected_parts(cells: IntArray) -> IntArray:
 def boundary_triangles(mesh: Mesh) -> IntArray:
     """Boundary split into triangles, (F, 3) vertex indices, counter-clockwise seen from outside.
 
-    A face with 3 nodes is one triangle, with 4 nodes two, with 6 nodes four; those of a face are consecutive.
+    A face with 3 nodes is one triangle, with 4 nodes two, with 6 nodes four, and so on; those of a face follow it.
     """
     return face_triangles(boundary_faces(mesh))
 
 
 def face_triangles(faces: IntArray) -> IntArray:
-    """Triangles (T, 3) that faces (F, 3 | 4 | 6) are split into, counter-clockwise as they are; see above."""
-    kinds = {cell_type.faces.shape[1]: cell_type for cell_type in _CELL_TYPES.values()}
-    return faces[:, kinds[faces.shape[1]].triangles].reshape(-1, 3)
+    """Triangles (T, 3) that faces (F, n) are split into, counter-clockwise as they are; see above."""
+    return faces[:, FACES[faces.shape[1]].triangles].reshape(-1, 3)
 
 
 def surface_vertices(mesh: Mesh) -> IntArray:
@@ -321,20 +267,23 @@ def _normalised_volumes(mesh: Mesh) -> tuple[FloatArray, FloatArray]:
 
     Determinants are multiplied by the reference cell's volume: both are equal where the map is affine.
     """
-    cell_type = _CELL_TYPES[mesh.cells.shape[1]]
+    element = mesh.element
+    points, weights = element.rule
+    gradients = element.shape(np.concatenate([points, element.shape.nodes]))[1]
     offsets = mesh.vertices[mesh.cells] - mesh.vertices[mesh.cells[:, :1]]
     nodes = np.ascontiguousarray(np.moveaxis(offsets, 0, 2))  # (K, 3, M) [m]
-    sides = nodes[cell_type.edges[:, 0]] - nodes[cell_type.edges[:, 1]]  # (E, 3, M) [m]
+    sides = nodes[element.edges[:, 0]] - nodes[element.edges[:, 1]]  # (E, 3, M) [m]
     longest = np.sqrt((sides**2).sum(axis=1).max(axis=0))
     nodes /= np.where(longest > 0, longest, 1.0)
     volumes = np.zeros(len(mesh.cells))
     smallest = np.full(len(mesh.cells), np.inf)
-    for gradient, weight in zip(cell_type.gradients, cell_type.weights, strict=True):
+    for number, gradient in enumerate(gradients):
         jacobian = np.tensordot(gradient.T, nodes, axes=1)  # (3, 3, M), transposed
         determinants = (np.cross(jacobian[0], jacobian[1], axis=0) * jacobian[2]).sum(axis=0)
-        volumes += weight * determinants
+        if number < len(points):
+            volumes += weights[number] * determinants
         smallest = np.minimum(smallest, determinants)
-    return volumes, smallest * cell_type.weights.sum()
+    return volumes, smallest * weights.sum()
 
 
 def _coincident(vertices: FloatArray) -> NDArray[np.bool_]:

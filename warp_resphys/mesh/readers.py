@@ -13,6 +13,7 @@ import numpy as np
 
 from ..io.errors import MeshError
 from ..io.files import atomic_path
+from .elements import ELEMENTS
 from .mesh import FloatArray, IntArray, Mesh, boundary_faces, check_mesh, quadratic
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}  # [m] length of one unit
 SHORTEST_DIAGONAL, LONGEST_DIAGONAL = 1e-3, 10.0  # [m] of a body whose units are believed
 
-_CELL_TYPES = ("tetra", "tetra10", "hexahedron")  # meshio's names of the cells that can be simulated
+_CELL_TYPES = tuple(element.file_type for element in ELEMENTS.values())  # meshio's names
 _SURFACE_CELLS = {"triangle": 3, "triangle6": 3, "quad": 4, "quad8": 4, "quad9": 4}  # number of corners
 _PHYSICAL, _GEOMETRICAL = "gmsh:physical", "gmsh:geometrical"  # meshio's names of gmsh's numbers of groups
 _log = logging.getLogger(__name__)
@@ -78,7 +79,7 @@ def read_surfaces(
     """
     mesh, content, places = _read(Path(path), units, order, drop_unreferenced)
     faces = boundary_faces(mesh)
-    corners = 4 if mesh.kind == "hexahedron" else 3
+    corners = mesh.element.face.corners
     face_of = {tuple(sorted(face)): number for number, face in enumerate(faces[:, :corners].tolist())}
     surfaces = {}
     for name, nodes in _named_surfaces(content).items():
@@ -108,7 +109,7 @@ def write_mesh(path: str | os.PathLike[str], mesh: Mesh, surfaces: Mapping[str, 
     import meshio
 
     path = Path(path)
-    kind = _CELL_TYPES[(4, 10, 8).index(mesh.cells.shape[1])]
+    kind = mesh.element.file_type
     blocks, groups, fields = [(kind, mesh.cells)], [np.zeros(len(mesh.cells), dtype=np.int64)], {}
     as_gmsh = path.suffix == ".msh"
     if as_gmsh:
@@ -151,7 +152,7 @@ def _read(path: Path, units: str, order: int, drop_unreferenced: bool) -> tuple[
         check_mesh(mesh)
         mesh = Mesh(mesh.vertices * METRES[units], mesh.cells)
         _check_size(mesh, units)
-        return quadratic(mesh) if order == 2 and mesh.kind != "tetrahedron10" else mesh, content, places
+        return quadratic(mesh) if order == 2 and mesh.kind == mesh.element.linear else mesh, content, places
     except MeshError as error:
         raise MeshError(f"{path}: {error}") from error
 

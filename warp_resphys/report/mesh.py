@@ -19,6 +19,7 @@ from ..mesh.arm import mesh_arm, name_surfaces
 from ..mesh.arm_geometry import arm_geometry
 from ..mesh.cavities import MOST_TRIANGLES, open_cavities
 from ..mesh.chambers import Chamber, find_chambers
+from ..mesh.elements import ELEMENTS
 from ..mesh.mesh import (
     IntArray,
     Mesh,
@@ -229,7 +230,7 @@ def _scene(summary: MeshSummary) -> dict[str, Any]:
     normal[np.ptp(mesh.vertices, axis=0).argmax()] = 0.0  # the body is cut along its longest side
     return {
         "vertices": mesh.vertices,
-        "cells": mesh.cells[:, : 8 if mesh.kind == "hexahedron" else 4],
+        "cells": mesh.cells[:, : ELEMENTS[mesh.element.linear].nodes],
         "triangles": triangles,
         "edges": render.face_edges(mesh),
         "outer": triangles[~np.isin(triangles[:, 0], within)],

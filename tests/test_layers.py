@@ -1,6 +1,7 @@
 """The table in CONTRIBUTING.md says where every module is; imports point up it, and never in a circle."""
 
 import ast
+import importlib
 import re
 from graphlib import TopologicalSorter
 from pathlib import Path
@@ -77,3 +78,17 @@ def test_imports_point_up(path):
 def test_no_two_modules_import_each_other():
     graph = {name: {other for other, _ in imported(path) if other != name} for path, name in modules().items()}
     TopologicalSorter(graph).prepare()  # Raises a CycleError that names the circle.
+
+
+def named_in_the_table_of_the_paper():
+    text = (REPOSITORY / "CONTRIBUTING.md").read_text(encoding="utf-8").partition("## Where the paper is")[2]
+    return re.findall(r"`((?:[a-z_]+\.)+\w+(?:\.\w+)?)`", text.partition("\n## ")[0])
+
+
+@pytest.mark.parametrize("name", named_in_the_table_of_the_paper())
+def test_what_the_table_of_the_paper_names_is_there(name):
+    module, *attributes = re.fullmatch(r"((?:[a-z_]+\.)*[a-z_]+)\.(.+)", name).groups()
+    place = importlib.import_module("warp_resphys." + module)
+    for attribute in attributes[0].split("."):
+        place = getattr(place, attribute)
+    assert place.__doc__

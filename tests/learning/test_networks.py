@@ -244,7 +244,7 @@ class TestActuation:
         model = model.double().eval()
         with torch.no_grad():
             held = Range.of(model.encode(q, v, self.LOADS))
-        told = self.LOADS[[range(5), range(5, 10), range(5), range(5)]]  # during each of four steps
+        told = torch.stack([self.LOADS[i : i + 5] for i in (0, 5, 0, 0)])  # during each of four steps
         watched = LearnedPredictor(model, told, held)
 
         def predicted(q, v, step):

@@ -75,24 +75,24 @@ def test_recorded_pressures_are_checked():
 
 
 def test_a_lag_follows_a_step_exponentially_and_has_a_derivative():
-    command = torch.full((1, 50, 1), 2e4, dtype=torch.float64)
+    command = torch.full((50, 1, 1), 2e4, dtype=torch.float64)
     rise = torch.tensor([0.07], dtype=torch.float64, requires_grad=True)
     found = lagged(command, rise, STEP)
     times = STEP * torch.arange(1, 51, dtype=torch.float64)
-    torch.testing.assert_close(found[0, :, 0], 2e4 * (1 - torch.exp(-times / rise)))
+    torch.testing.assert_close(found[:, 0, 0], 2e4 * (1 - torch.exp(-times / rise)))
     found.sum().backward()
     expected = -(2e4 * torch.exp(-times / 0.07) * times / 0.07**2).sum()
     torch.testing.assert_close(rise.grad[0], expected)
 
 
 def test_memory_keeps_what_the_pressure_was():
-    pressure = torch.zeros(1, 100, 2, dtype=torch.float64)
-    pressure[:, 20:, 0] = 1e4
+    pressure = torch.zeros(100, 1, 2, dtype=torch.float64)
+    pressure[20:, :, 0] = 1e4
     told = remembered(pressure, [0.1, 1.0], STEP)
-    assert told.shape == (1, 100, 6)
+    assert told.shape == (100, 1, 6)
     torch.testing.assert_close(told[..., :2], pressure)
-    assert not told[:, :20].any()
-    fast, slow = told[0, -1, 2], told[0, -1, 4]
+    assert not told[:20].any()
+    fast, slow = told[-1, 0, 2], told[-1, 0, 4]
     assert float(fast) == pytest.approx(1e4, rel=1e-3)
     assert float(slow) == pytest.approx(1e4 * (1 - np.exp(-0.8)), rel=1e-9)
     torch.testing.assert_close(remembered(pressure, [], STEP), pressure)

@@ -6,6 +6,7 @@ import torch
 
 from warp_resphys import Body, Corotated, Mesh, PointMass, Simulator, State, box_hexahedra, select_vertices
 from warp_resphys.dynamics.inputs import Inputs
+from warp_resphys.energies.materials import make_material
 from warp_resphys.io.errors import InputError, MeshError, ResphysError
 from warp_resphys.studies.gradient_check import check_configured
 
@@ -16,7 +17,7 @@ ELEMENTS, VERTICES, FIXED = len(MESH.cells), len(MESH.vertices), len(BODY.fixed_
 
 @pytest.fixture(scope="module")
 def simulator():
-    return Simulator(BODY, Corotated(1e5, 0.4, 1000.0))
+    return Simulator(BODY, Corotated(1e5, 0.4, density=1000.0))
 
 
 def refused(message, error=InputError):
@@ -34,7 +35,7 @@ NAN, INF = float("nan"), float("inf")
 @pytest.mark.parametrize(
     ("constants", "message"),
     [
-        ({"youngs_modulus": 0.0}, "youngs_modulus is 0: it must be positive, in pascals"),
+        ({"youngs_modulus": 0.0}, "youngs_modulus is 0: it must be positive, in Pa"),
         ({"youngs_modulus": -1e5}, "youngs_modulus is -100000: it must be positive"),
         ({"youngs_modulus": NAN}, "youngs_modulus is nan"),
         ({"youngs_modulus": INF}, "youngs_modulus is inf"),
@@ -50,12 +51,13 @@ NAN, INF = float("nan"), float("inf")
         ({"mass_damping": -0.1}, "mass_damping is -0.1: it must be zero or more, in 1/s"),
         ({"stiffness_damping": -1e-3}, "stiffness_damping is -0.001: it must be zero or more, in s"),
         ({"stiffness_damping": INF}, "stiffness_damping is inf"),
+        ({"lame_lambda": 1e5}, "corotated has no constant 'lame_lambda': it has youngs_modulus, poissons_ratio, density"),
         ({"model": "linear"}, "material model is 'linear': choose one of corotated, stable_neo_hookean"),
     ],
 )
 def test_material(constants, message):
     with refused(message):
-        Corotated(**constants)
+        make_material(**constants)
 
 
 @pytest.mark.parametrize(
@@ -131,7 +133,7 @@ def arguments(simulator):
 
 
 def step(simulator, q, v, external_force, fixed_positions):
-    return simulator.step(State(q, v), external_force, fixed_positions)
+    return simulator.step(State(q, v), Inputs(external_force, fixed_positions))
 
 
 NAMES = {"q": "state.q", "v": "state.v", "external_force": "external_force", "fixed_positions": "fixed_positions"}
@@ -165,8 +167,8 @@ def test_wrong_shape_of_positions(simulator):
 def test_rollout_with_the_wrong_number_of_steps(simulator):
     state = simulator.rest_state(1)
     forces = torch.zeros(3, *state.q.shape)
-    with refused("external_forces has 3 time steps, but 4 are to be simulated"):
-        simulator.rollout(state, 4, forces)
+    with refused("external_force has 3 time steps, but 4 are to be simulated"):
+        simulator.rollout(state, 4, Inputs(external_force=forces))
     with refused("fixed_positions has 3 time steps, but 4 are to be simulated"):
         simulator.rollout(state, 4, Inputs(fixed_positions=forces[:, :, simulator.fixed]))
 
@@ -181,7 +183,7 @@ def test_rollout_with_the_wrong_number_of_steps(simulator):
 )
 def test_material_of_another_mesh(constants, simulator):
     with refused(f"a material parameter has {ELEMENTS + 1} values for {ELEMENTS} elements"):
-        simulator.step(simulator.rest_state(1), material=Corotated(**constants))
+        simulator.step(simulator.rest_state(1), parameters=constants)
 
 
 @pytest.mark.parametrize(
@@ -196,7 +198,7 @@ def test_material_of_another_mesh(constants, simulator):
 )
 def test_material_of_another_batch(constants, simulator):
     with refused("3 environments"):
-        simulator.step(simulator.rest_state(2), material=Corotated(**constants))
+        simulator.step(simulator.rest_state(2), parameters=constants)
 
 
 def test_static_equilibrium_of_a_free_body():
@@ -210,7 +212,7 @@ def test_static_equilibrium_of_values_that_are_not_finite(name, simulator):
     values = torch.zeros(1, d, 3, dtype=torch.float64)
     values[0, 1, 2] = NAN
     with refused(f"{name} is not finite in environment 0, vertex 1"):
-        simulator.static_equilibrium(**{name: values})
+        simulator.static_equilibrium(**({name: values} if name == "start" else {"inputs": Inputs(**{name: values})}))
 
 
 def test_gravity(simulator):

@@ -15,25 +15,27 @@ import torch
 from hydra import compose, initialize_config_module
 from main_job import IN_RUN, run
 from omegaconf import OmegaConf
-from warp_resphys.learning.driven import DrivenMotions, DrivenReplay, at_rest
-from warp_resphys.learning.driven_rollout import Range
 
 from warp_resphys.data.actuation import PressureSequences
 from warp_resphys.data.markers import bind_markers
 from warp_resphys.data.recordings.arrays import write_recording
 from warp_resphys.data.recordings.reading import read_recording
+from warp_resphys.data.trials import Trials
+from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.experiment.actuated import experiment, reconstruct, train
 from warp_resphys.experiment.actuated.checks import check_driven
 from warp_resphys.experiment.actuated.evaluate import summary
 from warp_resphys.experiment.actuated.importing import import_driven
 from warp_resphys.experiment.actuated.reconstruct import replayed_errors
 from warp_resphys.experiment.actuated.scene import DrivenScene
-from warp_resphys.experiment.build import build_simulator
+from warp_resphys.experiment.build import build_simulator, chambers_of
 from warp_resphys.experiment.checks import check_configuration
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_array, read_checkpoint, read_hdf5
 from warp_resphys.io.stages import StageContext
 from warp_resphys.learning.identification import Bounds, Identifier
+from warp_resphys.learning.predictors import Range
+from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.mesh.mesh import select_vertices
 
 # A short segment with two chambers of some 70 vertices, on which everything takes seconds.
@@ -134,6 +136,7 @@ def test_every_stage_leaves_its_files_and_the_errors_are_those_of_the_roll_outs(
 def test_recordings_are_seen_by_cameras_and_registered_back(finished):
     """The import undoes the cameras' frame to within the noise and the misplaced markers."""
     truth = json.loads((finished / "run" / "truth.json").read_text())
+    assert (truth["material"]["mass_damping"], truth["material"]["fibre_stiffness"]) == (0.5, 1e4)
     recording = read_recording(finished / "run" / "recordings" / "t000.h5")
     assert np.linalg.norm(recording.positions[0, 0] - truth["bound"]["T1"]) > 0.01
     _, _, pressure = motions(finished)
@@ -244,7 +247,7 @@ def recorded(tmp_path, finished, change):
         (["data.test=[t777]"], "data.test names the trial 't777'"),
         (["data.folder=nowhere"], "nowhere is no folder"),
         (["data.train=0"], "data.train is 0: it must be a number of trials, or a list"),
-        (["pressure_coupling=weak"], "pressure_coupling is 'weak'"),
+        (["coupling=weak"], "coupling is 'weak': choose one of implicit, explicit"),
         (["force_frame=rest"], "force_frame is 'rest': choose one of corotated, world."),
         (["actuation.memory=[-1.0]"], "actuation.memory"),
         (["synthetic.sequences.rest=1.0"], "leave no time between two rests"),
@@ -253,6 +256,7 @@ def recorded(tmp_path, finished, change):
         (["synthetic.fibres.angles=[90.0]"], "synthetic: fibre angles are"),
         (["simulation.youngs_modulus=264"], "is its unit millimetres"),
         (["+identify.parameters.stiffness={lower:0.0,upper:1.0}"], "identify.parameters names 'stiffness'"),
+        (["+identify.parameters.attached_mass_factor={lower:0.5,upper:2.0}"], "names 'attached_mass_factor': choose from"),
         (["refinement=solver_in_the_loop"], "refinement is for experiments without pressures"),
         (["task=tune"], "task=tune does not search the networks of the experiment tiny"),
         (["+data.colour=red"], "unknown key 'data.colour'"),
@@ -354,21 +358,24 @@ def read_published(folder):
 
 def driven_motions(simulator, steps=12, count=2):
     """Motions of a simulator under pressures, seen at a few vertices."""
-    chambers = len(simulator.body.chambers)
+    chambers = len(chambers_of(simulator.body))
     sequences = PressureSequences(rest=0.01, correlation_time=0.05)
     drawn = [sequences.draw(steps, 0.01, chambers, np.random.default_rng(i))[1:] for i in range(count)]
-    pressure = simulator.tensor(np.stack(drawn))
+    inputs = Inputs(pressure=simulator.tensor(np.stack(drawn, axis=1)))
     mesh = simulator.body.mesh
     places = mesh.vertices[select_vertices(mesh, z=-0.1)[:4]]
     read = bind_markers(mesh, places, ["a", "b", "c", "d"]).to(simulator.rest_positions)
     with torch.no_grad():
         state = simulator.static_equilibrium(batch=count)
-        path = simulator.rollout(state, steps, pressures=pressure.transpose(0, 1)).q
+        path = simulator.rollout(state, steps, inputs).q
     markers = torch.stack([read(q) for q in path], 1)
     times = simulator.tensor(0.01 * np.arange(steps + 1)).expand(count, -1)
-    masses = torch.zeros(count, simulator.body.n_vertices, dtype=torch.float64)
     names = tuple(f"m{i}" for i in range(count))
-    return DrivenMotions(names, times, markers, markers[:, 0], masses, pressure), read
+    return Trials(names, times, markers, markers[:, 0], inputs), read
+
+
+def at_rest(simulator, motions):
+    return Start.resting(simulator.rest_positions.expand(len(motions.names), -1, -1))
 
 
 def tiny_simulator(**material):
@@ -381,21 +388,21 @@ def test_identification_finds_the_stiffness_that_made_motions_and_the_valves_lag
     """The start depends on the stiffness as much as the motion does: gravity stretches the body before that."""
     simulator = tiny_simulator(youngs_modulus=150e3)
     motions, read = driven_motions(simulator)
-    replay = DrivenReplay(tiny_simulator(), read, motions)
+    replay = Replay(tiny_simulator(), read, motions)
     bounds = {"youngs_modulus": Bounds(5e4, 5e5, True), "pressure_rise": Bounds(0.0, 0.1)}
-    identifier = Identifier(replay, at_rest(motions, simulator.rest_positions), bounds)
+    identifier = Identifier(replay, at_rest(simulator, motions), bounds)
     found = identifier.run([{"youngs_modulus": 264e3, "pressure_rise": 0.02}], 25)
     assert found.parameters["youngs_modulus"] == pytest.approx(150e3, rel=0.01)
     assert found.parameters["pressure_rise"] < 1e-3
     with pytest.raises(InputError, match="no parameter 'colour'"):
-        Identifier(replay, at_rest(motions, simulator.rest_positions), {"colour": Bounds(0.0, 1.0)})
+        Identifier(replay, at_rest(simulator, motions), {"colour": Bounds(0.0, 1.0)})
 
 
 def test_the_replays_gradient_is_that_of_differences():
     simulator = tiny_simulator(stiffness_damping=2e-3)
     motions, read = driven_motions(simulator, steps=4)
-    replay = DrivenReplay(simulator, read, motions)
-    release = at_rest(motions, simulator.rest_positions)
+    replay = Replay(simulator, read, motions)
+    release = at_rest(simulator, motions)
     for name, value in (("youngs_modulus", 2e5), ("stiffness_damping", 3e-3), ("pressure_rise", 0.02)):
         x = torch.tensor([value], dtype=torch.float64, requires_grad=True)
         loss = lambda x, name=name: 1e6 * replay.errors(replay(release, {name: x})).square().sum()  # noqa: E731

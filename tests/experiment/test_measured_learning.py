@@ -6,13 +6,15 @@ import torch
 
 from warp_resphys import Body, Simulator, State, box_hexahedra, select_vertices
 from warp_resphys.data.markers import bind_markers
+from warp_resphys.data.trials import Trials
+from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.experiment.measured.evaluate import marker_errors, markers_at_frames
 from warp_resphys.experiment.measured.scene import at_steps
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.io.files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.markers_in_the_loop import MarkersInTheLoop, MotionLoss, epochs_that_hold_up
 from warp_resphys.learning.networks import build_model
-from warp_resphys.learning.replay import Motions, Release, Replay
+from warp_resphys.learning.replay import Replay, Start
 
 MESH = box_hexahedra(divisions=(2, 1, 1))
 TIP = select_vertices(MESH, x=0.1)
@@ -47,7 +49,7 @@ def motions_of(times, markers, held=None):
     names = tuple(f"m{i}" for i in range(count))
     attached = torch.zeros(count, len(MESH.vertices), dtype=torch.float64)
     attached[:, TIP] = LOADS[:count] / len(TIP)
-    return Motions(names, times, markers, held, attached)
+    return Trials(names, times, markers, held, Inputs(attached_mass=attached))
 
 
 class TestAtSteps:
@@ -115,7 +117,7 @@ def test_markers_at_frames_follow_the_steps_and_are_lost_with_them():
     q[1, 7:] = torch.nan
     times = (0.004 + STEP * torch.arange(10, dtype=torch.float64)).repeat(2, 1)
     motions = motions_of(times, torch.as_tensor(POINTS).repeat(2, 10, 1, 1))
-    release = Release(State(q[:, 0], torch.zeros_like(q[:, 0])), torch.tensor([0.0, 0.006], dtype=torch.float64))
+    release = Start(State(q[:, 0], torch.zeros_like(q[:, 0])), torch.tensor([0.0, 0.006], dtype=torch.float64))
     found = markers_at_frames(q, sim, MARKERS, motions, release)
     since = (times - release.delay[:, None]).clamp_min(0.0)
     expected = torch.as_tensor(POINTS) + since[..., None, None] * velocity
@@ -130,7 +132,7 @@ def observed_motions(frames=8):
     times = (STEP * torch.arange(1, frames + 1, dtype=torch.float64)).repeat(2, 1)
     blank = motions_of(times, torch.as_tensor(POINTS).repeat(2, frames, 1, 1))
     rest = sim.rest_state(2)
-    release = Release(State(rest.q, rest.v), torch.zeros(2, dtype=torch.float64))
+    release = Start(State(rest.q, rest.v), torch.zeros(2, dtype=torch.float64))
     with torch.no_grad():
         markers = Replay(sim, MARKERS, blank)(release, {"youngs_modulus": tensor(180e3)[0][None]})[0]
     return motions_of(times, markers), release

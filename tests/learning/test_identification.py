@@ -9,10 +9,12 @@ import torch
 
 from warp_resphys import Body, Simulator
 from warp_resphys.data.markers import bind_markers
+from warp_resphys.data.trials import Trials
+from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.dynamics.nonlinear_solver import SolverSettings
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.learning.identification import Bounds, Identifier
-from warp_resphys.learning.replay import Motions, Release, Replay
+from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.linalg.least_squares import minimise
 from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
 
@@ -44,16 +46,15 @@ def replay_of(sim, truth, masses=(0.0, 0.05), frames=25, noise=0.0, seed=0):
     count = len(masses)
     times = (0.01 * torch.arange(frames, dtype=torch.float64)).expand(count, -1)
     held = torch.as_tensor(POINTS).expand(count, -1, -1)
-    blank = Motions(
-        tuple(f"m{i}" for i in range(count)), times, held[:, None].repeat(1, frames, 1, 1), held, hanging(masses)
-    )
-    release = Release(sim.rest_state(count), torch.zeros(count, dtype=torch.float64))
+    names, inputs = tuple(f"m{i}" for i in range(count)), Inputs(attached_mass=hanging(masses))
+    blank = Trials(names, times, held[:, None].repeat(1, frames, 1, 1), held, inputs)
+    release = Start(sim.rest_state(count), torch.zeros(count, dtype=torch.float64))
     with torch.no_grad():
         markers = Replay(sim, MARKERS, blank)(release, {name: one(value) for name, value in truth.items()})[0]
     markers = markers + noise * torch.randn(
         markers.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
     )
-    return Replay(sim, MARKERS, Motions(blank.names, times, markers, held, blank.attached_mass)), release
+    return Replay(sim, MARKERS, replace(blank, observed=markers)), release
 
 
 def identify(noise=0.0, seed=0, bounds=RANGES, first=FIRST, truth=TRUTH, **options):
@@ -85,11 +86,11 @@ def test_without_noise_the_parameters_are_exact():
 
 def test_the_predicted_deviation_is_that_of_repetitions():
     replay, release = replay_of(simulator(), TRUTH, masses=(0.05,), frames=12)
-    clean, found, predicted = replay.motions, [], []
+    clean, found, predicted = replay.trials, [], []
     generator = torch.Generator().manual_seed(1)
     for _ in range(10):
-        markers = clean.markers + 3e-4 * torch.randn(clean.markers.shape, generator=generator, dtype=torch.float64)
-        motions = replace(clean, markers=markers)
+        markers = clean.observed + 3e-4 * torch.randn(clean.observed.shape, generator=generator, dtype=torch.float64)
+        motions = replace(clean, observed=markers)
         result = Identifier(Replay(replay.simulator, MARKERS, motions), release, RANGES).run([TRUTH], 2)
         found.append([result.parameters[name] for name in RANGES])
         predicted.append([result.uncertainty.deviation[name] for name in RANGES])
@@ -139,7 +140,7 @@ def test_failed_points_of_a_grid_are_infinite_and_the_others_unchanged():
     bounds = {"youngs_modulus": Bounds(1.0, 1e10, logarithmic=True)}
     replay, release = replay_of(simulator(), {"youngs_modulus": 215e3}, frames=5)
     whole = Identifier(replay, release, bounds).grid({"youngs_modulus": 6}, {})
-    few = Replay(simulator(solver=SolverSettings(max_iterations=10)), MARKERS, replay.motions)
+    few = Replay(simulator(solver=SolverSettings(max_iterations=10)), MARKERS, replay.trials)
     losses = Identifier(few, release, bounds).grid({"youngs_modulus": 6}, {})
     good = np.isfinite(losses)
     assert np.isfinite(whole).all()
@@ -192,9 +193,9 @@ def test_finished_starts_are_not_done_again():
 
 def test_only_the_first_seconds_count():
     replay, release = replay_of(simulator(), TRUTH, frames=40)
-    spoilt = replay.motions.markers.clone()
+    spoilt = replay.trials.observed.clone()
     spoilt[:, 20:] += 1.0
-    motions = replace(replay.motions, markers=spoilt)
+    motions = replace(replay.trials, observed=spoilt)
     identifier = Identifier(Replay(replay.simulator, MARKERS, motions), release, RANGES, seconds=0.19)
     unit = replay.simulator.tensor([[identifier._unit(name, TRUTH) for name in RANGES]])
     assert float(identifier.losses(unit)) < 1e-12
@@ -215,8 +216,8 @@ def test_what_cannot_be_identified_is_refused(bounds, sentence):
 
 def test_a_motion_that_stands_still_is_refused():
     replay, release = replay_of(simulator(gravity=(0.0, 0.0, 0.0)), TRUTH, frames=3)
-    still = replay.motions.held[:, None].repeat(1, 3, 1, 1)
-    motions = replace(replay.motions, markers=still)
+    still = replay.trials.held[:, None].repeat(1, 3, 1, 1)
+    motions = replace(replay.trials, observed=still)
     with pytest.raises(InputError, match="'m0' stay where they were held"):
         Identifier(Replay(replay.simulator, MARKERS, motions), release, RANGES)
 

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 import torch
 from torch import nn
-from warp_resphys.learning.driven_rollout import Range, WatchedModel
 
-from warp_resphys import Body, Corotated, Simulator, box_hexahedra, select_vertices
+from warp_resphys import Body, Corotated, Simulator, State, box_hexahedra, select_vertices
 from warp_resphys.dynamics import modes
 from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.dynamics.modes import RestStiffness, vibration_modes
@@ -24,6 +23,7 @@ from warp_resphys.learning.networks import (
     pod_coder,
     restore,
 )
+from warp_resphys.learning.predictors import LearnedPredictor, Range
 
 REDUCED = {"kind": "reduced", "position_modes": 3, "velocity_modes": 4, "force_modes": 5}
 ARCHITECTURE = {"blocks": 2, "layers": 1, "width": 16, "activation": "normalised_elu"}
@@ -244,15 +244,24 @@ class TestActuation:
         model = model.double().eval()
         with torch.no_grad():
             held = Range.of(model.encode(q, v, self.LOADS))
-        watched = WatchedModel(model, held)
-        inside = watched(q[:5], v[:5], self.LOADS[:5])
-        for one, other in zip(inside, model.predict(q[:5], v[:5], self.LOADS[:5]), strict=True):
-            torch.testing.assert_close(one, other)
-        assert watched.left_at.tolist() == [-1] * 5
-        far = [watched(model.rest + size * (q[:5] - model.rest), size * v[:5], self.LOADS[:5]) for size in (1e6, 1e9)]
+        told = torch.stack([self.LOADS[i : i + 5] for i in (0, 5, 0, 0)])  # during each of four steps
+        watched = LearnedPredictor(model, told, held)
+
+        def predicted(q, v, step):
+            given = watched(State(q, v), step)
+            return (given.q, given.v) if isinstance(given, State) else (given,)
+
+        with torch.no_grad():
+            for step in (0, 1):
+                expected = model.predict(q[:5], v[:5], told[step])
+                for one, other in zip(predicted(q[:5], v[:5], step), expected, strict=True):
+                    torch.testing.assert_close(one, other)
+            assert watched.left_at.tolist() == [-1] * 5
+            away = q[:5] - model.rest
+            far = [predicted(model.rest + size * away, size * v[:5], step) for step, size in ((2, 1e6), (3, 1e9))]
         for one, other in zip(*far, strict=True):
             torch.testing.assert_close(one, other)
-        assert watched.left_at.tolist() == [1] * 5
+        assert watched.left_at.tolist() == [2] * 5
 
     def test_without_hidden_layers_it_is_affine(self):
         model, q, v = self.built(layers=0, blocks=1)

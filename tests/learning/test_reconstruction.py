@@ -9,7 +9,7 @@ from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, box_
 from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.learning.reconstruction import conjugate_gradients, make_reconstructor
-from warp_resphys.learning.rollout import HybridRollout, closed_loop
+from warp_resphys.learning.rollout import Rollout, closed_loop
 
 INTEGRATORS = ("implicit_euler", "bdf2", "midpoint")
 H = 0.01
@@ -264,8 +264,7 @@ class TestClosedLoop:
         observed, start = observation(5, (0.05, 0.2))
         sim = simulator()
         _, force = reconstruct("gauss_newton", sim, start, observed, 0.0)
-        steps = iter(force)
-        positions = closed_loop(HybridRollout(sim, lambda q, v: next(steps)), start, 5)
+        positions = closed_loop(Rollout(sim, lambda state, step: force[step]), start, 5)
         np.testing.assert_allclose(positions, observed.transpose(0, 1), rtol=0, atol=1e-9)
 
     def test_what_diverges_is_marked_and_does_not_touch_the_others(self):
@@ -273,17 +272,15 @@ class TestClosedLoop:
         few = SolverSettings(on_failure="count", max_iterations=15)
         counting = Simulator(BODY, MODEL, H, solver=few)
 
-        def predict(q, v):
-            predict.calls += 1
-            force = torch.zeros_like(q)
-            if predict.calls == 2:
+        def predict(state, step):
+            force = torch.zeros_like(state.q)
+            if step == 1:
                 force[0] = torch.nan
-            if predict.calls == 3:
+            if step == 2:
                 force[1] = 100.0 * torch.randn(12, 3, generator=torch.Generator().manual_seed(0))
             return force
 
-        predict.calls = 0
-        positions = closed_loop(HybridRollout(counting, predict), start, 5)
+        positions = closed_loop(Rollout(counting, predict), start, 5)
         lost = torch.isnan(positions).all(3).all(2)
         assert lost.tolist() == [
             [False, False, True, True, True, True],

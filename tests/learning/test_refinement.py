@@ -47,8 +47,21 @@ def network(seed=0):
     return build_model(sizes, rest, TRAIN.q.flatten(0, 1), TRAIN.v.flatten(0, 1), force)
 
 
-def window_loss(predict, window=3, batch_size=4, integrator="implicit_euler"):
-    return WindowLoss(predict, lambda: simulator(integrator=integrator), window, batch_size)
+class Formula:
+    """A model whose force is a function of positions and velocities."""
+
+    def __init__(self, force):
+        self.rest, self.force = simulator().rest_positions, force
+
+    def encode(self, q, v, told):
+        return q, v
+
+    def decode(self, state):
+        return [self.force(*state)]
+
+
+def window_loss(model, window=3, batch_size=4, integrator="implicit_euler"):
+    return WindowLoss(model, lambda: simulator(integrator=integrator), window, batch_size)
 
 
 def trainer(model=None, error=None, **settings):
@@ -93,9 +106,7 @@ class TestLoss:
 
     @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2", "midpoint"])
     def test_the_right_force_has_none(self, integrator):
-        def no_force(q, v):
-            return torch.zeros_like(q)
-
+        no_force = Formula(lambda q, v: torch.zeros_like(q))
         loss = WindowLoss(no_force, lambda: simulator(REALITY, integrator), 4, 3)
         target = motion(integrator)
         windows = loss.side_by_side(target)
@@ -111,7 +122,7 @@ class TestLoss:
             state = replace(sim.rest_state(1), q=TRAIN.q[run, frame][None], v=TRAIN.v[run, frame][None])
             for step in (1, 2, 3):
                 with torch.no_grad():
-                    state, _ = sim.step(state, model(state.q, state.v))
+                    state, _ = sim.step(state, Inputs(model(state.q, state.v)))
                 squares.append(1e6 * (state.q[0] - TRAIN.q[run, frame + step]).square().sum(-1).mean())
         loss = window_loss(model, batch_size=2)
         expected = float(torch.stack(squares).mean())
@@ -129,7 +140,7 @@ class TestLoss:
 
         windows = Windows(torch.tensor([0, 1, 1, 0]), torch.tensor([0, 4, 1, 5]))
         others = windows.pick(torch.tensor([0, 2, 3]))
-        whole, broken = window_loss(model, batch_size=4), window_loss(failing, batch_size=4)
+        whole, broken = window_loss(model, batch_size=4), window_loss(Formula(failing), batch_size=4)
         measured, lost = broken.measure(windows, TRAIN)
         assert lost.tolist() == [False, True, False, False]
         expected = whole.measure(others, TRAIN)[0]
@@ -186,7 +197,7 @@ class TestTraining:
             return torch.where(bad[:, None, None], math.nan, model(q, v))
 
         def make():
-            return SolverInTheLoop(model, window_loss(failing), TRAIN, VALIDATION, lambda model: 1.0, CONFIG)
+            return SolverInTheLoop(model, window_loss(Formula(failing)), TRAIN, VALIDATION, lambda model: 1.0, CONFIG)
 
         run = make()
         run.run_epoch()
@@ -199,7 +210,7 @@ class TestTraining:
         assert again.run_epoch()["train_loss"] < run.state.history[1]["train_loss"]
 
     def test_nothing_can_be_simulated(self):
-        loss = window_loss(lambda q, v: torch.full_like(q, math.nan))
+        loss = window_loss(Formula(lambda q, v: torch.full_like(q, math.nan)))
         run = SolverInTheLoop(network(), loss, TRAIN, VALIDATION, lambda model: 1.0, CONFIG)
         with pytest.raises(InputError, match="the simulator fails in every window of the training split"):
             run.run_epoch()

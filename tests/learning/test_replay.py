@@ -8,10 +8,12 @@ import torch
 
 from warp_resphys import Body, Corotated, PointMass, Simulator
 from warp_resphys.data.markers import bind_markers
+from warp_resphys.data.trials import Trials
+from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.dynamics.integrator import State
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.learning.release import ReleaseSettings, estimate_release, hold, sideways_shapes, velocity_shapes
-from warp_resphys.learning.replay import PARAMETERS, Motions, Release, Replay, sample, tilted_gravity
+from warp_resphys.learning.replay import Replay, Start, sample, tilted_gravity
 from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
 
 MESH = box_hexahedra(divisions=(4, 1, 1))
@@ -39,11 +41,12 @@ def blank(frames=12, masses=MASSES, rate=100.0):
     attached = torch.zeros(count, len(MESH.vertices), dtype=torch.float64)
     attached[:, TIP] = double(masses)[:, None] / len(TIP)
     names = tuple(f"m{i}" for i in range(count))
-    return Motions(names, times, held[:, None].repeat(1, frames, 1, 1) + 1e-3, held, attached)
+    places = held[:, None].repeat(1, frames, 1, 1) + 1e-3
+    return Trials(names, times, places, held, Inputs(attached_mass=attached))
 
 
 def at_rest(sim, count, delay=0.0):
-    return Release(sim.rest_state(count), torch.full((count,), delay, dtype=torch.float64))
+    return Start(sim.rest_state(count), torch.full((count,), delay, dtype=torch.float64))
 
 
 def test_sampling_is_exact_on_parabolas_and_at_the_steps():
@@ -129,15 +132,15 @@ def test_before_its_release_a_body_holds_still_and_frames_lie_between_steps():
 def test_gradients_of_every_parameter_agree_with_central_differences(integrator, nu):
     sim = simulator(integrator=integrator, relative_tolerance=1e-11)
     motions = blank(frames=8)
-    motions.markers[0, 3, 1] = torch.nan
-    motions.markers[1, 6:] = torch.nan
+    motions.observed[0, 3, 1] = torch.nan
+    motions.observed[1, 6:] = torch.nan
     release = at_rest(sim, 2, delay=0.004)
     replay = Replay(sim, MARKERS, motions)
     at = double([215e3, nu, 1070.0, 0.8, 0.002, 1.1, 0.05, -0.03])
     scale = double([1e5, 1e-3, 1000.0, 1.0, 0.01, 1.0, 1.0, 1.0])
 
     def losses(values):
-        return replay.errors(replay(release, dict(zip(PARAMETERS, values.mT, strict=True)))).square().sum((1, 2, 3, 4))
+        return replay.errors(replay(release, dict(zip(replay.known, values.mT, strict=True)))).square().sum((1, 2, 3, 4))
 
     x = at[None].clone().requires_grad_()
     (gradient,) = torch.autograd.grad(losses(x).sum(), x)
@@ -152,7 +155,7 @@ def test_gradients_of_every_parameter_agree_with_central_differences(integrator,
 def test_markers_that_were_not_seen_have_no_influence():
     sim, motions = simulator(), blank()
     release, e = at_rest(sim, 2), double([2e5]).requires_grad_()
-    motions.markers[:, 5:, 0] = torch.nan
+    motions.observed[:, 5:, 0] = torch.nan
     replay = Replay(sim, MARKERS, motions)
     errors = replay.errors(replay(release, {"youngs_modulus": e}))
     assert not bool((errors[:, :, 5:, 0] != 0.0).any())
@@ -160,23 +163,23 @@ def test_markers_that_were_not_seen_have_no_influence():
     (gradient,) = torch.autograd.grad(errors.square().sum(), e)
     assert bool(gradient.isfinite().all())
     with pytest.raises(InputError, match="'m1' was seen"):
-        replace(motions, markers=torch.where(double([[[[0.0]]], [[[1.0]]]]) > 0, torch.nan, motions.markers))
+        replace(motions, observed=torch.where(double([[[[0.0]]], [[[1.0]]]]) > 0, torch.nan, motions.observed))
 
 
 def test_motions_can_be_cut_and_chosen():
     motions = blank(frames=12)
     motions.times[1, 8:] = 0.07
-    motions.markers[1, 8:] = torch.nan
+    motions.observed[1, 8:] = torch.nan
     first = motions.first(0.045)
     assert first.times.shape == (2, 5)
-    assert first.markers.shape == (2, 5, 3, 3)
+    assert first.observed.shape == (2, 5, 3, 3)
     assert bool(motions.first(0.09).seen[1, 8:].any()) is False
     assert bool(motions.first(9.0).times.equal(motions.times))
     torch.testing.assert_close(motions.amplitude, torch.full((2,), 1e-3 * np.sqrt(3.0), dtype=torch.float64))
     chosen = motions.select([1])
     assert chosen.names == ("m1",)
     assert chosen.times.shape == (1, 12)
-    torch.testing.assert_close(chosen.attached_mass[0], motions.attached_mass[1])
+    torch.testing.assert_close(chosen.inputs.attached_mass[0], motions.inputs.attached_mass[1])
     with pytest.raises(InputError, match="do not belong"):
         replace(motions, times=motions.times[:, :4])
 
@@ -184,11 +187,11 @@ def test_motions_can_be_cut_and_chosen():
 def test_a_held_body_has_its_markers_where_they_were_and_is_at_rest():
     sim = simulator()
     replay = Replay(sim, MARKERS, blank())
-    straight = hold(sim, MARKERS, replay.motions, replay.tensors(), 6)
-    assert float((MARKERS(straight) - replay.motions.held).abs().max()) < 5e-5
-    turned = replay.motions.held + double([0.0, 0.004, 0.008])
+    straight = hold(replay, 6)
+    assert float((MARKERS(straight) - replay.trials.held).abs().max()) < 5e-5
+    turned = replay.trials.held + double([0.0, 0.004, 0.008])
     turned[1, 2] = torch.nan
-    bent = hold(sim, MARKERS, replace(replay.motions, held=turned), replay.tensors(), 6)
+    bent = hold(Replay(sim, MARKERS, replace(replay.trials, held=turned)), 6)
     distance = (MARKERS(bent) - turned).norm(dim=-1)
     assert float(distance.nanmean()) < 4e-4
     assert bool(bent.isfinite().all())
@@ -197,11 +200,11 @@ def test_a_held_body_has_its_markers_where_they_were_and_is_at_rest():
 def test_a_body_that_nothing_holds_rests_under_gravity_and_its_weight():
     sim = simulator()
     replay = Replay(sim, MARKERS, blank())
-    q = hold(sim, MARKERS, replay.motions, replay.tensors(), 0)
+    q = hold(replay, 0)
     for r, mass in enumerate(MASSES):
         alone = simulator(masses=(mass,)).static_equilibrium()
         torch.testing.assert_close(q[r], alone.q[0], rtol=0.0, atol=1e-7)
-    still = replay(Release(State(q, torch.zeros_like(q)), torch.zeros(2, dtype=torch.float64)))[0]
+    still = replay(Start(State(q, torch.zeros_like(q)), torch.zeros(2, dtype=torch.float64)))[0]
     assert float((still - still[:, :1]).abs().max()) < 1e-7
 
 
@@ -210,12 +213,12 @@ def test_the_delay_and_the_push_of_a_release_are_recovered():
     replay = Replay(sim, MARKERS, motions)
     shapes, delay = velocity_shapes(sim, 2), double([0.012, -0.004])
     assert float(shapes.norm(dim=2).amax()) == pytest.approx(1.0)
-    q = hold(sim, MARKERS, motions, replay.tensors(), 6)
+    q = hold(replay, 6)
     pushes = double([[0.06, -0.03], [0.0, 0.05]])
     velocity = torch.einsum("bk,knc->bnc", pushes, shapes)
-    seen = replay(Release(State(q, velocity), delay))[0]
+    seen = replay(Start(State(q, velocity), delay))[0]
     settings = ReleaseSettings(velocity_modes=2, delay=0.01, window=0.1, noise=1e-5, iterations=8)
-    found = estimate_release(sim, MARKERS, replace(motions, markers=seen), settings)
+    found = estimate_release(sim, MARKERS, replace(motions, observed=seen), settings)
     torch.testing.assert_close(found.delay, delay, rtol=0.0, atol=5e-4)
     torch.testing.assert_close(found.state.v, velocity, rtol=0.0, atol=3e-3)
     again = replay(found)[0]
@@ -228,19 +231,19 @@ def test_the_delay_and_the_push_of_a_release_are_recovered():
 def test_a_body_held_sideways_shows_it_once_it_is_let_go():
     sim, motions = simulator(), blank(frames=16)
     replay, shapes = Replay(sim, MARKERS, motions), sideways_shapes(sim)
-    q = hold(sim, MARKERS, motions, replay.tensors(), 6)
+    q = hold(replay, 6)
     bends = double([[0.002], [-0.003]])
     bent = q + torch.einsum("bk,knc->bnc", bends, shapes)
-    truth = Release(State(bent, torch.zeros_like(q)), torch.zeros(2).double(), MARKERS(q) - MARKERS(bent))
+    truth = Start(State(bent, torch.zeros_like(q)), torch.zeros(2).double(), MARKERS(q) - MARKERS(bent))
     seen = replay(truth)[0]
     torch.testing.assert_close(seen[:, 0], MARKERS(q), rtol=0.0, atol=1e-12)
     settings = ReleaseSettings(velocity_modes=0, delay=0.0, sideways=0.002, window=0.1, noise=1e-5)
-    found = estimate_release(sim, MARKERS, replace(motions, markers=seen), settings)
+    found = estimate_release(sim, MARKERS, replace(motions, observed=seen), settings)
     torch.testing.assert_close(found.state.q, bent, rtol=0.0, atol=2e-5)
     torch.testing.assert_close(replay(found)[0], seen, rtol=0.0, atol=1e-5)
     torch.testing.assert_close(found.select([1]).shift, found.shift[1:])
     torch.testing.assert_close(found.bound(found.shifted(seen)), seen)
-    straight = estimate_release(sim, MARKERS, replace(motions, markers=seen), replace(settings, sideways=0.0))
+    straight = estimate_release(sim, MARKERS, replace(motions, observed=seen), replace(settings, sideways=0.0))
     assert straight.shift is None
     assert float((replay(straight)[0] - seen).norm(dim=-1).mean()) > 1e-3
 
@@ -280,7 +283,7 @@ def test_a_body_that_cannot_be_held_says_so(monkeypatch):
 
     monkeypatch.setattr(sim.__class__, "static_equilibrium", fail)
     with pytest.raises(ConvergenceError):
-        hold(sim, MARKERS, replay.motions, replay.tensors(), 3)
+        hold(replay, 3)
 
 
 @pytest.mark.parametrize(

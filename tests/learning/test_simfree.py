@@ -7,7 +7,8 @@ import torch
 from warp_resphys import Body, Corotated, Simulator, State, box_hexahedra, select_vertices
 from warp_resphys.io.files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.networks import NextState, build_next_state, restore
-from warp_resphys.learning.rollout import FURTHEST, DataDrivenRollout, closed_loop
+from warp_resphys.learning.predictors import LearnedPredictor
+from warp_resphys.learning.rollout import FURTHEST, Rollout, closed_loop
 
 MESH = box_hexahedra((0.1, 0.03, 0.03), (2, 1, 1))
 SIMULATOR = Simulator(Body(MESH, fixed=select_vertices(MESH, x=0.0)), Corotated(215e3, 0.45))
@@ -58,7 +59,7 @@ def test_the_linear_part_alone_reproduces_a_linear_system(system, kind):
     model = linear_model(system, kind)
     z = torch.tensor([[1.0, -2.0, 0.5, 0.0, 1.5, -1.0], [0.0, 0.3, 0.0, -2.0, 0.0, 0.7]], dtype=torch.float64)
     start = State(*system.state(z))
-    positions = closed_loop(DataDrivenRollout(SIMULATOR, model), start, 30)
+    positions = closed_loop(Rollout(SIMULATOR, LearnedPredictor(model)), start, 30)
     for step in range(31):
         q, _ = system.state(z @ torch.linalg.matrix_power(system.matrix, step).mT)
         torch.testing.assert_close(positions[:, step], q, rtol=0.0, atol=1e-5 * float((start.q - REST).abs().max()))
@@ -81,14 +82,15 @@ def test_a_roll_out_that_diverges_is_lost_for_good_and_touches_no_other(value):
     """The second of three environments leaves at its third step, and would come back if it was asked."""
     calls = []
 
-    def predict(q, v):
-        calls.append(q.clone())
-        following = q + 1e-3
+    def predict(state, step):
+        assert step == len(calls)
+        calls.append(state.q.clone())
+        following = state.q + 1e-3
         if len(calls) == 3:
             following[1, -1, 0] = REST[-1, 0] + 0.1 * value
-        return following, v + 0.5
+        return State(following, state.v + 0.5)
 
-    rollout = DataDrivenRollout(SIMULATOR, predict)
+    rollout = Rollout(SIMULATOR, predict)
     start = SIMULATOR.rest_state(3)
     positions = closed_loop(rollout, start, 6)
     lost = torch.isnan(positions).all((2, 3))
@@ -101,5 +103,6 @@ def test_a_roll_out_that_diverges_is_lost_for_good_and_touches_no_other(value):
 
 def test_just_short_of_diverging_is_no_divergence():
     far = REST.expand(1, -1, -1) + 0.99 * FURTHEST * 0.1
-    positions = closed_loop(DataDrivenRollout(SIMULATOR, lambda q, v: (far, v)), SIMULATOR.rest_state(1), 2)
+    rollout = Rollout(SIMULATOR, lambda state, step: State(far, state.v))
+    positions = closed_loop(rollout, SIMULATOR.rest_state(1), 2)
     assert torch.equal(positions[:, 1], far)

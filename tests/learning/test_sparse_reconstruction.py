@@ -203,10 +203,10 @@ class TestLevenbergMarquardt:
         expected = solver.step(start, markers(observed[1]))
         step = Simulator.step
 
-        def fragile(self, state, force=None, **options):
-            if force is not None and float(force.abs().max()) > 50.0:
+        def fragile(self, state, inputs, parameters):
+            if float(inputs.external_force.abs().max()) > 50.0:
                 raise ConvergenceError("too much", state.q, None)
-            return step(self, state, force, **options)
+            return step(self, state, inputs, parameters)
 
         monkeypatch.setattr(Simulator, "step", fragile)
         found = solver.step(start, markers(observed[1]), first_guess=torch.full_like(start.q, 100.0))

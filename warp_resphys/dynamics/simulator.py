@@ -55,7 +55,11 @@ class Constants:
     @property
     def batch(self) -> int:
         """Environments that they are for; 1 where they are the same for all."""
-        return max(len(t) for t in (self.mass, self.gravity, self.mass_damping, *self.values.values()))
+        return max(map(len, self._tensors))
+
+    @property
+    def _tensors(self) -> tuple[torch.Tensor, ...]:
+        return (self.mass, self.gravity, self.mass_damping, self.stiffness_damping, *self.values.values())
 
     def check_batch(self, batch: int) -> None:
         """Refuses constants of another number of environments.
@@ -63,7 +67,7 @@ class Constants:
         Raises:
             InputError: some constant has neither one value nor one for each environment.
         """
-        for tensor in (self.mass, self.gravity, self.mass_damping, *self.values.values()):
+        for tensor in self._tensors:
             if len(tensor) not in (1, batch):
                 raise InputError(
                     f"a material parameter has values for {len(tensor)} environments, but the state has {batch}."

@@ -223,8 +223,9 @@ def sideways_shapes(simulator: Simulator) -> torch.Tensor:
     size = 0.1  # m/s^2
     with torch.no_grad():
         weightless = simulator.prepare({"gravity": torch.zeros_like(directions)})
+        mass = weightless.mass - simulator.tensor(simulator.body.attached_mass)
         for _ in range(3):  # Small enough for a linear answer, and well above rounding, however stiff the body is.
-            load = size * weightless.mass[..., None] * directions[:, None]
+            load = size * mass[..., None] * directions[:, None]
             bent = simulator.static_equilibrium(Inputs(load), weightless).q - simulator.rest_positions
             size *= _SIDEWAYS_STRAIN * extent / float(bent.norm(dim=2).max())
     turn, *_ = torch.linalg.svd(bent.flatten(1), full_matrices=False)  # To the softest direction and the stiffest.

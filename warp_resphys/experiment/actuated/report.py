@@ -18,7 +18,7 @@ from ...report.driven_tables import DRIVEN_MODELS
 from ...report.measured_data import Recordings, Trials
 from ..build import build_chambers, build_mesh
 from ..measured.files import IDENTIFICATION, REPORT, ROLLOUTS, TRUTH, training_file
-from ..measured.identify import first_guess
+from ..measured.identify import data_sheet
 from ..measured.report import error_notes, read_if_there, read_metrics, read_recordings
 from .files import LEARNED, MOTIONS, RAISED_MOTIONS, RECONSTRUCTION
 from .trials import is_synthetic
@@ -41,6 +41,7 @@ def report_driven(context: StageContext) -> None:
     metrics, truth = read_metrics(folder, config), read_json(folder / TRUTH) if synthetic else {}
     files = [folder / name for name in (MOTIONS, *((RAISED_MOTIONS,) if config["data"]["factors"] else ()))]
     actuation = read_actuation(files, config["data"]["pressure_limit"])
+    identification = read_if_there(folder / IDENTIFICATION)
     trials, beyond, film = read_rollouts(folder, metrics, config["time_step"], [*actuation.pressure])
     data = DrivenReport(
         experiment=config["name"],
@@ -55,8 +56,8 @@ def report_driven(context: StageContext) -> None:
         recordings=_at_rest(folder, config, mesh, trials, film),
         synthetic=synthetic,
         trials=trials,
-        identification=read_if_there(folder / IDENTIFICATION),
-        start=first_guess(config, {*config["identify"]["parameters"], "youngs_modulus", "poissons_ratio"}),
+        identification=identification,
+        start=data_sheet(config, identification),
         truth=truth.get("material", {}),
         training={m: read_json(path)["epochs"] for m in LEARNED if (path := folder / training_file(m)).is_file()},
         chambers=_chambers(build_chambers(config["chambers"], mesh), actuation.chambers),

@@ -71,9 +71,11 @@ def synthesise_driven(context: StageContext, processes: int = 1, higher: bool = 
 def _truth(settings: Mapping[str, Any], scene: Scene, noise: float) -> dict[str, Any]:
     """What the recordings were made with; ``noise`` in metres."""
     synthetic = settings["synthetic"]
+    fibres = synthetic["fibres"] or {}
+    wound = {"fibre_stiffness": fibres["stiffness"]} if "stiffness" in fibres else {}
     return {
-        "material": synthetic["material"],
-        "fibre_angles": (synthetic["fibres"] or {}).get("angles", []),
+        "material": {**synthetic["material"], **wound},
+        "fibre_angles": fibres.get("angles", []),
         "gravity": settings["gravity"],
         "rotation": scene.rotation.as_matrix(),
         "translation": scene.translation,

@@ -56,6 +56,12 @@ def first_guess(settings: Mapping[str, Any], names: Any) -> dict[str, float]:
     return {name: values.get(name, 0.0) for name in names}
 
 
+def data_sheet(settings: Mapping[str, Any], identification: Mapping[str, Any]) -> dict[str, float]:
+    """The first guess of all that was identified, and of what the landscape is drawn over."""
+    names = {name for found in identification.values() for name in found.get("parameters", {})}
+    return first_guess(settings, {*names, "youngs_modulus", "poissons_ratio"})
+
+
 def search(
     context: StageContext,
     kind: str,

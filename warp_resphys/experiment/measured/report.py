@@ -33,7 +33,7 @@ from .files import (
     fold_folder,
     training_file,
 )
-from .identify import first_guess
+from .identify import data_sheet
 from .trials import is_synthetic
 
 FloatArray = NDArray[np.float64]
@@ -54,6 +54,7 @@ def report_measured(context: StageContext) -> None:
     folder, config = context.run_dir, context.settings["config"]
     mesh = build_mesh(config["mesh"])
     metrics, truth = read_metrics(folder, config), read_if_there(_common(folder) / TRUTH)
+    identification = read_if_there(folder / IDENTIFICATION)
     data = MeasuredReport(
         experiment=config["name"],
         title=config["title"],
@@ -66,8 +67,8 @@ def report_measured(context: StageContext) -> None:
         fixed=select_vertices(mesh, **config["fixed"]),
         trials=read_trials(folder, config),
         recordings=read_recordings(_common(folder), config, mesh),
-        identification=read_if_there(folder / IDENTIFICATION),
-        start=first_guess(config, {**config["identify"]["parameters"], **(config["identify"]["elastic"] or {})}),
+        identification=identification,
+        start=data_sheet(config, identification),
         truth=truth.get("material", {}),
         training={m: read_json(path)["epochs"] for m in TRAINED if (path := folder / training_file(m)).is_file()},
         seconds=config["data"]["seconds"],

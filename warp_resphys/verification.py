@@ -4,8 +4,6 @@ The format is a NumPy archive without pickled objects that holds the keys of `RE
 vertices only, in x-major order; the hexahedra between them follow from the distinct coordinates.
 """
 
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +13,7 @@ from numpy.typing import NDArray
 
 from .body import Body
 from .errors import DataFileError, InputError
+from .files import read_arrays
 from .integrator import State
 from .material import Material
 from .mesh import Mesh, box_hexahedra, select_vertices
@@ -109,18 +108,9 @@ def read_reference(path: Path) -> ReferenceTrajectory:
 
 def _read_archive(path: Path) -> dict[str, FloatArray]:
     """The entries of `REFERENCE_SHAPES`, checked."""
-    try:
-        loaded = np.load(path, allow_pickle=False)
-        if not isinstance(loaded, np.lib.npyio.NpzFile):
-            raise DataFileError(f"{path} is a single array: give a reference trajectory (.npz).")
-        with loaded:
-            values = {name: loaded[name] for name in loaded.files}
-    except FileNotFoundError:
-        raise DataFileError(f"{path} does not exist: give a reference trajectory (.npz).") from None
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error):
-        raise DataFileError(
-            f"{path} is no NumPy archive of plain arrays, or a damaged one: give a reference trajectory (.npz)."
-        ) from None
+    values = read_arrays(path)
+    if "" in values:
+        raise DataFileError(f"{path} is a single array: give a reference trajectory (.npz).")
     _check_names(values, path)
     _check_values(values, path)
     return {name: np.asarray(value, dtype=np.float64) for name, value in values.items()}

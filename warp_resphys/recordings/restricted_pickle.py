@@ -112,7 +112,7 @@ def _encode(text: str, encoding: str = "latin1") -> bytes:
     """How protocols before the third write bytes."""
     if encoding != "latin1":
         raise ValueError(f"text in {encoding!r}")
-    return text.encode("latin1")
+    return str.encode(text, "latin1")  # A TypeError for what is no text.
 
 
 def _no_bytes() -> bytes:

@@ -19,8 +19,8 @@ def main(config: DictConfig) -> None:
     """Writes benchmark.json into the run folder and prints its tables."""
     from rich.console import Console
 
-    from warp_resphys.benchmark import benchmark_tables, run_benchmark
-    from warp_resphys.files import write_json
+    from warp_resphys.io.files import write_json
+    from warp_resphys.studies.benchmark import benchmark_tables, run_benchmark
 
     result = run_benchmark(cast(dict[str, Any], OmegaConf.to_container(config, resolve=True)))
     file = Path(HydraConfig.get().runtime.output_dir) / "benchmark.json"

@@ -15,7 +15,7 @@ from warp_resphys.cli import hydra_entry
 @hydra_entry("compare_recording")
 def main(config: DictConfig) -> None:
     """Writes comparison.json and comparison.png into the run folder and prints the numbers."""
-    from warp_resphys.recording_comparison import compare_recording
+    from warp_resphys.studies.recording_comparison import compare_recording
 
     folder = Path(HydraConfig.get().runtime.output_dir)
     result = compare_recording(cast(dict[str, Any], OmegaConf.to_container(config, resolve=True)), folder)

@@ -9,14 +9,14 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from warp_resphys.cli import hydra_entry
-from warp_resphys.errors import InputError
+from warp_resphys.io.errors import InputError
 
 
 @hydra_entry("convert_recordings")
 def main(config: DictConfig) -> None:
     """Writes one file for each trial, and index.json."""
-    from warp_resphys.recordings.published import convert_arm, convert_beam
-    from warp_resphys.recordings.segment import convert_segment
+    from warp_resphys.data.recordings.published import convert_arm, convert_beam
+    from warp_resphys.data.recordings.segment import convert_segment
 
     converters = {"arm": convert_arm, "beam": convert_beam, "segment": convert_segment}
     if config.layout not in converters:

@@ -19,7 +19,7 @@ def main(config: DictConfig) -> None:
     import warp as wp
     from rich.console import Console
 
-    from warp_resphys.gradient_check import check_configured, gradient_table
+    from warp_resphys.studies.gradient_check import check_configured, gradient_table
 
     wp.config.log_level = wp.LOG_WARNING
     settings = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))

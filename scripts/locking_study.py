@@ -20,7 +20,7 @@ def main(config: DictConfig) -> None:
     """Writes study.json, study.csv and study.png into the run folder and prints the table."""
     from rich.console import Console
 
-    from warp_resphys.report.locking import run_study
+    from warp_resphys.studies.locking_page import run_study
 
     folder = Path(HydraConfig.get().runtime.output_dir)
     console = Console(width=None if sys.stdout.isatty() else 140)

@@ -17,7 +17,7 @@ from warp_resphys.cli import hydra_entry
 @hydra_entry("reproduce")
 def main(config: DictConfig) -> None:
     """Writes reproduction.html, results.md and figures/ into the run folder."""
-    from warp_resphys.reproduction import reproduce
+    from warp_resphys.studies.reproduction import reproduce
 
     hydra = HydraConfig.get()
     plain = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))

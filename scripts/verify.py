@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from warp_resphys.errors import ConvergenceError, ResphysError
+from warp_resphys.io.errors import ConvergenceError, ResphysError
 
 LARGEST_ERROR = 1e-8  # m
 SOLVERS = ("projective_dynamics", "quasi_newton", "newton")
@@ -51,9 +51,9 @@ def _parser() -> argparse.ArgumentParser:
 def _verify(options: argparse.Namespace) -> int:
     import warp as wp
 
-    from warp_resphys.configured import choose_device
-    from warp_resphys.solver import SolverSettings
-    from warp_resphys.verification import compare_with_reference, read_reference
+    from warp_resphys.dynamics.nonlinear_solver import SolverSettings
+    from warp_resphys.experiment.build import choose_device
+    from warp_resphys.studies.verification import compare_with_reference, read_reference
 
     wp.config.log_level = wp.LOG_WARNING
     device = choose_device(options.device)

@@ -3,8 +3,8 @@
 import numpy as np
 
 from warp_resphys import Body, Mesh, box_hexahedra, box_tetrahedra, select_vertices
-from warp_resphys.chambers import find_chambers
-from warp_resphys.mesh import quadratic
+from warp_resphys.mesh.chambers import find_chambers
+from warp_resphys.mesh.mesh import quadratic
 
 SIZE, DIVISIONS = (0.06, 0.03, 0.02), (6, 3, 3)
 # The bricks that are left out, as (i, j, k): a chamber of two and one of a single brick.

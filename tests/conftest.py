@@ -8,9 +8,9 @@ import torch
 import warp as wp
 from main_job import IN_RUN, TINY, files, run
 
-from warp_resphys.mesh import box_hexahedra
+from warp_resphys.experiment import experiment
+from warp_resphys.mesh.mesh import box_hexahedra
 from warp_resphys.report import render
-from warp_resphys.tasks import experiment
 
 wp.config.log_level = wp.LOG_WARNING
 wp.init()

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 from measured_run import configuration, describe_recordings
 
-from warp_resphys.configured import build_mesh
-from warp_resphys.files import atomic_hdf5, create, read_json, write_json
-from warp_resphys.metrics import median_filter, summarise, summarise_each
+from warp_resphys.experiment.build import build_mesh
+from warp_resphys.io.files import atomic_hdf5, create, read_json, write_json
+from warp_resphys.learning.metrics import median_filter, summarise, summarise_each
 from warp_resphys.report.measured_data import mean_distance
 
 MODELS = ("simulation", "sysid", "simfree", "resphys")

@@ -10,9 +10,9 @@ import numpy as np
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
-from warp_resphys.files import atomic_hdf5, create, write_json
-from warp_resphys.mesh import box_hexahedra
-from warp_resphys.metrics import summarise
+from warp_resphys.io.files import atomic_hdf5, create, write_json
+from warp_resphys.learning.metrics import summarise
+from warp_resphys.mesh.mesh import box_hexahedra
 
 MODELS = ("published", "simulation", "sysid_elastic", "sysid", "simfree", "resphys_uncorrected", "resphys")
 LEARNED = ("simfree", "resphys_uncorrected", "resphys")

@@ -13,8 +13,9 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from warp_resphys import cli
-from warp_resphys.errors import InputError
-from warp_resphys.stages import StageInterrupted
+from warp_resphys.io.errors import InputError
+from warp_resphys.io.labels import run_label
+from warp_resphys.io.stages import StageInterrupted
 
 REPOSITORY = Path(__file__).parents[1]
 CONFIG = {
@@ -56,9 +57,9 @@ class Command:
         self.outputs: list[str] = []
         self.arguments = ["warp-resphys", "--config-path", str(config_dir)]
         self.monkeypatch, self.capsys = monkeypatch, capsys
-        tasks = types.ModuleType("warp_resphys.tasks")
+        tasks = types.ModuleType("warp_resphys.studies.tasks")
         tasks.run = self.run  # type: ignore[attr-defined]
-        monkeypatch.setitem(sys.modules, "warp_resphys.tasks", tasks)
+        monkeypatch.setitem(sys.modules, "warp_resphys.studies.tasks", tasks)
         monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
 
     def run(self, config: DictConfig) -> object:
@@ -98,13 +99,13 @@ class TestRunFolder:
         assert folders == [tmp_path]
 
     def test_labels(self):
-        assert cli.run_label([]) == "default"
-        assert cli.run_label(["device=cuda", "+extra.device=cpu"], ["device", "extra.device"]) == "default"
-        assert cli.run_label(["b=2", "a.c=1e-3", "~d"]) == "a.c=1e-3,b=2,~d"
-        assert cli.run_label(["a=2", "a=1"]) == "a=1"
+        assert run_label([]) == "default"
+        assert run_label(["device=cuda", "+extra.device=cpu"], ["device", "extra.device"]) == "default"
+        assert run_label(["b=2", "a.c=1e-3", "~d"]) == "a.c=1e-3,b=2,~d"
+        assert run_label(["a=2", "a=1"]) == "a=1"
         tuning = ["task=tune", "tune.trials=3", "~tune.space.trainer.gamma", "tune=mine", "tuned=best"]
-        assert cli.run_label(tuning, ["task", "tune"]) == "tuned=best"
-        awkward = [cli.run_label([f"a={value}"]) for value in ("x/y", "x y", "x" * 300, "x" * 301)]
+        assert run_label(tuning, ["task", "tune"]) == "tuned=best"
+        awkward = [run_label([f"a={value}"]) for value in ("x/y", "x y", "x" * 300, "x" * 301)]
         assert len(set(awkward)) == 4
         assert all(set(label) <= set("axy=-0123456789abcdef") and len(label) < 120 for label in awkward)
 
@@ -313,7 +314,7 @@ class TestProcess:
         out, err = self.start(config_dir, heavy, "--help").communicate(timeout=60)
         assert "experiment: beam, beam_twist" in out
         names = out.splitlines()[-1].removeprefix("imported: ").split()
-        ours = {f"warp_resphys.{name}" for name in ("cli", "conf", "errors", "files")}
+        ours = {f"warp_resphys.{name}" for name in ("cli", "conf", "io", "io.errors", "io.files", "io.labels")}
         assert {"warp_resphys", "warp_resphys.cli"} <= set(names) <= {"warp_resphys", *ours}
         assert err == ""
 
@@ -324,8 +325,8 @@ class TestProcess:
             def run(config):
                 print("running", flush=True)
                 time.sleep(60)
-            sys.modules["warp_resphys.tasks"] = types.ModuleType("tasks")
-            sys.modules["warp_resphys.tasks"].run = run
+            sys.modules["warp_resphys.studies.tasks"] = types.ModuleType("tasks")
+            sys.modules["warp_resphys.studies.tasks"].run = run
         """
         child = self.start(config_dir, sleeping)
         assert child.stdout.readline() == "running\n"

@@ -1,7 +1,8 @@
-"""The table in CONTRIBUTING.md says where every module is; imports point up it."""
+"""The table in CONTRIBUTING.md says where every module is; imports point up it, and never in a circle."""
 
 import ast
 import re
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -11,33 +12,43 @@ PACKAGE = REPOSITORY / "warp_resphys"
 
 
 def rows():
-    """Row of each place in the table: `solver` for a module, `tasks/` for a folder."""
+    """Row of each place in the table: `cli` for a module, `io/` for a folder."""
     text = (REPOSITORY / "CONTRIBUTING.md").read_text(encoding="utf-8")
     cells = re.findall(r"^\| ((?:`[\w/]+`(?:, )?)+) \|", text, flags=re.MULTILINE)
-    places = [(place, row) for row, cell in enumerate(cells) for place in re.findall(r"`([\w/]+)`", cell)]
+    places = [(place, row) for row, cell in enumerate(cells) for place in re.findall(r"`([a-z_/]+)`", cell)]
     assert len({place for place, _ in places}) == len(places)
     return dict(places)
 
 
 def place_of(name):
-    """Where a module inside the package belongs: "tasks.train" to `tasks/`, "solver" to `solver`."""
+    """Where a module inside the package belongs: "io.files" to `io/`, "cli" to `cli`."""
     first = name.split(".")[0]
     return f"{first}/" if (PACKAGE / first).is_dir() or first in ("kernels", "conf") else first
 
 
 def modules():
-    """File and place of every module but the package's own file, which only hands out names."""
-    ours = [path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py"]
-    places = {path: place_of(path.relative_to(PACKAGE).with_suffix("").parts[0]) for path in ours}
-    for folder in ("kernels", "scripts"):
-        places |= dict.fromkeys((REPOSITORY / folder).glob("*.py"), f"{folder}/")
-    return places
+    """File and dotted name below the package of every module but the package's own file, which only hands out names."""
+    found = {}
+    for folder, prefix in (
+        (PACKAGE, ()),
+        (REPOSITORY / "kernels", ("kernels",)),
+        (REPOSITORY / "scripts", ("scripts",)),
+    ):
+        for path in folder.rglob("*.py"):
+            parts = path.relative_to(folder).with_suffix("").parts
+            parts = parts[:-1] if parts[-1] == "__init__" else parts
+            if prefix or parts:
+                found[path] = ".".join((*prefix, *parts))
+    return found
 
 
 def imported(path):
-    """Places that a file imports from, wherever in the file it does so."""
-    package = path.relative_to(REPOSITORY).parts[:-1]
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    """Names below the package that a file imports from, and whether it does so when it is itself imported."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    package = ("warp_resphys", *modules()[path].split("."))
+    package = package if path.name == "__init__.py" else package[:-1]
+    known = set(modules().values())
+    for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom):
             base = package[: len(package) - node.level + 1] if node.level else ()
             names = [".".join([*base, *([node.module] if node.module else []), alias.name]) for alias in node.names]
@@ -45,16 +56,24 @@ def imported(path):
             names = [alias.name for alias in node.names]
         else:
             continue
-        yield from (place_of(name.removeprefix("warp_resphys.")) for name in names if name.startswith("warp_resphys."))
+        for name in names:
+            if name.startswith("warp_resphys."):
+                name = name.removeprefix("warp_resphys.")
+                yield name if name in known else name.rpartition(".")[0], node in tree.body
 
 
 def test_every_module_has_its_place_and_every_place_a_module():
-    assert {*modules().values(), "conf/"} == set(rows())
+    places = {"scripts/" if name.startswith("scripts") else place_of(name) for name in modules().values()}
+    assert {*places, "conf/"} == {place for place in rows() if place != "tests/"}
 
 
 @pytest.mark.parametrize("path", modules(), ids=lambda path: str(path.relative_to(REPOSITORY)))
 def test_imports_point_up(path):
-    row = rows()
-    own = row[modules()[path]]
-    below = {place for place in imported(path) if row.get(place, -1) > own}
-    assert below == set()
+    row, name = rows(), modules()[path]
+    own = row["scripts/" if name.startswith("scripts") else place_of(name)]
+    assert {other for other, _ in imported(path) if other and row[place_of(other)] > own} == set()
+
+
+def test_no_two_modules_import_each_other():
+    graph = {name: {other for other, _ in imported(path) if other != name} for path, name in modules().items()}
+    TopologicalSorter(graph).prepare()  # Raises a CycleError that names the circle.

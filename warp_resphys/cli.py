@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import functools
-import hashlib
 import logging
 import os
 import re
@@ -27,13 +26,13 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 from yaml import MarkedYAMLError
 
-from warp_resphys.errors import ResphysError
-from warp_resphys.files import OWN_OPTIONS, is_disk_full
+from .io.errors import ResphysError
+from .io.files import OWN_OPTIONS, is_disk_full
+from .io.labels import run_label
 
 CONFIG_PACKAGE = "pkg://warp_resphys.conf"
 USER_ERROR = 2
 INTERRUPTED = 130
-_LABEL_LENGTH = 100
 
 
 def hydra_entry(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Callable[[], None]]:
@@ -60,7 +59,7 @@ def hydra_entry(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
 @hydra_entry("config")
 def main(config: DictConfig) -> Any:
     """Runs the configured experiment: the console command `warp-resphys`."""
-    from warp_resphys.tasks import run
+    from .studies.tasks import run
 
     return run(config)
 
@@ -214,35 +213,6 @@ def _sentence(error: BaseException) -> str:
     if isinstance(error.__cause__, (OmegaConfBaseException, ResphysError)):
         lines.append(f"({_sentence(error.__cause__)})")
     return " ".join(lines)
-
-
-def run_label(overrides: Sequence[str], excluded: Sequence[str] = ()) -> str:
-    """Names a run folder after the overrides that tell it from the default run; an OmegaConf resolver.
-
-    The same overrides give the same name in any order, so that a repeated command finds its own files.
-
-    Args:
-        overrides: Hydra's task overrides, such as "material.density=900".
-        excluded: Keys that do not change the results, or that the folder is named after elsewhere, with all that
-            is below them.
-
-    Returns:
-        "key=value,key=value" sorted by key, "default" where nothing is left. Long names, and names with
-        characters that a folder should not have, are made fit and end in a hash of the whole.
-    """
-    settings = {}
-    for override in overrides:
-        key, _, value = override.partition("=")
-        bare = key.lstrip("+~")
-        if not any(bare == name or bare.startswith(f"{name}.") for name in excluded):
-            settings[key] = f"{key}={value}" if value else key
-    whole = ",".join(settings[key] for key in sorted(settings))
-    if not whole:
-        return "default"
-    label = re.sub(r"[^A-Za-z0-9._=,+~-]", "-", whole)
-    if label == whole and len(label) <= _LABEL_LENGTH:
-        return label
-    return f"{label[:_LABEL_LENGTH]}-{hashlib.sha256(whole.encode()).hexdigest()[:8]}"
 
 
 if __name__ == "__main__":

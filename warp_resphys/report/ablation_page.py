@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_resphys.files import write_text
-from warp_resphys.report.page import (
+from ..io.files import write_text
+from .page import (
     NO_BREAK_SPACE,
     Picture,
     draw_picture,
@@ -109,7 +109,7 @@ def _from_here_on(rows: Sequence[Mapping[str, Any]], key: str, below: float) -> 
 
 
 def _draw(data: AblationReport, folder: Path) -> Picture:
-    from warp_resphys.report import figures
+    from . import figures
 
     draw = partial(figures.marker_boxes, box_errors(data.metrics), data.metrics["uncorrected_mm"])
     return draw_picture(folder, FIGURE, draw, describe_boxes(data.metrics))

@@ -7,9 +7,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_resphys.chambers import Chamber
-from warp_resphys.metrics import PublishedError
-from warp_resphys.report.measured_data import SplitReport
+from ..learning.metrics import PublishedError
+from ..mesh.chambers import Chamber
+from .measured_data import SplitReport
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -12,8 +12,8 @@ from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
 from numpy.typing import NDArray
 
-from warp_resphys.metrics import median_filter
-from warp_resphys.report.figures import (
+from ..learning.metrics import median_filter
+from .figures import (
     CHAMBER_COLOURS,
     LARGEST_SHOWN,
     ROUND_STEPS,
@@ -24,8 +24,8 @@ from warp_resphys.report.figures import (
     positive,
     use_logarithm,
 )
-from warp_resphys.report.measured_figures import LEAST_SPAN, mean_of_trials, path_panel
-from warp_resphys.report.measured_tables import MODELS
+from .measured_figures import LEAST_SPAN, mean_of_trials, path_panel
+from .measured_tables import MODELS
 
 FloatArray = NDArray[np.float64]
 

@@ -9,9 +9,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_resphys.files import write_text
-from warp_resphys.report.driven_data import DrivenReport, drawn_markers, mean_of, tip_markers
-from warp_resphys.report.driven_tables import (
+from ..io.files import write_text
+from .driven_data import DrivenReport, drawn_markers, mean_of, tip_markers
+from .driven_tables import (
     DRIVEN_MODELS,
     driven_verdict,
     factor_table,
@@ -19,8 +19,8 @@ from warp_resphys.report.driven_tables import (
     range_texts,
     window_table,
 )
-from warp_resphys.report.measured_data import best_and_worst, shown_models
-from warp_resphys.report.measured_page import (
+from .measured_data import best_and_worst, shown_models
+from .measured_page import (
     attempt,
     common_parts,
     draw_identification,
@@ -30,9 +30,9 @@ from warp_resphys.report.measured_page import (
     instants,
     split_parts,
 )
-from warp_resphys.report.measured_tables import against, published_beside
-from warp_resphys.report.page import Picture, draw_picture, error_parts, figures_beside, page_template
-from warp_resphys.report.video import Motion
+from .measured_tables import against, published_beside
+from .page import Picture, draw_picture, error_parts, figures_beside, page_template
+from .video import Motion
 
 _LOG = logging.getLogger(__name__)
 FloatArray = NDArray[np.float64]
@@ -118,7 +118,7 @@ def _shown(data: DrivenReport) -> list[str]:
 
 def _draw(data: DrivenReport, folder: Path) -> tuple[dict[str, Picture], dict[str, str]]:
     """Draw the figures; say of those that cannot be drawn why."""
-    from warp_resphys.report import driven_figures
+    from . import driven_figures
 
     pictures: dict[str, Picture] = {}
     missing: dict[str, str] = {}
@@ -171,7 +171,7 @@ def _means(over: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[float, float
 
 def _draw_paths(data: DrivenReport, both: Callable[..., Picture], pictures: dict[str, Picture]) -> None:
     """The paths of the tip, and the markers over time with the pressures."""
-    from warp_resphys.report import driven_figures
+    from . import driven_figures
 
     trials = data.trials
     clamped = data.mesh.vertices[data.fixed]
@@ -240,8 +240,8 @@ def _draw_body(
     missing: dict[str, str],
 ) -> None:
     """The body with its chambers and markers, and instants of its motion."""
-    from warp_resphys.report import measured_figures
-    from warp_resphys.report.mesh import MeshSummary, draw_mesh
+    from . import measured_figures
+    from .mesh import MeshSummary, draw_mesh
 
     def draw(path: Path) -> Path:
         density = float(data.settings["simulation"]["density"])
@@ -281,7 +281,7 @@ def _motion(data: DrivenReport) -> Motion:
 
 def _instants(data: DrivenReport, _: Path) -> tuple[NDArray[np.uint8], list[str]]:
     """Pictures of three instants of the film."""
-    from warp_resphys.report.video import draw_instants
+    from .video import draw_instants
 
     motion = _motion(data)
     frames = instants(motion.measured, motion.bound, next(iter(motion.markers.values())))
@@ -289,7 +289,7 @@ def _instants(data: DrivenReport, _: Path) -> tuple[NDArray[np.uint8], list[str]
 
 
 def _write_video(data: DrivenReport, path: Path) -> Path:
-    from warp_resphys.report.video import write_video
+    from .video import write_video
 
     names = {model: name for model, (name, _) in DRIVEN_MODELS.items()}
     write_video(path, _motion(data), names, slower=1.0, longest=_LONGEST)

@@ -4,9 +4,9 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
-from warp_resphys.metrics import PublishedError
-from warp_resphys.report.measured_tables import MODELS, NONE, against, per_cent, verdict
-from warp_resphys.report.page import NO_BREAK_SPACE, error_parts, number_text, published_parts
+from ..learning.metrics import PublishedError
+from .measured_tables import MODELS, NONE, against, per_cent, verdict
+from .page import NO_BREAK_SPACE, error_parts, number_text, published_parts
 
 # As in reports without actuation, but for what is identified.
 DRIVEN_MODELS: Final[Mapping[str, tuple[str, str]]] = {

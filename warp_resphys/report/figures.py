@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
-from warp_resphys.report.render import COLOUR_MAP, Body
+from .render import COLOUR_MAP, Body
 
 FloatArray = NDArray[np.float64]
 

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_resphys.mesh import Mesh
-from warp_resphys.metrics import PublishedError
-from warp_resphys.registration import Registration
-from warp_resphys.report.measured_tables import MODELS
+from ..data.registration import Registration
+from ..learning.metrics import PublishedError
+from ..mesh.mesh import Mesh
+from .measured_tables import MODELS
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -21,7 +21,7 @@ class Recordings:
     """How the recordings are, and how they were registered.
 
     Attributes:
-        quality: By trial, as `warp_resphys.recordings.quality.Quality.to_plain` gives it.
+        quality: By trial, as `warp_resphys.data.recordings.quality.Quality.to_plain` gives it.
         residuals: By trial: `rms_mm`, `residual_mm` and `shift_mm` by label, `outliers`.
         registration: Of the trial that fits worst, for the picture.
         drawn: That trial's name.

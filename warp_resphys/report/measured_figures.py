@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
-from warp_resphys.report.figures import (
+from .figures import (
     NARROW,
     ROUND_STEPS,
     STYLE,
@@ -21,7 +21,7 @@ from warp_resphys.report.figures import (
     positive,
     use_logarithm,
 )
-from warp_resphys.report.measured_tables import MODELS
+from .measured_tables import MODELS
 
 FloatArray = NDArray[np.float64]
 

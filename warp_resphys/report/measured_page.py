@@ -10,8 +10,8 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_resphys.files import write_text
-from warp_resphys.report.measured_data import (
+from ..io.files import write_text
+from .measured_data import (
     FoldsReport,
     MeasuredReport,
     RunReport,
@@ -22,7 +22,7 @@ from warp_resphys.report.measured_data import (
     mean_distance,
     shown_models,
 )
-from warp_resphys.report.measured_tables import (
+from .measured_tables import (
     MODELS,
     against,
     identifications,
@@ -33,7 +33,7 @@ from warp_resphys.report.measured_tables import (
     uncertainty_text,
     verdict,
 )
-from warp_resphys.report.page import (
+from .page import (
     Picture,
     draw_picture,
     duration_text,
@@ -43,7 +43,7 @@ from warp_resphys.report.page import (
     number_text,
     page_template,
 )
-from warp_resphys.report.render import DrawingError
+from .render import DrawingError
 
 _LOG = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -149,7 +149,7 @@ def split_parts(data: SplitReport, pictures: Mapping[str, Picture]) -> dict[str,
 
 def _draw(data: MeasuredReport, folder: Path) -> tuple[dict[str, Picture], dict[str, str]]:
     """Draw the figures; say of those that cannot be drawn why."""
-    from warp_resphys.report import measured_figures
+    from . import measured_figures
 
     pictures: dict[str, Picture] = {}
     missing: dict[str, str] = {}
@@ -190,7 +190,7 @@ def attempt(name: str, path: Path, draw: Callable[[Path], T], missing: dict[str,
 
 def _paths(trials: Trials, trial: int) -> Callable[..., Any]:
     """The figure of one trial, marker by marker."""
-    from warp_resphys.report import measured_figures
+    from . import measured_figures
 
     reach = np.nanmax(np.linalg.norm(trials.measured[trial] - trials.bound, axis=2), axis=0, initial=0.0)
     kept = np.sort(np.argsort(-reach)[:_MOST_MARKERS])
@@ -212,7 +212,7 @@ def _describe_paths(trials: Trials, trial: int) -> str:
 
 def draw_training(data: SplitReport, both: Callable[..., Picture], pictures: dict[str, Picture]) -> None:
     """Draw how the training of each learned model went."""
-    from warp_resphys.report import figures
+    from . import figures
 
     for model, records in data.training.items():
         alt = f"Losses and validation roll-out error of {MODELS[model][0]}, {len(records)} epochs, on logarithmic axes."
@@ -221,7 +221,7 @@ def draw_training(data: SplitReport, both: Callable[..., Picture], pictures: dic
 
 def draw_identification(data: SplitReport, both: Callable[..., Picture], pictures: dict[str, Picture]) -> None:
     """Draw the losses of an identification over its evaluations, and over a grid, where they are known."""
-    from warp_resphys.report import measured_figures
+    from . import measured_figures
 
     found = data.identification
     histories = {name: found[name]["history"] for name in identifications(found) if any(found[name]["history"])}
@@ -261,7 +261,7 @@ def draw_registration_picture(
     data: RunReport, folder: Path, pictures: dict[str, Picture], missing: dict[str, str]
 ) -> None:
     """Draw the body at rest with the registered markers."""
-    from warp_resphys.report.registration_picture import draw_registration
+    from .registration_picture import draw_registration
 
     recordings = data.recordings
 
@@ -286,7 +286,7 @@ def draw_registration_picture(
 
 def _motion(data: MeasuredReport) -> Any:
     """The worst test trial, the simulated bodies brought to the times of the frames."""
-    from warp_resphys.report.video import Motion
+    from .video import Motion
 
     trials = data.trials
     worst = best_and_worst(trials)[0]
@@ -300,7 +300,7 @@ def _motion(data: MeasuredReport) -> Any:
 
 def _instants(data: MeasuredReport, _: Path) -> tuple[NDArray[np.uint8], list[str]]:
     """Pictures of three instants: see `instants`."""
-    from warp_resphys.report.video import draw_instants
+    from .video import draw_instants
 
     motion = _motion(data)
     frames = instants(motion.measured, motion.bound, next(iter(motion.markers.values())))
@@ -330,7 +330,7 @@ def instants(measured: FloatArray, bound: FloatArray, simulated: FloatArray) -> 
 
 
 def _write_video(data: MeasuredReport, path: Path) -> Path:
-    from warp_resphys.report.video import write_video
+    from .video import write_video
 
     write_video(path, _motion(data), {model: MODELS[model][0] for model in MODELS})
     return path

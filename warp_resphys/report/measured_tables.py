@@ -7,8 +7,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from warp_resphys.metrics import PublishedError
-from warp_resphys.report.page import NO_BREAK_SPACE, number_text, published_parts
+from ..learning.metrics import PublishedError
+from .page import NO_BREAK_SPACE, number_text, published_parts
 
 NONE: Final = "\N{EN DASH}"
 MINUS: Final = "\N{MINUS SIGN}"

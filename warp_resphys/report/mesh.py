@@ -13,13 +13,13 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from warp_resphys.arm import mesh_arm, name_surfaces
-from warp_resphys.arm_geometry import arm_geometry
-from warp_resphys.cavities import MOST_TRIANGLES, open_cavities
-from warp_resphys.chambers import Chamber, find_chambers
-from warp_resphys.errors import InputError, MeshError
-from warp_resphys.files import atomic_path
-from warp_resphys.mesh import (
+from ..io.errors import InputError, MeshError
+from ..io.files import atomic_path
+from ..mesh.arm import mesh_arm, name_surfaces
+from ..mesh.arm_geometry import arm_geometry
+from ..mesh.cavities import MOST_TRIANGLES, open_cavities
+from ..mesh.chambers import Chamber, find_chambers
+from ..mesh.mesh import (
     IntArray,
     Mesh,
     boundary_triangles,
@@ -28,10 +28,10 @@ from warp_resphys.mesh import (
     quadratic,
     select_vertices,
 )
-from warp_resphys.mesh_io import read_mesh, read_surfaces, read_vertices, write_mesh
-from warp_resphys.mesh_quality import cell_volumes, scaled_jacobian
-from warp_resphys.report import render
-from warp_resphys.report.figures import CHAMBER_COLOURS, STYLE
+from ..mesh.quality import cell_volumes, scaled_jacobian
+from ..mesh.readers import read_mesh, read_surfaces, read_vertices, write_mesh
+from . import render
+from .figures import CHAMBER_COLOURS, STYLE
 
 FloatArray = NDArray[np.float64]
 

@@ -15,10 +15,10 @@ import jinja2
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_resphys.errors import DataFileError, InputError
-from warp_resphys.files import disk_full_error, is_disk_full, write_text
-from warp_resphys.mesh import Mesh
-from warp_resphys.metrics import PublishedError, trajectory_errors
+from ..io.errors import DataFileError, InputError
+from ..io.files import disk_full_error, is_disk_full, write_text
+from ..learning.metrics import PublishedError, trajectory_errors
+from ..mesh.mesh import Mesh
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -73,7 +73,7 @@ class ReportData:
         simulator: The simulator that is corrected, in words, such as "E 215 kPa".
         reality: What it is brought to, in words.
         metrics: What `metrics.json` holds: `errors_mm`, `errors_vs_reconstruction_mm` (a summary a model, see
-            `warp_resphys.metrics.summarise`), `per_trajectory` (see `summarise_each`), `seconds` (a number a
+            `warp_resphys.learning.metrics.summarise`), `per_trajectory` (see `summarise_each`), `seconds` (a number a
             stage), `peak_memory_gib` (None where it is not known), `versions` (a text a package) and `device`.
         settings: The run's configuration, nested.
         published: Published errors of the models, empty where there are none.
@@ -169,7 +169,7 @@ def write_report(path: Path, data: ReportData) -> None:
 
 def _draw(data: ReportData, folder: Path) -> tuple[dict[str, Picture], dict[str, str]]:
     """Draw the figures in two widths, and save the wide ones; say of those that cannot be drawn why."""
-    from warp_resphys.report import figures, render
+    from . import figures, render
 
     both = partial(draw_picture, folder)
     motion = _tip_motion(data)
@@ -208,7 +208,7 @@ def draw_picture(folder: Path, name: str, draw: "Callable[..., Figure]", alt: st
         draw: Makes the figure; takes the keyword `narrow`.
         alt: What it shows, in words.
     """
-    from warp_resphys.report import figures
+    from . import figures
 
     wide, narrow = draw(narrow=False), draw(narrow=True)
     figures.save_png(wide, folder / f"{name}.png")

@@ -13,13 +13,13 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from warp_resphys.errors import InputError
-from warp_resphys.files import atomic_path, write_json
-from warp_resphys.recordings.processing import fill_gaps, release_of
-from warp_resphys.recordings.quality import BaseMotion, Quality, check_base, compare_base, quality, quality_table
-from warp_resphys.recordings.reading import read_recording
-from warp_resphys.recordings.recording import Recording
-from warp_resphys.report.figures import NARROW, STYLE, TONES, WIDE
+from ..data.recordings.processing import fill_gaps, release_of
+from ..data.recordings.quality import BaseMotion, Quality, check_base, compare_base, quality, quality_table
+from ..data.recordings.reading import read_recording
+from ..data.recordings.recording import Recording
+from ..io.errors import InputError
+from ..io.files import atomic_path, write_json
+from .figures import NARROW, STYLE, TONES, WIDE
 
 FloatArray = NDArray[np.float64]
 

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_resphys.files import atomic_path
-from warp_resphys.mesh import Mesh, boundary_triangles
-from warp_resphys.registration import Registration
-from warp_resphys.report import render
-from warp_resphys.report.render_markers import BODY, CLAMPED, INK, MEASURED
+from ..data.registration import Registration
+from ..io.files import atomic_path
+from ..mesh.mesh import Mesh, boundary_triangles
+from . import render
+from .render_markers import BODY, CLAMPED, INK, MEASURED
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

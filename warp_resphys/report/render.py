@@ -17,8 +17,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_resphys.errors import ResphysError
-from warp_resphys.mesh import Mesh, boundary_faces, boundary_triangles
+from ..io.errors import ResphysError
+from ..mesh.mesh import Mesh, boundary_faces, boundary_triangles
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

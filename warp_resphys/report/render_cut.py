@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from warp_resphys.report.render_markers import BODY, CLAMPED, INK, MEASURED
+from .render_markers import BODY, CLAMPED, INK, MEASURED
 
 CUT: Final = "#d3dde7"
 _TOWARDS_LIGHT: Final = (0.35, -0.9, 0.8)

@@ -11,8 +11,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_resphys.report.render import OUTLINE
-from warp_resphys.report.render_markers import INK, MEASURED
+from .render import OUTLINE
+from .render_markers import INK, MEASURED
 
 FloatArray = NDArray[np.float64]
 

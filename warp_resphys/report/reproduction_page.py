@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from warp_resphys.files import write_text
-from warp_resphys.report.page import Picture, draw_picture, figures_beside, page_template
+from ..io.files import write_text
+from .page import Picture, draw_picture, figures_beside, page_template
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing

@@ -13,11 +13,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_resphys.files import atomic_path
-from warp_resphys.mesh import Mesh, boundary_triangles
-from warp_resphys.progress import Progress
-from warp_resphys.report import render
-from warp_resphys.surface import closest_points
+from ..io.files import atomic_path
+from ..io.progress import Progress
+from ..mesh.mesh import Mesh, boundary_triangles
+from ..mesh.surface import closest_points
+from . import render
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -1,0 +1,98 @@
+"""Random pressures, valves that lag, and memory."""
+
+import numpy as np
+import pytest
+import torch
+
+from warp_resphys.data.actuation import PressureSequences, check_pressures, lagged, remembered
+from warp_resphys.io.errors import DataFileError, InputError
+
+STEP = 0.01
+
+
+def drawn(count=40, steps=150, chambers=2, **settings):
+    sequences = PressureSequences(**settings)
+    return np.stack([sequences.draw(steps, STEP, chambers, np.random.default_rng(i)) for i in range(count)])
+
+
+def test_sequences_start_and_end_at_rest_and_stay_within_the_limit():
+    p = drawn(rest=0.1)
+    assert p.min() == 0.0
+    assert p.max() == 20e3
+    assert not p[:, :11].any()
+    assert not p[:, -11:].any()
+    # Zero slope too: the first steps under pressure are small beside the typical change of a step.
+    typical = np.abs(np.diff(p, axis=1)).max()
+    assert np.abs(np.diff(p, axis=1))[:, 10:13].max() < 0.25 * typical
+
+
+def test_sequences_have_the_mean_deviation_and_correlations_asked_for():
+    """Far from the ends and the limits the process is stationary."""
+    settings = {"mean": 5e4, "deviation": 1e3, "correlation_time": 0.1, "limit": 1e5, "correlation": 0.6}
+    p = drawn(200, **settings)[:, 60:90] - 5e4
+    assert abs(p.mean()) < 150.0
+    assert p.std() == pytest.approx(1e3, rel=0.08)
+    for lag in (5, 10):
+        found = (p[:, lag:] * p[:, :-lag]).mean() / p.var()
+        assert found == pytest.approx(np.exp(-0.5 * (lag * STEP / 0.1) ** 2), abs=0.06)
+    assert np.corrcoef(p[..., 0].ravel(), p[..., 1].ravel())[0, 1] == pytest.approx(0.6, abs=0.08)
+
+
+def test_a_seed_gives_its_sequence_and_another_one_another():
+    first, again, other = (PressureSequences().draw(100, STEP, 3, np.random.default_rng(i)) for i in (4, 4, 5))
+    np.testing.assert_array_equal(first, again)
+    assert np.abs(first - other).max() > 1e3
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"deviation": 0.0}, "deviation of the pressures is 0"),
+        ({"limit": -1.0}, "limit of the pressures"),
+        ({"rest": -0.1}, "rest of the pressures"),
+        ({"rest": 2.0}, "leave no time between two rests"),
+        ({"correlation": -0.6}, "no pressures of 3 chambers have the correlation -0.6: it must lie above -0.5"),
+        ({"correlation": [[1.0, 0.0], [0.0, 1.0]]}, r"shape \(2, 2\).*3 chambers"),
+    ],
+)
+def test_bad_sequences(settings, message):
+    with pytest.raises(InputError, match=message):
+        PressureSequences(**settings).draw(300, STEP, 3, np.random.default_rng(0))
+
+
+def test_recorded_pressures_are_checked():
+    good = np.full((4, 2), 1e4)
+    np.testing.assert_array_equal(check_pressures(good, 2, 2e4, "a.h5"), good)
+    with pytest.raises(DataFileError, match=r"a\.h5 has pressures of 2 chambers, but the body has 6"):
+        check_pressures(good, 6, 2e4, "a.h5")
+    high = good.copy()
+    high[3, 1] = 2.5e4
+    with pytest.raises(DataFileError, match=r"chamber 2 is 25 kPa in frame 3, beyond data.pressure_limit of 20 kPa"):
+        check_pressures(high, 2, 2e4, "a.h5")
+    high[1, 0] = np.nan
+    with pytest.raises(DataFileError, match="chamber 1 is not finite in frame 1"):
+        check_pressures(high, 2, 2e4, "a.h5")
+
+
+def test_a_lag_follows_a_step_exponentially_and_has_a_derivative():
+    command = torch.full((1, 50, 1), 2e4, dtype=torch.float64)
+    rise = torch.tensor([0.07], dtype=torch.float64, requires_grad=True)
+    found = lagged(command, rise, STEP)
+    times = STEP * torch.arange(1, 51, dtype=torch.float64)
+    torch.testing.assert_close(found[0, :, 0], 2e4 * (1 - torch.exp(-times / rise)))
+    found.sum().backward()
+    expected = -(2e4 * torch.exp(-times / 0.07) * times / 0.07**2).sum()
+    torch.testing.assert_close(rise.grad[0], expected)
+
+
+def test_memory_keeps_what_the_pressure_was():
+    pressure = torch.zeros(1, 100, 2, dtype=torch.float64)
+    pressure[:, 20:, 0] = 1e4
+    told = remembered(pressure, [0.1, 1.0], STEP)
+    assert told.shape == (1, 100, 6)
+    torch.testing.assert_close(told[..., :2], pressure)
+    assert not told[:, :20].any()
+    fast, slow = told[0, -1, 2], told[0, -1, 4]
+    assert float(fast) == pytest.approx(1e4, rel=1e-3)
+    assert float(slow) == pytest.approx(1e4 * (1 - np.exp(-0.8)), rel=1e-9)
+    torch.testing.assert_close(remembered(pressure, [], STEP), pressure)

@@ -1,0 +1,177 @@
+import contextlib
+import dataclasses
+import struct
+from pathlib import Path
+
+import ezc3d
+import numpy as np
+import pytest
+
+from warp_resphys.data.recordings.c3d import read_c3d
+from warp_resphys.data.recordings.processing import fill_gaps
+from warp_resphys.data.recordings.recording import Recording
+from warp_resphys.data.recordings.release import find_release
+from warp_resphys.io import decoding
+from warp_resphys.io.errors import DataFileError
+
+TIP = ["Tip - 1", "Tip - 2", "Tip - 3"]
+
+
+def write_c3d(path, positions, labels, unit="mm", rate=200.0):
+    file = ezc3d.c3d()
+    file["parameters"]["POINT"]["UNITS"]["value"] = [unit]
+    file["parameters"]["POINT"]["RATE"]["value"] = [rate]
+    file["parameters"]["POINT"]["LABELS"]["value"] = list(labels)
+    file["data"]["points"] = np.concatenate(
+        [positions.transpose(2, 1, 0), np.ones((1, positions.shape[1], len(positions)))]
+    )
+    file.write(str(path))
+    return path
+
+
+@pytest.fixture
+def trajectory():
+    generator = np.random.default_rng(3)
+    return generator.normal(size=(40, 3, 3)).cumsum(axis=0)
+
+
+def test_read_c3d_converts_units_and_keeps_occlusions(tmp_path, trajectory):
+    trajectory[7:9, 1] = np.nan
+    recording = read_c3d(write_c3d(tmp_path / "small.c3d", trajectory, "abc"))
+    assert recording.labels == ("a", "b", "c")
+    assert recording.rate == 200.0
+    np.testing.assert_allclose(recording.positions, 1e-3 * trajectory, rtol=1e-6, atol=1e-9)
+    picked = recording.select(["c", "a"])
+    np.testing.assert_array_equal(picked.positions, recording.positions[:, [2, 0]])
+
+
+def test_read_c3d_recording(shared_data):
+    recording = read_c3d(shared_data / "beam_mocap" / "beam_gravity_V2_a.c3d")
+    assert recording.positions.shape == (500, 6, 3)
+    assert recording.rate == 100.0
+    np.testing.assert_allclose(recording.positions[0, 0], [0.074, 0.0306, 0.0748], atol=5e-5)
+
+
+def test_missing_marker_names_it_and_what_is_there(trajectory):
+    recording = Recording(("a", "b", "c"), trajectory, 100.0, Path("swing.c3d"))
+    with pytest.raises(DataFileError, match=r"swing\.c3d has no marker named 'd'; it has 'a', 'b', 'c'"):
+        recording.select(["a", "d"])
+
+
+def test_missing_and_foreign_files(tmp_path):
+    with pytest.raises(DataFileError, match="No such file"):
+        read_c3d(tmp_path / "absent.c3d")
+    (tmp_path / "notes.c3d").write_text("this is no recording")
+    with pytest.raises(DataFileError, match="not a C3D file"):
+        read_c3d(tmp_path / "notes.c3d")
+    (tmp_path / "empty.c3d").touch()
+    with pytest.raises(DataFileError, match="not a C3D file"):
+        read_c3d(tmp_path / "empty.c3d")
+
+
+@pytest.mark.parametrize("part", [0.001, 0.03, 0.3, 0.6, 0.9, 0.98])
+def test_truncated_file(tmp_path, trajectory, part):
+    content = write_c3d(tmp_path / "whole.c3d", np.tile(trajectory, (10, 1, 1)), "abc").read_bytes()
+    cut = tmp_path / "cut.c3d"
+    cut.write_bytes(content[: int(part * len(content))])
+    with pytest.raises(DataFileError, match="truncated"):
+        read_c3d(cut)
+
+
+@pytest.mark.parametrize(
+    ("name", "after", "value", "limits", "message"),
+    [
+        ("CONTACT", 10, 0xFF, {}, "ezc3d ends with -11"),  # of -1 dimensions
+        ("RATIO", 10, 0x80, {"MEMORY": (1 << 29, 0)}, "it takes more than 512 MiB of memory"),  # -32768 values a frame
+        ("CONTACT", 10, 0x7F, {"SECONDS": (1.0, 0.0)}, "does not end within 1 s"),  # of 127 dimensions
+    ],
+)
+def test_a_changed_byte_that_crashes_the_decoder_or_makes_it_claim_memory_or_time(
+    tmp_path, trajectory, monkeypatch, name, after, value, limits, message
+):
+    path = write_c3d(tmp_path / "whole.c3d", trajectory, "abc")
+    content = bytearray(path.read_bytes())
+    content[content.index(name.encode()) + after] = value
+    path.write_bytes(content)
+    for limit, given in limits.items():
+        monkeypatch.setattr(decoding, limit, given)
+    with pytest.raises(DataFileError, match=rf"whole\.c3d is damaged or truncated \(.*{message}\); copy"):
+        read_c3d(path)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_bytes_overwritten_in_the_parameters_never_escape_as_anything_else(tmp_path, trajectory, seed):
+    content = bytearray(write_c3d(tmp_path / "whole.c3d", trajectory, "abc").read_bytes())
+    generator = np.random.default_rng(seed)
+    for at in generator.integers(512, 1024, size=20):
+        struct.pack_into("B", content, at, generator.integers(256))
+    path = tmp_path / "damaged.c3d"
+    path.write_bytes(content)
+    with contextlib.suppress(DataFileError):
+        assert read_c3d(path).positions.shape[2] == 3
+
+
+def test_unknown_unit(tmp_path, trajectory):
+    with pytest.raises(DataFileError, match="positions in 'inch'"):
+        read_c3d(write_c3d(tmp_path / "inch.c3d", trajectory, "abc", unit="inch"))
+
+
+def test_fill_gaps_interpolates_a_swing_and_refuses_a_long_gap():
+    time = np.arange(100) / 100.0
+    swing = np.stack([np.sin(2 * np.pi * 7.0 * time), np.cos(2 * np.pi * 7.0 * time), time], axis=1)
+    positions = np.stack([swing, 2.0 * swing], axis=1)
+    gappy = positions.copy()
+    gappy[40:43, 1] = np.nan
+    gappy[98:, 0] = np.nan
+    recording = Recording(("a", "b"), gappy, 100.0, Path("swing.c3d"))
+    filled = fill_gaps(recording, longest=3).positions
+    np.testing.assert_allclose(filled[:98], positions[:98], atol=0.06)
+    np.testing.assert_array_equal(filled[98:, 0], np.stack([positions[97, 0]] * 2))
+    np.testing.assert_array_equal(recording.positions, gappy)
+    with pytest.raises(DataFileError, match="marker b is occluded in frames 40 to 42"):
+        fill_gaps(recording, longest=2)
+
+
+def test_never_seen_marker_is_refused():
+    positions = np.full((10, 1, 3), np.nan)
+    with pytest.raises(DataFileError, match=r"x\.c3d: marker a is seen in 0 of 10 frames"):
+        fill_gaps(Recording(("a",), positions, 100.0, Path("x.c3d")), longest=20)
+
+
+@pytest.mark.parametrize("release", [60.0, 60.25, 60.5, 60.9])
+def test_release_of_a_free_fall_is_found_between_frames(release):
+    time = np.maximum(np.arange(120) - release, 0.0) / 100.0
+    path = np.zeros((120, 3))
+    path[:, 2] = -0.01 * (1.0 - np.cos(48.0 * time) * np.exp(-2.5 * time))
+    path += np.random.default_rng(0).normal(scale=5e-6, size=path.shape)
+    path[:13] += [0.0, 3e-4, 0.0]  # a marker that was mistaken at first
+    path[30, 2] += 8e-3  # one sample gone astray
+    found = find_release(path, 100.0)
+    assert found.frame == pytest.approx(release, abs=0.25)
+    assert 13 <= found.rest[0] < found.rest[1] <= 61
+
+
+def test_release_of_recordings(shared_data):
+    for name, first_moving in (("gravity", 71), ("load52", 44), ("load101", 52)):
+        recording = read_c3d(shared_data / "beam_mocap" / f"beam_{name}_V2_a.c3d").select(TIP)
+        found = find_release(recording.positions.mean(axis=1), recording.rate)
+        assert first_moving - 1.1 <= found.frame < first_moving
+        assert found.rest[0] >= 13
+        assert found.rest[1] <= first_moving
+
+
+def test_no_release():
+    still = np.random.default_rng(0).normal(scale=1e-5, size=(200, 3))
+    with pytest.raises(DataFileError, match=r"never moves by more than 0\.\d\d mm"):
+        find_release(still, 100.0)
+    swinging = np.zeros((200, 3))
+    swinging[:, 2] = 0.01 * np.cos(0.5 * np.arange(200))
+    with pytest.raises(DataFileError, match="not still"):
+        find_release(swinging, 100.0)
+    with pytest.raises(DataFileError, match="No release"):
+        find_release(still[:1], 100.0)
+
+
+def test_recording_is_frozen(trajectory):
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        Recording(("a", "b", "c"), trajectory, 100.0, Path("x")).rate = 1.0

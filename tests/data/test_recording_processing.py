@@ -1,0 +1,283 @@
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from warp_resphys.data.recordings.jumps import find_jumps, find_swaps, mask_spikes
+from warp_resphys.data.recordings.processing import fill_gaps, release_of, resample, trim_to_release
+from warp_resphys.data.recordings.quality import check_base, compare_base, noise_level, quality, quality_table
+from warp_resphys.data.recordings.reading import read_recording
+from warp_resphys.data.recordings.recording import Recording
+from warp_resphys.data.recordings.release import Release
+from warp_resphys.io.errors import DataFileError, InputError
+
+NOISE = 5e-6
+RELEASE = 60.4
+TIP = ("tip 1", "tip 2")
+BASE = ("base 1", "base 2", "base 3")
+PLACES = np.array([[0.1, 0.0, 0.02], [0.1, 0.02, 0.0], [0.0, 0.0, 0.0], [0.0, 0.04, 0.0], [0.0, 0.0, 0.03]])
+
+
+def swinging(frames=300, rate=100.0, noise=NOISE, shift=0.0):
+    """A beam that is held and let go in frame 60.4: two markers swing by 10 mm at 7.7 Hz, three stand on the clamp."""
+    time = np.maximum(np.arange(frames) - RELEASE, 0.0) / rate
+    sag = -0.01 * (1.0 - np.exp(-2.5 * time) * np.cos(48.0 * time))
+    positions = np.tile(PLACES + shift, (frames, 1, 1))
+    positions[:, :2, 2] += sag[:, None] * [1.0, 0.9]
+    positions += np.random.default_rng(1).normal(scale=noise, size=positions.shape)
+    return Recording(TIP + BASE, positions, rate, Path("swing.c3d"))
+
+
+def test_masked_gaps_stay_and_short_ones_are_filled():
+    recording = swinging()
+    true = recording.positions.copy()
+    recording.positions[100:103, 0] = np.nan
+    recording.positions[150:170, 1] = np.nan
+    recording.positions[:4, 2] = np.nan
+    filled = fill_gaps(recording, 5, mask_long=True)
+    np.testing.assert_allclose(filled.positions[100:103, 0], true[100:103, 0], atol=2e-4)
+    assert filled.seen[:, 0].all()
+    np.testing.assert_array_equal(np.flatnonzero(~filled.seen[:, 1]), np.arange(150, 170))
+    np.testing.assert_array_equal(np.flatnonzero(~filled.seen[:, 2]), np.arange(4))
+    np.testing.assert_array_equal(filled.positions[recording.seen], recording.positions[recording.seen])
+    with pytest.raises(DataFileError, match=r"swing\.c3d: marker tip 2 is occluded in frames 150 to 169"):
+        fill_gaps(recording, 5)
+    recording.positions[:, 3] = np.nan
+    with pytest.raises(DataFileError, match=r"swing\.c3d: marker base 2 is seen in 0 of 300 frames"):
+        fill_gaps(recording, 5, mask_long=True)
+
+
+def test_a_multiple_of_the_rate_is_thinned_exactly():
+    recording = dataclasses.replace(swinging(), actuation=np.arange(300.0)[:, None])
+    thinned = resample(recording, 50.0)
+    np.testing.assert_array_equal(thinned.actuation[:, 0], np.arange(0.0, 300.0, 2.0))
+    np.testing.assert_array_equal(thinned.positions, recording.positions[::2])
+    assert thinned.rate == 50.0
+    np.testing.assert_array_equal(resample(recording, 100.0).positions, recording.positions)
+    np.testing.assert_array_equal(resample(recording, 1.0 / 0.03).positions, recording.positions[::3])
+
+
+@pytest.mark.parametrize("rate", [60.0, 200.0, 30.0])
+def test_other_rates_need_leave_to_interpolate(rate):
+    with pytest.raises(InputError, match=rf"swing\.c3d has 100 frames a second, which is no multiple of the {rate:g}"):
+        resample(swinging(), rate)
+
+
+@pytest.mark.parametrize("rate", [60.0, 200.0, 130.0])
+def test_interpolation_follows_a_swing(rate):
+    """Far from the ends, to (2 pi f h)^4 / 384 of the amplitude: the error of a cubic spline."""
+    omega, frames = 2.0 * np.pi * 7.7, np.arange(301)
+    path = 0.01 * np.sin(omega * frames / 100.0)
+    positions = np.stack([path, path**2, 0.0 * path], axis=1)[:, None] * [1.0, 100.0, 1.0]
+    recording = Recording(("a",), positions, 100.0, Path("swing.c3d"), actuation=path[:, None], start=0.004)
+    new = resample(recording, rate, interpolate=True)
+    assert len(new.positions) == int(3.0 * rate) + 1
+    assert new.start == 0.004
+    inside = slice(20, len(new.positions) - 20)
+    true = 0.01 * np.sin(omega * (new.time - 0.004))
+    bound = 0.01 * (omega / 100.0) ** 4 / 384.0
+    error = np.abs(new.positions[inside, 0, 0] - true[inside]).max()
+    assert error < 1.1 * bound
+    assert bound < 2e-6
+    np.testing.assert_allclose(new.actuation[:, 0], true, atol=0.01 * (omega / 100.0) ** 2 / 8.0)
+
+
+def test_interpolation_leaves_masked_frames_masked():
+    recording = swinging()
+    recording.positions[100:120, 0] = np.nan
+    new = resample(recording, 200.0, interpolate=True)
+    np.testing.assert_array_equal(np.flatnonzero(~new.seen[:, 0]), np.arange(199, 240))
+    assert new.seen[:, 1:].all()
+
+
+def test_trimming_keeps_the_time_from_the_release_and_the_rest_shape():
+    recording = swinging()
+    release = release_of(recording, TIP)
+    assert release.frame == pytest.approx(RELEASE, abs=0.25)
+    swing = trim_to_release(recording, Release(RELEASE, release.rest), seconds=1.0)
+    assert swing.start == pytest.approx(0.006)
+    np.testing.assert_array_equal(swing.positions, recording.positions[61:161])
+    assert swing.time[-1] == pytest.approx(0.996)
+    np.testing.assert_allclose(swing.rest, PLACES, atol=4.0 * NOISE)
+    early = trim_to_release(recording, release, before=3)
+    assert early.start < 0.0
+    assert len(early.positions) == 300 - 58
+    with pytest.raises(DataFileError, match=r"swing\.c3d ends 1 frames after its release"):
+        trim_to_release(recording, Release(298.5, (200, 290)))
+
+
+def test_the_release_is_found_from_the_markers_that_are_seen():
+    recording = swinging()
+    recording.positions[58:90, 0] = np.nan
+    assert release_of(recording, TIP).frame == pytest.approx(RELEASE, abs=0.25)
+    recording.positions[:8] = np.nan
+    recording.positions[200:220, 1] = np.nan
+    found = release_of(recording, TIP)
+    assert found.frame == pytest.approx(RELEASE, abs=0.25)
+    assert 8 <= found.rest[0] < found.rest[1] <= 61
+    recording.positions[50:70, 1] = np.nan
+    with pytest.raises(
+        DataFileError, match=r"in swing\.c3d, frames 8 to 57, the first without a long gap: the tip never"
+    ):
+        release_of(recording, TIP)
+    recording = swinging()
+    with pytest.raises(DataFileError, match=r"No release found in swing\.c3d"):
+        release_of(recording, BASE)
+
+
+def test_a_marker_hidden_while_held_has_no_place():
+    recording = swinging()
+    recording.positions[:70, 3] = np.nan
+    with pytest.raises(DataFileError, match=r"swing\.c3d: 'base 2' cannot be seen while the body is held"):
+        trim_to_release(recording, Release(RELEASE, (40, 60)))
+
+
+def test_a_swing_has_no_jumps():
+    """Neither its fastest steps (4.8 mm) nor the kink of the release, nor gaps, count."""
+    recording = swinging()
+    assert np.linalg.norm(np.diff(recording.positions, axis=0), axis=2).max() > 4e-3
+    recording.positions[70:74, 0] = np.nan
+    recording.positions[200:230, 1] = np.nan
+    assert find_jumps(recording) == []
+    assert find_swaps(recording, []) == []
+
+
+@pytest.mark.parametrize("column", [0, 3])
+def test_jumps_are_found_with_frame_and_size(column):
+    recording = swinging()
+    recording.positions[64:, column] += [0.0, 0.0, 5e-4]
+    recording.positions[150, column] += [8e-4, 0.0, 0.0]
+    jumps = find_jumps(recording)
+    assert {jump.label for jump in jumps} == {recording.labels[column]}
+    assert [jump.frame for jump in jumps] == [64, 150, 151]
+    assert jumps[0].size == pytest.approx(5e-4, abs=1e-4)
+    cleaned = mask_spikes(recording, jumps)
+    np.testing.assert_array_equal(np.argwhere(~cleaned.seen), [[150, column]])
+    recording = swinging()
+    recording.positions[200:, column] += [0.0, 5e-4, 0.0]
+    recording.positions[203:, column] += [0.0, 5e-4, 0.0]  # on, not back
+    jumps = find_jumps(recording)
+    assert [jump.frame for jump in jumps] == [200, 203]
+    assert mask_spikes(recording, jumps).seen.all()
+
+
+def test_exchanged_labels_are_found():
+    recording = swinging()
+    recording.positions[120:, [2, 3]] = recording.positions[120:, [3, 2]]
+    swaps = find_swaps(recording, find_jumps(recording))
+    assert [(swap.label, swap.other, swap.frame) for swap in swaps] == [
+        ("base 1", "base 2", 120),
+        ("base 2", "base 1", 120),
+    ]
+
+
+def test_a_marker_that_comes_back_under_another_name_is_found():
+    recording = swinging()
+    recording.positions[120:140, [3, 4]] = np.nan
+    recording.positions[140:, 3] = recording.positions[140:, 4]
+    recording.positions[140:, 4] = np.nan
+    swaps = find_swaps(recording, find_jumps(recording))
+    assert [(swap.label, swap.other, swap.frame) for swap in swaps] == [("base 2", "base 3", 140)]
+
+
+@pytest.mark.parametrize("noise", [3e-6, 5e-5])
+def test_noise_is_measured_beside_motion_jumps_and_gaps(noise):
+    recording = swinging(frames=500, noise=noise)
+    recording.positions[200:, 3] += 1e-3
+    recording.positions[::11, 4] = np.nan
+    found = noise_level(recording)
+    np.testing.assert_allclose(found, noise, rtol=0.25)
+    recording.positions[::3, 4] = np.nan
+    assert np.isnan(noise_level(recording)[4])
+
+
+def test_quality_of_a_recording():
+    recording = swinging()
+    recording.positions[100:103, 0] = np.nan
+    recording.positions[297:, 0] = np.nan
+    recording.positions[140:160, 1] = np.nan
+    recording.positions[:, 2] += np.linspace(0.0, 1e-3, 300)[:, None] * [0.0, 0.6, 0.8]
+    recording.positions[40:, 3] += 1e-3
+    result = quality(recording, BASE, longest_gap=5)
+    tip, tip2, drifting, jumping, good = result.markers
+    assert (tip.gaps, tip.longest_gap, tip.masked, tip.seen) == (2, 3, 3, pytest.approx(294 / 300))
+    assert (tip2.gaps, tip2.longest_gap, tip2.masked) == (1, 20, 20)
+    assert drifting.drift == pytest.approx(0.9e-3, rel=0.02)
+    assert [jump.frame for jump in jumping.jumps] == [40]
+    assert good.drift < 5e-6
+    assert tip.drift is None
+    assert tip2.reach > 5e-3
+    assert result.warnings == [
+        "tip 1 is hidden for up to 3 frames; 3 frames are masked.",
+        "tip 2 is hidden for up to 20 frames; 20 frames are masked.",
+        "base 1 should not move and drifts by 0.91 mm.",
+        "base 2 jumps once, by 1.73 mm, in frame 40.",
+        "base 2 should not move and drifts by 1.73 mm.",
+    ]
+    table = quality_table(result)
+    assert table[1][:5] == ["tip 1", "98.0 %", "2", "3", "3"]
+    assert table[4][5:7] == ["1", "1.73"]
+    with pytest.raises(DataFileError, match=r"swing\.c3d has no marker named 'foot'"):
+        quality(recording, ["foot"])
+
+
+def test_the_release_is_no_jump_of_the_body_but_may_be_one_of_the_base():
+    """A marker that is alone on its body jerks as it is let go; one on the clamp must not."""
+    recording = swinging().select([TIP[0], *BASE])
+    assert [jump.label for jump in find_jumps(recording)] == [TIP[0]]
+    recording.positions[61:, 1] += 1e-3
+    jumps = [marker.jumps for marker in quality(recording, BASE, Release(RELEASE, (40, 60))).markers]
+    assert [len(each) for each in jumps] == [0, 1, 0, 0]
+
+
+def test_base_markers_that_were_moved():
+    first, moved, bumped = swinging(), swinging(shift=0.005), swinging()
+    bumped.positions[:, 3] += [0.0, 2e-3, 0.0]
+    check_base([first, moved], BASE)
+    np.testing.assert_allclose(compare_base([first, moved], BASE)[0].shift, 0.005 * np.sqrt(3.0), atol=1e-5)
+    np.testing.assert_allclose(compare_base([first, moved], BASE)[0].distortion, 0.0, atol=1e-5)
+    with pytest.raises(DataFileError, match=r"base 1 stands 8\.66 mm from its place"):
+        check_base([first, moved], BASE, largest_shift=1e-3)
+    with pytest.raises(DataFileError, match=r"swing\.c3d: base marker base 2 moved by 2\.00 mm against the other"):
+        check_base([first, moved, bumped], BASE)
+    check_base([first, bumped], BASE, largest_distortion=5e-3)
+    with pytest.raises(InputError, match="two or more"):
+        check_base([first, moved], BASE[:1])
+    bumped.positions[:, 3] = np.nan
+    with pytest.raises(DataFileError, match="'base 2' is never seen"):
+        check_base([first, bumped], BASE)
+
+
+@pytest.mark.parametrize(
+    ("name", "jumps", "drifting"),
+    [
+        ("gravity", (0, 0, 1, 0, 1, 0), []),
+        ("load52", (0, 0, 1, 0, 3, 4), ["Base - 2"]),
+        ("load101", (0, 0, 3, 15, 1, 6), ["Base - 1", "Base - 2"]),
+    ],
+)
+def test_quality_of_the_beam_recordings(shared_data, name, jumps, drifting):
+    """Base markers jump and drift, as their owners' files show; tips swing and do not."""
+    recording = read_recording(shared_data / "beam_mocap" / f"beam_{name}_V2_a.c3d")
+    base = [label for label in recording.labels if label.startswith("Base")]
+    result = quality(recording, base)
+    assert tuple(len(marker.jumps) for marker in result.markers) == jumps
+    assert [marker.label for marker in result.markers if marker.drift is not None and marker.drift > 2e-4] == drifting
+    for marker in result.markers:
+        assert 2e-6 < marker.noise < 7e-6
+
+
+def test_base_of_the_beam_recordings(shared_data):
+    """The clamp was turned by 2 mm between the trials, and its markers kept their shape to 0.3 mm."""
+    trials = [
+        read_recording(shared_data / "beam_mocap" / f"beam_{name}_V2_a.c3d")
+        for name in ("gravity", "load52", "load101")
+    ]
+    base = [f"Base - {number}" for number in (1, 2, 3)]
+    motions = compare_base(trials, base)
+    assert all(1.5e-3 < motion.shift.max() < 2.5e-3 for motion in motions)
+    assert all(motion.distortion.max() < 3e-4 for motion in motions)
+    check_base(trials, base)
+    with pytest.raises(DataFileError, match=r"load52_V2_a\.c3d: base marker Base - 1 stands 2\.18 mm"):
+        check_base(trials, base, largest_shift=1e-3)

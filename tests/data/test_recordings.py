@@ -1,0 +1,412 @@
+import contextlib
+import csv
+import os
+import pickle
+
+import h5py
+import numpy as np
+import pytest
+
+from warp_resphys.data.recordings.arrays import write_recording
+from warp_resphys.data.recordings.reading import read_recording
+from warp_resphys.io.errors import DataFileError, InputError
+from warp_resphys.io.files import atomic_hdf5
+
+
+@pytest.fixture
+def positions():
+    """(40, 3, 3) [m] of three markers 0.1 m apart that swing."""
+    time = np.arange(40) / 100.0
+    swing = 0.01 * np.sin(40.0 * time)[:, None, None] * np.array([0.0, 1.0, 0.3])
+    return swing + np.array([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0], [0.0, 0.1, 1.1]])
+
+
+def write_table(path, positions, *, stamps=None, first="time [s]", unit="mm", delimiter=",", extra=()):
+    """A plain table in millimetres; a NaN becomes an empty cell."""
+    header = [first, *(f"{label}.{axis} [{unit}]" for label in "abc" for axis in "xyz"), *(name for name, _ in extra)]
+    stamps = np.arange(len(positions)) / 100.0 if stamps is None else stamps
+    with open(path, "w", newline="") as file:
+        writer = csv.writer(file, delimiter=delimiter)
+        writer.writerow(header)
+        for frame, stamp in enumerate(stamps):
+            cells = ["" if np.isnan(value) else f"{1e3 * value:.6f}" for value in positions[frame].ravel()]
+            writer.writerow([f"{stamp:.4f}", *cells, *(f"{column[frame]:g}" for _, column in extra)])
+    return path
+
+
+def edit(path, line, change):
+    lines = path.read_text().splitlines()
+    lines[line - 1] = change(lines[line - 1])
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("delimiter", [",", ";", "\t"])
+def test_table(tmp_path, positions, delimiter):
+    positions[7:9, 1] = np.nan
+    pressure = np.linspace(0.0, 39.0, 40)
+    path = write_table(tmp_path / "swing.csv", positions, delimiter=delimiter, extra=[("valve [mbar]", pressure)])
+    recording = read_recording(path)
+    assert recording.labels == ("a", "b", "c")
+    assert recording.rate == 100.0
+    np.testing.assert_allclose(recording.positions, positions, atol=1e-9)
+    np.testing.assert_allclose(recording.actuation, 100.0 * pressure[:, None])
+    np.testing.assert_array_equal(np.argwhere(~recording.seen), [[7, 1], [8, 1]])
+
+
+def test_table_in_another_order_of_columns(tmp_path, positions):
+    path = tmp_path / "swing.csv"
+    rows = ["frame,b.y,b.x,a.z,b.z,a.x,a.y"]
+    rows += [
+        ",".join(f"{value:.6f}" for value in (frame, b[1], b[0], a[2], b[2], a[0], a[1]))
+        for frame, (a, b, _) in enumerate(positions)
+    ]
+    path.write_text("\n".join(rows))
+    recording = read_recording(path, units="m", rate=50.0)
+    assert recording.labels == ("b", "a")
+    assert recording.rate == 50.0
+    np.testing.assert_allclose(recording.positions, positions[:, [1, 0]], atol=1e-6)
+
+
+def test_lines_that_were_not_recorded_are_occlusions(tmp_path, positions):
+    stamps = np.delete(np.arange(40), [10, 11, 12]) / 120.0
+    path = write_table(tmp_path / "swing.csv", np.delete(positions, [10, 11, 12], axis=0), stamps=stamps + 3.0)
+    recording = read_recording(path)
+    assert recording.rate == 120.0  # although times were rounded to 0.1 ms
+    assert recording.start == pytest.approx(3.0)
+    np.testing.assert_array_equal(np.flatnonzero(~recording.seen.any(axis=1)), [10, 11, 12])
+    np.testing.assert_allclose(recording.positions[13:], positions[13:], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("line", "change", "message"),
+    [
+        (1, lambda line: line.replace("time [s]", "t"), "has no header that is known"),
+        (1, lambda line: line.replace("time [s]", "time [ms]"), "gives its time in 'ms'"),
+        (1, lambda line: line.replace("b.y", "b.w"), r"column 6 is named 'b\.w', which is neither"),
+        (1, lambda line: line.replace("c.z", "c.y"), r"has two columns named 'c\.y'"),
+        (1, lambda line: line.replace("c.z [mm]", "valve [bar]"), r"marker c has no column 'c\.z'"),
+        (1, lambda line: line.replace("c.z [mm]", "c.z [cm]"), "gives positions in 'cm', 'mm'"),
+        (1, lambda line: line.replace("[mm]", "[inch]"), "gives positions in 'inch'"),
+        (1, lambda line: line.replace("[mm]", ""), "does not say in which unit"),
+        (5, lambda line: line.replace(",0.000000,", ",left,", 1), "line 5, column 2: 'left' is not a number"),
+        (6, lambda line: line.rpartition(",")[0], "line 6: 9 cells where the other lines have 10"),
+        (7, lambda line: "0.0499" + line[6:], None),
+        (7, lambda line: "0.0540" + line[6:], "line 7: the frames are not evenly spaced"),
+        (8, lambda line: "0.0100" + line[6:], "line 8: the time or frame does not rise"),
+        (8, lambda line: line[6:], "line 8: the time or frame does not rise"),
+        (8, lambda line: "1e308" + line[6:], "line 8: the time or frame does not rise, or is no number below 1e12"),
+        (2, lambda line: "-1e308" + line[6:], "line 2: the time or frame does not rise, or is no number below 1e12"),
+        (1, lambda line: line.replace("b.y", "b" + 20_000 * " " + "y"), "column 6 is named"),  # not in cubic time
+    ],
+)
+def test_wrong_tables_are_told_by_line_and_column(tmp_path, positions, line, change, message):
+    path = edit(write_table(tmp_path / "swing.csv", positions), line, change)
+    if message is None:
+        assert read_recording(path).rate == 100.0
+        return
+    with pytest.raises(DataFileError, match=rf"swing\.csv.*{message}"):
+        read_recording(path)
+
+
+@pytest.mark.parametrize(
+    "stamps", [np.arange(40) * 1e-310, [*np.arange(39) * 1e-310, 1e3], 1e11 + np.arange(40) * 1e-6]
+)
+def test_times_that_are_hardly_apart_are_refused(tmp_path, positions, stamps):
+    path = write_table(tmp_path / "swing.csv", positions)
+    for line, stamp in enumerate(stamps, start=2):
+        edit(
+            path, line, lambda text, stamp=stamp: f"{stamp!r}".removeprefix("np.float64(").removesuffix(")") + text[6:]
+        )
+    with pytest.raises(DataFileError, match=r"a frame rate of inf|do not belong to one recording|does not rise"):
+        read_recording(path)
+
+
+def test_times_far_apart_do_not_fill_the_memory(tmp_path, positions):
+    path = edit(write_table(tmp_path / "swing.csv", positions), 41, lambda line: "9e9" + line[6:])
+    with pytest.raises(DataFileError, match=r"do not belong to one recording|not evenly spaced"):
+        read_recording(path)
+
+
+def qualisys(path, positions, *, names=True, frame=True, missing="0.000", rate="200"):
+    lines = ["NO_OF_FRAMES\t40", "NO_OF_CAMERAS\t8", "NO_OF_MARKERS\t3", f"FREQUENCY\t{rate}", "DESCRIPTION\t--"]
+    lines += ["TIME_STAMP\t2024-03-01, 10:11:12.131\t4711.0", "DATA_INCLUDED\t3D", "MARKER_NAMES\tTip 1\tTip 2\tBase"]
+    if names:
+        columns = [f"{label} {axis}" for label in ("Tip 1", "Tip 2", "Base") for axis in "XYZ"]
+        lines.append("\t".join([*(["Frame", "Time"] if frame else []), *columns]))
+    for number, row in enumerate(positions.reshape(len(positions), -1)):
+        cells = [missing if np.isnan(value) else f"{1e3 * value:.3f}" for value in row]
+        lines.append("\t".join([*([str(number + 1), f"{number / 200:.5f}"] if frame else []), *cells]) + "\t" * names)
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize(("names", "frame"), [(True, True), (True, False), (False, True), (False, False)])
+@pytest.mark.parametrize("missing", ["0.000", "", "NULL"])
+def test_qualisys_export(tmp_path, positions, names, frame, missing):
+    positions[0:3, 0] = np.nan
+    recording = read_recording(qualisys(tmp_path / "swing.tsv", positions, names=names, frame=frame, missing=missing))
+    assert recording.labels == ("Tip 1", "Tip 2", "Base")
+    assert recording.rate == 200.0
+    np.testing.assert_allclose(recording.positions, positions, atol=1e-6)
+
+
+def test_wrong_qualisys_exports(tmp_path, positions):
+    path = qualisys(tmp_path / "swing.tsv", positions, rate="EXT")
+    with pytest.raises(DataFileError, match="does not say how many frames a second"):
+        read_recording(path)
+    assert read_recording(path, rate=80.0).rate == 80.0
+    edit(path, 4, lambda line: "FREQUENCY")
+    with pytest.raises(DataFileError, match="does not say how many frames a second"):
+        read_recording(path)
+    edit(path, 8, lambda line: line.rpartition("\t")[0])
+    with pytest.raises(DataFileError, match="numbers do not fit 2 markers"):
+        read_recording(path)
+    edit(path, 8, lambda line: "DESCRIPTION\t--")
+    with pytest.raises(DataFileError, match="has no MARKER_NAMES"):
+        read_recording(path)
+
+
+def without(path, *lines):
+    rows = path.read_text().splitlines()
+    path.write_text("\n".join(row for number, row in enumerate(rows, start=1) if number not in lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("names", [True, False])
+def test_the_frames_of_a_qualisys_export_are_counted(tmp_path, positions, names):
+    first = 10 if names else 9  # the line of the first frame
+    path = without(qualisys(tmp_path / "swing.tsv", positions, names=names), first, first + 6, first + 7)
+    recording = read_recording(path)
+    np.testing.assert_allclose(recording.positions[[0, 4, 7, 38]], positions[[1, 5, 8, 39]], atol=1e-6)
+    np.testing.assert_array_equal(np.flatnonzero(~recording.seen.any(axis=1)), [5, 6])
+    assert recording.start == pytest.approx(0.005)
+    rows = path.read_text().splitlines()
+    for wrong in (rows[first - 1 :][::-1], ["1" + row[row.index("\t") :] for row in rows[first - 1 :]]):
+        path.write_text("\n".join([*rows[: first - 1], *wrong]))
+        with pytest.raises(DataFileError, match=rf"swing\.tsv, line {first + 1}: the time or frame does not rise"):
+            read_recording(path)
+    path = without(qualisys(tmp_path / "swing.tsv", positions, names=names, frame=False), first + 6)
+    with pytest.raises(DataFileError, match=r"has 39 of the 40 frames of its NO_OF_FRAMES, and no column tells which"):
+        read_recording(path)
+
+
+def motive(path, positions, *, parent=False):
+    """Two rigid-body columns that must be passed over, then three markers with a column of their size."""
+    kinds, names, parts, axes = [["", label] for label in ("Type", "Name", "")] + [["Frame", "Time (Seconds)"]]
+    for axis in "XY":
+        for row, cell in zip((kinds, names, parts, axes), ("Rigid Body", "beam", "Position", axis), strict=True):
+            row.append(cell)
+    for label in ("beam:Tip", "beam:Mid", "Unlabeled 12"):
+        for axis in ("X", "Y", "Z", ""):
+            for row, cell in zip((kinds, names, parts, axes), ("Marker", label, "Position", axis), strict=True):
+                row.append(cell)
+    head = "Format Version,1.23,Take Name,swing,Capture Frame Rate,240.000000,Export Frame Rate,120.000000,"
+    lines = [head + "Total Exported Frames,40,Length Units,Centimeters,Coordinate Space,Global", "", ",".join(kinds)]
+    lines += [",".join(names), *([",Parent" + "," * 14] if parent else []), ",".join(parts), ",".join(axes)]
+    for number, frame in enumerate(positions):
+        cells = ["" if np.isnan(value) else f"{1e2 * value:.6f}" for value in frame.ravel()]
+        markers = [cell for marker in range(3) for cell in (*cells[3 * marker : 3 * marker + 3], "1.4")]
+        lines.append(",".join([str(number), f"{number / 120:.6f}", "1.0", "n/a", *markers]))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("parent", [False, True])
+def test_motive_export(tmp_path, positions, parent):
+    positions[5, 2] = np.nan
+    recording = read_recording(motive(tmp_path / "swing.csv", positions, parent=parent))
+    assert recording.labels == ("beam:Tip", "beam:Mid", "Unlabeled 12")
+    assert recording.rate == 120.0
+    np.testing.assert_allclose(recording.positions, positions, atol=1e-8)
+
+
+def test_wrong_motive_exports(tmp_path, positions):
+    path = motive(tmp_path / "swing.csv", positions)
+    edit(path, 1, lambda line: line.replace("Centimeters", "Cubits"))
+    with pytest.raises(DataFileError, match="gives positions in 'Cubits'"):
+        read_recording(path)
+    edit(path, 4, lambda line: line.replace("beam:Mid", "beam:Tip"))
+    with pytest.raises(DataFileError, match="more than one marker named 'beam:Tip'"):
+        read_recording(path)
+    edit(path, 3, lambda line: line.replace("Marker", "Bone"))
+    with pytest.raises(DataFileError, match="holds no markers"):
+        read_recording(path)
+
+
+def archive(path, positions, **changes):
+    content = {"positions": positions, "labels": np.array(["a", "b", "c"]), "rate_hz": 100.0, **changes}
+    np.savez(path, **{name: value for name, value in content.items() if value is not None})
+    return path
+
+
+def test_numpy_archive(tmp_path, positions):
+    pressure = np.ones((40, 2))
+    path = archive(
+        tmp_path / "swing.npz",
+        1e3 * positions,
+        units="mm",
+        actuation=pressure,
+        actuation_units="kPa",
+        rest=1e3 * positions[0],
+    )
+    recording = read_recording(path)
+    np.testing.assert_allclose(recording.positions, positions)
+    np.testing.assert_allclose(recording.actuation, 1e3 * pressure)
+    np.testing.assert_allclose(recording.rest, positions[0])
+    picked = recording.select(["c", "a"])
+    np.testing.assert_array_equal(picked.rest, recording.rest[[2, 0]])
+    np.testing.assert_array_equal(picked.positions, recording.positions[:, [2, 0]])
+    named = read_recording(archive(tmp_path / "plain.npz", positions, labels=None))
+    assert named.labels == ("marker 1", "marker 2", "marker 3")
+    assert read_recording(path, labels=["x", "y", "z"]).labels == ("x", "y", "z")
+    assert read_recording(path, labels=["*", "", "*"]).labels == ("* #1", "marker 2", "* #2")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"rate_hz": None}, "does not say how many frames a second"),
+        ({"rate_hz": -1.0}, "frame rate of -1"),
+        ({"positions": None}, "has no array 'positions'"),
+        ({"positions": np.zeros((40, 9))}, r"positions must be \(frames, markers, 3\), not \(40, 9\)"),
+        ({"positions": np.full((40, 3, 3), "x")}, "'positions' does not hold numbers"),
+        ({"positions": np.full((40, 3, 3), np.nan)}, "no marker is seen in any frame"),
+        ({"labels": np.array(["a", "b"])}, "has 3 markers and 2 labels"),
+        ({"labels": np.array(["a", "b", "c", "d"])}, "has 3 markers and 4 labels"),
+        ({"units": "ft"}, "gives positions in 'ft'"),
+        (
+            {"units": "cm", "positions": np.random.default_rng(0).normal(size=(40, 3, 3)) * 1e5},
+            "markers span .* set units to it",
+        ),
+        ({"positions": np.random.default_rng(0).normal(size=(40, 3, 3)) * 1e-6}, "all markers lie within"),
+        ({"actuation": np.zeros((39, 2))}, r"actuation has the shape \(39, 2\).* each of the 40 frames"),
+        ({"actuation": np.full((40, 2), np.nan)}, "an actuation is NaN"),
+        ({"actuation": np.zeros((40, 2)), "actuation_units": "psi"}, "gives its actuation in 'psi'"),
+        ({"rest": np.zeros((2, 3))}, r"rest has the shape \(2, 3\)"),
+        ({"start": np.inf}, "its first frame is at inf s"),
+        ({"start": np.nan}, "its first frame is at nan s"),
+        ({"start": np.zeros(2)}, r"'start' has the shape \(2,\); it must be one number"),
+        ({"rate_hz": np.full(40, 100.0)}, r"'rate_hz' has the shape \(40,\)"),
+        ({"rate_hz": 1e300}, r"gives a frame rate of 1e\+300 Hz"),
+        ({"actuation": np.full((40, 2), 1e308), "actuation_units": "bar"}, "an actuation is NaN or infinite"),
+    ],
+)
+def test_wrong_archives(tmp_path, positions, changes, message):
+    with pytest.raises(DataFileError, match=rf"swing\.npz.*{message}"):
+        read_recording(archive(tmp_path / "swing.npz", **{"positions": positions, **changes}))
+
+
+def test_arrays_larger_than_any_recording_are_not_read(tmp_path, positions, monkeypatch):
+    monkeypatch.setattr("warp_resphys.io.files.LARGEST_ARRAYS", 10 << 20)
+    zeros = np.zeros((200_000, 3, 3))  # 14 MB, of which little is left in the file
+    np.savez_compressed(tmp_path / "swing.npz", positions=zeros, rate_hz=100.0)
+    assert (tmp_path / "swing.npz").stat().st_size < 1 << 20
+    with pytest.raises(DataFileError, match=r"swing\.npz .* \(its arrays take more than"):
+        read_recording(tmp_path / "swing.npz")
+    with h5py.File(tmp_path / "swing.h5", "w") as file:
+        file.create_dataset("positions", (1 << 40, 3, 3), "f8", chunks=(64, 3, 3))  # nothing of it in the file
+    with pytest.raises(DataFileError, match=r"swing\.h5: 'positions' takes more than 4 GiB"):
+        read_recording(tmp_path / "swing.h5")
+
+
+class Payload:
+    """Runs a command when it is unpickled."""
+
+    def __init__(self, mark):
+        self.mark = mark
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.mark),)
+
+
+def test_objects_in_an_archive_are_refused_and_not_run(tmp_path, positions):
+    path = archive(tmp_path / "swing.npz", positions, labels=np.array([Payload(tmp_path / "ran")], dtype=object))
+    with pytest.raises(DataFileError, match="holds Python objects"):
+        read_recording(path)
+    (tmp_path / "bare.npz").write_bytes(pickle.dumps(Payload(tmp_path / "ran")))
+    with pytest.raises(DataFileError, match="holds Python objects"):
+        read_recording(tmp_path / "bare.npz")
+    assert not (tmp_path / "ran").exists()
+
+
+def test_damaged_and_foreign_files(tmp_path, positions):
+    whole = archive(tmp_path / "swing.npz", positions).read_bytes()
+    (tmp_path / "cut.npz").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(DataFileError, match=r"cut\.npz is no NumPy archive of plain arrays, or a damaged"):
+        read_recording(tmp_path / "cut.npz")
+    for at in range(0, len(whole), 97):  # Whatever is overwritten, there is one sentence, or a recording.
+        (tmp_path / "spoilt.npz").write_bytes(whole[:at] + b"(" + whole[at + 1 :])
+        with contextlib.suppress(DataFileError):
+            assert read_recording(tmp_path / "spoilt.npz").positions.shape[2] == 3
+    np.save(tmp_path / "single.npy", positions)
+    (tmp_path / "single.npy").rename(tmp_path / "single.npz")
+    with pytest.raises(DataFileError, match="is a single array"):
+        read_recording(tmp_path / "single.npz")
+    for name in ("absent.npz", "absent.csv", "absent.c3d"):
+        with pytest.raises(DataFileError, match=r"No such file|does not exist"):
+            read_recording(tmp_path / name)
+    with pytest.raises(DataFileError, match="does not exist"):
+        read_recording(tmp_path / "absent.h5")
+    (tmp_path / "noise.csv").write_bytes(bytes(range(256)))
+    with pytest.raises(DataFileError, match="is not a text file"):
+        read_recording(tmp_path / "noise.csv")
+    (tmp_path / "empty.csv").touch()
+    with pytest.raises(DataFileError, match="has no header that is known"):
+        read_recording(tmp_path / "empty.csv")
+    with pytest.raises(DataFileError, match=r"is no recording that can be read: give a file that ends in \.c3d"):
+        read_recording(tmp_path / "swing.mat")
+
+
+def test_a_marker_with_one_coordinate_missing_is_not_seen(tmp_path, positions):
+    positions[4, 1, 2] = np.nan
+    positions[6, 1, 0] = np.inf
+    recording = read_recording(archive(tmp_path / "swing.npz", positions))
+    np.testing.assert_array_equal(np.argwhere(np.isnan(recording.positions[:, 1]).all(axis=1))[:, 0], [4, 6])
+
+
+def test_what_is_given_is_checked(tmp_path, positions):
+    path = archive(tmp_path / "swing.npz", positions)
+    for given, message in (
+        ({"units": "inch"}, "units is 'inch'"),
+        ({"rate": 0.0}, r"rate is 0\.0"),
+        ({"labels": ["a"]}, "labels has 1 names; .* has 3 markers"),
+    ):
+        with pytest.raises(InputError, match=message):
+            read_recording(path, **given)
+
+
+def test_hdf5_gives_back_what_was_written(tmp_path, positions):
+    positions[3, 1] = np.nan
+    source = archive(tmp_path / "swing.npz", positions, actuation=np.ones((40, 2)), rest=positions[0], start=0.003)
+    before = read_recording(source)
+    write_recording(tmp_path / "new" / "swing.h5", before, {"weight_kg": 0.05})
+    after = read_recording(tmp_path / "new" / "swing.h5")
+    for name in ("positions", "actuation", "rest"):
+        np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
+    assert (after.labels, after.rate, after.start) == (before.labels, before.rate, 0.003)
+    with h5py.File(tmp_path / "new" / "swing.h5") as file:
+        assert file.attrs["weight_kg"] == 0.05
+        assert file["positions"].attrs["units"] == "m"
+
+
+def test_hdf5_of_another_program(tmp_path, positions):
+    with h5py.File(tmp_path / "swing.hdf5", "w") as file:
+        file["positions"] = 1e2 * positions
+        file["positions"].attrs["units"] = "cm"
+        file["labels"] = ["a", "b", "c"]
+        file["rate_hz"] = 100
+    recording = read_recording(tmp_path / "swing.hdf5")
+    np.testing.assert_allclose(recording.positions, positions)
+    assert recording.labels == ("a", "b", "c")
+    with atomic_hdf5(tmp_path / "run.h5", "trajectories"):
+        pass
+    with pytest.raises(DataFileError, match=r"run\.h5 holds 'trajectories' where 'recording' is needed"):
+        read_recording(tmp_path / "run.h5")
+
+
+def test_recorded_beam_in_the_wrong_unit_is_noticed(shared_data):
+    path = shared_data / "beam_mocap" / "beam_gravity_V2_a.c3d"
+    assert read_recording(path).labels[0] == "Tip - 1"
+    with pytest.raises(DataFileError, match=r"all markers lie within 0\.098 mm"):
+        read_recording(path, units="mm")

@@ -1,0 +1,277 @@
+import re
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from warp_resphys.data.recordings.c3d import read_c3d
+from warp_resphys.data.recordings.processing import fill_gaps
+from warp_resphys.data.recordings.release import find_release
+from warp_resphys.data.registration import (
+    RigidTransform,
+    kabsch,
+    register_markers,
+    register_to_surface,
+    root_mean_square,
+)
+from warp_resphys.io.errors import DataFileError, InputError
+from warp_resphys.mesh.mesh import boundary_triangles, box_hexahedra, box_tetrahedra
+from warp_resphys.mesh.surface import closest_points
+
+BEAM = {
+    "Tip - 1": (0.1, 0.015, 0.036),
+    "Tip - 2": (0.1, -0.006, 0.024),
+    "Tip - 3": (0.1, 0.036, 0.006),
+    "Base - 1": (0.006, -0.010, -0.001),
+    "Base - 2": (0.006, 0.040, 0.0275),
+    "Base - 3": (0.006, 0.040, 0.000),
+}
+NAMES, NOMINAL = list(BEAM), np.array(list(BEAM.values()))
+BASE = NAMES[3:]
+MOTION = RigidTransform(Rotation.from_euler("xyz", [0.4, -2.0, 1.1]).as_matrix(), np.array([0.3, -0.2, 1.5]))
+SOURCE = "swing.c3d"
+
+
+def measured(**moved):
+    """The nominal markers in the recording's frame, some moved [m] by their names' place."""
+    points = NOMINAL.copy()
+    for place, by in moved.items():
+        points[int(place[1:])] += by
+    return MOTION.apply(points)
+
+
+def assert_inverse(found, atol=1e-12):
+    np.testing.assert_allclose(found.rotation @ MOTION.rotation, np.eye(3), rtol=0, atol=atol)
+    np.testing.assert_allclose(found.rotation @ MOTION.translation + found.translation, 0.0, atol=atol)
+
+
+def test_kabsch_finds_a_batch_of_rigid_motions():
+    generator = np.random.default_rng(1)
+    rotation = Rotation.random(5, random_state=2).as_matrix()
+    translation = generator.normal(size=(5, 3))
+    source = generator.normal(size=(6, 3))
+    target = source @ rotation.transpose(0, 2, 1) + translation[:, None]
+    motion = kabsch(np.broadcast_to(source, target.shape), target)
+    np.testing.assert_allclose(motion.rotation, rotation, atol=1e-12)
+    np.testing.assert_allclose(motion.translation, translation, atol=1e-12)
+    np.testing.assert_allclose(motion.apply(source), target, atol=1e-12)
+
+
+def test_kabsch_of_a_mirror_image_is_a_rotation():
+    source = np.random.default_rng(4).normal(size=(7, 3))
+    motion = kabsch(source, source * [1.0, 1.0, -1.0])
+    assert np.linalg.det(motion.rotation) == pytest.approx(1.0)
+
+
+def test_kabsch_works_for_points_of_a_plane():
+    face = np.array([[0, 0, 0], [0, 1, 0], [0, 0, 1], [0, 1, 1.0]])
+    rotation = Rotation.from_euler("xyz", [0.3, -0.8, 2.0]).as_matrix()
+    np.testing.assert_allclose(kabsch(face, face @ rotation.T).rotation, rotation, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "points", [np.zeros((2, 3)), np.outer(np.arange(4.0), [1.0, 2.0, 3.0]), np.full((4, 3), np.nan)]
+)
+def test_kabsch_refuses(points):
+    with pytest.raises(InputError, match="Registration needs"):
+        kabsch(points, points)
+
+
+def test_root_mean_square():
+    assert root_mean_square(np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 0.0]])) == pytest.approx(5.0 / np.sqrt(2.0))
+
+
+class TestRegisterMarkers:
+    def test_a_known_motion_comes_back(self):
+        found = register_markers(measured(), NOMINAL, NAMES, source=SOURCE)
+        assert_inverse(found.transform)
+        np.testing.assert_allclose(found.positions, NOMINAL, rtol=0, atol=1e-12)
+        assert found.inliers.all()
+        assert found.outliers == ()
+        assert found.rms < 1e-12
+
+    @pytest.mark.parametrize("astray", range(6))
+    def test_one_marker_ten_centimetres_off_changes_nothing(self, astray):
+        points = measured(**{f"m{astray}": [0.06, 0.0, -0.08]})
+        found = register_markers(points, NOMINAL, NAMES, source=SOURCE)
+        assert_inverse(found.transform)
+        assert found.outliers == (NAMES[astray],)
+        assert list(np.flatnonzero(~found.inliers)) == [astray]
+        assert found.residual[astray] == pytest.approx(0.1)
+        assert found.rms < 1e-12
+
+    def test_swapped_names_are_left_out(self):
+        points = measured()[[0, 4, 2, 3, 1, 5]]
+        found = register_markers(points, NOMINAL, NAMES, source=SOURCE)
+        assert_inverse(found.transform)
+        assert found.outliers == ("Tip - 2", "Base - 2")
+        with pytest.raises(DataFileError, match=r"swing\.c3d: the markers at rest do not fit"):
+            register_markers(points, NOMINAL, NAMES, source=SOURCE, most_outliers=1)
+
+    def test_seven_of_fifteen_may_be_anywhere(self):
+        random = np.random.default_rng(0)
+        nominal = random.normal(scale=0.1, size=(15, 3))
+        points = MOTION.apply(nominal)
+        points[::2][:7] += random.normal(scale=0.1, size=(7, 3))
+        found = register_markers(points, nominal, [f"m{i}" for i in range(15)], source=SOURCE)
+        assert_inverse(found.transform)
+        assert len(found.outliers) == 7
+
+    def test_where_all_fit_it_is_the_least_squares_fit(self):
+        points = measured() + np.random.default_rng(1).normal(scale=1e-3, size=NOMINAL.shape)
+        found = register_markers(points, NOMINAL, NAMES, source=SOURCE)
+        plain = kabsch(points, NOMINAL)
+        np.testing.assert_allclose(found.transform.rotation, plain.rotation, rtol=0, atol=1e-12)
+        residual = np.linalg.norm(plain.apply(points) - NOMINAL, axis=1)
+        np.testing.assert_allclose(found.residual, residual, rtol=0, atol=1e-12)
+        assert found.rms == pytest.approx(np.sqrt(np.mean(residual**2)))
+
+    def test_base_only_ignores_a_tip_that_sags(self):
+        points = measured(m0=[0, 0, -0.01], m1=[0, 0, -0.01], m2=[0, 0, -0.012])
+        found = register_markers(points, NOMINAL, NAMES, source=SOURCE, use=BASE)
+        assert_inverse(found.transform)
+        np.testing.assert_allclose(found.residual, [0.01, 0.01, 0.012, 0, 0, 0], rtol=0, atol=1e-12)
+        assert list(found.inliers) == [False] * 3 + [True] * 3
+        assert found.outliers == ()
+
+    def test_a_marker_that_was_not_seen_is_left_out(self):
+        points = measured()
+        points[1] = np.nan
+        found = register_markers(points, NOMINAL, NAMES, source=SOURCE)
+        assert_inverse(found.transform)
+        assert np.isnan(found.residual[1])
+        assert np.isnan(found.positions[1]).all()
+        assert not found.inliers[1]
+        assert found.outliers == ()
+
+    @pytest.mark.parametrize(
+        ("points", "settings", "sentence"),
+        [
+            (
+                measured(m1=[0.1, 0.0, 0.0]),
+                {"most_outliers": 0},
+                "swing.c3d: the markers at rest do not fit their nominal positions to 4.0 mm: 'Tip - 2' is 100.0 mm "
+                "off (the others: 0.0 mm root mean square); check its name",
+            ),
+            (measured(m1=[0.1, 0.0, 0.0], m4=[0.0, 0.05, 0.0], m5=[0.03, 0.0, 0.0]), {}, "'Tip - 2' is "),
+            (measured(m3=[0.0, 0.03, 0.0]), {"use": BASE}, "mm off (all three: "),
+            (
+                np.where(np.arange(6)[:, None] > 3, np.nan, measured()),
+                {"use": BASE},
+                "registration needs three markers at rest, but 1 are left to it; not seen: 'Base - 2', 'Base - 3'.",
+            ),
+        ],
+    )
+    def test_it_names_file_and_marker(self, points, settings, sentence):
+        with pytest.raises(DataFileError, match=re.escape(sentence)) as error:
+            register_markers(points, NOMINAL, NAMES, source=SOURCE, **settings)
+        assert "swing.c3d" in str(error.value)
+
+    def test_base_markers_on_a_line_are_refused(self):
+        nominal = NOMINAL.copy()
+        nominal[3:] = [[0.0, 0.0, 0.0], [0.0, 0.02, 0.001], [0.0, 0.05, 0.0]]
+        with pytest.raises(InputError, match="'Base - 1', 'Base - 2', 'Base - 3' lie on one line to within 4"):
+            register_markers(MOTION.apply(nominal), nominal, NAMES, source=SOURCE, use=BASE)
+
+    def test_names_and_shapes(self):
+        with pytest.raises(InputError, match="should use 'Base - 9', but the markers are 'Tip - 1'"):
+            register_markers(measured(), NOMINAL, NAMES, source=SOURCE, use=["Base - 9"])
+        with pytest.raises(InputError, match="6 markers are named, with measured positions"):
+            register_markers(measured()[:5], NOMINAL, NAMES, source=SOURCE)
+
+
+@pytest.mark.parametrize(
+    ("name", "rms"), [("gravity", 0.807e-3), ("load52", 0.832e-3), ("load101", 1.132e-3)], ids=["bare", "52g", "101g"]
+)
+def test_recordings_of_the_beam(shared_data, name, rms):
+    recording = read_c3d(shared_data / "beam_mocap" / f"beam_{name}_V2_a.c3d").select(NAMES)
+    positions = fill_gaps(recording).positions
+    release = find_release(positions[:, :3].mean(axis=1), recording.rate)
+    held = np.median(positions[slice(*release.rest)], axis=0)
+    found = register_markers(held, NOMINAL, NAMES, source=recording.source)
+    assert found.rms == pytest.approx(rms, abs=2e-6)
+    assert found.inliers.all()
+    spoilt = held.copy()
+    spoilt[4] += 0.1
+    without = register_markers(spoilt, NOMINAL, NAMES, source=recording.source)
+    assert without.outliers == ("Base - 2",)
+    assert np.linalg.norm(without.positions - found.positions, axis=1)[:3].max() < 2.5e-3
+
+
+MESHES = {
+    "hexahedra": box_hexahedra(divisions=(5, 2, 2)),
+    "tetrahedra": box_tetrahedra(divisions=(5, 2, 2)),
+    "tetrahedra10": box_tetrahedra(divisions=(5, 2, 2), order=2),
+}
+
+
+@pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES.keys())
+def test_closest_points_of_a_box(mesh):
+    """Against the formula for a box, inside and outside of it."""
+    points = np.random.default_rng(2).uniform([-0.02, -0.02, -0.02], [0.12, 0.05, 0.05], (200, 3))
+    high = np.array([0.1, 0.03, 0.03])
+    outside = np.linalg.norm(np.maximum(np.maximum(-points, points - high), 0.0), axis=1)
+    inside = np.minimum(points, high - points).min(axis=1)
+    found = closest_points(mesh, points)
+    np.testing.assert_allclose(found.distances, np.where(outside > 0.0, outside, -inside), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(points - found.points, axis=1), np.abs(found.distances), atol=1e-12)
+    corners = mesh.vertices[found.triangles]
+    heights = np.einsum("pki,pi->pk", corners - found.points[:, None], found.normals)
+    np.testing.assert_allclose(heights, 0.0, atol=1e-12)
+    assert trimesh.Trimesh(mesh.vertices, boundary_triangles(mesh), process=False).volume > 0.0
+
+
+def test_beside_an_edge_the_face_below_is_the_closest():
+    found = closest_points(MESHES["hexahedra"], np.array([[0.1, 0.015, 0.036], [0.1, -0.006, 0.011]]))
+    np.testing.assert_allclose(found.normals, [[0, 0, 1], [0, -1, 0]], atol=1e-12)
+
+
+class TestRegisterToSurface:
+    names = tuple(f"m{i}" for i in range(8))
+    mesh = box_hexahedra(divisions=(10, 3, 3))
+
+    def stems(self, length):
+        """Markers on stems of one length on five faces, two or one on each, in the body's frame."""
+        points = [[0.03, 0.01, 0.03], [0.07, 0.02, 0.03], [0.05, 0.0, 0.02], [0.02, 0.03, 0.01]]
+        points += [[0.1, 0.02, 0.01], [0.08, 0.01, 0.0], [0.01, 0.0, 0.01], [0.09, 0.03, 0.02]]
+        normals = [[0, 0, 1], [0, 0, 1], [0, -1, 0], [0, 1, 0], [1, 0, 0], [0, 0, -1], [0, -1, 0], [0, 1, 0]]
+        return np.array(points) + length * np.array(normals)
+
+    @pytest.mark.parametrize("stem", [0.006, None])
+    def test_it_finds_the_motion_and_the_length_of_the_stems(self, stem):
+        points = self.stems(0.006)
+        away = RigidTransform(Rotation.from_rotvec([0.03, -0.02, 0.04]).as_matrix(), np.array([1e-3, -2e-3, 1.5e-3]))
+        start = RigidTransform(np.eye(3), np.zeros(3))
+        found = register_to_surface(
+            away.apply(points), self.mesh, start, self.names, source=SOURCE, stem=stem, hold=1e-9, largest_residual=1e-5
+        )
+        assert found.rms < 1e-6
+        np.testing.assert_allclose(found.positions, points, rtol=0, atol=2e-5)
+
+    def test_stems_of_different_lengths(self):
+        lengths = np.linspace(0.002, 0.009, 8)
+        points = self.stems(lengths[:, None])
+        points[6] = np.nan
+        start = RigidTransform(Rotation.from_rotvec([0.02, 0.01, -0.02]).as_matrix(), np.array([1e-3, 1e-3, 0.0]))
+        found = register_to_surface(points, self.mesh, start, self.names, source=SOURCE, stem=lengths, hold=1e-9)
+        np.testing.assert_allclose(found.positions, points, rtol=0, atol=2e-5)
+        assert np.isnan(found.residual[6])
+        assert not found.inliers[6]
+
+    def test_what_slides_along_the_surface_stays_where_it_starts(self):
+        points = self.stems(0.006)[:4] + [2e-3, 0.0, 1e-3]  # None of these four sees x.
+        start = RigidTransform(np.eye(3), np.zeros(3))
+        found = register_to_surface(points, self.mesh, start, self.names[:4], source=SOURCE, stem=0.006)
+        moved = found.positions - points
+        np.testing.assert_allclose(moved[:, 0], 0.0, atol=1e-4)
+        np.testing.assert_allclose(moved[:, 2].mean(), -1e-3, atol=5e-5)
+
+    def test_a_marker_off_the_surface_is_named(self):
+        points = self.stems(0.006)
+        points[3] += [0.0, 0.03, 0.0]
+        start = RigidTransform(np.eye(3), np.zeros(3))
+        with pytest.raises(DataFileError, match=r"swing\.c3d: marker 'm3' is .* mm off a stem of 6\.0 mm on"):
+            register_to_surface(points, self.mesh, start, self.names, source=SOURCE, stem=0.006)
+        with pytest.raises(InputError, match="hold is 0: it must be positive"):
+            register_to_surface(points, self.mesh, start, self.names, source=SOURCE, hold=0.0)

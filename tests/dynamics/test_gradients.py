@@ -1,0 +1,311 @@
+"""Adjoint gradients against central differences in float64."""
+
+import contextlib
+import io
+import math
+import runpy
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+from rich.console import Console
+
+from warp_resphys import (
+    Body,
+    Material,
+    Simulator,
+    SolverSettings,
+    State,
+    box_hexahedra,
+    box_tetrahedra,
+    select_vertices,
+)
+from warp_resphys.dynamics.integrator import INTEGRATORS
+from warp_resphys.studies.gradient_check import (
+    POSES,
+    GradientRow,
+    check_configured,
+    check_gradients,
+    gradient_table,
+    pose,
+)
+
+SIZE = (0.06, 0.02, 0.02)
+MESHES = {
+    "hexahedron": box_hexahedra(SIZE, (3, 1, 2)),
+    "tetrahedron": box_tetrahedra(SIZE, (3, 1, 1)),
+    "tetrahedron10": box_tetrahedra(SIZE, (2, 1, 1), order=2),
+}
+DAMPED = Material(264e3, 0.45, 1070.0, mass_damping=0.5, stiffness_damping=2e-3)
+TIGHT = SolverSettings("newton", relative_tolerance=1e-10)
+KINDS = [
+    "initial positions",
+    "initial velocities",
+    "external forces",
+    "fixed positions",
+    *(f"{name}, {kind}" for name in ("E", "nu") for kind in ("scalar", "per element", "per environment")),
+    "density",
+    "mass damping",
+    "stiffness damping",
+]
+SEVEN = [(s * k, s * w) for s in (1, -1) for k, w in ((1, 3 / 4), (2, -3 / 20), (3, 1 / 60))]
+
+
+def simulator(kind="hexahedron", material=DAMPED, **options):
+    mesh = MESHES[kind]
+    return Simulator(Body(mesh, fixed=select_vertices(mesh, x=0.0)), material, **({"solver": TIGHT} | options))
+
+
+def assert_equal(rows):
+    assert [row.parameter for row in rows] == KINDS
+    assert {row.parameter: row.relative_error for row in rows if not row.relative_error <= 1e-6} == {}
+    assert all(row.adjoint != 0.0 for row in rows)
+
+
+@pytest.mark.parametrize("poissons_ratio", [0.45, 0.499])
+@pytest.mark.parametrize("start", POSES)
+@pytest.mark.parametrize("kind", MESHES)
+def test_every_parameter_at_every_pose(kind, start, poissons_ratio, device):
+    material = replace(DAMPED, poissons_ratio=poissons_ratio)
+    assert_equal(check_gradients(simulator(kind, material, device=device), start, steps=2))
+
+
+@pytest.mark.parametrize("start", ["bent", "twisted"])
+@pytest.mark.parametrize("integrator", INTEGRATORS[1:])
+def test_every_parameter_with_every_integrator(integrator, start):
+    assert_equal(check_gradients(simulator(integrator=integrator), start, steps=3))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"material": replace(DAMPED, model="stable_neo_hookean")},
+        {"material": replace(DAMPED, poissons_ratio=-0.2)},
+        {"solver": SolverSettings("quasi_newton", relative_tolerance=1e-10)},
+        {"solver": SolverSettings("newton", relative_tolerance=1e-10, linear_solver="dense")},
+        {"solver": SolverSettings("newton", relative_tolerance=1e-10, linear_solver="sparse")},
+    ],
+    ids=["stable_neo_hookean", "auxetic", "quasi_newton", "dense", "sparse"],
+)
+def test_every_parameter_with_other_options(options):
+    assert_equal(check_gradients(simulator(**options), "bent", steps=2))
+
+
+def test_full_integration_and_per_vertex_mass():
+    mesh = MESHES["hexahedron"]
+    body = Body(mesh, fixed=select_vertices(mesh, x=0.0), mass="per_vertex", volume_integration="full")
+    assert_equal(check_gradients(Simulator(body, DAMPED, solver=TIGHT), "bent", steps=2))
+
+
+def derivative(loss, value, direction):
+    """Directional derivative by the adjoint and by central differences."""
+    variable = value.clone().requires_grad_(True)
+    (gradient,) = torch.autograd.grad(loss(variable), variable)
+    with torch.no_grad():
+        difference = sum(w * float(loss(value + k * direction)) for k, w in SEVEN)
+    return GradientRow("", float((gradient * direction).sum()), difference)
+
+
+def noise(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def test_poissons_ratio_of_zero_has_a_derivative():
+    """lambda vanishes there, its derivative does not."""
+    s = simulator()
+    state = pose(s, "bent", 1)
+    weights = noise(*state.q.shape)
+
+    def loss(nu):
+        return (weights * s.rollout(state, 2, material=replace(DAMPED, poissons_ratio=nu)).q[-1]).sum()
+
+    row = derivative(loss, torch.zeros(1, dtype=torch.float64), torch.full((1,), 1e-2, dtype=torch.float64))
+    assert row.relative_error <= 1e-6
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_gradient_through_a_hundred_and_twenty_steps(integrator):
+    s = simulator(integrator=integrator, material=replace(DAMPED, youngs_modulus=3e4))
+    state, steps = pose(s, "bent", 1), 120
+    tip = torch.as_tensor(select_vertices(MESHES["hexahedron"], x=SIZE[0]))
+
+    def end(trajectory):
+        return trajectory.q[-1, 0, tip, 2].mean() + 0.01 * trajectory.v[60:, 0, tip, 0].mean()
+
+    def of_modulus(e):
+        return end(s.rollout(state, steps, material=replace(s.material, youngs_modulus=e)))
+
+    def of_velocity(v):
+        return end(s.rollout(State(state.q, v), steps))
+
+    e = torch.tensor([3e4], dtype=torch.float64)
+    assert derivative(of_modulus, e, 2e-3 * e).relative_error <= 1e-6
+    assert derivative(of_velocity, state.v, 1e-3 * noise(*state.v.shape)).relative_error <= 1e-6
+
+
+def moving_clamp(s, steps):
+    """(T, 2, D, 3) targets of two clamps: one turns about x by 0.1 rad a step, both are carried off and shaken."""
+    clamp = s.rest_positions[s.fixed]
+    time = torch.arange(1, steps + 1, dtype=torch.float64)
+    shift = 1e-3 * torch.stack([time, 0.5 * time**2, 2.0 * (-1.0) ** time], dim=1)[:, None]
+    turn = torch.zeros(steps, 3, 3, dtype=torch.float64)
+    turn[:, 2, 1], turn[:, 1, 2] = 0.1 * time, -0.1 * time
+    centre = clamp.mean(0)
+    turned = centre + (clamp - centre) @ torch.linalg.matrix_exp(turn).mT
+    return torch.stack([turned + shift, clamp - 0.5 * shift], dim=1)
+
+
+@pytest.mark.parametrize("kind", MESHES)
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_a_clamp_that_moves(integrator, kind):
+    s = simulator(kind, integrator=integrator)
+    state, steps = pose(s, "bent", 2), 4
+    targets = moving_clamp(s, steps)
+    weights = noise(steps + 1, *state.q.shape, seed=1), s.time_step * noise(steps + 1, *state.q.shape, seed=2)
+
+    def loss(targets=targets, q=state.q, v=state.v, **constants):
+        moved = s.rollout(State(q, v), steps, fixed_positions=targets, material=replace(DAMPED, **constants))
+        return (weights[0] * moved.q).sum() + (weights[1] * moved.v).sum()
+
+    one = torch.ones(1, dtype=torch.float64)
+    cases = {
+        "targets": (lambda x: loss(targets=x), targets, 1e-6 * noise(*targets.shape, seed=3)),
+        "positions": (lambda x: loss(q=x), state.q, 1e-6 * noise(*state.q.shape, seed=4)),
+        "velocities": (lambda x: loss(v=x), state.v, 1e-4 * noise(*state.v.shape, seed=5)),
+        "E": (lambda x: loss(youngs_modulus=x), 264e3 * one, 2e3 * one),
+        "damping": (lambda x: loss(stiffness_damping=x), 2e-3 * one, 1e-5 * one),
+    }
+    errors = {name: derivative(*case).relative_error for name, case in cases.items()}
+    assert {name: error for name, error in errors.items() if not error <= 1e-6} == {}
+
+
+@pytest.mark.parametrize("kind", MESHES)
+def test_static_equilibrium(kind):
+    s = simulator(kind)
+    b, n, d = 2, s.body.n_vertices, len(s.fixed)
+    weights, elements = noise(b, n, 3), len(s.body.mesh.cells)
+    force = 1e-2 * noise(b, n, 3, seed=1)
+    fixed = s.rest_positions[s.fixed] + 1e-3 * noise(b, d, 3, seed=2)
+
+    def loss(force=force, fixed=fixed, **constants):
+        state = s.static_equilibrium(force, fixed, material=replace(DAMPED, **constants))
+        return (weights * state.q).sum()
+
+    ones = torch.ones(elements, dtype=torch.float64)
+    cases = {
+        "force": (lambda x: loss(force=x), force, 1e-3 * noise(b, n, 3, seed=3)),
+        "fixed": (lambda x: loss(fixed=x), fixed, 1e-5 * noise(b, d, 3, seed=4)),
+        "E": (lambda x: loss(youngs_modulus=x), 264e3 * ones, 2e3 * noise(elements, seed=5)),
+        "nu": (lambda x: loss(poissons_ratio=x), 0.45 * ones[:1], 1e-3 * ones[:1]),
+        "rho": (lambda x: loss(density=x), 1070.0 * ones, 10.0 * noise(elements, seed=6)),
+    }
+    errors = {name: derivative(*case).relative_error for name, case in cases.items()}
+    assert {name: error for name, error in errors.items() if not error <= 1e-6} == {}
+
+
+def test_static_equilibrium_does_not_depend_on_where_it_starts():
+    s = simulator()
+    start = pose(s, "bent", 1).q.requires_grad_(True)
+    found = s.static_equilibrium(start=start)
+    torch.testing.assert_close(found.q.detach(), s.static_equilibrium().q, rtol=0.0, atol=1e-10)
+    assert not found.q.requires_grad
+
+
+def test_fixed_velocities_and_positions_of_fixed_vertices_have_no_hidden_influence():
+    """Forces on fixed vertices change nothing; where they stand at the start matters when nothing moves them."""
+    s = simulator()
+    state = pose(s, "bent", 1)
+    q, force = state.q.clone().requires_grad_(True), torch.zeros_like(state.q).requires_grad_(True)
+    final = s.rollout(State(q, state.v), 2, force).final
+    gradients = torch.autograd.grad(final.q.sum(), (q, force))
+    assert float(gradients[0][:, s.fixed].abs().max()) > 0.1
+    assert float(gradients[1][:, s.fixed].abs().max()) == 0.0
+
+
+def test_gradients_add_up_over_a_shared_parameter():
+    s = simulator()
+    state = pose(s, "bent", 3)
+    shared = torch.tensor(2e5, dtype=torch.float64, requires_grad=True)
+    each = torch.full((3, 1), 2e5, dtype=torch.float64, requires_grad=True)
+    weights = noise(*state.q.shape)
+    gradients = []
+    for e in (shared, each):
+        q = s.rollout(state, 2, material=replace(DAMPED, youngs_modulus=e)).q[-1]
+        gradients.append(torch.autograd.grad((weights * q).sum(), e)[0])
+    torch.testing.assert_close(gradients[0], gradients[1].sum(), rtol=1e-9, atol=0.0)
+
+
+SMALL = ["mesh.divisions=[2,1,1]", "gradcheck.steps=1", "gradcheck.batch=1", "gradcheck.poses=[bent]"]
+
+
+@pytest.mark.parametrize("solver", ["quasi_newton", "newton"])
+def test_configured_check(solver):
+    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
+        config = compose("gradcheck", [*SMALL, f"solver={solver}", "experiment=beam_oscillation"])
+    results = list(check_configured(OmegaConf.to_container(config)))
+    assert [(nu, name) for nu, name, _ in results] == [(0.45, "bent"), (0.499, "bent")]
+    for _, _, rows in results:
+        assert_equal(rows)
+
+
+def test_table_shows_what_differs():
+    rows = [GradientRow("E, scalar", 1.0, 1.0 + 1e-9), GradientRow("density", 2.0, 2.1), GradientRow("v", 0.0, 0.0)]
+    console = Console(width=100, file=io.StringIO(), color_system="standard", force_terminal=True)
+    console.print(gradient_table(rows, "nu = 0.45, bent", 1e-6))
+    lines = console.file.getvalue().splitlines()
+    red = [line for line in lines if "\x1b[31m" in line]
+    assert len(red) == 2
+    assert "density" in red[0]
+    assert "4.8e-02" in red[0]
+    assert "v " in red[1]
+    assert "inf" in red[1]
+
+
+@pytest.mark.parametrize(
+    ("adjoint", "difference", "error"),
+    [
+        (2.0, 1.0, 0.5),
+        (0.0, 1e-9, 1.0),
+        (0.0, 0.0, math.inf),  # vanishing in both tells nothing
+        (math.nan, 1.0, math.inf),
+        (1.0, math.nan, math.inf),
+        (math.inf, math.inf, math.inf),
+    ],
+)
+def test_a_row_that_compares_nothing_is_an_infinite_error(adjoint, difference, error):
+    assert GradientRow("", adjoint, difference).relative_error == error
+
+
+def run_script(tmp_path, monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["gradcheck.py", *arguments, f"hydra.run.dir={tmp_path}"])
+    runpy.run_path(str(Path(__file__).parents[2] / "scripts" / "gradcheck.py"))["main"]()
+
+
+@pytest.mark.parametrize("values", [(0.0, 0.0), (math.nan, 1.0), (1.0, math.nan)])
+def test_script_fails_where_a_row_compares_nothing(values, tmp_path, monkeypatch, capsys):
+    rows = [GradientRow("v", *values), GradientRow("E, scalar", 1.0, 1.0)]
+    monkeypatch.setattr("warp_resphys.studies.gradient_check.check_configured", lambda _: iter([(0.45, "rest", rows)]))
+    with pytest.raises(SystemExit) as ended:
+        run_script(tmp_path, monkeypatch)
+    assert ended.value.code == 1
+    assert "Largest relative error: inf" in capsys.readouterr().out
+
+
+def test_a_body_without_a_clamp_has_no_row_for_it():
+    free = Simulator(Body(MESHES["hexahedron"]), DAMPED, solver=TIGHT)
+    rows = check_gradients(free, "bent", steps=1, batch=1)
+    assert [row.parameter for row in rows] == [kind for kind in KINDS if kind != "fixed positions"]
+    assert all(row.relative_error <= 1e-6 for row in rows)
+
+
+@pytest.mark.parametrize(("tolerance", "code"), [(1e-6, 0), (1e-16, 1)])
+def test_script_fails_beyond_the_tolerance(tolerance, code, tmp_path, monkeypatch, capsys):
+    arguments = [*SMALL, "gradcheck.poissons_ratios=[0.45]", f"gradcheck.tolerance={tolerance}"]
+    with pytest.raises(SystemExit) if code else contextlib.nullcontext() as ended:
+        run_script(tmp_path, monkeypatch, *arguments)
+    assert ended is None or ended.value.code == code
+    assert "Largest relative error" in capsys.readouterr().out

@@ -1,0 +1,233 @@
+"""Time integrators against closed forms and against their own limit."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from warp_resphys import (
+    Body,
+    Material,
+    PointMass,
+    Simulator,
+    SolverSettings,
+    State,
+    box_hexahedra,
+    box_tetrahedra,
+    select_vertices,
+)
+from warp_resphys.dynamics.integrator import INTEGRATORS
+from warp_resphys.io.errors import InputError
+
+SOFT = Material(2e4, 0.3, 1000.0, mass_damping=1.0, stiffness_damping=3e-3)
+MESH = box_hexahedra((0.04, 0.02, 0.02), (2, 1, 1))
+CLAMPED = Body(MESH, fixed=select_vertices(MESH, x=0.0))
+TIGHT = SolverSettings("newton", relative_tolerance=1e-10)
+WEIGHTLESS = (0.0, 0.0, 0.0)
+
+
+def swing(integrator, steps, material=SOFT, duration=0.04, moving=False):
+    """Positions and velocities at the end of a large motion that starts smoothly."""
+    simulator = Simulator(CLAMPED, material, duration / steps, integrator=integrator, solver=TIGHT)
+    state = simulator.rest_state()
+    x = state.q[..., :1] / 0.04
+    v = 1.5 * torch.cat([0 * x, x**2, -0.5 * x**2], dim=-1)
+    targets = None
+    if moving:
+        time = torch.linspace(0, duration, steps + 1, dtype=torch.float64)[1:]
+        shift = 5e-3 * torch.sin(time / duration * np.pi / 2) ** 3
+        targets = state.q[:, simulator.fixed] + shift[:, None, None, None] * torch.tensor([0.0, 1.0, 0.0])
+    trajectory = simulator.rollout(State(state.q, v), steps, fixed_positions=targets)
+    return trajectory.q[-1], trajectory.v[-1]
+
+
+@pytest.mark.parametrize("moving", [False, True], ids=["clamped", "moving clamp"])
+@pytest.mark.parametrize(("integrator", "order"), [("implicit_euler", 1), ("bdf2", 2), ("midpoint", 2)])
+def test_order_of_convergence(integrator, order, moving):
+    """Large rotations and strains with both dampings: positions and velocities converge at the method's order."""
+    results = [swing(integrator, steps, moving=moving) for steps in (32, 64, 128)]
+    free = torch.as_tensor(np.setdiff1d(np.arange(len(MESH.vertices)), CLAMPED.fixed_vertices))
+    for quantity in (0, 1):
+        coarse, middle, fine = (r[quantity][:, free] for r in results)
+        observed = torch.log2((coarse - middle).abs().max() / (middle - fine).abs().max())
+        assert float(observed) == pytest.approx(order, abs=0.25)
+
+
+def test_all_integrators_have_the_same_limit():
+    limits = []
+    for integrator in INTEGRATORS:
+        (coarse, _), (fine, _) = swing(integrator, 48), swing(integrator, 96)
+        order = 1 if integrator == "implicit_euler" else 2
+        limits.append(fine + (fine - coarse) / (2**order - 1))
+    torch.testing.assert_close(limits[1], limits[2], rtol=0.0, atol=4e-6)
+    torch.testing.assert_close(limits[0], limits[2], rtol=0.0, atol=1e-4)
+
+
+GROWTH = {
+    # Damping alone, v' = -alpha v: the amplification of a step with a = alpha h.
+    "implicit_euler": lambda a, n: (1 + a) ** -n,
+    "midpoint": lambda a, n: ((1 - a / 2) / (1 + a / 2)) ** n,
+}
+
+
+def bdf2_decay(a, n):
+    v = [1.0, 1.0 / (1 + a)]
+    for _ in range(n - 1):
+        v.append((4 * v[-1] - v[-2]) / (3 + 2 * a))
+    return v[n]
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_mass_damping_of_a_translation_is_exact(integrator, device):
+    h, alpha, steps = 0.02, 5.0, 6
+    material = Material(1e5, 0.4, 1000.0, mass_damping=alpha)
+    simulator = Simulator(
+        Body(MESH), material, h, gravity=WEIGHTLESS, integrator=integrator, solver=TIGHT, device=device
+    )
+    rest = simulator.rest_state()
+    v = simulator.tensor([0.3, -0.2, 0.1]).expand_as(rest.v)
+    final = simulator.rollout(State(rest.q, v), steps).final
+    factor = bdf2_decay(alpha * h, steps) if integrator == "bdf2" else GROWTH[integrator](alpha * h, steps)
+    torch.testing.assert_close(final.v, factor * v, rtol=1e-8, atol=1e-9)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_free_fall(integrator):
+    h, steps, g = 0.01, 10, -9.81
+    simulator = Simulator(Body(MESH), SOFT_UNDAMPED, h, (0, 0, g), integrator=integrator, solver=TIGHT)
+    final = simulator.rollout(simulator.rest_state(), steps).final
+    t = h * steps
+    torch.testing.assert_close(final.v[..., 2], torch.full_like(final.v[..., 2], g * t), rtol=1e-8, atol=0.0)
+    fallen = (final.q - simulator.rest_positions)[0, :, 2]
+    # Implicit Euler is ahead by g h t / 2; the starting step costs BDF2 a part of g h^2.
+    early = {"implicit_euler": g * t * h / 2, "midpoint": 0.0, "bdf2": float(fallen[0]) - g * t**2 / 2}[integrator]
+    assert abs(early) <= abs(g * t * h / 2) + 1e-12
+    torch.testing.assert_close(fallen, torch.full_like(fallen, g * t**2 / 2 + early), rtol=1e-7, atol=0.0)
+
+
+SOFT_UNDAMPED = replace(SOFT, mass_damping=0.0, stiffness_damping=0.0)
+
+
+def total_momenta(simulator, state):
+    mass = simulator.prepare().mass[0, :, None]
+    p = mass * state.v[0]
+    return p.sum(0), torch.linalg.cross(state.q[0], p).sum(0)
+
+
+def test_midpoint_conserves_momenta_and_rigid_rotations_are_not_damped():
+    """A spinning free body: viscosity acts on strain rates, not on rotations."""
+    h, omega = 2e-3, 8.0
+    simulator = Simulator(Body(MESH), SOFT_STIFFLY_DAMPED, h, WEIGHTLESS, "midpoint", solver=TIGHT)
+    rest = simulator.rest_state()
+    centred = rest.q - torch.tensor([0.02, 0.01, 0.01], dtype=torch.float64)
+    axis = torch.tensor([0.0, 0.0, omega], dtype=torch.float64)
+    state = State(rest.q, torch.linalg.cross(axis.expand_as(centred), centred))
+    before = total_momenta(simulator, state)
+    after = total_momenta(simulator, simulator.rollout(state, 100).final)
+    torch.testing.assert_close(after[0], before[0], rtol=0.0, atol=1e-10)
+    torch.testing.assert_close(after[1], before[1], rtol=1e-4, atol=1e-10)
+
+
+SOFT_STIFFLY_DAMPED = replace(SOFT, mass_damping=0.0, stiffness_damping=0.05)
+
+
+def test_midpoint_keeps_the_energy_of_small_vibrations_and_the_others_lose_some():
+    remaining = {}
+    for integrator in INTEGRATORS:
+        simulator = Simulator(CLAMPED, SOFT_UNDAMPED, 0.005, WEIGHTLESS, integrator, solver=TIGHT)
+        tip = torch.as_tensor(select_vertices(MESH, x=0.04))
+        force = torch.zeros_like(simulator.rest_state().q)
+        force[:, tip, 2] = 1e-4
+        state = simulator.static_equilibrium(force)
+        q = simulator.rollout(state, 200).q[:, 0, tip, 2].mean(-1) - float(state.q[0, tip, 2].mean())
+        centre = -(float(state.q[0, tip, 2].mean()) - float(simulator.rest_positions[tip, 2].mean()))
+        swings = (q - centre).abs()
+        remaining[integrator] = float(swings[150:].max() / swings[:50].max())
+    assert remaining["midpoint"] > 0.98
+    assert remaining["implicit_euler"] < 0.2
+    assert remaining["implicit_euler"] < remaining["bdf2"] < 0.98
+
+
+def test_stiffness_damping_matches_modal_damping_of_small_vibrations():
+    """A single mode decays as exp(-beta omega^2 t / 2)."""
+    beta, h = 2e-3, 5e-4
+    material = replace(SOFT_UNDAMPED, stiffness_damping=beta)
+    loose = SolverSettings("newton", relative_tolerance=1e-7)
+    simulator = Simulator(CLAMPED, material, h, WEIGHTLESS, "midpoint", solver=loose)
+    undamped = replace(simulator, material=SOFT_UNDAMPED, gravity=(0.0, 0.0, -1e-3))
+    undamped.static_equilibrium()  # sets the potential's stiffness
+    potential = undamped.workspace(1).potential
+    potential.positions.copy_(simulator.rest_positions)
+    potential.update_tangent()
+    free = np.setdiff1d(np.arange(potential.n_vertices), CLAMPED.fixed_vertices)
+    columns = []
+    for dof in (3 * free[:, None] + np.arange(3)).ravel():
+        unit = torch.zeros(1, potential.n_vertices * 3, dtype=torch.float64)
+        unit[0, dof] = 1.0
+        product = potential.stiffness_product(unit.view(1, -1, 3))
+        columns.append(product[0, free].reshape(-1).numpy())
+    stiffness = np.stack(columns, axis=1)
+    mass = np.repeat(simulator.prepare().mass[0, free].numpy(), 3)
+    values, vectors = np.linalg.eigh(stiffness / np.sqrt(mass[:, None] * mass))
+    omega, mode = np.sqrt(values[0]), vectors[:, 0] / np.sqrt(mass)
+    state = simulator.rest_state()
+    shape = torch.zeros_like(state.q)
+    shape[0, free] = torch.as_tensor(mode.reshape(-1, 3))
+    start = State(state.q + 1e-5 * shape / shape.abs().max(), state.v)
+    steps = round(2 * np.pi / omega / h) * 3
+    q = simulator.rollout(start, steps).q[:, 0] - simulator.rest_positions
+    amplitude = (q * shape).sum((1, 2)) / (q[0] * shape).sum()
+    time = h * np.arange(steps + 1)
+    rate = beta * omega**2 / 2
+    frequency = np.sqrt(omega**2 - rate**2)
+    expected = np.exp(-rate * time) * (np.cos(frequency * time) + rate / frequency * np.sin(frequency * time))
+    assert 0.01 < rate / omega < 0.2
+    np.testing.assert_allclose(amplitude, expected, atol=5e-3)
+
+
+def test_clamp_moves_as_told_and_takes_the_body_along():
+    for integrator in INTEGRATORS:
+        simulator = Simulator(CLAMPED, SOFT, 0.01, WEIGHTLESS, integrator, solver=TIGHT)
+        state = simulator.rest_state()
+        targets = state.q[:, simulator.fixed] + 1e-3 * torch.arange(1, 61)[:, None, None, None].clamp(max=20)
+        trajectory = simulator.rollout(state, 60, fixed_positions=targets)
+        torch.testing.assert_close(trajectory.q[1:, :, simulator.fixed], targets, rtol=0.0, atol=1e-12)
+        shift = trajectory.q[-1, 0] - simulator.rest_positions
+        assert float((shift - 0.02).abs().max()) < 2e-3
+
+
+@pytest.mark.parametrize("mesh", [MESH, box_tetrahedra((0.04, 0.02, 0.02), (2, 1, 1), 2)], ids=["hex", "tet10"])
+def test_point_mass_weighs_and_slows(mesh):
+    """A body of no weight of its own with a mass on its tip face is a spring: omega^2 = k / m."""
+    tip, grams = select_vertices(mesh, x=0.04), 0.05
+    body = Body(mesh, fixed=select_vertices(mesh, x=0.0), point_masses=[PointMass(grams, tip)])
+    light = Material(2e4, 0.3, 1e-3)
+    g, h = 1e-2, 1e-3
+    simulator = Simulator(body, light, h, (0.0, 0.0, -g), "midpoint", solver=TIGHT)
+    np.testing.assert_allclose(simulator.prepare().mass.sum() - grams, 1e-3 * 1.6e-5, rtol=1e-6)
+    sag = -float((simulator.static_equilibrium().q[0] - simulator.rest_positions)[tip, 2].mean())
+    bare = Simulator(Body(mesh, fixed=body.fixed), light, h, WEIGHTLESS, solver=TIGHT)
+    force = torch.zeros_like(bare.rest_state().q)
+    force[:, tip, 2] = -grams * g / len(tip)
+    pulled = -float((bare.static_equilibrium(force).q[0] - bare.rest_positions)[tip, 2].mean())
+    assert sag == pytest.approx(pulled, rel=1e-4)
+    omega = np.sqrt(g / sag)  # k / m
+    quarter = round(np.pi / omega / h)
+    q = simulator.rollout(simulator.rest_state(), quarter).q[:, 0, tip, 2].mean(-1)
+    drop = float(simulator.rest_positions[tip, 2].mean() - q[-1])
+    assert drop == pytest.approx(2 * sag, rel=0.02)  # half a period after the release: twice the sag
+
+
+def test_rollout_goes_on_from_its_final_state():
+    for integrator in INTEGRATORS:
+        simulator = Simulator(CLAMPED, SOFT, 0.01, integrator=integrator, solver=TIGHT)
+        whole = simulator.rollout(simulator.rest_state(), 6)
+        first = simulator.rollout(simulator.rest_state(), 3)
+        second = simulator.rollout(first.final, 3)
+        torch.testing.assert_close(second.q[-1], whole.q[-1], rtol=0.0, atol=1e-12)
+
+
+def test_unknown_integrator_is_refused():
+    with pytest.raises(InputError, match="integrator is 'rk4': choose one of implicit_euler, bdf2, midpoint"):
+        Simulator(CLAMPED, integrator="rk4")

@@ -1,0 +1,242 @@
+"""The three nonlinear solvers: agreement, failures, batches."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from warp_resphys import Body, Material, Simulator, SolverSettings, State, box_hexahedra, select_vertices
+from warp_resphys.dynamics.nonlinear_solver import SOLVERS
+from warp_resphys.io.errors import ConvergenceError, InputError
+from warp_resphys.linalg.lbfgs import InverseHessianUpdate
+from warp_resphys.studies.gradient_check import pose
+
+MESH = box_hexahedra((0.06, 0.02, 0.02), (4, 2, 2))
+BODY = Body(MESH, fixed=select_vertices(MESH, x=0.0))
+MATERIAL = Material(1e5, 0.45, 1000.0, stiffness_damping=1e-3)
+
+
+def simulator(name="quasi_newton", material=MATERIAL, body=BODY, device="cpu", **settings):
+    chosen = SolverSettings(name, **({"relative_tolerance": 1e-9} | settings))
+    return Simulator(body, material, solver=chosen, device=device)
+
+
+@pytest.mark.parametrize("start", ["bent", "twisted"])
+@pytest.mark.parametrize("model", ["corotated", "stable_neo_hookean"])
+def test_all_solvers_find_the_same_trajectory(model, start, device):
+    material = replace(MATERIAL, model=model)
+    results = {}
+    for name in SOLVERS:
+        s = simulator(name, material, device=device, max_iterations=5000)
+        trajectory = s.rollout(pose(s, start, 2), 4)
+        assert all(bool(r.converged.all()) for r in trajectory.reports)
+        assert all(float(r.relative_residual.max()) <= 1e-9 for r in trajectory.reports)
+        results[name] = trajectory.q
+    for name in SOLVERS[1:]:
+        torch.testing.assert_close(results[name], results[SOLVERS[0]], rtol=0.0, atol=1e-9)
+
+
+def test_linear_solvers_find_the_same_step():
+    results = []
+    for kind in ("banded", "dense", "sparse"):
+        s = simulator(linear_solver=kind)
+        results.append(s.step(pose(s, "bent", 2))[0].q)
+    torch.testing.assert_close(results[1], results[0], rtol=0.0, atol=1e-10)
+    torch.testing.assert_close(results[2], results[0], rtol=0.0, atol=1e-10)
+
+
+def test_solver_finds_the_minimum_and_reports_it():
+    s = simulator("newton", relative_tolerance=1e-10)
+    state = pose(s, "twisted", 1)
+    new, report = s.step(state)
+    potential = s.workspace(1).potential
+    potential.positions.copy_(new.q)
+    energy, balance = potential.evaluate()
+    residual = float(torch.linalg.vector_norm(potential.residual))
+    scale = float(balance) + float(torch.linalg.vector_norm(potential.force))
+    assert residual / scale == pytest.approx(float(report.relative_residual), rel=1e-6, abs=1e-13)
+    assert 2 <= int(report.iterations) <= 30
+    noise = torch.randn(new.q.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    potential.positions.copy_(new.q + 1e-5 * noise * potential.free_mask[:, None])
+    assert float(potential.evaluate()[0]) > float(energy)
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_failure_carries_the_last_positions_and_the_report(name):
+    s = simulator(name, max_iterations=1)
+    easy = s.rest_state(1)
+    hard = pose(s, "twisted", 1)
+    state = State(torch.cat([easy.q, hard.q]), torch.cat([easy.v, hard.v]))
+    with pytest.raises(ConvergenceError, match=f"the {name} solver stopped after 1 iterations") as caught:
+        s.step(state)
+    error = caught.value
+    assert error.positions.shape == (2, BODY.n_vertices, 3)
+    assert bool(torch.isfinite(error.positions).all())
+    assert not bool(error.report.converged[1])
+    assert float(error.report.relative_residual[1]) > 1e-9
+    assert "take a smaller time step" in str(error)
+
+
+def test_failures_are_counted_when_asked_for_and_the_simulation_goes_on():
+    s = simulator("newton", max_iterations=1, on_failure="count")
+    trajectory = s.rollout(pose(s, "twisted", 2), 3)
+    failed = torch.stack([~r.converged for r in trajectory.reports])
+    assert failed.shape == (3, 2)
+    assert bool(failed.any())
+    assert bool(torch.isfinite(trajectory.q).all())
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_batch_of_different_states_and_materials_equals_single_runs(name, device):
+    size, steps = 8, 3
+    generator = torch.Generator().manual_seed(0)
+
+    def spread(value, share):
+        return value * (1 + share * torch.rand(size, 1, generator=generator, dtype=torch.float64))
+
+    constants = {
+        "youngs_modulus": spread(1e5, 1.0),
+        "poissons_ratio": spread(0.4, 0.2),
+        "density": spread(1000.0, 0.5),
+    }
+    damping = {"mass_damping": spread(1.0, 1.0)[:, 0], "stiffness_damping": spread(1e-3, 1.0)[:, 0]}
+    s = simulator(name, relative_tolerance=1e-10, max_iterations=20000, device=device)
+    start = pose(s, "bent", size)
+    forces = s.tensor(1e-3 * torch.randn(steps, *start.q.shape, generator=generator, dtype=torch.float64))
+    together = s.rollout(start, steps, forces, material=Material(**constants, **damping))
+    for i in range(size):
+        own = {key: float(value[i]) for key, value in (constants | damping).items()}
+        state = State(start.q[i : i + 1], start.v[i : i + 1])
+        alone = s.rollout(state, steps, forces[:, i : i + 1], material=Material(**own))
+        torch.testing.assert_close(together.q[:, i], alone.q[:, 0], rtol=0.0, atol=1e-10)
+        torch.testing.assert_close(together.v[:, i], alone.v[:, 0], rtol=0.0, atol=1e-8)
+
+
+def test_material_per_element_equals_scalar_where_constant():
+    s = simulator(relative_tolerance=1e-10)
+    elements = len(MESH.cells)
+    spread = replace(
+        MATERIAL,
+        youngs_modulus=torch.full((elements,), 1e5, dtype=torch.float64),
+        poissons_ratio=torch.full((elements,), 0.45, dtype=torch.float64),
+        density=torch.full((elements,), 1000.0, dtype=torch.float64),
+    )
+    state = pose(s, "bent", 1)
+    torch.testing.assert_close(s.step(state, material=spread)[0].q, s.step(state)[0].q, rtol=0.0, atol=1e-12)
+    stiff_half = 1e5 * torch.where(torch.arange(elements) < elements // 2, 4.0, 1.0)
+    tip = select_vertices(MESH, x=0.06)
+    sags = [
+        float(s.static_equilibrium(material=replace(MATERIAL, youngs_modulus=e)).q[0, tip, 2].mean())
+        for e in (1e5, stiff_half, 4e5)
+    ]
+    assert sags[0] < sags[1] < sags[2]
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_float32_runs_and_agrees(name, device):
+    double = simulator(name, device=device, max_iterations=5000)
+    single = Simulator(
+        BODY,
+        MATERIAL,
+        solver=SolverSettings(name, relative_tolerance=1e-3, max_iterations=500),
+        dtype=torch.float32,
+        device=device,
+    )
+    reference = double.rollout(pose(double, "bent", 2), 3).q
+    found = single.rollout(pose(single, "bent", 2), 3)
+    assert found.q.dtype == torch.float32
+    torch.testing.assert_close(found.q.double(), reference, rtol=0.0, atol=2e-5)
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("offset", [0.0, 1.0])
+def test_a_body_on_which_nothing_acts_converges_at_once(name, dtype, offset):
+    """Its residual is rounding, and so are the forces that it would be measured against."""
+    s = Simulator(BODY, Material(264e3, 0.499, 1070.0), gravity=(0.0, 0.0, 0.0), solver=name, dtype=dtype)
+    rest = s.rest_state(2)
+    trajectory = s.rollout(State(rest.q + offset, rest.v), 3)
+    assert max(int(report.iterations.max()) for report in trajectory.reports) <= 10
+    moved = trajectory.q[-1] - offset - s.rest_positions
+    assert float(moved.abs().max()) < 200 * torch.finfo(dtype).eps * (0.06 + offset)
+
+
+def test_quasi_newton_reuses_its_factor_and_newton_does_not():
+    counts = {}
+    for name in ("quasi_newton", "newton"):
+        s = simulator(name, relative_tolerance=1e-6)
+        reports = s.rollout(pose(s, "bent", 1), 6).reports
+        counts[name] = sum(r.factorisations for r in reports)
+        iterations = sum(int(r.iterations) for r in reports)
+        if name == "newton":
+            assert counts[name] >= iterations
+    assert counts["quasi_newton"] < counts["newton"]
+
+
+@pytest.mark.parametrize("name", ["quasi_newton", "newton"])
+def test_recovers_from_inverted_elements(name):
+    s = simulator(name, max_iterations=500)
+    rest = s.rest_state(1)
+    q = rest.q.clone()
+    tip = torch.as_tensor(select_vertices(MESH, x=0.06))
+    q[:, tip, 0] -= 0.02  # the last layer is 0.015 thick
+    trajectory = s.rollout(State(q, rest.v), 40)
+    spread = trajectory.q[-1, 0, tip, 0].mean() - trajectory.q[-1, 0, :, 0].min()
+    assert float(spread) > 0.04
+
+
+@pytest.mark.parametrize("model", ["corotated", "stable_neo_hookean"])
+def test_auxetic_material_runs_with_all_solvers(model):
+    results = []
+    for name in SOLVERS:
+        s = simulator(name, Material(1e5, -0.3, 1000.0, model=model), max_iterations=5000)
+        results.append(s.rollout(pose(s, "bent", 1), 3).q)
+    torch.testing.assert_close(results[1], results[0], rtol=0.0, atol=1e-9)
+    torch.testing.assert_close(results[2], results[0], rtol=0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"name": "gauss"}, "solver is 'gauss': choose one of projective_dynamics, quasi_newton, newton"),
+        ({"relative_tolerance": 0.0}, "solver.relative_tolerance is 0.0: it must be positive"),
+        ({"relative_tolerance": float("nan")}, "solver.relative_tolerance is nan"),
+        ({"absolute_tolerance": -1.0}, "solver.absolute_tolerance is -1.0: it must be zero or more"),
+        ({"max_iterations": 0}, "solver.max_iterations is 0: it must be positive"),
+        ({"memory": -1}, "solver.memory is -1: it must be positive"),
+        ({"refactor_after": 0}, "solver.refactor_after is 0"),
+        ({"on_failure": "ignore"}, "solver.on_failure is 'ignore': choose raise or count"),
+    ],
+)
+def test_bad_settings_are_refused(settings, message):
+    with pytest.raises(InputError, match=message):
+        SolverSettings(**settings)
+
+
+class DiagonalMetric:
+    def __init__(self, inverse):
+        self.inverse = inverse
+
+    def apply(self, residual):
+        return self.inverse * residual
+
+
+def test_compact_updates_equal_the_bfgs_formula():
+    """More pairs than memory, one of them of negative curvature in one environment."""
+    generator = torch.Generator().manual_seed(0)
+    like = torch.zeros(2, 3, 3, dtype=torch.float64)
+    update, inverse = InverseHessianUpdate(3, like), 1.0 + torch.rand(2, 9, generator=generator, dtype=like.dtype)
+    pairs = torch.randn(5, 2, 2, 9, generator=generator, dtype=like.dtype)
+    pairs[:, 1] = 2.0 * pairs[:, 0] + 0.3 * pairs[:, 1]
+    pairs[3, 1, 1] *= -1.0
+    for s, y in pairs:
+        update.add(s, y)
+    residual = torch.randn(2, 9, generator=generator, dtype=like.dtype)
+    found = update.apply(residual, DiagonalMetric(inverse))
+    for b in range(2):
+        h = torch.diag(inverse[b])
+        for s, y in pairs[-3:, :, b]:
+            if s @ y > 0:
+                left = torch.eye(9, dtype=like.dtype) - torch.outer(s, y) / (s @ y)
+                h = left @ h @ left.T + torch.outer(s, s) / (s @ y)
+        torch.testing.assert_close(found[b], h @ residual[b], rtol=1e-10, atol=1e-12)

@@ -1,0 +1,86 @@
+"""What must never pass in silence: masks taken for indices, failures for results, settings that no longer hold."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from warp_resphys import Body, Material, Simulator, SolverSettings, State, box_hexahedra, select_vertices
+from warp_resphys.io.errors import ConvergenceError, InputError
+from warp_resphys.linalg.linear_solver import make_linear_solver
+
+MESH = box_hexahedra((0.06, 0.03, 0.03), (2, 1, 1))
+CLAMPED = Body(MESH, fixed=select_vertices(MESH, x=0.0))
+RUBBER = Material(264e3, 0.45)
+
+
+@pytest.mark.parametrize("fixed", [MESH.vertices[:, 0] == 0.0, [0.7], "abc"])
+def test_only_vertex_numbers_are_fixed(fixed):
+    with pytest.raises(InputError, match="fixed vertices must be vertex numbers"):
+        Body(MESH, fixed=fixed)
+
+
+def test_statics_never_return_a_failure():
+    settings = SolverSettings(max_iterations=1, on_failure="count")
+    with pytest.raises(ConvergenceError):
+        Simulator(CLAMPED, RUBBER, solver=settings).static_equilibrium()
+
+
+def test_a_clamp_moved_at_constant_speed_has_that_velocity_with_every_integrator():
+    for integrator in ("implicit_euler", "bdf2", "midpoint"):
+        sim = Simulator(CLAMPED, RUBBER, integrator=integrator)
+        speed = torch.tensor([0.0, 0.1, 0.0], dtype=torch.float64)
+        shift = sim.time_step * torch.arange(1, 5)[:, None, None, None] * speed
+        start = sim.rest_state()
+        start = State(start.q, speed.expand_as(start.q).clone())
+        trajectory = sim.rollout(start, 4, fixed_positions=start.q[:, sim.fixed] + shift)
+        torch.testing.assert_close(trajectory.v[:, :, sim.fixed], speed.expand(5, 1, len(sim.fixed), 3))
+
+
+def test_overflow_is_not_convergence():
+    sim = Simulator(CLAMPED, RUBBER, solver=SolverSettings(on_failure="count", max_iterations=5))
+    force = torch.zeros_like(sim.rest_positions)[None]
+    force[0, -1, 0] = 1e200
+    _, report = sim.step(sim.rest_state(), force)
+    assert not report.converged.any()
+
+
+@pytest.mark.parametrize("linear_solver", ["banded", "dense", "sparse"])
+def test_a_singular_system_is_a_convergence_error_with_every_linear_solver(linear_solver):
+    hinged = Body(MESH, fixed=[0])
+    sim = Simulator(hinged, RUBBER, solver=SolverSettings(linear_solver=linear_solver, max_iterations=20))
+    with pytest.raises(ConvergenceError):
+        sim.static_equilibrium()
+
+
+def test_a_singular_adjoint_is_an_error():
+    sim = Simulator(Body(MESH, fixed=[0]), RUBBER, gravity=(0.0, 0.0, 0.0))
+    force = torch.zeros(1, len(MESH.vertices), 3, dtype=torch.float64, requires_grad=True)
+    state = sim.static_equilibrium(force)
+    with pytest.raises(ConvergenceError, match="adjoint system is singular"):
+        state.q[0, -1, 2].backward()
+
+
+def test_a_simulator_is_constant():
+    sim = Simulator(CLAMPED, RUBBER)
+    with pytest.raises(AttributeError, match="a simulator is constant"):
+        sim.gravity = (0.0, 0.0, 0.0)
+    assert dataclasses.replace(sim, gravity=(0.0, 0.0, 0.0)).prepare().weight.abs().max() == 0.0
+
+
+def test_states_of_another_type_are_refused():
+    sim = Simulator(CLAMPED, RUBBER)
+    state = sim.rest_state()
+    with pytest.raises(InputError, match=r"state.q is torch.float32 on cpu: it must be torch.float64"):
+        sim.step(State(state.q.float(), state.v))
+    with pytest.raises(InputError, match=r"state.q is a ndarray: it must be a torch tensor"):
+        sim.step(State(state.q.numpy(), state.v))
+    with pytest.raises(InputError, match="steps is -3"):
+        sim.rollout(state, -3)
+
+
+def test_a_matrix_beyond_32_bit_addresses_is_refused():
+    nodes = np.arange(20_000)
+    with pytest.raises(InputError, match=r"choose solver.linear_solver=sparse"):
+        make_linear_solver("dense", nodes, nodes, len(nodes), 3, torch.device("cpu"), torch.float64)

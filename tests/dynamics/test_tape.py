@@ -1,0 +1,263 @@
+import gc
+import weakref
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from warp_resphys import Body, Material, Simulator, State, box_hexahedra
+from warp_resphys.dynamics.tape import record_rollout
+from warp_resphys.energies.launcher import warp_view
+from warp_resphys.io.errors import InputError
+
+BATCH, STEPS = 2, 3
+
+
+@wp.kernel(module="test_tape")
+def push(strength: wp.array[wp.float64], force_out: wp.array3d[wp.vec3d]):
+    """A force whose strength the tape differentiates, along z at every vertex."""
+    t, b, i = wp.tid()
+    phase = wp.float64(t + 2 * b) + wp.float64(0.3) * wp.float64(i)
+    force_out[t, b, i] = wp.vec3d(wp.float64(0.0), wp.float64(0.0), strength[b] * wp.cos(phase))
+
+
+@wp.kernel(module="test_tape")
+def add_squares(q: wp.array3d[wp.vec3d], rest: wp.array2d[wp.vec3d], loss: wp.array[wp.float64]):
+    """Sum over all times of the squared displacement."""
+    t, b, i = wp.tid()
+    u = q[t, b, i] - rest[b, i]
+    wp.atomic_add(loss, 0, wp.dot(u, u))
+
+
+def make_simulator(device: str, integrator: str = "implicit_euler") -> Simulator:
+    mesh = box_hexahedra((0.04, 0.02, 0.02), (2, 1, 1))
+    material = Material(1e5, 0.4, 1000.0, mass_damping=0.5, stiffness_damping=0.001)
+    clamped = np.flatnonzero(mesh.vertices[:, 0] == 0.0)
+    return Simulator(Body(mesh, clamped), material, integrator=integrator, relative_tolerance=1e-11, device=device)
+
+
+def array(tensor: torch.Tensor, dtype: type = wp.vec3d) -> wp.array:
+    """A Warp array of its own with a gradient."""
+    device = wp.device_from_torch(tensor.device)
+    return wp.array(tensor.cpu().numpy(), dtype=dtype, device=device, requires_grad=True)
+
+
+def moving_state(simulator: Simulator) -> State:
+    random = torch.Generator().manual_seed(3)
+    noise = simulator.tensor(torch.randn(2, BATCH, simulator.body.n_vertices, 3, generator=random))
+    free = simulator.rest_positions[:, :1] / simulator.rest_positions[:, 0].max()
+    return State(simulator.rest_positions + 5e-4 * free * noise[0], 0.05 * free * noise[1])
+
+
+@pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
+def test_gradients_equal_those_of_torch(device: str, integrator: str) -> None:
+    simulator = make_simulator(device, integrator)
+    state = moving_state(simulator)
+    random = torch.Generator().manual_seed(4)
+    shape = (STEPS, BATCH, simulator.body.n_vertices, 3)
+    inputs = {
+        "q": state.q,
+        "v": state.v,
+        "external_forces": simulator.tensor(1e-3 * torch.randn(shape, generator=random)),
+        "fixed_positions": (state.q[:, simulator.fixed] + 1e-4).expand(STEPS, -1, -1, -1).clone(),
+        "youngs_modulus": simulator.tensor([1.1e5, 0.9e5]),  # an element
+        "poissons_ratio": simulator.tensor([[0.35], [0.42]]),  # an environment
+        "density": simulator.tensor([1050.0]),
+        "mass_damping": simulator.tensor([0.4]),
+        "stiffness_damping": simulator.tensor([0.002]),
+    }
+    weights = simulator.tensor(torch.randn(2, STEPS + 1, *shape[1:], generator=random))
+
+    leaves = {name: value.clone().requires_grad_(True) for name, value in inputs.items()}
+    material = replace(simulator.material, **{k: leaves[k] for k in list(inputs)[4:]})
+    trajectory = simulator.rollout(
+        State(leaves["q"], leaves["v"]), STEPS, leaves["external_forces"], leaves["fixed_positions"], material
+    )
+    loss = (weights[0] * trajectory.q).sum() + (weights[1] * trajectory.v).sum()
+    expected = torch.autograd.grad(loss, list(leaves.values()))
+
+    arrays = {name: array(value, wp.vec3d if value.ndim > 2 else wp.float64) for name, value in inputs.items()}
+    tape = wp.Tape()
+    rollout = record_rollout(
+        tape,
+        make_simulator(device, integrator),  # a fresh one, with no factor left from the roll-out above
+        arrays["q"],
+        arrays["v"],
+        STEPS,
+        external_forces=arrays["external_forces"],
+        fixed_positions=arrays["fixed_positions"],
+        parameters={name: arrays[name] for name in list(inputs)[4:]},
+    )
+    assert len(rollout.reports) == STEPS
+    seeds = [wp.from_torch(w.contiguous(), dtype=wp.vec3d) for w in weights]
+    tape.backward(grads={rollout.q: seeds[0], rollout.v: seeds[1]})
+    for (name, value), wanted in zip(arrays.items(), expected, strict=True):
+        got = wp.to_torch(value.grad)
+        assert torch.linalg.norm(got - wanted) <= 1e-12 * torch.linalg.norm(wanted), name
+        assert torch.linalg.norm(wanted) > 0.0, name
+
+
+def taped_loss(simulator: Simulator, strength: wp.array, modulus: wp.array) -> tuple[wp.Tape, wp.array]:
+    """The loss kernel of a roll-out under the force kernel, on a tape."""
+    state = simulator.rest_state(BATCH)
+    n, device = simulator.body.n_vertices, strength.device
+    q, v = array(state.q), array(state.v)
+    rest = array(state.q)
+    force = wp.zeros((STEPS, BATCH, n), dtype=wp.vec3d, device=device, requires_grad=True)
+    loss = wp.zeros(1, dtype=wp.float64, device=device, requires_grad=True)
+    with wp.Tape() as tape:
+        wp.launch(push, dim=force.shape, inputs=[strength], outputs=[force], device=device)
+        rollout = record_rollout(
+            tape, simulator, q, v, STEPS, external_forces=force, parameters={"youngs_modulus": modulus}
+        )
+        wp.launch(add_squares, dim=rollout.q.shape, inputs=[rollout.q, rest], outputs=[loss], device=device)
+    return tape, loss
+
+
+@pytest.fixture
+def problem(device: str) -> tuple[Simulator, wp.array, wp.array]:
+    simulator = make_simulator(device)
+    strength = array(simulator.tensor([2e-2, -1e-2]), wp.float64)
+    return simulator, strength, array(simulator.tensor([1e5]), wp.float64)
+
+
+def test_mixed_tape_against_central_differences(problem: tuple[Simulator, wp.array, wp.array]) -> None:
+    simulator, strength, modulus = problem
+    tape, loss = taped_loss(simulator, strength, modulus)
+    tape.backward(loss)
+
+    def difference(value: wp.array, entry: int, change: float) -> float:
+        losses = []
+        for sign in (1.0, -1.0):
+            moved = value.numpy().copy()
+            moved[entry] += sign * change
+            other = wp.array(moved, dtype=wp.float64, device=value.device, requires_grad=True)
+            given = [other if a is value else a for a in (strength, modulus)]
+            losses.append(float(taped_loss(simulator, *given)[1].numpy()[0]))
+        return (losses[0] - losses[1]) / (2.0 * change)
+
+    for entry in range(BATCH):
+        assert strength.grad.numpy()[entry] == pytest.approx(difference(strength, entry, 1e-5), rel=1e-6)
+    assert modulus.grad.numpy()[0] == pytest.approx(difference(modulus, 0, 30.0), rel=1e-5)
+
+
+def test_gradients_accumulate_and_can_be_zeroed(problem: tuple[Simulator, wp.array, wp.array]) -> None:
+    simulator, strength, modulus = problem
+    tape, loss = taped_loss(simulator, strength, modulus)
+    tape.backward(loss)
+    once = strength.grad.numpy().copy(), modulus.grad.numpy().copy()
+    assert all(np.abs(g).min() > 0.0 for g in once)
+    tape.backward(loss)
+    for value, gradient in zip((strength, modulus), once, strict=True):
+        np.testing.assert_allclose(value.grad.numpy(), 2.0 * gradient, rtol=1e-12)
+    tape.zero()
+    assert not strength.grad.numpy().any()
+    assert not modulus.grad.numpy().any()
+    tape.backward(loss)
+    for value, gradient in zip((strength, modulus), once, strict=True):
+        np.testing.assert_allclose(value.grad.numpy(), gradient, rtol=1e-12)
+    other, loss = taped_loss(simulator, strength, modulus)
+    other.backward(loss)
+    np.testing.assert_allclose(modulus.grad.numpy(), 2.0 * once[1], rtol=1e-7)
+
+
+@pytest.mark.parametrize("integrator", ["midpoint", "bdf2"])
+def test_two_roll_outs_on_one_tape_are_one(device: str, integrator: str) -> None:
+    simulator = make_simulator(device, integrator)
+    state = moving_state(simulator)
+
+    def gradients(parts: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        q, v = array(state.q), array(state.v)
+        density = array(simulator.tensor([1000.0]), wp.float64)
+        tape = wp.Tape()
+        now: tuple[wp.array, wp.array] = (q, v)
+        before = None
+        for steps in parts:
+            rollout = record_rollout(tape, simulator, *now, steps, previous=before, parameters={"density": density})
+            now, before = (rollout.q[-1], rollout.v[-1]), (rollout.q[-2], rollout.v[-2])
+        rollout.q.grad[-1].fill_(1.0)
+        rollout.v.grad[-1].fill_(0.01)
+        tape.backward()
+        return rollout.q.numpy()[-1], q.grad.numpy(), density.grad.numpy()
+
+    whole, split = gradients((4,)), gradients((2, 2))
+    np.testing.assert_allclose(split[0], whole[0], atol=1e-10)
+    for a, b in zip(split[1:], whole[1:], strict=True):
+        np.testing.assert_allclose(a, b, rtol=0.0, atol=1e-7 * np.abs(b).max())
+
+
+def test_nothing_is_copied(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    simulator = make_simulator(device)
+    seen = {}
+    rollout_in_torch = simulator.rollout
+
+    def spy(state: State, steps: int, forces: torch.Tensor, fixed: None, material: Material, _: None) -> object:
+        trajectory = rollout_in_torch(state, steps, forces, fixed, material)
+        seen.update(q=state.q, v=state.v, force=forces, modulus=material.youngs_modulus)
+        seen.update(q_out=trajectory.q, v_out=trajectory.v)
+        return trajectory
+
+    monkeypatch.setattr(Simulator, "rollout", lambda self, *a, **k: spy(*a, **k))
+    state = simulator.rest_state(BATCH)
+    given = {"q": array(state.q), "v": array(state.v), "force": array(0.0 * state.q)}
+    given["modulus"] = array(simulator.tensor([1e5]), wp.float64)
+    rollout = record_rollout(
+        wp.Tape(),
+        simulator,
+        given["q"],
+        given["v"],
+        1,
+        external_forces=given["force"],
+        parameters={"youngs_modulus": given["modulus"]},
+    )
+    for name, value in {**given, "q_out": rollout.q, "v_out": rollout.v}.items():
+        assert seen[name].data_ptr() == value.ptr, name
+    potential = simulator.workspace(BATCH).potential
+    assert warp_view(potential.positions, wp.vec3d).ptr == potential.positions.data_ptr()
+    at_kernel = potential._inertia_command.params[-3:-1]  # positions in, residual out
+    assert [a.data for a in at_kernel] == [potential.positions.data_ptr(), potential.residual.data_ptr()]
+
+
+def test_a_dropped_tape_leaves_nothing_behind(device: str) -> None:
+    simulator = make_simulator(device)
+    state = simulator.rest_state(BATCH)
+    tape = wp.Tape()
+    force = array(0.0 * state.q)
+    rollout = record_rollout(tape, simulator, array(state.q), array(state.v), 1, external_forces=force)
+    rollout.q.grad.fill_(1.0)
+    tape.backward()
+    assert force.grad.numpy().any()
+    kept = weakref.ref(rollout.q)
+    del tape, rollout
+    gc.collect()
+    assert kept() is None
+
+
+def wrong_type(simulator: Simulator, q: wp.array, v: wp.array) -> None:
+    record_rollout(wp.Tape(), simulator, wp.zeros(q.shape, dtype=wp.vec3f, device=q.device), v, 1)
+
+
+def wrong_name(simulator: Simulator, q: wp.array, v: wp.array) -> None:
+    record_rollout(wp.Tape(), simulator, q, v, 1, parameters={"stiffness": v})
+
+
+def wrong_shape(simulator: Simulator, q: wp.array, v: wp.array) -> None:
+    record_rollout(wp.Tape(), simulator, q, v[:1], 1)
+
+
+@pytest.mark.parametrize(
+    ("call", "sentence"),
+    [
+        (wrong_type, "q must be a Warp array of vec3d"),
+        (wrong_name, "'stiffness' is no parameter"),
+        (wrong_shape, "state.v has shape"),
+    ],
+)
+def test_wrong_input_is_told(device: str, call: Callable[..., None], sentence: str) -> None:
+    simulator = make_simulator(device)
+    state = simulator.rest_state(BATCH)
+    with pytest.raises(InputError, match=sentence):
+        call(simulator, array(state.q), array(state.v))

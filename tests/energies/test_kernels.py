@@ -1,0 +1,294 @@
+"""Local step against an independent NumPy implementation: a single tetrahedron, any F, one F an environment."""
+
+import numpy as np
+import pytest
+import scipy.optimize
+import torch
+
+from warp_resphys import Body, Mesh, box_hexahedra, box_tetrahedra, select_vertices
+from warp_resphys.dynamics.assembly import BlockPattern, HessianAssembly
+from warp_resphys.energies.material import MODELS
+from warp_resphys.energies.potential import IncrementalPotential
+from warp_resphys.energies.terms import StepTerms
+from warp_resphys.linalg.linear_solver import make_linear_solver
+
+UNIT = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+TETRAHEDRON = Body(Mesh(UNIT, np.array([[0, 1, 2, 3]])), volume_integration="full")
+SHAPE, VOLUME = 3.0, 7.0
+
+
+def random_gradients(spread, count=10, seed=0):
+    return np.eye(3) + spread * np.random.default_rng(seed).normal(size=(count, 3, 3))
+
+
+GRADIENTS = np.concatenate(
+    [
+        np.eye(3)[None],
+        random_gradients(0.02),
+        random_gradients(0.3),
+        random_gradients(0.8),  # half of them inverted
+        [np.diag([1.0, 1.2, 0.0]), np.diag([1.1, 0.9, -0.2]), np.diag([0.4, 0.5, 0.6])],
+    ]
+)
+
+
+def unit_potential(gradients, model="corotated", shape=SHAPE, volume=VOLUME, viscosity=0.0, reference=None, **where):
+    """Potential of the unit tetrahedron, whose residual on vertices 1 to 3 is V times the stress's columns."""
+    count = len(gradients)
+    where = {"device": torch.device("cpu"), "dtype": torch.float64} | where
+    potential = IncrementalPotential(TETRAHEDRON, MODELS[model], count, **where)
+
+    def full(value, *size):
+        return torch.full((count, *size), float(value), **where)
+
+    strain = None if reference is None else torch.as_tensor(reference, **where).reshape(count, 1, 3, 3)
+    terms = [full(0, 4, 3), full(0, 4), full(0, 4, 3), full(shape, 1), full(volume, 1), full(viscosity)]
+    potential.set_terms(StepTerms(*terms, strain))
+    potential.positions.copy_(torch.as_tensor(UNIT @ gradients.transpose(0, 2, 1), **where))
+    return potential
+
+
+def stress_and_energy(gradients, *args, **kwargs):
+    potential = unit_potential(gradients, *args, **kwargs)
+    energy, _ = potential.evaluate()
+    return potential.residual[:, 1:].mT.cpu().numpy(), energy.cpu().numpy()
+
+
+def signed_svd(f):
+    u, s, vt = np.linalg.svd(f)
+    signs = np.array([1.0, 1.0, np.linalg.det(u)]), np.array([1.0, 1.0, np.linalg.det(vt)])
+    return u * signs[0], s * signs[0] * signs[1], vt * signs[1][:, None]
+
+
+def reference_unimodular(f):
+    """Minimises over log singular values from several starts."""
+    u, s, vt = signed_svd(f)
+
+    def distance(p):
+        d = np.exp([p[0], p[1], -p[0] - p[1]])
+        slope = 2 * (d - s) * d
+        return ((d - s) ** 2).sum(), np.array([slope[0] - slope[2], slope[1] - slope[2]])
+
+    starts = [(a, b) for a in (-0.7, 0.0, 0.7) for b in (-0.7, 0.0, 0.7)]
+    found = [scipy.optimize.minimize(distance, start, jac=True, options={"gtol": 1e-12}) for start in starts]
+    best = min(found, key=lambda result: result.fun).x
+    return u * np.exp([best[0], best[1], -best.sum()]) @ vt
+
+
+def cofactor(f):
+    return np.stack([np.cross(f[1], f[2]), np.cross(f[2], f[0]), np.cross(f[0], f[1])])
+
+
+def reference_energy(f, model):
+    if model == "corotated":
+        _, s, _ = signed_svd(f)
+        return SHAPE * ((s - 1) ** 2).sum() + VOLUME / 2 * ((f - reference_unimodular(f)) ** 2).sum()
+    j = np.linalg.det(f)
+    return SHAPE * (((f**2).sum() - 3) / 2 - (j - 1) + (j - 1) ** 2 / 2) + VOLUME / 2 * (j - 1) ** 2
+
+
+def test_polar_rotation_is_the_nearest_rotation(device):
+    stress, _ = stress_and_energy(GRADIENTS, shape=0.5, volume=0.0, device=torch.device(device))
+    wanted = [u @ vt for u, _, vt in map(signed_svd, GRADIENTS)]
+    np.testing.assert_allclose(GRADIENTS - stress, wanted, atol=1e-12)
+
+
+def test_nearest_unimodular_matrix_has_determinant_one_and_is_the_nearest(device):
+    stress, _ = stress_and_energy(GRADIENTS, shape=0.0, volume=1.0, device=torch.device(device))
+    nearest = GRADIENTS - stress
+    np.testing.assert_allclose(np.linalg.det(nearest), 1.0, atol=1e-9)
+    np.testing.assert_allclose(nearest, [reference_unimodular(f) for f in GRADIENTS], atol=1e-6)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_energies_equal_the_closed_form(model, device):
+    _, energy = stress_and_energy(GRADIENTS, model, device=torch.device(device))
+    np.testing.assert_allclose(energy, [reference_energy(f, model) for f in GRADIENTS], rtol=1e-9, atol=1e-14)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_stress_is_the_derivative_of_the_energy(model):
+    step, direction = 1e-5, np.random.default_rng(1).normal(size=GRADIENTS.shape)
+    stress, _ = stress_and_energy(GRADIENTS, model)
+    ahead, behind = (stress_and_energy(GRADIENTS + s * step * direction, model)[1] for s in (1, -1))
+    slope = np.einsum("nij,nij->n", stress, direction)
+    np.testing.assert_allclose((ahead - behind) / (2 * step), slope, rtol=2e-7, atol=2e-7)
+
+
+def viscous_energy(f, reference, viscosity, lame_factor):
+    rate = (f.transpose(0, 2, 1) @ f - np.eye(3)) / 2 - reference
+    squared = 2 * SHAPE * (rate**2).sum((1, 2)) + lame_factor * VOLUME * np.trace(rate, axis1=1, axis2=2) ** 2
+    return viscosity / 2 * squared
+
+
+@pytest.mark.parametrize(("model", "lame_factor"), [("corotated", 1 / 3), ("stable_neo_hookean", 1.0)])
+def test_viscous_stress_is_the_derivative_of_the_dissipation_potential(model, lame_factor):
+    rng = np.random.default_rng(2)
+    noise = rng.normal(scale=0.1, size=GRADIENTS.shape)
+    viscous = {"viscosity": 0.6, "reference": noise + noise.transpose(0, 2, 1)}
+    stress, energy = stress_and_energy(GRADIENTS, model, **viscous)
+    elastic_stress, elastic_energy = stress_and_energy(GRADIENTS, model)
+    arguments = (viscous["reference"], viscous["viscosity"], lame_factor)
+    np.testing.assert_allclose(energy - elastic_energy, viscous_energy(GRADIENTS, *arguments), rtol=1e-9, atol=1e-12)
+    step, direction = 1e-5, rng.normal(size=GRADIENTS.shape)
+    ahead, behind = (viscous_energy(GRADIENTS + s * step * direction, *arguments) for s in (1, -1))
+    slope = np.einsum("nij,nij->n", stress - elastic_stress, direction)
+    np.testing.assert_allclose((ahead - behind) / (2 * step), slope, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("viscosity", [0.0, 0.6])
+@pytest.mark.parametrize("model", MODELS)
+def test_tangent_is_the_derivative_of_the_stress(model, viscosity):
+    rng = np.random.default_rng(3)
+    noise = rng.normal(scale=0.1, size=GRADIENTS.shape)
+    viscous = {"viscosity": viscosity, "reference": noise + noise.transpose(0, 2, 1)}
+    direction, step = rng.normal(size=GRADIENTS.shape), 1e-6
+    potential = unit_potential(GRADIENTS, model, **viscous)
+    potential.update_tangent()
+    product = potential.stiffness_product(torch.as_tensor(UNIT @ direction.transpose(0, 2, 1)))[:, 1:].mT
+    ahead, behind = (stress_and_energy(GRADIENTS + s * step * direction, model, **viscous)[0] for s in (1, -1))
+    # Where F is flat or inverted the energies are stiffer and less smooth.
+    np.testing.assert_allclose(product, (ahead - behind) / (2 * step), rtol=1e-5, atol=2e-5)
+
+
+def dense_tangent(potential, positive=None):
+    """(B, 9, 9) dP/dF."""
+    potential.update_tangent(positive)
+    columns = []
+    for direction in np.eye(9).reshape(9, 3, 3):
+        moved = torch.as_tensor(UNIT @ direction.T).expand(potential.batch, -1, -1)
+        columns.append(potential.stiffness_product(moved)[:, 1:].mT.reshape(-1, 9))
+    return torch.stack(columns, dim=-1).numpy()
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_clamped_tangent_is_the_eigenvalue_clamp_at_every_point(model):
+    potential = unit_potential(GRADIENTS, model)
+    exact = dense_tangent(potential)
+    np.testing.assert_allclose(exact, exact.transpose(0, 2, 1), atol=1e-9 * np.abs(exact).max())
+    values, vectors = np.linalg.eigh(exact)
+    assert (values[:, 0] < -0.1).sum() > len(values) / 4  # otherwise there is nothing to clamp
+    wanted = np.einsum("nij,nj,nkj->nik", vectors, values.clip(0), vectors)
+    everywhere = torch.ones(potential.batch, dtype=torch.bool)
+    clamped = dense_tangent(potential, everywhere)
+    np.testing.assert_allclose(clamped, wanted, atol=1e-9 * np.abs(exact).max())
+
+
+def test_each_environment_is_clamped_on_its_own():
+    potential = unit_potential(np.stack([np.diag([0.3, 0.4, 0.5])] * 2))
+    exact = dense_tangent(potential)[1]
+    mixed = dense_tangent(potential, torch.tensor([True, False]))
+    assert np.linalg.eigvalsh(mixed[0]).min() > -1e-9
+    np.testing.assert_allclose(mixed[1], exact, atol=1e-12)
+    assert np.linalg.eigvalsh(exact).min() < -0.1
+
+
+def test_clamped_viscous_tangent_is_positive_semidefinite():
+    reference = np.tile(0.5 * np.eye(3), (len(GRADIENTS), 1, 1))  # compression rate: a negative geometric part
+    potential = unit_potential(GRADIENTS, viscosity=5.0, reference=reference)
+    everywhere = torch.ones(potential.batch, dtype=torch.bool)
+    assert np.linalg.eigvalsh(dense_tangent(potential)).min() < -1.0
+    assert np.linalg.eigvalsh(dense_tangent(potential, everywhere)).min() > -1e-9
+
+
+def test_collapsed_elements_stay_finite():
+    collapsed = np.stack([np.zeros((3, 3)), np.diag([1.0, 0, 0]), -np.eye(3), np.diag([1e3, 1e-3, -5])])
+    for model in MODELS:
+        stress, energy = stress_and_energy(collapsed, model)
+        assert np.isfinite(stress).all()
+        assert np.isfinite(energy).all()
+        assert np.isfinite(dense_tangent(unit_potential(collapsed, model))).all()
+
+
+def test_auxetic_material_has_a_negative_volume_term():
+    """A negative lambda (nu < 0) must not be taken for a missing term."""
+    plain, _ = stress_and_energy(GRADIENTS, volume=0.0)
+    positive, _ = stress_and_energy(GRADIENTS, volume=1.0)
+    negative, _ = stress_and_energy(GRADIENTS, volume=-1.0)
+    np.testing.assert_allclose(negative - plain, plain - positive, atol=1e-12)
+
+
+MESHES = {
+    "hexahedron": box_hexahedra((0.02, 0.02, 0.01), (2, 2, 1)),
+    "tetrahedron": box_tetrahedra((0.02, 0.01, 0.01), (2, 1, 1)),
+    "tetrahedron10": box_tetrahedra((0.02, 0.01, 0.01), (2, 1, 1), order=2),
+}
+
+
+def loaded_potential(mesh):
+    """Two environments of a deformed, damped body with inertia, its pattern, and its free degrees of freedom."""
+    body = Body(mesh, fixed=select_vertices(mesh, x=0.0))
+    b, n = 2, body.n_vertices
+    generator = torch.Generator().manual_seed(0)
+
+    def noise(*shape):
+        return torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+    potential = IncrementalPotential(body, MODELS["corotated"], b, torch.device("cpu"), torch.float64)
+    sets = body.discretisation.point_sets
+    volumes = [
+        np.concatenate([getattr(s, name).sum(axis=1) for s in sets]) for name in ("shape_volume", "volume_volume")
+    ]
+    stiffness = [torch.as_tensor(v) * (1.0 + noise(b, 1)) * scale for v, scale in zip(volumes, (1e5, 1e6), strict=True)]
+    strain = 0.01 * noise(b, potential.n_points, 3, 3)
+    potential.set_terms(
+        StepTerms(noise(b, n, 3), 1e4 * (1 + noise(b, n)), noise(b, n, 3), *stiffness, noise(b), strain + strain.mT)
+    )
+    potential.positions.copy_(torch.as_tensor(mesh.vertices) + 1e-3 * noise(b, n, 3))
+    pattern = BlockPattern(body)
+    dofs = (3 * pattern.free[:, None] + np.arange(3)).ravel()
+    return potential, pattern, dofs
+
+
+@pytest.mark.parametrize("kind", MESHES)
+def test_assembled_hessian_is_the_derivative_of_the_residual_in_every_layout(kind):
+    potential, pattern, dofs = loaded_potential(MESHES[kind])
+    size, step = 3 * potential.n_vertices, 1e-8
+    start = potential.positions.clone()
+    differences = np.zeros((2, len(dofs), len(dofs)))
+    for column, dof in enumerate(dofs):
+        moved = []
+        for sign in (1, -1):
+            potential.positions.copy_(start)
+            potential.positions.view(2, size)[:, dof] += sign * step
+            potential.evaluate()
+            moved.append(potential.residual.view(2, size)[:, dofs].numpy().copy())
+        differences[:, :, column] = (moved[0] - moved[1]) / (2 * step)
+    potential.positions.copy_(start)
+    potential.update_tangent()
+    right = torch.randn(2, len(dofs), 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    scale = np.abs(differences).max()
+    solutions = []
+    for layout in ("dense", "banded", "sparse"):
+        arguments = (pattern.rows, pattern.cols, len(pattern.free), 3, potential.device, potential.dtype)
+        solver = make_linear_solver(layout, *arguments)
+        values = HessianAssembly(potential, solver, pattern)()
+        if layout == "dense":
+            lower = values.view(2, len(dofs), len(dofs)).tril().numpy()
+            full = lower + np.tril(lower, -1).transpose(0, 2, 1)
+            np.testing.assert_allclose(full, differences, atol=1e-6 * scale)
+        factor = solver.factor(values)
+        assert not factor.failed.any()
+        solutions.append(factor.solve(right))
+        np.testing.assert_allclose(full @ solutions[-1].numpy(), right, atol=1e-8)
+    torch.testing.assert_close(solutions[1], solutions[0], rtol=1e-8, atol=1e-12)
+    torch.testing.assert_close(solutions[2], solutions[0], rtol=1e-8, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", MESHES)
+def test_float32_agrees_with_float64(kind):
+    mesh = MESHES[kind]
+    body = Body(mesh)
+    positions = mesh.vertices + 5e-4 * np.random.default_rng(0).random(mesh.vertices.shape)
+    residuals = []
+    for dtype in (torch.float64, torch.float32):
+        potential = IncrementalPotential(body, MODELS["corotated"], 1, torch.device("cpu"), dtype)
+        n, p = potential.n_vertices, potential.n_points
+        zeros = [torch.zeros(1, *shape, dtype=dtype) for shape in ((n, 3), (n,), (n, 3))]
+        ones = torch.ones(1, p, dtype=dtype)
+        potential.set_terms(StepTerms(*zeros, ones, ones, torch.zeros(1, dtype=dtype)))
+        potential.positions.copy_(torch.as_tensor(positions))
+        potential.evaluate()
+        residuals.append(potential.residual.double())
+    scale = float(residuals[0].abs().max())
+    torch.testing.assert_close(residuals[1], residuals[0], rtol=0.0, atol=1e-4 * scale)

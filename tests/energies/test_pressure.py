@@ -1,0 +1,301 @@
+"""Chambers, follower pressure and fibres."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from chambered import BRICK, KINDS, chambered, hollow_box
+
+from warp_resphys import Body, Material, Mesh, Simulator, SolverSettings, select_vertices
+from warp_resphys.dynamics.integrator import State
+from warp_resphys.dynamics.tape import record_rollout
+from warp_resphys.fem.surface_elements import Fibres, fibre_points
+from warp_resphys.io.errors import InputError, MeshError
+from warp_resphys.mesh.chambers import Chamber, check_chambers, find_chambers
+from warp_resphys.studies.gradient_check import check_gradients
+
+SOFT = Material(100e3, 0.45, 1070.0, mass_damping=0.5, stiffness_damping=2e-3)
+SEVEN = [(s * k, s * w) for s in (1, -1) for k, w in ((1, 3 / 4), (2, -3 / 20), (3, 1 / 60))]  # a stencil
+TIGHT = SolverSettings("newton", relative_tolerance=1e-10)
+
+
+def noise(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def simulator(kind="hexahedron", material=SOFT, fibres=None, **options):
+    return Simulator(chambered(kind, fibres=fibres), material, **({"solver": TIGHT} | options))
+
+
+def moved(s, batch=2, size=5e-4):
+    return s.rest_state(batch).q + size * noise(batch, s.body.n_vertices, 3)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_chambers_are_found_in_order_with_their_volumes(kind):
+    s = simulator(kind)
+    assert [c.name for c in s.body.chambers] == ["chamber_1", "chamber_2"]
+    volumes = s.chambers(1).volumes(s.rest_state().q)[0].numpy()
+    np.testing.assert_allclose(volumes, [2 * BRICK, BRICK], rtol=1e-12)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_volume_of_a_homogeneously_deformed_chamber(kind):
+    """Quadratic faces stay flat under an affine map, whose determinant scales the volume."""
+    s = simulator(kind)
+    f = torch.eye(3, dtype=torch.float64) + 0.3 * noise(3, 3)
+    q = s.rest_state().q @ f.mT + noise(3, seed=1)
+    volumes = s.chambers(1).volumes(q)[0] / torch.linalg.det(f)
+    np.testing.assert_allclose(volumes.numpy(), [2 * BRICK, BRICK], rtol=1e-11)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_pressure_in_a_closed_chamber_has_neither_force_nor_moment(kind):
+    s = simulator(kind)
+    q, pressure = moved(s), torch.tensor([[1e4, 2e4], [3e4, -1e4]], dtype=torch.float64)
+    force = s.chambers(2).force(q, pressure)
+    size = force.norm(dim=-1).sum(1)
+    assert bool((size > 1.0).all())
+    assert bool((force.sum(1).norm(dim=1) < 1e-13 * size).all())
+    assert bool((torch.linalg.cross(q, force).sum(1).norm(dim=1) < 1e-14 * size).all())
+
+
+def test_pressure_on_a_face_is_its_area_times_the_pressure_outwards():
+    s = simulator()
+    force = s.chambers(1).force(s.rest_state().q, torch.tensor([[1e4, 0.0]], dtype=torch.float64))[0]
+    face = np.intersect1d(select_vertices(s.body.mesh, x=0.03), s.body.chambers[0].vertices)
+    pushed = force[torch.as_tensor(face)].sum(0)
+    # The end of the chamber, 1 cm by 2/3 cm, and a sixth of each neighbouring side, which push apart.
+    np.testing.assert_allclose(pushed.numpy(), [1e4 * 0.01 * 0.02 / 3, 0.0, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_force_and_volume_have_exact_derivatives(kind):
+    s = simulator(kind)
+    chambers = s.chambers(2)
+    q, pressure = moved(s).requires_grad_(), (1e4 * noise(2, 2)).requires_grad_()
+    weights, w = noise(*q.shape, seed=1), noise(2, 2, seed=2)
+
+    def loss(x, p):
+        return (weights * chambers.force(x, p)).sum() + 1e6 * (w * chambers.volumes(x)).sum()
+
+    gradients = torch.autograd.grad(loss(q, pressure), (q, pressure))
+    with torch.no_grad():
+        for i, (value, gradient, step) in enumerate(zip((q, pressure), gradients, (1e-4, 1e2), strict=True)):
+            direction = noise(*value.shape, seed=3)
+            difference = 0.0
+            for k, weight in SEVEN:
+                sides = [q, pressure]
+                sides[i] = value + k * step * direction
+                difference += weight / step * float(loss(*sides))
+            assert float((gradient * direction).sum()) == pytest.approx(difference, rel=1e-8)
+
+
+def test_static_inflation_balances_pressure_by_virtual_work():
+    """At rest under pressure p, p dV = dE for any displacement: compare E along the way with the work of p."""
+    s = simulator(gravity=(0.0, 0.0, 0.0), material=Material(100e3, 0.45))
+    steps = np.linspace(0.0, 2e4, 21)
+    pressure = torch.tensor(np.stack([steps, np.zeros_like(steps)], 1))
+    rest = s.static_equilibrium(pressure=pressure)
+    volumes = s.chambers(21).volumes(rest.q)[:, 0].numpy()
+    assert volumes[-1] > 1.02 * volumes[0]
+    work = np.trapezoid(steps, volumes)
+    potential = s.workspace(21).potential
+    t = s.prepare()
+    stage = s.method.stage(s.rest_state(21), s.time_step)
+    potential.set_terms(s.step_terms(stage, 21, None, replace(t, mass=0.0 * t.mass), s.workspace(21)))
+    potential.positions.copy_(rest.q)
+    energy = potential.evaluate()[0].numpy()
+    assert energy[-1] - energy[0] == pytest.approx(work, rel=2e-3)  # the trapezoidal rule's error
+
+
+def wrong(rows):
+    return {row.parameter: row.relative_error for row in rows if not row.relative_error <= 1e-6}
+
+
+@pytest.mark.parametrize("start", ["rest", "bent", "twisted"])
+@pytest.mark.parametrize("poissons_ratio", [0.45, 0.499])
+def test_gradients_of_every_parameter_under_pressure(start, poissons_ratio, device):
+    s = simulator(material=replace(SOFT, poissons_ratio=poissons_ratio), device=device)
+    rows = check_gradients(s, start, steps=2)
+    assert "pressure" in [row.parameter for row in rows]
+    assert wrong(rows) == {}
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"kind": "tetrahedron"},
+        {"kind": "tetrahedron10"},
+        {"integrator": "midpoint"},
+        {"integrator": "bdf2"},
+        {"pressure_coupling": "explicit"},
+    ],
+    ids=lambda options: next(iter(options.values())),
+)
+def test_gradients_under_pressure_with_other_options(options):
+    assert wrong(check_gradients(simulator(**options), "bent", steps=2)) == {}
+
+
+@pytest.mark.parametrize("taut", [True, False])
+@pytest.mark.parametrize("kind", ["hexahedron", "tetrahedron10"])
+def test_gradients_with_fibres(kind, taut):
+    """Where all fibres are taut; and where some are not, or are about to be, and differences see their kinks."""
+    s = simulator(kind, SOFT, Fibres((20.0, -20.0)), time_step=1e-3)
+    start = s.rest_state(1).q * s.tensor([1.1, 1.1, 1.1] if taut else [1.0, 1.0, 1.0])
+    values = {"pressure": s.tensor([[2e4, 1e4]]), "stiffness": s.tensor([2e3, 1e3]), "q": start}
+    weights = noise(*start.shape)
+
+    def loss(**changed):
+        x = {**values, **changed}
+        material = replace(SOFT, fibre_stiffness=x["stiffness"])
+        end = s.rollout(State(x["q"], 0.0 * start), 3, material=material, pressures=x["pressure"])
+        return (weights * end.q[-1]).sum()
+
+    for name, value in values.items():
+        variable = value.clone().requires_grad_()
+        (gradient,) = torch.autograd.grad(loss(**{name: variable}), variable)
+        direction = noise(*value.shape, seed=1) * float(value.abs().mean())
+        step = 2e-4 if taut else 1e-4
+        with torch.no_grad():
+            difference = sum(w / step * float(loss(**{name: value + k * step * direction})) for k, w in SEVEN)
+        assert float((gradient * direction).sum()) == pytest.approx(difference, rel=1e-6 if taut else 1e-2)
+
+
+def test_explicit_coupling_is_that_of_the_state_before_and_meets_the_implicit_one_at_small_steps():
+    ends, pressure, steps = {}, torch.tensor([[2e4, 0.0]], dtype=torch.float64), (0.004, 0.002)
+    for coupling in ("implicit", "explicit"):
+        for h in steps:
+            s = simulator(pressure_coupling=coupling, time_step=h)
+            ends[coupling, h] = s.rollout(s.rest_state(), round(0.04 / h), pressures=pressure).q[-1]
+    apart = [float((ends["implicit", h] - ends["explicit", h]).norm()) for h in steps]
+    assert 0.0 < apart[1] < 0.6 * apart[0]
+    s = simulator(pressure_coupling="explicit")
+    state = State(moved(s, 1), 0.1 * noise(1, s.body.n_vertices, 3, seed=4))
+    force = s.chambers(1).force(state.q, pressure)
+    by_hand, _ = s.step(state, force)
+    torch.testing.assert_close(s.step(state, pressure=pressure)[0].q, by_hand.q, rtol=0, atol=1e-14)
+
+
+def test_batch_under_pressure_equals_single_runs():
+    s = simulator(material=replace(SOFT, fibre_stiffness=1e3), fibres=Fibres())
+    pressure = torch.tensor([[2e4, 0.0], [0.0, 1e4], [5e3, 5e3]], dtype=torch.float64)
+    together = s.rollout(s.rest_state(3), 5, pressures=pressure).q
+    for i in range(3):
+        alone = s.rollout(s.rest_state(1), 5, pressures=pressure[i : i + 1]).q
+        torch.testing.assert_close(together[:, i : i + 1], alone, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("solver", ["projective_dynamics", "quasi_newton"])
+def test_every_solver_finds_the_same_step(solver):
+    material, fibres = replace(SOFT, fibre_stiffness=1e3), Fibres()
+    pressure = torch.tensor([[2e4, 1e4]], dtype=torch.float64)
+    settings = SolverSettings(solver, relative_tolerance=1e-9)
+    ends = [
+        s.rollout(s.rest_state(), 3, pressures=pressure).q[-1]
+        for s in (simulator(material=material, fibres=fibres, solver=which) for which in (TIGHT, settings))
+    ]
+    torch.testing.assert_close(ends[1], ends[0], rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_fibres_run_around_the_chamber_and_spare_its_ends(kind):
+    """Stretching the chamber across itself stretches its fibres as much; along itself it does nothing to them."""
+    body = chambered(kind, fibres=Fibres())
+    points = fibre_points(body.mesh, body.chambers[:1], body.fibres)
+    sides = 2 * (0.01 + 0.02 / 3) * 0.02  # the chamber reaches 2 cm along x
+    assert points.weights.sum() == pytest.approx(sides, rel=1e-12)
+    for stretch, expected in (((1.0, 1.1, 1.1), 1.1), ((1.1, 1.0, 1.0), 1.0)):
+        x = body.mesh.vertices * np.array(stretch)
+        fibre = np.einsum("cki,cqk->cqi", x[points.nodes], points.gradients[..., 0])
+        lengths = np.linalg.norm(fibre, axis=-1).ravel()[points.weights > 0.0]
+        np.testing.assert_allclose(lengths, expected, rtol=1e-12)
+
+
+def test_fibres_hold_a_chamber_from_growing_wide_and_do_not_push():
+    pressure = torch.tensor([[2e4, 2e4]], dtype=torch.float64)
+    widths = {}
+    for stiffness in (0.0, 1e3, 1e5):
+        material = Material(50e3, 0.45, fibre_stiffness=stiffness)
+        s = simulator(material=material, fibres=Fibres(), gravity=(0.0, 0.0, 0.0))
+        for sign in (1.0, -1.0):
+            q = s.static_equilibrium(pressure=sign * pressure).q
+            widths[stiffness, sign] = float(s.chambers(1).volumes(q)[0, 0] / (2 * BRICK) - 1.0)
+    assert widths[0.0, 1.0] > 1.5 * widths[1e3, 1.0] > 2.0 * widths[1e5, 1.0] > 0.0
+    assert widths[1e5, -1.0] == pytest.approx(widths[0.0, -1.0], rel=0.1)
+    assert widths[0.0, -1.0] < 0.0
+
+
+def test_winding_angles_turn_the_fibres():
+    body = chambered("hexahedron", fibres=Fibres((30.0, -30.0)))
+    points = fibre_points(body.mesh, body.chambers, body.fibres)
+    along = np.einsum("cki,cqk->cqi", body.mesh.vertices[points.nodes], points.gradients[..., 0])[..., 0]
+    np.testing.assert_allclose(np.abs(along.ravel()[points.weights > 0.0]), 0.5, atol=1e-12)
+
+
+def test_fibres_go_around_the_given_direction_where_a_chamber_is_wider_than_long():
+    """The chamber of two bricks is longest along x; wound around y, its faces across y are ends."""
+    wound = {}
+    for axis in (None, (1.0, 0.1, 0.0), (0.1, 1.0, 0.0)):
+        body = chambered("hexahedron", fibres=Fibres(axis=axis))
+        points = fibre_points(body.mesh, body.chambers[:1], body.fibres)
+        faces = body.mesh.vertices[points.nodes[points.weights.reshape(len(points.nodes), -1)[:, 0] > 0.0]]
+        wound[axis] = set(np.flatnonzero(np.ptp(faces, axis=1).min(axis=0) < 1e-9))
+    assert wound == {None: {1, 2}, (1.0, 0.1, 0.0): {1, 2}, (0.1, 1.0, 0.0): {0, 2}}
+    across = Fibres(axis=[1.0, 1.0, 0.0])
+    with pytest.raises(MeshError, match=r"chamber_1 has no direction near \[1.0, 1.0, 0.0\]"):
+        fibre_points(body.mesh, body.chambers, across)
+
+
+def test_bad_input():
+    mesh = hollow_box("hexahedron")
+    chamber = find_chambers(mesh, (1.0, 0.0, 0.0))[0]
+    with pytest.raises(MeshError, match=r"lid is open: 4 edges of its surface belong to one face alone.*close"):
+        check_chambers([Chamber("lid", chamber.faces[1:])], mesh)
+    with pytest.raises(MeshError, match="the faces of turned look into the solid, or it is the outer surface"):
+        check_chambers([Chamber("turned", chamber.faces[:, ::-1])], mesh)
+    with pytest.raises(MeshError, match="again and first share a face"):
+        check_chambers([Chamber("first", chamber.faces), Chamber("again", chamber.faces)], mesh)
+    with pytest.raises(MeshError, match="is open"):
+        Body(mesh, chambers=[Chamber("lid", chamber.faces[1:])])
+    with pytest.raises(InputError, match="fibres are wound around chambers"):
+        Body(Mesh(mesh.vertices, mesh.cells), fibres=Fibres())
+    with pytest.raises(InputError, match="no fibres"):
+        simulator(material=replace(SOFT, fibre_stiffness=1.0)).prepare()
+    with pytest.raises(InputError, match=r"fibre_stiffness has 3 values for 2 chambers"):
+        simulator(material=replace(SOFT, fibre_stiffness=[1.0, 2.0, 3.0]), fibres=Fibres()).prepare()
+    with pytest.raises(InputError, match="pressure_coupling is 'weak'"):
+        simulator(pressure_coupling="weak")
+    with pytest.raises(InputError, match=r"pressure has shape \(1, 3\): it must be \(1, 2\) in Pa"):
+        simulator().step(simulator().rest_state(), pressure=torch.zeros(1, 3, dtype=torch.float64))
+    with pytest.raises(InputError, match="no chambers"):
+        Simulator(Body(mesh)).step(Simulator(Body(mesh)).rest_state(), pressure=torch.zeros(1, 1, dtype=torch.float64))
+    with pytest.raises(InputError, match="environment 0, chamber 1"):
+        simulator().step(simulator().rest_state(), pressure=torch.tensor([[0.0, torch.nan]], dtype=torch.float64))
+    for angles, toe in (((), 1e-3), ((90.0,), 1e-3), ((0.0,), 0.0)):
+        with pytest.raises(InputError, match="fibre"):
+            Fibres(angles, toe)
+
+
+def test_pressures_on_a_tape_have_the_gradient_of_torch(device):
+    s = simulator(material=replace(SOFT, fibre_stiffness=1e3), fibres=Fibres(), device=device)
+    state, weights = s.rest_state(2), s.tensor(noise(4, 2, s.body.n_vertices, 3))
+    values = {"pressures": s.tensor(1e4 * (1 + 0.1 * noise(3, 2, 2))), "fibre_stiffness": s.tensor([1e3, 2e3])}
+    leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
+    material = replace(s.material, fibre_stiffness=leaves["fibre_stiffness"])
+    trajectory = s.rollout(state, 3, material=material, pressures=leaves["pressures"])
+    expected = torch.autograd.grad((weights * trajectory.q).sum(), list(leaves.values()))
+    where, tape = wp.device_from_torch(s.rest_positions.device), wp.Tape()
+    arrays = {
+        name: wp.array(value.cpu().numpy(), dtype=wp.float64, device=where, requires_grad=True)
+        for name, value in values.items()
+    }
+    q, v = (wp.from_torch(t, dtype=wp.vec3d) for t in (state.q, state.v))
+    stiffness = {"fibre_stiffness": arrays["fibre_stiffness"]}
+    rollout = record_rollout(tape, s, q, v, 3, pressures=arrays["pressures"], parameters=stiffness)
+    rollout.q.grad = wp.from_torch(weights, dtype=wp.vec3d)
+    tape.backward()
+    for array, gradient in zip(arrays.values(), expected, strict=True):
+        torch.testing.assert_close(wp.to_torch(array.grad), gradient, rtol=1e-9, atol=0.0)

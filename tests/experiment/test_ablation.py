@@ -1,0 +1,264 @@
+"""The marker ablation through its command line, with a small beam and few steps."""
+
+import contextlib
+import csv
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from main_job import run
+
+from warp_resphys import box_hexahedra, select_vertices
+from warp_resphys.experiment import ablation
+from warp_resphys.io.files import read_hdf5
+from warp_resphys.io.resumable import ResumableHDF5
+from warp_resphys.mesh.mesh import surface_vertices
+from warp_resphys.report.ablation_page import verdict
+
+COUNTS = [1, 4, 33, 42]
+TINY = [
+    "experiment=marker_ablation",
+    "mesh.divisions=[4,2,2]",
+    "data.steps=8",
+    f"markers.counts={COUNTS}".replace(" ", ""),
+    "markers.draws=5",
+    "markers.processes=1",
+    "hydra/job_logging=none",
+    "hydra/hydra_logging=none",
+    "hydra.run.dir=run",
+]
+SURFACE = surface_vertices(box_hexahedra((0.1, 0.03, 0.03), (4, 2, 2)))
+CLAMPED = select_vertices(box_hexahedra((0.1, 0.03, 0.03), (4, 2, 2)), x=0.0)
+
+
+def rows(folder="run"):
+    return json.loads((Path(folder) / "metrics.json").read_text())["by_markers"]
+
+
+def errors(folder="run"):
+    return np.array([row["errors_mm"] for row in rows(folder)])
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    root = tmp_path_factory.mktemp("ablation")
+    with contextlib.chdir(root):
+        assert run(*TINY)[0] == 0
+    return root / "run"
+
+
+def test_more_markers_leave_less_error_and_spread(finished):
+    found = json.loads((finished / "metrics.json").read_text())
+    assert found["uncorrected_mm"] > 0.3
+    medians = [row["median_mm"] for row in rows(finished)]
+    assert np.diff(medians).max() <= 1e-9 * medians[0]  # The last count only adds markers that cannot move.
+    assert medians[1] < 0.2 * found["uncorrected_mm"]
+    assert rows(finished)[2]["interquartile_range_mm"] < 0.1 * rows(finished)[0]["interquartile_range_mm"]
+    assert list(found["seconds"]) == ["generate", "ablation", "report"]
+
+
+def test_sets_are_of_free_surface_vertices_unless_these_are_too_few(finished):
+    with read_hdf5(finished / "ablation.h5", "marker ablation") as file:
+        sets = file["markers"][:]
+        assert file["error"].attrs["units"] == "m"
+        assert file["count"][:].tolist() == COUNTS
+    assert sets.shape == (4, 5, 42)
+    assert len(SURFACE) - len(CLAMPED) == 33
+    for count, draws in zip(COUNTS, sets, strict=True):
+        assert (draws[:, count:] == -1).all()
+        chosen = [frozenset(row[:count].tolist()) for row in draws]
+        assert all(len(each) == count for each in chosen)
+        assert all(each <= set(SURFACE) - (set(CLAMPED) if count <= 33 else set()) for each in chosen)
+    assert len({frozenset(row[:4].tolist()) for row in sets[1]}) > 1
+
+
+def test_the_table_is_that_of_the_stored_distances(finished):
+    with read_hdf5(finished / "ablation.h5", "marker ablation") as file:
+        mean = 1e3 * file["error"][:].mean(-1)
+    np.testing.assert_allclose(errors(finished), mean)
+    with (finished / "ablation.csv").open() as file:
+        table = [(int(r["markers"]), int(r["draw"]), float(r["error_mm"])) for r in csv.DictReader(file)]
+    assert [t[:2] for t in table] == [(count, draw) for count in COUNTS for draw in range(5)]
+    np.testing.assert_allclose([t[2] for t in table], mean.ravel(), rtol=1e-8)
+    row = rows(finished)[0]
+    assert row["median_mm"] == pytest.approx(np.median(mean[0]))
+    assert row["interquartile_range_mm"] == pytest.approx(np.subtract(*np.quantile(mean[0], [0.75, 0.25])))
+
+
+def test_the_report_is_self_contained(finished):
+    page = (finished / "report.html").read_text()
+    assert not re.search(r"""<(?:script|img|link|iframe|source)\b[^>]*\b(?:src|href)\s*=\s*["'](?!data:)""", page)
+    assert "Box plot" in page
+    assert (finished / "figures" / "marker_ablation.png").is_file()
+
+
+def test_an_interrupted_run_goes_on_and_a_set_does_not_depend_on_the_other_counts(finished, folder, monkeypatch):
+    append = ResumableHDF5.append
+
+    def interrupted(file, **arrays):
+        append(file, **arrays)
+        if file.done == 2:
+            signal.raise_signal(signal.SIGINT)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    with monkeypatch.context() as patch:
+        patch.setattr(ResumableHDF5, "append", interrupted)
+        assert run(*TINY)[0] == 130
+    signal.signal(signal.SIGINT, before)
+    reconstructed, work = [], ablation._reconstruct
+
+    def counted(simulator, settings, vertices, *others):
+        reconstructed.append(vertices.shape[1])
+        return work(simulator, settings, vertices, *others)
+
+    monkeypatch.setattr(ablation, "_reconstruct", counted)
+    assert run(*TINY)[0] == 0
+    assert reconstructed == COUNTS[2:]
+    np.testing.assert_allclose(errors(), errors(finished), rtol=1e-6)
+    assert run(*TINY)[0] == 0
+    assert reconstructed == COUNTS[2:]
+    assert run(*TINY, "markers.counts=[4]")[0] == 0
+    np.testing.assert_allclose(errors(), errors(finished)[1:2], rtol=1e-6)
+    assert run(*TINY, "markers.counts=[4]", "seed=1")[0] == 0
+    assert np.abs(errors() / errors(finished)[1:2] - 1.0).max() > 0.01
+
+
+def test_processes_give_the_same_numbers_in_the_same_order_and_do_not_count_as_a_change(finished, folder):
+    assert run(*TINY, "markers.processes=2")[0] == 0
+    assert rows() == rows(finished)
+    with (
+        read_hdf5("run/ablation.h5", "marker ablation") as file,
+        read_hdf5(finished / "ablation.h5", "marker ablation") as serial,
+    ):
+        for name in ("count", "markers", "error", "misfit"):
+            np.testing.assert_array_equal(file[name][:], serial[name][:])
+    found = json.loads(Path("run/metrics.json").read_text())["peak_memory_gib"]
+    assert found > 2.0 * json.loads((finished / "metrics.json").read_text())["peak_memory_gib"]
+    written = Path("run/ablation.h5").stat().st_mtime_ns
+    assert run(*TINY, "markers.processes=3")[0] == 0
+    assert Path("run/ablation.h5").stat().st_mtime_ns == written
+
+
+def children_of(pid):
+    """Processes that a process has started and that still run."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            state, parent = path.read_text().rpartition(")")[2].split()[:2]
+            if int(parent) == pid and state != "Z":
+                found.append(int(path.parent.name))
+    return found
+
+
+def gone(pids):
+    """Whether all of these processes end within ten seconds."""
+    for _ in range(200):
+        if not any(Path(f"/proc/{pid}").exists() for pid in pids):
+            return True
+        time.sleep(0.05)
+    return False
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes under /proc")
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGKILL], ids=lambda sent: sent.name)
+def test_workers_end_with_their_parent_and_what_they_finished_is_kept(finished, folder, sent):
+    program = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    program += "from warp_resphys.cli import main\nmain()"
+    command = [sys.executable, "-c", program, *TINY, "markers.processes=2"]
+    journal = Path("run/ablation.h5.journal")
+    for _ in range(5):  # On a busy machine it may be done before this process looks.
+        shutil.rmtree("run", ignore_errors=True)
+        child = subprocess.Popen(
+            command, text=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True
+        )
+        while child.poll() is None and not (journal.exists() and journal.stat().st_size > 1000):
+            time.sleep(0.002)
+        workers = children_of(child.pid)
+        if len(workers) >= 2:
+            break
+        child.communicate(timeout=60)
+    assert len(workers) >= 2
+    os.killpg(child.pid, sent) if sent == signal.SIGINT else child.kill()
+    err = child.communicate(timeout=60)[1]
+    assert child.returncode == (130 if sent == signal.SIGINT else -signal.SIGKILL), err
+    assert "Traceback" not in err
+    assert gone(workers)
+    kept = journal.read_bytes()
+    assert run(*TINY)[0] == 0
+    assert len(kept) > 1000
+    np.testing.assert_allclose(errors(), errors(finished), rtol=1e-6)
+
+
+def test_an_error_in_a_worker_is_one_sentence(folder):
+    code, err = run(*TINY, "markers.processes=2", "reconstruction.max_iterations=1")
+    assert code == 2
+    assert err.splitlines()[-1].startswith("error: sparse Gauss-Newton reconstruction moved by ")
+    assert "Traceback" not in err
+
+
+@pytest.mark.parametrize(
+    "options",
+    [["markers.modes=8"], ["budget=quick", "data.steps=4"], ["mesh=beam_tetrahedra", "mesh.divisions=[2,1,1]"]],
+    ids=lambda options: options[0],
+)
+def test_other_options(folder, options):
+    small = [option for option in TINY if not (option.startswith("mesh") and options[0].startswith("mesh="))]
+    assert run(*small, "markers.counts=[6]", "markers.draws=2", *options)[0] == 0
+    assert rows()[0]["median_mm"] < 0.5 * json.loads(Path("run/metrics.json").read_text())["uncorrected_mm"]
+
+
+def test_the_published_method_gives_the_same_errors(folder):
+    small = [*TINY, "markers.counts=[4]", "markers.draws=1", "data.steps=3", "reconstruction.regularisation=1e-4"]
+    assert run(*small)[0] == 0
+    ours = errors()
+    assert run(*small, "reconstruction=lbfgsb")[0] == 0
+    np.testing.assert_allclose(errors(), ours, rtol=1e-3)
+    assert not np.array_equal(errors(), ours)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "sentence"),
+    [
+        ("markers.counts=[1,43]", "markers.counts asks for 43 markers, but the mesh has 42 surface vertices: ask for"),
+        ("markers.counts=[]", "markers.counts is []: it must be a list of different positive whole numbers."),
+        ("markers.counts=[0]", "markers.counts is [0]: it must be a list"),
+        ("markers.counts=[2,2]", "markers.counts is [2, 2]: it must be a list of different"),
+        ("markers.counts=4", "markers.counts is 4: it must be a list"),
+        ("markers.counts=[1.5]", "markers.counts is [1.5]: it must be a list"),
+        ("markers.draws=0", "markers.draws is 0: it must be a positive whole number."),
+        ("markers.modes=-1", "markers.modes is -1: it must be a positive whole number, or null."),
+        ("markers.modes=1000", "1000 vibration modes were asked for, but the body has 1 to 108."),
+        ("markers.processes=0", "markers.processes is 0: it must be a positive whole number, or null."),
+        ("markers=null", "markers is None: it must be a group of counts, draws, modes and processes."),
+        ("+markers.seeds=3", "it must be a group of counts, draws, modes and processes."),
+        ("data.steps=0", "data.steps is 0: it must be positive."),
+        ("data.weights_g.observed=[50,70]", "data.weights_g.observed is [50, 70]: it must be a list of one positive"),
+        ("data.weights_g.observed=[-1]", "data.weights_g.observed is [-1]: it must be a list of one positive"),
+        ("reconstruction.regularisation=0", "reconstruction.regularisation is 0: it must be positive, as markers"),
+        ("reconstruction=lbfgsb markers.modes=4", "4 modes are asked for, but reconstruction.method=lbfgsb has none"),
+    ],
+)
+def test_bad_input(folder, overrides, sentence):
+    code, err = run(*TINY, *overrides.split())
+    assert code == 2
+    assert sentence in err
+    assert "Traceback" not in err
+    assert not Path("run/motion.h5").exists()
+
+
+def test_verdict_looks_from_the_largest_number_of_markers_down():
+    def row(markers, median, spread):
+        return {"markers": markers, "median_mm": median, "interquartile_range_mm": spread}
+
+    said = verdict([row(1, 0.05, 0.2), row(2, 0.2, 0.04), row(4, 0.09, 0.06), row(8, 0.02, 0.01)], 1.0)
+    assert said.startswith("From 4 markers on, the median error stays below 0.1\N{NO-BREAK SPACE}mm")
+    assert said.endswith("apart from 8 markers on.")
+    assert verdict([row(1, 0.2, 0.2)], 1.0).startswith("With none of these")

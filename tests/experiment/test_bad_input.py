@@ -1,0 +1,258 @@
+"""What cannot be simulated is refused with the right class and a sentence that names it."""
+
+import numpy as np
+import pytest
+import torch
+
+from warp_resphys import Body, Material, Mesh, PointMass, Simulator, State, box_hexahedra, select_vertices
+from warp_resphys.io.errors import InputError, MeshError, ResphysError
+from warp_resphys.studies.gradient_check import check_configured
+
+MESH = box_hexahedra((0.02, 0.01, 0.01), (2, 1, 1))
+BODY = Body(MESH, fixed=select_vertices(MESH, x=0.0))
+ELEMENTS, VERTICES, FIXED = len(MESH.cells), len(MESH.vertices), len(BODY.fixed_vertices)
+
+
+@pytest.fixture(scope="module")
+def simulator():
+    return Simulator(BODY, Material(1e5, 0.4, 1000.0))
+
+
+def refused(message, error=InputError):
+    return pytest.raises(error, match=message)
+
+
+def test_every_error_is_one_the_command_line_explains():
+    assert issubclass(MeshError, InputError)
+    assert issubclass(InputError, ResphysError)
+
+
+NAN, INF = float("nan"), float("inf")
+
+
+@pytest.mark.parametrize(
+    ("constants", "message"),
+    [
+        ({"youngs_modulus": 0.0}, "youngs_modulus is 0: it must be positive, in pascals"),
+        ({"youngs_modulus": -1e5}, "youngs_modulus is -100000: it must be positive"),
+        ({"youngs_modulus": NAN}, "youngs_modulus is nan"),
+        ({"youngs_modulus": INF}, "youngs_modulus is inf"),
+        ({"youngs_modulus": [1e5, -1.0]}, "youngs_modulus is -1: it must be positive"),
+        ({"youngs_modulus": torch.ones(1, 1, 1)}, r"youngs_modulus has shape \(1, 1, 1\): give a number"),
+        ({"youngs_modulus": []}, r"youngs_modulus has shape \(0,\): give a number"),
+        ({"poissons_ratio": 0.5}, "poissons_ratio is 0.5: it must be greater than -1 and less than 0.5"),
+        ({"poissons_ratio": 0.7}, "poissons_ratio is 0.7"),
+        ({"poissons_ratio": -1.0}, "poissons_ratio is -1"),
+        ({"poissons_ratio": NAN}, "poissons_ratio is nan"),
+        ({"density": 0.0}, "density is 0: it must be positive, in kg/m"),
+        ({"density": -1.0}, "density is -1"),
+        ({"mass_damping": -0.1}, "mass_damping is -0.1: it must be zero or more, in 1/s"),
+        ({"stiffness_damping": -1e-3}, "stiffness_damping is -0.001: it must be zero or more, in s"),
+        ({"stiffness_damping": INF}, "stiffness_damping is inf"),
+        ({"model": "linear"}, "material model is 'linear': choose one of corotated, stable_neo_hookean"),
+    ],
+)
+def test_material(constants, message):
+    with refused(message):
+        Material(**constants)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"time_step": 0.0}, "time_step is 0: it must be positive, in seconds"),
+        ({"time_step": -0.01}, "time_step is -0.01: it must be positive"),
+        ({"time_step": NAN}, "time_step is nan"),
+        ({"time_step": INF}, "time_step is inf"),
+        ({"integrator": "euler"}, "integrator is 'euler': choose one of implicit_euler, bdf2, midpoint"),
+        ({"solver": "gauss"}, "solver is 'gauss': choose one of projective_dynamics, quasi_newton, newton"),
+        ({"relative_tolerance": 0.0}, "solver.relative_tolerance is 0.0: it must be positive"),
+        ({"dtype": torch.float16}, "dtype is torch.float16: choose torch.float64 or torch.float32"),
+    ],
+)
+def test_simulator(options, message):
+    with refused(message):
+        Simulator(BODY, **options)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+def test_absent_cuda_device():
+    with refused("device is 'cuda', but torch finds no CUDA device: choose device=cpu"):
+        Simulator(BODY, device="cuda")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"fixed": [0, VERTICES]}, f"fixed vertices must lie between 0 and {VERTICES - 1}"),
+        ({"fixed": [-1]}, f"fixed vertices must lie between 0 and {VERTICES - 1}"),
+        ({"fixed": range(VERTICES)}, "every vertex is fixed: leave some free to move"),
+        ({"mass": "consistent"}, "mass is 'consistent': choose one of row_sum, per_vertex"),
+    ],
+)
+def test_body(options, message):
+    with refused(message):
+        Body(MESH, **options)
+
+
+@pytest.mark.parametrize(
+    ("mass", "message"),
+    [
+        (PointMass(-0.1, [0]), "a point mass of -0.1 kg: its mass must be zero or more"),
+        (PointMass(NAN, [0]), "a point mass of nan kg"),
+        (PointMass(0.1, []), "a point mass must hang on at least one vertex"),
+        (PointMass(0.1, [VERTICES]), f"a point mass's vertices must lie between 0 and {VERTICES - 1}"),
+        (PointMass(0.1, [True, False]), "a point mass's vertices must be vertex numbers"),
+        (PointMass(0.1, [0, 1], [0.5]), "a point mass on 2 vertices needs 2 weights, zero or more, that sum to one"),
+        (PointMass(0.1, [0, 1], [2.0, -1.0]), "a point mass on 2 vertices needs 2 weights, zero or more"),
+        (PointMass(0.1, [0, 1], [NAN, 1.0]), "a point mass on 2 vertices needs 2 weights, zero or more"),
+        (PointMass(0.1, [0, 1], [0.5, 0.6]), "a point mass on 2 vertices needs 2 weights, zero or more"),
+    ],
+)
+def test_point_mass(mass, message):
+    with refused(message):
+        Simulator(Body(MESH, point_masses=[mass]))
+
+
+def test_volume_integration():
+    with refused("volume_integration is 'reduced': choose one of centre, full"):
+        Simulator(Body(MESH, volume_integration="reduced"))
+
+
+def arguments(simulator):
+    rest = simulator.rest_state(2)
+    return {
+        "q": rest.q,
+        "v": rest.v,
+        "external_force": torch.zeros_like(rest.q),
+        "fixed_positions": rest.q[:, simulator.fixed],
+    }
+
+
+def step(simulator, q, v, external_force, fixed_positions):
+    return simulator.step(State(q, v), external_force, fixed_positions)
+
+
+NAMES = {"q": "state.q", "v": "state.v", "external_force": "external_force", "fixed_positions": "fixed_positions"}
+
+
+@pytest.mark.parametrize("value", [NAN, INF])
+@pytest.mark.parametrize("name", NAMES)
+def test_values_that_are_not_finite(name, value, simulator):
+    given = {key: tensor.clone() for key, tensor in arguments(simulator).items()}
+    given[name][1, 2, 0] = value
+    with refused(f"{NAMES[name]} is not finite in environment 1, vertex 2"):
+        step(simulator, **given)
+
+
+@pytest.mark.parametrize("name", ["v", "external_force", "fixed_positions"])
+def test_wrong_shapes(name, simulator):
+    given = arguments(simulator)
+    wanted = rf"it must be \(2, {FIXED if name == 'fixed_positions' else VERTICES}, 3\)"
+    for wrong in (given[name][:1], given[name][:, :-1], given[name][..., :2], given[name][0]):
+        with refused(f"{NAMES[name]} has shape .*{wanted}"):
+            step(simulator, **(given | {name: wrong}))
+
+
+def test_wrong_shape_of_positions(simulator):
+    given = arguments(simulator)
+    for wrong in (given["q"][:, :-1], given["q"][..., :2], given["q"][0]):
+        with refused("state.q has shape"):
+            step(simulator, **(given | {"q": wrong}))
+
+
+def test_rollout_with_the_wrong_number_of_steps(simulator):
+    state = simulator.rest_state(1)
+    forces = torch.zeros(3, *state.q.shape)
+    with refused("external_forces has 3 time steps, but 4 are to be simulated"):
+        simulator.rollout(state, 4, forces)
+    with refused("fixed_positions has 3 time steps, but 4 are to be simulated"):
+        simulator.rollout(state, 4, fixed_positions=forces[:, :, simulator.fixed])
+
+
+@pytest.mark.parametrize(
+    "constants",
+    [
+        {"youngs_modulus": [1e5] * (ELEMENTS + 1)},
+        {"poissons_ratio": [0.4] * (ELEMENTS + 1)},
+        {"density": [1000.0] * (ELEMENTS + 1)},
+    ],
+)
+def test_material_of_another_mesh(constants, simulator):
+    with refused(f"a material parameter has {ELEMENTS + 1} values for {ELEMENTS} elements"):
+        simulator.step(simulator.rest_state(1), material=Material(**constants))
+
+
+@pytest.mark.parametrize(
+    "constants",
+    [
+        {"youngs_modulus": np.full((3, 1), 1e5)},
+        {"density": np.full((3, 1), 1e3)},
+        {"mass_damping": [1.0, 2.0, 3.0]},
+        {"stiffness_damping": [1e-3, 2e-3, 3e-3]},
+    ],
+    ids=lambda constants: next(iter(constants)),
+)
+def test_material_of_another_batch(constants, simulator):
+    with refused("3 environments"):
+        simulator.step(simulator.rest_state(2), material=Material(**constants))
+
+
+def test_static_equilibrium_of_a_free_body():
+    with refused("a body without fixed vertices has no static equilibrium: fix some vertices"):
+        Simulator(Body(MESH)).static_equilibrium()
+
+
+@pytest.mark.parametrize("name", ["external_force", "fixed_positions", "start"])
+def test_static_equilibrium_of_values_that_are_not_finite(name, simulator):
+    d = FIXED if name == "fixed_positions" else VERTICES
+    values = torch.zeros(1, d, 3, dtype=torch.float64)
+    values[0, 1, 2] = NAN
+    with refused(f"{name} is not finite in environment 0, vertex 1"):
+        simulator.static_equilibrium(**{name: values})
+
+
+def test_gravity(simulator):
+    for gravity in ((0.0, -9.81), (0.0, 0.0, NAN)):
+        with refused("gravity"):
+            Simulator(BODY, gravity=gravity)
+
+
+def test_mesh_with_vertices_that_no_cell_uses():
+    unused = Mesh(np.concatenate([MESH.vertices, [[1.0, 1.0, 1.0]]]), MESH.cells)
+    with refused("vertices .* belong to no cell", MeshError):
+        Simulator(Body(unused))
+
+
+def test_inverted_mesh():
+    with refused("inverted", MeshError):
+        Simulator(Body(Mesh(MESH.vertices, MESH.cells[:, [4, 5, 6, 7, 0, 1, 2, 3]])))
+
+
+GRADCHECK = {
+    "dtype": "float64",
+    "gradcheck": {
+        "poses": ["rest"],
+        "poissons_ratios": [0.45],
+        "steps": 1,
+        "batch": 1,
+        "mass_damping": 1.0,
+        "stiffness_damping": 1e-3,
+    },
+}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"poses": ["folded"]}, "gradcheck.poses has 'folded': choose from rest, bent, twisted"),
+        ({"steps": 0}, "gradcheck.steps is 0: it must be positive"),
+        ({"mass_damping": 0.0}, "gradcheck.mass_damping is 0.0: it must be positive"),
+    ],
+)
+def test_gradient_check(changes, message):
+    config = GRADCHECK | {"gradcheck": GRADCHECK["gradcheck"] | changes}
+    with refused(message):
+        next(check_configured(config))
+    with refused("dtype is 'float32': gradients are checked in float64"):
+        next(check_configured(GRADCHECK | {"dtype": "float32"}))

@@ -1,0 +1,427 @@
+"""A small experiment with pressures through its command line: its stages, its files and what it refuses.
+
+The report has tests of its own.
+"""
+
+import dataclasses
+import json
+import shutil
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+from main_job import IN_RUN, run
+from omegaconf import OmegaConf
+
+from warp_resphys.data.actuation import PressureSequences
+from warp_resphys.data.markers import bind_markers
+from warp_resphys.data.recordings.arrays import write_recording
+from warp_resphys.data.recordings.reading import read_recording
+from warp_resphys.experiment.actuated import experiment, reconstruct, train
+from warp_resphys.experiment.actuated.checks import check_driven
+from warp_resphys.experiment.actuated.evaluate import summary
+from warp_resphys.experiment.actuated.importing import import_driven
+from warp_resphys.experiment.actuated.reconstruct import replayed_errors
+from warp_resphys.experiment.actuated.scene import DrivenScene
+from warp_resphys.experiment.build import build_simulator
+from warp_resphys.experiment.checks import check_configuration
+from warp_resphys.io.errors import InputError
+from warp_resphys.io.files import read_array, read_checkpoint, read_hdf5
+from warp_resphys.io.stages import StageContext
+from warp_resphys.learning.driven import DrivenMotions, DrivenReplay, at_rest
+from warp_resphys.learning.driven_rollout import Range
+from warp_resphys.learning.identification import Bounds, Identifier
+from warp_resphys.mesh.mesh import select_vertices
+
+# A short segment with two chambers of some 70 vertices, on which everything takes seconds.
+SEGMENT = """# @package _global_
+defaults: [sopra, {override /mesh: segment}, _self_]
+name: tiny
+tip: {z: -0.1}
+chambers: {count: 2}
+mesh: {size: 0.03, layers: 0.05, chambers: 2}
+data:
+  {steps: 12, sequences: 5, train: 2, validation: 1, test: 1, windows: [0.06, 0.12], rest_seconds: 0.01, cutoff: 20.0}
+markers:
+  followed: null
+  others: {B1: [0.03, 0.0, 0.0], B2: [0.0, 0.03, 0.0], B3: [-0.03, -0.03, 0.0]}
+  bind: rigid
+  bind_to: {z: -0.1}
+parallel: {processes: 1, batch: 2}
+identify:
+  {trials: 1, seconds: 0.05, max_evaluations: 3, grid: {youngs_modulus: {points: 2}, poissons_ratio: {points: 1}}}
+network: {position_modes: 2, velocity_modes: 0, force_modes: 2, width: 8}
+trainer: {epochs: 4, rollout_every: 2, batch_size: 16}
+synthetic:
+  mesh: {chamber_lengths: [0.09], caps: [0.005, 0.005], radii: [0.0222, 0.0222], chambers: 2, outline: round,
+    size: 0.02, layers: 0.03, wall: 0.003, web: 0.003}
+  sequences: {rest: 0.01, correlation_time: 0.03}
+"""
+FOLLOWED = "markers.followed={T1:[0.02,0.0,-0.1],T2:[0.0,0.02,-0.1],T3:[-0.02,-0.01,-0.1]}"
+QUIET = ["hydra/job_logging=none", "hydra/hydra_logging=none", IN_RUN]
+COMMAND = ["experiment=tiny", FOLLOWED, *QUIET]
+STAGES = ["synthesise", "import", "identify", "reconstruct", "train_simfree", "train_resphys", "evaluate", "report"]
+RAISED = ["synthesise_raised", "import_raised"]
+
+
+def place_experiment(folder):
+    place = Path(folder) / "configs" / "experiment" / "tiny.yaml"
+    place.parent.mkdir(parents=True, exist_ok=True)
+    place.write_text(SEGMENT)
+
+
+def configuration(*overrides, experiment="sopra"):
+    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
+        return OmegaConf.to_container(compose("config", [f"experiment={experiment}", *overrides]), resolve=True)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A complete run, in one process, that was tested at a higher pressure later."""
+    folder = tmp_path_factory.mktemp("driven")
+    place_experiment(folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setattr(experiment, "report_driven", lambda context: (context.run_dir / "report.html").write_text("-"))
+        code, err = run(*COMMAND)
+        assert (code, err[-500:] if code else "") == (0, "")
+        before = {path: path.stat().st_mtime_ns for path in (folder / "run").rglob("*.h5")}
+        code, err = run(*COMMAND, "data.factors=[1.5]")
+    assert (code, err[-500:] if code else "") == (0, "")
+    changed = [path.name for path, at in before.items() if path.stat().st_mtime_ns != at]
+    assert changed == ["rollouts.h5"]  # Nothing but the new trials is simulated again, and nothing learned.
+    return folder
+
+
+def motions(folder):
+    """Names, markers and pressures of all trials, those at higher pressures last."""
+    found = []
+    for name in ("motions.h5", "motions_raised.h5"):
+        with read_hdf5(folder / "run" / name, "motions") as file:
+            names = [str(each) for each in file.attrs["names"]]
+            found.append((names, read_array(file, "markers"), read_array(file, "pressure")))
+    (a, b) = found
+    return a[0] + b[0], np.concatenate([a[1], b[1]]), np.concatenate([a[2], b[2]])
+
+
+def metrics(folder):
+    return json.loads((folder / "run" / "metrics.json").read_text())
+
+
+def test_every_stage_leaves_its_files_and_the_errors_are_those_of_the_roll_outs(finished):
+    assert sorted(path.stem for path in (finished / "run" / "stages").glob("*.json")) == sorted([*STAGES, *RAISED])
+    assert not list((finished / "run").glob("*_parts"))
+    found = metrics(finished)
+    names, observed, _ = motions(finished)
+    with read_hdf5(finished / "run" / "rollouts.h5", "rollouts") as file:
+        tested = [str(name) for name in file.attrs["names"]]
+        markers = {model: read_array(file, f"{model}_markers") for model in found["errors_mm"]}
+    assert names == ["t000", "t001", "t002", "t003", "t003_x1.5"]
+    assert tested == names[3:]
+    for model, x in markers.items():
+        for row, factor in enumerate(("1", "1.5")):
+            expected = 1e3 * np.linalg.norm(x[row] - observed[3 + row], axis=-1).mean()
+            assert found["overpressure"][factor][model]["mean"] == pytest.approx(expected, rel=1e-6)
+        first = 1e3 * np.linalg.norm(x[0, :7] - observed[3, :7], axis=-1).mean()
+        assert found["windows"]["0.06"][model]["mean"] == pytest.approx(first, rel=1e-6)
+    growth = found["windows"]["0.12"]["sysid"]["mean"] / found["windows"]["0.06"]["sysid"]["mean"] - 1.0
+    assert found["growth"]["sysid"] == pytest.approx(growth)
+
+
+def test_recordings_are_seen_by_cameras_and_registered_back(finished):
+    """The import undoes the cameras' frame to within the noise and the misplaced markers."""
+    truth = json.loads((finished / "run" / "truth.json").read_text())
+    recording = read_recording(finished / "run" / "recordings" / "t000.h5")
+    assert np.linalg.norm(recording.positions[0, 0] - truth["bound"]["T1"]) > 0.01
+    _, _, pressure = motions(finished)
+    with read_hdf5(finished / "run" / "motions.h5", "motions") as file:
+        bound = read_array(file, "bound")
+    np.testing.assert_allclose(bound, np.array(list(truth["bound"].values())), atol=1e-3)
+    assert 0.0 < pressure[:4].max() <= 20e3
+    np.testing.assert_allclose(pressure[4], 1.5 * pressure[3])
+    np.testing.assert_allclose(pressure[0], recording.actuation[1:])
+
+
+def test_the_reconstruction_reaches_the_smoothed_markers(finished):
+    found = json.loads((finished / "run" / "reconstruction.json").read_text())
+    assert found["mean_mm"] < 0.2
+    with read_hdf5(finished / "run" / "reconstruction.h5", "reconstruction") as file:
+        assert [str(name) for name in file.attrs["names"]] == ["t000", "t001", "t002"]
+        assert read_array(file, "force").shape == (3, 13, read_array(file, "q").shape[2], 3)
+
+
+def test_forces_that_do_not_hold_the_body_are_named(finished, monkeypatch, tmp_path, caplog):
+    """Replayed, the forces lead where they were found; a simulation that goes elsewhere with them is reported."""
+    summary = json.loads((finished / "run" / "reconstruction.json").read_text())
+    with read_hdf5(finished / "run" / "reconstruction.h5", "reconstruction") as file:
+        states = {name: read_array(file, name)[2:] for name in ("q", "v", "force")}
+    settings = json.loads((finished / "run" / "stages" / "reconstruct.json").read_text())["settings"]
+    replay = partial(replayed_errors, settings, finished / "run", ("t002",))
+    found = replay(states)
+    assert found.mean() == pytest.approx(summary["replayed_mm"], rel=1e-3)
+    assert found.mean() < 0.2
+    assert replay({**states, "force": 0.0 * states["force"]}).mean() > 2.0 * found.mean()
+    begun = {name: values[:, :7] for name, values in states.items()}  # as where a part of each trial is learned from
+    np.testing.assert_array_equal(replay(begun), found[:, :7])
+    states["force"][0, 6:] = np.nan
+    assert np.isfinite(replay(states)).sum() == 6
+    for name in ("motions.h5", "identification.json"):
+        shutil.copy(finished / "run" / name, tmp_path)
+    monkeypatch.setattr(reconstruct, "replayed_errors", lambda *rest: np.full(rest[3]["force"].shape[:2], np.inf))
+    reconstruct.reconstruct_driven(StageContext("reconstruct", tmp_path, "", settings))
+    assert "the forces lead inf mm away from the markers" in caplog.text
+    assert json.loads((tmp_path / "reconstruction.json").read_text())["replayed_mm"] is None
+
+
+def test_forces_are_learned_as_they_are_in_the_rest_shape(finished, monkeypatch):
+    settings = json.loads((finished / "run" / "stages" / "train_resphys.json").read_text())["settings"]
+    assert settings["force_frame"] == "corotated"
+    assert read_checkpoint(finished / "run" / "resphys.safetensors", "residual force")[1]["force_frame"] == "corotated"
+    learned = {}
+    for frame in ("corotated", "world"):
+        keep = lambda context, scene, model, samples, *rest: learned.update({rest[-1]: samples})  # noqa: E731
+        monkeypatch.setattr(train, "_fit", keep)
+        train.train_driven(StageContext("train_resphys", finished / "run", "", {**settings, "force_frame": frame}))
+    turned, kept = (learned[frame]["train"] for frame in ("corotated", "world"))
+    scene = DrivenScene(settings, finished / "run")
+    back = scene.frames("corotated").to_world(turned.q, turned.v, turned.outputs[0])
+    size = float(kept.outputs[0].abs().max())
+    np.testing.assert_allclose(back, kept.outputs[0], atol=1e-5 * size)
+    assert float((turned.outputs[0] - kept.outputs[0]).abs().max()) > 1e-3 * size
+
+
+def test_the_same_command_does_nothing_again_and_other_windows_only_evaluate(finished, monkeypatch):
+    monkeypatch.chdir(finished)
+    monkeypatch.setattr(experiment, "report_driven", lambda context: (context.run_dir / "report.html").write_text("-"))
+    before = {path: path.stat().st_mtime_ns for path in (finished / "run").glob("*.h5")}
+    code, _ = run(*COMMAND, "data.factors=[1.5]", "data.windows=[0.05,0.12]")
+    assert code == 0
+    after = {path.name for path, at in before.items() if path.stat().st_mtime_ns != at}
+    assert after == {"rollouts.h5"}
+    assert "0.05" in metrics(finished)["windows"]
+
+
+def test_recordings_in_a_folder_give_what_the_simulation_that_made_them_gave(finished, monkeypatch, tmp_path):
+    """The same trials from files, in two processes; those at higher pressures are not among them."""
+    assert {path.stem for path in (finished / "run" / "recordings").iterdir()} == {"t000", "t001", "t002", "t003"}
+    assert [path.stem for path in (finished / "run" / "recordings_raised").iterdir()] == ["t003_x1.5"]
+    place_experiment(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(experiment, "report_driven", lambda context: (context.run_dir / "report.html").write_text("-"))
+    places = [f"data.folder={finished / 'run' / 'recordings'}", "data.train=[t000,t001]", "data.validation=[t002]"]
+    code, err = run(*COMMAND, *places, "data.test=[t003]", "parallel.processes=2", "parallel.batch=1")
+    assert code == 0, err
+    first, second = metrics(finished), metrics(tmp_path)
+    for model in ("simulation", "sysid"):
+        assert second["errors_mm"][model]["mean"] == pytest.approx(first["errors_mm"][model]["mean"], rel=5e-3)
+
+
+def refused(finished, monkeypatch, *overrides):
+    monkeypatch.chdir(finished)
+    code, err = run(*COMMAND, *overrides)
+    assert code == 2
+    assert err.count("\n") == 1
+    return err
+
+
+def recorded(tmp_path, finished, change):
+    """A folder with the recordings, the first of them changed."""
+    for name in ("t000", "t001", "t002", "t003"):
+        recording = read_recording(finished / "run" / "recordings" / f"{name}.h5")
+        write_recording(tmp_path / f"{name}.h5", change(recording) if name == "t000" else recording)
+    return [f"data.folder={tmp_path}", "data.train=[t000,t001]", "data.validation=[t002]", "data.test=[t003]"]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["chambers.count=3"], "the mesh has 2 closed chambers, but chambers.count is 3"),
+        (["data.train=9"], "data.train, data.validation and data.test ask for 11 trials, but there are 5"),
+        (["data.test=[t000]"], "the trial 't000' is in two splits"),
+        (["data.test=[t777]"], "data.test names the trial 't777'"),
+        (["data.folder=nowhere"], "nowhere is no folder"),
+        (["data.train=0"], "data.train is 0: it must be a number of trials, or a list"),
+        (["pressure_coupling=weak"], "pressure_coupling is 'weak'"),
+        (["force_frame=rest"], "force_frame is 'rest': choose one of corotated, world."),
+        (["actuation.memory=[-1.0]"], "actuation.memory"),
+        (["synthetic.sequences.rest=1.0"], "leave no time between two rests"),
+        (["synthetic.sequences.limit=1.0"], "unknown key 'synthetic.sequences.limit'"),
+        (["synthetic.material.stiffness=1.0"], "unknown key 'synthetic.material.stiffness'"),
+        (["synthetic.fibres.angles=[90.0]"], "synthetic: fibre angles are"),
+        (["simulation.youngs_modulus=264"], "is its unit millimetres"),
+        (["+identify.parameters.stiffness={lower:0.0,upper:1.0}"], "identify.parameters names 'stiffness'"),
+        (["refinement=solver_in_the_loop"], "refinement is for experiments without pressures"),
+        (["task=tune"], "task=tune does not search the networks of the experiment tiny"),
+        (["+data.colour=red"], "unknown key 'data.colour'"),
+        (["data.windows=[0.06,5.0]"], "data.windows is [0.06, 5.0]: they must rise, up to the 0.12 s"),
+        (["data.train_fraction=1.5"], "data.train_fraction is 1.5"),
+        (["data.cutoff=80.0"], "data.cutoff is 80 Hz: it must be below 50 Hz"),
+        (["data.factors=[1.0]"], "data.factors is [1.0]"),
+        (["data.factors=[1.5]", "data.folder=run/recordings", "data.test=[t003]"], "recordings have their own"),
+        (["synthetic.time_step=0.003"], "the first must be a multiple of the second"),
+        (["+identify.parameters.fibre_stiffness={lower:1.0,upper:2.0}"], "but fibres is null"),
+        (["data.chambers=[]"], "data.chambers is []: it must be a list of different chambers, from 1"),
+        (["synthetic.sequences.mean=high"], "synthetic.sequences.mean is 'high': it must be a finite number"),
+        (["synthetic.sequences.correlation=[[1.0],[0.0]]"], "it must be a finite number, or a matrix of them"),
+        (["+identify.first_guess.youngs_modulus=soft"], "identify.first_guess.youngs_modulus is 'soft'"),
+        (["+identify.first_guess.pressure_rise=0.04"], "identify.first_guess.pressure_rise is of no use"),
+        (["reconstruction=lbfgsb", "+reconstruction.modes=4"], "reconstruction.method=lbfgsb has none"),
+    ],
+)
+def test_bad_configurations_cost_one_sentence(finished, monkeypatch, overrides, message):
+    assert message in refused(finished, monkeypatch, *overrides)
+
+
+def test_bad_recordings_cost_one_sentence(finished, monkeypatch, tmp_path):
+    def with_pressures(values):
+        return lambda recording: dataclasses.replace(recording, actuation=values(recording.actuation))
+
+    cases = {
+        "three": (
+            with_pressures(lambda p: np.concatenate([p, p[:, :1]], axis=1)),
+            "t000.h5 has pressures of 3 chambers",
+        ),
+        "high": (with_pressures(lambda p: p + 3e4 * (np.arange(len(p)) > 5)[:, None]), "beyond data.pressure_limit"),
+        "late": (with_pressures(lambda p: p + 1e3), "t000.h5 begins under pressure"),
+        "none": (lambda recording: dataclasses.replace(recording, actuation=None), "no array 'actuation'"),
+    }
+    for name, (change, message) in cases.items():
+        (tmp_path / name).mkdir()
+        assert message in refused(finished, monkeypatch, *recorded(tmp_path / name, finished, change))
+
+
+def test_pressures_in_another_unit_and_two_files_of_one_name_cost_one_sentence(finished, monkeypatch, tmp_path):
+    def in_kilopascal(recording):
+        return dataclasses.replace(recording, actuation=1e-3 * recording.actuation)
+
+    places = recorded(tmp_path, finished, in_kilopascal)
+    for name in ("t001", "t002", "t003"):
+        write_recording(tmp_path / f"{name}.h5", in_kilopascal(read_recording(tmp_path / f"{name}.h5")))
+    assert "the pressures of all 4 recordings stay below" in refused(finished, monkeypatch, *places)
+    (tmp_path / "t001.csv").touch()
+    assert "t001.csv and t001.h5, two recordings of one name" in refused(finished, monkeypatch, *places)
+
+
+def test_another_method_of_reconstruction_is_taken_as_a_whole():
+    for name in ("sopra", "segment_real", "beam_real"):
+        chosen = configuration("reconstruction=lbfgsb", experiment=name)["reconstruction"]
+        assert (chosen["method"], chosen["regularisation"]) == ("lbfgsb", 1e-4)
+
+
+def test_a_short_recording_is_named_and_its_rest_counts_as_not_seen(finished, monkeypatch, tmp_path, caplog):
+    def shortened(recording):
+        return dataclasses.replace(recording, positions=recording.positions[:9], actuation=recording.actuation[:9])
+
+    monkeypatch.chdir(finished)
+    path = f"hydra.searchpath=[file://{finished / 'configs'}]"
+    config = configuration(path, FOLLOWED, *recorded(tmp_path, finished, shortened), experiment="tiny")
+    stages = {stage.name: stage for stage in experiment.driven_stages(config)}
+    import_driven(StageContext("import", tmp_path, "", stages["import"].settings))
+    with read_hdf5(tmp_path / "motions.h5", "motions") as file:
+        seen = np.isfinite(read_array(file, "markers")).all(axis=(2, 3))
+    assert seen.sum(axis=1).tolist() == [9, 13, 13, 13]
+    assert "t000.h5 ends after 8 of the 12 steps" in caplog.text
+
+
+def test_the_number_of_processes_is_no_setting_of_the_results(finished, monkeypatch):
+    monkeypatch.chdir(finished)
+    monkeypatch.setattr(experiment, "report_driven", lambda context: (context.run_dir / "report.html").write_text("-"))
+    written = []
+    for processes in (1, 2):
+        code, _ = run(*COMMAND, "data.factors=[1.5]", f"parallel.processes={processes}")
+        assert code == 0
+        written.append({path: path.stat().st_mtime_ns for path in (finished / "run").glob("*.h5")})
+    assert written[0] == written[1]
+
+
+def test_the_configurations_of_every_experiment_with_pressures_are_accepted(tmp_path, monkeypatch):
+    for name in ("sopra", "sopra_extrapolation", "sopra_overpressure"):
+        for overrides in ([], ["budget=quick"]):
+            check_configuration(configuration(*overrides, experiment=name))
+    recording = read_published(tmp_path)
+    check_driven(configuration(f"data.folder={recording}", experiment="segment_real"))
+
+
+def read_published(folder):
+    """Empty recordings of the names that segment_real asks for."""
+    for pressure in (50, 100, 125, 175, 200, 250, 275, 325, 350, 400):
+        (folder / f"segment_{pressure:03d}.h5").touch()
+    return folder
+
+
+def driven_motions(simulator, steps=12, count=2):
+    """Motions of a simulator under pressures, seen at a few vertices."""
+    chambers = len(simulator.body.chambers)
+    sequences = PressureSequences(rest=0.01, correlation_time=0.05)
+    drawn = [sequences.draw(steps, 0.01, chambers, np.random.default_rng(i))[1:] for i in range(count)]
+    pressure = simulator.tensor(np.stack(drawn))
+    mesh = simulator.body.mesh
+    places = mesh.vertices[select_vertices(mesh, z=-0.1)[:4]]
+    read = bind_markers(mesh, places, ["a", "b", "c", "d"]).to(simulator.rest_positions)
+    with torch.no_grad():
+        state = simulator.static_equilibrium(batch=count)
+        path = simulator.rollout(state, steps, pressures=pressure.transpose(0, 1)).q
+    markers = torch.stack([read(q) for q in path], 1)
+    times = simulator.tensor(0.01 * np.arange(steps + 1)).expand(count, -1)
+    masses = torch.zeros(count, simulator.body.n_vertices, dtype=torch.float64)
+    names = tuple(f"m{i}" for i in range(count))
+    return DrivenMotions(names, times, markers, markers[:, 0], masses, pressure), read
+
+
+def tiny_simulator(**material):
+    config = configuration("mesh=segment", "mesh.size=0.03", "mesh.layers=0.05", "chambers.count=3")
+    config["simulation"] |= material
+    return build_simulator(config)
+
+
+def test_identification_finds_the_stiffness_that_made_motions_and_the_valves_lag():
+    """The start depends on the stiffness as much as the motion does: gravity stretches the body before that."""
+    simulator = tiny_simulator(youngs_modulus=150e3)
+    motions, read = driven_motions(simulator)
+    replay = DrivenReplay(tiny_simulator(), read, motions)
+    bounds = {"youngs_modulus": Bounds(5e4, 5e5, True), "pressure_rise": Bounds(0.0, 0.1)}
+    identifier = Identifier(replay, at_rest(motions, simulator.rest_positions), bounds)
+    found = identifier.run([{"youngs_modulus": 264e3, "pressure_rise": 0.02}], 25)
+    assert found.parameters["youngs_modulus"] == pytest.approx(150e3, rel=0.01)
+    assert found.parameters["pressure_rise"] < 1e-3
+    with pytest.raises(InputError, match="no parameter 'colour'"):
+        Identifier(replay, at_rest(motions, simulator.rest_positions), {"colour": Bounds(0.0, 1.0)})
+
+
+def test_the_replays_gradient_is_that_of_differences():
+    simulator = tiny_simulator(stiffness_damping=2e-3)
+    motions, read = driven_motions(simulator, steps=4)
+    replay = DrivenReplay(simulator, read, motions)
+    release = at_rest(motions, simulator.rest_positions)
+    for name, value in (("youngs_modulus", 2e5), ("stiffness_damping", 3e-3), ("pressure_rise", 0.02)):
+        x = torch.tensor([value], dtype=torch.float64, requires_grad=True)
+        loss = lambda x, name=name: 1e6 * replay.errors(replay(release, {name: x})).square().sum()  # noqa: E731
+        (gradient,) = torch.autograd.grad(loss(x), x)
+        with torch.no_grad():
+            step = 1e-4 * value
+            difference = (loss(x + step) - loss(x - step)) / (2 * step)
+        assert float(gradient) == pytest.approx(float(difference), rel=1e-4)
+
+
+def test_leaving_the_range_of_the_training_is_noticed():
+    inputs = torch.tensor([[0.0, 1.0], [2.0, 3.0]])
+    watched = Range.restore(Range.of(inputs).description(), inputs)
+    probe = torch.tensor([[2.4, 2.0], [2.6, 2.0], [1.0, 0.4], [1.0, torch.nan]])
+    assert watched.left(probe).tolist() == [False, True, True, False]
+
+
+def test_a_diverged_roll_out_and_one_that_left_the_range_are_reported():
+    observed = np.zeros((2, 5, 1, 3))
+    good, lost = observed + np.array([3e-3, 0.0, 4e-3]), observed.copy()
+    lost[1, 3:] = np.nan
+    settings = {"data": {"windows": [0.02, 0.04]}}
+    left = {"resphys": np.array([-1, 3])}
+    markers = {"sysid": good, "resphys": lost}
+    found = summary(settings, {"1": ("a", "b")}, markers, observed, left, ("m",), 0.01)
+    assert found["errors_mm"]["sysid"]["mean"] == pytest.approx(5.0)
+    assert found["errors_mm"]["resphys"]["diverged"] == 1
+    assert found["range"]["resphys"] == {"left": 1, "first_s": {"b": pytest.approx(0.03)}}
+    assert found["growth"]["sysid"] == pytest.approx(0.0)

@@ -1,0 +1,323 @@
+"""The main job through its command line: `warp-resphys` with a small beam, a few steps and a few epochs."""
+
+import json
+import re
+from pathlib import Path
+
+import meshio
+import numpy as np
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+from main_job import (
+    CORRECTED,
+    IN_RUN,
+    LEARNED,
+    MODELS,
+    REFINE,
+    REFINED,
+    REPOSITORY,
+    SHORT,
+    STAGES,
+    TINY,
+    errors,
+    files,
+    metrics,
+    ran,
+    run,
+    same_errors,
+)
+from omegaconf import OmegaConf
+
+from warp_resphys import box_hexahedra
+from warp_resphys.experiment import evaluate, experiment, train
+from warp_resphys.experiment.build import build_simulator
+from warp_resphys.experiment.checks import check_configuration
+from warp_resphys.io.errors import InputError
+from warp_resphys.io.files import read_checkpoint, read_hdf5
+from warp_resphys.io.stages import package_versions
+
+
+class TestCompleteRun:
+    def test_files(self, finished):
+        names = set(finished[1]) - {f"stages/{name}.json" for name in STAGES}
+        names = {name for name in names if not name.startswith("figures/")}
+        data = {"trajectories.h5", "reconstruction.h5", "rollouts.h5", "model.safetensors", "training.json"}
+        data |= {"simfree.safetensors", "simfree_training.json", "times.json"}
+        assert names == data | {"errors.json", "metrics.json", "report.html"}
+
+    def test_metrics(self, finished):
+        found = metrics(finished[0])
+        keys = ["errors_mm", "errors_vs_reconstruction_mm", "per_trajectory", "networks", "seconds_per_test_trajectory"]
+        assert list(found) == [*keys, "seconds", "peak_memory_gib", "versions", "device"]
+        assert set(found["seconds_per_test_trajectory"]) == {"simulation", "true_parameters", "resphys", "inference"}
+        assert set(found["errors_mm"]) == {"simulation", "reconstruction", "resphys", "simfree"}
+        assert set(found["errors_vs_reconstruction_mm"]) == {"simulation", "resphys", "simfree"}
+        assert list(found["seconds"]) == STAGES
+        assert all(0.0 < s < 600.0 for s in found["seconds"].values())
+        assert 0.1 < found["peak_memory_gib"] < 4.0
+        assert found["versions"] == package_versions()
+        assert {"python", "warp-resphys", "warp-lang", "torch"} <= set(found["versions"])
+        assert found["device"] in ("cpu", "cuda")
+        assert [each["name"] for each in found["per_trajectory"]] == ["70 g", "150 g"]
+
+    def test_the_correction_corrects(self, finished):
+        found = metrics(finished[0])["errors_mm"]
+        assert found["simulation"]["mean"] > 0.5
+        assert found["resphys"]["mean"] < 0.02 * found["simulation"]["mean"]
+        assert found["reconstruction"]["mean"] < 1e-3
+        assert all(found[model]["diverged"] == 0 for model in MODELS)
+
+    def test_errors_are_those_of_the_stored_positions(self, finished):
+        with read_hdf5(finished[0] / "trajectories.h5", "trajectories") as file:
+            assert list(file.attrs["names"]) == [f"{w} g" for w in (50, 90, 130, 110, 70, 150)]
+            target = file["q"][4:, 1:]
+            assert file["q"].shape == (6, 13, 45, 3)
+            assert file["q"].attrs["units"] == "m"
+        with read_hdf5(finished[0] / "rollouts.h5", "rollouts") as file:
+            stored = {model: file[f"{model}_q"][:, 1:] for model in ("simulation", "resphys", "simfree")}
+        with read_hdf5(finished[0] / "reconstruction.h5", "reconstruction") as file:
+            stored["reconstruction"] = file["q"][4:, 1:]
+            assert not file["force"][:, 0].any()
+        found = metrics(finished[0])
+        for model, q in stored.items():
+            distances = 1e3 * np.linalg.norm(q - target, axis=-1).mean(-1)
+            summary = found["errors_mm"][model]
+            np.testing.assert_allclose([summary["mean"], summary["std"]], [distances.mean(), distances.std()])
+        against = 1e3 * np.linalg.norm(stored["resphys"] - stored["reconstruction"], axis=-1).mean()
+        np.testing.assert_allclose(found["errors_vs_reconstruction_mm"]["resphys"]["mean"], against)
+
+    def test_the_roll_out_starts_from_the_target_and_knows_nothing_else_of_it(self, finished):
+        with read_hdf5(finished[0] / "trajectories.h5", "trajectories") as file:
+            start, target = file["q"][4:, 0], file["q"][4:]
+        with read_hdf5(finished[0] / "rollouts.h5", "rollouts") as file:
+            np.testing.assert_array_equal(file["resphys_q"][:, 0], start)
+            np.testing.assert_array_equal(file["simulation_q"][:, 0], start)
+            assert np.abs(file["resphys_q"][:, -1] - target[:, -1]).max() > 0.0
+
+    def test_settings_and_seeds_are_saved(self, finished):
+        record = json.loads((finished[0] / "stages" / "train.json").read_text())
+        assert record["settings"]["seed"] == 0
+        assert record["settings"]["trainer"]["epochs"] == 40
+        saved = OmegaConf.load(finished[0] / ".hydra" / "config.yaml")
+        assert saved.network.width == 32
+        training = json.loads((finished[0] / "training.json").read_text())
+        history, kept = training["epochs"], training["kept"]
+        assert [r["epoch"] for r in history if "rollout_error_mm" in r] == [10, 20, 30, 40]
+        assert kept["validation_rollout_error_mm"] == min(r.get("rollout_error_mm", 1e9) for r in history)
+        assert history[kept["epoch"] - 1]["rollout_error_mm"] == kept["validation_rollout_error_mm"]
+        _, metadata = read_checkpoint(finished[0] / "model.safetensors", "residual force")
+        assert metadata.items() >= kept.items()
+        assert metrics(finished[0])["networks"]["resphys"] == kept
+
+    def test_the_report_is_self_contained(self, finished):
+        page = (finished[0] / "report.html").read_text()
+        assert "4.488" in page  # published, beside ours
+        assert not re.search(r"""<(?:script|img|link|iframe|source)\b[^>]*\b(?:src|href)\s*=\s*["'](?!data:)""", page)
+        assert "@import" not in page
+
+    def test_the_second_call_runs_nothing(self, finished):
+        _, first, second = finished
+        changed = [name for name in second if second[name] != first.get(name)]
+        assert changed == ["metrics.json"]
+        assert json.loads(first["metrics.json"][1]) == json.loads(second["metrics.json"][1])
+
+
+@pytest.mark.usefixtures("no_report")
+class TestChanges:
+    @pytest.mark.parametrize(
+        ("override", "expected"),
+        [
+            ("trainer.epochs=30", LEARNED),
+            ("network.blocks=2", LEARNED),
+            ("seed=3", LEARNED),
+            ("reconstruction.regularisation=1e-9", CORRECTED),
+            ("simulation.youngs_modulus=220e3", CORRECTED),
+            ("reality.youngs_modulus=270e3", STAGES),
+            ("data.weights_g.test=[60]", STAGES),
+            ("title=Another", ["report"]),
+        ],
+    )
+    def test_what_depends_on_it_runs_again_and_nothing_else(self, copied, override, expected):
+        assert run(*TINY, IN_RUN, override)[0] == 0
+        assert ran(copied) == expected
+
+    def test_the_same_seed_gives_the_same_numbers_in_another_folder(self, finished, folder):
+        assert run(*TINY, "hydra.run.dir=again")[0] == 0
+        same_errors(errors("again"), errors(finished[0]))
+
+    def test_multirun(self, finished, folder):
+        code, err = run("--multirun", "seed=0,1", *TINY)
+        assert (code, "Traceback" in err) == (0, False)
+        folders = sorted(Path("runs/beam_oscillation").glob("*/metrics.json"))
+        assert len(folders) == 2
+        found = [errors(path.parent) for path in folders]
+        seeds = [OmegaConf.load(path.parent / ".hydra" / "config.yaml").seed for path in folders]
+        same_errors(found[seeds.index(0)], errors(finished[0]))
+        assert found[0] != found[1]
+        same_errors(*(metrics(path.parent)["errors_mm"]["simulation"]["mean"] for path in folders))
+
+    @pytest.mark.parametrize(
+        "options",
+        [
+            ["mesh=beam_tetrahedra", "mesh.divisions=[2,1,1]", *SHORT],
+            ["physics=published", *TINY],
+            ["solver=newton", *TINY],
+            ["solver=projective_dynamics", *TINY, "data.steps=4"],
+            ["reconstruction=lbfgsb", *TINY, "data.steps=4"],
+            ["trainer=published", *TINY, "trainer.learning_rate=1e-2"],
+            ["integrator=bdf2", *TINY],
+            ["integrator=midpoint", *TINY],
+            ["reality.model=stable_neo_hookean", "reality.stiffness_damping=1e-3", *TINY],
+        ],
+        ids=lambda options: options[0],
+    )
+    def test_other_options_run_and_the_correction_corrects(self, folder, options):
+        code, err = run(*options, IN_RUN)
+        assert (code, "Warning" in err) == (0, False)
+        found = metrics()["errors_mm"]
+        assert found["reconstruction"]["mean"] < 0.1 * found["simulation"]["mean"]
+        assert found["resphys"]["mean"] < 0.5 * found["simulation"]["mean"]
+
+    def test_the_published_network_runs(self, folder):
+        short = [option for option in TINY if not option.startswith("network")]
+        small = ["network=published", "network.width=16", "trainer.epochs=2", "trainer.rollout_every=1"]
+        assert run(*short, *small, IN_RUN)[0] == 0
+        for name, history, kind in (
+            ("model", "training", "residual force"),
+            ("simfree", "simfree_training", "next state"),
+        ):
+            _, metadata = read_checkpoint(f"run/{name}.safetensors", kind)
+            assert metadata["architecture"] == {"blocks": 5, "layers": 3, "width": 16, "activation": "normalised_elu"}
+            assert not metadata["reduced"]
+            records = json.loads(Path(f"run/{history}.json").read_text())["epochs"]
+            assert [r["epoch"] for r in records if "rollout_error_mm" in r] == [1, 2]
+        assert metrics()["errors_mm"].keys() == {*MODELS, "simfree"}
+
+    def test_kept_weights_that_diverge_are_no_secret(self, folder, monkeypatch, caplog):
+        monkeypatch.setattr(train.Validation, "error_mm", lambda self, rollout: float("inf"))
+        assert run(*TINY, IN_RUN, "trainer.selection=validation_loss", "trainer.epochs=3")[0] == 0
+        assert "train: the weights that are kept diverge on the validation split" in caplog.text
+        for name in ("resphys", "simfree"):
+            kept = metrics()["networks"][name]
+            assert (kept["selection"], kept["validation_rollout_error_mm"]) == ("validation_loss", None)
+        history = json.loads(Path("run/training.json").read_text())["epochs"]
+        assert min(history, key=lambda r: r["validation_loss"])["epoch"] == metrics()["networks"]["resphys"]["epoch"]
+
+    def test_refinement_is_never_worse_on_the_validation_split(self, finished, copied):
+        """Here it overfits three short trajectories, so that the weights from before it are taken."""
+        assert run(*TINY, *REFINE, IN_RUN)[0] == 0
+        assert ran(copied) == ["refine", "evaluate", "time", "report"]
+        history = json.loads(Path("run/refinement.json").read_text())["epochs"]
+        assert [r["epoch"] for r in history] == [0, 1, 2, 3]
+        assert history[3]["train_loss"] < history[0]["train_loss"]
+        found, before = metrics()["networks"], metrics(finished[0])["networks"]
+        assert found["resphys"] == before["resphys"]
+        assert found["refinement"]["epoch"] == 0
+        start = found["resphys"]["validation_rollout_error_mm"]
+        assert found["refinement"]["validation_rollout_error_mm"] == pytest.approx(start, rel=1e-6)
+        same_errors(errors(), errors(finished[0]))
+        before = files()
+        assert run(*TINY, *REFINE, IN_RUN, "refinement.epochs=1")[0] == 0
+        assert ran(before) == ["refine", "evaluate", "time", "report"]
+
+    def test_refinement_helps_a_poor_network(self, folder):
+        poor = [*TINY, "trainer.epochs=3", "trainer.linear_noise=null"]
+        assert run(*poor, *REFINE, "hydra.run.dir=run")[0] == 0
+        found, refined = metrics(), files()
+        assert found["networks"]["refinement"]["epoch"] > 0
+        start = found["networks"]["resphys"]["validation_rollout_error_mm"]
+        assert found["networks"]["refinement"]["validation_rollout_error_mm"] < 0.9 * start
+        assert list(found["seconds"]) == REFINED
+        assert run(*poor, IN_RUN)[0] == 0  # without it again
+        assert ran(refined) == ["evaluate", "time", "report"]
+        assert list(metrics()["seconds"]) == STAGES
+        assert found["errors_mm"]["resphys"]["mean"] < 0.9 * metrics()["errors_mm"]["resphys"]["mean"]
+
+    def test_a_diverged_roll_out_is_counted_and_is_no_number(self, finished, copied, monkeypatch):
+        """The second of two test trajectories gets a force that is not finite at its fifth step."""
+        whole = evaluate.force_predictor
+
+        def diverging(model):
+            predict, calls = whole(model), []
+
+            def force(q, v):
+                calls.append(None)
+                found = predict(q, v)
+                found[1] *= torch.nan if len(calls) == 5 else 1.0
+                return found
+
+            return force
+
+        monkeypatch.setattr(evaluate, "force_predictor", diverging)
+        Path("run/rollouts.h5").unlink()
+        assert run(*TINY, IN_RUN)[0] == 0
+        found, before = metrics(), metrics(finished[0])
+        for group in ("errors_mm", "errors_vs_reconstruction_mm"):
+            lost = {"mean": None, "std": None, "trajectories": 2, "diverged": 1}
+            expected = {model: pytest.approx(summary, rel=1e-6) for model, summary in before[group].items()}
+            assert found[group] == {**expected, "resphys": lost}
+        rows, expected = ([each["errors_mm"] for each in m["per_trajectory"]] for m in (found, before))
+        assert rows[0] == pytest.approx(expected[0], rel=1e-6)
+        assert rows[1].pop("resphys") is None
+        assert expected[1].pop("resphys") is not None
+        assert rows[1] == pytest.approx(expected[1], rel=1e-6)
+        with read_hdf5("run/rollouts.h5", "rollouts") as file:
+            assert np.isnan(file["resphys_q"][:]).all((2, 3)).tolist() == [13 * [False], 5 * [False] + 8 * [True]]
+            assert np.isfinite(file["resphys_q"][1, :5]).all()
+
+
+def options(group):
+    return sorted(path.stem for path in (REPOSITORY / "conf" / group).glob("*.yaml"))
+
+
+GROUPS = ("mesh", "physics", "solver", "reconstruction", "network", "trainer", "refinement", "budget")
+SIMULATED = [
+    name for name in options("experiment") if name.startswith(("beam_oscillation", "beam_twist", "marker_ablation"))
+]  # others: test_measured_configuration.py
+FROM_MARKERS = ("levenberg_marquardt", "pressure", "pressure_steps")  # reconstructions
+CHOICES = [
+    (name, group, option)
+    for name in SIMULATED
+    for group in GROUPS
+    for option in options(group)
+    if not (group == "reconstruction" and option in FROM_MARKERS)
+]
+
+
+class TestConfiguration:
+    def composed(self, *overrides):
+        with initialize_config_module("warp_resphys.conf", version_base="1.3"):
+            config = compose("config", overrides=list(overrides))
+        return OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+
+    @pytest.mark.parametrize(("name", "group", "option"), CHOICES, ids="-".join)
+    def test_every_option_of_every_experiment_is_accepted_and_built(self, folder, name, group, option):
+        overrides = [f"experiment={name}", f"{group}={option}"]
+        if group == "mesh" and option in ("file", "arm_published"):
+            box = box_hexahedra((0.1, 0.03, 0.03), (4, 2, 2))
+            meshio.write("box.vtu", meshio.Mesh(box.vertices, [("hexahedron", box.cells)]))
+            overrides.append("mesh.path=box.vtu")
+        config = self.composed(*overrides)
+        check_configuration(config)
+        real, wrong = (build_simulator(config, which) for which in ("reality", "simulation"))
+        assert real.material != wrong.material
+        wanted = REFINED if option == "solver_in_the_loop" else STAGES
+        assert [stage.name for stage in experiment.stages(config)] == wanted
+
+    @pytest.mark.parametrize("option", FROM_MARKERS)
+    def test_reconstructions_from_markers_are_refused_where_whole_states_are_known(self, option):
+        with pytest.raises(InputError, match=r"reconstruction.(method is 'levenberg_marquardt': choose one of|modes)"):
+            check_configuration(self.composed(f"reconstruction={option}"))
+
+    def test_published_sizes_and_settings(self):
+        config = self.composed("physics=published", "network=published", "trainer=published")
+        assert build_simulator(config).body.n_vertices * 3 == 528
+        assert {k: len(v) for k, v in config["data"]["weights_g"].items()} == {"train": 9, "validation": 2, "test": 5}
+        assert config["data"]["steps"] == 150
+        assert [config["network"][k] for k in ("blocks", "layers", "width")] == [5, 3, 512]
+        keys = ("epochs", "batch_size", "learning_rate", "weight_decay")
+        assert [config["trainer"][k] for k in keys] == [1000, 256, 1e-3, 1e-5]
+        keys = ("schedule", "gamma", "step_epochs", "selection")
+        assert [config["trainer"][k] for k in keys] == ["step", 0.83, 100, "validation_loss"]
+        assert config["physics"] == {"mass": "per_vertex", "volume_integration": "full"}

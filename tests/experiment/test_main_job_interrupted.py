@@ -1,0 +1,150 @@
+"""The main job, interrupted and killed: what it keeps, and how it goes on."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from main_job import IN_RUN, REFINE, REPOSITORY, TINY, errors, run, same_errors
+
+from warp_resphys.io.files import read_hdf5
+from warp_resphys.io.resumable import ResumableHDF5
+from warp_resphys.learning.reconstruction import LBFGSB
+from warp_resphys.learning.training import EpochTrainer
+
+
+class Interruption:
+    """Sends SIGINT to this process at a chosen step or epoch, and counts the work done."""
+
+    def __init__(self, monkeypatch):
+        self.at = None
+        self.done = Counter()
+        append, run_epoch = ResumableHDF5.append, EpochTrainer.run_epoch
+
+        def interrupted_append(file, **arrays):
+            append(file, **arrays)
+            self.count(file.kind)
+
+        def interrupted_epoch(trainer):
+            record = run_epoch(trainer)
+            self.count("epochs")
+            return record
+
+        monkeypatch.setattr(ResumableHDF5, "append", interrupted_append)
+        monkeypatch.setattr(EpochTrainer, "run_epoch", interrupted_epoch)
+
+    def count(self, kind):
+        self.done[kind] += 1
+        if self.at == (kind, self.done[kind]):
+            signal.raise_signal(signal.SIGINT)
+
+
+@pytest.mark.usefixtures("no_report")
+class TestInterruption:
+    @pytest.fixture
+    def interruption(self, monkeypatch):
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)
+        yield Interruption(monkeypatch)
+        signal.signal(signal.SIGINT, before)
+
+    @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
+    def test_ctrl_c_in_every_stage(self, folder, interruption, integrator):
+        arguments = [*TINY, f"integrator={integrator}"]
+        assert run(*arguments, "hydra.run.dir=whole")[0] == 0
+        whole = Counter(interruption.done)
+        assert whole == {"trajectories": 13, "reconstruction": 13, "epochs": 80, "rollouts": 13}
+        interruption.done.clear()
+        cuts = {"trajectories": ("generate", 1), "reconstruction": ("reconstruct", 7), "epochs": ("train", 25)}
+        for kind, (stage, at) in {**cuts, "rollouts": ("evaluate", 5)}.items():
+            interruption.at = (kind, at)
+            code, err = run(*arguments, IN_RUN)
+            assert code == 130
+            assert f"interrupted in stage '{stage}'" in err
+            assert "the same command goes on from there" in err
+            assert "Traceback" not in err
+            assert not Path("run/metrics.json").exists()
+            assert not list(Path("run").rglob("*.partial"))
+        interruption.at = None
+        assert run(*arguments, IN_RUN)[0] == 0
+        repeated = interruption.done - whole
+        assert sorted(repeated.elements()) in ([], ["epochs"])  # the epoch that the signal fell into
+        same_errors(errors(), errors("whole"))
+        assert not list(Path("run").glob("*.journal"))
+        assert not list(Path("run").glob("train*.safetensors"))
+
+    def test_ctrl_c_while_refining(self, finished, folder, interruption):
+        shutil.copytree(finished[0], "run")
+        shutil.copytree(finished[0], "whole")
+        assert run(*TINY, *REFINE, "hydra.run.dir=whole")[0] == 0
+        assert interruption.done["epochs"] == 3
+        interruption.done.clear()
+        interruption.at = ("epochs", 2)
+        code, err = run(*TINY, *REFINE, IN_RUN)
+        assert (code, "interrupted in stage 'refine'" in err) == (130, True)
+        interruption.at = None
+        assert run(*TINY, *REFINE, IN_RUN)[0] == 0
+        assert interruption.done["epochs"] in (3, 4)
+        first, second = (json.loads(Path(f"{name}/refinement.json").read_text()) for name in ("run", "whole"))
+        losses = [[r["train_loss"] for r in found["epochs"]] for found in (first, second)]
+        assert losses[0] == losses[1]
+        same_errors(errors(), errors("whole"))
+
+    def test_twice_in_one_stage_and_before_the_first_frame(self, finished, folder, interruption):
+        for at in (1, 2, 9):
+            interruption.at = ("reconstruction", at)
+            assert run(*TINY, IN_RUN)[0] == 130
+        interruption.at = None
+        assert run(*TINY, IN_RUN)[0] == 0
+        same_errors(errors(), errors(finished[0]))
+
+    def test_each_frame_starts_from_the_force_of_the_one_before(self, folder, interruption, monkeypatch):
+        guesses, step = [], LBFGSB.step
+
+        def recorded(self, state, observed, first_guess=None):
+            guesses.append(first_guess)
+            return step(self, state, observed, first_guess)
+
+        monkeypatch.setattr(LBFGSB, "step", recorded)
+        arguments = [*TINY, IN_RUN, "reconstruction=lbfgsb", "data.steps=4"]
+        interruption.at = ("reconstruction", 3)
+        assert run(*arguments)[0] == 130
+        assert run(*arguments)[0] == 0
+        with read_hdf5("run/reconstruction.h5", "reconstruction") as file:
+            np.testing.assert_array_equal(np.stack(guesses, axis=1), file["force"][:, :-1])
+
+    @staticmethod
+    def start(until):
+        """The command in a process of its own, once a file is there."""
+        program = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        program += "from warp_resphys.cli import main\nmain()"
+        command = [sys.executable, "-c", program, *TINY, IN_RUN]
+        environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+        child = subprocess.Popen(command, env=environment, text=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+        while not Path(until).exists() and child.poll() is None:
+            time.sleep(0.002)
+        return child
+
+    def test_ctrl_c_in_a_real_process(self, finished, folder):
+        child = self.start("run/trajectories.h5.journal")
+        child.send_signal(signal.SIGINT)
+        err = child.communicate(timeout=60)[1]
+        assert child.returncode == 130, err
+        assert "interrupted in stage" in err
+        assert "Traceback" not in err
+        assert run(*TINY, IN_RUN)[0] == 0
+        same_errors(errors(), errors(finished[0]))
+
+    def test_killed_without_warning(self, finished, folder):
+        child = self.start("run/reconstruction.h5.journal")
+        child.kill()
+        err = child.communicate(timeout=60)[1]
+        assert child.returncode == -signal.SIGKILL, err
+        assert run(*TINY, IN_RUN)[0] == 0
+        same_errors(errors(), errors(finished[0]))

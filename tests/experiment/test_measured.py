@@ -1,0 +1,461 @@
+"""Recordings of a body, real or simulated, become markers in its frame; what cannot is refused by file and marker."""
+
+import copy
+import json
+import logging
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from measured_run import configuration
+from scipy.spatial.transform import Rotation
+
+from warp_resphys import cli
+from warp_resphys.data.recordings.arrays import write_recording
+from warp_resphys.data.recordings.reading import read_recording
+from warp_resphys.data.recordings.recording import Recording
+from warp_resphys.experiment.build import build_body
+from warp_resphys.experiment.checks import check_configuration
+from warp_resphys.experiment.measured.files import MARKERS, QUALITY, REGISTRATION, TRUTH, read_motions, recording_file
+from warp_resphys.experiment.measured.importing import import_recordings
+from warp_resphys.experiment.measured.stages import import_stages
+from warp_resphys.experiment.measured.synthesise import make_scene, reality, simulate
+from warp_resphys.experiment.measured.trials import trials_of
+from warp_resphys.io.errors import DataFileError, InputError
+from warp_resphys.io.files import read_hdf5
+from warp_resphys.io.stages import StageContext, fingerprint, run_stages
+
+ROOT = Path(__file__).parents[2]
+TIPS, BASES = tuple(f"Tip - {i}" for i in (1, 2, 3)), tuple(f"Base - {i}" for i in (1, 2, 3))
+RATE = 100.0
+SMALL = [
+    "synthetic.mesh.divisions=[6,2,2]",
+    "synthetic.time_step=0.005",
+    "synthetic.seconds=0.6",
+    "data.seconds=0.5",
+    "synthetic.train=[m0,m50]",
+    "synthetic.validation=[]",
+    "synthetic.test=[m90]",
+]
+
+
+def read_json(path):
+    return json.loads(path.read_text())
+
+
+@pytest.fixture(scope="module")
+def laboratory(tmp_path_factory):
+    """A run of the first stages without recordings."""
+    folder = tmp_path_factory.mktemp("laboratory")
+    config = configuration(*SMALL)
+    check_configuration(config)
+    run_stages(import_stages(config), folder)
+    return folder, config
+
+
+def test_simulated_markers_come_back_within_noise(laboratory):
+    folder, config = laboratory
+    motions, bound, labels, _ = read_motions(folder / MARKERS, build_body(config), config["data"]["hung_on"])
+    assert motions.names == ("m0", "m50", "m90")
+    assert labels == TIPS
+    np.testing.assert_allclose(motions.attached_mass.sum(1), [0.0, 0.05, 0.09], atol=1e-12)
+    scene = make_scene(config)
+    released = np.array(list(read_json(folder / TRUTH)["released_s"].values()))
+    found = np.array([each["release_frame"] for each in read_json(folder / QUALITY).values()]) / RATE
+    times = motions.times.numpy() + (found - released)[:, None]
+    true = simulate(config, reality(config, scene.gravity), scene, trials_of(config), times)
+    # The nominal places turn the frame by a little; what has to come back is the motion in it.
+    turn, _ = Rotation.align_vectors(bound - bound.mean(0), scene.followed - scene.followed.mean(0))
+    assert np.degrees(turn.magnitude()) < 1.0
+    moved = turn.apply((true - scene.followed).reshape(-1, 3)).reshape(true.shape)
+    off = (motions.markers.numpy() - bound - moved)[motions.seen.numpy()]
+    assert float(motions.amplitude[2]) > 0.01
+    assert np.sqrt(np.mean(off**2)) < 2.5 * config["synthetic"]["noise"]
+    torch.testing.assert_close(motions.held, torch.as_tensor(bound).expand(3, -1, -1), rtol=0.0, atol=1e-12)
+    registration = read_json(folder / REGISTRATION)["m50"]
+    assert 0.2 < registration["rms_mm"] < 0.6  # misplaced by 0.3 mm a coordinate, less what the motion takes up
+    assert max(abs(x) for shift in registration["shift_mm"].values() for x in shift) < 0.1
+
+
+def test_frames_end_with_what_counts(laboratory):
+    folder, config = laboratory
+    with read_hdf5(folder / MARKERS, "markers") as file:
+        times, markers = file["times"][()], file["markers"][()]
+    assert (np.diff(times, axis=1) >= 0.0).all()
+    assert (times[:, 0] >= 0.0).all()
+    assert (times[:, 0] < 1.0 / RATE).all()
+    assert times.max() <= config["data"]["seconds"]
+    assert times[:, -1].min() > config["data"]["seconds"] - 1.0 / RATE
+    ended = np.concatenate([np.zeros((len(times), 1), bool), np.diff(times, axis=1) == 0.0], axis=1)
+    np.testing.assert_array_equal(np.isnan(markers).all((2, 3)), ended)
+
+
+def test_gravity_and_release_are_recovered(laboratory):
+    folder, config = laboratory
+    truth, quality = read_json(folder / TRUTH), read_json(folder / QUALITY)
+    with read_hdf5(folder / MARKERS, "markers") as file:
+        gravity = np.asarray(file.attrs["gravity"])
+    true = np.array(truth["gravity"])
+    lean = np.degrees(np.arccos(gravity @ true / np.linalg.norm(gravity) / np.linalg.norm(true)))
+    assert lean < 0.5
+    assert np.linalg.norm(gravity) == pytest.approx(9.80709)
+    tilt = np.degrees(np.arccos(-true[2] / np.linalg.norm(true)))
+    assert tilt == pytest.approx(config["synthetic"]["tilt"])
+    for name, at in truth["released_s"].items():
+        assert quality[name]["release_frame"] == pytest.approx(RATE * at, abs=0.3)
+        assert 40.0 < RATE * at < 41.0
+
+
+def test_the_recordings_are_in_a_frame_of_their_own(laboratory):
+    folder, config = laboratory
+    recording = read_recording(folder / recording_file("m0"))
+    assert recording.labels == (*TIPS, *BASES)
+    nominal = np.array([*config["markers"]["followed"].values(), *config["markers"]["others"].values()])
+    assert np.linalg.norm(recording.positions[0] - nominal, axis=1).min() > 0.05
+    sag = recording.positions[-1, :3].mean(0) - recording.positions[0, :3].mean(0)
+    assert -sag[0] > 0.99 * np.linalg.norm(sag) - 2e-3  # up is x
+
+
+def test_a_trial_does_not_depend_on_the_others(tmp_path, laboratory):
+    folder, config = laboratory
+    alone = copy.deepcopy(config)
+    alone["synthetic"] |= {"train": ["m90"], "test": ["m50"]}
+    run_stages(import_stages(alone)[:1], tmp_path)
+    one, other = (read_recording(place / recording_file("m90")) for place in (folder, tmp_path))
+    np.testing.assert_allclose(one.positions, other.positions, rtol=0.0, atol=1e-7)
+    again = configuration(*SMALL, "seed=1")
+    assert fingerprint(import_stages(again)[0], {}) != fingerprint(import_stages(config)[0], {})
+    assert np.abs(make_scene(again).translation - make_scene(config).translation).min() > 1e-3
+
+
+def test_without_a_known_vertical_gravity_is_as_configured(tmp_path):
+    config = configuration(*SMALL, "data.up=null", "synthetic.train=[m90]", "synthetic.test=[m50]", "data.seconds=0.1")
+    config["synthetic"]["seconds"] = 0.1
+    run_stages(import_stages(config), tmp_path)
+    with read_hdf5(tmp_path / MARKERS, "markers") as file:
+        np.testing.assert_allclose(file.attrs["gravity"], config["gravity"])
+    assert "vertical_deg" not in read_json(tmp_path / REGISTRATION)["m90"]
+
+
+class Shelf:
+    """Recordings in a folder, made of the simulated ones, and the configuration that names them."""
+
+    def __init__(self, folder, laboratory):
+        made, config = laboratory
+        self.folder, self.config = folder, copy.deepcopy(config)
+        names = {"bare": "m0", "load52": "m50", "load101": "m90"}
+        hung = config["synthetic"]["trials"]
+        self.config["data"] |= {
+            "folder": str(folder),
+            "trials": {name: {"file": f"{name}.h5", "hung": hung[of]["hung"]} for name, of in names.items()},
+        }
+        self.recordings = {name: read_recording(made / recording_file(of)) for name, of in names.items()}
+        for name in names:
+            self.write(name)
+
+    def write(self, name, **changes):
+        recording = self.recordings[name]
+        fields = {"labels": recording.labels, "positions": recording.positions, "rate": recording.rate, **changes}
+        path = self.folder / f"{name}.h5"
+        write_recording(path, Recording(source=path, **fields))
+
+    def move(self, name, label, by, frames=slice(None)):
+        recording = self.recordings[name]
+        positions = recording.positions.copy()
+        positions[frames, recording.labels.index(label)] += by
+        self.write(name, positions=positions)
+
+    def bring_in(self):
+        import_recordings(StageContext("import", self.folder, "", self.config))
+        with read_hdf5(self.folder / MARKERS, "markers") as file:
+            return {name: file[name][()] for name in file} | dict(file.attrs)
+
+
+@pytest.fixture
+def shelf(tmp_path, laboratory):
+    return Shelf(tmp_path, laboratory)
+
+
+def test_recordings_of_a_folder_give_what_the_run_folder_gave(shelf, laboratory):
+    found = shelf.bring_in()
+    with read_hdf5(laboratory[0] / MARKERS, "markers") as file:
+        np.testing.assert_array_equal(found["markers"], file["markers"][()])
+    assert list(found["names"]) == ["bare", "load52", "load101"]
+    np.testing.assert_array_equal(found["load"], [0.0, 0.05, 0.09])
+
+
+def test_short_gaps_are_filled_and_long_ones_masked(shelf):
+    whole = shelf.bring_in()["markers"]
+    positions = shelf.recordings["load52"].positions.copy()
+    positions[50:53, 0] = positions[60:70, 1] = np.nan
+    shelf.write("load52", positions=positions)
+    found = shelf.bring_in()["markers"]
+    np.testing.assert_allclose(found[1, :, 0], whole[1, :, 0], rtol=0.0, atol=1e-3)
+    first = 60 - int(np.ceil(read_json(shelf.folder / QUALITY)["load52"]["release_frame"]))
+    hidden = np.zeros(found.shape[1], bool)
+    hidden[first : first + 10] = True
+    np.testing.assert_array_equal(np.isnan(found[1, :, 1]).all(1), hidden | np.isnan(whole[1, :, 1]).all(1))
+    np.testing.assert_array_equal(found[2], whole[2])
+
+
+def test_a_rate_that_does_not_fit_the_step_keeps_its_frames(shelf, caplog):
+    shelf.write("bare", rate=130.0)
+    with caplog.at_level(logging.INFO):
+        found = shelf.bring_in()
+    assert "bare.h5 has 130 frames a second and the simulation 100 steps" in caplog.text
+    steps = np.diff(found["times"][0])
+    np.testing.assert_allclose(steps[steps > 0.0], 1.0 / 130.0)
+    assert "load52.h5 has" not in caplog.text
+
+
+def test_each_trial_stands_where_the_mean_of_all_does(shelf):
+    shelf.write("load101", positions=shelf.recordings["load101"].positions + [0.002, 0.001, -0.001])
+    whole = shelf.bring_in()
+    shelf.config["data"]["trials"].pop("load101")
+    rest = shelf.bring_in()
+    np.testing.assert_allclose(whole["bound"], rest["bound"], rtol=0.0, atol=3e-5)
+    np.testing.assert_allclose(whole["markers"][2, 0], whole["bound"], rtol=0.0, atol=1e-3)
+    shelf.move("load52", "Tip - 2", [0.0, 0.0012, 0.0])
+    moved = shelf.bring_in()
+    swing, same = (found["markers"][1] - found["bound"] for found in (rest, moved))
+    np.testing.assert_allclose(swing, same, rtol=0.0, atol=4e-4)  # a registration that is turned a little
+    assert moved["held"][1] == pytest.approx(moved["bound"])
+    shift = read_json(shelf.folder / REGISTRATION)["load52"]["shift_mm"]["Tip - 2"]
+    assert np.linalg.norm(shift) == pytest.approx(0.6 * 0.7, abs=0.2)  # half of 1.2 mm, less what the fit takes up
+
+
+def published_layout(shelf, name, first):
+    """The recording from a frame on, with the places of its markers on the undeformed body."""
+    positions = shelf.recordings[name].positions
+    shelf.write(name, positions=positions[first:], rest=np.median(positions[:40], axis=0))
+
+
+def test_recordings_that_begin_with_the_release_of_a_deformed_body(shelf):
+    """As the published ones do: a loaded beam at rest, whose weight is cut off."""
+    whole = shelf.bring_in()
+    for name in shelf.recordings:
+        published_layout(shelf, name, first=44)
+    shelf.config["data"] |= {"begins": "released", "rest": "file", "seconds": 0.4}
+    found = shelf.bring_in()
+    np.testing.assert_allclose(found["bound"], whole["bound"], rtol=0.0, atol=2e-5)
+    np.testing.assert_allclose(found["held"], found["markers"][:, 0], rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(found["times"], np.broadcast_to(np.arange(41) / RATE, (3, 41)), atol=1e-9)
+    np.testing.assert_allclose(found["markers"][2], whole["markers"][2, 3:44], rtol=0.0, atol=5e-5)
+    assert np.linalg.norm(found["held"] - found["bound"], axis=2).min() > 5e-4
+
+
+def test_a_recording_without_its_rest_is_named(shelf):
+    shelf.config["data"]["rest"] = "file"
+    refuse(shelf, r"bare\.h5 has no array 'rest' .* or set data\.rest to held")
+    rest = np.median(shelf.recordings["bare"].positions[:40], axis=0)
+    rest[1] = np.nan
+    shelf.write("bare", rest=rest)
+    refuse(shelf, r"bare\.h5: 'rest' has no place of 'Tip - 2'")
+
+
+def refuse(shelf, message, error=DataFileError):
+    with pytest.raises(error, match=message):
+        shelf.bring_in()
+
+
+def test_a_missing_file_is_named(shelf):
+    (shelf.folder / "load52.h5").unlink()
+    refuse(shelf, r"load52\.h5 does not exist")
+    with pytest.raises(DataFileError, match=r"cannot read .*load52\.h5 .*data\.trials\.load52\.file"):
+        import_stages(shelf.config)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.9])
+def test_a_truncated_file_is_named(shelf, share):
+    path = shelf.folder / "load52.h5"
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    refuse(shelf, r"load52\.h5 is (truncated|damaged)")
+
+
+def test_names_that_do_not_match_are_listed(shelf):
+    shelf.write("load101", labels=("Tip 1", *TIPS[1:], *BASES))
+    refuse(shelf, r"load101\.h5 has no marker named 'Tip - 1'; it has 'Tip 1', 'Tip - 2'.*set the marker names")
+
+
+@pytest.mark.parametrize("label", ["Tip - 2", "Base - 3"])
+def test_a_marker_that_is_never_seen_is_named(shelf, label):
+    shelf.move("load52", label, np.nan)
+    refuse(shelf, rf"load52\.h5: .*{label}.* seen")
+
+
+def test_a_marker_that_is_hidden_while_the_body_is_held_is_named(shelf):
+    shelf.move("load52", "Tip - 2", np.nan, slice(None, 45))
+    refuse(shelf, r"load52\.h5: 'Tip - 2' cannot be seen while the body is held")
+
+
+def test_a_marker_that_is_hidden_after_the_release_is_named(shelf):
+    shelf.move("load52", "Tip - 2", np.nan, slice(41, None))
+    refuse(shelf, r"load52\.h5: 'Tip - 2' cannot be seen in the 0\.5 s after the release")
+
+
+def test_a_base_marker_that_moved_between_trials_is_named(shelf):
+    shelf.move("load52", "Base - 3", [0.002, 0.0, 0.0])
+    refuse(shelf, r"load52\.h5: base marker Base - \d moved by \d\.\d\d mm against .* since .*bare\.h5")
+
+
+def test_a_base_that_moved_as_a_whole_is_named(shelf):
+    shelf.write("load101", positions=shelf.recordings["load101"].positions + [0.02, 0.0, 0.0])
+    refuse(shelf, r"load101\.h5: base marker Base - \d stands 20\.\d\d mm from its place in .*bare\.h5")
+    shelf.config["markers"]["largest_shift"] = None
+    shelf.bring_in()
+
+
+def test_what_moved_after_the_release_alone_is_no_fault_of_the_base(shelf):
+    shelf.move("load52", "Base - 3", [0.0, 0.0, 0.002], slice(45, None))
+    shelf.bring_in()
+
+
+def test_a_residual_above_the_threshold_names_file_and_marker(shelf):
+    for name in shelf.recordings:
+        shelf.move(name, "Tip - 3", [0.0, 0.0, 0.012])
+    shelf.config["markers"]["others"].pop("Base - 3")
+    shelf.config["markers"]["others"].pop("Base - 2")
+    refuse(shelf, r"bare\.h5: the markers at rest do not fit .* 4\.0 mm: 'Tip - 3' is \d+\.\d mm off")
+
+
+def test_one_outlier_among_six_is_left_out_and_named(shelf):
+    whole = shelf.bring_in()
+    for name in shelf.recordings:
+        shelf.move(name, "Base - 3", [0.0, 0.0, 0.012])
+    found = shelf.bring_in()
+    assert read_json(shelf.folder / REGISTRATION)["bare"]["outliers"] == ["Base - 3"]
+    np.testing.assert_allclose(found["bound"], whole["bound"], rtol=0.0, atol=1e-3)
+
+
+def test_a_trial_without_a_release_is_named(shelf):
+    held = np.broadcast_to(shelf.recordings["bare"].positions[:1], (100, 6, 3))
+    shelf.write("load52", positions=held + np.random.default_rng(0).normal(scale=1e-5, size=held.shape))
+    refuse(shelf, r"No release found in .*load52\.h5.* never moves by more than")
+
+
+def test_too_few_frames_a_second_are_refused(shelf):
+    shelf.write("load52", rate=25.0)
+    refuse(shelf, r"load52\.h5 has 25 frames a second, too few .* record 40 or more")
+
+
+@pytest.mark.parametrize("up", ["-x", "y", [0.0, 0.0, 1.0]])
+def test_a_wrong_vertical_is_noticed(shelf, up):
+    shelf.config["data"]["up"] = up
+    refuse(shelf, r"bare\.h5: with data\.up .* degrees from the configured one: set data\.up", InputError)
+
+
+def test_a_marker_far_from_the_body_is_named(shelf):
+    shelf.config["mesh"]["size"] = [0.06, 0.03, 0.03]
+    shelf.config["markers"]["bind"] = "normal"
+    shelf.config["markers"]["bind_to"] = None
+    refuse(shelf, r"Marker 'Tip - \d' is \d\d\.\d mm from the surface", InputError)
+
+
+def test_a_changed_recording_is_imported_again(shelf):
+    before = fingerprint(import_stages(shelf.config)[0], {})
+    assert fingerprint(import_stages(shelf.config)[0], {}) == before
+    shelf.move("load52", "Tip - 1", 1e-6)
+    assert fingerprint(import_stages(shelf.config)[0], {}) != before
+
+
+def test_the_three_beams(shared_data, tmp_path):
+    config = configuration(f"data.folder={shared_data / 'beam_mocap'}")
+    check_configuration(config)
+    run_stages(import_stages(config), tmp_path)
+    registration = read_json(tmp_path / REGISTRATION)
+    rms = {name: round(each["rms_mm"], 2) for name, each in registration.items()}
+    assert rms == {"bare": 0.81, "load52": 0.83, "load101": 1.13}  # docs/registration.md
+    motions, bound, _, gravity = read_motions(tmp_path / MARKERS, build_body(config), config["data"]["hung_on"])
+    assert bool(motions.seen[motions.times < 1.38].all())
+    np.testing.assert_allclose(motions.attached_mass.sum(1) * 9.80709, [0.0, 0.51012, 1.00062], atol=1e-4)
+    assert int((motions.attached_mass[1] > 0.0).sum()) == 4
+    nominal = np.array(list(config["markers"]["followed"].values()))
+    assert np.linalg.norm(bound - nominal, axis=1).max() < 2e-3
+    assert np.degrees(np.arccos(-gravity[2] / np.linalg.norm(gravity))) < 10.0
+    for row, name in enumerate(("gravity", "load52", "load101")):  # a rigid motion keeps every distance
+        tip = read_recording(shared_data / "beam_mocap" / f"beam_{name}_V2_a.c3d").select(TIPS).positions.mean(1)
+        farthest = np.linalg.norm(tip - np.median(tip[15:40], axis=0), axis=1).max()
+        moved = (motions.markers - motions.held[:, None])[row].mean(1).nan_to_num().norm(dim=1).max()
+        assert float(moved) == pytest.approx(farthest, rel=0.02)
+        assert farthest > 0.009
+    quality = read_json(tmp_path / QUALITY)
+    assert any("Base - 1 jumps" in warning for warning in quality["load101"]["warnings"])
+
+
+class TestCommand:
+    @pytest.fixture
+    def command(self, shelf, monkeypatch, capsys):
+        """Runs the experiment on the shelf's recordings, through the command line."""
+
+        def run(*overrides):
+            trials = [f"++data.trials.{name}={{file: {name}.h5, hung: 0.0}}" for name in shelf.recordings]
+            quiet = ["hydra/job_logging=none", "hydra/hydra_logging=none"]
+            places = [f"data.folder={shelf.folder}", f"hydra.run.dir={shelf.folder / 'run'}"]
+            arguments = ["warp-resphys", "experiment=beam_real", *places, *quiet, *trials, *overrides]
+            monkeypatch.setattr(sys, "argv", arguments)
+            with pytest.raises(SystemExit) as ended:
+                cli.main()
+            err = capsys.readouterr().err
+            assert ended.value.code == 2
+            assert "Traceback" not in err
+            return err
+
+        return run
+
+    def test_a_marker_that_moved(self, shelf, command):
+        shelf.move("load52", "Base - 3", [0.002, 0.0, 0.0])
+        sentence = r"^error: .*load52\.h5: base marker Base - 3 moved by 2\.00 mm .*\n$"
+        assert re.search(sentence, command(), flags=re.MULTILINE)
+        assert not (shelf.folder / "run" / MARKERS).exists()
+
+    def test_names_that_do_not_match(self, shelf, command):
+        shelf.write("bare", labels=("a", *TIPS[1:], *BASES))
+        assert "bare.h5 has no marker named 'Tip - 1'; it has 'a'" in command()
+
+    def test_a_file_that_is_not_there(self, shelf, command):
+        err = command("data.trials.bare.file=gone.c3d")
+        assert "gone.c3d (No such file or directory): check data.folder and data.trials.bare.file." in err
+
+    def test_a_trial_in_two_splits(self, shelf, command):
+        err = command("data.folds=null", "data.train=[bare]", "data.test=[bare,load52]")
+        assert err.endswith(
+            "error: the trial 'bare' is in data.train and data.test: every trial is in one split, once.\n"
+        )
+
+
+TUTORIAL = ROOT / "docs" / "bring_your_robot.md"
+
+
+def test_the_tutorial(shared_data, tmp_path, monkeypatch):
+    """Its mesh, its configuration and its output, on the recordings that it was written with."""
+    blocks = re.findall(r"```(\w*)\n(.*?)```", TUTORIAL.read_text(encoding="utf-8"), flags=re.DOTALL)
+    (mesh,), (written,) = ([text for kind, text in blocks if kind == wanted] for wanted in ("python", "yaml"))
+    (log,) = [text.splitlines() for _, text in blocks if text.startswith("import: ")]
+    monkeypatch.chdir(tmp_path)
+    exec(compile(mesh, TUTORIAL.name, "exec"), {})
+    (tmp_path / "recordings").symlink_to(shared_data / "beam_mocap")
+    place = tmp_path / "configs" / "experiment" / "my_robot.yaml"
+    place.parent.mkdir(parents=True)
+    place.write_text(written)
+    assert len(written.splitlines()) < 36
+    config = configuration(f"hydra.searchpath=[file://{tmp_path / 'configs'}]", experiment="my_robot")
+    check_configuration(config)
+    run_stages(import_stages(config), tmp_path)
+    quality, registration = read_json(tmp_path / QUALITY), read_json(tmp_path / REGISTRATION)
+    for line, (name, each) in zip(log, quality.items(), strict=True):
+        rms = registration[name]["rms_mm"]
+        assert line == f"import: {name} is let go in frame {each['release_frame']:.1f}, registered to {rms:.2f} mm"
+
+
+def test_an_experiment_may_set_gravity(tmp_path):
+    place = tmp_path / "experiment" / "hanging.yaml"
+    place.parent.mkdir()
+    place.write_text("# @package _global_\ndefaults: [beam_real, _self_]\nname: hanging\ngravity: [9.81, 0.0, 0.0]\n")
+    config = configuration(f"hydra.searchpath=[file://{tmp_path}]", experiment="hanging")
+    assert config["gravity"] == [9.81, 0.0, 0.0]
+    given = configuration(f"hydra.searchpath=[file://{tmp_path}]", "gravity=[0,0,-1]", experiment="hanging")
+    assert given["gravity"] == [0, 0, -1]

@@ -1,0 +1,253 @@
+"""Configurations of experiments on recordings: what is refused, what a budget changes, and which choice wins."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from measured_run import configuration
+
+from warp_resphys.experiment.checks import check_configuration
+from warp_resphys.experiment.kinds import dotted
+from warp_resphys.experiment.measured.trials import folds_of, split_of, trials_of, vertical
+from warp_resphys.experiment.trajectories import training_settings
+from warp_resphys.io.errors import InputError, ResphysError
+
+ROOT = Path(__file__).parents[2]
+
+
+def changed(config, key, value):
+    *path, last = key.split("/")
+    group = config
+    for name in path:
+        group = group[name]
+    group[last] = value
+    return config
+
+
+TRIALS = {"a": {"file": "a.c3d", "hung": 0.0}, "b": {"file": "b.c3d", "hung": 0.1}}
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("data/seconds", 0.0, "data.seconds is 0.0: it must be a positive number"),
+        ("data/seconds", "long", "data.seconds is 'long': it must be a positive number"),
+        ("data/longest_gap", 2.5, "data.longest_gap is 2.5: it must be a whole number"),
+        ("data/units", "inch", "data.units is 'inch': it must be one of m, cm, mm"),
+        ("data/units", ["m"], r"data.units is \['m'\]: it must be one of m, cm, mm"),
+        ("data/folds", "five", "data.folds is 'five': it must be one of leave_one_out"),
+        ("data/up", "up", "data.up is 'up': give x, -x"),
+        ("data/up", [0.0, 0.0, 0.0], "data.up is .*: give x, -x"),
+        ("data/up", [0.0, 1.0], "data.up is .*: it must be x, -x"),
+        ("data/begins", "later", "data.begins is 'later': it must be one of held, released"),
+        ("data/hung", {"x": 0.1}, "unknown key 'data.hung': data has kind, folder"),
+        ("data/hung_on", {"x": 0.07003}, "no vertex lies within"),
+        ("data/hung_on", {"x": 0.0}, "data.hung_on names fixed vertices alone"),
+        ("data/hung_on", {"w": 0.0}, "unknown key 'data.hung_on.w'"),
+        ("data/hung_on", {"x": "tip"}, "data.hung_on.x is 'tip': it must be a number"),
+        ("data/hung_on", None, "a trial has a load, but data.hung_on is not set"),
+        ("data/trials", {}, "data.trials is empty: name each trial"),
+        ("data/trials", {"a/b": TRIALS["a"]}, "data.trials.a/b: files are named after trials"),
+        ("data/trials", {7: TRIALS["a"]}, "data.trials.7: files are named after trials"),
+        ("data/trials", {"a": {"file": "a.c3d"}}, "data.trials.a is .*: it needs file and hung"),
+        ("data/trials", {"a": {"file": 3, "hung": 0.0}}, "data.trials.a.file is 3: it must be the name of a file"),
+        ("data/trials", {"a": {"file": "a.c3d", "hung": -0.1}}, "data.trials.a.hung is -0.1: it must be a mass"),
+        ("data/trials", {"a": TRIALS["a"], "b": TRIALS["a"]}, "the trials 'a' and 'b' have the same file, a.c3d"),
+        ("data/trials", {"a": TRIALS["a"]}, "data.folds is leave_one_out, which needs two trials"),
+        ("markers/bind", "glue", "markers.bind is 'glue': it must be one of normal, frame, rigid"),
+        ("markers/bind_to", None, "markers.bind is rigid: set markers.bind_to"),
+        ("markers/bind_to", {"x": 0.07003}, "no vertex lies within"),
+        ("markers/followed", {}, "markers.followed is empty"),
+        ("markers/followed/Tip - 1", [0.1, 0.0], r"markers.followed.Tip - 1 is \[0.1, 0.0\]: it must be three numbers"),
+        ("markers/others/Tip - 1", [0.1, 0.0, 0.0], "the marker 'Tip - 1' is in markers.followed and markers.others"),
+        ("markers/others", {"Base - 1": [0, 0, 0], "Base - 2": "x"}, "markers.others.Base - 2 is 'x'"),
+        ("markers/largest_residual", -1.0, "markers.largest_residual is -1.0: it must be a positive number"),
+        ("published/simulation/colour", "red", "unknown key 'published.simulation.colour'"),
+        ("published/simulation/poissons_ratio", 0.6, "published.simulation: poissons_ratio is 0.6"),
+        ("published/physics/mass", "heavy", "published.physics.mass is 'heavy': it must be one of row_sum"),
+        ("published/physics", {"mass": "row_sum"}, "published.physics.volume_integration is missing"),
+        ("release", None, "release is None: it must be a group of settings"),
+        ("release/window", "x", "release.window is 'x': it must be a positive number"),
+        ("data/rest", "file", "release.sideways is 0.002 m, but data.rest is file"),
+        ("gravity", [0.0, 0.0, 0.0], "release.sideways is across gravity, but gravity is zero"),
+        ("data/limit", {"train": 2}, "data.limit.validation is missing"),
+        ("data/limit", 2, "data.limit is 2: it must be a group of settings"),
+        ("release/sideways", -1.0, "release.sideways is -1.0: it must be a number, zero or more"),
+        ("identify/substeps", 0, "identify.substeps is 0: it must be a whole number, one or more"),
+        ("release/colour", 1, "unknown key 'release.colour': release has hold_modes"),
+        ("in_the_loop/epochs", 0, "in_the_loop.epochs is 0: it must be a whole number, one or more"),
+        ("identify/starts", "two", "identify.starts is 'two': it must be a whole number"),
+        ("identify/parameters", {}, "identify.parameters is empty"),
+        ("identify/parameters/colour", {"lower": 0.0, "upper": 1.0}, "identify.parameters names 'colour'"),
+        (
+            "identify/elastic/density",
+            {"lower": 0.0, "upper": 1.0},
+            "identify.elastic names .density.: choose from youngs",
+        ),
+        ("identify/parameters/density", {"lower": 0.0}, "identify.parameters.density.upper is missing"),
+        (
+            "identify/parameters/density",
+            {"lower": 2.0, "upper": 1.0},
+            "identify.parameters.density: the bounds 2 and 1",
+        ),
+        ("identify/grid/youngs_modulus/points", 0, "identify.grid.youngs_modulus.points is 0"),
+        ("identify/grid/youngs_modulus/lower", 1e9, "identify.grid.youngs_modulus: the bounds"),
+        ("identify/first_guess/mass_damping", 50.0, "identify.first_guess.mass_damping is 50.0: .* from 0 to 10"),
+        ("identify/first_guess/colour", 1.0, "identify.first_guess names 'colour'"),
+        ("published/integrator", "euler", "published.integrator is 'euler': it must be one of"),
+    ],
+)
+def test_configuration_of_recordings_is_checked(key, value, message):
+    config = changed(configuration("data.folder=recordings"), key, value)
+    with pytest.raises(ResphysError, match=message):
+        check_configuration(config)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("synthetic", None, "data.folder is not set: give the folder of the recordings"),
+        ("data/rest", "file", "data.rest is file, but simulated bodies are held undeformed"),
+        ("synthetic/tilt", 45.0, "synthetic.tilt is 45.0: it must be an angle from 0 to 20 degrees"),
+        ("synthetic/seconds", 1.0, "synthetic.seconds is 1.0, less than data.seconds"),
+        (
+            "synthetic/material/youngs_modulus",
+            "soft",
+            "synthetic.material.youngs_modulus is 'soft': it must be a number",
+        ),
+        ("synthetic/material/stiffness_damping", -1.0, "synthetic.material: stiffness_damping is -1"),
+        ("synthetic/integrator", "rk4", "synthetic.integrator is 'rk4'"),
+        ("synthetic/trials/m0", {"hung": -0.01}, "synthetic.trials.m0.hung is -0.01"),
+        ("synthetic/test", [], "synthetic.test is empty: name one of synthetic.trials"),
+        ("synthetic/test", ["m10", "m99"], "synthetic.test names the trial 'm99', which is not in synthetic.trials"),
+        ("synthetic/test", ["m10", "m20"], "the trial 'm20' is in synthetic.train and synthetic.test"),
+        ("synthetic/test", ["m10", "m10"], "the trial 'm10' is twice in synthetic.test"),
+        ("synthetic/mesh/kind", "sphere", "mesh.kind is 'sphere'"),
+    ],
+)
+def test_configuration_of_a_simulated_laboratory_is_checked(key, value, message):
+    with pytest.raises(ResphysError, match=message):
+        check_configuration(changed(configuration(), key, value))
+
+
+GROUPS = ("physics", "solver", "reconstruction", "network", "trainer", "budget")
+OPTIONS = [(group, path.stem) for group in GROUPS for path in sorted((ROOT / "conf" / group).glob("*.yaml"))]
+
+
+@pytest.mark.parametrize(("group", "option"), OPTIONS)
+def test_every_option_goes_with_recordings(group, option):
+    check_configuration(configuration(f"{group}={option}"))
+
+
+def test_refinement_is_refused():
+    with pytest.raises(InputError, match="refinement is for simulated experiments"):
+        check_configuration(configuration("refinement=solver_in_the_loop"))
+
+
+def test_folds_and_splits(tmp_path):
+    config = configuration(f"data.folder={tmp_path}")
+    folds = folds_of(config)
+    assert {name: fold.test for name, fold in folds.items()} == {
+        name: (name,) for name in ("bare", "load52", "load101")
+    }
+    assert folds["load52"].train == ("bare", "load101")
+    config["data"] |= {"folds": None, "train": ["load101", "bare"], "test": ["load52"]}
+    check_configuration(config)
+    assert folds_of(config) is None
+    assert [trial.name for trial in trials_of(config)] == ["load101", "bare", "load52"] == list(split_of(config).names)
+    assert trials_of(config)[1].file == tmp_path / "beam_gravity_V2_a.c3d"
+    config["data"]["train"] = []
+    with pytest.raises(InputError, match=r"data\.train is empty: .* or set data\.folds to leave_one_out"):
+        check_configuration(config)
+
+
+def test_a_budget_takes_fewer_simulated_trials():
+    split = split_of(configuration("budget=quick"))
+    assert [len(part) for part in (split.train, split.validation, split.test)] == [3, 1, 1]
+
+
+def test_a_budget_takes_fewer_folds():
+    settings = ["data.folder=recordings", "budget=quick"]
+    assert {name: fold.train for name, fold in folds_of(configuration(*settings)).items()} == {
+        "bare": ("load52", "load101")
+    }
+    folds = folds_of(configuration(*settings, "data.limit.test=2", "data.limit.train=1"))
+    assert {name: fold.train for name, fold in folds.items()} == {"bare": ("load52",), "load101": ("bare",)}
+
+
+def test_the_quick_budget_wins_over_the_experiment_and_the_command_line_over_both():
+    config = configuration("budget=quick", "data.folder=recordings", experiment="beam_real_repeated")
+    check_configuration(config)
+    identify = config["identify"]
+    assert identify["starts"] * identify["max_evaluations"] <= 8
+    assert np.prod([axis["points"] for axis in identify["grid"].values()]) <= 21
+    assert (config["in_the_loop"]["epochs"], config["in_the_loop"]["penalty"]) == (2, 1e-3)
+    assert config["data"]["seconds"] == 0.7
+    given = configuration("budget=quick", "in_the_loop.epochs=7", "data.seconds=1", experiment="beam_real_repeated")
+    assert (given["in_the_loop"]["epochs"], given["data"]["seconds"]) == (7, 1)
+    full = configuration("budget=full", experiment="beam_real_repeated")
+    assert (full["in_the_loop"]["epochs"], full["data"]["seconds"]) == (10, 1.4)
+
+
+@pytest.mark.parametrize("experiment", ["beam_oscillation", "beam_twist", "marker_ablation"])
+def test_the_quick_budget_of_recordings_is_not_that_of_simulations(experiment):
+    full, quick = (dict(dotted(configuration(f"budget={name}", experiment=experiment))) for name in ("full", "quick"))
+    limit = {"data.limit.train": 5, "data.limit.validation": 1, "data.limit.test": 2}
+    rest = {"budget": "quick", "data.steps": 60, "trainer.epochs": 200, "trainer.rollout_every": 50}
+    assert {key: value for key, value in quick.items() if full.get(key) != value} == limit | rest
+    assert full.keys() - quick.keys() == {"data.limit"}
+
+
+@pytest.mark.parametrize("experiment", ["beam_real", "beam_real_repeated", "beam_synthetic"])
+@pytest.mark.parametrize(
+    ("group", "option"), [("network", "published"), ("network", "reduced"), ("trainer", "published")]
+)
+def test_a_network_or_trainer_on_the_command_line_is_taken_whole(experiment, group, option):
+    wanted = configuration(f"{group}={option}", experiment="beam_oscillation")[group]
+    config = configuration(f"{group}={option}", experiment=experiment)
+    assert config[group] == wanted
+    assert training_settings(config, "simfree")[group] == wanted
+    other = "network" if group == "trainer" else "trainer"
+    assert config[other] == configuration(experiment=experiment)[other]
+
+
+@pytest.mark.parametrize(
+    ("experiment", "modes", "layers"),
+    [("beam_real", [2, 2, 2], 0), ("beam_real_repeated", [3, 3, 6], 0), ("beam_synthetic", [3, 3, 4], 2)],
+)
+def test_without_a_choice_few_recordings_train_a_small_network(experiment, modes, layers):
+    config = configuration(experiment=experiment)
+    check_configuration(config | {"data": config["data"] | ({} if layers else {"folder": "recordings"})})
+    names = ("position_modes", "velocity_modes", "force_modes")
+    small = {"kind": "reduced", "blocks": 1, "layers": layers, "width": 16, "activation": "normalised_elu"}
+    assert config["network"] == small | dict(zip(names, modes, strict=True))
+    simfree = training_settings(config, "simfree")
+    own = {"position_modes": 6, "velocity_modes": 6, "layers": 3, "width": 128}
+    assert simfree["network"] == config["network"] | own
+    default = configuration(experiment="beam_oscillation")["trainer"]
+    assert simfree["trainer"] == default | {"epochs": 200, "rollout_every": 20}
+    assert config["trainer"] == default
+
+
+def test_the_identification_of_e_and_nu_alone_can_be_left_out():
+    config = configuration("identify.elastic=null", "~identify.parameters.mass_damping", "data.folder=recordings")
+    check_configuration(config)
+    assert config["identify"]["elastic"] is None
+    assert list(config["identify"]["parameters"]) == ["youngs_modulus", "stiffness_damping"]
+
+
+def test_an_experiment_may_choose_its_network(tmp_path):
+    place = tmp_path / "experiment" / "own.yaml"
+    place.parent.mkdir()
+    place.write_text(
+        "# @package _global_\ndefaults: [beam_real, override /network: reduced, _self_]\nnetwork: {force_modes: 4}\n"
+    )
+    at = f"hydra.searchpath=[file://{tmp_path}]"
+    reduced = configuration("network=reduced", experiment="beam_oscillation")["network"]
+    assert configuration(at, experiment="own")["network"] == reduced | {"force_modes": 4}
+    assert configuration(at, "network=published", experiment="own")["network"]["kind"] == "nodal"
+
+
+def test_vertical():
+    np.testing.assert_array_equal(vertical("-y"), [0.0, -1.0, 0.0])
+    np.testing.assert_array_equal(vertical([0.0, 0.0, 2.0]), vertical("z"))

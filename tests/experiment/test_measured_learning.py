@@ -1,0 +1,272 @@
+"""Learning from markers: what they say at the steps, the errors of roll-outs, and training through the simulator."""
+
+import numpy as np
+import pytest
+import torch
+
+from warp_resphys import Body, Simulator, State, box_hexahedra, select_vertices
+from warp_resphys.data.markers import bind_markers
+from warp_resphys.experiment.measured.evaluate import marker_errors, markers_at_frames
+from warp_resphys.experiment.measured.scene import at_steps
+from warp_resphys.io.errors import ConvergenceError, InputError
+from warp_resphys.io.files import read_checkpoint, write_checkpoint
+from warp_resphys.learning.markers_in_the_loop import MarkersInTheLoop, MotionLoss, epochs_that_hold_up
+from warp_resphys.learning.networks import build_model
+from warp_resphys.learning.replay import Motions, Release, Replay
+
+MESH = box_hexahedra(divisions=(2, 1, 1))
+TIP = select_vertices(MESH, x=0.1)
+POINTS = np.array([[0.1, 0.015, 0.036], [0.1, -0.006, 0.024]])
+MARKERS = bind_markers(MESH, POINTS, ["a", "b"], kind="rigid", vertices=TIP)
+STEP = 0.01
+LOADS = torch.tensor([[0.0], [0.05]], dtype=torch.float64)
+NETWORK = {
+    "kind": "reduced",
+    "position_modes": 2,
+    "velocity_modes": 2,
+    "force_modes": 2,
+    "blocks": 1,
+    "activation": "normalised_elu",
+    "layers": 0,
+    "width": 8,
+}
+CONFIG = {"epochs": 4, "penalty": 1e-3, "memory": 5, "rollout_every": 1, "patience": 3}
+
+
+def simulator():
+    return Simulator(Body(MESH, select_vertices(MESH, x=0.0)), time_step=STEP, relative_tolerance=1e-12)
+
+
+def tensor(*rows):
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+def motions_of(times, markers, held=None):
+    count = len(times)
+    held = torch.as_tensor(POINTS).expand(count, -1, -1) if held is None else held
+    names = tuple(f"m{i}" for i in range(count))
+    attached = torch.zeros(count, len(MESH.vertices), dtype=torch.float64)
+    attached[:, TIP] = LOADS[:count] / len(TIP)
+    return Motions(names, times, markers, held, attached)
+
+
+class TestAtSteps:
+    TIMES = 0.003 + STEP * torch.arange(20, dtype=torch.float64)
+
+    @staticmethod
+    def path(times):
+        """(..., 2, 3) [m] a cubic, which a spline follows exactly."""
+        t = torch.as_tensor(times, dtype=torch.float64)[..., None, None]
+        return torch.as_tensor(POINTS) + t**2 * torch.tensor([0.3, -0.1, 1.0]) + t**3 * torch.tensor([1.0, 2.0, -3.0])
+
+    def seen(self, *hidden):
+        markers = self.path(self.TIMES)[None].clone()
+        for marker, frames in hidden:
+            markers[0, frames, marker] = torch.nan
+        return motions_of(self.TIMES[None], markers)
+
+    def test_it_starts_where_the_markers_were_held_and_ends_with_the_last_frame(self):
+        found = at_steps(self.seen(), STEP)
+        assert found.shape == (1, 20, 2, 3)  # 0 to 0.19 s, the last frame at 0.193 s
+        np.testing.assert_allclose(found[0], self.path(STEP * np.arange(20)), rtol=0, atol=1e-12)
+        finer = at_steps(self.seen(), 0.5 * STEP)[0]
+        np.testing.assert_allclose(finer, self.path(0.5 * STEP * np.arange(39)), rtol=0, atol=1e-12)
+
+    def test_short_gaps_are_bridged_and_long_ones_are_not_seen(self):
+        found = at_steps(self.seen((0, slice(5, 6)), (0, slice(10, 15)), (1, slice(2, None))), STEP)[0]
+        # Frames 9 and 15, at 0.093 and 0.153 s, are the last and first sight; 0.015 s around them count.
+        lost = np.isnan(found[:, 0]).all(1)
+        np.testing.assert_array_equal(np.flatnonzero(lost), [11, 12, 13])
+        np.testing.assert_allclose(found[~lost, 0], self.path(STEP * np.flatnonzero(~lost))[:, 0], rtol=0, atol=1e-12)
+        assert np.isnan(found[:, 1]).all()  # three sights with that at the release: too few for a cubic
+
+    def test_a_motion_that_ends_early_is_not_seen_from_there(self):
+        short = self.TIMES.clone()
+        short[12:] = short[11]
+        markers = self.path(torch.stack([self.TIMES, short]))
+        markers[1, 12:] = torch.nan
+        found = at_steps(motions_of(torch.stack([self.TIMES, short]), markers), STEP)
+        assert np.isfinite(found[0]).all()
+        np.testing.assert_array_equal(np.isnan(found[1]).all((1, 2)), np.arange(20) > 11)
+
+    def test_a_late_release_is_time_zero(self):
+        found = at_steps(self.seen(), STEP, delay=tensor(0.002)[0][None])[0]
+        np.testing.assert_allclose(found[2:], self.path(0.002 + STEP * np.arange(2, 20)), rtol=0, atol=1e-6)
+
+
+def test_errors_are_means_over_the_markers_that_were_seen():
+    observed = np.zeros((4, 2, 3))
+    simulated = np.zeros((4, 2, 3))
+    simulated[:, 0, 0], simulated[:, 1, 2] = 0.003, 0.001
+    observed[1, 0] = observed[2] = np.nan
+    np.testing.assert_allclose(marker_errors(simulated, observed), [2.0, 1.0, 2.0])
+    simulated[2:] = np.nan
+    np.testing.assert_allclose(marker_errors(simulated, observed), [2.0, 1.0, np.nan])
+    simulated[1] = np.nan
+    simulated[1, 1] = 0.0
+    np.testing.assert_allclose(marker_errors(simulated, observed)[:2], [2.0, 0.0])
+
+
+def test_markers_at_frames_follow_the_steps_and_are_lost_with_them():
+    sim = simulator()
+    velocity = torch.tensor([0.2, -0.1, 0.3], dtype=torch.float64)
+    t = STEP * torch.arange(12, dtype=torch.float64)
+    q = (sim.rest_positions + t[:, None, None] * velocity).repeat(2, 1, 1, 1)
+    q[1, 7:] = torch.nan
+    times = (0.004 + STEP * torch.arange(10, dtype=torch.float64)).repeat(2, 1)
+    motions = motions_of(times, torch.as_tensor(POINTS).repeat(2, 10, 1, 1))
+    release = Release(State(q[:, 0], torch.zeros_like(q[:, 0])), torch.tensor([0.0, 0.006], dtype=torch.float64))
+    found = markers_at_frames(q, sim, MARKERS, motions, release)
+    since = (times - release.delay[:, None]).clamp_min(0.0)
+    expected = torch.as_tensor(POINTS) + since[..., None, None] * velocity
+    torch.testing.assert_close(found[0], expected[0], rtol=0.0, atol=1e-9)
+    torch.testing.assert_close(found[1, :6], expected[1, :6], rtol=0.0, atol=1e-9)
+    assert bool(found[1, 7:].isnan().all())  # from 0.068 s on, the step before the first that is lost
+
+
+def observed_motions(frames=8):
+    """Two motions of the beam, bare and with a weight, that another stiffness made; and how they begin."""
+    sim = simulator()
+    times = (STEP * torch.arange(1, frames + 1, dtype=torch.float64)).repeat(2, 1)
+    blank = motions_of(times, torch.as_tensor(POINTS).repeat(2, frames, 1, 1))
+    rest = sim.rest_state(2)
+    release = Release(State(rest.q, rest.v), torch.zeros(2, dtype=torch.float64))
+    with torch.no_grad():
+        markers = Replay(sim, MARKERS, blank)(release, {"youngs_modulus": tensor(180e3)[0][None]})[0]
+    return motions_of(times, markers), release
+
+
+@pytest.fixture(scope="module")
+def loss():
+    motions, release = observed_motions()
+    return MotionLoss(Replay(simulator(), MARKERS, motions), release, {}, LOADS)
+
+
+def network(seed=0, **changes):
+    torch.manual_seed(seed)
+    rest = simulator().rest_positions
+    q, v, force = (1e-2 * torch.randn(12, *rest.shape, dtype=torch.float64) for _ in range(3))
+    return build_model({**NETWORK, **changes}, rest, rest + q, v, force + 1e-2, LOADS.repeat(6, 1)).double()
+
+
+def finish(trainer):
+    while not trainer.finished:
+        trainer.run_epoch()
+    return trainer
+
+
+class TestMarkersInTheLoop:
+    @pytest.mark.parametrize("changes", [{}, {"layers": 1, "blocks": 2}, {"kind": "nodal"}])
+    def test_it_starts_at_the_simulator_as_it_is(self, loss, changes):
+        model = network(**changes)
+        assert float(loss(model).detach()) != pytest.approx(float(loss(None)), rel=1e-6)
+        trainer = MarkersInTheLoop(model, loss, None, {**CONFIG, "epochs": 1})
+        rest = simulator().rest_state(2)
+        assert not model(rest.q, rest.v + 1.0, LOADS).any()
+        trainer.run_epoch()
+        first, second = trainer.state.history
+        assert first["rollout_error_mm"] == pytest.approx(loss.error_mm(None), rel=1e-9)
+        if not changes:
+            assert first["train_loss"] == pytest.approx(float(loss(None)), rel=1e-9)
+        assert second["train_loss"] < first["train_loss"]
+
+    def test_the_gradient_is_that_of_central_differences(self, loss):
+        model = network(layers=1)
+        loss(model).backward()
+        random = torch.Generator().manual_seed(3)
+        checked = 0
+        for weight in model.network.parameters():
+            direction = torch.randn(weight.shape, generator=random, dtype=torch.float64)
+            ends = []
+            for sign in (-1.0, 1.0):
+                with torch.no_grad():
+                    weight += sign * 1e-5 * direction
+                    ends.append(float(loss(model)))
+                    weight -= sign * 1e-5 * direction
+            expected = (ends[1] - ends[0]) / 2e-5
+            assert float((weight.grad * direction).sum()) == pytest.approx(expected, rel=1e-5, abs=1e-9)
+            checked += abs(expected) > 1e-6
+        assert checked >= 4
+
+    def test_it_descends_and_keeps_the_best_weights(self, loss):
+        trainer = finish(MarkersInTheLoop(network(), loss, loss, CONFIG))
+        losses = [record["train_loss"] for record in trainer.state.history]
+        assert losses == sorted(losses, reverse=True)
+        assert losses[-1] < 0.5 * losses[0]
+        errors = [record["rollout_error_mm"] for record in trainer.state.history]
+        assert loss.error_mm(trainer.use_best()) == pytest.approx(min(errors), rel=1e-9)
+
+    def test_it_goes_on_bit_for_bit(self, loss, tmp_path):
+        whole = finish(MarkersInTheLoop(network(), loss, loss, CONFIG))
+        part = MarkersInTheLoop(network(), loss, loss, CONFIG)
+        for _ in range(2):
+            part.run_epoch()
+        write_checkpoint(tmp_path / "part.safetensors", "training", *part.snapshot())
+        again = MarkersInTheLoop(network(seed=1), loss, loss, CONFIG)
+        again.resume(*read_checkpoint(tmp_path / "part.safetensors", "training"))
+        finish(again)
+        assert again.state.history == whole.state.history
+        one, other = (trainer.use_best().state_dict() for trainer in (whole, again))
+        assert all(torch.equal(one[key], other[key]) for key in one)
+
+    def test_the_line_search_comes_back_from_a_simulation_that_fails(self, loss, monkeypatch):
+        calls = []
+        call = MotionLoss.__call__
+
+        def fragile(self, model):
+            calls.append(torch.is_grad_enabled())
+            if sum(calls) == 2:  # the first weights that the first line search tries
+                raise ConvergenceError("no", self._release.state.q, None)
+            return call(self, model)
+
+        monkeypatch.setattr(MotionLoss, "__call__", fragile)
+        trainer = finish(MarkersInTheLoop(network(), loss, loss, {**CONFIG, "epochs": 2}))
+        losses = [record["train_loss"] for record in trainer.state.history]
+        assert losses[2] < losses[0]
+        assert all(torch.isfinite(w).all() for w in trainer.model.network.parameters())
+
+    def test_a_validation_that_fails_is_infinitely_wrong(self, loss, monkeypatch):
+        def failing(*_, **__):
+            raise ConvergenceError("no", torch.zeros(1), None)
+
+        monkeypatch.setattr(Replay, "__call__", failing)
+        assert loss.error_mm(None) == float("inf")
+
+    def test_no_constant_force_is_learned(self, loss):
+        model = finish(MarkersInTheLoop(network(), loss, None, {**CONFIG, "epochs": 2})).model
+        rest = simulator().rest_state(2)
+        assert model(rest.q + 1e-3, rest.v, 0.0 * LOADS).any()
+        assert not model(rest.q, rest.v, 0.0 * LOADS).any()
+
+    def test_epochs_are_those_that_serve_motions_held_out(self, loss):
+        """Here the held-out motions are those of training, there such as the simulator makes without a force."""
+        motions, release = observed_motions()
+        sim = simulator()
+        with torch.no_grad():
+            exact = Replay(sim, MARKERS, motions)(release)[0]
+        other = MotionLoss(Replay(sim, MARKERS, motions_of(motions.times, exact)), release, {}, LOADS)
+        config, seen = {**CONFIG, "epochs": 3}, []
+        assert epochs_that_hold_up(network, [(loss, loss)], config, lambda: seen.append(1)) == 3
+        assert len(seen) == 3
+        for patience, spent in ((2, 2), (9, 3)):
+            seen.clear()
+            chosen = epochs_that_hold_up(
+                network, [(loss, other)], {**config, "patience": patience}, lambda: seen.append(1)
+            )
+            assert (chosen, len(seen)) == (0, spent)
+        histories = []
+        for held_out in (loss, other):
+            alone = finish(MarkersInTheLoop(network(), loss, held_out, config))
+            histories.append([record["rollout_error_mm"] for record in alone.state.history])
+        parts = [(loss, loss), (loss, loss), (loss, other)]  # The mean over them decides.
+        mean = np.average(histories, axis=0, weights=[2, 1])
+        assert 0 < np.argmin(mean) == epochs_that_hold_up(network, parts, config, lambda: None)
+        trainer = MarkersInTheLoop(network(), loss, None, config, epochs=0)
+        trainer.begin()
+        assert trainer.finished
+        assert loss.error_mm(trainer.use_best()) == pytest.approx(loss.error_mm(None), rel=1e-9)
+
+    @pytest.mark.parametrize(("key", "value"), [("epochs", 0), ("memory", 0), ("patience", 0), ("penalty", -1.0)])
+    def test_bad_settings(self, loss, key, value):
+        with pytest.raises(InputError, match=rf"in_the_loop\.{key} is {value}: it must be"):
+            MarkersInTheLoop(network(), loss, None, {**CONFIG, key: value})

@@ -1,0 +1,330 @@
+"""Experiments on recordings through the command line, from synthetic reality or a folder to the errors of all models.
+
+Reports are made of these files in test_measured_report.py; here they read them, but draw nothing.
+"""
+
+import contextlib
+import json
+import re
+import shutil
+import signal
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_module
+from main_job import run
+from omegaconf import OmegaConf
+
+from warp_resphys.experiment.measured import report
+from warp_resphys.experiment.measured.evaluate import marker_errors
+from warp_resphys.experiment.measured.experiment import learning_stages
+from warp_resphys.experiment.measured.files import MODELS, TRAINED
+from warp_resphys.experiment.measured.trials import split_of
+from warp_resphys.io.files import read_checkpoint, read_hdf5
+from warp_resphys.io.stages import StageInterrupted, run_stages
+from warp_resphys.learning.identification import Identifier
+from warp_resphys.learning.networks import NextState, ResidualForce, restore
+
+TINY = [
+    "experiment=beam_real",
+    "mesh.divisions=[4,1,1]",
+    "data.seconds=0.2",
+    "~identify.parameters.mass_damping",
+    "~identify.first_guess.mass_damping",
+    "identify.starts=1",
+    "identify.max_evaluations=6",
+    "identify.grid.youngs_modulus.points=2",
+    "identify.grid.poissons_ratio.points=1",
+    "in_the_loop.epochs=2",
+    "simfree.trainer.epochs=10",
+    "simfree.trainer.rollout_every=10",
+    "hydra/job_logging=none",
+    "hydra/hydra_logging=none",
+    "hydra.run.dir=run",
+]
+SYNTHETIC = [
+    *TINY,
+    "synthetic.mesh.divisions=[6,2,2]",
+    "synthetic.time_step=0.005",
+    "synthetic.seconds=0.3",
+    "synthetic.train=[m0,m80]",
+    "synthetic.validation=[m20]",
+    "synthetic.test=[m50]",
+]
+FOLDS = [
+    *TINY,
+    "data.folder=recordings",
+    "data.trials.bare.file=m0.h5",
+    "data.trials.load52={file: m50.h5, hung: 0.05}",
+    "~data.trials.load101",
+    "identify.max_evaluations=3",
+    "in_the_loop.epochs=1",
+]
+STAGES = [
+    "identify",
+    "reconstruct_resphys_uncorrected",
+    "train_resphys_uncorrected",
+    "reconstruct_resphys",
+    "train_resphys",
+    "train_simfree",
+    "evaluate",
+    "report",
+]
+
+
+def configuration(*overrides):
+    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
+        return OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
+
+
+def records(folder):
+    return {path.stem: json.loads(path.read_text()) for path in (folder / "stages").glob("*.json")}
+
+
+def read(path):
+    return json.loads(path.read_text())
+
+
+@pytest.fixture(scope="module")
+def pages():
+    """What the reports would have shown, by their files."""
+    shown = {}
+
+    def write(path, data):
+        shown[path.parent.name] = data
+        path.write_text("-")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(report, "write_measured_report", write)
+        patch.setattr(report, "write_folds_report", write)
+        yield shown
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory, pages):
+    root = tmp_path_factory.mktemp("measured")
+    with contextlib.chdir(root):
+        code, err = run(*SYNTHETIC)
+        assert code == 0, err
+    return root / "run"
+
+
+class TestCompleteRun:
+    def test_files(self, finished):
+        names = {str(p.relative_to(finished)) for p in finished.rglob("*") if p.is_file() and ".hydra" not in p.parts}
+        expected = {f"recordings/{trial}.h5" for trial in ("m0", "m20", "m50", "m80")}
+        expected |= {"truth.json", "markers.h5", "quality.json", "registration.json", "identification.json"}
+        expected |= {"rollouts.h5", "errors.json", "metrics.json", "report.html"}
+        expected |= {name for model in TRAINED for name in (f"{model}.safetensors", f"training_{model}.json")}
+        expected |= {f"reconstruction_{model}.h5" for model in TRAINED if model != "simfree"}
+        expected |= {f"stages/{stage}.json" for stage in ("synthesise", "import", *STAGES)}
+        assert names - {".lock"} == expected
+        for model in TRAINED:
+            kind, name = (NextState, "next state") if model == "simfree" else (ResidualForce, "residual force")
+            restored = restore(kind, *read_checkpoint(finished / f"{model}.safetensors", name))
+            assert (restored.actuation is None) == (model != "simfree")  # in_the_loop.sees_loads is false
+
+    def test_identification(self, finished):
+        found = read(finished / "identification.json")
+        assert list(found["sysid"]["parameters"]) == ["youngs_modulus", "stiffness_damping"]
+        assert list(found["sysid_elastic"]["parameters"]) == ["youngs_modulus", "poissons_ratio"]
+        for each in (found["sysid"], found["sysid_elastic"]):
+            losses = [record["loss"] for record in each["history"][0]]
+            assert each["loss"] == min(losses) < losses[0]
+            assert len(losses) <= 6
+        assert np.isfinite(found["landscape"]["loss"]).all()
+        assert np.shape(found["landscape"]["loss"]) == (2, 1)
+        assert np.shape(found["sysid"]["uncertainty"]["correlation"]) == (2, 2)
+
+    def test_errors(self, finished):
+        found = read(finished / "metrics.json")
+        errors = {model: summary["mean"] for model, summary in found["errors_mm"].items()}
+        assert tuple(errors) == MODELS
+        assert all(0.01 < error < 50.0 for error in errors.values()), errors
+        assert errors["sysid"] < 0.5 * errors["simulation"] < 0.5 * errors["published"]
+        assert [each["name"] for each in found["per_trajectory"]] == ["m50"]
+        assert found["parameters"].keys() == {"sysid", "sysid_elastic"}
+        assert 0.0 < found["sideways_mm"]["m50"] < 0.5  # The simulated beam is held straight.
+        assert found["noise_mm"] == pytest.approx(0.05 * np.sqrt(8.0 / np.pi), rel=0.05)  # Maxwell's distribution
+        for model, each in found["per_marker"].items():
+            assert np.mean(list(each.values())) == pytest.approx(errors[model])
+
+    def test_errors_are_those_of_the_stored_markers(self, finished):
+        with read_hdf5(finished / "markers.h5", "markers") as file:
+            observed = file["markers"][list(file.attrs["names"]).index("m50")]
+        with read_hdf5(finished / "rollouts.h5", "rollouts") as file:
+            assert list(file.attrs["names"]) == ["m50"]
+            stored = {model: file[f"{model}_markers"][0] for model in MODELS}
+            steps = {file[f"{model}_q"].shape[1:] for model in MODELS}
+            fall = file["sysid_q"][0, 2, -1, 2] - file["sysid_q"][0, 0, -1, 2]
+        assert fall == pytest.approx(
+            -0.5 * 9.80709 * 0.02**2, rel=0.15
+        )  # freely at first; by half steps, kept at whole ones
+        assert steps == {(22, 20, 3)}  # 0.2 s of 0.01 s, and one step past the last frame for the slope there
+        errors = read(finished / "errors.json")["errors_mm"]
+        for model, markers in stored.items():
+            assert marker_errors(markers, observed).mean() == pytest.approx(errors[model]["mean"], rel=1e-9)
+
+    @pytest.mark.parametrize("model", ["resphys_uncorrected", "resphys"])
+    def test_training_begins_without_a_force_and_descends(self, finished, model):
+        training = read(finished / f"training_{model}.json")
+        first, *others = training["epochs"]
+        assert [record["epoch"] for record in training["epochs"]] == [0, 1, 2]
+        losses = [record["train_loss"] for record in others]
+        assert losses == sorted(losses, reverse=True)
+        assert losses[-1] < first["train_loss"]
+        assert training["kept"]["validation_rollout_error_mm"] <= first["rollout_error_mm"]
+        if model == "resphys":
+            sysid = read(finished / "identification.json")["sysid"]["loss"]
+            assert first["train_loss"] == pytest.approx(sysid, rel=1e-3)
+
+    def test_the_report_can_read_all_of_it(self, finished, pages):
+        shown = pages["run"]
+        assert shown.truth is not None
+        assert len(shown.notes) == 2
+        assert re.search(r"the markers by 0\.\d mm \(m50\), as the identified simulator has it", shown.notes[0])
+        assert shown.notes[1] == "The noise of the markers alone is 0.08 mm."
+        assert set(shown.training) == set(TRAINED)
+        assert len(shown.identification["sysid"]["history"]) == 1
+
+    def test_the_second_call_runs_nothing(self, finished):
+        before = records(finished)
+        with contextlib.chdir(finished.parent):
+            code, err = run(*SYNTHETIC)
+        assert (code, records(finished) == before) == (0, True), err
+
+
+def test_what_depends_on_the_epochs_runs_again_and_nothing_else(finished, tmp_path, monkeypatch):
+    shutil.copytree(finished, tmp_path / "run")
+    monkeypatch.chdir(tmp_path)
+    before = records(finished)
+    assert run(*SYNTHETIC, "in_the_loop.epochs=1")[0] == 0
+    after = records(tmp_path / "run")
+    ran = [stage for stage in STAGES if after[stage] != before[stage]]
+    assert ran == ["train_resphys_uncorrected", "train_resphys", "evaluate", "report"]
+    for model in ("resphys", "resphys_uncorrected"):
+        one, two = (read(place / f"training_{model}.json")["epochs"] for place in (tmp_path / "run", finished))
+        assert one[1]["train_loss"] == pytest.approx(two[1]["train_loss"], rel=1e-9)
+
+
+def test_folds(finished, tmp_path, monkeypatch, pages):
+    shutil.copytree(finished / "recordings", tmp_path / "recordings")
+    monkeypatch.chdir(tmp_path)
+    code, err = run(*FOLDS)
+    assert code == 0, err
+    found = read(tmp_path / "run" / "metrics.json")
+    assert list(found["folds"]) == ["bare", "load52"]
+    for model, summary in found["errors_mm"].items():
+        means = [fold["errors_mm"][model]["mean"] for fold in found["folds"].values()]
+        assert summary["mean"] == pytest.approx(np.mean(means))
+        assert (summary["trajectories"], summary["diverged"]) == (2, 0)
+    for trial, fold in found["folds"].items():
+        folder = tmp_path / "run" / f"fold_{trial}"
+        assert [each["name"] for each in fold["per_trajectory"]] == [trial]
+        assert read(folder / "metrics.json") == fold
+        settings = records(folder)["train_resphys"]["settings"]["split"]
+        assert trial not in settings["train"] + settings["validation"]
+    assert (tmp_path / "run" / "report.html").is_file()
+    assert pages["run"].pages == {trial: f"fold_{trial}/report.html" for trial in found["folds"]}
+
+
+def test_an_interrupted_identification_goes_on_with_the_next_start(finished, tmp_path, monkeypatch):
+    """The descents themselves are left out: each start stays where it is."""
+    shutil.copy(finished / "markers.h5", tmp_path)
+    config = configuration(*[each for each in SYNTHETIC if "hydra" not in each], "identify.starts=2")
+    (stage, *_) = learning_stages(config, split_of(config), ".", "imported")
+    descents, at = [], 2
+
+    def descend(self, number, start, max_evaluations, tolerance, report):
+        descents.append((self.replay.simulator.integrator, number))
+        if len(descents) == at:
+            raise KeyboardInterrupt
+        return {"parameters": dict(start), "loss": float(number + 1), "history": [{"loss": 1.0, **start}]}
+
+    monkeypatch.setattr(Identifier, "_descend", descend)
+    with pytest.raises(StageInterrupted, match="interrupted in stage 'identify'"):
+        run_stages([stage], tmp_path)
+    assert not (tmp_path / "identification.json").exists()
+    run_stages([stage], tmp_path)
+    searches = [("midpoint", 0), ("midpoint", 1), ("midpoint", 1), ("implicit_euler", 0), ("implicit_euler", 1)]
+    assert descents == searches
+    assert len(read(tmp_path / "identification.json")["sysid"]["history"]) == 2
+    assert not list(tmp_path.glob("identify_*.json"))
+
+
+def test_an_interrupted_landscape_goes_on_and_loses_no_identification(finished, tmp_path, monkeypatch, capsys):
+    """The searches are left out; the losses of the landscape count its points, and the second is a failure."""
+    shutil.copy(finished / "markers.h5", tmp_path)
+    grid = ["identify.starts=2", "identify.grid.youngs_modulus.points=5", "identify.grid.poissons_ratio.points=2"]
+    config = configuration(*[each for each in SYNTHETIC if "hydra" not in each], *grid)
+    (stage, *_) = learning_stages(config, split_of(config), ".", "imported")
+    calls, moduli, interrupt_at = [], [], [6]
+
+    def starts(self, first, count, candidates, seed):
+        calls.append("starts")
+        return [first] * count
+
+    def descend(self, number, start, max_evaluations, tolerance, report):
+        calls.append("descent")
+        return {"parameters": dict(start), "loss": float(number + 1), "history": [{"loss": 1.0, **start}]}
+
+    def losses(self, points):
+        if len(moduli) in interrupt_at:
+            interrupt_at.clear()
+            raise KeyboardInterrupt
+        before = len(moduli)
+        moduli.extend(points[:, 0])
+        return np.array([np.inf if place == 1 else float(place) for place in range(before, len(moduli))])
+
+    monkeypatch.setattr(Identifier, "starts", starts)
+    monkeypatch.setattr(Identifier, "_descend", descend)
+    monkeypatch.setattr(Identifier, "uncertainty", lambda *_: calls.append("uncertainty"))
+    monkeypatch.setattr(Identifier, "_losses_safe", losses)
+    monkeypatch.setattr("warp_resphys.experiment.measured.identify._AT_ONCE", 2)
+    with pytest.raises(StageInterrupted, match="interrupted in stage 'identify'"):
+        run_stages([stage], tmp_path)
+    once = ["starts", "descent", "descent", "uncertainty"] * 2
+    assert calls == once
+    assert "identify: landscape: 6/10 points" in capsys.readouterr().err
+    run_stages([stage], tmp_path)
+    assert calls == once
+    err = capsys.readouterr().err
+    assert "identify: 4/24 evaluations at most" in err
+    assert "identify: landscape: 10/10 points" in err
+    found = read(tmp_path / "identification.json")
+    assert found["landscape"]["loss"] == [[0, None], [2, 3], [4, 5], [6, 7], [8, 9]]
+    np.testing.assert_allclose(moduli, np.repeat(np.linspace(0.0, 1.0, 5), 2))
+    assert found["sysid_elastic"]["loss"] == 1.0
+    assert not list(tmp_path.glob("identify_*.json"))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "sentence"),
+    [
+        (["data.folder=nowhere"], "cannot read nowhere/beam_gravity_V2_a.c3d"),
+        (["+identify.parameters.colour={lower: 0.0, upper: 1.0}"], "identify.parameters names 'colour': choose from"),
+        (["identify.parameters.youngs_modulus.upper=1.0"], "identify.parameters.youngs_modulus: the bounds 50000 and"),
+        (["in_the_loop.epochs=0"], "in_the_loop.epochs is 0: it must be a whole number, one or more"),
+        (["network.kind=other"], "network.kind is 'other'"),
+        (["synthetic.trials={a: {hung: 0.0}}"], "unknown key 'synthetic.trials.a', did you mean"),
+    ],
+)
+def test_bad_input_is_one_sentence(tmp_path, monkeypatch, overrides, sentence):
+    monkeypatch.chdir(tmp_path)
+    code, err = run(*SYNTHETIC, *overrides)
+    (last,) = err.strip().splitlines()[-1:]
+    assert (code, "Traceback" in err) == (2, False)
+    assert last.startswith(f"error: {sentence}")
+
+
+def test_ctrl_c_is_130(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(Identifier, "starts", lambda *_: signal.raise_signal(signal.SIGINT))
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        code, err = run(*SYNTHETIC)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert code == 130
+    assert "interrupted in stage 'identify'" in err
+    assert "Traceback" not in err

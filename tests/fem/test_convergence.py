@@ -1,0 +1,148 @@
+"""Static deflections: convergence with refinement, the documented sags, and linear elasticity for small strains."""
+
+import numpy as np
+import pytest
+import scipy.sparse
+import scipy.sparse.linalg
+import torch
+
+from warp_resphys import (
+    Body,
+    Material,
+    Mesh,
+    Simulator,
+    SolverSettings,
+    box_hexahedra,
+    box_tetrahedra,
+    quadratic,
+    select_vertices,
+)
+from warp_resphys.energies.material import small_strain_poissons_ratio
+from warp_resphys.fem.elements import physical_gradients
+from warp_resphys.mesh.shape_functions import gauss_hexahedron, hexahedron_shape
+
+BEAM = (0.1, 0.03, 0.03)
+SILICONE = {"youngs_modulus": 264e3, "density": 1070.0}
+
+
+def tip_sag(mesh, material, gravity=9.80709, **body):
+    """Mean vertical displacement of the tip face under its own weight [m]."""
+    fixed, tip = select_vertices(mesh, x=0.0), select_vertices(mesh, x=BEAM[0])
+    settings = SolverSettings("newton", relative_tolerance=1e-8)
+    simulator = Simulator(Body(mesh, fixed=fixed, **body), material, gravity=(0, 0, -gravity), solver=settings)
+    moved = simulator.static_equilibrium().q[0] - simulator.rest_positions
+    return float(moved[tip, 2].mean())
+
+
+@pytest.mark.parametrize(("integration", "sag_mm", "tolerance_mm"), [("centre", -6.42, 0.03), ("full", -3.07, 0.03)])
+def test_sag_of_the_beam(integration, sag_mm, tolerance_mm):
+    sag = tip_sag(box_hexahedra(), Material(poissons_ratio=0.499, **SILICONE), volume_integration=integration)
+    assert 1e3 * sag == pytest.approx(sag_mm, abs=tolerance_mm)
+
+
+def test_sag_with_ten_node_tetrahedra_is_within_two_percent_on_275_vertices():
+    mesh = box_tetrahedra(BEAM, (5, 2, 2), order=2)
+    assert len(mesh.vertices) == 275
+    assert 1e3 * tip_sag(mesh, Material(poissons_ratio=0.499, **SILICONE)) == pytest.approx(-6.75, rel=0.02)
+
+
+def test_vertex_patches_relieve_linear_tetrahedra_and_converge_from_the_stiff_side():
+    material = Material(poissons_ratio=0.499, **SILICONE)
+    plain = tip_sag(box_tetrahedra(BEAM, (10, 3, 3)), material, volume_integration="full")
+    coarse, fine = (tip_sag(box_tetrahedra(BEAM, d), material) for d in ((10, 3, 3), (15, 5, 5)))
+    assert -6.75e-3 < fine < coarse < 3.5 * plain < 0.0
+
+
+def linear_sags(mesh, sizes, poissons_ratio):
+    """Sags under a load so small that the problem is linear [m]."""
+    material = Material(264e3, poissons_ratio, 1070.0, model="stable_neo_hookean")
+    return np.array([tip_sag(mesh(n), material, gravity=1e-4) for n in sizes])
+
+
+def bricks(n):
+    return box_hexahedra(BEAM, (4 * n, n, n))
+
+
+def quadratic_tetrahedra(n):
+    return box_tetrahedra(BEAM, (2 * n, n, n), order=2)
+
+
+def test_cantilever_converges_at_the_expected_rate():
+    """Order 2 for hexahedra and 3 for 10-node tetrahedra (nu = 0 has no singularity at the clamp).
+
+    The limit is the extrapolation of the other element's sags.
+    """
+    hexahedra, tetrahedra = linear_sags(bricks, (2, 4, 8), 0.0), linear_sags(quadratic_tetrahedra, (1, 2, 4), 0.0)
+    limit_of_hexahedra = hexahedra[2] + (hexahedra[2] - hexahedra[1]) / 3
+    limit_of_tetrahedra = tetrahedra[2] + (tetrahedra[2] - tetrahedra[1]) / 7
+    assert limit_of_hexahedra == pytest.approx(limit_of_tetrahedra, rel=1e-3)
+    errors = hexahedra - limit_of_tetrahedra, tetrahedra[:2] - limit_of_hexahedra
+    assert (errors[0] > 0).all()  # too stiff
+    rates = [np.log2(e[:-1] / e[1:]) for e in errors]
+    np.testing.assert_allclose(rates[0], 2.0, atol=0.2)
+    np.testing.assert_allclose(rates[1], 3.0, atol=0.3)
+
+
+def test_elements_agree_on_the_limit_at_moderate_poissons_ratio():
+    hexahedra, tetrahedra = linear_sags(bricks, (4, 8), 0.3), linear_sags(quadratic_tetrahedra, (2, 4), 0.3)
+    assert abs(hexahedra[1] - tetrahedra[1]) < 0.3 * abs(hexahedra[0] - tetrahedra[0])
+    assert hexahedra[1] == pytest.approx(tetrahedra[1], rel=0.01)
+
+
+def linear_elasticity(mesh, fixed, mu, lame_lambda, force):
+    """Displacement of full-integrated hexahedra by Hooke's law, assembled from strain matrices."""
+    points, weights = gauss_hexahedron()
+    gradients, determinants = physical_gradients(mesh.vertices, mesh.cells, hexahedron_shape(points)[1])
+    hooke = np.zeros((6, 6))
+    hooke[:3, :3] = lame_lambda
+    hooke += np.diag([2 * mu] * 3 + [mu] * 3)
+    c, q, k, _ = gradients.shape
+    strain = np.zeros((c, q, 6, k, 3))
+    for i, (a, b) in enumerate([(0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1)]):
+        strain[:, :, i, :, a] += gradients[..., b]
+        if a != b:
+            strain[:, :, i, :, b] += gradients[..., a]
+    strain = strain.reshape(c, q, 6, 3 * k)
+    blocks = np.einsum("cq,cqia,ij,cqjb->cab", determinants * weights, strain, hooke, strain, optimize=True)
+    dofs = (3 * mesh.cells[:, :, None] + np.arange(3)).reshape(c, -1)
+    rows, cols = (np.broadcast_to(d, blocks.shape).ravel() for d in (dofs[:, :, None], dofs[:, None, :]))
+    size = mesh.vertices.size
+    matrix = scipy.sparse.coo_array((blocks.ravel(), (rows, cols)), shape=(size, size)).tocsc()
+    free = np.setdiff1d(np.arange(size), (3 * fixed[:, None] + np.arange(3)).ravel())
+    displacement = np.zeros(size)
+    displacement[free] = scipy.sparse.linalg.spsolve(matrix[free][:, free], force.ravel()[free])
+    return displacement.reshape(-1, 3)
+
+
+@pytest.mark.parametrize("model", ["corotated", "stable_neo_hookean"])
+def test_small_strains_are_linear_elasticity(model):
+    youngs_modulus, poissons_ratio = 1e5, 0.4
+    mesh = box_hexahedra((0.06, 0.02, 0.03), (4, 2, 2))
+    fixed = select_vertices(mesh, x=0.0)
+    force = 1e-7 * np.random.default_rng(0).normal(size=mesh.vertices.shape)
+    material = Material(youngs_modulus, poissons_ratio, 1000.0, model=model)
+    settings = SolverSettings("newton", relative_tolerance=1e-6)
+    body = Body(mesh, fixed=fixed, volume_integration="full")
+    simulator = Simulator(body, material, gravity=(0.0, 0.0, 0.0), solver=settings)
+    found = simulator.static_equilibrium(torch.as_tensor(force)[None]).q[0] - simulator.rest_positions
+    mu = youngs_modulus / (2 * (1 + poissons_ratio))
+    lame_lambda = youngs_modulus * poissons_ratio / ((1 + poissons_ratio) * (1 - 2 * poissons_ratio))
+    if model == "corotated":
+        lame_lambda /= 3
+        effective = small_strain_poissons_ratio(poissons_ratio)
+        assert lame_lambda / mu == pytest.approx(2 * effective / (1 - 2 * effective), rel=1e-12)
+    expected = linear_elasticity(mesh, fixed, mu, lame_lambda, force)
+    np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
+
+
+def test_distorted_meshes_give_the_same_deflection():
+    material = Material(poissons_ratio=0.45, **SILICONE)
+    mesh = box_tetrahedra(BEAM, (5, 2, 2))
+    rng = np.random.default_rng(0)
+    inner = np.ones(len(mesh.vertices), dtype=bool)
+    for axis, length in enumerate(BEAM):
+        inner &= (mesh.vertices[:, axis] > 1e-9) & (mesh.vertices[:, axis] < length - 1e-9)
+    moved = mesh.vertices + 2e-3 * rng.uniform(-1, 1, mesh.vertices.shape) * inner[:, None]
+    assert inner.any()
+    regular, distorted = (tip_sag(quadratic(Mesh(v, mesh.cells)), material) for v in (mesh.vertices, moved))
+    assert distorted == pytest.approx(regular, rel=0.01)

@@ -1,0 +1,261 @@
+import errno
+import json
+import os
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch
+
+from warp_resphys.io import files
+from warp_resphys.io.errors import DataFileError
+from warp_resphys.io.resumable import resume_checkpoint
+
+POSITIONS = np.linspace(0.0, 1.0, 130 * 4 * 3).reshape(130, 4, 3)
+
+
+@pytest.fixture
+def trajectory(tmp_path: Path) -> Path:
+    path = tmp_path / "data" / "trajectory.h5"
+    with files.atomic_hdf5(path, "trajectories", {"time_step": 0.01}) as file:
+        files.create(file, "positions", POSITIONS, "m")
+        files.create(file, "weights/mass", np.array(0.05), "kg")
+    return path
+
+
+def read_positions(path: Path) -> np.ndarray:
+    with files.read_hdf5(path, "trajectories") as file:
+        return files.read_array(file, "positions", shape=(None, 4, 3))
+
+
+class TestAtomicFiles:
+    def test_a_failing_writer_leaves_the_old_file_alone(self, tmp_path):
+        path = tmp_path / "metrics.json"
+        files.write_json(path, {"a": 1})
+        with files.atomic_path(path) as partial:
+            partial.write_text("2")
+            assert files.read_json(path) == {"a": 1}
+        assert files.read_json(path) == 2
+        with pytest.raises(TypeError), files.atomic_path(path) as partial:
+            partial.write_bytes("neither bytes nor finished")
+        assert files.read_json(path) == 2
+        assert os.listdir(tmp_path) == ["metrics.json"]
+
+    def test_the_content_is_on_the_disk_before_the_name_is(self, tmp_path, monkeypatch):
+        calls = []
+        for name in ("fsync", "replace"):
+            real = getattr(os, name)
+            monkeypatch.setattr(os, name, lambda *a, name=name, real=real: (calls.append(name), real(*a)))
+        files.write_json(tmp_path / "a.json", {})
+        assert calls == ["fsync", "replace", "fsync"]
+
+    def test_nothing_is_at_the_place_before_the_block_has_ended(self, tmp_path):
+        with files.atomic_hdf5(tmp_path / "a.h5", "k") as file:
+            files.create(file, "x", np.zeros(3))
+            assert not (tmp_path / "a.h5").exists()
+        assert os.listdir(tmp_path) == ["a.h5"]
+
+    def test_a_place_that_cannot_be_written_is_named(self, tmp_path):
+        (tmp_path / "file").write_text("")
+        with pytest.raises(DataFileError, match=r"cannot write .*file/sub/a\.json \(Not a directory\)"):
+            files.write_json(tmp_path / "file" / "sub" / "a.json", {})
+        (tmp_path / "folder.h5").mkdir()
+        with (
+            pytest.raises(DataFileError, match=r"cannot write .*folder\.h5"),
+            files.atomic_hdf5(tmp_path / "folder.h5", "k"),
+        ):
+            pass
+
+    def test_errors_of_other_files_are_not_blamed_on_this_one(self, tmp_path):
+        with pytest.raises(FileNotFoundError), files.atomic_path(tmp_path / "a.json"):
+            (tmp_path / "other").read_text()
+
+    def test_disk_full_is_recognised_by_number_and_by_text(self):
+        for code in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+            assert files.is_disk_full(OSError(code, ""))
+        assert files.is_disk_full(RuntimeError("I/O error: No space left on device (os error 28)"))
+        assert not files.is_disk_full(OSError(errno.EACCES, "Permission denied"))
+
+
+class TestJson:
+    def test_numpy_paths_and_numbers_that_json_does_not_know(self, tmp_path):
+        path = tmp_path / "a.json"
+        data = {
+            "x": np.float64(1.5),
+            "n": np.array([[1, 2]]),
+            "p": Path("b"),
+            "bad": [np.nan, -np.inf],
+            3: True,
+        }
+        files.write_json(path, data)
+        parsed = json.loads(path.read_text(), parse_constant=pytest.fail)
+        assert parsed == {"x": 1.5, "n": [[1, 2]], "p": "b", "bad": [None, None], "3": True}
+
+    def test_objects_are_refused(self, tmp_path):
+        with pytest.raises(TypeError, match="object cannot be written"):
+            files.write_json(tmp_path / "a.json", {"a": object()})
+        assert os.listdir(tmp_path) == []
+
+    @pytest.mark.parametrize(
+        ("content", "message"),
+        [(b'{"a": 1', "not a JSON file"), (b"\xff\xfe", "not a JSON"), (None, "not exist")],
+    )
+    def test_unreadable(self, tmp_path, content, message):
+        path = tmp_path / "a.json"
+        if content is not None:
+            path.write_bytes(content)
+        with pytest.raises(DataFileError, match=f"{path}.*{message}"):
+            files.read_json(path)
+
+
+class TestHdf5:
+    def test_round_trip_with_units_checksums_and_chunks_along_time(self, trajectory):
+        with files.read_hdf5(trajectory, "trajectories") as file:
+            dataset = file["positions"]
+            assert dataset.chunks == (64, 4, 3)
+            assert dataset.fletcher32
+            assert dataset.attrs["units"] == "m"
+            assert file.attrs["time_step"] == 0.01
+            assert files.read_array(file, "weights/mass", shape=()) == 0.05
+            assert np.array_equal(files.read_array(file, "positions", index=(slice(3, 5), 2)), POSITIONS[3:5, 2])
+        assert np.array_equal(read_positions(trajectory), POSITIONS)
+
+    def test_chunks(self):
+        assert files.chunk_shape((200, 5)) == (64, 5)
+        assert files.chunk_shape((20, 5)) == (20, 5)
+        assert files.chunk_shape((8, 151, 176, 3), time_axis=1) == (1, 64, 176, 3)
+        assert files.chunk_shape(()) is None
+        assert files.chunk_shape((0, 3)) is None
+
+    def test_cut_anywhere_it_is_refused(self, trajectory):
+        content = trajectory.read_bytes()
+        for length in [*range(0, 2048, 97), len(content) // 2, len(content) - 1]:
+            trajectory.write_bytes(content[:length])
+            with pytest.raises(DataFileError, match=r"trajectory\.h5 (is truncated|is not an HDF5 file|is damaged)"):
+                read_positions(trajectory)
+
+    def test_a_flipped_bit_never_gives_other_numbers(self, trajectory):
+        content = trajectory.read_bytes()
+        refused = 0
+        for place in range(0, len(content), 61):
+            damaged = bytearray(content)
+            damaged[place] ^= 0x10
+            trajectory.write_bytes(damaged)
+            try:
+                assert np.array_equal(read_positions(trajectory), POSITIONS), f"byte {place}"
+            except DataFileError:
+                refused += 1
+        assert refused > 0.8 * len(range(0, POSITIONS.nbytes, 61))
+
+    @pytest.mark.parametrize(
+        ("attributes", "message"),
+        [
+            ({"format": "other"}, "was not written by warp_resphys"),
+            ({"format": np.arange(3)}, "was not written by warp_resphys"),
+            ({"format": "warp_resphys", "version": 2}, "format version 2"),
+            (
+                {"format": "warp_resphys", "version": 1, "kind": "forces"},
+                "holds 'forces' where 'trajectories'",
+            ),
+            ({"format": "warp_resphys", "version": 1, "kind": "trajectories"}, "is unfinished"),
+        ],
+    )
+    def test_files_of_others(self, tmp_path, attributes, message):
+        path = tmp_path / "a.h5"
+        with h5py.File(path, "w") as file:
+            file.attrs.update(attributes)
+        with pytest.raises(DataFileError, match=message), files.read_hdf5(path, "trajectories"):
+            pass
+
+    def test_no_hdf5_at_all(self, tmp_path):
+        np.savez(tmp_path / "a.npz", x=POSITIONS)
+        (tmp_path / "empty.h5").touch()
+        for name, message in [
+            ("a.npz", "not an HDF5 file"),
+            ("empty.h5", "not an HDF5 file|truncated"),
+            ("none.h5", "does not exist"),
+            (".", "Is a directory"),
+        ]:
+            with pytest.raises(DataFileError, match=message), files.open_hdf5(tmp_path / name):
+                pass
+
+    def test_missing_and_misshapen_datasets(self, trajectory):
+        with files.read_hdf5(trajectory, "trajectories") as file:
+            for name in ("velocities", "weights"):
+                with pytest.raises(DataFileError, match=f"no dataset '{name}'"):
+                    files.read_array(file, name)
+            for shape in [(None, 4), (None, 5, 3)]:
+                with pytest.raises(DataFileError, match=r"shape \(130, 4, 3\) where any x"):
+                    files.read_array(file, "positions", shape=shape)
+
+    @pytest.mark.parametrize("kind", ["external link", "soft link", "external storage", "virtual"])
+    def test_data_outside_of_the_file_are_refused(self, tmp_path, trajectory, kind):
+        path = tmp_path / "a.h5"
+        (tmp_path / "secret").write_bytes(bytes(80))
+        with h5py.File(path, "w") as file:
+            group = file.create_group("inner")
+            if kind == "external link":
+                group["x"] = h5py.ExternalLink(str(trajectory), "/positions")
+            elif kind == "soft link":
+                group["x"] = h5py.SoftLink("/elsewhere")
+            elif kind == "external storage":
+                group.create_dataset("x", (10,), "f8", external=[(str(tmp_path / "secret"), 0, 80)])
+            else:
+                layout = h5py.VirtualLayout((130, 4, 3), "f8")
+                layout[...] = h5py.VirtualSource(str(trajectory), "positions", (130, 4, 3))
+                group.create_virtual_dataset("x", layout)
+        with (
+            pytest.raises(DataFileError, match=r"'/inner/x' of .*use a file that holds its own data"),
+            files.open_hdf5(path),
+        ):
+            pass
+
+    def test_groups_that_hold_each_other_are_walked_once(self, tmp_path):
+        with h5py.File(tmp_path / "a.h5", "w") as file:
+            file.create_group("inner")["outer"] = file["/"]
+        with files.open_hdf5(tmp_path / "a.h5") as file:
+            assert "inner/outer/inner" in file
+
+    def test_errors_of_other_files_are_not_blamed_on_this_one(self, trajectory, tmp_path):
+        with pytest.raises(FileNotFoundError), files.open_hdf5(trajectory):
+            (tmp_path / "other").read_text()
+
+
+class TestCheckpoints:
+    @property
+    def tensors(self) -> dict[str, torch.Tensor]:
+        return {"weight": torch.arange(6.0).reshape(2, 3).T, "step": torch.tensor(3)}  # not contiguous
+
+    def test_round_trip(self, tmp_path):
+        path = tmp_path / "a.safetensors"
+        shared = {**self.tensors, "alias": self.tensors["weight"]}
+        files.write_checkpoint(path, "network", shared, {"epoch": 3, "mean": np.float64(0.5), "fingerprint": "f"})
+        tensors, metadata = files.read_checkpoint(path, "network")
+        assert all(torch.equal(tensors[name], shared[name]) for name in shared)
+        assert metadata == {"epoch": 3, "mean": 0.5, "fingerprint": "f"}
+        tensors["weight"] += 1  # own memory, not the file's
+        resumed = resume_checkpoint(path, "network", "f")
+        assert resumed is not None
+        assert torch.equal(resumed[0]["weight"], self.tensors["weight"])
+        assert resume_checkpoint(path, "network", "g") is None
+        assert resume_checkpoint(tmp_path / "none", "network", "f") is None
+
+    def test_unusable(self, tmp_path):
+        path = tmp_path / "a.safetensors"
+        files.write_checkpoint(path, "network", self.tensors, {"fingerprint": "f"})
+        with pytest.raises(DataFileError, match="holds 'network', version 1, where 'other', version 1"):
+            files.read_checkpoint(path, "other")
+        content = path.read_bytes()
+        for length in (0, 5, 40, len(content) - 1):
+            path.write_bytes(content[:length])
+            with pytest.raises(DataFileError, match="no complete safetensors file"):
+                files.read_checkpoint(path, "network")
+            assert resume_checkpoint(path, "network", "f") is None
+        with pytest.raises(DataFileError, match="does not exist"):
+            files.read_checkpoint(tmp_path / "none", "network")
+        from safetensors.torch import save_file
+
+        save_file({"x": torch.zeros(2)}, path)
+        with pytest.raises(DataFileError, match="was not written by warp_resphys"):
+            files.read_checkpoint(path, "network")

@@ -1,0 +1,335 @@
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+from rich.progress import Progress as Bars
+
+from warp_resphys.io.errors import DataFileError, InputError
+from warp_resphys.io.files import write_json
+from warp_resphys.io.memory import peak_memory_gib
+from warp_resphys.io.progress import Progress
+from warp_resphys.io.stages import (
+    Stage,
+    StageContext,
+    StageInterrupted,
+    fingerprint,
+    resources_used,
+    run_lock,
+    run_stages,
+)
+
+REPOSITORY = Path(__file__).parents[2]
+
+
+class Experiment:
+    """Three small stages in a row, and the order in which they ran."""
+
+    def __init__(self, run_dir: Path) -> None:
+        self.run_dir = run_dir
+        self.ran: list[str] = []
+        self.settings: dict[str, dict[str, Any]] = {
+            "generate": {"seed": 0},
+            "train": {"epochs": 5},
+            "report": {},
+        }
+        self.behaviour: dict[str, Callable[[StageContext], None]] = {}
+
+    def work(self, context: StageContext) -> None:
+        self.ran.append(context.name)
+        self.behaviour.get(context.name, lambda context: None)(context)
+        write_json(context.run_dir / f"{context.name}.json", context.settings)
+
+    def stages(self) -> list[Stage]:
+        upstream = {"generate": (), "train": ("generate",), "report": ("generate", "train")}
+        return [
+            Stage(name, self.work, (f"{name}.json",), self.settings[name], upstream[name]) for name in self.settings
+        ]
+
+    def run(self) -> list[str]:
+        self.ran.clear()
+        self.seconds = run_stages(self.stages(), self.run_dir)
+        return list(self.ran)
+
+
+@pytest.fixture
+def experiment(tmp_path: Path) -> Experiment:
+    return Experiment(tmp_path / "run")
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    now = [100.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    return now
+
+
+def interrupt(context: StageContext) -> None:
+    raise KeyboardInterrupt
+
+
+class TestResources:
+    def test_the_peak_is_that_of_the_stage_that_took_most(self, experiment):
+        experiment.run()
+        found = resources_used(experiment.run_dir, ["generate", "train", "evaluate"])
+        assert found["seconds"] == {name: experiment.seconds[name] for name in ("generate", "train")}
+        assert found["peak_memory_gib"] == pytest.approx(peak_memory_gib(), rel=0.1)
+        for name, peak in (("generate", 3.0), ("train", None)):  # None: as written before memory was recorded
+            path = experiment.run_dir / "stages" / f"{name}.json"
+            record = {key: value for key, value in json.loads(path.read_text()).items() if key != "peak_memory_gib"}
+            write_json(path, record | ({} if peak is None else {"peak_memory_gib": peak}))
+        assert resources_used(experiment.run_dir, ["generate", "train"])["peak_memory_gib"] == 3.0
+        assert resources_used(experiment.run_dir, ["train"])["peak_memory_gib"] is None
+        assert experiment.run() == []
+
+    def test_memory_in_bytes(self):
+        program = "import sys; from warp_resphys.io.memory import peak_memory_gib; before = peak_memory_gib()\n"
+        program += "held = b'x' * (300 * 2**20); print(peak_memory_gib() - before)"
+        found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+        assert float(found) == pytest.approx(300 / 1024, rel=0.1)
+
+
+class TestSkipping:
+    def test_nothing_runs_twice(self, experiment, caplog):
+        caplog.set_level("INFO")
+        assert experiment.run() == ["generate", "train", "report"]
+        seconds = experiment.seconds
+        assert seconds.keys() == experiment.settings.keys()
+        assert experiment.run() == []
+        assert experiment.seconds == seconds
+        assert [r.message for r in caplog.records[-3:]] == [f"{name}: up to date" for name in experiment.settings]
+        record = json.loads((experiment.run_dir / "stages" / "train.json").read_text())
+        assert record["settings"] == {"epochs": 5}
+        assert record["versions"]["h5py"]
+
+    def test_changed_settings_run_the_stage_and_those_after_it(self, experiment):
+        experiment.run()
+        experiment.settings["train"] = {"epochs": 6}
+        assert experiment.run() == ["train", "report"]
+        experiment.settings["generate"] = {"seed": 1}
+        assert experiment.run() == ["generate", "train", "report"]
+        assert experiment.run() == []
+
+    def test_missing_or_damaged_outputs_are_made_again(self, experiment, caplog):
+        experiment.run()
+        output = experiment.run_dir / "train.json"
+        for damage in (
+            output.unlink,
+            lambda: output.write_text("{"),
+            lambda: output.write_text('{\n  "epochs": 7\n}\n'),
+        ):
+            damage()
+            assert experiment.run() == ["train"]
+            assert "missing or changed since they were written: train.json" in caplog.text
+            assert json.loads(output.read_text()) == {"epochs": 5}
+        assert experiment.run() == []
+
+    def test_a_copied_run_folder_is_as_good_as_the_original(self, experiment):
+        experiment.run()
+        for path in experiment.run_dir.glob("*.json"):
+            os.utime(path, (0, 0))
+        assert experiment.run() == []
+
+    @pytest.mark.parametrize("record", ["", "[]", "{}", '{"fingerprint": 3}'])
+    def test_a_broken_record_is_no_record(self, experiment, record):
+        experiment.run()
+        (experiment.run_dir / "stages" / "train.json").write_text(record)
+        assert experiment.run() == ["train"]
+
+    def test_outputs_of_two_settings_are_never_mixed(self, experiment):
+        """Old outputs stay valid until new ones replace them; half replaced, they are valid for neither."""
+
+        def two_outputs(context: StageContext) -> None:
+            write_json(context.run_dir / "a.json", context.settings)
+            if stop:
+                raise KeyboardInterrupt
+            write_json(context.run_dir / "b.json", context.settings)
+            experiment.ran.append(str(context.settings["x"]))
+
+        def run(x: int) -> list[str]:
+            experiment.ran.clear()
+            run_stages([Stage("s", two_outputs, ("a.json", "b.json"), {"x": x})], experiment.run_dir)
+            return experiment.ran
+
+        stop = False
+        assert run(1) == ["1"]
+        stop = True
+        with pytest.raises(StageInterrupted):
+            run(2)
+        stop = False
+        assert run(1) == ["1"]
+        assert run(2) == ["2"]
+
+    def test_old_outputs_are_valid_again_if_new_ones_were_not_written(self, experiment):
+        experiment.run()
+        experiment.settings["train"] = {"epochs": 6}
+        experiment.behaviour["train"] = interrupt
+        with pytest.raises(StageInterrupted):
+            experiment.run()
+        experiment.settings["train"] = {"epochs": 5}
+        assert experiment.run() == []
+
+    def test_fingerprint_covers_all_that_it_should_and_not_the_order_of_keys(self):
+        def of(upstream: str = "u", **changes: Any) -> str:
+            fields = {"name": "s", "function": print, "outputs": (), "settings": {"a": 1, "b": {"c": 2.0}}}
+            return fingerprint(Stage(**{**fields, "upstream": ("before",), **changes}), {"before": upstream})
+
+        assert of() == of(settings={"b": {"c": 2.0}, "a": 1})
+        others = [of("v"), of(name="t"), of(settings={"a": 1, "b": {"c": 3.0}}), of(format_version=2)]
+        assert len({of(), *others}) == 5
+
+    def test_wrong_order_of_stages_is_refused(self, experiment):
+        stages = experiment.stages()
+        for wrong in ([stages[1], stages[0]], [stages[0], stages[0]]):
+            with pytest.raises(ValueError, match="there twice or stands before"):
+                run_stages(wrong, experiment.run_dir)
+
+
+class TestInterruption:
+    def test_the_message_says_what_is_kept_and_seconds_add_up(self, experiment, clock):
+        def interrupt_after_a_while(context: StageContext) -> None:
+            clock[0] += 30.0
+            raise KeyboardInterrupt
+
+        def finish(context: StageContext) -> None:
+            clock[0] += 5.0
+
+        experiment.behaviour["train"] = interrupt_after_a_while
+        for _ in range(2):
+            with pytest.raises(
+                StageInterrupted,
+                match=r"in stage 'train' \(finished and kept: generate; .*same command goes on",
+            ):
+                experiment.run()
+        experiment.behaviour["train"] = finish
+        assert experiment.run() == ["train", "report"]
+        assert experiment.seconds == {"generate": 0.0, "train": 65.0, "report": 0.0}
+        records = sorted(path.name for path in (experiment.run_dir / "stages").iterdir())
+        assert records == ["generate.json", "report.json", "train.json"]
+
+        experiment.settings["train"] = {"epochs": 6}
+        experiment.behaviour["train"] = interrupt_after_a_while
+        with pytest.raises(StageInterrupted):
+            experiment.run()
+        experiment.settings["train"] = {"epochs": 7}
+        experiment.behaviour["train"] = finish
+        experiment.run()
+        assert experiment.seconds["train"] == 5.0
+
+    def test_errors_pass_through_and_the_stage_runs_again(self, experiment):
+        def fail(context: StageContext) -> None:
+            raise InputError("no")
+
+        experiment.behaviour["train"] = fail
+        with pytest.raises(InputError, match="no"):
+            experiment.run()
+        experiment.behaviour.clear()
+        assert experiment.run() == ["train", "report"]
+
+
+class TestLock:
+    def test_one_process_at_a_time(self, experiment):
+        with (
+            run_lock(experiment.run_dir),
+            pytest.raises(InputError, match="another process is writing the run folder"),
+        ):
+            experiment.run()
+        assert experiment.ran == []
+        assert experiment.run() == ["generate", "train", "report"]
+
+    def test_the_lock_of_a_killed_process_is_gone(self, tmp_path):
+        program = """
+            import sys, time
+            from warp_resphys.io.stages import run_lock
+            with run_lock(sys.argv[1]):
+                print("locked", flush=True)
+                time.sleep(60)
+        """
+        command = [sys.executable, "-c", textwrap.dedent(program), str(tmp_path)]
+        environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+        child = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+        assert child.stdout.readline() == "locked\n"
+        with pytest.raises(InputError, match="another process"), run_lock(tmp_path):
+            pass
+        child.send_signal(signal.SIGKILL)
+        child.wait(timeout=10)
+        with run_lock(tmp_path):
+            pass
+
+    def test_a_folder_that_cannot_be_made(self, tmp_path):
+        (tmp_path / "file").touch()
+        with (
+            pytest.raises(DataFileError, match="cannot write the run folder"),
+            run_lock(tmp_path / "file" / "run"),
+        ):
+            pass
+
+
+class TestProgress:
+    def test_a_log_gets_a_line_every_ten_seconds_and_one_at_the_end(self, clock):
+        stream = io.StringIO()
+        with Progress("train", 100, "epochs", start_at=40, console=Console(file=stream)) as bar:
+            for _ in range(60):
+                clock[0] += 0.5
+                bar.advance(loss=0.0012345, rate="slow")
+        assert stream.getvalue().splitlines() == [
+            "train: 60/100 epochs, 2 epochs/s, 0:20 left, loss 0.00123, rate slow",
+            "train: 80/100 epochs, 2 epochs/s, 0:10 left, loss 0.00123, rate slow",
+            "train: 100/100 epochs, 2 epochs/s, in 0:30, loss 0.00123, rate slow",
+        ]
+
+    def test_a_short_loop_gets_one_line(self, clock):
+        stream = io.StringIO()
+        with Progress("mesh", 2, "bodies", console=Console(file=stream)) as bar:
+            clock[0] += 0.5
+            bar.advance(2)
+        assert stream.getvalue() == "mesh: 2/2 bodies, 4 bodies/s, in 0:00\n"
+
+    def test_slow_units_and_interruption(self, clock):
+        stream = io.StringIO()
+
+        def advance_and_stop(bar: Progress) -> None:
+            clock[0] += 1800.0
+            bar.advance()
+            raise KeyboardInterrupt
+
+        console = Console(file=stream)
+        with pytest.raises(KeyboardInterrupt), Progress("fit", 9, "runs", console=console) as bar:
+            advance_and_stop(bar)
+        assert stream.getvalue().splitlines() == ["fit: 1/9 runs, 30:00 each, 4:00:00 left"]
+
+    @pytest.mark.parametrize(("terminal", "most"), [(True, 201), (False, 2)], ids=["terminal", "log"])
+    def test_most_calls_only_count(self, clock, monkeypatch, terminal, most):
+        """In 20 s a bar is drawn every 0.1 s at most, a line printed every 10 s."""
+        described, shown, update, out = [], [], Bars.update, Console.print
+
+        class Observed(Progress):
+            def status(self) -> str:
+                described.append(self.done)
+                return super().status()
+
+        def updated(*arguments, **options):
+            shown.append(arguments)
+            return (update if terminal else out)(*arguments, **options)
+
+        stream = io.StringIO()
+        console = Console(file=stream, force_terminal=terminal, width=120)
+        monkeypatch.setattr(*((Bars, "update") if terminal else (Console, "print")), updated)
+        with Observed("roll out", 20_000, "steps", console=console) as bar:
+            described.clear()
+            for step in range(20_000):
+                clock[0] += 1e-3
+                bar.advance(error=0.5 * step)
+            assert len(described) == len(shown)
+            assert 0.9 * most <= len(shown) <= most
+        assert "20000/20000 steps" in stream.getvalue()
+        assert "error 1e+04" in stream.getvalue()

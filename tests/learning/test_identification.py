@@ -1,0 +1,280 @@
+"""Identification: parameters come back from sparse, noisy markers, with the deviation that was predicted."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from warp_resphys import Body, Simulator
+from warp_resphys.data.markers import bind_markers
+from warp_resphys.dynamics.nonlinear_solver import SolverSettings
+from warp_resphys.io.errors import ConvergenceError, InputError
+from warp_resphys.learning.identification import Bounds, Identifier
+from warp_resphys.learning.replay import Motions, Release, Replay
+from warp_resphys.linalg.least_squares import minimise
+from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
+
+MESH = box_hexahedra(divisions=(4, 1, 1))
+TIP = select_vertices(MESH, x=0.1)
+POINTS = np.array([[0.1, 0.015, 0.036], [0.1, -0.006, 0.024], [0.1, 0.036, 0.006]])
+MARKERS = bind_markers(MESH, POINTS, ["a", "b", "c"], kind="rigid", vertices=TIP)
+TRUTH = {"youngs_modulus": 215e3, "stiffness_damping": 0.002}
+RANGES = {"youngs_modulus": Bounds(1e5, 1e6, logarithmic=True), "stiffness_damping": Bounds(0.0, 0.02)}
+FIRST = {"youngs_modulus": 400e3, "stiffness_damping": 0.0}
+
+
+def simulator(**options):
+    return Simulator(Body(MESH, select_vertices(MESH, x=0.0)), time_step=0.01, integrator="bdf2", **options)
+
+
+def one(value):
+    return torch.tensor([value], dtype=torch.float64)
+
+
+def hanging(masses):
+    attached = torch.zeros(len(masses), len(MESH.vertices), dtype=torch.float64)
+    attached[:, TIP] = torch.tensor(masses, dtype=torch.float64)[:, None] / len(TIP)
+    return attached
+
+
+def replay_of(sim, truth, masses=(0.0, 0.05), frames=25, noise=0.0, seed=0):
+    """Motions from rest under gravity with the true parameters, and their beginning."""
+    count = len(masses)
+    times = (0.01 * torch.arange(frames, dtype=torch.float64)).expand(count, -1)
+    held = torch.as_tensor(POINTS).expand(count, -1, -1)
+    blank = Motions(
+        tuple(f"m{i}" for i in range(count)), times, held[:, None].repeat(1, frames, 1, 1), held, hanging(masses)
+    )
+    release = Release(sim.rest_state(count), torch.zeros(count, dtype=torch.float64))
+    with torch.no_grad():
+        markers = Replay(sim, MARKERS, blank)(release, {name: one(value) for name, value in truth.items()})[0]
+    markers = markers + noise * torch.randn(
+        markers.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
+    )
+    return Replay(sim, MARKERS, Motions(blank.names, times, markers, held, blank.attached_mass)), release
+
+
+def identify(noise=0.0, seed=0, bounds=RANGES, first=FIRST, truth=TRUTH, **options):
+    replay, release = replay_of(simulator(), truth, noise=noise, seed=seed, **options)
+    return Identifier(replay, release, bounds).run([first], 40)
+
+
+def test_stiffness_and_damping_are_recovered_from_sparse_noisy_markers():
+    found = identify(noise=5e-5)
+    assert found.parameters["youngs_modulus"] == pytest.approx(215e3, rel=1e-3)
+    assert found.parameters["stiffness_damping"] == pytest.approx(0.002, rel=0.02)
+    assert found.at_bounds == ()
+    assert len(found.history[0]) < 25
+
+
+def test_without_noise_the_parameters_are_exact():
+    truth = {"youngs_modulus": 180e3, "poissons_ratio": 0.47, "mass_damping": 1.0}
+    bounds = {
+        "youngs_modulus": Bounds(1e5, 1e6, logarithmic=True),
+        "poissons_ratio": Bounds(0.3, 0.499),
+        "mass_damping": Bounds(0.0, 5.0),
+    }
+    first = {"youngs_modulus": 264e3, "poissons_ratio": 0.499, "mass_damping": 0.0}
+    found = identify(truth=truth, bounds=bounds, first=first)
+    for name, value in truth.items():
+        assert found.parameters[name] == pytest.approx(value, rel=1e-3), name
+    assert found.loss < 1e-9
+
+
+def test_the_predicted_deviation_is_that_of_repetitions():
+    replay, release = replay_of(simulator(), TRUTH, masses=(0.05,), frames=12)
+    clean, found, predicted = replay.motions, [], []
+    generator = torch.Generator().manual_seed(1)
+    for _ in range(10):
+        markers = clean.markers + 3e-4 * torch.randn(clean.markers.shape, generator=generator, dtype=torch.float64)
+        motions = replace(clean, markers=markers)
+        result = Identifier(Replay(replay.simulator, MARKERS, motions), release, RANGES).run([TRUTH], 2)
+        found.append([result.parameters[name] for name in RANGES])
+        predicted.append([result.uncertainty.deviation[name] for name in RANGES])
+    ratio = np.std(found, axis=0, ddof=1) / np.mean(predicted, axis=0)
+    assert (ratio > 0.5).all()
+    assert (ratio < 2.0).all()
+
+
+def test_stiffness_and_density_of_a_body_without_weights_cannot_be_told_apart():
+    bounds = {"youngs_modulus": Bounds(1e5, 1e6), "density": Bounds(800.0, 1500.0)}
+    truth = {"youngs_modulus": 215e3, "density": 1070.0}
+    replay, release = replay_of(simulator(), truth, masses=(0.0,), noise=5e-5)
+    identifier = Identifier(replay, release, bounds)
+    uncertainty = identifier.uncertainty(np.array([identifier._unit(name, truth) for name in bounds]))
+    assert uncertainty.correlation[0][1] > 0.999
+    assert uncertainty.poorest_deviation > 1.0
+    replay, release = replay_of(simulator(), truth, masses=(0.0, 0.05), noise=5e-5)
+    told = Identifier(replay, release, bounds).uncertainty(np.array([0.13, 0.39]))
+    assert told.poorest_deviation < 0.1
+
+
+def test_a_parameter_outside_its_range_ends_on_the_bound():
+    bounds = {"youngs_modulus": Bounds(3e5, 1e6, logarithmic=True)}
+    found = identify(truth={"youngs_modulus": 215e3}, bounds=bounds, first={"youngs_modulus": 6e5}, frames=12)
+    assert found.at_bounds == ("youngs_modulus",)
+    assert found.parameters["youngs_modulus"] == pytest.approx(3e5)
+
+
+def test_a_grid_has_its_minimum_at_the_truth_and_the_axes_asked_for():
+    replay, release = replay_of(simulator(), TRUTH, frames=20)
+    identifier = Identifier(replay, release, {**RANGES, "poissons_ratio": Bounds(0.4, 0.499)})
+    others = {**TRUTH, "poissons_ratio": 0.499}
+    losses = identifier.grid({"stiffness_damping": 3, "youngs_modulus": 7}, others)
+    assert losses.shape == (3, 7)
+    ticks = identifier.ticks("youngs_modulus", 7)
+    assert ticks[0] == 1e5
+    assert ticks[-1] == pytest.approx(1e6)
+    assert ticks[losses[0].argmin()] == pytest.approx(215e3, rel=0.2)
+    one_by_one = [
+        identifier.grid({"youngs_modulus": 1}, others | {"youngs_modulus": 1e5}),
+        identifier.grid({"youngs_modulus": 7}, others | {"stiffness_damping": 0.01}, chunk=2),
+    ]
+    np.testing.assert_allclose(one_by_one[1], losses[1], rtol=1e-5)
+
+
+def test_failed_points_of_a_grid_are_infinite_and_the_others_unchanged():
+    bounds = {"youngs_modulus": Bounds(1.0, 1e10, logarithmic=True)}
+    replay, release = replay_of(simulator(), {"youngs_modulus": 215e3}, frames=5)
+    whole = Identifier(replay, release, bounds).grid({"youngs_modulus": 6}, {})
+    few = Replay(simulator(solver=SolverSettings(max_iterations=10)), MARKERS, replay.motions)
+    losses = Identifier(few, release, bounds).grid({"youngs_modulus": 6}, {})
+    good = np.isfinite(losses)
+    assert np.isfinite(whole).all()
+    assert 0 < good.sum() < 6
+    np.testing.assert_allclose(losses[good], whole[good], rtol=1e-5)
+
+
+def test_a_start_where_the_simulation_fails_is_passed_over(monkeypatch):
+    replay, release = replay_of(simulator(), TRUTH, frames=15)
+    simulate = Replay.__call__
+
+    def fragile(self, release, parameters):
+        if bool((parameters["youngs_modulus"] < 150e3).any()):
+            raise ConvergenceError("too soft", None, None)
+        return simulate(self, release, parameters)
+
+    monkeypatch.setattr(Replay, "__call__", fragile)
+    soft = FIRST | {"youngs_modulus": 120e3}
+    identifier = Identifier(replay, release, RANGES)
+    found = identifier.run([soft, FIRST], 20)
+    assert found.parameters["youngs_modulus"] == pytest.approx(215e3, rel=1e-3)
+    assert found.history[0] == []
+    with pytest.raises(ConvergenceError, match="every start"):
+        identifier.run([soft], 20)
+
+
+def test_starts_are_the_first_guess_and_the_best_candidates():
+    replay, release = replay_of(simulator(), TRUTH, frames=20)
+    identifier = Identifier(replay, release, RANGES)
+    starts = identifier.starts(FIRST, 3, 8, seed=0)
+    assert len(starts) == 3
+    assert starts[0] == pytest.approx(FIRST)
+    assert starts == identifier.starts(FIRST, 3, 8, seed=0) != identifier.starts(FIRST, 3, 8, seed=1)
+    assert abs(np.log(starts[1]["youngs_modulus"] / 215e3)) < 0.5
+
+
+def test_finished_starts_are_not_done_again():
+    replay, release = replay_of(simulator(), TRUTH, frames=10)
+    kept, calls = [], []
+    starts = [FIRST, {"youngs_modulus": 150e3, "stiffness_damping": 0.01}]
+    whole = Identifier(replay, release, RANGES).run(starts, 2, keep=lambda a: kept.append(json.loads(json.dumps(a))))
+    assert [len(attempts) for attempts in kept] == [1, 2]
+    again = Identifier(replay, release, RANGES).run(
+        starts, 2, report=lambda number, *_: calls.append(number), finished=kept[0]
+    )
+    assert set(calls) == {1}
+    assert again.parameters == whole.parameters
+    assert again.history == whole.history
+
+
+def test_only_the_first_seconds_count():
+    replay, release = replay_of(simulator(), TRUTH, frames=40)
+    spoilt = replay.motions.markers.clone()
+    spoilt[:, 20:] += 1.0
+    motions = replace(replay.motions, markers=spoilt)
+    identifier = Identifier(Replay(replay.simulator, MARKERS, motions), release, RANGES, seconds=0.19)
+    unit = replay.simulator.tensor([[identifier._unit(name, TRUTH) for name in RANGES]])
+    assert float(identifier.losses(unit)) < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("bounds", "sentence"),
+    [
+        ({}, "nothing to identify"),
+        ({"stiffness": Bounds(0.0, 1.0)}, "no parameter 'stiffness'"),
+    ],
+)
+def test_what_cannot_be_identified_is_refused(bounds, sentence):
+    replay, release = replay_of(simulator(), TRUTH, frames=3)
+    with pytest.raises(InputError, match=sentence):
+        Identifier(replay, release, bounds)
+
+
+def test_a_motion_that_stands_still_is_refused():
+    replay, release = replay_of(simulator(gravity=(0.0, 0.0, 0.0)), TRUTH, frames=3)
+    still = replay.motions.held[:, None].repeat(1, 3, 1, 1)
+    motions = replace(replay.motions, markers=still)
+    with pytest.raises(InputError, match="'m0' stay where they were held"):
+        Identifier(Replay(replay.simulator, MARKERS, motions), release, RANGES)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "log"), [(1.0, 1.0, False), (2.0, 1.0, False), (0.0, 1.0, True), (0.0, np.inf, False)]
+)
+def test_bounds_leave_a_range(low, high, log):
+    with pytest.raises(InputError):
+        Bounds(low, high, log)
+
+
+@pytest.mark.parametrize("bounds", [Bounds(1e5, 1e6, logarithmic=True), Bounds(-1.0, 3.0)])
+def test_bounds_there_and_back(bounds):
+    unit = torch.linspace(0.0, 1.0, 5, dtype=torch.float64)
+    values = bounds.from_unit(unit)
+    assert [bounds.to_unit(float(v)) for v in values] == pytest.approx(unit.tolist(), abs=1e-12)
+    assert float(values[0]) == bounds.lower
+    assert float(values[-1]) == pytest.approx(bounds.upper)
+
+
+class Valley:
+    """|r|^2 with a bent narrow floor: r = (100 (y - x^2), x - 0.7), failing left of a wall."""
+
+    def __init__(self, wall=-1.0):
+        self.wall, self.calls = wall, 0
+
+    def residuals(self, x):
+        return np.array([100.0 * (x[1] - x[0] ** 2), x[0] - 0.7])
+
+    def jacobian(self, x):
+        return np.array([[-200.0 * x[0], 100.0], [1.0, 0.0]])
+
+    def __call__(self, x):
+        self.calls += 1
+        assert (x >= 0.0).all()
+        assert (x <= 1.0).all()
+        if x[0] < self.wall:
+            return np.inf, np.zeros(2)
+        r = self.residuals(x)
+        return float(r @ r), 2.0 * self.jacobian(x).T @ r
+
+    def matrix(self, x):
+        return 2.0 * self.jacobian(x).T @ self.jacobian(x)
+
+
+def test_the_descent_follows_a_bent_valley():
+    valley = Valley()
+    x, value = minimise(valley, np.array([0.05, 0.9]), valley.matrix, 50)
+    np.testing.assert_allclose(x, [0.7, 0.49], atol=1e-6)
+    assert value < 1e-10
+    assert valley.calls < 60
+
+
+def test_the_descent_turns_back_from_failures_and_copes_without_a_matrix():
+    valley = Valley(wall=0.6)
+    x, _ = minimise(valley, np.array([0.99, 0.2]), valley.matrix, 50)
+    np.testing.assert_allclose(x, [0.7, 0.49], atol=1e-5)
+    x, value = minimise(Valley(), np.array([0.4, 0.1]), lambda _: None, 200)
+    assert value < 0.1
+    assert minimise(Valley(wall=0.6), np.array([0.1, 0.1]), valley.matrix, 5)[1] == np.inf

@@ -1,0 +1,81 @@
+"""Roll-out errors against values computed by hand."""
+
+import json
+
+import numpy as np
+import pytest
+
+from warp_resphys.io.errors import InputError
+from warp_resphys.learning.metrics import PUBLISHED_MM, summarise, summarise_each, summarise_folds, trajectory_errors
+
+
+def two_vertices(*distances: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """A roll-out whose two vertices are off by the given distances [m] at each state, and its target."""
+    target = np.random.default_rng(0).normal(size=(len(distances), 2, 3))
+    directions = np.array([[0.6, 0.0, -0.8], [0.0, 1.0, 0.0]])  # Unit vectors.
+    return target + np.asarray(distances)[:, :, None] * directions, target
+
+
+def test_errors_are_mean_distances_in_millimetres_without_the_initial_state() -> None:
+    positions, target = two_vertices((5.0, 5.0), (0.001, 0.003), (0.0, 0.004))
+    np.testing.assert_allclose(trajectory_errors(positions, target), [2.0, 2.0], rtol=1e-12)
+
+
+def test_summary_pools_steps_and_takes_the_deviation_of_the_vertex_means() -> None:
+    # Per-step means 1, 2 | 3, 6: mean 3, population variance ((2^2 + 1^2 + 0 + 3^2) / 4) = 3.5.
+    summary = summarise([np.array([1.0, 2.0]), np.array([3.0, 6.0])])
+    assert summary == {"mean": 3.0, "std": pytest.approx(np.sqrt(3.5)), "trajectories": 2, "diverged": 0}
+
+
+def test_trajectories_of_unequal_length_weigh_by_their_steps() -> None:
+    assert summarise([np.array([4.0]), np.array([1.0, 1.0])])["mean"] == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e300])
+def test_a_diverged_rollout_is_counted_and_leaves_no_mean(bad: float) -> None:
+    positions, target = two_vertices((0.0, 0.0), (0.001, 0.001), (0.001, 0.001))
+    good = trajectory_errors(positions, target)
+    positions[2, 1] = bad
+    errors = trajectory_errors(positions, target)
+    assert errors[0] == pytest.approx(1.0)
+    summary = summarise([good, errors])
+    assert (summary["mean"], summary["std"], summary["diverged"], summary["trajectories"]) == (
+        None,
+        None,
+        1,
+        2,
+    )
+    each = summarise_each(["a", "b"], {"resphys": [good, errors]})
+    assert [entry["errors_mm"]["resphys"] for entry in each] == [pytest.approx(1.0), None]
+    json.dumps([summary, each], allow_nan=False)
+
+
+def test_wrong_shapes_and_unobserved_targets_are_refused() -> None:
+    positions, target = two_vertices((0.0, 0.0), (0.001, 0.001))
+    with pytest.raises(InputError, match=r"\(2, 1, 3\)"):
+        trajectory_errors(positions, target[:, :1])
+    with pytest.raises(InputError, match="steps"):
+        trajectory_errors(positions[:1], target[:1])
+    target[1, 0, 2] = np.nan
+    with pytest.raises(InputError, match="state 1"):
+        trajectory_errors(positions, target)
+    with pytest.raises(InputError, match="at least one step"):
+        summarise([])
+    with pytest.raises(InputError, match="1 roll-outs for 2"):
+        summarise_each(["a", "b"], {"resphys": [np.ones(3)]})
+
+
+def test_published_numbers() -> None:
+    assert PUBLISHED_MM["beam_oscillation"]["simulation"] == (4.488, 1.468)
+    assert PUBLISHED_MM["beam_oscillation"]["resphys"] == (0.004, 0.010)
+    assert PUBLISHED_MM["sopra"]["resphys"] == (5.77, 3.00)
+
+
+def test_folds_weigh_the_same_whatever_their_length() -> None:
+    folds = [
+        {"resphys": summarise([np.array([1.0, 1.0, 1.0])]), "simfree": summarise([np.array([2.0])])},
+        {"resphys": summarise([np.array([3.0]), np.array([5.0])]), "simfree": summarise([np.array([np.nan])])},
+    ]
+    found = summarise_folds(folds)
+    assert found["resphys"] == {"mean": 2.5, "std": 1.5, "trajectories": 3, "diverged": 0}
+    assert found["simfree"] == {"mean": None, "std": None, "trajectories": 2, "diverged": 1}

@@ -1,0 +1,362 @@
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from warp_resphys import Body, Material, Simulator, box_hexahedra, select_vertices
+from warp_resphys.dynamics import modes
+from warp_resphys.dynamics.modes import RestStiffness, vibration_modes
+from warp_resphys.io.errors import InputError
+from warp_resphys.io.files import read_checkpoint, write_checkpoint
+from warp_resphys.learning.driven_rollout import Range, WatchedModel
+from warp_resphys.learning.networks import (
+    NextState,
+    ResidualForce,
+    SkipMLP,
+    actuation_coder,
+    build_model,
+    build_next_state,
+    displacement_coder,
+    nodal_coder,
+    pod_coder,
+    restore,
+)
+
+REDUCED = {"kind": "reduced", "position_modes": 3, "velocity_modes": 4, "force_modes": 5}
+ARCHITECTURE = {"blocks": 2, "layers": 1, "width": 16, "activation": "normalised_elu"}
+KINDS = {"reduced": {**REDUCED, **ARCHITECTURE}, "nodal": {"kind": "nodal", **ARCHITECTURE}}
+
+
+def field(samples, vertices=6, rank=None, seed=0):
+    """(S, N, 3) of falling singular values."""
+    random = np.random.default_rng(seed)
+    columns = 3 * vertices
+    rank = rank or min(samples, columns)
+    left = np.linalg.qr(random.normal(size=(samples, rank)))[0]
+    right = np.linalg.qr(random.normal(size=(columns, rank)))[0]
+    values = 3.0 * 0.5 ** np.arange(rank)
+    return torch.tensor((left * values) @ right.T).view(samples, vertices, 3)
+
+
+def built(kind):
+    torch.manual_seed(0)
+    rest, q, v, force = field(1, seed=5)[0], field(40, seed=1), field(40, seed=2), field(40, seed=3)
+    return build_model(KINDS[kind], rest, rest + q, v, force), rest + q, v, force
+
+
+class TestSkipMLP:
+    def test_published_structure(self):
+        network = SkipMLP(30, 12, blocks=5, layers=3, width=512, activation="normalised_elu")
+        assert len(network.blocks) == 5
+        for i, block in enumerate(network.blocks):
+            hidden = [nn.Linear, nn.LayerNorm, nn.ELU]
+            assert [type(m) for m in block] == 3 * hidden + [nn.Linear]
+            sizes = [(m.in_features, m.out_features) for m in block if isinstance(m, nn.Linear)]
+            assert sizes == [(30 if i == 0 else 12, 512), (512, 512), (512, 512), (512, 12)]
+            assert all(m.normalized_shape == (512,) for m in block if isinstance(m, nn.LayerNorm))
+
+    def test_a_smooth_network_has_no_normalisation(self):
+        (block,) = SkipMLP(5, 2, blocks=1, layers=2, width=8, activation="silu").blocks
+        assert [type(m) for m in block] == [nn.Linear, nn.SiLU, nn.Linear, nn.SiLU, nn.Linear]
+
+    def test_blocks_after_the_first_add_to_their_input(self):
+        torch.manual_seed(0)
+        network = SkipMLP(4, 3, blocks=3, layers=1, width=8, activation="normalised_elu")
+        x = torch.randn(5, 4)
+        first = network.blocks[0](x)
+        second = first + network.blocks[1](first)
+        assert torch.equal(network(x), second + network.blocks[2](second))
+        for block in list(network.blocks)[1:]:
+            nn.init.zeros_(block[-1].weight)
+            nn.init.zeros_(block[-1].bias)
+        assert torch.equal(network(x), first)
+
+
+class TestPOD:
+    def test_basis_is_orthonormal_and_the_best_of_its_size(self):
+        samples = field(40)
+        coder = pod_coder(samples, 4)
+        basis = coder.basis
+        np.testing.assert_allclose(basis.mT @ basis, np.eye(4), atol=1e-14)
+        x = samples.flatten(1)
+        missed = (samples - coder.decode(coder.encode(samples))).flatten(1)
+        smallest = torch.linalg.svdvals(x)[4:].square().sum()  # Eckart and Young
+        np.testing.assert_allclose(missed.square().sum(), smallest, rtol=1e-10)
+
+    def test_round_trip_and_projection(self):
+        samples = field(40)
+        coder = pod_coder(samples, 4)
+        coordinates = torch.randn(7, 4, dtype=torch.float64)
+        assert coder.size == 4
+        np.testing.assert_allclose(coder.encode(coder.decode(coordinates)), coordinates, atol=1e-12)
+        whole = pod_coder(samples, 18)
+        np.testing.assert_allclose(whole.decode(whole.encode(samples)), samples, atol=1e-12)
+
+    def test_coordinates_have_unit_mean_square_down_to_the_floor(self):
+        samples = field(40)  # deviations fall as 2^-k: the floor of 0.3 % lies between the 8th and 9th after the first
+        coordinates = pod_coder(samples, 12).encode(samples)
+        size = coordinates.square().mean(0).sqrt().numpy()
+        np.testing.assert_allclose(size[:9], 1.0, rtol=1e-10)
+        np.testing.assert_allclose(size[9:], 0.5 ** np.arange(9, 12) / 3e-3, rtol=1e-10)
+
+    @pytest.mark.parametrize(("samples", "modes"), [(40, 19), (5, 6), (40, 0), (40, -1)])
+    def test_modes_that_the_samples_do_not_have(self, samples, modes):
+        with pytest.raises(InputError, match=f"{modes} modes were asked for, but {samples} samples give 1 to"):
+            pod_coder(field(samples), modes)
+
+
+class TestNodalCoder:
+    def test_round_trip_and_standardisation(self):
+        samples = 2.0 + field(40)
+        coder = nodal_coder(samples)
+        coordinates = coder.encode(samples)
+        np.testing.assert_allclose(coordinates.mean(0), 0.0, atol=1e-12)
+        np.testing.assert_allclose(coordinates.std(0), 1.0, rtol=1e-12)
+        np.testing.assert_allclose(coder.decode(coordinates), samples, atol=1e-14)
+        assert coder.size == 18
+
+    def test_constant_coordinates_stay_zero(self):
+        samples = field(40)
+        samples[:, 2, 1] = 0.25
+        coder = nodal_coder(samples)
+        assert not coder.encode(samples)[:, 3 * 2 + 1].any()
+        assert torch.isfinite(coder.decode(coder.encode(samples))).all()
+        assert torch.equal(coder.decode(coder.encode(samples))[:, 2, 1], samples[:, 2, 1])
+
+
+class TestResidualForce:
+    def test_linear_part_is_ridge_regression(self):
+        model, *_ = built("reduced")
+        random = np.random.default_rng(0)
+        x, y = random.normal(size=(30, 7)).astype(np.float32), random.normal(size=(30, 5)).astype(np.float32)
+        noise = 0.3
+        model.fit_linear(torch.tensor(x), torch.tensor(y), noise)
+        # Least squares with rows that say: noise sqrt(S) times each weight is zero.
+        rows = np.vstack([x, np.sqrt(30) * noise * np.eye(7)]).astype(np.float64)
+        expected = np.linalg.lstsq(rows, np.vstack([y, np.zeros((7, 5))]), rcond=None)[0]
+        np.testing.assert_allclose(model.linear, expected, rtol=1e-5, atol=1e-7)
+        left = y - x @ expected
+        np.testing.assert_allclose(model.remainder, np.sqrt((left**2).mean()), rtol=1e-6)
+        inputs = torch.tensor(x)
+        together = model.standardised(inputs)
+        np.testing.assert_allclose(
+            together.detach(), inputs @ model.linear + model.remainder * model.network(inputs).detach(), rtol=1e-6
+        )
+
+    def test_ridge_is_what_noisy_inputs_teach(self):
+        model, *_ = built("reduced")
+        random = np.random.default_rng(1)
+        x, y = random.normal(size=(20, 7)), random.normal(size=(20, 5))
+        model.fit_linear(torch.tensor(x), torch.tensor(y), 0.5)
+        many = np.repeat(x, 20000, axis=0)
+        noisy = many + 0.5 * random.normal(size=many.shape)
+        expected = np.linalg.lstsq(noisy, np.repeat(y, 20000, axis=0), rcond=None)[0]
+        np.testing.assert_allclose(model.linear, expected, atol=5e-3)
+
+    @pytest.mark.parametrize("kind", KINDS)
+    def test_force_from_state(self, kind):
+        model, q, v, force = built(kind)
+        inputs = model.encode(q, v)
+        sizes = {"reduced": (7, 5), "nodal": (36, 18)}[kind]
+        assert (inputs.shape[1], model.coders[0].size) == sizes
+        assert inputs.dtype == torch.float32
+        np.testing.assert_allclose(inputs[:, : sizes[0] // 2].std(0), 1.0, rtol=0.05)
+        # With a linear part that is exact, the force comes back.
+        with torch.no_grad():
+            model.linear.copy_(torch.linalg.lstsq(inputs, model.encode_outputs(force)).solution)
+            model.remainder.zero_()
+            found = model(q, v)
+        wanted = model.coders[0].decode((inputs @ model.linear).double())
+        assert found.dtype == torch.float64
+        np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-12)
+
+    @pytest.mark.parametrize("kind", KINDS)
+    def test_saved_and_restored_it_gives_identical_forces(self, kind, tmp_path):
+        model, q, v, force = built(kind)
+        model.fit_linear(model.encode(q, v), model.encode_outputs(force), 1e-2)
+        write_checkpoint(tmp_path / "model.safetensors", "residual force", model.state_dict(), model.description())
+        again = restore(ResidualForce, *read_checkpoint(tmp_path / "model.safetensors", "residual force"))
+        assert again.state_dict().keys() == model.state_dict().keys()
+        assert not again.training
+        with torch.no_grad():
+            expected = model(q, v)
+            assert expected.abs().max() > 1e-3
+            assert torch.equal(again(q, v), expected)
+
+    def test_the_rest_shape_is_subtracted(self):
+        model, q, v, _ = built("nodal")
+        rest = model.rest.clone()
+        shifted = build_model(KINDS["nodal"], rest + 1.0, q + 1.0, v, field(40, seed=3))
+        np.testing.assert_allclose(shifted.encode(q + 1.0, v), model.encode(q, v), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        ({"kind": "graph"}, "network.kind is 'graph': choose one of reduced, nodal."),
+        ({"activation": "relu"}, "network.activation is 'relu': choose one of normalised_elu, silu."),
+        ({"blocks": 0}, "network.blocks is 0: it must be positive."),
+        ({"layers": -1}, "network.layers is -1: it must be zero or more."),
+        ({"width": 0}, "network.width is 0: it must be positive."),
+        ({"width": -1}, "network.width is -1: it must be positive."),
+        ({"force_modes": 0}, "network.force_modes is 0: it must be positive."),
+    ],
+)
+def test_bad_settings(settings, sentence):
+    samples = field(40)
+    with pytest.raises(InputError) as error:
+        build_model({**KINDS["reduced"], **settings}, samples[0], samples, samples, samples)
+    assert str(error.value) == sentence
+
+
+class TestActuation:
+    LOADS = torch.tensor([[0.0, 0.0], [0.05, 0.0], [0.1, 0.0]], dtype=torch.float64).repeat(14, 1)[:40]
+
+    def built(self, build=build_model, **changes):
+        torch.manual_seed(0)
+        rest, q, v = field(1, seed=5)[0], field(40, seed=1), field(40, seed=2)
+        fields = (rest, rest + q, v, *([field(40, seed=3)] if build is build_model else []))
+        return build({**KINDS["reduced"], **changes}, *fields, self.LOADS), rest + q, v
+
+    def test_it_is_in_units_of_its_size_and_none_stays_zero(self):
+        coded = actuation_coder(self.LOADS).encode(self.LOADS)
+        assert float(coded[:, 0].square().mean()) == pytest.approx(1.0)
+        assert not coded[0].any()
+        assert not coded[:, 1].any()
+
+    @pytest.mark.parametrize(("kind", "build"), [(ResidualForce, build_model), (NextState, build_next_state)])
+    def test_round_trip_in_double_precision(self, tmp_path, kind, build):
+        model, q, v = self.built(build)
+        model = model.double().eval()
+        write_checkpoint(tmp_path / "model.safetensors", "test", model.state_dict(), model.description())
+        again = restore(kind, *read_checkpoint(tmp_path / "model.safetensors", "test"))
+        with torch.no_grad():
+            for one, other in zip(model.predict(q, v, self.LOADS), again.predict(q, v, self.LOADS), strict=True):
+                assert torch.equal(one, other)
+            assert not torch.equal(model.predict(q, v, self.LOADS)[0], model.predict(q, v, 2.0 * self.LOADS)[0])
+
+    @pytest.mark.parametrize("build", [build_model, build_next_state])
+    def test_outside_its_training_a_model_is_held_at_the_edge(self, build):
+        model, q, v = self.built(build)
+        model = model.double().eval()
+        with torch.no_grad():
+            held = Range.of(model.encode(q, v, self.LOADS))
+        watched = WatchedModel(model, held)
+        inside = watched(q[:5], v[:5], self.LOADS[:5])
+        for one, other in zip(inside, model.predict(q[:5], v[:5], self.LOADS[:5]), strict=True):
+            torch.testing.assert_close(one, other)
+        assert watched.left_at.tolist() == [-1] * 5
+        far = [watched(model.rest + size * (q[:5] - model.rest), size * v[:5], self.LOADS[:5]) for size in (1e6, 1e9)]
+        for one, other in zip(*far, strict=True):
+            torch.testing.assert_close(one, other)
+        assert watched.left_at.tolist() == [1] * 5
+
+    def test_without_hidden_layers_it_is_affine(self):
+        model, q, v = self.built(layers=0, blocks=1)
+        model = model.double()
+        with torch.no_grad():
+            ends = [model(q[pick], v[pick], self.LOADS[pick]) for pick in (slice(0, 10), slice(10, 20))]
+            halfway = [0.5 * (x[:10] + x[10:20]) for x in (q, v, self.LOADS)]
+            middle = model(*halfway)
+        torch.testing.assert_close(middle, 0.5 * (ends[0] + ends[1]), rtol=1e-12, atol=1e-12)
+
+    def test_it_must_be_given(self):
+        model, q, v = self.built()
+        with pytest.raises(ValueError, match="trained with an actuation"):
+            model(q, v)
+
+
+def clamped_beam():
+    mesh = box_hexahedra((0.1, 0.02, 0.02), (5, 1, 1))
+    return Simulator(Body(mesh, fixed=select_vertices(mesh, x=0.0)), Material(2e5, 0.3), gravity=(0.0, 0.0, 0.0))
+
+
+def test_rest_stiffness_is_that_of_a_small_load_and_its_own_inverse():
+    simulator = clamped_beam()
+    stiffness = RestStiffness(simulator)
+    force = torch.zeros(1, simulator.body.n_vertices, 3, dtype=torch.float64)
+    force[:, -1, 2] = 1e-5
+    moved = simulator.static_equilibrium(force).q - simulator.rest_positions
+    found = stiffness.displacements(force.reshape(-1, 1).numpy())
+    np.testing.assert_allclose(found[:, 0], moved.reshape(-1).numpy(), atol=1e-4 * float(moved.abs().max()))
+    np.testing.assert_allclose(stiffness.forces(found), force.reshape(-1, 1).numpy(), atol=1e-15)
+
+
+def test_modes_of_displacements_keep_the_weak_force_that_bends_and_drop_the_strong_one_that_does_not():
+    simulator = clamped_beam()
+    stiffness, n = RestStiffness(simulator), simulator.body.n_vertices
+    random = torch.Generator().manual_seed(0)
+    bend, squeeze = (torch.zeros(n, 3, dtype=torch.float64) for _ in range(2))
+    tip = np.flatnonzero(simulator.body.mesh.vertices[:, 0] > 0.099)
+    bend[tip, 2] = 1e-3
+    squeeze[tip, 1] = 1e-2 * torch.tensor([1.0, 1.0, -1.0, -1.0], dtype=torch.float64)  # cancels
+    amounts = torch.randn(50, 2, generator=random, dtype=torch.float64)
+    forces = amounts[:, :1, None] * bend + amounts[:, 1:, None] * squeeze
+    coder = displacement_coder(forces, stiffness, 1)
+    kept = coder.decode(coder.encode(forces))
+    moved = stiffness.displacements((kept - forces).flatten(1).T.numpy())
+    assert np.abs(moved).max() < 0.05 * np.abs(stiffness.displacements(forces.flatten(1).T.numpy())).max()
+    assert float((kept - forces).norm()) > 0.9 * float((amounts[:, 1:, None] * squeeze).norm())
+    plain = pod_coder(forces, 1)
+    assert float((plain.decode(plain.encode(forces)) - forces).norm()) < 0.2 * float(forces.norm())
+    both = displacement_coder(forces, stiffness, 2)
+    torch.testing.assert_close(both.decode(both.encode(forces)), forces, rtol=0.0, atol=1e-12)
+
+
+def test_a_network_may_be_blind_for_velocities_and_is_restored_with_its_dual_modes():
+    simulator = clamped_beam()
+    rest, n = simulator.rest_positions, simulator.body.n_vertices
+    random = torch.Generator().manual_seed(0)
+    q, v, force = (1e-3 * torch.randn(20, n, 3, generator=random, dtype=torch.float64) for _ in range(3))
+    config = {"kind": "reduced", "position_modes": 3, "velocity_modes": 0, "force_modes": 2}
+    config |= {"blocks": 1, "layers": 1, "width": 8, "activation": "silu"}
+    model = build_model(config, rest, rest + q, v, force, stiffness=RestStiffness(simulator)).double().eval()
+    torch.testing.assert_close(model(rest + q, v), model(rest + q, 10.0 * v))
+    assert not torch.equal(model(rest + 2.0 * q, v), model(rest + q, v))
+    again = restore(ResidualForce, model.state_dict(), model.description())
+    torch.testing.assert_close(again(rest + q, v), model(rest + q, v))
+
+
+@pytest.mark.parametrize("changes", [{"kind": "nodal"}, {"velocity_modes": 0}, {}])
+def test_networks_from_samples_in_single_precision_take_states_in_double_precision(changes):
+    simulator = clamped_beam()
+    rest, n = simulator.rest_positions, simulator.body.n_vertices
+    random = torch.Generator().manual_seed(0)
+    u, v, force = (1e-3 * torch.randn(20, n, 3, generator=random, dtype=torch.float64) for _ in range(3))
+    config = {"kind": "reduced", "position_modes": 3, "velocity_modes": 2, "force_modes": 2}
+    config |= {"blocks": 1, "layers": 1, "width": 8, "activation": "silu", **changes}
+    models = []
+    for dtype in (torch.float32, torch.float64):
+        torch.manual_seed(0)
+        samples = [x.to(dtype) for x in (rest + u, v, force)]
+        models.append(build_model(config, rest, *samples, stiffness=RestStiffness(simulator)).eval())
+        models[-1].fit_linear(models[-1].encode(*samples[:2]), models[-1].encode_outputs(samples[2]), 0.1)
+    with torch.no_grad():
+        single, double = (model(rest + u, v) for model in models)
+    assert single.dtype == torch.float64
+    torch.testing.assert_close(single, double, rtol=1e-3, atol=1e-3 * float(double.abs().max()))
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_modes_of_large_bodies_are_those_of_small_ones(monkeypatch, held):
+    """Lanczos and the dense solver span the same forces, also of a body that nothing holds."""
+    mesh = box_hexahedra((0.1, 0.02, 0.03), (5, 1, 1))
+    fixed = select_vertices(mesh, x=0.0) if held else ()
+    simulator = Simulator(Body(mesh, fixed=fixed), Material(2e5, 0.3, stiffness_damping=1e-3))
+    dense = vibration_modes(simulator, 8).numpy()
+    monkeypatch.setattr(modes, "_DENSE", 0)
+    cosines = np.linalg.svd(dense.T @ vibration_modes(simulator, 8).numpy())[1]
+    np.testing.assert_allclose(cosines, 1.0, atol=1e-7)
+
+
+def test_rest_stiffness_knows_no_viscosity_and_wants_a_body_that_is_held():
+    plain, damped = (
+        RestStiffness(dataclasses.replace(clamped_beam(), material=Material(2e5, 0.3, stiffness_damping=beta)))
+        for beta in (0.0, 0.01)
+    )
+    force = np.random.default_rng(0).standard_normal((3 * 24, 2))
+    np.testing.assert_allclose(damped.displacements(force), plain.displacements(force), rtol=1e-9)
+    with pytest.raises(InputError, match="fix some vertices"):
+        RestStiffness(Simulator(Body(box_hexahedra())))

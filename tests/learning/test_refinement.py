@@ -1,0 +1,222 @@
+"""Solver-in-the-loop refinement: its gradient, its windows, its optimiser and its way back from an interruption."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from warp_resphys import Body, Material, Simulator, box_hexahedra, select_vertices
+from warp_resphys.dynamics.nonlinear_solver import SolverSettings
+from warp_resphys.io.errors import InputError
+from warp_resphys.io.files import read_checkpoint, write_checkpoint
+from warp_resphys.learning.networks import build_model
+from warp_resphys.learning.refinement import Motion, SolverInTheLoop, WindowLoss, Windows
+
+MESH = box_hexahedra((0.06, 0.02, 0.02), (3, 1, 1))
+BODY = Body(MESH, fixed=select_vertices(MESH, x=0.0))
+REALITY, WRONG = Material(264e3, 0.45), Material(215e3, 0.45)
+CONFIG = {"kind": "solver_in_the_loop", "window": 3, "epochs": 4, "batch_size": 4, "memory": 5, "rollout_every": 1}
+FRAMES = 11
+
+
+def simulator(material=WRONG, integrator="implicit_euler"):
+    settings = SolverSettings(relative_tolerance=1e-11, on_failure="count")
+    return Simulator(BODY, material, integrator=integrator, solver=settings)
+
+
+def motion(integrator="implicit_euler", seed=0):
+    """Two releases from loads."""
+    real = simulator(REALITY, integrator)
+    load = torch.zeros(2, len(MESH.vertices), 3, dtype=torch.float64)
+    random = torch.Generator().manual_seed(seed)
+    load[:, select_vertices(MESH, x=0.06)] = 0.1 * torch.rand(2, 1, 3, generator=random, dtype=torch.float64) - 0.05
+    found = real.rollout(real.static_equilibrium(load), FRAMES - 1)
+    return Motion(found.q.transpose(0, 1).contiguous(), found.v.transpose(0, 1).contiguous())
+
+
+TRAIN, VALIDATION = motion(), motion(seed=1)
+
+
+def network(seed=0):
+    torch.manual_seed(seed)
+    rest = simulator().rest_positions
+    force = 1e-3 * torch.randn(FRAMES * 2, *rest.shape, dtype=torch.float64)
+    sizes = {"kind": "nodal", "blocks": 2, "layers": 1, "width": 8, "activation": "normalised_elu"}
+    return build_model(sizes, rest, TRAIN.q.flatten(0, 1), TRAIN.v.flatten(0, 1), force)
+
+
+def window_loss(predict, window=3, batch_size=4, integrator="implicit_euler"):
+    return WindowLoss(predict, lambda: simulator(integrator=integrator), window, batch_size)
+
+
+def trainer(model=None, error=None, **settings):
+    model = network() if model is None else model
+    config = {**CONFIG, **settings}
+    loss = window_loss(model, config["window"], config["batch_size"])
+
+    def drift(model):
+        return loss.measure(loss.side_by_side(VALIDATION), VALIDATION)[0] ** 0.5
+
+    return SolverInTheLoop(model, loss, TRAIN, VALIDATION, error or drift, config)
+
+
+def finish(trainer):
+    while not trainer.finished:
+        trainer.run_epoch()
+    return trainer
+
+
+def same(a, b):
+    return a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
+
+
+class TestLoss:
+    def test_its_gradient_is_that_of_central_differences(self):
+        model = network().double()
+        loss = window_loss(model, window=4)
+        windows = Windows(torch.tensor([0, 1, 1]), torch.tensor([0, 2, 5]))
+        loss.backward(windows, TRAIN, 1e-3)
+        random = torch.Generator().manual_seed(3)
+        for weight in model.network.parameters():
+            direction = torch.randn(weight.shape, generator=random, dtype=torch.float64)
+            ends = []
+            for sign in (-1.0, 1.0):
+                with torch.no_grad():
+                    weight += sign * 1e-5 * direction
+                    ends.append(loss.measure(windows, TRAIN)[0] / 1e-3)
+                    weight -= sign * 1e-5 * direction
+            expected = (ends[1] - ends[0]) / 2e-5
+            assert abs(expected) > 1e-3
+            assert float((weight.grad * direction).sum()) == pytest.approx(expected, rel=2e-6)
+
+    @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2", "midpoint"])
+    def test_the_right_force_has_none(self, integrator):
+        def no_force(q, v):
+            return torch.zeros_like(q)
+
+        loss = WindowLoss(no_force, lambda: simulator(REALITY, integrator), 4, 3)
+        target = motion(integrator)
+        windows = loss.side_by_side(target)
+        assert windows.frame.tolist() == 2 * ([1, 5] if integrator == "bdf2" else [0, 4])
+        assert loss.measure(windows, target)[0] < 1e-12  # mm^2
+        assert window_loss(no_force, 4, integrator=integrator).measure(windows, target)[0] > 1e-3
+
+    def test_it_is_the_mean_squared_distance_of_separate_roll_outs(self):
+        model, sim = network(), simulator()
+        windows = Windows(torch.tensor([1, 0, 1]), torch.tensor([0, 3, 6]))
+        squares = []
+        for run, frame in zip(windows.trajectory, windows.frame, strict=True):
+            state = replace(sim.rest_state(1), q=TRAIN.q[run, frame][None], v=TRAIN.v[run, frame][None])
+            for step in (1, 2, 3):
+                with torch.no_grad():
+                    state, _ = sim.step(state, model(state.q, state.v))
+                squares.append(1e6 * (state.q[0] - TRAIN.q[run, frame + step]).square().sum(-1).mean())
+        loss = window_loss(model, batch_size=2)
+        expected = float(torch.stack(squares).mean())
+        assert loss.measure(windows, TRAIN)[0] == pytest.approx(expected, rel=1e-6)
+        assert loss.backward(windows, TRAIN, 2.0) == pytest.approx(expected / 2.0, rel=1e-6)
+
+    @pytest.mark.parametrize("value", [math.nan, 1e6])
+    def test_a_window_that_fails_poisons_no_other(self, value):
+        """The force is no good in windows of the second trajectory after its frame 4."""
+        model = network()
+
+        def failing(q, v):
+            bad = (q - TRAIN.q[1, 4]).abs().flatten(1).amax(1) < 1e-9
+            return torch.where(bad[:, None, None], value, model(q, v))
+
+        windows = Windows(torch.tensor([0, 1, 1, 0]), torch.tensor([0, 4, 1, 5]))
+        others = windows.pick(torch.tensor([0, 2, 3]))
+        whole, broken = window_loss(model, batch_size=4), window_loss(failing, batch_size=4)
+        measured, lost = broken.measure(windows, TRAIN)
+        assert lost.tolist() == [False, True, False, False]
+        expected = whole.measure(others, TRAIN)[0]
+        assert measured == pytest.approx(expected, rel=1e-6)
+        whole.backward(others, TRAIN, 1.0)
+        gradients = [w.grad.clone() for w in model.parameters()]
+        model.zero_grad()
+        loss = broken.backward(windows, TRAIN, 1.0)
+        assert loss == pytest.approx(0.75 * expected + 0.25 * (1e3 * 10.0 * 0.06) ** 2)
+        for weight, gradient in zip(model.parameters(), gradients, strict=True):
+            torch.testing.assert_close(weight.grad, 0.75 * gradient, rtol=1e-4, atol=1e-9)
+
+
+class TestTraining:
+    def test_it_lowers_the_loss_and_the_roll_out_error(self):
+        run = finish(trainer(epochs=8))
+        history = run.state.history
+        assert [r["epoch"] for r in history] == list(range(9))
+        losses = [r["train_loss"] for r in history]
+        assert losses == sorted(losses, reverse=True)
+        assert losses[-1] < 0.1 * losses[0]
+        assert (
+            history[run.state.best_epoch]["rollout_error_mm"] == run.best_error < 0.5 * history[0]["rollout_error_mm"]
+        )
+
+    def test_the_weights_that_it_starts_from_win_unless_others_are_better(self):
+        before = {k: t.clone() for k, t in network().state_dict().items()}
+        errors = iter([1.0, 2.0, 1.0, math.inf, 3.0])
+        run = finish(trainer(error=lambda model: next(errors)))
+        assert not same(dict(run.model.state_dict()), before)
+        assert (run.state.best_epoch, run.best_error) == (0, 1.0)
+        assert same(dict(run.use_best().state_dict()), before)
+
+    @pytest.mark.parametrize("after", [1, 3])
+    def test_a_snapshot_goes_on_exactly(self, after, tmp_path):
+        whole = finish(trainer())
+        first = trainer()
+        for _ in range(after):
+            first.run_epoch()
+        path = tmp_path / "training.safetensors"
+        write_checkpoint(path, "training", *first.snapshot())
+        second = trainer(network(seed=7))
+        second.resume(*read_checkpoint(path, "training"))
+        finish(second)
+        assert second.state.history == whole.state.history
+        assert same(second.model.state_dict(), whole.model.state_dict())
+        assert same(second.use_best().state_dict(), whole.use_best().state_dict())
+
+    def test_windows_that_fail_at_the_start_are_left_out_for_good(self, tmp_path):
+        model = network()
+
+        def failing(q, v):
+            bad = (q - TRAIN.q[1, 3]).abs().flatten(1).amax(1) < 1e-9
+            return torch.where(bad[:, None, None], math.nan, model(q, v))
+
+        def make():
+            return SolverInTheLoop(model, window_loss(failing), TRAIN, VALIDATION, lambda model: 1.0, CONFIG)
+
+        run = make()
+        run.run_epoch()
+        assert run.state.history[0]["left_out"] == 1
+        assert all(math.isfinite(r["train_loss"]) for r in run.state.history)
+        assert run.state.history[1]["train_loss"] < run.state.history[0]["train_loss"]
+        write_checkpoint(tmp_path / "a.safetensors", "training", *run.snapshot())
+        again = make()
+        again.resume(*read_checkpoint(tmp_path / "a.safetensors", "training"))
+        assert again.run_epoch()["train_loss"] < run.state.history[1]["train_loss"]
+
+    def test_nothing_can_be_simulated(self):
+        loss = window_loss(lambda q, v: torch.full_like(q, math.nan))
+        run = SolverInTheLoop(network(), loss, TRAIN, VALIDATION, lambda model: 1.0, CONFIG)
+        with pytest.raises(InputError, match="the simulator fails in every window of the training split"):
+            run.run_epoch()
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        ({"kind": "adjoint"}, "refinement.kind is 'adjoint': choose one of none, solver_in_the_loop."),
+        ({"window": 0}, "refinement.window is 0: it must be positive."),
+        ({"window": 10}, "refinement.window is 10: it must be less than the data's 10 steps."),
+        ({"epochs": 0}, "refinement.epochs is 0: it must be positive."),
+        ({"batch_size": -1}, "refinement.batch_size is -1: it must be positive."),
+        ({"memory": 0}, "refinement.memory is 0: it must be positive."),
+        ({"rollout_every": 0}, "refinement.rollout_every is 0: it must be positive."),
+    ],
+)
+def test_bad_settings(settings, sentence):
+    with pytest.raises(InputError) as error:
+        trainer(**settings)
+    assert str(error.value) == sentence

@@ -1,0 +1,291 @@
+"""Replays of observed motions: their gradients, other weights and gravities at once, and how motions begin."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from warp_resphys import Body, Material, PointMass, Simulator
+from warp_resphys.data.markers import bind_markers
+from warp_resphys.dynamics.integrator import State
+from warp_resphys.io.errors import ConvergenceError, InputError
+from warp_resphys.learning.release import ReleaseSettings, estimate_release, hold, sideways_shapes, velocity_shapes
+from warp_resphys.learning.replay import PARAMETERS, Motions, Release, Replay, sample, tilted_gravity
+from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
+
+MESH = box_hexahedra(divisions=(4, 1, 1))
+TIP = select_vertices(MESH, x=0.1)
+POINTS = np.array([[0.1, 0.015, 0.036], [0.1, -0.006, 0.024], [0.1, 0.036, 0.006]])
+MARKERS = bind_markers(MESH, POINTS, ["a", "b", "c"], kind="rigid", vertices=TIP)
+MASSES = (0.0, 0.05)
+
+
+def simulator(masses=(), **options):
+    options = {"integrator": "bdf2", "material": Material(215e3, 0.45)} | options
+    body = Body(MESH, select_vertices(MESH, x=0.0), point_masses=[PointMass(m, TIP) for m in masses])
+    return Simulator(body, time_step=0.01, **options)
+
+
+def double(values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def blank(frames=12, masses=MASSES, rate=100.0):
+    """Motions whose markers stand a little off from where they were held."""
+    count = len(masses)
+    times = (torch.arange(frames, dtype=torch.float64) / rate).expand(count, -1)
+    held = torch.as_tensor(POINTS).expand(count, -1, -1)
+    attached = torch.zeros(count, len(MESH.vertices), dtype=torch.float64)
+    attached[:, TIP] = double(masses)[:, None] / len(TIP)
+    names = tuple(f"m{i}" for i in range(count))
+    return Motions(names, times, held[:, None].repeat(1, frames, 1, 1) + 1e-3, held, attached)
+
+
+def at_rest(sim, count, delay=0.0):
+    return Release(sim.rest_state(count), torch.full((count,), delay, dtype=torch.float64))
+
+
+def test_sampling_is_exact_on_parabolas_and_at_the_steps():
+    h, t = 0.1, 0.1 * torch.arange(6, dtype=torch.float64)
+    parabola = torch.stack([1.0 + 2.0 * t - 3.0 * t**2, t**2])[..., None]
+    times = double([[0.0, 0.013, 0.25, 0.4999, 0.5], [0.5, 0.31, 0.07, 0.0, 0.2]])
+    values = sample(parabola, times, h)[..., 0]
+    torch.testing.assert_close(values[0], 1.0 + 2.0 * times[0] - 3.0 * times[0] ** 2, rtol=0.0, atol=1e-14)
+    torch.testing.assert_close(values[1], times[1] ** 2, rtol=0.0, atol=1e-14)
+    torch.testing.assert_close(sample(t[None] ** 3, t[None], h), t[None] ** 3, rtol=0.0, atol=1e-15)
+    assert float(sample(parabola, double([[9.0], [9.0]]), h)[1, 0, 0]) == float(parabola[1, -1, 0])
+
+
+def test_sampling_is_of_third_order_and_differentiable():
+    def error(h):
+        series = torch.sin(h * torch.arange(int(1.0 / h) + 2, dtype=torch.float64))[None]
+        times = torch.linspace(0.1, 0.9, 77, dtype=torch.float64)[None]
+        return float((sample(series, times, h) - torch.sin(times)).abs().max())
+
+    assert error(0.025) < error(0.05) / 7.0
+    generator = torch.Generator().manual_seed(0)
+    series = torch.rand(2, 6, 3, generator=generator, dtype=torch.float64, requires_grad=True)
+    times = double([[0.013, 0.25], [0.31, 0.487]]).requires_grad_()
+    assert torch.autograd.gradcheck(lambda s, t: sample(s, t, 0.1), (series, times))
+
+
+def test_gravity_turns_by_its_components_and_keeps_its_strength():
+    sim = simulator(gravity=(0.0, -9.8, 0.0))
+    turned = tilted_gravity(sim, double([0.0, 0.1, 0.0]), double([0.0, 0.0, -0.2]))
+    expected = 9.8 * np.array([[0, -1, 0], [0.1, -1, 0] / np.sqrt(1.01), [0, -1, -0.2] / np.sqrt(1.04)])
+    np.testing.assert_allclose(turned.numpy(), expected, atol=1e-12)
+    oblique = tilted_gravity(simulator(gravity=(3.0, -2.0, 9.0)), double([0.3]), None)
+    assert float(oblique.norm()) == pytest.approx(np.sqrt(94.0))
+    assert tilted_gravity(sim, None, None).tolist() == [[0.0, -9.8, 0.0]]
+    with pytest.raises(InputError, match="without gravity"):
+        tilted_gravity(simulator(gravity=(0.0, 0.0, 0.0)), double([0.1]), None)
+
+
+def test_environments_with_other_weights_and_gravities_are_those_of_separate_simulators():
+    sim, motions = simulator(), blank()
+    tilts = {"gravity_tilt_1": double([0.0, 0.2]), "attached_mass_factor": double([1.0, 1.5])}
+    together = Replay(sim, MARKERS, motions)(at_rest(sim, 2), tilts)
+    for e in range(2):
+        gravity = tuple(tilted_gravity(sim, tilts["gravity_tilt_1"][e : e + 1], None)[0].tolist())
+        for r, mass in enumerate(MASSES):
+            alone = simulator(masses=(mass * float(tilts["attached_mass_factor"][e]),), gravity=gravity)
+            q = alone.rollout(alone.rest_state(), 11).q[:, 0]
+            torch.testing.assert_close(together[e, r], MARKERS(q), rtol=0.0, atol=1e-8)
+
+
+def test_sets_of_parameters_at_once_are_those_one_by_one():
+    sim = simulator()
+    replay, release = Replay(sim, MARKERS, blank()), at_rest(sim, 2)
+    values = {
+        "youngs_modulus": double([2e5, 4e5]),
+        "density": double([1000.0, 1200.0]),
+        "mass_damping": double([0, 3.0]),
+    }
+    together = replay(release, values)
+    for e in range(2):
+        alone = replay(release, {name: value[e : e + 1] for name, value in values.items()})
+        torch.testing.assert_close(together[e], alone[0], rtol=0.0, atol=1e-8)
+    defaults = {
+        "youngs_modulus": double([215e3]),
+        "attached_mass_factor": double([1.0]),
+        "gravity_tilt_2": double([0.0]),
+    }
+    torch.testing.assert_close(replay(release), replay(release, defaults), rtol=0.0, atol=1e-9)
+    with pytest.raises(InputError, match="no parameter 'stiffness'"):
+        replay(release, {"stiffness": double([1.0])})
+
+
+def test_before_its_release_a_body_holds_still_and_frames_lie_between_steps():
+    sim = simulator()
+    slow = Replay(sim, MARKERS, blank(frames=24, rate=200.0))
+    on_time, late = slow(at_rest(sim, 2))[0], slow(at_rest(sim, 2, delay=0.03))[0]
+    torch.testing.assert_close(late[:, 6:], on_time[:, :-6], rtol=0.0, atol=1e-6)
+    torch.testing.assert_close(late[:, :6], torch.as_tensor(POINTS).expand(2, 6, -1, -1), rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("nu", [0.45, 0.499])
+@pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2", "midpoint"])
+def test_gradients_of_every_parameter_agree_with_central_differences(integrator, nu):
+    sim = simulator(integrator=integrator, relative_tolerance=1e-11)
+    motions = blank(frames=8)
+    motions.markers[0, 3, 1] = torch.nan
+    motions.markers[1, 6:] = torch.nan
+    release = at_rest(sim, 2, delay=0.004)
+    replay = Replay(sim, MARKERS, motions)
+    at = double([215e3, nu, 1070.0, 0.8, 0.002, 1.1, 0.05, -0.03])
+    scale = double([1e5, 1e-3, 1000.0, 1.0, 0.01, 1.0, 1.0, 1.0])
+
+    def losses(values):
+        return replay.errors(replay(release, dict(zip(PARAMETERS, values.mT, strict=True)))).square().sum((1, 2, 3, 4))
+
+    x = at[None].clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(losses(x).sum(), x)
+    steps = torch.diag(1e-4 * scale)
+    with torch.no_grad():
+        ahead, behind = losses(torch.cat([at + steps, at - steps])).view(2, -1)
+    differences = (ahead - behind) / 2e-4
+    assert float(differences.abs().min()) > 0.0
+    torch.testing.assert_close(gradient[0] * scale, differences, rtol=1e-4, atol=1e-5 * float(differences.abs().max()))
+
+
+def test_markers_that_were_not_seen_have_no_influence():
+    sim, motions = simulator(), blank()
+    release, e = at_rest(sim, 2), double([2e5]).requires_grad_()
+    motions.markers[:, 5:, 0] = torch.nan
+    replay = Replay(sim, MARKERS, motions)
+    errors = replay.errors(replay(release, {"youngs_modulus": e}))
+    assert not bool((errors[:, :, 5:, 0] != 0.0).any())
+    assert bool((errors[:, :, 5:, 1] != 0.0).all())
+    (gradient,) = torch.autograd.grad(errors.square().sum(), e)
+    assert bool(gradient.isfinite().all())
+    with pytest.raises(InputError, match="'m1' was seen"):
+        replace(motions, markers=torch.where(double([[[[0.0]]], [[[1.0]]]]) > 0, torch.nan, motions.markers))
+
+
+def test_motions_can_be_cut_and_chosen():
+    motions = blank(frames=12)
+    motions.times[1, 8:] = 0.07
+    motions.markers[1, 8:] = torch.nan
+    first = motions.first(0.045)
+    assert first.times.shape == (2, 5)
+    assert first.markers.shape == (2, 5, 3, 3)
+    assert bool(motions.first(0.09).seen[1, 8:].any()) is False
+    assert bool(motions.first(9.0).times.equal(motions.times))
+    torch.testing.assert_close(motions.amplitude, torch.full((2,), 1e-3 * np.sqrt(3.0), dtype=torch.float64))
+    chosen = motions.select([1])
+    assert chosen.names == ("m1",)
+    assert chosen.times.shape == (1, 12)
+    torch.testing.assert_close(chosen.attached_mass[0], motions.attached_mass[1])
+    with pytest.raises(InputError, match="do not belong"):
+        replace(motions, times=motions.times[:, :4])
+
+
+def test_a_held_body_has_its_markers_where_they_were_and_is_at_rest():
+    sim = simulator()
+    replay = Replay(sim, MARKERS, blank())
+    straight = hold(sim, MARKERS, replay.motions, replay.tensors(), 6)
+    assert float((MARKERS(straight) - replay.motions.held).abs().max()) < 5e-5
+    turned = replay.motions.held + double([0.0, 0.004, 0.008])
+    turned[1, 2] = torch.nan
+    bent = hold(sim, MARKERS, replace(replay.motions, held=turned), replay.tensors(), 6)
+    distance = (MARKERS(bent) - turned).norm(dim=-1)
+    assert float(distance.nanmean()) < 4e-4
+    assert bool(bent.isfinite().all())
+
+
+def test_a_body_that_nothing_holds_rests_under_gravity_and_its_weight():
+    sim = simulator()
+    replay = Replay(sim, MARKERS, blank())
+    q = hold(sim, MARKERS, replay.motions, replay.tensors(), 0)
+    for r, mass in enumerate(MASSES):
+        alone = simulator(masses=(mass,)).static_equilibrium()
+        torch.testing.assert_close(q[r], alone.q[0], rtol=0.0, atol=1e-7)
+    still = replay(Release(State(q, torch.zeros_like(q)), torch.zeros(2, dtype=torch.float64)))[0]
+    assert float((still - still[:, :1]).abs().max()) < 1e-7
+
+
+def test_the_delay_and_the_push_of_a_release_are_recovered():
+    sim, motions = simulator(), blank(frames=16)
+    replay = Replay(sim, MARKERS, motions)
+    shapes, delay = velocity_shapes(sim, 2), double([0.012, -0.004])
+    assert float(shapes.norm(dim=2).amax()) == pytest.approx(1.0)
+    q = hold(sim, MARKERS, motions, replay.tensors(), 6)
+    pushes = double([[0.06, -0.03], [0.0, 0.05]])
+    velocity = torch.einsum("bk,knc->bnc", pushes, shapes)
+    seen = replay(Release(State(q, velocity), delay))[0]
+    settings = ReleaseSettings(velocity_modes=2, delay=0.01, window=0.1, noise=1e-5, iterations=8)
+    found = estimate_release(sim, MARKERS, replace(motions, markers=seen), settings)
+    torch.testing.assert_close(found.delay, delay, rtol=0.0, atol=5e-4)
+    torch.testing.assert_close(found.state.v, velocity, rtol=0.0, atol=3e-3)
+    again = replay(found)[0]
+    assert float((again - seen).norm(dim=-1).mean()) < 2e-5
+    assert found.shift is None
+    kept = estimate_release(sim, MARKERS, motions, ReleaseSettings(velocity_modes=0, delay=0.0))
+    assert float(kept.delay.abs().max() + kept.state.v.abs().max()) == 0.0
+
+
+def test_a_body_held_sideways_shows_it_once_it_is_let_go():
+    sim, motions = simulator(), blank(frames=16)
+    replay, shapes = Replay(sim, MARKERS, motions), sideways_shapes(sim)
+    q = hold(sim, MARKERS, motions, replay.tensors(), 6)
+    bends = double([[0.002], [-0.003]])
+    bent = q + torch.einsum("bk,knc->bnc", bends, shapes)
+    truth = Release(State(bent, torch.zeros_like(q)), torch.zeros(2).double(), MARKERS(q) - MARKERS(bent))
+    seen = replay(truth)[0]
+    torch.testing.assert_close(seen[:, 0], MARKERS(q), rtol=0.0, atol=1e-12)
+    settings = ReleaseSettings(velocity_modes=0, delay=0.0, sideways=0.002, window=0.1, noise=1e-5)
+    found = estimate_release(sim, MARKERS, replace(motions, markers=seen), settings)
+    torch.testing.assert_close(found.state.q, bent, rtol=0.0, atol=2e-5)
+    torch.testing.assert_close(replay(found)[0], seen, rtol=0.0, atol=1e-5)
+    torch.testing.assert_close(found.select([1]).shift, found.shift[1:])
+    torch.testing.assert_close(found.bound(found.shifted(seen)), seen)
+    straight = estimate_release(sim, MARKERS, replace(motions, markers=seen), replace(settings, sideways=0.0))
+    assert straight.shift is None
+    assert float((replay(straight)[0] - seen).norm(dim=-1).mean()) > 1e-3
+
+
+@pytest.mark.parametrize("gravity", [(0.0, 0.0, -9.8), (1.2, 0.1, -9.7)])
+def test_bodies_bend_sideways_across_gravity(gravity):
+    shapes = sideways_shapes(simulator(gravity=gravity))
+    assert shapes.shape[0] == 1  # The beam is stiff along itself, and where it is not level that would bend it down.
+    assert float(shapes[0].norm(dim=1).max()) == pytest.approx(1.0)
+    assert float(shapes[0, TIP, 1].abs().min()) > 0.95
+    assert float(shapes[0, :, 2].abs().max()) < 0.02
+    loaded = sideways_shapes(simulator(masses=(0.3,), gravity=gravity))
+    torch.testing.assert_close(loaded.abs(), shapes.abs(), rtol=0.0, atol=1e-6)
+    hanging = sideways_shapes(simulator(gravity=(9.8, 0.0, 0.0)))
+    assert hanging.shape[0] == 2
+    across = hanging[:, TIP, 1:].mean(1)
+    torch.testing.assert_close((across @ across.mT).diagonal(), torch.ones(2).double(), rtol=0.1, atol=0.0)
+    assert abs(float(across[0] @ across[1])) < 0.05
+
+
+def test_the_shape_of_bending_is_found_in_single_precision_and_for_stiff_bodies():
+    exact = sideways_shapes(simulator())
+    for modulus in (215e3, 1e9):
+        sim = simulator(material=Material(modulus, 0.45), dtype=torch.float32, relative_tolerance=1e-4)
+        rough = sideways_shapes(sim).double()
+        assert len(rough) == 1
+        sign = torch.sign((rough * exact).sum())
+        torch.testing.assert_close(sign * rough, exact, rtol=0.0, atol=0.03)
+
+
+def test_a_body_that_cannot_be_held_says_so(monkeypatch):
+    sim = simulator()
+    replay = Replay(sim, MARKERS, blank())
+
+    def fail(*_, **__):
+        raise ConvergenceError("no equilibrium", None, None)
+
+    monkeypatch.setattr(sim.__class__, "static_equilibrium", fail)
+    with pytest.raises(ConvergenceError):
+        hold(sim, MARKERS, replay.motions, replay.tensors(), 3)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"window": 0.0}, {"noise": -1.0}, {"delay": -0.1}, {"velocity_modes": -1}, {"sideways": -1.0}]
+)
+def test_settings_out_of_range_are_refused(wrong):
+    with pytest.raises(InputError, match=f"release.{next(iter(wrong))}"):
+        ReleaseSettings(**wrong)

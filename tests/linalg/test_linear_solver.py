@@ -1,0 +1,141 @@
+"""Every layout factorises the same batch of symmetric matrices."""
+
+import numpy as np
+import pytest
+import scipy.linalg
+import torch
+
+from warp_resphys.io.errors import InputError
+from warp_resphys.linalg import linear_solver
+from warp_resphys.linalg.linear_solver import bandwidth_reducing_order, make_linear_solver
+
+NODES, BATCH = 12, 3
+
+
+def pattern():
+    """A ring with a few chords: its given order has full bandwidth."""
+    pairs = {(i, i) for i in range(NODES)} | {(max(i, (i + 1) % NODES), min(i, (i + 1) % NODES)) for i in range(NODES)}
+    rows, cols = np.array(sorted(pairs | {(7, 2), (9, 4)})).T
+    return rows, cols
+
+
+def matrices(block, shift, seed=0):
+    """(B, n, n) symmetric matrices of the pattern; positive definite for a large shift."""
+    rows, cols = pattern()
+    rng = np.random.default_rng(seed)
+    dense = np.zeros((BATCH, NODES, block, NODES, block))
+    for r, c in zip(rows, cols, strict=True):
+        values = rng.normal(size=(BATCH, block, block))
+        dense[:, r, :, c] += values
+        dense[:, c, :, r] += values.transpose(0, 2, 1)
+    n = NODES * block
+    return dense.reshape(BATCH, n, n) + shift * np.eye(n)
+
+
+def values_of(solver, dense):
+    """The solver's value array, written as the assembly kernel writes it."""
+    rows, cols = pattern()
+    k = solver.block
+    values = np.zeros((len(dense), solver.n_values))
+    for (r, c), addresses in zip(zip(rows, cols, strict=True), solver.address, strict=True):
+        block = dense[:, r * k : (r + 1) * k, c * k : (c + 1) * k].reshape(len(dense), -1)
+        stored = addresses >= 0
+        values[:, addresses[stored]] = block[:, stored]
+    return torch.as_tensor(values).to(solver.device, solver.dtype)
+
+
+def make(kind, block, device="cpu", dtype=torch.float64):
+    return make_linear_solver(kind, *pattern(), NODES, block, torch.device(device), dtype)
+
+
+def layouts(device):
+    return ["dense", "sparse"] + (["banded"] if device == "cpu" else [])
+
+
+@pytest.fixture(params=[True, False], ids=["cholespy", "scipy"])
+def cholespy(request, monkeypatch):
+    if request.param:
+        pytest.importorskip("cholespy")
+    else:
+        monkeypatch.setattr(linear_solver, "_cholespy", lambda: None)
+
+
+@pytest.mark.parametrize("block", [1, 3])
+@pytest.mark.parametrize("definite", [True, False])
+def test_solutions_equal_numpy(block, definite, device, cholespy):
+    dense = matrices(block, 20.0 if definite else 0.3)
+    assert (np.linalg.eigvalsh(dense)[:, 0] > 0).all() == definite
+    right = np.random.default_rng(1).normal(size=(BATCH, NODES * block, 4))
+    for kind in layouts(device):
+        solver = make(kind, block, device)
+        factor = solver.factor(values_of(solver, dense), definite=definite)
+        assert not factor.failed.any()
+        found = factor.solve(torch.as_tensor(right, device=device))
+        np.testing.assert_allclose(found.cpu(), np.linalg.solve(dense, right), rtol=1e-9, atol=1e-9)
+
+
+def test_one_factor_serves_the_whole_batch(device, cholespy):
+    dense = matrices(1, 20.0)[:1]
+    right = torch.randn(BATCH, NODES, 3, dtype=torch.float64).to(device)
+    for kind in layouts(device):
+        solver = make(kind, 1, device)
+        found = solver.factor(values_of(solver, dense)).solve(right)
+        np.testing.assert_allclose(found.cpu(), np.linalg.solve(dense, right.cpu()), rtol=1e-9, atol=1e-9)
+
+
+def test_matrices_that_are_not_positive_definite_are_reported_one_by_one(device, cholespy):
+    dense = matrices(3, 20.0)
+    dense[1] -= 25.0 * np.eye(NODES * 3)
+    for kind in layouts(device):
+        solver = make(kind, 3, device)
+        np.testing.assert_array_equal(solver.factor(values_of(solver, dense)).failed, [False, True, False])
+
+
+def test_nan_counts_as_failed_or_stays_nan():
+    """A NaN in a matrix never turns into a finite solution."""
+    dense = matrices(3, 20.0)
+    dense[2, 5, 5] = np.nan
+    right = torch.ones(BATCH, NODES * 3, 1, dtype=torch.float64)
+    for kind in layouts("cpu"):
+        solver = make(kind, 3)
+        factor = solver.factor(values_of(solver, dense))
+        if not factor.failed[2]:
+            assert not torch.isfinite(factor.solve(right)[2]).all()
+
+
+def test_float32_values_give_float32_solutions(device):
+    dense, right = matrices(3, 20.0), torch.ones(BATCH, NODES * 3, 1, device=device)
+    for kind in layouts(device):
+        solver = make(kind, 3, device, torch.float32)
+        found = solver.factor(values_of(solver, dense)).solve(right)
+        assert found.dtype == torch.float32
+        np.testing.assert_allclose(found.cpu(), np.linalg.solve(dense, right.cpu()), rtol=1e-3, atol=1e-5)
+
+
+def test_band_is_as_narrow_as_the_order_allows():
+    rows, cols = pattern()
+    order = bandwidth_reducing_order(rows, cols, NODES)
+    assert sorted(order) == list(range(NODES))
+    place = np.argsort(order)
+    assert np.abs(place[rows] - place[cols]).max() < np.abs(rows - cols).max()
+    solver = make("banded", 3)
+    assert solver.bandwidth < 3 * np.abs(rows - cols).max()
+
+
+def test_band_storage_is_lapacks():
+    dense = matrices(3, 20.0)
+    solver = make("banded", 3)
+    bands = values_of(solver, dense).numpy().reshape(BATCH, solver.n, -1)
+    right = np.ones(solver.n)
+    order = solver._order.numpy()
+    for matrix, band in zip(dense, bands, strict=True):
+        reference = np.linalg.solve(matrix[np.ix_(order, order)], right)
+        np.testing.assert_allclose(scipy.linalg.solveh_banded(band.T, right, lower=True), reference, rtol=1e-9)
+
+
+def test_bad_choices_are_refused():
+    with pytest.raises(InputError, match="linear_solver is 'lu': choose one of auto, banded, dense, sparse"):
+        make("lu", 3)
+    with pytest.raises(InputError, match="linear_solver=banded runs on the CPU alone"):
+        make("banded", 3, "cuda")
+    assert isinstance(make("auto", 3), linear_solver.BandedSolver)

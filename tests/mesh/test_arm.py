@@ -1,0 +1,301 @@
+import re
+import sys
+from importlib import resources
+from math import pi
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+
+from warp_resphys.experiment.build import build_mesh
+from warp_resphys.io.errors import InputError, MeshError
+from warp_resphys.mesh.arm import mesh_arm
+from warp_resphys.mesh.arm_geometry import ArmGeometry, arm_geometry
+from warp_resphys.mesh.chambers import check_chambers, find_chambers
+from warp_resphys.mesh.mesh import boundary_faces, check_mesh, face_triangles, quadratic
+from warp_resphys.mesh.quality import cell_volumes, scaled_jacobian
+from warp_resphys.mesh.readers import read_mesh, read_surfaces, write_mesh
+
+SHIPPED = resources.files("warp_resphys") / "meshes"
+SHAPES = [
+    ("half_disc", "lobed", 3),
+    ("half_disc", "round", 2),
+    ("half_disc", "round", 5),
+    ("disc", "lobed", 4),
+    ("disc", "round", 3),
+    ("sector", "round", 3),
+    ("sector", "round", 6),
+]
+
+
+def volume(mesh, faces):
+    """Of what a surface encloses; negative where its faces are counter-clockwise seen from within."""
+    return np.linalg.det(mesh.vertices[face_triangles(faces)]).sum() / 6.0
+
+
+def frustum(first, last, length):
+    """Volume between two similar sections of these areas."""
+    return length / 3.0 * (first + last + np.sqrt(first * last))
+
+
+def sopra_chambers():
+    """Volumes of its chambers: half discs of radii 14 to 9.5 mm and 9.5 to 6.5 mm, 120 mm long."""
+    areas = [pi / 2.0 * r**2 for r in (0.014, 0.0095, 0.0065)]
+    return [frustum(areas[i], areas[i + 1], 0.120) for i in (0, 0, 0, 1, 1, 1)]
+
+
+def sopra_silicone():
+    """Volume of the solid: three lobes of 4 mm more than the half discs, that meet 30 degrees behind their centres."""
+    heights = np.linspace(0.0, 1.0, 2001)
+    radii = (0.0283923, 0.0212942, 0.0165622)
+    inner = (0.014, 0.0095, 0.0065)
+    total = 0.010 * lobes(radii[0], inner[0]) + 0.021 * lobes(radii[1], inner[1]) + 0.005 * lobes(radii[2], inner[2])
+    for i in (0, 1):
+        areas = [
+            lobes(radii[i] + t * (radii[i + 1] - radii[i]), inner[i] + t * (inner[i + 1] - inner[i])) for t in heights
+        ]
+        total += 0.120 * np.trapezoid(areas, heights)
+    return total - sum(sopra_chambers())
+
+
+def lobes(radius, inner):
+    """Area inside three circles of a radius of 4 mm more than the half discs', by polar integration."""
+    outer = inner + 0.004
+    angle = np.linspace(-pi / 3.0, pi / 3.0, 2001)
+    d = radius - outer
+    reach = d * np.cos(angle) + np.sqrt(outer**2 - (d * np.sin(angle)) ** 2)
+    return 3.0 * np.trapezoid(0.5 * reach**2, angle)
+
+
+def polygons(section, size):
+    divisions = section.divisions(size)
+    return section.chamber_polygon(divisions), section.body_polygon(divisions)
+
+
+def area(polygon):
+    """Area of (N,) complex corners, counter-clockwise."""
+    return 0.5 * (polygon.conj() * np.roll(polygon, -1)).imag.sum()
+
+
+def quad_areas(mesh, faces):
+    """Area of the (F, 3 | 4) faces."""
+    corners = mesh.vertices[face_triangles(faces)]
+    return 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
+
+
+def configured(*overrides):
+    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
+        return OmegaConf.to_container(compose("config", list(overrides)), resolve=True)["mesh"]
+
+
+@pytest.mark.parametrize(("cells", "size"), [("hexahedra", 0.01), ("hexahedra", 0.002), ("tetrahedra", 0.03)])
+def test_sopra_has_its_chambers_and_its_silicone_at_every_size(cells, size):
+    if cells == "tetrahedra":
+        pytest.importorskip("gmsh", reason="gmsh is not installed", exc_type=ImportError)
+    mesh, surfaces = mesh_arm(ArmGeometry(), size, cells)
+    check_mesh(mesh)
+    assert cells == "tetrahedra" or scaled_jacobian(mesh).min() > 0.45
+    volumes = [-volume(mesh, surfaces[f"chamber_{i}"]) for i in range(1, 7)]
+    np.testing.assert_allclose(volumes, sopra_chambers(), rtol=1e-5)
+    assert cell_volumes(mesh).sum() == pytest.approx(sopra_silicone(), rel=2e-3)
+
+
+@pytest.mark.parametrize(("profile", "outline", "count"), SHAPES)
+def test_polygons_have_the_areas_of_the_curves_and_converge_to_them(profile, outline, count):
+    section = ArmGeometry(
+        (0.1,), (0.01, 0.01), (0.025, 0.025), count, profile, outline, wall=0.003, web=0.0025
+    ).section(0.025)
+    fine = [area(each) for each in polygons(section, 1e-4)]
+    for size, most in ((1.0, 0.16), (0.002, 0.012), (0.0005, 8e-4)):
+        np.testing.assert_allclose([area(each) for each in polygons(section, size)], fine, rtol=1e-12)
+        assert all(0.0 < growth < most for growth in section.growth(section.divisions(size)))
+
+
+def test_walls_flat_sides_and_arcs_are_divided_by_their_own_lengths():
+    section = ArmGeometry().section(0.02248)
+    lines = (("A1", "B1"), ("C", "W"), ("C", "M"), ("O", "W"), ("A1", "C"), ("B1", "V"))
+    for size, numbers in ((1.0, (1, 1, 1)), (0.0065, (1, 2, 1)), (0.005, (1, 2, 2)), (0.002, (2, 5, 5))):
+        divisions = section.divisions(size)
+        assert [divisions[line] for line in lines] == list(np.repeat(numbers, 2))
+    assert max(ArmGeometry(profile="sector", outline="round", chambers=2).section(0.025).divisions(1.0).values()) == 2
+
+
+def test_polygons_are_measured_against_the_circle():
+    section = ArmGeometry(profile="disc", outline="round").section(0.0283923)
+    assert area(polygons(section, 1.0)[1]) == pytest.approx(pi * section.radius**2, rel=1e-12)
+    assert area(polygons(section, 1.0)[0]) == pytest.approx(pi * section.arc_radius**2, rel=1e-12)
+
+
+def test_chamber_stands_where_it_was_published(shared_data):
+    published = read_mesh(shared_data / "sopra_mesh" / "sopra_494.vtk", drop_unreferenced=True)
+    points = ArmGeometry().section(0.0283923).points  # where its corners lie on the outline
+    lobe = np.array([points["B0"], points["B1"], points["B2"]])
+    outline = np.outer(np.exp(2j * pi * np.arange(3) / 3), [*lobe, *lobe.conj()])
+    for part, axis in ((outline.real, 0), (outline.imag, 1)):
+        ends = published.vertices[:, axis].min(), published.vertices[:, axis].max()
+        np.testing.assert_allclose((part.min(), part.max()), ends, atol=2e-6)
+    mesh, _ = mesh_arm(ArmGeometry(), 0.002)
+    assert np.ptp(mesh.vertices[:, 2]) == pytest.approx(np.ptp(published.vertices[:, 2]), abs=2e-6)
+    for ours, theirs in zip(find_chambers(mesh), find_chambers(published), strict=True):
+        for side in (np.min, np.max):
+            np.testing.assert_allclose(
+                side(mesh.vertices[ours.vertices], axis=0),
+                side(published.vertices[theirs.vertices], axis=0),
+                atol=6e-4,
+            )
+
+
+@pytest.mark.parametrize(("profile", "outline", "count"), SHAPES)
+@pytest.mark.parametrize("size", [0.01, 0.0025])
+def test_walls_and_webs_are_as_thick_as_asked(profile, outline, count, size):
+    geometry = ArmGeometry((0.1,), (0.01, 0.01), (0.025, 0.025), count, profile, outline, wall=0.003, web=0.0025)
+    mesh, surfaces = mesh_arm(geometry, size, layers=0.03)
+    check_mesh(mesh)
+    assert scaled_jacobian(mesh).min() > (0.18 if profile == "disc" else 0.2)
+    assert len(surfaces) == 3 + count
+    first = np.unique(surfaces["chamber_1"])
+    across = mesh.vertices[first, :2] @ [np.sin(pi / count), -np.cos(pi / count)]
+    if profile != "disc":  # corners are kept
+        assert across.min() == pytest.approx(0.5 * 0.0025, abs=1e-9)  # the middle of the web is at 0
+    wall = mesh.vertices[:, 0].max() - mesh.vertices[first, 0].max()
+    assert wall == pytest.approx(0.003, abs=1e-3 if size > 0.005 else 1e-4)
+
+
+def test_solid_and_chambers_fill_the_outline():
+    mesh, surfaces = mesh_arm(ArmGeometry((0.1,), (0.01, 0.01), (0.025, 0.025)), 0.005)
+    outline = quad_areas(mesh, surfaces["base"])
+    hollow = -sum(volume(mesh, surfaces[f"chamber_{i}"]) for i in (1, 2, 3))
+    assert cell_volumes(mesh).sum() + hollow == pytest.approx(0.12 * outline, rel=1e-12)
+    assert quad_areas(mesh, surfaces["tip"]) == pytest.approx(outline, rel=1e-12)
+
+
+@pytest.mark.parametrize("cells", ["hexahedra", "tetrahedra"])
+def test_surfaces_are_named_as_the_contract_says(cells):
+    if cells == "tetrahedra":
+        pytest.importorskip("gmsh", reason="gmsh is not installed", exc_type=ImportError)
+    mesh, surfaces = mesh_arm(ArmGeometry(), 0.012, cells)
+    assert list(surfaces) == ["base", "tip", "outside", *(f"chamber_{i}" for i in range(1, 7))]
+    named = np.concatenate(list(surfaces.values()))
+    assert len(np.unique(np.sort(named, axis=1), axis=0)) == len(named) == len(boundary_faces(mesh))
+    for number in range(6):
+        corners = mesh.vertices[surfaces[f"chamber_{number + 1}"]]
+        centre = corners.mean(axis=(0, 1))
+        assert centre[2] == pytest.approx(-0.07 if number < 3 else -0.211, abs=2e-3)
+        angle = np.angle(np.exp(1j * (np.arctan2(centre[1], centre[0]) - 2 * pi * number / 3)))
+        assert abs(angle) < 0.02
+    for chamber in find_chambers(mesh):
+        np.testing.assert_array_equal(chamber.faces, surfaces[chamber.name])
+    check_chambers(find_chambers(mesh), mesh)
+    assert np.all(mesh.vertices[np.unique(surfaces["base"]), 2] == 0.0)
+    assert np.all(np.diff(mesh.vertices[:, 2]) < 1e-12)  # numbered from the base down
+
+
+def test_tetrahedra_have_the_same_volumes():
+    pytest.importorskip("gmsh", reason="gmsh is not installed", exc_type=ImportError)
+    mesh, surfaces = mesh_arm(ArmGeometry(), 0.005, "tetrahedra")
+    volumes = [-volume(mesh, surfaces[f"chamber_{i}"]) for i in range(1, 7)]
+    np.testing.assert_allclose(volumes, sopra_chambers(), rtol=0.05)
+    check_mesh(quadratic(mesh))
+
+
+def test_rotated_segments_take_tetrahedra():
+    geometry = ArmGeometry(outline="round", rotations=(0.0, 60.0))
+    with pytest.raises(MeshError, match="set the arm's cells to tetrahedra"):
+        mesh_arm(geometry, 0.01)
+    pytest.importorskip("gmsh", reason="gmsh is not installed", exc_type=ImportError)
+    mesh, surfaces = mesh_arm(geometry, 0.012, "tetrahedra")
+    centre = mesh.vertices[np.unique(surfaces["chamber_4"])].mean(axis=0)
+    assert np.degrees(np.arctan2(centre[1], centre[0])) == pytest.approx(60.0, abs=2.0)
+
+
+def test_without_gmsh_one_sentence(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gmsh", None)
+    with pytest.raises(MeshError, match=r"need gmsh, which cannot be imported .*pip install gmsh"):
+        mesh_arm(ArmGeometry(), 0.01, "tetrahedra")
+    mesh_arm(ArmGeometry(), 0.01)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"chamber_lengths": ()}, "chamber_lengths are empty"),
+        ({"caps": (0.01, 0.01)}, "caps are 2 numbers, but 2 chamber_lengths need 3"),
+        ({"radii": (0.028, -0.02, 0.016)}, "radii has -0.02"),
+        ({"wall": float("nan")}, "wall has nan"),
+        ({"chambers": 1}, "chambers are 1 a segment"),
+        ({"profile": "square"}, "profile is 'square'"),
+        ({"profile": "sector"}, "lobed outline does not go with sectors"),
+        ({"wall": 0.02}, "3 chambers do not fit: make the wall"),
+        ({"core": 0.002}, "a core of 1.167 mm leaves webs of|a core of 2 mm leaves webs of"),
+        ({"rotations": (10.0,)}, "rotations are 1 numbers, but it has 2 segments"),
+        ({"chamber_lengths": 0.1}, "chamber_lengths are 0.1: give a list"),
+        ({"wall": 0.0005, "web": 0.02}, "lobes of the outline do not meet"),
+    ],
+)
+def test_measures_that_make_no_arm(changes, message):
+    with pytest.raises(MeshError, match=message):
+        ArmGeometry(**changes)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"size": 0.0}, "size has 0.0"),
+        ({"size": 1e-5}, "more than 2000000 cells"),
+        ({"size": 0.01, "cells": "bricks"}, "cells are 'bricks'"),
+        ({"size": 0.01, "layers": -1.0}, "layers has -1.0"),
+        ({"size": 0.01, "layers": 0.1, "cells": "tetrahedra"}, "layers are for arms of hexahedra"),
+    ],
+)
+def test_sizes_that_make_no_mesh(arguments, message):
+    with pytest.raises(MeshError, match=message):
+        mesh_arm(ArmGeometry(), **arguments)
+
+
+@pytest.mark.parametrize(("option", "count"), [("arm_coarse", 530), ("arm", 1373), ("arm_fine", 1950)])
+def test_shipped_arms(option, count):
+    mesh = build_mesh(configured(f"mesh={option}"))
+    assert len(mesh.vertices) == count
+    chambers = find_chambers(mesh)
+    assert len(chambers) == 6
+    check_chambers(chambers, mesh)
+    np.testing.assert_allclose([-volume(mesh, chamber.faces) for chamber in chambers], sopra_chambers(), rtol=1e-5)
+
+
+def test_shipped_arms_come_from_the_commands_beside_them(tmp_path):
+    rows = re.findall(r"mesh\.size=(\S+) mesh\.layers=(\S+) file=(\S+)`", (SHIPPED / "README.md").read_text())
+    assert {name for _, _, name in rows} == {each.name for each in SHIPPED.iterdir() if each.name.endswith(".msh")}
+    for size, layers, name in rows:
+        mesh, surfaces = mesh_arm(ArmGeometry(), float(size), layers=float(layers))
+        with resources.as_file(SHIPPED / name) as path:
+            shipped, named = read_mesh(path), read_surfaces(path)
+            assert path.stat().st_size < 300_000
+        np.testing.assert_allclose(shipped.vertices, mesh.vertices, atol=1e-12)
+        np.testing.assert_array_equal(shipped.cells, mesh.cells)
+        assert list(named) == list(surfaces)
+        for key, faces in surfaces.items():
+            np.testing.assert_array_equal(named[key], faces)
+
+
+def test_unknown_shipped_arm():
+    with pytest.raises(
+        InputError, match=r"'octopus': the arms that come with the package are arm_hexahedra_1400, arm_h"
+    ):
+        build_mesh({"kind": "arm", "name": "octopus"})
+
+
+def test_generated_arm_is_configured():
+    config = configured("mesh=arm_generated", "mesh.chambers=4", "mesh.size=0.012")
+    assert arm_geometry(config) == ArmGeometry(chambers=4)
+    assert len(find_chambers(build_mesh(config))) == 8
+
+
+def test_named_surfaces_survive_a_file(tmp_path):
+    mesh, surfaces = mesh_arm(ArmGeometry(), 0.01)
+    write_mesh(tmp_path / "arm.msh", mesh, surfaces)
+    read = read_surfaces(tmp_path / "arm.msh")
+    assert all(np.array_equal(read[name], faces) for name, faces in surfaces.items())
+    write_mesh(tmp_path / "arm.vtu", mesh, surfaces)
+    np.testing.assert_array_equal(read_mesh(tmp_path / "arm.vtu").cells, mesh.cells)
+    assert read_surfaces(tmp_path / "arm.vtu") == {}

@@ -1,0 +1,429 @@
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import nullcontext
+from importlib import resources
+from pathlib import Path
+
+import meshio
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from warp_resphys.io import decoding
+from warp_resphys.io.errors import MeshError
+from warp_resphys.mesh import readers
+from warp_resphys.mesh.mesh import (
+    IntArray,
+    Mesh,
+    boundary_faces,
+    boundary_triangles,
+    box_hexahedra,
+    box_tetrahedra,
+    check_mesh,
+    quadratic,
+    select_vertices,
+    surface_vertices,
+)
+from warp_resphys.mesh.readers import read_mesh
+
+MESHIO_NAMES = {"tetrahedron": "tetra", "tetrahedron10": "tetra10", "hexahedron": "hexahedron"}
+BOXES = {
+    "hexahedron": box_hexahedra,
+    "tetrahedron": box_tetrahedra,
+    "tetrahedron10": lambda size, divisions: box_tetrahedra(size, divisions, order=2),
+}
+PER_METRE = {"m": 1, "cm": 100, "mm": 1000}
+TRIANGLES_PER_BRICK_SIDE = {"hexahedron": 2, "tetrahedron": 2, "tetrahedron10": 8}
+
+
+def enclosed_volume(mesh: Mesh) -> float:
+    """Divergence theorem on the boundary, so positive only if the triangles face outwards."""
+    a, b, c = np.moveaxis(mesh.vertices[boundary_triangles(mesh)], 1, 0)
+    return float(np.einsum("fi,fi->", a, np.cross(b, c)) / 6)
+
+
+def is_closed(triangles: IntArray) -> bool:
+    """Every directed edge occurs once, and once in the other direction."""
+    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    directed = {tuple(edge) for edge in edges.tolist()}
+    return len(directed) == len(edges) and all((b, a) in directed for a, b in directed)
+
+
+def cell_volume(mesh: Mesh) -> float:
+    """Sum over straight tetrahedra."""
+    x = mesh.vertices[mesh.cells[:, :4]]
+    return float(np.linalg.det(x[:, 1:] - x[:, :1]).sum() / 6)
+
+
+def write(path: Path, mesh: Mesh, *blocks: tuple[str, object], units: str = "m") -> Path:
+    cells = [*blocks, (MESHIO_NAMES[mesh.kind], mesh.cells)]
+    file_format = None if path.suffix != ".msh" else "gmsh22" if blocks else "gmsh"  # not ANSYS
+    meshio.write(path, meshio.Mesh(mesh.vertices * PER_METRE[units], cells), file_format=file_format)
+    return path
+
+
+def with_vertex(mesh: Mesh, index: int, position: float | list[float]) -> Mesh:
+    vertices = mesh.vertices.copy()
+    vertices[index] = position
+    return Mesh(vertices, mesh.cells)
+
+
+def with_cell(mesh: Mesh, cell: int, nodes: int | list[int], vertices: int | IntArray) -> Mesh:
+    cells = mesh.cells.copy()
+    cells[cell, nodes] = vertices
+    return Mesh(mesh.vertices, cells)
+
+
+def test_beam_has_the_vertex_order_of_the_reference_files() -> None:
+    mesh = box_hexahedra()
+    assert mesh.kind == "hexahedron"
+    assert mesh.vertices.shape == (176, 3)
+    assert mesh.cells.shape == (90, 8)
+    for i, j, k in ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (10, 3, 3), (7, 2, 1)):
+        expected = [0.01 * i, 0.01 * j, 0.01 * k]
+        np.testing.assert_allclose(mesh.vertices[(4 * i + j) * 4 + k], expected, atol=1e-17)
+    assert mesh.vertices[-1].tolist() == [0.1, 0.03, 0.03]
+    assert len(surface_vertices(mesh)) == 140
+    assert len(boundary_faces(mesh)) == 2 * (10 * 3 + 10 * 3 + 3 * 3)
+
+
+def test_brick_has_the_node_order_of_vtk() -> None:
+    mesh = box_hexahedra((1, 1, 1), (1, 1, 1))
+    expected = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]]
+    assert mesh.vertices[mesh.cells[0]].tolist() == expected
+
+
+def test_tetrahedra_are_positive_fill_the_box_and_conform() -> None:
+    mesh = box_tetrahedra((0.1, 0.02, 0.03), (4, 2, 3))
+    x = mesh.vertices[mesh.cells]
+    volumes = np.linalg.det(x[:, 1:] - x[:, :1]) / 6
+    np.testing.assert_allclose(volumes, 0.1 * 0.02 * 0.03 / (6 * 4 * 2 * 3), rtol=1e-12)
+    faces = np.sort(mesh.cells[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), axis=1)
+    faces, counts = np.unique(faces, axis=0, return_counts=True)
+    assert set(counts.tolist()) == {1, 2}
+    outside = {tuple(face) for face in faces[counts == 1].tolist()}
+    assert outside == {tuple(face) for face in np.sort(boundary_faces(mesh), axis=1).tolist()}
+    assert len(outside) == 2 * 2 * (4 * 2 + 2 * 3 + 3 * 4)
+
+
+def test_quadratic_tetrahedra_share_edge_midpoints() -> None:
+    linear = box_tetrahedra(divisions=(5, 2, 2))
+    mesh = quadratic(linear)
+    assert mesh.kind == "tetrahedron10"
+    assert len(mesh.vertices) == 11 * 5 * 5  # midpoints of all bricks' edges, faces and diagonals, each once
+    assert np.array_equal(mesh.vertices[mesh.cells[:, :4]], linear.vertices[linear.cells])
+    for node, ends in zip(range(4, 10), ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)), strict=True):
+        middle = mesh.vertices[mesh.cells[:, ends]].mean(axis=1)
+        np.testing.assert_allclose(mesh.vertices[mesh.cells[:, node]], middle, atol=1e-17)
+    assert np.array_equal(box_tetrahedra(divisions=(5, 2, 2), order=2).cells, mesh.cells)
+
+
+def test_quadratic_faces_hold_the_midpoint_between_consecutive_corners() -> None:
+    mesh = box_tetrahedra(divisions=(2, 1, 2), order=2)
+    x = mesh.vertices[boundary_faces(mesh)]
+    np.testing.assert_allclose(x[:, 3:], (x[:, :3] + x[:, [1, 2, 0]]) / 2, atol=1e-17)
+
+
+@given(
+    kind=st.sampled_from(sorted(BOXES)),
+    size=st.tuples(*[st.floats(1e-3, 10.0)] * 3),
+    divisions=st.tuples(*[st.integers(1, 4)] * 3),
+)
+@settings(max_examples=40, deadline=None)
+def test_any_box_is_valid_closed_and_outward(
+    kind: str, size: tuple[float, float, float], divisions: tuple[int, int, int]
+) -> None:
+    mesh = BOXES[kind](size, divisions)
+    check_mesh(mesh)
+    assert mesh.kind == kind
+    assert enclosed_volume(mesh) == pytest.approx(np.prod(size), rel=1e-12)
+    assert is_closed(boundary_triangles(mesh))
+    nx, ny, nz = divisions
+    sides = 2 * (nx * ny + ny * nz + nz * nx)
+    assert len(boundary_triangles(mesh)) == TRIANGLES_PER_BRICK_SIDE[kind] * sides
+    points = np.array(divisions) * (2 if kind == "tetrahedron10" else 1)
+    assert len(mesh.vertices) == np.prod(points + 1)
+    assert len(surface_vertices(mesh)) == np.prod(points + 1) - np.prod(points - 1)
+
+
+def test_boundary_encloses_the_cells_of_a_distorted_mesh_with_a_cavity() -> None:
+    box = box_tetrahedra((0.1, 0.1, 0.1), (5, 5, 5))
+    middle = np.abs(box.vertices[box.cells].mean(axis=1) - 0.05).max(axis=1) < 0.01
+    moved = box.vertices + np.random.default_rng(3).uniform(-2e-3, 2e-3, box.vertices.shape)
+    mesh = Mesh(moved, box.cells[~middle])
+    check_mesh(mesh)
+    assert middle.sum() == 6
+    assert is_closed(boundary_triangles(mesh))
+    assert len(boundary_faces(mesh)) == 2 * 6 * 25 + 2 * 6
+    assert enclosed_volume(mesh) == pytest.approx(cell_volume(mesh), rel=1e-12)
+
+
+@pytest.mark.parametrize("size", [(0.1, 0, 1), (1, -1, 1), (1, np.nan, 1), (1, np.inf, 1), (1, 1), 0.1])
+def test_bad_sizes_are_refused(size: tuple[float, ...]) -> None:
+    with pytest.raises(MeshError, match="size of a box must be three positive lengths"):
+        box_hexahedra(size)
+
+
+@pytest.mark.parametrize("divisions", [(1, 0, 1), (1, -2, 1), (1, 2.0, 1), (1, 1), 3, (True, True, True)])
+def test_bad_divisions_are_refused(divisions: tuple[int, ...]) -> None:
+    with pytest.raises(MeshError, match="divisions of a box must be three positive integers"):
+        box_tetrahedra(divisions=divisions)
+
+
+def test_order_and_kind_are_checked() -> None:
+    with pytest.raises(MeshError, match="order of tetrahedra must be 1 or 2, not 3"):
+        box_tetrahedra(order=3)
+    with pytest.raises(MeshError, match="not to hexahedron cells"):
+        quadratic(box_hexahedra())
+
+
+def test_selection_of_a_plane_and_of_an_edge() -> None:
+    mesh = box_hexahedra()
+    assert select_vertices(mesh, x=0.0).tolist() == list(range(16))
+    assert select_vertices(mesh, x=0.1, z=0.03).tolist() == [163, 167, 171, 175]
+    assert len(select_vertices(mesh, y=0.0149, tolerance=0.006)) == 2 * 11 * 4
+
+
+def test_empty_selections_are_refused() -> None:
+    mesh = box_hexahedra()
+    with pytest.raises(MeshError, match=r"x = 0\.2 m: the mesh reaches x from 0 to 0.1 m"):
+        select_vertices(mesh, x=0.2)
+    with pytest.raises(MeshError, match="at least one of the coordinates"):
+        select_vertices(mesh)
+
+
+@pytest.mark.parametrize(
+    ("vertices", "cells", "which"),
+    [
+        (np.zeros((4, 2)), np.zeros((1, 4), int), "vertices"),
+        (np.zeros((4, 3), complex), np.zeros((1, 4), int), "vertices"),
+        (np.zeros((4, 3)), np.zeros((1, 5), int), "cells"),
+        (np.zeros((4, 3)), np.zeros((1, 4)), "cells"),
+    ],
+)
+def test_bad_shapes_and_types_are_refused(vertices: np.ndarray, cells: np.ndarray, which: str) -> None:
+    with pytest.raises(MeshError, match=f"^{which} must be"):
+        Mesh(vertices, cells)
+
+
+TURNED = [4, 5, 6, 7, 0, 1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    ("broken", "match"),
+    [
+        (lambda m: Mesh(m.vertices, m.cells[:0]), "empty"),
+        (lambda m: Mesh(m.vertices[:0], m.cells), "empty"),
+        (lambda m: with_vertex(m, 5, [0, np.nan, 0]), r"^1 of 176 vertices \(5; .* NaN or infinite"),
+        (lambda m: with_vertex(m, 7, [0, 0, np.inf]), r"^1 of 176 vertices \(7; .* NaN or infinite"),
+        (lambda m: with_cell(m, 3, 1, 176), r"^1 of 90 cells \(3; .* outside 0 to 175"),
+        (lambda m: with_cell(m, 4, 1, -1), r"^1 of 90 cells \(4; .* outside 0 to 175"),
+        (lambda m: Mesh(np.vstack([m.vertices, [[1, 1, 1]]]), m.cells), r"^1 of 177 .* \(176; .* no cell"),
+        (lambda m: with_cell(m, 8, TURNED, m.cells[8]), r"^1 of 90 cells \(8; .* inverted"),
+        (lambda m: Mesh(m.vertices, m.cells[:, TURNED]), r"^90 .* \(0, 1, 2, 3, 4, \.\.\.; .* inverted"),
+    ],
+)
+def test_broken_meshes_are_refused_by_name(broken: Callable[[Mesh], Mesh], match: str) -> None:
+    mesh = box_hexahedra()
+    check_mesh(mesh)
+    with pytest.raises(MeshError, match=match):
+        check_mesh(broken(mesh))
+
+
+def test_inverted_tetrahedron_is_refused() -> None:
+    mesh = box_tetrahedra()
+    with pytest.raises(MeshError, match=r"^1 of 540 cells \(17; .* inverted"):
+        check_mesh(with_cell(mesh, 17, [1, 0, 2, 3], mesh.cells[17]))
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_flatness_is_relative_to_the_longest_edge(scale: float) -> None:
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.3, 0.3, 1]])
+    flat, thin = corners * [scale, scale, 1e-12 * scale], corners * [scale, scale, 1e-10 * scale]
+    check_mesh(Mesh(thin, np.array([[0, 1, 2, 3]])))
+    with pytest.raises(MeshError, match="flat"):
+        check_mesh(Mesh(flat, np.array([[0, 1, 2, 3]])))
+
+
+def test_hexahedron_is_checked_at_its_corners() -> None:
+    """With corner 6 of the unit cube at (s, s, s) the determinant there is 3 s - 2; inside it is positive."""
+    cube = box_hexahedra((1, 1, 1), (1, 1, 1))
+    check_mesh(with_vertex(cube, 7, 0.67))
+    with pytest.raises(MeshError, match="folded"):
+        check_mesh(with_vertex(cube, 7, 0.66))
+
+
+def test_quadratic_tetrahedron_is_checked_at_its_nodes() -> None:
+    """A midpoint at a quarter of its edge makes the map singular at the corner (quarter-point element)."""
+    mesh = quadratic(Mesh(np.eye(4)[:, 1:], np.array([[0, 1, 2, 3]])))
+    node = mesh.cells[0, 4]
+    check_mesh(with_vertex(mesh, node, [0.26, 0, 0]))
+    with pytest.raises(MeshError, match="folded"):
+        check_mesh(with_vertex(mesh, node, [0.24, 0, 0]))
+
+
+@pytest.mark.parametrize(("gap", "cracked"), [(0.0, True), (1e-11, True), (1e-6, False)])
+def test_crack_between_coincident_vertices_is_refused(gap: float, cracked: bool) -> None:
+    left = box_hexahedra((0.1, 0.1, 0.1), (4, 4, 4))
+    right = left.vertices + np.array([0.1 + gap, 0, 0])
+    mesh = Mesh(np.vstack([left.vertices, right]), np.vstack([left.cells, left.cells + len(right)]))
+    with pytest.raises(MeshError, match=r"^25 of 250 .* on another one") if cracked else nullcontext():
+        check_mesh(mesh)
+
+
+@pytest.mark.parametrize("units", ["m", "cm", "mm"])
+@pytest.mark.parametrize("extension", ["vtk", "vtu", "msh", "inp"])
+@pytest.mark.parametrize("kind", sorted(BOXES))
+def test_files_come_back_in_metres(tmp_path: Path, kind: str, extension: str, units: str) -> None:
+    mesh = BOXES[kind]((0.1, 0.03, 0.02), (2, 1, 1))
+    read = read_mesh(write(tmp_path / f"box.{extension}", mesh, units=units), units=units)
+    assert read.kind == kind
+    np.testing.assert_allclose(read.vertices, mesh.vertices, rtol=1e-12, atol=1e-15)
+    assert np.array_equal(read.cells, mesh.cells)
+
+
+def test_reading_ignores_surface_cells_joins_blocks_and_keeps_quiet(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    mesh = box_tetrahedra(divisions=(2, 1, 1))
+    blocks = [("triangle", [[0, 1, 2]]), ("tetra", mesh.cells[:5]), ("line", [[0, 1]])]
+    path = write(tmp_path / "box.msh", Mesh(mesh.vertices, mesh.cells[5:]), *blocks)
+    path.write_bytes(path.read_bytes().replace(b"$EndElements\n", b""))  # meshio warns of the missing end
+    capfd.readouterr()
+    assert np.array_equal(read_mesh(path).cells, mesh.cells)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_order_two_adds_midpoints_to_linear_files_only(tmp_path: Path) -> None:
+    linear, curved = box_tetrahedra(), box_tetrahedra(order=2)
+    assert np.array_equal(read_mesh(write(tmp_path / "1.vtk", linear), order=2).cells, curved.cells)
+    for order in (1, 2):
+        assert np.array_equal(read_mesh(write(tmp_path / "2.vtk", curved), order=order).cells, curved.cells)
+    with pytest.raises(MeshError, match="not to hexahedron"):
+        read_mesh(write(tmp_path / "3.vtk", box_hexahedra()), order=2)
+
+
+def test_unreferenced_vertices_are_dropped_only_on_request(tmp_path: Path) -> None:
+    mesh = box_tetrahedra()
+    vertices = np.vstack([[[9, 9, 9], [8, 8, 8]], mesh.vertices])
+    path = write(tmp_path / "box.vtk", Mesh(vertices, mesh.cells + 2))
+    with pytest.raises(MeshError, match=r"box.vtk: 2 of 178 vertices \(0, 1; .* no cell"):
+        read_mesh(path)
+    read = read_mesh(path, drop_unreferenced=True)
+    assert np.array_equal(read.vertices, mesh.vertices)
+    assert np.array_equal(read.cells, mesh.cells)
+
+
+@pytest.mark.parametrize(("size", "written_in", "units"), [(0.1, "mm", "m"), (0.1, "m", "mm"), (6.0, "m", "m")])
+def test_implausible_size_is_refused(tmp_path: Path, size: float, written_in: str, units: str) -> None:
+    path = write(tmp_path / "box.vtk", box_hexahedra([size] * 3, (1, 1, 1)), units=written_in)
+    diagonal = f"{np.sqrt(3) * size * PER_METRE[written_in] / PER_METRE[units]:g} m"
+    with pytest.raises(MeshError, match=f"units={units}, .* is {diagonal}, .* did you mean units="):
+        read_mesh(path, units=units)
+
+
+def test_files_without_usable_cells_are_refused(tmp_path: Path) -> None:
+    tetrahedra, hexahedra = box_tetrahedra(), box_hexahedra()
+    mixed = write(tmp_path / "mixed.vtk", hexahedra, ("tetra", tetrahedra.cells))
+    with pytest.raises(MeshError, match=r"mixed.vtk: the file has hexahedron and tetra cells"):
+        read_mesh(mixed)
+    serendipity = tmp_path / "curved.vtk"
+    meshio.write(serendipity, meshio.Mesh(hexahedra.vertices, [("hexahedron20", [list(range(20))])]))
+    with pytest.raises(MeshError, match="hexahedron20"):
+        read_mesh(serendipity)
+    surface = tmp_path / "surface.stl"
+    meshio.write(surface, meshio.Mesh(tetrahedra.vertices, [("triangle", boundary_triangles(tetrahedra))]))
+    with pytest.raises(MeshError, match=r"no tetrahedra or hexahedra \(only: triangle\)"):
+        read_mesh(surface)
+
+
+def test_file_with_indices_out_of_range_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "box.vtk", Mesh(box_tetrahedra().vertices, box_tetrahedra().cells + 3))
+    for drop in (False, True):
+        with pytest.raises(MeshError, match="outside 0 to 175"):
+            read_mesh(path, drop_unreferenced=drop)
+
+
+BAD_FILES = ["missing.vtk", "folder.vtk", "mesh.xyz", "foreign.vtk", "cut.vtk", "cut.msh", "cut.vtu"]
+
+
+@pytest.mark.parametrize("name", BAD_FILES)
+def test_unreadable_file_gives_one_sentence_and_no_output(
+    tmp_path: Path, name: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "folder.vtk").mkdir()
+    (tmp_path / "mesh.xyz").write_text("0 0 0\n")
+    (tmp_path / "foreign.vtk").write_bytes(bytes(range(256)) * 4)
+    path = tmp_path / name
+    if name.startswith("cut"):
+        content = write(path, box_tetrahedra()).read_bytes()
+        path.write_bytes(content[: len(content) // 2])
+    capfd.readouterr()
+    with pytest.raises(MeshError) as caught:
+        read_mesh(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_format_that_needs_another_package_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write(tmp_path / "box.med", box_tetrahedra())
+    (tmp_path / "without" / "h5py.py").parent.mkdir()
+    (tmp_path / "without" / "h5py.py").write_text("raise ModuleNotFoundError('no h5py', name='h5py')")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "without"))
+    with pytest.raises(MeshError, match="install the Python package h5py"):
+        read_mesh(path)
+
+
+def test_files_that_are_read_for_ever_or_claim_too_much_memory_end_with_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write(tmp_path / "cut.tec", box_tetrahedra())
+    path.write_text(path.read_text()[:2000])
+    monkeypatch.setattr(decoding, "SECONDS", (1.0, 0.0))
+    with pytest.raises(MeshError, match=r"cut\.tec: meshio cannot read .* \(decoding it does not end within 1 s\)"):
+        read_mesh(path)
+    path = write(tmp_path / "big.vtk", box_tetrahedra())
+    path.write_bytes(path.read_bytes().replace(b"POINTS 176", b"POINTS 17600000000"))
+    with pytest.raises(MeshError, match=r"big\.vtk: meshio cannot read .* \(it takes more than 20\d\d MiB of memory\)"):
+        read_mesh(path)
+
+
+def test_only_the_meshes_of_the_package_are_read_in_this_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shipped = Path(str(resources.files("warp_resphys"))) / "meshes" / "arm_hexahedra_500.msh"
+    read = []
+    monkeypatch.setattr(readers, "decode", lambda library, path: read.append(path) or decoding.decode(library, path))
+    copied = Path(shutil.copy(shipped, tmp_path))
+    assert np.array_equal(read_mesh(shipped).vertices, read_mesh(copied).vertices)
+    assert read == [copied]
+
+
+def test_arguments_of_reading_are_checked(tmp_path: Path) -> None:
+    path = write(tmp_path / "box.vtk", box_tetrahedra())
+    with pytest.raises(MeshError, match="m, cm, mm, not inch"):
+        read_mesh(path, units="inch")
+    with pytest.raises(MeshError, match="order of a mesh must be 1 or 2, not 3"):
+        read_mesh(path, order=3)
+
+
+def test_published_arm(shared_data: Path) -> None:
+    """The file of 494 vertices numbers 30 that only its surface cells and points use."""
+    path = shared_data / "sopra_mesh" / "sopra_494.vtk"
+    with pytest.raises(MeshError, match="30 of 494 vertices"):
+        read_mesh(path)
+    mesh = read_mesh(path, drop_unreferenced=True)
+    assert mesh.vertices.shape == (464, 3)
+    assert mesh.cells.shape == (1605, 4)
+    assert is_closed(boundary_triangles(mesh))
+    assert enclosed_volume(mesh) == pytest.approx(cell_volume(mesh), rel=1e-12)
+    assert mesh.vertices[:, 2].min() == pytest.approx(-0.276)
+
+
+def test_importing_the_mesh_modules_leaves_meshio_alone() -> None:
+    code = "import sys, warp_resphys.mesh, warp_resphys.mesh.readers; sys.exit('meshio' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,73 @@
+import matplotlib.colors
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from warp_resphys.data.registration import register_markers
+from warp_resphys.mesh.mesh import boundary_triangles, box_hexahedra, select_vertices
+from warp_resphys.report import registration_picture, render
+from warp_resphys.report.registration_picture import _VIEWS, _pictures, _round_length, _spread, _view, draw_registration
+from warp_resphys.report.render_markers import MEASURED
+
+MESH = box_hexahedra(divisions=(3, 2, 2))
+NAMES = ["Tip - 1", "Tip - 2", "Tip - 3", "Base - 1", "Base - 2", "a marker with a rather long name"]
+POINTS = np.array([[0.1, 0.01, 0.04], [0.1, -0.01, 0.02], [0.1, 0.04, 0], [0, -0.01, 0], [0, 0.04, 0.03], [0, 0.04, 0]])
+
+
+@pytest.mark.usefixtures("can_draw")
+def test_markers_are_drawn_where_labels_and_rings_are_put():
+    """Off the body and alone, a marker's pixels lie around its projection, in both views."""
+    marker = np.array([[0.13, -0.02, 0.06]])
+    views = [_view(*each, np.concatenate([MESH.vertices, marker]), 0.004) for each in _VIEWS]
+    scene = {
+        "vertices": MESH.vertices,
+        "triangles": boundary_triangles(MESH),
+        "edges": render.face_edges(MESH),
+        "clamped": boundary_triangles(MESH)[:0],
+        "markers": marker,
+        "feet": marker,
+        "radius": np.array(0.003),
+    }
+    ball = matplotlib.colors.rgb_to_hsv(matplotlib.colors.to_rgb(MEASURED))
+    for view, pixels in zip(views, _pictures(views, scene), strict=True):
+        height, width = pixels.shape[:2]
+        assert width / height == pytest.approx(view.extent[0] / view.extent[1], rel=0.01)
+        colours = matplotlib.colors.rgb_to_hsv(pixels)
+        rows, columns = np.nonzero((np.abs(colours[..., 0] - ball[0]) < 0.03) & (colours[..., 1] > 0.6))
+        expected = (view.project(marker[0]) - view.low) / view.extent * [width, height]
+        found = np.array([columns.mean() + 0.5, height - rows.mean() - 0.5])
+        np.testing.assert_allclose(found, expected, rtol=0, atol=2.0)
+        scale = width / view.extent[0] / (1.0 if np.isinf(view.distance) else view.distance)
+        assert np.ptp(columns) == pytest.approx(2 * 0.003 * scale, rel=0.25)
+
+
+@pytest.mark.usefixtures("can_draw")
+def test_picture_with_an_outlier_and_a_marker_that_was_not_seen(tmp_path):
+    measured = POINTS.copy()
+    measured[1] += [0.02, 0.0, 0.03]
+    measured[4] = np.nan
+    found = register_markers(measured, POINTS, NAMES, source="swing.c3d", largest_residual=0.002)
+    fixed = select_vertices(MESH, x=0.0)
+    draw_registration(tmp_path / "with.png", MESH, found, POINTS, POINTS, fixed, title="Beam")
+    draw_registration(tmp_path / "without.png", MESH, found)
+    pictures = [imread(tmp_path / name)[..., :3] for name in ("with.png", "without.png")]
+    blue = [np.all(np.abs(p - matplotlib.colors.to_rgb(registration_picture.NOMINAL)) < 0.05, -1) for p in pictures]
+    assert blue[0].sum() > 1000
+    assert not blue[1].any()
+    for picture in pictures:  # Nothing is cut off.
+        rim = np.concatenate(
+            [picture[:3].ravel(), picture[-3:].ravel(), picture[:, :3].ravel(), picture[:, -3:].ravel()]
+        )
+        assert rim.min() == 1.0
+
+
+def test_labels_are_moved_apart_as_little_as_it_takes():
+    np.testing.assert_allclose(_spread(np.array([0.0, 3.0, 9.0]), 2.0), [0.0, 3.0, 9.0])
+    np.testing.assert_allclose(_spread(np.array([1.0, 1.0, 1.0]), 2.0), [-1.0, 1.0, 3.0])
+    np.testing.assert_allclose(_spread(np.array([0.0, 0.5, 9.0]), 1.0), [-0.25, 0.75, 9.0])
+    assert _spread(np.array([]), 1.0).shape == (0,)
+
+
+@pytest.mark.parametrize(("longest", "length"), [(0.0299, 0.02), (0.05, 0.05), (0.0019, 0.001), (1.2, 1.0)])
+def test_scale(longest, length):
+    assert _round_length(longest) == pytest.approx(length)

@@ -1,0 +1,77 @@
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+
+from warp_resphys.experiment.build import build_simulator
+from warp_resphys.io.errors import InputError
+from warp_resphys.io.files import read_json, write_json
+from warp_resphys.studies.benchmark import PARTS, benchmark_tables, released, run_benchmark
+
+TINY = [
+    "mesh.divisions=[2,1,1]",
+    "benchmark.refinements=[1,2]",
+    "benchmark.batches.cpu=[1,2]",
+    "benchmark.batches.cuda=[1,2]",
+    "benchmark.steps={1: 2, 2: 1}",
+    "benchmark.projective_dynamics.steps=1",
+    "benchmark.repeats=2",
+    "benchmark.parts_repeats=2",
+]
+
+
+def configuration(*overrides: str) -> dict[str, Any]:
+    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
+        config = compose("benchmark", [*TINY, *overrides])
+    plain = OmegaConf.to_container(config, resolve=True)
+    assert isinstance(plain, dict)
+    return plain
+
+
+def test_every_case_is_measured(device: str, tmp_path: Path) -> None:
+    write_json(tmp_path / "benchmark.json", run_benchmark(configuration(f"device={device}")))
+    result = read_json(tmp_path / "benchmark.json")
+    cases = [(r["solver"], r["poissons_ratio"], r["refinement"], r["batch"]) for r in result["steps"]]
+    grid = [(s, nu, r, b) for s in ("quasi_newton", "newton") for nu in (0.45, 0.499) for r in (1, 2) for b in (1, 2)]
+    assert sorted(cases) == sorted([*grid, *(("projective_dynamics", nu, 1, 1) for nu in (0.45, 0.499))])
+    for row in result["steps"]:
+        assert row["iterations"] >= 1.0
+        assert row["repeats"] == 2
+        assert row["unknowns"] == {1: 24, 2: 108}[row["refinement"]]
+        assert row["steps"] == (1 if row["solver"] == "projective_dynamics" or row["refinement"] == 2 else 2)
+        assert 0.0 < row["fastest_forward_ms"] <= row["forward_ms"]
+        assert 0.0 < row["fastest_backward_ms"] <= row["backward_ms"]
+    newton = [r for r in result["steps"] if r["solver"] == "newton"]
+    assert all(r["factorisations"] >= r["iterations"] for r in newton)
+    assert [(p["refinement"], p["batch"]) for p in result["parts"]] == [(1, 1), (1, 2), (2, 1), (2, 2)]
+    assert all(p[f"{name}_ms"] > 0.0 for p in result["parts"] for name in PARTS)
+    for kind in ("cold", "warm"):
+        assert all(seconds > 0.0 for seconds in result["cold_start"][kind].values())
+    assert result["yardstick_ms"] > 0.0
+    assert result["hardware"]["cpu"]
+    assert {"torch", "warp-lang", "python"} <= set(result["versions"])
+    assert [table.row_count for table in benchmark_tables(result)] == [len(result["steps"]), 4, 2]
+
+
+def test_quick_measures_the_coarsest_mesh_alone() -> None:
+    result = run_benchmark(configuration("benchmark.quick=true", "benchmark.cold_start=false", "device=cpu"))
+    assert {(r["refinement"], r["batch"]) for r in result["steps"]} == {(1, 1)}
+    assert result["cold_start"] is None
+    assert len(benchmark_tables(json.loads(json.dumps(result)))) == 2
+
+
+def test_the_beam_hangs_under_the_weight() -> None:
+    simulator = build_simulator(configuration("device=cpu"))
+    heavy, light = released(simulator, 0.1, 2), released(simulator, 0.0, 2)
+    sag = (heavy.q - light.q)[:, :, 2].min(1).values
+    assert float(sag[0]) < 1.3 * float(sag[1]) < 0.0
+    assert math.isclose(float(heavy.v.abs().max()), 0.0)
+
+
+def test_a_mesh_from_a_file_cannot_be_refined() -> None:
+    with pytest.raises(InputError, match="choose mesh=beam_hexahedra"):
+        run_benchmark({**configuration(), "mesh": {"kind": "file", "path": "arm.vtk"}})

@@ -1,0 +1,235 @@
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import meshio
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_module
+from matplotlib.image import imread
+from omegaconf import OmegaConf
+
+from warp_resphys.io.errors import InputError, MeshError
+from warp_resphys.mesh.arm import mesh_arm, name_surfaces
+from warp_resphys.mesh.arm_geometry import ArmGeometry
+from warp_resphys.mesh.cavities import open_cavities
+from warp_resphys.mesh.mesh import Mesh, boundary_faces, box_hexahedra, box_tetrahedra, quadratic
+from warp_resphys.mesh.quality import cell_volumes, scaled_jacobian
+from warp_resphys.mesh.readers import read_mesh, read_surfaces, read_vertices, write_mesh
+from warp_resphys.report.mesh import inspect_mesh, make_arm
+
+ROOT = Path(__file__).parents[2]
+
+
+def configured(name, *overrides):
+    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
+        return OmegaConf.to_container(compose(name, list(overrides)), resolve=True)
+
+
+def rows_of(text):
+    return dict(re.split(r"  +", line, maxsplit=1) for line in text.splitlines())
+
+
+def without(mesh, dropped):
+    """The mesh less some cells, and less the vertices that are then unused."""
+    cells = mesh.cells[~dropped]
+    used, numbered = np.unique(cells, return_inverse=True)
+    return Mesh(mesh.vertices[used], numbered.reshape(cells.shape))
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return mesh_arm(ArmGeometry(), 0.01)
+
+
+class TestQuality:
+    def test_ideal_cells(self):
+        assert scaled_jacobian(box_hexahedra((3.0, 1.0, 1.0), (1, 1, 1))) == pytest.approx(1.0)
+        regular = Mesh(np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]), np.array([[0, 2, 1, 3]]))
+        np.testing.assert_allclose(np.abs(scaled_jacobian(regular)), 1.0)
+        np.testing.assert_allclose(scaled_jacobian(quadratic(regular)), scaled_jacobian(regular))
+
+    def test_a_sheared_brick_is_worth_the_sine_of_its_angle(self):
+        box = box_hexahedra((1.0, 1.0, 1.0), (1, 1, 1))
+        sheared = Mesh(box.vertices + box.vertices[:, 1:2] * [[1.0 / np.tan(0.5), 0.0, 0.0]], box.cells)
+        assert scaled_jacobian(sheared) == pytest.approx(np.sin(0.5))
+        inverted = Mesh(box.vertices * [1.0, 1.0, -1.0], box.cells)
+        assert scaled_jacobian(inverted) == pytest.approx(-1.0)
+
+    @pytest.mark.parametrize("mesh", [box_hexahedra(), box_tetrahedra(), box_tetrahedra(order=2)])
+    def test_volumes(self, mesh):
+        assert cell_volumes(mesh).sum() == pytest.approx(9e-5, rel=1e-12)
+        assert cell_volumes(mesh).min() > 0.0
+
+
+class TestOpenCavities:
+    def test_closed_chambers_are_none(self, arm):
+        assert open_cavities(arm[0]) == []
+        assert open_cavities(box_tetrahedra()) == []
+
+    def test_an_arm_without_its_last_cap(self, arm):
+        mesh, _ = arm
+        found = open_cavities(without(mesh, mesh.vertices[mesh.cells].mean(axis=1)[:, 2] < -0.271))
+        assert len(found) == 3
+        assert sorted(np.degrees(np.arctan2(each.centre[1], each.centre[0])) for each in found) == pytest.approx(
+            [-120.0, 0.0, 120.0], abs=1.0
+        )
+        assert all(3e-3 < each.area < 6e-3 for each in found)
+
+    def test_a_hole_in_a_wall(self, arm):
+        mesh, _ = arm
+        centres = mesh.vertices[mesh.cells].mean(axis=1)
+        (found,) = open_cavities(without(mesh, np.arange(len(centres)) == np.argmax(centres @ [1.0, 0.1, 0.0])))
+        assert found.centre == pytest.approx([0.014, 0.0, -0.065], abs=0.01)
+
+
+class TestNamedSurfaces:
+    def test_gmsh_may_name_them(self, tmp_path):
+        """A file as gmsh writes it, version 4.1: surfaces have no orientation, and a vertex of them is in no cell."""
+        gmsh = pytest.importorskip("gmsh", reason="gmsh is not installed", exc_type=ImportError)
+        gmsh.initialize(interruptible=False)
+        try:
+            gmsh.option.setNumber("General.Terminal", 0)
+            outer, inner = gmsh.model.occ.addBox(0, 0, 0, 60, 40, 40), gmsh.model.occ.addSphere(30, 20, 20, 12)
+            ((_, body),), _ = gmsh.model.occ.cut([(3, outer)], [(3, inner)])
+            gmsh.model.occ.synchronize()
+            ball = gmsh.model.getEntitiesInBoundingBox(17, 7, 7, 43, 33, 33, 2)
+            gmsh.model.addPhysicalGroup(3, [body], name="silicone")
+            gmsh.model.addPhysicalGroup(2, [tag for _, tag in ball], name="my chamber")
+            gmsh.model.addPhysicalGroup(
+                2, [gmsh.model.getEntitiesInBoundingBox(-1, -1, -1, 1, 41, 41, 2)[0][1]], name="wall"
+            )
+            gmsh.option.setNumber("Mesh.MeshSizeMax", 12)
+            gmsh.model.mesh.generate(3)
+            gmsh.write(str(tmp_path / "mine.msh"))
+        finally:
+            gmsh.finalize()
+        for order, nodes in ((1, 3), (2, 6)):
+            mesh = read_mesh(tmp_path / "mine.msh", "mm", order)
+            surfaces = read_surfaces(tmp_path / "mine.msh", "mm", order)
+            assert set(surfaces) == {"my chamber", "wall"}
+            assert surfaces["my chamber"].shape[1] == nodes
+            radii = np.linalg.norm(mesh.vertices[surfaces["my chamber"][:, :3]] - [0.03, 0.02, 0.02], axis=-1)
+            np.testing.assert_allclose(radii, 0.012, rtol=1e-6)
+            np.testing.assert_array_equal(mesh.vertices[surfaces["wall"], 0], 0.0)
+            chamber = name_surfaces(mesh)["chamber_1"]
+            np.testing.assert_array_equal(np.unique(surfaces["my chamber"]), np.unique(chamber))
+
+    def test_cell_sets_of_other_formats_and_dropped_vertices(self, tmp_path):
+        box = box_hexahedra((0.1, 0.03, 0.03), (4, 2, 2))
+        faces = boundary_faces(box)
+        left = faces[np.all(box.vertices[faces, 0] == 0.0, axis=1)]
+        points = np.concatenate([[[9.0, 9.0, 9.0]], box.vertices])  # the first one is in no cell
+        cells = [("hexahedron", box.cells + 1), ("quad", left[::-1, ::-1] + 1)]
+        sets = {"clamp": [np.empty(0, dtype=int), np.arange(len(left))]}
+        meshio.write(tmp_path / "box.inp", meshio.Mesh(points, cells, cell_sets=sets))
+        found = read_surfaces(tmp_path / "box.inp", drop_unreferenced=True)
+        np.testing.assert_array_equal(found["clamp"], left)
+        assert len(read_vertices(tmp_path / "box.inp")) == len(box.vertices) + 1
+
+    def test_a_surface_within_the_body_is_refused(self, tmp_path, arm):
+        mesh, surfaces = arm
+        inside = mesh.cells[:1, [0, 1, 2, 3]]
+        assert not np.any(np.all(np.sort(boundary_faces(mesh), axis=1) == np.sort(inside), axis=1))
+        write_mesh(tmp_path / "arm.msh", mesh, {**surfaces, "middle": inside})
+        with pytest.raises(
+            MeshError, match=r"arm\.msh: 1 of 1 faces of the surface 'middle' are no faces of the body's"
+        ):
+            read_surfaces(tmp_path / "arm.msh")
+
+    @pytest.mark.parametrize("kind", ["tetrahedron10", "tetrahedron"])
+    def test_tetrahedra_keep_midpoints(self, tmp_path, kind):
+        mesh = box_tetrahedra(order=2 if kind == "tetrahedron10" else 1)
+        surfaces = {"all": boundary_faces(mesh)}
+        write_mesh(tmp_path / "box.msh", mesh, surfaces)
+        assert read_mesh(tmp_path / "box.msh").kind == kind
+        np.testing.assert_array_equal(read_surfaces(tmp_path / "box.msh")["all"], surfaces["all"])
+
+    def test_unknown_extension(self, tmp_path, arm):
+        with pytest.raises(MeshError, match=r"meshio does not know the extension '\.arm'"):
+            write_mesh(tmp_path / "mesh.arm", arm[0])
+        with pytest.raises(MeshError, match=r"mesh\.stl: meshio cannot write such a file"):
+            write_mesh(tmp_path / "mesh.stl", arm[0])
+        assert not list(tmp_path.iterdir())
+
+    @pytest.mark.parametrize(("written", "wrong"), [(1e3, "m"), (1e2, "m"), (1.0, "mm")])
+    def test_an_arm_in_other_units_is_refused(self, tmp_path, arm, written, wrong):
+        write_mesh(tmp_path / "arm.msh", Mesh(arm[0].vertices * written, arm[0].cells))
+        with pytest.raises(MeshError, match=f"read with units={wrong}, the diagonal .* did you mean units="):
+            read_mesh(tmp_path / "arm.msh", units=wrong)
+
+
+def test_published_arm(tmp_path, shared_data):
+    path = shared_data / "sopra_mesh" / "sopra_494.vtk"
+    rows = rows_of(inspect_mesh(configured("inspect_mesh", f"path={path}", "fixed.z=0", "picture=false"), tmp_path))
+    assert rows["vertices in the file"] == "494 = 1,482 degrees of freedom"
+    assert rows["of these unused"].startswith("30 belong to no cell")
+    assert rows["vertices"] == "464 = 1,392 degrees of freedom"
+    assert [rows[f"chamber_{i}"].split(",")[0] for i in range(1, 7)] == ["70 faces"] * 6
+    assert rows["chamber_1"] == "70 faces, 22.15 cm3, centre (14.1, -0.0, -70.2) mm"
+    assert rows["fixed"] == "36 vertices at z = 0 m, 21 of them used"
+    assert rows["pieces"] == "1 of the body, 7 of its boundary"
+    assert rows["open cavities"] == "none"
+    with pytest.raises(MeshError, match="read with units=mm"):
+        inspect_mesh(configured("inspect_mesh", f"path={path}", "units=mm"), tmp_path)
+
+
+def test_a_body_in_two_pieces_with_an_open_chamber(tmp_path, arm):
+    mesh = without(arm[0], arm[0].vertices[arm[0].cells].mean(axis=1)[:, 2] < -0.271)
+    apart = Mesh(
+        np.concatenate([mesh.vertices, mesh.vertices + [0.1, 0.0, 0.0]]),
+        np.concatenate([mesh.cells, mesh.cells + len(mesh.vertices)]),
+    )
+    write_mesh(tmp_path / "two.vtu", apart)
+    rows = rows_of(inspect_mesh(configured("inspect_mesh", f"path={tmp_path}/two.vtu", "picture=false"), tmp_path))
+    assert rows["pieces"].startswith("2 of the body, 8 of its boundary")
+    assert rows["open cavities"].count("cm2 around") == 6
+    assert "pressure needs a closed chamber" in rows["open cavities"]
+    assert "of these unused" not in rows
+    assert "fixed" not in rows
+
+
+def test_make_arm_writes_what_it_says(tmp_path):
+    text = make_arm(configured("make_arm", "mesh.size=0.01", "mesh.layers=0.03", "file=own.msh"), tmp_path)
+    rows = rows_of(text)
+    mesh = read_mesh(tmp_path / "own.msh")
+    assert rows["vertices"] == f"{len(mesh.vertices)} = {3 * len(mesh.vertices):,} degrees of freedom"
+    assert set(read_surfaces(tmp_path / "own.msh")) == set(name_surfaces(mesh))
+    assert rows["mass"].startswith(f"{1070e3 * cell_volumes(mesh).sum():.1f} g")
+    picture = imread(tmp_path / "arm.png")[..., :3]
+    colours = {"chamber 1": (0.90, 0.62, 0.0), "chamber 4": (0.84, 0.37, 0.0)}
+    views = picture[: int(0.85 * len(picture))]  # without the legend
+    for colour in colours.values():
+        hue = np.abs(views / views.max(axis=2, keepdims=True).clip(0.1) - np.array(colour) / max(colour)).max(axis=2)
+        assert (hue < 0.05).sum() > 2000
+
+
+@pytest.mark.parametrize(
+    ("overrides", "error", "message"),
+    [
+        (["mesh.order=2"], MeshError, r"mesh\.order is 2: choose 1, or 2 for tetrahedra"),
+        (["density=-1"], InputError, "density is -1"),
+        (["mesh.wall=thick"], MeshError, "wall has 'thick'"),
+        (["mesh.radii=0.02"], MeshError, r"radii are 0\.02: give a list"),
+    ],
+)
+def test_wrong_settings(tmp_path, overrides, error, message):
+    with pytest.raises(error, match=message):
+        make_arm(configured("make_arm", *overrides), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("script", "arguments", "message"),
+    [
+        ("make_arm", ["mesh.wall=0.02"], "error: where the arm's radius is 21.29 mm, 3 chambers do not fit"),
+        ("inspect_mesh", ["path=nowhere.vtk"], "error: nowhere.vtk: there is no such mesh file"),
+        ("inspect_mesh", [], "error: Missing mandatory value: path"),
+    ],
+)
+def test_commands_end_with_one_sentence(tmp_path, script, arguments, message):
+    command = [sys.executable, str(ROOT / "scripts" / f"{script}.py"), *arguments]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.strip().splitlines()[-1].startswith(message)
+    assert "Traceback" not in done.stderr

@@ -1,0 +1,126 @@
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_module
+from matplotlib.colors import to_rgb
+from omegaconf import OmegaConf
+
+from warp_resphys.data.recordings.arrays import write_recording
+from warp_resphys.data.recordings.quality import quality
+from warp_resphys.data.recordings.reading import read_recording
+from warp_resphys.data.recordings.recording import Recording
+from warp_resphys.data.recordings.release import Release
+from warp_resphys.io.errors import DataFileError, InputError
+from warp_resphys.report.recordings import inspect_recording, recording_quality
+
+ROOT = Path(__file__).parents[2]
+LABELS = ("tip", "base 1", "base 2")
+
+
+def configured(*overrides):
+    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
+        return OmegaConf.to_container(compose("inspect_recording", list(overrides)), resolve=True)
+
+
+def held_then_let_go(base=0.0):
+    time = np.maximum(np.arange(200) - 60.4, 0.0) / 100.0
+    positions = np.tile([[0.1, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.04, base]], (200, 1, 1))
+    positions[:, 0, 2] -= 0.01 * (1.0 - np.exp(-2.5 * time) * np.cos(48.0 * time))
+    positions += np.random.default_rng(0).normal(scale=5e-6, size=positions.shape)
+    positions[100:103, 0] = np.nan
+    positions[150:170, 0] = np.nan
+    positions[90:, 1] += 1e-3
+    return Recording(LABELS, positions, 100.0, Path("swing.h5"))
+
+
+@pytest.fixture
+def path(tmp_path):
+    write_recording(tmp_path / "swing.h5", held_then_let_go())
+    return tmp_path / "swing.h5"
+
+
+def test_table_and_files(tmp_path, path):
+    text = inspect_recording(
+        configured(f"recording.path={path}", "still=[base 1, base 2]", "moving=[tip]"), tmp_path / "out"
+    )
+    rows = text.splitlines()
+    assert rows[0].split()[:6] == ["marker", "seen", "gaps", "longest", "masked", "jumps"]
+    assert rows[1].split()[:7] == ["tip", "88.5", "%", "2", "20", "20", "0"]
+    assert len({len(row.rstrip()) for row in rows[2:4]}) == 1
+    assert any("tip is hidden for up to 20 frames; 20 frames are masked." in row for row in rows)
+    assert any("base 1 jumps once, by 1.73 mm, in frame 90." in row for row in rows)
+    assert "Let go in frame 60." in text
+    found = json.loads((tmp_path / "out" / "quality.json").read_text())
+    assert found["release_frame"] == pytest.approx(60.4, abs=0.25)
+    assert found["markers"][1]["jumps"] == [{"frame": 90, "mm": pytest.approx(1.73, abs=0.02)}]
+    assert (tmp_path / "out" / "quality.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_trials_are_compared(tmp_path, path):
+    config = configured(f"recording.path={path}", "still=[base 1, base 2]", f"compare_with=[{tmp_path}/other.h5]")
+    write_recording(tmp_path / "other.h5", held_then_let_go(base=0.002))
+    text = inspect_recording(config, tmp_path / "out")
+    assert "other.h5: the base stands up to 2.00 mm from its place here; its markers moved by up to 0.0" in text
+    write_recording(tmp_path / "other.h5", held_then_let_go(base=0.03))
+    with pytest.raises(DataFileError, match=r"other\.h5: base marker base 1 moved by \d+\.\d\d mm"):
+        inspect_recording(config, tmp_path / "out")
+    assert json.loads((tmp_path / "out" / "quality.json").read_text())["base"][0]["shift_mm"]["base 2"] > 29.0
+
+
+@pytest.mark.parametrize("narrow", [False, True])
+def test_picture_shows_what_is_seen_filled_and_masked(narrow):
+    recording = held_then_let_go()
+    recording.positions[:, 2] = np.nan
+    result = quality(recording, LABELS[1:], Release(60.4, (40, 60)))
+    figure = recording_quality(recording, result, narrow=narrow)
+    *panels, raster = figure.axes
+    assert len(panels) == 4  # x, y, z and the markers that should not move
+    drawn = panels[2].lines[1].get_ydata()  # the frames that were seen
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(drawn)), np.r_[100:103, 150:170])
+    bridged = panels[2].lines[0].get_ydata()
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(bridged)), np.r_[150:170])
+    assert np.nanmax(np.abs(drawn)) == pytest.approx(10.0, abs=2.0)  # millimetres
+    image = raster.images[0].get_array()
+    assert image.shape == (3, 200, 3)
+    colours = [tuple(image[0, frame]) for frame in (0, 101, 160)]
+    assert colours == [to_rgb("#dde1e6"), to_rgb("#e69f00"), to_rgb("#c4481b")]
+    np.testing.assert_array_equal(image[2], np.tile(colours[2], (200, 1)))
+    jumps = [line.get_xdata() for line in raster.lines if line.get_marker() == "|" and len(line.get_xdata())]
+    np.testing.assert_allclose(jumps, [[0.905]])
+    figure.canvas.draw()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["still=base 1"], "still is 'base 1': set it to a list"),
+        (["least_jump=small"], "least_jump is 'small': set it to a number"),
+        (["longest_gap=-1"], "longest_gap is -1"),
+        (["recording.rate=fast"], "recording.rate is 'fast'"),
+        (["recording.labels=a"], "recording.labels is 'a'"),
+        (["compare_with=[a.h5]"], "compare_with needs two or more markers"),
+    ],
+)
+def test_wrong_settings(tmp_path, path, overrides, message):
+    with pytest.raises(InputError, match=message):
+        inspect_recording(configured(f"recording.path={path}", *overrides), tmp_path)
+
+
+def test_command_ends_with_one_sentence(tmp_path, path):
+    command = [sys.executable, str(ROOT / "scripts" / "inspect_recording.py"), f"recording.path={path}", "still=[foot]"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.strip().splitlines()[-1].startswith(f"error: {path} has no marker named 'foot'; it has 'tip'")
+    assert "Traceback" not in done.stderr
+
+
+def test_beam_recording(tmp_path, shared_data):
+    path = shared_data / "beam_mocap" / "beam_load101_V2_a.c3d"
+    moving = [label for label in read_recording(path).labels if label.startswith("Tip")]
+    config = configured(f"recording.path={path}", "still=[Base - 1,Base - 2,Base - 3]")
+    text = inspect_recording({**config, "moving": moving}, tmp_path)
+    assert "Base - 1 jumps 15 times, farthest by 1.22 mm, in frame 61." in text

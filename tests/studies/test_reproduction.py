@@ -1,0 +1,226 @@
+"""The reproduction: which runs it makes, what its page says of them, and how it ends. Small beams, few steps."""
+
+import contextlib
+import json
+import os
+import re
+import runpy
+import signal
+import subprocess
+import sys
+import time
+from datetime import datetime
+from functools import partial
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_module
+from main_job import end_of
+from omegaconf import OmegaConf
+
+from warp_resphys.io.errors import InputError
+from warp_resphys.report.page import error_parts, number_text
+from warp_resphys.studies.reproduction import Run, _Pace, execute, plan
+
+REPOSITORY = Path(__file__).parents[2]
+SCRIPT = REPOSITORY / "scripts" / "reproduce.py"
+TINY = [
+    'overrides=["mesh.divisions=[4,2,2]","data.steps=8","trainer.epochs=4","trainer.rollout_every=2"]',
+    'experiments.marker_ablation.overrides=["markers.counts=[1,4]","markers.draws=3","markers.processes=1"]',
+    "budget=quick",
+    "hydra/job_logging=none",
+    "hydra/hydra_logging=none",
+]
+STARTED = ["beam_oscillation/default", "beam_oscillation/published_network", "beam_twist/default", "marker_ablation"]
+FAILING = 'experiments.beam_twist.overrides=["data.twist_axis=w"]'
+DEFAULT = Path("runs/beam_oscillation")
+
+
+def configured(*overrides):
+    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
+        return OmegaConf.to_container(compose("reproduce", list(overrides)), resolve=True)
+
+
+def run(*arguments):
+    """Exit code of the script in this process, and what it wrote to stderr."""
+    return end_of(partial(runpy.run_path, str(SCRIPT), run_name="__main__"), "reproduce.py", *arguments)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """Two variants of one experiment, the ablation, and a run that fails between them."""
+    root = tmp_path_factory.mktemp("reproduction")
+    with contextlib.chdir(root):
+        code, err = run(*TINY, FAILING, f"only=[{','.join(STARTED)}]", "results=docs")
+    return root, code, err
+
+
+def metrics(root, experiment, variant):
+    found = root / "runs" / experiment
+    published = [path for path in found.iterdir() if "network=published" in path.name]
+    other = [path for path in found.iterdir() if path not in published]
+    (chosen,) = published if variant == "published_network" else other
+    return json.loads((chosen / "metrics.json").read_text())
+
+
+class TestPage:
+    def test_a_failed_run_is_one_sentence_and_the_others_are_run(self, finished):
+        root, code, err = finished
+        assert code == 2
+        assert err.splitlines()[-1].startswith("error: 1 of 4 runs failed (beam_twist/default): the page says why")
+        assert "Traceback" not in err
+        assert [f"[{number}/4] {name}" for number, name in enumerate(STARTED[:3], 1)] == re.findall(
+            r"^(\[[123]/4\] [\w/]+), about \d+:\d\d left in all$", err, flags=re.MULTILINE
+        )
+        page = (root / "outputs/reproduce/reproduction.html").read_text()
+        assert "Twisting beam: here: data.twist_axis is &#39;w&#39;" in page
+        assert len(list((root / "runs/marker_ablation").glob("*/metrics.json"))) == 1
+
+    def test_each_published_number_stands_beside_ours(self, finished):
+        root, _, _ = finished
+        text = (root / "outputs/reproduce/results.md").read_text()
+        ours, network = (
+            metrics(root, "beam_oscillation", variant)["errors_mm"] for variant in ("default", "published_network")
+        )
+        for model, label, published in (
+            ("simulation", "Uncorrected simulation", "4.488 ± 1.468"),
+            ("simfree", "SimFree", "0.035 ± 0.070"),
+            ("resphys", r"\*\*ResPhys\*\*", "0.004 ± 0.010"),
+        ):
+            cells = [" ".join(error_parts(each[model])).strip() for each in (ours, network)]
+            assert re.search(
+                rf"^\| {label} \| {published} \| {re.escape(cells[0])} \| {re.escape(cells[1])} \|$", text, re.M
+            )
+        times = metrics(root, "beam_oscillation", "default")["seconds_per_test_trajectory"]["simulation"]
+        assert (
+            f"| Uncorrected simulation | 0.711 ± 0.002 5.1 ms a step | {times['mean']:.3f} ± {times['std']:.3f}" in text
+        )
+        for row in metrics(root, "marker_ablation", "default")["by_markers"]:
+            published = "below 0.1" if row["markers"] >= 4 else "not said"
+            assert f"| {row['markers']} | {published} | high | {number_text(row['median_mm'])} |" in text
+        assert "| Degrees of freedom | 528 | 135 |" in text
+        assert "| Testing trajectories | 5 | 2 |" in text
+
+    def test_the_page_needs_nothing_beside_it(self, finished):
+        page = (finished[0] / "outputs/reproduce/reproduction.html").read_text()
+        assert not re.search(r"""<(?:script|img|link|iframe|source)\b[^>]*\b(?:src|href)\s*=\s*["'](?!data:)""", page)
+        assert len(re.findall(r"<figure ", page)) == 3
+        assert "4.488" in page
+
+    def test_the_dated_results_are_small_and_whole(self, finished):
+        (page,) = (finished[0] / "docs").glob("*.md")
+        assert page.name == f"{datetime.now():%Y-%m-%d}-reproduction.md"
+        text = page.read_text()
+        names = re.findall(r"\]\(([\w./-]+\.png)\)", text)
+        assert len(names) == 3
+        assert all(0 < (page.parent / name).stat().st_size < 200_000 for name in names)
+        assert "python scripts/reproduce.py" in text
+        assert "- processor: " in text
+        assert "&#39;" not in text
+
+    def test_what_is_up_to_date_is_not_run_again(self, finished):
+        root, _, _ = finished
+        records = {path: path.read_bytes() for path in root.glob("runs/*/*/stages/*.json")}
+        with contextlib.chdir(root):
+            assert run(*TINY, "only=[beam_oscillation/default,marker_ablation]")[0] == 0
+        assert {path: path.read_bytes() for path in root.glob("runs/*/*/stages/*.json")} == records
+
+
+class TestPlan:
+    def test_the_folders_are_those_of_the_ordinary_command(self):
+        runs = {each.name: each for each in plan(configured('overrides=["seed=1"]', "runs=elsewhere"))}
+        assert runs["beam_twist/published_physics"].folder == Path("elsewhere/beam_twist/physics=published,seed=1")
+        assert runs["beam_twist/published_physics"].arguments == (
+            "experiment=beam_twist",
+            "physics=published",
+            "seed=1",
+        )
+        assert plan(configured())[0].folder == Path("runs/beam_oscillation/default")
+
+    def test_every_configured_run_is_a_configuration(self):
+        assert [each.name for each in plan(configured())] == [
+            *(
+                f"{beam}/{variant}"
+                for beam in ("beam_oscillation", "beam_twist")
+                for variant in ("default", "published_physics", "published_network")
+            ),
+            "marker_ablation/default",
+        ]
+        runs = plan(configured("budget=quick"))
+        with initialize_config_module("warp_resphys.conf", version_base="1.3"):
+            for each in runs:
+                assert compose("config", list(each.arguments)).budget == "quick"
+
+    def test_only(self):
+        names = [each.name for each in plan(configured("only=[marker_ablation,beam_twist/default]"))]
+        assert names == ["beam_twist/default", "marker_ablation/default"]
+
+    @pytest.mark.parametrize(
+        ("override", "sentence"),
+        [
+            ("only=[beam_twst]", "only names 'beam_twst', which is no experiment or run: there are beam_oscillation, "),
+            ("only=[]", "only is []: name at least one experiment or run"),
+            ("only=beam_twist", "only is 'beam_twist': it must be a list of words."),
+            ("overrides=[1]", "overrides is [1]: it must be a list of words."),
+            ("experiments.beam_twist.variants=[quick]", "experiments.beam_twist.variants names 'quick': there are "),
+        ],
+    )
+    def test_bad_input(self, override, sentence):
+        with pytest.raises(InputError, match=re.escape(sentence)):
+            plan(configured(override))
+
+    def test_bad_input_on_the_command_line(self, folder):
+        code, err = run("only=[sopra]", "hydra/job_logging=none", "hydra/hydra_logging=none")
+        assert code == 2
+        assert err.startswith("error: only names 'sopra'")
+        assert len(err.splitlines()) == 1
+
+
+def test_the_estimate_learns_from_the_runs_that_are_done(tmp_path):
+    def planned(name, minutes):
+        return Run(name, "default", (), tmp_path / name, minutes)
+
+    (tmp_path / "there").mkdir()
+    (tmp_path / "there" / "metrics.json").write_text("{}")
+    runs = [planned("first", 1.0), planned("there", 50.0), planned("last", 2.0)]
+    pace = _Pace(runs)
+    assert pace.left() == pytest.approx(180.0 + 8.0)
+    pace.count(runs[0], 30.0)
+    assert pace.left() == pytest.approx(0.5 * 120.0 + 8.0)
+    pace.count(runs[1], 5.0)
+    assert pace.left() == pytest.approx(60.0)
+
+
+def test_a_run_that_ends_without_a_sentence_points_to_its_log(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "executable", "/bin/false")
+    log = tmp_path / "log"
+    assert (
+        execute(Run("a", "b", (), tmp_path, 1.0), log, print) == f"it ended with exit code 1; what it said is in {log}"
+    )
+
+
+def test_ctrl_c_stops_the_run_and_keeps_what_it_has(folder):
+    """The signal reaches the reproduction alone; it hands it on to the run, which is out of reach of the terminal."""
+    program = "import signal, runpy; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    program += f"runpy.run_path({str(SCRIPT)!r}, run_name='__main__')"
+    arguments = [each for each in TINY if not each.startswith("overrides")]
+    command = [sys.executable, "-c", program, *arguments, "only=[beam_oscillation/default]"]
+    child = subprocess.Popen(
+        command,
+        text=True,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+    found = []
+    while not found and child.poll() is None:
+        time.sleep(0.01)
+        found = list(DEFAULT.glob("*/trajectories.h5.journal"))
+    child.send_signal(signal.SIGINT)
+    err = child.communicate(timeout=100)[1]
+    assert child.returncode == 130, err
+    assert "interrupted in run 1 of 1, beam_oscillation/default" in err
+    assert "Traceback" not in err
+    assert not Path("outputs/reproduce/reproduction.html").exists()
+    assert "interrupted in stage 'generate'" in Path("outputs/reproduce/logs/beam_oscillation-default.log").read_text()
+    assert found[0].stat().st_size > 0

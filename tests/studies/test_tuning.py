@@ -1,0 +1,376 @@
+"""The search for settings: the task, what it leaves, and how it survives crashes and bad input."""
+
+import csv
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from main_job import IN_RUN, TINY, files, run
+from omegaconf import OmegaConf
+from test_tuning_study import Dead
+
+from warp_resphys.experiment import experiment
+from warp_resphys.io.files import read_checkpoint
+from warp_resphys.learning.training import Trainer
+from warp_resphys.studies.tuning import figures as tuning_figures
+from warp_resphys.studies.tuning import tune
+from warp_resphys.studies.tuning.space import Choice, Range
+from warp_resphys.studies.tuning.study import SharedStudy
+
+REPOSITORY = Path(__file__).parents[2]
+SPACE = [
+    "tune.space.network.width=[8,16]",
+    "tune.space.network.blocks={low:1,high:2}",
+    "tune.space.network.layers={low:1,high:2}",
+]
+TRIALS = 4
+EPOCHS = 6
+SEARCH = [
+    *TINY,
+    "trainer.epochs=6",
+    "tune.settings.trainer.rollout_every=3",
+    "task=tune",
+    f"tune.trials={TRIALS}",
+    *SPACE,
+]
+FOLDER = Path("run/tune/resphys")
+WIDTHS = {"network.width": Choice((8, 16, 32)), "trainer.gamma": Range(0.8, 1.0, log=False, whole=False)}
+
+
+@pytest.fixture
+def no_pictures(monkeypatch):
+    """Pictures take most of a tiny search's time, and the report of a tiny run's."""
+    monkeypatch.setattr(tune, "write_pictures", lambda tuning, study: None)
+    monkeypatch.setattr(experiment, "make_report", lambda context: (context.run_dir / "report.html").write_text("-"))
+
+
+def table(folder=FOLDER):
+    with open(Path(folder) / "trials.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def results(folder=FOLDER):
+    """What was tried and what came of it, whatever the order."""
+    keys = ("state", "rollout_error_mm", "network.width", "network.blocks", "network.layers", "trainer.learning_rate")
+    return sorted(tuple(row[key] for key in keys) for row in table(folder))
+
+
+@pytest.fixture(scope="module")
+def searched(tmp_path_factory):
+    """A whole search by one process, and the run folder's files before and after a run of the best settings."""
+    root = tmp_path_factory.mktemp("searched")
+    before = Path.cwd()
+    os.chdir(root)
+    try:
+        code, err = run(*SEARCH, IN_RUN)
+        assert (code, "Warning" in err) == (0, False), err
+    finally:
+        os.chdir(before)
+    return root
+
+
+class TestSearch:
+    def test_what_it_leaves(self, searched):
+        found = {str(path.relative_to(searched / FOLDER)) for path in (searched / FOLDER).rglob("*") if path.is_file()}
+        pages = {"tune.html", "tune.json", "trials.csv", "history.png", "importance.png", "settings.png"}
+        locks = {"study.lock", "study.journal.lock", "results.lock"}
+        assert found == pages | locks | {"study.journal"}
+        rows = table(searched / FOLDER)
+        assert [row["state"] for row in rows] == TRIALS * ["complete"]
+        assert all(row["network.width"] in ("8", "16") for row in rows)
+        best = json.loads((searched / FOLDER / "tune.json").read_text())["best"]
+        assert best["rollout_error_mm"] == min(float(row["rollout_error_mm"]) for row in rows)
+        configured = json.loads((searched / "run" / "training.json").read_text())["kept"]["validation_rollout_error_mm"]
+        assert json.loads((searched / FOLDER / "tune.json").read_text())["configured_rollout_error_mm"] == configured
+        page = (searched / FOLDER / "tune.html").read_text()
+        assert "tuned=beam_oscillation_resphys" in page
+        assert page.count("data:image/svg+xml") == 6
+
+    def test_a_later_run_names_the_best_settings_and_gets_the_same_error(self, searched, monkeypatch, no_pictures):
+        monkeypatch.chdir(searched)
+        best = json.loads((FOLDER / "tune.json").read_text())["best"]
+        settings = [option for option in TINY if not option.startswith(("network", "trainer"))]
+        assert run(*settings, "tuned=beam_oscillation_resphys", "hydra.run.dir=best")[0] == 0
+        _, metadata = read_checkpoint("best/model.safetensors", "residual force")
+        assert metadata["validation_rollout_error_mm"] == pytest.approx(best["rollout_error_mm"], rel=1e-6)
+        config = OmegaConf.load("best/.hydra/config.yaml")
+        assert config.network.width == best["settings"]["network.width"]
+        assert config.trainer.schedule == "step"
+        code, err = run("tuned=beam_oscilation_resphys")
+        assert code == 2
+        assert "unknown tuned 'beam_oscilation_resphys', did you mean 'beam_oscillation_resphys'" in err
+
+    def test_the_folder_is_that_of_the_run_and_what_it_holds_is_used(self, folder, no_pictures):
+        short = [*SEARCH, "tune.trials=1"]
+        assert run(*[option for option in SEARCH if not option.startswith(("task", "tune"))])[0] == 0
+        (run_folder,) = Path("runs/beam_oscillation").iterdir()
+        before = files(run_folder)
+        assert run(*short)[0] == 0
+        assert [*Path("runs/beam_oscillation").iterdir()] == [run_folder]
+        now = files(run_folder)
+        assert {name: now[name] for name in before if not name.endswith(".log")} == {
+            name: content for name, content in before.items() if not name.endswith(".log")
+        }
+
+    def test_simfree_is_tuned_by_itself(self, folder, no_pictures):
+        assert run(*SEARCH, IN_RUN, "tune.model=simfree", "tune.trials=2")[0] == 0
+        assert not Path("run/reconstruction.h5").exists()
+        found = OmegaConf.load("configs/tuned/beam_oscillation_simfree.yaml")
+        assert set(found) == {"tuned", "simfree"}
+        best = json.loads(Path("run/tune/simfree/tune.json").read_text())["best"]
+        assert found.simfree.network.width == best["settings"]["network.width"]
+        assert run(*TINY, IN_RUN, "tuned=beam_oscillation_simfree", "network.width=12", "trainer.epochs=2")[0] == 0
+        architectures = {
+            name: read_checkpoint(f"run/{name}.safetensors", kind)
+            for name, kind in (("model", "residual force"), ("simfree", "next state"))
+        }
+        assert architectures["model"][1]["architecture"]["width"] == 12
+        assert architectures["simfree"][1]["architecture"]["width"] == best["settings"]["network.width"]
+        kept = architectures["simfree"][1]["validation_rollout_error_mm"]
+        assert kept == pytest.approx(best["rollout_error_mm"], rel=1e-6)
+
+    def test_a_diverged_trial_counts_and_is_not_the_best(self, folder, monkeypatch):
+        whole = tune.residual_force_learning
+
+        def diverging(context):
+            learning = whole(context)
+            return tune.Learning(learning.samples, learning.build, lambda model: math.inf)
+
+        monkeypatch.setattr(tune, "residual_force_learning", diverging)
+        assert run(*SEARCH, IN_RUN, "tune.trials=2")[0] == 0
+        assert [row["rollout_error_mm"] for row in table()] == ["inf", "inf"]
+        assert json.loads((FOLDER / "tune.json").read_text())["best"] is None
+        assert not Path("configs").exists()
+        assert "None of them came to a roll-out that stays finite" in (FOLDER / "tune.html").read_text()
+
+
+class Interrupted:
+    """Sends SIGINT to this process in a chosen epoch, and counts the epochs."""
+
+    def __init__(self, monkeypatch):
+        self.at, self.done = 0, 0
+        run_epoch = Trainer.run_epoch
+
+        def counted(trainer):
+            record = run_epoch(trainer)
+            self.done += 1
+            if self.done == self.at:
+                signal.raise_signal(signal.SIGINT)
+            return record
+
+        monkeypatch.setattr(Trainer, "run_epoch", counted)
+
+
+def start(hang: bool):
+    """The command in a process of its own; if asked to, it hangs in the fifth epoch of its second trial.
+
+    Before it lie a training as configured and a whole trial, of six epochs each.
+    """
+    program = """
+import time
+from warp_resphys.learning.training import Trainer
+from warp_resphys.experiment import train
+from warp_resphys.studies.tuning import tune
+train._CHECKPOINT_SECONDS = 0.0
+tune.write_pictures = lambda tuning, study: None
+run_epoch, done = Trainer.run_epoch, []
+def hanging(trainer):
+    if len(done) == 16:
+        open("hanging", "w").close()
+        time.sleep(1000)
+    done.append(1)
+    return run_epoch(trainer)
+"""
+    program += "Trainer.run_epoch = hanging\n" if hang else ""
+    program += "from warp_resphys.cli import main\nmain()"
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    return subprocess.Popen(
+        [sys.executable, "-c", program, *SEARCH, IN_RUN], env=environment, text=True, stderr=subprocess.PIPE
+    )
+
+
+@pytest.mark.usefixtures("no_pictures")
+class TestCrashes:
+    def test_one_of_two_workers_is_killed_in_the_middle_of_a_trial(self, searched, folder):
+        doomed = start(hang=True)
+        while not Path("hanging").exists():
+            assert doomed.poll() is None, doomed.communicate()[1]
+            time.sleep(0.01)
+        other = start(hang=False)
+        while not table_has(TRIALS - 1) and other.poll() is None:
+            time.sleep(0.02)
+        assert other.poll() is None  # It waits for the one that hangs, and that lives.
+        doomed.kill()
+        doomed.communicate()
+        err = other.communicate(timeout=60)[1]
+        assert other.returncode == 0, err
+        # The same trials as in a search that nothing disturbed, each with the same result, and each once.
+        assert results() == results(searched / FOLDER)
+        taken = [line for line in err.splitlines() if line.startswith("trial 1: ")]
+        assert len(taken) == 1
+        assert f"{EPOCHS}/{EPOCHS} epochs" in taken[0]
+        journal = [json.loads(line) for line in (FOLDER / "study.journal").read_text().splitlines()]
+        claims = [log["user_attr"]["claims"] for log in journal if "claims" in log.get("user_attr", {})]
+        assert sorted(len(each) for each in claims) == [1] * TRIALS + [2]
+        assert not list((FOLDER / "trials").iterdir())
+
+    def test_a_trial_goes_on_from_its_checkpoint(self, searched, folder, monkeypatch):
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)
+        try:
+            interrupted = Interrupted(monkeypatch)
+            for at in (9, 20):
+                interrupted.at = at
+                code, err = run(*SEARCH, IN_RUN)
+                assert code == 130
+                assert "interrupted in trial" in err
+                assert "the same command goes on from there" in err
+                assert "Traceback" not in err
+            assert run(*SEARCH, IN_RUN)[0] == 0
+        finally:
+            signal.signal(signal.SIGINT, before)
+        assert interrupted.done <= (TRIALS + 1) * EPOCHS + 2  # the epochs that the signals fell into
+        assert results() == results(searched / FOLDER)
+        assert run(*SEARCH, IN_RUN)[0] == 0  # nothing is left to do
+        assert interrupted.done <= (TRIALS + 1) * EPOCHS + 2
+
+    def test_a_worker_that_wakes_too_late_tells_nothing(self, folder, monkeypatch):
+        """While the first trial trains, another process takes it over and finishes it."""
+        run_epoch, taken = Trainer.run_epoch, []
+
+        def overtaken(trainer):
+            if not taken and seen[0].holders():
+                (claims,) = FOLDER.glob("study.journal")
+                study = join_journal(claims.parent)
+                taken.append(study.claim())
+                assert study.tell(taken[0], 123.0, 1.0)
+            return run_epoch(trainer)
+
+        def join_journal(path):
+            study = object.__new__(SharedStudy)
+            study.__dict__ |= {**seen[0].__dict__, "_watch": Dead(), "_identity": {"token": "b", "host": "b", "pid": 2}}
+            return study
+
+        seen, whole = [], SharedStudy.__init__
+
+        def remembered(self, *arguments):
+            whole(self, *arguments)
+            seen.append(self)
+
+        monkeypatch.setattr(SharedStudy, "__init__", remembered)
+        monkeypatch.setattr(Trainer, "run_epoch", overtaken)
+        assert run(*SEARCH, IN_RUN)[0] == 0
+        rows = table()
+        assert [row["rollout_error_mm"] == "123.0" for row in rows] == [True] + (TRIALS - 1) * [False]
+        assert not list((FOLDER / "trials").iterdir())
+
+
+def table_has(count):
+    try:
+        return sum(row["state"] == "complete" for row in table()) >= count
+    except FileNotFoundError:
+        return False
+
+
+@pytest.mark.usefixtures("no_pictures")
+class TestBadInput:
+    @pytest.mark.parametrize(
+        ("override", "sentence"),
+        [
+            ("tune.space.network.width=[8,32]", "has another setting: the search space of network.width was one of 8,"),
+            (
+                "~tune.space.trainer.gamma",
+                "another setting: the search space of trainer.gamma was 0.8 to 1, now it",
+            ),
+            ("trainer.epochs=7", "has another setting: trainer.epochs was 6, now it is 7; go on with the old setting"),
+            ("seed=2", "has another setting: seed was 0, now it is 2"),
+            ("data.steps=13", "has another setting: data.steps was 12, now it is 13"),
+        ],
+    )
+    def test_a_study_of_something_else(self, searched, monkeypatch, override, sentence):
+        monkeypatch.chdir(searched)
+        kept = (FOLDER / "study.journal", Path("run/trajectories.h5"))
+        before = [path.read_bytes() for path in kept]
+        code, err = run(*SEARCH, IN_RUN, override)
+        assert code == 2
+        last = err.splitlines()[-1]
+        assert last.startswith("error: the study in ")
+        assert sentence in last
+        assert [path.read_bytes() for path in kept] == before
+
+    @pytest.mark.parametrize(
+        ("override", "sentence"),
+        [
+            ("task=tun", "task is 'tun': choose run or tune."),
+            ("tune.model=sysid", "tune.model is 'sysid': choose one of resphys, simfree."),
+            ("tune.trials=0", "tune.trials is 0: it must be a whole number, 1 or more."),
+            ("tune.stale_after=0", "tune.stale_after is 0: it must be positive, in seconds."),
+            ("tune.trial_seconds=soon", "tune.trial_seconds is 'soon': it must be positive, in seconds."),
+            ("tune.save_as=a/b", "tune.save_as is 'a/b': use letters, digits, _ and - alone."),
+            ("tune.space.trainer.gamma={low:0.8,high:1.2}", "tune: trainer.gamma is 1.2: it must be greater than 0"),
+            ("tune.space.network.width=[8.5,16]", "tune: network.width is 8.5: it must be a whole number."),
+            ("+tune.space.network.depth=[1,2]", "unknown key 'network.depth' in the group tune"),
+            ("+tune.settings.network.width=8", "tune.settings.network.width and tune.space.network.width exclude"),
+            ("simfree=3", "simfree is 3: it must be a group of settings."),
+            ("+simfree.network.width=-1", "simfree: network.width is -1: it must be positive."),
+        ],
+    )
+    def test_settings(self, folder, override, sentence):
+        code, err = run(*SEARCH, IN_RUN, override)
+        assert code == 2
+        assert err.splitlines()[-1].startswith(f"error: {sentence}")
+        assert not Path("run/trajectories.h5").exists()
+
+    def test_the_other_space_is_a_study_of_its_own(self, searched, monkeypatch):
+        monkeypatch.chdir(searched)
+        settings = [option for option in SEARCH if not option.startswith("tune.")]
+        small = ["tune.space.network.width=[8,16]", "tune.settings.trainer.rollout_every=3", "tune.trials=1"]
+        assert run(*settings, IN_RUN, "trainer.epochs=6", "tune=reduced", *small)[0] == 0
+        (row,) = table("run/tune/resphys_reduced")
+        assert row["state"] == "complete"
+        assert 4 <= int(row["network.position_modes"]) <= 12
+        assert "trainer.gamma" not in row
+        assert Path("configs/tuned/beam_oscillation_resphys_reduced.yaml").is_file()
+
+    def test_an_experiment_without_training(self, folder):
+        code, err = run("experiment=marker_ablation", "task=tune", IN_RUN)
+        assert code == 2
+        assert "error: the experiment marker_ablation trains no network: tune another one." in err
+
+    @pytest.mark.parametrize("name", ["beam_real", "beam_real_repeated", "beam_synthetic"])
+    def test_an_experiment_on_recordings(self, folder, name):
+        code, err = run(f"experiment={name}", "task=tune", "data.folder=recordings", IN_RUN)
+        assert code == 2
+        assert err.strip().splitlines()[-1] == (
+            f"error: task=tune does not search the networks of the experiment {name}, which learns from recordings: "
+            "set network and in_the_loop, and simfree and trainer for the baseline, and compare runs with --multirun."
+        )
+
+    def test_settings_that_the_data_do_not_allow_end_the_search_and_the_trial_does_not_count(self, folder):
+        code, err = run(*SEARCH, IN_RUN, "+tune.space.network.force_modes=[500,1000]")
+        assert code == 2
+        assert "error: trial 0 (network.blocks " in err
+        assert " modes were asked for, but 36 samples give 1 to 36." in err
+        assert not FOLDER.joinpath("trials.csv").exists()
+        assert not list(FOLDER.glob("trials/*"))
+
+    def test_trials_that_take_too_long_are_given_up_and_count(self, folder):
+        assert run(*SEARCH, IN_RUN, "tune.trials=2", "tune.trial_seconds=1e-6")[0] == 0
+        assert [row["state"] for row in table()] == ["pruned", "pruned"]
+        assert json.loads((FOLDER / "tune.json").read_text())["best"] is None
+
+
+@pytest.mark.parametrize("narrow", [False, True])
+def test_figures_of_searches_that_found_nothing(narrow, tmp_path):
+    nothing = np.full(3, np.nan)
+    for errors, pruned in ((nothing, nothing), (np.array([np.inf, 1.0, np.nan]), np.array([np.nan, np.nan, 2.0]))):
+        tuning_figures.search_history(errors, pruned, None, narrow=narrow).savefig(tmp_path / "history.png")
+    tuning_figures.importance_bars({}, narrow=narrow).savefig(tmp_path / "importance.png")
+    space = {"width": WIDTHS["network.width"], "rate": Range(1e-4, 1e-2, log=True, whole=False)}
+    tuning_figures.setting_scatter(np.array([]), [], space, narrow=narrow).savefig(tmp_path / "settings.png")

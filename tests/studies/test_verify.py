@@ -1,0 +1,182 @@
+"""Reference trajectories: the documented format, the comparison, and the script's exit codes."""
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from warp_resphys import Body, Material, Simulator, SolverSettings, State, box_hexahedra, select_vertices
+from warp_resphys.io.errors import DataFileError, InputError
+from warp_resphys.studies.verification import box_of_vertices, compare_with_reference, read_reference
+
+SCRIPT = Path(__file__).parents[2] / "scripts" / "verify.py"
+FILES = ("beam_tip_load_nu045.npz", "beam_tip_load_nu0499.npz", "beam_twist_nu0499.npz")
+
+
+def load_script():
+    spec = importlib.util.spec_from_file_location("verify", SCRIPT)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+verify = load_script()
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_reference_is_reproduced(name, reference_data, device):
+    reference = read_reference(reference_data / name)
+    for solver in ("newton", "quasi_newton"):
+        result = compare_with_reference(reference, SolverSettings(solver, relative_tolerance=1e-7), device)
+        assert result.largest_error <= 1e-8
+        assert 2 < result.iterations < 40
+
+
+def test_reference_is_reproduced_by_projective_dynamics(reference_data, capsys):
+    arguments = [str(reference_data / FILES[0]), "--solver", "projective_dynamics", "--tolerance", "1e-6"]
+    assert verify.main(arguments) == 0
+    assert "beam_tip_load_nu045" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_all_references_are_reproduced_by_all_solvers(reference_data):
+    assert verify.main([str(reference_data / name) for name in FILES]) == 0
+
+
+def trajectory(mesh, steps=3):
+    """A file's content, computed by the simulator itself."""
+    constants = {"youngs_modulus": 1e5, "poissons_ratio": 0.4, "density": 1000.0}
+    gravity, h = np.array([0.0, 0.3, -9.0]), 0.008
+    fixed = select_vertices(mesh, x=mesh.vertices[:, 0].min())
+    body = Body(mesh, fixed=fixed, mass="per_vertex", volume_integration="full")
+    settings = SolverSettings("newton", relative_tolerance=1e-10)
+    simulator = Simulator(body, Material(**constants), h, gravity, solver=settings)
+    forces = 1e-3 * np.random.default_rng(0).normal(size=(steps, len(mesh.vertices), 3))
+    rest = simulator.rest_state()
+    v = 0.1 * (rest.q - rest.q[:, :1]) * (rest.q[..., :1] > mesh.vertices[:, 0].min())
+    result = simulator.rollout(State(rest.q, v), steps, simulator.tensor(forces)[:, None])
+    states = {"q": result.q[:, 0].numpy(), "v": result.v[:, 0].numpy()}
+    return constants | {"dt": h, "gravity": gravity, "vertices": mesh.vertices, "f_ext": forces} | states
+
+
+UNEVEN = box_hexahedra((1.0, 1.0, 1.0), (3, 2, 1))
+UNEVEN = type(UNEVEN)(UNEVEN.vertices**1.5 * [0.05, 0.02, 0.01] + [0.2, -0.1, 0.3], UNEVEN.cells)
+CONTENT = trajectory(UNEVEN)
+
+
+def write(folder, name="file.npz", without=(), **changes):
+    path = folder / name
+    np.savez(path, **{key: value for key, value in (CONTENT | changes).items() if key not in without})
+    return path
+
+
+def test_any_box_grid_is_recovered():
+    mesh = box_of_vertices(UNEVEN.vertices)
+    np.testing.assert_array_equal(mesh.cells, UNEVEN.cells)
+    np.testing.assert_array_equal(mesh.vertices, UNEVEN.vertices)
+
+
+def test_every_solver_reproduces_a_file_of_another_grid(tmp_path, capsys):
+    assert verify.main([str(write(tmp_path))]) == 0
+    lines = capsys.readouterr().out.splitlines()[-3:]
+    assert [line.split()[1] for line in lines] == ["projective_dynamics", "quasi_newton", "newton"]
+    assert all(float(line.split()[-1]) <= 1e-8 for line in lines)
+
+
+@pytest.mark.parametrize("key", ["q", "youngs_modulus", "density", "dt", "gravity", "f_ext"])
+def test_a_perturbed_file_fails(key, tmp_path, capsys):
+    changed = np.array(CONTENT[key], dtype=float)
+    if key == "q":
+        changed[-1, -1, -1] += 2e-8
+    else:
+        changed *= 1.001
+    path = write(tmp_path, **{key: changed})
+    assert verify.main([str(path), "--solver", "newton"]) == 1
+    assert "exceeds 1e-08" in capsys.readouterr().out
+
+
+def test_largest_error_is_a_distance(tmp_path):
+    q = CONTENT["q"].copy()
+    q[2, 5] += [3e-5, 0.0, 4e-5]
+    result = compare_with_reference(
+        read_reference(write(tmp_path, q=q)), SolverSettings("newton", relative_tolerance=1e-8)
+    )
+    assert result.largest_error == pytest.approx(5e-5, rel=1e-4)
+
+
+def test_one_bad_file_among_good_ones_fails(tmp_path):
+    good, bad = write(tmp_path), write(tmp_path, "bad.npz", q=CONTENT["q"] + 1e-6 * (CONTENT["q"] > 0.23))
+    assert verify.main([str(bad), str(good), "--solver", "newton"]) == 1
+
+
+def test_no_convergence_fails(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(verify, "MAX_ITERATIONS", 1)
+    assert verify.main([str(write(tmp_path)), "--solver", "newton"]) == 1
+    assert "not converged" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("without", "changes", "message"),
+    [
+        (["f_ext", "dt"], {}, "lacks dt, f_ext: a reference trajectory has youngs_modulus"),
+        ([], {"masses": np.ones(3)}, "has masses: a reference trajectory has youngs_modulus"),
+        (["v"], {"w": np.ones(3)}, "lacks v and has w"),
+        ([], {"q": CONTENT["q"][:-1]}, r"q is \(3, 24, 3\) of float64, but must be \(T \+ 1, N, 3\)"),
+        ([], {"gravity": np.ones(2)}, r"gravity is \(2,\) of float64, but must be \(3\)"),
+        ([], {"density": np.ones(2)}, r"density is \(2,\) of float64, but must be a single number"),
+        ([], {"dt": np.array("0.01")}, "dt is .* but must be a single number with real numbers"),
+        ([], {"v": np.full_like(CONTENT["v"], np.nan)}, "v has values that are not finite"),
+        ([], {"dt": 0.0}, "dt is 0: it must be positive, in seconds"),
+        ([], {"vertices": CONTENT["vertices"][::-1]}, "24 vertices with 4 x 3 x 2 distinct coordinates"),
+        ([], {"vertices": CONTENT["vertices"] * [1, 1, 0]}, "are no box grid in x-major order"),
+        ([], {"poissons_ratio": 0.5}, "poissons_ratio is 0.5: it must be greater than -1 and less than 0.5"),
+    ],
+)
+def test_foreign_content_is_refused(without, changes, message, tmp_path, capsys):
+    path = write(tmp_path, without=without, **changes)
+    with pytest.raises((DataFileError, InputError), match=message):
+        read_reference(path)
+    assert verify.main([str(path)]) == 2
+    captured = capsys.readouterr()
+    assert captured.err.count("\n") == 1
+    assert captured.err.startswith(f"error: {path}")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("text.npz", b"not an archive", "is no NumPy archive"),
+        ("empty.npz", b"", "is no NumPy archive"),
+        ("truncated.npz", None, "is no NumPy archive"),
+        ("missing.npz", ..., "does not exist"),
+    ],
+)
+def test_foreign_files_are_refused(name, content, message, tmp_path, capsys):
+    path = tmp_path / name
+    if content is None:
+        content = write(tmp_path).read_bytes()[:-200]
+    if content is not ...:
+        path.write_bytes(content)
+    assert verify.main([str(path)]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: {path} {message}")
+    assert "pickle.load" not in error
+
+
+def test_pickled_objects_are_never_loaded(tmp_path, capsys):
+    path = write(tmp_path, gravity=np.array([0.0, "x", None], dtype=object))
+    assert verify.main([str(path)]) == 2
+    assert "is no NumPy archive of plain arrays" in capsys.readouterr().err
+
+
+def test_a_single_array_is_no_trajectory(tmp_path):
+    path = tmp_path / "array.npy"
+    np.save(path, np.ones(3))
+    with pytest.raises(DataFileError, match="is a single array"):
+        read_reference(path)
+
+
+def test_a_tolerance_of_zero_is_refused(tmp_path, capsys):
+    assert verify.main([str(write(tmp_path)), "--tolerance", "0"]) == 2
+    assert "solver.relative_tolerance is 0.0: it must be positive" in capsys.readouterr().err

@@ -1,0 +1,192 @@
+"""Pressures that drive a body: random smooth sequences, the lag of a valve, and a memory of what was."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from ..io.errors import DataFileError, InputError
+
+FloatArray = NDArray[np.float64]
+
+_JITTER = 1e-9  # of the variance, on the diagonal of a smooth covariance
+_SLACK = 1.005  # by which a pressure gauge may exceed the limit
+
+
+@dataclass(frozen=True)
+class PressureSequences:
+    """A distribution of pressures over time: a Gaussian process, clipped to what the chambers take.
+
+    Each chamber's pressure is a normal variable at each time, correlated with those at other times by
+    ``exp(-(t - t')^2 / (2 correlation_time^2))`` and with the other chambers by `correlation`. It is conditioned on
+    being zero, with zero slope, at the start and the end, where the body rests (Rasmussen and Williams 2006, section
+    2.2); then what is below zero or above the limit is cut off.
+
+    Attributes:
+        mean: [Pa].
+        deviation: [Pa].
+        correlation_time: [s]; the longer, the smoother.
+        correlation: between each two chambers, less than 1; or a (C, C) matrix.
+        limit: [Pa].
+        rest: without pressure before the start and after the end [s].
+    """
+
+    mean: float = 8e3
+    deviation: float = 9e3
+    correlation_time: float = 0.4
+    correlation: float | Sequence[Sequence[float]] = 0.0
+    limit: float = 20e3
+    rest: float = 0.1
+
+    def __post_init__(self) -> None:
+        """Checks the ranges.
+
+        Raises:
+            InputError: a number out of range.
+        """
+        for name in ("deviation", "correlation_time", "limit"):
+            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
+                raise InputError(f"{name} of the pressures is {getattr(self, name)}: it must be positive.")
+        if not self.rest >= 0.0:
+            raise InputError(f"rest of the pressures is {self.rest}: it must be zero or more, in s.")
+
+    def draw(self, steps: int, time_step: float, chambers: int, random: np.random.Generator) -> FloatArray:
+        """(K + 1, C) a sequence of pressures at the times 0, h, ..., K h [Pa].
+
+        Args:
+            steps: K.
+            time_step: h [s].
+            chambers: C.
+            random: of the sequence.
+
+        Raises:
+            InputError: there is no time between the rests, or the chambers' correlations are those of no distribution.
+        """
+        times = time_step * np.arange(steps + 1)
+        inside = (times >= self.rest - 1e-9) & (times <= times[-1] - self.rest + 1e-9)
+        if inside.sum() < 3:
+            raise InputError(
+                f"{times[-1]:g} s leave no time between two rests of {self.rest:g} s: simulate longer, or rest less."
+            )
+        normal = self._root(inside.sum(), time_step) @ random.standard_normal((inside.sum(), chambers))
+        bridge = self._bridge(inside.sum(), time_step)
+        pressures = np.zeros((steps + 1, chambers))
+        pressures[inside] = self.mean * bridge[:, None] + self.deviation * normal @ self._between(chambers).T
+        pressures[np.flatnonzero(inside)[[0, -1]]] = 0.0  # as it is but for rounding
+        return np.clip(pressures, 0.0, self.limit)
+
+    def _covariance(self, first: FloatArray, second: FloatArray) -> FloatArray:
+        scaled = (first[:, None] - second[None]) / self.correlation_time
+        covariance: FloatArray = np.exp(-0.5 * scaled**2)
+        return covariance
+
+    def _ends(self, count: int, step: float) -> tuple[FloatArray, FloatArray]:
+        """Times of the sequence, and those at which it is zero: two close to each end leave no slope."""
+        times: FloatArray = step * np.arange(count, dtype=np.float64)
+        close = 0.05 * self.correlation_time
+        ends: FloatArray = np.array([times[0] - close, times[0], times[-1], times[-1] + close], dtype=np.float64)
+        return times, ends
+
+    def _bridge(self, count: int, step: float) -> FloatArray:
+        """(count,) what remains of a mean of one: zero at both ends."""
+        times, ends = self._ends(count, step)
+        weights = np.linalg.solve(self._covariance(ends, ends) + _JITTER * np.eye(4), np.ones(4))
+        bridge: FloatArray = 1.0 - self._covariance(times, ends) @ weights
+        return bridge
+
+    def _root(self, count: int, step: float) -> FloatArray:
+        """(count, count) factor L of the conditional covariance L L^T over time."""
+        times, ends = self._ends(count, step)
+        across = self._covariance(times, ends)
+        solved = np.linalg.solve(self._covariance(ends, ends) + _JITTER * np.eye(4), across.T)
+        values, vectors = np.linalg.eigh(self._covariance(times, times) - across @ solved)
+        root: FloatArray = vectors * np.sqrt(np.maximum(values, 0.0))
+        return root
+
+    def _between(self, chambers: int) -> FloatArray:
+        """(C, C) factor of the chambers' correlations."""
+        matrix: FloatArray = np.asarray(self.correlation, dtype=np.float64)
+        if matrix.ndim == 0:
+            same = np.eye(chambers)
+            matrix = same + (1.0 - same) * matrix
+        if matrix.shape != (chambers, chambers):
+            raise InputError(
+                f"the correlations of the pressures have the shape {matrix.shape}: give one number, or a matrix for "
+                f"{chambers} chambers."
+            )
+        try:
+            root: FloatArray = np.asarray(np.linalg.cholesky(matrix), dtype=np.float64)
+        except np.linalg.LinAlgError:
+            raise InputError(
+                f"no pressures of {chambers} chambers have the correlation {self.correlation}: it must lie above "
+                f"{-1.0 / max(chambers - 1, 1):.3g} and below 1, or be a positive definite matrix."
+            ) from None
+        return root
+
+
+def check_pressures(pressures: ArrayLike, chambers: int, limit: float, source: str | Path) -> FloatArray:
+    """(T, C) recorded pressures, if a body with these chambers can take them [Pa].
+
+    Args:
+        pressures: (T, C') [Pa].
+        chambers: C.
+        limit: [Pa].
+        source: the file that they are from, for messages.
+
+    Raises:
+        DataFileError: another number of chambers, a value that is not finite, or a pressure beyond the limit.
+    """
+    values = np.asarray(pressures, dtype=np.float64)
+    if values.ndim != 2 or values.shape[1] != chambers:
+        found = values.shape[1] if values.ndim == 2 else "no"
+        raise DataFileError(
+            f"{source} has pressures of {found} chambers, but the body has {chambers}: take the mesh of that robot, or "
+            "set data.chambers to the mesh's chamber of each column of the file."
+        )
+    if not np.isfinite(values).all():
+        frame, chamber = np.argwhere(~np.isfinite(values))[0]
+        raise DataFileError(f"{source}: the pressure of chamber {chamber + 1} is not finite in frame {frame}.")
+    frame, chamber = np.unravel_index(np.abs(values).argmax(), values.shape)
+    highest = float(values[frame, chamber])
+    if abs(highest) > _SLACK * limit:
+        raise DataFileError(
+            f"{source}: the pressure of chamber {chamber + 1} is {1e-3 * highest:.4g} kPa in frame {frame}, beyond "
+            f"data.pressure_limit of {1e-3 * limit:.4g} kPa: raise the limit if the robot takes that, or check the "
+            "unit of the file."
+        )
+    return values
+
+
+def lagged(pressure: torch.Tensor, rise: torch.Tensor, step: float) -> torch.Tensor:
+    """(B, K, C) pressures behind a valve, which follow the commanded ones with a time constant.
+
+    Exact for commands that are constant during steps: a first-order lag, from no pressure.
+
+    Args:
+        pressure: (B, K, C) commanded during each step [Pa].
+        rise: (B,) time constant [s], differentiable.
+        step: h [s].
+    """
+    keep = torch.exp(-step / rise.clamp_min(1e-2 * step))[:, None]
+    behind, series = torch.zeros_like(pressure[:, 0]), []
+    for command in pressure.unbind(1):
+        behind = command + keep * (behind - command)
+        series.append(behind)
+    return torch.stack(series, 1)
+
+
+def remembered(pressure: torch.Tensor, seconds: Sequence[float], step: float) -> torch.Tensor:
+    """(B, K, C (1 + n)) pressures, and what a memory of each time constant keeps of them: exponential means.
+
+    A viscoelastic body creeps under a constant pressure: where it goes next depends on how long that has lasted, which
+    its state tells badly. These are the internal variables of n Maxwell elements that the pressure drives.
+
+    Args:
+        pressure: (B, K, C) [Pa].
+        seconds: n time constants [s].
+        step: h [s].
+    """
+    return torch.cat([pressure, *(lagged(pressure, pressure.new_full((len(pressure),), s), step) for s in seconds)], -1)

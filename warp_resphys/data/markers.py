@@ -1,0 +1,383 @@
+r"""Markers on a deforming body: from the positions of its vertices to those of its markers, differentiably.
+
+A marker stands on a stem. What a body does to the stem is decided by what it is bound to:
+
+- ``normal``: x = sum b_i q_i + d n. The stem is along the normal n of the deformed surface triangle, of constant
+  length d; the b_i sum to one and say where in the triangle's plane it stands.
+- ``frame``: x = sum b_i q_i + R o. It stands on the closest point of the surface and turns with the triangle: R is
+  the rotation of its tangent plane that is closest to the deformation (the polar factor).
+- ``rigid``: x = c + R o. It follows the rigid motion that is closest to that of a set of vertices, such as those of a
+  face that it is glued to; c is their centre.
+
+All reproduce the markers at rest, and carry them rigidly where the body moves rigidly.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from typing_extensions import override
+
+from ..io.errors import InputError
+from ..mesh.mesh import Mesh
+from ..mesh.surface import closest_points
+
+SURFACE_KINDS = ("normal", "frame")
+KINDS = (*SURFACE_KINDS, "rigid")
+
+
+class Markers(ABC):
+    """A map from the vertices of a body to m markers."""
+
+    linear: ClassVar[bool] = False  # Whether `transposed_jacobian` is the same everywhere.
+
+    @abstractmethod
+    def __call__(self, positions: torch.Tensor) -> torch.Tensor:
+        """(B, N, 3) positions of the vertices to (B, m, 3) positions of the markers [m]."""
+
+    @abstractmethod
+    def feet(self, positions: torch.Tensor) -> torch.Tensor:
+        """(B, m, 3) where on the body the markers' stems stand [m]."""
+
+    @property
+    @abstractmethod
+    def used(self) -> torch.Tensor:
+        """(K,) all vertices that the markers depend on, perhaps repeated."""
+
+    def transposed_jacobian(self, positions: torch.Tensor) -> torch.Tensor:
+        """(B, 3 N, 3 m) the transposed derivative of the markers by the vertices at positions (B, N, 3)."""
+        with torch.enable_grad():
+            q = positions.detach().requires_grad_(True)
+            at = self(q)
+            seeds = torch.eye(at[0].numel(), device=q.device, dtype=q.dtype).view(-1, 1, *at.shape[1:])
+            (rows,) = torch.autograd.grad(at, q, seeds.expand(-1, *at.shape), is_grads_batched=True)
+        return rows.flatten(2).permute(1, 2, 0).contiguous()
+
+    def to(self, like: torch.Tensor) -> Self:
+        """The same markers on the device and in the precision of a tensor."""
+        changed: dict[str, Any] = {}
+        for field in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, field.name)
+            if isinstance(value, torch.Tensor):
+                changed[field.name] = value.to(like) if value.is_floating_point() else value.to(like.device)
+        return replace(self, **changed)  # type: ignore[type-var]
+
+
+@dataclass(frozen=True)
+class MarkerMap(Markers):
+    """Markers as weighted sums of vertices, other ones in every environment.
+
+    Attributes:
+        vertices: (B, m, k) the vertices of each marker.
+        weights: (B, m, k) their weights; a marker whose weights are all zero is none.
+    """
+
+    vertices: torch.Tensor
+    weights: torch.Tensor
+    linear: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        """Checks that the shapes agree.
+
+        Raises:
+            InputError: they do not, or there is no marker.
+        """
+        if self.vertices.ndim != 3 or self.vertices.shape != self.weights.shape or not self.vertices.numel():
+            raise InputError(
+                f"marker vertices of shape {tuple(self.vertices.shape)} with weights of shape "
+                f"{tuple(self.weights.shape)}: both must be (environments, markers, vertices a marker)."
+            )
+
+    @classmethod
+    def at_vertices(cls, vertices: torch.Tensor, dtype: torch.dtype = torch.float64) -> "MarkerMap":
+        """One marker on each of (B, m) vertices."""
+        return cls(vertices[..., None], torch.ones_like(vertices[..., None], dtype=dtype))
+
+    @override
+    def __call__(self, positions: torch.Tensor) -> torch.Tensor:
+        """C: (B, N, ...) values at the vertices to (B, m, ...) values at the markers."""
+        batch = torch.arange(len(self.vertices), device=positions.device)[:, None, None]
+        weights = self.weights.reshape(*self.weights.shape, *[1] * (positions.ndim - 2))
+        return (positions[batch, self.vertices] * weights).sum(2)
+
+    @override
+    def feet(self, positions: torch.Tensor) -> torch.Tensor:
+        return self(positions)
+
+    @property
+    @override
+    def used(self) -> torch.Tensor:
+        return self.vertices.flatten()
+
+    @override
+    def transposed_jacobian(self, positions: torch.Tensor) -> torch.Tensor:
+        return self.transposed(positions.shape[1])
+
+    def transposed(self, n_vertices: int) -> torch.Tensor:
+        """(B, 3 N, 3 m) matrix of C^T."""
+        b, m, _ = self.vertices.shape
+        out = self.weights.new_zeros(b, n_vertices, 3, m, 3)
+        batch = torch.arange(b, device=out.device)[:, None, None]
+        marker = torch.arange(m, device=out.device)[:, None]
+        for axis in range(3):
+            where = (batch, self.vertices, torch.full_like(marker, axis), marker, torch.full_like(marker, axis))
+            out.index_put_(where, self.weights, accumulate=True)
+        return out.reshape(b, 3 * n_vertices, 3 * m)
+
+
+@dataclass(frozen=True)
+class SurfaceMarkers(Markers):
+    """Markers that stand on triangles of the surface; kinds ``normal`` and ``frame`` (see the module).
+
+    Attributes:
+        triangles: (m, 3) vertices, counter-clockwise seen from outside.
+        weights: (m, 3) barycentric coordinates of the feet, the sum of each row one.
+        unstretch: (m, 2, 2) from the triangle's edges to its tangents at rest: the inverse of their coordinates [1/m].
+        offsets: (m, 3) stems [m] along the first and second tangent and the normal.
+    """
+
+    triangles: torch.Tensor
+    weights: torch.Tensor
+    unstretch: torch.Tensor
+    offsets: torch.Tensor
+
+    @override
+    def __call__(self, positions: torch.Tensor) -> torch.Tensor:
+        corners = positions[:, self.triangles]  # (B, m, 3, 3)
+        stems = torch.einsum("bmij,mj->bmi", tangent_frames(corners, self.unstretch), self.offsets)
+        return torch.einsum("bmki,mk->bmi", corners, self.weights) + stems
+
+    @override
+    def feet(self, positions: torch.Tensor) -> torch.Tensor:
+        return torch.einsum("bmki,mk->bmi", positions[:, self.triangles], self.weights)
+
+    @property
+    @override
+    def used(self) -> torch.Tensor:
+        return self.triangles.flatten()
+
+
+@dataclass(frozen=True)
+class RigidMarkers(Markers):
+    """Markers that follow the rigid motion of a set of vertices; kind ``rigid`` (see the module).
+
+    Attributes:
+        vertices: (S,) three or more, not on one line.
+        rest: (S, 3) [m] where these are at rest, from their centre.
+        offsets: (m, 3) [m] the markers at rest, from the centre of the vertices.
+        stands: (m, 3) [m] the feet at rest, from the centre of the vertices.
+    """
+
+    vertices: torch.Tensor
+    rest: torch.Tensor
+    offsets: torch.Tensor
+    stands: torch.Tensor
+
+    @override
+    def __call__(self, positions: torch.Tensor) -> torch.Tensor:
+        return self._carry(positions, self.offsets)
+
+    @override
+    def feet(self, positions: torch.Tensor) -> torch.Tensor:
+        return self._carry(positions, self.stands)
+
+    @property
+    @override
+    def used(self) -> torch.Tensor:
+        return self.vertices
+
+    def _carry(self, positions: torch.Tensor, offsets: torch.Tensor) -> torch.Tensor:
+        now = positions[:, self.vertices]  # (B, S, 3)
+        centre = now.mean(1, keepdim=True)
+        rotation = closest_rotation((now - centre).mT @ self.rest)
+        return centre + offsets @ rotation.mT
+
+
+@dataclass(frozen=True)
+class JoinedMarkers(Markers):
+    """Markers of several kinds.
+
+    Attributes:
+        parts: the markers of each kind.
+        order: (m,) place of each marker in the parts laid end to end.
+    """
+
+    parts: tuple[Markers, ...]
+    order: torch.Tensor
+
+    @override
+    def __call__(self, positions: torch.Tensor) -> torch.Tensor:
+        return torch.cat([part(positions) for part in self.parts], 1)[:, self.order]
+
+    @override
+    def feet(self, positions: torch.Tensor) -> torch.Tensor:
+        return torch.cat([part.feet(positions) for part in self.parts], 1)[:, self.order]
+
+    @property
+    @override
+    def used(self) -> torch.Tensor:
+        return torch.cat([part.used for part in self.parts])
+
+    @override
+    def to(self, like: torch.Tensor) -> Self:
+        return replace(self, parts=tuple(part.to(like) for part in self.parts), order=self.order.to(like.device))
+
+
+def tangent_frames(corners: torch.Tensor, unstretch: torch.Tensor) -> torch.Tensor:
+    """(B, m, 3, 3) rotated tangents and normals of deformed triangles, as columns.
+
+    With f1, f2 the images of the orthonormal tangents and n the unit normal, f1 + f2 x n points along the first column
+    of the rotation closest to the deformation of the plane: the polar factor of [[a, b], [c, d]] is the matrix
+    [[a + d, b - c], [c - b, a + d]], scaled to determinant one.
+
+    Args:
+        corners: (B, m, 3, 3) the corners' positions [m].
+        unstretch: (m, 2, 2) see `SurfaceMarkers`.
+    """
+    edges = corners[:, :, 1:] - corners[:, :, :1]  # (B, m, 2, 3)
+    first, second = torch.einsum("bmki,mkj->jbmi", edges, unstretch)
+    normal = torch.nn.functional.normalize(torch.linalg.cross(first, second), dim=-1, eps=0.0)
+    along = torch.nn.functional.normalize(first + torch.linalg.cross(second, normal), dim=-1, eps=0.0)
+    return torch.stack([along, torch.linalg.cross(normal, along), normal], dim=-1)
+
+
+def closest_rotation(matrix: torch.Tensor) -> torch.Tensor:
+    r"""(B, 3, 3) rotations R that maximise tr(R^T A), differentiable once.
+
+    Where R is optimal, S = R^T A is symmetric. When A changes by dA, R becomes R (1 + [w]) with
+
+        (tr(S) 1 - S) w = axial(R^T dA - dA^T R),
+
+    as [w] S + S [w] = [(tr(S) 1 - S) w]. The matrix on the left has the eigenvalues s2 + s3, s1 + s3 and s1 + s2,
+    s3 with the sign of det A: it is regular for every set of points that is not on a line, also for a plane and
+    symmetric one, where the singular vectors themselves have no derivative. A step of Newton's method from the
+    optimum moves nothing and has that derivative; so this is one, with all else constant.
+
+    Args:
+        matrix: (B, 3, 3) A. One that is not finite has the rotation of the identity.
+    """
+    identity = torch.eye(3, device=matrix.device, dtype=matrix.dtype)
+    with torch.no_grad():
+        finite = matrix.isfinite().all(-1).all(-1)[:, None, None]
+        u, _, vt = torch.linalg.svd(torch.where(finite, matrix, identity))
+        sign = torch.linalg.det(u @ vt).sign()
+        rotation = u @ torch.diag_embed(torch.stack([torch.ones_like(sign), torch.ones_like(sign), sign], -1)) @ vt
+        shape = rotation.mT @ torch.where(finite, matrix, identity)
+        stiffness = torch.diagonal(shape, dim1=-2, dim2=-1).sum(-1)[:, None, None] * identity - shape
+        inverse = torch.linalg.inv(0.5 * (stiffness + stiffness.mT))
+    turned = rotation.mT @ matrix
+    skew = turned - turned.mT
+    axial = torch.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], -1)
+    spin = (inverse @ axial[:, :, None])[:, :, 0]
+    zero = torch.zeros_like(spin[:, 0])
+    x, y, z = spin.unbind(-1)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).view(-1, 3, 3)
+    return rotation + rotation @ cross
+
+
+def bind_markers(
+    mesh: Mesh,
+    positions: ArrayLike,
+    names: Sequence[str],
+    *,
+    kind: str | Sequence[str] = "normal",
+    vertices: ArrayLike | None = None,
+    largest_distance: float = 0.02,
+) -> Markers:
+    """Binds markers to a body at rest.
+
+    Faces with four nodes count as two triangles, those with six as four, through all of their nodes; a marker is bound
+    to one of these. Beside an edge, a ``normal`` marker stands on the plane of that adjacent triangle which it lies
+    most squarely above, outside of the triangle where need be, and a ``frame`` marker on the edge.
+
+    Args:
+        mesh: The body.
+        positions: (m, 3) [m] where the markers are at rest, in its frame.
+        names: m names.
+        kind: One of `KINDS` for all markers, or one for each.
+        vertices: (S,) the vertices that ``rigid`` markers follow.
+        largest_distance: How far from the surface a marker may be [m].
+
+    Returns:
+        Markers in float64 on the CPU.
+
+    Raises:
+        InputError: A marker is too far from the surface or not finite, a kind is unknown, or the vertices of ``rigid``
+            markers are missing, too few, on one line or not there.
+    """
+    points = np.asarray(positions, dtype=np.float64)
+    kinds = [kind] * len(names) if isinstance(kind, str) else list(kind)
+    _check_markers(points, names, kinds)
+    found = closest_points(mesh, points)
+    worst = int(np.argmax(np.abs(found.distances)))
+    if abs(found.distances[worst]) > largest_distance:
+        raise InputError(
+            f"Marker '{names[worst]}' is {1e3 * abs(found.distances[worst]):.1f} mm from the surface of the body, more "
+            f"than {1e3 * largest_distance:.1f} mm: check its position, the unit of the mesh and the registration."
+        )
+    on_surface = np.array([each in SURFACE_KINDS for each in kinds], dtype=bool)
+    parts: list[Markers] = []
+    if on_surface.any():
+        flat = np.array([each == "normal" for each in kinds])[on_surface]
+        parts.append(
+            _on_triangles(mesh, found.triangles[on_surface], points[on_surface], found.points[on_surface], flat)
+        )
+    if not on_surface.all():
+        parts.append(_on_vertices(mesh, vertices, points[~on_surface], found.points[~on_surface]))
+    if len(parts) == 1:
+        return parts[0]
+    order = np.argsort(np.concatenate([np.flatnonzero(on_surface), np.flatnonzero(~on_surface)]))
+    return JoinedMarkers(tuple(parts), torch.as_tensor(order))
+
+
+def _check_markers(points: np.ndarray, names: Sequence[str], kinds: Sequence[str]) -> None:
+    if points.shape != (len(names), 3) or len(kinds) != len(names) or not len(names):
+        raise InputError(
+            f"{len(names)} markers are named, with {len(kinds)} kinds and positions {points.shape}: there must be a "
+            "kind and three coordinates for each, and one marker at least."
+        )
+    for name, point, kind in zip(names, points, kinds, strict=True):
+        if kind not in KINDS:
+            raise InputError(f"The kind of marker '{name}' is {kind!r}: choose one of {', '.join(KINDS)}.")
+        if not np.isfinite(point).all():
+            raise InputError(f"Marker '{name}' was not seen at rest, so it cannot be bound: leave it out.")
+
+
+def _on_triangles(
+    mesh: Mesh, triangles: np.ndarray, points: np.ndarray, closest: np.ndarray, flat: np.ndarray
+) -> SurfaceMarkers:
+    """Markers with feet at the closest points; `flat` ones right below them, in the triangle's plane."""
+    corners = mesh.vertices[triangles]  # (m, 3, 3)
+    edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)  # (m, 3, 2), as columns
+    normal = np.cross(edges[:, :, 0], edges[:, :, 1])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    first = edges[:, :, 0] / np.linalg.norm(edges[:, :, 0], axis=1, keepdims=True)
+    frame = np.stack([first, np.cross(normal, first), normal], axis=2)  # (m, 3, 3), as columns
+    unstretch = np.linalg.inv(np.swapaxes(frame[:, :, :2], 1, 2) @ edges)
+    above = np.sum((points - corners[:, 0]) * normal, axis=1, keepdims=True)
+    feet = np.where(flat[:, None], points - above * normal, closest)
+    inside = unstretch @ (np.swapaxes(frame[:, :, :2], 1, 2) @ (feet - corners[:, 0])[:, :, None])  # (m, 2, 1)
+    weights = np.concatenate([1.0 - inside.sum(axis=1), inside[:, :, 0]], axis=1)
+    stems = points - np.einsum("mki,mk->mi", corners, weights)
+    offsets = (np.swapaxes(frame, 1, 2) @ stems[:, :, None])[:, :, 0]
+    offsets[flat, :2] = 0.0
+    return SurfaceMarkers(*map(torch.as_tensor, (triangles, weights, unstretch, offsets)))
+
+
+def _on_vertices(mesh: Mesh, vertices: ArrayLike | None, points: np.ndarray, feet: np.ndarray) -> RigidMarkers:
+    chosen = np.unique(np.asarray([] if vertices is None else vertices, dtype=np.int64))
+    if len(chosen) < 3 or chosen[0] < 0 or chosen[-1] >= len(mesh.vertices):
+        raise InputError(
+            f"Rigid markers follow {len(chosen)} vertices: give three or more of the {len(mesh.vertices)} of the mesh, "
+            "such as those of a face."
+        )
+    centre = mesh.vertices[chosen].mean(axis=0)
+    rest = mesh.vertices[chosen] - centre
+    spread = np.linalg.svd(rest, compute_uv=False)
+    if spread[1] <= 1e-6 * spread[0]:
+        raise InputError("The vertices that rigid markers follow lie on one line: choose those of a face.")
+    return RigidMarkers(*map(torch.as_tensor, (chosen, rest, points - centre, feet - centre)))

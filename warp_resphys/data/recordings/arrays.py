@@ -1,0 +1,127 @@
+"""Recordings as arrays: NumPy archives (.npz) and HDF5 files, with the layout of docs/recordings.md."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from ...io.errors import DataFileError
+from ...io.files import FORMAT, LARGEST_ARRAYS, atomic_hdf5, create, open_hdf5, read_arrays
+from .recording import SI_PER_ACTUATION_UNIT, RawRecording, Recording
+
+KIND = "recording"
+_NAMES = ("positions", "labels", "rate_hz", "units", "actuation", "actuation_units", "rest", "start")
+
+
+def read_raw_npz(path: Path) -> RawRecording:
+    """Reads a NumPy archive without running anything that is in it.
+
+    Raises:
+        DataFileError: The file is missing, no archive or damaged, holds Python objects, or an array is missing or
+            wrong.
+    """
+    found = read_arrays(path, _NAMES)
+    if "" in found:
+        raise DataFileError(f"{path} is a single array, not an archive: save it with numpy.savez.")
+    return _assemble(found.get, path)
+
+
+def read_raw_hdf5(path: Path) -> RawRecording:
+    """Reads an HDF5 file of any origin: each name of the layout may be a dataset or an attribute of the root.
+
+    Raises:
+        DataFileError: The file is missing, no HDF5 file or damaged, refers to other files, was written for something
+            else by this program, or an array is missing or wrong.
+    """
+    with open_hdf5(path) as file:
+        kind = file.attrs.get("kind")
+        if file.attrs.get("format") == FORMAT and kind != KIND:
+            raise DataFileError(f"{path} holds '{kind}' where '{KIND}' is needed: check the path.")
+
+        def find(name: str) -> NDArray[Any] | None:
+            if name == "units" and "positions" in file and "units" in file["positions"].attrs:
+                return np.asarray(file["positions"].attrs["units"])
+            if name == "actuation_units" and "actuation" in file and "units" in file["actuation"].attrs:
+                return np.asarray(file["actuation"].attrs["units"])
+            item = file.get(name)
+            if isinstance(item, h5py.Dataset):
+                if item.nbytes > LARGEST_ARRAYS:
+                    raise DataFileError(f"{path}: '{name}' takes more than {LARGEST_ARRAYS >> 30} GiB: split the file.")
+                return np.asarray(item[()])
+            return np.asarray(file.attrs[name]) if name in file.attrs else None
+
+        return _assemble(find, path)
+
+
+def write_recording(path: str | Path, recording: Recording, attributes: Mapping[str, Any] | None = None) -> None:
+    """Writes the HDF5 layout, in metres, so that `read_recording` gives the same recording back.
+
+    Args:
+        path: Where to write; missing folders are made.
+        recording: What to write.
+        attributes: What else is known of the trial, such as a load, as attributes of the root.
+
+    Raises:
+        DataFileError: The file cannot be written.
+    """
+    known = {"labels": list(recording.labels), "rate_hz": recording.rate, "start": recording.start}
+    with atomic_hdf5(path, KIND, {**(attributes or {}), **known, "source": recording.source.name}) as file:
+        create(file, "positions", recording.positions, units="m")
+        if recording.rest is not None:
+            create(file, "rest", recording.rest, units="m")
+        if recording.actuation is not None:
+            create(file, "actuation", recording.actuation, units="1")
+
+
+def _assemble(find: Callable[[str], NDArray[Any] | None], path: Path) -> RawRecording:
+    """A recording from arrays of the layout, by name."""
+    positions = _floats(find, "positions", path)
+    if positions is None:
+        raise DataFileError(f"{path} has no array 'positions' (frames, markers, 3): see docs/recordings.md.")
+    actuation = _floats(find, "actuation", path)
+    if actuation is not None:
+        unit = _word(find("actuation_units")) or "1"
+        if unit not in SI_PER_ACTUATION_UNIT:
+            raise DataFileError(
+                f"{path} gives its actuation in '{unit}': give it in one of {', '.join(SI_PER_ACTUATION_UNIT)}."
+            )
+        with np.errstate(over="ignore"):
+            actuation = actuation * SI_PER_ACTUATION_UNIT[unit]
+    labels = find("labels")
+    rate, start = _number(find, "rate_hz", path), _number(find, "start", path)
+    return RawRecording(
+        positions=positions,
+        labels=None if labels is None else tuple(_text(label) for label in np.ravel(labels)),
+        unit=_word(find("units")) or "m",
+        rate=rate,
+        actuation=actuation,
+        rest=_floats(find, "rest", path),
+        start=start or 0.0,
+    )
+
+
+def _floats(find: Callable[[str], NDArray[Any] | None], name: str, path: Path) -> NDArray[np.float64] | None:
+    array = find(name)
+    if array is None:
+        return None
+    if array.dtype.kind not in "fiu":
+        raise DataFileError(f"{path}: '{name}' does not hold numbers (it is {array.dtype}); save numbers there.")
+    return np.asarray(array, dtype=np.float64)
+
+
+def _number(find: Callable[[str], NDArray[Any] | None], name: str, path: Path) -> float | None:
+    array = _floats(find, name, path)
+    if array is not None and array.size != 1:
+        raise DataFileError(f"{path}: '{name}' has the shape {array.shape}; it must be one number.")
+    return None if array is None else array.item()
+
+
+def _word(array: NDArray[Any] | None) -> str | None:
+    return None if array is None or array.size != 1 else _text(array.item())
+
+
+def _text(value: Any) -> str:
+    return value.decode(errors="replace") if isinstance(value, bytes) else str(value)

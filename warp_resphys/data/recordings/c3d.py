@@ -1,0 +1,63 @@
+"""C3D files, decoded by ezc3d in a process of its own."""
+
+import struct
+from pathlib import Path
+
+from ...io.decoding import DecodingError, decode
+from ...io.errors import DataFileError
+from .recording import RawRecording, Recording, to_recording
+
+_MAGIC = 0x50
+_BIG_ENDIAN_PROCESSOR = 86
+
+
+def read_c3d(path: str | Path) -> Recording:
+    """Reads the marker trajectories of a C3D file.
+
+    Args:
+        path: The file. Its own unit (m, cm or mm) is converted to metres; occluded samples become NaN.
+
+    Raises:
+        DataFileError: The file is missing, not C3D, damaged, truncated, or holds no marker trajectories.
+    """
+    path = Path(path)
+    return to_recording(read_raw_c3d(path), path)
+
+
+def read_raw_c3d(path: Path) -> RawRecording:
+    """What a C3D file holds, in its own unit; raises DataFileError as `read_c3d`."""
+    declared_frames = _declared_frames(path)
+    try:
+        decoded = decode("ezc3d", path)
+    except DecodingError as error:
+        raise DataFileError(f"{path} is damaged or truncated ({error}); copy or export it again.") from error
+    points = decoded["points"]
+    if points.ndim != 3 or points.shape[1] == 0 or points.shape[2] == 0:
+        raise DataFileError(f"{path} holds no marker trajectories: give a C3D file with 3D points.")
+    if points.shape[2] < declared_frames:
+        raise DataFileError(
+            f"{path} is truncated: it holds {points.shape[2]} of the {declared_frames} frames that its "
+            "header declares; copy or export it again."
+        )
+    return RawRecording(
+        positions=points[:3].transpose(2, 1, 0),
+        labels=tuple(str(label) for label in decoded["labels"][: points.shape[1]]),
+        unit=str(decoded["units"][0]).strip() if decoded["units"].size else None,
+        rate=float(decoded["rate"][0]) if decoded["rate"].size else None,
+    )
+
+
+def _declared_frames(path: Path) -> int:
+    """Number of frames in the C3D header (its first 512 bytes), which the decoder silently corrects."""
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise DataFileError(f"Cannot read {path}: {error.strerror}; check the path of the recording.") from error
+    if len(content) < 2 or content[1] != _MAGIC:
+        raise DataFileError(f"{path} is not a C3D file: give a motion-capture recording in C3D format.")
+    processor_at = (content[0] - 1) * 512 + 3
+    if len(content) < 512 or content[0] == 0 or len(content) <= processor_at:
+        raise DataFileError(f"{path} is truncated: it ends after {len(content)} bytes; copy or export it again.")
+    order = ">" if content[processor_at] == _BIG_ENDIAN_PROCESSOR else "<"
+    first, last = struct.unpack_from(order + "2H", content, 6)
+    return int(last - first + 1)

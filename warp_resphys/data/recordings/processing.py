@@ -1,0 +1,208 @@
+"""From a recording as it was measured to one that a simulation can be compared with.
+
+What is known stays; what is short and lies between known frames is interpolated; the rest is masked: its positions
+stay NaN, and `Recording.seen` is False there.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.signal import butter, sosfiltfilt
+
+from ...io.errors import DataFileError, InputError
+from .recording import BoolArray, Recording, listed, runs
+from .release import Release, find_release
+
+FloatArray = NDArray[np.float64]
+
+_FIRST_SECONDS = 0.2  # A stretch may begin so much later than the first one.
+_WHOLE = 1e-6  # Relative; how near a ratio of rates must be to a whole number.
+
+
+def fill_gaps(recording: Recording, longest: int = 5, *, mask_long: bool = False) -> Recording:
+    """Interpolates short occlusions by a cubic spline through the frames in which the marker was seen.
+
+    Args:
+        recording: What to fill.
+        longest: The longest gap that is filled, in frames.
+        mask_long: Leave longer gaps, and gaps at either end, as NaN. Otherwise a longer gap is refused, and a short
+            one at either end is filled with the nearest sample, as nothing lies beyond it.
+
+    Raises:
+        DataFileError: A marker is seen in fewer than two frames or, unless that is masked, occluded for longer.
+    """
+    positions = recording.positions.copy()
+    frames = np.arange(len(positions))
+    for column, (label, seen) in enumerate(zip(recording.labels, recording.seen.T, strict=True)):
+        if np.count_nonzero(seen) < 2:
+            raise DataFileError(
+                f"{recording.source}: marker {label} is seen in {np.count_nonzero(seen)} of {len(seen)} frames; "
+                "leave it out of the configured markers."
+            )
+        wanted = np.zeros(len(seen), dtype=np.bool_)
+        for start, stop in runs(~seen):
+            inner = start > 0 and stop < len(seen)
+            if stop - start > longest and not mask_long:
+                raise DataFileError(
+                    f"{recording.source}: marker {label} is occluded in frames {start} to {stop - 1}, longer "
+                    f"than the {longest} frames that are interpolated; leave it out or raise the limit."
+                )
+            wanted[start:stop] = stop - start <= longest and (inner or not mask_long)
+        if wanted.any():
+            known = frames[seen]
+            inside = np.clip(frames[wanted], known[0], known[-1])
+            positions[wanted, column] = CubicSpline(known, positions[seen, column])(inside)
+    return dataclasses.replace(recording, positions=positions)
+
+
+def resample(recording: Recording, rate: float, *, interpolate: bool = False) -> Recording:
+    """Brings a recording to the simulator's rate 1/h.
+
+    Where the recording's rate is a whole multiple, every n-th frame is kept, exactly as measured. Otherwise, if
+    `interpolate`, a cubic spline goes through the frames in which a marker was seen; a new frame is seen if the frames
+    on both sides of it were. Actuation is interpolated linearly. What is interpolated should move slowly beside the
+    frame rate: a spline follows a swing with n frames a period to about (2 pi / n)^4 / 384 of its amplitude.
+
+    Args:
+        recording: What to resample.
+        rate: Steps a second wanted [Hz].
+        interpolate: Whether the frames may be interpolated.
+
+    Raises:
+        InputError: The rate is not positive, or the recording's is no multiple of it and may not be interpolated.
+    """
+    if not (np.isfinite(rate) and rate > 0.0):
+        raise InputError(f"The rate to resample to is {rate!r}: it must be a number above zero, in Hz.")
+    ratio = recording.rate / rate
+    every = round(ratio)
+    if every >= 1 and abs(ratio - every) <= _WHOLE * ratio:
+        actuation = None if recording.actuation is None else recording.actuation[::every]
+        return dataclasses.replace(
+            recording, positions=recording.positions[::every], actuation=actuation, rate=float(rate)
+        )
+    if not interpolate:
+        raise InputError(
+            f"{recording.source} has {recording.rate:g} frames a second, which is no multiple of the {rate:g} steps a "
+            f"second of the simulation: make time_step a multiple of {1.0 / recording.rate:g} s, or set "
+            "recording.interpolate to true."
+        )
+    old = np.arange(len(recording.positions))
+    new = np.arange(int((len(old) - 1) / ratio * (1.0 + _WHOLE)) + 1) * ratio
+    new = np.minimum(new, old[-1])
+    below, above = np.floor(new + _WHOLE).astype(int), np.ceil(new - _WHOLE).astype(int)
+    positions = np.full((len(new), len(recording.labels), 3), np.nan)
+    for column, known in enumerate(recording.seen.T):
+        kept = known[below] & known[above]
+        if kept.any() and np.count_nonzero(known) > 1:
+            spline = CubicSpline(old[known], recording.positions[known, column])
+            positions[kept, column] = spline(new[kept])
+    actuation = None
+    if recording.actuation is not None:
+        actuation = np.stack([np.interp(new, old, channel) for channel in recording.actuation.T], axis=1)
+    return dataclasses.replace(recording, positions=positions, actuation=actuation, rate=float(rate))
+
+
+def smooth(recording: Recording, cutoff: float) -> Recording:
+    """Takes out what is faster than a body moves: a Butterworth filter forwards and backwards, which delays nothing.
+
+    Its gain is one half at the cut-off, and falls by 48 dB an octave above it. Forces follow from accelerations, in
+    which noise grows with the square of its frequency: without this, a force that explains every frame is mostly noise.
+
+    Args:
+        recording: gaps stay gaps; it is filtered through straight lines across them.
+        cutoff: [Hz], less than half of the frame rate.
+
+    Raises:
+        InputError: a cut-off out of that range.
+        DataFileError: too few frames.
+    """
+    if not 0.0 < cutoff < 0.5 * recording.rate:
+        raise InputError(
+            f"the cut-off is {cutoff:g} Hz: it must lie between 0 and {0.5 * recording.rate:g} Hz, half of the rate."
+        )
+    sections = butter(4, cutoff, fs=recording.rate, output="sos")
+    pad = min(round(3.0 * recording.rate / cutoff), len(recording.positions) - 2)
+    if pad < 1:
+        raise DataFileError(f"{recording.source} has {len(recording.positions)} frames, too few to be filtered.")
+    positions = np.full_like(recording.positions, np.nan)
+    frames = np.arange(len(positions))
+    for column, seen in enumerate(recording.seen.T):
+        if seen.any():
+            found = [np.interp(frames, frames[seen], x[seen]) for x in recording.positions[:, column].T]
+            positions[:, column] = sosfiltfilt(sections, np.stack(found, axis=1), axis=0, padlen=pad)
+            positions[~seen, column] = np.nan
+    return dataclasses.replace(recording, positions=positions)
+
+
+def release_of(recording: Recording, labels: Sequence[str], longest_gap: int = 5) -> Release:
+    """Finds when the body was let go, from the mean of the markers that are seen longest without a break at first.
+
+    Args:
+        recording: With its frames from before the release.
+        labels: Markers that move, such as those of the tip.
+        longest_gap: The longest occlusion that is interpolated for this, in frames.
+
+    Raises:
+        DataFileError: A marker is missing, or nothing is let go before all of them are hidden.
+    """
+    moving = fill_gaps(recording.select(labels), longest_gap, mask_long=True)
+    stretches = [stretch for seen in moving.seen.T for stretch in runs(seen)]
+    earliest = min(start for start, _ in stretches) + _FIRST_SECONDS * moving.rate
+    start, stop = max((stretch for stretch in stretches if stretch[0] <= earliest), key=lambda each: each[1] - each[0])
+    use = moving.seen[start:stop].all(axis=0)
+    part = (
+        "" if stop - start == len(moving.positions) else f", frames {start} to {stop - 1}, the first without a long gap"
+    )
+    path = moving.positions[start:stop, use].mean(axis=1)
+    found = find_release(path, recording.rate, source=f"{recording.source}{part}")
+    return Release(start + found.frame, (start + found.rest[0], start + found.rest[1]))
+
+
+def trim_to_release(
+    recording: Recording, release: Release, *, before: int = 0, seconds: float | None = None
+) -> Recording:
+    """The frames from the release on, and where the markers were while the body was held.
+
+    The release falls between two frames: `start` of the result is the time from it to the first frame that is kept.
+
+    Args:
+        recording: The whole recording.
+        release: Its release.
+        before: How many frames before the release to keep; `start` is negative then.
+        seconds: How long to keep after the release [s]; everything if None.
+
+    Raises:
+        DataFileError: A marker is not seen at all while the body is held, or too few frames are left.
+    """
+    held = recording.positions[slice(*release.rest)]
+    visible = recording.seen[slice(*release.rest)]
+    hidden = [label for label, frames in zip(recording.labels, visible.T, strict=True) if not frames.any()]
+    if hidden:
+        raise DataFileError(
+            f"{recording.source}: {listed(hidden)} cannot be seen while the body is held (frames {release.rest[0]} to "
+            f"{release.rest[1] - 1}), so where it sits is not known; leave it out of the configured markers."
+        )
+    first = max(0, int(np.ceil(release.frame)) - before)
+    last = len(recording.positions)
+    if seconds is not None:
+        last = min(last, int(np.floor(release.frame + seconds * recording.rate)) + 1)
+    if last - first < 2:
+        raise DataFileError(
+            f"{recording.source} ends {last - first} frames after its release in frame {release.frame:.1f}; give a "
+            "recording of the motion that follows."
+        )
+    return dataclasses.replace(
+        recording,
+        positions=recording.positions[first:last],
+        actuation=None if recording.actuation is None else recording.actuation[first:last],
+        rest=np.nanmedian(held, axis=0),
+        start=(first - release.frame) / recording.rate,
+    )
+
+
+def filled(before: Recording, after: Recording) -> BoolArray:
+    """(T, M) what `fill_gaps` filled."""
+    return np.asarray(after.seen & ~before.seen)

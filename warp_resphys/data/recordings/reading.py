@@ -1,0 +1,49 @@
+"""One function for every kind of recording."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+from ...io.errors import DataFileError
+from .arrays import read_raw_hdf5, read_raw_npz
+from .c3d import read_raw_c3d
+from .recording import RawRecording, Recording, to_recording
+from .text import read_raw_text
+
+READERS: Final[Mapping[str, Callable[[Path], RawRecording]]] = {
+    ".c3d": read_raw_c3d,
+    ".csv": read_raw_text,
+    ".tsv": read_raw_text,
+    ".txt": read_raw_text,
+    ".npz": read_raw_npz,
+    ".h5": read_raw_hdf5,
+    ".hdf5": read_raw_hdf5,
+}
+
+
+def read_recording(
+    path: str | Path,
+    units: str | None = None,
+    rate: float | None = None,
+    labels: Sequence[str] | None = None,
+) -> Recording:
+    """Reads a recording; the end of its name tells the format. docs/recordings.md describes the layouts.
+
+    Args:
+        path: A C3D, CSV, TSV, npz or HDF5 file.
+        units: m, cm or mm, where the file does not say it, or says it wrongly.
+        rate: Frames a second [Hz], where the file does not say it, or says it wrongly.
+        labels: A name for each marker in the file's order, in place of those in the file.
+
+    Raises:
+        DataFileError: The file is missing, of another format, damaged, or lacks something that was not given.
+        InputError: What was given cannot be used.
+    """
+    path = Path(path)
+    reader = READERS.get(path.suffix.lower())
+    if reader is None:
+        raise DataFileError(
+            f"{path} is no recording that can be read: give a file that ends in {', '.join(READERS)}, or convert it "
+            "with scripts/convert_recordings.py."
+        )
+    return to_recording(reader(path), path, units, rate, labels)

@@ -1,0 +1,94 @@
+"""The published recordings of a pneumatic segment under steps of pressure: their layout, and the way into ours.
+
+They are others' data; docs/recordings.md says where they are offered. The segment hangs along -z from its clamp at
+z = 0. The chamber that is inflated is the one towards +x: the tip goes towards -x.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...io.errors import DataFileError
+from ...io.files import read_arrays
+from .jumps import mask_repeats
+from .published import write_trials
+from .recording import SI_PER_ACTUATION_UNIT, RawRecording, Recording, to_recording
+from .valve import valve_opening
+
+FloatArray = NDArray[np.float64]
+
+LENGTH: Final = 0.1  # [m]
+# [m] where the markers should be: four on the clamp, three at the tip, in the order of the labels.
+SEGMENT_NOMINAL: Final = np.array(
+    [
+        *((-0.0505, -0.0205, 0.102), (-0.0305, -0.0505, 0.102), (-0.0105, 0.0505, 0.102), (-0.0505, 0.0235, 0.102)),
+        *((-0.0096, -0.0265, 0.0), (-0.0096, 0.0265, 0.0), (-0.0282, 0.0, 0.0)),
+    ]
+) - np.array([0.0, 0.0, LENGTH])
+CLAMP_LABELS: Final = tuple(f"Clamp - {number}" for number in range(1, 5))
+TIP_LABELS: Final = tuple(f"Tip - {number}" for number in range(1, 4))
+SEGMENT_LABELS: Final = (*CLAMP_LABELS, *TIP_LABELS)
+_LARGEST_PRESSURE: Final = 1e5  # mbar
+MARKERS: Final = (0, 3, 2, 1, 4, 6, 5)  # which recorded marker each of the labels is
+
+
+def read_published_segment(path: str | Path) -> dict[int, Recording]:
+    """Reads the recordings of the segment, by pressure in mbar.
+
+    Time zero is the opening of the valve, as `valve_opening` finds it; the actuation is the pressure asked for, a step.
+    `rest` is the median of the frames before it. Frames that repeat the one before were not measured, and are NaN.
+
+    Args:
+        path: an archive of `pressure_mbar` (R,), `markers` (R, T, 7, 3) [m] and `rate_hz`.
+
+    Raises:
+        DataFileError: the file is missing, damaged or holds Python objects; the arrays are missing or have other
+            shapes; two trials have the same pressure; or the valve's opening is not found.
+    """
+    path = Path(path)
+    arrays = read_arrays(path)
+    missing = [name for name in ("pressure_mbar", "markers", "rate_hz") if name not in arrays]
+    if missing:
+        raise DataFileError(
+            f"{path} has no array '{missing[0]}'; it has {', '.join(arrays) or 'none'}: check the path."
+        )
+    pressure, markers, rate = arrays["pressure_mbar"], arrays["markers"], arrays["rate_hz"]
+    wanted = (len(MARKERS), 3)
+    if markers.ndim != 4 or markers.shape[2:] != wanted or pressure.shape != markers.shape[:1] or rate.size != 1:
+        raise DataFileError(
+            f"{path}: markers {markers.shape}, pressure_mbar {pressure.shape} and rate_hz {rate.shape} must have the "
+            f"shapes (trials, frames, {wanted[0]}, 3), (trials,) and (): check the path."
+        )
+    for name in ("pressure_mbar", "markers", "rate_hz"):
+        if arrays[name].dtype.kind not in "fiu":
+            raise DataFileError(f"{path}: '{name}' does not hold numbers (it is {arrays[name].dtype}): check the path.")
+    if not (np.abs(pressure) <= _LARGEST_PRESSURE).all():
+        raise DataFileError(f"{path}: 'pressure_mbar' must be finite, and at most {_LARGEST_PRESSURE:g} mbar.")
+    names = np.rint(pressure).astype(int).tolist()
+    if len(set(names)) != len(names):
+        raise DataFileError(f"{path}: two trials have the same pressure, to a mbar; give each trial its own.")
+    return {
+        name: _trial(RawRecording(frames[:, list(MARKERS)], SEGMENT_LABELS, "m", rate.item()), mbar, path)
+        for name, mbar, frames in zip(names, pressure.tolist(), markers, strict=True)
+    }
+
+
+def convert_segment(source: str | Path, folder: Path) -> list[dict[str, Any]]:
+    """Writes each trial as segment_050.h5 (50 mbar) and so on, and index.json; returns what that says of each."""
+    trials: list[tuple[int, Recording, dict[str, Any]]] = [
+        (mbar, recording, {"pressure_mbar": mbar, "valve_opening_s": -recording.start})
+        for mbar, recording in read_published_segment(source).items()
+    ]
+    return write_trials(folder, "segment", trials, SEGMENT_NOMINAL)
+
+
+def _trial(raw: RawRecording, mbar: float, path: Path) -> Recording:
+    recording = mask_repeats(to_recording(raw, path))
+    recording = replace(recording, start=-valve_opening(recording, TIP_LABELS))
+    open_ = recording.time >= 0.0
+    step = np.where(open_, mbar * SI_PER_ACTUATION_UNIT["mbar"], 0.0)[:, None]  # (T, 1) [Pa]
+    rest = np.nanmedian(recording.positions[~open_], axis=0)
+    return replace(recording, actuation=step, rest=rest)

@@ -1,0 +1,93 @@
+"""The Hessian: which vertices it couples, and its assembly in the layout of a linear solver."""
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..energies.launcher import warp_view
+from ..energies.potential import IncrementalPotential
+from ..fem.body import Body
+from ..kernels.assembly import assembly_kernels
+from ..linalg.linear_solver import LinearSolver
+
+
+class BlockPattern:
+    """Which pairs of vertices the Hessian couples, and which cell blocks make up each pair.
+
+    Attributes:
+        free: (F,) vertices that are not fixed.
+        rows: (E,) row of each block, an index into ``free``.
+        cols: (E,) its column; ``rows >= cols``.
+        start: (E + 1,) where a block's entries of ``contribution`` begin.
+        contribution: cell block, or -1 - cell block where it enters transposed.
+        diagonal_vertex: (E,) the vertex of a diagonal block, else -1.
+        offsets: first cell block of each point set.
+        n_cell_blocks: of all point sets.
+    """
+
+    def __init__(self, body: Body) -> None:
+        n = body.n_vertices
+        is_free = np.ones(n, dtype=bool)
+        is_free[body.fixed_vertices] = False
+        self.free = np.flatnonzero(is_free)
+        reduced = np.where(is_free, np.cumsum(is_free) - 1, -1)
+        sources: list[NDArray[np.int64]] = []
+        pairs: list[NDArray[np.int64]] = []
+        self.offsets: list[int] = []
+        self.n_cell_blocks = 0
+        for points in body.point_sets:
+            a, c = np.tril_indices(points.nodes.shape[1])
+            pair = np.stack([reduced[points.nodes[:, a]], reduced[points.nodes[:, c]]], axis=-1).reshape(-1, 2)
+            # A padded node repeats its patch's own vertex with a zero gradient and contributes nothing.
+            used = np.abs(points.gradients).sum(axis=(1, 3)) > 0.0
+            keep = (pair >= 0).all(axis=1) & (used[:, a] & used[:, c]).ravel()
+            sources.append(self.n_cell_blocks + np.flatnonzero(keep))
+            pairs.append(pair[keep])
+            self.offsets.append(self.n_cell_blocks)
+            self.n_cell_blocks += len(pair)
+        self._collect(np.concatenate(sources), np.concatenate(pairs))
+
+    def _collect(self, source: NDArray[np.int64], pair: NDArray[np.int64]) -> None:
+        """Sorts the cell blocks by matrix block; a block above the diagonal enters transposed."""
+        n = len(self.free)
+        source = np.where(pair[:, 0] < pair[:, 1], -1 - source, source)
+        diagonal = np.arange(n) * (n + 1)
+        key = pair.max(axis=1) * n + pair.min(axis=1)
+        blocks, inverse = np.unique(np.concatenate([key, diagonal]), return_inverse=True)
+        order = np.argsort(inverse[: len(key)], kind="stable")
+        self.rows, self.cols = blocks // n, blocks % n
+        self.contribution = source[order]
+        self.start = np.searchsorted(inverse[: len(key)][order], np.arange(len(blocks) + 1))
+        self.diagonal_vertex = np.where(self.rows == self.cols, self.free[self.rows], -1)
+
+
+class HessianAssembly:
+    """Recorded launches from the tangent of a potential to the value array of a linear solver."""
+
+    def __init__(self, potential: IncrementalPotential, solver: LinearSolver, pattern: BlockPattern) -> None:
+        p, k = potential, assembly_kernels(potential.scalar)
+        self._potential = p
+        blocks = p.zeros(pattern.n_cell_blocks, 3, 3)
+        self._values = p.zeros(solver.n_values)
+        self._commands = []
+        for s, offset in zip(p.sets, pattern.offsets, strict=True):
+            inputs = [s.gradients, s.points_per_cell]
+            inputs += [p.points_view(p.tangent, s.part, p.mat33), offset]
+            self._commands.append(
+                p.record(k.cell_blocks, (p.batch, s.cells, s.nodes_per_cell), inputs, [warp_view(blocks, p.mat33)])
+            )
+        inputs = [
+            p.upload(pattern.start.astype(np.int32), int),
+            p.upload(pattern.contribution.astype(np.int32), int),
+            p.upload(pattern.diagonal_vertex.astype(np.int32), int),
+            p.upload(solver.address, int),
+            warp_view(blocks, p.mat33),
+            warp_view(p.terms.inertia, p.scalar),
+        ]
+        dim = (p.batch, len(pattern.rows))
+        self._commands.append(p.record(k.scatter_blocks, dim, inputs, [warp_view(self._values, p.scalar)]))
+
+    def __call__(self) -> torch.Tensor:
+        """(B, n_values) from the potential's last `update_tangent`; overwritten by the next call."""
+        self._potential.launch(*self._commands)
+        return self._values

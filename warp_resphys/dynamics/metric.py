@@ -1,0 +1,156 @@
+"""The matrix of the global step: a Hessian, or the constant matrix of projective dynamics."""
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+import torch
+from typing_extensions import override
+
+from ..energies.potential import IncrementalPotential
+from ..energies.terms import PointTerm
+from ..linalg.linear_solver import Factor, LinearSolver
+from .assembly import BlockPattern, HessianAssembly
+
+
+class Metric(ABC):
+    """A factorised approximation of the potential's Hessian.
+
+    Attributes:
+        clamped: (B,) environments whose matrix is positive definite by force or by construction: a line search that
+            fails with it gets no further try.
+    """
+
+    clamped: torch.Tensor
+
+    @abstractmethod
+    def ready(self) -> bool:
+        """Whether there is a factor that may serve the current terms."""
+
+    @abstractmethod
+    def refactor(self, clamp: bool = False) -> None:
+        """Factorises at the potential's positions."""
+
+    @abstractmethod
+    def apply(self, residual: torch.Tensor) -> torch.Tensor:
+        """(B, 3 N) displacement [m] for a (B, 3 N) residual [N]; zero at fixed vertices."""
+
+
+class HessianMetric(Metric):
+    """The exact Hessian; its positive-definite clamp in environments whose Hessian is indefinite.
+
+    Args:
+        potential: whose Hessian it is.
+        pattern: its block structure.
+        linear: solver built for that pattern with blocks of 3.
+    """
+
+    def __init__(self, potential: IncrementalPotential, pattern: BlockPattern, linear: LinearSolver) -> None:
+        self._potential, self._linear = potential, linear
+        self._assemble = HessianAssembly(potential, linear, pattern)
+        free = torch.as_tensor(pattern.free, device=potential.device)
+        self._dofs = (3 * free[:, None] + torch.arange(3, device=potential.device)).reshape(-1)
+        self._factor: Factor | None = None
+        self.clamped = torch.zeros(potential.batch, dtype=torch.bool, device=potential.device)
+
+    @override
+    def ready(self) -> bool:
+        return self._factor is not None
+
+    @override
+    def refactor(self, clamp: bool = False) -> None:
+        self.clamped.fill_(clamp)
+        self._factor = self._factorise()
+        if self._factor.failed.any() and not clamp:
+            self.clamped = torch.as_tensor(self._factor.failed, device=self.clamped.device)
+            self._factor = self._factorise()
+
+    def _factorise(self) -> Factor:
+        self._potential.update_tangent(self.clamped)
+        return self._linear.factor(self._assemble())
+
+    def refactor_exact(self) -> None:
+        """Factorises the Hessian as it is, indefinite or not: for adjoints."""
+        self.clamped.zero_()
+        self._potential.update_tangent()
+        self._factor = self._linear.factor(self._assemble())
+        if self._factor.failed.any():
+            self._factor = self._linear.factor(self._assemble(), definite=False)
+
+    @override
+    def apply(self, residual: torch.Tensor) -> torch.Tensor:
+        return self.solve(residual[:, :, None])[:, :, 0]
+
+    def solve(self, right: torch.Tensor) -> torch.Tensor:
+        """(B, 3 N, m) solutions for (B, 3 N, m) right-hand sides; zero at fixed vertices."""
+        if self._factor is None:
+            raise RuntimeError("refactor before solve")
+        out = torch.zeros_like(right)
+        out[:, self._dofs] = self._factor.solve(right[:, self._dofs])
+        return out
+
+
+class ProjectiveMetric(Metric):
+    """Inertia plus ``(2 mu + lambda) V G G^T`` at every point of the solid, the same in each coordinate.
+
+    Fibres enter with their stiffness, pressure not at all.
+
+    This is the Hessian of the distances to fixed projections (Bouaziz et al. 2014, equation 10). It does not depend on
+    the positions: one factor serves until inertia or stiffness change, and the whole batch where these are shared.
+    """
+
+    def __init__(self, potential: IncrementalPotential, pattern: BlockPattern, linear: LinearSolver) -> None:
+        self._potential, self._pattern, self._linear = potential, pattern, linear
+        self._free = torch.as_tensor(pattern.free, device=potential.device)
+        self._address = torch.as_tensor(linear.address[:, 0], device=potential.device, dtype=torch.int64)
+        self._products = [self._gradient_products(s) for s in potential.sets]
+        self._key: tuple[torch.Tensor, ...] | None = None
+        self.clamped = torch.ones(potential.batch, dtype=torch.bool, device=potential.device)
+        self._factor: Factor | None = None
+
+    def _gradient_products(self, points: PointTerm) -> torch.Tensor:
+        """(C, Q, pairs) scalar products of the gradients of every node pair a >= c of a cell."""
+        gradients = points.operators
+        a, c = np.tril_indices(gradients.shape[2])
+        products = np.einsum("cqpi,cqpi->cqp", gradients[:, :, a], gradients[:, :, c])
+        return torch.as_tensor(products, device=self._potential.device, dtype=self._potential.dtype)
+
+    def _terms(self) -> tuple[torch.Tensor, ...]:
+        t = self._potential.terms
+        return t.inertia, *(s.curvature(t) for s in self._potential.sets)
+
+    @override
+    def ready(self) -> bool:
+        terms = self._terms()
+        return self._key is not None and all(map(torch.equal, self._key, terms))
+
+    @override
+    def refactor(self, clamp: bool = False) -> None:
+        del clamp  # The matrix is positive definite as it is.
+        self._key = tuple(t.clone() for t in self._terms())
+        inertia, *weights = (t[:1] if bool((t == t[:1]).all()) else t for t in self._key)
+        batch = max(len(t) for t in (inertia, *weights))
+        parts = []
+        for products, weight in zip(self._products, weights, strict=True):
+            w = weight.expand(batch, -1).reshape(batch, *products.shape[:2])
+            parts.append(torch.einsum("bcq,cqp->bcp", w, products).reshape(batch, -1))
+        blocks = torch.cat(parts, dim=1)
+        source = torch.as_tensor(self._pattern.contribution, device=blocks.device)
+        source = torch.where(source < 0, -1 - source, source)
+        counts = torch.as_tensor(np.diff(self._pattern.start), device=blocks.device)
+        # Sums in a fixed order, unlike index_add_ on a GPU.
+        sums = torch.segment_reduce(blocks[:, source].mT.contiguous(), "sum", lengths=counts, axis=0)
+        values = torch.zeros(batch, self._linear.n_values, device=blocks.device, dtype=blocks.dtype)
+        values[:, self._address] = sums.mT
+        diagonal = torch.as_tensor(self._pattern.rows == self._pattern.cols, device=blocks.device)
+        vertex = torch.as_tensor(self._pattern.diagonal_vertex, device=blocks.device)[diagonal]
+        values[:, self._address[diagonal]] += inertia[:, vertex]
+        self._factor = self._linear.factor(values)
+
+    @override
+    def apply(self, residual: torch.Tensor) -> torch.Tensor:
+        if self._factor is None:
+            raise RuntimeError("refactor before apply")
+        right = residual.view(self._potential.batch, -1, 3)
+        out = torch.zeros_like(right)
+        out[:, self._free] = self._factor.solve(right[:, self._free])
+        return out.view_as(residual)

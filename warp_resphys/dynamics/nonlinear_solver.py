@@ -1,0 +1,241 @@
+"""Minimises an incremental potential: local steps on the points, global steps with a factorised matrix.
+
+Three solvers differ in the matrix of the global step and share everything else:
+
+=======================  ====================================================================================
+``projective_dynamics``  constant projective-dynamics matrix, accelerated by L-BFGS (Liu et al. 2017)
+``quasi_newton``         Hessian of a recent state, accelerated by L-BFGS; factorised anew when steps get slow
+``newton``               Hessian of every iterate, clamped to positive eigenvalues where it is not positive definite
+=======================  ====================================================================================
+
+An environment of the batch has converged when its residual is at most ``relative_tolerance`` times the norm of the
+forces that balance: inertia and loads. Where next to nothing moves, rounding leaves more than that: an environment
+whose residual is within rounding and has not halved in three iterations has converged too.
+"""
+
+from dataclasses import dataclass
+
+import torch
+
+from ..energies.potential import IncrementalPotential
+from ..io.errors import ConvergenceError, InputError
+from ..linalg.lbfgs import InverseHessianUpdate
+from ..linalg.linear_solver import LINEAR_SOLVERS, make_linear_solver
+from .assembly import BlockPattern
+from .metric import HessianMetric, Metric, ProjectiveMetric
+
+SOLVERS = ("projective_dynamics", "quasi_newton", "newton")
+_ARMIJO = 1e-4
+_MAX_HALVINGS = 25
+_STALLS = 3
+
+
+@dataclass(frozen=True)
+class SolverSettings:
+    """How to solve a step.
+
+    Attributes:
+        name: one of `SOLVERS`.
+        relative_tolerance: residual over balancing forces at which a solve has converged.
+        absolute_tolerance: residual below which it has converged in any case [N].
+        max_iterations: after which it has failed.
+        memory: pairs that L-BFGS keeps.
+        refactor_after: mean iterations a step above which ``quasi_newton`` factorises anew.
+        linear_solver: ``auto``, ``banded``, ``dense`` or ``sparse``.
+        on_failure: ``raise`` a `ConvergenceError`, or ``count`` the failure in the report and go on.
+    """
+
+    name: str = "quasi_newton"
+    relative_tolerance: float = 1e-8
+    absolute_tolerance: float = 1e-12
+    max_iterations: int = 2000
+    memory: int = 12
+    refactor_after: int = 4
+    linear_solver: str = "auto"
+    on_failure: str = "raise"
+
+    def __post_init__(self) -> None:
+        """Checks the settings.
+
+        Raises:
+            InputError: an unknown name, or a number out of range.
+        """
+        if self.name not in SOLVERS:
+            raise InputError(f"solver is {self.name!r}: choose one of {', '.join(SOLVERS)}.")
+        if self.on_failure not in ("raise", "count"):
+            raise InputError(f"solver.on_failure is {self.on_failure!r}: choose raise or count.")
+        if self.linear_solver not in LINEAR_SOLVERS:
+            raise InputError(
+                f"solver.linear_solver is {self.linear_solver!r}: choose one of {', '.join(LINEAR_SOLVERS)}."
+            )
+        for key in ("relative_tolerance", "max_iterations", "memory", "refactor_after"):
+            if not getattr(self, key) > 0:
+                raise InputError(f"solver.{key} is {getattr(self, key)}: it must be positive.")
+        if not self.absolute_tolerance >= 0:
+            raise InputError(f"solver.absolute_tolerance is {self.absolute_tolerance}: it must be zero or more.")
+
+
+@dataclass(frozen=True)
+class SolveReport:
+    """Outcome of a solve.
+
+    Attributes:
+        iterations: (B,) global steps of each environment.
+        relative_residual: (B,) last residual over balancing forces.
+        converged: (B,) bool.
+        factorisations: of the whole batch.
+    """
+
+    iterations: torch.Tensor
+    relative_residual: torch.Tensor
+    converged: torch.Tensor
+    factorisations: int
+
+
+class NonlinearSolver:
+    """Minimises a potential again and again; keeps factor and buffers between solves.
+
+    Args:
+        potential: evaluated at its current terms.
+        pattern: block structure of its Hessian.
+        settings: see `SolverSettings`.
+    """
+
+    def __init__(self, potential: IncrementalPotential, pattern: BlockPattern, settings: SolverSettings) -> None:
+        self.potential, self.settings = potential, settings
+        self.metric: Metric
+        kind = settings.linear_solver
+        where = (potential.device, potential.dtype)
+        if settings.name == "projective_dynamics":
+            linear = make_linear_solver(kind, pattern.rows, pattern.cols, len(pattern.free), 1, *where)
+            self.metric = ProjectiveMetric(potential, pattern, linear)
+        else:
+            linear = make_linear_solver(kind, pattern.rows, pattern.cols, len(pattern.free), 3, *where)
+            self.metric = HessianMetric(potential, pattern, linear)
+        memory = 0 if settings.name == "newton" else settings.memory
+        self._update = InverseHessianUpdate(memory, potential.positions)
+        self._mean_iterations = float("inf")
+
+    def solve(self, start: torch.Tensor) -> SolveReport:
+        """Minimises from (B, N, 3); the minimiser is left in ``potential.positions``.
+
+        Raises:
+            ConvergenceError: an environment did not converge and failures are not merely counted.
+        """
+        run = _Run(self, start)
+        while run.advance():
+            pass
+        self._mean_iterations = float(run.iterations.double().mean())
+        report = SolveReport(run.iterations, run.relative_residual, run.converged, run.factorisations)
+        if self.settings.on_failure == "raise" and not bool(run.converged.all()):
+            worst = int((~run.converged).nonzero()[0])
+            raise ConvergenceError(
+                f"the {self.settings.name} solver stopped after {int(run.iterations[worst])} iterations with a "
+                f"relative residual of {float(run.relative_residual[worst]):.2e} in environment {worst} of "
+                f"{len(run.converged)}: take a smaller time step or loads, raise solver.max_iterations, or choose "
+                "solver.name=newton.",
+                self.potential.positions.clone(),
+                report,
+            )
+        return report
+
+    def stale(self, iteration: int) -> bool:
+        """Whether the global step's matrix should be factorised before this iteration."""
+        name, limit = self.settings.name, self.settings.refactor_after
+        if name == "newton":
+            return True
+        if iteration == 0:
+            return not self.metric.ready() or (name == "quasi_newton" and self._mean_iterations > limit)
+        return name == "quasi_newton" and iteration % (3 * limit) == 0
+
+
+class _Run:
+    """One solve: the iterate, its residual, and which environments are done."""
+
+    def __init__(self, solver: NonlinearSolver, start: torch.Tensor) -> None:
+        self.solver, self.potential = solver, solver.potential
+        p = self.potential
+        p.positions.copy_(start)
+        self.batch = p.batch
+        self.force_norm = torch.linalg.vector_norm(p.force.view(self.batch, -1), dim=1)
+        self.iterations = torch.zeros(self.batch, dtype=torch.int64, device=p.device)
+        self.stuck = torch.zeros(self.batch, dtype=torch.bool, device=p.device)
+        self.rounding = p.residual_rounding()
+        self.smallest = torch.full_like(self.rounding, torch.inf)
+        self.stalls = torch.zeros_like(self.iterations)
+        self.factorisations = 0
+        self.iteration = 0
+        self.clamp = False
+        solver._update.reset()
+        self._accept(*p.evaluate())
+
+    def _accept(self, energy: torch.Tensor, balance: torch.Tensor) -> None:
+        s = self.solver.settings
+        self.energy = energy
+        self.residual = self.potential.residual.view(self.batch, -1).clone()
+        norm = torch.linalg.vector_norm(self.residual, dim=1)
+        scale = balance + self.force_norm
+        self.relative_residual = norm / scale.clamp_min(s.absolute_tolerance)
+        self.stalls = torch.where(norm < 0.5 * self.smallest, 0, self.stalls + 1)
+        self.smallest = torch.minimum(self.smallest, norm)
+        at_rounding = (norm <= self.rounding) & (self.stalls >= _STALLS)
+        small = (norm <= s.relative_tolerance * scale) | (norm <= s.absolute_tolerance) | at_rounding
+        self.converged = small & torch.isfinite(norm) & torch.isfinite(scale)
+
+    def advance(self) -> bool:
+        """One global step and line search; False when every environment is done."""
+        active = ~(self.converged | self.stuck)
+        if not bool(active.any()) or self.iteration >= self.solver.settings.max_iterations:
+            return False
+        if self.clamp or self.solver.stale(self.iteration):
+            self._refactor()
+        direction = -self.solver._update.apply(self.residual, self.solver.metric)
+        direction *= active[:, None]
+        slope = torch.linalg.vecdot(self.residual, direction)
+        if bool((slope > 0).any()):
+            self.solver._update.reset()
+            direction = -self.solver.metric.apply(self.residual) * active[:, None]
+            slope = torch.linalg.vecdot(self.residual, direction)
+        self.iterations += active
+        self.iteration += 1
+        self._line_search(direction, slope, active)
+        return True
+
+    def _refactor(self) -> None:
+        self.solver.metric.refactor(self.clamp)
+        self.solver._update.reset()
+        self.factorisations += 1
+        self.clamp = False
+
+    def _line_search(self, direction: torch.Tensor, slope: torch.Tensor, active: torch.Tensor) -> None:
+        """Backtracks to a decrease of the energy, or of the slope where the energy is down to rounding.
+
+        The second test is the approximate Wolfe condition of Hager and Zhang (2005).
+        """
+        p = self.potential
+        start = p.positions.clone()
+        step = torch.ones_like(slope)
+        before = self.residual
+        for _ in range(_MAX_HALVINGS):
+            p.positions.copy_(start).add_((step[:, None] * direction).view_as(start))
+            energy, balance = p.evaluate()
+            failed = active & ~(energy <= self.energy + _ARMIJO * step * slope)
+            if bool(failed.any()):
+                after = torch.linalg.vecdot(p.residual.view(self.batch, -1), direction)
+                flat = (energy <= self.energy + p.energy_rounding()) & (after <= (2 * _ARMIJO - 1) * slope)
+                failed &= ~flat
+            if not bool(failed.any()):
+                break
+            step = torch.where(failed, 0.5 * step, step)
+        else:
+            self._give_up(failed, start, direction, step)
+            energy, balance = p.evaluate()
+        self._accept(energy, balance)
+        self.solver._update.add(step[:, None] * direction, self.residual - before)
+
+    def _give_up(self, failed: torch.Tensor, start: torch.Tensor, direction: torch.Tensor, step: torch.Tensor) -> None:
+        """Stays where it was; a clamped Hessian gets one more try before the environment counts as stuck."""
+        step.masked_fill_(failed, 0.0)
+        self.potential.positions.copy_(start).add_((step[:, None] * direction).view_as(start))
+        self.stuck |= failed & self.solver.metric.clamped
+        self.clamp = True

@@ -1,0 +1,164 @@
+"""Roll-outs on a Warp tape: the second door to the gradients that ``torch.autograd`` gives.
+
+A recorded roll-out stands between its user's kernels on a tape, and ``tape.backward`` differentiates all of it:
+
+    with wp.Tape() as tape:
+        wp.launch(forces, dim=..., inputs=[parameters], outputs=[external_forces])
+        rollout = record_rollout(tape, simulator, q, v, steps=60, external_forces=external_forces)
+        wp.launch(loss, dim=..., inputs=[rollout.q], outputs=[value])
+    tape.backward(value)
+
+Nothing is copied on the way in or out: torch sees the memory of the arrays that are passed, and the arrays
+that come back see torch's. What a step keeps for its adjoint is what it keeps for torch, its states alone.
+"""
+
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import torch
+import warp as wp
+
+from ..energies.launcher import SCALARS
+from ..io.errors import InputError
+from .integrator import State
+from .nonlinear_solver import SolveReport
+from .simulator import Simulator
+
+PARAMETERS = ("youngs_modulus", "poissons_ratio", "density", "mass_damping", "stiffness_damping", "fibre_stiffness")
+_VECTORS = {torch.float64: wp.vec3d, torch.float32: wp.vec3f}
+
+
+@dataclass(frozen=True)
+class RecordedRollout:
+    """Result of a recorded roll-out.
+
+    Attributes:
+        q: (T + 1, B, N) vec3 positions, the start included [m].
+        v: (T + 1, B, N) vec3 velocities [m/s].
+        reports: T outcomes of the solver.
+    """
+
+    q: wp.array
+    v: wp.array
+    reports: list[SolveReport]
+
+
+def record_rollout(
+    tape: wp.Tape,
+    simulator: Simulator,
+    q: wp.array,
+    v: wp.array,
+    steps: int,
+    *,
+    previous: tuple[wp.array, wp.array] | None = None,
+    external_forces: wp.array | None = None,
+    fixed_positions: wp.array | None = None,
+    parameters: Mapping[str, wp.array] | None = None,
+    pressures: wp.array | None = None,
+) -> RecordedRollout:
+    """Steps many times, and records on a tape how to differentiate that.
+
+    Gradients are added to the ``grad`` of every array given that requires gradients. As for Warp's own
+    kernels, the arrays must keep their values until ``tape.backward``, which reads the gradients of the
+    results and sets them to zero unless they are to be retained. It may be called again.
+
+    Args:
+        tape: entered by the caller or not.
+        simulator: of the body; its device and type are those of every array.
+        q: (B, N) vec3 positions [m].
+        v: (B, N) vec3 velocities [m/s].
+        steps: T.
+        previous: (q, v) one step earlier, where an earlier roll-out by BDF2 goes on: its ``(q[-2], v[-2])``.
+        external_forces: (T, B, N) vec3 for each step, or (B, N) vec3 throughout [N].
+        fixed_positions: (T, B, D) vec3 of the fixed vertices at the end of each step [m].
+        parameters: values in place of the material's, by a name of `PARAMETERS`, shaped as `Material` says.
+        pressures: (T, B, C) gauge pressure in each chamber during each step, or (B, C) throughout [Pa].
+
+    Raises:
+        InputError: an unknown parameter, an array of another type or device than the simulator's, wrong
+            shapes, or values that are not finite.
+        ConvergenceError: see `Simulator.step`.
+    """
+    leaves = _Leaves(simulator)
+    back = None
+    if previous is not None:
+        back = leaves.vectors("previous q", previous[0]), leaves.vectors("previous v", previous[1])
+    state = State(leaves.vectors("q", q), leaves.vectors("v", v), back)
+    forces = None if external_forces is None else leaves.vectors("external_forces", external_forces)
+    fixed = None if fixed_positions is None else leaves.vectors("fixed_positions", fixed_positions)
+    pressed = None if pressures is None else leaves.scalars("pressures", pressures)
+    values: dict[str, Any] = {}
+    for name, array in (parameters or {}).items():
+        if name not in PARAMETERS:
+            raise InputError(f"{name!r} is no parameter of a material: choose from {', '.join(PARAMETERS)}.")
+        values[name] = leaves.scalars(name, array)
+    with leaves.stream(), torch.enable_grad():
+        trajectory = simulator.rollout(state, steps, forces, fixed, replace(simulator.material, **values), pressed)
+    results = [trajectory.q, trajectory.v]
+    arrays = [leaves.result(tensor) for tensor in results]
+    if leaves.pairs:
+        tape.record_func(leaves.backward(results, arrays), [array for array, _ in leaves.pairs] + arrays)
+    return RecordedRollout(arrays[0], arrays[1], trajectory.reports)
+
+
+class _Leaves:
+    """The inputs of a roll-out as leaves of a torch graph, on the memory of the arrays.
+
+    Attributes:
+        pairs: each array that requires gradients, with its leaf.
+    """
+
+    def __init__(self, simulator: Simulator) -> None:
+        self.dtype, self.device = simulator.dtype, simulator.rest_positions.device
+        self._warp_device = wp.device_from_torch(self.device)
+        self.pairs: list[tuple[wp.array, torch.Tensor]] = []
+
+    def vectors(self, name: str, array: wp.array) -> torch.Tensor:
+        """(..., 3) leaf of an array of vec3."""
+        return self._leaf(name, array, _VECTORS[self.dtype])
+
+    def scalars(self, name: str, array: wp.array) -> torch.Tensor:
+        """Leaf of an array of numbers."""
+        return self._leaf(name, array, SCALARS[self.dtype])
+
+    def _leaf(self, name: str, array: wp.array, dtype: type) -> torch.Tensor:
+        if not isinstance(array, wp.array) or array.dtype != dtype or array.device != self._warp_device:
+            raise InputError(
+                f"{name} must be a Warp array of {dtype.__name__} on {self._warp_device}, like the simulator."
+            )
+        leaf = wp.to_torch(array, requires_grad=False)
+        if array.requires_grad:
+            leaf.requires_grad_(True)
+            self.pairs.append((array, leaf))
+        return leaf
+
+    def result(self, tensor: torch.Tensor) -> wp.array:
+        """The array of vec3 on the memory of a tensor of the graph."""
+        dtype = _VECTORS[self.dtype]
+        array = wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=bool(self.pairs))
+        return cast(wp.array, array)
+
+    def stream(self) -> AbstractContextManager[object]:
+        """Makes torch work on Warp's stream, so that neither overtakes the other."""
+        if self.device.type == "cpu":
+            return nullcontext()
+        return torch.cuda.stream(wp.stream_to_torch(self._warp_device))
+
+    def backward(self, results: list[torch.Tensor], arrays: list[wp.array]) -> Callable[[], None]:
+        """The function that takes the gradients of the results to the leaves."""
+
+        def differentiate() -> None:
+            with self.stream():
+                adjoints = [wp.to_torch(array.grad) for array in arrays]
+                leaves = [leaf for _, leaf in self.pairs]
+                gradients = torch.autograd.grad(results, leaves, adjoints, retain_graph=True, allow_unused=True)
+                for (array, _), gradient in zip(self.pairs, gradients, strict=True):
+                    if gradient is not None:
+                        wp.to_torch(array.grad).add_(gradient)
+                for array, adjoint in zip(arrays, adjoints, strict=True):
+                    if not array.retain_grad:
+                        adjoint.zero_()
+
+        return differentiate

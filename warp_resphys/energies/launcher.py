@@ -1,0 +1,66 @@
+"""Warp launches on torch's memory, recorded once and made as often as needed."""
+
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+from numpy.typing import NDArray
+
+from ..kernels.matrices import matrix_functions
+
+SCALARS: dict[torch.dtype, Any] = {torch.float64: wp.float64, torch.float32: wp.float32}
+
+
+def warp_view(tensor: torch.Tensor, dtype: Any) -> Any:
+    """A Warp array on a tensor's own memory, without a gradient."""
+    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
+
+
+class Launcher:
+    """Buffers and launches for a batch, on one device and in one type.
+
+    Args:
+        batch: environments B.
+        device: of every buffer.
+        dtype: ``torch.float64`` or ``torch.float32``.
+
+    Attributes:
+        scalar: Warp's number type; ``vec3`` and ``mat33`` are its vectors and matrices.
+    """
+
+    def __init__(self, batch: int, device: torch.device, dtype: torch.dtype) -> None:
+        self.batch, self.device, self.dtype = batch, device, dtype
+        self.scalar = SCALARS[dtype]
+        functions = matrix_functions(self.scalar)
+        self.vec3, self.mat33 = functions.vec3, functions.mat33
+        self._stream: tuple[torch.cuda.Stream, Any] | None = None
+
+    def zeros(self, *shape: int) -> torch.Tensor:
+        """(B, *shape) on the launcher's device, in its type."""
+        return torch.zeros(self.batch, *shape, device=self.device, dtype=self.dtype)
+
+    def upload(self, values: NDArray[Any], dtype: Any) -> Any:
+        """A Warp array with a copy of the values."""
+        return wp.array(np.ascontiguousarray(values), dtype=dtype, device=str(self.device))
+
+    def points_view(self, tensor: torch.Tensor, part: slice, dtype: Any) -> Any:
+        """Warp array on the points of one set."""
+        return warp_view(tensor[:, part], dtype)
+
+    def record(self, kernel: Any, dim: tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> Any:
+        """A launch to be made by `launch`, as often as needed."""
+        return wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=str(self.device), record_cmd=True)
+
+    def launch(self, *commands: Any) -> None:
+        """Makes recorded launches, on torch's stream."""
+        if self.device.type == "cpu":
+            for command in commands:
+                command.launch()
+            return
+        handle = torch.cuda.current_stream(self.device)
+        if self._stream is None or self._stream[0] != handle:
+            self._stream = (handle, wp.stream_from_torch(handle))
+        stream = self._stream[1]
+        for command in commands:
+            command.launch(stream)

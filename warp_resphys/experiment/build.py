@@ -1,0 +1,155 @@
+"""Builds meshes, bodies, materials and simulators from configurations."""
+
+from collections.abc import Mapping
+from importlib import resources
+from typing import Any
+
+import torch
+
+from ..dynamics.nonlinear_solver import SolverSettings
+from ..dynamics.simulator import Simulator
+from ..energies.material import Material
+from ..fem.body import Body, PointMass
+from ..fem.surface_elements import Fibres
+from ..io.errors import InputError
+from ..mesh.arm import mesh_arm
+from ..mesh.arm_geometry import arm_geometry
+from ..mesh.chambers import Chamber, find_chambers
+from ..mesh.mesh import Mesh, box_hexahedra, box_tetrahedra, check_mesh, quadratic, select_vertices
+from ..mesh.readers import read_mesh
+
+_MESH_KINDS = ("box_hexahedra", "box_tetrahedra", "file", "arm", "arm_generated")
+_DTYPES = {"float64": torch.float64, "float32": torch.float32}
+
+
+def choose_device(name: str) -> torch.device:
+    """The named device; ``auto`` is CUDA where torch finds one.
+
+    Raises:
+        InputError: an unknown device, or CUDA without a CUDA device.
+    """
+    available = torch.cuda.is_available()
+    if name == "auto":
+        return torch.device("cuda" if available else "cpu")
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        device = None
+    if device is None or device.type not in ("cpu", "cuda"):
+        raise InputError(f"device is {name!r}: choose auto, cpu or cuda.")
+    if device.type == "cuda" and not available:
+        raise InputError(f"device is {name!r}, but torch finds no CUDA device: choose device=cpu.")
+    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+        raise InputError(f"device is {name!r}, but torch finds {torch.cuda.device_count()} CUDA devices.")
+    return device
+
+
+def build_mesh(config: Mapping[str, Any]) -> Mesh:
+    """A mesh from the group ``mesh``.
+
+    Raises:
+        InputError: an unknown kind.
+        MeshError: a mesh that cannot be read or simulated.
+    """
+    kind = config["kind"]
+    if kind == "box_hexahedra":
+        mesh = box_hexahedra(config["size"], config["divisions"])
+    elif kind == "box_tetrahedra":
+        mesh = box_tetrahedra(config["size"], config["divisions"], config.get("order", 1))
+    elif kind == "file":
+        mesh = read_mesh(config["path"], config["units"], config["order"], config["drop_unreferenced"])
+    elif kind == "arm":
+        mesh = shipped_arm(config["name"])
+    elif kind == "arm_generated":
+        mesh, _ = mesh_arm(arm_geometry(config), config["size"], config["cells"], config["layers"])
+        mesh = quadratic(mesh) if config["order"] == 2 else mesh
+    else:
+        raise InputError(f"mesh.kind is {kind!r}: choose {', '.join(_MESH_KINDS[:-1])} or {_MESH_KINDS[-1]}.")
+    check_mesh(mesh)
+    return mesh
+
+
+def shipped_arm(name: str) -> Mesh:
+    """One of the meshes that come with the package.
+
+    Raises:
+        InputError: there is none of that name.
+    """
+    folder = resources.files("warp_resphys") / "meshes"
+    known = sorted(each.name.removesuffix(".msh") for each in folder.iterdir() if each.name.endswith(".msh"))
+    if name not in known:
+        raise InputError(f"mesh.name is {name!r}: the arms that come with the package are {', '.join(known)}.")
+    with resources.as_file(folder / f"{name}.msh") as path:
+        return read_mesh(path)
+
+
+def build_chambers(config: Mapping[str, Any] | None, mesh: Mesh) -> tuple[Chamber, ...]:
+    """The closed chambers of a mesh, from the group ``chambers``; none without the group.
+
+    Raises:
+        InputError: the mesh has another number of them.
+    """
+    if config is None:
+        return ()
+    found = find_chambers(mesh, config["axis"])
+    if len(found) != config["count"]:
+        raise InputError(
+            f"the mesh has {len(found)} closed chambers, but chambers.count is {config['count']}: a chamber that is "
+            "open to the outside is none, so close it in the mesh, or set chambers.count."
+        )
+    return found
+
+
+def build_body(config: Mapping[str, Any], point_masses: tuple[PointMass, ...] = ()) -> Body:
+    """A body from the groups ``mesh``, ``physics``, ``fixed``, and, where it has any, ``chambers`` and ``fibres``."""
+    mesh = build_mesh(config["mesh"])
+    fibres, chambers = config.get("fibres"), config.get("chambers")
+    return Body(
+        mesh,
+        chambers=build_chambers(chambers, mesh),
+        fibres=None if fibres is None else Fibres(**fibres, axis=None if chambers is None else chambers["axis"]),
+        fixed=select_vertices(mesh, **config["fixed"]),
+        mass=config["physics"]["mass"],
+        volume_integration=config["physics"]["volume_integration"],
+        point_masses=point_masses,
+    )
+
+
+def build_simulator(
+    config: Mapping[str, Any],
+    material: str = "simulation",
+    body: Body | None = None,
+    on_failure: str | None = None,
+) -> Simulator:
+    """A simulator from a whole configuration.
+
+    Args:
+        config: with the keys of ``conf/config.yaml``.
+        material: the key of its material: ``simulation`` or ``reality``.
+        body: the body, where it was built already.
+        on_failure: in place of the configured one.
+
+    Raises:
+        InputError: a value that cannot be simulated.
+    """
+    if config["dtype"] not in _DTYPES:
+        raise InputError(f"dtype is {config['dtype']!r}: choose float64 or float32.")
+    try:
+        constants = Material(**config[material])
+    except InputError as error:
+        raise InputError(f"{material}: {error}") from error
+    settings = dict(config["solver"])
+    if on_failure is not None:
+        settings["on_failure"] = on_failure
+    device = "cpu" if config["device"] == "auto" else config["device"]
+    return Simulator(
+        build_body(config) if body is None else body,
+        constants,
+        time_step=config["time_step"],
+        gravity=config["gravity"],
+        integrator=config["integrator"],
+        solver=SolverSettings(**settings),
+        device=choose_device(device),
+        dtype=_DTYPES[config["dtype"]],
+        pressure_coupling=config.get("pressure_coupling", "implicit"),
+    )

@@ -1,0 +1,159 @@
+"""A body: the constant part of a simulation, in NumPy on the host."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import ArrayLike, NDArray
+
+from ..io.errors import InputError
+from ..mesh.chambers import Chamber, check_chambers
+from ..mesh.mesh import Mesh
+from .elements import Discretisation, Points, discretise
+from .surface_elements import Fibres, SurfacePoints, fibre_points, pressure_points
+
+MASS_MODES = ("row_sum", "per_vertex")
+
+
+def _vertex_indices(values: ArrayLike, n_vertices: int, what: str) -> NDArray[np.int64]:
+    """(n,) indices of vertices that the mesh has.
+
+    Raises:
+        InputError: values that are no whole numbers, such as a mask, or that no vertex has.
+    """
+    indices = np.asarray(values).ravel()
+    if indices.size and indices.dtype.kind not in "iu":
+        raise InputError(f"{what} must be vertex numbers: turn a mask into them with np.flatnonzero.")
+    if indices.size and (indices.min() < 0 or indices.max() >= n_vertices):
+        raise InputError(f"{what} must lie between 0 and {n_vertices - 1}.")
+    return indices.astype(np.int64)
+
+
+@dataclass(frozen=True)
+class PointMass:
+    """A weight that moves with the body: it has inertia, and hangs in gravity.
+
+    Attributes:
+        mass: [kg].
+        vertices: (n,) the vertices that carry it.
+        weights: (n,) the share of each, summing to one; equal shares where left out.
+    """
+
+    mass: float
+    vertices: Sequence[int]
+    weights: Sequence[float] | None = None
+
+    def per_vertex(self, n_vertices: int) -> NDArray[np.float64]:
+        """(N,) mass at each vertex [kg].
+
+        Raises:
+            InputError: a negative mass, a vertex that the mesh does not have, or weights that do not sum to one.
+        """
+        vertices = _vertex_indices(self.vertices, n_vertices, "a point mass's vertices")
+        n = len(vertices)
+        weights = np.full(n, 1.0 / max(n, 1)) if self.weights is None else np.asarray(self.weights, dtype=float)
+        if not np.isfinite(self.mass) or self.mass < 0.0:
+            raise InputError(f"a point mass of {self.mass:g} kg: its mass must be zero or more.")
+        if n == 0:
+            raise InputError("a point mass must hang on at least one vertex.")
+        if weights.shape != (n,) or not (weights >= 0.0).all() or not abs(weights.sum() - 1.0) <= 1e-9:
+            raise InputError(f"a point mass on {n} vertices needs {n} weights, zero or more, that sum to one.")
+        mass = np.zeros(n_vertices)
+        np.add.at(mass, vertices, weights * self.mass)
+        return mass
+
+
+@dataclass(frozen=True)
+class Body:
+    """A mesh with its boundary conditions, masses and integration rule.
+
+    Attributes:
+        mesh: the rest shape.
+        fixed: vertices with prescribed positions (Dirichlet); they rest where they are unless moved. Their positions
+            are given in the order of ``fixed_vertices``.
+        mass: ``row_sum`` lumps each element's own mass on its vertices (HRZ for 10-node tetrahedra). ``per_vertex``
+            gives every vertex the density times the mean element volume, which is wrong by a factor of two on the
+            published beam and serves for comparison with the published code alone.
+        volume_integration: ``centre`` or ``full`` (see `elements.discretise`).
+        point_masses: attached weights.
+        chambers: closed surfaces under pressure (`chambers.find_chambers`).
+        fibres: thread around the chambers, or None; how stiff it is says the material.
+    """
+
+    mesh: Mesh
+    fixed: ArrayLike = ()
+    mass: str = "row_sum"
+    volume_integration: str = "centre"
+    point_masses: Sequence[PointMass] = field(default=())
+    chambers: Sequence[Chamber] = field(default=())
+    fibres: Fibres | None = None
+
+    def __post_init__(self) -> None:
+        """Checks the fixed vertices, the mass mode and the chambers.
+
+        Raises:
+            InputError: an unknown mass mode, fixed vertices that the mesh does not have, or fibres without chambers.
+            MeshError: an open chamber.
+        """
+        if self.mass not in MASS_MODES:
+            raise InputError(f"mass is {self.mass!r}: choose one of {', '.join(MASS_MODES)}.")
+        fixed = np.unique(_vertex_indices(self.fixed, self.n_vertices, "fixed vertices"))
+        if len(fixed) == self.n_vertices:
+            raise InputError("every vertex is fixed: leave some free to move.")
+        object.__setattr__(self, "fixed", fixed)
+        if self.fibres is not None and not self.chambers:
+            raise InputError("fibres are wound around chambers, but the body has none: leave the fibres out.")
+        check_chambers(self.chambers, self.mesh)
+
+    @property
+    def n_vertices(self) -> int:
+        """N."""
+        return len(self.mesh.vertices)
+
+    @property
+    def fixed_vertices(self) -> NDArray[np.int64]:
+        """(D,) vertices with prescribed positions, in ascending order."""
+        return np.asarray(self.fixed)
+
+    @cached_property
+    def discretisation(self) -> Discretisation:
+        """Integration points and volumes."""
+        return discretise(self.mesh, self.volume_integration)
+
+    @cached_property
+    def pressure_points(self) -> SurfacePoints | None:
+        """Points of the chambers' surfaces, on which pressure acts; None without chambers."""
+        return pressure_points(self.chambers) if self.chambers else None
+
+    @cached_property
+    def fibre_points(self) -> SurfacePoints | None:
+        """Points of the fibres; None without fibres."""
+        return None if self.fibres is None else fibre_points(self.mesh, self.chambers, self.fibres)
+
+    @property
+    def point_sets(self) -> tuple[Points, ...]:
+        """Every set of points that carries energy: the solid's, then pressure's and the fibres'."""
+        surface = (self.pressure_points, self.fibre_points)
+        return (*self.discretisation.point_sets, *(points for points in surface if points is not None))
+
+    @cached_property
+    def mass_volume(self) -> scipy.sparse.csr_array:
+        """(N, M) volume of each element that each vertex carries as mass [m^3]."""
+        return self._per_vertex_volume if self.mass == "per_vertex" else self.discretisation.lumped_volume
+
+    @cached_property
+    def load_volume(self) -> scipy.sparse.csr_array:
+        """(N, M) volume of each element whose weight acts on each vertex [m^3]."""
+        return self._per_vertex_volume if self.mass == "per_vertex" else self.discretisation.load_volume
+
+    @cached_property
+    def _per_vertex_volume(self) -> scipy.sparse.csr_array:
+        volumes = self.discretisation.element_volumes
+        return scipy.sparse.csr_array(np.tile(volumes / len(volumes), (self.n_vertices, 1)))
+
+    @cached_property
+    def attached_mass(self) -> NDArray[np.float64]:
+        """(N,) mass of the attached weights [kg]."""
+        return sum((m.per_vertex(self.n_vertices) for m in self.point_masses), np.zeros(self.n_vertices))

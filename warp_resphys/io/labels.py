@@ -1,0 +1,36 @@
+"""Names of run folders."""
+
+import hashlib
+import re
+from collections.abc import Sequence
+
+_LABEL_LENGTH = 100
+
+
+def run_label(overrides: Sequence[str], excluded: Sequence[str] = ()) -> str:
+    """Names a run folder after the overrides that tell it from the default run; an OmegaConf resolver.
+
+    The same overrides give the same name in any order, so that a repeated command finds its own files.
+
+    Args:
+        overrides: Hydra's task overrides, such as "material.density=900".
+        excluded: Keys that do not change the results, or that the folder is named after elsewhere, with all that
+            is below them.
+
+    Returns:
+        "key=value,key=value" sorted by key, "default" where nothing is left. Long names, and names with
+        characters that a folder should not have, are made fit and end in a hash of the whole.
+    """
+    settings = {}
+    for override in overrides:
+        key, _, value = override.partition("=")
+        bare = key.lstrip("+~")
+        if not any(bare == name or bare.startswith(f"{name}.") for name in excluded):
+            settings[key] = f"{key}={value}" if value else key
+    whole = ",".join(settings[key] for key in sorted(settings))
+    if not whole:
+        return "default"
+    label = re.sub(r"[^A-Za-z0-9._=,+~-]", "-", whole)
+    if label == whole and len(label) <= _LABEL_LENGTH:
+        return label
+    return f"{label[:_LABEL_LENGTH]}-{hashlib.sha256(whole.encode()).hexdigest()[:8]}"

@@ -1,0 +1,47 @@
+"""What a result was computed on and with, for those who compare its times."""
+
+import os
+import platform
+import shutil
+import subprocess
+from pathlib import Path
+
+import torch
+
+from .processes import available_cores
+
+_CPU_INFO = Path("/proc/cpuinfo")
+
+
+def hardware() -> dict[str, str]:
+    """Processor, cores that this process may use, GPU and operating system, in words."""
+    gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
+    return {
+        "processor": _processor(),
+        "cores used": f"{available_cores()} of {os.cpu_count()}",
+        "GPU": gpu,
+        "system": f"{platform.system()} {platform.machine()}",
+    }
+
+
+def _processor() -> str:
+    if _CPU_INFO.is_file():
+        for line in _CPU_INFO.read_text(encoding="utf-8").splitlines():
+            key, _, value = line.partition(":")
+            if key.strip() == "model name":
+                return value.strip()
+    return platform.processor() or platform.machine()
+
+
+def commit() -> str | None:
+    """The commit of the code that runs, with "and changes" where files differ; None outside a git repository."""
+    folder = Path(__file__).parent
+    if shutil.which("git") is None or _git(folder, "ls-files", "--error-unmatch", Path(__file__).name) is None:
+        return None
+    name = _git(folder, "rev-parse", "--short=10", "HEAD")
+    return f"{name} and changes" if _git(folder, "status", "--porcelain", "--untracked-files=no") else name
+
+
+def _git(folder: Path, *arguments: str) -> str | None:
+    result = subprocess.run(["git", *arguments], cwd=folder, capture_output=True, text=True, check=False)
+    return result.stdout.strip() if result.returncode == 0 else None

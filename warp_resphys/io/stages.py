@@ -1,0 +1,287 @@
+"""Runs the stages of an experiment, each of them only when something that it depends on has changed.
+
+Stages talk through files in the run folder. Beside its outputs, a stage leaves a record of what they were
+made from (`stages/<name>.json`); the fingerprint in it covers the stage's settings and those of all stages
+before it.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import logging
+import os
+import platform
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from .errors import DataFileError, InputError
+from .files import digest, read_json, to_plain, write_json
+from .memory import WorkersMemory, peak_memory_gib
+
+log = logging.getLogger(__name__)
+
+_RECORDED_PACKAGES = (
+    "warp-resphys",
+    "warp-lang",
+    "torch",
+    "numpy",
+    "scipy",
+    "cholespy",
+    "h5py",
+    "hydra-core",
+)
+
+
+@dataclass(frozen=True)
+class StageContext:
+    """What a stage is told when it runs.
+
+    Attributes:
+        name: The stage's name.
+        run_dir: The run folder; outputs are written there.
+        fingerprint: Identifies everything the outputs depend on; resumable files are marked with it.
+        settings: The settings that the stage declared.
+        memory: Of its worker processes, which it is to count.
+    """
+
+    name: str
+    run_dir: Path
+    fingerprint: str
+    settings: Mapping[str, Any]
+    memory: WorkersMemory = field(default_factory=WorkersMemory)
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A step of an experiment, from files to files.
+
+    Attributes:
+        name: Its name, also that of its record.
+        function: Does the work; it writes each output whole or not at all.
+        outputs: Names of the files that it writes, relative to the run folder.
+        settings: Plain nested settings that the outputs depend on, and no others.
+        upstream: Names of the stages whose outputs it reads.
+        format_version: To be raised when the stage's code changes what it writes.
+    """
+
+    name: str
+    function: Callable[[StageContext], None]
+    outputs: tuple[str, ...]
+    settings: Mapping[str, Any]
+    upstream: tuple[str, ...] = ()
+    format_version: int = 1
+
+
+class StageInterrupted(KeyboardInterrupt):
+    """Ctrl-C during a stage; the message says what is kept."""
+
+
+def fingerprint(stage: Stage, upstream_fingerprints: Mapping[str, str]) -> str:
+    """SHA-256 of all that a stage's outputs depend on, in hexadecimal."""
+    content = {
+        "name": stage.name,
+        "format_version": stage.format_version,
+        "settings": to_plain(stage.settings),
+        "upstream": [upstream_fingerprints[name] for name in stage.upstream],
+    }
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def run_stages(stages: Sequence[Stage], run_dir: str | Path, wait: bool = False) -> dict[str, float]:
+    """Runs those of the stages whose outputs are missing, damaged or made from other settings.
+
+    Args:
+        stages: In the order in which they run; a stage comes after those it reads from.
+        run_dir: The run folder, made where it is missing; one process at a time may use it.
+        wait: Whether to wait for another process that uses it, in place of raising.
+
+    Returns:
+        The seconds that each stage took, summed over interrupted runs.
+
+    Raises:
+        InputError: another process uses the run folder.
+        DataFileError: a file cannot be read or written.
+        StageInterrupted: the user pressed Ctrl-C; what is done so far is kept.
+    """
+    run_dir = Path(run_dir)
+    known: dict[str, str] = {}
+    seconds: dict[str, float] = {}
+    with run_lock(run_dir, wait):
+        for stage in stages:
+            if stage.name in known or not known.keys() >= set(stage.upstream):
+                raise ValueError(f"stage '{stage.name}' is there twice or stands before a stage it reads from")
+            known[stage.name] = fingerprint(stage, known)
+            context = StageContext(stage.name, run_dir, known[stage.name], stage.settings)
+            record = _valid_record(stage, context)
+            if record is not None:
+                log.info("%s: up to date", stage.name)
+                seconds[stage.name] = record["seconds"]
+            else:
+                seconds[stage.name] = _run_stage(stage, context, finished=list(seconds))
+    return seconds
+
+
+def _run_stage(stage: Stage, context: StageContext, finished: list[str]) -> float:
+    """Runs one stage, writes its record and returns its seconds, those of interrupted runs included."""
+    progress = context.run_dir / "stages" / f"{stage.name}.progress.json"
+    before = _seconds_so_far(progress, context.fingerprint)
+    log.info("%s: %s", stage.name, f"going on after {before:.0f} s" if before else "started")
+    start = time.perf_counter()
+    try:
+        stage.function(context)
+        total = before + time.perf_counter() - start
+        _write_record(stage, context, total)
+    except KeyboardInterrupt as error:
+        _keep_seconds(progress, context, before + time.perf_counter() - start)
+        whole = f"finished and kept: {', '.join(finished)}; " if finished else ""
+        raise StageInterrupted(
+            f"interrupted in stage '{stage.name}' ({whole}what '{stage.name}' has saved is kept); "
+            f"the same command goes on from there"
+        ) from error
+    except Exception:
+        _keep_seconds(progress, context, before + time.perf_counter() - start)
+        raise
+    progress.unlink(missing_ok=True)
+    log.info("%s: done in %.1f s", stage.name, total)
+    return total
+
+
+def _write_record(stage: Stage, context: StageContext, seconds: float) -> None:
+    write_json(
+        context.run_dir / "stages" / f"{stage.name}.json",
+        {
+            "fingerprint": context.fingerprint,
+            "seconds": seconds,
+            "peak_memory_gib": peak_memory_gib() + context.memory.gib,
+            "finished": datetime.now(UTC).isoformat(timespec="seconds"),
+            "outputs": {name: _identity(context.run_dir / name) for name in stage.outputs},
+            "settings": to_plain(stage.settings),
+            "versions": package_versions(),
+        },
+    )
+
+
+def _seconds_so_far(progress: Path, expected: str) -> float:
+    if not progress.is_file():
+        return 0.0
+    try:
+        record = read_json(progress)
+        return float(record["seconds"]) if record["fingerprint"] == expected else 0.0
+    except (DataFileError, KeyError, TypeError, ValueError) as error:
+        log.warning("the time spent so far is not known (%s): %s", progress, error)
+        return 0.0
+
+
+def _keep_seconds(progress: Path, context: StageContext, seconds: float) -> None:
+    """Stores the time spent in an unfinished stage; a failure to do so must not hide why it is unfinished."""
+    try:
+        write_json(progress, {"fingerprint": context.fingerprint, "seconds": seconds})
+    except DataFileError as error:
+        log.warning("the time spent in '%s' is not kept: %s", context.name, error)
+
+
+def resources_used(run_dir: str | Path, names: Sequence[str]) -> dict[str, Any]:
+    """What `metrics.json` says of the stages that are done: seconds of each, and the largest of their peaks of memory.
+
+    A stage that was run before its memory was recorded does not count for the peak, which is None if there is no other.
+    """
+    paths = {name: Path(run_dir) / "stages" / f"{name}.json" for name in names}
+    records = {name: read_json(path) for name, path in paths.items() if path.is_file()}
+    peaks = [record["peak_memory_gib"] for record in records.values() if "peak_memory_gib" in record]
+    return {
+        "seconds": {name: record["seconds"] for name, record in records.items()},
+        "peak_memory_gib": max(peaks, default=None),
+    }
+
+
+def _identity(path: Path) -> dict[str, Any]:
+    """What tells an output from another file of the same name."""
+    status = path.stat()
+    return {"bytes": status.st_size, "modified_ns": status.st_mtime_ns, "sha256": digest(path)}
+
+
+def _valid_record(stage: Stage, context: StageContext) -> dict[str, Any] | None:
+    """The record of an earlier run whose outputs are still the ones asked for, or None."""
+    path = context.run_dir / "stages" / f"{stage.name}.json"
+    if not path.is_file():
+        return None
+    try:
+        record = read_json(path)
+        if record["fingerprint"] != context.fingerprint:
+            log.info("%s: settings changed", stage.name)
+            return None
+        changed = [name for name in stage.outputs if not _is_same(context.run_dir / name, record["outputs"][name])]
+        float(record["seconds"])
+    except (DataFileError, KeyError, TypeError, ValueError) as error:
+        log.warning("%s: its record cannot be used (%s: %s)", stage.name, type(error).__name__, error)
+        return None
+    if changed:
+        log.warning("%s: missing or changed since they were written: %s", stage.name, ", ".join(changed))
+        return None
+    return dict(record)
+
+
+def _is_same(path: Path, identity: Mapping[str, Any]) -> bool:
+    """Compares a file with its identity; its content is read only if the times differ, as after copying."""
+    if not path.is_file() or path.stat().st_size != identity["bytes"]:
+        return False
+    return bool(path.stat().st_mtime_ns == identity["modified_ns"] or digest(path) == identity["sha256"])
+
+
+@contextmanager
+def run_lock(run_dir: str | Path, wait: bool = False) -> Iterator[None]:
+    """Holds a run folder for this process; the operating system lets go of it however the process ends.
+
+    Args:
+        run_dir: The run folder, made where it is missing.
+        wait: Whether to wait for another process that holds it, in place of raising.
+
+    Raises:
+        InputError: another process holds it.
+        DataFileError: the folder cannot be made, or its file system has no locks.
+    """
+    path = Path(run_dir) / ".lock"
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+    except OSError as error:
+        raise DataFileError(
+            f"cannot write the run folder {run_dir} ({error.strerror}): make it writable or choose another"
+        ) from error
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            if not wait:
+                raise InputError(
+                    f"another process is writing the run folder {run_dir}: wait for it or choose another one"
+                ) from error
+            log.info("waiting for another process that is writing the run folder %s", run_dir)
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        except OSError as error:
+            raise DataFileError(
+                f"cannot lock the run folder {run_dir} ({error.strerror}): choose one on another disk"
+            ) from error
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def package_versions() -> dict[str, str]:
+    """Versions of Python and of the packages that results depend on; absent packages are left out."""
+    versions = {"python": platform.python_version()}
+    for name in _RECORDED_PACKAGES:
+        try:
+            versions[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return versions

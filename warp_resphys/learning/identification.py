@@ -1,0 +1,361 @@
+"""System identification: the physical parameters with which a simulator comes closest to observed motions.
+
+The loss is the mean square distance of simulated and observed markers, each motion in units of its own amplitude, over
+all motions at once. `descent` minimises it within bounds, from the best of a coarse set of starts, with gradients
+through the simulator.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+import scipy.stats
+import torch
+from numpy.typing import NDArray
+
+from ..io.errors import ConvergenceError, InputError
+from ..linalg.least_squares import minimise
+from .replay import Release, Replay
+
+Report = Callable[[int, float, Mapping[str, float]], None]
+Attempt = dict[str, Any]
+
+_MOST_ITERATIONS = 200  # of a solve; steps take a handful, and parameters that need more have failed
+_DIFFERENCE = 1e-3  # of a range, for derivatives by differences
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """The range of a parameter.
+
+    Attributes:
+        lower: in the parameter's unit.
+        upper: the same.
+        logarithmic: whether it is searched on a logarithmic scale.
+    """
+
+    lower: float
+    upper: float
+    logarithmic: bool = False
+
+    def __post_init__(self) -> None:
+        """Checks the range.
+
+        Raises:
+            InputError: an empty or infinite range, or a logarithmic one that is not positive.
+        """
+        if not (math.isfinite(self.lower) and math.isfinite(self.upper) and self.lower < self.upper):
+            raise InputError(f"the bounds {self.lower:g} and {self.upper:g} leave no range: the first must be smaller.")
+        if self.logarithmic and not self.lower > 0.0:
+            raise InputError(f"a logarithmic range from {self.lower:g}: its lower bound must be positive.")
+
+    def to_unit(self, value: float) -> float:
+        """A value as a fraction of the range, 0 to 1."""
+        low, high, x = (math.log(v) if self.logarithmic else v for v in (self.lower, self.upper, value))
+        return (x - low) / (high - low)
+
+    def from_unit(self, unit: torch.Tensor) -> torch.Tensor:
+        """Values of fractions, differentiable."""
+        if self.logarithmic:
+            return self.lower * torch.exp(unit * math.log(self.upper / self.lower))
+        return self.lower + unit * (self.upper - self.lower)
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """What the data say about the parameters near the minimum (Gauss-Newton approximation).
+
+    Attributes:
+        deviation: standard deviation of each parameter, in its unit.
+        correlation: (P, P) of the parameters, in their order.
+        poorest: the direction that the data tell least about: weights of the parameters, in fractions of their ranges.
+        poorest_deviation: standard deviation along it, as a fraction of the ranges.
+    """
+
+    deviation: dict[str, float]
+    correlation: list[list[float]]
+    poorest: dict[str, float]
+    poorest_deviation: float
+
+
+@dataclass
+class Identification:
+    """Result of an identification.
+
+    Attributes:
+        parameters: the values of the smallest loss.
+        loss: that loss, relative to the motions' amplitudes.
+        history: for every start the records ``loss`` and the parameters, one an evaluation that did not fail.
+        at_bounds: parameters that ended on a bound.
+        uncertainty: see the class; None if the simulation fails beside the minimum.
+    """
+
+    parameters: dict[str, float]
+    loss: float
+    history: list[list[dict[str, float]]] = field(default_factory=list)
+    at_bounds: tuple[str, ...] = ()
+    uncertainty: Uncertainty | None = None
+
+
+class Identifier:
+    """Searches parameters.
+
+    Args:
+        replay: of the motions to fit.
+        release: how they begin.
+        bounds: range of each parameter to identify.
+        seconds: how much of each motion counts; all of it if None.
+
+    Raises:
+        InputError: an unknown parameter, or none; or a motion in which nothing moves.
+    """
+
+    def __init__(
+        self, replay: Replay, release: Release, bounds: Mapping[str, Bounds], seconds: float | None = None
+    ) -> None:
+        if not bounds:
+            raise InputError("there is nothing to identify: name a parameter under identify.parameters.")
+        for name in bounds:
+            if name not in replay.known:
+                raise InputError(f"there is no parameter {name!r} to identify: choose from {', '.join(replay.known)}.")
+        motions = replay.motions if seconds is None else replay.motions.first(seconds)
+        for name, moved in zip(motions.names, motions.amplitude.tolist(), strict=True):
+            if not moved > 0.0:
+                raise InputError(f"the markers of the motion {name!r} stay where they were held: leave it out.")
+        simulator = replay.simulator
+        most = min(simulator.settings.max_iterations, _MOST_ITERATIONS)
+        settings = replace(simulator.settings, max_iterations=most, on_failure="raise")
+        self.replay = type(replay)(replace(simulator, solver=settings), replay.markers, motions)
+        self.release, self.bounds = release, dict(bounds)
+        self._weight = motions.loss_weight
+
+    def losses(self, unit: torch.Tensor) -> torch.Tensor:
+        """(E,) losses of (E, P) parameters, each a fraction of its range."""
+        return (self._residuals(unit).square().sum((2, 3, 4)) * self._weight).sum(1)
+
+    def _residuals(self, unit: torch.Tensor) -> torch.Tensor:
+        values = {name: b.from_unit(unit[:, i]) for i, (name, b) in enumerate(self.bounds.items())}
+        return self.replay.errors(self.replay(self.release, values))
+
+    def grid(
+        self,
+        axes: Mapping[str, int],
+        others: Mapping[str, float],
+        chunk: int = 12,
+        finished: Sequence[float] = (),
+        report: Callable[[list[float]], None] | None = None,
+    ) -> NDArray[np.float64]:
+        """Losses on a grid over some of the parameters, the others held.
+
+        Args:
+            axes: number of points of each parameter of the grid, over its whole range.
+            others: values of the remaining parameters.
+            chunk: sets of parameters that are simulated at once.
+            finished: what an interrupted call with the same arguments told last; those losses are not computed again.
+            report: is told the losses so far, in the order of the grid's points, after every chunk.
+
+        Returns:
+            Losses with an axis for each of `axes`, in their order; infinite where a simulation failed.
+        """
+        ticks = [
+            np.linspace(0.0, 1.0, axes[name]) if name in axes else [self._unit(name, others)] for name in self.bounds
+        ]
+        points = np.array(list(product(*ticks)))
+        losses = list(finished)
+        while len(losses) < len(points):
+            losses += self._losses_safe(points[len(losses) : len(losses) + chunk]).tolist()
+            if report is not None:
+                report(losses)
+        inside = [name for name in self.bounds if name in axes]
+        return (
+            np.array(losses).reshape([axes[name] for name in inside]).transpose([inside.index(name) for name in axes])
+        )
+
+    def ticks(self, name: str, count: int) -> NDArray[np.float64]:
+        """The values of a parameter on `grid`."""
+        return self.bounds[name].from_unit(torch.linspace(0.0, 1.0, count, dtype=torch.float64)).numpy()
+
+    def _unit(self, name: str, values: Mapping[str, float]) -> float:
+        bounds = self.bounds[name]
+        return bounds.to_unit(min(max(values[name], bounds.lower), bounds.upper))
+
+    def _losses_safe(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Losses without gradients; where some simulations fail, the others are done again without them."""
+        losses, left = np.full(len(points), np.inf), np.arange(len(points))
+        while len(left):
+            try:
+                with torch.no_grad():
+                    losses[left] = self.losses(self.replay.simulator.tensor(points[left])).cpu().numpy()
+                break
+            except ConvergenceError as error:
+                left = left[error.report.converged.view(len(left), -1).all(1).cpu().numpy()]
+        return losses
+
+    def starts(self, first: Mapping[str, float], count: int, candidates: int, seed: int) -> list[dict[str, float]]:
+        """The first guess, and the best of random candidates around the ranges.
+
+        Args:
+            first: a value of each parameter.
+            count: starts, the first guess included.
+            candidates: how many random sets are tried.
+            seed: of the sets (Latin hypercube).
+        """
+        units = [np.array([self._unit(name, first) for name in self.bounds])]
+        if count > 1:
+            sampler = scipy.stats.qmc.LatinHypercube(len(self.bounds), rng=np.random.default_rng(seed))
+            points = sampler.random(max(candidates, count - 1))
+            losses = np.concatenate([self._losses_safe(points[i : i + 8]) for i in range(0, len(points), 8)])
+            units += [points[i] for i in np.argsort(losses)[: count - 1] if np.isfinite(losses[i])]
+        return [self._values(u) for u in units]
+
+    def _values(self, unit: Sequence[float] | NDArray[np.float64]) -> dict[str, float]:
+        return {
+            n: float(b.from_unit(torch.tensor(float(u), dtype=torch.float64)))
+            for (n, b), u in zip(self.bounds.items(), unit, strict=True)
+        }
+
+    def run(
+        self,
+        starts: Sequence[Mapping[str, float]],
+        max_evaluations: int,
+        report: Report | None = None,
+        finished: Sequence[Attempt] = (),
+        keep: Callable[[list[Attempt]], None] | None = None,
+        tolerance: float = 1e-6,
+    ) -> Identification:
+        """Minimises the loss from every start and keeps the best.
+
+        Args:
+            starts: a value of each parameter, for each start.
+            max_evaluations: of the loss and its gradient, a start.
+            tolerance: relative decrease of the loss that is still worth a step.
+            report: called after every evaluation with the start's number, the loss (infinite where the simulation
+                failed) and the parameters.
+            finished: what an interrupted run with the same starts gave to `keep`; those starts are not done again.
+            keep: called after every start with the results of all so far, which can be written as JSON.
+
+        Raises:
+            ConvergenceError: the simulation fails at every start.
+        """
+        attempts = list(finished)
+        for number in range(len(attempts), len(starts)):
+            attempts.append(self._descend(number, starts[number], max_evaluations, tolerance, report))
+            if keep is not None:
+                keep(attempts)
+        good = [attempt for attempt in attempts if attempt["loss"] is not None]
+        if not good:
+            raise ConvergenceError("the simulation failed at every start of the identification.", None, None)
+        best = min(good, key=lambda attempt: attempt["loss"])
+        unit = np.array([self._unit(name, best["parameters"]) for name in self.bounds])
+        at_bounds = tuple(n for n, u in zip(self.bounds, unit, strict=True) if min(u, 1.0 - u) < 1e-4)
+        histories = [attempt["history"] for attempt in attempts]
+        return Identification(best["parameters"], best["loss"], histories, at_bounds, self.uncertainty(unit))
+
+    def _descend(
+        self, number: int, start: Mapping[str, float], max_evaluations: int, tolerance: float, report: Report | None
+    ) -> Attempt:
+        """What one start leads to: the parameters, their loss (None if the simulation fails there), the history."""
+        history: list[dict[str, float]] = []
+
+        def objective(unit: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+            loss, gradient = self._loss_and_gradient(unit)
+            if np.isfinite(loss):
+                history.append({"loss": loss, **self._values(unit)})
+            if report is not None:
+                report(number, loss, self._values(unit))
+            return loss, gradient
+
+        def matrix(unit: NDArray[np.float64]) -> NDArray[np.float64] | None:
+            found = self._linearise(unit)
+            return None if found is None else 2.0 * np.einsum("rip,riq->pq", found[1], found[1])
+
+        first = np.array([self._unit(name, start) for name in self.bounds])
+        unit, loss = minimise(objective, first, matrix, max_evaluations, tolerance)
+        return {
+            "parameters": self._values(unit),
+            "loss": loss if np.isfinite(loss) else None,
+            "history": history,
+        }
+
+    def _loss_and_gradient(self, unit: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        """Infinite, and zero, where the simulation fails."""
+        x = self.replay.simulator.tensor(unit)[None].requires_grad_()
+        try:
+            loss = self.losses(x)[0]
+            (gradient,) = torch.autograd.grad(loss, x)
+        except ConvergenceError:
+            return np.inf, np.zeros_like(unit)
+        return float(loss.detach()), gradient[0].double().cpu().numpy()
+
+    def _linearise(
+        self, unit: NDArray[np.float64], central: bool = False
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """Weighted residuals (R, T, M, 3) and their derivatives (R, T M 3, P) by the fractions, from differences.
+
+        One-sided differences lead into the range; central ones are taken a step inside of it. None where a simulation
+        fails.
+        """
+        count, steps = len(unit), np.where(unit < 0.5, _DIFFERENCE, -_DIFFERENCE)
+        if central:
+            unit = np.clip(unit, _DIFFERENCE, 1.0 - _DIFFERENCE)
+        sides = [unit[None], unit + np.diag(steps), unit - np.diag(steps)]
+        try:
+            with torch.no_grad():
+                residuals = self._residuals(self.replay.simulator.tensor(np.concatenate(sides[: 3 if central else 2])))
+        except ConvergenceError:
+            return None
+        weighted = (residuals * self._weight.sqrt()[:, None, None, None]).double().cpu().numpy()
+        flat = weighted.reshape(*weighted.shape[:2], -1)
+        behind, width = (flat[count + 1 :], 2.0 * steps) if central else (flat[:1], steps)
+        return weighted[0], np.moveaxis((flat[1 : count + 1] - behind) / width[:, None, None], 0, -1)
+
+    def uncertainty(self, unit: NDArray[np.float64]) -> Uncertainty | None:
+        """Covariance (J^T J)^-1 (sum_r s_r^2 J_r^T J_r) (J^T J)^-1 at fractions of the ranges, J_r that of a motion.
+
+        s_r^2 is the mean square residual of the motion times the number of frames that tell nothing new: the sum of
+        the residuals' autocorrelation up to its first zero. None if the simulation fails close by.
+        """
+        found = self._linearise(unit, central=True)
+        if found is None:
+            return None
+        residuals, jacobian = found
+        each = 3 * self.replay.motions.seen.sum((1, 2)).cpu().numpy()
+        free = 1.0 - min(len(unit) / each.sum(), 0.5)
+        squares = np.square(residuals).sum((1, 2, 3)) / (each * free)
+        variances = squares * [_redundancy(series) for series in residuals]
+        blocks = np.einsum("rip,riq->rpq", jacobian, jacobian)
+        values, vectors = np.linalg.eigh(blocks.sum(0))
+        inverse = (vectors / np.maximum(values, 1e-12 * max(values[-1], 1e-300))) @ vectors.T
+        covariance = inverse @ np.einsum("r,rpq->pq", variances, blocks) @ inverse
+        deviation = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+        slopes = [self._slope(name, u) for name, u in zip(self.bounds, unit, strict=True)]
+        poorest = vectors[:, 0] * np.sign(vectors[np.abs(vectors[:, 0]).argmax(), 0])
+        return Uncertainty(
+            deviation={n: float(d * s) for n, d, s in zip(self.bounds, deviation, slopes, strict=True)},
+            correlation=(covariance / np.outer(deviation, deviation)).tolist(),
+            poorest=dict(zip(self.bounds, poorest.tolist(), strict=True)),
+            poorest_deviation=float(np.sqrt(max(vectors[:, 0] @ covariance @ vectors[:, 0], 0.0))),
+        )
+
+    def _slope(self, name: str, unit: float) -> float:
+        """Derivative of a parameter with respect to its fraction."""
+        x = torch.tensor(float(unit), dtype=torch.float64, requires_grad=True)
+        (slope,) = torch.autograd.grad(self.bounds[name].from_unit(x), x)
+        return float(slope)
+
+
+def _redundancy(residuals: NDArray[np.float64]) -> float:
+    """How many frames (T, M, 3) weigh as much as one: 1 + 2 sum of the autocorrelation up to its first zero."""
+    series = residuals.reshape(len(residuals), -1)
+    products = [float((series[lag:] * series[: len(series) - lag]).sum()) for lag in range(len(series) // 2)]
+    if products[0] <= 0.0:
+        return 1.0
+    total = 1.0
+    for value in products[1:]:
+        if value <= 0.0:
+            break
+        total += 2.0 * value / products[0]
+    return total

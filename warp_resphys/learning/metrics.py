@@ -1,0 +1,251 @@
+"""Roll-out errors as the experiments define them, and the published numbers that stand beside them."""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Final, NamedTuple, TypedDict
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..io.errors import InputError
+
+MILLIMETRES_PER_METRE: Final = 1e3
+
+
+class PublishedError(NamedTuple):
+    """A published roll-out error [mm]: mean and standard deviation over the authors' test trajectories."""
+
+    mean: float
+    std: float
+
+
+class ErrorSummary(TypedDict):
+    """One model's roll-out error [mm] on one split, ready for `metrics.json`.
+
+    `mean` and `std` are None when a roll-out diverged: a mean over the survivors would flatter the model.
+    """
+
+    mean: float | None
+    std: float | None
+    trajectories: int
+    diverged: int
+
+
+# J. Gao, M. Y. Michelis, A. Spielberg, R. K. Katzschmann, "Sim-to-Real of Soft Robots with Learned Residual
+# Physics", IEEE Robotics and Automation Letters, 2024: the tables of sim-to-sim results (beam_oscillation,
+# beam_twist), the sim-to-real results (beam_real, sopra) and the extrapolation to 10 s after training on 5 s.
+PUBLISHED_MM: Final[Mapping[str, Mapping[str, PublishedError]]] = {
+    "beam_oscillation": {
+        "simulation": PublishedError(4.488, 1.468),
+        "simfree": PublishedError(0.035, 0.070),
+        "resphys": PublishedError(0.004, 0.010),
+    },
+    "beam_twist": {
+        "simulation": PublishedError(4.362, 1.541),
+        "simfree": PublishedError(0.038, 0.147),
+        "resphys": PublishedError(0.004, 0.011),
+    },
+    "beam_real": {
+        "simulation": PublishedError(5.46, 1.78),
+        "sysid": PublishedError(1.32, 1.38),
+        "simfree": PublishedError(0.63, 0.49),
+        "resphys": PublishedError(0.52, 0.48),
+    },
+    "sopra": {
+        "simulation": PublishedError(7.50, 3.69),
+        "sysid": PublishedError(7.31, 3.54),
+        "simfree": PublishedError(8.35, 4.03),
+        "resphys": PublishedError(5.77, 3.00),
+    },
+    "sopra_extrapolation": {
+        "sysid": PublishedError(7.57, 3.59),
+        "simfree": PublishedError(9.89, 5.02),
+        "resphys": PublishedError(6.10, 3.22),
+    },
+}
+# The extrapolation's errors at the length that was trained on [s]; those at 10 s stand above.
+PUBLISHED_WINDOWS_MM: Final[Mapping[str, Mapping[str, Mapping[str, PublishedError]]]] = {
+    "sopra_extrapolation": {
+        "5": {
+            "sysid": PublishedError(7.51, 3.63),
+            "simfree": PublishedError(9.54, 5.60),
+            "resphys": PublishedError(5.79, 3.09),
+        },
+        "10": PUBLISHED_MM["sopra_extrapolation"],
+    },
+}
+# The same paper's tables of parameters, which the first two experiments share but for their trajectories.
+_PUBLISHED_BEAMS: Final[Mapping[str, float]] = {
+    "degrees of freedom": 528,
+    "Poisson's ratio, incorrect beam": 0.45,
+    "Poisson's ratio, correct beam": 0.499,
+    "Young's modulus, incorrect beam": 215e3,
+    "Young's modulus, correct beam": 264e3,
+    "step size": 0.01,
+}
+PUBLISHED_SETUP: Final[Mapping[str, Mapping[str, float]]] = {
+    "beam_oscillation": {
+        **_PUBLISHED_BEAMS,
+        "time steps": 150,
+        "training trajectories": 9,
+        "validation trajectories": 2,
+        "testing trajectories": 5,
+    },
+    "beam_twist": {
+        **_PUBLISHED_BEAMS,
+        "time steps": 100,
+        "training trajectories": 10,
+        "validation trajectories": 2,
+        "testing trajectories": 8,
+    },
+}
+# The same paper's time benchmark: a trajectory of the real beam, 140 steps, on a 32-core AMD Ryzen Threadripper 3970X;
+# mean and standard deviation [s].
+PUBLISHED_SECONDS: Final[Mapping[str, tuple[float, float]]] = {
+    "simulation": (0.711, 0.002),
+    "true_parameters": (2.218, 0.005),
+    "resphys": (1.393, 0.004),
+    "inference": (0.112, 0.002),
+}
+PUBLISHED_SECONDS_STEPS: Final = 140
+# And of its marker ablation, whose values are not printed: the median error [mm] stays below this from 4 markers on.
+PUBLISHED_MARKER_MEDIAN_MM: Final = 0.1
+PUBLISHED_MARKERS: Final = 4
+PUBLISHED_MARKERS_OF_SMALL_SPREAD: Final = 10
+
+
+def trajectory_errors(positions: ArrayLike, target: ArrayLike) -> NDArray[np.float64]:
+    """Return the error of one roll-out at each step: the mean distance of its vertices from the target's.
+
+    State 0 is given to the roll-out, so it is left out. A roll-out that diverged keeps its non-finite values,
+    and a caller that stopped one early pads it with NaN: `summarise` counts both.
+
+    Args:
+        positions: (T+1, N, 3) simulated vertices or markers [m], states 0 to T.
+        target: (T+1, N, 3) where they should have been [m].
+
+    Returns:
+        (T,) errors [mm] of the steps 1 to T.
+
+    Raises:
+        InputError: The shapes differ or are not (T+1, N, 3), or the target is not finite.
+    """
+    simulated = np.asarray(positions, dtype=np.float64)  # (T+1, N, 3) [m]
+    wanted = np.asarray(target, dtype=np.float64)  # (T+1, N, 3) [m]
+    if simulated.shape != wanted.shape or simulated.ndim != 3 or simulated.shape[2] != 3 or len(simulated) < 2:
+        raise InputError(
+            f"cannot compare positions of shape {simulated.shape} with a target of shape {wanted.shape}: "
+            "both must be (steps + 1, vertices, 3)"
+        )
+    if not np.isfinite(wanted).all():
+        state = int(np.argwhere(~np.isfinite(wanted))[0, 0])
+        raise InputError(f"the target trajectory is not finite at state {state}: leave out what was not observed")
+    with np.errstate(over="ignore", invalid="ignore"):  # A diverged roll-out reaches inf, and inf - inf.
+        distance = np.linalg.norm(simulated[1:] - wanted[1:], axis=2)  # (T, N) [m]
+        return np.asarray(distance.mean(axis=1) * MILLIMETRES_PER_METRE)
+
+
+def summarise(errors: Iterable[NDArray[np.float64]]) -> ErrorSummary:
+    """Return the mean error over trajectories, steps and vertices, with its standard deviation.
+
+    The mean is E_q of the published source. The deviation is over trajectories and steps, of the mean over
+    the vertices.
+
+    Args:
+        errors: One (T,) array [mm] a trajectory, as `trajectory_errors` returns it; T may differ.
+
+    Raises:
+        InputError: There is no trajectory, or one has no step.
+    """
+    rows = [np.asarray(each, dtype=np.float64) for each in errors]
+    if not rows or any(row.size == 0 for row in rows):
+        raise InputError("no roll-out error to summarise: the test split needs a trajectory of at least one step")
+    diverged = sum(not np.isfinite(row).all() for row in rows)
+    pooled = np.concatenate(rows)  # (sum of T,) [mm]
+    return {
+        "mean": None if diverged else float(pooled.mean()),
+        "std": None if diverged else float(pooled.std()),
+        "trajectories": len(rows),
+        "diverged": diverged,
+    }
+
+
+def summarise_each(names: Sequence[str], errors: Mapping[str, Iterable[NDArray[np.float64]]]) -> list[dict[str, Any]]:
+    """Return what `metrics.json` lists under `per_trajectory`: the mean error of every model on each.
+
+    Args:
+        names: R names of the trajectories.
+        errors: For each model R arrays (T,) [mm], or one (R, T).
+
+    Returns:
+        R entries `{"name": ..., "errors_mm": {model: mean [mm], or None where the roll-out diverged}}`.
+
+    Raises:
+        InputError: A model has another number of trajectories than there are names.
+    """
+    means = {model: [_finite_mean(row) for row in rows] for model, rows in errors.items()}
+    for model, rows in means.items():
+        if len(rows) != len(names):
+            raise InputError(f"{model} has {len(rows)} roll-outs for {len(names)} test trajectories")
+    return [
+        {"name": name, "errors_mm": {model: rows[index] for model, rows in means.items()}}
+        for index, name in enumerate(names)
+    ]
+
+
+def summarise_folds(folds: Sequence[Mapping[str, ErrorSummary]]) -> dict[str, ErrorSummary]:
+    """Return the errors of a cross-validation: the mean of the folds' means, each fold weighing the same.
+
+    Args:
+        folds: The summaries of every model in every fold.
+    """
+    return {model: _over_folds([fold[model] for fold in folds]) for model in folds[0]}
+
+
+def published_errors(name: str) -> Mapping[str, PublishedError]:
+    """Return the published errors of an experiment, or of the one that it is a variant of, as its name says."""
+    known = [each for each in PUBLISHED_MM if name.startswith(each)]
+    return PUBLISHED_MM[max(known, key=len)] if known else {}
+
+
+def median_filter(values: ArrayLike, time_step: float, window: float = 1.0) -> NDArray[np.float64]:
+    """Return the median over a window of time around each step, as the published figures of the arm have it.
+
+    The window is cut at both ends, and holds as many steps before the current one as after it. NaN is left out, and
+    stays where there is nothing else; an infinite value is larger than all others.
+
+    Args:
+        values: (..., T) at equal steps.
+        time_step: Between two of them [s].
+        window: Length of the window [s].
+
+    Raises:
+        InputError: The step or the window is not positive.
+    """
+    if not (time_step > 0.0 and window > 0.0):
+        raise InputError(f"a median filter of {window} s at steps of {time_step} s: both must be positive")
+    rows = np.asarray(values, dtype=np.float64)
+    half = int(0.5 * window / time_step + 1e-9)
+    blank = np.full((*rows.shape[:-1], half), np.nan)
+    windows = np.lib.stride_tricks.sliding_window_view(np.concatenate([blank, rows, blank], axis=-1), 2 * half + 1, -1)
+    ordered = np.sort(windows, axis=-1)  # NaN comes last
+    count = (~np.isnan(ordered)).sum(axis=-1, keepdims=True)
+    low, high = (np.take_along_axis(ordered, np.maximum(count - 1 + up, 0) // 2, axis=-1)[..., 0] for up in (0, 1))
+    return np.where(low == high, low, 0.5 * (low + high))
+
+
+def _over_folds(summaries: Sequence[ErrorSummary]) -> ErrorSummary:
+    means = [each["mean"] for each in summaries]
+    known = [mean for mean in means if mean is not None]
+    whole = len(known) == len(means)
+    return {
+        "mean": float(np.mean(known)) if whole else None,
+        "std": float(np.std(known)) if whole else None,
+        "trajectories": sum(each["trajectories"] for each in summaries),
+        "diverged": sum(each["diverged"] for each in summaries),
+    }
+
+
+def _finite_mean(values: NDArray[np.float64]) -> float | None:
+    mean = float(np.mean(values))
+    return mean if math.isfinite(mean) else None

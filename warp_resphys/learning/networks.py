@@ -1,0 +1,419 @@
+"""Networks that predict a residual force, or the next state, from the state.
+
+A model is a coder around a multi-layer perceptron: the coder turns (q, v) into standardised inputs and standardised
+outputs into forces. Its constants come from the training split and are saved with the weights.
+"""
+
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+import torch
+from torch import nn
+from typing_extensions import override
+
+from ..dynamics.modes import RestStiffness
+from ..io.errors import InputError
+
+NETWORK_KINDS = ("reduced", "nodal")
+ACTIVATIONS = ("normalised_elu", "silu")
+# Modes and coordinates that vary less than this fraction of the largest are not amplified to unit deviation.
+_DEVIATION_FLOOR = 3e-3
+# Samples that modes are taken from, evenly picked: neighbours in time tell the same, and more take minutes.
+_SAMPLES_FOR_MODES = 2_000
+
+
+class SkipMLP(nn.Module):
+    """Blocks of perceptrons with skip connections between blocks.
+
+    Every linear layer but a block's last is followed by LayerNorm and ELU, as published, or by SiLU alone, which makes
+    a smoother function. Blocks after the first add to their input.
+
+    Args:
+        n_in: inputs.
+        n_out: outputs, also the width between blocks.
+        blocks: number of blocks.
+        layers: hidden layers a block; 0 makes the map affine.
+        width: of the hidden layers.
+        activation: one of `ACTIVATIONS`.
+    """
+
+    def __init__(self, n_in: int, n_out: int, blocks: int, layers: int, width: int, activation: str) -> None:
+        super().__init__()
+        sizes = [n_in if i == 0 else n_out for i in range(blocks)]
+        self.blocks = nn.ModuleList(_perceptron(size, n_out, layers, width, activation) for size in sizes)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """(S, n_in) to (S, n_out)."""
+        first, *others = self.blocks
+        x = first(x)
+        for block in others:
+            x = x + block(x)
+        return x
+
+
+def _perceptron(n_in: int, n_out: int, layers: int, width: int, activation: str) -> nn.Sequential:
+    modules: list[nn.Module] = []
+    for i in range(layers):
+        modules.append(nn.Linear(n_in if i == 0 else width, width))
+        modules += [nn.SiLU()] if activation == "silu" else [nn.LayerNorm(width), nn.ELU()]
+    return nn.Sequential(*modules, nn.Linear(width if layers else n_in, n_out))
+
+
+class Coder(nn.Module):
+    """An affine map between a field on the vertices and standardised coordinates: c = (x - mean) basis / scale.
+
+    Its constants are in double precision, as states of simulations are, whatever the samples were that it is from.
+
+    Args:
+        mean: (D,) flattened field of the origin.
+        basis: (D, M) columns; None for the coordinates themselves.
+        scale: (M,) deviation of each coordinate.
+        dual: (D, M) columns with dual^T basis = 1, by which fields are decoded; None: the basis, which is orthonormal.
+    """
+
+    mean: torch.Tensor
+    scale: torch.Tensor
+    basis: torch.Tensor | None
+    dual: torch.Tensor | None
+
+    def __init__(
+        self,
+        mean: torch.Tensor,
+        basis: torch.Tensor | None,
+        scale: torch.Tensor,
+        dual: torch.Tensor | None = None,
+    ) -> None:
+        super().__init__()
+        for name, values in (("mean", mean), ("basis", basis), ("scale", scale), ("dual", dual)):
+            self.register_buffer(name, None if values is None else values.double())
+
+    @property
+    def size(self) -> int:
+        """M."""
+        return len(self.scale)
+
+    def encode(self, field: torch.Tensor) -> torch.Tensor:
+        """(S, N, 3) to (S, M)."""
+        x = field.flatten(1) - self.mean
+        return (x if self.basis is None else x @ self.basis) / self.scale
+
+    def decode(self, coordinates: torch.Tensor) -> torch.Tensor:
+        """(S, M) to (S, N, 3)."""
+        x = coordinates * self.scale
+        if self.basis is not None:
+            x = x @ (self.basis if self.dual is None else self.dual).mT
+        return (x + self.mean).unflatten(1, (-1, 3))
+
+
+def pod_coder(samples: torch.Tensor, modes: int) -> Coder:
+    """Proper orthogonal decomposition about zero: the modes that hold most of the samples' energy.
+
+    Args:
+        samples: (S, N, 3), with S at least ``modes``.
+        modes: M.
+
+    Raises:
+        InputError: more modes than samples or coordinates.
+    """
+    x = _some(samples).flatten(1).double()
+    if not 1 <= modes <= min(x.shape):
+        raise InputError(f"{modes} modes were asked for, but {len(x)} samples give 1 to {min(x.shape)}.")
+    _, _, directions = torch.linalg.svd(x, full_matrices=False)
+    basis = directions[:modes].mT.contiguous()
+    deviation = (x @ basis).square().mean(0).sqrt()
+    return Coder(torch.zeros_like(x[0]), basis, deviation.clamp_min(_DEVIATION_FLOOR * float(deviation.max())))
+
+
+def _some(samples: torch.Tensor) -> torch.Tensor:
+    """At most so many of (S, ...) samples as modes are taken from."""
+    return samples[:: -(-len(samples) // _SAMPLES_FOR_MODES)]
+
+
+def displacement_coder(samples: torch.Tensor, stiffness: RestStiffness, modes: int) -> Coder:
+    """Forces by the displacements that they would cause: their main modes Psi, with f = K Psi c and c = Psi^T K^-1 f.
+
+    A slender body is moved most by forces that are small beside those that cancel. In the modes of the forces
+    themselves, a small error of the large ones moves it more than the small ones do; in those of K^-1 f, the error of a
+    coordinate is the error of the body.
+
+    Args:
+        samples: (S, N, 3) forces [N].
+        stiffness: K, of the body at rest.
+        modes: M.
+
+    Raises:
+        InputError: more modes than samples or coordinates.
+    """
+    forces = _some(samples).flatten(1).double()
+    moved = torch.as_tensor(stiffness.displacements(forces.cpu().numpy().T).T.copy()).to(forces)
+    coder = pod_coder(moved.unflatten(1, (-1, 3)), modes)
+    assert coder.basis is not None
+    psi = coder.basis.cpu().numpy()
+    basis, dual = (torch.as_tensor(part).to(forces) for part in (stiffness.displacements(psi), stiffness.forces(psi)))
+    return Coder(torch.zeros_like(forces[0]), basis, coder.scale, dual)
+
+
+def actuation_coder(samples: torch.Tensor) -> Coder:
+    """Each number of (S, A) in units of its root mean square: no actuation stays zero."""
+    size = samples.square().mean(0).sqrt()
+    return Coder(torch.zeros_like(size), None, torch.where(size > 0.0, size, torch.ones_like(size)))
+
+
+def nodal_coder(samples: torch.Tensor) -> Coder:
+    """Standardisation of every coordinate of (S, N, 3), as published; constant coordinates stay zero."""
+    x = samples.flatten(1)
+    deviation = x.std(0)
+    return Coder(x.mean(0), None, torch.where(deviation > 0.0, deviation, torch.ones_like(deviation)))
+
+
+class StateMap(nn.Module):
+    """Fields predicted from a state, in standardised coordinates: a linear part and a network for what it leaves.
+
+    Attributes:
+        fields: names of the predicted fields, in order.
+
+    Args:
+        rest: (N, 3) rest positions [m].
+        position: coder of positions less the rest shape.
+        velocity: coder of velocities.
+        outputs: coder of each predicted field.
+        architecture: ``blocks``, ``layers``, ``width`` and ``activation``.
+        actuation: coder of what acts on the body, such as weights or pressures; None where nothing does.
+    """
+
+    fields: tuple[str, ...]
+    rest: torch.Tensor
+    linear: torch.Tensor
+    remainder: torch.Tensor
+
+    def __init__(
+        self,
+        rest: torch.Tensor,
+        position: Coder,
+        velocity: Coder,
+        outputs: Mapping[str, Coder],
+        architecture: Mapping[str, Any],
+        actuation: Coder | None = None,
+    ) -> None:
+        super().__init__()
+        self.register_buffer("rest", rest)
+        self.position, self.velocity, self.actuation = position, velocity, actuation
+        self.outputs = nn.ModuleDict(outputs)
+        self.architecture = {key: architecture[key] for key in ("blocks", "layers", "width", "activation")}
+        self._sizes = [coder.size for coder in outputs.values()]
+        n_in = position.size + velocity.size + (0 if actuation is None else actuation.size)
+        n_out = sum(self._sizes)
+        self.network = SkipMLP(n_in, n_out, **self.architecture).to(rest.device)
+        self.register_buffer("linear", torch.zeros(n_in, n_out, device=rest.device))
+        self.register_buffer("remainder", torch.ones((), device=rest.device))
+
+    @property
+    def coders(self) -> list[Coder]:
+        """Coders of the predicted fields, in order."""
+        return [coder for coder in self.outputs.values() if isinstance(coder, Coder)]
+
+    def fit_linear(self, inputs: torch.Tensor, outputs: torch.Tensor, noise: float) -> None:
+        """Sets the linear part by least squares, as if the inputs had noise of that deviation (ridge regression).
+
+        Args:
+            inputs: (S, n_in) standardised.
+            outputs: (S, n_out) standardised.
+            noise: standard deviation.
+        """
+        x, y = inputs.double(), outputs.double()
+        gram = x.mT @ x + len(x) * noise**2 * torch.eye(x.shape[1], device=x.device, dtype=x.dtype)
+        linear = torch.linalg.solve(gram, x.mT @ y)
+        self.linear.copy_(linear)
+        self.remainder.copy_((y - x @ linear).square().mean().sqrt())
+
+    def standardised(self, inputs: torch.Tensor) -> torch.Tensor:
+        """(S, n_out) standardised fields from (S, n_in) standardised inputs: linear part and network."""
+        return inputs @ self.linear + self.remainder * self.network(inputs)
+
+    def encode(self, q: torch.Tensor, v: torch.Tensor, actuation: torch.Tensor | None = None) -> torch.Tensor:
+        """(S, n_in) standardised inputs, as precise as the network.
+
+        Args:
+            q: (S, N, 3) positions [m].
+            v: (S, N, 3) velocities [m/s].
+            actuation: (S, A), for a model that was built with one.
+        """
+        parts = [self.position.encode(q - self.rest), self.velocity.encode(v)]
+        if self.actuation is not None:
+            if actuation is None:
+                raise ValueError("this model was trained with an actuation: pass one")
+            parts.append(self.actuation.encode(actuation))
+        return torch.cat(parts, dim=1).to(self.linear.dtype)
+
+    def encode_outputs(self, *fields: torch.Tensor) -> torch.Tensor:
+        """(S, n_out) standardised outputs, as precise as the network, from (S, N, 3) fields in the coders' order."""
+        pairs = zip(self.coders, fields, strict=True)
+        return torch.cat([coder.encode(field) for coder, field in pairs], dim=1).to(self.linear.dtype)
+
+    def decode(self, inputs: torch.Tensor) -> list[torch.Tensor]:
+        """(S, N, 3) fields in order, from (S, n_in) standardised inputs."""
+        parts = self.standardised(inputs).split(self._sizes, dim=1)
+        return [coder.decode(part) for coder, part in zip(self.coders, parts, strict=True)]
+
+    def predict(self, q: torch.Tensor, v: torch.Tensor, actuation: torch.Tensor | None = None) -> list[torch.Tensor]:
+        """(S, N, 3) fields in order, from a state as `encode` takes it."""
+        return self.decode(self.encode(q, v, actuation))
+
+    def description(self) -> dict[str, Any]:
+        """What `restore` needs beside the tensors."""
+        return {
+            "architecture": self.architecture,
+            "reduced": self.position.basis is not None,
+            "actuated": self.actuation is not None,
+        }
+
+
+class ResidualForce(StateMap):
+    """Residual force of a state (the published method's network)."""
+
+    fields = ("force",)
+
+    def forward(self, q: torch.Tensor, v: torch.Tensor, actuation: torch.Tensor | None = None) -> torch.Tensor:
+        """(S, N, 3) residual force [N]."""
+        return self.predict(q, v, actuation)[0]
+
+
+class NextState(StateMap):
+    """The next state of a state: the purely data-driven baseline (SimFree)."""
+
+    fields = ("next_position", "next_velocity")
+
+    def forward(
+        self, q: torch.Tensor, v: torch.Tensor, actuation: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """(S, N, 3) positions [m] and velocities [m/s] one time step on."""
+        position, velocity = self.predict(q, v, actuation)
+        return position, velocity
+
+    @override
+    def decode(self, inputs: torch.Tensor) -> list[torch.Tensor]:
+        """(S, N, 3) positions [m] and velocities [m/s], from (S, n_in) standardised inputs."""
+        displacement, velocity = super().decode(inputs)
+        return [self.rest + displacement, velocity]
+
+
+def build_model(
+    config: Mapping[str, Any],
+    rest: torch.Tensor,
+    q: torch.Tensor,
+    v: torch.Tensor,
+    force: torch.Tensor,
+    actuation: torch.Tensor | None = None,
+    stiffness: RestStiffness | None = None,
+) -> ResidualForce:
+    """A residual force with coders from training samples.
+
+    Args:
+        config: the group ``network``.
+        rest: (N, 3) rest positions [m].
+        q: (S, N, 3) positions [m].
+        v: (S, N, 3) velocities [m/s].
+        force: (S, N, 3) residual forces [N].
+        actuation: (S, A) what else acts on the body, or None.
+        stiffness: of the body at rest, for a ``reduced`` network whose modes are those of the displacements that forces
+            would cause; of the forces themselves if None.
+
+    Raises:
+        InputError: an unknown kind, or sizes that do not fit the samples.
+    """
+    position, velocity = _state_coders(config, q - rest, v)
+    if config["kind"] == "reduced":
+        modes = config["force_modes"]
+        coder = pod_coder(force, modes) if stiffness is None else displacement_coder(force, stiffness, modes)
+    else:
+        coder = nodal_coder(force)
+    actuated = None if actuation is None else actuation_coder(actuation)
+    return ResidualForce(rest, position, velocity, {"force": coder}, config, actuated)
+
+
+def build_next_state(
+    config: Mapping[str, Any],
+    rest: torch.Tensor,
+    q: torch.Tensor,
+    v: torch.Tensor,
+    actuation: torch.Tensor | None = None,
+) -> NextState:
+    """A data-driven baseline of the same family: in- and outputs share their coders.
+
+    Args:
+        config: the group ``network``.
+        rest: (N, 3) rest positions [m].
+        q: (S, N, 3) positions [m].
+        v: (S, N, 3) velocities [m/s].
+        actuation: (S, A) what acts on the body, or None.
+
+    Raises:
+        InputError: an unknown kind, or sizes that do not fit the samples.
+    """
+    position, velocity = _state_coders(config, q - rest, v)
+    outputs = dict(zip(NextState.fields, _state_coders(config, q - rest, v), strict=True))
+    actuated = None if actuation is None else actuation_coder(actuation)
+    return NextState(rest, position, velocity, outputs, config, actuated)
+
+
+def _state_coders(config: Mapping[str, Any], u: torch.Tensor, v: torch.Tensor) -> tuple[Coder, Coder]:
+    """Coders of displacements and velocities."""
+    check_network(config)
+    if config["kind"] == "reduced":
+        pairs = ((u, config["position_modes"]), (v, config["velocity_modes"]))
+        found = [pod_coder(field, modes) if modes else _blind_coder(field) for field, modes in pairs]
+        return found[0], found[1]
+    return nodal_coder(u), nodal_coder(v)
+
+
+def _blind_coder(samples: torch.Tensor) -> Coder:
+    """No coordinates at all: for what a network is not to see."""
+    nothing = samples.new_zeros(samples[0].numel())
+    return Coder(nothing, nothing.new_zeros(len(nothing), 0), nothing.new_zeros(0))
+
+
+def check_network(config: Mapping[str, Any]) -> None:
+    """Checks the ranges of the group ``network``.
+
+    Raises:
+        InputError: an unknown kind or activation, or a size that is not positive.
+    """
+    if config["kind"] not in NETWORK_KINDS:
+        raise InputError(f"network.kind is {config['kind']!r}: choose one of {', '.join(NETWORK_KINDS)}.")
+    if config["activation"] not in ACTIVATIONS:
+        raise InputError(f"network.activation is {config['activation']!r}: choose one of {', '.join(ACTIVATIONS)}.")
+    reduced = config["kind"] == "reduced"
+    for key in ("blocks", "width", *(("force_modes",) if reduced else ())):
+        if not config[key] > 0:
+            raise InputError(f"network.{key} is {config[key]}: it must be positive.")
+    for key in ("layers", *(("position_modes", "velocity_modes") if reduced else ())):
+        if not config[key] >= 0:
+            raise InputError(f"network.{key} is {config[key]}: it must be zero or more.")
+
+
+Model = TypeVar("Model", bound=StateMap)
+
+
+def restore(kind: type[Model], tensors: Mapping[str, torch.Tensor], description: Mapping[str, Any]) -> Model:
+    """A model from its ``state_dict`` and `StateMap.description`.
+
+    Args:
+        kind: `ResidualForce` or `NextState`.
+        tensors: the ``state_dict``.
+        description: what `StateMap.description` returned.
+    """
+
+    def coder(name: str) -> Coder:
+        parts = [tensors.get(f"{name}.{part}") for part in ("mean", "basis", "scale", "dual")]
+        assert parts[0] is not None
+        assert parts[2] is not None
+        return Coder(parts[0], parts[1], parts[2], parts[3])
+
+    outputs = {name: coder(f"outputs.{name}") for name in kind.fields}
+    actuation = coder("actuation") if description["actuated"] else None
+    state = coder("position"), coder("velocity")
+    model = kind(tensors["rest"], *state, outputs, description["architecture"], actuation)
+    if tensors["linear"].dtype == torch.float64:
+        model.double()
+    model.load_state_dict(tensors)
+    return model.eval()

@@ -1,0 +1,250 @@
+"""How an observed motion begins: the body that is held, and how it was let go.
+
+The body is at rest under gravity, its weights and a virtual force that brings its markers to where they were held
+(the published method finds such forces by steps through time; a static equilibrium has none to wait for). The hand lets
+go between two frames, and not without a push, of a body that it may have bent sideways: the delay, a velocity in a few
+slow modes, and a sideways displacement are what best explains the first frames.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+
+from ..dynamics.integrator import State
+from ..dynamics.modes import vibration_modes
+from ..dynamics.simulator import MaterialTensors, Simulator
+from ..io.errors import ConvergenceError, InputError
+from .replay import Markers, Motions, Release, Replay
+
+_HOLD_ITERATIONS = 30
+_HOLD_TOLERANCE = 1e-7  # m, change of any position in the last iteration
+_SIDEWAYS_STRAIN = 1e-3  # of the body's extent: how far it is bent to find how it bends
+_HOLD_WEIGHT = 1e-6  # w, in units of the largest diagonal entry of the first J^T J
+
+
+@dataclass(frozen=True)
+class ReleaseSettings:
+    """How the beginning of a motion is estimated.
+
+    Attributes:
+        hold_modes: vibration modes whose inertial forces hold the body; 0 lets it go from where gravity leaves it.
+        velocity_modes: vibration modes that the velocity at the release is made of; 0 for none.
+        window: how much of the motion after the release is used [s].
+        noise: what a marker may be off for reasons that no release explains [m].
+        delay: expected deviation of the moment of release from the one found in the frames [s]; 0 keeps that one.
+        speed: expected size of the velocity of the fastest vertex [m/s].
+        sideways: expected displacement, across gravity, of a body that seems to be held undeformed [m]: as a sideways
+            acceleration bends it, at the vertex that moves furthest; 0 for none. Along gravity it would be mistaken for
+            a weight or a stiffness.
+        iterations: Gauss-Newton steps.
+    """
+
+    hold_modes: int = 6
+    velocity_modes: int = 0
+    window: float = 0.13
+    noise: float = 3e-4
+    delay: float = 0.0
+    speed: float = 0.05
+    sideways: float = 0.0
+    iterations: int = 4
+
+    def __post_init__(self) -> None:
+        """Checks the ranges.
+
+        Raises:
+            InputError: a number out of range.
+        """
+        for name in ("window", "noise", "speed", "iterations"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"release.{name} is {getattr(self, name)}: it must be positive.")
+        for name in ("hold_modes", "velocity_modes", "delay", "sideways"):
+            if not getattr(self, name) >= 0:
+                raise InputError(f"release.{name} is {getattr(self, name)}: it must be zero or more.")
+
+
+def estimate_release(simulator: Simulator, markers: Markers, motions: Motions, settings: ReleaseSettings) -> Release:
+    """The beginning of every motion, as this simulator would have it.
+
+    Args:
+        simulator: of the body.
+        markers: (B, N, 3) positions of the vertices to (B, M, 3) markers [m].
+        motions: what was observed.
+        settings: see the class.
+
+    Raises:
+        ConvergenceError: the body cannot be held, or a step of the simulation fails.
+    """
+    replay = Replay(simulator, markers, motions)
+    with torch.no_grad():
+        tensors = replay.tensors()
+    q = hold(simulator, markers, motions, tensors, settings.hold_modes)
+    release = Release(State(q, torch.zeros_like(q)), torch.zeros_like(motions.times[:, 0]))
+    return _let_go(simulator, markers, motions.first(settings.window), release, settings)
+
+
+def hold(
+    simulator: Simulator, markers: Markers, motions: Motions, tensors: MaterialTensors, modes: int
+) -> torch.Tensor:
+    """(R, N, 3) positions at rest under gravity, weights and the virtual force that holds the markers best [m].
+
+    Levenberg-Marquardt on |m(q(a)) - y|^2 + w |a|^2 with q(a) the equilibrium under the force B a. The weight w is so
+    small that it only keeps what no marker sees from moving.
+
+    Args:
+        simulator: of the body.
+        markers: positions of the vertices to markers.
+        motions: tell where the markers were held.
+        tensors: of the R environments.
+        modes: columns of B, the inertial forces of the slowest vibrations.
+
+    Raises:
+        ConvergenceError: no equilibrium was found.
+    """
+    count = len(motions.names)
+    target = motions.held
+    if modes == 0:
+        with torch.no_grad():
+            return simulator.static_equilibrium(material=tensors, batch=count).q
+    basis = vibration_modes(simulator, modes)
+    identity = torch.eye(modes, dtype=target.dtype, device=target.device)
+
+    def equilibrium(a: torch.Tensor, start: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Positions, and (R, 3 M) distances from where the markers were held."""
+        load = (a @ basis.mT).unflatten(1, (-1, 3))
+        q = simulator.static_equilibrium(load, material=tensors, start=start).q
+        return q, torch.where(torch.isfinite(target), target - markers(q), 0.0).flatten(1)
+
+    force = simulator.rest_positions.new_zeros(count, modes)
+    damping = force.new_full((count, 1, 1), 1e-3)  # in units of the largest diagonal entry
+    weight = None
+    with torch.no_grad():
+        q, missing = equilibrium(force, simulator.rest_state(count).q)
+    for _ in range(_HOLD_ITERATIONS):
+        jacobian = -_derivatives(equilibrium, force, q)
+        gram = jacobian.mT @ jacobian
+        scale = gram.diagonal(dim1=1, dim2=2).amax(1)[:, None, None]
+        weight = _HOLD_WEIGHT * scale if weight is None else weight
+        right = jacobian.mT @ missing[..., None] - weight * force[..., None]
+        change = torch.linalg.solve(gram + (weight + damping * scale) * identity, right)[..., 0]
+        try:
+            with torch.no_grad():
+                new_q, new_missing = equilibrium(force + change, q)
+        except ConvergenceError:
+            damping = 10.0 * damping
+            continue
+        before, after = (
+            y.square().sum(1) + weight[:, 0, 0] * a.square().sum(1)
+            for y, a in ((missing, force), (new_missing, force + change))
+        )
+        better = after <= before
+        moved = float((new_q - q).abs().max())
+        force = torch.where(better[:, None], force + change, force)
+        q = torch.where(better[:, None, None], new_q, q)
+        missing = torch.where(better[:, None], new_missing, missing)
+        damping = torch.where(better[:, None, None], 0.2 * damping, 10.0 * damping).clamp(1e-9, 1e6)
+        if moved < _HOLD_TOLERANCE:
+            break
+    return q
+
+
+def _derivatives(
+    equilibrium: Callable[[torch.Tensor, torch.Tensor], tuple[torch.Tensor, torch.Tensor]],
+    force: torch.Tensor,
+    q: torch.Tensor,
+) -> torch.Tensor:
+    """(R, 3 M, modes) of what is missing by the (R, modes) force, at its equilibrium q."""
+    a = force.clone().requires_grad_()
+    _, missing = equilibrium(a, q)
+    rows = [torch.autograd.grad(missing[:, i].sum(), a, retain_graph=True)[0] for i in range(missing.shape[1])]
+    return torch.stack(rows, 1)
+
+
+def _let_go(
+    simulator: Simulator, markers: Markers, motions: Motions, held: Release, settings: ReleaseSettings
+) -> Release:
+    """What explains the first frames (`_Beginning`), by Gauss-Newton with differences over a batch."""
+    beginning = _Beginning(simulator, markers, held, settings)
+    count, unknowns = len(motions.names), len(beginning.deviation)
+    if not unknowns:
+        return held
+    parameters = simulator.rest_positions.new_zeros(count, unknowns)  # in expected deviations
+    size = 1 + unknowns
+    replay = Replay(simulator, markers, motions.select(list(range(count)) * size))
+    step = 0.05
+    identity = torch.eye(unknowns, dtype=parameters.dtype, device=parameters.device)
+    offsets = torch.cat([torch.zeros_like(identity[:1]), step * identity]).repeat_interleave(count, 0)
+    best, least = parameters, torch.full_like(parameters[:, 0], torch.inf)
+    with torch.no_grad():
+        for _ in range(settings.iterations + 1):  # The last one only tells whether the step before was good.
+            simulated = replay(beginning(parameters.repeat(size, 1) + offsets))
+            residual = replay.errors(simulated)[0].flatten(1).unflatten(0, (size, count)) / settings.noise
+            objective = residual[0].square().sum(1) + parameters.square().sum(1)
+            better = objective < least
+            best, least = torch.where(better[:, None], parameters, best), torch.where(better, objective, least)
+            jacobian = ((residual[1:] - residual[0]) / step).permute(1, 2, 0)
+            right = jacobian.mT @ residual[0][..., None] + parameters[..., None]
+            change = torch.linalg.solve(jacobian.mT @ jacobian + identity, right)[..., 0].clamp(-3.0, 3.0)
+            # Back half way to the best so far where a step was too long.
+            parameters = torch.where(better[:, None], parameters - change, 0.5 * (parameters + best))
+        return beginning(best)
+
+
+class _Beginning:
+    """Releases of given delays, velocities and sideways displacements, each in units of its expected deviation.
+
+    Args:
+        simulator: of the body.
+        markers: positions of the vertices to markers.
+        held: the release at the time of the frames, at rest, of a body that is held undeformed.
+        settings: tell what is looked for.
+    """
+
+    def __init__(self, simulator: Simulator, markers: Markers, held: Release, settings: ReleaseSettings) -> None:
+        self._markers, self._held = markers, held
+        velocities = velocity_shapes(simulator, settings.velocity_modes)
+        sideways = sideways_shapes(simulator) if settings.sideways > 0.0 else velocities[:0]
+        self._shapes = (velocities, sideways)
+        self._sizes = (int(settings.delay > 0.0), len(velocities), len(sideways))
+        deviations = (settings.delay, settings.speed, settings.sideways)
+        self.deviation = simulator.tensor([d for d, n in zip(deviations, self._sizes, strict=True) for _ in range(n)])
+
+    def __call__(self, values: torch.Tensor) -> Release:
+        """The releases of (k R, unknowns) values, the R motions running fastest."""
+        delay, speeds, bends = (values * self.deviation).split(self._sizes, 1)
+        repeats = len(values) // len(self._held.delay)
+        held = self._held.state.q.repeat(repeats, 1, 1)
+        velocity, bend = (torch.einsum("bk,knc->bnc", a, b) for a, b in zip((speeds, bends), self._shapes, strict=True))
+        shift = self._markers(held) - self._markers(held + bend) if len(self._shapes[1]) else None
+        return Release(State(held + bend, velocity), delay.sum(1), shift)
+
+
+def sideways_shapes(simulator: Simulator) -> torch.Tensor:
+    """(1 or 2, N, 3) displacements by accelerations across gravity, about rest, each with its furthest vertex at one.
+
+    Of the two directions the stiffer one is left out if it bends the body less than half as far: what little it moves
+    may well be along gravity. Weights that hang on the body take no part.
+    """
+    directions = torch.linalg.svd(simulator.tensor(simulator.gravity)[None])[2][1:]
+    extent = float((simulator.rest_positions.amax(0) - simulator.rest_positions.amin(0)).max())
+    size = 0.1  # m/s^2
+    with torch.no_grad():
+        tensors = simulator.prepare(attached_mass=torch.zeros_like(simulator.rest_positions[None, :, 0]))
+        weightless = replace(tensors, weight=torch.zeros_like(tensors.weight).expand(2, -1, -1))
+        for _ in range(3):  # Small enough for a linear answer, and well above rounding, however stiff the body is.
+            load = size * tensors.mass[..., None] * directions[:, None]
+            bent = simulator.static_equilibrium(load, material=weightless).q - simulator.rest_positions
+            size *= _SIDEWAYS_STRAIN * extent / float(bent.norm(dim=2).max())
+    turn, *_ = torch.linalg.svd(bent.flatten(1), full_matrices=False)  # To the softest direction and the stiffest.
+    shapes = torch.einsum("ij,inc->jnc", turn, bent)
+    furthest = shapes.norm(dim=2).amax(1)
+    return (shapes / furthest[:, None, None])[furthest >= 0.5 * furthest[0]]
+
+
+def velocity_shapes(simulator: Simulator, modes: int) -> torch.Tensor:
+    """(modes, N, 3) shapes of the slowest vibrations, each with its fastest vertex at one."""
+    if modes == 0:
+        return simulator.rest_positions.new_zeros(0, *simulator.rest_positions.shape)
+    inertial = vibration_modes(simulator, modes).mT.unflatten(1, (-1, 3))
+    shapes = inertial / simulator.prepare().mass[..., None]
+    return shapes / shapes.norm(dim=2).amax(1)[:, None, None]

@@ -1,0 +1,278 @@
+"""Supervised training of a model, chosen by its roll-outs or, as published, by its validation loss."""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Generic
+
+import torch
+from typing_extensions import override
+
+from ..io.errors import InputError
+from .networks import Model, StateMap
+
+SCHEDULES = ("cosine", "step")
+SELECTIONS = ("rollout", "validation_loss")
+
+
+@dataclass(frozen=True)
+class Samples:
+    """States and the fields that belong to them, each (S, N, 3), and (S, A) what else acts on the body, if anything."""
+
+    q: torch.Tensor
+    v: torch.Tensor
+    outputs: tuple[torch.Tensor, ...]
+    actuation: torch.Tensor | None = None
+
+
+@dataclass
+class TrainingState:
+    """All that training goes on from.
+
+    Attributes:
+        epoch: epochs done.
+        history: one record an epoch: ``epoch``, ``train_loss``, ``validation_loss``, ``learning_rate``, and
+            ``rollout_error_mm`` where it was measured; infinite where a roll-out diverged.
+        best_score: smallest so far of what weights are selected by, a roll-out error [mm] or a validation loss.
+        best_epoch: after which it was reached.
+        best: weights that had it.
+    """
+
+    epoch: int = 0
+    history: list[dict[str, float]] = field(default_factory=list)
+    best_score: float = math.inf
+    best_epoch: int = 0
+    best: dict[str, torch.Tensor] = field(default_factory=dict)
+
+
+class EpochTrainer(ABC, Generic[Model]):
+    """Trains epoch by epoch, and keeps the weights with the smallest roll-out error.
+
+    Args:
+        model: to train.
+        rollout_error: mean roll-out error on the validation split [mm]; infinite where a roll-out diverged.
+        config: with ``epochs`` and ``rollout_every``.
+    """
+
+    selection = "rollout"
+
+    def __init__(self, model: Model, rollout_error: Callable[[Model], float], config: Mapping[str, Any]) -> None:
+        self.model, self.config, self.rollout_error = model, config, rollout_error
+        self.state = TrainingState()
+
+    @abstractmethod
+    def _run_epoch(self) -> dict[str, float]:
+        """Trains for one epoch; returns what its record says of the losses."""
+
+    @property
+    def finished(self) -> bool:
+        """Whether all epochs are done."""
+        return self.state.epoch >= self.config["epochs"]
+
+    def run_epoch(self) -> dict[str, float]:
+        """One epoch; returns its record."""
+        losses = self._run_epoch()
+        self.state.epoch += 1
+        record = {"epoch": float(self.state.epoch), **losses}
+        if self.state.epoch % self.config["rollout_every"] == 0 or self.finished:
+            record["rollout_error_mm"] = self.rollout_error(self.model)
+        self._keep(record)
+        return record
+
+    def _keep(self, record: dict[str, float]) -> None:
+        """Adds to the history; keeps the weights if they are the best so far, or the first that could be compared."""
+        self.state.history.append(record)
+        score = record.get("rollout_error_mm" if self.selection == "rollout" else self.selection)
+        if score is not None and (score < self.state.best_score or not self.state.best):
+            self.state.best_score, self.state.best_epoch = score, self.state.epoch
+            self.state.best = {k: t.detach().clone() for k, t in self.model.network.state_dict().items()}
+
+    def _kept_record(self) -> dict[str, float]:
+        """The record of the epoch whose weights are kept."""
+        return next(record for record in self.state.history if record["epoch"] == self.state.best_epoch)
+
+    @property
+    def best_error(self) -> float:
+        """Roll-out error of the kept weights [mm]; infinite where one diverged, NaN where none was measured yet."""
+        return self._kept_record().get("rollout_error_mm", math.nan) if self.state.best else math.nan
+
+    def use_best(self) -> Model:
+        """The model with the weights that are kept; completes the history by their roll-out error."""
+        self.model.network.load_state_dict(self.state.best)
+        self.model.eval()
+        record = self._kept_record()
+        if "rollout_error_mm" not in record:
+            record["rollout_error_mm"] = self.rollout_error(self.model)
+        return self.model
+
+    def snapshot(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+        """Tensors and metadata from which `resume` goes on exactly."""
+        tensors = {f"model.{k}": t for k, t in self.model.state_dict().items()}
+        tensors |= {f"best.{k}": t for k, t in self.state.best.items()}
+        best = self.state.best_score if math.isfinite(self.state.best_score) else None
+        return tensors, {
+            "epoch": self.state.epoch,
+            "best_score": best,
+            "best_epoch": self.state.best_epoch,
+            "history": self.state.history,
+        }
+
+    def resume(self, tensors: Mapping[str, torch.Tensor], metadata: Mapping[str, Any]) -> None:
+        """Goes on from a `snapshot`."""
+        self.model.load_state_dict(part_of(tensors, "model."))
+        best = metadata["best_score"]
+        self.state = TrainingState(
+            metadata["epoch"],
+            list(metadata["history"]),
+            math.inf if best is None else best,
+            metadata["best_epoch"],
+            part_of(tensors, "best."),
+        )
+
+
+class Trainer(EpochTrainer[Model]):
+    """Minimises the mean squared error of the standardised outputs by Adam.
+
+    The weights that are kept have the smallest roll-out error on the validation split, measured every so many epochs,
+    or the smallest validation loss of all epochs. In either case `use_best` leaves their roll-out error in the history.
+
+    Args:
+        model: to train; on the device of the samples.
+        train: training samples.
+        validation: held-out samples.
+        rollout_error: mean roll-out error on the validation split [mm]; infinite where a roll-out diverged.
+        config: the group ``trainer``.
+        seed: of the batches and the noise.
+
+    Raises:
+        InputError: an empty split, or a setting out of range.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        train: Samples,
+        validation: Samples,
+        rollout_error: Callable[[Model], float],
+        config: Mapping[str, Any],
+        seed: int,
+    ) -> None:
+        for name, samples in (("training", train), ("validation", validation)):
+            if not len(samples.q):
+                raise InputError(f"the {name} split is empty: give it at least one trajectory.")
+        check_trainer(config)
+        super().__init__(model, rollout_error, config)
+        self.selection = config["selection"]
+        self._random = torch.Generator().manual_seed(seed)
+        self._optimiser = torch.optim.Adam(
+            model.network.parameters(), lr=config["learning_rate"], weight_decay=config["weight_decay"]
+        )
+        with torch.no_grad():
+            self._train = (model.encode(train.q, train.v, train.actuation), model.encode_outputs(*train.outputs))
+            self._validation = (
+                model.encode(validation.q, validation.v, validation.actuation),
+                model.encode_outputs(*validation.outputs),
+            )
+            if config["linear_noise"] is not None:
+                model.fit_linear(*self._train, config["linear_noise"])
+            self._weights = scale_weights(model, config["scale_weight"])
+
+    def learning_rate(self, epoch: int) -> float:
+        """Cosine from the first to the final rate, or a factor gamma every so many epochs."""
+        first, last = self.config["learning_rate"], self.config["final_learning_rate"]
+        if self.config["schedule"] == "step":
+            return float(first * self.config["gamma"] ** (epoch // self.config["step_epochs"]))
+        phase = epoch / max(self.config["epochs"] - 1, 1)
+        return float(last + 0.5 * (first - last) * (1.0 + math.cos(math.pi * phase)))
+
+    @override
+    def _run_epoch(self) -> dict[str, float]:
+        """One pass over the training samples."""
+        rate = self.learning_rate(self.state.epoch)
+        for group in self._optimiser.param_groups:
+            group["lr"] = rate
+        inputs, outputs = self._train
+        order = torch.randperm(len(inputs), generator=self._random).to(inputs.device)
+        total = torch.zeros((), device=inputs.device)
+        self.model.train()
+        for batch in order.split(self.config["batch_size"]):
+            x = inputs[batch]
+            if self.config["noise"] > 0.0:
+                noise = torch.randn(x.shape, generator=self._random).to(x.device)
+                x = x + self.config["noise"] * noise
+            loss = self._loss(x, outputs[batch])
+            self._optimiser.zero_grad()
+            loss.backward()
+            self._optimiser.step()
+            total += loss.detach() * len(batch)
+        train_loss = float(total) / len(inputs) * float(self.model.remainder) ** 2
+        return {"train_loss": train_loss, "validation_loss": self._validate(), "learning_rate": rate}
+
+    def _validate(self) -> float:
+        self.model.eval()
+        with torch.no_grad():
+            x, y = self._validation
+            return float(self._loss(x, y)) * float(self.model.remainder) ** 2
+
+    def _loss(self, inputs: torch.Tensor, outputs: torch.Tensor) -> torch.Tensor:
+        """Weighted mean squared error of the standardised outputs, in units of what the linear part leaves."""
+        error = self._weights * (self.model.standardised(inputs) - outputs)
+        return (error / self.model.remainder).square().mean()
+
+    @override
+    def snapshot(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+        tensors, metadata = super().snapshot()
+        tensors["random"] = self._random.get_state()
+        for i, slot in self._optimiser.state_dict()["state"].items():
+            tensors |= {f"adam.{i}.{k}": t for k, t in slot.items()}
+        return tensors, metadata
+
+    @override
+    def resume(self, tensors: Mapping[str, torch.Tensor], metadata: Mapping[str, Any]) -> None:
+        super().resume(tensors, metadata)
+        self._random.set_state(tensors["random"])
+        slots: dict[int, dict[str, torch.Tensor]] = {}
+        for key, tensor in part_of(tensors, "adam.").items():
+            index, name = key.split(".")
+            slots.setdefault(int(index), {})[name] = tensor
+        self._optimiser.load_state_dict({**self._optimiser.state_dict(), "state": slots})
+
+
+def scale_weights(model: StateMap, exponent: float) -> torch.Tensor:
+    """(n_out,) weights of the standardised outputs in the loss: their deviations to a power, mean square one a field.
+
+    Standardised outputs are all alike to a loss. With the power one it is the squared error of the fields themselves,
+    where a few modes hold nearly everything; a half lets the small ones be learned too.
+    """
+    weights = []
+    for coder in model.coders:
+        powers = coder.scale**exponent
+        weights.append(powers / powers.square().mean().sqrt())
+    return torch.cat(weights).to(model.linear.dtype)
+
+
+def check_trainer(config: Mapping[str, Any]) -> None:
+    """Checks the ranges of the group ``trainer``.
+
+    Raises:
+        InputError: a setting out of range.
+    """
+    for key, known in (("schedule", SCHEDULES), ("selection", SELECTIONS)):
+        if config[key] not in known:
+            raise InputError(f"trainer.{key} is {config[key]!r}: choose one of {', '.join(known)}.")
+    for key in ("epochs", "batch_size", "learning_rate", "final_learning_rate", "step_epochs", "rollout_every"):
+        if not config[key] > 0:
+            raise InputError(f"trainer.{key} is {config[key]}: it must be positive.")
+    if not 0.0 < config["gamma"] <= 1.0:
+        raise InputError(f"trainer.gamma is {config['gamma']}: it must be greater than 0 and at most 1.")
+    for key in ("weight_decay", "noise", "scale_weight"):
+        if not config[key] >= 0:
+            raise InputError(f"trainer.{key} is {config[key]}: it must be zero or more.")
+    if config["linear_noise"] is not None and not config["linear_noise"] > 0:
+        raise InputError(f"trainer.linear_noise is {config['linear_noise']}: it must be positive, or null.")
+
+
+def part_of(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
+    """Those whose names start so, without that start."""
+    return {key.removeprefix(prefix): tensor for key, tensor in tensors.items() if key.startswith(prefix)}

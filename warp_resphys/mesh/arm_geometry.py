@@ -1,0 +1,133 @@
+"""Measures of pneumatic arms: segments in a row, each with closed chambers around the axis."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from math import isfinite
+from typing import Any
+
+import numpy as np
+
+from ..io.errors import MeshError
+from .arm_section import Section
+
+PROFILES = ("half_disc", "disc", "sector")
+OUTLINES = ("lobed", "round")
+MOST_CHAMBERS = 8  # in a segment
+
+
+@dataclass(frozen=True)
+class ArmGeometry:
+    """Measures of a pneumatic arm; those of SoPrA (Toshimitsu et al. 2021) by default.
+
+    From the base on, the arm is a cap, the chambers of a segment, a cap, and so on, and ends with a cap. It tapers
+    evenly along chambers; caps are cylinders.
+
+    Attributes:
+        chamber_lengths: lengths of the chambers of each segment [m].
+        caps: heights of the solid parts before, between and after the chambers [m]; one more than there are segments.
+        radii: of the outline before the first chambers and after those of each segment [m]; one more than there are
+            segments. It is where the outline is farthest from the axis.
+        chambers: number of chambers of each segment, 2 to 8.
+        profile: of a chamber: ``half_disc``, its flat side towards the axis; ``disc``; or ``sector`` of an annulus.
+        outline: ``lobed``: around each chamber, at the distance of the wall; or ``round``: a circle.
+        wall: between a chamber and the outline [m].
+        web: between neighbouring chambers, where they are closest [m].
+        core: between the axis and the chambers, at the base [m]; it shrinks with the radius. None: as little as the
+            webs allow.
+        rotations: of the chambers of each segment about the axis [degrees], counter-clockwise seen from the base;
+            empty: all lie in line, the first towards +x.
+
+    Raises:
+        MeshError: a measure is not positive, numbers of measures do not fit, or the chambers do not.
+    """
+
+    chamber_lengths: Sequence[float] = (0.120, 0.120)
+    caps: Sequence[float] = (0.010, 0.021, 0.005)
+    radii: Sequence[float] = (0.0283923, 0.0212942, 0.0165622)
+    chambers: int = 3
+    profile: str = "half_disc"
+    outline: str = "lobed"
+    wall: float = 0.004
+    web: float = 0.004
+    core: float | None = None
+    rotations: Sequence[float] = ()
+
+    def __post_init__(self) -> None:
+        """Check all measures, and store sequences as tuples."""
+        for name in ("chamber_lengths", "caps", "radii", "rotations"):
+            object.__setattr__(self, name, numbers(name, getattr(self, name), positive=name != "rotations"))
+        count = len(self.chamber_lengths)
+        if not count:
+            raise MeshError("the arm's chamber_lengths are empty: give one length for each segment.")
+        for name in ("caps", "radii"):
+            given = len(getattr(self, name))
+            if given != count + 1:
+                raise MeshError(f"the arm's {name} are {given} numbers, but {count} chamber_lengths need {count + 1}.")
+        if self.rotations and len(self.rotations) != count:
+            raise MeshError(f"the arm's rotations are {len(self.rotations)} numbers, but it has {count} segments.")
+        for name in ("wall", "web", *(("core",) if self.core is not None else ())):
+            numbers(name, (getattr(self, name),))
+        for name, known in (("profile", PROFILES), ("outline", OUTLINES)):
+            if getattr(self, name) not in known:
+                raise MeshError(f"the arm's {name} is {getattr(self, name)!r}: choose {', '.join(known)}.")
+        if (
+            isinstance(self.chambers, bool)
+            or not isinstance(self.chambers, int)
+            or not 2 <= self.chambers <= MOST_CHAMBERS
+        ):
+            raise MeshError(
+                f"the arm's chambers are {self.chambers!r} a segment: choose a whole number, 2 to {MOST_CHAMBERS}."
+            )
+        if self.outline == "lobed" and (self.profile == "sector" or any(self.rotations)):
+            what = "sectors" if self.profile == "sector" else "rotations"
+            raise MeshError(f"a lobed outline does not go with {what}: set the arm's outline to round.")
+        for radius in self.radii:
+            self.section(radius).check()
+
+    @property
+    def length(self) -> float:
+        """From the base to the tip [m]."""
+        return float(sum(self.chamber_lengths) + sum(self.caps))
+
+    @property
+    def stations(self) -> tuple[float, ...]:
+        """Heights where caps and chambers begin and end, from the base's 0 down to the tip [m]; an even number."""
+        parts = [self.caps[0]]
+        for chamber, cap in zip(self.chamber_lengths, self.caps[1:], strict=True):
+            parts += [chamber, cap]
+        return (0.0, *(-np.cumsum(parts)).tolist())
+
+    def section(self, radius: float) -> Section:
+        """The cross-section where the outline has a radius [m], not rotated."""
+        core = None if self.core is None else self.core * radius / self.radii[0]
+        return Section(radius, self.chambers, self.profile, self.outline, self.wall, self.web, core)
+
+    def radius_at(self, height: float) -> float:
+        """The radius of the outline at a height [m], 0 at the base and negative below it."""
+        ends = np.array(self.stations[1:-1])
+        return float(np.interp(-height, -ends, np.repeat(self.radii, 2)[1:-1]))
+
+
+def arm_geometry(config: Mapping[str, Any]) -> ArmGeometry:
+    """The measures of an arm from a group that has the keys of `ArmGeometry`, and perhaps others.
+
+    Raises:
+        MeshError: measures of which no arm can be made.
+    """
+    return ArmGeometry(**{field.name: config[field.name] for field in fields(ArmGeometry)})
+
+
+def numbers(name: str, given: Sequence[Any], positive: bool = True) -> tuple[float, ...]:
+    """The numbers of a measure as a tuple.
+
+    Raises:
+        MeshError: one is no finite number, or not positive.
+    """
+    if isinstance(given, str) or not isinstance(given, Sequence):
+        raise MeshError(f"the arm's {name} are {given!r}: give a list of numbers.")
+    for value in given:
+        good = isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
+        if not good or (positive and value <= 0.0):
+            unit = "a positive number, in metres" if positive else "a number, in degrees"
+            raise MeshError(f"the arm's {name} has {value!r}: it must be {unit}.")
+    return tuple(float(value) for value in given)

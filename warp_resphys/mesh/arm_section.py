@@ -1,0 +1,469 @@
+"""Cross-sections of pneumatic arms: their outlines, and blocks of quadrilaterals that fill them.
+
+Points of a section are complex numbers, x + iy [m]. Chamber 1 lies towards +x; the others follow counter-clockwise.
+
+A mesh has polygons in place of the curves. With corners on the curves, a coarse chamber would be too small by a tenth,
+and pressure would bend the arm as much less. So points on arcs are moved away from the arc's centre, by such a share of
+their distance that the polygon has the area of the curve that it stands for (`Section.growth`).
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from math import asin, ceil, cos, pi, sin, sqrt
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..io.errors import MeshError
+
+ComplexArray = NDArray[np.complex128]
+IntArray = NDArray[np.int64]
+Edge = tuple[str, str]  # names of its ends, in the order of the alphabet where it is a key
+Divisions = Mapping[Edge, int]
+
+SOLID = -1  # instead of the number of a chamber
+_LEAST_ROOM = 0.1  # that a chamber takes of the radius
+_LARGEST_TURN = 1.15  # of an arc for which one straight edge stands [rad]
+
+
+class Piece(NamedTuple):
+    """A piece of an outline.
+
+    Attributes:
+        start: its first point.
+        end: its last point.
+        centre: of the circle that it is an arc of, shorter than half of it; None where it is straight.
+    """
+
+    start: complex
+    end: complex
+    centre: complex | None
+
+    def points(self, t: NDArray[np.float64]) -> ComplexArray:
+        """Points at fractions (T,) of its length."""
+        if self.centre is None:
+            return np.asarray(self.start + (self.end - self.start) * t, dtype=np.complex128)
+        # A complex power turns and stretches evenly, so that ends at unlike distances from the centre do no harm.
+        spoke = self.start - self.centre
+        return np.asarray(self.centre + spoke * ((self.end - self.centre) / spoke) ** t, dtype=np.complex128)
+
+    @property
+    def turn(self) -> float:
+        """Angle that its arc spans [rad], positive counter-clockwise; 0 where it is straight."""
+        return 0.0 if self.centre is None else float(np.angle((self.end - self.centre) / (self.start - self.centre)))
+
+    @property
+    def area(self) -> float:
+        """Between the piece and the origin [m^2], positive where it runs counter-clockwise."""
+        triangle = 0.5 * (self.start.conjugate() * self.end).imag
+        if self.centre is None:
+            return float(triangle)
+        return float(triangle + 0.5 * abs(self.start - self.centre) ** 2 * (self.turn - sin(self.turn)))
+
+    def turned(self, angle: float) -> "Piece":
+        """The piece, turned about the axis by an angle [rad]."""
+        turn = complex(cos(angle), sin(angle))
+        return Piece(self.start * turn, self.end * turn, None if self.centre is None else self.centre * turn)
+
+    def mirrored(self) -> "Piece":
+        """The piece on the other side of the x axis."""
+        centre = None if self.centre is None else self.centre.conjugate()
+        return Piece(self.start.conjugate(), self.end.conjugate(), centre)
+
+    def reversed(self) -> "Piece":
+        """The same piece from its end to its start."""
+        return Piece(self.end, self.start, self.centre)
+
+
+class Growth(NamedTuple):
+    """How far the corners of the polygons lie outside the curves, as shares of the arcs' radii.
+
+    Attributes:
+        chamber: of a chamber.
+        outline: of the arm.
+    """
+
+    chamber: float
+    outline: float
+
+
+@dataclass(frozen=True)
+class Section:
+    """The cross-section of an arm at one height.
+
+    The half of a wedge counter-clockwise of the middle of chamber 1 is described by named points, and mirrored:
+
+        O            the axis
+        M, C, (E)    the chamber's inner side: its middle, its corner, and where a sector's straight side ends
+        A0 to Am     the chamber's outer arc, from its last corner (C or E) to its crown
+        B0 to Bm     the outline opposite
+        W, (U)       the middle of the web opposite C (and E)
+        V            the middle of the web on the outline; lobes meet there, and B0 is there as well
+        Xm, Xc, X1, X2  inside of the chamber, next to M, C, A1 and A2: used where caps close it
+
+    Attributes:
+        radius: of the outline, where it is farthest from the axis [m].
+        count: number of chambers.
+        profile: of a chamber: ``half_disc``, its flat side towards the axis; ``disc``; or ``sector`` of an annulus.
+        outline: ``lobed``: around each chamber, at the distance of the wall; or ``round``: a circle.
+        wall: between a chamber and the outline [m].
+        web: between neighbouring chambers, where they are closest [m].
+        core: between the axis and a chamber [m]; None: the least that the webs allow.
+    """
+
+    radius: float
+    count: int
+    profile: str
+    outline: str
+    wall: float
+    web: float
+    core: float | None = None
+
+    @property
+    def half_angle(self) -> float:
+        """Between the middle of a chamber and the middle of the web beside it [rad]."""
+        return pi / self.count
+
+    @property
+    def arc_centre(self) -> float:
+        """Distance from the axis to the centre of the chamber's outer arc [m]."""
+        reach, s, c = self.radius - self.wall, sin(self.half_angle), cos(self.half_angle)
+        if self.profile == "sector":
+            return 0.0
+        # With the centre at d and the radius a = reach - d, the middle of the web is at d s - a c from the corner of
+        # half a disc and at d s - a from a disc; either is half the web.
+        if self.profile == "half_disc":
+            return (0.5 * self.web + reach * c) / (s + c) if self.core is None else self.core
+        return (0.5 * self.web + reach) / (s + 1.0) if self.core is None else 0.5 * (self.core + reach)
+
+    @property
+    def arc_radius(self) -> float:
+        """Radius of the chamber's outer arc [m]."""
+        return self.radius - self.wall - self.arc_centre
+
+    @property
+    def inner_radius(self) -> float:
+        """Distance between the axis and a chamber [m]."""
+        if self.profile == "half_disc":
+            return self.arc_centre
+        if self.profile == "disc":
+            return self.arc_centre - self.arc_radius
+        return self.web / sin(self.half_angle) if self.core is None else self.core
+
+    def check(self) -> None:
+        """Checks that the chambers fit.
+
+        Raises:
+            MeshError: they do not.
+        """
+        where = f"where the arm's radius is {1e3 * self.radius:.4g} mm"
+        d, a, s, c = self.arc_centre, self.arc_radius, sin(self.half_angle), cos(self.half_angle)
+        room = a - self.inner_radius if self.profile == "sector" else a
+        if room < _LEAST_ROOM * self.radius or self.inner_radius <= 0.0:
+            raise MeshError(f"{where}, {self.count} chambers do not fit: make the wall, the web or the core thinner.")
+        if self.core is not None:
+            gaps = {"half_disc": d * s - a * c, "disc": d * s - a, "sector": self.core * s}
+            gap = 2.0 * gaps[self.profile]
+            if gap < self.web * (1.0 - 1e-9):
+                raise MeshError(
+                    f"{where}, a core of {1e3 * self.core:.4g} mm leaves webs of {1e3 * gap:.4g} mm between chambers, "
+                    f"less than the {1e3 * self.web:.4g} mm that are asked for: change the core, or set it to null."
+                )
+        if self.outline == "lobed" and not (d * s < a + self.wall and d * c < abs(self._valley())):
+            raise MeshError(
+                f"{where}, the lobes of the outline do not meet: make the wall thicker or the outline round."
+            )
+
+    def _valley(self) -> complex:
+        """Where the outline crosses the middle of the web."""
+        d, s, c = self.arc_centre, sin(self.half_angle), cos(self.half_angle)
+        if self.outline == "round":
+            return complex(self.radius * c, self.radius * s)
+        return (d * c + sqrt(max((self.arc_radius + self.wall) ** 2 - (d * s) ** 2, 0.0))) * complex(c, s)
+
+    @property
+    def rows(self) -> int:
+        """Number m of the pieces that half of the outer arc is divided into."""
+        return 1 if self.profile == "sector" else 2
+
+    @property
+    def inner_side(self) -> tuple[str, ...]:
+        """Names of the points of half the inner side, from its middle."""
+        return ("M", "C", "E") if self.profile == "sector" else ("M", "C")
+
+    @cached_property
+    def points(self) -> Mapping[str, complex]:
+        """The named points."""
+        d, a, half, valley = self.arc_centre, self.arc_radius, self.half_angle, self._valley()
+        point = {"O": 0j, "M": complex(self.inner_radius), "V": valley}
+        if self.profile == "sector":
+            for name, radius in (("C", self.inner_radius), ("E", a)):
+                point[name] = radius * np.exp(1j * (half - asin(0.5 * self.web / radius)))
+        elif self.profile == "half_disc":
+            point["C"] = complex(d, a)
+        else:  # where the wall is thinnest towards the valley, or the web is
+            lobe = valley - d if self.outline == "lobed" else np.exp(1j * (half / 2 + pi / 2))
+            point["C"] = d + a * lobe / abs(lobe)
+        last = point[self.inner_side[-1]]
+        point["B0"] = valley if self.outline == "lobed" else self.radius * last / abs(last)
+        for i, t in enumerate(np.linspace(0.0, 1.0, self.rows + 1)):
+            point[f"A{i}"] = complex(Piece(last, complex(d + a), complex(d)).points(t))
+            point[f"B{i}"] = complex(Piece(point["B0"], complex(self.radius), self._outline_centre).points(t))
+        if self.profile == "half_disc":
+            point |= {"X1": d + (0.45 + 0.2j) * a, "X2": complex(d + 0.65 * a)}
+        elif self.profile == "disc":
+            point |= {f"X{name[-1].lower()}": 0.5 * (d + point[name]) for name in ("M", "C", "A1", "A2")}
+        along = np.exp(1j * half)
+        feet = [(point[name] / along).real for name in self.inner_side[1:]]
+        if self.outline == "lobed":  # opposite the valley, as far from the corners
+            feet[-1] = max(2.0 * feet[-1] - abs(valley), 0.5 * feet[-1])
+        for name, foot in zip("WU", feet, strict=False):
+            point[name] = foot * along
+        return point
+
+    @property
+    def _outline_centre(self) -> complex:
+        """Of the outline's arc opposite chamber 1."""
+        return complex(self.arc_centre if self.outline == "lobed" else 0.0)
+
+    @property
+    def _arcs(self) -> tuple[set[str], ...]:
+        """Letters of further points with an arc of the chamber between them."""
+        return {"half_disc": ({"A", "C"},), "disc": ({"A", "C"}, {"M", "C"}), "sector": ({"M", "C"},)}[self.profile]
+
+    def piece(self, first: str, last: str) -> Piece:
+        """The line between two neighbouring named points."""
+        pair = {first[0], last[0]}
+        centre: complex | None = None
+        if pair == {"B"} or (pair == {"B", "V"} and self.outline == "round"):
+            centre = self._outline_centre
+        elif pair == {"A"} or pair in self._arcs:
+            centre = complex(self.arc_centre)
+        return Piece(self.points[first], self.points[last], centre)
+
+    def motion(self, name: str) -> complex:
+        """How a named point moves with the growth of its curve: a corner stays, or keeps the web as wide as it is."""
+        point = self.points[name]
+        if name[0] in "AMCE":
+            if self.profile == "sector" and name not in ("M", "A1"):
+                along = complex(np.exp(1j * self.half_angle))
+                return (point / along).real * along
+            corner = self.profile == "half_disc" and name in ("A0", "C", "M")
+            return 0j if corner else point - self.arc_centre
+        if name[0] in "BV":
+            return 0j if self.outline == "lobed" and name in ("B0", "V") else point - self._outline_centre
+        if name == "W" and self.profile == "disc":  # goes with the corner opposite, as in `points`
+            along = complex(np.exp(1j * self.half_angle))
+            return (2.0 if self.outline == "lobed" else 1.0) * (self.motion("C") / along).real * along
+        return 0j
+
+    def divisions(self, size: float) -> Divisions:
+        """Into how many edges the lines between named points are divided, so that these have a length on average.
+
+        Opposite sides of a block are divided alike, and so on through the blocks: walls, chambers' flat sides and arcs
+        have numbers of their own, from the lengths of what is solid. No edge stands for more than about 65 degrees of
+        an arc.
+
+        Args:
+            size: the length that is aimed at [m].
+        """
+        strips: list[list[Edge]] = []
+        solid: set[Edge] = set()
+        for corners, chamber in self.blocks():
+            names = [name for name, _, _ in corners]
+            if chamber == SOLID:
+                solid.update(self.edge(*pair) for pair in zip(names, names[1:] + names[:1], strict=True))
+            for pair in (0, 1):
+                sides = [self.edge(names[i], names[(i + 1) % 4]) for i in (pair, pair + 2)]
+                joined = [strip for strip in strips if not set(sides).isdisjoint(strip)]
+                strips = [strip for strip in strips if strip not in joined]
+                strips.append(sorted({*sides, *(edge for strip in joined for edge in strip)}))
+        numbers = {}
+        for strip in strips:
+            pieces = [self.piece(*edge) for edge in [each for each in strip if each in solid] or strip]
+            least = ceil(max(abs(piece.turn) for piece in pieces) / _LARGEST_TURN)
+            length = float(np.mean([abs(piece.end - piece.start) for piece in pieces]))
+            numbers.update(dict.fromkeys(strip, max(1, least, round(length / size))))
+        return numbers
+
+    def edge(self, first: str, last: str) -> Edge:
+        """The line between two named points, however it is named."""
+        same = {"A0": self.inner_side[-1], **({"B0": "V"} if self.outline == "lobed" else {})}
+        a, b = sorted((same.get(first, first), same.get(last, last)))
+        return a, b
+
+    def growth(self, divisions: Divisions) -> "Growth":
+        """How far the corners of polygons move so that their areas are right.
+
+        Args:
+            divisions: number of straight edges in place of each line between two named points.
+        """
+        return Growth(*(self._path_growth(sides, divisions) for sides in (self._chamber_sides, self._outline_sides)))
+
+    @property
+    def _chamber_sides(self) -> tuple[Edge, ...]:
+        """Neighbouring names along half the outline of a chamber, from its crown."""
+        arc = [f"A{i}" for i in range(self.rows, -1, -1)]
+        return (*pairwise(arc), *pairwise(self.inner_side[::-1]))
+
+    @property
+    def _outline_sides(self) -> tuple[Edge, ...]:
+        """Neighbouring names along half the outline opposite a chamber, from its crown."""
+        arc = [f"B{i}" for i in range(self.rows, -1, -1)]
+        return tuple(pairwise(arc if self.outline == "lobed" else [*arc, "V"]))
+
+    def _path_growth(self, sides: Sequence[Edge], divisions: Divisions) -> float:
+        """The share by which the points of neighbouring sides move.
+
+        With points p + e w, a polygon has the area A0 + A1 e + A2 e^2, which is to be that of the curve.
+        """
+        start, move, area = [], [], 0.0
+        for first, last in sides:
+            piece = self.piece(first, last)
+            t = np.linspace(0.0, 1.0, divisions[self.edge(first, last)] + 1)
+            area += piece.area
+            start.append(piece.points(t))
+            moves = np.zeros_like(start[-1]) if piece.centre is None else start[-1] - piece.centre
+            ends = (self.motion(first), self.motion(last))
+            moves = ends[0] * (1 - t) + ends[1] * t if piece.centre is None else moves
+            moves[0], moves[-1] = ends
+            move.append(moves)
+        p, w = np.concatenate(start), np.concatenate(move)
+        a0, a2 = _fan(p, p), _fan(w, w)
+        a1 = _fan(p, w) + _fan(w, p)
+        lack = area - a0
+        return float(2.0 * lack / (a1 + sqrt(a1**2 + 4.0 * a2 * lack)))
+
+    def chamber_polygon(self, divisions: Divisions) -> ComplexArray:
+        """The corners of chamber 1, counter-clockwise from its crown."""
+        upper = self._polygon(self._chamber_sides, divisions)
+        return np.concatenate([upper, upper[-2:0:-1].conj()])
+
+    def body_polygon(self, divisions: Divisions) -> ComplexArray:
+        """The corners of the arm's outline, counter-clockwise from chamber 1."""
+        half = self._polygon(self._outline_sides, divisions)
+        turns = np.exp(2j * self.half_angle * np.arange(self.count))
+        wedge = np.concatenate([half[:0:-1].conj(), half[:-1]])
+        return np.asarray((turns[:, None] * wedge).ravel(), dtype=np.complex128)
+
+    def _polygon(self, sides: Sequence[Edge], divisions: Divisions) -> ComplexArray:
+        growth = self.growth(divisions)
+        points = []
+        for first, last in sides:
+            t = np.linspace(0.0, 1.0, divisions[self.edge(first, last)] + 1)
+            points.append(grown(self, growth, (first, False, 0), (last, False, 0), t))
+        return np.concatenate([points[0][:1], *(each[1:] for each in points)])
+
+    def blocks(self) -> Iterator[tuple[list[tuple[str, bool, int]], int]]:
+        """Quadrilaterals that fill the section: four corners, each (name, mirrored or not, wedge), and the chamber."""
+        m, n = self.rows, self.count
+        inner, middle = self.inner_side, ("O", "W", "U")
+        solid = [(middle[i], inner[i], inner[i + 1], middle[i + 1]) for i in range(len(inner) - 1)]
+        solid += [(f"A{i}", f"B{i}", f"B{i + 1}", f"A{i + 1}") for i in range(m)]
+        if self.outline == "round":
+            solid.append((middle[len(inner) - 1], inner[-1], "B0", "V"))
+        hollow = {
+            "half_disc": [("M", "X1", "A1", "C"), ("X1", "X2", "A2", "A1")],
+            "disc": [
+                ("M", "Xm", "Xc", "C"),
+                ("C", "Xc", "X1", "A1"),
+                ("A1", "X1", "X2", "A2"),
+                ("Xm", "X2", "X1", "Xc"),
+            ],
+            "sector": [("M", "A1", "A0", "C")],
+        }[self.profile]
+        for j in range(n):
+            for mirrored in (False, True):
+                yield from (([(name, mirrored, j) for name in names], SOLID) for names in solid)
+                yield from (([(name, mirrored, j) for name in names], j) for names in hollow)
+            if self.profile == "half_disc":
+                yield [("M", False, j), ("X1", True, j), ("X2", False, j), ("X1", False, j)], j
+            if self.outline == "lobed":
+                corner, back = inner[-1], middle[len(inner) - 1]
+                yield [(back, False, j), (corner, False, j), ("V", False, j), (corner, True, (j + 1) % n)], SOLID
+
+
+def section_grids(section: Section, divisions: Divisions) -> tuple[list[ComplexArray], list[int]]:
+    """Grids of points in the blocks of a section, by transfinite interpolation (Gordon and Hall 1973).
+
+    Args:
+        section: the section.
+        divisions: into how many quadrilaterals the lines between named points are divided, see `Section.divisions`.
+
+    Returns:
+        Of each block: (k + 1, l + 1) points, those along the second axis counter-clockwise of those along the first,
+        and the chamber that it belongs to, counted from 0, or `SOLID`.
+    """
+    growth = section.growth(divisions)
+    grids, chambers = [], []
+    for corners, chamber in section.blocks():
+        along, across = (
+            np.linspace(0.0, 1.0, divisions[section.edge(corners[a][0], corners[b][0])] + 1)
+            for a, b in ((0, 1), (0, 3))
+        )
+        sides = ((0, 1, along), (3, 2, along), (0, 3, across), (1, 2, across))
+        low, high, left, right = (grown(section, growth, corners[i], corners[k], t) for i, k, t in sides)
+        u, v = along[:, None], across[None, :]
+        grid = (1 - v) * low[:, None] + v * high[:, None] + (1 - u) * left[None, :] + u * right[None, :]
+        grid = grid - (1 - u) * ((1 - v) * low[0] + v * high[0]) - u * ((1 - v) * low[-1] + v * high[-1])
+        p, q, r = grid[0, 0], grid[-1, 0], grid[-1, -1]
+        grids.append(grid if ((q - p).conjugate() * (r - p)).imag > 0.0 else grid.T)
+        chambers.append(chamber)
+    return grids, chambers
+
+
+def section_points(grids: Sequence[ComplexArray]) -> ComplexArray:
+    """All points of grids, one after the other."""
+    return np.concatenate([grid.ravel() for grid in grids])
+
+
+def section_quadrilaterals(grids: Sequence[ComplexArray]) -> tuple[IntArray, list[IntArray]]:
+    """Numbers the points of grids that share sides.
+
+    Args:
+        grids: as from `section_grids`.
+
+    Returns:
+        (S,) a place of each point among `section_points`, and of each block (Q, 4) the points of its quadrilaterals,
+        counter-clockwise.
+    """
+    flat = section_points(grids)
+    unit = 1e-7 * np.abs(flat).max()
+    keys = np.floor(np.stack([flat.real, flat.imag], axis=1) / unit + 0.1234567)  # no point of symmetry near a step
+    _, place, number = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    ends = np.cumsum([grid.size for grid in grids])
+    quads = []
+    for grid, index in zip(grids, np.split(number.ravel(), ends[:-1]), strict=True):
+        i = index.reshape(grid.shape)
+        corners = [i[:-1, :-1], i[1:, :-1], i[1:, 1:], i[:-1, 1:]]
+        quads.append(np.stack(corners, axis=-1).reshape(-1, 4))
+    return place, quads
+
+
+def grown(
+    section: Section, growth: Growth, first: tuple[str, bool, int], last: tuple[str, bool, int], t: NDArray[np.float64]
+) -> ComplexArray:
+    """Points at fractions (T,) of the line between two neighbouring corners, each (name, mirrored or not, wedge)."""
+    ends, moves = [], []
+    for (name, mirrored, wedge), other in ((first, last), (last, first)):
+        share = growth.outline if name[0] in "BV" else growth.chamber
+        piece, move = section.piece(name, other[0]), share * section.motion(name)
+        angle = 2.0 * section.half_angle * wedge
+        ends.append((piece.mirrored() if mirrored else piece).turned(angle))
+        moves.append((move.conjugate() if mirrored else move) * complex(cos(angle), sin(angle)))
+    exact = Piece(ends[0].start, ends[1].start, ends[0].centre)
+    points = exact.points(t)
+    if exact.centre is None:
+        return points + moves[0] * (1.0 - t) + moves[1] * t
+    share = growth.outline if first[0][0] in "BV" else growth.chamber
+    points += share * (points - exact.centre)
+    points[0], points[-1] = exact.start + moves[0], exact.end + moves[1]
+    return points
+
+
+def _fan(a: ComplexArray, b: ComplexArray) -> float:
+    """The bilinear form that is the area between an open polygon and the origin where both are the same."""
+    return float(0.5 * (a[:-1].conj() * b[1:]).imag.sum())

@@ -1,0 +1,114 @@
+"""Closed chambers of a body: the inner surfaces on which pressure acts."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..io.errors import MeshError
+from .mesh import Mesh, boundary_faces, connected_parts, face_triangles
+
+_SAME_HEIGHT = 0.05  # of the body's length: chambers whose centres are closer than that along it are side by side
+
+
+@dataclass(frozen=True, eq=False)
+class Chamber:
+    """A closed surface inside a body.
+
+    Attributes:
+        name: by which results and messages call it.
+        faces: (F, 3 | 4 | 6) vertices of its faces, ordered as `mesh.boundary_faces` gives them: counter-clockwise seen
+            from outside of the solid, that is, from inside the chamber.
+    """
+
+    name: str
+    faces: NDArray[np.int64]
+
+    @property
+    def vertices(self) -> NDArray[np.int64]:
+        """(S,) sorted vertices on it."""
+        return np.unique(self.faces)
+
+
+def find_chambers(mesh: Mesh, axis: Sequence[float] = (0.0, 0.0, -1.0)) -> tuple[Chamber, ...]:
+    """The inner components of a body's boundary, in a fixed order.
+
+    A component is a chamber where its faces, seen from outside of the solid, enclose a negative volume. A cavity that
+    is open to the outside is part of the outer surface, and no chamber.
+
+    Args:
+        mesh: the body.
+        axis: (3,) from its clamped end along it. Chambers are ordered along it; those side by side by their angle about
+            it, counter-clockwise seen against the axis, from the direction of x (of y where the axis is x).
+
+    Returns:
+        The chambers, named ``chamber_1`` and so on.
+    """
+    faces = boundary_faces(mesh)
+    owner = connected_parts(faces)
+    corners = mesh.vertices[face_triangles(faces)] - mesh.vertices.mean(axis=0)
+    signed = np.linalg.det(corners).reshape(len(faces), -1).sum(axis=1)
+    volumes = np.bincount(owner, weights=signed)
+    inner = [faces[owner == i] for i in np.flatnonzero(volumes < 0.0)]
+    order = _along(mesh, inner, np.asarray(axis, dtype=np.float64)) if inner else []
+    return tuple(Chamber(f"chamber_{number}", inner[i]) for number, i in enumerate(order, start=1))
+
+
+def _along(mesh: Mesh, surfaces: Sequence[NDArray[np.int64]], axis: NDArray[np.float64]) -> list[int]:
+    """The order of surfaces along an axis, and about it."""
+    along = axis / np.linalg.norm(axis)
+    across = np.eye(3)[0 if abs(along[0]) < 0.9 else 1]
+    across = across - (across @ along) * along
+    across /= np.linalg.norm(across)
+    centres = np.array([mesh.vertices[np.unique(faces)].mean(axis=0) for faces in surfaces])
+    heights = centres @ along
+    offset = centres - 0.5 * (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0))
+    angles = np.arctan2(offset @ np.cross(-along, across), offset @ across)
+    angles = np.where(angles < -1e-2, angles + 2.0 * np.pi, angles)
+    same = _SAME_HEIGHT * float(np.ptp(mesh.vertices @ along))
+    level = np.zeros(len(centres), dtype=np.int64)
+    by_height = np.argsort(heights, kind="stable")
+    steps = np.diff(heights[by_height]) > same
+    level[by_height[1:]] = np.cumsum(steps)
+    return [int(i) for i in np.lexsort((angles, level))]
+
+
+def check_chambers(chambers: Sequence[Chamber], mesh: Mesh) -> None:
+    """Checks that pressure in each chamber has no net force.
+
+    Raises:
+        MeshError: a chamber has no faces, faces of vertices that the mesh does not have, an edge on its rim, faces that
+            look the wrong way, or a face of another chamber.
+    """
+    owners: dict[frozenset[int], str] = {}
+    for chamber in chambers:
+        faces = chamber.faces
+        if not len(faces):
+            raise MeshError(f"{chamber.name} has no faces: name the surface that bounds it.")
+        if faces.min() < 0 or faces.max() >= len(mesh.vertices):
+            raise MeshError(
+                f"{chamber.name} has faces of vertices that the mesh does not have: take both from one file."
+            )
+        corners = faces[:, : 4 if faces.shape[1] == 4 else 3]
+        edges = np.stack([corners, np.roll(corners, -1, axis=1)], axis=-1).reshape(-1, 2)
+        ahead = edges[:, 0] * len(mesh.vertices) + edges[:, 1]
+        back = edges[:, 1] * len(mesh.vertices) + edges[:, 0]
+        rim = np.flatnonzero(~np.isin(ahead, back))
+        if len(rim):
+            where = ", ".join(f"{1e3 * x:.1f}" for x in mesh.vertices[edges[rim[0]]].mean(axis=0))
+            raise MeshError(
+                f"{chamber.name} is open: {len(rim)} edges of its surface belong to one face alone, one of them at "
+                f"({where}) mm; close the surface, or the pressure would push the body away."
+            )
+        triangles = face_triangles(faces)
+        volume = -float(np.linalg.det(mesh.vertices[triangles] - mesh.vertices[triangles[0, 0]]).sum()) / 6.0
+        if volume <= 0.0:
+            raise MeshError(
+                f"the faces of {chamber.name} look into the solid, or it is the outer surface of the body: list the "
+                "vertices of each face counter-clockwise as seen from inside the chamber."
+            )
+        for face in map(frozenset, faces.tolist()):
+            other = owners.setdefault(face, chamber.name)
+            if other != chamber.name:
+                raise MeshError(f"{chamber.name} and {other} share a face: every face belongs to one chamber.")

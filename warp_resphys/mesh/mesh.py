@@ -1,0 +1,365 @@
+"""Volume meshes: boxes, edge midpoints, boundaries, selections and the checks that a simulation relies on.
+
+Nodes are numbered as VTK numbers them. Lengths are metres; conversion from other units belongs to
+`warp_resphys.mesh.readers`, which reads files.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.csgraph
+from numpy.typing import NDArray
+
+from ..io.errors import MeshError
+from .shape_functions import (
+    HEXAHEDRON_NODES,
+    TETRAHEDRON10_NODES,
+    TETRAHEDRON_EDGES,
+    gauss_hexahedron,
+    gauss_tetrahedron,
+    hexahedron_shape,
+    tetrahedron10_shape,
+    tetrahedron_shape,
+)
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+DEGENERATE_VOLUME = 1e-12  # smallest volume of a cell, over the cube of its longest edge
+COINCIDENT_DISTANCE = 1e-9  # largest distance of vertices that count as one, over the diagonal of the mesh
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Vertices and cells of one kind, constant once built.
+
+    Building one checks shapes and number types only; `check_mesh` checks what the numbers mean.
+
+    Attributes:
+        vertices: (N, 3) [m] rest positions.
+        cells: (M, K) vertex indices in VTK's order; K = 4, 8 or 10.
+
+    Raises:
+        MeshError: An array has the wrong shape, or the indices are not integers.
+    """
+
+    vertices: FloatArray
+    cells: IntArray
+
+    def __post_init__(self) -> None:
+        """Check shapes and number types, and store contiguous float64 and int64 arrays."""
+        vertices, cells = np.asarray(self.vertices), np.asarray(self.cells)
+        if vertices.ndim != 2 or vertices.shape[1] != 3 or vertices.dtype.kind not in "fiu":
+            raise MeshError(f"vertices must be (N, 3) numbers, not {vertices.shape} of {vertices.dtype}")
+        if cells.ndim != 2 or cells.shape[1] not in _CELL_TYPES or cells.dtype.kind not in "iu":
+            raise MeshError(f"cells must be (M, 4 | 8 | 10) integers, not {cells.shape} of {cells.dtype}")
+        object.__setattr__(self, "vertices", np.ascontiguousarray(vertices, dtype=np.float64))
+        object.__setattr__(self, "cells", np.ascontiguousarray(cells, dtype=np.int64))
+
+    @property
+    def kind(self) -> str:
+        """Kind of the cells: "tetrahedron", "tetrahedron10" or "hexahedron"."""
+        return _CELL_TYPES[self.cells.shape[1]].name
+
+
+@dataclass(frozen=True, eq=False)
+class _CellType:
+    """What the functions below need to know about one kind of cell.
+
+    Attributes:
+        name: Name of the kind.
+        edges: (E, 2) corner nodes of the edges.
+        faces: (F, 3 | 4 | 6) nodes of the faces, counter-clockwise seen from outside, then midpoints.
+        triangles: (T, 3) triangles that a face is split into, as indices of the face's nodes.
+        gradients: (P, K, 3) derivatives of the K shape functions at the points where the map is checked.
+        weights: (P,) quadrature weights of these points; they sum to the reference cell's volume.
+    """
+
+    name: str
+    edges: IntArray
+    faces: IntArray
+    triangles: IntArray
+    gradients: FloatArray
+    weights: FloatArray
+
+
+def _tetrahedron_type() -> _CellType:
+    """4 nodes; the map is affine, so one point tells all."""
+    return _CellType(
+        name="tetrahedron",
+        edges=TETRAHEDRON_EDGES,
+        faces=np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]),
+        triangles=np.array([[0, 1, 2]]),
+        gradients=tetrahedron_shape(np.zeros((1, 3)))[1],
+        weights=np.array([1 / 6]),
+    )
+
+
+def _tetrahedron10_type() -> _CellType:
+    """4 corners, then the midpoints of the edges; the points are those of the 4-point rule, then the nodes."""
+    points, weights = gauss_tetrahedron()
+    return _CellType(
+        name="tetrahedron10",
+        edges=TETRAHEDRON_EDGES,
+        faces=np.array([[0, 2, 1, 6, 5, 4], [0, 1, 3, 4, 8, 7], [1, 2, 3, 5, 9, 8], [0, 3, 2, 7, 9, 6]]),
+        triangles=np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]]),
+        gradients=tetrahedron10_shape(np.concatenate([points, TETRAHEDRON10_NODES]))[1],
+        weights=np.concatenate([weights, np.zeros(len(TETRAHEDRON10_NODES))]),
+    )
+
+
+def _hexahedron_type() -> _CellType:
+    """8 nodes, trilinear; the points are the 2x2x2 Gauss points, then the corners."""
+    points, weights = gauss_hexahedron()
+    sides = np.linalg.norm(HEXAHEDRON_NODES[:, None] - HEXAHEDRON_NODES, axis=2)
+    return _CellType(
+        name="hexahedron",
+        edges=np.argwhere(np.triu(sides == 2)),
+        faces=np.array([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]]),
+        triangles=np.array([[0, 1, 2], [0, 2, 3]]),
+        gradients=hexahedron_shape(np.concatenate([points, HEXAHEDRON_NODES]))[1],
+        weights=np.concatenate([weights, np.zeros(len(HEXAHEDRON_NODES))]),
+    )
+
+
+_BRICK_CORNERS = (HEXAHEDRON_NODES.astype(np.int64) + 1) // 2  # steps along x, y and z from the lowest corner
+# Kuhn's six tetrahedra around the diagonal from corner 0 to corner 6. The diagonals of opposite faces are
+# parallel, so that neighbouring bricks fit.
+_BRICK_TETRAHEDRA = np.array([[0, a, b, 6] for a, b in ((1, 2), (2, 3), (3, 7), (7, 4), (4, 5), (5, 1))])
+_CELL_TYPES = {4: _tetrahedron_type(), 8: _hexahedron_type(), 10: _tetrahedron10_type()}
+
+
+def box_hexahedra(size: Sequence[float] = (0.1, 0.03, 0.03), divisions: Sequence[int] = (10, 3, 3)) -> Mesh:
+    """Box of equal bricks with one corner at the origin.
+
+    Vertex (i, j, k) has index (i (ny + 1) + j) (nz + 1) + k; cells are numbered the same way.
+
+    Args:
+        size: Lengths along x, y and z [m].
+        divisions: Numbers of bricks (nx, ny, nz) along the axes.
+
+    Returns:
+        Mesh of nx ny nz hexahedra.
+
+    Raises:
+        MeshError: A length is not positive and finite, or a number is not a positive integer.
+    """
+    sides, counts = np.asarray(size), np.asarray(divisions)
+    if sides.shape != (3,) or sides.dtype.kind not in "fiu" or not 0 < sides.min() <= sides.max() < np.inf:
+        raise MeshError(f"the size of a box must be three positive lengths in metres, not {size}")
+    if counts.shape != (3,) or counts.dtype.kind not in "iu" or np.any(counts < 1):
+        raise MeshError(f"the divisions of a box must be three positive integers, not {divisions}")
+    axes = [np.linspace(0.0, length, count + 1) for length, count in zip(sides, counts, strict=True)]
+    vertices = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    index = np.arange(len(vertices)).reshape(counts + 1)
+    return Mesh(vertices, index[:-1, :-1, :-1].reshape(-1, 1) + index[tuple(_BRICK_CORNERS.T)])
+
+
+def box_tetrahedra(
+    size: Sequence[float] = (0.1, 0.03, 0.03), divisions: Sequence[int] = (10, 3, 3), order: int = 1
+) -> Mesh:
+    """Box whose bricks are split into six tetrahedra each (Kuhn 1960), conforming and of equal volume.
+
+    Args:
+        size: Lengths along x, y and z [m].
+        divisions: Numbers of bricks (nx, ny, nz) along the axes.
+        order: 1 for 4-node tetrahedra, 2 for 10-node ones.
+
+    Returns:
+        Mesh of 6 nx ny nz tetrahedra; its first vertices are those of `box_hexahedra`.
+
+    Raises:
+        MeshError: As in `box_hexahedra`, or the order is neither 1 nor 2.
+    """
+    if order not in (1, 2):
+        raise MeshError(f"the order of tetrahedra must be 1 or 2, not {order}")
+    bricks = box_hexahedra(size, divisions)
+    mesh = Mesh(bricks.vertices, bricks.cells[:, _BRICK_TETRAHEDRA].reshape(-1, 4))
+    return quadratic(mesh) if order == 2 else mesh
+
+
+def quadratic(mesh: Mesh) -> Mesh:
+    """Add the midpoints of the edges to 4-node tetrahedra; neighbours share them.
+
+    Args:
+        mesh: Mesh of 4-node tetrahedra.
+
+    Returns:
+        Mesh of 10-node tetrahedra; its first vertices are those of `mesh`, unchanged.
+
+    Raises:
+        MeshError: The cells are of another kind.
+    """
+    if mesh.kind != "tetrahedron":
+        raise MeshError(f"edge midpoints can be added to 4-node tetrahedra only, not to {mesh.kind} cells")
+    count = len(mesh.vertices)
+    ends = np.sort(mesh.cells[:, _CELL_TYPES[10].edges].reshape(-1, 2), axis=1)
+    keys, edge_of = np.unique(ends[:, 0] * count + ends[:, 1], return_inverse=True)
+    midpoints = (mesh.vertices[keys // count] + mesh.vertices[keys % count]) / 2
+    return Mesh(
+        np.concatenate([mesh.vertices, midpoints]),
+        np.concatenate([mesh.cells, count + edge_of.reshape(-1, 6)], axis=1),
+    )
+
+
+def check_mesh(mesh: Mesh) -> None:
+    """Check that a finite-element method can use the mesh.
+
+    The Jacobian determinant of each cell's map from its reference cell must be positive at the quadrature
+    points and at the nodes.
+
+    Args:
+        mesh: The mesh.
+
+    Raises:
+        MeshError: The mesh is empty; a coordinate is not finite; an index is out of range; a vertex belongs
+            to no cell; two vertices coincide; a cell is flat, inverted or folded.
+    """
+    vertices, cells, count = mesh.vertices, mesh.cells, len(mesh.vertices)
+    if count == 0 or len(cells) == 0:
+        raise MeshError(f"the mesh is empty: it has {count} vertices and {len(cells)} cells")
+    _refuse(np.any(~np.isfinite(vertices), axis=1), "vertices", "have a NaN or infinite coordinate")
+    _refuse(np.any((cells < 0) | (cells >= count), axis=1), "cells", f"have indices outside 0 to {count - 1}")
+    unused = np.bincount(cells.ravel(), minlength=count) == 0
+    _refuse(unused, "vertices", "belong to no cell; reading with drop_unreferenced leaves them out")
+    _refuse(_coincident(vertices), "vertices", "lie on another one, a crack between cells; merge them")
+    volumes, determinants = _normalised_volumes(mesh)
+    _refuse(np.abs(volumes) < DEGENERATE_VOLUME, "cells", "are flat; remove them or mesh the body anew")
+    _refuse(determinants < DEGENERATE_VOLUME, "cells", "are inverted or folded; reorder or move their nodes")
+
+
+def boundary_faces(mesh: Mesh) -> IntArray:
+    """Faces that belong to one cell only.
+
+    Args:
+        mesh: The mesh.
+
+    Returns:
+        (F, 3) vertex indices for 4-node tetrahedra, (F, 4) for hexahedra, (F, 6) for 10-node tetrahedra: the
+        corners, counter-clockwise seen from outside, then the midpoints of the sides. Ordered by cell.
+    """
+    cell_type = _CELL_TYPES[mesh.cells.shape[1]]
+    faces = mesh.cells[:, cell_type.faces].reshape(-1, cell_type.faces.shape[1])
+    corners = 4 if mesh.kind == "hexahedron" else 3
+    keys = np.sort(faces[:, :corners], axis=1)
+    order = np.lexsort(keys.T)
+    repeated = np.all(keys[order[1:]] == keys[order[:-1]], axis=1)
+    single = np.ones(len(faces), dtype=bool)
+    single[order[1:][repeated]] = False
+    single[order[:-1][repeated]] = False
+    return faces[single]
+
+
+def connected_parts(cells: IntArray) -> IntArray:
+    """Which of the parts that do not touch each cell or face (M, K) belongs to, (M,) numbered from 0."""
+    count = int(cells.max(initial=-1)) + 1
+    ends = cells.ravel(), np.roll(cells, 1, axis=1).ravel()
+    graph = scipy.sparse.coo_array((np.ones(cells.size, dtype=np.int8), ends), shape=(count, count))
+    _, labels = scipy.sparse.csgraph.connected_components(graph, directed=False)
+    return np.unique(labels[cells[:, 0]], return_inverse=True)[1]
+
+
+def boundary_triangles(mesh: Mesh) -> IntArray:
+    """Boundary split into triangles, (F, 3) vertex indices, counter-clockwise seen from outside.
+
+    A face with 3 nodes is one triangle, with 4 nodes two, with 6 nodes four; those of a face are consecutive.
+    """
+    return face_triangles(boundary_faces(mesh))
+
+
+def face_triangles(faces: IntArray) -> IntArray:
+    """Triangles (T, 3) that faces (F, 3 | 4 | 6) are split into, counter-clockwise as they are; see above."""
+    kinds = {cell_type.faces.shape[1]: cell_type for cell_type in _CELL_TYPES.values()}
+    return faces[:, kinds[faces.shape[1]].triangles].reshape(-1, 3)
+
+
+def surface_vertices(mesh: Mesh) -> IntArray:
+    """Vertices on the boundary, (S,) sorted indices."""
+    return np.unique(boundary_faces(mesh))
+
+
+def select_vertices(
+    mesh: Mesh,
+    x: float | None = None,
+    y: float | None = None,
+    z: float | None = None,
+    tolerance: float = 1e-9,
+) -> IntArray:
+    """Vertices on a plane, or where two or three planes meet.
+
+    Args:
+        mesh: The mesh.
+        x: Coordinate of a plane across the x axis [m], or None for any.
+        y: The same for the y axis.
+        z: The same for the z axis.
+        tolerance: Largest distance of a vertex from each plane [m].
+
+    Returns:
+        (S,) sorted vertex indices, at least one.
+
+    Raises:
+        MeshError: No coordinate is given, or no vertex lies there.
+    """
+    planes = {axis: at for axis, at in enumerate((x, y, z)) if at is not None}
+    if not planes:
+        raise MeshError("a selection of vertices needs at least one of the coordinates x, y and z")
+    chosen = np.ones(len(mesh.vertices), dtype=bool)
+    for axis, at in planes.items():
+        chosen &= np.abs(mesh.vertices[:, axis] - at) <= tolerance
+    if not chosen.any():
+        low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+        wanted = ", ".join(f"{'xyz'[axis]} = {at:g}" for axis, at in planes.items())
+        spans = ", ".join(f"{'xyz'[axis]} from {low[axis]:g} to {high[axis]:g}" for axis in planes)
+        raise MeshError(f"no vertex lies within {tolerance:g} m of {wanted} m: the mesh reaches {spans} m")
+    return np.flatnonzero(chosen)
+
+
+def _normalised_volumes(mesh: Mesh) -> tuple[FloatArray, FloatArray]:
+    """Volumes and smallest Jacobian determinants of the cells, both (M,) and over the longest edge cubed.
+
+    Determinants are multiplied by the reference cell's volume: both are equal where the map is affine.
+    """
+    cell_type = _CELL_TYPES[mesh.cells.shape[1]]
+    offsets = mesh.vertices[mesh.cells] - mesh.vertices[mesh.cells[:, :1]]
+    nodes = np.ascontiguousarray(np.moveaxis(offsets, 0, 2))  # (K, 3, M) [m]
+    sides = nodes[cell_type.edges[:, 0]] - nodes[cell_type.edges[:, 1]]  # (E, 3, M) [m]
+    longest = np.sqrt((sides**2).sum(axis=1).max(axis=0))
+    nodes /= np.where(longest > 0, longest, 1.0)
+    volumes = np.zeros(len(mesh.cells))
+    smallest = np.full(len(mesh.cells), np.inf)
+    for gradient, weight in zip(cell_type.gradients, cell_type.weights, strict=True):
+        jacobian = np.tensordot(gradient.T, nodes, axes=1)  # (3, 3, M), transposed
+        determinants = (np.cross(jacobian[0], jacobian[1], axis=0) * jacobian[2]).sum(axis=0)
+        volumes += weight * determinants
+        smallest = np.minimum(smallest, determinants)
+    return volumes, smallest * cell_type.weights.sum()
+
+
+def _coincident(vertices: FloatArray) -> NDArray[np.bool_]:
+    """Flags of vertices that lie on another one, (N,); one of each pair.
+
+    Coincident points have close projections on any direction. Sorted along a skew one, each vertex is
+    compared with its successor, then with the one after it, until projections are apart or a pair is found.
+    """
+    offsets = vertices - vertices[0]
+    distance = COINCIDENT_DISTANCE * np.linalg.norm(np.ptp(offsets, axis=0))
+    heights = offsets @ np.sqrt([1 / 6, 2 / 6, 3 / 6])
+    order = np.argsort(heights)
+    found = np.zeros(len(vertices), dtype=bool)
+    for step in range(1, len(vertices)):
+        close = np.flatnonzero(heights[order[step:]] - heights[order[:-step]] <= distance)
+        pairs = order[close], order[close + step]
+        found[pairs[1]] = np.linalg.norm(offsets[pairs[1]] - offsets[pairs[0]], axis=1) <= distance
+        if not len(close) or found.any():
+            break
+    return found
+
+
+def _refuse(broken: NDArray[np.bool_], nouns: str, problem: str) -> None:
+    """Raise MeshError if any flag is set, naming the first few and how many there are."""
+    numbers = np.flatnonzero(broken)
+    if len(numbers):
+        first = ", ".join(map(str, numbers[:5])) + (", ..." if len(numbers) > 5 else "")
+        raise MeshError(f"{len(numbers)} of {len(broken)} {nouns} ({first}; counted from 0) {problem}")

@@ -1,0 +1,203 @@
+"""Reading and writing of volume meshes and their named surfaces, through meshio; lengths become metres here."""
+
+import os
+from collections.abc import Mapping
+from contextlib import redirect_stderr, redirect_stdout
+from importlib import resources
+from io import StringIO
+from pathlib import Path
+
+import numpy as np
+
+from ..io.decoding import Arrays, DecodingError, decode, mesh_arrays
+from ..io.errors import MeshError
+from ..io.files import atomic_path
+from .mesh import FloatArray, IntArray, Mesh, boundary_faces, check_mesh, quadratic
+
+METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}  # [m] length of one unit
+SHORTEST_DIAGONAL, LONGEST_DIAGONAL = 1e-3, 10.0  # [m] of a body whose units are believed
+
+_CELL_TYPES = ("tetra", "tetra10", "hexahedron")  # meshio's names of the cells that can be simulated
+_PHYSICAL, _GEOMETRICAL = "gmsh:physical", "gmsh:geometrical"  # meshio's names of gmsh's numbers of groups
+
+
+def read_mesh(path: str | os.PathLike[str], units: str = "m", order: int = 1, drop_unreferenced: bool = False) -> Mesh:
+    """Read and check a tetrahedral or hexahedral mesh in any format that meshio reads.
+
+    Points, lines and surface cells of the file are ignored, as are its data fields.
+
+    Args:
+        path: The file; its extension tells the format.
+        units: Unit of the coordinates in the file: "m", "cm" or "mm".
+        order: 2 adds the edge midpoints to 4-node tetrahedra; 1 takes the cells as they are in the file.
+        drop_unreferenced: Leave out vertices that belong to no volume cell, which are an error otherwise.
+
+    Returns:
+        The mesh in metres. Vertices keep the file's order.
+
+    Raises:
+        MeshError: The file is missing or unreadable, has no volume cells or cells of several or unsupported
+            kinds, fails `check_mesh`, is less than 1 mm or more than 10 m across; or an argument is unknown.
+    """
+    return _read(Path(path), units, order, drop_unreferenced)[0]
+
+
+def read_vertices(path: str | os.PathLike[str], units: str = "m") -> FloatArray:
+    """Read all vertices of a mesh file, (N, 3) [m], those that no volume cell uses as well.
+
+    Raises:
+        MeshError: As in `read_mesh`.
+    """
+    return np.asarray(_read(Path(path), units, order=1, drop_unreferenced=True)[1]["points"] * METRES[units])
+
+
+def read_surfaces(
+    path: str | os.PathLike[str], units: str = "m", order: int = 1, drop_unreferenced: bool = False
+) -> dict[str, IntArray]:
+    """Read the named surfaces of a mesh file: gmsh's physical groups, or the cell sets of other formats.
+
+    Args:
+        path: The file; its extension tells the format.
+        units: As in `read_mesh`.
+        order: As in `read_mesh`.
+        drop_unreferenced: As in `read_mesh`.
+
+    Returns:
+        (F, 3 | 4 | 6) faces by name, of the mesh that `read_mesh` gives for the same arguments and as
+        `mesh.boundary_faces` gives them; empty where the file names no surface.
+
+    Raises:
+        MeshError: As in `read_mesh`, or a named surface has a face that is not on the boundary of the body.
+    """
+    mesh, content, places = _read(Path(path), units, order, drop_unreferenced)
+    faces = boundary_faces(mesh)
+    corners = 4 if mesh.kind == "hexahedron" else 3
+    face_of = {tuple(sorted(face)): number for number, face in enumerate(faces[:, :corners].tolist())}
+    surfaces = {}
+    for key, nodes in content.items():
+        kind, _, name = key.partition("/")
+        if kind != "surface":
+            continue
+        found = [face_of.get(tuple(sorted(places[face].tolist()))) for face in nodes]
+        missing = found.count(None)
+        if missing:
+            raise MeshError(
+                f"{path}: {missing} of {len(found)} faces of the surface {name!r} are no faces of the body's boundary; "
+                "name surfaces that bound the volume, and mesh them with it"
+            )
+        surfaces[name] = faces[np.unique(np.array(found, dtype=np.int64))]
+    return surfaces
+
+
+def write_mesh(path: str | os.PathLike[str], mesh: Mesh, surfaces: Mapping[str, IntArray] | None = None) -> None:
+    """Write a mesh in metres.
+
+    Args:
+        path: The file; its extension tells the format. Only .msh, which is gmsh's, keeps named surfaces.
+        mesh: The mesh.
+        surfaces: (F, 3 | 4 | 6) faces by name.
+
+    Raises:
+        MeshError: The extension is unknown to meshio, or its format does not know such cells.
+        DataFileError: The disk is full, or the place cannot be written to.
+    """
+    import meshio
+
+    path = Path(path)
+    kind = _CELL_TYPES[(4, 10, 8).index(mesh.cells.shape[1])]
+    blocks, groups, fields = [(kind, mesh.cells)], [np.zeros(len(mesh.cells), dtype=np.int64)], {}
+    as_gmsh = path.suffix == ".msh"
+    if as_gmsh:
+        fields["body"] = np.array([1, 3])
+        groups[0] += 1
+        for number, (name, faces) in enumerate((surfaces or {}).items(), start=2):
+            fields[name] = np.array([number, 2])
+            blocks.append(({3: "triangle", 4: "quad", 6: "triangle6"}[faces.shape[1]], faces))
+            groups.append(np.full(len(faces), number))
+    formats = ["gmsh"] if as_gmsh else meshio.extension_to_filetypes.get(path.suffix, [])
+    if not formats:
+        raise MeshError(f"{path}: meshio does not know the extension {path.suffix!r}; use .msh, .vtu or .vtk")
+    data = {_PHYSICAL: groups, _GEOMETRICAL: groups} if as_gmsh else {}
+    content = meshio.Mesh(mesh.vertices, blocks, cell_data=data, field_data=fields)
+    try:
+        with atomic_path(path) as target, redirect_stdout(StringIO()), redirect_stderr(StringIO()):
+            if as_gmsh:  # 2.2 is the version of which meshio writes the names of groups
+                meshio.write(target, content, file_format="gmsh22", binary=False, float_fmt=".12g")
+            else:
+                meshio.write(target, content, file_format=formats[0])
+            _volume_cells(mesh_arrays(str(target), formats[0]))  # some formats leave out what they do not know
+    except (meshio.WriteError, meshio.ReadError, MeshError, DecodingError, KeyError, SystemExit) as error:
+        raise MeshError(f"{path}: meshio cannot write such a file ({error}); use .msh, .vtu or .vtk") from error
+
+
+def _read(path: Path, units: str, order: int, drop_unreferenced: bool) -> tuple[Mesh, Arrays, IntArray]:
+    """The mesh, the file's content, and the number of each vertex of the file in the mesh, -1 where it was dropped."""
+    if units not in METRES:
+        raise MeshError(f"the units of a mesh file must be one of {', '.join(METRES)}, not {units}")
+    if order not in (1, 2):
+        raise MeshError(f"the order of a mesh must be 1 or 2, not {order}")
+    if not path.is_file():
+        raise MeshError(f"{path}: there is no such mesh file")
+    content = _read_file(path)
+    try:
+        mesh = Mesh(content["points"], _volume_cells(content))
+        places = np.arange(len(mesh.vertices))
+        if drop_unreferenced:
+            mesh, places = _without_unreferenced(mesh)
+        check_mesh(mesh)
+        mesh = Mesh(mesh.vertices * METRES[units], mesh.cells)
+        _check_size(mesh, units)
+        return quadratic(mesh) if order == 2 and mesh.kind != "tetrahedron10" else mesh, content, places
+    except MeshError as error:
+        raise MeshError(f"{path}: {error}") from error
+
+
+def _read_file(path: Path) -> Arrays:
+    """What `decoding.mesh_arrays` gives; only the package's own files are read in this process."""
+    try:
+        if path.parent.resolve() == Path(str(resources.files("warp_resphys") / "meshes")).resolve():
+            return mesh_arrays(str(path))
+        return decode("meshio", path)
+    except DecodingError as error:
+        raise MeshError(
+            f"{path}: meshio cannot read this file ({error}); is it whole, and of its extension's format?"
+        ) from error
+
+
+def _volume_cells(arrays: Arrays) -> IntArray:
+    """Cells of the one supported kind in a file, (M, 4 | 8 | 10); MeshError if there is not exactly one."""
+    solids = {name.removeprefix("solid/"): cells for name, cells in arrays.items() if name.startswith("solid/")}
+    if not solids:
+        others = ", ".join(sorted({*arrays["types"].tolist()})) or "no cells"
+        raise MeshError(f"the file has no tetrahedra or hexahedra (only: {others}); mesh the volume first")
+    if len(solids) > 1 or not solids.keys() <= {*_CELL_TYPES}:
+        wanted = f"{', '.join(_CELL_TYPES[:-1])} or {_CELL_TYPES[-1]}"
+        raise MeshError(f"the file has {' and '.join(sorted(solids))} cells; all must be {wanted}, and of one kind")
+    (cells,) = solids.values()
+    return cells
+
+
+def _without_unreferenced(mesh: Mesh) -> tuple[Mesh, IntArray]:
+    """Drop vertices that belong to no cell; a mesh with invalid indices stays as it is, to be refused.
+
+    Returns:
+        The mesh, and the new number of each vertex, -1 where it was dropped.
+    """
+    count = len(mesh.vertices)
+    used, cells = np.unique(mesh.cells, return_inverse=True)
+    if used[0] < 0 or used[-1] >= count:
+        return mesh, np.arange(count)
+    places = np.full(count, -1)
+    places[used] = np.arange(len(used))
+    return Mesh(mesh.vertices[used], cells.reshape(mesh.cells.shape)), places
+
+
+def _check_size(mesh: Mesh, units: str) -> None:
+    """Raise MeshError if the bounding box is so small or large that the units are likely wrong."""
+    diagonal = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
+    if not SHORTEST_DIAGONAL <= diagonal <= LONGEST_DIAGONAL:
+        others = " or ".join(f"units={unit}" for unit in METRES if unit != units)
+        raise MeshError(
+            f"read with units={units}, the diagonal of the bounding box is {diagonal:g} m, outside "
+            f"{SHORTEST_DIAGONAL:g} to {LONGEST_DIAGONAL:g} m; did you mean {others}?"
+        )

@@ -1,1 +1,0 @@
-"""Residual physics: the forces that a simulator lacks, and a network that predicts them."""

@@ -1,0 +1,1 @@
+"""Is it right, how fast is it, and what was published: checks, benchmarks and studies beside the experiments."""

@@ -1,0 +1,402 @@
+"""Times the simulator: forward and backward steps, the parts of a step, the cold start.
+
+Machines differ, and so does one machine from minute to minute. The cases of a refinement therefore take turns, medians
+are reported, and a fixed task of LAPACK, the *yardstick*, takes its turn with them: times over the yardstick's compare.
+"""
+
+import datetime
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+import torch
+from rich.table import Table
+from threadpoolctl import threadpool_limits
+
+from ..dynamics.assembly import HessianAssembly
+from ..dynamics.integrator import State
+from ..dynamics.simulator import Simulator
+from ..experiment.build import build_body, build_simulator
+from ..io.errors import InputError
+from ..io.progress import Progress
+from ..io.stages import package_versions
+from ..linalg.linear_solver import make_linear_solver
+
+PARTS = ("local_step", "tangent", "assembly", "factor", "solve")
+_YARDSTICK_SIZE = 480
+
+
+@dataclass
+class Case:
+    """One row of the benchmark: a simulator at the state it starts from, and what was measured of it.
+
+    Attributes:
+        solver: its name.
+        material: Young's modulus [Pa] and Poisson's ratio.
+        refinement: of the configured box.
+        batch: environments.
+        steps: of a roll-out.
+        pressures: (T, B, C) in its chambers, if it has any [Pa].
+        forward: seconds of each roll-out.
+        backward: seconds of each adjoint.
+        iterations: mean a step.
+        factorisations: mean a step.
+    """
+
+    solver: str
+    material: Mapping[str, float]
+    refinement: int
+    batch: int
+    steps: int
+    simulator: Simulator
+    start: State
+    pressures: torch.Tensor | None = None
+    forward: list[float] = field(default_factory=list)
+    backward: list[float] = field(default_factory=list)
+    iterations: float = 0.0
+    factorisations: float = 0.0
+
+    def measure(self) -> None:
+        """One roll-out, and its gradient by the start, the force at every step and Young's modulus."""
+        sim, b, n = self.simulator, self.batch, self.simulator.body.n_vertices
+        q, v = (t.clone().requires_grad_(True) for t in (self.start.q, self.start.v))
+        forces = torch.zeros(self.steps, b, n, 3, device=q.device, dtype=q.dtype, requires_grad=True)
+        modulus = sim.tensor(self.material["youngs_modulus"]).reshape(1).requires_grad_(True)
+        material = replace(sim.material, youngs_modulus=modulus)
+        began = _now(q.device)
+        trajectory = sim.rollout(State(q, v), self.steps, forces, material=material, pressures=self.pressures)
+        done = _now(q.device)
+        loss = trajectory.q[-1].square().sum() + trajectory.v[-1].square().sum()
+        turned = _now(q.device)
+        torch.autograd.grad(loss, (q, v, forces, modulus))
+        self.backward.append(_now(q.device) - turned)
+        self.forward.append(done - began)
+        self.iterations = float(np.mean([r.iterations.double().mean().item() for r in trajectory.reports]))
+        self.factorisations = float(np.mean([r.factorisations for r in trajectory.reports]))
+
+    def row(self) -> dict[str, Any]:
+        """The case for the file; times are of one step of the whole batch."""
+        return {
+            "solver": self.solver,
+            **self.material,
+            "refinement": self.refinement,
+            "unknowns": 3 * (self.simulator.body.n_vertices - len(self.simulator.fixed)),
+            "batch": self.batch,
+            "steps": self.steps,
+            "repeats": len(self.forward),
+            "forward_ms": 1e3 * median(self.forward) / self.steps,
+            "backward_ms": 1e3 * median(self.backward) / self.steps,
+            "fastest_forward_ms": 1e3 * min(self.forward) / self.steps,
+            "fastest_backward_ms": 1e3 * min(self.backward) / self.steps,
+            "iterations": self.iterations,
+            "factorisations": self.factorisations,
+        }
+
+
+def run_benchmark(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Measures everything that the section ``benchmark`` of a configuration asks for.
+
+    Returns:
+        ``steps`` (a row for each `Case`), ``parts`` (milliseconds of the parts of a step), ``cold_start`` (seconds of a
+        new process without and with compiled kernels), ``yardstick_ms``, ``hardware``, ``versions``, ``date`` and
+        ``settings``.
+
+    Raises:
+        InputError: a configuration that cannot be simulated or refined.
+    """
+    settings = _quick(config["benchmark"]) if config["benchmark"]["quick"] else dict(config["benchmark"])
+    yardstick: list[float] = []
+    steps: list[dict[str, Any]] = []
+    parts: list[dict[str, Any]] = []
+    for refinement in settings["refinements"]:
+        cases = _cases(config, settings, refinement)
+        _take_turns(cases, settings, yardstick)
+        steps += [case.row() for case in cases]
+        timed = {case.batch: case for case in reversed(cases)}
+        parts += [_time_parts(timed[batch], settings["parts_repeats"]) for batch in sorted(timed)]
+    return {
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "hardware": hardware(str(config["device"])),
+        "versions": package_versions(),
+        "settings": {**settings, "device": config["device"], "dtype": config["dtype"]},
+        "yardstick_ms": 1e3 * median(yardstick),
+        "steps": steps,
+        "parts": parts,
+        "cold_start": cold_start(config) if settings["cold_start"] else None,
+    }
+
+
+def _quick(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The coarsest mesh and a single environment, twice."""
+    few = {"refinements": [1], "batches": {"cpu": [1], "cuda": [1]}, "repeats": 2, "parts_repeats": 10}
+    return {**settings, **few}
+
+
+def _cases(config: Mapping[str, Any], settings: Mapping[str, Any], refinement: int) -> list[Case]:
+    """Every combination of solver, material and batch, at its start and warmed up."""
+    body = build_body({**config, "mesh": _refined(config, refinement)})
+    kind = "cuda" if str(config["device"]).startswith("cuda") else "cpu"
+    cases = []
+    for solver in settings["solvers"]:
+        limits = settings.get(solver, {})
+        if refinement not in limits.get("refinements", [refinement]):
+            continue
+        for material in settings["materials"]:
+            changed = {
+                **config,
+                "simulation": {**config["simulation"], **material},
+                "solver": {
+                    **config["solver"],
+                    "name": solver,
+                    "relative_tolerance": settings["relative_tolerance"],
+                    "max_iterations": settings["max_iterations"],
+                },
+            }
+            batches = limits.get("batches", settings["batches"][kind])
+            for batch in (b for b in batches if b <= _at(settings["largest_batch"], refinement)):
+                simulator = build_simulator(changed, body=body)
+                steps = limits.get("steps", _at(settings["steps"], refinement))
+                case = _at_start(
+                    Case(solver, material, refinement, batch, steps, simulator, simulator.rest_state()), settings
+                )
+                simulator.rollout(case.start, 2, pressures=None if case.pressures is None else case.pressures[:2])
+                cases.append(case)
+    return cases
+
+
+def _refined(config: Mapping[str, Any], refinement: int) -> dict[str, Any]:
+    """The group ``mesh`` of a refined box, or of a body with chambers, which has one refinement."""
+    mesh = dict(config["mesh"])
+    if "divisions" in mesh:
+        mesh["divisions"] = [refinement * int(d) for d in mesh["divisions"]]
+    elif config.get("chambers") is None:
+        raise InputError(
+            "the benchmark refines a box, or drives a body with chambers: choose mesh=beam_hexahedra or "
+            "mesh=beam_tetrahedra, or experiment=sopra."
+        )
+    elif refinement != 1:
+        raise InputError("a body with chambers is taken as it is: set benchmark.refinements=[1].")
+    return mesh
+
+
+def _at_start(case: Case, settings: Mapping[str, Any]) -> Case:
+    """The case at its start: let go from a weight, or at rest before the pressures of its chambers come."""
+    simulator, batch = case.simulator, case.batch
+    chambers = len(simulator.body.chambers)
+    if not chambers:
+        return replace(case, start=released(simulator, settings["tip_mass"], batch))
+    phase = simulator.tensor(np.arange(case.steps)[:, None, None] / case.steps)
+    shift = simulator.tensor(np.arange(chambers) / chambers + 0.1 * np.arange(batch)[:, None])
+    pressures = 0.5 * settings["pressure"] * (1.0 - torch.cos(2.0 * torch.pi * (phase + shift)))
+    start = simulator.static_equilibrium(batch=batch, pressure=pressures[0]).detach()
+    return replace(case, start=start, pressures=pressures)
+
+
+def _at(values: Mapping[Any, int], refinement: int) -> int:
+    """The value for a refinement, or for the largest one that is named."""
+    named = {int(r): n for r, n in values.items()}
+    return int(named.get(refinement, named[max(named)]))
+
+
+def released(simulator: Simulator, mass: float, batch: int) -> State:
+    """Rest under a weight at the tip, lighter in each further environment of a batch.
+
+    Args:
+        simulator: of a body that is clamped at its smallest x.
+        mass: [kg].
+        batch: environments.
+    """
+    x = simulator.rest_positions[:, 0]
+    tip = x > x.max() - 1e-9 * (x.max() - x.min())
+    share = tip.to(simulator.dtype) / tip.sum()  # (N,)
+    masses = mass * (1.0 - 0.5 * torch.arange(batch, device=x.device, dtype=simulator.dtype) / batch)
+    force = masses[:, None, None] * share[:, None] * simulator.tensor(simulator.gravity)
+    return simulator.static_equilibrium(force).detach()
+
+
+def _take_turns(cases: list[Case], settings: Mapping[str, Any], yardstick: list[float]) -> None:
+    with Progress(f"refinement {cases[0].refinement}", len(cases) * settings["repeats"], "runs") as progress:
+        for _ in range(settings["repeats"]):
+            for case in cases:
+                if sum(case.forward) + sum(case.backward) <= settings["seconds"]:
+                    case.measure()
+                progress.advance()
+            yardstick.append(measure_yardstick())
+
+
+def measure_yardstick() -> float:
+    """Seconds of a product and a Cholesky factor of 480 x 480 matrices in NumPy on one thread, the median of five."""
+    n = _YARDSTICK_SIZE
+    random = np.random.default_rng(0).standard_normal((n, n))
+
+    def task() -> None:
+        np.linalg.cholesky(random @ random.T + n * np.eye(n))
+
+    with threadpool_limits(1):
+        return _median_seconds(task, 5, torch.device("cpu"))
+
+
+def _time_parts(case: Case, repeats: int) -> dict[str, Any]:
+    """Milliseconds of each part of an iteration, for the whole batch, at the end of the case's last roll-out."""
+    sim = case.simulator
+    workspace = sim.workspace(case.batch)
+    potential, pattern = workspace.potential, workspace.pattern
+    device = potential.device
+    kind = sim.settings.linear_solver
+    linear = make_linear_solver(kind, pattern.rows, pattern.cols, len(pattern.free), 3, device, potential.dtype)
+    assemble = HessianAssembly(potential, linear, pattern)
+    potential.update_tangent()
+    values = assemble().clone()
+    factor = linear.factor(values)
+    right = torch.ones(case.batch, linear.n, 1, device=device, dtype=potential.dtype)
+    tasks: dict[str, Callable[[], object]] = {
+        "local_step": potential.evaluate,
+        "tangent": potential.update_tangent,
+        "assembly": assemble,
+        "factor": lambda: linear.factor(values),
+        "solve": lambda: factor.solve(right),
+    }
+    times = {f"{name}_ms": 1e3 * _median_seconds(tasks[name], repeats, device) for name in PARTS}
+    return {
+        "refinement": case.refinement,
+        "batch": case.batch,
+        "linear_solver": type(linear).__name__,
+        **times,
+    }
+
+
+def _median_seconds(task: Callable[[], object], repeats: int, device: torch.device) -> float:
+    seconds = []
+    for _ in range(repeats):
+        began = _now(device)
+        task()
+        seconds.append(_now(device) - began)
+    return median(seconds)
+
+
+def _now(device: torch.device) -> float:
+    """Seconds, once the device has finished what it was given."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
+
+
+def hardware(device: str) -> dict[str, Any]:
+    """Names and counts of the processors."""
+    name = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        lines = info.read_text(encoding="utf-8").splitlines()
+        name = next((x.partition(":")[2].strip() for x in lines if x.startswith("model name")), name)
+    gpu = torch.cuda.get_device_name(torch.device(device)) if device.startswith("cuda") else None
+    return {"cpu": name, "cores": os.cpu_count(), "torch_threads": torch.get_num_threads(), "gpu": gpu}
+
+
+_COLD_START = """
+import sys, time
+began = time.perf_counter()
+from .benchmark import first_step
+first_step(began, sys.stdin.read())
+"""
+
+
+def cold_start(config: Mapping[str, Any]) -> dict[str, dict[str, float]]:
+    """Seconds that a new process takes to import, to get its kernels and to step, without a kernel cache and with it.
+
+    Raises:
+        RuntimeError: the process failed.
+    """
+    given = {k: config[k] for k in _NEEDED}
+    result = {}
+    with tempfile.TemporaryDirectory() as cache:
+        for name in ("cold", "warm"):
+            run = subprocess.run(
+                [sys.executable, "-c", _COLD_START],
+                input=json.dumps(given),
+                env={**os.environ, "WARP_CACHE_PATH": cache},
+                capture_output=True,
+                text=True,
+                check=False,
+            )
+            if run.returncode != 0:
+                raise RuntimeError(f"the process that measures the cold start failed:\n{run.stderr}")
+            result[name] = json.loads(run.stdout.splitlines()[-1])
+    return result
+
+
+_NEEDED = (
+    "mesh",
+    "physics",
+    "fixed",
+    "solver",
+    "simulation",
+    "gravity",
+    "time_step",
+    "integrator",
+    "device",
+    "dtype",
+)
+
+
+def first_step(began: float, config: str) -> None:
+    """Prints what this new process has taken until it made its first step, as a line of JSON.
+
+    Args:
+        began: ``time.perf_counter()`` before the imports.
+        config: keys of the main configuration, as JSON.
+    """
+    imported = time.perf_counter()
+    simulator = build_simulator(json.loads(config))
+    state = simulator.rest_state()
+    built = time.perf_counter()
+    potential = simulator.workspace(1).potential
+    potential.update_tangent()
+    kernels = _now(potential.device)
+    simulator.step(state)
+    stepped = _now(potential.device)
+    times = {
+        "import_s": imported - began,
+        "build_s": built - imported,
+        "kernels_s": kernels - built,
+        "first_step_s": stepped - kernels,
+    }
+    print(json.dumps(times))
+
+
+def benchmark_tables(result: Mapping[str, Any]) -> list[Table]:
+    """The result for a terminal."""
+    yardstick = result["yardstick_ms"]
+    where = result["hardware"]["gpu"] or result["hardware"]["cpu"]
+    steps = Table(title=f"Milliseconds a step of the whole batch, {where} (yardstick {yardstick:.2f} ms)")
+    for heading in ("solver", "nu", "unknowns", "batch", "forward", "backward", "forward / yardstick"):
+        steps.add_column(heading, justify="left" if heading == "solver" else "right")
+    steps.add_column("iterations", justify="right")
+    steps.add_column("factorisations", justify="right")
+    for row in result["steps"]:
+        forward = row["forward_ms"]
+        times = (f"{forward:.2f}", f"{row['backward_ms']:.2f}", f"{forward / yardstick:.2f}")
+        counts = (f"{row['iterations']:.1f}", f"{row['factorisations']:.2f}")
+        which = (row["solver"], f"{row['poissons_ratio']:g}", str(row["unknowns"]), str(row["batch"]))
+        steps.add_row(*which, *times, *counts)
+    parts = Table("refinement", "batch", *(p.replace("_", " ") for p in PARTS), title="Milliseconds of the parts")
+    for row in result["parts"]:
+        parts.add_row(str(row["refinement"]), str(row["batch"]), *(f"{row[f'{p}_ms']:.3f}" for p in PARTS))
+    tables = [steps, parts]
+    if result["cold_start"] is not None:
+        names = list(result["cold_start"]["cold"])
+        start = Table("kernel cache", *(n.removesuffix("_s").replace("_", " ") for n in names))
+        start.title = "Seconds of a new process"
+        for kind, times in result["cold_start"].items():
+            start.add_row(kind, *(f"{times[n]:.2f}" for n in names))
+        tables.append(start)
+    return tables

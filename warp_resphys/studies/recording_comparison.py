@@ -1,0 +1,380 @@
+"""A recording of a beam that is let go, beside the simulation of the same beam with data-sheet material.
+
+The recording is registered to the frame of the simulated body, in which the clamped face lies in x = 0 and
+gravity points along -z. Arrays are in metres; T frames or steps, M markers, N vertices.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from ..data.oscillation import Oscillation, measure_oscillation
+from ..data.recordings.processing import fill_gaps
+from ..data.recordings.reading import read_recording
+from ..data.recordings.recording import Recording
+from ..data.recordings.release import Release, find_release
+from ..data.registration import kabsch, root_mean_square
+from ..io.errors import DataFileError, InputError
+from ..io.files import atomic_path, write_json
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+FloatArray = NDArray[np.float64]
+
+_MILLI = 1e3
+_CLOSE_UP_SECONDS = 1.4
+_POSITIVE_GROUPS = ("simulation", "comparison")
+_HELD_FRAMES = 20  # that give the rest position where the release is configured
+# Ink and the vermilion of Okabe and Ito (2008), which everyone can tell apart.
+_LINES: dict[str, dict[str, Any]] = {
+    "measured": {"color": "#1c2127", "linestyle": "none", "marker": "o", "markersize": 2.0},
+    "simulated": {"color": "#d55e00", "linewidth": 1.3},
+}
+_STYLE: Any = {
+    "font.size": 9,
+    "text.color": "#1c2127",
+    "axes.titlelocation": "left",
+    "axes.titlesize": 9,
+    "axes.edgecolor": "#5c6670",
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#dde1e6",
+    "grid.linewidth": 0.6,
+    "legend.frameon": False,
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Marker:
+    """A marker and its nominal position (x, y, z) [m] in the frame of the body."""
+
+    name: str
+    position: tuple[float, float, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Swing:
+    """Tip markers of a beam from its release on.
+
+    Attributes:
+        time: (T,) [s] since the release.
+        displacement: (T, M, 3) [m] from where the markers were while the beam was held straight.
+    """
+
+    time: FloatArray
+    displacement: FloatArray
+
+    @property
+    def deflection(self) -> FloatArray:
+        """(T,) [m] mean displacement of the markers along z; negative is down."""
+        return self.displacement[:, :, 2].mean(axis=1)
+
+    @property
+    def rate(self) -> float:
+        """Samples a second [Hz]."""
+        return (len(self.time) - 1) / float(self.time[-1] - self.time[0])
+
+
+@dataclasses.dataclass(frozen=True)
+class MeasuredSwing(Swing):
+    """The swing of a recording.
+
+    Attributes:
+        rest_markers: (M, 3) [m] where the tip markers were while the beam was held, in the frame of the body.
+        release: The moment of release, in frames of the recording.
+        registration_residual: Root mean square [m] between measured and nominal markers at rest.
+    """
+
+    rest_markers: FloatArray
+    release: Release
+    registration_residual: float
+
+
+def measured_swing(
+    recording: Recording,
+    tip: Sequence[Marker],
+    base: Sequence[Marker],
+    *,
+    longest_gap: int,
+    largest_residual: float,
+    release_frame: float | None = None,
+) -> MeasuredSwing:
+    """Finds the release, registers the recording by its markers at rest and follows the tip from then on.
+
+    Args:
+        recording: The recording.
+        tip: The markers of the tip.
+        base: The markers on the clamp.
+        longest_gap: The longest occlusion that is interpolated, in frames.
+        largest_residual: Registration residual [m] beyond which the markers are not the nominal ones.
+        release_frame: The release, where it is known; found from the tip if None.
+
+    Raises:
+        DataFileError: A marker is missing or occluded for long, nothing is let go, or the markers do not fit.
+        InputError: The given release is not in the recording.
+    """
+    markers = [*tip, *base]
+    nominal = np.array([marker.position for marker in markers])
+    recording = fill_gaps(recording.select([marker.name for marker in markers]), longest_gap)
+    positions = recording.positions
+    if release_frame is None:
+        release = find_release(positions[:, : len(tip)].mean(axis=1), recording.rate, source=recording.source)
+    elif 1.0 <= release_frame < len(positions) - 1:
+        release = Release(release_frame, (max(0, int(release_frame) - _HELD_FRAMES), int(release_frame)))
+    else:
+        raise InputError(
+            f"recording.release_frame is {release_frame:g}: set it to one of the {len(positions)} frames recorded."
+        )
+    held = np.median(positions[slice(*release.rest)], axis=0)
+    motion = kabsch(held, nominal)
+    residual = root_mean_square(motion.apply(held) - nominal)
+    if residual > largest_residual:
+        raise DataFileError(
+            f"{recording.source}: the markers at rest are {1e3 * residual:.1f} mm (root mean square) off "
+            f"their nominal positions, more than {1e3 * largest_residual:.1f} mm; check the configured names "
+            "and positions."
+        )
+    first = int(np.ceil(release.frame))
+    frames = np.arange(first, len(positions))
+    rest_markers = motion.apply(held)[: len(tip)]
+    displacement = motion.apply(positions[first:])[:, : len(tip)] - rest_markers
+    time = np.asarray((frames - release.frame) / recording.rate, dtype=np.float64)
+    return MeasuredSwing(time, displacement, rest_markers, release, residual)
+
+
+def follow_face(face: FloatArray, rest_face: FloatArray, markers: FloatArray) -> FloatArray:
+    """Displacement of markers on stems that stand on a face and follow its rigid motion.
+
+    Args:
+        face: (T, S, 3) [m] vertices of the face over time.
+        rest_face: (S, 3) [m] the same at rest.
+        markers: (M, 3) [m] at rest.
+
+    Returns:
+        (T, M, 3) [m].
+    """
+    return kabsch(np.broadcast_to(rest_face, face.shape), face).apply(markers) - markers
+
+
+def marker_error(measured: Swing, simulated: Swing, seconds: float) -> float:
+    """Mean distance [m] of simulated and measured markers over the measured frames of the first seconds."""
+    inside = measured.time <= min(seconds, simulated.time[-1])
+    at_frames = CubicSpline(simulated.time, simulated.displacement)(measured.time[inside])
+    return float(np.linalg.norm(at_frames - measured.displacement[inside], axis=-1).mean())
+
+
+def simulate_swing(config: Mapping[str, Any], rest_markers: FloatArray, seconds: float) -> Swing:
+    """Simulates the beam let go from straight and at rest, and follows the tip markers.
+
+    Args:
+        config: With the groups `body`, `material`, `simulation` and `recording` of compare_recording.yaml.
+        rest_markers: (M, 3) [m] where the markers are at rest, in the frame of the body.
+        seconds: How long to simulate [s].
+
+    Raises:
+        InputError: A value in the configuration cannot be simulated.
+        ConvergenceError: A step did not converge.
+    """
+    import torch
+
+    from ..dynamics.simulator import Simulator
+    from ..energies.material import Material
+    from ..fem.body import Body, PointMass
+    from ..mesh.mesh import box_hexahedra, select_vertices
+
+    body_config, simulation = config["body"], config["simulation"]
+    length, _, height = body_config["size"]
+    mesh = box_hexahedra(body_config["size"], body_config["divisions"])
+    tip_face = select_vertices(mesh, x=length)
+    weights = []
+    if config["recording"]["hung_weight"] > 0.0:
+        mass = config["recording"]["hung_weight"] / simulation["gravity"]
+        weights.append(PointMass(mass, select_vertices(mesh, x=length, z=height).tolist()))
+    body = Body(
+        mesh,
+        fixed=select_vertices(mesh, x=0.0),
+        mass=body_config["mass"],
+        volume_integration=body_config["volume_integration"],
+        point_masses=weights,
+    )
+    simulator = Simulator(
+        body,
+        Material(**config["material"]),
+        time_step=simulation["time_step"],
+        gravity=(0.0, 0.0, -simulation["gravity"]),
+        integrator=simulation["integrator"],
+        solver=simulation["solver"],
+        relative_tolerance=simulation["relative_tolerance"],
+        device=simulation["device"],
+    )
+    steps = int(np.ceil(seconds / simulation["time_step"]))
+    with torch.no_grad():
+        positions = simulator.rollout(simulator.rest_state(), steps).q
+    face = positions[:, 0, tip_face].cpu().numpy().astype(np.float64)
+    time = simulation["time_step"] * np.arange(steps + 1)
+    return Swing(time, follow_face(face, mesh.vertices[tip_face], rest_markers))
+
+
+def compare_recording(config: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Measures and simulates a swing, and writes comparison.json and comparison.png.
+
+    Args:
+        config: The settings of compare_recording.yaml, as plain containers.
+        folder: Where to write.
+
+    Returns:
+        What comparison.json holds.
+
+    Raises:
+        DataFileError: The recording cannot be read or used, or a result cannot be written.
+        InputError: A value in the configuration is wrong.
+        ConvergenceError: A step of the simulation did not converge.
+    """
+    _check_numbers(config)
+    settings, registration, comparison = config["recording"], config["registration"], config["comparison"]
+    if settings["path"] is None:
+        raise InputError("No recording given: set recording.path to one, as in recording.path=swing.c3d.")
+    tip, base = ([Marker(**marker) for marker in config["markers"][part]] for part in ("tip", "base"))
+    measured = measured_swing(
+        read_recording(settings["path"]),
+        tip,
+        base,
+        longest_gap=registration["longest_gap"],
+        largest_residual=registration["largest_residual"],
+        release_frame=settings["release_frame"],
+    )
+    simulated = simulate_swing(config, measured.rest_markers, float(measured.time[-1]))
+    oscillations = {
+        name: measure_oscillation(
+            swing.deflection, swing.rate, window=comparison["fit_seconds"], tail=comparison["tail_seconds"]
+        )
+        for name, swing in (("measured", measured), ("simulated", simulated))
+    }
+    error = marker_error(measured, simulated, comparison["error_seconds"])
+    result = _summary(measured, oscillations, error) | {"config": dict(config)}
+    figure = draw_comparison(measured, simulated, result)
+    write_json(folder / "comparison.json", result)
+    with atomic_path(folder / "comparison.png") as partial:
+        figure.savefig(partial, dpi=160, format="png")
+    return result
+
+
+def draw_comparison(measured: Swing, simulated: Swing, result: Mapping[str, Any]) -> "Figure":
+    """Draws the deflection of the tip over time with its numbers beside it, and each marker below.
+
+    Args:
+        measured: The recording, drawn as points.
+        simulated: The simulation, drawn as a line.
+        result: What comparison.json holds.
+    """
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
+
+    labels = [marker["name"] for marker in result["config"]["markers"]["tip"]]
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(10.0, 6.2), layout="constrained")
+        rows = figure.add_gridspec(2, 1, height_ratios=[1.5, 1.0])
+        top = rows[0].subgridspec(1, 2, width_ratios=[2.2, 1.0])
+        whole = figure.add_subplot(top[0])
+        for name, swing in (("measured", measured), ("simulated", simulated)):
+            whole.plot(swing.time, _MILLI * swing.deflection, label=name, **_LINES[name])
+            whole.axhline(result[name]["sag_mm"], color=_LINES[name]["color"], linewidth=0.7, linestyle=":")
+        whole.set(xlabel="time since release [s]", ylabel="deflection, mean of the tip markers [mm]")
+        whole.set_xlim(0.0, measured.time[-1])
+        whole.set_title(result["config"]["recording"]["title"], fontsize=11, fontweight="bold")
+        whole.legend(loc="lower right", ncols=2)
+        _write_numbers(figure.add_subplot(top[1]), result)
+        panels = rows[1].subgridspec(1, len(labels)).subplots(sharey=True, squeeze=False)[0]
+        for marker, (axes, label) in enumerate(zip(panels, labels, strict=True)):
+            for name, swing in (("measured", measured), ("simulated", simulated)):
+                axes.plot(swing.time, _MILLI * swing.displacement[:, marker, 2], **_LINES[name])
+            axes.set(xlabel="time since release [s]", xlim=(0.0, min(_CLOSE_UP_SECONDS, measured.time[-1])))
+            axes.xaxis.set_major_locator(MaxNLocator(5))
+            axes.set_title(label)
+        panels[0].set_ylabel("vertical displacement [mm]")
+    return figure
+
+
+def _check_numbers(config: Mapping[str, Any]) -> None:
+    """Raises InputError for the first number that is not one or out of range."""
+    names = [f"{group}.{key}" for group in ("material", "registration", "comparison") for key in config[group]]
+    names += ["recording.hung_weight", "simulation.time_step", "simulation.gravity"]
+    if config["recording"]["release_frame"] is not None:
+        names.append("recording.release_frame")
+    for name in names:
+        group, _, key = name.partition(".")
+        value = config[group][key]
+        least, wanted = (1e-12, "more than zero") if group in _POSITIVE_GROUPS else (0.0, "not below zero")
+        if name != "material.model" and not (isinstance(value, int | float) and least <= value < np.inf):
+            raise InputError(f"{name} is {value!r}: set it to a number, {wanted}.")
+
+
+def _write_numbers(axes: "Axes", result: Mapping[str, Any]) -> None:
+    """Writes sag, period and decay of both swings, and how far they are apart, as a small table."""
+    axes.set_axis_off()
+    lines: list[tuple[str, ...]] = [("", "measured", "simulated", "difference")]
+    for label, key, scale, decimals, compared in (
+        ("sag [mm]", "sag_mm", 1.0, 2, "sag"),
+        ("period [ms]", "period_s", _MILLI, 1, "period"),
+        ("decay [1/s]", "decay_rate_per_s", 1.0, 2, "decay_rate"),
+    ):
+        numbers = [f"{scale * result[name][key]:.{decimals}f}" for name in ("measured", "simulated")]
+        lines.append((label, *numbers, f"{100.0 * result['relative_difference'][compared]:+.1f} %"))
+    columns = (0.0, 0.5, 0.82, 1.14)
+    for line, cells in enumerate(lines):
+        for x, cell, name in zip(columns, cells, lines[0], strict=True):
+            axes.text(
+                x,
+                0.9 - 0.1 * line,
+                cell.replace("-", "\N{MINUS SIGN}"),
+                transform=axes.transAxes,
+                horizontalalignment="right" if name else "left",
+                color=_LINES[name]["color"] if name in _LINES else _STYLE["text.color"],
+                fontweight="normal" if line else "bold",
+            )
+    seconds = result["config"]["comparison"]["error_seconds"]
+    notes = (
+        f"Tip markers {result['marker_error_mm']:.2f} mm apart on average in the first {seconds:g} s.\n"
+        f"Released in frame {result['release_frame']:.1f}; registered to nominal markers\n"
+        f"with {result['registration_residual_mm']:.2f} mm left (root mean square)."
+    )
+    axes.text(0.0, 0.46, notes, transform=axes.transAxes, verticalalignment="top", fontsize=8, linespacing=1.5)
+
+
+def _summary(measured: MeasuredSwing, oscillations: Mapping[str, Oscillation], error: float) -> dict[str, Any]:
+    """The content of comparison.json, in millimetres and seconds."""
+    return {
+        "release_frame": measured.release.frame,
+        "rest_frames": list(measured.release.rest),
+        "registration_residual_mm": _MILLI * measured.registration_residual,
+        **{
+            name: {
+                "sag_mm": _MILLI * found.sag,
+                "period_s": found.period,
+                "decay_rate_per_s": found.decay_rate,
+                "damping_ratio": found.damping_ratio,
+                "tail_spread_mm": _MILLI * found.tail_spread,
+                "fit_residual_mm": _MILLI * found.fit_residual,
+            }
+            for name, found in oscillations.items()
+        },
+        "relative_difference": _relative_difference(oscillations["measured"], oscillations["simulated"]),
+        "marker_error_mm": _MILLI * error,
+    }
+
+
+def _relative_difference(measured: Oscillation, simulated: Oscillation) -> dict[str, float]:
+    """(simulated - measured) / measured of each number."""
+    names = ("sag", "period", "decay_rate", "damping_ratio")
+    return {name: getattr(simulated, name) / getattr(measured, name) - 1.0 for name in names}

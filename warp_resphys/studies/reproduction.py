@@ -1,0 +1,276 @@
+"""Every experiment in turn, each through the ordinary command, and one page that sets published results beside ours."""
+
+import logging
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from ..experiment.trajectories import METRICS
+from ..io.errors import DataFileError, InputError, ResphysError
+from ..io.files import disk_full_error, is_disk_full, write_text
+from ..io.labels import run_label
+from ..io.machine import commit, hardware
+from ..io.progress import clock
+from ..io.stages import package_versions, run_lock
+from ..report.reproduction_page import Reproduction, markdown, write_reproduction
+from .comparison import Result, compare
+
+log = logging.getLogger(__name__)
+
+PAGE = "reproduction.html"
+_UP_TO_DATE_SECONDS = 8.0  # for a run that finds nothing to do
+_LINE_SECONDS = 60.0
+_PATIENCE = 60.0  # s that an interrupted run gets to save what it has
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run of the ordinary command.
+
+    Attributes:
+        experiment: name of the experiment.
+        variant: name of the variant.
+        arguments: of the command.
+        folder: that it writes, the one that the ordinary command takes for the same arguments.
+        minutes: that it may take.
+    """
+
+    experiment: str
+    variant: str
+    arguments: tuple[str, ...]
+    folder: Path
+    minutes: float
+
+    @property
+    def name(self) -> str:
+        """As in the key ``only``."""
+        return f"{self.experiment}/{self.variant}"
+
+
+class ReproductionInterrupted(KeyboardInterrupt):
+    """Ctrl-C during a run; the message says what is kept."""
+
+
+def reproduce(config: Mapping[str, Any], folder: Path, overrides: Sequence[str] = ()) -> None:
+    """Runs what is configured and writes the page, and where asked for a dated one.
+
+    Args:
+        config: with the keys of ``conf/reproduce.yaml``.
+        folder: of the page and of the runs' logs.
+        overrides: the command's own, to be named on the page.
+
+    Raises:
+        InputError: a value that cannot be used.
+        ResphysError: a run failed; the others were run, and the page is written.
+        ReproductionInterrupted: Ctrl-C.
+    """
+    runs = plan(config)
+    with run_lock(folder):
+        results = run_all(runs, folder / "logs")
+        page = Reproduction(
+            date=f"{datetime.now():%Y-%m-%d}",
+            command=shlex.join(["python", "scripts/reproduce.py", *overrides]),
+            hardware=hardware(),
+            commit=commit(),
+            versions=package_versions(),
+            **compare(config, results),
+        )
+        write_reproduction(folder / PAGE, page)
+        if config["results"] is not None:
+            _write_results(Path(config["results"]), folder, page)
+    print(f"Page: {folder / PAGE}")
+    if failed := [f"{result.experiment}/{result.variant}" for result in results if result.failure]:
+        raise ResphysError(
+            f"{len(failed)} of {len(runs)} runs failed ({', '.join(failed)}): the page says why; mend it and run the "
+            "same command again."
+        )
+
+
+def _write_results(root: Path, folder: Path, page: Reproduction) -> None:
+    """The page as Markdown, with its figures in a folder of their own, both named by the date."""
+    name = f"{page.date}-reproduction"
+    try:
+        shutil.rmtree(root / name, ignore_errors=True)
+        (root / name).mkdir(parents=True)
+        for figure in (figure.name for section in page.sections for figure in section.figures):
+            shutil.copy(folder / "figures" / f"{figure}.png", root / name)
+    except OSError as error:
+        if is_disk_full(error):
+            raise disk_full_error(root) from error
+        raise DataFileError(f"cannot write {root} ({error.strerror}): choose another folder for results.") from error
+    write_text(root / f"{name}.md", markdown(page, name))
+    print(f"Results: {root / name}.md")
+
+
+def plan(config: Mapping[str, Any]) -> list[Run]:
+    """The runs that are asked for, in order.
+
+    Raises:
+        InputError: a value of the wrong kind, or a name that does not exist.
+    """
+    for key in ("overrides", "only"):
+        value = config[key]
+        if not (key == "only" and value is None) and not (
+            isinstance(value, list) and all(isinstance(each, str) for each in value)
+        ):
+            raise InputError(f"{key} is {value!r}: it must be a list of words.")
+    runs = [_run(config, experiment, variant) for experiment, variant in _pairs(config)]
+    wanted = config["only"]
+    if wanted is None:
+        return runs
+    known = {run.experiment for run in runs} | {run.name for run in runs}
+    for name in wanted:
+        if name not in known:
+            raise InputError(
+                f"only names {name!r}, which is no experiment or run: there are {', '.join(sorted(known))}."
+            )
+    chosen = [run for run in runs if {run.experiment, run.name} & {*wanted}]
+    if not chosen:
+        raise InputError("only is []: name at least one experiment or run, or leave it null for all.")
+    return chosen
+
+
+def _pairs(config: Mapping[str, Any]) -> list[tuple[str, str]]:
+    pairs = [(experiment, name) for experiment, group in config["experiments"].items() for name in group["variants"]]
+    for experiment, name in pairs:
+        if name not in config["variants"]:
+            raise InputError(
+                f"experiments.{experiment}.variants names {name!r}: there are {', '.join(config['variants'])}."
+            )
+    return pairs
+
+
+def _run(config: Mapping[str, Any], experiment: str, name: str) -> Run:
+    variant = config["variants"][name]
+    overrides = [*variant["overrides"], *config["experiments"][experiment]["overrides"], *config["overrides"]]
+    if config["budget"] != "full":
+        overrides.append(f"budget={config['budget']}")
+    folder = Path(config["runs"]) / experiment / run_label(overrides, ("experiment", "device"))
+    return Run(experiment, name, (f"experiment={experiment}", *overrides), folder, variant["minutes"][config["budget"]])
+
+
+def run_all(runs: Sequence[Run], logs: Path) -> list[Result]:
+    """Runs one after the other; one that fails does not keep the others from running.
+
+    Raises:
+        ReproductionInterrupted: Ctrl-C.
+    """
+    logs.mkdir(parents=True, exist_ok=True)
+    console = Console(stderr=True)
+    results: list[Result] = []
+    pace = _Pace(runs)
+    for number, run in enumerate(runs, 1):
+        head = f"[{number}/{len(runs)}] {run.name}"
+        console.print(f"{head}, about {clock(pace.left())} left in all", markup=False, highlight=False, soft_wrap=True)
+        start = time.perf_counter()
+        try:
+            with console.status(run.name) as status:
+                failure = execute(run, logs / f"{run.experiment}-{run.variant}.log", _Follower(console, status.update))
+        except KeyboardInterrupt as error:
+            raise ReproductionInterrupted(
+                f"interrupted in run {number} of {len(runs)}, {run.name}; it keeps what it has, as do those before it, "
+                "and the same command goes on from there"
+            ) from error
+        pace.count(run, time.perf_counter() - start)
+        if failure:
+            console.print(f"{head} failed: {failure}", markup=False, highlight=False, soft_wrap=True)
+        results.append(Result(run.experiment, run.variant, run.arguments, run.folder, failure))
+    return results
+
+
+class _Pace:
+    """How long the runs that are left will take, from their minutes and from how long the others took."""
+
+    def __init__(self, runs: Sequence[Run]) -> None:
+        self._expected = {run.name: 60.0 * run.minutes for run in runs if not (run.folder / METRICS).is_file()}
+        self._there = {run.name for run in runs} - self._expected.keys()
+        self._taken = self._planned = 0.0
+
+    def left(self) -> float:
+        """Seconds."""
+        pace = self._taken / self._planned if self._planned else 1.0
+        return pace * sum(self._expected.values()) + _UP_TO_DATE_SECONDS * len(self._there)
+
+    def count(self, run: Run, seconds: float) -> None:
+        """Takes note of a run that is done."""
+        self._there.discard(run.name)
+        if run.name in self._expected:
+            self._planned += self._expected.pop(run.name)
+            self._taken += seconds
+
+
+class _Follower:
+    """Shows a run's own lines: the latest in a terminal, one a minute in a log."""
+
+    def __init__(self, console: Console, update: Callable[[str], None]) -> None:
+        self._console = console
+        self._update = update
+        self._next = time.monotonic() + _LINE_SECONDS
+
+    def __call__(self, line: str) -> None:
+        if self._console.is_terminal:
+            self._update(line.replace("[", r"\["))
+        elif time.monotonic() >= self._next:
+            self._console.print(f"    {line}", markup=False, highlight=False, soft_wrap=True)
+            self._next = time.monotonic() + _LINE_SECONDS
+
+
+def execute(run: Run, log_file: Path, follow: Callable[[str], None]) -> str | None:
+    """Runs the ordinary command in a process of its own, out of reach of the terminal's Ctrl-C.
+
+    Args:
+        run: which.
+        log_file: for all that it says.
+        follow: takes each line that it writes to stderr.
+
+    Returns:
+        The sentence that it failed with, or None.
+    """
+    place = str(run.folder).replace("\\", r"\\").replace("'", r"\'")
+    command = [sys.executable, "-m", "warp_resphys.cli", *run.arguments, f"hydra.run.dir='{place}'"]
+    environment = {
+        name: value for name, value in os.environ.items() if name != "HYDRA_FULL_ERROR"
+    }  # hydra_entry sets it
+    sentence = None
+    with (
+        log_file.open("a", encoding="utf-8", buffering=1) as written,
+        subprocess.Popen(
+            command, stdout=written, stderr=subprocess.PIPE, text=True, start_new_session=True, env=environment
+        ) as child,
+    ):
+        assert child.stderr is not None
+        try:
+            for line in child.stderr:
+                written.write(line)
+                if line.startswith("error: "):
+                    sentence = line.removeprefix("error: ").strip()
+                elif line.strip():
+                    follow(line.strip())
+            child.wait()
+        except BaseException:
+            written.write(_stop(child))
+            raise
+    if child.returncode == 0:
+        return None
+    return sentence or f"it ended with exit code {child.returncode}; what it said is in {log_file}"
+
+
+def _stop(child: "subprocess.Popen[str]") -> str:
+    """Ends a run as Ctrl-C does, and by force if it does not listen; what it says at last."""
+    child.send_signal(signal.SIGINT)
+    try:
+        return child.communicate(timeout=_PATIENCE)[1]
+    except subprocess.TimeoutExpired:
+        child.kill()
+        return child.communicate()[1]

@@ -1,0 +1,295 @@
+"""A study that any number of processes keep together in one folder.
+
+What is tried and what came of it stands in a journal to which every process appends. Who decides anything about the
+whole study (what to try next, whether enough was tried, whose trial is whose) holds the study's lock meanwhile, so that
+no trial is begun, told or taken over twice. A trial belongs to the worker that claimed it last.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import optuna
+from optuna.storages import JournalStorage
+from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
+from optuna.trial import FrozenTrial, Trial, TrialState
+from typing_extensions import override
+
+from ...io.errors import DataFileError, InputError
+from ...io.files import to_plain
+from .space import Choice, Dimension, described, dotted
+from .workers import Watch, held
+
+JOURNAL = "study.journal"
+_LOCK = "study.lock"
+_NAME = "tuning"
+_COUNTED = (TrialState.COMPLETE, TrialState.PRUNED)
+_MISSING = object()
+
+
+class JournalLock(JournalFileOpenLock):
+    """Lets one process at a time append to a journal, and removes what a killed one left half written.
+
+    Optuna's own locks stay behind when their holder is killed, for half a minute; this one does not.
+    """
+
+    def __init__(self, journal: Path) -> None:
+        """Describes the lock of a journal."""
+        super().__init__(str(journal))
+        self._journal = journal
+        self._held: Any = None
+
+    @override
+    def acquire(self) -> bool:
+        """Waits for the lock, and cuts off a last line without an end."""
+        self._held = held(self._journal.with_name(f"{self._journal.name}.lock"))
+        self._held.__enter__()
+        self._mend()
+        return True
+
+    @override
+    def release(self) -> None:
+        """Lets go."""
+        self._held.__exit__(None, None, None)
+
+    def _mend(self) -> None:
+        descriptor = os.open(self._journal, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            size = os.fstat(descriptor).st_size
+            if size and os.pread(descriptor, 1, size - 1) != b"\n":
+                os.ftruncate(descriptor, os.pread(descriptor, size, 0).rfind(b"\n") + 1)
+        finally:
+            os.close(descriptor)
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A trial that this worker runs.
+
+    Attributes:
+        number: of the trial, from 0 on.
+        settings: what is tried, by dotted key.
+        claims: how many workers have had it so far, this one included.
+        trial: as the sampler knows it.
+    """
+
+    number: int
+    settings: Mapping[str, Any]
+    claims: int
+    trial: Trial
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What is known of a trial.
+
+    Attributes:
+        number: of the trial, from 0 on.
+        state: ``complete``, ``pruned``, ``failed`` or ``running``.
+        error: the objective [mm]; infinite where everything diverged, None where it is not known.
+        settings: what was tried, by dotted key.
+        seconds: of computation, over all workers that had it [s]; None where it is not known.
+        reports: values on the way by step.
+    """
+
+    number: int
+    state: str
+    error: float | None
+    settings: Mapping[str, Any]
+    seconds: float | None
+    reports: Mapping[int, float]
+
+
+class SharedStudy:
+    """The study in a folder, as one of its workers sees it.
+
+    Args:
+        folder: where the study is, or is to be made.
+        space: what each setting may be.
+        conditions: everything else that a trial's result depends on, as plain data.
+        trials: how many are to be finished, over all workers.
+        seed: of the sampler.
+        identity: of this worker.
+        watch: tells which other workers live.
+
+    Raises:
+        InputError: the study that is there has another space or other conditions.
+        DataFileError: the folder cannot be written, or the journal is damaged.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        space: Mapping[str, Dimension],
+        conditions: Mapping[str, Any],
+        trials: int,
+        seed: int,
+        identity: Mapping[str, Any],
+        watch: Watch,
+    ) -> None:
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
+        self.folder, self.trials = folder, trials
+        self._space, self._seed, self._identity, self._watch = space, seed, dict(identity), watch
+        folder.mkdir(parents=True, exist_ok=True)
+        journal = folder / JOURNAL
+        with self.lock():
+            try:
+                storage = JournalStorage(JournalFileBackend(str(journal), lock_obj=JournalLock(journal)))
+            except (ValueError, KeyError, AssertionError) as error:
+                raise DataFileError(f"{journal} is damaged ({error}): delete it to start the study anew") from error
+            self._storage = storage
+            if any(study.study_name == _NAME for study in storage.get_all_studies()):
+                self._study = optuna.load_study(study_name=_NAME, storage=storage)
+            else:
+                self._study = optuna.create_study(study_name=_NAME, storage=storage)
+            self._id = storage.get_study_id_from_name(_NAME)
+            self._agree({"space": described(space), **to_plain(conditions)})
+
+    def lock(self) -> Any:
+        """A context in which no other worker decides anything about the study."""
+        return held(self.folder / _LOCK)
+
+    def _agree(self, conditions: dict[str, Any]) -> None:
+        """Marks a new study with its conditions, and compares those of an old one."""
+        found = self._study.user_attrs.get("conditions")
+        if found is None:
+            self._study.set_user_attr("conditions", conditions)
+            return
+        there, here = dict(dotted(found)), dict(dotted(conditions))
+        different = [key for key in sorted({*there, *here}) if there.get(key, _MISSING) != here.get(key, _MISSING)]
+        if not different:
+            return
+        key = next((key for key in different if key.startswith("space.")), different[0])
+        old, new = (_told(side.get(key, _MISSING)) for side in (there, here))
+        what = f"the search space of {key.removeprefix('space.')}" if key.startswith("space.") else key
+        raise InputError(
+            f"the study in {self.folder} has another setting: {what} was {old}, now it is {new}; go on with the old "
+            f"setting, delete the folder, or name another study with tune.study=..."
+        )
+
+    def claim(self) -> Claim | None:
+        """A trial for this worker: one that a dead worker left, or a new one; None if there is none to take now."""
+        with self.lock():
+            trials = self._study.get_trials(deepcopy=False)
+            running = [trial for trial in trials if trial.state == TrialState.RUNNING]
+            for trial in running:
+                claims = trial.user_attrs.get("claims", [])
+                if not claims or not self._watch.is_alive(claims[-1]):
+                    number = self._storage.get_trial_id_from_study_id_trial_number(self._id, trial.number)
+                    return self._take(Trial(self._study, number))
+            if len(running) + sum(trial.state in _COUNTED for trial in trials) >= self.trials:
+                return None
+            # Each trial draws numbers of its own, so that workers with the same seed do not try the same.
+            seed = int(np.random.SeedSequence([self._seed, len(trials)]).generate_state(1)[0])
+            self._study.sampler = optuna.samplers.TPESampler(seed=seed)
+            return self._take(self._study.ask())
+
+    def _take(self, trial: Trial) -> Claim:
+        claims = [*trial.user_attrs.get("claims", []), self._identity]
+        trial.set_user_attr("claims", claims)
+        settings = {key: _decoded(each, _suggested(trial, key, each)) for key, each in self._space.items()}
+        return Claim(trial.number, settings, len(claims), trial)
+
+    def owns(self, claim: Claim) -> bool:
+        """Whether a trial is still this worker's: nobody took it over."""
+        now = self._find(claim)
+        return now.state == TrialState.RUNNING and now.user_attrs["claims"][-1] == self._identity
+
+    def _find(self, claim: Claim) -> FrozenTrial:
+        return self._study.get_trials(deepcopy=False)[claim.number]
+
+    def report(self, claim: Claim, step: int, value: float) -> None:
+        """Notes a value on the way.
+
+        Args:
+            claim: the trial.
+            step: where it was measured, such as an epoch.
+            value: the smaller, the better; infinite where it diverged.
+        """
+        if step not in self._find(claim).intermediate_values:
+            claim.trial.report(value, step)
+
+    def tell(self, claim: Claim, value: float | None, seconds: float) -> bool:
+        """Ends a trial.
+
+        Args:
+            claim: the trial.
+            value: the objective, infinite where it diverged; None for a trial that is given up.
+            seconds: of computation.
+
+        Returns:
+            Whether it was this worker's to end; if not, nothing is changed.
+        """
+        return self._end(claim, seconds, TrialState.PRUNED if value is None else TrialState.COMPLETE, value)
+
+    def fail(self, claim: Claim, seconds: float) -> bool:
+        """Ends a trial that cannot be computed; it does not count."""
+        return self._end(claim, seconds, TrialState.FAIL, None)
+
+    def _end(self, claim: Claim, seconds: float, state: TrialState, value: float | None) -> bool:
+        with self.lock():
+            if not self.owns(claim):
+                return False
+            claim.trial.set_user_attr("seconds", seconds)
+            self._study.tell(claim.trial, value, state=state)
+            return True
+
+    def outcomes(self) -> list[Outcome]:
+        """All trials so far."""
+        return [self._outcome(trial) for trial in self._study.get_trials(deepcopy=False)]
+
+    def _outcome(self, trial: FrozenTrial) -> Outcome:
+        settings = {key: _decoded(self._space[key], trial.params[key]) for key in self._space if key in trial.params}
+        state = {TrialState.COMPLETE: "complete", TrialState.PRUNED: "pruned", TrialState.FAIL: "failed"}
+        error = min(trial.intermediate_values.values(), default=None) if trial.value is None else trial.value
+        return Outcome(
+            trial.number,
+            state.get(trial.state, "running"),
+            error,
+            settings,
+            trial.user_attrs.get("seconds"),
+            trial.intermediate_values,
+        )
+
+    def holders(self) -> list[str]:
+        """Who runs a trial now, in words."""
+        trials = self._study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
+        return [f"{c[-1]['host']}:{c[-1]['pid']}" for c in (t.user_attrs.get("claims") for t in trials) if c]
+
+    def importance(self) -> dict[str, float]:
+        """How much each setting matters for being among the best quarter, summing to one; empty if that is not known.
+
+        The method is PED-ANOVA (Watanabe et al., 2023, arXiv:2304.10255).
+        """
+        values = [trial.value for trial in self._study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))]
+        if len({value for value in values if value is not None and math.isfinite(value)}) < 4:
+            return {}
+        evaluator = optuna.importance.PedAnovaImportanceEvaluator(target_quantile=0.25)
+        found = optuna.importance.get_param_importances(self._study, evaluator=evaluator)
+        return {key: float(value) for key, value in found.items()}
+
+
+def _suggested(trial: Trial, key: str, dimension: Dimension) -> Any:
+    """What the sampler draws: of ordered values their place, as neighbours resemble each other."""
+    if isinstance(dimension, Choice):
+        if dimension.ordered:
+            return trial.suggest_int(key, 0, len(dimension.values) - 1)
+        return trial.suggest_categorical(key, dimension.values)
+    if dimension.whole:
+        return trial.suggest_int(key, int(dimension.low), int(dimension.high), log=dimension.log)
+    return trial.suggest_float(key, dimension.low, dimension.high, log=dimension.log)
+
+
+def _decoded(dimension: Dimension, value: Any) -> Any:
+    """The setting that a drawn value stands for."""
+    return dimension.values[value] if isinstance(dimension, Choice) and dimension.ordered else value
+
+
+def _told(value: Any) -> str:
+    return "absent" if value is _MISSING else str(value)

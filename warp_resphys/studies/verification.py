@@ -1,0 +1,210 @@
+"""Reference trajectories of boxes, and how far a simulation with their own parameters departs from them.
+
+The format is a NumPy archive without pickled objects that holds the keys of `REFERENCE_SHAPES`. It carries
+vertices only, in x-major order; the hexahedra between them follow from the distinct coordinates.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..dynamics.integrator import State
+from ..dynamics.nonlinear_solver import SolverSettings
+from ..dynamics.simulator import Simulator
+from ..energies.material import Material
+from ..fem.body import Body
+from ..io.errors import DataFileError, InputError
+from ..io.files import read_arrays
+from ..mesh.mesh import Mesh, box_hexahedra, select_vertices
+
+FloatArray = NDArray[np.float64]
+
+# Shape of each entry; T steps, N vertices.
+REFERENCE_SHAPES: dict[str, tuple[int | str, ...]] = {
+    "youngs_modulus": (),  # Pa
+    "poissons_ratio": (),
+    "density": (),  # kg/m^3
+    "dt": (),  # s
+    "gravity": (3,),  # m/s^2
+    "vertices": ("N", 3),  # m
+    "f_ext": ("T", "N", 3),  # N, held during step t
+    "q": ("T + 1", "N", 3),  # m, state 0 is the start
+    "v": ("T + 1", "N", 3),  # m/s
+}
+_GRID_TOLERANCE = 1e-9  # of the box's length: distance within which coordinates count as equal
+
+
+@dataclass(frozen=True)
+class ReferenceTrajectory:
+    """A recorded simulation of a box whose face at the smallest x is held.
+
+    Attributes:
+        material: its constants.
+        time_step: [s].
+        gravity: (3,) [m/s^2].
+        mesh: the box of hexahedra, with the file's vertices.
+        forces: (T, N, 3) external force held during each step [N].
+        q: (T + 1, N, 3) positions [m].
+        v: (T + 1, N, 3) velocities [m/s].
+    """
+
+    material: Material
+    time_step: float
+    gravity: FloatArray
+    mesh: Mesh
+    forces: FloatArray
+    q: FloatArray
+    v: FloatArray
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Outcome of a comparison.
+
+    Attributes:
+        largest_error: largest distance of a vertex from the reference over all steps [m].
+        iterations: mean global steps of the solver a time step.
+    """
+
+    largest_error: float
+    iterations: float
+
+
+def read_reference(path: Path) -> ReferenceTrajectory:
+    """Reads a reference trajectory.
+
+    Args:
+        path: a NumPy archive (.npz) without pickled objects.
+
+    Raises:
+        DataFileError: the file is missing or no such archive; it lacks entries, has others, or has some of wrong shape,
+            type or range; or its vertices are no box grid in x-major order.
+    """
+    values = _read_archive(path)
+    if not values["dt"] > 0.0:
+        raise DataFileError(f"{path}: dt is {float(values['dt']):g}: it must be positive, in seconds.")
+    try:
+        material = Material(
+            youngs_modulus=float(values["youngs_modulus"]),
+            poissons_ratio=float(values["poissons_ratio"]),
+            density=float(values["density"]),
+        )
+    except InputError as error:
+        raise DataFileError(f"{path}: {error}") from None
+    mesh = box_of_vertices(values["vertices"], str(path))
+    return ReferenceTrajectory(
+        material,
+        float(values["dt"]),
+        values["gravity"],
+        mesh,
+        values["f_ext"],
+        values["q"],
+        values["v"],
+    )
+
+
+def _read_archive(path: Path) -> dict[str, FloatArray]:
+    """The entries of `REFERENCE_SHAPES`, checked."""
+    values = read_arrays(path)
+    if "" in values:
+        raise DataFileError(f"{path} is a single array: give a reference trajectory (.npz).")
+    _check_names(values, path)
+    _check_values(values, path)
+    return {name: np.asarray(value, dtype=np.float64) for name, value in values.items()}
+
+
+def _check_names(values: dict[str, NDArray[np.generic]], path: Path) -> None:
+    missing = [name for name in REFERENCE_SHAPES if name not in values]
+    foreign = sorted(name for name in values if name not in REFERENCE_SHAPES)
+    found = [f"{problem} {', '.join(names)}" for problem, names in (("lacks", missing), ("has", foreign)) if names]
+    if found:
+        raise DataFileError(
+            f"{path} {' and '.join(found)}: a reference trajectory has {', '.join(REFERENCE_SHAPES)} and no more."
+        )
+
+
+def _check_values(values: dict[str, NDArray[np.generic]], path: Path) -> None:
+    """Refuses entries of another shape or type; f_ext and vertices say what T and N are."""
+    steps, vertices = np.shape(values["f_ext"])[:1], np.shape(values["vertices"])[:1]
+    sizes = {"T": steps[0] if steps else 0, "N": vertices[0] if vertices else 0}
+    sizes["T + 1"] = sizes["T"] + 1
+    for name, wanted in REFERENCE_SHAPES.items():
+        value = values[name]
+        shape = tuple(sizes[size] if isinstance(size, str) else size for size in wanted)
+        if value.shape != shape or value.dtype.kind not in "fiu":
+            described = f"({', '.join(map(str, wanted))})" if wanted else "a single number"
+            raise DataFileError(
+                f"{path}: {name} is {value.shape} of {value.dtype}, but must be {described} with real numbers"
+                f"{f', here {shape}' if wanted else ''}."
+            )
+        if not np.isfinite(value).all():
+            raise DataFileError(f"{path}: {name} has values that are not finite.")
+        if not value.size:
+            raise DataFileError(f"{path}: {name} is empty.")
+
+
+def box_of_vertices(vertices: FloatArray, source: str = "the mesh") -> Mesh:
+    """The box of hexahedra whose vertices are given.
+
+    Args:
+        vertices: (N, 3) grid points in x-major order, z running fastest [m]; the spacing may vary.
+        source: what to name in an error.
+
+    Raises:
+        DataFileError: the vertices are no such grid.
+    """
+    tolerance = _GRID_TOLERANCE * float(np.ptp(vertices, axis=0).max(initial=0.0))
+    axes = [_distinct(vertices[:, axis], tolerance) for axis in range(3)]
+    divisions = [len(axis) - 1 for axis in axes]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    if min(divisions) < 1 or grid.shape != vertices.shape or np.abs(grid - vertices).max() > tolerance:
+        counts = " x ".join(str(len(axis)) for axis in axes)
+        raise DataFileError(
+            f"{source}: {len(vertices)} vertices with {counts} distinct coordinates along x, y and z are no box grid "
+            "in x-major order (z runs fastest), from which alone the hexahedra can be recovered."
+        )
+    return Mesh(vertices, box_hexahedra(divisions=divisions).cells)
+
+
+def _distinct(coordinates: FloatArray, tolerance: float) -> FloatArray:
+    """Sorted coordinates that lie further apart than the tolerance."""
+    ordered = np.sort(coordinates)
+    return ordered[np.concatenate([[True], np.diff(ordered) > tolerance])]
+
+
+def compare_with_reference(
+    reference: ReferenceTrajectory, settings: SolverSettings, device: str | torch.device = "cpu"
+) -> Comparison:
+    """Simulates a reference trajectory from its own start, loads and parameters, the way it was computed.
+
+    That is with implicit Euler, the mean element's mass at every vertex, full integration of both terms of the energy,
+    and the face at the smallest x held.
+
+    Args:
+        reference: what to reproduce.
+        settings: the solver's.
+        device: a torch device.
+
+    Raises:
+        ConvergenceError: the solver failed.
+    """
+    mesh = reference.mesh
+    fixed = select_vertices(mesh, x=float(mesh.vertices[:, 0].min()))
+    body = Body(mesh, fixed=fixed, mass="per_vertex", volume_integration="full")
+    simulator = Simulator(
+        body,
+        reference.material,
+        time_step=reference.time_step,
+        gravity=[float(g) for g in reference.gravity],
+        solver=settings,
+        device=device,
+    )
+    q, v, forces = (simulator.tensor(x) for x in (reference.q, reference.v, reference.forces))
+    with torch.no_grad():
+        trajectory = simulator.rollout(State(q[:1], v[:1]), len(forces), forces[:, None])
+    distance = torch.linalg.vector_norm(trajectory.q[:, 0] - q, dim=-1)
+    iterations = torch.stack([report.iterations for report in trajectory.reports])
+    return Comparison(float(distance.max()), float(iterations.double().mean()))

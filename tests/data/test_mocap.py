@@ -11,6 +11,7 @@ from warp_resphys.data.recordings.c3d import read_c3d
 from warp_resphys.data.recordings.processing import fill_gaps
 from warp_resphys.data.recordings.recording import Recording
 from warp_resphys.data.recordings.release import find_release
+from warp_resphys.io import decoding
 from warp_resphys.io.errors import DataFileError
 
 TIP = ["Tip - 1", "Tip - 2", "Tip - 3"]
@@ -77,14 +78,24 @@ def test_truncated_file(tmp_path, trajectory, part):
         read_c3d(cut)
 
 
-def test_damaged_file_that_crashes_the_decoder(tmp_path, trajectory, monkeypatch):
+@pytest.mark.parametrize(
+    ("name", "after", "value", "limits", "message"),
+    [
+        ("CONTACT", 10, 0xFF, {}, "ezc3d ends with -11"),  # of -1 dimensions
+        ("RATIO", 10, 0x80, {"MEMORY": (1 << 29, 0)}, "it takes more than 512 MiB of memory"),  # -32768 values a frame
+        ("CONTACT", 10, 0x7F, {"SECONDS": (1.0, 0.0)}, "does not end within 1 s"),  # of 127 dimensions
+    ],
+)
+def test_a_changed_byte_that_crashes_the_decoder_or_makes_it_claim_memory_or_time(
+    tmp_path, trajectory, monkeypatch, name, after, value, limits, message
+):
     path = write_c3d(tmp_path / "whole.c3d", trajectory, "abc")
-    monkeypatch.setattr("warp_resphys.data.recordings.c3d._DECODE_PROGRAM", "import os; os.abort()")
-    with pytest.raises(DataFileError, match="damaged or truncated"):
-        read_c3d(path)
-    monkeypatch.setattr("warp_resphys.data.recordings.c3d._DECODE_PROGRAM", "while True: pass")
-    monkeypatch.setattr("warp_resphys.data.recordings.c3d._DECODE_SECONDS", 0.3)
-    with pytest.raises(DataFileError, match="does not end"):
+    content = bytearray(path.read_bytes())
+    content[content.index(name.encode()) + after] = value
+    path.write_bytes(content)
+    for limit, given in limits.items():
+        monkeypatch.setattr(decoding, limit, given)
+    with pytest.raises(DataFileError, match=rf"whole\.c3d is damaged or truncated \(.*{message}\); copy"):
         read_c3d(path)
 
 

@@ -4,6 +4,8 @@ import os
 import pickle
 import subprocess
 import sys
+import time
+import tracemalloc
 from collections import OrderedDict
 from pathlib import Path
 
@@ -168,6 +170,58 @@ def test_a_size_that_is_claimed_is_not_allocated(tmp_path):
         read_pickled_arrays(tmp_path / "data.pkl")
 
 
+MIB = (1 << 20).to_bytes(4, "little")
+TEXT, NUMBER = b"X" + MIB + b"7" * (1 << 20), b"\x8b" + MIB + b"7" * (1 << 20)
+DEEP = b")" + 100_000 * b"\x85"  # (((...)))
+ENCODE = b"c_codecs\nencode\n"
+ARRAY = b"cnumpy._core.multiarray\n_reconstruct\n)R(K\x01J\x00\x00\x10\x00\x85"  # of 2^20 numbers
+ARRAY += b"cnumpy\ndtype\nX\x02\x00\x00\x00u1\x85R\x89h\x00tb"
+SHARED = b"".join(b"J" + n.to_bytes(4, "little") + ARRAY for n in range(2000))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"}" + DEEP + b"Ns.", "keys that are neither short texts"),  # hashing it fills the stack
+        (b"})" + 60 * b"2\x86" + b"Ns.", "keys that are neither short texts"),  # 2^60 tuples to hash
+        (b"}" + TEXT + b"Ns.", "keys that are neither short texts"),
+        (b"}" + NUMBER + b"Ns.", "keys that are neither short texts"),
+        (DEEP + b")\x93.", "names a function by what is no text"),
+        (b"}Nr\xff\xff\xff\x7fa.", "appends to what is no list"),  # two thousand million memo entries
+        (b"}" + 1_000_001 * b"N" + b".", "more than 1000000 operations"),
+        (ENCODE + b"q\x00" + TEXT + b"\x85q\x01" + 10_000 * b"0h\x00h\x01R" + b".", "its texts take more than"),
+        (ENCODE + TEXT + b"\x85Rq\x000}(" + SHARED + b"u.", "its arrays take more than"),
+    ],
+    ids=lambda part: part if isinstance(part, str) else "",
+)
+def test_pickles_made_to_take_memory_or_time_end_soon_with_one_sentence(tmp_path, monkeypatch, content, message):
+    monkeypatch.setattr("warp_resphys.data.recordings.restricted_pickle.MOST_BYTES", 1 << 26)
+    (tmp_path / "data.pkl").write_bytes(b"\x80\x04" + content)
+    began = time.process_time()
+    tracemalloc.start()
+    try:
+        with pytest.raises(DataFileError, match=rf"data\.pkl is damaged, .*{message}.*\): fetch") as caught:
+            read_pickled_arrays(tmp_path / "data.pkl")
+        assert tracemalloc.get_traced_memory()[1] < 1 << 28
+    finally:
+        tracemalloc.stop()
+    assert time.process_time() - began < 20.0
+    assert len(str(caught.value)) < 500
+
+
+def test_values_that_lie_deep_in_each_other_are_passed_over(tmp_path):
+    deep = b"}X\x01\x00\x00\x00a]" + 100_000 * b"]" + 100_000 * b"a" + b"s."
+    (tmp_path / "data.pkl").write_bytes(b"\x80\x02" + deep)
+    assert read_pickled_arrays(tmp_path / "data.pkl") == {}
+
+
+def test_a_pickle_that_is_too_large_is_not_read(tmp_path):
+    with open(tmp_path / "data.pkl", "wb") as file:
+        file.truncate((1 << 30) + 1)
+    with pytest.raises(DataFileError, match="it has more than 1024 MiB"):
+        read_pickled_arrays(tmp_path / "data.pkl")
+
+
 def test_the_arm_comes_out_in_the_order_of_the_mesh(tmp_path, arm):
     np.save(tmp_path / "captured.npy", arm, allow_pickle=True)
     index = convert_arm(tmp_path / "captured.npy", tmp_path / "out")
@@ -231,7 +285,7 @@ def test_wrong_beam_files(tmp_path, beam):
     with pytest.raises(DataFileError, match=r"qs_real0_reorder\.npy: an array has the shape \(6, 10, 3\)"):
         convert_beam(beam, tmp_path / "out")
     np.save(beam / "qs_real0_reorder.npy", np.array([Payload(tmp_path / "ran")], dtype=object), allow_pickle=True)
-    with pytest.raises(DataFileError, match=r"qs_real0_reorder\.npy is damaged, or does not hold plain arrays"):
+    with pytest.raises(DataFileError, match=r"qs_real0_reorder\.npy is no NumPy archive of plain arrays"):
         convert_beam(beam, tmp_path / "out")
     assert not (tmp_path / "ran").exists()
 

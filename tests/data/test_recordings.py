@@ -95,6 +95,9 @@ def test_lines_that_were_not_recorded_are_occlusions(tmp_path, positions):
         (7, lambda line: "0.0540" + line[6:], "line 7: the frames are not evenly spaced"),
         (8, lambda line: "0.0100" + line[6:], "line 8: the time or frame does not rise"),
         (8, lambda line: line[6:], "line 8: the time or frame does not rise"),
+        (8, lambda line: "1e308" + line[6:], "line 8: the time or frame does not rise, or is no number below 1e12"),
+        (2, lambda line: "-1e308" + line[6:], "line 2: the time or frame does not rise, or is no number below 1e12"),
+        (1, lambda line: line.replace("b.y", "b" + 20_000 * " " + "y"), "column 6 is named"),  # not in cubic time
     ],
 )
 def test_wrong_tables_are_told_by_line_and_column(tmp_path, positions, line, change, message):
@@ -103,6 +106,19 @@ def test_wrong_tables_are_told_by_line_and_column(tmp_path, positions, line, cha
         assert read_recording(path).rate == 100.0
         return
     with pytest.raises(DataFileError, match=rf"swing\.csv.*{message}"):
+        read_recording(path)
+
+
+@pytest.mark.parametrize(
+    "stamps", [np.arange(40) * 1e-310, [*np.arange(39) * 1e-310, 1e3], 1e11 + np.arange(40) * 1e-6]
+)
+def test_times_that_are_hardly_apart_are_refused(tmp_path, positions, stamps):
+    path = write_table(tmp_path / "swing.csv", positions)
+    for line, stamp in enumerate(stamps, start=2):
+        edit(
+            path, line, lambda text, stamp=stamp: f"{stamp!r}".removeprefix("np.float64(").removesuffix(")") + text[6:]
+        )
+    with pytest.raises(DataFileError, match=r"a frame rate of inf|do not belong to one recording|does not rise"):
         read_recording(path)
 
 
@@ -148,6 +164,30 @@ def test_wrong_qualisys_exports(tmp_path, positions):
         read_recording(path)
     edit(path, 8, lambda line: "DESCRIPTION\t--")
     with pytest.raises(DataFileError, match="has no MARKER_NAMES"):
+        read_recording(path)
+
+
+def without(path, *lines):
+    rows = path.read_text().splitlines()
+    path.write_text("\n".join(row for number, row in enumerate(rows, start=1) if number not in lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("names", [True, False])
+def test_the_frames_of_a_qualisys_export_are_counted(tmp_path, positions, names):
+    first = 10 if names else 9  # the line of the first frame
+    path = without(qualisys(tmp_path / "swing.tsv", positions, names=names), first, first + 6, first + 7)
+    recording = read_recording(path)
+    np.testing.assert_allclose(recording.positions[[0, 4, 7, 38]], positions[[1, 5, 8, 39]], atol=1e-6)
+    np.testing.assert_array_equal(np.flatnonzero(~recording.seen.any(axis=1)), [5, 6])
+    assert recording.start == pytest.approx(0.005)
+    rows = path.read_text().splitlines()
+    for wrong in (rows[first - 1 :][::-1], ["1" + row[row.index("\t") :] for row in rows[first - 1 :]]):
+        path.write_text("\n".join([*rows[: first - 1], *wrong]))
+        with pytest.raises(DataFileError, match=rf"swing\.tsv, line {first + 1}: the time or frame does not rise"):
+            read_recording(path)
+    path = without(qualisys(tmp_path / "swing.tsv", positions, names=names, frame=False), first + 6)
+    with pytest.raises(DataFileError, match=r"has 39 of the 40 frames of its NO_OF_FRAMES, and no column tells which"):
         read_recording(path)
 
 
@@ -244,11 +284,30 @@ def test_numpy_archive(tmp_path, positions):
         ({"actuation": np.full((40, 2), np.nan)}, "an actuation is NaN"),
         ({"actuation": np.zeros((40, 2)), "actuation_units": "psi"}, "gives its actuation in 'psi'"),
         ({"rest": np.zeros((2, 3))}, r"rest has the shape \(2, 3\)"),
+        ({"start": np.inf}, "its first frame is at inf s"),
+        ({"start": np.nan}, "its first frame is at nan s"),
+        ({"start": np.zeros(2)}, r"'start' has the shape \(2,\); it must be one number"),
+        ({"rate_hz": np.full(40, 100.0)}, r"'rate_hz' has the shape \(40,\)"),
+        ({"rate_hz": 1e300}, r"gives a frame rate of 1e\+300 Hz"),
+        ({"actuation": np.full((40, 2), 1e308), "actuation_units": "bar"}, "an actuation is NaN or infinite"),
     ],
 )
 def test_wrong_archives(tmp_path, positions, changes, message):
     with pytest.raises(DataFileError, match=rf"swing\.npz.*{message}"):
         read_recording(archive(tmp_path / "swing.npz", **{"positions": positions, **changes}))
+
+
+def test_arrays_larger_than_any_recording_are_not_read(tmp_path, positions, monkeypatch):
+    monkeypatch.setattr("warp_resphys.io.files.LARGEST_ARRAYS", 10 << 20)
+    zeros = np.zeros((200_000, 3, 3))  # 14 MB, of which little is left in the file
+    np.savez_compressed(tmp_path / "swing.npz", positions=zeros, rate_hz=100.0)
+    assert (tmp_path / "swing.npz").stat().st_size < 1 << 20
+    with pytest.raises(DataFileError, match=r"swing\.npz .* \(its arrays take more than"):
+        read_recording(tmp_path / "swing.npz")
+    with h5py.File(tmp_path / "swing.h5", "w") as file:
+        file.create_dataset("positions", (1 << 40, 3, 3), "f8", chunks=(64, 3, 3))  # nothing of it in the file
+    with pytest.raises(DataFileError, match=r"swing\.h5: 'positions' takes more than 4 GiB"):
+        read_recording(tmp_path / "swing.h5")
 
 
 class Payload:
@@ -274,7 +333,7 @@ def test_objects_in_an_archive_are_refused_and_not_run(tmp_path, positions):
 def test_damaged_and_foreign_files(tmp_path, positions):
     whole = archive(tmp_path / "swing.npz", positions).read_bytes()
     (tmp_path / "cut.npz").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(DataFileError, match=r"cut\.npz is not a NumPy archive, or damaged"):
+    with pytest.raises(DataFileError, match=r"cut\.npz is no NumPy archive of plain arrays, or a damaged"):
         read_recording(tmp_path / "cut.npz")
     for at in range(0, len(whole), 97):  # Whatever is overwritten, there is one sentence, or a recording.
         (tmp_path / "spoilt.npz").write_bytes(whole[:at] + b"(" + whole[at + 1 :])
@@ -285,7 +344,7 @@ def test_damaged_and_foreign_files(tmp_path, positions):
     with pytest.raises(DataFileError, match="is a single array"):
         read_recording(tmp_path / "single.npz")
     for name in ("absent.npz", "absent.csv", "absent.c3d"):
-        with pytest.raises(DataFileError, match="No such file"):
+        with pytest.raises(DataFileError, match=r"No such file|does not exist"):
             read_recording(tmp_path / name)
     with pytest.raises(DataFileError, match="does not exist"):
         read_recording(tmp_path / "absent.h5")

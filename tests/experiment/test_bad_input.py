@@ -51,7 +51,10 @@ NAN, INF = float("nan"), float("inf")
         ({"mass_damping": -0.1}, "mass_damping is -0.1: it must be zero or more, in 1/s"),
         ({"stiffness_damping": -1e-3}, "stiffness_damping is -0.001: it must be zero or more, in s"),
         ({"stiffness_damping": INF}, "stiffness_damping is inf"),
-        ({"lame_lambda": 1e5}, "corotated has no constant 'lame_lambda': it has youngs_modulus, poissons_ratio, density"),
+        (
+            {"lame_lambda": 1e5},
+            "corotated has no constant 'lame_lambda': it has youngs_modulus, poissons_ratio, density",
+        ),
         ({"model": "linear"}, "material model is 'linear': choose one of corotated, stable_neo_hookean"),
     ],
 )

@@ -256,7 +256,10 @@ def recorded(tmp_path, finished, change):
         (["synthetic.fibres.angles=[90.0]"], "synthetic: fibre angles are"),
         (["simulation.youngs_modulus=264"], "is its unit millimetres"),
         (["+identify.parameters.stiffness={lower:0.0,upper:1.0}"], "identify.parameters names 'stiffness'"),
-        (["+identify.parameters.attached_mass_factor={lower:0.5,upper:2.0}"], "names 'attached_mass_factor': choose from"),
+        (
+            ["+identify.parameters.attached_mass_factor={lower:0.5,upper:2.0}"],
+            "names 'attached_mass_factor': choose from",
+        ),
         (["refinement=solver_in_the_loop"], "refinement is for experiments without pressures"),
         (["task=tune"], "task=tune does not search the networks of the experiment tiny"),
         (["+data.colour=red"], "unknown key 'data.colour'"),

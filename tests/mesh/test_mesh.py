@@ -1,8 +1,10 @@
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import nullcontext
 from functools import partial
+from importlib import resources
 from pathlib import Path
 
 import meshio
@@ -11,7 +13,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from warp_resphys.io import decoding
 from warp_resphys.io.errors import MeshError
+from warp_resphys.mesh import readers
 from warp_resphys.mesh.elements import ELEMENTS
 from warp_resphys.mesh.mesh import (
     IntArray,
@@ -387,9 +391,36 @@ def test_unreadable_file_gives_one_sentence_and_no_output(
 
 def test_format_that_needs_another_package_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write(tmp_path / "box.med", box_tetrahedra())
-    monkeypatch.setitem(sys.modules, "h5py", None)
+    (tmp_path / "without" / "h5py.py").parent.mkdir()
+    (tmp_path / "without" / "h5py.py").write_text("raise ModuleNotFoundError('no h5py', name='h5py')")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "without"))
     with pytest.raises(MeshError, match="install the Python package h5py"):
         read_mesh(path)
+
+
+def test_files_that_are_read_for_ever_or_claim_too_much_memory_end_with_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write(tmp_path / "cut.tec", box_tetrahedra())
+    path.write_text(path.read_text()[:2000])
+    monkeypatch.setattr(decoding, "SECONDS", (1.0, 0.0))
+    with pytest.raises(MeshError, match=r"cut\.tec: meshio cannot read .* \(decoding it does not end within 1 s\)"):
+        read_mesh(path)
+    path = write(tmp_path / "big.vtk", box_tetrahedra())
+    path.write_bytes(path.read_bytes().replace(b"POINTS 176", b"POINTS 17600000000"))
+    with pytest.raises(MeshError, match=r"big\.vtk: meshio cannot read .* \(it takes more than 20\d\d MiB of memory\)"):
+        read_mesh(path)
+
+
+def test_only_the_meshes_of_the_package_are_read_in_this_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shipped = Path(str(resources.files("warp_resphys"))) / "meshes" / "arm_hexahedra_500.msh"
+    read = []
+    monkeypatch.setattr(readers, "decode", lambda library, path: read.append(path) or decoding.decode(library, path))
+    copied = Path(shutil.copy(shipped, tmp_path))
+    assert np.array_equal(read_mesh(shipped).vertices, read_mesh(copied).vertices)
+    assert read == [copied]
 
 
 def test_arguments_of_reading_are_checked(tmp_path: Path) -> None:

@@ -13,7 +13,11 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Iterator, Mapping
+import struct
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,6 +35,12 @@ FORMAT = "warp_resphys"
 FORMAT_VERSION = 1
 CHUNK_STEPS = 64
 OWN_OPTIONS = "configs"  # In the working directory: the user's configuration groups and their options.
+LARGEST_ARRAYS = 4 << 30  # bytes in one file
+# What numpy.load raises for a file that is damaged or made up.
+_ARRAY_FAULTS = (
+    *(EOFError, LookupError, MemoryError, OverflowError, RuntimeError, SyntaxError, TypeError, ValueError),
+    *(struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error),
+)
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -292,6 +302,33 @@ def read_hdf5(path: str | Path, expected_kind: str) -> Iterator[h5py.File]:
         if complete != "True":
             raise DataFileError(f"{path} is unfinished: delete it and run the stage that writes it again")
         yield file
+
+
+def read_arrays(path: str | Path, names: Sequence[str] | None = None) -> dict[str, npt.NDArray[Any]]:
+    """The arrays of a .npz file by name, or that of a .npy file by no name; nothing in it is run.
+
+    Args:
+        path: the file.
+        names: those to read, where there are more; all of them by default.
+
+    Raises:
+        DataFileError: the file is missing, damaged or no such file, holds Python objects, or is too large.
+    """
+    try:
+        with open(path, "rb") as file:
+            content = np.load(file, allow_pickle=False)
+            if isinstance(content, np.ndarray):
+                return {"": content}
+            if sum(member.file_size for member in content.zip.infolist()) > LARGEST_ARRAYS:
+                raise ValueError(f"its arrays take more than {LARGEST_ARRAYS >> 30} GiB")
+            return {name: content[name] for name in content.files if names is None or name in names}
+    except OSError as error:
+        raise _read_error(path, error) from error
+    except _ARRAY_FAULTS as error:
+        reason = "it holds Python objects, which can run code" if "allow_pickle" in str(error) else str(error)
+        raise DataFileError(
+            f"{path} is no NumPy archive of plain arrays, or a damaged one ({reason}): save or fetch it again"
+        ) from error
 
 
 def read_array(

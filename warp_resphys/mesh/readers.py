@@ -1,31 +1,25 @@
 """Reading and writing of volume meshes and their named surfaces, through meshio; lengths become metres here."""
 
-import logging
 import os
-import warnings
 from collections.abc import Mapping
 from contextlib import redirect_stderr, redirect_stdout
+from importlib import resources
 from io import StringIO
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..io.decoding import Arrays, DecodingError, decode, mesh_arrays
 from ..io.errors import MeshError
 from ..io.files import atomic_path
 from .elements import ELEMENTS
 from .mesh import FloatArray, IntArray, Mesh, boundary_faces, check_mesh, quadratic
 
-if TYPE_CHECKING:
-    import meshio
-
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}  # [m] length of one unit
 SHORTEST_DIAGONAL, LONGEST_DIAGONAL = 1e-3, 10.0  # [m] of a body whose units are believed
 
 _CELL_TYPES = tuple(element.file_type for element in ELEMENTS.values())  # meshio's names
-_SURFACE_CELLS = {"triangle": 3, "triangle6": 3, "quad": 4, "quad8": 4, "quad9": 4}  # number of corners
 _PHYSICAL, _GEOMETRICAL = "gmsh:physical", "gmsh:geometrical"  # meshio's names of gmsh's numbers of groups
-_log = logging.getLogger(__name__)
 
 
 def read_mesh(path: str | os.PathLike[str], units: str = "m", order: int = 1, drop_unreferenced: bool = False) -> Mesh:
@@ -55,8 +49,7 @@ def read_vertices(path: str | os.PathLike[str], units: str = "m") -> FloatArray:
     Raises:
         MeshError: As in `read_mesh`.
     """
-    content = _read(Path(path), units, order=1, drop_unreferenced=True)[1]
-    return np.asarray(content.points, dtype=np.float64) * METRES[units]
+    return np.asarray(_read(Path(path), units, order=1, drop_unreferenced=True)[1]["points"] * METRES[units])
 
 
 def read_surfaces(
@@ -82,7 +75,10 @@ def read_surfaces(
     corners = mesh.element.face.corners
     face_of = {tuple(sorted(face)): number for number, face in enumerate(faces[:, :corners].tolist())}
     surfaces = {}
-    for name, nodes in _named_surfaces(content).items():
+    for key, nodes in content.items():
+        kind, _, name = key.partition("/")
+        if kind != "surface":
+            continue
         found = [face_of.get(tuple(sorted(places[face].tolist()))) for face in nodes]
         missing = found.count(None)
         if missing:
@@ -130,12 +126,12 @@ def write_mesh(path: str | os.PathLike[str], mesh: Mesh, surfaces: Mapping[str, 
                 meshio.write(target, content, file_format="gmsh22", binary=False, float_fmt=".12g")
             else:
                 meshio.write(target, content, file_format=formats[0])
-            _volume_cells(meshio.read(target, file_format=formats[0]))  # some formats leave out what they do not know
-    except (meshio.WriteError, meshio.ReadError, MeshError, KeyError, SystemExit) as error:
+            _volume_cells(mesh_arrays(str(target), formats[0]))  # some formats leave out what they do not know
+    except (meshio.WriteError, meshio.ReadError, MeshError, DecodingError, KeyError, SystemExit) as error:
         raise MeshError(f"{path}: meshio cannot write such a file ({error}); use .msh, .vtu or .vtk") from error
 
 
-def _read(path: Path, units: str, order: int, drop_unreferenced: bool) -> tuple[Mesh, "meshio.Mesh", IntArray]:
+def _read(path: Path, units: str, order: int, drop_unreferenced: bool) -> tuple[Mesh, Arrays, IntArray]:
     """The mesh, the file's content, and the number of each vertex of the file in the mesh, -1 where it was dropped."""
     if units not in METRES:
         raise MeshError(f"the units of a mesh file must be one of {', '.join(METRES)}, not {units}")
@@ -145,7 +141,7 @@ def _read(path: Path, units: str, order: int, drop_unreferenced: bool) -> tuple[
         raise MeshError(f"{path}: there is no such mesh file")
     content = _read_file(path)
     try:
-        mesh = Mesh(content.points, _volume_cells(content))
+        mesh = Mesh(content["points"], _volume_cells(content))
         places = np.arange(len(mesh.vertices))
         if drop_unreferenced:
             mesh, places = _without_unreferenced(mesh)
@@ -157,59 +153,29 @@ def _read(path: Path, units: str, order: int, drop_unreferenced: bool) -> tuple[
         raise MeshError(f"{path}: {error}") from error
 
 
-def _read_file(path: Path) -> "meshio.Mesh":
-    """Read a file with meshio, which raises exceptions of many kinds, prints, and exits on some bad files."""
-    printed, warned = StringIO(), StringIO()
+def _read_file(path: Path) -> Arrays:
+    """What `decoding.mesh_arrays` gives; only the package's own files are read in this process."""
     try:
-        with redirect_stdout(printed), redirect_stderr(warned), warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            import meshio
-
-            content = meshio.read(path)
-    except ModuleNotFoundError as error:
-        raise MeshError(f"{path}: to read this format, install the Python package {error.name}") from error
-    except (Exception, SystemExit) as error:
-        said = printed.getvalue() if isinstance(error, SystemExit) else f"{type(error).__name__}: {error}"
-        reason = " ".join(said.split())[:200] or "no reason given"
+        if path.parent.resolve() == Path(str(resources.files("warp_resphys") / "meshes")).resolve():
+            return mesh_arrays(str(path))
+        return decode("meshio", path)
+    except DecodingError as error:
         raise MeshError(
-            f"{path}: meshio cannot read this file ({reason}); is it whole, and of its extension's format?"
+            f"{path}: meshio cannot read this file ({error}); is it whole, and of its extension's format?"
         ) from error
-    if warned.getvalue():
-        _log.debug("%s: meshio says: %s", path, warned.getvalue())
-    return content
 
 
-def _volume_cells(content: "meshio.Mesh") -> IntArray:
+def _volume_cells(arrays: Arrays) -> IntArray:
     """Cells of the one supported kind in a file, (M, 4 | 8 | 10); MeshError if there is not exactly one."""
-    solids = {block.type for block in content.cells if block.dim == 3 and len(block)}
+    solids = {name.removeprefix("solid/"): cells for name, cells in arrays.items() if name.startswith("solid/")}
     if not solids:
-        others = ", ".join(sorted({block.type for block in content.cells})) or "no cells"
+        others = ", ".join(sorted({*arrays["types"].tolist()})) or "no cells"
         raise MeshError(f"the file has no tetrahedra or hexahedra (only: {others}); mesh the volume first")
-    if len(solids) > 1 or not solids.issubset(_CELL_TYPES):
+    if len(solids) > 1 or not solids.keys() <= {*_CELL_TYPES}:
         wanted = f"{', '.join(_CELL_TYPES[:-1])} or {_CELL_TYPES[-1]}"
         raise MeshError(f"the file has {' and '.join(sorted(solids))} cells; all must be {wanted}, and of one kind")
-    blocks = [np.asarray(block.data, dtype=np.int64) for block in content.cells if block.type in solids]
-    return np.concatenate([block for block in blocks if len(block)])
-
-
-def _named_surfaces(content: "meshio.Mesh") -> dict[str, IntArray]:
-    """Corners of the faces of each named surface of a file, (F, 3 | 4)."""
-    groups = {tuple(int(n) for n in tag): name for name, tag in content.field_data.items() if len(tag) == 2}
-    members: dict[str, list[IntArray]] = {}
-    for number, block in enumerate(content.cells):
-        if block.type not in _SURFACE_CELLS:
-            continue
-        corners = np.asarray(block.data, dtype=np.int64)[:, : _SURFACE_CELLS[block.type]]
-        if _PHYSICAL in content.cell_data:
-            tags = np.asarray(content.cell_data[_PHYSICAL][number])
-            for tag in np.unique(tags).tolist():
-                if (tag, 2) in groups:
-                    members.setdefault(groups[tag, 2], []).append(corners[tags == tag])
-            continue
-        for name, sets in content.cell_sets.items():
-            if sets[number] is not None and len(sets[number]):
-                members.setdefault(name, []).append(corners[np.asarray(sets[number], dtype=np.int64)])
-    return {name: np.concatenate(parts) for name, parts in members.items()}
+    (cells,) = solids.values()
+    return cells
 
 
 def _without_unreferenced(mesh: Mesh) -> tuple[Mesh, IntArray]:

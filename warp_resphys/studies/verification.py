@@ -4,8 +4,6 @@ The format is a NumPy archive without pickled objects that holds the keys of `RE
 vertices only, in x-major order; the hexahedra between them follow from the distinct coordinates.
 """
 
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +18,7 @@ from ..dynamics.simulator import Simulator
 from ..energies.materials import Corotated, Material
 from ..fem.body import Body
 from ..io.errors import DataFileError, InputError
+from ..io.files import read_arrays
 from ..mesh.mesh import Mesh, box_hexahedra, select_vertices
 
 FloatArray = NDArray[np.float64]
@@ -110,18 +109,9 @@ def read_reference(path: Path) -> ReferenceTrajectory:
 
 def _read_archive(path: Path) -> dict[str, FloatArray]:
     """The entries of `REFERENCE_SHAPES`, checked."""
-    try:
-        loaded = np.load(path, allow_pickle=False)
-        if not isinstance(loaded, np.lib.npyio.NpzFile):
-            raise DataFileError(f"{path} is a single array: give a reference trajectory (.npz).")
-        with loaded:
-            values = {name: loaded[name] for name in loaded.files}
-    except FileNotFoundError:
-        raise DataFileError(f"{path} does not exist: give a reference trajectory (.npz).") from None
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error):
-        raise DataFileError(
-            f"{path} is no NumPy archive of plain arrays, or a damaged one: give a reference trajectory (.npz)."
-        ) from None
+    values = read_arrays(path)
+    if "" in values:
+        raise DataFileError(f"{path} is a single array: give a reference trajectory (.npz).")
     _check_names(values, path)
     _check_values(values, path)
     return {name: np.asarray(value, dtype=np.float64) for name, value in values.items()}

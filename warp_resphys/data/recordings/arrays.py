@@ -1,8 +1,5 @@
 """Recordings as arrays: NumPy archives (.npz) and HDF5 files, with the layout of docs/recordings.md."""
 
-import tokenize
-import zipfile
-import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -12,15 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...io.errors import DataFileError
-from ...io.files import FORMAT, atomic_hdf5, create, open_hdf5
+from ...io.files import FORMAT, LARGEST_ARRAYS, atomic_hdf5, create, open_hdf5, read_arrays
 from .recording import SI_PER_ACTUATION_UNIT, RawRecording, Recording
 
 KIND = "recording"
-# What numpy.load raises for a file that is damaged or made up.
-ARCHIVE_FAULTS = (
-    *(EOFError, LookupError, MemoryError, OverflowError, RuntimeError, SyntaxError, TypeError, ValueError),
-    *(tokenize.TokenError, zipfile.BadZipFile, zlib.error),
-)
 _NAMES = ("positions", "labels", "rate_hz", "units", "actuation", "actuation_units", "rest", "start")
 
 
@@ -31,25 +23,9 @@ def read_raw_npz(path: Path) -> RawRecording:
         DataFileError: The file is missing, no archive or damaged, holds Python objects, or an array is missing or
             wrong.
     """
-    found: dict[str, NDArray[Any]] = {}
-    try:
-        archive = np.load(path, allow_pickle=False)
-        if isinstance(archive, np.ndarray):
-            raise DataFileError(f"{path} is a single array, not an archive: save it with numpy.savez.")
-        with archive:
-            for name in _NAMES:
-                if name in archive.files:
-                    found[name] = archive[name]
-    except OSError as error:
-        raise DataFileError(
-            f"Cannot read {path}: {error.strerror or error}; check the path of the recording."
-        ) from error
-    except ARCHIVE_FAULTS as error:
-        if "allow_pickle" in str(error):
-            raise DataFileError(
-                f"{path} holds Python objects (a pickle), which can run code: save plain arrays of numbers instead."
-            ) from error
-        raise DataFileError(f"{path} is not a NumPy archive, or damaged ({error}): save it again.") from error
+    found = read_arrays(path, _NAMES)
+    if "" in found:
+        raise DataFileError(f"{path} is a single array, not an archive: save it with numpy.savez.")
     return _assemble(found.get, path)
 
 
@@ -72,6 +48,8 @@ def read_raw_hdf5(path: Path) -> RawRecording:
                 return np.asarray(file["actuation"].attrs["units"])
             item = file.get(name)
             if isinstance(item, h5py.Dataset):
+                if item.nbytes > LARGEST_ARRAYS:
+                    raise DataFileError(f"{path}: '{name}' takes more than {LARGEST_ARRAYS >> 30} GiB: split the file.")
                 return np.asarray(item[()])
             return np.asarray(file.attrs[name]) if name in file.attrs else None
 
@@ -110,19 +88,18 @@ def _assemble(find: Callable[[str], NDArray[Any] | None], path: Path) -> RawReco
             raise DataFileError(
                 f"{path} gives its actuation in '{unit}': give it in one of {', '.join(SI_PER_ACTUATION_UNIT)}."
             )
-        actuation = actuation * SI_PER_ACTUATION_UNIT[unit]
-        if not np.isfinite(actuation).all():
-            raise DataFileError(f"{path}: an actuation is NaN or infinite; every frame needs one.")
+        with np.errstate(over="ignore"):
+            actuation = actuation * SI_PER_ACTUATION_UNIT[unit]
     labels = find("labels")
-    rate, start = _floats(find, "rate_hz", path), _floats(find, "start", path)
+    rate, start = _number(find, "rate_hz", path), _number(find, "start", path)
     return RawRecording(
         positions=positions,
         labels=None if labels is None else tuple(_text(label) for label in np.ravel(labels)),
         unit=_word(find("units")) or "m",
-        rate=None if rate is None or rate.size != 1 else rate.item(),
+        rate=rate,
         actuation=actuation,
         rest=_floats(find, "rest", path),
-        start=0.0 if start is None or start.size != 1 else start.item(),
+        start=start or 0.0,
     )
 
 
@@ -133,6 +110,13 @@ def _floats(find: Callable[[str], NDArray[Any] | None], name: str, path: Path) -
     if array.dtype.kind not in "fiu":
         raise DataFileError(f"{path}: '{name}' does not hold numbers (it is {array.dtype}); save numbers there.")
     return np.asarray(array, dtype=np.float64)
+
+
+def _number(find: Callable[[str], NDArray[Any] | None], name: str, path: Path) -> float | None:
+    array = _floats(find, name, path)
+    if array is not None and array.size != 1:
+        raise DataFileError(f"{path}: '{name}' has the shape {array.shape}; it must be one number.")
+    return None if array is None else array.item()
 
 
 def _word(array: NDArray[Any] | None) -> str | None:

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...io.errors import DataFileError
-from ...io.files import write_json
+from ...io.files import read_arrays, write_json
 from ...io.progress import Progress
 from ..registration import kabsch, root_mean_square
-from .arrays import ARCHIVE_FAULTS, write_recording
+from .arrays import write_recording
 from .recording import SI_PER_ACTUATION_UNIT, RawRecording, Recording, to_recording
 from .restricted_pickle import read_pickled_arrays
 
@@ -106,10 +106,10 @@ def read_published_beam(folder: str | Path) -> dict[int, Recording]:
     if not files:
         raise DataFileError(f"{folder} holds no file qs_real0_reorder.npy or the like: check the path.")
     rest_file = folder / _TRIAL_ARRAYS
-    rests = load_arrays(rest_file) if rest_file.exists() else {}
+    rests = read_arrays(rest_file) if rest_file.exists() else {}
     recordings = {}
     for trial, file in sorted(files.items()):
-        frames = _beam_frames(load_arrays(file)[""], file)
+        frames = _beam_frames(read_arrays(file)[""], file)
         rest = _beam_frames(rests[f"arr_{trial}"], rest_file)[-1] if f"arr_{trial}" in rests else None
         recordings[trial] = to_recording(RawRecording(frames, BEAM_LABELS, "mm", RATE, rest=rest), file)
     return recordings
@@ -153,18 +153,6 @@ def write_trials(
             progress.advance()
     write_json(folder / "index.json", index)
     return index
-
-
-def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of a .npz file by name, or that of a .npy file by no name; nothing in it is run."""
-    try:
-        with open(path, "rb") as file:
-            content = np.load(file, allow_pickle=False)
-            return {"": content} if isinstance(content, np.ndarray) else {name: content[name] for name in content.files}
-    except OSError as error:
-        raise DataFileError(f"Cannot read {path}: {error.strerror or error}; check the path.") from error
-    except ARCHIVE_FAULTS as error:
-        raise DataFileError(f"{path} is damaged, or does not hold plain arrays ({error}): fetch it again.") from error
 
 
 def _beam_frames(array: NDArray[Any], path: Path) -> FloatArray:

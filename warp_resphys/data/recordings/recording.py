@@ -17,6 +17,7 @@ METRES_PER_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 SI_PER_ACTUATION_UNIT = {"Pa": 1.0, "kPa": 1e3, "mbar": 1e2, "bar": 1e5, "N": 1.0, "1": 1.0}
 LARGEST_SPAN = 100.0  # [m]
 LEAST_SPAN = 1e-3  # [m]
+RATES = (1e-3, 1e6)  # [Hz]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,7 +117,7 @@ def to_recording(
     """
     if units is not None and units not in METRES_PER_UNIT:
         raise InputError(f"units is {units!r}: set it to m, cm or mm, the unit of {path}.")
-    if rate is not None and not (np.isfinite(rate) and rate > 0.0):
+    if rate is not None and not RATES[0] <= rate <= RATES[1]:
         raise InputError(f"rate is {rate!r}: set it to the frames a second of {path}.")
     markers = raw.positions.shape[1] if raw.positions.ndim == 3 else 0
     if raw.positions.ndim != 3 or raw.positions.shape[2] != 3 or 0 in raw.positions.shape:
@@ -135,6 +136,10 @@ def to_recording(
             f"{path}: actuation has the shape {raw.actuation.shape}; it needs a row for each of the "
             f"{len(positions)} frames."
         )
+    if raw.actuation is not None and not np.isfinite(raw.actuation).all():
+        raise DataFileError(f"{path}: an actuation is NaN or infinite; every frame needs one.")
+    if not np.isfinite(raw.start):
+        raise DataFileError(f"{path}: its first frame is at {raw.start} s: give the time of each frame, or no start.")
     check_span(positions, path)
     return Recording(names, positions, _rate(raw, path, rate), path, raw.actuation, rest, raw.start)
 
@@ -152,7 +157,8 @@ def check_span(positions: FloatArray, path: Path) -> None:
     seen = positions[np.isfinite(positions).all(axis=2)]
     if not len(seen):
         raise DataFileError(f"{path}: no marker is seen in any frame; check how it was exported.")
-    span = float(np.ptp(seen, axis=0).max())
+    with np.errstate(over="ignore"):
+        span = float(np.ptp(seen, axis=0).max())
     if not LEAST_SPAN <= span <= LARGEST_SPAN:
         size = f"all markers lie within {1e3 * span:.2g} mm" if span < LEAST_SPAN else f"markers span {span:.3g} m"
         raise DataFileError(
@@ -185,7 +191,7 @@ def _rate(raw: RawRecording, path: Path, given: float | None) -> float:
     rate = given if given is not None else raw.rate
     if rate is None:
         raise DataFileError(f"{path} does not say how many frames a second it has: set rate, in Hz.")
-    if not (np.isfinite(rate) and rate > 0.0):
+    if not RATES[0] <= rate <= RATES[1]:
         raise DataFileError(f"{path} gives a frame rate of {rate} Hz: export it with its rate, or set rate.")
     return float(rate)
 

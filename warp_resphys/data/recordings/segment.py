@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...io.errors import DataFileError
+from ...io.files import read_arrays
 from .jumps import mask_repeats
-from .published import load_arrays, write_trials
+from .published import write_trials
 from .recording import SI_PER_ACTUATION_UNIT, RawRecording, Recording, to_recording
 from .valve import valve_opening
 
@@ -30,6 +31,7 @@ SEGMENT_NOMINAL: Final = np.array(
 CLAMP_LABELS: Final = tuple(f"Clamp - {number}" for number in range(1, 5))
 TIP_LABELS: Final = tuple(f"Tip - {number}" for number in range(1, 4))
 SEGMENT_LABELS: Final = (*CLAMP_LABELS, *TIP_LABELS)
+_LARGEST_PRESSURE: Final = 1e5  # mbar
 MARKERS: Final = (0, 3, 2, 1, 4, 6, 5)  # which recorded marker each of the labels is
 
 
@@ -47,7 +49,7 @@ def read_published_segment(path: str | Path) -> dict[int, Recording]:
             shapes; two trials have the same pressure; or the valve's opening is not found.
     """
     path = Path(path)
-    arrays = load_arrays(path)
+    arrays = read_arrays(path)
     missing = [name for name in ("pressure_mbar", "markers", "rate_hz") if name not in arrays]
     if missing:
         raise DataFileError(
@@ -60,6 +62,11 @@ def read_published_segment(path: str | Path) -> dict[int, Recording]:
             f"{path}: markers {markers.shape}, pressure_mbar {pressure.shape} and rate_hz {rate.shape} must have the "
             f"shapes (trials, frames, {wanted[0]}, 3), (trials,) and (): check the path."
         )
+    for name in ("pressure_mbar", "markers", "rate_hz"):
+        if arrays[name].dtype.kind not in "fiu":
+            raise DataFileError(f"{path}: '{name}' does not hold numbers (it is {arrays[name].dtype}): check the path.")
+    if not (np.abs(pressure) <= _LARGEST_PRESSURE).all():
+        raise DataFileError(f"{path}: 'pressure_mbar' must be finite, and at most {_LARGEST_PRESSURE:g} mbar.")
     names = np.rint(pressure).astype(int).tolist()
     if len(set(names)) != len(names):
         raise DataFileError(f"{path}: two trials have the same pressure, to a mbar; give each trial its own.")

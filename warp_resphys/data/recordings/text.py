@@ -5,7 +5,6 @@ docs/recordings.md describes the layouts. A cell that is empty or NaN is an occl
 
 import csv
 import io
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -20,10 +19,10 @@ Rows = list[list[str]]
 
 _AXES = ("x", "y", "z")
 _OCCLUDED = ("", "nan", "null")
-_COLUMN = re.compile(r"(?P<name>.*?)\s*(?:\[(?P<unit>[^\]]*)\])?\s*", re.DOTALL)
 _QUALISYS_KEYS = ("FILE_VERSION", "NO_OF_FRAMES", "NO_OF_MARKERS", "FREQUENCY", "MARKER_NAMES")
 _MOTIVE_UNITS = {"meters": "m", "centimeters": "cm", "millimeters": "mm"}
 _UNEVEN = 0.25  # of a frame, that a time stamp may be off
+_LARGEST_STAMP = 1e12  # [s or 1], a time or frame number that is believed
 _LEAST_RECORDED = 0.1  # of the frames between the first and the last
 
 
@@ -54,8 +53,7 @@ def read_raw_text(path: Path) -> RawRecording:
 
 def _read_table(rows: Rows, path: Path) -> RawRecording:
     """A header of `time [s]` or `frame`, then `<marker>.x`, `.y`, `.z` of each marker, and channels `name [unit]`."""
-    header = [_COLUMN.fullmatch(cell.strip()) for cell in rows[0]] if rows else []
-    columns = [(found["name"], found["unit"]) for found in header if found is not None]
+    columns = [_name_and_unit(cell.strip()) for cell in rows[0]] if rows else []
     clock = columns[0][0].lower() if columns else ""
     if clock not in ("time", "frame") or len(columns) < 4:
         raise DataFileError(
@@ -68,18 +66,27 @@ def _read_table(rows: Rows, path: Path) -> RawRecording:
     if clock == "time" and columns[0][1] not in (None, "s"):
         raise DataFileError(f"{path} gives its time in '{columns[0][1]}': it must be in seconds, 'time [s]'.")
     frames, rate = _frames_of(stamps, None if clock == "frame" else 0.0, lines, path)
-    positions = _spread(values[:, list(places.values())], frames).reshape(frames[-1] + 1, -1, 3)
+    positions = _markers_at(frames, values[:, list(places.values())])
     actuation = None
     if channels:
-        driven = values[:, list(channels)] * list(channels.values())
+        with np.errstate(over="ignore"):
+            driven = values[:, list(channels)] * list(channels.values())
         if not np.isfinite(driven).all():
             row = int(np.argmin(np.isfinite(driven).all(axis=1)))
-            raise DataFileError(f"{path}, line {lines[row]}: an actuation is missing; every frame needs one.")
+            raise DataFileError(
+                f"{path}, line {lines[row]}: an actuation is missing or infinite; every frame needs one."
+            )
         grid = np.arange(frames[-1] + 1)
         actuation = np.stack([np.interp(grid, frames, channel) for channel in driven.T], axis=1)
     labels = tuple(dict.fromkeys(label for label, _ in places))
     start = float(stamps[0]) if clock == "time" else 0.0
     return RawRecording(positions, labels, units, rate, actuation, start=start)
+
+
+def _name_and_unit(cell: str) -> tuple[str, str | None]:
+    """The parts of `name [unit]`; no unit without brackets at its end."""
+    name, bracket, unit = cell.removesuffix("]").rpartition("[")
+    return (name.rstrip(), unit) if bracket and cell.endswith("]") else (cell, None)
 
 
 def _columns_of(
@@ -118,7 +125,8 @@ def _columns_of(
 def _read_qualisys(rows: Rows, path: Path) -> RawRecording:
     """Lines of a key and its values, then perhaps a line of column names, then a line a frame; millimetres.
 
-    Qualisys writes 0.000 for all three coordinates of a marker that it did not see, or leaves them empty.
+    A line may begin with its frame's number, or with that and its time. Qualisys writes 0.000 for all three
+    coordinates of a marker that it did not see, or leaves them empty.
     """
     first = next((number for number, row in enumerate(rows) if _is_data(row)), len(rows))
     keys = {row[0].strip(): [cell.strip() for cell in row[1:]] for row in rows[:first] if row}
@@ -137,7 +145,17 @@ def _read_qualisys(rows: Rows, path: Path) -> RawRecording:
             f"{path}, line {lines[0]}: {width} numbers do not fit {len(labels)} markers; export 3D data with column "
             "names, and with nothing but the frame and its time before the positions."
         )
-    positions = values[:, leading : leading + 3 * len(labels)].reshape(len(values), len(labels), 3)
+    if leading:
+        frames, _ = _frames_of(values[:, 0], None, lines, path)
+    else:  # Nothing but their number tells whether all of them are there.
+        frames = np.arange(len(values))
+        declared = "".join(keys.get("NO_OF_FRAMES", [])[:1])
+        if declared and declared != str(len(values)):
+            raise DataFileError(
+                f"{path} has {len(values)} of the {declared} frames of its NO_OF_FRAMES, and no column tells which: "
+                "export it again, with the frame and its time before the positions."
+            )
+    positions = _markers_at(frames, values[:, leading : leading + 3 * len(labels)])
     positions[(positions == 0.0).all(axis=2)] = np.nan
     rate = "".join(keys.get("FREQUENCY", [])[:1])
     start = float(values[0, 1]) if leading == 2 else 0.0
@@ -173,7 +191,7 @@ def _read_motive(rows: Rows, path: Path) -> RawRecording:
     values, lines = _numbers(rows, axes_line + 1, len(axes), path, only=[0, *places.values()])
     frames, _ = _frames_of(values[:, 0], None, lines, path)
     chosen = [places[label, axis] for label in labels for axis in _AXES]
-    positions = _spread(values[:, chosen], frames).reshape(frames[-1] + 1, -1, 3)
+    positions = _markers_at(frames, values[:, chosen])
     rate = keys.get("Export Frame Rate") or keys.get("Capture Frame Rate") or ""
     unit = keys.get("Length Units", "").strip()
     return RawRecording(
@@ -254,14 +272,21 @@ def _frames_of(
     Raises:
         DataFileError: A stamp is missing, does not rise, or is not a whole number of frames after the first.
     """
-    steps = np.diff(stamps)
-    wrong = ~np.isfinite(stamps[1:]) | ~(steps > 0.0)
-    if not np.isfinite(stamps[0]) or wrong.any():
-        line = lines[0] if not np.isfinite(stamps[0]) else lines[int(np.argmax(wrong)) + 1]
-        raise DataFileError(f"{path}, line {line}: the time or frame does not rise; sort the lines and fill it in.")
-    interval = 1.0 if time is None else float(np.median(steps))
+    known = np.abs(stamps) <= _LARGEST_STAMP
+    steps = np.diff(np.where(known, stamps, np.nan))
+    wrong = np.append(~known[0], ~(steps > 0.0))
+    if wrong.any():
+        line = lines[int(np.argmax(wrong))]
+        raise DataFileError(
+            f"{path}, line {line}: the time or frame does not rise, or is no number below 1e12; sort the "
+            "lines and fill it in."
+        )
+    interval, span = 1.0 if time is None else float(np.median(steps)), float(stamps[-1] - stamps[0])
+    foreign = DataFileError(f"{path}: its times or frame numbers do not belong to one recording; check that column.")
+    if _LEAST_RECORDED * span > interval * len(stamps):
+        raise foreign
     if time is not None:  # The whole recording tells the interval better than times that were rounded.
-        interval = (stamps[-1] - stamps[0]) / round((stamps[-1] - stamps[0]) / interval)
+        interval = span / round(span / interval)
     exact = (stamps - stamps[0]) / interval
     frames = np.round(exact).astype(np.int64)
     uneven = np.abs(exact - frames) > _UNEVEN
@@ -270,16 +295,16 @@ def _frames_of(
             f"{path}, line {lines[int(np.argmax(uneven))]}: the frames are not evenly spaced; export the recording "
             "at a constant frame rate."
         )
-    if len(frames) < _LEAST_RECORDED * (frames[-1] + 1) or (np.diff(frames) < 1).any():
-        raise DataFileError(f"{path}: its times or frame numbers do not belong to one recording; check that column.")
+    if (np.diff(frames) < 1).any():
+        raise foreign
     rate = None if time is None else 1.0 / interval
-    if rate is not None and abs(rate - round(rate)) < 1e-3 * rate and round(rate) > 0:
+    if rate is not None and rate < _LARGEST_STAMP and abs(rate - round(rate)) < 1e-3 * rate and round(rate) > 0:
         rate = float(round(rate))
     return frames, rate
 
 
-def _spread(values: FloatArray, frames: NDArray[np.int64]) -> FloatArray:
-    """Rows at their frames; a frame that was not recorded is NaN."""
+def _markers_at(frames: NDArray[np.int64], values: FloatArray) -> FloatArray:
+    """(T, M, 3) positions from (R, 3 M) rows at their frames; a frame that was not recorded is NaN."""
     spread = np.full((int(frames[-1]) + 1, values.shape[1]), np.nan)
     spread[frames] = values
-    return spread
+    return spread.reshape(len(spread), -1, 3)

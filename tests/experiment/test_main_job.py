@@ -36,6 +36,8 @@ from warp_resphys.experiment.checks import check_configuration
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_checkpoint, read_hdf5
 from warp_resphys.io.stages import package_versions
+from warp_resphys.learning.networks import ResidualForce
+from warp_resphys.learning.predictors import LearnedPredictor
 
 
 class TestCompleteRun:
@@ -236,20 +238,15 @@ class TestChanges:
 
     def test_a_diverged_roll_out_is_counted_and_is_no_number(self, finished, copied, monkeypatch):
         """The second of two test trajectories gets a force that is not finite at its fifth step."""
-        whole = evaluate.force_predictor
 
-        def diverging(model):
-            predict, calls = whole(model), []
-
-            def force(q, v):
-                calls.append(None)
-                found = predict(q, v)
-                found[1] *= torch.nan if len(calls) == 5 else 1.0
+        class Diverging(LearnedPredictor):
+            def __call__(self, state, step):
+                found = super().__call__(state, step)
+                if isinstance(self.model, ResidualForce):
+                    found[1] *= torch.nan if step == 4 else 1.0
                 return found
 
-            return force
-
-        monkeypatch.setattr(evaluate, "force_predictor", diverging)
+        monkeypatch.setattr(evaluate, "LearnedPredictor", Diverging)
         Path("run/rollouts.h5").unlink()
         assert run(*TINY, IN_RUN)[0] == 0
         found, before = metrics(), metrics(finished[0])

@@ -18,9 +18,9 @@ class TestBadInput:
     @pytest.mark.parametrize(
         ("overrides", "sentence"),
         [
-            ("simulation.youngs_modulus=0", "simulation: youngs_modulus is 0: it must be positive, in pascals."),
-            ("reality.youngs_modulus=-1e5", "reality: youngs_modulus is -100000: it must be positive, in pascals."),
-            ("simulation.youngs_modulus=nan", "simulation: youngs_modulus is nan: it must be positive, in pascals."),
+            ("simulation.youngs_modulus=0", "simulation: youngs_modulus is 0: it must be positive, in Pa."),
+            ("reality.youngs_modulus=-1e5", "reality: youngs_modulus is -100000: it must be positive, in Pa."),
+            ("simulation.youngs_modulus=nan", "simulation: youngs_modulus is nan: it must be positive, in Pa."),
             ("simulation.poissons_ratio=0.5", "simulation: poissons_ratio is 0.5: it must be greater than -1 and less"),
             (
                 "reality.poissons_ratio=-1",
@@ -30,7 +30,7 @@ class TestBadInput:
             ("time_step=-0.01", "time_step is -0.01: it must be positive, in seconds."),
             ("experiment=beam_oscilation", "unknown experiment 'beam_oscilation', did you mean 'beam_oscillation'"),
             ("trainer.epoch=5", "unknown key 'trainer.epoch', did you mean 'trainer.epochs'"),
-            ("+simulation.stiffness=5", "unknown key 'simulation.stiffness': simulation has youngs_modulus, "),
+            ("+simulation.stiffness=5", "simulation: corotated has no constant 'stiffness': it has youngs_modulus, "),
             ("simulation.youngs_modulus=soft", "simulation.youngs_modulus is 'soft': it must be a number."),
             ("trainer.epochs=2.5", "trainer.epochs is 2.5: it must be a whole number."),
             ("trainer.learning_rate=0", "trainer.learning_rate is 0: it must be positive."),

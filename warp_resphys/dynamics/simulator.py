@@ -78,6 +78,11 @@ class Trajectory:
     final: State
 
 
+def _check_count(name: str, value: object) -> None:
+    if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
+        raise InputError(f"{name} is {value!r}: it must be a whole number, one or more.")
+
+
 def _device(name: str | torch.device) -> torch.device:
     """A device that the kernels run on.
 
@@ -268,7 +273,12 @@ class Simulator:
         return self._chambers[batch]
 
     def rest_state(self, batch: int = 1) -> State:
-        """The undeformed body at rest."""
+        """The undeformed body at rest.
+
+        Raises:
+            InputError: the batch is no whole number, one or more.
+        """
+        _check_count("batch", batch)
         q = self.rest_positions.expand(batch, -1, -1).clone()
         return State(q, torch.zeros_like(q))
 
@@ -383,7 +393,8 @@ class Simulator:
             raise InputError("a body without fixed vertices has no static equilibrium: fix some vertices.")
         given = [t for t in (external_force, fixed_positions, start, pressure) if t is not None]
         tensors = self.prepare(material)
-        batch = batch or max([len(t) for t in given] + [len(tensors.shape_stiffness), len(tensors.weight)])
+        if batch is None:
+            batch = max([len(t) for t in given] + [len(tensors.shape_stiffness), len(tensors.weight)])
         state = self.rest_state(batch)
         self._check(state, external_force, fixed_positions, start, pressure)
         tensors.check_batch(batch)
@@ -436,8 +447,7 @@ class Simulator:
             InputError: wrong shapes, or values that are not finite.
             ConvergenceError: see `step`.
         """
-        if not steps >= 1:
-            raise InputError(f"steps is {steps}: it must be at least 1.")
+        _check_count("steps", steps)
         series = (("external_forces", external_forces, 4), ("fixed_positions", fixed_positions, 4))
         for name, values, axes in (*series, ("pressures", pressures, 3)):
             if values is not None and values.ndim == axes and len(values) != steps:

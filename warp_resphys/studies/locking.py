@@ -16,6 +16,7 @@ import torch
 from ..dynamics.nonlinear_solver import SolverSettings
 from ..dynamics.simulator import GRAVITY, Simulator
 from ..energies.material import Material
+from ..experiment.kinds import NATURAL, check_kind
 from ..fem.body import Body
 from ..fem.surface_elements import Fibres
 from ..io.errors import InputError
@@ -92,9 +93,11 @@ def measure(mesh: Mesh, study: Mapping[str, Any], timed: bool = True) -> dict[st
         InputError: the mesh has no such chamber.
         ConvergenceError: an equilibrium was not found.
     """
+    for key in ("chamber", "steps", "repeats"):
+        check_kind(f"study.{key}", study[key], NATURAL)
     chambers = find_chambers(mesh)
     number = study["chamber"]
-    if not 1 <= number <= len(chambers):
+    if number > len(chambers):
         raise InputError(f"study.chamber is {number}, but the mesh has {len(chambers)} closed chambers.")
     heights = mesh.vertices[:, 2]
     tolerance = 1e-6 * float(np.ptp(heights))

@@ -167,6 +167,16 @@ def test_wrong_shape_of_positions(simulator):
             step(simulator, **(given | {"q": wrong}))
 
 
+@pytest.mark.parametrize("count", [0, -1, 2.5, NAN, True, "two"])
+def test_batches_and_steps_that_are_no_whole_numbers(simulator, count):
+    with refused("batch is .*: it must be a whole number, one or more"):
+        simulator.rest_state(count)
+    with refused("batch is .*: it must be a whole number, one or more"):
+        simulator.static_equilibrium(batch=count)
+    with refused("steps is .*: it must be a whole number, one or more"):
+        simulator.rollout(simulator.rest_state(1), count)
+
+
 def test_rollout_with_the_wrong_number_of_steps(simulator):
     state = simulator.rest_state(1)
     forces = torch.zeros(3, *state.q.shape)
@@ -242,6 +252,9 @@ GRADCHECK = {
         "poissons_ratios": [0.45],
         "steps": 1,
         "batch": 1,
+        "seed": 0,
+        "tolerance": 1e-6,
+        "relative_tolerance": 1e-10,
         "mass_damping": 1.0,
         "stiffness_damping": 1e-3,
     },
@@ -252,8 +265,12 @@ GRADCHECK = {
     ("changes", "message"),
     [
         ({"poses": ["folded"]}, "gradcheck.poses has 'folded': choose from rest, bent, twisted"),
-        ({"steps": 0}, "gradcheck.steps is 0: it must be positive"),
-        ({"mass_damping": 0.0}, "gradcheck.mass_damping is 0.0: it must be positive"),
+        ({"steps": 0}, "gradcheck.steps is 0: it must be a whole number, one or more"),
+        ({"steps": 2.5}, "gradcheck.steps is 2.5: it must be a whole number, one or more"),
+        ({"batch": "two"}, "gradcheck.batch is 'two': it must be a whole number, one or more"),
+        ({"seed": -1}, "gradcheck.seed is -1: it must be a whole number, zero or more"),
+        ({"poissons_ratios": []}, "gradcheck.poissons_ratios is .*: it must be a list of numbers"),
+        ({"mass_damping": 0.0}, "gradcheck.mass_damping is 0.0: it must be a positive number"),
     ],
 )
 def test_gradient_check(changes, message):

@@ -75,3 +75,25 @@ def test_the_beam_hangs_under_the_weight() -> None:
 def test_a_mesh_from_a_file_cannot_be_refined() -> None:
     with pytest.raises(InputError, match="choose mesh=beam_hexahedra"):
         run_benchmark({**configuration(), "mesh": {"kind": "file", "path": "arm.vtk"}})
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ("benchmark.batches.cpu=[0]", r"benchmark.batches.cpu is \[0\]: it must be a list of whole numbers"),
+        ("benchmark.steps={1: 2.5}", "benchmark.steps is .*: it must be whole numbers by refinement"),
+        ("benchmark.projective_dynamics.steps=2.5", "benchmark.projective_dynamics.steps is 2.5: it must be a whole"),
+        ("benchmark.repeats=0", "benchmark.repeats is 0: it must be a whole number"),
+        ("benchmark.solvers=[]", r"benchmark.solvers is \[\]"),
+        ("benchmark.tip_mass=heavy", "benchmark.tip_mass is 'heavy': it must be a number, zero or more"),
+        ("benchmark.materials=[{E: 1.0}]", "unknown key 'benchmark.materials.0.E'"),
+        ("+benchmark.colour=red", "unknown key 'benchmark.colour'"),
+        (
+            "benchmark.batches.cpu=[300];benchmark.solvers=[newton]",
+            "benchmark.largest_batch leave nothing of refinement 1",
+        ),
+    ],
+)
+def test_what_cannot_be_measured_is_refused_first(overrides: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        run_benchmark(configuration("device=cpu", *overrides.split(";")))

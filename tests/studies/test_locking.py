@@ -81,9 +81,18 @@ def test_deflections_have_their_directions_and_sizes():
     assert result["iterations"] >= 1.0
 
 
-def test_a_chamber_that_is_not_there():
-    study = configured()["study"] | {"chamber": 7}
-    with pytest.raises(InputError, match=r"study.chamber is 7, but the mesh has 6 closed chambers"):
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("chamber", 7, "is 7, but the mesh has 6 closed chambers"),
+        ("chamber", 0, "is 0: it must be a whole number, one or more"),
+        ("steps", 2.5, "is 2.5: it must be a whole number, one or more"),
+        ("repeats", 0, "is 0: it must be a whole number, one or more"),
+    ],
+)
+def test_a_chamber_that_is_not_there_and_counts_that_are_none(key, value, message):
+    study = configured()["study"] | {key: value}
+    with pytest.raises(InputError, match=f"study.{key} {message}"):
         measure(mesh_arm(ArmGeometry(), 0.01, layers=0.06)[0], study)
 
 

@@ -91,6 +91,11 @@ class Trajectory:
     final: State
 
 
+def _check_count(name: str, value: object) -> None:
+    if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
+        raise InputError(f"{name} is {value!r}: it must be a whole number, one or more.")
+
+
 def _device(name: str | torch.device) -> torch.device:
     """A device that the kernels run on.
 
@@ -260,7 +265,12 @@ class Simulator:
         return self._held[batch, name]
 
     def rest_state(self, batch: int = 1) -> State:
-        """The undeformed body at rest."""
+        """The undeformed body at rest.
+
+        Raises:
+            InputError: the batch is no whole number, one or more.
+        """
+        _check_count("batch", batch)
         q = self.rest_positions.expand(batch, -1, -1).clone()
         return State(q, torch.zeros_like(q))
 
@@ -405,7 +415,8 @@ class Simulator:
         inputs = _NOTHING if inputs is None else inputs
         constants = self.prepare(parameters)
         given = [*inputs.fields.values(), *([] if start is None else [start])]
-        batch = batch or max([len(t) for t in given] + [constants.batch])
+        if batch is None:
+            batch = max([len(t) for t in given] + [constants.batch])
         state = self.rest_state(batch)
         self._check(state, inputs, constants)
         if start is not None:
@@ -445,8 +456,7 @@ class Simulator:
             InputError: wrong shapes, or values that are not finite.
             ConvergenceError: see `step`.
         """
-        if not steps >= 1:
-            raise InputError(f"steps is {steps}: it must be at least 1.")
+        _check_count("steps", steps)
         inputs = _NOTHING if inputs is None else inputs
         inputs.check_steps(steps)
         constants = self.prepare(parameters)

@@ -56,6 +56,10 @@ POSITIVE = Kind(lambda value: is_finite(value) and value > 0.0, "a positive numb
 NOT_NEGATIVE = Kind(lambda value: is_finite(value) and value >= 0.0, "a number, zero or more")
 NATURAL = Kind(lambda value: is_whole_number(value) and value > 0, "a whole number, one or more")
 COUNT = Kind(lambda value: is_whole_number(value) and value >= 0, "a whole number, zero or more")
+NATURALS = Kind(
+    lambda value: isinstance(value, list) and bool(value) and all(map(NATURAL.fits, value)),
+    "a list of whole numbers, one or more",
+)
 TRUTH_VALUE = Kind(lambda value: isinstance(value, bool), "true or false")
 
 
@@ -89,9 +93,13 @@ def check_keys(group: str, settings: Any, kinds: Mapping[str, Kind], others: Seq
     for key, kind in kinds.items():
         if key not in settings:
             raise InputError(f"{group}.{key} is missing: {group} needs {', '.join(kinds)}.")
-        value = settings[key]
-        if not (value is None and kind.optional) and not kind.fits(value):
-            raise InputError(f"{group}.{key} is {value!r}: it must be {kind.wanted}.")
+        check_kind(f"{group}.{key}", settings[key], kind)
+
+
+def check_kind(name: str, value: Any, kind: Kind) -> None:
+    """Raises InputError if a value is not of its kind."""
+    if not (value is None and kind.optional) and not kind.fits(value):
+        raise InputError(f"{name} is {value!r}: it must be {kind.wanted}.")
 
 
 def dotted(groups: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

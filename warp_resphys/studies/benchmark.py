@@ -26,8 +26,20 @@ from threadpoolctl import threadpool_limits
 from ..dynamics.assembly import HessianAssembly
 from ..dynamics.inputs import Inputs
 from ..dynamics.integrator import State
+from ..dynamics.nonlinear_solver import SOLVERS
 from ..dynamics.simulator import Simulator
 from ..experiment.build import build_body, build_simulator
+from ..experiment.kinds import (
+    FINITE,
+    GROUP,
+    NATURAL,
+    NATURALS,
+    NOT_NEGATIVE,
+    POSITIVE,
+    TRUTH_VALUE,
+    Kind,
+    check_keys,
+)
 from ..io.errors import InputError
 from ..io.progress import Progress
 from ..io.stages import package_versions
@@ -115,6 +127,7 @@ def run_benchmark(config: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         InputError: a configuration that cannot be simulated or refined.
     """
+    _check(config["benchmark"])
     settings = _quick(config["benchmark"]) if config["benchmark"]["quick"] else dict(config["benchmark"])
     yardstick: list[float] = []
     steps: list[dict[str, Any]] = []
@@ -135,6 +148,45 @@ def run_benchmark(config: Mapping[str, Any]) -> dict[str, Any]:
         "parts": parts,
         "cold_start": cold_start(config) if settings["cold_start"] else None,
     }
+
+
+_BY_REFINEMENT = Kind(
+    lambda value: isinstance(value, Mapping) and bool(value) and all(map(NATURAL.fits, (*value, *value.values()))),
+    "whole numbers by refinement, one or more",
+)
+_LIMITS = {"refinements": NATURALS, "batches": NATURALS, "steps": NATURAL}
+_KEYS = {
+    "quick": TRUTH_VALUE,
+    "solvers": Kind(lambda value: isinstance(value, list) and bool(value), "a list of solvers"),
+    "materials": Kind(lambda value: isinstance(value, list) and bool(value), "a list of materials"),
+    "refinements": NATURALS,
+    "batches": GROUP,
+    "largest_batch": _BY_REFINEMENT,
+    "steps": _BY_REFINEMENT,
+    "relative_tolerance": POSITIVE,
+    "max_iterations": NATURAL,
+    "tip_mass": NOT_NEGATIVE,
+    "pressure": FINITE,
+    "repeats": NATURAL,
+    "seconds": POSITIVE,
+    "parts_repeats": NATURAL,
+    "cold_start": TRUTH_VALUE,
+}
+
+
+def _check(settings: Mapping[str, Any]) -> None:
+    """Checks the group ``benchmark``.
+
+    Raises:
+        InputError: a value of the wrong kind or out of range, an unknown key, or no batch to measure.
+    """
+    check_keys("benchmark", settings, _KEYS, SOLVERS)
+    check_keys("benchmark.batches", settings["batches"], {"cpu": NATURALS, "cuda": NATURALS})
+    for solver in (solver for solver in SOLVERS if solver in settings):
+        known = {key: kind for key, kind in _LIMITS.items() if key in (settings[solver] or ())}
+        check_keys(f"benchmark.{solver}", settings[solver], known)
+    for number, material in enumerate(settings["materials"]):
+        check_keys(f"benchmark.materials.{number}", material, {"poissons_ratio": FINITE, "youngs_modulus": POSITIVE})
 
 
 def _quick(settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -172,6 +224,11 @@ def _cases(config: Mapping[str, Any], settings: Mapping[str, Any], refinement: i
                 )
                 simulator.rollout(case.start, 2, Inputs(**{k: v[:2] for k, v in case.inputs.fields.items()}))
                 cases.append(case)
+    if not cases:
+        raise InputError(
+            f"benchmark.batches and benchmark.largest_batch leave nothing of refinement {refinement}: name a smaller "
+            "batch."
+        )
     return cases
 
 

@@ -13,10 +13,22 @@ from ..dynamics.inputs import Inputs
 from ..dynamics.integrator import State
 from ..dynamics.simulator import Simulator
 from ..experiment.build import build_simulator
+from ..experiment.kinds import COUNT, NATURAL, POSITIVE, Kind, check_keys, is_list
 from ..io.errors import InputError
 from ..mesh.poses import twisted
 
 POSES = ("rest", "bent", "twisted")
+_KEYS = {
+    "poses": Kind(lambda value: isinstance(value, list) and bool(value), "a list of poses"),
+    "poissons_ratios": Kind(lambda value: is_list(value) and bool(value), "a list of numbers"),
+    "steps": NATURAL,
+    "batch": NATURAL,
+    "seed": COUNT,
+    "tolerance": POSITIVE,
+    "relative_tolerance": POSITIVE,
+    "mass_damping": POSITIVE,
+    "stiffness_damping": POSITIVE,
+}
 # Seven-point stencil: its error is of sixth order in the step, so that steps of a percent, which drown the rounding of
 # the solves, still leave a truncation of 1e-10.
 _STENCIL = tuple((s * k, s * w) for s in (1, -1) for k, w in ((1, 3.0 / 4.0), (2, -3.0 / 20.0), (3, 1.0 / 60.0)))
@@ -183,14 +195,12 @@ def check_configured(config: Mapping[str, Any]) -> Iterator[tuple[float, str, li
         ConvergenceError: the solver does not reach the tolerance.
     """
     check = config["gradcheck"]
+    check_keys("gradcheck", check, _KEYS)
     for name in check["poses"]:
         if name not in POSES:
             raise InputError(f"gradcheck.poses has {name!r}: choose from {', '.join(POSES)}.")
     if config["dtype"] != "float64":
         raise InputError(f"dtype is {config['dtype']!r}: gradients are checked in float64.")
-    for key in ("mass_damping", "stiffness_damping", "steps", "batch"):
-        if not check[key] > 0:
-            raise InputError(f"gradcheck.{key} is {check[key]}: it must be positive.")
     damping = {key: check[key] for key in ("mass_damping", "stiffness_damping")}
     solver = {**config["solver"], "relative_tolerance": check["relative_tolerance"]}
     simulator = build_simulator({**config, "solver": solver})

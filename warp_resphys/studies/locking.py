@@ -19,6 +19,7 @@ from ..dynamics.simulator import GRAVITY, Simulator
 from ..energies.fibres import Fibres
 from ..energies.materials import make_material
 from ..energies.pressure import Pressure
+from ..experiment.kinds import NATURAL, check_kind
 from ..fem.body import Body
 from ..io.errors import InputError
 from ..mesh.arm import mesh_arm
@@ -94,9 +95,11 @@ def measure(mesh: Mesh, study: Mapping[str, Any], timed: bool = True) -> dict[st
         InputError: the mesh has no such chamber.
         ConvergenceError: an equilibrium was not found.
     """
+    for key in ("chamber", "steps", "repeats"):
+        check_kind(f"study.{key}", study[key], NATURAL)
     chambers = find_chambers(mesh)
     number = study["chamber"]
-    if not 1 <= number <= len(chambers):
+    if number > len(chambers):
         raise InputError(f"study.chamber is {number}, but the mesh has {len(chambers)} closed chambers.")
     heights = mesh.vertices[:, 2]
     tolerance = 1e-6 * float(np.ptp(heights))

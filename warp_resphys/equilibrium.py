@@ -25,7 +25,7 @@ class Workspace:
         pattern: block structure of the Hessian.
         batch: environments.
         device: of every buffer.
-        dtype: of every buffer.
+        dtype: of states and factors; the potential is evaluated in float64.
     """
 
     def __init__(
@@ -37,8 +37,8 @@ class Workspace:
         device: torch.device,
         dtype: torch.dtype,
     ) -> None:
-        self.potential = IncrementalPotential(body, model, batch, device, dtype)
-        self.pattern = pattern
+        self.potential = IncrementalPotential(body, model, batch, device, torch.float64)
+        self.pattern, self.dtype = pattern, dtype
         self.fixed = torch.as_tensor(body.fixed_vertices, device=device)
         self._solvers: dict[tuple[str, SolverSettings], NonlinearSolver] = {}
         self._adjoint: HessianMetric | None = None
@@ -47,7 +47,7 @@ class Workspace:
         """The solver for a purpose (dynamics, statics), built at its first use; each keeps its own factor."""
         key = (purpose, settings)
         if key not in self._solvers:
-            self._solvers[key] = NonlinearSolver(self.potential, self.pattern, settings)
+            self._solvers[key] = NonlinearSolver(self.potential, self.pattern, settings, self.dtype)
         return self._solvers[key]
 
     def adjoint_metric(self, linear_solver: str) -> HessianMetric:
@@ -95,7 +95,7 @@ class Equilibrium(torch.autograd.Function):
             start[:, workspace.fixed] = fixed_positions.detach()
         with threads_for(start.numel()):
             reports.append(solver.solve(start.detach()))
-        x = workspace.potential.positions.clone()
+        x = workspace.potential.positions.to(start.dtype, copy=True)
         ctx.workspace, ctx.linear_solver = workspace, solver.settings.linear_solver
         ctx.save_for_backward(x, *terms.tensors())
         return x
@@ -117,6 +117,7 @@ def _adjoint(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...
     potential.positions.copy_(x)
     metric = ctx.workspace.adjoint_metric(ctx.linear_solver)
     metric.refactor_exact()
+    gradient = gradient.to(potential.dtype)
     z = metric.apply(gradient.reshape(len(x), -1)).view_as(x)
     product = potential.stiffness_product(z)
     _check_adjoint(potential, z, product, gradient)
@@ -162,8 +163,7 @@ def _check_adjoint(
     right = gradient * potential.free_mask[:, None]
     left = (product + potential.inertia[..., None] * z) * potential.free_mask[:, None]
     error = (left - right).flatten(1).norm(dim=1)
-    loose = 1e-6 if z.dtype == torch.float64 else 1e-2
-    if not bool((error <= loose * right.flatten(1).norm(dim=1)).all()):
+    if not bool((error <= 1e-6 * right.flatten(1).norm(dim=1)).all()):
         raise ConvergenceError(
             "the adjoint system is singular at a state of the roll-out, so that there is no gradient: fix the body so "
             "that it cannot move freely, or keep away from the point where it buckles.",
@@ -180,11 +180,11 @@ class GreenStrain(torch.autograd.Function):
     def forward(ctx: Any, potential: IncrementalPotential, positions: torch.Tensor) -> torch.Tensor:
         ctx.potential = potential
         ctx.save_for_backward(positions)
-        return potential.strain(positions.detach())
+        return potential.strain(positions.detach().to(potential.dtype))
 
     @override
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: torch.Tensor) -> tuple[None, torch.Tensor]:
         (positions,) = ctx.saved_tensors
-        return None, ctx.potential.strain_adjoint(positions, gradient)
+        return None, ctx.potential.strain_adjoint(positions.to(gradient.dtype), gradient)

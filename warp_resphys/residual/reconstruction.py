@@ -157,6 +157,7 @@ class GaussNewton(Reconstructor):
             dx = self._direction(p, x - target, force)
             x, objective, force = self._search(p, x, dx, target, objective)
             change = dx.abs().max()
+        x, force = x.to(sim.dtype), force.to(sim.dtype)
         return Reconstruction(sim.method.finish(state, x, sim.time_step), force, iterations)
 
     def _evaluate(

@@ -164,7 +164,7 @@ class SparseGaussNewton(_OnMarkers):
         """
         metric = workspace.adjoint_metric(self.simulator.settings.linear_solver)
         metric.refactor_exact()
-        residual = workspace.potential.residual.reshape(len(x), -1, 1)
+        residual = workspace.potential.residual.reshape(len(x), -1, 1).to(x.dtype)
         transposed = self.markers.transposed_jacobian(end) if self._constant is None else self._constant
         transposed = transposed * seen.flatten(1)[:, None]
         basis = self._basis

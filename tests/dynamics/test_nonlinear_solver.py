@@ -144,6 +144,84 @@ def test_float32_runs_and_agrees(name, device):
     torch.testing.assert_close(found.q.double(), reference, rtol=0.0, atol=2e-5)
 
 
+@pytest.fixture
+def pulled_beam():
+    """Simulators of the README's beam by settings, nearly incompressible, and its pose under a pull."""
+    mesh = box_hexahedra((0.1, 0.03, 0.03), (10, 3, 3))
+    body = Body(mesh, fixed=select_vertices(mesh, x=0.0))
+
+    def make(nu=0.499, **settings):
+        return Simulator(body, Corotated(264e3, nu, density=1070.0), **settings)
+
+    exact = make()
+    load = torch.zeros_like(exact.rest_positions)[None]
+    load[:, select_vertices(mesh, x=0.1), 2] = -0.05
+    return make, exact.static_equilibrium(Inputs(load))
+
+
+@pytest.mark.parametrize("tolerance", [1e-5, 1e-8])
+@pytest.mark.parametrize("name", ["quasi_newton", "newton"])
+def test_float32_converges_for_a_nearly_incompressible_solid(pulled_beam, name, tolerance, device):
+    """To the resolution of its positions, about 4e-9 m: the volume term leaves float32 no digit of the residual."""
+    make, held = pulled_beam
+    reference = make(device=device).rollout(State(held.q.to(device), held.v.to(device)), 20)
+    single = make(solver=name, relative_tolerance=tolerance, dtype=torch.float32, device=device)
+    found = single.rollout(State(single.tensor(held.q), single.tensor(held.v)), 20)
+    assert all(bool(r.converged.all()) for r in found.reports)
+    assert max(float(r.relative_residual.max()) for r in found.reports) <= tolerance
+    assert found.q.dtype == torch.float32
+    torch.testing.assert_close(found.q.double(), reference.q, rtol=0.0, atol=2e-8)
+
+
+def test_float32_gradients_of_a_nearly_incompressible_solid(pulled_beam):
+    make, held = pulled_beam
+    gradients = []
+    for dtype in (torch.float64, torch.float32):
+        modulus = torch.tensor([264e3], dtype=dtype, requires_grad=True)
+        q = held.q.to(dtype).requires_grad_()
+        sim = make(dtype=dtype, relative_tolerance=1e-8)
+        end = sim.rollout(State(q, torch.zeros_like(q)), 5, parameters={"youngs_modulus": modulus}).q[-1]
+        gradients.append(torch.autograd.grad(end[..., 2].square().sum(), (q, modulus)))
+    for exact, single in zip(*gradients, strict=True):
+        assert single.dtype == torch.float32
+        assert float((single.double() - exact).norm()) < 3e-4 * float(exact.norm())
+
+
+def test_a_slow_solver_is_not_taken_for_one_at_rounding(pulled_beam):
+    """A kilometre from the origin rounding leaves residuals of 3e-7; projective dynamics crawls long before that."""
+    make, held = pulled_beam
+    start = State(held.q + 1000.0, held.v)
+    exact = make(0.495, solver="newton").step(start)[0]
+    found, report = make(0.495, solver="projective_dynamics").step(start)
+    assert bool(report.converged)
+    assert float(report.relative_residual) < 1.5e-6
+    torch.testing.assert_close(found.q, exact.q, rtol=0.0, atol=2e-10)
+
+
+@pytest.mark.parametrize("linear_solver", ["banded", "dense", "sparse"])
+@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("speed", [1e80, 1e160])
+def test_an_overflow_touches_neither_neighbours_nor_later_steps(name, linear_solver, speed, device):
+    if device == "cuda" and linear_solver == "banded":
+        pytest.skip("banded factors are the CPU's")
+    s = simulator(name, device=device, linear_solver=linear_solver, on_failure="count", max_iterations=500)
+    calm = pose(s, "bent", 2)
+    wanted = [s.step(calm)]
+    wanted.append(s.step(wanted[0][0]))
+    wild = calm.v.clone()
+    wild[0] += speed
+    new, report = s.step(State(calm.q, wild))
+    assert bool(report.converged[1])
+    assert bool(torch.isfinite(new.q).all())
+    torch.testing.assert_close(new.q[1], wanted[0][0].q[1], rtol=0.0, atol=1e-9)
+    state = State(torch.stack([calm.q[0], new.q[1]]), torch.stack([calm.v[0], new.v[1]]))
+    for step in range(2):
+        state, report = s.step(state)
+        assert bool(report.converged.all())
+        assert int(report.iterations.max()) <= 2 * max(int(r.iterations.max()) for _, r in wanted)
+        torch.testing.assert_close(state.q[0], wanted[step][0].q[0], rtol=0.0, atol=1e-9)
+
+
 @pytest.mark.parametrize("name", SOLVERS)
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize("offset", [0.0, 1.0])

@@ -151,6 +151,26 @@ def test_values_that_are_not_finite(name, value, simulator):
         step(simulator, **given)
 
 
+@pytest.mark.parametrize("integrator", ["bdf2", "implicit_euler"])
+def test_the_state_before_is_checked_like_the_state(integrator):
+    simulator = Simulator(Body(MESH, fixed=select_vertices(MESH, x=0.0)), integrator=integrator)
+    rest = simulator.rest_state(2)
+    for which in (0, 1):
+        for value in (NAN, INF):
+            pair = [rest.q.clone(), rest.v.clone()]
+            pair[which][1, 2, 0] = value
+            with refused(rf"state.previous\[{which}\] is not finite in environment 1, vertex 2"):
+                simulator.step(State(rest.q, rest.v, tuple(pair)))
+        for wrong in (rest.q[:1], rest.q.float(), rest.q.numpy()):
+            pair = [rest.q, rest.v]
+            pair[which] = wrong
+            with refused(rf"state.previous\[{which}\] "):
+                simulator.step(State(rest.q, rest.v, tuple(pair)))
+    for wrong in (rest.q, (rest.q,)):
+        with refused(r"state.previous must be the pair \(q, v\)"):
+            simulator.step(State(rest.q, rest.v, wrong))
+
+
 @pytest.mark.parametrize("name", ["v", "external_force", "fixed_positions"])
 def test_wrong_shapes(name, simulator):
     given = arguments(simulator)

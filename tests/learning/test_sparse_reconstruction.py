@@ -9,6 +9,7 @@ from warp_resphys import Body, Corotated, Simulator, State, box_hexahedra, selec
 from warp_resphys.data.markers import KINDS, MarkerMap, bind_markers
 from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.io.errors import ConvergenceError, InputError
+from warp_resphys.learning.reconstruction import make_reconstructor
 from warp_resphys.learning.sparse_reconstruction import (
     SparseGaussNewton,
     SparseLevenbergMarquardt,
@@ -65,6 +66,29 @@ class TestMarkerMap:
     def test_bad_shapes(self, shape):
         with pytest.raises(InputError, match="both must be"):
             MarkerMap(torch.zeros(shape, dtype=torch.int64), torch.ones(shape))
+
+
+@pytest.mark.parametrize(
+    ("method", "options"),
+    [("gauss_newton", {}), ("gauss_newton", {"modes": 6}), ("levenberg_marquardt", {}), ("full", {})],
+)
+def test_in_single_precision(method, options):
+    """Two steps in a row of a nearly incompressible beam, so that states keep their type."""
+    observed, start = observation(2)
+    found = []
+    for dtype in (torch.float64, torch.float32):
+        sim = simulator(poissons_ratio=0.499, dtype=dtype, relative_tolerance=1e-8)
+        first = State(start.q.to(dtype), start.v.to(dtype))
+        if method == "full":
+            solver = make_reconstructor(sim, "gauss_newton", 1e-6, 1e-7, 40)
+            solver.markers = lambda q: q
+        else:
+            solver = make_sparse_reconstructor(sim, markers_at([5, 10]), method, 1e-6, 1e-6, 60, **options)
+        q, force = reconstruct(solver, first, observed.to(dtype))
+        assert q.dtype == force.dtype == dtype
+        found.append((q.double(), force.double()))
+    torch.testing.assert_close(found[1][0], found[0][0], rtol=0.0, atol=1e-6)
+    torch.testing.assert_close(found[1][1], found[0][1], rtol=0.0, atol=1e-2 * float(found[0][1].abs().max()))
 
 
 class TestGaussNewton:

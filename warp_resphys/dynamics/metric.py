@@ -66,7 +66,7 @@ class HessianMetric(Metric):
 
     def _factorise(self) -> Factor:
         self._potential.update_tangent(self.clamped)
-        return self._linear.factor(self._assemble())
+        return self._linear.factor(self._assemble().to(self._linear.dtype))
 
     def refactor_exact(self) -> None:
         """Factorises the Hessian as it is, indefinite or not: for adjoints."""
@@ -85,7 +85,7 @@ class HessianMetric(Metric):
         if self._factor is None:
             raise RuntimeError("refactor before solve")
         out = torch.zeros_like(right)
-        out[:, self._dofs] = self._factor.solve(right[:, self._dofs])
+        out[:, self._dofs] = self._factor.solve(right[:, self._dofs].to(self._linear.dtype)).to(right.dtype)
         return out
 
 
@@ -145,7 +145,7 @@ class ProjectiveMetric(Metric):
         diagonal = torch.as_tensor(self._pattern.rows == self._pattern.cols, device=blocks.device)
         vertex = torch.as_tensor(self._pattern.diagonal_vertex, device=blocks.device)[diagonal]
         values[:, self._address[diagonal]] += inertia[:, vertex]
-        self._factor = self._linear.factor(values)
+        self._factor = self._linear.factor(values.to(self._linear.dtype))
 
     @override
     def apply(self, residual: torch.Tensor) -> torch.Tensor:

@@ -9,8 +9,11 @@ Three solvers differ in the matrix of the global step and share everything else:
 =======================  ====================================================================================
 
 An environment of the batch has converged when its residual is at most ``relative_tolerance`` times the norm of the
-forces that balance: inertia and loads. Where next to nothing moves, rounding leaves more than that: an environment
-whose residual is within rounding and has not halved in three iterations has converged too.
+forces that balance: inertia and loads. Rounding may leave more than that. An environment whose residual has not halved
+in three iterations has converged too if it is less than what moving every coordinate by one unit of rounding makes of
+it, which is measured; and one on which nothing acts, if its first step is within the rounding of its state.
+
+Residuals and positions are float64. Factors and directions may be float32: they decide how many iterations it takes.
 """
 
 from dataclasses import dataclass
@@ -99,13 +102,16 @@ class NonlinearSolver:
         potential: evaluated at its current terms.
         pattern: block structure of its Hessian.
         settings: see `SolverSettings`.
+        dtype: of factors and directions.
     """
 
-    def __init__(self, potential: IncrementalPotential, pattern: BlockPattern, settings: SolverSettings) -> None:
-        self.potential, self.settings = potential, settings
+    def __init__(
+        self, potential: IncrementalPotential, pattern: BlockPattern, settings: SolverSettings, dtype: torch.dtype
+    ) -> None:
+        self.potential, self.settings, self.dtype = potential, settings, dtype
         self.metric: Metric
         kind = settings.linear_solver
-        where = (potential.device, potential.dtype)
+        where = (potential.device, dtype)
         if settings.name == "projective_dynamics":
             linear = make_linear_solver(kind, pattern.rows, pattern.cols, len(pattern.free), 1, *where)
             self.metric = ProjectiveMetric(potential, pattern, linear)
@@ -113,7 +119,7 @@ class NonlinearSolver:
             linear = make_linear_solver(kind, pattern.rows, pattern.cols, len(pattern.free), 3, *where)
             self.metric = HessianMetric(potential, pattern, linear)
         memory = 0 if settings.name == "newton" else settings.memory
-        self._update = InverseHessianUpdate(memory, potential.positions)
+        self._update = InverseHessianUpdate(memory, potential.positions.to(dtype))
         self._mean_iterations = float("inf")
 
     def solve(self, start: torch.Tensor) -> SolveReport:
@@ -159,53 +165,86 @@ class _Run:
         self.batch = p.batch
         self.force_norm = torch.linalg.vector_norm(p.force.view(self.batch, -1), dim=1)
         self.iterations = torch.zeros(self.batch, dtype=torch.int64, device=p.device)
-        self.stuck = torch.zeros(self.batch, dtype=torch.bool, device=p.device)
-        self.rounding = p.residual_rounding()
-        self.smallest = torch.full_like(self.rounding, torch.inf)
+        self.converged = torch.zeros(self.batch, dtype=torch.bool, device=p.device)
+        self.energy = self.rounding = self.smallest = torch.full_like(self.force_norm, torch.inf)
         self.stalls = torch.zeros_like(self.iterations)
         self.factorisations = 0
         self.iteration = 0
-        self.clamp = False
+        self.clamp: bool | None = None  # How to factorise before the next iteration, if that must be.
         solver._update.reset()
         self._accept(*p.evaluate())
+        self.stuck = ~torch.isfinite(self.relative_residual)
 
     def _accept(self, energy: torch.Tensor, balance: torch.Tensor) -> None:
         s = self.solver.settings
-        self.energy = energy
         self.residual = self.potential.residual.view(self.batch, -1).clone()
         norm = torch.linalg.vector_norm(self.residual, dim=1)
         scale = balance + self.force_norm
-        self.relative_residual = norm / scale.clamp_min(s.absolute_tolerance)
+        self.scale, self.relative_residual = scale, norm / scale.clamp_min(s.absolute_tolerance)
         self.stalls = torch.where(norm < 0.5 * self.smallest, 0, self.stalls + 1)
         self.smallest = torch.minimum(self.smallest, norm)
-        at_rounding = (norm <= self.rounding) & (self.stalls >= _STALLS)
-        small = (norm <= s.relative_tolerance * scale) | (norm <= s.absolute_tolerance) | at_rounding
-        self.converged = small & torch.isfinite(norm) & torch.isfinite(scale)
+        small = (norm <= s.relative_tolerance * scale) | (norm <= s.absolute_tolerance)
+        self.converged |= small & (norm + scale < torch.inf)
+        if self.iteration >= _STALLS and int(self.stalls.max()) >= _STALLS:
+            flat = self.energy - energy <= self.potential.energy_rounding()
+            stalled = flat & (self.stalls >= _STALLS) & (norm <= self.rounding) & ~self.converged
+            if bool(stalled.any()):
+                self.rounding = self.potential.residual_rounding()
+                self.converged |= stalled & (norm <= self.rounding)
+        self.energy = energy
 
     def advance(self) -> bool:
         """One global step and line search; False when every environment is done."""
-        active = ~(self.converged | self.stuck)
-        if not bool(active.any()) or self.iteration >= self.solver.settings.max_iterations:
+        resting = self.converged | self.stuck
+        if bool(resting.all()) or self.iteration >= self.solver.settings.max_iterations:
             return False
-        if self.clamp or self.solver.stale(self.iteration):
+        if self.clamp is not None or self.solver.stale(self.iteration):
             self._refactor()
-        direction = -self.solver._update.apply(self.residual, self.solver.metric)
-        direction *= active[:, None]
-        slope = torch.linalg.vecdot(self.residual, direction)
-        if bool((slope > 0).any()):
-            self.solver._update.reset()
-            direction = -self.solver.metric.apply(self.residual) * active[:, None]
-            slope = torch.linalg.vecdot(self.residual, direction)
+        direction, slope = self._direction(resting)
+        active = ~resting
         self.iterations += active
         self.iteration += 1
         self._line_search(direction, slope, active)
+        if self.iteration == 1 and bool((self.force_norm == 0.0).any()):
+            self.converged |= active & ~self.stuck & self._within_rounding(direction)
         return True
 
+    def _within_rounding(self, direction: torch.Tensor) -> torch.Tensor:
+        """(B,) whether a step of (B, 3 N) and the forces that balance after it are those of rounding the state."""
+        p = self.potential
+        rounding = torch.finfo(self.solver.dtype).eps * p.positions.abs().amax((1, 2))
+        forces = 2.0 * rounding * torch.linalg.vector_norm(p.inertia, dim=1)
+        return (direction.abs().amax(1) <= rounding) & (self.scale <= forces)
+
+    def _direction(self, resting: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """(B, 3 N) where to go, and (B,) the slope of the energy there; zero for environments that rest or are stuck.
+
+        A factor that an overflow left behind is made again. What has no finite direction then is stuck.
+        """
+        solver = self.solver
+        residual = self.residual.to(solver.dtype)
+
+        def along(product: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            direction = (-product.to(self.residual.dtype)).masked_fill_(resting[:, None], 0.0)
+            return direction, torch.linalg.vecdot(self.residual, direction).masked_fill_(resting, 0.0)
+
+        direction, slope = along(solver._update.apply(residual, solver.metric))
+        if not bool((slope <= 0).all()):
+            solver._update.reset()
+            direction, slope = along(solver.metric.apply(residual))
+            if not self.factorisations and not bool(torch.isfinite(slope).all()):
+                self._refactor()
+                direction, slope = along(solver.metric.apply(residual))
+            resting = ~torch.isfinite(slope)
+            self.stuck |= resting
+            direction, slope = direction.masked_fill_(resting[:, None], 0.0), slope.masked_fill_(resting, 0.0)
+        return direction, slope
+
     def _refactor(self) -> None:
-        self.solver.metric.refactor(self.clamp)
+        self.solver.metric.refactor(bool(self.clamp))
         self.solver._update.reset()
         self.factorisations += 1
-        self.clamp = False
+        self.clamp = None
 
     def _line_search(self, direction: torch.Tensor, slope: torch.Tensor, active: torch.Tensor) -> None:
         """Backtracks to a decrease of the energy, or of the slope where the energy is down to rounding.
@@ -234,8 +273,9 @@ class _Run:
         self.solver._update.add(step[:, None] * direction, self.residual - before)
 
     def _give_up(self, failed: torch.Tensor, start: torch.Tensor, direction: torch.Tensor, step: torch.Tensor) -> None:
-        """Stays where it was; a clamped Hessian gets one more try before the environment counts as stuck."""
+        """Stays where it was; a new factor, and a clamped one, get a try before the environment counts as stuck."""
         step.masked_fill_(failed, 0.0)
         self.potential.positions.copy_(start).add_((step[:, None] * direction).view_as(start))
-        self.stuck |= failed & self.solver.metric.clamped
-        self.clamp = True
+        self.clamp = self.factorisations > 0
+        if self.clamp:
+            self.stuck |= failed & self.solver.metric.clamped

@@ -1,5 +1,6 @@
 """Batched, differentiable simulation of one body."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -126,7 +127,9 @@ class Simulator:
         solver: a name, or `SolverSettings`.
         relative_tolerance: shorthand for that field of the settings.
         device: a torch device.
-        dtype: ``torch.float64`` or ``torch.float32``.
+        dtype: ``torch.float64``, or ``torch.float32`` for states, loads and factors. Forces are evaluated in float64 in
+            both: single precision leaves a nearly incompressible solid no digit of them. A float32 step is as good as
+            its positions then, 4e-9 m on a beam of 0.1 m, from a relative tolerance of 1e-5 on.
         coupling: of the energies that are loads, such as pressure: ``implicit``, they act on the body as it is at the
             end of a step (in its middle, for ``midpoint``); or ``explicit``, as it is at its start, as published.
 
@@ -473,9 +476,11 @@ class Simulator:
         batch, n, like = state.batch, self.body.n_vertices, self.rest_positions
         fields = {"state.q": state.q, "state.v": state.v}
         if state.previous is not None:
+            if not (isinstance(state.previous, tuple) and len(state.previous) == 2):
+                raise InputError("state.previous must be the pair (q, v) of the step before, or None.")
             fields |= {f"state.previous[{i}]": each for i, each in enumerate(state.previous)}
-        for name, values in fields.items():
-            check_tensor(name, values, (batch, n, 3), "m/s" if name[-1] in "v1" else "m", "vertex", like)
+        for unit, (name, values) in zip(itertools.cycle(("m", "m/s")), fields.items(), strict=False):
+            check_tensor(name, values, (batch, n, 3), unit, "vertex", like)
         if not isinstance(inputs, Inputs):
             raise InputError(f"the inputs are a {type(inputs).__name__}: give Inputs(external_force=...), say.")
         inputs.check([energy for energy, _ in self._energies], batch, n, len(self.fixed), like)

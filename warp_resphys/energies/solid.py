@@ -189,11 +189,11 @@ class GreenStrain(torch.autograd.Function):
     def forward(ctx: Any, term: SolidTerm, positions: torch.Tensor) -> torch.Tensor:
         ctx.term = term
         ctx.save_for_backward(positions)
-        return term.strain(positions.detach())
+        return term.strain(positions.detach().to(term.launcher.dtype))
 
     @override
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: torch.Tensor) -> tuple[None, torch.Tensor]:
         (positions,) = ctx.saved_tensors
-        return None, ctx.term.strain_adjoint(positions, gradient)
+        return None, ctx.term.strain_adjoint(positions.to(gradient.dtype), gradient)

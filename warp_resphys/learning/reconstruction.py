@@ -138,6 +138,7 @@ class GaussNewton(Reconstructor):
             dx = _direction(step, x - target, force, weight)
             x, objective, force = _search(step, x, dx, target, objective, weight)
             change = dx.abs().max()
+        x, force = x.to(sim.dtype), force.to(sim.dtype)
         return Reconstruction(step.finish(x), force, iterations)
 
 

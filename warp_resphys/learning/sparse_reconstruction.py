@@ -157,7 +157,7 @@ class SparseGaussNewton(_OnMarkers):
             seen: (B, m, 3) bool.
             weight: lambda e^2.
         """
-        residual = problem.residual(x).reshape(len(x), -1, 1)
+        residual = problem.residual(x).reshape(len(x), -1, 1).to(x.dtype)
         problem.factorise(x)
         transposed = self.markers.transposed_jacobian(end) if self._constant is None else self._constant
         transposed = transposed * seen.flatten(1)[:, None]

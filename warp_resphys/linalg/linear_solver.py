@@ -34,7 +34,7 @@ class Factor(ABC):
     """A factorised batch of matrices.
 
     Attributes:
-        failed: (B,) bool; matrices that are not positive definite and have no factor.
+        failed: (B,) bool; matrices that are not positive definite and have no factor: their solutions are not finite.
     """
 
     failed: NDArray[np.bool_]
@@ -148,7 +148,9 @@ class _BandedFactor(Factor):
             else:
                 lu, pivots, info = factorise(_general_band(band), self._width, self._width, overwrite_ab=1)
                 self._factors.append((lu, pivots))
-            self.failed[i] = info != 0
+            if info != 0:
+                self.failed[i] = True
+                (factor if definite else lu).fill(np.nan)
 
     @override
     def solve(self, rhs: torch.Tensor) -> torch.Tensor:
@@ -208,6 +210,8 @@ class _DenseFactor(Factor):
             full = lower.tril() + lower.tril(-1).mT
             self._lu, self._pivots, info = torch.linalg.lu_factor_ex(full)
         self.failed = info.cpu().numpy() != 0
+        if self.failed.any():
+            (self._cholesky if definite else self._lu)[info != 0] = torch.nan
 
     @override
     def solve(self, rhs: torch.Tensor) -> torch.Tensor:

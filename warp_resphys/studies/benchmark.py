@@ -311,12 +311,12 @@ def _time_parts(case: Case, repeats: int) -> dict[str, Any]:
     potential, pattern = workspace.potential, workspace.pattern
     device = potential.device
     kind = sim.settings.linear_solver
-    linear = make_linear_solver(kind, pattern.rows, pattern.cols, len(pattern.free), 3, device, potential.dtype)
+    linear = make_linear_solver(kind, pattern.rows, pattern.cols, len(pattern.free), 3, device, sim.dtype)
     assemble = HessianAssembly(potential, linear, pattern)
     potential.update_tangent()
-    values = assemble().clone()
+    values = assemble().to(sim.dtype, copy=True)
     factor = linear.factor(values)
-    right = torch.ones(case.batch, linear.n, 1, device=device, dtype=potential.dtype)
+    right = torch.ones(case.batch, linear.n, 1, device=device, dtype=sim.dtype)
     tasks: dict[str, Callable[[], object]] = {
         "local_step": potential.evaluate,
         "tangent": potential.update_tangent,

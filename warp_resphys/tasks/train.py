@@ -25,7 +25,7 @@ from ..residual.rollout import (
     closed_loop,
 )
 from ..residual.training import EpochTrainer, Samples, Trainer
-from ..resumable import resume_checkpoint
+from ..resumable import forget_checkpoint, keep_checkpoint, resume_checkpoint
 from ..stages import StageContext
 from .trajectories import (
     MODEL,
@@ -160,7 +160,7 @@ def fit(
         best.state_dict(),
         {**best.description(), **(known or {}), **kept, "fingerprint": context.fingerprint},
     )
-    checkpoint.unlink(missing_ok=True)
+    forget_checkpoint(checkpoint)
 
 
 def run_epochs(
@@ -208,7 +208,7 @@ def _copy(snapshot: Snapshot) -> Snapshot:
 
 def save_training(checkpoint: Path, kept: Snapshot, fingerprint: str) -> None:
     """Writes a checkpoint that `resume_checkpoint` reads under the same fingerprint."""
-    write_checkpoint(checkpoint, "training", kept[0], {**kept[1], "fingerprint": fingerprint})
+    keep_checkpoint(checkpoint, "training", kept[0], {**kept[1], "fingerprint": fingerprint})
 
 
 def _read(path: Path, kind: str, device: torch.device, *names: str) -> list[torch.Tensor]:

@@ -13,10 +13,10 @@ from typing import Any
 from omegaconf import DictConfig
 
 from ..errors import DataFileError, InputError
-from ..files import read_json, write_checkpoint
+from ..files import read_json
 from ..progress import clock
 from ..residual.training import Trainer
-from ..resumable import resume_checkpoint
+from ..resumable import forget_checkpoint, keep_checkpoint, resume_checkpoint
 from ..stages import StageContext, StageInterrupted, run_stages
 from ..tuning.space import fixed_settings, with_settings
 from ..tuning.study import Claim, SharedStudy
@@ -141,7 +141,7 @@ def _run_trial(bench: _Bench, claim: Claim) -> None:
 
     def save(kept: Snapshot) -> None:
         metadata = {**kept[1], "seconds": seconds(), "fingerprint": fingerprint}
-        write_checkpoint(path, "training", kept[0], metadata)
+        keep_checkpoint(path, "training", kept[0], metadata)
 
     def watch(record: Mapping[str, float]) -> None:
         if seconds() > bench.trial_seconds:
@@ -161,7 +161,7 @@ def _run_trial(bench: _Bench, claim: Claim) -> None:
     except SlowError:
         pass
     except LostError:
-        path.unlink(missing_ok=True)
+        forget_checkpoint(path)
         log.warning("trial %d was taken over by another process: this one gave no sign of life", claim.number)
         return
     except KeyboardInterrupt as error:
@@ -180,7 +180,7 @@ def _run_trial(bench: _Bench, claim: Claim) -> None:
         _forget(bench, claim)
         _log_progress(bench.study, claim, value, seconds())
     else:
-        path.unlink(missing_ok=True)
+        forget_checkpoint(path)
 
 
 def _forget(bench: _Bench, claim: Claim) -> None:

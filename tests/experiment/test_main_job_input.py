@@ -1,5 +1,6 @@
 """The main job with settings, meshes, files and disks that it cannot use: one sentence, exit code 2."""
 
+import os
 import re
 import resource
 import shutil
@@ -137,6 +138,21 @@ class TestBadInput:
         assert run(*TINY, IN_RUN)[0] == 0
         assert "reconstruct: missing or changed since they were written: reconstruction.h5" in caplog.text
         assert ran(copied) == ["reconstruct"]  # the same forces as before: what follows is still valid
+        same_errors(errors(), errors(finished[0]))
+
+    def test_a_flipped_bit_in_a_network_is_an_error_until_it_is_deleted(self, finished, copied, no_report):
+        """Its size and time are as before, as after a fault of the disk."""
+        path, content = Path("run/model.safetensors"), bytearray(copied["model.safetensors"][1])
+        content[-2] ^= 0x20
+        path.write_bytes(content)
+        os.utime(path, ns=(copied["model.safetensors"][0],) * 2)
+        Path("run/rollouts.h5").unlink()
+        code, err = run(*TINY, IN_RUN)
+        assert code == 2
+        assert re.search("^error: .*model.safetensors is damaged .*: delete it and run the same command", err, re.M)
+        path.unlink()
+        assert run(*TINY, IN_RUN)[0] == 0
+        assert ran(copied)[0] == "train"
         same_errors(errors(), errors(finished[0]))
 
     @staticmethod

@@ -10,7 +10,7 @@ import torch
 
 from warp_resphys.io import files
 from warp_resphys.io.errors import DataFileError
-from warp_resphys.io.resumable import resume_checkpoint
+from warp_resphys.io.resumable import forget_checkpoint, keep_checkpoint, resume_checkpoint
 
 POSITIONS = np.linspace(0.0, 1.0, 130 * 4 * 3).reshape(130, 4, 3)
 
@@ -240,6 +240,49 @@ class TestCheckpoints:
         assert torch.equal(resumed[0]["weight"], self.tensors["weight"])
         assert resume_checkpoint(path, "network", "g") is None
         assert resume_checkpoint(tmp_path / "none", "network", "f") is None
+
+    def test_no_flipped_bit_passes(self, tmp_path):
+        path = tmp_path / "a.safetensors"
+        metadata = {"epoch": 3, "fingerprint": "f"}
+        files.write_checkpoint(path, "network", self.tensors, metadata)
+        content = path.read_bytes()
+        for place in range(len(content)):
+            damaged = bytearray(content)
+            damaged[place] ^= 1 << place % 8
+            path.write_bytes(damaged)
+            try:
+                tensors, found = files.read_checkpoint(path, "network")
+            except DataFileError:
+                continue
+            assert found == metadata
+            assert tensors.keys() == self.tensors.keys()
+            assert all(torch.equal(tensors[name], self.tensors[name]) for name in tensors)
+        path.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+        with pytest.raises(DataFileError, match=r"a.safetensors is damaged .*: delete it and run the same command"):
+            files.read_checkpoint(path, "network")
+
+    def test_files_without_a_checksum_are_read(self, tmp_path, monkeypatch):
+        path = tmp_path / "a.safetensors"
+        with monkeypatch.context() as patched:
+            patched.setattr(files, "_checksum", lambda *_: "none")
+            files.write_checkpoint(path, "network", self.tensors, {})
+        path.write_bytes(path.read_bytes().replace(b"checksum", b"whatever"))
+        assert torch.equal(files.read_checkpoint(path, "network")[0]["weight"], self.tensors["weight"])
+
+    def test_a_damaged_checkpoint_gives_way_to_the_one_before(self, tmp_path, caplog):
+        path = tmp_path / "train.safetensors"
+        for epoch in (1, 2, 3):
+            keep_checkpoint(path, "training", self.tensors, {"fingerprint": "f", "epoch": epoch})
+        assert resume_checkpoint(path, "training", "f")[1]["epoch"] == 3
+        content = path.read_bytes()
+        path.write_bytes(content[:-3] + bytes([content[-3] ^ 4]) + content[-2:])
+        assert resume_checkpoint(path, "training", "f")[1]["epoch"] == 2
+        assert f"{path} is damaged" in caplog.text
+        path.unlink()  # As if the program had been killed between two files.
+        assert resume_checkpoint(path, "training", "f")[1]["epoch"] == 2
+        assert resume_checkpoint(path, "training", "g") is None
+        forget_checkpoint(path)
+        assert not list(tmp_path.iterdir())
 
     def test_unusable(self, tmp_path):
         path = tmp_path / "a.safetensors"

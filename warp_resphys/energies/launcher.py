@@ -7,7 +7,10 @@ import torch
 import warp as wp
 from numpy.typing import NDArray
 
+from ..io.kernel_cache import ensure_kernel_cache
 from ..kernels.points import point_kernels
+
+ensure_kernel_cache()  # Before Warp is first used, by this package or by who imports it.
 
 SCALARS: dict[torch.dtype, Any] = {torch.float64: wp.float64, torch.float32: wp.float32}
 

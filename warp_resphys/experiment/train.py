@@ -13,7 +13,7 @@ import torch
 from ..dynamics.integrator import State
 from ..io.files import read_checkpoint, write_checkpoint, write_json
 from ..io.progress import Progress
-from ..io.resumable import resume_checkpoint
+from ..io.resumable import forget_checkpoint, keep_checkpoint, resume_checkpoint
 from ..io.stages import StageContext
 from ..learning.metrics import summarise, trajectory_errors
 from ..learning.networks import Model, NextState, ResidualForce, build_model, build_next_state, restore
@@ -154,7 +154,7 @@ def fit(
         best.state_dict(),
         {**best.description(), **(known or {}), **kept, "fingerprint": context.fingerprint},
     )
-    checkpoint.unlink(missing_ok=True)
+    forget_checkpoint(checkpoint)
 
 
 def run_epochs(
@@ -202,7 +202,7 @@ def _copy(snapshot: Snapshot) -> Snapshot:
 
 def save_training(checkpoint: Path, kept: Snapshot, fingerprint: str) -> None:
     """Writes a checkpoint that `resume_checkpoint` reads under the same fingerprint."""
-    write_checkpoint(checkpoint, "training", kept[0], {**kept[1], "fingerprint": fingerprint})
+    keep_checkpoint(checkpoint, "training", kept[0], {**kept[1], "fingerprint": fingerprint})
 
 
 def _read(path: Path, kind: str, device: torch.device, *names: str) -> list[torch.Tensor]:

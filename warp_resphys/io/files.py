@@ -364,29 +364,42 @@ def read_array(
 def write_checkpoint(
     path: str | Path, kind: str, tensors: Mapping[str, torch.Tensor], metadata: Mapping[str, Any]
 ) -> None:
-    """Writes tensors and plain metadata as a safetensors file, atomically.
+    """Writes tensors and plain metadata as a safetensors file with a checksum, atomically.
 
     Raises:
         DataFileError: the file cannot be written.
     """
     from safetensors.torch import save
 
+    own = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
+    text = json.dumps(to_plain(metadata))
     header = {
         "format": FORMAT,
         "version": str(FORMAT_VERSION),
         "kind": kind,
-        "metadata": json.dumps(to_plain(metadata)),
+        "metadata": text,
+        "checksum": _checksum(own, text),
     }
-    own = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
     with atomic_path(path) as partial:
         partial.write_bytes(save(own, metadata=header))
+
+
+def _checksum(tensors: Mapping[str, torch.Tensor], metadata: str) -> str:
+    """CRC-32 of the metadata and of the tensors with their names, types and shapes."""
+    import torch
+
+    crc = zlib.crc32(metadata.encode())
+    for name, tensor in sorted(tensors.items()):
+        crc = zlib.crc32(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode(), crc)
+        crc = zlib.crc32(tensor.flatten().view(torch.uint8).numpy().data, crc)
+    return f"{crc:08x}"
 
 
 def read_checkpoint(path: str | Path, expected_kind: str) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
     """Reads what `write_checkpoint` wrote: the tensors, on the CPU, and the metadata.
 
     Raises:
-        DataFileError: the file is missing, unreadable, truncated, of another program, kind or version.
+        DataFileError: the file is missing, unreadable, truncated, damaged, of another program, kind or version.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -402,6 +415,11 @@ def read_checkpoint(path: str | Path, expected_kind: str) -> tuple[dict[str, tor
                     f"{FORMAT_VERSION}, is needed: check the path"
                 )
             tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
+            checksum = _checksum(tensors, header["metadata"])
+            if header.get("checksum", checksum) != checksum:  # Files of earlier versions have none.
+                raise DataFileError(
+                    f"{path} is damaged (it does not match its checksum): delete it and run the same command again"
+                )
             return tensors, json.loads(header["metadata"])
     except OSError as error:
         raise _read_error(path, error) from error

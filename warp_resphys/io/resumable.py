@@ -33,6 +33,7 @@ from .files import (
     read_array,
     read_checkpoint,
     read_hdf5,
+    write_checkpoint,
 )
 
 if TYPE_CHECKING:
@@ -316,21 +317,41 @@ class ResumableHDF5:
         )
 
 
-def resume_checkpoint(
-    path: str | Path, kind: str, fingerprint: str
-) -> tuple[dict[str, torch.Tensor], dict[str, Any]] | None:
-    """Reads a checkpoint to go on from; None if there is none, or none of this fingerprint.
+def keep_checkpoint(path: Path, kind: str, tensors: Mapping[str, torch.Tensor], metadata: Mapping[str, Any]) -> None:
+    """Writes a checkpoint to go on from; the one before stays beside it, in case this one gets damaged.
 
-    The fingerprint is the entry "fingerprint" of the metadata that `files.write_checkpoint` was given.
+    Raises:
+        DataFileError: the file cannot be written.
     """
-    if not Path(path).exists():
-        return None
-    try:
-        tensors, metadata = read_checkpoint(path, kind)
-    except DataFileError as error:
-        log.warning("starting afresh: %s", error)
-        return None
-    if metadata.get("fingerprint") != fingerprint:
-        log.warning("starting afresh: %s belongs to other settings", path)
-        return None
-    return tensors, metadata
+    if path.exists():
+        os.replace(path, _before(path))
+    write_checkpoint(path, kind, tensors, metadata)
+
+
+def resume_checkpoint(path: Path, kind: str, fingerprint: str) -> tuple[dict[str, torch.Tensor], dict[str, Any]] | None:
+    """Reads the last checkpoint of `keep_checkpoint` that is whole; None if there is none, or none of this fingerprint.
+
+    The fingerprint is the entry "fingerprint" of its metadata.
+    """
+    for candidate in (path, _before(path)):
+        if not candidate.exists():
+            continue
+        try:
+            tensors, metadata = read_checkpoint(candidate, kind)
+        except DataFileError as error:
+            log.warning("not going on from a checkpoint: %s", error)
+            continue
+        if metadata.get("fingerprint") == fingerprint:
+            return tensors, metadata
+        log.warning("not going on from %s: it belongs to other settings", candidate)
+    return None
+
+
+def forget_checkpoint(path: Path) -> None:
+    """Removes what `keep_checkpoint` wrote."""
+    path.unlink(missing_ok=True)
+    _before(path).unlink(missing_ok=True)
+
+
+def _before(path: Path) -> Path:
+    return path.with_suffix(f".before{path.suffix}")

@@ -21,9 +21,9 @@ from ...experiment.measured.checks import RECORDINGS
 from ...experiment.train import Learning, Snapshot, next_state_learning, residual_force_learning, run_epochs
 from ...experiment.trajectories import MODELS, SIMFREE_TRAINING, TRAINING, training_settings
 from ...io.errors import DataFileError, InputError
-from ...io.files import read_json, write_checkpoint
+from ...io.files import read_json
 from ...io.progress import clock
-from ...io.resumable import resume_checkpoint
+from ...io.resumable import forget_checkpoint, keep_checkpoint, resume_checkpoint
 from ...io.stages import StageContext, StageInterrupted, run_stages
 from ...learning.networks import check_network
 from ...learning.training import Trainer, check_trainer
@@ -147,7 +147,7 @@ def _run_trial(bench: _Bench, claim: Claim) -> None:
 
     def save(kept: Snapshot) -> None:
         metadata = {**kept[1], "seconds": seconds(), "fingerprint": fingerprint}
-        write_checkpoint(path, "training", kept[0], metadata)
+        keep_checkpoint(path, "training", kept[0], metadata)
 
     def watch(record: Mapping[str, float]) -> None:
         if seconds() > bench.trial_seconds:
@@ -167,7 +167,7 @@ def _run_trial(bench: _Bench, claim: Claim) -> None:
     except SlowError:
         pass
     except LostError:
-        path.unlink(missing_ok=True)
+        forget_checkpoint(path)
         log.warning("trial %d was taken over by another process: this one gave no sign of life", claim.number)
         return
     except KeyboardInterrupt as error:
@@ -186,7 +186,7 @@ def _run_trial(bench: _Bench, claim: Claim) -> None:
         _forget(bench, claim)
         _log_progress(bench.study, claim, value, seconds())
     else:
-        path.unlink(missing_ok=True)
+        forget_checkpoint(path)
 
 
 def _forget(bench: _Bench, claim: Claim) -> None:

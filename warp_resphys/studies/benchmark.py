@@ -306,7 +306,7 @@ def hardware(device: str) -> dict[str, Any]:
 _COLD_START = """
 import sys, time
 began = time.perf_counter()
-from .benchmark import first_step
+from warp_resphys.studies.benchmark import first_step
 first_step(began, sys.stdin.read())
 """
 

@@ -10,7 +10,7 @@ import warp as wp
 from rich.console import Console
 from rich.table import Table
 
-from warp_resphys import Body, Material, Mesh, Simulator, box_hexahedra, box_tetrahedra, select_vertices
+from warp_resphys import Body, Corotated, Mesh, Simulator, box_hexahedra, box_tetrahedra, select_vertices
 
 SIZE = (0.1, 0.03, 0.03)  # m
 YOUNGS_MODULUS = 264e3  # Pa
@@ -20,7 +20,7 @@ POISSONS_RATIOS = (0.45, 0.499)
 def sag_mm(mesh: Mesh, poissons_ratio: float, volume_integration: str) -> float:
     """Mean vertical displacement of the free face at rest under gravity [mm]."""
     body = Body(mesh, fixed=select_vertices(mesh, x=0.0), volume_integration=volume_integration)
-    simulator = Simulator(body, Material(YOUNGS_MODULUS, poissons_ratio))
+    simulator = Simulator(body, Corotated(YOUNGS_MODULUS, poissons_ratio))
     tip = select_vertices(mesh, x=SIZE[0])
     q = simulator.static_equilibrium().q[0].cpu().numpy()
     return float(1e3 * (q - mesh.vertices)[tip, 2].mean())

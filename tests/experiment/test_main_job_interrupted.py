@@ -107,9 +107,9 @@ class TestInterruption:
     def test_each_frame_starts_from_the_force_of_the_one_before(self, folder, interruption, monkeypatch):
         guesses, step = [], LBFGSB.step
 
-        def recorded(self, state, observed, first_guess=None):
+        def recorded(self, state, observed, inputs=None, first_guess=None):
             guesses.append(first_guess)
-            return step(self, state, observed, first_guess)
+            return step(self, state, observed, inputs, first_guess)
 
         monkeypatch.setattr(LBFGSB, "step", recorded)
         arguments = [*TINY, IN_RUN, "reconstruction=lbfgsb", "data.steps=4"]

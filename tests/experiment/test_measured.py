@@ -61,7 +61,7 @@ def test_simulated_markers_come_back_within_noise(laboratory):
     motions, bound, labels, _ = read_motions(folder / MARKERS, build_body(config), config["data"]["hung_on"])
     assert motions.names == ("m0", "m50", "m90")
     assert labels == TIPS
-    np.testing.assert_allclose(motions.attached_mass.sum(1), [0.0, 0.05, 0.09], atol=1e-12)
+    np.testing.assert_allclose(motions.inputs.attached_mass.sum(1), [0.0, 0.05, 0.09], atol=1e-12)
     scene = make_scene(config)
     released = np.array(list(read_json(folder / TRUTH)["released_s"].values()))
     found = np.array([each["release_frame"] for each in read_json(folder / QUALITY).values()]) / RATE
@@ -71,7 +71,7 @@ def test_simulated_markers_come_back_within_noise(laboratory):
     turn, _ = Rotation.align_vectors(bound - bound.mean(0), scene.followed - scene.followed.mean(0))
     assert np.degrees(turn.magnitude()) < 1.0
     moved = turn.apply((true - scene.followed).reshape(-1, 3)).reshape(true.shape)
-    off = (motions.markers.numpy() - bound - moved)[motions.seen.numpy()]
+    off = (motions.observed.numpy() - bound - moved)[motions.seen.numpy()]
     assert float(motions.amplitude[2]) > 0.01
     assert np.sqrt(np.mean(off**2)) < 2.5 * config["synthetic"]["noise"]
     torch.testing.assert_close(motions.held, torch.as_tensor(bound).expand(3, -1, -1), rtol=0.0, atol=1e-12)
@@ -371,15 +371,15 @@ def test_the_three_beams(shared_data, tmp_path):
     assert rms == {"bare": 0.81, "load52": 0.83, "load101": 1.13}  # docs/registration.md
     motions, bound, _, gravity = read_motions(tmp_path / MARKERS, build_body(config), config["data"]["hung_on"])
     assert bool(motions.seen[motions.times < 1.38].all())
-    np.testing.assert_allclose(motions.attached_mass.sum(1) * 9.80709, [0.0, 0.51012, 1.00062], atol=1e-4)
-    assert int((motions.attached_mass[1] > 0.0).sum()) == 4
+    np.testing.assert_allclose(motions.inputs.attached_mass.sum(1) * 9.80709, [0.0, 0.51012, 1.00062], atol=1e-4)
+    assert int((motions.inputs.attached_mass[1] > 0.0).sum()) == 4
     nominal = np.array(list(config["markers"]["followed"].values()))
     assert np.linalg.norm(bound - nominal, axis=1).max() < 2e-3
     assert np.degrees(np.arccos(-gravity[2] / np.linalg.norm(gravity))) < 10.0
     for row, name in enumerate(("gravity", "load52", "load101")):  # a rigid motion keeps every distance
         tip = read_recording(shared_data / "beam_mocap" / f"beam_{name}_V2_a.c3d").select(TIPS).positions.mean(1)
         farthest = np.linalg.norm(tip - np.median(tip[15:40], axis=0), axis=1).max()
-        moved = (motions.markers - motions.held[:, None])[row].mean(1).nan_to_num().norm(dim=1).max()
+        moved = (motions.observed - motions.held[:, None])[row].mean(1).nan_to_num().norm(dim=1).max()
         assert float(moved) == pytest.approx(farthest, rel=0.02)
         assert farthest > 0.009
     quality = read_json(tmp_path / QUALITY)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, box_hexahedra, select_vertices
+from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.studies.verification import box_of_vertices, compare_with_reference, read_reference
 
@@ -55,7 +56,7 @@ def trajectory(mesh, steps=3):
     forces = 1e-3 * np.random.default_rng(0).normal(size=(steps, len(mesh.vertices), 3))
     rest = simulator.rest_state()
     v = 0.1 * (rest.q - rest.q[:, :1]) * (rest.q[..., :1] > mesh.vertices[:, 0].min())
-    result = simulator.rollout(State(rest.q, v), steps, simulator.tensor(forces)[:, None])
+    result = simulator.rollout(State(rest.q, v), steps, Inputs(simulator.tensor(forces)[:, None]))
     states = {"q": result.q[:, 0].numpy(), "v": result.v[:, 0].numpy()}
     return constants | {"dt": h, "gravity": gravity, "vertices": mesh.vertices, "f_ext": forces} | states
 

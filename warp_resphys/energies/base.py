@@ -69,7 +69,7 @@ class Quantity:
         try:
             values = torch.as_tensor(value, dtype=torch.float64).detach().cpu()
         except (TypeError, ValueError, RuntimeError):
-            raise InputError(f"{self.name} is {value!r}: it must be {self.wanted}.") from None
+            raise InputError(f"{self.name} is {value!r}: it must be a number, {self.wanted}.") from None
         inside = (values >= self.lower if self.closed else values > self.lower) & (values < self.upper)
         inside &= torch.isfinite(values)
         if values.numel() == 0 or values.ndim > 2:

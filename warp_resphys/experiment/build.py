@@ -127,7 +127,7 @@ def build_material(config: Mapping[str, Any], key: str) -> Material:
     if "fibre_stiffness" in config[key]:
         raise InputError(f"{key}.fibre_stiffness is now stiffness, in the group fibres of the same body.")
     try:
-        return make_material(**config[key])
+        return make_material(**{str(name): value for name, value in config[key].items()})
     except InputError as error:
         raise InputError(f"{key}: {error}") from error
 

@@ -288,14 +288,13 @@ def _check_synthetic(config: Mapping[str, Any]) -> None:
 
 
 def _check_material(config: Mapping[str, Any], key: str, group: str) -> None:
-    for name, value in config[key].items():
-        if not (is_word(value) if name == "model" else is_number(value)):
-            wanted = "word" if name == "model" else "number"
-            raise InputError(f"{group}.{key}.{name} is {value!r}: it must be a {wanted}.")
     try:
         build_material(config, key)
     except InputError as error:
         raise InputError(f"{group}.{error}") from error
+    for name, value in config[key].items():
+        if name != "model" and not is_number(value):
+            raise InputError(f"{group}.{key}.{name} is {value!r}: it must be a number.")
 
 
 def _check_place(place: Any, at: str) -> None:

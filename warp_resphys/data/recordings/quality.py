@@ -355,8 +355,8 @@ def check_passive(recording: Recording) -> None:
     """Refuses a recording with pressures or forces that nothing would use; raises DataFileError."""
     if recording.actuation is not None:
         raise DataFileError(
-            f"{recording.source} holds an actuation, {recording.actuation.shape[1]} in each frame, which nothing here uses: "
-            "take an experiment with pressures (data.kind: pressure), or leave it out of the file."
+            f"{recording.source} holds an actuation, {recording.actuation.shape[1]} in each frame, which nothing here "
+            "uses: take an experiment with pressures (data.kind: pressure), or leave it out of the file."
         )
 
 

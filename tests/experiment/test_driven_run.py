@@ -286,6 +286,10 @@ def test_bad_recordings_cost_one_sentence(finished, monkeypatch, tmp_path):
     def with_pressures(values):
         return lambda recording: dataclasses.replace(recording, actuation=values(recording.actuation))
 
+    def stilled(recording):
+        noise = np.random.default_rng(0).normal(scale=3e-5, size=recording.positions.shape)
+        return dataclasses.replace(recording, positions=recording.positions[:1] + noise)
+
     cases = {
         "three": (
             with_pressures(lambda p: np.concatenate([p, p[:, :1]], axis=1)),
@@ -294,6 +298,7 @@ def test_bad_recordings_cost_one_sentence(finished, monkeypatch, tmp_path):
         "high": (with_pressures(lambda p: p + 3e4 * (np.arange(len(p)) > 5)[:, None]), "beyond data.pressure_limit"),
         "late": (with_pressures(lambda p: p + 1e3), "t000.h5 begins under pressure"),
         "none": (lambda recording: dataclasses.replace(recording, actuation=None), "no array 'actuation'"),
+        "still": (stilled, "t000.h5: 'T1', 'T2', 'T3' never move by more than"),
     }
     for name, (change, message) in cases.items():
         (tmp_path / name).mkdir()

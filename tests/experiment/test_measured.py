@@ -337,6 +337,22 @@ def test_a_trial_without_a_release_is_named(shelf):
     refuse(shelf, r"No release found in .*load52\.h5.* never moves by more than")
 
 
+def test_recordings_in_which_nothing_moves_are_named(shelf):
+    """Also those that begin with the release, of which none is looked for."""
+    for name in shelf.recordings:
+        published_layout(shelf, name, first=44)
+    shelf.config["data"] |= {"begins": "released", "rest": "file", "seconds": 0.4}
+    rest = np.median(shelf.recordings["load52"].positions[:40], axis=0)
+    still = rest + np.random.default_rng(0).normal(scale=5e-5, size=(100, 6, 3))
+    shelf.write("load52", positions=still, rest=rest)
+    refuse(shelf, r"load52\.h5: 'Tip - 1', .* never move by more than 0\.\d\d mm in the 0\.41 s that count")
+
+
+def test_pressures_that_nothing_uses_are_named(shelf):
+    shelf.write("load52", actuation=np.zeros((len(shelf.recordings["load52"].positions), 2)))
+    refuse(shelf, r"load52\.h5 holds an actuation, 2 in each frame, which nothing here uses: take an experiment with")
+
+
 def test_too_few_frames_a_second_are_refused(shelf):
     shelf.write("load52", rate=25.0)
     refuse(shelf, r"load52\.h5 has 25 frames a second, too few .* record 40 or more")

@@ -90,7 +90,7 @@ def test_a_mesh_from_a_file_cannot_be_refined() -> None:
         ("+benchmark.colour=red", "unknown key 'benchmark.colour'"),
         (
             "benchmark.batches.cpu=[300];benchmark.solvers=[newton]",
-            "benchmark.largest_batch leave nothing of refinement 1",
+            "benchmark.largest_batch leave none of refinement 1",
         ),
     ],
 )

@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import subprocess
 import sys
@@ -147,6 +148,19 @@ def test_comparison_of_a_simulation_with_its_own_recording(tmp_path, monkeypatch
     assert written["config"] == config
     assert (tmp_path / "comparison.png").read_bytes().startswith(b"\x89PNG")
     assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_recording_in_which_nothing_moves_or_with_pressures_is_refused(tmp_path, monkeypatch):
+    config = configured("recording.path=swing.c3d", "recording.release_frame=50")
+    labels = tuple(marker["name"] for part in ("tip", "base") for marker in config["markers"][part])
+    still = Recording(labels, recorded(np.zeros((200, 3, 3)), release=50).positions, 100.0, Path("swing.c3d"))
+    monkeypatch.setattr(recording_comparison, "read_recording", lambda path: still)
+    with pytest.raises(DataFileError, match=r"swing\.c3d: 'Tip - 1', .* never move by more than"):
+        compare_recording(config, tmp_path)
+    driven = dataclasses.replace(still, actuation=np.zeros((len(still.positions), 1)))
+    monkeypatch.setattr(recording_comparison, "read_recording", lambda path: driven)
+    with pytest.raises(DataFileError, match=r"swing\.c3d holds an actuation, 1 in each frame, which nothing here"):
+        compare_recording(config, tmp_path)
 
 
 @pytest.mark.parametrize(

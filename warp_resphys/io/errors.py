@@ -2,9 +2,19 @@
 
 from typing import Any
 
+_LONGEST = 1000
+
 
 class ResphysError(Exception):
-    """Base of every error whose message is written for the user: what was wrong, where, and what to do."""
+    """Base of every error whose message is written for the user: what was wrong, where, and what to do.
+
+    Messages quote files and what libraries say of them; what is left of that is one line, not too long, that no
+    terminal takes for commands.
+    """
+
+    def __init__(self, message: object = "") -> None:
+        line = "".join(letter if letter.isprintable() else " " for letter in str(message))
+        super().__init__(line if len(line) <= _LONGEST else f"{line[:500]} ... {line[-300:]}")
 
 
 class InputError(ResphysError, ValueError):

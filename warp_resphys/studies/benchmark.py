@@ -226,8 +226,7 @@ def _cases(config: Mapping[str, Any], settings: Mapping[str, Any], refinement: i
                 cases.append(case)
     if not cases:
         raise InputError(
-            f"benchmark.batches and benchmark.largest_batch leave nothing of refinement {refinement}: name a smaller "
-            "batch."
+            f"benchmark.batches and benchmark.largest_batch leave none of refinement {refinement}: name a smaller one."
         )
     return cases
 

@@ -15,6 +15,7 @@ from scipy.interpolate import CubicSpline
 
 from ..data.oscillation import Oscillation, measure_oscillation
 from ..data.recordings.processing import fill_gaps
+from ..data.recordings.quality import check_motion, check_passive
 from ..data.recordings.reading import read_recording
 from ..data.recordings.recording import Recording
 from ..data.recordings.release import Release, find_release
@@ -245,8 +246,11 @@ def compare_recording(config: Mapping[str, Any], folder: Path) -> dict[str, Any]
     if settings["path"] is None:
         raise InputError("No recording given: set recording.path to one, as in recording.path=swing.c3d.")
     tip, base = ([Marker(**marker) for marker in config["markers"][part]] for part in ("tip", "base"))
+    recording = read_recording(settings["path"])
+    check_passive(recording)
+    check_motion(recording, [marker.name for marker in tip])
     measured = measured_swing(
-        read_recording(settings["path"]),
+        recording,
         tip,
         base,
         longest_gap=registration["longest_gap"],

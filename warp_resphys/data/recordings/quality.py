@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 
 from ...io.errors import DataFileError, InputError
 from .jumps import LEAST_JUMP, Jump, Swap, find_jumps, find_swaps
@@ -15,6 +16,7 @@ from .release import Release
 
 FloatArray = NDArray[np.float64]
 
+LEAST_MOTION = 5e-4  # [m]
 _MILLI = 1e3
 _NOISE_FRAMES = 25
 _LEAST_NOISE_FRAMES = 10
@@ -323,6 +325,39 @@ def check_base(
                 f"place in {recordings[0].source}: the set-up or the cameras' frame was moved; register each recording "
                 f"by itself, or raise the limit of {_MILLI * largest_shift:g} mm."
             )
+
+
+def check_motion(recording: Recording, labels: Sequence[str], least: float = LEAST_MOTION) -> None:
+    """Refuses a recording in which nothing moves, as of a stream that froze, or of the wrong markers.
+
+    Args:
+        recording: Gaps are NaN.
+        labels: Markers that should move.
+        least: Distance from its first position [m] that one of them must reach, in the median of three frames.
+
+    Raises:
+        DataFileError: A marker is not in the recording, or none of them moves so far.
+    """
+    chosen, farthest = recording.select(labels), 0.0
+    for path, seen in zip(chosen.positions.swapaxes(0, 1), chosen.seen.T, strict=True):
+        if seen.any():
+            smooth = median_filter(path[seen], size=(3, 1), mode="nearest")
+            farthest = max(farthest, float(np.linalg.norm(smooth - smooth[0], axis=1).max()))
+    if farthest < least:
+        raise DataFileError(
+            f"{recording.source}: {listed(labels)} never move by more than {_MILLI * farthest:.2f} mm in the "
+            f"{len(recording.positions) / recording.rate:.3g} s that count: follow markers that move, or leave the "
+            "recording out."
+        )
+
+
+def check_passive(recording: Recording) -> None:
+    """Refuses a recording with pressures or forces that nothing would use; raises DataFileError."""
+    if recording.actuation is not None:
+        raise DataFileError(
+            f"{recording.source} holds an actuation, {recording.actuation.shape[1]} in each frame, which nothing here "
+            "uses: take an experiment with pressures (data.kind: pressure), or leave it out of the file."
+        )
 
 
 def _distances(places: FloatArray) -> FloatArray:

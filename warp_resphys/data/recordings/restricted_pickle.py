@@ -8,6 +8,7 @@ takes longer or makes more than its own bytes in the file do, however deeply val
 keys, so nothing is hashed or compared through them, and the memo is a dictionary, so its numbers claim no memory.
 """
 
+import io
 import os
 import pickletools
 import re
@@ -25,7 +26,6 @@ MOST_BYTES = 1 << 30  # of the file, of the texts that it encodes, and of its ar
 _NUMBERS = "biuf"
 _LONGEST_HEADER = 10_000
 _LONGEST_KEY = 1000
-_LONGEST_REASON = 200
 _FAULTS = (ArithmeticError, LookupError, MemoryError, TypeError, ValueError)
 _VALUE = re.compile(r"(SHORT_)?(BIN)?(INT|LONG|FLOAT|STRING|UNICODE|BYTES|BYTEARRAY)\d?")
 _PLAIN = {operation.name for operation in pickletools.opcodes if _VALUE.fullmatch(operation.name)}
@@ -271,7 +271,7 @@ def read_pickled_arrays(path: str | Path) -> dict[str, NDArray[np.float64]]:
             _skip_header(file, path)
             if os.fstat(file.fileno()).st_size > MOST_BYTES:
                 raise ValueError(f"it has more than {MOST_BYTES >> 20} MiB")
-            content = _Machine().run(file)
+            content = _Machine().run(io.BytesIO(file.read()))  # which makes no room for bytes that are not there
         content = content.item() if isinstance(content, _Array) else content
         if not isinstance(content, dict):
             raise DataFileError(f"{path} holds no dictionary of arrays: check the path.")
@@ -285,18 +285,11 @@ def read_pickled_arrays(path: str | Path) -> dict[str, NDArray[np.float64]]:
         raise DataFileError(f"Cannot read {path}: {error.strerror}; check the path.") from error
     except _RefusedError as error:
         raise DataFileError(
-            f"{path} is refused: it would construct '{_brief(error)}', and only NumPy arrays, numbers, text, lists, "
+            f"{path} is refused: it would construct '{error}', and only NumPy arrays, numbers, text, lists, "
             "tuples and dictionaries may be in it; do not open it with anything else either."
         ) from error
     except _FAULTS as error:
-        raise DataFileError(
-            f"{path} is damaged, or no pickle of plain arrays ({_brief(error)}): fetch it again."
-        ) from error
-
-
-def _brief(error: Exception) -> str:
-    """What an error says, in a part of a line: it may quote the file."""
-    return " ".join(str(error)[:_LONGEST_REASON].split())
+        raise DataFileError(f"{path} is damaged, or no pickle of plain arrays ({error}): fetch it again.") from error
 
 
 def _skip_header(file: BinaryIO, path: Path) -> None:

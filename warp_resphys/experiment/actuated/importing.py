@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ...data.actuation import check_pressures
 from ...data.recordings.processing import fill_gaps, resample, smooth
-from ...data.recordings.quality import check_base, quality
+from ...data.recordings.quality import check_base, check_motion, quality
 from ...data.recordings.reading import read_recording
 from ...data.recordings.recording import Recording, listed
 from ...data.recordings.valve import valve_opening
@@ -182,6 +182,8 @@ def _observe(trial: Trial, context: StageContext, simulator: Simulator, expected
     else:
         recording = read_recording(trial.file, data["units"], data["rate"])
     recording = resample(recording.select(labels), 1.0 / settings["time_step"], interpolate=True)
+    counting = replace(recording, positions=recording.positions[: data["steps"] + 1])
+    check_motion(counting, list(markers["followed"]))
     pressure = _pressure(recording, settings, simulator, trial.factor)
     filled = fill_gaps(recording, data["longest_gap"], mask_long=True)
     rest = _rest(filled, pressure, data, list(markers["followed"]))

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...data.recordings.processing import fill_gaps, release_of, trim_to_release
-from ...data.recordings.quality import check_base, quality
+from ...data.recordings.quality import check_base, check_motion, check_passive, quality
 from ...data.recordings.reading import read_recording
 from ...data.recordings.recording import Recording, listed
 from ...data.recordings.release import Release
@@ -164,7 +164,9 @@ def observe(settings: Mapping[str, Any], run_dir: Path) -> list[Observed]:
 def _read(trial: Trial, data: Mapping[str, Any], run_dir: Path, synthetic: bool) -> Recording:
     if synthetic or trial.file is None:
         return read_recording(run_dir / recording_file(trial.name))
-    return read_recording(trial.file, data["units"], data["rate"])
+    recording = read_recording(trial.file, data["units"], data["rate"])
+    check_passive(recording)
+    return recording
 
 
 def _check_rates(recordings: Sequence[Recording], time_step: float) -> None:
@@ -222,6 +224,7 @@ def _moving(each: Observed, followed: Sequence[str], data: Mapping[str, Any]) ->
             f"{moving.source}: {listed(lost)} cannot be seen in the {data['seconds']:g} s after the release; leave it "
             "out of markers.followed."
         )
+    check_motion(moving, followed)
     return moving
 
 

@@ -1,0 +1,186 @@
+"""Files that were damaged at random: every reader gives what it read or one sentence, within memory and time."""
+
+import contextlib
+import pickle
+import resource
+import time
+import tracemalloc
+import warnings
+from functools import partial
+from pathlib import Path
+
+import ezc3d
+import numpy as np
+import pytest
+
+from warp_resphys.data.recordings.published import read_published_arm
+from warp_resphys.data.recordings.reading import read_recording
+from warp_resphys.data.recordings.segment import read_published_segment
+from warp_resphys.io import decoding
+from warp_resphys.io.errors import DataFileError, InputError
+from warp_resphys.mesh.mesh import box_tetrahedra
+from warp_resphys.mesh.readers import read_mesh, read_surfaces, write_mesh
+
+FRAMES = np.arange(12)
+POSITIONS = 0.1 * np.random.default_rng(0).normal(size=(12, 3, 3)).cumsum(axis=0)  # [m]
+
+
+def rows(separator, *columns):
+    return [separator.join(f"{value:.6g}" for value in row) for row in np.column_stack(columns)]
+
+
+def write_c3d(path):
+    file = ezc3d.c3d()
+    point = file["parameters"]["POINT"]
+    point["UNITS"]["value"], point["RATE"]["value"], point["LABELS"]["value"] = ["mm"], [100.0], list("abc")
+    file["data"]["points"] = np.concatenate([1e3 * POSITIONS.transpose(2, 1, 0), np.ones((1, 3, 12))])
+    file.write(str(path))
+
+
+def write_csv(path):
+    header = ",".join(["time [s]", *(f"{label}.{axis} [mm]" for label in "abc" for axis in "xyz"), "valve [bar]"])
+    path.write_text("\n".join([header, *rows(",", FRAMES / 100, 1e3 * POSITIONS.reshape(12, 9), FRAMES)]) + "\n")
+
+
+def write_tsv(path):
+    head = ["NO_OF_FRAMES\t12", "NO_OF_MARKERS\t3", "FREQUENCY\t100", "MARKER_NAMES\ta\tb\tc"]
+    head += ["\t".join(["Frame", "Time", *(f"{label} {axis}" for label in "abc" for axis in "XYZ")])]
+    path.write_text("\n".join([*head, *rows("\t", FRAMES + 1, FRAMES / 100, 1e3 * POSITIONS.reshape(12, 9))]) + "\n")
+
+
+def write_motive(path):
+    head = ["Format Version,1.23,Export Frame Rate,100,Length Units,Meters", ",Type," + ",".join(["Marker"] * 9)]
+    head += [",Name," + ",".join(label for label in "abc" for _ in range(3)), "Frame,Time," + ",".join("XYZXYZXYZ")]
+    path.write_text("\n".join([*head, *rows(",", FRAMES, FRAMES / 100, POSITIONS.reshape(12, 9))]) + "\n")
+
+
+def write_npz(path):
+    known = {"labels": np.array(list("abc")), "rate_hz": 100.0, "units": "m", "start": 0.5, "rest": POSITIONS[0]}
+    np.savez(path, positions=POSITIONS, actuation=np.ones((12, 2)), actuation_units="kPa", **known)
+
+
+def write_segment(path):
+    markers = np.repeat(0.05 * np.random.default_rng(1).normal(size=(2, 1, 7, 3)), 30, axis=1)
+    markers[:, 10:] += 1e-4 * (np.arange(20) ** 2)[:, None, None]
+    np.savez_compressed(path, pressure_mbar=np.array([50.0, 75.0]), markers=markers, rate_hz=100.0)
+
+
+def write_pickle(path, protocol):
+    data = {"data": np.zeros((2, 3, 15, 3)), "p": np.arange(36.0).reshape(2, 3, 6), "note": [1, {"x": (None, "y")}]}
+    data["data"][:, 1:] = 0.01
+    path.write_bytes(pickle.dumps(data, protocol=protocol))
+
+
+def write_box(path):
+    mesh = box_tetrahedra((0.1, 0.03, 0.03), (2, 1, 1))
+    write_mesh(path, mesh)
+
+
+HERE = {
+    "a.csv": (write_csv, read_recording),
+    "motive.csv": (write_motive, read_recording),
+    "a.tsv": (write_tsv, read_recording),
+    "a.npz": (write_npz, read_recording),
+    "segment.npz": (write_segment, read_published_segment),
+    "zero.pkl": (partial(write_pickle, protocol=0), read_published_arm),
+    "two.pkl": (partial(write_pickle, protocol=2), read_published_arm),
+    "five.pkl": (partial(write_pickle, protocol=5), read_published_arm),
+}
+ELSEWHERE = {
+    "a.c3d": (write_c3d, read_recording),
+    "a.msh": (write_box, read_surfaces),
+    "a.vtk": (write_box, read_mesh),
+    "a.vtu": (write_box, read_mesh),
+}
+
+
+def damaged(content, random):
+    """The content with a few bytes changed, cut off, taken out or put in twice."""
+    content = bytearray(content)
+    kind, at = random.integers(8), int(random.integers(len(content)))
+    if kind == 0:
+        return content[:at]
+    if kind == 1:
+        return content[:at] + content[at + int(random.integers(1, 200)) :]
+    if kind == 2:
+        return content[:at] + content[at : at + 100] + content[at:]
+    for place in random.integers(len(content), size=random.integers(1, 5)):
+        content[place] = random.choice([random.integers(256), content[place] ^ 1, content[place] ^ 128, 0, 255, 57])
+    return content
+
+
+def is_one_sentence(message, path):
+    assert str(path) in message
+    assert message.isprintable()
+    assert len(message) <= 1000
+    return True
+
+
+def read_damaged(tmp_path, name, write, read, seed, count):
+    """Reads the file damaged in so many ways; returns how many of them were refused."""
+    write(tmp_path / name)
+    read(tmp_path / name)
+    whole, refused = (tmp_path / name).read_bytes(), 0
+    for number in range(count):
+        (tmp_path / name).write_bytes(damaged(whole, np.random.default_rng([seed, number])))
+        began = time.perf_counter()
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("error", RuntimeWarning)
+                read(tmp_path / name)
+        except (DataFileError, InputError) as error:
+            refused += is_one_sentence(str(error), tmp_path / name)
+        except BaseException as error:
+            raise AssertionError(f"{name}, damaged as number {number} of seed {seed}: {error!r}") from error
+        assert time.perf_counter() - began < 60.0
+    return refused
+
+
+@contextlib.contextmanager
+def little_memory(limit):
+    tracemalloc.start()
+    try:
+        yield
+        assert tracemalloc.get_traced_memory()[1] < limit
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("name", HERE)
+def test_damaged_files_that_are_read_in_this_process(tmp_path, name):
+    with little_memory(32 << 20):
+        assert read_damaged(tmp_path, name, *HERE[name], seed=0, count=150) > 20
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", HERE)
+def test_many_damaged_files_that_are_read_in_this_process(tmp_path, name):
+    with little_memory(256 << 20):
+        assert read_damaged(tmp_path, name, *HERE[name], seed=1, count=5000) > 500
+
+
+def within_limits(monkeypatch, tmp_path, name, seed, count):
+    monkeypatch.setattr(decoding, "MEMORY", (1 << 29, 64))
+    monkeypatch.setattr(decoding, "SECONDS", (3.0, 2e-6))
+    before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+    refused = read_damaged(tmp_path, name, *ELSEWHERE[name], seed=seed, count=count)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+    assert after <= max(before, 600 << 10)  # KiB
+    return refused
+
+
+@pytest.mark.parametrize("name", ELSEWHERE)
+def test_damaged_files_that_are_read_in_another_process(tmp_path, monkeypatch, name):
+    assert within_limits(monkeypatch, tmp_path, name, seed=0, count=6) > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ELSEWHERE)
+def test_many_damaged_files_that_are_read_in_another_process(tmp_path, monkeypatch, name):
+    assert within_limits(monkeypatch, tmp_path, name, seed=1, count=400) > 40
+
+
+def test_the_files_are_small(tmp_path):
+    for name, (write, _) in {**HERE, **ELSEWHERE}.items():
+        write(Path(tmp_path / name))
+        assert (tmp_path / name).stat().st_size < 20_000

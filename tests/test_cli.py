@@ -1,6 +1,8 @@
 import logging
 import os
+import re
 import runpy
+import shlex
 import signal
 import subprocess
 import sys
@@ -10,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from hydra import compose, initialize_config_module
 from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
@@ -351,6 +354,24 @@ class TestCommands:
         runpy.run_path(str(path), run_name="__main__")
         assert called[0] in cli.COMMANDS
         assert path.stem.replace("_", "-").startswith(called[0])
+
+
+def documented():
+    """Every command line with arguments in the documentation and in the help, without what is said of it."""
+    found = set()
+    for path in [*REPOSITORY.glob("*.md"), *REPOSITORY.glob("docs/*.md"), *REPOSITORY.glob("conf/**/*.yaml")]:
+        text = re.sub(r"\\\n *", "", path.read_text(encoding="utf-8"))
+        lines = re.findall(r"^[# ]*warp-resphys (.*)$|`warp-resphys ([^`]*)`", text, flags=re.MULTILINE)
+        found |= {re.split(r"  +[\w(]|#", a or b)[0].strip() for a, b in lines}
+    return sorted(line for line in found if "=" in line and "my_robot" not in line)
+
+
+def test_every_documented_line_has_keys_that_exist():
+    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
+        for line in documented():
+            command, arguments = cli._read([word for word in shlex.split(line) if word != "--multirun"], None)
+            known = [re.sub(r"^seed=0,.*", "seed=0", each) for each in arguments if not each.startswith("tuned=")]
+            compose(cli._CONFIGURATIONS.get(command, command.replace("-", "_")), known)
 
 
 class TestProcess:

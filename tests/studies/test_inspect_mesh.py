@@ -9,6 +9,7 @@ from hydra import compose, initialize_config_module
 from matplotlib.image import imread
 from omegaconf import OmegaConf
 
+from warp_resphys import cli
 from warp_resphys.io.errors import InputError, MeshError
 from warp_resphys.mesh.arm import mesh_arm, name_surfaces
 from warp_resphys.mesh.arm_geometry import ArmGeometry
@@ -170,6 +171,16 @@ def test_published_arm(tmp_path, shared_data):
     assert rows["open cavities"] == "none"
     with pytest.raises(MeshError, match="read with units=mm"):
         inspect_mesh(configured("inspect", f"mesh.path={path}", "mesh.units=mm"), tmp_path)
+
+
+def test_any_mesh_that_an_experiment_may_have(folder, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["warp-resphys", "inspect", "mesh=arm_coarse", "fixed.z=0", "picture=false"])
+    cli.main()
+    rows = rows_of(capsys.readouterr().out)
+    assert rows["vertices"] == "530 = 1,590 degrees of freedom"
+    assert rows["fixed"] == "43 vertices at z = 0 m, 43 of them used"
+    assert rows["chamber_6"].startswith("40 faces, 12.21 cm3")
+    assert not {"vertices in the file", "Written:"} & rows.keys()
 
 
 def test_a_body_in_two_pieces_with_an_open_chamber(tmp_path, arm):

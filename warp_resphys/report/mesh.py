@@ -164,7 +164,8 @@ def inspect_mesh(config: Mapping[str, Any], folder: Path, built: Mesh | None = N
         where = ", ".join(f"{axis} = {at:g} m" for axis, at in chosen.items())
         there = [np.abs(points[:, "xyz".index(axis)] - at) <= _ON_PLANE for axis, at in chosen.items()]
         rows.append(("fixed", f"{np.all(there, axis=0).sum()} vertices at {where}, {len(fixed)} of them used"))
-    rows.append(("surfaces with a name", names or "none"))
+    if built is None:
+        rows.append(("surfaces with a name", names or "none"))
     rows.append(("open cavities", _cavities(mesh)))
     if config["picture"]:
         draw_mesh(folder / "mesh.png", summary)

@@ -1,5 +1,8 @@
 import logging
 import os
+import re
+import runpy
+import shlex
 import signal
 import subprocess
 import sys
@@ -9,6 +12,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from hydra import compose, initialize_config_module
+from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
@@ -18,6 +23,7 @@ from warp_resphys.io.labels import run_label
 from warp_resphys.io.stages import StageInterrupted
 
 REPOSITORY = Path(__file__).parents[1]
+EXPERIMENT = "warp_resphys.experiment.experiment"
 CONFIG = {
     "config.yaml": """
         defaults:
@@ -57,9 +63,9 @@ class Command:
         self.outputs: list[str] = []
         self.arguments = ["warp-resphys", "--config-path", str(config_dir)]
         self.monkeypatch, self.capsys = monkeypatch, capsys
-        tasks = types.ModuleType("warp_resphys.studies.tasks")
-        tasks.run = self.run  # type: ignore[attr-defined]
-        monkeypatch.setitem(sys.modules, "warp_resphys.studies.tasks", tasks)
+        experiment = types.ModuleType(EXPERIMENT)
+        experiment.run_experiment = self.run  # type: ignore[attr-defined]
+        monkeypatch.setitem(sys.modules, EXPERIMENT, experiment)
         monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
 
     def run(self, config: DictConfig) -> object:
@@ -103,8 +109,8 @@ class TestRunFolder:
         assert run_label(["device=cuda", "+extra.device=cpu"], ["device", "extra.device"]) == "default"
         assert run_label(["b=2", "a.c=1e-3", "~d"]) == "a.c=1e-3,b=2,~d"
         assert run_label(["a=2", "a=1"]) == "a=1"
-        tuning = ["task=tune", "tune.trials=3", "~tune.space.trainer.gamma", "tune=mine", "tuned=best"]
-        assert run_label(tuning, ["task", "tune"]) == "tuned=best"
+        tuning = ["tune.trials=3", "~tune.space.trainer.gamma", "tune=mine", "tuned=best"]
+        assert run_label(tuning, ["tune"]) == "tuned=best"
         awkward = [run_label([f"a={value}"]) for value in ("x/y", "x y", "x" * 300, "x" * 301)]
         assert len(set(awkward)) == 4
         assert all(set(label) <= set("axy=-0123456789abcdef") and len(label) < 120 for label in awkward)
@@ -182,7 +188,12 @@ class TestUserErrors:
             ("material.densty=1", "unknown key 'material.densty', did you mean 'material.density'"),
             ("--multirun sed=1,2", "unknown key 'sed', did you mean 'seed'"),
             ("seed=[1", "cannot read the override 'seed=[1'"),
-            ("seed", "cannot read the override 'seed'"),
+            ("run seed", "cannot read the override 'seed'"),
+            ("seed", "unknown command 'seed' (--help lists all)"),
+            ("seed=1 make_arm", "unknown command 'make_arm', did you mean 'make-arm'?"),
+            ("pressure_coupling=explicit", "unknown key 'pressure_coupling': it is now 'coupling'"),
+            ("+simulation.fibre_stiffness=1", "unknown key 'simulation.fibre_stiffness': it is now 'fibres.stiffness'"),
+            ("task=tune", "unknown key 'task': it is now 'warp-resphys tune'"),
             ("seed=${nothing}", "Interpolation key 'nothing' not found"),
             ("+seed=1", "Could not append to config. An item is already at 'seed'."),
             ("hydra.run.dir=conf/config.yaml", "cannot write conf/config.yaml (File exists)"),
@@ -279,19 +290,88 @@ class TestOtherEnds:
         )
         assert len(command.outputs) == 1
 
-    def test_scripts_share_it(self, command, monkeypatch, capsys):
-        seeds = []
 
-        @cli.hydra_entry("config")
-        def check(config: DictConfig) -> None:
-            seeds.append(config.seed)
-            raise InputError("bad gradient")
+class TestCommands:
+    """Which function a command line leads to, and with what."""
 
+    @pytest.fixture
+    def calls(self, command, config_dir, monkeypatch):
+        found = []
+
+        for name, (job, _) in cli.COMMANDS.items():
+            module, function = f"warp_resphys.{job}".split(":")
+            monkeypatch.setitem(sys.modules, module, sys.modules.get(module, types.ModuleType(module)))
+            monkeypatch.setattr(
+                sys.modules[module], function, lambda config, name=name: found.append((name, config)), raising=False
+            )
+        for name in ("gradcheck", "make_arm", "verify"):
+            (config_dir / f"{name}.yaml").write_text("defaults: [config, _self_]\nfiles: []")
+        return found
+
+    @pytest.mark.parametrize(
+        ("arguments", "name", "seed"),
+        [
+            ("", "run", 0),
+            ("run", "run", 0),
+            ("seed=1", "run", 1),
+            ("make-arm seed=2", "make-arm", 2),
+            ("seed=3 gradcheck", "gradcheck", 3),
+            ("--run gradcheck +extra=1 ~material", "gradcheck", 0),
+            ("--config-dir . gradcheck", "gradcheck", 0),
+        ],
+    )
+    def test_the_first_bare_word_is_the_command(self, command, calls, arguments, name, seed):
+        assert command(*arguments.split()) == (0, "")
+        assert [(called, config.seed) for called, config in calls] == [(name, seed)]
+
+    def test_it_may_be_given_in_python_as_scripts_do(self, command, calls, monkeypatch):
         monkeypatch.setattr(sys, "argv", [*command.arguments, "seed=5"])
-        with pytest.raises(SystemExit) as end:
-            check()
-        assert (end.value.code, seeds) == (2, [5])
-        assert capsys.readouterr().err == "error: bad gradient\n"
+        cli.main("gradcheck")
+        assert [(called, config.seed) for called, config in calls] == [("gradcheck", 5)]
+
+    def test_words_after_it_are_files_where_it_takes_some(self, command, calls):
+        assert command("verify", "seed=1", "a.npz", "b c's [1],.npz", "--run") == (0, "")
+        assert calls[0][1].files == ["a.npz", "b c's [1],.npz"]
+        assert command("gradcheck", "a.npz")[1].startswith("error: cannot read the override 'a.npz'")
+        assert len(calls) == 1
+
+    def test_an_old_key_in_a_file_ends_like_one_on_the_command_line(self, command, calls, config_dir):
+        (config_dir / "experiment" / "beam.yaml").write_text(
+            "# @package _global_\nname: beam\npressure_coupling: implicit"
+        )
+        assert command() == (2, "error: unknown key 'pressure_coupling': it is now 'coupling'\n")
+        assert calls == []
+
+    def test_options_with_a_value_are_those_of_hydra(self):
+        actions = get_args_parser()._actions
+        valued = {name for action in actions if action.nargs in (None, "?") for name in action.option_strings}
+        assert set(cli._VALUED) == valued
+
+    @pytest.mark.parametrize("path", sorted((REPOSITORY / "scripts").glob("*.py")), ids=lambda path: path.stem)
+    def test_scripts_are_commands(self, path, monkeypatch):
+        called = []
+        monkeypatch.setattr(cli, "main", called.append)
+        runpy.run_path(str(path), run_name="__main__")
+        assert called[0] in cli.COMMANDS
+        assert path.stem.replace("_", "-").startswith(called[0])
+
+
+def documented():
+    """Every command line with arguments in the documentation and in the help, without what is said of it."""
+    found = set()
+    for path in [*REPOSITORY.glob("*.md"), *REPOSITORY.glob("docs/*.md"), *REPOSITORY.glob("conf/**/*.yaml")]:
+        text = re.sub(r"\\\n *", "", path.read_text(encoding="utf-8"))
+        lines = re.findall(r"^[# ]*warp-resphys (.*)$|`warp-resphys ([^`]*)`", text, flags=re.MULTILINE)
+        found |= {re.split(r"  +[\w(]|#", a or b)[0].strip() for a, b in lines}
+    return sorted(line for line in found if "=" in line and "my_robot" not in line)
+
+
+def test_every_documented_line_has_keys_that_exist():
+    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
+        for line in documented():
+            command, arguments = cli._read([word for word in shlex.split(line) if word != "--multirun"], None)
+            known = [re.sub(r"^seed=0,.*", "seed=0", each) for each in arguments if not each.startswith("tuned=")]
+            compose(cli._CONFIGURATIONS.get(command, command.replace("-", "_")), known)
 
 
 class TestProcess:
@@ -325,8 +405,8 @@ class TestProcess:
             def run(config):
                 print("running", flush=True)
                 time.sleep(60)
-            sys.modules["warp_resphys.studies.tasks"] = types.ModuleType("tasks")
-            sys.modules["warp_resphys.studies.tasks"].run = run
+            sys.modules["warp_resphys.experiment.experiment"] = types.ModuleType("experiment")
+            sys.modules["warp_resphys.experiment.experiment"].run_experiment = run
         """
         child = self.start(config_dir, sleeping)
         assert child.stdout.readline() == "running\n"

@@ -11,6 +11,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import pytest
+import yaml
 
 REPOSITORY = Path(__file__).parents[1]
 TINY = [
@@ -122,6 +123,43 @@ main()
     assert "experiment: beam_oscillation" in out
     assert "budget=quick" in out
     assert not list(tmp_path.iterdir())
+
+
+def test_every_command_says_what_it_does_and_what_it_takes(installed, tmp_path):
+    program = """
+import contextlib, io, json, sys
+for name in ("torch", "warp", "scipy", "matplotlib", "pyvista", "vtk", "meshio", "trimesh", "ezc3d"):
+    sys.modules[name] = None  # importing it fails
+from warp_resphys import cli
+found = {}
+for command, (_, purpose) in cli.COMMANDS.items():
+    found[command] = [purpose]
+    for option in ("--help", "--cfg=job"):
+        sys.argv = ["warp-resphys", command, option]
+        with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.suppress(SystemExit):
+            cli.main()
+        found[command].append(out.getvalue())
+print(json.dumps(found))
+"""
+    found = json.loads(call(installed / "python", "-c", program, folder=tmp_path))
+    keys = {"run": "seed", "tune": "tune", "inspect": "recording", "convert": "layout", "verify": "files"}
+    assert keys.keys() < found.keys()
+    for command, (purpose, text, config) in found.items():
+        assert f"warp-resphys {command}: {purpose}\n" in text or command == "run"
+        assert f"warp-resphys {command:14} {purpose}\n" in found["run"][1]
+        assert f"\nwarp-resphys {command}" in text
+        assert "Hydra" not in text
+        assert yaml.safe_load(config).keys() >= {keys.get(command)} - {None}
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_command_runs_from_an_empty_folder(installed, tmp_path):
+    out = call(installed / "warp-resphys", "make-arm", "mesh.layers=0.03", "picture=false", folder=tmp_path)
+    assert "chamber_6" in out
+    out = call(
+        installed / "warp-resphys", "inspect", "mesh.path=outputs/make-arm/arm.msh", "picture=false", folder=tmp_path
+    )
+    assert "chamber_6 (" in out
 
 
 def test_importing_the_package_imports_nothing_heavy(installed, tmp_path):

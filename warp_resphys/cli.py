@@ -1,17 +1,17 @@
-"""The console command `warp-resphys`, and what it shares with the scripts: Hydra, errors in one sentence."""
+"""The console command `warp-resphys`: its commands, each configured by Hydra, and errors in one sentence."""
 
 from __future__ import annotations
 
 import difflib
-import functools
 import logging
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from importlib import resources
+from collections.abc import Iterator, Mapping, Sequence
+from importlib import import_module, resources
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, Final
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -26,7 +26,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 from yaml import MarkedYAMLError
 
-from .io.errors import ResphysError
+from .io.errors import InputError, ResphysError
 from .io.files import OWN_OPTIONS, is_disk_full
 from .io.labels import run_label
 
@@ -35,46 +35,64 @@ USER_ERROR = 2
 INTERRUPTED = 130
 
 
-def hydra_entry(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Callable[[], None]]:
-    """Turns a function of a configuration into a command that is configured by Hydra.
+# Each command: its function below this package, which takes the configuration of the same name, and its purpose.
+COMMANDS: Final[Mapping[str, tuple[str, str]]] = MappingProxyType(
+    {
+        "run": ("experiment.experiment:run_experiment", "run an experiment; the word run may be left out"),
+        "tune": ("studies.tuning.tune:run_tuning", "search for better settings of the network and its training"),
+        "reproduce": ("studies.reproduction:reproduce", "run the simulated beams, and compare with what was published"),
+        "inspect": ("studies.preparation:inspect", "say what is in a mesh, or how good a recording is"),
+        "make-arm": ("studies.preparation:make_arm", "make the mesh of a pneumatic arm"),
+        "convert": ("studies.preparation:convert", "bring the published recordings into a format that is safe to open"),
+        "compare": ("studies.recording_comparison:compare", "set a beam that is let go beside its simulation"),
+        "verify": ("studies.verification:verify", "simulate reference trajectories, and compare every vertex"),
+        "gradcheck": ("studies.gradient_check:gradcheck", "compare adjoint gradients with central differences"),
+        "benchmark": ("studies.benchmark:benchmark", "time steps, forward and backward, and what they consist of"),
+        "element-study": ("studies.elements:element_study", "static sag of a beam, by element and refinement"),
+        "locking-study": ("studies.locking_page:locking_study", "deflection of an arm, by element and refinement"),
+    }
+)
+_CONFIGURATIONS: Final = {"run": "config"}  # where it is not called as the command is
+_WORDS: Final = {"verify": "files"}  # the key that takes the words after the command, as a list
 
-    The command ends with exit code 2 and one sentence on stderr where the user can mend what is wrong, with
+# What keys were called before, and what has taken their place.
+RENAMED: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "task": "warp-resphys tune",
+        "pressure_coupling": "coupling",
+        "simulation.fibre_stiffness": "fibres.stiffness",
+        "synthetic.material.fibre_stiffness": "synthetic.fibres.stiffness",
+    }
+)
+
+# Hydra's options whose next word is their value.
+_VALUED: Final = (
+    *("--cfg", "-c", "--package", "-p", "--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd"),
+    *("--info", "-i", "--experimental-rerun"),
+)
+
+
+def main(command: str | None = None) -> None:
+    """Does what the command line asks for.
+
+    The process ends with exit code 2 and one sentence on stderr where the user can mend what is wrong, with
     130 after Ctrl-C, and with 1 and a traceback for everything else. With HYDRA_FULL_ERROR=1 in the
     environment, every error keeps its traceback.
 
     Args:
-        config_name: Name of a configuration in the package warp_resphys.conf.
+        command: one of COMMANDS; where left out, the first bare word of the command line, and without one, run.
     """
-
-    def decorate(job: Callable[[DictConfig], Any]) -> Callable[[], None]:
-        @functools.wraps(job)
-        def command() -> None:
-            _run_command(job, config_name)
-
-        return command
-
-    return decorate
-
-
-@hydra_entry("config")
-def main(config: DictConfig) -> Any:
-    """Runs the configured experiment: the console command `warp-resphys`."""
-    from .studies.tasks import run
-
-    return run(config)
-
-
-def _run_command(job: Callable[[DictConfig], Any], config_name: str) -> None:
-    """Runs a job under Hydra and exits with the code that fits its outcome."""
     reported: list[BaseException] = []
     started = False
 
-    @functools.wraps(job)
-    def reporting_job(config: DictConfig) -> Any:
+    def job(config: DictConfig) -> Any:
         nonlocal started
         started = True
         try:
-            return job(config)
+            if old := next((key for key in RENAMED if OmegaConf.select(config, key) is not None), None):
+                raise InputError(_successor(old))
+            module, _, function = COMMANDS[chosen][0].partition(":")
+            return getattr(import_module(f"{__package__}.{module}"), function)(config)
         except Exception as error:
             sentence = _explain(error, started)
             if sentence is None or full_error:
@@ -91,11 +109,14 @@ def _run_command(job: Callable[[DictConfig], Any], config_name: str) -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra hands errors on instead of printing them and leaving
     logging.raiseExceptions = False  # a log file on a full disk must not fill the screen with tracebacks
     OmegaConf.register_new_resolver("run_label", run_label, replace=True)
+    OmegaConf.register_new_resolver("purpose", _purpose, replace=True)
     try:
         if any(argument.startswith("--experimental-rerun") for argument in sys.argv[1:]):
             raise HydraException("--experimental-rerun reads a pickle, which can run code: use overrides")
-        sys.argv = [arguments[0], *_own_options(), *arguments[1:]]
-        hydra.main(version_base="1.3", config_path=CONFIG_PACKAGE, config_name=config_name)(reporting_job)()
+        chosen, rest = _read(arguments[1:], command)
+        sys.argv = [arguments[0], *_own_options(), *rest]
+        configuration = _CONFIGURATIONS.get(chosen, chosen.replace("-", "_"))
+        hydra.main(version_base="1.3", config_path=CONFIG_PACKAGE, config_name=configuration)(job)()
     except KeyboardInterrupt as error:
         print(f"\n{error}" if str(error) else "\ninterrupted", file=sys.stderr, flush=True)
         raise SystemExit(INTERRUPTED) from None
@@ -111,6 +132,37 @@ def _run_command(job: Callable[[DictConfig], Any], config_name: str) -> None:
         logging.raiseExceptions = raise_exceptions
         if not full_error:
             del os.environ["HYDRA_FULL_ERROR"]
+
+
+def _read(arguments: Sequence[str], command: str | None) -> tuple[str, list[str]]:
+    """The command that is asked for, and what Hydra is to read.
+
+    Raises:
+        InputError: there is no such command.
+    """
+    rest = list(arguments)
+    words = [
+        at
+        for at, argument in enumerate(rest)
+        if "=" not in argument and argument[:1] not in ("-", "+", "~") and (at == 0 or rest[at - 1] not in _VALUED)
+    ]
+    if command is None:
+        command = rest.pop(words[0]) if words else "run"
+        words = [at - 1 for at in words[1:]]
+    if command not in COMMANDS:
+        raise InputError(f"unknown command '{command}'{_did_you_mean(command, list(COMMANDS))} (--help lists all)")
+    if command in _WORDS and words:
+        quoted = ["'{}'".format(rest[at].replace("'", r"\'")) for at in words]
+        rest[words[0]] = f"{_WORDS[command]}=[{','.join(quoted)}]"
+        rest = [argument for at, argument in enumerate(rest) if at not in words[1:]]
+    return command, rest
+
+
+def _purpose(command: str = "") -> str:
+    """For the help: what a command is for, or all of them; an OmegaConf resolver."""
+    if command in COMMANDS:
+        return f"warp-resphys {command}: {COMMANDS[command][1]}"
+    return "\n".join(f"warp-resphys {name:14} {purpose}" for name, (_, purpose) in COMMANDS.items())
 
 
 def _own_options() -> list[str]:
@@ -184,11 +236,17 @@ def _explain_key(error: HydraException, cause: OmegaConfBaseException) -> str:
     wanted = named.group(1) if named else str(cause.full_key)
     root = {} if cause.parent_node is None else OmegaConf.to_container(cause.parent_node._get_root())
     known = [key for key in _keys(root) if key.partition(".")[0] != "hydra"]
+    if wanted in RENAMED:
+        return _successor(wanted)
     if wanted in known:  # The value has a key of its own that does not exist.
         wanted = str(cause.full_key)
     same_name = [key for key in known if key.rpartition(".")[2] == wanted.rpartition(".")[2]]
     hint = _did_you_mean(wanted, known, preferred=same_name)
     return f"unknown key '{wanted}'{hint} (--cfg job lists all keys, +{wanted}=... adds a new one)"
+
+
+def _successor(key: str) -> str:
+    return f"unknown key '{key}': it is now '{RENAMED[key]}'"
 
 
 def _keys(config: Any, prefix: str = "") -> Iterator[str]:

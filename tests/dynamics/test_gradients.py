@@ -3,10 +3,8 @@
 import contextlib
 import io
 import math
-import runpy
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -23,6 +21,7 @@ from warp_resphys import (
     State,
     box_hexahedra,
     box_tetrahedra,
+    cli,
     select_vertices,
 )
 from warp_resphys.dynamics.inputs import Inputs
@@ -281,7 +280,7 @@ def test_a_row_that_compares_nothing_is_an_infinite_error(adjoint, difference, e
 
 def run_script(tmp_path, monkeypatch, *arguments):
     monkeypatch.setattr(sys, "argv", ["gradcheck.py", *arguments, f"hydra.run.dir={tmp_path}"])
-    runpy.run_path(str(Path(__file__).parents[2] / "scripts" / "gradcheck.py"))["main"]()
+    cli.main("gradcheck")
 
 
 @pytest.mark.parametrize("values", [(0.0, 0.0), (math.nan, 1.0), (1.0, math.nan)])

@@ -261,7 +261,7 @@ def recorded(tmp_path, finished, change):
             "names 'attached_mass_factor': choose from",
         ),
         (["refinement=solver_in_the_loop"], "refinement is for experiments without pressures"),
-        (["task=tune"], "task=tune does not search the networks of the experiment tiny"),
+        (["tune"], "tune does not search the networks of the experiment tiny"),
         (["+data.colour=red"], "unknown key 'data.colour'"),
         (["data.windows=[0.06,5.0]"], "data.windows is [0.06, 5.0]: they must rise, up to the 0.12 s"),
         (["data.train_fraction=1.5"], "data.train_fraction is 1.5"),

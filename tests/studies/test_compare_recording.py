@@ -24,7 +24,6 @@ from warp_resphys.studies.recording_comparison import (
     simulate_swing,
 )
 
-ROOT = Path(__file__).parents[2]
 TIP = [Marker("a", (0.1, 0.015, 0.036)), Marker("b", (0.1, -0.006, 0.024)), Marker("c", (0.1, 0.036, 0.006))]
 BASE = [
     Marker("d", (0.006, -0.01, -0.001)),
@@ -36,7 +35,7 @@ ROTATION = Rotation.from_euler("xyz", [0.4, -1.5, 2.0])
 
 def configured(*overrides):
     with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        return OmegaConf.to_container(compose("compare_recording", list(overrides)), resolve=True)
+        return OmegaConf.to_container(compose("compare", list(overrides)), resolve=True)
 
 
 def recorded(displacement, release):
@@ -207,7 +206,7 @@ def test_refused_settings(tmp_path, override, sentence):
 
 def test_command_line_tells_what_is_wrong_in_one_sentence(tmp_path):
     (tmp_path / "notes.c3d").write_text("not a recording")
-    command = [sys.executable, str(ROOT / "scripts" / "compare_recording.py"), "recording.path=notes.c3d"]
+    command = [sys.executable, "-m", "warp_resphys.cli", "compare", "recording.path=notes.c3d"]
     result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert result.returncode == 2
     assert result.stderr.strip().splitlines() == [

@@ -1,7 +1,6 @@
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import meshio
 import numpy as np
@@ -10,6 +9,7 @@ from hydra import compose, initialize_config_module
 from matplotlib.image import imread
 from omegaconf import OmegaConf
 
+from warp_resphys import cli
 from warp_resphys.io.errors import InputError, MeshError
 from warp_resphys.mesh.arm import mesh_arm, name_surfaces
 from warp_resphys.mesh.arm_geometry import ArmGeometry
@@ -18,8 +18,6 @@ from warp_resphys.mesh.mesh import Mesh, boundary_faces, box_hexahedra, box_tetr
 from warp_resphys.mesh.quality import cell_volumes, scaled_jacobian
 from warp_resphys.mesh.readers import read_mesh, read_surfaces, read_vertices, write_mesh
 from warp_resphys.report.mesh import inspect_mesh, make_arm
-
-ROOT = Path(__file__).parents[2]
 
 
 def configured(name, *overrides):
@@ -162,7 +160,7 @@ class TestNamedSurfaces:
 
 def test_published_arm(tmp_path, shared_data):
     path = shared_data / "sopra_mesh" / "sopra_494.vtk"
-    rows = rows_of(inspect_mesh(configured("inspect_mesh", f"path={path}", "fixed.z=0", "picture=false"), tmp_path))
+    rows = rows_of(inspect_mesh(configured("inspect", f"mesh.path={path}", "fixed.z=0", "picture=false"), tmp_path))
     assert rows["vertices in the file"] == "494 = 1,482 degrees of freedom"
     assert rows["of these unused"].startswith("30 belong to no cell")
     assert rows["vertices"] == "464 = 1,392 degrees of freedom"
@@ -172,7 +170,17 @@ def test_published_arm(tmp_path, shared_data):
     assert rows["pieces"] == "1 of the body, 7 of its boundary"
     assert rows["open cavities"] == "none"
     with pytest.raises(MeshError, match="read with units=mm"):
-        inspect_mesh(configured("inspect_mesh", f"path={path}", "units=mm"), tmp_path)
+        inspect_mesh(configured("inspect", f"mesh.path={path}", "mesh.units=mm"), tmp_path)
+
+
+def test_any_mesh_that_an_experiment_may_have(folder, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["warp-resphys", "inspect", "mesh=arm_coarse", "fixed.z=0", "picture=false"])
+    cli.main()
+    rows = rows_of(capsys.readouterr().out)
+    assert rows["vertices"] == "530 = 1,590 degrees of freedom"
+    assert rows["fixed"] == "43 vertices at z = 0 m, 43 of them used"
+    assert rows["chamber_6"].startswith("40 faces, 12.21 cm3")
+    assert not {"vertices in the file", "surfaces with a name", "Written:"} & rows.keys()
 
 
 def test_a_body_in_two_pieces_with_an_open_chamber(tmp_path, arm):
@@ -182,7 +190,7 @@ def test_a_body_in_two_pieces_with_an_open_chamber(tmp_path, arm):
         np.concatenate([mesh.cells, mesh.cells + len(mesh.vertices)]),
     )
     write_mesh(tmp_path / "two.vtu", apart)
-    rows = rows_of(inspect_mesh(configured("inspect_mesh", f"path={tmp_path}/two.vtu", "picture=false"), tmp_path))
+    rows = rows_of(inspect_mesh(configured("inspect", f"mesh.path={tmp_path}/two.vtu", "picture=false"), tmp_path))
     assert rows["pieces"].startswith("2 of the body, 8 of its boundary")
     assert rows["open cavities"].count("cm2 around") == 6
     assert "pressure needs a closed chamber" in rows["open cavities"]
@@ -220,16 +228,16 @@ def test_wrong_settings(tmp_path, overrides, error, message):
 
 
 @pytest.mark.parametrize(
-    ("script", "arguments", "message"),
+    ("command", "arguments", "message"),
     [
-        ("make_arm", ["mesh.wall=0.02"], "error: where the arm's radius is 21.29 mm, 3 chambers do not fit"),
-        ("inspect_mesh", ["path=nowhere.vtk"], "error: nowhere.vtk: there is no such mesh file"),
-        ("inspect_mesh", [], "error: Missing mandatory value: path"),
+        ("make-arm", ["mesh.wall=0.02"], "error: where the arm's radius is 21.29 mm, 3 chambers do not fit"),
+        ("inspect", ["mesh.path=nowhere.vtk"], "error: nowhere.vtk: there is no such mesh file"),
+        ("inspect", [], "error: nothing to inspect: name a file, as in mesh.path=FILE or recording.path=FILE."),
     ],
 )
-def test_commands_end_with_one_sentence(tmp_path, script, arguments, message):
-    command = [sys.executable, str(ROOT / "scripts" / f"{script}.py"), *arguments]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+def test_commands_end_with_one_sentence(tmp_path, command, arguments, message):
+    line = [sys.executable, "-m", "warp_resphys.cli", command, *arguments]
+    done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert done.stderr.strip().splitlines()[-1].startswith(message)
     assert "Traceback" not in done.stderr

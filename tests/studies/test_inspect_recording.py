@@ -17,13 +17,12 @@ from warp_resphys.data.recordings.release import Release
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.report.recordings import inspect_recording, recording_quality
 
-ROOT = Path(__file__).parents[2]
 LABELS = ("tip", "base 1", "base 2")
 
 
 def configured(*overrides):
     with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        return OmegaConf.to_container(compose("inspect_recording", list(overrides)), resolve=True)
+        return OmegaConf.to_container(compose("inspect", list(overrides)), resolve=True)
 
 
 def held_then_let_go(base=0.0):
@@ -111,7 +110,7 @@ def test_wrong_settings(tmp_path, path, overrides, message):
 
 
 def test_command_ends_with_one_sentence(tmp_path, path):
-    command = [sys.executable, str(ROOT / "scripts" / "inspect_recording.py"), f"recording.path={path}", "still=[foot]"]
+    command = [sys.executable, "-m", "warp_resphys.cli", "inspect", f"recording.path={path}", "still=[foot]"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert done.stderr.strip().splitlines()[-1].startswith(f"error: {path} has no marker named 'foot'; it has 'tip'")

@@ -4,13 +4,11 @@ import contextlib
 import json
 import os
 import re
-import runpy
 import signal
 import subprocess
 import sys
 import time
 from datetime import datetime
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -18,12 +16,11 @@ from hydra import compose, initialize_config_module
 from main_job import end_of
 from omegaconf import OmegaConf
 
+from warp_resphys import cli
 from warp_resphys.io.errors import InputError
 from warp_resphys.report.page import error_parts, number_text
 from warp_resphys.studies.reproduction import Run, _Pace, execute, plan
 
-REPOSITORY = Path(__file__).parents[2]
-SCRIPT = REPOSITORY / "scripts" / "reproduce.py"
 TINY = [
     'overrides=["mesh.divisions=[4,2,2]","data.steps=8","trainer.epochs=4","trainer.rollout_every=2"]',
     'experiments.marker_ablation.overrides=["markers.counts=[1,4]","markers.draws=3","markers.processes=1"]',
@@ -42,8 +39,8 @@ def configured(*overrides):
 
 
 def run(*arguments):
-    """Exit code of the script in this process, and what it wrote to stderr."""
-    return end_of(partial(runpy.run_path, str(SCRIPT), run_name="__main__"), "reproduce.py", *arguments)
+    """Exit code of the command in this process, and what it wrote to stderr."""
+    return end_of(cli.main, "warp-resphys", "reproduce", *arguments)
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +111,7 @@ class TestPage:
         names = re.findall(r"\]\(([\w./-]+\.png)\)", text)
         assert len(names) == 3
         assert all(0 < (page.parent / name).stat().st_size < 200_000 for name in names)
-        assert "python scripts/reproduce.py" in text
+        assert "warp-resphys reproduce " in text
         assert "- processor: " in text
         assert "&#39;" not in text
 
@@ -201,8 +198,8 @@ def test_a_run_that_ends_without_a_sentence_points_to_its_log(tmp_path, monkeypa
 
 def test_ctrl_c_stops_the_run_and_keeps_what_it_has(folder):
     """The signal reaches the reproduction alone; it hands it on to the run, which is out of reach of the terminal."""
-    program = "import signal, runpy; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-    program += f"runpy.run_path({str(SCRIPT)!r}, run_name='__main__')"
+    program = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    program += "from warp_resphys.cli import main\nmain('reproduce')"
     arguments = [each for each in TINY if not each.startswith("overrides")]
     command = [sys.executable, "-c", program, *arguments, "only=[beam_oscillation/default]"]
     child = subprocess.Popen(
@@ -215,7 +212,7 @@ def test_ctrl_c_stops_the_run_and_keeps_what_it_has(folder):
     found = []
     while not found and child.poll() is None:
         time.sleep(0.01)
-        found = list(DEFAULT.glob("*/trajectories.h5.journal"))
+        found = [path for path in DEFAULT.glob("*/trajectories.h5.journal") if path.stat().st_size]
     child.send_signal(signal.SIGINT)
     err = child.communicate(timeout=100)[1]
     assert child.returncode == 130, err

@@ -36,7 +36,7 @@ SEARCH = [
     *TINY,
     "trainer.epochs=6",
     "tune.settings.trainer.rollout_every=3",
-    "task=tune",
+    "tune",
     f"tune.trials={TRIALS}",
     *SPACE,
 ]
@@ -109,7 +109,7 @@ class TestSearch:
 
     def test_the_folder_is_that_of_the_run_and_what_it_holds_is_used(self, folder, no_pictures):
         short = [*SEARCH, "tune.trials=1"]
-        assert run(*[option for option in SEARCH if not option.startswith(("task", "tune"))])[0] == 0
+        assert run(*[option for option in SEARCH if not option.startswith("tune")])[0] == 0
         (run_folder,) = Path("runs/beam_oscillation").iterdir()
         before = files(run_folder)
         assert run(*short)[0] == 0
@@ -307,7 +307,6 @@ class TestBadInput:
     @pytest.mark.parametrize(
         ("override", "sentence"),
         [
-            ("task=tun", "task is 'tun': choose run or tune."),
             ("tune.model=sysid", "tune.model is 'sysid': choose one of resphys, simfree."),
             ("tune.trials=0", "tune.trials is 0: it must be a whole number, 1 or more."),
             ("tune.stale_after=0", "tune.stale_after is 0: it must be positive, in seconds."),
@@ -339,16 +338,16 @@ class TestBadInput:
         assert Path("configs/tuned/beam_oscillation_resphys_reduced.yaml").is_file()
 
     def test_an_experiment_without_training(self, folder):
-        code, err = run("experiment=marker_ablation", "task=tune", IN_RUN)
+        code, err = run("tune", "experiment=marker_ablation", IN_RUN)
         assert code == 2
         assert "error: the experiment marker_ablation trains no network: tune another one." in err
 
     @pytest.mark.parametrize("name", ["beam_real", "beam_real_repeated", "beam_synthetic"])
     def test_an_experiment_on_recordings(self, folder, name):
-        code, err = run(f"experiment={name}", "task=tune", "data.folder=recordings", IN_RUN)
+        code, err = run("tune", f"experiment={name}", "data.folder=recordings", IN_RUN)
         assert code == 2
         assert err.strip().splitlines()[-1] == (
-            f"error: task=tune does not search the networks of the experiment {name}, which learns from recordings: "
+            f"error: tune does not search the networks of the experiment {name}, which learns from recordings: "
             "set network and in_the_loop, and simfree and trainer for the baseline, and compare runs with --multirun."
         )
 

@@ -1,28 +1,27 @@
-"""Reference trajectories: the documented format, the comparison, and the script's exit codes."""
+"""Reference trajectories: the documented format, the comparison, and the command's exit codes."""
 
-import importlib.util
-from pathlib import Path
+import sys
+from unittest import mock
 
 import numpy as np
 import pytest
 
-from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, box_hexahedra, select_vertices
-from warp_resphys.dynamics.inputs import Inputs
+from warp_resphys import Body, Corotated, Inputs, Simulator, SolverSettings, State, box_hexahedra, cli, select_vertices
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.studies.verification import box_of_vertices, compare_with_reference, read_reference
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "verify.py"
+pytestmark = pytest.mark.usefixtures("folder")
 FILES = ("beam_tip_load_nu045.npz", "beam_tip_load_nu0499.npz", "beam_twist_nu0499.npz")
 
 
-def load_script():
-    spec = importlib.util.spec_from_file_location("verify", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-verify = load_script()
+def verify(*arguments):
+    """Exit code of the command in this process."""
+    with mock.patch.object(sys, "argv", ["warp-resphys", "verify", *map(str, arguments), "hydra.run.dir=run"]):
+        try:
+            cli.main()
+        except SystemExit as end:
+            return end.code
+    return 0
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -35,14 +34,13 @@ def test_reference_is_reproduced(name, reference_data, device):
 
 
 def test_reference_is_reproduced_by_projective_dynamics(reference_data, capsys):
-    arguments = [str(reference_data / FILES[0]), "--solver", "projective_dynamics", "--tolerance", "1e-6"]
-    assert verify.main(arguments) == 0
+    assert verify(reference_data / FILES[0], "solvers=[projective_dynamics]", "tolerance=1e-6") == 0
     assert "beam_tip_load_nu045" in capsys.readouterr().out
 
 
 @pytest.mark.slow
 def test_all_references_are_reproduced_by_all_solvers(reference_data):
-    assert verify.main([str(reference_data / name) for name in FILES]) == 0
+    assert verify(*(reference_data / name for name in FILES)) == 0
 
 
 def trajectory(mesh, steps=3):
@@ -56,7 +54,7 @@ def trajectory(mesh, steps=3):
     forces = 1e-3 * np.random.default_rng(0).normal(size=(steps, len(mesh.vertices), 3))
     rest = simulator.rest_state()
     v = 0.1 * (rest.q - rest.q[:, :1]) * (rest.q[..., :1] > mesh.vertices[:, 0].min())
-    result = simulator.rollout(State(rest.q, v), steps, Inputs(simulator.tensor(forces)[:, None]))
+    result = simulator.rollout(State(rest.q, v), steps, Inputs(external_force=simulator.tensor(forces)[:, None]))
     states = {"q": result.q[:, 0].numpy(), "v": result.v[:, 0].numpy()}
     return constants | {"dt": h, "gravity": gravity, "vertices": mesh.vertices, "f_ext": forces} | states
 
@@ -79,7 +77,7 @@ def test_any_box_grid_is_recovered():
 
 
 def test_every_solver_reproduces_a_file_of_another_grid(tmp_path, capsys):
-    assert verify.main([str(write(tmp_path))]) == 0
+    assert verify(write(tmp_path)) == 0
     lines = capsys.readouterr().out.splitlines()[-3:]
     assert [line.split()[1] for line in lines] == ["projective_dynamics", "quasi_newton", "newton"]
     assert all(float(line.split()[-1]) <= 1e-8 for line in lines)
@@ -93,7 +91,7 @@ def test_a_perturbed_file_fails(key, tmp_path, capsys):
     else:
         changed *= 1.001
     path = write(tmp_path, **{key: changed})
-    assert verify.main([str(path), "--solver", "newton"]) == 1
+    assert verify(path, "solvers=[newton]") == 1
     assert "exceeds 1e-08" in capsys.readouterr().out
 
 
@@ -108,12 +106,11 @@ def test_largest_error_is_a_distance(tmp_path):
 
 def test_one_bad_file_among_good_ones_fails(tmp_path):
     good, bad = write(tmp_path), write(tmp_path, "bad.npz", q=CONTENT["q"] + 1e-6 * (CONTENT["q"] > 0.23))
-    assert verify.main([str(bad), str(good), "--solver", "newton"]) == 1
+    assert verify(bad, good, "solvers=[newton]") == 1
 
 
-def test_no_convergence_fails(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(verify, "MAX_ITERATIONS", 1)
-    assert verify.main([str(write(tmp_path)), "--solver", "newton"]) == 1
+def test_no_convergence_fails(tmp_path, capsys):
+    assert verify(write(tmp_path), "solvers=[newton]", "max_iterations=1") == 1
     assert "not converged" in capsys.readouterr().out
 
 
@@ -138,7 +135,7 @@ def test_foreign_content_is_refused(without, changes, message, tmp_path, capsys)
     path = write(tmp_path, without=without, **changes)
     with pytest.raises((DataFileError, InputError), match=message):
         read_reference(path)
-    assert verify.main([str(path)]) == 2
+    assert verify(path) == 2
     captured = capsys.readouterr()
     assert captured.err.count("\n") == 1
     assert captured.err.startswith(f"error: {path}")
@@ -159,7 +156,7 @@ def test_foreign_files_are_refused(name, content, message, tmp_path, capsys):
         content = write(tmp_path).read_bytes()[:-200]
     if content is not ...:
         path.write_bytes(content)
-    assert verify.main([str(path)]) == 2
+    assert verify(path) == 2
     error = capsys.readouterr().err
     assert error.startswith(f"error: {path} {message}")
     assert "pickle.load" not in error
@@ -167,7 +164,7 @@ def test_foreign_files_are_refused(name, content, message, tmp_path, capsys):
 
 def test_pickled_objects_are_never_loaded(tmp_path, capsys):
     path = write(tmp_path, gravity=np.array([0.0, "x", None], dtype=object))
-    assert verify.main([str(path)]) == 2
+    assert verify(path) == 2
     assert "is no NumPy archive of plain arrays" in capsys.readouterr().err
 
 
@@ -179,5 +176,5 @@ def test_a_single_array_is_no_trajectory(tmp_path):
 
 
 def test_a_tolerance_of_zero_is_refused(tmp_path, capsys):
-    assert verify.main([str(write(tmp_path)), "--tolerance", "0"]) == 2
-    assert "solver.relative_tolerance is 0.0: it must be positive" in capsys.readouterr().err
+    assert verify(write(tmp_path), "tolerance=0") == 2
+    assert "solver.relative_tolerance is 0: it must be positive" in capsys.readouterr().err

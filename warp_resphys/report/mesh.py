@@ -129,12 +129,13 @@ def make_arm(config: Mapping[str, Any], folder: Path) -> str:
     return _table([*summary.rows(), ("clamped at the base", f"{len(summary.fixed)} vertices")])
 
 
-def inspect_mesh(config: Mapping[str, Any], folder: Path) -> str:
-    """Says what is in a mesh file.
+def inspect_mesh(config: Mapping[str, Any], folder: Path, built: Mesh | None = None) -> str:
+    """Says what is in a mesh.
 
     Args:
-        config: With the keys of `conf/inspect_mesh.yaml`.
+        config: With the keys of `conf/inspect.yaml`.
         folder: Where the picture goes.
+        built: The mesh, where it is not that of the file `mesh.path`.
 
     Returns:
         A table.
@@ -143,23 +144,29 @@ def inspect_mesh(config: Mapping[str, Any], folder: Path) -> str:
         InputError: A setting of the wrong kind.
         MeshError: A file that cannot be read, or a mesh that cannot be simulated.
     """
-    path, units, order, density = config["path"], config["units"], config["order"], _positive(config, "density")
-    in_file = read_vertices(path, units)
-    used = len(read_mesh(path, units, drop_unreferenced=True).vertices)
-    mesh = read_mesh(path, units, order, drop_unreferenced=True)
+    density, rows, names = _positive(config, "density"), [], ""
+    if built is None:
+        path, units, order = (config["mesh"][key] for key in ("path", "units", "order"))
+        points = read_vertices(path, units)
+        mesh = read_mesh(path, units, order, drop_unreferenced=True)
+        unused = len(points) - len(read_mesh(path, units, drop_unreferenced=True).vertices)
+        rows.append(("vertices in the file", f"{len(points):,} = {3 * len(points):,} degrees of freedom"))
+        if unused:
+            rows.append(("of these unused", f"{unused} belong to no cell; drop_unreferenced leaves them out"))
+        surfaces = read_surfaces(path, units, order, True)
+        names = ", ".join(f"{name} ({len(faces)})" for name, faces in surfaces.items())
+    else:
+        mesh, points = built, built.vertices
     chosen = {axis: at for axis, at in config["fixed"].items() if at is not None}
     fixed = select_vertices(mesh, **chosen) if chosen else np.empty(0, dtype=np.int64)
     summary = MeshSummary(mesh, density, fixed, find_chambers(mesh))
-    rows = [("vertices in the file", f"{len(in_file):,} = {3 * len(in_file):,} degrees of freedom")]
-    if used < len(in_file):
-        rows.append(("of these unused", f"{len(in_file) - used} belong to no cell; drop_unreferenced leaves them out"))
     rows += summary.rows()
     if chosen:
         where = ", ".join(f"{axis} = {at:g} m" for axis, at in chosen.items())
-        there = [np.abs(in_file[:, "xyz".index(axis)] - at) <= _ON_PLANE for axis, at in chosen.items()]
+        there = [np.abs(points[:, "xyz".index(axis)] - at) <= _ON_PLANE for axis, at in chosen.items()]
         rows.append(("fixed", f"{np.all(there, axis=0).sum()} vertices at {where}, {len(fixed)} of them used"))
-    names = ", ".join(f"{name} ({len(faces)})" for name, faces in read_surfaces(path, units, order, True).items())
-    rows.append(("surfaces with a name", f"{names or 'none'}"))
+    if built is None:
+        rows.append(("surfaces with a name", names or "none"))
     rows.append(("open cavities", _cavities(mesh)))
     if config["picture"]:
         draw_mesh(folder / "mesh.png", summary)

@@ -82,7 +82,7 @@ def inspect_recording(config: Mapping[str, Any], folder: Path) -> str:
     """Examines a recording, and writes quality.json and quality.png.
 
     Args:
-        config: With the keys of conf/inspect_recording.yaml.
+        config: With the keys of conf/inspect.yaml.
         folder: Where to write.
 
     Returns:

@@ -20,6 +20,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from omegaconf import DictConfig
+from rich.console import Console
 from rich.table import Table
 from threadpoolctl import threadpool_limits
 
@@ -41,9 +43,11 @@ from ..experiment.kinds import (
     check_keys,
 )
 from ..io.errors import InputError
+from ..io.files import write_json
 from ..io.progress import Progress
 from ..io.stages import package_versions
 from ..linalg.linear_solver import make_linear_solver
+from .settings import settings_of
 
 PARTS = ("local_step", "tangent", "assembly", "factor", "solve")
 _YARDSTICK_SIZE = 480
@@ -114,6 +118,18 @@ class Case:
             "iterations": self.iterations,
             "factorisations": self.factorisations,
         }
+
+
+def benchmark(config: DictConfig) -> None:
+    """Writes benchmark.json into the run folder and prints its tables; see `run_benchmark`."""
+    plain, folder = settings_of(config)
+    result = run_benchmark(plain)
+    file = folder / "benchmark.json"
+    write_json(file, result)
+    console = Console()
+    for table in benchmark_tables(result):
+        console.print(table)
+    console.print(f"Written: {file}")
 
 
 def run_benchmark(config: Mapping[str, Any]) -> dict[str, Any]:

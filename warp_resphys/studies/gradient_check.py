@@ -7,6 +7,9 @@ from functools import partial
 from typing import Any
 
 import torch
+import warp as wp
+from omegaconf import DictConfig
+from rich.console import Console
 from rich.table import Table
 
 from ..dynamics.inputs import Inputs
@@ -16,6 +19,7 @@ from ..experiment.build import build_simulator
 from ..experiment.kinds import COUNT, NATURAL, POSITIVE, Kind, check_keys, is_list
 from ..io.errors import InputError
 from ..mesh.poses import twisted
+from .settings import settings_of
 
 POSES = ("rest", "bent", "twisted")
 _KEYS = {
@@ -179,6 +183,20 @@ class _Problem:
         with torch.no_grad():
             difference = sum(w * float(loss(value + k * direction)) for k, w in _STENCIL)
         return GradientRow(name, float((gradient * direction).sum()), difference)
+
+
+def gradcheck(config: DictConfig) -> None:
+    """Prints a table for every Poisson's ratio and pose; exits with 1 where an error exceeds the tolerance."""
+    wp.config.log_level = wp.LOG_WARNING
+    plain, _ = settings_of(config)
+    tolerance = plain["gradcheck"]["tolerance"]
+    console, largest = Console(), 0.0
+    for poissons_ratio, pose, rows in check_configured(plain):
+        console.print(gradient_table(rows, f"nu = {poissons_ratio:g}, {pose}", tolerance))
+        largest = max([largest, *(row.relative_error for row in rows)])
+    console.print(f"Largest relative error: {largest:.1e}, {tolerance:.0e} allowed.")
+    if not largest <= tolerance:
+        raise SystemExit(1)
 
 
 def check_configured(config: Mapping[str, Any]) -> Iterator[tuple[float, str, list[GradientRow]]]:

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -10,18 +11,30 @@ from typing import Any, Final
 
 from matplotlib import rc_context
 from matplotlib.figure import Figure
+from omegaconf import DictConfig
+from rich.console import Console
 from rich.table import Table
 
 from ..io.files import atomic_path, digest, read_json, write_json, write_text
 from ..io.progress import Progress
 from ..report.figures import STYLE, TONES, new_figure, save_png
 from .locking import HEXAHEDRA, LINEAR, LOADS, QUADRATIC, Case, cases, cheapest, converged, measure
+from .settings import settings_of
 
 TITLES: Final[Mapping[str, str]] = MappingProxyType(
     {"gravity": "gravity, base tilted", "fibres": "pressure, with fibres", "pressure": "pressure, without fibres"}
 )
 _MARKS: Final = MappingProxyType({LINEAR: ("simulation", "^"), QUADRATIC: ("resphys", "s"), HEXAHEDRA: ("sysid", "o")})
 _MEASURED: Final = ("hexahedra", "linear_tetrahedra", "quadratic_tetrahedra", "file", "units", "within")
+
+
+def locking_study(config: DictConfig) -> None:
+    """Writes study.json, study.csv and study.png into the run folder and prints the table; see `run_study`."""
+    plain, folder = settings_of(config)
+    console = Console(width=None if sys.stdout.isatty() else 140)
+    for part in run_study(plain, folder):
+        console.print(part)
+    console.print(f"Written: {folder}/study.json, study.csv, study.png")
 
 
 def run_study(config: Mapping[str, Any], folder: Path) -> list[Table | str]:

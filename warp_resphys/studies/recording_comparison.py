@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from omegaconf import DictConfig
 from scipy.interpolate import CubicSpline
 
 from ..data.oscillation import Oscillation, measure_oscillation
@@ -22,6 +23,7 @@ from ..data.recordings.release import Release, find_release
 from ..data.registration import kabsch, root_mean_square
 from ..io.errors import DataFileError, InputError
 from ..io.files import atomic_path, write_json
+from .settings import settings_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -178,7 +180,7 @@ def simulate_swing(config: Mapping[str, Any], rest_markers: FloatArray, seconds:
     """Simulates the beam let go from straight and at rest, and follows the tip markers.
 
     Args:
-        config: With the groups `body`, `material`, `simulation` and `recording` of compare_recording.yaml.
+        config: With the groups `body`, `material`, `simulation` and `recording` of compare.yaml.
         rest_markers: (M, 3) [m] where the markers are at rest, in the frame of the body.
         seconds: How long to simulate [s].
 
@@ -226,11 +228,27 @@ def simulate_swing(config: Mapping[str, Any], rest_markers: FloatArray, seconds:
     return Swing(time, follow_face(face, mesh.vertices[tip_face], rest_markers))
 
 
+def compare(config: DictConfig) -> None:
+    """Writes comparison.json and comparison.png into the run folder and prints the numbers; see `compare_recording`."""
+    plain, folder = settings_of(config)
+    result = compare_recording(plain, folder)
+    print(f"{'':16}{'measured':>12}{'simulated':>12}{'difference':>12}")
+    for label, key, compared in (
+        ("sag [mm]", "sag_mm", "sag"),
+        ("period [s]", "period_s", "period"),
+        ("decay [1/s]", "decay_rate_per_s", "decay_rate"),
+    ):
+        measured, simulated = result["measured"][key], result["simulated"][key]
+        difference = result["relative_difference"][compared]
+        print(f"{label:16}{measured:12.4g}{simulated:12.4g}{difference:12.1%}")
+    print(f"Written: {folder / 'comparison.json'}, {folder / 'comparison.png'}")
+
+
 def compare_recording(config: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Measures and simulates a swing, and writes comparison.json and comparison.png.
 
     Args:
-        config: The settings of compare_recording.yaml, as plain containers.
+        config: The settings of compare.yaml, as plain containers.
         folder: Where to write.
 
     Returns:

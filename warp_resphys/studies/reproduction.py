@@ -14,6 +14,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
 from rich.console import Console
 
 from ..experiment.trajectories import METRICS
@@ -25,6 +27,7 @@ from ..io.progress import clock
 from ..io.stages import package_versions, run_lock
 from ..report.reproduction_page import Reproduction, markdown, write_reproduction
 from .comparison import Result, compare
+from .settings import settings_of
 
 log = logging.getLogger(__name__)
 
@@ -62,33 +65,29 @@ class ReproductionInterrupted(KeyboardInterrupt):
     """Ctrl-C during a run; the message says what is kept."""
 
 
-def reproduce(config: Mapping[str, Any], folder: Path, overrides: Sequence[str] = ()) -> None:
-    """Runs what is configured and writes the page, and where asked for a dated one.
-
-    Args:
-        config: with the keys of ``conf/reproduce.yaml``.
-        folder: of the page and of the runs' logs.
-        overrides: the command's own, to be named on the page.
+def reproduce(config: DictConfig) -> None:
+    """Runs what is configured; writes the page and logs into the run folder, and where asked a dated page of results.
 
     Raises:
         InputError: a value that cannot be used.
         ResphysError: a run failed; the others were run, and the page is written.
         ReproductionInterrupted: Ctrl-C.
     """
-    runs = plan(config)
+    plain, folder = settings_of(config)
+    runs = plan(plain)
     with run_lock(folder):
         results = run_all(runs, folder / "logs")
         page = Reproduction(
             date=f"{datetime.now():%Y-%m-%d}",
-            command=shlex.join(["python", "scripts/reproduce.py", *overrides]),
+            command=shlex.join(["warp-resphys", "reproduce", *HydraConfig.get().overrides.task]),
             hardware=hardware(),
             commit=commit(),
             versions=package_versions(),
-            **compare(config, results),
+            **compare(plain, results),
         )
         write_reproduction(folder / PAGE, page)
-        if config["results"] is not None:
-            _write_results(Path(config["results"]), folder, page)
+        if plain["results"] is not None:
+            _write_results(Path(plain["results"]), folder, page)
     print(f"Page: {folder / PAGE}")
     if failed := [f"{result.experiment}/{result.variant}" for result in results if result.failure]:
         raise ResphysError(
@@ -239,9 +238,7 @@ def execute(run: Run, log_file: Path, follow: Callable[[str], None]) -> str | No
     """
     place = str(run.folder).replace("\\", r"\\").replace("'", r"\'")
     command = [sys.executable, "-m", "warp_resphys.cli", *run.arguments, f"hydra.run.dir='{place}'"]
-    environment = {
-        name: value for name, value in os.environ.items() if name != "HYDRA_FULL_ERROR"
-    }  # hydra_entry sets it
+    environment = {name: value for name, value in os.environ.items() if name != "HYDRA_FULL_ERROR"}  # cli.main sets it
     sentence = None
     with (
         log_file.open("a", encoding="utf-8", buffering=1) as written,

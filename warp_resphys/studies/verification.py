@@ -9,17 +9,23 @@ from pathlib import Path
 
 import numpy as np
 import torch
+import warp as wp
 from numpy.typing import NDArray
+from omegaconf import DictConfig
 
 from ..dynamics.inputs import Inputs
 from ..dynamics.integrator import State
 from ..dynamics.nonlinear_solver import SolverSettings
 from ..dynamics.simulator import Simulator
 from ..energies.materials import Corotated, Material
+from ..experiment.build import choose_device
 from ..fem.body import Body
-from ..io.errors import DataFileError, InputError
+from ..io.errors import ConvergenceError, DataFileError, InputError
 from ..io.files import read_arrays
 from ..mesh.mesh import Mesh, box_hexahedra, select_vertices
+from .settings import settings_of
+
+LARGEST_ERROR = 1e-8  # m
 
 FloatArray = NDArray[np.float64]
 
@@ -36,6 +42,39 @@ REFERENCE_SHAPES: dict[str, tuple[int | str, ...]] = {
     "v": ("T + 1", "N", 3),  # m/s
 }
 _GRID_TOLERANCE = 1e-9  # of the box's length: distance within which coordinates count as equal
+
+
+def verify(config: DictConfig) -> None:
+    """Prints the largest vertex error of each file and solver; exits with 1 where one exceeds `LARGEST_ERROR`.
+
+    Raises:
+        InputError: no file is named, or a value cannot be used.
+        DataFileError: see `read_reference`.
+    """
+    given, _ = settings_of(config)
+    if not given["files"] or not isinstance(given["files"], list):
+        raise InputError("name reference trajectories, as in warp-resphys verify FILE...")
+    wp.config.log_level = wp.LOG_WARNING
+    device, tolerance = choose_device(given["device"]), given["tolerance"]
+    references = {path: read_reference(path) for path in map(Path, given["files"])}
+    within = True
+    print(f"{'file':32}{'solver':22}{'tolerance':>10}{'iterations':>12}{'largest error [m]':>20}")
+    for path, reference in references.items():
+        for name in given["solvers"]:
+            settings = SolverSettings(name, relative_tolerance=tolerance, max_iterations=given["max_iterations"])
+            label = f"{path.stem:32}{name:22}{tolerance:10.0e}"
+            try:
+                result = compare_with_reference(reference, settings, device)
+            except ConvergenceError as error:
+                print(f"{label}  not converged: {error}")
+                within = False
+                continue
+            passed = result.largest_error <= LARGEST_ERROR
+            within &= passed
+            verdict = "" if passed else f"  exceeds {LARGEST_ERROR:.0e}"
+            print(f"{label}{result.iterations:12.1f}{result.largest_error:20.2e}{verdict}", flush=True)
+    if not within:
+        raise SystemExit(1)
 
 
 @dataclass(frozen=True)

@@ -44,6 +44,6 @@ def read_recording(
     if reader is None:
         raise DataFileError(
             f"{path} is no recording that can be read: give a file that ends in {', '.join(READERS)}, or convert it "
-            "with scripts/convert_recordings.py."
+            "with warp-resphys convert."
         )
     return to_recording(reader(path), path, units, rate, labels)

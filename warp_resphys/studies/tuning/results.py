@@ -110,7 +110,7 @@ def option_text(tuning: Tuning, best: Outcome, trials: int) -> str:
     found: dict[str, Any] = {key: groups[key] for key in ("network", "trainer")}
     if tuning.config["tune"]["model"] == "simfree":
         found = {"simfree": found}
-    command = shlex.join(["warp-resphys", *HydraConfig.get().overrides.task])
+    command = shlex.join(["warp-resphys", "tune", *HydraConfig.get().overrides.task])
     head = [
         "# @package _global_",
         f"# Trial {best.number} of {trials} until {datetime.now(UTC).date()}: roll-out error of "

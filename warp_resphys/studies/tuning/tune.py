@@ -1,4 +1,4 @@
-"""The task `tune`: the search for settings, shared by any number of processes."""
+"""The command `tune`: the search for settings, shared by any number of processes."""
 
 import hashlib
 import json
@@ -237,7 +237,7 @@ def check_tuning(config: Mapping[str, Any]) -> dict[str, Dimension]:
     tune = config["tune"]
     if config["data"]["kind"] in (RECORDINGS, PRESSURE):
         raise InputError(
-            f"task=tune does not search the networks of the experiment {config['name']}, which learns from recordings: "
+            f"tune does not search the networks of the experiment {config['name']}, which learns from recordings: "
             "set network and in_the_loop, and simfree and trainer for the baseline, and compare runs with --multirun."
         )
     if "markers" in config:

@@ -17,9 +17,8 @@ from .simulator import Simulator
 
 _PRESSURE = 1e4  # [Pa] in the chambers, about
 POSES = ("rest", "bent", "twisted")
-# Seven-point stencil: its error is of sixth order in the step, so that steps of a percent, which drown the rounding of
-# the solves, still leave a truncation of 1e-10.
-_STENCIL = tuple((s * k, s * w) for s in (1, -1) for k, w in ((1, 3.0 / 4.0), (2, -3.0 / 20.0), (3, 1.0 / 60.0)))
+_HALVINGS = 6  # of the step of a difference
+_ACCURACY = 1e-8  # relative, at which a difference is good enough
 
 
 @dataclass(frozen=True)
@@ -30,11 +29,13 @@ class GradientRow:
         parameter: its name.
         adjoint: directional derivative of the loss by the adjoint.
         difference: the same by central differences.
+        uncertainty: of the difference, by truncation and rounding.
     """
 
     parameter: str
     adjoint: float
     difference: float
+    uncertainty: float = 0.0
 
     @property
     def relative_error(self) -> float:
@@ -45,6 +46,28 @@ class GradientRow:
         scale = max(abs(self.adjoint), abs(self.difference))
         error = abs(self.adjoint - self.difference) / scale if scale > 0.0 else math.inf
         return error if math.isfinite(error) else math.inf
+
+
+def central_difference(function: Callable[[float], float]) -> tuple[float, float]:
+    """Derivative at zero of a function of one number, and about how far it may be off.
+
+    Central differences over steps of 1, 1/2, 1/4, ... are extrapolated to a step of zero (Ridders 1982). Truncation
+    makes the first extrapolations change from one step to the next, rounding the last ones: the one that changes least
+    is taken, and its change says how good it is.
+    """
+    row: list[float] = []
+    best, error = math.nan, math.inf
+    for k in range(1 + _HALVINGS):
+        step, before = 0.5**k, row
+        row = [(function(step) - function(-step)) / (2.0 * step)]
+        for j, coarser in enumerate(before, 1):
+            row.append(row[-1] + (row[-1] - coarser) / (4.0**j - 1.0))
+            change = max(abs(row[-1] - row[-2]), abs(row[-1] - coarser))
+            if change < error:
+                best, error = row[-1], change
+        if error <= _ACCURACY * abs(best):
+            break
+    return best, error
 
 
 def pose(simulator: Simulator, name: str, batch: int) -> State:
@@ -75,7 +98,8 @@ def check_gradients(
 ) -> list[GradientRow]:
     """Compares the directional derivatives of a random linear functional of all positions and velocities.
 
-    The material's damping constants should be positive, or their central differences would leave the physical range.
+    Constants vary by factors, and Poisson's ratio between its bounds, so that no difference leaves the physical range.
+    The damping constants must be positive.
 
     Args:
         simulator: with a tight tolerance, in float64.
@@ -133,37 +157,39 @@ class _Problem:
 
     def cases(self) -> dict[str, tuple[Callable[[torch.Tensor], torch.Tensor], torch.Tensor, float]]:
         """Loss, value and typical size of a change, by parameter."""
-        m, b = self.simulator.material, self.batch
+        b = self.batch
         elements = len(self.simulator.body.mesh.cells)
         length = float((self.state.q[0].max(0).values - self.state.q[0].min(0).values).max())
-        full = self.simulator.tensor
         cases: dict[str, tuple[Callable[[torch.Tensor], torch.Tensor], torch.Tensor, float]] = {
-            "initial positions": (lambda x: self.loss(q=x), self.state.q, 1e-5 * length),
-            "initial velocities": (lambda x: self.loss(v=x), self.state.v, 1e-2 * length),
-            "external forces": (lambda x: self.loss(forces=x), self.forces, 1e-3),
+            "initial positions": (lambda x: self.loss(q=x), self.state.q, 3e-4 * length),
+            "initial velocities": (lambda x: self.loss(v=x), self.state.v, 0.3 * length),
+            "external forces": (lambda x: self.loss(forces=x), self.forces, 1e-2),
         }
         if len(self.simulator.fixed):
-            cases["fixed positions"] = (lambda x: self.loss(targets=x), self.targets, 1e-5 * length)
+            cases["fixed positions"] = (lambda x: self.loss(targets=x), self.targets, 3e-4 * length)
+
         shapes = {"scalar": (1,), "per element": (elements,), "per environment": (b, 1)}
-        for name, key, change, limit in (("E", "youngs_modulus", 1e-2, 0.0), ("nu", "poissons_ratio", 2e-2, 0.5)):
-            constant = float(getattr(m, key))
-            for kind, shape in shapes.items():
-                value = full(constant).expand(shape).clone()
-                cases[f"{name}, {kind}"] = (self._vary(key), value, change * abs(constant - limit))
-        for key, change in (("density", 1e-2), ("mass_damping", 0.25), ("stiffness_damping", 5e-3)):
-            value = full(float(getattr(m, key))).reshape(1)
-            cases[key.replace("_", " ")] = (self._vary(key), value, change * float(value))
+        constants = {
+            f"{name}, {kind}": (key, shape)
+            for name, key in (("E", "youngs_modulus"), ("nu", "poissons_ratio"))
+            for kind, shape in shapes.items()
+        }
+        constants |= {key.replace("_", " "): (key, (1,)) for key in ("density", "mass_damping", "stiffness_damping")}
         if self.pressures is not None:
             cases["pressure"] = (lambda x: self.loss(pressures=x), self.pressures, 0.1 * _PRESSURE)
         if self.simulator.body.fibres is not None:
-            stiffness = full(m.fibre_stiffness).mean()
             for kind, count in (("scalar", 1), ("per chamber", len(self.simulator.body.chambers))):
-                value = stiffness.expand(count).clone()
-                cases[f"fibre stiffness, {kind}"] = (self._vary("fibre_stiffness"), value, 1e-2 * float(stiffness))
-        return cases
+                constants[f"fibre stiffness, {kind}"] = ("fibre_stiffness", (count,))
+        zero = self.simulator.tensor(0.0)
+        return cases | {name: (self._vary(key), zero.expand(shape), 0.7) for name, (key, shape) in constants.items()}
 
     def _vary(self, key: str) -> Callable[[torch.Tensor], torch.Tensor]:
-        def loss(value: torch.Tensor) -> torch.Tensor:
+        """The loss by the logarithm of a constant's factor, or by that of nu's way from -1 over that to 0.5."""
+        base = self.simulator.tensor(getattr(self.simulator.material, key)).mean()
+
+        def loss(x: torch.Tensor) -> torch.Tensor:
+            nu = key == "poissons_ratio"
+            value = 1.5 * torch.sigmoid(torch.logit((base + 1.0) / 1.5) + x) - 1.0 if nu else base * torch.exp(x)
             changed: dict[str, Any] = {key: value}
             return self.loss(material=replace(self.simulator.material, **changed))
 
@@ -173,12 +199,12 @@ class _Problem:
         self, name: str, loss: Callable[[torch.Tensor], torch.Tensor], value: torch.Tensor, size: float
     ) -> GradientRow:
         direction = self.noise(*value.shape)
-        direction = size * direction / (0.5 + direction.abs())  # bounded by size, as the stencil's truncation is then
+        direction *= size / direction.abs().max()
         variable = value.detach().clone().requires_grad_(True)
         (gradient,) = torch.autograd.grad(loss(variable), variable)
         with torch.no_grad():
-            difference = sum(w * float(loss(value + k * direction)) for k, w in _STENCIL)
-        return GradientRow(name, float((gradient * direction).sum()), difference)
+            difference = central_difference(lambda step: float(loss(value + step * direction)))
+        return GradientRow(name, float((gradient * direction).sum()), *difference)
 
 
 def check_configured(config: Mapping[str, Any]) -> Iterator[tuple[float, str, list[GradientRow]]]:
@@ -214,13 +240,13 @@ def check_configured(config: Mapping[str, Any]) -> Iterator[tuple[float, str, li
 
 
 def gradient_table(rows: list[GradientRow], title: str, tolerance: float) -> Table:
-    """Adjoint, difference and relative error of each parameter, in red beyond the tolerance."""
+    """Adjoint, difference, its uncertainty and relative error of each parameter, in red beyond the tolerance."""
     table = Table(title=title, title_justify="left")
     table.add_column("parameter", min_width=20)
-    for name in ("adjoint", "difference", "relative error"):
+    for name in ("adjoint", "difference", "uncertain by", "relative error"):
         table.add_column(name, justify="right")
     for row in rows:
         failed = not row.relative_error <= tolerance
-        values = (f"{row.adjoint:.9e}", f"{row.difference:.9e}", f"{row.relative_error:.1e}")
+        values = (f"{row.adjoint:.9e}", f"{row.difference:.9e}", f"{row.uncertainty:.1e}", f"{row.relative_error:.1e}")
         table.add_row(row.parameter, *values, style="red" if failed else None)
     return table

@@ -29,6 +29,7 @@ from warp_resphys.dynamics.integrator import INTEGRATORS
 from warp_resphys.studies.gradient_check import (
     POSES,
     GradientRow,
+    central_difference,
     check_configured,
     check_gradients,
     gradient_table,
@@ -43,14 +44,13 @@ MESHES = {
     "hexahedron27": box_hexahedra(SIZE, (1, 1, 1), nodes=27),
 }
 DAMPED = Corotated(264e3, 0.45, density=1070.0, mass_damping=0.5, stiffness_damping=2e-3)
-TIGHT = SolverSettings("newton", relative_tolerance=1e-10)
+TIGHT = SolverSettings("newton", relative_tolerance=1e-12)
 PER_ELEMENT = ("", ", each element", ", each environment")
 KINDS = [
     *("q", "v", "external_force", "fixed_positions", "attached_mass"),
     *(f"{name}{kind}" for name in ("youngs_modulus", "poissons_ratio", "density") for kind in PER_ELEMENT),
     *("mass_damping, each environment", "stiffness_damping, each environment", "gravity, each environment"),
 ]
-SEVEN = [(s * k, s * w) for s in (1, -1) for k, w in ((1, 3 / 4), (2, -3 / 20), (3, 1 / 60))]
 
 
 def simulator(kind="hexahedron", material=DAMPED, **options):
@@ -83,9 +83,9 @@ def test_every_parameter_with_every_integrator(integrator, start):
     [
         {"material": StableNeoHookean(**DAMPED.constants)},
         {"material": replace(DAMPED, poissons_ratio=-0.2)},
-        {"solver": SolverSettings("quasi_newton", relative_tolerance=1e-10)},
-        {"solver": SolverSettings("newton", relative_tolerance=1e-10, linear_solver="dense")},
-        {"solver": SolverSettings("newton", relative_tolerance=1e-10, linear_solver="sparse")},
+        {"solver": SolverSettings("quasi_newton", relative_tolerance=1e-12)},
+        {"solver": SolverSettings("newton", relative_tolerance=1e-12, linear_solver="dense")},
+        {"solver": SolverSettings("newton", relative_tolerance=1e-12, linear_solver="sparse")},
     ],
     ids=["stable_neo_hookean", "auxetic", "quasi_newton", "dense", "sparse"],
 )
@@ -104,8 +104,29 @@ def derivative(loss, value, direction):
     variable = value.clone().requires_grad_(True)
     (gradient,) = torch.autograd.grad(loss(variable), variable)
     with torch.no_grad():
-        difference = sum(w * float(loss(value + k * direction)) for k, w in SEVEN)
-    return GradientRow("", float((gradient * direction).sum()), difference)
+        difference = central_difference(lambda step: float(loss(value + step * direction)))
+    return GradientRow("", float((gradient * direction).sum()), *difference)
+
+
+@pytest.mark.parametrize("rounding", [0.0, 1e-12, 1e-9])
+@pytest.mark.parametrize("scale", [1.0, 3.0])
+def test_a_difference_is_as_good_as_rounding_allows_and_says_how_good(scale, rounding):
+    """A function whose values are off at random by a given amount, with a pole near the first step."""
+    random = torch.Generator().manual_seed(0)
+
+    def function(step):
+        return math.exp(scale * step) / (3.5 + scale * step) + rounding * float(torch.randn(1, generator=random))
+
+    exact = scale * (1.0 / 3.5 - 1.0 / 3.5**2)
+    found, uncertainty = central_difference(function)
+    assert abs(found - exact) < max(1e-8 * exact, 20.0 * rounding)
+    assert uncertainty < max(1e-8 * exact, 20.0 * rounding)
+
+
+def test_a_difference_passes_over_a_kink_within_long_steps_and_doubts_one_within_all_of_them():
+    assert central_difference(lambda step: abs(step + 0.1) + 0.3 * step)[0] == pytest.approx(1.3, rel=1e-12)
+    assert central_difference(lambda step: abs(step + 1e-3) + 0.3 * step)[1] > 1e-3
+    assert central_difference(lambda step: math.nan)[1] == math.inf
 
 
 def noise(*shape, seed=0):

@@ -11,6 +11,7 @@ from warp_resphys.data.markers import bind_markers
 from warp_resphys.data.trials import Trials
 from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.dynamics.integrator import State
+from warp_resphys.dynamics.modes import vibration_modes
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.learning.release import ReleaseSettings, estimate_release, hold, sideways_shapes, velocity_shapes
 from warp_resphys.learning.replay import Replay, Start, sample, tilted_gravity
@@ -210,7 +211,16 @@ def test_a_body_that_nothing_holds_rests_under_gravity_and_its_weight():
     assert float((still - still[:, :1]).abs().max()) < 1e-7
 
 
-def test_the_delay_and_the_push_of_a_release_are_recovered():
+@pytest.mark.parametrize("angle", [0.0, 0.3, 0.6, 0.9, 1.2, 1.5])
+def test_the_delay_and_the_push_of_a_release_are_recovered_in_any_basis(angle, monkeypatch):
+    """The beam is square: any rotation of its first two vibrations is as good a basis."""
+
+    def rotated(sim, count):
+        basis = vibration_modes(sim, count)
+        turn = double([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        return torch.cat([basis[:, :2] @ turn, basis[:, 2:]], 1)
+
+    monkeypatch.setattr("warp_resphys.learning.release.vibration_modes", rotated)
     sim, motions = simulator(), blank(frames=16)
     replay = Replay(sim, MARKERS, motions)
     shapes, delay = velocity_shapes(sim, 2), double([0.012, -0.004])
@@ -228,6 +238,21 @@ def test_the_delay_and_the_push_of_a_release_are_recovered():
     assert found.shift is None
     kept = estimate_release(sim, MARKERS, motions, ReleaseSettings(velocity_modes=0, delay=0.0))
     assert float(kept.delay.abs().max() + kept.state.v.abs().max()) == 0.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_releases_within_twice_what_is_expected_are_recovered(seed):
+    """Delays between any two frames: each frame that sees the body at rest or moving is a minimum of its own."""
+    sim, count = simulator(), 8
+    motions = blank(frames=12, masses=(0.0,) * count)
+    values = 4.0 * torch.rand(count, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) - 2.0
+    velocity = torch.einsum("bk,knc->bnc", 0.05 * values[:, 1:], velocity_shapes(sim, 2))
+    q = sim.rest_state(count).q
+    release = Start(State(q, velocity), 0.01 * values[:, 0])
+    seen = Replay(sim, MARKERS, motions)(release)[0]
+    settings = ReleaseSettings(hold_modes=6, velocity_modes=2, delay=0.01, window=0.1, noise=1e-5)
+    found = estimate_release(sim, MARKERS, replace(motions, observed=seen), settings)
+    torch.testing.assert_close(found.delay, release.delay, rtol=0.0, atol=5e-4)
 
 
 def test_a_body_held_sideways_shows_it_once_it_is_let_go():

@@ -1,5 +1,7 @@
 """Vibration modes of a body about its rest shape."""
 
+from dataclasses import replace
+
 import numpy as np
 import scipy.linalg
 import scipy.sparse
@@ -13,12 +15,18 @@ from .simulator import Simulator
 FloatArray = NDArray[np.float64]
 
 _DENSE = 600  # unknowns, beyond which all eigenvalues of a dense matrix take too long to find a few of them
+_MORE = 6  # looked for beyond the count, so that no cluster is cut: a body that nothing holds has six motions at rest
+_AXES = np.array([1.0, 2.0, 4.0])  # weights of x, y and z: they differ, and so do the means of any two
+_SAME = 1e-4  # relative difference of eigenvalues that rounding may make
+_ZERO = 1e-12  # the same where nothing holds a body, in units of the largest entry
 
 
 def vibration_modes(simulator: Simulator, count: int) -> torch.Tensor:
     """(3 N, count) orthonormal columns that span the inertial forces M phi of the slowest vibrations about rest.
 
-    The modes phi solve K phi = omega^2 M phi with K the stiffness of the rest shape.
+    The modes phi solve K phi = omega^2 M phi with K the stiffness of the rest shape. They do not depend on rounding:
+    vibrations of one frequency, such as those of a square beam across its two sides, are told apart by the axes (see
+    `resolved`), and of a set that the count cuts, the first ones are taken.
 
     Raises:
         InputError: no mode, or more modes than there are free coordinates.
@@ -30,21 +38,53 @@ def vibration_modes(simulator: Simulator, count: int) -> torch.Tensor:
     root = np.sqrt(inertia)
     unscale = scipy.sparse.diags_array(1.0 / root)
     scaled = (unscale @ stiffness @ unscale).tocsc()
-    if unknowns <= max(_DENSE, count):
-        _, shapes = scipy.linalg.eigh(scaled.toarray(), subset_by_index=[0, count - 1])
+    number = min(count + _MORE, unknowns)
+    if unknowns <= max(_DENSE, number):
+        values, shapes = scipy.linalg.eigh(scaled.toarray(), subset_by_index=[0, number - 1])
     else:
         # Lanczos about a little less than zero, where a body that nothing holds is regular too, always from one start.
         below = -1e-8 * float(scaled.diagonal().max())
-        values, shapes = scipy.sparse.linalg.eigsh(scaled, count, sigma=below, v0=np.ones(unknowns))
-        shapes = shapes[:, np.argsort(values)]
+        values, shapes = scipy.sparse.linalg.eigsh(scaled, number, sigma=below, v0=np.ones(unknowns))
+        order = np.argsort(values)
+        values, shapes = values[order], shapes[:, order]
+    same = _SAME * np.abs(values) + _ZERO * scaled.diagonal().max()
+    shapes = resolved(values, shapes, simulator.body.mesh.vertices[free], same)[:, :count]
+    orthonormal = with_signs(np.linalg.qr(root[:, None] * shapes)[0])
     basis = simulator.rest_positions.new_zeros(simulator.body.n_vertices, 3, count)
-    orthonormal = np.linalg.qr(root[:, None] * shapes)[0]
     basis[free] = simulator.tensor(orthonormal.reshape(-1, 3, count))
     return basis.flatten(0, 1)
 
 
+def resolved(values: FloatArray, shapes: FloatArray, positions: FloatArray, same: FloatArray | float) -> FloatArray:
+    """(3 F, m) orthonormal shapes, those that share a value turned among each other so that they lie along the axes.
+
+    Any orthonormal basis of such shapes is as good, and rounding chooses one. This one diagonalises a weighted sum of
+    squares. Its weights differ by axis, which tells a beam's bending to one side from that to the other, and grow along
+    the axes, which tells apart shapes whose axes weigh the same.
+
+    Args:
+        values: (m,) that the shapes belong to, in order.
+        shapes: (3 F, m) orthonormal.
+        positions: (F, 3) of the vertices at rest [m].
+        same: up to which difference from the one before a value is the same.
+    """
+    place = (positions - positions.min(0)) / np.ptp(positions, axis=0).max()
+    weights = (np.exp(2.0 * place) @ _AXES)[:, None] * _AXES
+    apart = np.abs(np.diff(values)) > np.broadcast_to(same, values.shape)[1:]
+    clusters = np.split(shapes, np.flatnonzero(apart) + 1, axis=1)
+    return np.hstack([s @ np.linalg.eigh(s.T @ (weights.reshape(-1, 1) * s))[1] for s in clusters])
+
+
+def with_signs(shapes: FloatArray) -> FloatArray:
+    """(n, m) columns with the first of their entries that are about the largest positive."""
+    size = np.abs(shapes)
+    first = (size > 0.99 * size.max(0)).argmax(0)
+    return shapes * np.sign(np.take_along_axis(shapes, first[None], 0))
+
+
 def _about_rest(simulator: Simulator) -> tuple[scipy.sparse.csc_array, FloatArray, NDArray[np.int64]]:
     """Elastic stiffness (3 F, 3 F) [N/m] and inertia (3 F,) of the F free vertices at rest, and these vertices."""
+    simulator = replace(simulator, dtype=torch.float64)  # The slowest vibrations are below the rounding of float32.
     rest = simulator.rest_state()
     elastic = simulator.prepare({"stiffness_damping": 0.0})
     found = simulator.linearise(rest, parameters=elastic)

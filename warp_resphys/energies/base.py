@@ -56,9 +56,14 @@ class Quantity:
         ends += [f"less than {self.upper:g}"] if np.isfinite(self.upper) else []
         return (" and ".join(ends) or "finite") + unit
 
-    def room(self, value: torch.Tensor) -> torch.Tensor:
-        """How far a value may change: the distance to the nearest bound, if that is less than the value itself."""
-        return torch.minimum(value.abs().clamp_min(1e-300), torch.minimum(value - self.lower, self.upper - value))
+    def varied(self, value: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
+        """A value within the range for every x, and the given one for zero: changed by a factor exp(x), at first."""
+        if np.isfinite(self.lower) and np.isfinite(self.upper):
+            width = self.upper - self.lower
+            return self.lower + width * torch.sigmoid(torch.logit((value - self.lower) / width) + x)
+        if np.isfinite(self.lower):
+            return self.lower + (value - self.lower) * torch.exp(x)
+        return value + value.abs().amax() * x
 
     def check(self, value: Any) -> None:
         """Refuses a value out of range.

@@ -9,12 +9,13 @@ slow modes, and a sideways displacement are what best explains the first frames.
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 
 from ..data.trials import Trials
 from ..dynamics.inputs import Inputs
 from ..dynamics.integrator import State
-from ..dynamics.modes import vibration_modes
+from ..dynamics.modes import resolved, vibration_modes, with_signs
 from ..dynamics.simulator import Simulator
 from ..io.errors import ConvergenceError, InputError
 from .replay import Observe, Replay, Start
@@ -22,6 +23,7 @@ from .replay import Observe, Replay, Start
 _HOLD_ITERATIONS = 30
 _HOLD_TOLERANCE = 1e-7  # m, change of any position in the last iteration
 _SIDEWAYS_STRAIN = 1e-3  # of the body's extent: how far it is bent to find how it bends
+_DELAYS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # that the search begins at, in expected deviations
 _HOLD_WEIGHT = 1e-6  # w, in units of the largest diagonal entry of the first J^T J
 
 
@@ -39,7 +41,7 @@ class ReleaseSettings:
         sideways: expected displacement, across gravity, of a body that seems to be held undeformed [m]: as a sideways
             acceleration bends it, at the vertex that moves furthest; 0 for none. Along gravity it would be mistaken for
             a weight or a stiffness.
-        iterations: Gauss-Newton steps.
+        iterations: Levenberg-Marquardt steps.
     """
 
     hold_modes: int = 6
@@ -156,31 +158,42 @@ def _derivatives(
 
 
 def _let_go(simulator: Simulator, markers: Observe, motions: Trials, held: Start, settings: ReleaseSettings) -> Start:
-    """What explains the first frames (`_Beginning`), by Gauss-Newton with differences over a batch."""
+    """What explains the first frames (`_Beginning`), by Levenberg-Marquardt with differences over a batch.
+
+    A frame before the release sees the body at rest and one after it does not, so that the objective has a kink at the
+    delay of every frame, and minima between them: several delays are tried, and the best one is kept.
+    """
     beginning = _Beginning(simulator, markers, held, settings)
     count, unknowns = len(motions.names), len(beginning.deviation)
     if not unknowns:
         return held
-    parameters = simulator.rest_positions.new_zeros(count, unknowns)  # in expected deviations
-    size = 1 + unknowns
-    replay = Replay(simulator, markers, motions.select(list(range(count)) * size))
+    starts = simulator.tensor(_DELAYS if settings.delay > 0.0 else (0.0,))
+    runs, size = len(starts) * count, 1 + unknowns
+    replay = Replay(simulator, markers, motions.select(list(range(count)) * len(starts) * size))
     step = 0.05
-    identity = torch.eye(unknowns, dtype=parameters.dtype, device=parameters.device)
-    offsets = torch.cat([torch.zeros_like(identity[:1]), step * identity]).repeat_interleave(count, 0)
-    best, least = parameters, torch.full_like(parameters[:, 0], torch.inf)
+    identity = torch.eye(unknowns, dtype=starts.dtype, device=starts.device)
+    offsets = torch.cat([torch.zeros_like(identity[:1]), step * identity]).repeat_interleave(runs, 0)
+    trial = starts.repeat_interleave(count)[:, None] * identity[0]  # (runs, unknowns), in expected deviations
+    best, least, right = trial, torch.full_like(trial[:, 0], torch.inf), trial[..., None]
+    gram = identity.expand(runs, -1, -1)
+    damping = torch.full_like(gram[:, :1, :1], 1e-2)  # in units of the largest diagonal entry
     with torch.no_grad():
         for _ in range(settings.iterations + 1):  # The last one only tells whether the step before was good.
-            simulated = replay(beginning(parameters.repeat(size, 1) + offsets))
-            residual = replay.errors(simulated)[0].flatten(1).unflatten(0, (size, count)) / settings.noise
-            objective = residual[0].square().sum(1) + parameters.square().sum(1)
+            simulated = replay(beginning(trial.repeat(size, 1) + offsets))
+            residual = replay.errors(simulated)[0].flatten(1).unflatten(0, (size, runs)) / settings.noise
+            objective = residual[0].square().sum(1) + trial.square().sum(1)
             better = objective < least
-            best, least = torch.where(better[:, None], parameters, best), torch.where(better, objective, least)
+            least, kept = torch.where(better, objective, least), better[:, None]
+            best, better = torch.where(kept, trial, best), kept[..., None]
             jacobian = ((residual[1:] - residual[0]) / step).permute(1, 2, 0)
-            right = jacobian.mT @ residual[0][..., None] + parameters[..., None]
-            change = torch.linalg.solve(jacobian.mT @ jacobian + identity, right)[..., 0].clamp(-3.0, 3.0)
-            # Back half way to the best so far where a step was too long.
-            parameters = torch.where(better[:, None], parameters - change, 0.5 * (parameters + best))
-        return beginning(best)
+            gram = torch.where(better, jacobian.mT @ jacobian + identity, gram)
+            right = torch.where(better, jacobian.mT @ residual[0][..., None] + trial[..., None], right)
+            damping = torch.where(better, 0.2 * damping, 10.0 * damping)
+            scale = gram.diagonal(dim1=1, dim2=2).amax(1)[:, None, None]
+            change = torch.linalg.solve(gram + damping * scale * identity, right)[..., 0]
+            trial = best - change * (3.0 / change.abs().amax(1, keepdim=True)).clamp_max(1.0)
+        chosen = least.view(-1, count).argmin(0)
+        return beginning(best.view(-1, count, unknowns)[chosen, torch.arange(count, device=chosen.device)])
 
 
 class _Beginning:
@@ -228,10 +241,13 @@ def sideways_shapes(simulator: Simulator) -> torch.Tensor:
             load = size * mass[..., None] * directions[:, None]
             bent = simulator.static_equilibrium(Inputs(load), weightless).q - simulator.rest_positions
             size *= _SIDEWAYS_STRAIN * extent / float(bent.norm(dim=2).max())
-    turn, *_ = torch.linalg.svd(bent.flatten(1), full_matrices=False)  # To the softest direction and the stiffest.
-    shapes = torch.einsum("ij,inc->jnc", turn, bent)
+    # From the softest direction to the stiffest; a hundredth of difference is within what the solver leaves.
+    _, sizes, rows = np.linalg.svd(bent.flatten(1).double().cpu().numpy(), full_matrices=False)
+    columns = with_signs(resolved(sizes, rows.T, simulator.body.mesh.vertices, 0.01 * sizes))
+    shapes = simulator.tensor(columns.T).unflatten(1, (-1, 3))
     furthest = shapes.norm(dim=2).amax(1)
-    return (shapes / furthest[:, None, None])[furthest >= 0.5 * furthest[0]]
+    reach = simulator.tensor(sizes) * furthest
+    return (shapes / furthest[:, None, None])[reach >= 0.5 * reach[0]]
 
 
 def velocity_shapes(simulator: Simulator, modes: int) -> torch.Tensor:

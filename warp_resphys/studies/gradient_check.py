@@ -15,6 +15,7 @@ from rich.table import Table
 from ..dynamics.inputs import Inputs
 from ..dynamics.integrator import State
 from ..dynamics.simulator import Simulator
+from ..energies.base import Quantity
 from ..experiment.build import build_simulator
 from ..experiment.kinds import COUNT, NATURAL, POSITIVE, Kind, check_keys, is_list
 from ..io.errors import InputError
@@ -33,9 +34,8 @@ _KEYS = {
     "mass_damping": POSITIVE,
     "stiffness_damping": POSITIVE,
 }
-# Seven-point stencil: its error is of sixth order in the step, so that steps of a percent, which drown the rounding of
-# the solves, still leave a truncation of 1e-10.
-_STENCIL = tuple((s * k, s * w) for s in (1, -1) for k, w in ((1, 3.0 / 4.0), (2, -3.0 / 20.0), (3, 1.0 / 60.0)))
+_HALVINGS = 6  # of the step of a difference
+_ACCURACY = 1e-8  # relative, at which a difference is good enough
 
 
 @dataclass(frozen=True)
@@ -46,11 +46,13 @@ class GradientRow:
         parameter: its name.
         adjoint: directional derivative of the loss by the adjoint.
         difference: the same by central differences.
+        uncertainty: of the difference, by truncation and rounding.
     """
 
     parameter: str
     adjoint: float
     difference: float
+    uncertainty: float = 0.0
 
     @property
     def relative_error(self) -> float:
@@ -61,6 +63,28 @@ class GradientRow:
         scale = max(abs(self.adjoint), abs(self.difference))
         error = abs(self.adjoint - self.difference) / scale if scale > 0.0 else math.inf
         return error if math.isfinite(error) else math.inf
+
+
+def central_difference(function: Callable[[float], float]) -> tuple[float, float]:
+    """Derivative at zero of a function of one number, and about how far it may be off.
+
+    Central differences over steps of 1, 1/2, 1/4, ... are extrapolated to a step of zero (Ridders 1982). Truncation
+    makes the first extrapolations change from one step to the next, rounding the last ones: the one that changes least
+    is taken, and its change says how good it is.
+    """
+    row: list[float] = []
+    best, error = math.nan, math.inf
+    for k in range(1 + _HALVINGS):
+        step, before = 0.5**k, row
+        row = [(function(step) - function(-step)) / (2.0 * step)]
+        for j, coarser in enumerate(before, 1):
+            row.append(row[-1] + (row[-1] - coarser) / (4.0**j - 1.0))
+            change = max(abs(row[-1] - row[-2]), abs(row[-1] - coarser))
+            if change < error:
+                best, error = row[-1], change
+        if error <= _ACCURACY * abs(best):
+            break
+    return best, error
 
 
 def pose(simulator: Simulator, name: str, batch: int) -> State:
@@ -91,7 +115,8 @@ def check_gradients(
 ) -> list[GradientRow]:
     """Compares the directional derivatives of a random linear functional of all positions and velocities.
 
-    Constants on a bound of their range, such as damping of zero, cannot be checked: give the simulator others.
+    Constants vary within their range, so that no difference leaves it. One on a bound of it, such as damping of zero,
+    cannot be checked: give the simulator others.
 
     Args:
         simulator: with a tight tolerance, in float64.
@@ -147,8 +172,8 @@ class _Problem:
         """Loss, value and typical size of a change: of the state, and of every input and parameter of the simulator."""
         simulator = self.simulator
         length = float((self.state.q[0].max(0).values - self.state.q[0].min(0).values).max())
-        fields = {"q": (self.state.q, 1e-5 * length), "v": (self.state.v, 1e-2 * length)}
-        sizes = {"external_force": 1e-3, "fixed_positions": 1e-5 * length, "attached_mass": 1e-4}
+        fields = {"q": (self.state.q, 3e-4 * length), "v": (self.state.v, 0.3 * length)}
+        sizes = {"external_force": 1e-2, "fixed_positions": 3e-4 * length, "attached_mass": 5e-5}
         for name, value in self.inputs.fields.items():
             size = sizes[name] if name in sizes else 0.1 * simulator.inputs[name].typical
             if value.numel():
@@ -163,26 +188,27 @@ class _Problem:
                 shapes = {"one": (1,), quantity.per: (simulator.counts[name],), **shapes}
             if name == "gravity":
                 shapes = {"environment": (self.batch, 3)}
+            base = constant if name == "gravity" else constant.mean()
             for kind, shape in shapes.items():
-                value = (constant if name == "gravity" else constant.mean()).expand(shape).clone()
-                room = float(value.abs().amax() if name == "gravity" else quantity.room(constant.mean()))
-                cases[f"{name}, each {kind}" if kind != "one" else name] = (
-                    partial(self.loss, name),
-                    value,
-                    1e-2 * room,
-                )
+                vary = partial(self._varied, quantity, base)
+                title = f"{name}, each {kind}" if kind != "one" else name
+                cases[title] = vary, torch.zeros(shape, device=base.device, dtype=base.dtype), 0.7
         return cases
+
+    def _varied(self, quantity: Quantity, base: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
+        """The loss by how a parameter varies in its range."""
+        return self.loss(quantity.name, quantity.varied(base, x))
 
     def compare(
         self, name: str, loss: Callable[[torch.Tensor], torch.Tensor], value: torch.Tensor, size: float
     ) -> GradientRow:
         direction = self.noise(*value.shape)
-        direction = size * direction / (0.5 + direction.abs())  # bounded by size, as the stencil's truncation is then
+        direction *= size / direction.abs().max()
         variable = value.detach().clone().requires_grad_(True)
         (gradient,) = torch.autograd.grad(loss(variable), variable)
         with torch.no_grad():
-            difference = sum(w * float(loss(value + k * direction)) for k, w in _STENCIL)
-        return GradientRow(name, float((gradient * direction).sum()), difference)
+            difference = central_difference(lambda step: float(loss(value + step * direction)))
+        return GradientRow(name, float((gradient * direction).sum()), *difference)
 
 
 def gradcheck(config: DictConfig) -> None:
@@ -231,13 +257,13 @@ def check_configured(config: Mapping[str, Any]) -> Iterator[tuple[float, str, li
 
 
 def gradient_table(rows: list[GradientRow], title: str, tolerance: float) -> Table:
-    """Adjoint, difference and relative error of each parameter, in red beyond the tolerance."""
+    """Adjoint, difference, its uncertainty and relative error of each parameter, in red beyond the tolerance."""
     table = Table(title=title, title_justify="left")
     table.add_column("parameter", min_width=20)
-    for name in ("adjoint", "difference", "relative error"):
+    for name in ("adjoint", "difference", "uncertain by", "relative error"):
         table.add_column(name, justify="right")
     for row in rows:
         failed = not row.relative_error <= tolerance
-        values = (f"{row.adjoint:.9e}", f"{row.difference:.9e}", f"{row.relative_error:.1e}")
+        values = (f"{row.adjoint:.9e}", f"{row.difference:.9e}", f"{row.uncertainty:.1e}", f"{row.relative_error:.1e}")
         table.add_row(row.parameter, *values, style="red" if failed else None)
     return table

@@ -260,10 +260,10 @@ def gradient_table(rows: list[GradientRow], title: str, tolerance: float) -> Tab
     """Adjoint, difference, its uncertainty and relative error of each parameter, in red beyond the tolerance."""
     table = Table(title=title, title_justify="left")
     table.add_column("parameter", min_width=20)
-    for name in ("adjoint", "difference", "uncertain by", "relative error"):
+    for name in ("adjoint", "difference", "uncertain\nby", "relative\nerror"):
         table.add_column(name, justify="right")
     for row in rows:
         failed = not row.relative_error <= tolerance
-        values = (f"{row.adjoint:.9e}", f"{row.difference:.9e}", f"{row.uncertainty:.1e}", f"{row.relative_error:.1e}")
+        values = (f"{row.adjoint:.6e}", f"{row.difference:.6e}", f"{row.uncertainty:.1e}", f"{row.relative_error:.1e}")
         table.add_row(row.parameter, *values, style="red" if failed else None)
     return table

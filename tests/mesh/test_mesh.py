@@ -237,6 +237,7 @@ TURNED = [4, 5, 6, 7, 0, 1, 2, 3]
         (lambda m: Mesh(m.vertices[:0], m.cells), "empty"),
         (lambda m: with_vertex(m, 5, [0, np.nan, 0]), r"^1 of 176 vertices \(5; .* NaN or infinite"),
         (lambda m: with_vertex(m, 7, [0, 0, np.inf]), r"^1 of 176 vertices \(7; .* NaN or infinite"),
+        (lambda m: with_vertex(m, 7, [0, 0, 1e300]), r"^1 of 176 vertices \(7; .* NaN or infinite"),
         (lambda m: with_cell(m, 3, 1, 176), r"^1 of 90 cells \(3; .* outside 0 to 175"),
         (lambda m: with_cell(m, 4, 1, -1), r"^1 of 90 cells \(4; .* outside 0 to 175"),
         (lambda m: Mesh(np.vstack([m.vertices, [[1, 1, 1]]]), m.cells), r"^1 of 177 .* \(176; .* no cell"),
@@ -421,6 +422,13 @@ def test_only_the_meshes_of_the_package_are_read_in_this_process(
     copied = Path(shutil.copy(shipped, tmp_path))
     assert np.array_equal(read_mesh(shipped).vertices, read_mesh(copied).vertices)
     assert read == [copied]
+    mesh = read_mesh(copied)  # not decoded again,
+    assert read == [copied]
+    mesh.vertices[:] = mesh.cells[:] = 0  # whatever is done to what was read,
+    assert np.array_equal(read_mesh(copied).cells, read_mesh(shipped).cells)
+    write(copied, box_tetrahedra())  # until it changes
+    assert len(read_mesh(copied).vertices) == 176
+    assert read == [copied, copied]
 
 
 def test_arguments_of_reading_are_checked(tmp_path: Path) -> None:

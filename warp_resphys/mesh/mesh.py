@@ -18,6 +18,7 @@ from .elements import BY_NODES, ELEMENTS, FACES, Element
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+LARGEST_COORDINATE = 1e50  # in any unit; the product of three must be a number
 DEGENERATE_VOLUME = 1e-12  # smallest volume of a cell, over the cube of its longest edge
 COINCIDENT_DISTANCE = 1e-9  # largest distance of vertices that count as one, over the diagonal of the mesh
 
@@ -168,7 +169,7 @@ def check_mesh(mesh: Mesh) -> None:
     vertices, cells, count = mesh.vertices, mesh.cells, len(mesh.vertices)
     if count == 0 or len(cells) == 0:
         raise MeshError(f"the mesh is empty: it has {count} vertices and {len(cells)} cells")
-    _refuse(np.any(~np.isfinite(vertices), axis=1), "vertices", "have a NaN or infinite coordinate")
+    _refuse(np.any(~(np.abs(vertices) < LARGEST_COORDINATE), axis=1), "vertices", "have a NaN or infinite coordinate")
     _refuse(np.any((cells < 0) | (cells >= count), axis=1), "cells", f"have indices outside 0 to {count - 1}")
     unused = np.bincount(cells.ravel(), minlength=count) == 0
     _refuse(unused, "vertices", "belong to no cell; reading with drop_unreferenced leaves them out")

@@ -1,5 +1,6 @@
 """Reading and writing of volume meshes and their named surfaces, through meshio; lengths become metres here."""
 
+import functools
 import os
 from collections.abc import Mapping
 from contextlib import redirect_stderr, redirect_stdout
@@ -141,7 +142,7 @@ def _read(path: Path, units: str, order: int, drop_unreferenced: bool) -> tuple[
         raise MeshError(f"{path}: there is no such mesh file")
     content = _read_file(path)
     try:
-        mesh = Mesh(content["points"], _volume_cells(content))
+        mesh = Mesh(content["points"], _volume_cells(content).copy())
         places = np.arange(len(mesh.vertices))
         if drop_unreferenced:
             mesh, places = _without_unreferenced(mesh)
@@ -158,11 +159,18 @@ def _read_file(path: Path) -> Arrays:
     try:
         if path.parent.resolve() == Path(str(resources.files("warp_resphys") / "meshes")).resolve():
             return mesh_arrays(str(path))
-        return decode("meshio", path)
+        known = path.stat()
+        return _decoded(path.absolute(), known.st_ino, known.st_size, known.st_mtime_ns)
     except DecodingError as error:
         raise MeshError(
             f"{path}: meshio cannot read this file ({error}); is it whole, and of its extension's format?"
         ) from error
+
+
+@functools.lru_cache(maxsize=2)
+def _decoded(path: Path, *_: int) -> Arrays:
+    """The arrays of a file in one state; an experiment reads its mesh a dozen times, each a third of a second."""
+    return decode("meshio", path)
 
 
 def _volume_cells(arrays: Arrays) -> IntArray:

@@ -114,6 +114,31 @@ def test_what_is_not_there_is_left_out_and_what_diverged_is_said(tmp_path):
 
 
 @pytest.mark.usefixtures("no_drawing")
+def test_a_learned_force_without_an_epoch_wins_nothing(tmp_path):
+    write_recordings(tmp_path)
+    write_split(tmp_path, ["bare", "load52"], models=("simulation", "sysid_elastic", "sysid", "resphys"))
+    errors = read_json(tmp_path / "errors.json")
+    for row in (errors["errors_mm"], *(each["errors_mm"] for each in errors["per_trajectory"])):
+        row["resphys"] = row["sysid"]
+    write_json(tmp_path / "errors.json", errors)
+    history = read_json(tmp_path / "training_resphys.json")
+    write_json(tmp_path / "training_resphys.json", {**history, "kept": {**history["kept"], "epoch": 0}})
+    found = read_json(tmp_path / "identification.json")
+    found["sysid"]["parameters"]["youngs_modulus"] = 2e6
+    write_json(tmp_path / "identification.json", found)
+    page = report(tmp_path, SETTINGS | {"identify": {"parameters": {"youngs_modulus": {"lower": 5e4, "upper": 2e6}}}})
+    head = page.text[: page.text.index("Error of the markers")].replace("\u00a0", " ")
+    mean = f"{errors['errors_mm']['sysid']['mean']:.3f}"
+    assert re.search(f"{mean} mm from the measured ones over the first [0-9.]+ s with SysID;", head)
+    assert "The learned force (ResPhys) adds nothing to SysID: none of its training served held-out trials" in head
+    assert "Identification (SysID) leaves" in head
+    assert "youngs_modulus was identified at its upper bound, 2e+06: widen identify.parameters" in head
+    assert "no force: none of its training was kept" in page.text
+    winners = re.findall(r'class="answer"><th scope="row">([^<]+)<', page.source)
+    assert set(winners) == {"SysID"}
+
+
+@pytest.mark.usefixtures("no_drawing")
 def test_page_over_folds_leads_to_theirs(tmp_path):
     write_folds(tmp_path, models=("simulation", "sysid", "resphys"))
     metrics = read_json(tmp_path / "metrics.json")

@@ -79,3 +79,4 @@ def test_folds_weigh_the_same_whatever_their_length() -> None:
     found = summarise_folds(folds)
     assert found["resphys"] == {"mean": 2.5, "std": 1.5, "trajectories": 3, "diverged": 0}
     assert found["simfree"] == {"mean": None, "std": None, "trajectories": 2, "diverged": 1}
+    assert summarise_folds(folds[:1])["resphys"] == {"mean": 1.0, "std": None, "trajectories": 1, "diverged": 0}

@@ -351,6 +351,7 @@ def test_numbers_have_sensible_digits() -> None:
     assert number_text(2.14e-9) == "2.1 \N{MULTIPLICATION SIGN} 10⁻⁹"
     summary = {"mean": 0.000721, "std": 0.00031, "trajectories": 5, "diverged": 0}
     assert error_parts(summary) == ("0.00072", "± 0.00031")
+    assert error_parts({**summary, "std": None}) == ("0.00072", "")  # of one fold
     assert [duration_text(each) for each in (0.421, 12.34, 59.97, 184.6)] == [
         "0.42 s",
         "12.3 s",

@@ -240,7 +240,7 @@ def _over_folds(summaries: Sequence[ErrorSummary]) -> ErrorSummary:
     whole = len(known) == len(means)
     return {
         "mean": float(np.mean(known)) if whole else None,
-        "std": float(np.std(known)) if whole else None,
+        "std": float(np.std(known)) if whole and len(known) > 1 else None,
         "trajectories": sum(each["trajectories"] for each in summaries),
         "diverged": sum(each["diverged"] for each in summaries),
     }

@@ -44,6 +44,7 @@ from warp_resphys.report.page import (
     page_template,
 )
 from warp_resphys.report.render import DrawingError
+from warp_resphys.verdict import best, epochs_kept, judgement, untrained
 
 _LOG = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -74,7 +75,7 @@ def write_measured_report(path: Path, data: MeasuredReport) -> None:
     models = [model for model in MODELS if model in errors]
     page = page_template("measured.html").render(
         **common_parts(data, pictures, missing),
-        verdict=verdict(errors, data.trials.names, data.seconds),
+        verdict=verdict(errors, data.trials.names, data.seconds, without=untrained(epochs_kept(metrics))),
         models=models,
         against=against(errors),
         measured={model: error_parts(each) for model, each in errors.items()},
@@ -107,7 +108,9 @@ def write_folds_report(path: Path, data: FoldsReport) -> None:
     models = [model for model in MODELS if model in errors]
     page = page_template("measured_folds.html").render(
         **common_parts(data, pictures, missing),
-        verdict=verdict(errors, tuple(data.pages), data.seconds, folds=True),
+        verdict=verdict(
+            errors, tuple(data.pages), data.seconds, folds=True, without=untrained(epochs_kept(data.metrics))
+        ),
         models=models,
         against=against(errors),
         measured={model: error_parts(each) for model, each in errors.items()},
@@ -120,13 +123,17 @@ def write_folds_report(path: Path, data: FoldsReport) -> None:
 
 def common_parts(data: RunReport, pictures: Mapping[str, Picture], missing: Mapping[str, str]) -> dict[str, Any]:
     """Return what every page on recordings asks for."""
+    idle = untrained(epochs_kept(data.metrics))
+    no_force = {model: (MODELS[model][0], "no force: none of its training was kept") for model in idle}
     return {
+        "judged": judgement(data.metrics, data.settings),
+        "answer": best(data.metrics["errors_mm"], idle),
         "title": data.title,
         "data": data,
         "metrics": data.metrics,
         "pictures": pictures,
         "missing": missing,
-        "names": MODELS,
+        "names": {**MODELS, **no_force},
         "residuals": residual_rows(data.recordings.residuals),
         "quality": quality_rows(data.recordings.quality),
         "warnings": [(trial, said) for trial, each in data.recordings.quality.items() for said in each["warnings"]],

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -39,7 +39,14 @@ _WHOLE: Final = 99.5  # [%] of a parameter's range.
 _TIED: Final = 0.9  # From this correlation on, two parameters are named as not told apart.
 
 
-def verdict(errors: Mapping[str, Any], trials: Sequence[str], seconds: float | None, *, folds: bool = False) -> str:
+def verdict(
+    errors: Mapping[str, Any],
+    trials: Sequence[str],
+    seconds: float | None,
+    *,
+    folds: bool = False,
+    without: Collection[str] = (),
+) -> str:
     """Say how far the models are from what was measured.
 
     Args:
@@ -47,7 +54,9 @@ def verdict(errors: Mapping[str, Any], trials: Sequence[str], seconds: float | N
         trials: Names of the test trials.
         seconds: How much of them counts.
         folds: Whether each trial was the test of a fold of its own.
+        without: Models that learned nothing.
     """
+    errors = {model: each for model, each in errors.items() if model not in without}
     who = f"trial {trials[0]}" if len(trials) == 1 else f"{len(trials)} trials"
     held = "each of them kept back once" if folds and len(trials) > 1 else "which no training or identification saw"
     span = "" if seconds is None else f" over the first {seconds:g} s"

@@ -19,6 +19,7 @@ from warp_resphys.errors import DataFileError, InputError
 from warp_resphys.files import disk_full_error, is_disk_full, write_text
 from warp_resphys.mesh import Mesh
 from warp_resphys.metrics import PublishedError, trajectory_errors
+from warp_resphys.verdict import best, judgement
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -245,6 +246,8 @@ def _render_page(data: ReportData, pictures: Mapping[str, Picture], missing: Map
         missing=missing,
         names=_MODELS,
         models=models,
+        judged=judgement(metrics, data.settings),
+        answer=best(metrics["errors_mm"]),
         timed=_TIMED,
         verdict=verdict(metrics["errors_mm"], data.published, data.simulator, data.reality),
         measured={model: error_parts(each) for model, each in metrics["errors_mm"].items()},
@@ -312,10 +315,12 @@ def number_text(value: float | None) -> str:
 
 
 def error_parts(summary: Mapping[str, Any]) -> tuple[str, str]:
-    """Return a mean and its "± deviation", with as many digits as the smaller of the two deserves."""
+    """Return a mean and its "± deviation" if it has one, with as many digits as the smaller of the two deserves."""
     mean, std = summary["mean"], summary["std"]
     if mean is None:
         return f"{summary['diverged']} of {summary['trajectories']} diverged", ""
+    if std is None:
+        return number_text(mean), ""
     decimals = _decimals(min(mean, std) or mean)
     if decimals <= MOST_DECIMALS:
         return f"{mean:.{decimals}f}", f"± {std:.{decimals}f}"

@@ -13,6 +13,7 @@ from rich.table import Table
 from ..files import write_json
 from ..report.page import number_text
 from ..stages import Stage, StageContext, run_stages
+from ..verdict import judgement
 from .ablation import run_ablation
 from .actuated.checks import PRESSURE
 from .actuated.experiment import run_driven
@@ -141,10 +142,10 @@ def run_experiment(config: DictConfig) -> None:
     run_stages(stages(plain), folder)
     metrics = collect_metrics(StageContext("metrics", folder, "", {}), plain)
     write_json(folder / METRICS, metrics)
-    _print(metrics, folder)
+    _print(metrics, folder, plain)
 
 
-def _print(metrics: dict[str, Any], folder: Path) -> None:
+def _print(metrics: dict[str, Any], folder: Path, config: dict[str, Any]) -> None:
     """Errors as a table, and where the report is."""
     table = Table("model", "mean [mm]", "std [mm]", "diverged", title="Roll-out error against the target, test split")
     for model, summary in metrics["errors_mm"].items():
@@ -152,4 +153,6 @@ def _print(metrics: dict[str, Any], folder: Path) -> None:
         table.add_row(model, *row)
     console = Console()
     console.print(table)
+    for said in judgement(metrics, config):
+        console.print(said, soft_wrap=True)
     console.print(f"Report: {folder / REPORT}", soft_wrap=True)

@@ -12,6 +12,7 @@ from ...errors import DataFileError
 from ...files import digest, read_json, write_json
 from ...report.page import number_text
 from ...stages import Stage, package_versions, resources_used, run_stages
+from ...verdict import judgement
 from ..measured.files import (
     ERRORS,
     IDENTIFICATION,
@@ -21,6 +22,7 @@ from ..measured.files import (
     REPORT,
     ROLLOUTS,
     TRUTH,
+    learned,
     training_file,
     weights_file,
 )
@@ -168,7 +170,7 @@ def run_driven(config: dict[str, Any], folder: Path) -> None:
     run_stages(stages, folder)
     metrics = collect_metrics(folder, stages)
     write_json(folder / METRICS, metrics)
-    _print(metrics, folder)
+    _print(metrics, folder, config)
 
 
 def collect_metrics(folder: Path, stages: list[Stage]) -> dict[str, Any]:
@@ -178,13 +180,13 @@ def collect_metrics(folder: Path, stages: list[Stage]) -> dict[str, Any]:
         **read_json(folder / ERRORS),
         **({"noise_mm": read_json(folder / TRUTH)["noise_mm"]} if "synthesise" in names else {}),
         "reconstruction": read_json(folder / RECONSTRUCTION),
-        "parameters": {"sysid": read_json(folder / IDENTIFICATION)["sysid"]["parameters"]},
+        **learned(folder),
         **resources_used(folder, names),
         "versions": package_versions(),
     }
 
 
-def _print(metrics: Mapping[str, Any], folder: Path) -> None:
+def _print(metrics: Mapping[str, Any], folder: Path, config: Mapping[str, Any]) -> None:
     """Errors as a table, a column for every window and pressure factor that tells more, and where the report is."""
     whole = metrics["errors_mm"]
     groups = {f"first {seconds} s": found for seconds, found in metrics["windows"].items()}
@@ -205,4 +207,6 @@ def _print(metrics: Mapping[str, Any], folder: Path) -> None:
             )
     if "noise_mm" in metrics:
         console.print(f"The noise of the markers alone is {number_text(metrics['noise_mm'])} mm.")
+    for said in judgement(metrics, config):
+        console.print(said, soft_wrap=True)
     console.print(f"Report: {folder / REPORT}", soft_wrap=True)

@@ -11,9 +11,21 @@ from ...files import read_json, write_json
 from ...metrics import summarise_folds
 from ...report.page import number_text
 from ...stages import Stage, package_versions, resources_used, run_stages
+from ...verdict import judgement
 from ..trajectories import Split, shown, simulated, training_settings
 from .evaluate import evaluate_markers
-from .files import ERRORS, IDENTIFICATION, METRICS, REPORT, ROLLOUTS, TRUTH, fold_folder, training_file, weights_file
+from .files import (
+    ERRORS,
+    IDENTIFICATION,
+    METRICS,
+    REPORT,
+    ROLLOUTS,
+    TRUTH,
+    fold_folder,
+    learned,
+    training_file,
+    weights_file,
+)
 from .identify import identify
 from .reconstruct import reconstruct_markers
 from .report import report_folds, report_measured
@@ -97,25 +109,22 @@ def run_measured(config: dict[str, Any], folder: Path) -> None:
         each = {trial: fold["errors_mm"] for trial, fold in metrics["folds"].items()}
         reported = {"config": shown(config), "folds": each}
         run_stages([*first, Stage("report", report_folds, (REPORT,), reported, ("import",))], folder)
-    _print(metrics, folder)
+    _print(metrics, folder, config)
 
 
 def collect_metrics(folder: Path, stages: list[Stage]) -> dict[str, Any]:
     """Errors, the noise in them where known, identified parameters, time and memory of the stages, and versions."""
-    identified = read_json(folder / IDENTIFICATION)
     simulated_reality = "synthesise" in [stage.name for stage in stages]
     return {
         **read_json(folder / ERRORS),
         **({"noise_mm": read_json(folder / TRUTH)["noise_mm"]} if simulated_reality else {}),
-        "parameters": {
-            name: identified[name]["parameters"] for name in ("sysid", "sysid_elastic") if name in identified
-        },
+        **learned(folder),
         **resources_used(folder, [stage.name for stage in stages]),
         "versions": package_versions(),
     }
 
 
-def _print(metrics: Mapping[str, Any], folder: Path) -> None:
+def _print(metrics: Mapping[str, Any], folder: Path, config: Mapping[str, Any]) -> None:
     """Errors as a table, a column for every fold, and where the report is."""
     folds: Mapping[str, Any] = metrics.get("folds", {})
     table = Table("model", "mean [mm]", *folds, title="Error of the markers of trials that no training saw")
@@ -126,4 +135,6 @@ def _print(metrics: Mapping[str, Any], folder: Path) -> None:
     console.print(table)
     if "noise_mm" in metrics:
         console.print(f"The noise of the markers alone is {number_text(metrics['noise_mm'])} mm.")
+    for said in judgement(metrics, config):
+        console.print(said, soft_wrap=True)
     console.print(f"Report: {folder / REPORT}", soft_wrap=True)

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from ...body import Body
 from ...errors import InputError
-from ...files import read_array, read_hdf5
+from ...files import read_array, read_hdf5, read_json
 from ...mesh import select_vertices
 from ...replay import Motions
 from ..trajectories import ERRORS, METRICS, REPORT, ROLLOUTS
@@ -28,6 +29,7 @@ __all__ = (
     "TRUTH",
     "attached_mass",
     "fold_folder",
+    "learned",
     "read_motions",
     "recording_file",
     "training_file",
@@ -67,6 +69,16 @@ def training_file(model: str) -> str:
 def weights_file(model: str) -> str:
     """What a model has learned."""
     return f"{model}.safetensors"
+
+
+def learned(folder: Path) -> dict[str, Any]:
+    """Which weights were kept and what was identified, as metrics.json has them, of the stages that are done."""
+    found = read_json(folder / IDENTIFICATION) if (folder / IDENTIFICATION).is_file() else {}
+    histories = {model: folder / training_file(model) for model in TRAINED}
+    return {
+        "networks": {model: read_json(path)["kept"] for model, path in histories.items() if path.is_file()},
+        "parameters": {name: each["parameters"] for name, each in found.items() if "parameters" in each},
+    }
 
 
 def fold_folder(trial: str) -> str:

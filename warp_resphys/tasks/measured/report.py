@@ -32,6 +32,7 @@ from .files import (
     TRAINED,
     TRUTH,
     fold_folder,
+    learned,
     training_file,
 )
 from .identify import first_guess
@@ -122,6 +123,7 @@ def read_metrics(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
     records = sorted((folder / "stages").glob("*.json"), key=lambda path: path.stat().st_mtime_ns)
     return {
         **read_json(folder / ERRORS),
+        **learned(folder),
         **resources_used(folder, [path.stem for path in records]),
         "versions": package_versions(),
         "device": str(choose_device(config["device"])),

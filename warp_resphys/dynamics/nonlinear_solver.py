@@ -39,7 +39,8 @@ class SolverSettings:
 
     Attributes:
         name: one of `SOLVERS`.
-        relative_tolerance: residual over balancing forces at which a solve has converged.
+        relative_tolerance: residual over balancing forces at which a solve has converged; where states are float32,
+            less than 1e-5 gains nothing.
         absolute_tolerance: residual below which it has converged in any case [N].
         max_iterations: after which it has failed.
         memory: pairs that L-BFGS keeps.

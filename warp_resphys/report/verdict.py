@@ -91,6 +91,8 @@ def gains(errors: Mapping[str, Sequence[float | None]], epochs: Mapping[str, Seq
             continue
         sentence = _gain(name, _BASES[base], errors[model], errors[base], list(epochs.get(model, ())))
         said.append(sentence[0].upper() + sentence[1:])
+    if said and all(len(each) == 1 for each in errors.values()):
+        said.append("All this is on one held-out trial: nothing tells whether another shows the same; test on more.")
     return said
 
 
@@ -110,24 +112,17 @@ def _gain(
     if len(pairs) < len(before):
         return f"{name} cannot be compared with {base}, which diverged on held-out trials or has no error there.{idle}"
     shares = [1.0 - a / b for a, b in pairs]
-    share = fmean(shares)
+    share, spread = fmean(shares), stdev(shares) if len(shares) > 1 else None
     means = f"mean {fmean(b for _, b in pairs):.3g} to {fmean(a for a, _ in pairs):.3g} mm"
-    which = f"{'less' if share >= 0.0 else 'more'} error than {base}"
-    if len(pairs) == 1:
-        return (
-            f"{name} leaves {_per_cent(abs(share))} % {which} ({means}) on the only held-out trial: nothing tells "
-            f"whether another would show the same, so test on more.{idle}"
-        )
-    spread = stdev(shares)
-    said = f"{name} leaves {_per_cent(abs(share))} ± {100.0 * spread:.2g} % {which} on {len(pairs)} trials ({means}): "
+    digits = 2 if 0.99 < share < 1.0 else 0  # Where nearly everything is gone.
+    amount = f"{100.0 * abs(share):.{digits}f}{'' if spread is None else f' ± {100.0 * spread:.2g}'} %"
+    said = f"{name} leaves {amount} {'less' if share >= 0.0 else 'more'} error than {base}"
+    if spread is None:
+        return f"{said} ({means}).{idle}"
+    said += f" on {len(pairs)} trials ({means}): "
     if abs(share) <= spread:
         return f"{said}that is within its spread over the trials, so another may show the opposite.{idle}"
     return f"{said}it {'helps' if share > 0.0 else 'does harm'}, by more than its spread over the trials.{idle}"
-
-
-def _per_cent(share: float) -> str:
-    """With decimals where nearly everything is gone."""
-    return f"{100.0 * share:.{2 if 0.99 < share < 1.0 else 0}f}"
 
 
 def advice(folds: Sequence[Sequence[Identified]]) -> list[str]:
@@ -142,9 +137,10 @@ def advice(folds: Sequence[Sequence[Identified]]) -> list[str]:
         name = each.key.rpartition(".")[2]
         for end, bound in (("lower", each.lower), ("upper", each.upper)):
             if abs(each.value - bound) <= close:
+                widen = f"widen {each.key}.{end} if the body can be so" if bound else f"take it out (~{each.key})"
                 sentence = (
-                    f"{name} was identified at its {end} bound, {bound:g}: widen {each.key}.{end} if the body can be "
-                    "so, else look for what it makes up for, such as a wrong weight, mesh or registration."
+                    f"{name} was identified at its {end} bound, {bound:g}: {widen}, or look for what it makes up for, "
+                    "such as a wrong weight, mesh or registration."
                 )
                 break
         else:

@@ -97,7 +97,7 @@ def write_mesh(path: str | os.PathLike[str], mesh: Mesh, surfaces: Mapping[str, 
     Args:
         path: The file; its extension tells the format. Only .msh, which is gmsh's, keeps named surfaces.
         mesh: The mesh.
-        surfaces: (F, 3 | 4 | 6) faces by name.
+        surfaces: (F, 3 | 4 | 6 | 8 | 9) faces by name.
 
     Raises:
         MeshError: The extension is unknown to meshio, or its format does not know such cells.
@@ -114,7 +114,7 @@ def write_mesh(path: str | os.PathLike[str], mesh: Mesh, surfaces: Mapping[str, 
         groups[0] += 1
         for number, (name, faces) in enumerate((surfaces or {}).items(), start=2):
             fields[name] = np.array([number, 2])
-            blocks.append(({3: "triangle", 4: "quad", 6: "triangle6"}[faces.shape[1]], faces))
+            blocks.append(({3: "triangle", 4: "quad", 6: "triangle6", 8: "quad8", 9: "quad9"}[faces.shape[1]], faces))
             groups.append(np.full(len(faces), number))
     formats = ["gmsh"] if as_gmsh else meshio.extension_to_filetypes.get(path.suffix, [])
     if not formats:

@@ -43,10 +43,12 @@ def sag_mm(mesh: Mesh, material: Corotated, volume_integration: str) -> float:
 
 
 def _meshes(refinement: int) -> dict[str, Mesh]:
-    """The beam of every kind of element; 10-node tetrahedra are twice as large as the others."""
+    """The beam of every kind of element; quadratic ones are twice as large as linear ones."""
     n = refinement
     return {
         "8-node hexahedra": box_hexahedra(_SIZE, (10 * n, 3 * n, 3 * n)),
+        "20-node hexahedra": box_hexahedra(_SIZE, (5 * n, 2 * n, 2 * n), nodes=20),
+        "27-node hexahedra": box_hexahedra(_SIZE, (5 * n, 2 * n, 2 * n), nodes=27),
         "4-node tetrahedra": box_tetrahedra(_SIZE, (10 * n, 3 * n, 3 * n)),
         "10-node tetrahedra": box_tetrahedra(_SIZE, (5 * n, 2 * n, 2 * n), order=2),
     }

@@ -64,8 +64,9 @@ def test_quick_measures_the_coarsest_mesh_alone() -> None:
     assert len(benchmark_tables(json.loads(json.dumps(result)))) == 2
 
 
-def test_the_beam_hangs_under_the_weight() -> None:
-    simulator = build_simulator(configuration("device=cpu"))
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_the_beam_hangs_under_the_weight(dtype: str) -> None:
+    simulator = build_simulator(configuration("device=cpu", f"dtype={dtype}"))
     heavy, light = released(simulator, 0.1, 2), released(simulator, 0.0, 2)
     sag = (heavy.q - light.q)[:, :, 2].min(1).values
     assert float(sag[0]) < 1.3 * float(sag[1]) < 0.0

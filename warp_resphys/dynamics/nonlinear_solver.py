@@ -141,7 +141,7 @@ class NonlinearSolver:
                 f"relative residual of {float(run.relative_residual[worst]):.2e} in environment {worst} of "
                 f"{len(run.converged)}: take a smaller time step or loads, raise solver.max_iterations, or choose "
                 "solver.name=newton.",
-                self.potential.positions.clone(),
+                self.potential.positions.to(self.dtype, copy=True),
                 report,
             )
         return report
@@ -236,9 +236,9 @@ class _Run:
             if not self.factorisations and not bool(torch.isfinite(slope).all()):
                 self._refactor()
                 direction, slope = along(solver.metric.apply(residual))
-            resting = ~torch.isfinite(slope)
-            self.stuck |= resting
-            direction, slope = direction.masked_fill_(resting[:, None], 0.0), slope.masked_fill_(resting, 0.0)
+            lost = ~torch.isfinite(slope)
+            self.stuck |= lost
+            direction, slope = direction.masked_fill_(lost[:, None], 0.0), slope.masked_fill_(lost, 0.0)
         return direction, slope
 
     def _refactor(self) -> None:

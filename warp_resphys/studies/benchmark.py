@@ -290,7 +290,7 @@ def released(simulator: Simulator, mass: float, batch: int) -> State:
         batch: environments.
     """
     x = simulator.rest_positions[:, 0]
-    tip = x > x.max() - 1e-9 * (x.max() - x.min())
+    tip = x >= x.max() - 1e-9 * (x.max() - x.min())
     share = tip.to(simulator.dtype) / tip.sum()  # (N,)
     masses = mass * (1.0 - 0.5 * torch.arange(batch, device=x.device, dtype=simulator.dtype) / batch)
     force = masses[:, None, None] * share[:, None] * simulator.tensor(simulator.gravity)

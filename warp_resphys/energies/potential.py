@@ -184,11 +184,12 @@ class IncrementalPotential(Launcher):
     def residual_rounding(self) -> torch.Tensor:
         """(B,) norm by which the residual last evaluated changes when every coordinate moves by one rounding unit [N].
 
-        Each goes up or down at random. The least residuals that solves reach are a sixth to a third of the result.
+        That of the largest coordinate, up or down at random: deformation gradients sum over coordinates of all sizes.
         """
         positions, residual = self.positions.clone(), self.residual.clone()
         signs = np.random.default_rng(0).choice([-1.0, 1.0], positions.shape[1:])
-        self.positions.addcmul_(positions, positions.new_tensor(signs), value=torch.finfo(self.dtype).eps)
+        unit = torch.finfo(self.dtype).eps * positions.abs().amax(dim=(1, 2), keepdim=True)
+        self.positions.addcmul_(unit, positions.new_tensor(signs))
         self.evaluate()
         change = torch.linalg.vector_norm((self.residual - residual).view(self.batch, -1), dim=1)
         self.positions.copy_(positions)

@@ -48,7 +48,8 @@ def unit_potential(gradients, model="corotated", shape=SHAPE, volume=VOLUME, vis
         return torch.full((count, *size), float(value), **where)
 
     strain = None if reference is None else torch.as_tensor(reference, **where).reshape(count, 1, 3, 3)
-    stiffness = torch.stack([full(shape, 1), full(volume, 1)], dim=-1)
+    sizes = {"shape": shape, "volume": volume}
+    stiffness = torch.stack([full(sizes[rule], 1) for rule in MATERIALS[model].rules], dim=-1)
     values = {"stiffness": stiffness, "viscosity": full(viscosity), "reference_strain": strain}
     potential.set_terms(StepTerms(full(0, 4, 3), full(0, 4), full(0, 4, 3), values))
     potential.positions.copy_(torch.as_tensor(UNIT @ gradients.transpose(0, 2, 1), **where))
@@ -91,6 +92,9 @@ def reference_energy(f, model):
         _, s, _ = signed_svd(f)
         return SHAPE * ((s - 1) ** 2).sum() + VOLUME / 2 * ((f - reference_unimodular(f)) ** 2).sum()
     j = np.linalg.det(f)
+    if model == "mooney_rivlin":  # with c10 = c01
+        first = (f**2).sum() - 3 - 2 * (j - 1) + (j - 1) ** 2
+        return SHAPE * (first + (cofactor(f) ** 2).sum() - 3 - 4 * (j - 1)) + VOLUME / 2 * (j - 1) ** 2
     return SHAPE * (((f**2).sum() - 3) / 2 - (j - 1) + (j - 1) ** 2 / 2) + VOLUME / 2 * (j - 1) ** 2
 
 

@@ -38,7 +38,7 @@ INTERRUPTED = 130
 # Each command: its function below this package, which takes the configuration of the same name, and its purpose.
 COMMANDS: Final[Mapping[str, tuple[str, str]]] = MappingProxyType(
     {
-        "run": ("experiment.experiment:run_experiment", "run an experiment; the word run may be left out"),
+        "run": ("experiment.pipeline:run_experiment", "run an experiment; the word run may be left out"),
         "tune": ("studies.tuning.tune:run_tuning", "search for better settings of the network and its training"),
         "reproduce": ("studies.reproduction:reproduce", "run the simulated beams, and compare with what was published"),
         "inspect": ("studies.preparation:inspect", "say what is in a mesh, or how good a recording is"),
@@ -61,7 +61,21 @@ RENAMED: Final[Mapping[str, str]] = MappingProxyType(
         "task": "warp-resphys tune",
         "pressure_coupling": "coupling",
         "simulation.fibre_stiffness": "fibres.stiffness",
-        "synthetic.material.fibre_stiffness": "synthetic.fibres.stiffness",
+        "synthetic.material.fibre_stiffness": "laboratory.fibres.stiffness",
+        "reality": "target",
+        "synthetic": "laboratory",
+        "trajectory_source": "trial_source",
+        "markers.followed": "markers.tracked",
+        "markers.others": "markers.reference",
+        "markers.counts": "ablation.counts",
+        "markers.draws": "ablation.draws",
+        "markers.modes": "ablation.modes",
+        "markers.processes": "ablation.processes",
+        "data.hung_on": "data.payload_at",
+        "data.factors": "data.pressure_scales",
+        "data.windows": "data.horizons",
+        "actuation.memory": "actuation.filter_time_constants",
+        "in_the_loop.sees_loads": "actuation.sees_payload",
     }
 )
 
@@ -236,13 +250,19 @@ def _explain_key(error: HydraException, cause: OmegaConfBaseException) -> str:
     wanted = named.group(1) if named else str(cause.full_key)
     root = {} if cause.parent_node is None else OmegaConf.to_container(cause.parent_node._get_root())
     known = [key for key in _keys(root) if key.partition(".")[0] != "hydra"]
-    if wanted in RENAMED:
-        return _successor(wanted)
+    if renamed := _renamed(wanted):
+        return _successor(renamed)
     if wanted in known:  # The value has a key of its own that does not exist.
         wanted = str(cause.full_key)
     same_name = [key for key in known if key.rpartition(".")[2] == wanted.rpartition(".")[2]]
     hint = _did_you_mean(wanted, known, preferred=same_name)
     return f"unknown key '{wanted}'{hint} (--cfg job lists all keys, +{wanted}=... adds a new one)"
+
+
+def _renamed(key: str) -> str:
+    """The key that was renamed, of this name or one that this begins with; nothing if there is none."""
+    parts = key.split(".")
+    return next((name for n in range(len(parts), 0, -1) if (name := ".".join(parts[:n])) in RENAMED), "")
 
 
 def _successor(key: str) -> str:

@@ -101,6 +101,22 @@ class Inputs:
         fields = self.fields
         return Inputs(**{n: v[min(step, len(v) - 1)] if series[n] else v for n, v in fields.items()})
 
+    def from_steps(self, first: torch.Tensor, steps: int) -> "Inputs":
+        """Those during some steps, which every environment begins at a step of its own.
+
+        Args:
+            first: (B,) numbers of the first steps.
+            steps: how many; past the end of a series its last stays.
+        """
+        span = first + torch.arange(steps, device=first.device)[:, None]
+
+        def pick(value: torch.Tensor) -> torch.Tensor:
+            at = span.clamp_max(len(value) - 1).to(value.device)
+            return value[at, torch.arange(value.shape[1], device=value.device)]
+
+        series = self._series()
+        return Inputs(**{name: pick(v) if series[name] else v for name, v in self.fields.items()})
+
     def check(self, energies: Sequence[Energy], batch: int, vertices: int, fixed: int, like: torch.Tensor) -> None:
         """Refuses what cannot be simulated, in one sentence on the first such field.
 

@@ -3,7 +3,6 @@
 One motion is observed through random subsets of the surface vertices alone, and reconstructed from each of them.
 """
 
-import logging
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import closing
 from functools import partial
@@ -19,8 +18,7 @@ from rich.table import Table
 
 from ..data.markers import MarkerMap
 from ..dynamics.integrator import State
-from ..io.errors import InputError
-from ..io.files import atomic_hdf5, create, read_json, write_json, write_text
+from ..io.files import atomic_hdf5, create, read_array, read_hdf5, read_json, write_json, write_text
 from ..io.memory import WorkersMemory
 from ..io.processes import Advance, available_cores, in_processes
 from ..io.progress import Progress
@@ -31,10 +29,9 @@ from ..mesh.mesh import surface_vertices
 from ..report.ablation_page import AblationReport, write_ablation_report
 from ..report.page import number_text
 from .build import build_mesh, build_simulator, choose_device
-from .generate import held_state
-from .trajectories import METRICS, REPORT, read_fields
+from .files import METRICS, REPORT
+from .simulate import held_state
 
-log = logging.getLogger(__name__)
 
 MOTION = "motion.h5"
 DRAWS = "ablation.h5"
@@ -44,37 +41,35 @@ _STAGES = ("generate", "ablation", "report")
 _MM = 1e3
 
 
-def ablation_stages(config: dict[str, Any], base: dict[str, Any]) -> list[Stage]:
+def ablation_stages(config: Mapping[str, Any], base: Mapping[str, Any], shown: Mapping[str, Any]) -> list[Stage]:
     """The stages of the study.
 
     Args:
         config: the whole configuration.
         base: the settings that every simulation depends on.
+        shown: what the report says of the configuration.
     """
 
     def pick(*keys: str) -> dict[str, Any]:
         return {**base, **{key: config[key] for key in keys}}
 
-    markers = dict(config["markers"])
-    processes = _processes(markers.pop("processes"), config)
+    own = dict(config["ablation"])
+    processes = _processes(own.pop("processes"), config)
     return [
-        Stage("generate", generate_motion, (MOTION,), pick("reality", "simulation", "data")),
+        Stage("generate", generate_motion, (MOTION,), pick("target", "simulation", "data")),
         Stage(
             "ablation",
             partial(ablate, processes=processes),
             (DRAWS, SUMMARY, TABLE),
-            {**pick("simulation", "reconstruction", "seed"), "markers": markers},
+            {**pick("simulation", "reconstruction", "seed"), "ablation": own},
             ("generate",),
-            format_version=2,
         ),
-        Stage("report", report_ablation, (REPORT,), {"config": config}, ("ablation",)),
+        Stage("report", report_ablation, (REPORT,), {"config": shown}, ("ablation",)),
     ]
 
 
-def run_ablation(config: dict[str, Any], base: dict[str, Any], folder: Path) -> None:
-    """Runs what has changed, writes metrics.json and prints the errors."""
-    check_ablation(config)
-    run_stages(ablation_stages(config, base), folder)
+def print_ablation(config: Mapping[str, Any], folder: Path) -> None:
+    """Writes metrics.json and prints the errors."""
     metrics = collect_metrics(folder, config)
     write_json(folder / METRICS, metrics)
     table = Table("markers", "median [mm]", "quartiles [mm]", title="Error of the reconstructed motion, all vertices")
@@ -86,51 +81,14 @@ def run_ablation(config: dict[str, Any], base: dict[str, Any], folder: Path) -> 
     console.print(f"Report: {folder / REPORT}", soft_wrap=True)
 
 
-def check_ablation(config: Mapping[str, Any]) -> None:
-    """Checks what this study has beyond the other experiments.
-
-    Raises:
-        InputError: a value of the wrong kind or out of range, or more markers than surface vertices.
-    """
-    markers = config["markers"]
-    if not isinstance(markers, Mapping) or set(markers) != {"counts", "draws", "modes", "processes"}:
-        raise InputError(f"markers is {markers!r}: it must be a group of counts, draws, modes and processes.")
-    counts = markers["counts"]
-    if not isinstance(counts, list) or not counts or not all(map(_is_count, counts)) or len({*counts}) < len(counts):
-        raise InputError(f"markers.counts is {counts!r}: it must be a list of different positive whole numbers.")
-    if not _is_count(markers["draws"]):
-        raise InputError(f"markers.draws is {markers['draws']!r}: it must be a positive whole number.")
-    for key in ("modes", "processes"):
-        if markers[key] is not None and not _is_count(markers[key]):
-            raise InputError(f"markers.{key} is {markers[key]!r}: it must be a positive whole number, or null.")
-    surface = len(surface_vertices(build_mesh(config["mesh"])))
-    if max(counts) > surface:
-        raise InputError(
-            f"markers.counts asks for {max(counts)} markers, but the mesh has {surface} surface vertices: "
-            "ask for fewer, or refine the mesh."
-        )
-    observed = config["data"]["weights_g"].get("observed")
-    if not isinstance(observed, list) or len(observed) != 1 or not 0.0 < observed[0] < np.inf:
-        raise InputError(f"data.weights_g.observed is {observed!r}: it must be a list of one positive weight, in g.")
-    if not config["data"]["steps"] > 0:
-        raise InputError(f"data.steps is {config['data']['steps']}: it must be positive.")
-    simulator = build_simulator(config, "simulation")
-    probe = MarkerMap.at_vertices(torch.zeros(1, 1, dtype=torch.int64))
-    make_sparse_reconstructor(simulator, probe, **config["reconstruction"], modes=markers["modes"])
-
-
-def _is_count(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value > 0
-
-
 def generate_motion(context: StageContext) -> None:
     """Writes motion.h5: q (T + 1, N, 3) from the held state on, and what the uncorrected simulator makes of it."""
     settings = context.settings
     data = settings["data"]
-    reality, simulation = (build_simulator(settings, name) for name in ("reality", "simulation"))
+    target, simulation = (build_simulator(settings, name) for name in ("target", "simulation"))
     with torch.no_grad():
-        start = held_state(reality, data["load"], 1e-3 * np.array(data["weights_g"]["observed"]))
-        motion = {"q": reality.rollout(start, data["steps"]).q[:, 0]}
+        start = held_state(target, data["load"], 1e-3 * np.array(data["weights_g"]["observed"]))
+        motion = {"q": target.rollout(start, data["steps"]).q[:, 0]}
         motion["uncorrected_q"] = simulation.rollout(start, data["steps"]).q[:, 0]
     attributes = {"fingerprint": context.fingerprint, "time_step": settings["time_step"]}
     with atomic_hdf5(context.run_dir / MOTION, "motion", attributes) as file:
@@ -141,7 +99,7 @@ def generate_motion(context: StageContext) -> None:
 def _processes(wanted: int | None, config: Mapping[str, Any]) -> int:
     """How many processes share the counts: unless told, one a core, and a single one on a GPU."""
     cores = 1 if config["device"].startswith("cuda") else available_cores()
-    return min(cores if wanted is None else wanted, len(config["markers"]["counts"]))
+    return min(cores if wanted is None else wanted, len(config["ablation"]["counts"]))
 
 
 def ablate(context: StageContext, processes: int = 1) -> None:
@@ -152,7 +110,7 @@ def ablate(context: StageContext, processes: int = 1) -> None:
         processes: that share the numbers of markers; 1 for this one alone.
     """
     settings = context.settings
-    counts, draws = settings["markers"]["counts"], settings["markers"]["draws"]
+    counts, draws = settings["ablation"]["counts"], settings["ablation"]["draws"]
     motion, uncorrected = read_fields(context.run_dir / MOTION, "motion", "q", "uncorrected_q")
     steps = len(motion) - 1
     fields = {
@@ -181,6 +139,12 @@ def ablate(context: StageContext, processes: int = 1) -> None:
     for count, e, m in zip(counts, error, misfit, strict=True):
         lines += [f"{count},{i},{a:.9g},{b:.9g}" for i, (a, b) in enumerate(zip(e, m, strict=True))]
     write_text(context.run_dir / TABLE, "\n".join(lines) + "\n")
+
+
+def read_fields(path: Path, kind: str, *names: str) -> list[NDArray[np.float64]]:
+    """The named datasets of a file."""
+    with read_hdf5(path, kind) as file:
+        return [read_array(file, name) for name in names]
 
 
 _Task = tuple[Mapping[str, Any], Path, int]
@@ -213,7 +177,7 @@ def reconstruct_count(
     wp.config.log_level = wp.LOG_WARNING
     simulator = build_simulator(settings, "simulation")
     (motion,) = read_fields(path, "motion", "q")
-    vertices = draw_markers(simulator, count, settings["markers"]["draws"], settings["seed"])
+    vertices = draw_markers(simulator, count, settings["ablation"]["draws"], settings["seed"])
     return vertices, *_reconstruct(simulator, settings, vertices, simulator.tensor(motion), advance)
 
 
@@ -235,7 +199,7 @@ def _reconstruct(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Mean distances (draws, T) from the motion (T + 1, N, 3), of all vertices and of the markers [m]."""
     markers = MarkerMap.at_vertices(torch.as_tensor(vertices, device=motion.device), motion.dtype)
-    modes = settings["markers"]["modes"]
+    modes = settings["ablation"]["modes"]
     reconstructor = make_sparse_reconstructor(simulator, markers, **settings["reconstruction"], modes=modes)
     q = motion[0].expand(len(vertices), -1, -1).clone()
     state, force = State(q, torch.zeros_like(q)), torch.zeros_like(q)

@@ -5,7 +5,9 @@ from importlib import resources
 from typing import Any
 
 import torch
+from numpy.typing import ArrayLike
 
+from ..data.markers import Markers, bind_markers
 from ..dynamics.nonlinear_solver import SolverSettings
 from ..dynamics.simulator import Simulator
 from ..energies.base import Energy
@@ -124,8 +126,6 @@ def build_material(config: Mapping[str, Any], key: str) -> Material:
     Raises:
         InputError: an unknown constant, or one out of range.
     """
-    if "fibre_stiffness" in config[key]:
-        raise InputError(f"{key}.fibre_stiffness is now stiffness, in the group fibres of the same body.")
     try:
         return make_material(**{str(name): value for name, value in config[key].items()})
     except InputError as error:
@@ -142,6 +142,30 @@ def build_body(config: Mapping[str, Any], point_masses: tuple[PointMass, ...] = 
         mass=config["physics"]["mass"],
         volume_integration=config["physics"]["volume_integration"],
         point_masses=point_masses,
+    )
+
+
+def bound_markers(settings: Mapping[str, Any], mesh: Mesh, places: ArrayLike, labels: Sequence[str]) -> Markers:
+    """Markers at places on the undeformed body, in float64 on the CPU.
+
+    Args:
+        settings: the group ``markers``.
+        mesh: of the body.
+        places: (M, 3) [m].
+        labels: M names.
+
+    Raises:
+        InputError: see `bind_markers`.
+        MeshError: no vertex lies where ``markers.bind_to`` says.
+    """
+    vertices = None if settings["bind_to"] is None else select_vertices(mesh, **settings["bind_to"])
+    return bind_markers(
+        mesh,
+        places,
+        labels,
+        kind=settings["bind"],
+        vertices=vertices,
+        largest_distance=settings["largest_distance"],
     )
 
 

@@ -1,120 +1,42 @@
 """Checks of a whole configuration before anything is computed, so that a slip costs no stage that comes before it."""
 
-import inspect
 import math
-import re
-from collections.abc import Callable, Iterable, Mapping
-from fnmatch import fnmatchcase
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ..dynamics.nonlinear_solver import SolverSettings
-from ..io.errors import InputError
-from ..learning.networks import check_network
-from ..learning.reconstruction import make_reconstructor
-from ..learning.refinement import check_refinement
-from ..learning.sparse_reconstruction import make_sparse_reconstructor
-from ..learning.training import check_trainer
-from ..mesh.mesh import select_vertices
-from .actuated.checks import PRESSURE, check_driven
-from .build import build_material, build_simulator
-from .kinds import dotted, is_list, is_number, is_whole_number, is_word
-from .measured.checks import RECORDINGS, check_measured
-from .trajectories import MODELS, training_settings, variation_of
+import numpy as np
+import torch
 
-_GROUPS = (
-    "mesh",
-    "physics",
-    "solver",
-    "reconstruction",
-    "network",
-    "trainer",
-    "refinement",
-    "fixed",
-    "simulation",
-    "simfree",
-    "data",
-    "tip",
+from ..data.actuation import PressureSequences
+from ..data.markers import MarkerMap
+from ..energies.materials import Material
+from ..fem.body import Body
+from ..io.errors import InputError
+from ..io.memory import available_memory_gib
+from ..learning.identification import Bounds
+from ..learning.reconstruction import make_reconstructor
+from ..learning.replay import MASS_FACTOR, known_parameters
+from ..learning.sparse_reconstruction import make_sparse_reconstructor
+from ..mesh.mesh import select_vertices, surface_vertices
+from .build import build_body, build_material, build_simulator, chambers_of
+from .files import STATIC, attached_mass
+from .identify import ELASTIC
+from .laboratory import laboratory_settings, substeps_of, vertical
+from .schema import IN_THE_LOOP, NAME, NETWORK, TRAINER, check, configuration_group
+from .trials import (
+    folds_of,
+    is_laboratory,
+    known_trials,
+    sees_markers,
+    split_of,
+    trials_of,
+    variation_of,
 )
-_WORDS = (
-    "dtype",
-    "device",
-    "integrator",
-    "data.twist_axis",
-    "mesh.cells",
-    "mesh.profile",
-    "mesh.outline",
-    "*.kind",
-    "*.model",
-    "*.name",
-    "*.method",
-    "solver.linear_solver",
-    "network.activation",
-    "trainer.schedule",
-    "trainer.selection",
-)
-_WHOLE_NUMBERS = (
-    "seed",
-    "data.steps",
-    "data.limit.*",
-    "mesh.chambers",
-    "mesh.nodes",
-    "mesh.order",
-    "*.max_iterations",
-    "solver.memory",
-    "solver.refactor_after",
-    "network.*",
-    "trainer.epochs",
-    "trainer.batch_size",
-    "trainer.step_epochs",
-    "trainer.rollout_every",
-    "refinement.window",
-    "refinement.epochs",
-    "refinement.batch_size",
-    "refinement.memory",
-    "refinement.rollout_every",
-)
-_NUMBERS = (
-    "time_step",
-    "fixed.*",
-    "tip.*",
-    "data.load.*",
-    "mesh.wall",
-    "mesh.web",
-    "mesh.core",
-    "mesh.layers",
-    "simulation.*",
-    "reality.*",
-    "*.relative_tolerance",
-    "*.absolute_tolerance",
-    "reconstruction.*",
-    "trainer.*",
-)
-_LISTS = (
-    "gravity",
-    "data.weights_g.*",
-    "data.angles_deg.*",
-    "mesh.chamber_lengths",
-    "mesh.caps",
-    "mesh.radii",
-    "mesh.rotations",
-)
-_OPTIONAL = (
-    "reconstruction.modes",
-    "trainer.linear_noise",
-    "fixed.*",
-    "tip.*",
-    "data.load.*",
-    "data.limit",
-    "mesh.core",
-    "mesh.layers",
-)
-# Groups that are handed on as keyword arguments.
-_TAKEN_BY: Mapping[str, Callable[..., Any]] = {
-    "solver": SolverSettings,
-    "reconstruction": make_reconstructor,
-    "fixed": select_vertices,
-    "tip": select_vertices,
-}
+
+_LONGEST_STRETCH = 0.3  # rho g L / E from which on the size of a body is not believed
+_BYTES_PER_CELL = 4_000  # that a mesh, its points and its matrix take at least
+_SHARE_OF_MEMORY = 0.8
+_GROUPS = {"network": NETWORK, "trainer": TRAINER, "in_the_loop": IN_THE_LOOP}
 
 
 def check_configuration(config: Mapping[str, Any]) -> None:
@@ -124,91 +46,338 @@ def check_configuration(config: Mapping[str, Any]) -> None:
         config: with the keys of ``conf/config.yaml``.
 
     Raises:
-        InputError: a value of the wrong kind or out of range, or an unknown key.
+        InputError: a value of the wrong kind or out of range, an unknown key, or values that do not fit each other.
+        MeshError: a mesh that cannot be read or simulated, or a place where no vertex lies.
+        DataFileError: a folder without recordings.
     """
-    _check_groups(config, _GROUPS)
-    kind_of_data = config["data"].get("kind")
-    measured = kind_of_data in (RECORDINGS, PRESSURE)
-    if measured:
-        _check_groups(config, ("markers",))
-    else:
-        kind = variation_of(config["data"])
-        loaded = config["data"]["kind"] == "release_from_load"
-        _check_groups(config, ("reality", f"data.{kind.key}", *(["data.load"] if loaded else [])))
-    for key, value in dotted({key: value for key, value in config.items() if key != "tune"}):
-        check_kind(key, value)
-    if not isinstance(config["name"], str) or not re.fullmatch(r"[\w-]+", config["name"]):
-        raise InputError(f"name is {config['name']!r}: a folder is named so: use letters, digits, _ and - alone.")
+    recorded = sees_markers(config)
+    if not recorded:
+        variation_of(config["data"])
+    elif is_laboratory(config) and config["laboratory"] is None:
+        raise InputError("data.folder is not set: give the folder of the recordings.")
+    check("", config, configuration_group(config))
     if config["dtype"] != "float64":
         raise InputError(f"dtype is {config['dtype']!r}: experiments need float64; float32 is for roll-outs in Python.")
-    if len(config["gravity"]) != 3 or not all(map(math.isfinite, config["gravity"])):
-        raise InputError(f"gravity is {config['gravity']}: it must be three finite numbers, in m/s^2.")
-    if not 0 <= config["seed"] < 2**63:
-        raise InputError(f"seed is {config['seed']}: it must lie between 0 and 2^63 - 1.")
-    for key, function in _TAKEN_BY.items():
-        if key not in config:
-            continue
-        if key == "reconstruction" and measured:
-            function = make_sparse_reconstructor
-        own_names = inspect.signature(function).parameters
-        known = [name for name in own_names if name not in ("mesh", "simulator", "markers")]
-        for name in config[key]:
-            if name not in known:
-                raise InputError(f"unknown key '{key}.{name}': {key} has {', '.join(known)}.")
-    for key in ("simulation", "reality"):
-        if key in config:
-            build_material(config, key)
-    own = config["simfree"]
-    if own.keys() != {"network", "trainer"} or not all(isinstance(each, Mapping) for each in own.values()):
-        raise InputError(f"simfree is {own!r}: it must be a group of the groups network and trainer.")
-    for model in MODELS:
+    check_memory(config)
+    for model in ("resphys", "simfree"):
         _check_training(config, model)
-    if kind_of_data == PRESSURE:
-        check_driven(config)
-    elif measured:
-        check_measured(config)
+    for key in ("simulation", *(("target",) if not recorded else ())):
+        _check_material(config, key, "")
+    body = build_body(config)
+    select_vertices(body.mesh, **config["tip"])
+    simulator = build_simulator(config, body=body)
+    _check_size(body, simulator.material, config["gravity"])
+    if recorded:
+        _check_recorded(config, body)
+        probe = MarkerMap.at_vertices(torch.zeros(1, 1, dtype=torch.int64))
+        make_sparse_reconstructor(simulator, probe, **config["reconstruction"])
+    elif "ablation" in config:
+        _check_ablation(config, body)
     else:
-        check_refinement(config["refinement"], config["data"]["steps"])
-        make_reconstructor(build_simulator(config), **config["reconstruction"])
+        split_of(config)
+        if variation_of(config["data"]).key == "weights_g":
+            select_vertices(body.mesh, **config["data"]["load"])
+        if "modes" in config["reconstruction"]:
+            raise InputError("reconstruction.modes is for bodies that are seen through markers: leave it out.")
+        make_reconstructor(simulator, **config["reconstruction"])
+    steps = config["data"].get("steps")
+    refinement = config["refinement"]
+    if refinement["kind"] != "none" and steps is not None and refinement["window"] >= steps:
+        raise InputError(f"refinement.window is {refinement['window']}: it must be less than the data's {steps} steps.")
+    if config["identify"] is not None:
+        check_identification(config["identify"], _known(config, simulator))
+
+
+def check_memory(config: Mapping[str, Any]) -> None:
+    """Refuses what this machine has no memory for, before it is tried.
+
+    Raises:
+        InputError: a mesh or a network that is too large.
+    """
+    limit = _SHARE_OF_MEMORY * available_memory_gib()
+    meshes = {
+        "mesh": config["mesh"],
+        **({"laboratory.mesh": config["laboratory"]["mesh"]} if config["laboratory"] else {}),
+    }
+    for key, mesh in meshes.items():
+        cells = math.prod(mesh["divisions"]) if "divisions" in mesh else 0
+        needed = cells * _BYTES_PER_CELL / 2**30
+        if needed > limit:
+            raise InputError(
+                f"{key}.divisions gives {cells:,} cells, which take {needed:.3g} GiB at least, and {limit:.3g} GiB are "
+                "free: take fewer."
+            )
+    network = config["network"]
+    weights = network["blocks"] * (network["layers"] + 1) * network["width"] ** 2
+    if 16 * weights / 2**30 > limit:  # weights, gradients and two moments of Adam in single precision
+        raise InputError(
+            f"network.width, layers and blocks make {weights:,} weights, which take {16 * weights / 2**30:.3g} GiB to "
+            f"train, and {limit:.3g} GiB are free: take a smaller network."
+        )
+
+
+def training_settings(config: Mapping[str, Any], model: str) -> dict[str, Any]:
+    """The groups ``network``, ``trainer`` and ``in_the_loop`` and the seed that a model is trained with.
+
+    Args:
+        config: the whole configuration.
+        model: ``simfree``, whose own settings replace the common ones, or any other.
+    """
+    own = config["simfree"] if model == "simfree" else {}
+    groups = {key: {**config[key], **own.get(key, {})} for key in ("network", "trainer")}
+    return {**groups, "in_the_loop": None if model == "simfree" else config["in_the_loop"], "seed": config["seed"]}
+
+
+def check_training(groups: Mapping[str, Any]) -> None:
+    """Checks the groups that a model is trained with; see `training_settings`.
+
+    Raises:
+        InputError: a value of the wrong kind or out of range.
+    """
+    for key, spec in _GROUPS.items():
+        if groups.get(key) is not None:
+            check(key, groups[key], spec)
+    network = groups["network"]
+    if network["kind"] == "reduced":
+        for key in ("position_modes", "velocity_modes", "force_modes"):
+            if key not in network:
+                raise InputError(f"network.{key} is missing: a reduced network needs it.")
 
 
 def _check_training(config: Mapping[str, Any], model: str) -> None:
-    """Checks the settings that a model is trained with."""
-    settings = training_settings(config, model)
     try:
-        for group in ("network", "trainer"):
-            for key, value in settings[group].items():
-                check_kind(f"{group}.{key}", value)
-        check_network(settings["network"])
-        check_trainer(settings["trainer"])
+        check_training(training_settings(config, model))
     except InputError as error:
         raise (error if model == "resphys" else InputError(f"simfree: {error}")) from error
 
 
-def _check_groups(config: Mapping[str, Any], keys: Iterable[str]) -> None:
-    """Refuses what should be a group of settings and is none."""
-    for key in keys:
-        group: Any = config
-        for name in key.split("."):
-            group = group.get(name)
-        if not isinstance(group, Mapping):
-            raise InputError(f"{key} is {group!r}: it must be a group of settings.")
+def _check_material(config: Mapping[str, Any], key: str, group: str) -> None:
+    try:
+        build_material(config, key)
+    except InputError as error:
+        raise InputError(f"{group}{error}") from error
 
 
-def check_kind(key: str, value: Any) -> None:
-    """Compares a value with the first kind that its key belongs to; other keys may hold anything."""
-    if value is None and any(fnmatchcase(key, pattern) for pattern in _OPTIONAL):
+def _known(config: Mapping[str, Any], simulator: Any) -> list[str]:
+    """The parameters that may be identified: no factor on payloads where nothing hangs."""
+    hangs = config["data"].get("payload_at") is not None
+    return [name for name in known_parameters(simulator) if hangs or name != MASS_FACTOR]
+
+
+def _check_recorded(config: Mapping[str, Any], body: Body) -> None:
+    """What an experiment has that sees its bodies through markers."""
+    data = config["data"]
+    _check_markers(config, body)
+    vertical(data["up"])
+    _check_trials(config)
+    if folds_of(config) is None:
+        split_of(config)
+    trials = trials_of(config)
+    attached_mass(body, data["payload_at"], np.array([trial.payload for trial in trials]))
+    begins = {trial.begins for trial in trials}
+    if begins & {"held", "released"} and data["seconds"] is None:
+        raise InputError("data.seconds is not set: say how much of each trial counts after its release, in s.")
+    if begins & {"rest", STATIC} and data["steps"] is None:
+        raise InputError("data.steps is not set: say how many steps of the simulation are read of each recording.")
+    if STATIC in begins and config["in_the_loop"] is None:
+        split = split_of(config) if folds_of(config) is None else None
+        known = known_trials(config)
+        if split is not None and all(known[name].begins == STATIC for name in (*split.train, *split.validation)):
+            raise InputError(
+                "all trials of training and validation are poses, and a force is learned from motions or on whole "
+                "trials: set in_the_loop, as in conf/recordings/released.yaml."
+            )
+    _check_release(config, begins)
+    chambers = len(chambers_of(body))
+    if chambers:
+        _check_pressures(config, chambers)
+    _check_times(config, begins)
+    if config["published"] is not None:
+        _check_material(config["published"], "simulation", "published.")
+    if is_laboratory(config):
+        _check_laboratory(config, begins, chambers)
+
+
+def _check_markers(config: Mapping[str, Any], body: Body) -> None:
+    markers = config["markers"]
+    both = [label for label in markers["tracked"] if label in markers["reference"]]
+    if both:
+        raise InputError(
+            f"the marker '{both[0]}' is in markers.tracked and markers.reference: it moves or stands still."
+        )
+    if not markers["tracked"]:
+        raise InputError("markers.tracked is empty: name the markers that errors are measured on, with their places.")
+    count = len(markers["tracked"]) + len(markers["reference"])
+    if count < 3:
+        raise InputError(f"markers names {count} in all: registration needs three or more.")
+    if markers["bind"] == "rigid" and markers["bind_to"] is None:
+        raise InputError("markers.bind is rigid: set markers.bind_to to the vertices that they follow, as {x: 0.1}.")
+    if markers["bind_to"] is not None:
+        select_vertices(body.mesh, **markers["bind_to"])
+
+
+def _check_trials(config: Mapping[str, Any]) -> None:
+    """Names and files of the configured trials."""
+    data, laboratory = config["data"], is_laboratory(config)
+    group, trials = ("laboratory", config["laboratory"]["trials"]) if laboratory else ("data", data["trials"])
+    if laboratory and not trials and not data["sequences"]:
+        raise InputError("laboratory.trials is empty: name each trial, or set data.sequences.")
+    files: dict[str, str] = {}
+    for name, trial in trials.items():
+        at = f"{group}.trials.{name}"
+        if not isinstance(name, str) or not NAME.fits(name):
+            raise InputError(f"{at}: files are named after trials: use letters, digits, _ and -, not digits alone.")
+        if laboratory:
+            continue
+        if "file" not in trial:
+            raise InputError(f"{at}.file is missing: give the name of a file in data.folder.")
+        other = files.setdefault(trial["file"], name)
+        if other != name:
+            raise InputError(f"the trials '{other}' and '{name}' have the same file, {trial['file']}: name it once.")
+
+
+def _check_release(config: Mapping[str, Any], begins: set[str]) -> None:
+    sideways = config["release"]["sideways"]
+    if not begins & {"held", "released"} or sideways == 0.0:
         return
-    for patterns, fits, wanted in _KINDS:
-        if any(fnmatchcase(key, pattern) for pattern in patterns):
-            if not fits(value):
-                raise InputError(f"{key} is {value!r}: it must be {wanted}.")
-            return
+    if config["data"]["rest"] != "held":
+        raise InputError(
+            f"release.sideways is {sideways:g} m, but data.rest is {config['data']['rest']}: that "
+            "tells where the markers are on the undeformed body, so set release.sideways to 0."
+        )
+    if not np.any(config["gravity"]):
+        raise InputError("release.sideways is across gravity, but gravity is zero: set release.sideways to 0.")
 
 
-_KINDS = (
-    (_WORDS, is_word, "a word"),
-    (_WHOLE_NUMBERS, is_whole_number, "a whole number"),
-    (_NUMBERS, is_number, "a number"),
-    (_LISTS, is_list, "a list of numbers"),
-)
+def _check_pressures(config: Mapping[str, Any], chambers: int) -> None:
+    data = config["data"]
+    if data["pressure_limit"] is None:
+        raise InputError("data.pressure_limit is not set: say what the chambers take, in Pa.")
+    if data["chambers"] is not None and max(data["chambers"]) > chambers:
+        raise InputError(f"data.chambers names chamber {max(data['chambers'])}, but the mesh has {chambers}.")
+    scales = data["pressure_scales"]
+    if 1.0 in scales or len({*scales}) < len(scales):
+        raise InputError(
+            f"data.pressure_scales is {scales}: give different ones, none of them 1, which is always tested."
+        )
+    if scales and not is_laboratory(config):
+        raise InputError(
+            "data.pressure_scales raises the pressures of simulated trials, and recordings have their own: leave it empty."
+        )
+    if scales and data["folds"]:
+        raise InputError("data.pressure_scales and data.folds exclude each other: take one of them out.")
+
+
+def _check_times(config: Mapping[str, Any], begins: set[str]) -> None:
+    """What the length of driven trials has to fit."""
+    data, step = config["data"], config["time_step"]
+    if "rest" in begins:
+        length, horizons = data["steps"] * step, data["horizons"]
+        if horizons and (horizons != sorted({*horizons}) or horizons[-1] > length + 1e-9):
+            raise InputError(f"data.horizons is {horizons}: they must rise, up to the {length:g} s of data.steps.")
+    if data["cutoff"] is not None and not data["cutoff"] < 0.5 / step:
+        raise InputError(
+            f"data.cutoff is {data['cutoff']:g} Hz: it must be below {0.5 / step:g} Hz, half of the steps."
+        )
+
+
+def _check_laboratory(config: Mapping[str, Any], begins: set[str], chambers: int) -> None:
+    laboratory, data = config["laboratory"], config["data"]
+    _check_material(laboratory, "material", "laboratory.")
+    for trial in trials_of(config):
+        if trial.pull is not None and data["rest"] != "file":
+            raise InputError(
+                f"laboratory.trials.{trial.name}.pull deforms the body before its release: set data.rest to file, so that "
+                "the recordings tell where markers are on the undeformed body."
+            )
+    if data["rest"] == "file" and any(trial.pull is None and trial.begins == "held" for trial in trials_of(config)):
+        raise InputError("data.rest is file, but simulated bodies are held undeformed: set it to held.")
+    if begins & {"held", "released"}:
+        for key in ("seconds", "held_seconds"):
+            if laboratory.get(key) is None:
+                raise InputError(f"laboratory.{key} is missing: trials that are let go need it.")
+        if laboratory["seconds"] < data["seconds"]:
+            raise InputError(
+                f"laboratory.seconds is {laboratory['seconds']}, less than data.seconds ({data['seconds']}): "
+                "follow the body for as long as it counts."
+            )
+    if "rest" in begins:
+        substeps_of(config)
+        if chambers:
+            sequences = PressureSequences(limit=data["pressure_limit"], **laboratory.get("sequences", {}))
+            random = np.random.default_rng(0)
+            sequences.draw(data["steps"], config["time_step"], config["chambers"]["count"], random)
+    try:
+        material = build_material(laboratory, "material")
+        body = build_body(laboratory_settings(config))
+    except InputError as error:
+        raise InputError(f"laboratory: {error}") from error
+    _check_size(body, material, config["gravity"])
+
+
+def _check_size(body: Body, material: Material, gravity: Sequence[float]) -> None:
+    """Refuses a body that would sag under its own weight beyond belief, as one whose unit was mistaken does.
+
+    A body of length L under its weight has strains of rho g L / E: a percent for an arm of silicone.
+
+    Raises:
+        InputError: strains of more than a few tenths.
+    """
+    length = float(np.linalg.norm(np.ptp(np.asarray(body.mesh.vertices), axis=0)))
+    density, stiffness = (float(np.mean(np.asarray(material.constants[x]))) for x in ("density", "youngs_modulus"))
+    strain = density * float(np.linalg.norm(gravity)) * length / stiffness
+    if strain > _LONGEST_STRETCH:
+        raise InputError(
+            f"the mesh is {length:.3g} m across: with E = {1e-3 * stiffness:.3g} kPa its own weight would strain it by "
+            f"{100.0 * strain:.0f} %; is its unit millimetres (mesh.units=mm), or that of youngs_modulus not Pa?"
+        )
+
+
+def check_identification(identify: Mapping[str, Any], known: Sequence[str]) -> None:
+    """Checks the group ``identify``, whose values are of their kinds.
+
+    Args:
+        identify: the group.
+        known: parameters that may be identified.
+
+    Raises:
+        InputError: no parameter, an unknown one, or a range or a first guess that does not fit.
+    """
+    if not identify["parameters"]:
+        raise InputError(f"identify.parameters is empty: give a range of one or more of {', '.join(known)}.")
+    for group, choice in (("parameters", known), ("elastic", ELASTIC), ("grid", ELASTIC)):
+        for name, settings in (identify.get(group) or {}).items():
+            if name not in choice:
+                raise InputError(f"identify.{group} names '{name}': choose from {', '.join(choice)}.")
+            try:
+                Bounds(**{key: value for key, value in settings.items() if key != "points"})
+            except InputError as error:
+                raise InputError(f"identify.{group}.{name}: {error}") from error
+    for name, value in identify["first_guess"].items():
+        if name not in identify["parameters"]:
+            if name not in known:
+                raise InputError(f"identify.first_guess names '{name}': choose from {', '.join(known)}.")
+            continue
+        within = identify["parameters"][name]
+        if not within["lower"] <= value <= within["upper"]:
+            raise InputError(
+                f"identify.first_guess.{name} is {value!r}: it must be a number from {within['lower']:g} to "
+                f"{within['upper']:g}, its range."
+            )
+
+
+def _check_ablation(config: Mapping[str, Any], body: Body) -> None:
+    """What the marker ablation has of its own."""
+    counts, surface = config["ablation"]["counts"], len(surface_vertices(body.mesh))
+    if max(counts) > surface:
+        raise InputError(
+            f"ablation.counts asks for {max(counts)} markers, but the mesh has {surface} surface vertices: "
+            "ask for fewer, or refine the mesh."
+        )
+    observed = config["data"]["weights_g"].get("observed")
+    if not isinstance(observed, list) or len(observed) != 1 or not 0.0 < observed[0] < np.inf:
+        raise InputError(f"data.weights_g.observed is {observed!r}: it must be a list of one positive weight, in g.")
+    probe = MarkerMap.at_vertices(torch.zeros(1, 1, dtype=torch.int64))
+    make_sparse_reconstructor(
+        build_simulator(config), probe, **config["reconstruction"], modes=config["ablation"]["modes"]
+    )

@@ -1,132 +1,342 @@
-"""Stage: roll-outs of the test split, by every model, and their errors."""
+"""Stages: roll-outs of the test trials by every model, their errors, and how long they take."""
 
-from collections.abc import Callable
-from functools import partial
+import time
+from collections.abc import Mapping, Sequence
+from statistics import mean, pstdev
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from ..dynamics.integrator import State
-from ..dynamics.simulator import Simulator
-from ..io.files import write_json
+from ..io.errors import ConvergenceError
+from ..io.files import atomic_hdf5, create, read_array, read_hdf5, write_json
+from ..io.processes import Advance
 from ..io.progress import Progress
-from ..io.resumable import Field, ResumableHDF5
+from ..io.resumable import Field
 from ..io.stages import StageContext
-from ..learning.metrics import summarise, summarise_each, trajectory_errors
-from ..learning.predictors import LearnedPredictor
-from ..learning.rollout import Rollout
-from .build import build_simulator
-from .train import load_model, load_simfree
-from .trajectories import (
-    ERRORS,
-    RECONSTRUCTION,
-    ROLLOUTS,
-    SIMFREE,
-    TRAJECTORIES,
-    read_fields,
-    split_of,
-)
+from ..learning.metrics import errors_per_marker, marker_errors, median_filter, summarise, summarise_each
+from ..learning.replay import Replay, Start
+from .files import ERRORS, ROLLOUTS, TIMES, reconstruction_file
+from .models import ModelRollout, first_frame, learned_of
+from .parts import March, Part, pack, read_parts, remove_parts, split_into_parts, unpack, work_on
+from .scene import LEARNED, Scene, models_of
 
-MODELS = ("simulation", "resphys", "simfree")
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+_FILM_FRAMES = 256  # at most
+_FILTERED_SECONDS = 4.0  # that trials must last for the median filter over a second
 
 
-def evaluate(context: StageContext) -> None:
-    """Writes rollouts.h5, (R, T + 1, N, 3) positions a model and the target, and errors.json."""
+def evaluate(context: StageContext, processes: int = 1) -> None:
+    """Writes rollouts.h5, what is observed of every model's roll-outs of the test trials, and errors.json."""
     settings = context.settings
-    split, _ = split_of(settings["data"])
-    part = split.indices("test")
-    (target, velocity) = read_fields(context.run_dir / TRAJECTORIES, "trajectories", "q", "v")
-    (reconstruction,) = read_fields(context.run_dir / RECONSTRUCTION, "reconstruction", "q")
-    target, reconstruction = target[part], reconstruction[part]
-    _roll_out(context, target[:, 0], velocity[part, 0], target.shape[1])
-    positions = dict(
-        zip(MODELS, read_fields(context.run_dir / ROLLOUTS, "rollouts", *(f"{m}_q" for m in MODELS)), strict=True)
-    )
-    positions["reconstruction"] = reconstruction
-    against_target = {m: _errors(q, target) for m, q in positions.items()}
-    against_reconstruction = {m: _errors(positions[m], reconstruction) for m in MODELS}
-    summary: dict[str, Any] = {
-        "errors_mm": {m: summarise(e) for m, e in against_target.items()},
-        "errors_vs_reconstruction_mm": {m: summarise(e) for m, e in against_reconstruction.items()},
-        "per_trajectory": summarise_each(split.test, against_target),
+    scene = Scene(settings, context.run_dir, "count")
+    groups = {scale: tuple(names) for scale, names in settings["groups"].items()}
+    names = [name for group in groups.values() for name in group]
+    models = models_of(settings)
+    filmed = film_trial(scene, groups["1"])
+    parts: dict[str, list[Part]] = {model: [] for model in models}
+    for number, some in enumerate(scene.alike(names)):
+        for model in models:
+            frames = 1 + int(float(scene.trials(some).times.max()) / scene.model_simulator(model).time_step)
+            label = f"{model}{number}"
+            parts[model] += split_into_parts(context, some, settings["batch"], frames, label, (model, filmed))
+    work_on([part for some in parts.values() for part in some], roll_out_part, processes)
+    observed = {model: _observed(scene, model, some, names) for model, some in parts.items()}
+    single = scene.dataset.bound is not None  # markers
+    attributes = {"names": names, "time_step": settings["time_step"], "film_trial": filmed}
+    with atomic_hdf5(context.run_dir / ROLLOUTS, "rollouts", attributes) as file:
+        for model, values in observed.items():
+            create(file, f"{model}_observed", values.astype(np.float32) if single else values, "m", time_axis=1)
+            bodies = next(read_parts([part], "film") for part in parts[model] if filmed in part.names)
+            substeps = round(settings["time_step"] / scene.model_simulator(model).time_step)
+            shown = film_steps(scene_steps(scene, filmed))
+            create(file, f"{model}_film", bodies[np.minimum(substeps * shown, len(bodies) - 1)], "m")
+        create(file, "film_steps", shown)
+    left = {
+        model: _by_name(some, read_parts(some, "left")[:, -1], names)
+        for model, some in parts.items()
+        if model in LEARNED and settings["range_guard"]
     }
-    write_json(context.run_dir / ERRORS, summary)
+    write_json(context.run_dir / ERRORS, summary(context, scene, groups, observed, left))
+    remove_parts(context)
 
 
-def _errors(positions: NDArray[np.float64], target: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    return [trajectory_errors(q, t) for q, t in zip(positions, target, strict=True)]
+def scene_steps(scene: Scene, name: str) -> int:
+    """Time steps that a trial lasts."""
+    return int(float(scene.trials([name]).times.max()) / scene.config["time_step"] + 1e-6)
 
 
-def _roll_out(context: StageContext, q: NDArray[np.float64], v: NDArray[np.float64], frames: int) -> None:
-    """Every model over all frames; frame 0 is the start."""
-    simulator = build_simulator(context.settings, on_failure="count")
-    make = model_rollouts(context, simulator)
-    batch, vertices, _ = q.shape
-    fields = {}
-    for m in MODELS:
-        fields[f"{m}_q"] = Field((batch, vertices, 3), "m", batch_axes=1)
-        fields[f"{m}_v"] = Field((batch, vertices, 3), "m/s", batch_axes=1)
-    path = context.run_dir / ROLLOUTS
-    with (
-        ResumableHDF5(path, "rollouts", context.fingerprint, frames, fields) as file,
-        Progress("evaluate", frames, "frames", file.done) as progress,
-    ):
-        runs = {m: _Run(simulator, make[m], m, file, q, v) for m in MODELS}
-        while file.done < file.steps:
-            arrays: dict[str, NDArray[np.float64]] = {}
-            for run in runs.values():
-                arrays |= run.frame(file.done)
-            file.append(**arrays)
-            progress.advance()
-        file.finish({"names": list(split_of(context.settings["data"])[0].test)})
+def film_trial(scene: Scene, names: Sequence[str]) -> str:
+    """The test trial that moves most; its bodies are drawn."""
+    found = {}
+    for some in scene.alike(names):
+        found |= dict(zip(some, scene.trials(some).amplitude.tolist(), strict=True))
+    return max(names, key=lambda name: found[name])
 
 
-def model_rollouts(context: StageContext, simulator: Simulator) -> dict[str, Callable[[torch.Tensor | None], Rollout]]:
-    """For each model, what makes its roll-out from the environments that are lost already."""
-    force = LearnedPredictor(load_model(context.run_dir / context.settings["force"]))
-    following = LearnedPredictor(load_simfree(context.run_dir / SIMFREE))
-    predictors = {"simulation": None, "resphys": force, "simfree": following}
-    return {name: partial(_rollout, simulator, predict) for name, predict in predictors.items()}
+def film_steps(steps: int) -> IntArray:
+    """Steps whose bodies are kept for pictures."""
+    return np.arange(0, steps + 1, max(-(-steps // _FILM_FRAMES), 1))
 
 
-def _rollout(simulator: Simulator, predict: LearnedPredictor | None, lost: torch.Tensor | None) -> Rollout:
-    return Rollout(simulator, predict, lost=lost)
+def _by_name(parts: Sequence[Part], rows: NDArray[Any], names: Sequence[str]) -> NDArray[Any]:
+    """Rows of all parts, in the order of the names."""
+    order = [name for part in parts for name in part.names]
+    return rows[[order.index(name) for name in names]]
 
 
-class _Run:
-    """One model's roll-out, from the start or from where a file ends."""
+def _observed(scene: Scene, model: str, parts: Sequence[Part], names: Sequence[str]) -> FloatArray:
+    """(R, T, M, 3) what is observed of a model's roll-outs at the frames of the trials [m], NaN past their end."""
+    frames, found = scene.dataset.observed.shape[1], []
+    for part in parts:
+        series, delay, shift = (torch.from_numpy(read_parts([part], name)) for name in ("points", "delay", "shift"))
+        trials = scene.trials(part.names)
+        start = Start(State(series[:, 0], series[:, 0]), delay, shift)
+        run = Replay(scene.model_simulator(model), scene.observe, trials)
+        if run.is_static:
+            series = series[:, -1:]
+        values = run.at_frames(series.to(trials.observed), start.to(trials.observed)).cpu().numpy()
+        padding = [(0, 0), (0, frames - values.shape[1]), (0, 0), (0, 0)]
+        found.append(np.pad(values, padding, constant_values=np.nan))
+    return _by_name(parts, np.concatenate(found), names)
 
-    def __init__(
-        self,
-        simulator: Simulator,
-        make: Callable[[torch.Tensor | None], Rollout],
-        name: str,
-        file: ResumableHDF5,
-        q: NDArray[np.float64],
-        v: NDArray[np.float64],
-    ) -> None:
-        self.name = name
-        previous = None
-        if file.done > 0 and file.done < file.steps:
-            q, v = (file.read(file.done - 1)[f"{name}_{key}"] for key in "qv")
-            if file.done > 1:
-                back = file.read(file.done - 2)
-                previous = (
-                    simulator.tensor(np.nan_to_num(back[f"{name}_q"])),
-                    simulator.tensor(back[f"{name}_v"]),
-                )
-        positions = simulator.tensor(q)
-        lost = ~torch.isfinite(positions).flatten(1).all(1)
-        rest = simulator.rest_state(len(positions)).q
-        start = torch.where(lost[:, None, None], rest, positions)
-        self.rollout = make(lost)
-        self.state = State(start, simulator.tensor(v), previous)
 
-    def frame(self, index: int) -> dict[str, NDArray[np.float64]]:
-        """Positions and velocities of the next frame; the first is the start."""
-        if index > 0:
-            self.state = self.rollout.step(self.state)
-        q = self.rollout.positions(self.state)
-        return {f"{self.name}_q": q.cpu().numpy(), f"{self.name}_v": self.state.v.cpu().numpy()}
+def roll_out_part(part: Part, advance: Advance) -> None:
+    """What is observed of a model's roll-out of some trials, bodies of the filmed one, and when they left the range."""
+    scene = Scene(part.context.settings, part.context.run_dir, "count")
+    part.march(_RollingOut(scene, part), advance)
+
+
+class _RollingOut(March):
+    """A model over some trials."""
+
+    def __init__(self, scene: Scene, part: Part) -> None:
+        model, filmed = part.more
+        simulator = scene.model_simulator(model)
+        self._run = ModelRollout(scene, model, part.names, learned_of(scene, model, simulator.rest_positions))
+        self._filmed = part.names.index(filmed) if filmed in part.names else None
+        self._state: State | None = None
+        self._failed = False
+        start = self._run.start
+        batch, count = len(part.names), self._run.replay.trials.observed.shape[2]
+        self.frames = self._run.steps + 1
+        self.fields = {"points": Field((batch, count, 3), "m", batch_axes=1)}
+        if self._run.predictor is not None:
+            self.fields["left"] = Field((batch,), "1", "int64", batch_axes=1)
+        if self._filmed is not None:
+            self.fields["film"] = Field((simulator.body.n_vertices, 3), "m", "float32")
+        shift = torch.zeros(batch, count, 3) if start.shift is None else start.shift
+        self._constants = {"delay": (start.delay.cpu().numpy(), "s"), "shift": (shift.cpu().numpy(), "m")}
+
+    @override
+    def frame(self, number: int) -> tuple[dict[str, Any], dict[str, object]]:
+        run = self._run
+        if number == 0:
+            self._state = self._begin()
+        else:
+            assert self._state is not None
+            self._state = run.rollout.step(self._state)
+        points, bodies = run.points(self._state), run.rollout.positions(self._state)
+        if self._failed:
+            points, bodies = torch.full_like(points, torch.nan), torch.full_like(bodies, torch.nan)
+        kept: dict[str, Any] = {"points": points.cpu().numpy()}
+        if run.predictor is not None:
+            known = run.predictor.left_at
+            kept["left"] = np.full(len(points), -1) if known is None else known.cpu().numpy()
+        if self._filmed is not None:
+            kept["film"] = bodies[self._filmed].cpu().numpy()
+        return kept, {}
+
+    def _begin(self) -> State:
+        """The first state; a pose that does not settle has failed."""
+        try:
+            return self._run.begin()
+        except ConvergenceError:
+            if not self._run.replay.is_static:
+                raise
+            self._failed = True
+            return self._run.simulator.rest_state(len(self._run.replay.trials.names))
+
+    @override
+    def snapshot(self) -> dict[str, torch.Tensor]:
+        assert self._state is not None
+        predictor, lost = self._run.predictor, self._run.rollout.lost(self._state)
+        left = {} if predictor is None or predictor.left_at is None else {"left": predictor.left_at}
+        return {**pack(self._state), "lost": lost, "done": torch.tensor(self._run.rollout.done), **left}
+
+    @override
+    def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
+        self._state = unpack(tensors, self._run.simulator.rest_positions)
+        device = self._state.q.device
+        self._run.rollout.resume(tensors["lost"].to(device), int(tensors["done"]))
+        if self._run.predictor is not None and "left" in tensors:
+            self._run.predictor.left_at = tensors["left"].to(device)
+
+    @override
+    def constants(self) -> dict[str, tuple[Any, str]]:
+        return dict(self._constants)
+
+
+def summary(
+    context: StageContext,
+    scene: Scene,
+    groups: Mapping[str, Sequence[str]],
+    simulated: Mapping[str, FloatArray],
+    left: Mapping[str, IntArray],
+) -> dict[str, Any]:
+    """What errors.json says.
+
+    Args:
+        context: of the stage.
+        scene: of the experiment.
+        groups: names of the trials by pressure scale, the nominal ones first.
+        simulated: by model, (R, T, M, 3) what is observed of its roll-outs [m], NaN where one diverged.
+        left: by model, (R,) the step at which a trial left the range of the training, or -1.
+    """
+    settings, dataset = context.settings, scene.dataset
+    (_, names), *scaled = groups.items()
+    count, every = len(names), [name for group in groups.values() for name in group]
+    observed = dataset.observed[dataset.rows(every)]
+    first = [first_frame(scene, [name]) for name in every]
+    models = dict(simulated)
+    if dataset.bound is None:
+        models["reconstruction"] = _reconstructed(context, names)
+    test = {model: values[:count] for model, values in models.items()}
+    errors = {model: _errors(x, observed, first) for model, x in test.items()}
+    found: dict[str, Any] = {
+        "errors_mm": {model: summarise(rows) for model, rows in errors.items()},
+        "per_trajectory": summarise_each(tuple(names), errors),
+    }
+    if dataset.bound is None:
+        target = test["reconstruction"]
+        against = {model: _errors(x, target, first) for model, x in test.items() if model != "reconstruction"}
+        found["errors_vs_reconstruction_mm"] = {model: summarise(rows) for model, rows in against.items()}
+    else:
+        seen = observed[:count]
+        found["per_marker"] = {model: errors_per_marker(x, seen, dataset.labels) for model, x in test.items()}
+    step = settings["time_step"]
+    found |= _over_time(settings, test, observed, errors)
+    if left:
+        found["range"] = {model: _range(rows[:count], names, step) for model, rows in left.items()}
+    if scaled:
+        found["scales"] = {"1": found["errors_mm"]}
+        for number, (scale, _) in enumerate(scaled, start=1):
+            rows = slice(number * count, (number + 1) * count)
+            found["scales"][scale] = {
+                m: summarise(_errors(x[rows], observed[rows], first)) for m, x in simulated.items()
+            }
+        if left:
+            found["scales_range"] = {"1": found["range"]}
+            for number, (scale, some) in enumerate(scaled, start=1):
+                rows = slice(number * count, (number + 1) * count)
+                found["scales_range"][scale] = {m: _range(each[rows], some, step) for m, each in left.items()}
+    sideways = _sideways(scene, names)
+    return {**found, **({"sideways_mm": sideways} if sideways else {})}
+
+
+def _errors(simulated: FloatArray, observed: FloatArray, first: Sequence[int]) -> list[FloatArray]:
+    each = zip(simulated, observed, first, strict=False)
+    return [marker_errors(x[start:], y[start:]) for x, y, start in each]
+
+
+def _reconstructed(context: StageContext, names: Sequence[str]) -> FloatArray:
+    """(R, T, N, 3) positions of the test trials with the forces that fit them [m]."""
+    with read_hdf5(context.run_dir / reconstruction_file("resphys"), "reconstruction") as file:
+        order = [str(name) for name in file.attrs["names"]]
+        return read_array(file, "q")[[order.index(name) for name in names]]
+
+
+def _over_time(
+    settings: Mapping[str, Any],
+    test: Mapping[str, FloatArray],
+    observed: FloatArray,
+    errors: Mapping[str, Sequence[FloatArray]],
+) -> dict[str, Any]:
+    """Errors up to horizons, how they grow, and the largest of long trials without what is short."""
+    step, horizons = settings["time_step"], settings["data"].get("horizons") or []
+    found: dict[str, Any] = {}
+    if horizons:
+        first = [0] * len(observed)
+        found["horizons"] = {
+            f"{seconds:g}": {m: summarise(_errors(x[:, :frames], observed[:, :frames], first)) for m, x in test.items()}
+            for seconds in horizons
+            for frames in [round(seconds / step) + 1]
+        }
+    if len(horizons) > 1:
+        near, far = (found["horizons"][f"{seconds:g}"] for seconds in (horizons[0], horizons[-1]))
+        found["growth"] = {model: _growth(near[model], far[model]) for model in test}
+    if horizons and horizons[-1] >= _FILTERED_SECONDS:
+        found["median_filtered"] = {model: _largest_filtered(rows, step) for model, rows in errors.items()}
+    return found
+
+
+def _largest_filtered(errors: Sequence[FloatArray], step: float) -> float | None:
+    """Largest error of any trial after a median over a second of time [mm]; None where a roll-out diverged."""
+    if not all(np.isfinite(each).all() for each in errors):
+        return None
+    return max(float(median_filter(each, step).max()) for each in errors)
+
+
+def _growth(first: Mapping[str, Any], last: Mapping[str, Any]) -> float | None:
+    """By how much of itself the mean error grows; None where a roll-out diverged."""
+    if first["mean"] is None or last["mean"] is None:
+        return None
+    return float(last["mean"] / first["mean"] - 1.0)
+
+
+def _range(left: IntArray, names: Sequence[str], step: float) -> dict[str, Any]:
+    gone = {name: float(step * at) for name, at in zip(names, left, strict=True) if at >= 0}
+    return {"left": len(gone), "first_s": gone}
+
+
+def _sideways(scene: Scene, names: Sequence[str]) -> dict[str, float]:
+    """How far sideways bodies were held [mm], as the identified simulator has it, where that was estimated."""
+    if scene.config.get("release", {}).get("sideways", 0.0) <= 0.0:
+        return {}
+    simulator, found = scene.model_simulator("resphys"), {}
+    for some in scene.alike(names):
+        shift = scene.start(simulator, scene.trials(some)).shift if scene.begins(some[0]) == "released" else None
+        if shift is not None:
+            found |= dict(zip(some, (1e3 * shift.norm(dim=2).mean(1)).tolist(), strict=True))
+    return found
+
+
+def time_models(context: StageContext) -> None:
+    """Writes times.json: seconds a test trial, mean and standard deviation over the trials.
+
+    The published table's rows: the uncorrected simulator, the simulator with the true parameters where these are known,
+    the simulator with the learned force, and the network alone. One trial at a time, each once, after a run of the first
+    to warm up.
+    """
+    scene = Scene(context.settings, context.run_dir, "count")
+    names = scene.moving(context.settings["groups"]["1"])
+    simulator = scene.model_simulator("resphys")
+    learned = learned_of(scene, "resphys", simulator.rest_positions)
+    starts = {name: scene.start(simulator, scene.trials([name])) for name in names}
+    rows: dict[str, tuple[str, Any, Any]] = {"simulation": ("simulation", None, scene.simulator("simulation"))}
+    if scene.config.get("target") is not None:
+        rows["target"] = ("simulation", None, scene.simulator("target"))
+    rows |= {"resphys": ("resphys", learned, simulator), "inference": ("resphys", learned, simulator)}
+    times: dict[str, dict[str, float]] = {}
+    steps = 0
+    with Progress(context.name, len(rows) * len(names), "trials") as progress, torch.no_grad():
+        for row, (model, known, stepping) in rows.items():
+            runs = [ModelRollout(scene, model, [name], known, starts[name], stepping) for name in names]
+            seconds = []
+            for run in (runs[0], *runs):
+                state, steps = run.begin(), run.steps
+                predictor, before = run.predictor, time.perf_counter()
+                for step in range(steps):
+                    if row == "inference" and predictor is not None:
+                        predictor(state, step)
+                    else:
+                        state = run.rollout.step(state)
+                seconds.append(time.perf_counter() - before)
+            progress.advance(len(names))
+            times[row] = {"mean": mean(seconds[1:]), "std": pstdev(seconds[1:])}
+    write_json(context.run_dir / TIMES, {"steps": steps, "seconds": times})

@@ -1,42 +1,207 @@
-"""Stage: the forces that bring the simulator to the trajectories."""
+"""Stage: the forces that bring a simulator to the trials that it should have learned from."""
 
+import dataclasses
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from typing_extensions import override
 
 from ..dynamics.integrator import State
-from ..io.progress import Progress
-from ..io.resumable import Field, ResumableHDF5
+from ..dynamics.simulator import Simulator
+from ..io.files import atomic_hdf5, create, write_json
+from ..io.processes import Advance
+from ..io.resumable import Field
 from ..io.stages import StageContext
-from ..learning.reconstruction import make_reconstructor
-from .build import build_simulator
-from .trajectories import RECONSTRUCTION, TRAJECTORIES, last_state, read_fields, state_fields
+from ..learning.metrics import marker_errors
+from ..learning.reconstruction import Reconstructor, make_reconstructor
+from ..learning.replay import Replay
+from ..learning.rollout import Rollout
+from ..learning.sparse_reconstruction import make_sparse_reconstructor
+from .files import RECONSTRUCTION, read_if_there, reconstruction_file
+from .parts import March, Part, pack, read_parts, remove_parts, split_into_parts, unpack, work_on
+from .scene import Scene
+
+log = logging.getLogger(__name__)
+
+FloatArray = NDArray[np.float64]
+
+_UNITS = {"q": "m", "v": "m/s", "force": "N"}
+_UNHELD = 0.1  # mm, by which replayed markers may be further off than reconstructed ones
 
 
-def reconstruct(context: StageContext) -> None:
-    """Writes reconstruction.h5: q, v and force (B, T + 1, N, 3).
+def reconstruct(context: StageContext, processes: int = 1) -> None:
+    """Writes reconstruction_<model>.h5: q, v and force (R, K + 1, N, 3), and adds to reconstruction.json.
 
-    The force of a frame is the one that led to it; that of the first frame is zero.
+    The force of a frame is the one that led to it; that of the first frame is zero. Forces from markers are kept in
+    single precision, which rounds positions to 1e-8 m. The summary says how far the reconstructed points are from those
+    that were seen, and how far they are where the forces of validation are replayed. Forces can lead along equilibria
+    that are not stable, such as those of a chamber's wall that is about to buckle: step by step the markers are met, but
+    nothing that learns these forces will go there.
     """
-    settings = context.settings
-    simulator = build_simulator(settings, "simulation")
-    reconstructor = make_reconstructor(simulator, **settings["reconstruction"])
-    observed, velocity = read_fields(context.run_dir / TRAJECTORIES, "trajectories", "q", "v")
-    batch, frames, vertices, _ = observed.shape
-    fields = state_fields(batch, vertices)
-    fields["force"] = Field((batch, vertices, 3), "N", batch_axes=1)
-    path = context.run_dir / RECONSTRUCTION
-    with (
-        ResumableHDF5(path, "reconstruction", context.fingerprint, frames, fields) as file,
-        Progress("reconstruct", frames, "frames", file.done) as progress,
-    ):
-        state = State(simulator.tensor(observed[:, 0]), simulator.tensor(velocity[:, 0]))
-        force, iterations = torch.zeros_like(state.q), 0
-        if file.done > 0:
-            state = last_state(file, simulator.rest_positions)
-            force = simulator.tensor(file.read(file.done - 1)["force"])
-        while file.done < file.steps:
-            if file.done > 0:
-                result = reconstructor.step(state, simulator.tensor(observed[:, file.done]), first_guess=force)
-                state, force, iterations = result.state.detach(), result.force, result.iterations
-            file.append(q=state.q.cpu().numpy(), v=state.v.cpu().numpy(), force=force.cpu().numpy())
-            progress.advance(iterations=iterations)
-        file.finish({"regularisation": settings["reconstruction"]["regularisation"]})
+    settings, model = context.settings, context.settings["model"]
+    scene = Scene(settings, context.run_dir)
+    moving = scene.moving(settings["reconstructed"])
+    parts = []
+    for number, names in enumerate(scene.alike(moving)):
+        last = float(scene.trials(names).times.max()) / scene.model_simulator(model).time_step
+        frames = scene.learned_steps(int(last + 1e-6)) + 1
+        parts += split_into_parts(context, names, settings["batch"], frames, f"part{number}")
+    work_on(parts, reconstruct_part, processes)
+    order = [name for part in parts for name in part.names]
+    rows = [row for row, name in enumerate(order) if name in settings["split"]["validation"]]
+    error, held_out = _together(parts, "error"), {}
+    with atomic_hdf5(context.run_dir / reconstruction_file(model), "reconstruction", {"names": order}) as file:
+        create(file, "error", error, "mm", time_axis=1)
+        for name, unit in _UNITS.items():  # One after the other: those of many trials fill the memory.
+            values = _together(parts, name)
+            create(file, name, values, unit, time_axis=1)
+            held_out[name] = values[rows].copy()
+    summary = {"mean_mm": float(np.nanmean(error)), "max_mm": float(np.nanmax(error))}
+    if rows and scene.dataset.bound is not None:
+        names = [order[row] for row in rows]
+        summary["replayed_mm"] = _replay(context, names, {**held_out, "error": error[rows]})
+    found = read_if_there(context.run_dir / RECONSTRUCTION)
+    finite = {key: value if np.isfinite(value) else None for key, value in summary.items()}
+    write_json(context.run_dir / RECONSTRUCTION, {**found, model: finite})
+    remove_parts(context)
+
+
+def _together(parts: Sequence[Part], name: str) -> FloatArray:
+    """The arrays of all parts; those with fewer frames are padded with NaN."""
+    found = [read_parts([part], name) for part in parts]
+    frames = max(each.shape[1] for each in found)
+    padding = [[(0, 0), (0, frames - each.shape[1]), *[(0, 0)] * (each.ndim - 2)] for each in found]
+    return np.concatenate([np.pad(x, w, constant_values=np.nan) for x, w in zip(found, padding, strict=True)])
+
+
+def _replay(context: StageContext, names: Sequence[str], found: Mapping[str, FloatArray]) -> float:
+    """Mean distance of the markers where the forces of some trials are replayed [mm]; warns where it is too large."""
+    replayed = float(np.nanmean(replayed_errors(context.settings, context.run_dir, tuple(names), found)))
+    met = float(np.nanmean(found["error"]))
+    if not replayed <= met + _UNHELD:
+        log.warning(
+            "%s: replayed, the forces lead %.2f mm away from the markers, %.2f mm when they were found: raise "
+            "reconstruction.regularisation, or set reconstruction.modes.",
+            *(context.name, replayed, met),
+        )
+    return replayed
+
+
+def reconstruct_part(part: Part, advance: Advance) -> None:
+    """q, v, force (B, K + 1, N, 3) and the distance of what is observed (B, K + 1) [mm] of trials that begin alike.
+
+    Raises:
+        ConvergenceError: a step fails.
+    """
+    scene = Scene(part.context.settings, part.context.run_dir)
+    part.march(_Reconstructing(scene, part.context.settings, part.names), advance)
+
+
+def reconstructing_simulator(scene: Scene, model: str) -> Simulator:
+    """The simulator of a model, with an integrator whose velocities do not ring where positions are prescribed.
+
+    The midpoint rule's do: v+ = 2 (q+ - q) / h - v keeps every deviation.
+    """
+    simulator = scene.model_simulator(model)
+    return dataclasses.replace(simulator, integrator="bdf2") if simulator.integrator == "midpoint" else simulator
+
+
+class _Reconstructing(March):
+    """Some trials, brought to what was observed of them step by step."""
+
+    def __init__(self, scene: Scene, settings: Mapping[str, Any], names: Sequence[str]) -> None:
+        self._simulator = reconstructing_simulator(scene, settings["model"])
+        replay, self._start = scene.replay(self._simulator, names)
+        self._replay, self._observe = replay, scene.observe
+        self._constants, self._inputs, self._resting = replay.setting(scene.parameters(settings["model"]))
+        self._method = make_method(scene, self._simulator, settings["reconstruction"]).with_constants(self._constants)
+        self._observed = scene.explained(self._simulator, replay.trials, self._start)
+        self._state: State | None = None
+        self._force = torch.zeros_like(self._start.state.q)
+        dtype = "float64" if scene.dataset.bound is None else "float32"
+        shape = (len(names), self._simulator.body.n_vertices, 3)
+        self.fields = {name: Field(shape, unit, dtype, 1) for name, unit in _UNITS.items()}
+        self.fields["error"] = Field((len(names),), "mm", dtype, 1)
+        self.frames = self._observed.shape[1]
+
+    @override
+    def frame(self, number: int) -> tuple[dict[str, Any], dict[str, object]]:
+        shown: dict[str, object] = {}
+        if number == 0:
+            self._state = self._replay.begin(self._start, self._constants, self._resting)
+        else:
+            assert self._state is not None
+            result = self._method.step(self._state, self._observed[:, number], self._inputs.at(number - 1), self._force)
+            self._state, self._force = result.state.detach(), result.force
+            shown["iterations"] = result.iterations
+        kept = {"q": self._state.q, "v": self._state.v, "force": self._force}
+        reached = self._observe(self._state.q)
+        pairs = zip(reached.cpu().numpy(), self._observed[:, number].cpu().numpy(), strict=True)
+        error = np.array([frame_error(x, y) for x, y in pairs])
+        return {**{name: value.cpu().numpy() for name, value in kept.items()}, "error": error}, shown
+
+    @override
+    def snapshot(self) -> dict[str, torch.Tensor]:
+        assert self._state is not None
+        return {**pack(self._state), "force": self._force}
+
+    @override
+    def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
+        self._state = unpack(tensors, self._simulator.rest_positions)
+        self._force = tensors["force"].to(self._state.q)
+
+
+def make_method(scene: Scene, simulator: Simulator, settings: Mapping[str, Any]) -> Reconstructor:
+    """The configured reconstruction: of full states, which has a faster way, or of markers."""
+    if scene.dataset.bound is None:
+        return make_reconstructor(simulator, **settings)
+    return make_sparse_reconstructor(simulator, scene.observe, **settings)  # type: ignore[arg-type]
+
+
+def replayed_errors(
+    settings: Mapping[str, Any], run_dir: Path, names: tuple[str, ...], found: Mapping[str, FloatArray]
+) -> FloatArray:
+    """(B, K + 1) distance of the markers [mm] of simulations with reconstructed forces; infinite from where one fails.
+
+    The forces turn with the body, from where it was to where it is, if those that are learned do (``force_frame``).
+
+    Args:
+        settings: of the stage.
+        run_dir: with the imported trials and the identified parameters.
+        names: of trials that begin alike.
+        found: q [m], v [m/s] and the force [N] that leads there, each (B, K + 1, N, 3).
+    """
+    scene = Scene(settings, run_dir, "count")
+    simulator = reconstructing_simulator(scene, settings["model"])
+    replay, start = scene.replay(simulator, names)
+    constants, inputs, resting = replay.setting(scene.parameters(settings["model"]))
+    observed = scene.explained(simulator, replay.trials, start)
+    frames = scene.frames(simulator)
+    steps = (found["q"][:, :-1], found["v"][:, :-1], found["force"][:, 1:])
+    known = [torch.from_numpy(each).to(simulator.rest_positions).unbind(1) for each in steps]
+
+    def predict(state: State, step: int) -> torch.Tensor:
+        q, v, force = (series[step] for series in known)
+        return force if frames is None else frames.to_world(state.q, state.v, frames.to_rest(q, v, force))
+
+    rollout = Rollout(simulator, predict, inputs, constants)
+    errors = np.full(found["q"].shape[:2], np.inf, dtype=np.float32)
+    with torch.no_grad():
+        state = replay.begin(start, constants, resting)
+        for k in range(errors.shape[1]):
+            state = rollout.step(state) if k > 0 else state
+            reached, seen = scene.observe(state.q).cpu().numpy(), observed[:, k].cpu().numpy()
+            for row in np.flatnonzero(~rollout.lost(state).cpu().numpy()):
+                errors[row, k] = frame_error(reached[row], seen[row])
+    return errors
+
+
+def frame_error(reached: FloatArray, observed: FloatArray) -> float:
+    """Mean distance of the points (M, 3) of a frame that were seen [mm]; NaN if none was."""
+    found = marker_errors(reached[None], observed[None])
+    return float(found[0]) if len(found) else float("nan")

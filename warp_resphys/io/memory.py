@@ -30,3 +30,16 @@ def peak_memory_gib() -> float:
     if known:
         return int(known[1]) / 2**20
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**30 if sys.platform == "darwin" else 2**20)
+
+
+def available_memory_gib() -> float:
+    """Memory that this process may still take [GiB]: what is free, within a container's limit; infinite where unknown."""
+    found = []
+    meminfo = Path("/proc/meminfo")
+    known = re.search(r"^MemAvailable:\s+(\d+) kB$", meminfo.read_text(), re.MULTILINE) if meminfo.is_file() else None
+    if known:
+        found.append(int(known[1]) / 2**20)
+    limit = Path("/sys/fs/cgroup/memory.max")
+    if limit.is_file() and (text := limit.read_text().strip()).isdigit():
+        found.append(int(text) / 2**30)
+    return min(found, default=float("inf"))

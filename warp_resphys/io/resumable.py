@@ -166,6 +166,13 @@ class ResumableHDF5:
         if time.monotonic() - self._synced > _SYNC_SECONDS:
             self._sync()
 
+    def rewind(self, steps: int) -> None:
+        """Forgets all but the first steps, which are written anew."""
+        if not self._finished and steps < self.done:
+            assert self._descriptor is not None
+            os.ftruncate(self._descriptor, self._offset(steps))
+            self.done = steps
+
     def read(self, step: int) -> dict[str, npt.NDArray[Any]]:
         """The arrays of a step that is done, for instance to start the next one from.
 

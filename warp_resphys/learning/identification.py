@@ -104,8 +104,8 @@ class Identifier:
     """Searches parameters.
 
     Args:
-        replay: of the motions to fit.
-        release: how they begin.
+        replays: of the trials to fit, each of trials that begin alike, such as motions and static poses, with how these
+            begin; all by one simulator.
         bounds: range of each parameter to identify.
         seconds: how much of each motion counts; all of it if None.
 
@@ -114,31 +114,37 @@ class Identifier:
     """
 
     def __init__(
-        self, replay: Replay, release: Start, bounds: Mapping[str, Bounds], seconds: float | None = None
+        self, replays: Sequence[tuple[Replay, Start]], bounds: Mapping[str, Bounds], seconds: float | None = None
     ) -> None:
         if not bounds:
             raise InputError("there is nothing to identify: name a parameter under identify.parameters.")
+        first = replays[0][0]
         for name in bounds:
-            if name not in replay.known:
-                raise InputError(f"there is no parameter {name!r} to identify: choose from {', '.join(replay.known)}.")
-        motions = replay.trials if seconds is None else replay.trials.first(seconds)
-        for name, moved in zip(motions.names, motions.amplitude.tolist(), strict=True):
-            if not moved > 0.0:
-                raise InputError(f"the markers of the trial {name!r} stay where they were held: leave it out.")
-        simulator = replay.simulator
+            if name not in first.known:
+                raise InputError(f"there is no parameter {name!r} to identify: choose from {', '.join(first.known)}.")
+        simulator, self.bounds = first.simulator, dict(bounds)
         most = min(simulator.settings.max_iterations, _MOST_ITERATIONS)
         settings = replace(simulator.settings, max_iterations=most, on_failure="raise")
-        self.replay = Replay(replace(simulator, solver=settings), replay.observe, motions)
-        self.release, self.bounds = release, dict(bounds)
-        self._weight = motions.loss_weight
+        self.simulator = replace(simulator, solver=settings)
+        self._replays, self._weights = [], []
+        count = sum(len(replay.trials.names) for replay, _ in replays)
+        for replay, start in replays:
+            trials = replay.trials if seconds is None else replay.trials.first(seconds)
+            for name, moved in zip(trials.names, trials.amplitude.tolist(), strict=True):
+                if not moved > 0.0:
+                    raise InputError(f"the markers of the trial {name!r} stay where they were held: leave it out.")
+            self._replays.append((Replay(self.simulator, replay.observe, trials), start))
+            self._weights.append(trials.loss_weight * (len(trials.names) / count))
 
     def losses(self, unit: torch.Tensor) -> torch.Tensor:
         """(E,) losses of (E, P) parameters, each a fraction of its range."""
-        return (self._residuals(unit).square().sum((2, 3, 4)) * self._weight).sum(1)
+        pairs = zip(self._residuals(unit), self._weights, strict=True)
+        return torch.stack([(each.square().sum((2, 3, 4)) * weight).sum(1) for each, weight in pairs]).sum(0)
 
-    def _residuals(self, unit: torch.Tensor) -> torch.Tensor:
+    def _residuals(self, unit: torch.Tensor) -> list[torch.Tensor]:
+        """(E, R, T, M, 3) simulated less observed points of each replay [m]."""
         values = {name: b.from_unit(unit[:, i]) for i, (name, b) in enumerate(self.bounds.items())}
-        return self.replay.errors(self.replay(self.release, values))
+        return [replay.errors(replay(start, values)) for replay, start in self._replays]
 
     def grid(
         self,
@@ -188,7 +194,7 @@ class Identifier:
         while len(left):
             try:
                 with torch.no_grad():
-                    losses[left] = self.losses(self.replay.simulator.tensor(points[left])).cpu().numpy()
+                    losses[left] = self.losses(self.simulator.tensor(points[left])).cpu().numpy()
                 break
             except ConvergenceError as error:
                 left = left[error.report.converged.view(len(left), -1).all(1).cpu().numpy()]
@@ -270,7 +276,7 @@ class Identifier:
 
         def matrix(unit: NDArray[np.float64]) -> NDArray[np.float64] | None:
             found = self._linearise(unit)
-            return None if found is None else 2.0 * np.einsum("rip,riq->pq", found[1], found[1])
+            return None if found is None else 2.0 * sum(jacobian.T @ jacobian for _, jacobian, _ in found)
 
         first = np.array([self._unit(name, start) for name in self.bounds])
         unit, loss = minimise(objective, first, matrix, max_evaluations, tolerance)
@@ -282,7 +288,7 @@ class Identifier:
 
     def _loss_and_gradient(self, unit: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         """Infinite, and zero, where the simulation fails."""
-        x = self.replay.simulator.tensor(unit)[None].requires_grad_()
+        x = self.simulator.tensor(unit)[None].requires_grad_()
         try:
             loss = self.losses(x)[0]
             (gradient,) = torch.autograd.grad(loss, x)
@@ -292,11 +298,14 @@ class Identifier:
 
     def _linearise(
         self, unit: NDArray[np.float64], central: bool = False
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """Weighted residuals (R, T, M, 3) and their derivatives (R, T M 3, P) by the fractions, from differences.
+    ) -> list[tuple[NDArray[np.float64], NDArray[np.float64], int]] | None:
+        """Weighted residuals of every trial, their derivatives by the fractions from differences, and how many count.
 
         One-sided differences lead into the range; central ones are taken a step inside of it. None where a simulation
         fails.
+
+        Returns:
+            A trial each (T, 3 M), (3 T M, P) and the number of coordinates that were seen.
         """
         count, steps = len(unit), np.where(unit < 0.5, _DIFFERENCE, -_DIFFERENCE)
         if central:
@@ -304,29 +313,32 @@ class Identifier:
         sides = [unit[None], unit + np.diag(steps), unit - np.diag(steps)]
         try:
             with torch.no_grad():
-                residuals = self._residuals(self.replay.simulator.tensor(np.concatenate(sides[: 3 if central else 2])))
+                residuals = self._residuals(self.simulator.tensor(np.concatenate(sides[: 3 if central else 2])))
         except ConvergenceError:
             return None
-        weighted = (residuals * self._weight.sqrt()[:, None, None, None]).double().cpu().numpy()
-        flat = weighted.reshape(*weighted.shape[:2], -1)
-        behind, width = (flat[count + 1 :], 2.0 * steps) if central else (flat[:1], steps)
-        return weighted[0], np.moveaxis((flat[1 : count + 1] - behind) / width[:, None, None], 0, -1)
+        found = []
+        for (replay, _), each, weight in zip(self._replays, residuals, self._weights, strict=True):
+            weighted = (each * weight.sqrt()[:, None, None, None]).double().cpu().numpy()  # (E, R, T, M, 3)
+            flat = weighted.reshape(*weighted.shape[:2], -1)
+            behind, width = (flat[count + 1 :], 2.0 * steps) if central else (flat[:1], steps)
+            jacobian = np.moveaxis((flat[1 : count + 1] - behind) / width[:, None, None], 0, -1)
+            seen = 3 * replay.trials.seen.sum((1, 2)).cpu().numpy()
+            rows = weighted[0].reshape(*weighted.shape[1:3], -1)
+            found += list(zip(rows, jacobian, seen.tolist(), strict=True))
+        return found
 
     def uncertainty(self, unit: NDArray[np.float64]) -> Uncertainty | None:
-        """Covariance (J^T J)^-1 (sum_r s_r^2 J_r^T J_r) (J^T J)^-1 at fractions of the ranges, J_r that of a motion.
+        """Covariance (J^T J)^-1 (sum_r s_r^2 J_r^T J_r) (J^T J)^-1 at fractions of the ranges, J_r that of a trial.
 
-        s_r^2 is the mean square residual of the motion times the number of frames that tell nothing new: the sum of
+        s_r^2 is the mean square residual of the trial times the number of frames that tell nothing new: the sum of
         the residuals' autocorrelation up to its first zero. None if the simulation fails close by.
         """
         found = self._linearise(unit, central=True)
         if found is None:
             return None
-        residuals, jacobian = found
-        each = 3 * self.replay.trials.seen.sum((1, 2)).cpu().numpy()
-        free = 1.0 - min(len(unit) / each.sum(), 0.5)
-        squares = np.square(residuals).sum((1, 2, 3)) / (each * free)
-        variances = squares * [_redundancy(series) for series in residuals]
-        blocks = np.einsum("rip,riq->rpq", jacobian, jacobian)
+        free = 1.0 - min(len(unit) / sum(seen for _, _, seen in found), 0.5)
+        variances = [np.square(rows).sum() / (seen * free) * _redundancy(rows) for rows, _, seen in found]
+        blocks = np.stack([jacobian.T @ jacobian for _, jacobian, _ in found])
         values, vectors = np.linalg.eigh(blocks.sum(0))
         inverse = (vectors / np.maximum(values, 1e-12 * max(values[-1], 1e-300))) @ vectors.T
         covariance = inverse @ np.einsum("r,rpq->pq", variances, blocks) @ inverse
@@ -347,9 +359,10 @@ class Identifier:
         return float(slope)
 
 
-def _redundancy(residuals: NDArray[np.float64]) -> float:
-    """How many frames (T, M, 3) weigh as much as one: 1 + 2 sum of the autocorrelation up to its first zero."""
-    series = residuals.reshape(len(residuals), -1)
+def _redundancy(series: NDArray[np.float64]) -> float:
+    """How many frames (T, C) weigh as much as one: 1 + 2 sum of the autocorrelation up to its first zero."""
+    if len(series) < 2:
+        return 1.0
     products = [float((series[lag:] * series[: len(series) - lag]).sum()) for lag in range(len(series) // 2)]
     if products[0] <= 0.0:
         return 1.0

@@ -5,12 +5,14 @@ every weight is paid for, so that it departs from there only as far as the motio
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from typing_extensions import override
 
+from ..dynamics.frames import VertexFrames
 from ..io.errors import ConvergenceError, InputError
 from .full_batch import FullBatchTrainer
 from .networks import ResidualForce
@@ -20,48 +22,68 @@ from .replay import Replay, Start
 _FAILURE = 1e4  # loss of a simulation that fails: the line search comes back from there
 
 
-class MotionLoss:
-    """Mean over motions of the mean squared distance of markers, in units of each motion's amplitude.
+@dataclass(frozen=True)
+class Watched:
+    """Trials that begin alike, as a loss sees them.
 
-    Args:
-        replay: of the motions.
-        release: how they begin.
-        parameters: (1,) physical parameters that were identified.
+    Attributes:
+        replay: of the trials.
+        start: how they begin.
         told: what a model is told of the inputs (`LearnedPredictor`); None for nothing.
+        frames: with which forces turn; None if they do not.
     """
 
-    def __init__(
-        self,
-        replay: Replay,
-        release: Start,
-        parameters: Mapping[str, torch.Tensor],
-        told: torch.Tensor | None,
-    ) -> None:
-        self._replay, self._release, self._parameters, self._told = replay, release, parameters, told
-        self._weight = replay.trials.loss_weight
+    replay: Replay
+    start: Start
+    told: torch.Tensor | None = None
+    frames: VertexFrames | None = None
 
-    def markers(self, model: ResidualForce | None) -> torch.Tensor:
-        """(R, T, M, 3) at the frames [m], with the force of the model or without any.
+
+class MotionLoss:
+    """Mean over trials of the mean squared distance of markers, in units of each trial's amplitude.
+
+    Args:
+        watched: the trials, in groups that begin alike.
+        parameters: (1,) physical parameters that were identified.
+    """
+
+    def __init__(self, watched: Sequence[Watched], parameters: Mapping[str, torch.Tensor]) -> None:
+        self._watched, self._parameters = watched, parameters
+        counts = [len(each.replay.trials.names) for each in watched]
+        shares = [count / sum(counts) for count in counts]
+        self._weights = [w.replay.trials.loss_weight * share for w, share in zip(watched, shares, strict=True)]
+
+    def markers(self, model: ResidualForce | None) -> list[torch.Tensor]:
+        """(R, T, M, 3) at the frames of each group [m], with the force of the model or without any.
 
         Raises:
             ConvergenceError: the simulation fails.
         """
-        force: Any = None if model is None else LearnedPredictor(model, self._told)
-        return self._replay(self._release, self._parameters or None, force=force)[0]
+        found = []
+        for each in self._watched:
+            force: Any = None if model is None else LearnedPredictor(model, each.told, frames=each.frames)
+            found.append(each.replay(each.start, self._parameters or None, force=force)[0])
+        return found
+
+    def _errors(self, model: ResidualForce | None) -> list[torch.Tensor]:
+        """(R, T, M, 3) simulated less observed markers of each group [m]."""
+        pairs = zip(self._watched, self.markers(model), strict=True)
+        return [each.replay.errors(markers[None])[0] for each, markers in pairs]
 
     def __call__(self, model: ResidualForce | None) -> torch.Tensor:
         """The loss, differentiable in the model's weights."""
-        errors = self._replay.errors(self.markers(model)[None])[0]
-        return (errors.square().sum((1, 2, 3)) * self._weight).sum()
+        pairs = zip(self._errors(model), self._weights, strict=True)
+        return torch.stack([(errors.square().sum((1, 2, 3)) * weight).sum() for errors, weight in pairs]).sum()
 
     def error_mm(self, model: ResidualForce | None) -> float:
-        """Mean distance of the markers that were seen, motions weighing the same [mm]; infinite where one diverged."""
+        """Mean distance of the markers that were seen, trials weighing the same [mm]; infinite where one diverged."""
         try:
             with torch.no_grad():
-                errors = self._replay.errors(self.markers(model)[None])[0].norm(dim=-1)
+                errors = [each.norm(dim=-1).sum((1, 2)) for each in self._errors(model)]
         except ConvergenceError:
             return float("inf")
-        return 1e3 * float((errors.sum((1, 2)) / self._replay.trials.seen.sum((1, 2))).mean())
+        seen = [each.replay.trials.seen.sum((1, 2)) for each in self._watched]
+        return 1e3 * float(torch.cat([e / s for e, s in zip(errors, seen, strict=True)]).mean())
 
 
 class MarkersInTheLoop(FullBatchTrainer):
@@ -76,9 +98,6 @@ class MarkersInTheLoop(FullBatchTrainer):
         validation: loss on the validation motions, by which the weights are chosen; None: the training motions are.
         config: the group ``in_the_loop``.
         epochs: in place of the configured ones; 0 keeps the simulator as it is.
-
-    Raises:
-        InputError: a setting out of range.
     """
 
     def __init__(
@@ -89,7 +108,6 @@ class MarkersInTheLoop(FullBatchTrainer):
         config: Mapping[str, Any],
         epochs: int | None = None,
     ) -> None:
-        check_in_the_loop(config)
         judge = train if validation is None else validation
         with torch.no_grad():
             _remove_force(model)
@@ -167,16 +185,3 @@ def _remove_force(model: ResidualForce) -> None:
         last.weight.zero_()
         last.bias.zero_()
         last.bias.requires_grad_(False)
-
-
-def check_in_the_loop(config: Mapping[str, Any]) -> None:
-    """Checks the ranges of the group ``in_the_loop``.
-
-    Raises:
-        InputError: a setting out of range.
-    """
-    for key in ("epochs", "memory", "rollout_every", "patience"):
-        if not config[key] > 0:
-            raise InputError(f"in_the_loop.{key} is {config[key]}: it must be positive.")
-    if not config["penalty"] >= 0.0:
-        raise InputError(f"in_the_loop.penalty is {config['penalty']}: it must be zero or more.")

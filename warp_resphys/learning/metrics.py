@@ -145,6 +145,39 @@ def trajectory_errors(positions: ArrayLike, target: ArrayLike) -> NDArray[np.flo
         return np.asarray(distance.mean(axis=1) * MILLIMETRES_PER_METRE)
 
 
+def marker_errors(simulated: NDArray[np.float64], observed: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the mean distance of the markers that were seen, of the frames in which one was (the paper's eq. 7).
+
+    Args:
+        simulated: (T, M, 3) [m], NaN where the roll-out diverged.
+        observed: (T, M, 3) [m], NaN where a marker was not seen.
+
+    Returns:
+        (T',) errors [mm].
+    """
+    seen = np.asarray(np.isfinite(observed).all(-1))
+    distance = np.where(seen, np.linalg.norm(simulated - np.where(seen[..., None], observed, 0.0), axis=-1), 0.0)
+    any_seen = seen.any(1)
+    return np.asarray(MILLIMETRES_PER_METRE * distance.sum(1)[any_seen] / seen.sum(1)[any_seen])
+
+
+def errors_per_marker(
+    simulated: NDArray[np.float64], observed: NDArray[np.float64], labels: Sequence[str]
+) -> dict[str, float | None]:
+    """Return the mean error of each marker [mm]; None where a roll-out diverged or the marker was never seen.
+
+    Args:
+        simulated: (R, T, M, 3) [m], NaN where a roll-out diverged.
+        observed: (R, T, M, 3) [m], NaN where a marker was not seen.
+        labels: M names.
+    """
+    found: dict[str, float | None] = {}
+    for m, label in enumerate(labels):
+        errors = [marker_errors(x[:, m : m + 1], y[:, m : m + 1]) for x, y in zip(simulated, observed, strict=True)]
+        found[label] = _finite_mean(np.concatenate(errors)) if any(map(len, errors)) else None
+    return found
+
+
 def summarise(errors: Iterable[NDArray[np.float64]]) -> ErrorSummary:
     """Return the mean error over trajectories, steps and vertices, with its standard deviation.
 

@@ -16,6 +16,7 @@ from ..io.errors import InputError
 
 NETWORK_KINDS = ("reduced", "nodal")
 ACTIVATIONS = ("normalised_elu", "silu")
+FORCE_BASES = ("force", "displacement")
 # Modes and coordinates that vary less than this fraction of the largest are not amplified to unit deviation.
 _DEVIATION_FLOOR = 3e-3
 # Samples that modes are taken from, evenly picked: neighbours in time tell the same, and more take minutes.
@@ -358,7 +359,8 @@ def build_next_state(
 
 def _state_coders(config: Mapping[str, Any], u: torch.Tensor, v: torch.Tensor) -> tuple[Coder, Coder]:
     """Coders of displacements and velocities."""
-    check_network(config)
+    if config["kind"] not in NETWORK_KINDS:
+        raise InputError(f"network.kind is {config['kind']!r}: choose one of {', '.join(NETWORK_KINDS)}.")
     if config["kind"] == "reduced":
         pairs = ((u, config["position_modes"]), (v, config["velocity_modes"]))
         found = [pod_coder(field, modes) if modes else _blind_coder(field) for field, modes in pairs]
@@ -370,25 +372,6 @@ def _blind_coder(samples: torch.Tensor) -> Coder:
     """No coordinates at all: for what a network is not to see."""
     nothing = samples.new_zeros(samples[0].numel())
     return Coder(nothing, nothing.new_zeros(len(nothing), 0), nothing.new_zeros(0))
-
-
-def check_network(config: Mapping[str, Any]) -> None:
-    """Checks the ranges of the group ``network``.
-
-    Raises:
-        InputError: an unknown kind or activation, or a size that is not positive.
-    """
-    if config["kind"] not in NETWORK_KINDS:
-        raise InputError(f"network.kind is {config['kind']!r}: choose one of {', '.join(NETWORK_KINDS)}.")
-    if config["activation"] not in ACTIVATIONS:
-        raise InputError(f"network.activation is {config['activation']!r}: choose one of {', '.join(ACTIVATIONS)}.")
-    reduced = config["kind"] == "reduced"
-    for key in ("blocks", "width", *(("force_modes",) if reduced else ())):
-        if not config[key] > 0:
-            raise InputError(f"network.{key} is {config[key]}: it must be positive.")
-    for key in ("layers", *(("position_modes", "velocity_modes") if reduced else ())):
-        if not config[key] >= 0:
-            raise InputError(f"network.{key} is {config[key]}: it must be zero or more.")
 
 
 Model = TypeVar("Model", bound=StateMap)

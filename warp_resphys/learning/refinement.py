@@ -1,52 +1,64 @@
 """Solver-in-the-loop refinement: a residual force that was trained on single steps, trained on through the simulator.
 
-The loss is how far the simulator, with the predicted force, is from the target trajectory over windows of k steps that
-start on it (Um et al. 2020, "Solver-in-the-Loop"). Its gradient goes back through the implicit adjoint of every step.
+The loss is how far what is observed of the simulator, with the predicted force, is from the target over windows of k
+steps that start on it, or on states that were reconstructed from it (Um et al. 2020, "Solver-in-the-Loop"). Its gradient goes back through the implicit adjoint of every step.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from typing_extensions import override
 
+from ..data.trials import Trials
+from ..dynamics.frames import VertexFrames
 from ..dynamics.integrator import State
 from ..dynamics.simulator import Simulator
 from ..io.errors import ConvergenceError, InputError
 from .full_batch import FullBatchTrainer
 from .networks import ResidualForce
-from .predictors import LearnedPredictor
+from .predictors import LearnedPredictor, Range
+from .replay import Observe, Replay
 from .rollout import FURTHEST, Rollout
 
 REFINEMENTS = ("none", "solver_in_the_loop")
+_WINDOW = ("motion", "trial", "frame")
 _SMALLEST_UNIT = 1e-20  # mm^2
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Target trajectories of a split.
+    """Trials that begin alike, at a simulator's steps.
 
     Attributes:
-        q: (R, T + 1, N, 3) positions [m].
-        v: (R, T + 1, N, 3) velocities [m/s].
+        q: (R, K + 1, N, 3) positions that windows start from [m].
+        v: (R, K + 1, N, 3) velocities there [m/s].
+        target: (R, K + 1, M, 3) what should be observed [m], NaN where nothing was seen.
+        trials: what acted on the bodies.
+        told: what the model is told of that, see `LearnedPredictor`; None for nothing.
     """
 
     q: torch.Tensor
     v: torch.Tensor
+    target: torch.Tensor
+    trials: Trials
+    told: torch.Tensor | None = None
 
 
 @dataclass(frozen=True)
 class Windows:
-    """Pieces of trajectories.
+    """Pieces of motions.
 
     Attributes:
-        trajectory: (W,) number of the trajectory.
+        motion: (W,) number of the motion.
+        trial: (W,) number of the trial in it.
         frame: (W,) frame that the window starts from.
     """
 
-    trajectory: torch.Tensor
+    motion: torch.Tensor
+    trial: torch.Tensor
     frame: torch.Tensor
 
     def __len__(self) -> int:
@@ -55,7 +67,7 @@ class Windows:
 
     def pick(self, which: torch.Tensor) -> "Windows":
         """Some of them, by number."""
-        return Windows(self.trajectory[which], self.frame[which])
+        return Windows(self.motion[which], self.trial[which], self.frame[which])
 
 
 class WindowLoss:
@@ -67,42 +79,63 @@ class WindowLoss:
             factor that a solver keeps would make it depend on what was computed before.
         window: k.
         batch_size: windows that are simulated at once.
+        observe: (B, N, 3) positions to (B, M, 3) observed points [m]; all vertices if left out.
+        parameters: (1,) physical parameters that were identified.
+        frames: with which forces turn; None if they do not.
+        range_: of the model's inputs, in which they are held; None for no guard.
     """
 
     def __init__(
-        self, model: ResidualForce, make_simulator: Callable[[], Simulator], window: int, batch_size: int
+        self,
+        model: ResidualForce,
+        make_simulator: Callable[[], Simulator],
+        window: int,
+        batch_size: int,
+        observe: Observe = lambda q: q,
+        parameters: Mapping[str, torch.Tensor] | None = None,
+        frames: VertexFrames | None = None,
+        range_: Range | None = None,
     ) -> None:
-        self._model, self._make_simulator = model, make_simulator
+        self._model, self._make_simulator, self._observe = model, make_simulator, observe
         self._window, self._batch_size = window, batch_size
+        self._parameters, self._frames, self._range = parameters or {}, frames, range_
         simulator = make_simulator()
         self._first_frame = 1 if simulator.integrator == "bdf2" else 0  # BDF2 looks back.
         rest = simulator.rest_positions
         self.failure = (1e3 * FURTHEST * float((rest.amax(0) - rest.amin(0)).max())) ** 2  # of a window [mm^2]
 
-    def side_by_side(self, motion: Motion) -> Windows:
-        """Windows that cover the trajectories, but for what is left over at their ends."""
-        trajectories, frames = motion.q.shape[:2]
-        start = torch.arange(self._first_frame, frames - self._window, self._window)
-        return Windows(torch.arange(trajectories).repeat_interleave(len(start)), start.repeat(trajectories))
+    def side_by_side(self, motions: Sequence[Motion]) -> Windows:
+        """Windows that cover the trials, but for what is left over at their ends or not seen at all."""
+        found = []
+        for number, motion in enumerate(motions):
+            frames = motion.q.shape[1]
+            start = torch.arange(self._first_frame, frames - self._window, self._window)
+            trial, frame = (t.flatten() for t in torch.meshgrid(torch.arange(len(motion.q)), start, indexing="ij"))
+            span = frame[:, None] + torch.arange(1, self._window + 1)
+            seen = torch.isfinite(motion.target.cpu()[trial[:, None], span]).all(-1).flatten(1).any(1)
+            known = torch.isfinite(motion.q.cpu()[trial, frame]).flatten(1).all(1)
+            found.append([x[seen & known] for x in (torch.full_like(trial, number), trial, frame)])
+        return Windows(*(torch.cat(each) for each in zip(*found, strict=True)))
 
     @torch.no_grad()
-    def measure(self, windows: Windows, motion: Motion) -> tuple[float, torch.Tensor]:
+    def measure(self, windows: Windows, motions: Sequence[Motion]) -> tuple[float, torch.Tensor]:
         """Mean squared distance [mm^2] of the windows that can be simulated, and (W,) bool: which of them cannot."""
         simulator = self._make_simulator()
-        parts = [windows.pick(part) for part in torch.arange(len(windows)).split(self._batch_size)]
-        measured = [self._distances(simulator, part, motion) for part in parts]
-        squares, lost = (torch.cat(tensors) for tensors in zip(*measured, strict=True))
-        return float(squares.mean()), lost
+        lost, squares = torch.zeros(len(windows), dtype=torch.bool), []
+        for part in self._parts(windows):
+            measured, failed = self._distances(simulator, windows.pick(part), motions)
+            lost[part], squares = failed, [*squares, measured]
+        return float(torch.cat(squares).mean()), lost
 
-    def backward(self, windows: Windows, motion: Motion, unit: float) -> float:
+    def backward(self, windows: Windows, motions: Sequence[Motion], unit: float) -> float:
         """Mean squared distance in a unit [mm^2]; adds its gradient to those of the weights.
 
         A window that cannot be simulated counts as `FURTHEST` body lengths, without a gradient.
         """
         simulator = self._make_simulator()
         total, each = 0.0, 1.0 / (unit * len(windows))
-        for part in torch.arange(len(windows)).split(self._batch_size):
-            squares, lost = self._distances(simulator, windows.pick(part), motion)
+        for part in self._parts(windows):
+            squares, lost = self._distances(simulator, windows.pick(part), motions)
             failed = int(lost.sum())
             if len(squares):
                 try:
@@ -112,13 +145,22 @@ class WindowLoss:
             total += each * (float(squares.detach().sum()) + failed * self.failure)
         return total
 
-    def _distances(self, simulator: Simulator, windows: Windows, motion: Motion) -> tuple[torch.Tensor, torch.Tensor]:
+    def _parts(self, windows: Windows) -> list[torch.Tensor]:
+        """Numbers of windows that are simulated at once: of one motion each."""
+        found = []
+        for motion in windows.motion.unique().tolist():
+            found += (windows.motion == motion).nonzero()[:, 0].split(self._batch_size)
+        return found
+
+    def _distances(
+        self, simulator: Simulator, windows: Windows, motions: Sequence[Motion]
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """(U,) mean squared distances [mm^2] of the windows that can be simulated, and (W,) bool: which cannot.
 
         Where some fail, the others are simulated again beside copies of each other, so that neither their states nor
         their gradients meet a number that is not finite.
         """
-        batch = len(windows)
+        batch, motion = len(windows), motions[int(windows.motion[0])]
         whole = torch.arange(batch)
         lost = torch.ones(batch, dtype=torch.bool)
         while len(whole):
@@ -133,18 +175,34 @@ class WindowLoss:
 
     def _roll_out(self, simulator: Simulator, windows: Windows, motion: Motion) -> tuple[torch.Tensor, torch.Tensor]:
         """(W,) mean squared distances [mm^2], and (W,) bool: which windows failed."""
-        run, frame = windows.trajectory, windows.frame
+        run, frame = windows.trial, windows.frame
         previous = None
         if self._first_frame:
             previous = (motion.q[run, frame - 1], motion.v[run, frame - 1])
         state = State(motion.q[run, frame], motion.v[run, frame], previous)
-        rollout = Rollout(simulator, LearnedPredictor(self._model))
+        constants, inputs, _ = Replay(simulator, self._observe, motion.trials.select(run.tolist())).setting(
+            self._parameters
+        )
+        told = None if motion.told is None else _during(motion.told.index_select(-2, run), frame, self._window)
+        predict = LearnedPredictor(self._model, told, self._range, self._frames)
+        acting = inputs.from_steps(frame, self._window)
+        rollout = Rollout(simulator, predict, acting, constants)
         squares = state.q.new_zeros(len(windows))
         for step in range(1, self._window + 1):
             state = rollout.differentiable_step(state)
-            distance = 1e3 * (state.q - motion.q[run, frame + step])
-            squares = squares + distance.square().sum(-1).mean(-1)
+            target = motion.target[run, frame + step]
+            seen = torch.isfinite(target).all(-1)
+            distance = torch.where(seen[..., None], 1e3 * (self._observe(state.q) - target), 0.0)
+            squares = squares + distance.square().sum((1, 2)) / seen.sum(1).clamp_min(1)
         return squares / self._window, rollout.lost(state)
+
+
+def _during(series: torch.Tensor, first: torch.Tensor, steps: int) -> torch.Tensor:
+    """(k, W, A) what (K, W, A) series are during k steps, each from its own first one; (W, A) stays as it is."""
+    if series.ndim == 2:
+        return series
+    at = (first + torch.arange(steps)[:, None]).clamp_max(len(series) - 1).to(series.device)
+    return series[at, torch.arange(series.shape[1], device=series.device)]
 
 
 class SolverInTheLoop(FullBatchTrainer):
@@ -160,25 +218,21 @@ class SolverInTheLoop(FullBatchTrainer):
     Args:
         model: to refine.
         loss: of windows.
-        train: training trajectories.
-        validation: held-out trajectories.
+        train: training trials.
+        validation: held-out trials.
         rollout_error: mean roll-out error on the validation split [mm]; infinite where a roll-out diverged.
         config: the group ``refinement``.
-
-    Raises:
-        InputError: a setting out of range.
     """
 
     def __init__(
         self,
         model: ResidualForce,
         loss: WindowLoss,
-        train: Motion,
-        validation: Motion,
+        train: Sequence[Motion],
+        validation: Sequence[Motion],
         rollout_error: Callable[[ResidualForce], float],
         config: Mapping[str, Any],
     ) -> None:
-        check_refinement(config, train.q.shape[1] - 1)
         super().__init__(model, rollout_error, config)
         self._loss, self._train, self._validation = loss, train, validation
         self._windows = loss.side_by_side(train)
@@ -219,31 +273,10 @@ class SolverInTheLoop(FullBatchTrainer):
     @override
     def snapshot(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
         tensors, metadata = super().snapshot()
-        tensors |= {"windows.trajectory": self._windows.trajectory, "windows.frame": self._windows.frame}
+        tensors |= {f"windows.{name}": getattr(self._windows, name) for name in _WINDOW}
         return tensors, metadata
 
     @override
     def resume(self, tensors: Mapping[str, torch.Tensor], metadata: Mapping[str, Any]) -> None:
         super().resume(tensors, metadata)
-        self._windows = Windows(tensors["windows.trajectory"], tensors["windows.frame"])
-
-
-def check_refinement(config: Mapping[str, Any], steps: int) -> None:
-    """Checks the ranges of the group ``refinement``.
-
-    Args:
-        config: the group.
-        steps: of a trajectory.
-
-    Raises:
-        InputError: an unknown kind, or a setting out of range.
-    """
-    if config["kind"] not in REFINEMENTS:
-        raise InputError(f"refinement.kind is {config['kind']!r}: choose one of {', '.join(REFINEMENTS)}.")
-    if config["kind"] == "none":
-        return
-    for key in ("window", "epochs", "batch_size", "memory", "rollout_every"):
-        if not config[key] > 0:
-            raise InputError(f"refinement.{key} is {config[key]}: it must be positive.")
-    if config["window"] >= steps:
-        raise InputError(f"refinement.window is {config['window']}: it must be less than the data's {steps} steps.")
+        self._windows = Windows(*(tensors[f"windows.{name}"] for name in _WINDOW))

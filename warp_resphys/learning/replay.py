@@ -15,10 +15,12 @@ from ..data.trials import Trials
 from ..dynamics.inputs import Inputs
 from ..dynamics.integrator import State
 from ..dynamics.simulator import Constants, Simulator
-from ..io.errors import InputError
+from ..io.errors import ConvergenceError, InputError
 
 MASS_FACTOR = "attached_mass_factor"
 TILTS = ("gravity_tilt_1", "gravity_tilt_2")
+_POSE_ITERATIONS = 50
+_POSE_TOLERANCE = 1e-8  # m
 Observe = Callable[[torch.Tensor], torch.Tensor]
 StepForce = Callable[[State, int], torch.Tensor]
 Parameters = Mapping[str, torch.Tensor]
@@ -51,6 +53,13 @@ class Start:
         pick = torch.as_tensor(indices, device=self.delay.device)
         shift = None if self.shift is None else self.shift[pick]
         return replace(self, state=State(self.state.q[pick], self.state.v[pick]), delay=self.delay[pick], shift=shift)
+
+    def to(self, like: torch.Tensor) -> "Start":
+        """The same on the device and in the type of a tensor."""
+        shift = None if self.shift is None else self.shift.to(like)
+        return replace(
+            self, state=State(self.state.q.to(like), self.state.v.to(like)), delay=self.delay.to(like), shift=shift
+        )
 
     def shifted(self, markers: torch.Tensor) -> torch.Tensor:
         """(..., R, T, M, 3) markers where they sit, of those where they are bound [m]."""
@@ -113,12 +122,39 @@ class Replay:
         resting = self.trials.resting.repeat(each).replace(attached_mass=inputs.attached_mass)
         return sim.prepare(constants), inputs, resting
 
-    def begin(self, start: Start, constants: Constants, resting: Inputs, each: int = 1) -> State:
-        """The states (E R) from which the trials go on, for the constants and resting inputs of `setting`."""
+    def begin(
+        self, start: Start, constants: Constants, resting: Inputs, each: int = 1, force: StepForce | None = None
+    ) -> State:
+        """The states (E R) from which the trials go on, for the constants and resting inputs of `setting`.
+
+        A force acts on poses alone, which have no time in which it could: they are in equilibrium with the force of where
+        they are, found by going there again and again.
+
+        Raises:
+            ConvergenceError: there is no equilibrium, or a pose and its force do not settle.
+        """
         q, v = start.state.q.repeat(each, 1, 1), start.state.v.repeat(each, 1, 1)
-        if start.at_rest:
-            return self.simulator.static_equilibrium(resting, constants, start=q)
-        return State(q, v)
+        if not start.at_rest:
+            return State(q, v)
+        state = self.simulator.static_equilibrium(resting, constants, start=q)
+        if force is None or not self.is_static:
+            return state
+        for _ in range(_POSE_ITERATIONS):
+            before = state.q.detach()
+            state = self.simulator.static_equilibrium(resting.plus(force(state, 0)), constants, start=before)
+            if float((state.q.detach() - before).abs().max()) < _POSE_TOLERANCE:
+                return state
+        raise ConvergenceError(
+            f"a pose and the force that depends on it did not settle in {_POSE_ITERATIONS} iterations: the force is too "
+            "large to be a correction.",
+            state.q,
+            None,
+        )
+
+    @property
+    def is_static(self) -> bool:
+        """Whether the trials are poses, without time."""
+        return self.trials.observed.shape[1] == 1 and not bool(self.trials.times.any())
 
     def steps(self, start: Start) -> int:
         """Steps that reach past all frames: one more, for the slope there, where a frame is between two steps."""
@@ -141,7 +177,7 @@ class Replay:
         """
         each = len(next(iter(parameters.values()))) if parameters else 1
         constants, inputs, resting = self.setting(parameters)
-        state = self.begin(start, constants, resting, each)
+        state = self.begin(start, constants, resting, each, force)
         series = [self.observe(state.q)]
         for k in range(self.steps(start)):
             added = None if force is None else force(state, k)

@@ -25,8 +25,9 @@ class Rollout:
         predict: see `Predictor`; None for the simulator as it is. One that gives the next state replaces it.
         inputs: what acts on the batch, from the first step on.
         constants: other ones than the simulator's.
-        lost: (B,) bool, environments that diverged before.
-        done: steps that were made before.
+
+    Attributes:
+        done: steps that were made.
     """
 
     def __init__(
@@ -35,14 +36,17 @@ class Rollout:
         predict: Predictor | None = None,
         inputs: Inputs | None = None,
         constants: Constants | None = None,
-        lost: torch.Tensor | None = None,
-        done: int = 0,
     ) -> None:
-        self.simulator, self._predict, self._lost, self._step = simulator, predict, lost, done
+        self.simulator, self._predict, self.done = simulator, predict, 0
+        self._lost: torch.Tensor | None = None
         self._inputs = Inputs() if inputs is None else inputs
         self._constants = simulator.prepare() if constants is None else constants
         self._rest = simulator.rest_positions
         self._length = float((self._rest.amax(0) - self._rest.amin(0)).max())
+
+    def resume(self, lost: torch.Tensor, done: int) -> None:
+        """Goes on after so many steps, in which environments (B,) were lost."""
+        self._lost, self.done = lost, done
 
     @torch.no_grad()
     def step(self, state: State) -> State:
@@ -53,16 +57,16 @@ class Rollout:
         """Advances a batch by one step; gradients are meaningless where an environment is lost."""
         lost = self.lost(state)
         new, failed = self._advance(state, lost)
-        self._step += 1
+        self.done += 1
         distance = (new.q - self._rest).abs().flatten(1).amax(1)
         self._lost = lost | failed | ~(distance < FURTHEST * self._length)
         return self._reset(new, self._lost) if bool(self._lost.any()) else new
 
     def _advance(self, state: State, lost: torch.Tensor) -> tuple[State, torch.Tensor]:
         """The next state, and which environments (B,) failed."""
-        inputs, force, failed = self._inputs.at(self._step), None, lost
+        inputs, force, failed = self._inputs.at(self.done), None, lost
         if self._predict is not None:
-            given = self._predict(state, self._step)
+            given = self._predict(state, self.done)
             if isinstance(given, State):
                 return given, lost
             failed = lost | ~torch.isfinite(given).flatten(1).all(1)

@@ -146,7 +146,7 @@ class Trainer(EpochTrainer[Model]):
         seed: of the batches and the noise.
 
     Raises:
-        InputError: an empty split, or a setting out of range.
+        InputError: an empty split.
     """
 
     def __init__(
@@ -161,7 +161,6 @@ class Trainer(EpochTrainer[Model]):
         for name, samples in (("training", train), ("validation", validation)):
             if not len(samples.q):
                 raise InputError(f"the {name} split is empty: give it at least one trajectory.")
-        check_trainer(config)
         super().__init__(model, rollout_error, config)
         self.selection = config["selection"]
         self._random = torch.Generator().manual_seed(seed)
@@ -250,27 +249,6 @@ def scale_weights(model: StateMap, exponent: float) -> torch.Tensor:
         powers = coder.scale**exponent
         weights.append(powers / powers.square().mean().sqrt())
     return torch.cat(weights).to(model.linear.dtype)
-
-
-def check_trainer(config: Mapping[str, Any]) -> None:
-    """Checks the ranges of the group ``trainer``.
-
-    Raises:
-        InputError: a setting out of range.
-    """
-    for key, known in (("schedule", SCHEDULES), ("selection", SELECTIONS)):
-        if config[key] not in known:
-            raise InputError(f"trainer.{key} is {config[key]!r}: choose one of {', '.join(known)}.")
-    for key in ("epochs", "batch_size", "learning_rate", "final_learning_rate", "step_epochs", "rollout_every"):
-        if not config[key] > 0:
-            raise InputError(f"trainer.{key} is {config[key]}: it must be positive.")
-    if not 0.0 < config["gamma"] <= 1.0:
-        raise InputError(f"trainer.gamma is {config['gamma']}: it must be greater than 0 and at most 1.")
-    for key in ("weight_decay", "noise", "scale_weight"):
-        if not config[key] >= 0:
-            raise InputError(f"trainer.{key} is {config[key]}: it must be zero or more.")
-    if config["linear_noise"] is not None and not config["linear_noise"] > 0:
-        raise InputError(f"trainer.linear_noise is {config['linear_noise']}: it must be positive, or null.")
 
 
 def part_of(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:

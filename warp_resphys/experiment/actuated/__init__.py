@@ -1,1 +1,0 @@
-"""Experiments on bodies that pressure drives, recorded or simulated."""

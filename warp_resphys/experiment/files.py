@@ -1,0 +1,225 @@
+"""Names of the files in a run folder, and the dataset: trials as they were simulated or recorded."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from ..data.trials import Trials
+from ..dynamics.inputs import Inputs
+from ..fem.body import Body
+from ..io.errors import InputError
+from ..io.files import atomic_hdf5, create, read_array, read_hdf5, read_json
+from ..mesh.mesh import select_vertices
+
+FloatArray = NDArray[np.float64]
+
+DATASET: Final = "dataset.h5"
+SCALED_DATASET: Final = "dataset_scaled.h5"
+TRUTH: Final = "truth.json"
+QUALITY: Final = "quality.json"
+REGISTRATION: Final = "registration.json"
+IDENTIFICATION: Final = "identification.json"
+RECONSTRUCTION: Final = "reconstruction.json"
+ROLLOUTS: Final = "rollouts.h5"
+ERRORS: Final = "errors.json"
+TIMES: Final = "times.json"
+METRICS: Final = "metrics.json"
+REPORT: Final = "report.html"
+
+GIVEN: Final = "given"  # how trials begin whose state a simulation knows
+STATIC: Final = "static"
+DATASET_KIND: Final = "dataset"
+
+
+def reconstruction_file(model: str) -> str:
+    """The states and forces that a model's simulator was brought to."""
+    return f"reconstruction_{model}.h5"
+
+
+def weights_file(model: str, refined: bool = False) -> str:
+    """What a model has learned."""
+    return f"{model}_refined.safetensors" if refined else f"{model}.safetensors"
+
+
+def training_file(model: str, refined: bool = False) -> str:
+    """How the training of a model, or its refinement through the simulator, went."""
+    return f"refinement_{model}.json" if refined else f"training_{model}.json"
+
+
+def fold_folder(trial: str) -> str:
+    """The folder of the fold that is tested on a trial, in the run folder."""
+    return f"fold_{trial}"
+
+
+def read_if_there(path: Path) -> dict[str, Any]:
+    """What a JSON file holds; nothing where there is none."""
+    content: dict[str, Any] = read_json(path) if path.is_file() else {}
+    return content
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """R trials of one body, in its frame, as `DATASET` has them.
+
+    Attributes:
+        names: of the trials.
+        labels: of the M tracked markers; none where every vertex is observed.
+        begins: how each trial begins, see `trials.BEGINNINGS`; held bodies are ``released`` here.
+        times: (R, T) of the frames [s]; trials that end early repeat their last time.
+        observed: (R, T, M, 3) [m], NaN where nothing was seen.
+        held: (R, M, 3) the same before time zero [m].
+        payload: (R,) mass that hangs on the body [kg].
+        gravity: (3,) [m/s^2].
+        time_step: of the inputs [s].
+        bound: (M, 3) the markers on the undeformed body [m]; None for vertices.
+        smoothed: (R, T, M, 3) what forces are to explain of the markers [m]; None for all of it.
+        velocity: (R, T, N, 3) of the vertices [m/s], where a simulation knows them.
+        inputs: (R, K, C) during each step, by name, such as ``pressure`` [Pa].
+        channels: what the C are called, by input.
+    """
+
+    names: tuple[str, ...]
+    labels: tuple[str, ...]
+    begins: tuple[str, ...]
+    times: FloatArray
+    observed: FloatArray
+    held: FloatArray
+    payload: FloatArray
+    gravity: FloatArray
+    time_step: float
+    bound: FloatArray | None = None
+    smoothed: FloatArray | None = None
+    velocity: FloatArray | None = None
+    inputs: Mapping[str, FloatArray] = field(default_factory=dict)
+    channels: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def write(self, path: Path) -> None:
+        """Writes its file, for `read_dataset`.
+
+        Raises:
+            DataFileError: the file cannot be written.
+        """
+        attributes = describe(self.names, self.labels, self.begins, self.gravity, self.time_step, self.channels)
+        with atomic_hdf5(path, DATASET_KIND, attributes) as file:
+            for name in ("observed", "smoothed"):
+                if getattr(self, name) is not None:
+                    create(file, name, getattr(self, name), units="m", time_axis=1)
+            for name, values in self.inputs.items():
+                create(file, name, values, units="Pa", time_axis=1)
+            for name, unit in (("times", "s"), ("held", "m"), ("payload", "kg"), ("bound", "m")):
+                if getattr(self, name) is not None:
+                    create(file, name, getattr(self, name), units=unit)
+
+    def joined(self, other: "Dataset") -> "Dataset":
+        """These trials and others of the same body after them, with as many frames."""
+        arrays = {
+            name: None
+            if getattr(self, name) is None
+            else np.concatenate([getattr(each, name) for each in (self, other)])
+            for name in ("times", "observed", "held", "payload", "smoothed", "velocity")
+        }
+        inputs = {name: np.concatenate([values, other.inputs[name]]) for name, values in self.inputs.items()}
+        begins = self.begins + other.begins
+        return replace(self, names=self.names + other.names, begins=begins, inputs=inputs, **arrays)
+
+    def rows(self, names: Sequence[str]) -> list[int]:
+        """Where trials are."""
+        return [self.names.index(name) for name in names]
+
+    def trials(self, names: Sequence[str], body: Body, payload_at: Mapping[str, float] | None) -> Trials:
+        """Some of the trials, which begin alike, in float64 on the CPU.
+
+        Args:
+            names: of the trials.
+            body: that payloads hang on.
+            payload_at: see `attached_mass`.
+
+        Raises:
+            InputError: see `attached_mass`.
+        """
+        rows = self.rows(names)
+        static = self.begins[rows[0]] == STATIC
+        frames = slice(None, 1) if static else slice(None)
+        given = {key: torch.from_numpy(values[rows].swapaxes(0, 1).copy()) for key, values in self.inputs.items()}
+        if any(self.payload):
+            given["attached_mass"] = torch.from_numpy(attached_mass(body, payload_at, self.payload[rows]))
+        resting = (
+            Inputs(**{key: values[-1] for key, values in given.items() if key in self.inputs}) if static else Inputs()
+        )
+        arrays = (self.times[rows][:, frames], self.observed[rows][:, frames], self.held[rows])
+        return Trials(tuple(names), *map(torch.from_numpy, arrays), Inputs(**given), resting)
+
+
+def describe(
+    names: Sequence[str],
+    labels: Sequence[str],
+    begins: Sequence[str],
+    gravity: ArrayLike,
+    time_step: float,
+    channels: Mapping[str, Sequence[str]],
+) -> dict[str, Any]:
+    """Attributes of a dataset's file; see `Dataset`."""
+    words = {"names": list(names), "labels": list(labels), "begins": list(begins), "inputs": list(channels)}
+    of_inputs = {f"{name}_channels": list(known) for name, known in channels.items()}
+    return {**words, "gravity": np.asarray(gravity, dtype=np.float64), "time_step": time_step, **of_inputs}
+
+
+def read_dataset(path: Path) -> Dataset:
+    """Reads what `Dataset.write` wrote, or a simulation of trials.
+
+    Raises:
+        DataFileError: the file is missing, damaged or of another kind.
+    """
+    with read_hdf5(path, DATASET_KIND) as file:
+        names, labels, begins, inputs = (
+            tuple(str(each) for each in file.attrs[key]) for key in ("names", "labels", "begins", "inputs")
+        )
+        r = len(names)
+        times = read_array(file, "times", (r, None))
+        observed = read_array(file, "observed", (r, times.shape[1], len(labels) or None, 3))
+        m = observed.shape[2]
+        shapes = {"bound": (m, 3), "smoothed": observed.shape, "velocity": observed.shape}
+        optional = {name: read_array(file, name, shape) if name in file else None for name, shape in shapes.items()}
+        return Dataset(
+            names,
+            labels,
+            begins,
+            times,
+            observed,
+            held=read_array(file, "held", (r, m, 3)) if "held" in file else observed[:, 0],
+            payload=read_array(file, "payload", (r,)) if "payload" in file else np.zeros(r),
+            gravity=np.asarray(file.attrs["gravity"], dtype=np.float64),
+            time_step=float(file.attrs["time_step"]),
+            inputs={name: read_array(file, name, (r, None, None)) for name in inputs},
+            channels={name: tuple(str(each) for each in file.attrs[f"{name}_channels"]) for name in inputs},
+            **optional,
+        )
+
+
+def attached_mass(body: Body, payload_at: Mapping[str, float] | None, loads: FloatArray) -> FloatArray:
+    """(R, N) payloads in equal shares on the vertices that carry them [kg].
+
+    Args:
+        body: that they hang on.
+        payload_at: its vertices, such as ``{"x": 0.1, "z": 0.03}`` [m]; None where nothing ever hangs.
+        loads: (R,) [kg].
+
+    Raises:
+        InputError: a payload without a place, or a place where nothing can move.
+        MeshError: no vertex lies there.
+    """
+    masses = np.zeros((len(loads), body.n_vertices))
+    if not np.any(loads):
+        return masses
+    if payload_at is None:
+        raise InputError("a trial has a payload, but data.payload_at is not set: name the vertices that carry it.")
+    carrying = select_vertices(body.mesh, **payload_at)
+    if np.isin(carrying, body.fixed_vertices).all():
+        raise InputError("data.payload_at names fixed vertices alone: hang the payload on vertices that can move.")
+    masses[:, carrying] = loads[:, None] / len(carrying)
+    return masses

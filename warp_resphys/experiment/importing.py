@@ -1,0 +1,544 @@
+"""Stage: from recordings to markers in the frame of the body, and what acted on it, from time zero on.
+
+Time zero is the release of a body that was held, or the first frame of one that rests until its inputs come. Released
+bodies keep the times of their frames: losses and errors are taken at them, from the simulation between its steps, so that
+the frame rate need not fit the time step. Driven ones are brought to the steps, which their inputs are constant in.
+"""
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..data.actuation import check_pressures
+from ..data.recordings.processing import fill_gaps, release_of, resample, smooth, trim_to_release
+from ..data.recordings.quality import check_base, check_motion, check_passive, quality
+from ..data.recordings.reading import read_recording
+from ..data.recordings.recording import Recording, listed
+from ..data.recordings.release import Release
+from ..data.recordings.valve import valve_opening
+from ..data.registration import Registration, register_markers
+from ..dynamics.simulator import Simulator
+from ..io.errors import DataFileError, InputError
+from ..io.files import write_json
+from ..io.stages import StageContext
+from .build import bound_markers, build_simulator, chambers_of
+from .files import DATASET, QUALITY, REGISTRATION, SCALED_DATASET, STATIC, Dataset, read_dataset
+from .laboratory import vertical
+from .trials import Trial, evenly, is_laboratory, scaled_trials_of, trials_of
+
+log = logging.getLogger(__name__)
+
+FloatArray = NDArray[np.float64]
+
+_LEAST_RATE = 40.0  # Hz; the first tenth of a second tells how a body was let go, and four frames are few for that
+_LARGEST_LEAN = 30.0  # degrees between the vertical of a recording and the configured gravity
+_REST_PRESSURE = 0.01  # of the limit: less is what a gauge shows of none
+_SHOWN = 6  # driven trials whose quality and registration are kept for the report
+_POSE_SECONDS = 0.2  # at the end of a recording, that tell a pose
+_MILLI = 1e3
+_START = Release(0.0, (0, 1))  # of a recording that begins with it
+
+
+@dataclass(frozen=True)
+class Observed:
+    """A trial as it was recorded.
+
+    Attributes:
+        trial: what is configured of it.
+        raw: the configured markers, the tracked ones first, as measured.
+        moving: the tracked ones from time zero on, short gaps filled, long ones NaN.
+        still: (M', 3) where all markers were before time zero, in the frame of the recording [m].
+        registration: of the markers at rest.
+        pressure: (T, C) in the chambers of the body at the frames [Pa]; None without chambers.
+        release: when the body was let go; None of others.
+    """
+
+    trial: Trial
+    raw: Recording
+    moving: Recording
+    still: FloatArray
+    registration: Registration
+    pressure: FloatArray | None = None
+    release: Release | None = None
+
+    @property
+    def is_released(self) -> bool:
+        """Whether it was let go."""
+        return self.release is not None
+
+    def to_body(self, points: FloatArray, shift: FloatArray) -> FloatArray:
+        """(..., M, 3) points of the recording in the frame of the body, moved by (M, 3) [m]."""
+        moved: FloatArray = self.registration.transform.apply(points.reshape(-1, 3)).reshape(points.shape) + shift
+        return moved
+
+
+class Importer:
+    """Reads and registers trials.
+
+    Args:
+        context: of the stage, with the groups data, markers, laboratory, mesh and what a simulator needs.
+    """
+
+    def __init__(self, context: StageContext) -> None:
+        self.context, self.settings = context, context.settings
+        self.data, self.markers = self.settings["data"], self.settings["markers"]
+        self.simulator: Simulator = build_simulator(self.settings)
+        self.tracked = list(self.markers["tracked"])
+        self.nominal = _places(self.markers["tracked"])
+        self._chambers = chambers_of(self.simulator.body)
+        self._hanging: FloatArray | None = None
+
+    @property
+    def labels(self) -> list[str]:
+        """All configured markers, the tracked ones first."""
+        return [*self.tracked, *self.markers["reference"]]
+
+    def expected(self, observed_at_rest: bool) -> FloatArray:
+        """(M', 3) where all markers are when they are registered: on the undeformed body, or as it hangs [m]."""
+        reference = _places(self.markers["reference"])
+        if not observed_at_rest:
+            return np.concatenate([self.nominal, reference])
+        if self._hanging is None:
+            read = bound_markers(self.markers, self.simulator.body.mesh, self.nominal, tuple(self.tracked))
+            still = read.to(self.simulator.rest_positions)(self.simulator.static_equilibrium().q)[0]
+            self._hanging = still.cpu().numpy()
+        return np.concatenate([self._hanging, reference])
+
+    def observe(self, trials: Sequence[Trial]) -> list[Observed]:
+        """Reads every trial, finds time zero and registers it.
+
+        Raises:
+            DataFileError: a recording that cannot be read or used; the sentence names the file and the marker.
+        """
+        recordings = [self._read(trial) for trial in trials]
+        self._check_rates([each for each, trial in zip(recordings, trials, strict=True) if _has_release(trial)])
+        releases = [self._release(each, trial) for each, trial in zip(recordings, trials, strict=True)]
+        ready = [
+            each if _has_release(trial) else resample(each, 1.0 / self.settings["time_step"], interpolate=True)
+            for each, trial in zip(recordings, trials, strict=True)
+        ]
+        self._check_reference(ready, releases)
+        each = zip(trials, ready, releases, strict=True)
+        return [
+            self._driven(trial, recording) if release is None else self._released(trial, recording, release)
+            for trial, recording, release in each
+        ]
+
+    def _read(self, trial: Trial) -> Recording:
+        if is_laboratory(self.settings) or trial.file is None:
+            recording = read_recording(self.context.run_dir / trial.recording)
+        else:
+            recording = read_recording(trial.file, self.data["units"], self.data["rate"])
+        if not self._chambers:
+            check_passive(recording)
+        return recording.select(self.labels)
+
+    def _release(self, recording: Recording, trial: Trial) -> Release | None:
+        if not _has_release(trial):
+            return None
+        return _START if trial.begins == "released" else release_of(recording, self.tracked, self.data["longest_gap"])
+
+    def _check_rates(self, recordings: Sequence[Recording]) -> None:
+        """Refuses recordings that are too slow, and says which frames fall between the steps of the simulation."""
+        for recording in recordings:
+            if recording.rate < _LEAST_RATE:
+                raise DataFileError(
+                    f"{recording.source} has {recording.rate:g} frames a second, too few to tell how the body was let "
+                    f"go: record {_LEAST_RATE:g} or more, or set data.rate if the file is wrong."
+                )
+            ratio = recording.rate * self.settings["time_step"]
+            if abs(max(ratio, 1.0 / ratio) - round(max(ratio, 1.0 / ratio))) > 1e-6:
+                log.info(
+                    "import: %s has %g frames a second and the simulation %g steps: it is read off at the times of the "
+                    "frames, between its steps",
+                    *(recording.source.name, recording.rate, 1.0 / self.settings["time_step"]),
+                )
+
+    def _check_reference(self, recordings: Sequence[Recording], releases: Sequence[Release | None]) -> None:
+        """Refuses recordings whose reference markers moved against each other between trials."""
+        if len(self.markers["reference"]) > 1:
+            still = [
+                each if at is None else replace(each, positions=each.positions[slice(*at.rest)])
+                for each, at in zip(recordings, releases, strict=True)
+            ]
+            check_base(
+                still,
+                list(self.markers["reference"]),
+                largest_distortion=self.markers["largest_distortion"],
+                largest_shift=self.markers["largest_shift"],
+            )
+
+    def _register(self, places: FloatArray, recording: Recording, at_rest: bool, only_reference: bool) -> Registration:
+        return register_markers(
+            places,
+            self.expected(at_rest),
+            self.labels,
+            source=recording.source,
+            largest_residual=self.markers["largest_residual"],
+            use=list(self.markers["reference"]) if only_reference else None,
+        )
+
+    def _released(self, trial: Trial, recording: Recording, release: Release) -> Observed:
+        """A body that was held, undeformed or as the file says, and let go."""
+        still = _median(replace(recording, positions=recording.positions[slice(*release.rest)]), self.tracked)
+        places = _rest_of(recording, self.tracked) if self.data["rest"] == "file" else still
+        registration = self._register(places, recording, at_rest=False, only_reference=False)
+        off = f"; left out: {listed(registration.outliers)}" if registration.outliers else ""
+        log.info(
+            "import: %s is let go in frame %.1f, registered to %.2f mm%s",
+            *(trial.name, release.frame, _MILLI * registration.rms, off),
+        )
+        filled = fill_gaps(recording.select(self.tracked), self.data["longest_gap"], mask_long=True)
+        moving = trim_to_release(filled, release, seconds=self.data["seconds"])
+        lost = [label for label, seen in zip(moving.labels, moving.seen.T, strict=True) if not seen.any()]
+        if lost:
+            raise DataFileError(
+                f"{moving.source}: {listed(lost)} cannot be seen in the {self.data['seconds']:g} s after the release; "
+                "leave it out of markers.tracked."
+            )
+        check_motion(moving, self.tracked)
+        pressure = None
+        if self._chambers:  # Constant: how a valve moves while a body swings is not told by this.
+            pressure = self._pressure(moving, trial)[:1]
+        return Observed(trial, recording, moving, still, registration, pressure, release)
+
+    def _driven(self, trial: Trial, recording: Recording) -> Observed:
+        """A body that rests until its inputs come, or one in a pose."""
+        counting = replace(recording, positions=recording.positions[: self.data["steps"] + 1])
+        static = trial.begins == STATIC
+        if not static:
+            check_motion(counting, self.tracked)
+        pressure = self._pressure(recording, trial) if self._chambers else None
+        filled = fill_gaps(recording, self.data["longest_gap"], mask_long=True)
+        loaded = trial.payload > 0.0 or (pressure is not None and not self._is_at_rest(pressure[:1])[0])
+        if static and loaded:  # From the first frame on: where the body is at rest, the other trials tell.
+            still = _median(filled, self.tracked)
+            registration = self._register(still, recording, at_rest=True, only_reference=True)
+        else:
+            still = self._resting(filled, pressure)
+            registration = self._register(still, recording, at_rest=True, only_reference=False)
+        off = f"; left out: {listed(registration.outliers)}" if registration.outliers else ""
+        log.debug("import: %s registered to %.2f mm%s", trial.name, _MILLI * registration.rms, off)
+        moving = filled.select(self.tracked)
+        if static:
+            frames = max(round(_POSE_SECONDS * moving.rate), 1)
+            last = replace(moving, positions=moving.positions[-frames:])
+            moving = replace(moving, positions=_median(last, self.tracked)[None])
+            pressure = None if pressure is None else np.median(pressure[-frames:], axis=0)[None]
+        return Observed(trial, recording, moving, still, registration, pressure)
+
+    def _is_at_rest(self, pressure: FloatArray) -> NDArray[np.bool_]:
+        """(T,) whether (T, C) pressures are what a gauge shows of none."""
+        return np.asarray(np.abs(pressure).max(axis=1) <= _REST_PRESSURE * self.data["pressure_limit"])
+
+    def _resting(self, recording: Recording, pressure: FloatArray | None) -> FloatArray:
+        """(M', 3) mean positions of the markers before the inputs come [m], NaN for one that is not seen."""
+        driven = np.flatnonzero(~self._is_at_rest(pressure)) if pressure is not None else np.zeros(0, dtype=np.int64)
+        until = int(driven[0]) if len(driven) else len(recording.positions)
+        if until < 1:
+            raise DataFileError(
+                f"{recording.source} begins under pressure: its first frame must show the body at rest."
+            )
+        count = max(min(until, round(self.data["rest_seconds"] * recording.rate)), 1)
+        return _central(replace(recording, positions=recording.positions[:count]), self.tracked, np.mean, "rests")
+
+    def _pressure(self, recording: Recording, trial: Trial) -> FloatArray:
+        """(T, C) in the chambers of the body [Pa].
+
+        Raises:
+            DataFileError: no pressures, of another number of chambers, or beyond the limit.
+        """
+        data, chambers = self.data, len(self._chambers)
+        found = recording.actuation
+        if found is None:
+            if trial.begins in ("held", "released"):
+                return np.zeros((len(recording.positions), chambers))
+            raise DataFileError(
+                f"{recording.source} has no array 'actuation' with the pressures of the chambers: add it "
+                "(docs/recordings.md)."
+            )
+        if data["chambers"] is not None:
+            columns = list(data["chambers"])
+            if len(columns) != found.shape[1]:
+                raise DataFileError(
+                    f"{recording.source} has pressures of {found.shape[1]} chambers, but data.chambers names "
+                    f"{len(columns)}: name the mesh's chamber of each column of the file."
+                )
+            placed = np.zeros((len(found), chambers))
+            placed[:, [int(number) - 1 for number in columns]] = found
+            found = placed
+        values = check_pressures(found, chambers, trial.scale * data["pressure_limit"], recording.source)
+        if data["valve"] == "detected" and not _has_release(trial):
+            opening = valve_opening(recording, self.tracked)
+            # Commanded pressures from that moment on; the step in which the valve opens has its share.
+            frame = (opening - recording.start) * recording.rate
+            values = np.asarray(values * np.clip(np.arange(len(values)) - frame, 0.0, 1.0)[:, None])
+        return values
+
+
+def _has_release(trial: Trial) -> bool:
+    return trial.begins in ("held", "released")
+
+
+def import_recordings(context: StageContext) -> None:
+    """Writes dataset.h5, quality.json and registration.json.
+
+    Raises:
+        DataFileError: a recording that cannot be read or used; the sentence names the file and the marker.
+        InputError: a configured value that does not fit.
+    """
+    importer = Importer(context)
+    settings, tracked = context.settings, importer.tracked
+    observed = importer.observe(trials_of(settings))
+    _check_unit([each.pressure for each in observed if each.pressure is not None], settings["data"])
+    split = settings.get("split")
+    known = set(split["train"]) | set(split["validation"]) if split else {each.trial.name for each in observed}
+    offsets = np.stack([_offset(importer, each) for each in observed])  # (R, M, 3) [m]
+    told = [row for row, each in enumerate(observed) if _tells_places(each) and each.trial.name in known]
+    told = told or [row for row, each in enumerate(observed) if _tells_places(each)]
+    mean = np.nanmean(offsets[told], axis=0) if told else np.zeros_like(importer.nominal)
+    bound = importer.nominal + mean
+    bound_markers(
+        settings["markers"], importer.simulator.body.mesh, bound, tracked
+    )  # Refuses a marker that is far off.
+    shifts = _shifts(settings["data"], observed, mean, offsets)
+    verticals = _verticals(observed, settings)
+    gravity = _gravity(verticals, settings)
+    _dataset(importer, observed, bound, shifts, gravity).write(context.run_dir / DATASET)
+    _write_quality(context, observed, tracked, shifts, verticals, gravity)
+
+
+def import_scaled(context: StageContext) -> None:
+    """Writes dataset_scaled.h5, of the trials at other pressures; markers sit where they sit in dataset.h5.
+
+    Raises:
+        DataFileError: a recording that cannot be read or used.
+    """
+    importer = Importer(context)
+    known = read_dataset(context.run_dir / DATASET)
+    assert known.bound is not None
+    observed = importer.observe(scaled_trials_of(context.settings))
+    offsets = np.stack([_offset(importer, each) for each in observed])
+    shifts = _shifts(context.settings["data"], observed, known.bound - importer.nominal, offsets)
+    _dataset(importer, observed, known.bound, shifts, known.gravity).write(context.run_dir / SCALED_DATASET)
+
+
+def _places(markers: Mapping[str, Any]) -> FloatArray:
+    return np.array([*markers.values()], dtype=np.float64).reshape(-1, 3)
+
+
+def _tells_places(each: Observed) -> bool:
+    """Whether a trial shows where markers sit on the body at rest; one that is loaded from its first frame does not."""
+    return each.is_released or each.trial.begins != STATIC or each.trial.payload == 0.0
+
+
+def _offset(importer: Importer, each: Observed) -> FloatArray:
+    """(M, 3) how far the tracked markers of a trial are from where they should be, in the frame of the body [m]."""
+    count = len(importer.tracked)
+    return each.registration.positions[:count] - importer.expected(not each.is_released)[:count]
+
+
+def _shifts(data: Mapping[str, Any], observed: Sequence[Observed], mean: FloatArray, offsets: FloatArray) -> FloatArray:
+    """(R, M, 3) by which each trial's markers are moved [m]: to where they sit on the whole, if they drift."""
+    if data["alignment"] == "shared":
+        return np.zeros_like(offsets)
+    own = np.array([_tells_places(each) for each in observed])
+    return np.where(own[:, None, None], mean - offsets, 0.0)
+
+
+def _median(recording: Recording, tracked: Sequence[str]) -> FloatArray:
+    """(M', 3) median positions of the markers of a body that is held [m], NaN for one that is not seen."""
+    return _central(recording, tracked, np.median, "is held")
+
+
+def _central(recording: Recording, tracked: Sequence[str], centre: Any, while_it: str) -> FloatArray:
+    seen: NDArray[np.bool_] = recording.seen
+    ever = np.any(seen, axis=0)
+    hidden = [label for label, ok in zip(recording.labels, ever.tolist(), strict=True) if not ok]
+    lost = [label for label in hidden if label in tracked]
+    if lost:
+        raise DataFileError(
+            f"{recording.source}: {listed(lost)} cannot be seen while the body {while_it}, so where it sits is not "
+            "known; leave it out of markers.tracked."
+        )
+    places = np.full(recording.positions.shape[1:], np.nan)
+    for column, frames in enumerate(seen.T):
+        if frames.any():
+            places[column] = centre(recording.positions[frames, column], axis=0)
+    return places
+
+
+def _rest_of(recording: Recording, tracked: Sequence[str]) -> FloatArray:
+    """(M', 3) the markers on the undeformed body, as the file has them [m]."""
+    if recording.rest is None:
+        raise DataFileError(
+            f"{recording.source} has no array 'rest' that tells where its markers are on the undeformed body: add it "
+            "(docs/recordings.md), or set data.rest to held if the body is held undeformed."
+        )
+    lost = [label for label in tracked if not np.isfinite(recording.rest[recording.labels.index(label)]).all()]
+    if lost:
+        raise DataFileError(f"{recording.source}: 'rest' has no place of {listed(lost)}; leave it out of the markers.")
+    return recording.rest
+
+
+def _check_unit(pressures: Sequence[FloatArray], data: Mapping[str, Any]) -> None:
+    """Refuses recordings under which the body would hardly move, as those do whose unit was mistaken.
+
+    Raises:
+        DataFileError: no pressure is near the limit.
+    """
+    if not pressures or all(len(each) == 1 for each in pressures):
+        return
+    highest, limit = max(float(np.abs(each).max()) for each in pressures), data["pressure_limit"]
+    if highest < _REST_PRESSURE * limit:
+        raise DataFileError(
+            f"the pressures of all {len(pressures)} recordings stay below {highest:.3g} Pa, and data.pressure_limit is "
+            f"{limit:.3g} Pa: name their unit in the files (actuation_units, or the header of the column), or set the "
+            "limit to what the robot takes."
+        )
+
+
+def _dataset(
+    importer: Importer, observed: Sequence[Observed], bound: FloatArray, shifts: FloatArray, gravity: FloatArray
+) -> Dataset:
+    """The trials in the frame of the body; those that end early are padded."""
+    settings, chambers = importer.settings, chambers_of(importer.simulator.body)
+    data, cutoff = settings["data"], settings["data"].get("cutoff")
+    steps = data.get("steps")
+    frames = max(len(each.moving.positions) if each.is_released else 1 for each in observed)
+    if any(each.trial.begins == "rest" for each in observed):
+        frames = max(frames, steps + 1)
+    shape = (len(observed), frames, len(importer.tracked), 3)
+    markers, smoothed = np.full(shape, np.nan), np.full(shape, np.nan)
+    times, held = np.zeros(shape[:2]), np.zeros((shape[0], *shape[2:]))
+    pressure = np.zeros((len(observed), steps if steps else 1, len(chambers))) if chambers else None
+    for row, each in enumerate(observed):
+        limit = frames if each.is_released or steps is None else steps + 1
+        seen = each.moving.positions[:limit]
+        slow = each.moving if cutoff is None or len(seen) == 1 else smooth(each.moving, cutoff)
+        markers[row, : len(seen)] = each.to_body(seen, shifts[row])
+        smoothed[row, : len(seen)] = each.to_body(slow.positions[:limit], shifts[row])
+        held[row] = each.to_body(each.still[: shape[2]], shifts[row])
+        if each.is_released:
+            times[row] = np.pad(each.moving.time, (0, frames - len(seen)), mode="edge")
+        elif each.trial.begins == "rest":
+            times[row] = np.minimum(np.arange(frames), steps) * settings["time_step"]
+            held[row] = markers[row, 0]
+        else:
+            held[row] = bound if each.trial.payload > 0.0 else held[row]
+        if pressure is not None and each.pressure is not None:
+            _fill_pressure(pressure[row], each)
+    channels = {"pressure": tuple(chamber.name for chamber in chambers)} if pressure is not None else {}
+    return Dataset(
+        names=tuple(each.trial.name for each in observed),
+        labels=tuple(importer.tracked),
+        begins=tuple("released" if each.is_released else each.trial.begins for each in observed),
+        times=times,
+        observed=markers,
+        held=held,
+        payload=np.array([each.trial.payload for each in observed]),
+        gravity=gravity,
+        time_step=settings["time_step"],
+        bound=bound,
+        smoothed=smoothed if cutoff is not None or all(each.trial.begins == "rest" for each in observed) else None,
+        inputs={} if pressure is None else {"pressure": pressure},
+        channels=channels,
+    )
+
+
+def _fill_pressure(row: FloatArray, each: Observed) -> None:
+    """Writes the pressures (K, C) during the steps of a trial; past its end, and in a pose, the last ones."""
+    assert each.pressure is not None
+    series = each.pressure if len(each.pressure) == 1 else each.pressure[1 : len(row) + 1]
+    row[: len(series)] = series
+    row[len(series) :] = each.pressure[-1]
+    if 1 < len(series) < len(row):
+        log.warning(
+            "import: %s ends after %d of the %d steps of data.steps; the rest counts as not seen.",
+            each.raw.source.name,
+            len(series),
+            len(row),
+        )
+
+
+def _verticals(observed: Sequence[Observed], settings: Mapping[str, Any]) -> FloatArray | None:
+    """(R, 3) the vertical of each recording in the frame of the body; None if it is not known.
+
+    Raises:
+        InputError: it points elsewhere than the configured gravity.
+    """
+    up = vertical(settings["data"].get("up"))
+    if up is None:
+        return None
+    verticals = np.stack([each.registration.transform.rotation @ up for each in observed])
+    configured = np.asarray(settings["gravity"], dtype=np.float64)
+    for each, found in zip(observed, verticals, strict=True):
+        if configured.any() and _angle(found, -configured) > _LARGEST_LEAN:
+            down = ", ".join(f"{-each:.2f}" for each in found)
+            raise InputError(
+                f"{each.raw.source}: with data.up {settings['data']['up']}, gravity points along ({down}) in the "
+                f"frame of the body, {_angle(found, -configured):.0f} degrees from the configured one: set data.up to "
+                "the vertical of the recordings, or gravity to its direction in the frame of markers and mesh."
+            )
+    return verticals
+
+
+def _gravity(verticals: FloatArray | None, settings: Mapping[str, Any]) -> FloatArray:
+    """(3,) gravity in the frame of the body, as strong as configured [m/s^2]."""
+    configured = np.asarray(settings["gravity"], dtype=np.float64)
+    if verticals is None:
+        return configured
+    mean = verticals.mean(axis=0)
+    return np.asarray(-np.linalg.norm(configured) * mean / np.linalg.norm(mean))
+
+
+def _angle(a: FloatArray, b: FloatArray) -> float:
+    """Degrees between two vectors."""
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
+
+
+def _write_quality(
+    context: StageContext,
+    observed: Sequence[Observed],
+    tracked: Sequence[str],
+    shifts: FloatArray,
+    verticals: FloatArray | None,
+    gravity: FloatArray,
+) -> None:
+    """quality.json and registration.json: of all released trials, and of a few driven ones."""
+    reference, gap = list(context.settings["markers"]["reference"]), context.settings["data"]["longest_gap"]
+    released = [row for row, each in enumerate(observed) if each.is_released]
+    driven = [row for row, each in enumerate(observed) if not each.is_released]
+    shown = sorted(released + (evenly(driven, _SHOWN) if driven else []))
+    qualities, registrations = {}, {}
+    for row in shown:
+        each = observed[row]
+        name = each.trial.name
+        found = quality(each.raw, reference, each.release, longest_gap=gap)
+        qualities[name] = found.to_plain()
+        if each.is_released:
+            for warning in found.warnings:
+                log.warning("%s: %s", found.source.name, warning)
+        elif found.warnings:
+            log.info("import: %s: %d remarks on its quality in the report", found.source.name, len(found.warnings))
+        registrations[name] = registration_summary(each.registration, tracked, -shifts[row])
+        if verticals is not None:
+            registrations[name]["vertical_deg"] = _angle(verticals[row], -gravity)
+    write_json(context.run_dir / QUALITY, qualities)
+    write_json(context.run_dir / REGISTRATION, registrations)
+
+
+def registration_summary(registration: Registration, tracked: Sequence[str], shift: FloatArray) -> dict[str, Any]:
+    """For registration.json: lengths in millimetres, but for the positions in the frame of the body, in metres."""
+    residual = dict(zip(registration.names, _MILLI * registration.residual, strict=True))
+    return {
+        "positions": dict(zip(registration.names, registration.positions.tolist(), strict=True)),
+        "rms_mm": _MILLI * registration.rms,
+        "residual_mm": residual,
+        "outliers": list(registration.outliers),
+        "shift_mm": dict(zip(tracked, (_MILLI * shift).tolist(), strict=True)),
+    }

@@ -1,0 +1,342 @@
+"""An experiment: its stages in order, from a configuration, for one split or for every fold of a cross-validation.
+
+A stage is there because the configuration asks for what it makes: the settings of each are all that its files depend on.
+"""
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+import warp as wp
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
+from rich.table import Table
+
+from ..io.errors import DataFileError
+from ..io.files import digest, read_json, write_json
+from ..io.stages import Stage, package_versions, resources_used, run_stages
+from ..learning.metrics import summarise_folds
+from ..report.page import number_text
+from ..report.verdict import judgement
+from .ablation import ablation_stages, print_ablation
+from .build import choose_device
+from .checks import check_configuration, training_settings
+from .evaluate import evaluate, time_models
+from .files import (
+    DATASET,
+    ERRORS,
+    IDENTIFICATION,
+    METRICS,
+    QUALITY,
+    RECONSTRUCTION,
+    REGISTRATION,
+    REPORT,
+    ROLLOUTS,
+    SCALED_DATASET,
+    TIMES,
+    TRUTH,
+    fold_folder,
+    read_if_there,
+    reconstruction_file,
+    training_file,
+    weights_file,
+)
+from .identify import identify
+from .importing import import_recordings, import_scaled
+from .laboratory import run_laboratory
+from .learn import refine, train
+from .models import SIMFREE
+from .parts import processes_for
+from .reconstruct import reconstruct
+from .report import make_folds_report, make_report
+from .scene import LEARNED, models_of
+from .simulate import simulate
+from .trials import Split, folds_of, is_laboratory, scaled_trials_of, sees_markers, split_of, test_groups, trials_of
+
+_SIMULATED = ("mesh", "physics", "fixed", "gravity", "time_step", "integrator", "solver", "device", "dtype")
+_ACTING = ("chambers", "fibres", "coupling")
+_DRAWN = ("laboratory", "fixed", "chambers", "gravity", "time_step", "solver", "device", "dtype", "seed", "tip")
+_DRAWN_DATA = (
+    *("folder", "trials", "sequences", "begins", "train", "validation", "test", "folds", "limit"),
+    *("payload_at", "up", "rest", "steps", "pressure_limit"),
+)
+_DRAWN_MARKERS = ("tracked", "reference", "bind", "bind_to", "largest_distance")
+_LATER_DATA = ("horizons", "train_fraction", "pressure_scales")
+_LEARNED_FROM = ("simulation", "markers", "actuation", "release", "force_frame")
+_LEARNED_DATA = ("payload_at", "train_fraction", "seconds")
+
+
+def simulated(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings that every simulation of an experiment depends on."""
+    base = {key: config[key] for key in (*_SIMULATED, *_ACTING)}
+    if config["mesh"]["kind"] == "file":
+        base["mesh_digest"] = digest(config["mesh"]["path"])
+    return base
+
+
+def shown(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The configuration without what has no bearing on a run."""
+    return {key: value for key, value in config.items() if key != "tune"}
+
+
+def _pick(config: Mapping[str, Any], *keys: str) -> dict[str, Any]:
+    return {key: config[key] for key in keys if key in config}
+
+
+def acquisition_stages(config: Mapping[str, Any]) -> list[Stage]:
+    """The stages that lead to dataset.h5: a simulation of the trials, or their import, perhaps from a laboratory.
+
+    Args:
+        config: that `check_configuration` accepts.
+
+    Raises:
+        DataFileError: a recording that is not there.
+    """
+    base, data = simulated(config), config["data"]
+    if not sees_markers(config):
+        return [Stage("simulate", simulate, (DATASET,), {**base, **_pick(config, "target", "data")})]
+    stages, processes = [], processes_for(config)
+    imported = {**base, **_pick(config, "simulation", "markers")}
+    imported["data"] = {key: value for key, value in data.items() if key not in _LATER_DATA} | {"pressure_scales": []}
+    trials = trials_of(config)
+    if folds_of(config) is None:
+        imported["split"] = {name: each for name, each in split_of(config).plain().items() if name != "test"}
+    imported |= {"laboratory": config["laboratory"], "in_the_loop": config["in_the_loop"] is not None}
+    if is_laboratory(config):
+        files = (*(trial.recording for trial in trials), TRUTH)
+        play = partial(run_laboratory, processes=processes)
+        stages.append(Stage("laboratory", play, files, _laboratory_settings(config, ())))
+    else:
+        imported["recordings"] = {trial.name: _digest(trial.name, trial.file) for trial in trials}
+    needs = tuple(stage.name for stage in stages)
+    stages.append(Stage("import", import_recordings, (DATASET, QUALITY, REGISTRATION), imported, needs))
+    scales = data["pressure_scales"]
+    if scales:
+        files = tuple(trial.recording for trial in scaled_trials_of(config))
+        play = partial(run_laboratory, processes=processes, scaled=True)
+        stages.append(Stage("laboratory_scaled", play, files, _laboratory_settings(config, scales), needs))
+        more = {**imported, "data": {**imported["data"], "pressure_scales": scales}}
+        needs = ("import", "laboratory_scaled")
+        stages.append(Stage("import_scaled", import_scaled, (SCALED_DATASET,), more, needs))
+    return stages
+
+
+def _laboratory_settings(config: Mapping[str, Any], scales: Sequence[float]) -> dict[str, Any]:
+    """What the recordings of a simulated laboratory depend on."""
+    own: dict[str, Any] = {
+        **_pick(config, *_DRAWN),
+        "data": {**_pick(config["data"], *_DRAWN_DATA), "pressure_scales": list(scales)},
+        "markers": _pick(config["markers"], *_DRAWN_MARKERS),
+        "batch": config["parallel"]["batch"],
+        "in_the_loop": config["in_the_loop"] is not None,
+    }
+    if config["laboratory"]["mesh"]["kind"] == "file":
+        own["mesh_digest"] = digest(config["laboratory"]["mesh"]["path"])
+    return own
+
+
+def _digest(trial: str, path: Path | None) -> str:
+    try:
+        return digest(str(path))
+    except OSError as error:
+        raise DataFileError(
+            f"cannot read {path} ({error.strerror}): check data.folder and data.trials.{trial}.file."
+        ) from error
+
+
+def learning_stages(config: Mapping[str, Any], split: Split, shared: str, acquired: str) -> list[Stage]:
+    """The stages of one split, from the identification to the report.
+
+    Args:
+        config: that `check_configuration` accepts.
+        split: names of trials.
+        shared: the folder of dataset.h5, relative to that of the split.
+        acquired: fingerprint of the stage that wrote it.
+    """
+    processes, models, identifies = processes_for(config), models_of(config), config["identify"] is not None
+    base: dict[str, Any] = {
+        **simulated(config),
+        **_pick(config, *_LEARNED_FROM),
+        "data": _pick(config["data"], *_LEARNED_DATA),
+        "identify": _pick(config["identify"], "integrator", "substeps", "elastic") if identifies else None,
+        "refinement": config["refinement"]["kind"],
+        "batch": config["parallel"]["batch"],
+        "shared": shared,
+        "acquired": acquired,
+        "split": split.plain(),
+    }
+    needs: tuple[str, ...] = ()
+    stages = []
+    if identifies:
+        settings = {**base, **_pick(config, "identify", "seed")}
+        stages.append(Stage("identify", identify, (IDENTIFICATION,), settings))
+        needs = ("identify",)
+    observed = [*split.train, *split.validation, *(() if sees_markers(config) else split.test)]
+    known: list[str] = []
+    for model in (each for each in models if each in LEARNED and each != SIMFREE):
+        stages += _force_stages(config, {**base, "model": model}, observed, needs, processes)
+        known.append(stages[-1].name)
+    settings = {**base, **training_settings(config, SIMFREE), "range_guard": config["range_guard"], "model": SIMFREE}
+    outputs = (weights_file(SIMFREE), training_file(SIMFREE))
+    stages.append(Stage("train_simfree", train, outputs, settings, (*needs, "reconstruct_resphys")))
+    known.append("train_simfree")
+    groups = {"groups": test_groups(config, split), "range_guard": config["range_guard"]}
+    tested = {**base, **groups, **_pick(config, "published", "correct_uncorrected")}
+    tested["data"] = {**base["data"], **_pick(config["data"], "horizons")}
+    stages.append(
+        Stage(
+            "evaluate",
+            partial(evaluate, processes=processes),
+            (ROLLOUTS, ERRORS),
+            tested,
+            (*needs, *known, "reconstruct_resphys"),
+        )
+    )
+    if config["timing"]:
+        timed = {**base, **groups, **_pick(config, "target")}
+        stages.append(Stage("time", time_models, (TIMES,), timed, (*needs, *known)))
+    reported = {"config": shown(config), "acquired": acquired}
+    last = [stage.name for stage in stages if stage.name in ("evaluate", "time")]
+    stages.append(Stage("report", make_report, (REPORT,), reported, tuple(last)))
+    return stages
+
+
+def _force_stages(
+    config: Mapping[str, Any], base: dict[str, Any], observed: Sequence[str], needs: tuple[str, ...], processes: int
+) -> list[Stage]:
+    """Those that learn the residual force of one simulator: reconstruct, train, and refine where that is asked for."""
+    model = base["model"]
+    found = Stage(
+        f"reconstruct_{model}",
+        partial(reconstruct, processes=processes),
+        (reconstruction_file(model),),
+        {**base, **_pick(config, "reconstruction"), "reconstructed": list(observed)},
+        needs,
+    )
+    learned = {**base, **training_settings(config, model), "range_guard": config["range_guard"]}
+    outputs = (weights_file(model), training_file(model))
+    trained = Stage(f"train_{model}", train, outputs, learned, (*needs, found.name))
+    if config["refinement"]["kind"] == "none":
+        return [found, trained]
+    refined = {**base, **_pick(config, "refinement"), "range_guard": config["range_guard"], "seed": config["seed"]}
+    outputs = (weights_file(model, True), training_file(model, True))
+    return [found, trained, Stage(f"refine_{model}", refine, outputs, refined, (*needs, found.name, trained.name))]
+
+
+def prepare(config: DictConfig) -> tuple[dict[str, Any], Path]:
+    """The checked configuration as plain data, and the run folder.
+
+    Raises:
+        InputError: a value of the wrong kind or out of range, or an unknown key.
+    """
+    wp.config.log_level = wp.LOG_WARNING
+    if config.device == "cpu" or not torch.cuda.is_available():
+        torch.set_num_threads(1)  # The networks are small: see threads.py.
+    plain: dict[str, Any] = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)  # type: ignore[assignment]
+    check_configuration(plain)
+    return plain, Path(HydraConfig.get().runtime.output_dir)
+
+
+def acquire(config: Mapping[str, Any], folder: Path, wait: bool = False) -> tuple[list[Stage], str]:
+    """Runs the stages that lead to dataset.h5; returns them and the fingerprint of the last."""
+    stages = acquisition_stages(config)
+    run_stages(stages, folder, wait)
+    return stages, str(read_json(folder / "stages" / f"{stages[-1].name}.json")["fingerprint"])
+
+
+def run_experiment(config: DictConfig) -> None:
+    """Runs what has changed, writes metrics.json and prints the errors."""
+    plain, folder = prepare(config)
+    if "ablation" in plain:
+        run_stages(ablation_stages(plain, simulated(plain), shown(plain)), folder)
+        print_ablation(plain, folder)
+        return
+    first, acquired = acquire(plain, folder)
+    folds = folds_of(plain)
+    if folds is None:
+        stages = learning_stages(plain, split_of(plain), ".", acquired)
+        run_stages(stages, folder)
+        metrics = collect_metrics(plain, folder, folder, [*first, *stages])
+    else:
+        metrics = _run_folds(plain, folder, folds, first, acquired)
+    write_json(folder / METRICS, metrics)
+    if folds is not None:
+        each = {trial: fold["errors_mm"] for trial, fold in metrics["folds"].items()}
+        reported = {"config": shown(plain), "folds": each}
+        run_stages([*first, Stage("report", make_folds_report, (REPORT,), reported, (first[-1].name,))], folder)
+    _print(metrics, folder, plain)
+
+
+def _run_folds(
+    config: dict[str, Any], folder: Path, folds: Mapping[str, Split], first: Sequence[Stage], acquired: str
+) -> dict[str, Any]:
+    """What metrics.json says of a cross-validation, each fold of which has a folder of its own."""
+    found = {}
+    for trial, split in folds.items():
+        inner = folder / fold_folder(trial)
+        stages = learning_stages(config, split, "..", acquired)
+        run_stages(stages, inner)
+        found[trial] = collect_metrics(config, inner, folder, stages)
+        write_json(inner / METRICS, found[trial])
+    return {
+        "errors_mm": summarise_folds([each["errors_mm"] for each in found.values()]),
+        "folds": found,
+        **resources_used(folder, [stage.name for stage in first]),
+        "versions": package_versions(),
+        "device": str(choose_device(config["device"])),
+    }
+
+
+def collect_metrics(config: Mapping[str, Any], folder: Path, shared: Path, stages: Sequence[Stage]) -> dict[str, Any]:
+    """Errors, the noise in them where known, what was kept and identified, time and memory of the stages, and versions."""
+    networks = {
+        f"{model}_refined" if refined else model: read_json(path)["kept"]
+        for model in LEARNED
+        for refined in (False, True)
+        if (path := folder / training_file(model, refined)).is_file()
+    }
+    identified = read_if_there(folder / IDENTIFICATION)
+    truth, times = read_if_there(shared / TRUTH), read_if_there(folder / TIMES)
+    return {
+        **read_json(folder / ERRORS),
+        **({"noise_mm": truth["noise_mm"]} if "noise_mm" in truth else {}),
+        "networks": networks,
+        "parameters": {name: each["parameters"] for name, each in identified.items() if "parameters" in each},
+        "reconstruction": read_if_there(folder / RECONSTRUCTION),
+        **({"seconds_per_test_trajectory": times["seconds"]} if times else {}),
+        **resources_used(folder, [stage.name for stage in stages]),
+        "versions": package_versions(),
+        "device": str(choose_device(config["device"])),
+    }
+
+
+def _print(metrics: Mapping[str, Any], folder: Path, config: Mapping[str, Any]) -> None:
+    """Errors as a table, with a column for every fold, horizon and pressure scale that tells more, and what they say."""
+    whole = metrics["errors_mm"]
+    columns = {trial: fold["errors_mm"] for trial, fold in metrics.get("folds", {}).items()}
+    columns |= {f"first {seconds} s": found for seconds, found in metrics.get("horizons", {}).items()}
+    columns |= {f"{scale} x": found for scale, found in metrics.get("scales", {}).items()}
+    columns = {name: found for name, found in columns.items() if found != whole}
+    what = "markers" if sees_markers(config) else "vertices"
+    title = f"Error of the {what} in trials that no training saw" + "; x: times the pressure" * ("scales" in metrics)
+    table = Table("model", "mean [mm]", "std [mm]", *columns, "diverged", title=title)
+    for model, summary in whole.items():
+        each = [number_text(found[model]["mean"]) if model in found else "" for found in columns.values()]
+        std = "" if summary["std"] is None else number_text(summary["std"])
+        table.add_row(model, number_text(summary["mean"]), std, *each, str(summary["diverged"]))
+    console = Console()
+    console.print(table)
+    for model, found in metrics.get("range", {}).items():
+        if found["left"]:
+            first = min(found["first_s"].values())
+            console.print(
+                f"{model}: {found['left']} test trials leave the states of the training, from {first:.2f} s on."
+            )
+    if "noise_mm" in metrics:
+        console.print(f"The noise of the markers alone is {number_text(metrics['noise_mm'])} mm.")
+    for said in judgement(metrics, config):
+        console.print(said, soft_wrap=True)
+    console.print(f"Report: {folder / REPORT}", soft_wrap=True)

@@ -1,0 +1,252 @@
+"""What the stages of an experiment share: the body, its trials, its simulators and its models."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from ..data.actuation import remembered
+from ..data.trials import Trials
+from ..dynamics.frames import VertexFrames
+from ..dynamics.integrator import State
+from ..dynamics.simulator import Simulator
+from ..fem.body import Body
+from ..io.files import read_json
+from ..learning.release import ReleaseSettings, estimate_release
+from ..learning.replay import Replay, Start
+from .build import bound_markers, build_body, build_simulator
+from .files import DATASET, GIVEN, IDENTIFICATION, SCALED_DATASET, STATIC, Dataset, read_dataset
+
+COROTATED: Final = "corotated"
+FORCE_FRAMES: Final = (COROTATED, "world")
+LEARNED: Final = ("simfree", "resphys_uncorrected", "resphys")
+# By model: the simulator that it is, or corrects, and the identification whose parameters that has.
+MODELS: Final[Mapping[str, tuple[str, str | None]]] = {
+    "published": ("published", None),
+    "simulation": ("simulation", None),
+    "sysid_elastic": ("simulation", "sysid_elastic"),
+    "sysid": ("identified", "sysid"),
+    "simfree": ("identified", "sysid"),
+    "resphys_uncorrected": ("simulation", None),
+    "resphys": ("identified", "sysid"),
+}
+Observe = Callable[[torch.Tensor], torch.Tensor]
+
+
+def models_of(config: Mapping[str, Any]) -> list[str]:
+    """The models that an experiment compares, as its configuration asks for them."""
+    identify = config.get("identify")
+    absent = {
+        "published": config.get("published") is None,
+        "sysid": identify is None,
+        "sysid_elastic": identify is None or not identify.get("elastic"),
+        "resphys_uncorrected": identify is None or not config.get("correct_uncorrected"),
+    }
+    return [model for model in MODELS if not absent.get(model)]
+
+
+def every_vertex(positions: torch.Tensor) -> torch.Tensor:
+    """What is observed where a simulation knows the full state: the identity."""
+    return positions
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The trials and the simulators of an experiment.
+
+    Attributes:
+        config: the settings of the stage.
+        folder: of the split.
+        on_failure: whether a step that fails raises, or is counted.
+    """
+
+    config: Mapping[str, Any]
+    folder: Path
+    on_failure: str = "raise"
+
+    @cached_property
+    def dataset(self) -> Dataset:
+        """The trials, and those at other pressures where the stage tests them."""
+        shared = self.folder / self.config["shared"]
+        found = read_dataset(shared / DATASET)
+        if len(self.config.get("groups", ())) > 1:
+            found = found.joined(read_dataset(shared / SCALED_DATASET))
+        return found
+
+    @cached_property
+    def body(self) -> Body:
+        """That is simulated."""
+        return build_body(self.config)
+
+    @cached_property
+    def _simulators(self) -> dict[str, Simulator]:
+        return {}
+
+    def simulator(self, kind: str) -> Simulator:
+        """A simulator under the gravity of the trials.
+
+        Args:
+            kind: ``simulation`` (uncorrected), ``target`` (which made the trials), ``published``, or ``identified``, which
+                may step with another integrator, and take shorter steps.
+        """
+        if kind not in self._simulators:
+            self._simulators[kind] = self.new_simulator(kind)
+        return self._simulators[kind]
+
+    def new_simulator(self, kind: str, on_failure: str | None = None) -> Simulator:
+        """One of its own, whose solver has seen nothing yet; see `simulator`."""
+        config = {**self.config, "gravity": self.dataset.gravity.tolist()}
+        identify = config.get("identify") or {}
+        if kind == "published":
+            config |= config["published"]
+        elif kind == "identified" and identify.get("integrator") is not None:
+            config |= {"integrator": identify["integrator"], "time_step": config["time_step"] / identify["substeps"]}
+        material, body = ("target" if kind == "target" else "simulation"), (None if kind == "published" else self.body)
+        return build_simulator(config, material, body, on_failure or self.on_failure)
+
+    @cached_property
+    def observe(self) -> Observe:
+        """(B, N, 3) positions to what is observed of them: (B, M, 3) markers, or all of them."""
+        if self.dataset.bound is None:
+            return every_vertex
+        found = bound_markers(self.config["markers"], self.body.mesh, self.dataset.bound, self.dataset.labels)
+        return found.to(self.simulator("simulation").rest_positions)
+
+    def trials(self, names: Sequence[str]) -> Trials:
+        """Some of the trials, which begin alike, on the simulators' device."""
+        payload_at = self.config["data"].get("payload_at")
+        return self.dataset.trials(names, self.body, payload_at).to(self.simulator("simulation").rest_positions)
+
+    def alike(self, names: Sequence[str]) -> list[tuple[str, ...]]:
+        """Trials in groups that begin alike, and can be simulated as one batch."""
+        kinds = [self.dataset.begins[row] for row in self.dataset.rows(names)]
+        each = zip(names, kinds, strict=True)
+        found: dict[str, list[str]] = {}
+        for name, kind in each:
+            found.setdefault(kind, []).append(name)
+        return [tuple(some) for some in found.values()]
+
+    def moving(self, names: Sequence[str]) -> tuple[str, ...]:
+        """Those of the trials that have a time."""
+        return tuple(name for name in names if self.begins(name) != STATIC)
+
+    def begins(self, name: str) -> str:
+        """How a trial begins."""
+        return self.dataset.begins[self.dataset.names.index(name)]
+
+    def start(self, simulator: Simulator, trials: Trials) -> Start:
+        """How trials begin, as a simulator would have it."""
+        begins = self.begins(trials.names[0])
+        if begins == GIVEN:
+            q = trials.observed[:, 0]
+            velocity = self.dataset.velocity
+            v = torch.zeros_like(q) if velocity is None else q.new_tensor(velocity[self.dataset.rows(trials.names), 0])
+            return Start(State(q, v), q.new_zeros(len(q)))
+        if begins == "released":
+            return estimate_release(simulator, self.observe, trials, ReleaseSettings(**self.config["release"]))
+        return Start.resting(simulator.rest_positions.expand(len(trials.names), -1, -1))
+
+    def replay(self, simulator: Simulator, names: Sequence[str]) -> tuple[Replay, Start]:
+        """A simulator of some of the trials, which begin alike, and how they begin."""
+        trials = self.trials(names)
+        return Replay(simulator, self.observe, trials), self.start(simulator, trials)
+
+    def replays(self, kind: str, names: Sequence[str]) -> list[tuple[Replay, Start]]:
+        """A simulator of any of the trials, a replay for those that begin alike."""
+        return [self.replay(self.simulator(kind), some) for some in self.alike(names)]
+
+    def parameters(self, model: str) -> dict[str, torch.Tensor]:
+        """(1,) identified parameters of a model's simulator; none for one that is not identified."""
+        key = MODELS[model][1]
+        if key is None or self.config.get("identify") is None:
+            return {}
+        values = read_json(self.folder / IDENTIFICATION)[key]["parameters"]
+        return {name: torch.tensor([x]).to(self.simulator("simulation").rest_positions) for name, x in values.items()}
+
+    def model_simulator(self, model: str) -> Simulator:
+        """The one that a model is, or corrects."""
+        kind = MODELS[model][0]
+        return self.simulator("simulation" if kind == "identified" and self.config.get("identify") is None else kind)
+
+    def conditions(
+        self, replay: Replay, parameters: Mapping[str, torch.Tensor], payload: bool = False
+    ) -> torch.Tensor | None:
+        """What networks are told of trials beside the state; None where nothing acts on them.
+
+        Args:
+            replay: of the trials.
+            parameters: (1,) that were identified.
+            payload: whether they are told of it, whatever is configured (``actuation.sees_payload``).
+
+        Returns:
+            (R, 1) the payloads [kg]; or (K, R, A) during each step, these and each input with its exponential means.
+        """
+        _, inputs, _ = replay.setting(parameters)
+        actuation, told = self.config["actuation"], []
+        if self.config["data"].get("payload_at") is not None and (payload or actuation["sees_payload"]):
+            rows = self.dataset.rows(replay.trials.names)
+            told.append(replay.trials.times.new_tensor(self.dataset.payload[rows])[:, None])
+        if not inputs.actuation:
+            return told[0] if told else None
+        constants = actuation["filter_time_constants"]
+        series = [remembered(each, constants, self.dataset.time_step) for each in inputs.actuation.values()]
+        return torch.cat([*(each.expand(len(series[0]), -1, -1) for each in told), *series], -1)
+
+    def frames(self, simulator: Simulator, kind: str | None = None) -> VertexFrames | None:
+        """With which residual forces turn; None where they keep their directions (``force_frame: world``)."""
+        if (self.config["force_frame"] if kind is None else kind) != COROTATED:
+            return None
+        return VertexFrames(simulator.body, simulator.time_step, simulator.rest_positions)
+
+    def explained(self, simulator: Simulator, trials: Trials, start: Start) -> torch.Tensor:
+        """(R, K + 1, M, 3) what forces are to explain at a simulator's steps [m], NaN where nothing was seen.
+
+        That is the part of each trial that is learned from.
+        """
+        if self.dataset.smoothed is not None and self.begins(trials.names[0]) == "rest":
+            found = simulator.tensor(self.dataset.smoothed[self.dataset.rows(trials.names)])
+        elif self.begins(trials.names[0]) == GIVEN:
+            found = trials.observed
+        else:
+            found = start.bound(simulator.tensor(at_steps(trials, simulator.time_step, start.delay)))
+        return found[:, : self.learned_steps(found.shape[1] - 1) + 1]
+
+    def learned_steps(self, steps: int) -> int:
+        """Steps of a trial that are learned from."""
+        return max(round(self.config["data"].get("train_fraction", 1.0) * steps), 1)
+
+
+def at_steps(trials: Trials, step: float, delay: torch.Tensor | None = None) -> NDArray[np.float64]:
+    """(R, K + 1, M, 3) markers at the steps of a simulation [m], NaN after a motion's end and in long occlusions.
+
+    Cubic splines through the frames in which a marker was seen, with where it was held at time zero. Steps further than
+    a frame and a half from the next sight of a marker count as not seen.
+
+    Args:
+        trials: observed.
+        step: h [s].
+        delay: (R,) by which the bodies were let go later than the time zero of the frames [s]; none if left out.
+    """
+    since = trials.times if delay is None else (trials.times - delay[:, None]).clamp_min(0.0)
+    times, markers, held = (t.cpu().numpy() for t in (since, trials.observed, trials.held))
+    steps = step * np.arange(int(times.max() / step + 1e-6) + 1)
+    found = np.full((len(times), len(steps), *markers.shape[2:]), np.nan)
+    for r, m in np.ndindex(len(times), markers.shape[2]):
+        seen = np.isfinite(markers[r, :, m]).all(1)
+        t, y = times[r, seen], markers[r, seen, m]
+        t, first = np.unique(t, return_index=True)
+        y = y[first]
+        if np.isfinite(held[r, m]).all() and (not len(t) or t[0] > 1e-9):
+            t, y = np.concatenate([[0.0], t]), np.concatenate([held[r, m][None], y])
+        if len(t) < 4:
+            continue
+        nearest = np.abs(steps[:, None] - t).min(1)
+        near = (nearest <= 1.5 * np.median(np.diff(t))) & (steps <= t[-1] + 1e-9)
+        found[r, near, m] = CubicSpline(t, y)(steps[near])
+    return found

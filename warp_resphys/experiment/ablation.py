@@ -23,7 +23,7 @@ from ..io.memory import WorkersMemory
 from ..io.processes import Advance, available_cores, in_processes
 from ..io.progress import Progress
 from ..io.resumable import Field, ResumableHDF5
-from ..io.stages import Stage, StageContext, package_versions, resources_used, run_stages
+from ..io.stages import Stage, StageContext, package_versions, resources_used
 from ..learning.sparse_reconstruction import make_sparse_reconstructor
 from ..mesh.mesh import surface_vertices
 from ..report.ablation_page import AblationReport, write_ablation_report
@@ -31,7 +31,6 @@ from ..report.page import number_text
 from .build import build_mesh, build_simulator, choose_device
 from .files import METRICS, REPORT
 from .simulate import held_state
-
 
 MOTION = "motion.h5"
 DRAWS = "ablation.h5"

@@ -262,7 +262,8 @@ def _check_pressures(config: Mapping[str, Any], chambers: int) -> None:
         )
     if scales and not is_laboratory(config):
         raise InputError(
-            "data.pressure_scales raises the pressures of simulated trials, and recordings have their own: leave it empty."
+            "data.pressure_scales raises the pressures of simulated trials, and recordings have their own: leave it "
+            "empty."
         )
     if scales and data["folds"]:
         raise InputError("data.pressure_scales and data.folds exclude each other: take one of them out.")
@@ -287,8 +288,8 @@ def _check_laboratory(config: Mapping[str, Any], begins: set[str], chambers: int
     for trial in trials_of(config):
         if trial.pull is not None and data["rest"] != "file":
             raise InputError(
-                f"laboratory.trials.{trial.name}.pull deforms the body before its release: set data.rest to file, so that "
-                "the recordings tell where markers are on the undeformed body."
+                f"laboratory.trials.{trial.name}.pull deforms the body before its release: set data.rest to file, so "
+                "that the recordings tell where markers are on the undeformed body."
             )
     if data["rest"] == "file" and any(trial.pull is None and trial.begins == "held" for trial in trials_of(config)):
         raise InputError("data.rest is file, but simulated bodies are held undeformed: set it to held.")

@@ -73,7 +73,7 @@ def scene_steps(scene: Scene, name: str) -> int:
 
 def film_trial(scene: Scene, names: Sequence[str]) -> str:
     """The test trial that moves most; its bodies are drawn."""
-    found = {}
+    found: dict[str, float] = {}
     for some in scene.alike(names):
         found |= dict(zip(some, scene.trials(some).amplitude.tolist(), strict=True))
     return max(names, key=lambda name: found[name])
@@ -298,7 +298,8 @@ def _sideways(scene: Scene, names: Sequence[str]) -> dict[str, float]:
     """How far sideways bodies were held [mm], as the identified simulator has it, where that was estimated."""
     if scene.config.get("release", {}).get("sideways", 0.0) <= 0.0:
         return {}
-    simulator, found = scene.model_simulator("resphys"), {}
+    simulator = scene.model_simulator("resphys")
+    found: dict[str, float] = {}
     for some in scene.alike(names):
         shift = scene.start(simulator, scene.trials(some)).shift if scene.begins(some[0]) == "released" else None
         if shift is not None:
@@ -310,8 +311,8 @@ def time_models(context: StageContext) -> None:
     """Writes times.json: seconds a test trial, mean and standard deviation over the trials.
 
     The published table's rows: the uncorrected simulator, the simulator with the true parameters where these are known,
-    the simulator with the learned force, and the network alone. One trial at a time, each once, after a run of the first
-    to warm up.
+    the simulator with the learned force, and the network alone. One trial at a time, each once, after a run of the
+    first to warm up.
     """
     scene = Scene(context.settings, context.run_dir, "count")
     names = scene.moving(context.settings["groups"]["1"])

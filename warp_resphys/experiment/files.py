@@ -124,8 +124,9 @@ class Dataset:
             for name in ("times", "observed", "held", "payload", "smoothed", "velocity")
         }
         inputs = {name: np.concatenate([values, other.inputs[name]]) for name, values in self.inputs.items()}
-        begins = self.begins + other.begins
-        return replace(self, names=self.names + other.names, begins=begins, inputs=inputs, **arrays)
+        words = {"names": self.names + other.names, "begins": self.begins + other.begins}
+        changed: dict[str, Any] = {**words, **arrays, "inputs": inputs}
+        return replace(self, **changed)
 
     def rows(self, names: Sequence[str]) -> list[int]:
         """Where trials are."""
@@ -151,8 +152,8 @@ class Dataset:
         resting = (
             Inputs(**{key: values[-1] for key, values in given.items() if key in self.inputs}) if static else Inputs()
         )
-        arrays = (self.times[rows][:, frames], self.observed[rows][:, frames], self.held[rows])
-        return Trials(tuple(names), *map(torch.from_numpy, arrays), Inputs(**given), resting)
+        times, observed = (torch.from_numpy(x[rows][:, frames]) for x in (self.times, self.observed))
+        return Trials(tuple(names), times, observed, torch.from_numpy(self.held[rows]), Inputs(**given), resting)
 
 
 def describe(

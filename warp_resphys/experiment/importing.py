@@ -1,8 +1,8 @@
 """Stage: from recordings to markers in the frame of the body, and what acted on it, from time zero on.
 
 Time zero is the release of a body that was held, or the first frame of one that rests until its inputs come. Released
-bodies keep the times of their frames: losses and errors are taken at them, from the simulation between its steps, so that
-the frame rate need not fit the time step. Driven ones are brought to the steps, which their inputs are constant in.
+bodies keep the times of their frames: losses and errors are taken at them, from the simulation between its steps, so
+that the frame rate need not fit the time step. Driven ones are brought to the steps, during which inputs are constant.
 """
 
 import logging

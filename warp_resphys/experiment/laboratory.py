@@ -1,8 +1,8 @@
 """Stage: recordings of a simulated body that plays the real one, for users without a laboratory.
 
-Its mesh is finer and its steps smaller than those of the simulator to correct, its material is another one, fibres may be
-wound around its chambers. It stands a little off level, its markers sit a little off their nominal places, and cameras
-see it in their frame, with noise.
+Its mesh is finer and its steps smaller than those of the simulator to correct, its material is another one, fibres may
+be wound around its chambers. It stands a little off level, its markers sit a little off their nominal places, and
+cameras see it in their frame, with noise.
 """
 
 import zlib
@@ -328,8 +328,8 @@ def substeps_of(settings: Mapping[str, Any]) -> int:
     ratio = settings["time_step"] / settings["laboratory"]["time_step"]
     if abs(ratio - round(ratio)) > 1e-6 or round(ratio) < 1:
         raise InputError(
-            f"time_step is {settings['time_step']:g} s and laboratory.time_step {settings['laboratory']['time_step']:g} "
-            "s: the first must be a multiple of the second."
+            f"time_step is {settings['time_step']:g} s and laboratory.time_step "
+            f"{settings['laboratory']['time_step']:g} s: the first must be a multiple of the second."
         )
     return round(ratio)
 

@@ -94,7 +94,8 @@ def states_of(scene: Scene, model: str, names: Sequence[str], device: torch.devi
 
 def _told(scene: Scene, model: str, names: Sequence[str], steps: int) -> torch.Tensor | None:
     """(R, K, A) what a model is told of the inputs of some trials."""
-    parameters, each = scene.parameters(model), {}
+    parameters = scene.parameters(model)
+    each: dict[str, torch.Tensor] = {}
     for some in scene.alike(names):
         replay = Replay(scene.model_simulator(model), scene.observe, scene.trials(some))
         told = scene.conditions(replay, parameters, model == SIMFREE)

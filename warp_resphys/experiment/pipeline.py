@@ -1,6 +1,6 @@
 """An experiment: its stages in order, from a configuration, for one split or for every fold of a cross-validation.
 
-A stage is there because the configuration asks for what it makes: the settings of each are all that its files depend on.
+A stage is there because the configuration asks for what it makes; its settings are all that its files depend on.
 """
 
 from collections.abc import Mapping, Sequence
@@ -291,7 +291,7 @@ def _run_folds(
 
 
 def collect_metrics(config: Mapping[str, Any], folder: Path, shared: Path, stages: Sequence[Stage]) -> dict[str, Any]:
-    """Errors, the noise in them where known, what was kept and identified, time and memory of the stages, and versions."""
+    """Errors, the noise in them where known, what was kept and identified, time and memory of the stages, versions."""
     networks = {
         f"{model}_refined" if refined else model: read_json(path)["kept"]
         for model in LEARNED
@@ -314,7 +314,7 @@ def collect_metrics(config: Mapping[str, Any], folder: Path, shared: Path, stage
 
 
 def _print(metrics: Mapping[str, Any], folder: Path, config: Mapping[str, Any]) -> None:
-    """Errors as a table, with a column for every fold, horizon and pressure scale that tells more, and what they say."""
+    """Errors as a table, a column for every fold, horizon and pressure scale that tells more, and what they say."""
     whole = metrics["errors_mm"]
     columns = {trial: fold["errors_mm"] for trial, fold in metrics.get("folds", {}).items()}
     columns |= {f"first {seconds} s": found for seconds, found in metrics.get("horizons", {}).items()}

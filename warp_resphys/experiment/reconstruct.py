@@ -19,7 +19,6 @@ from ..io.resumable import Field
 from ..io.stages import StageContext
 from ..learning.metrics import marker_errors
 from ..learning.reconstruction import Reconstructor, make_reconstructor
-from ..learning.replay import Replay
 from ..learning.rollout import Rollout
 from ..learning.sparse_reconstruction import make_sparse_reconstructor
 from .files import RECONSTRUCTION, read_if_there, reconstruction_file
@@ -40,13 +39,13 @@ def reconstruct(context: StageContext, processes: int = 1) -> None:
     The force of a frame is the one that led to it; that of the first frame is zero. Forces from markers are kept in
     single precision, which rounds positions to 1e-8 m. The summary says how far the reconstructed points are from those
     that were seen, and how far they are where the forces of validation are replayed. Forces can lead along equilibria
-    that are not stable, such as those of a chamber's wall that is about to buckle: step by step the markers are met, but
-    nothing that learns these forces will go there.
+    that are not stable, such as those of a chamber's wall that is about to buckle: step by step the markers are met,
+    but nothing that learns these forces will go there.
     """
     settings, model = context.settings, context.settings["model"]
     scene = Scene(settings, context.run_dir)
     moving = scene.moving(settings["reconstructed"])
-    parts = []
+    parts: list[Part] = []
     for number, names in enumerate(scene.alike(moving)):
         last = float(scene.trials(names).times.max()) / scene.model_simulator(model).time_step
         frames = scene.learned_steps(int(last + 1e-6)) + 1
@@ -63,8 +62,7 @@ def reconstruct(context: StageContext, processes: int = 1) -> None:
             held_out[name] = values[rows].copy()
     summary = {"mean_mm": float(np.nanmean(error)), "max_mm": float(np.nanmax(error))}
     if rows and scene.dataset.bound is not None:
-        names = [order[row] for row in rows]
-        summary["replayed_mm"] = _replay(context, names, {**held_out, "error": error[rows]})
+        summary["replayed_mm"] = _replay(context, [order[row] for row in rows], {**held_out, "error": error[rows]})
     found = read_if_there(context.run_dir / RECONSTRUCTION)
     finite = {key: value if np.isfinite(value) else None for key, value in summary.items()}
     write_json(context.run_dir / RECONSTRUCTION, {**found, model: finite})
@@ -190,7 +188,7 @@ def replayed_errors(
         return force if frames is None else frames.to_world(state.q, state.v, frames.to_rest(q, v, force))
 
     rollout = Rollout(simulator, predict, inputs, constants)
-    errors = np.full(found["q"].shape[:2], np.inf, dtype=np.float32)
+    errors: FloatArray = np.full(found["q"].shape[:2], np.inf)
     with torch.no_grad():
         state = replay.begin(start, constants, resting)
         for k in range(errors.shape[1]):

@@ -92,8 +92,8 @@ class Scene:
         """A simulator under the gravity of the trials.
 
         Args:
-            kind: ``simulation`` (uncorrected), ``target`` (which made the trials), ``published``, or ``identified``, which
-                may step with another integrator, and take shorter steps.
+            kind: ``simulation`` (uncorrected), ``target`` (which made the trials), ``published``, or ``identified``,
+                which may step with another integrator, and take shorter steps.
         """
         if kind not in self._simulators:
             self._simulators[kind] = self.new_simulator(kind)

@@ -143,7 +143,7 @@ _FORCE: Final = Kind(_is_place, "three numbers, in N")
 _AXIS: Final = Kind(lambda value: _is_place(value) and any(value), "three numbers, not all zero")
 _POSITIVES: Final = _list(POSITIVE.fits, "a list of positive numbers")
 _NOT_NEGATIVES: Final = _list(NOT_NEGATIVE.fits, "a list of numbers, zero or more")
-_NUMBERS: Final = _list(is_number, "a list of numbers")
+NUMBERS: Final = _list(is_number, "a list of numbers")
 _THREE_NATURALS: Final = Kind(
     lambda value: isinstance(value, list) and len(value) == 3 and all(at_most(10_000).fits(each) for each in value),
     "three whole numbers from 1 to 10,000",
@@ -197,7 +197,7 @@ _MESHES: Final[Mapping[str, Mapping[str, Spec]]] = {
         "wall": POSITIVE,
         "web": POSITIVE,
         "core": optional(POSITIVE),
-        "rotations": _NUMBERS,
+        "rotations": NUMBERS,
     },
 }
 
@@ -329,7 +329,7 @@ _SEQUENCES = Group(
         "rest": absent(NOT_NEGATIVE),
     }
 )
-_FIBRES = Group({"angles": _NUMBERS, "toe": POSITIVE, "stiffness": NOT_NEGATIVE}, optional=True)
+_FIBRES = Group({"angles": NUMBERS, "toe": POSITIVE, "stiffness": NOT_NEGATIVE}, optional=True)
 _LIMIT = Group(dict.fromkeys(SPLITS, NATURAL), optional=True)
 _SPLIT = dict.fromkeys(SPLITS, _TRIALS)
 _UP = Kind(lambda value: _is_word(value) or _is_place(value), "x, -x, y, -y, z, -z, three numbers, or null", True)
@@ -367,8 +367,8 @@ _SIMULATED = Group(
         "steps": NATURAL,
         "load": absent(PLACE),
         "twist_axis": absent(one_of("x", "y", "z")),
-        "weights_g": absent(Group(each=_NUMBERS)),
-        "angles_deg": absent(Group(each=_NUMBERS)),
+        "weights_g": absent(Group(each=NUMBERS)),
+        "angles_deg": absent(Group(each=NUMBERS)),
         "folds": absent(optional(one_of(*FOLDS))),
         "limit": _LIMIT,
     }

@@ -167,7 +167,8 @@ def _recordings(data: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         other = found.setdefault(path.stem, {"file": path})["file"]
         if other != path:
             raise DataFileError(
-                f"{folder} has {other.name} and {path.name}, two recordings of one name: list the trials in data.trials."
+                f"{folder} has {other.name} and {path.name}, two recordings of one name: list the trials in "
+                "data.trials."
             )
     if not found:
         raise DataFileError(f"{folder} holds no recording ({', '.join(_SUFFIXES)}): set data.folder to that of yours.")

@@ -33,7 +33,7 @@ def peak_memory_gib() -> float:
 
 
 def available_memory_gib() -> float:
-    """Memory that this process may still take [GiB]: what is free, within a container's limit; infinite where unknown."""
+    """Memory that this process may still take [GiB]: what is free, within a container's limit; else infinite."""
     found = []
     meminfo = Path("/proc/meminfo")
     known = re.search(r"^MemAvailable:\s+(\d+) kB$", meminfo.read_text(), re.MULTILINE) if meminfo.is_file() else None

@@ -276,7 +276,7 @@ class Identifier:
 
         def matrix(unit: NDArray[np.float64]) -> NDArray[np.float64] | None:
             found = self._linearise(unit)
-            return None if found is None else 2.0 * sum(jacobian.T @ jacobian for _, jacobian, _ in found)
+            return None if found is None else 2.0 * np.stack([j.T @ j for _, j, _ in found]).sum(0)
 
         first = np.array([self._unit(name, start) for name in self.bounds])
         unit, loss = minimise(objective, first, matrix, max_evaluations, tolerance)

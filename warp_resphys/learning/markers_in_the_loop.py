@@ -13,7 +13,7 @@ import torch
 from typing_extensions import override
 
 from ..dynamics.frames import VertexFrames
-from ..io.errors import ConvergenceError, InputError
+from ..io.errors import ConvergenceError
 from .full_batch import FullBatchTrainer
 from .networks import ResidualForce
 from .predictors import LearnedPredictor

@@ -1,7 +1,8 @@
 """Solver-in-the-loop refinement: a residual force that was trained on single steps, trained on through the simulator.
 
 The loss is how far what is observed of the simulator, with the predicted force, is from the target over windows of k
-steps that start on it, or on states that were reconstructed from it (Um et al. 2020, "Solver-in-the-Loop"). Its gradient goes back through the implicit adjoint of every step.
+steps that start on it, or on states that were reconstructed from it (Um et al. 2020, "Solver-in-the-Loop"). Its
+gradient goes back through the implicit adjoint of every step.
 """
 
 import math
@@ -121,7 +122,8 @@ class WindowLoss:
     def measure(self, windows: Windows, motions: Sequence[Motion]) -> tuple[float, torch.Tensor]:
         """Mean squared distance [mm^2] of the windows that can be simulated, and (W,) bool: which of them cannot."""
         simulator = self._make_simulator()
-        lost, squares = torch.zeros(len(windows), dtype=torch.bool), []
+        lost = torch.zeros(len(windows), dtype=torch.bool)
+        squares: list[torch.Tensor] = []
         for part in self._parts(windows):
             measured, failed = self._distances(simulator, windows.pick(part), motions)
             lost[part], squares = failed, [*squares, measured]

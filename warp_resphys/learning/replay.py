@@ -127,8 +127,8 @@ class Replay:
     ) -> State:
         """The states (E R) from which the trials go on, for the constants and resting inputs of `setting`.
 
-        A force acts on poses alone, which have no time in which it could: they are in equilibrium with the force of where
-        they are, found by going there again and again.
+        A force acts on poses alone, which have no time in which it could: they are in equilibrium with the force of
+        where they are, found by going there again and again.
 
         Raises:
             ConvergenceError: there is no equilibrium, or a pose and its force do not settle.
@@ -145,8 +145,8 @@ class Replay:
             if float((state.q.detach() - before).abs().max()) < _POSE_TOLERANCE:
                 return state
         raise ConvergenceError(
-            f"a pose and the force that depends on it did not settle in {_POSE_ITERATIONS} iterations: the force is too "
-            "large to be a correction.",
+            f"a pose and the force that depends on it did not settle in {_POSE_ITERATIONS} iterations: the force "
+            "is too large to be a correction.",
             state.q,
             None,
         )

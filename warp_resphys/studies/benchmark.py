@@ -31,16 +31,17 @@ from ..dynamics.integrator import State
 from ..dynamics.nonlinear_solver import SOLVERS
 from ..dynamics.simulator import Simulator
 from ..experiment.build import build_body, build_simulator
-from ..experiment.kinds import (
+from ..experiment.schema import (
     FINITE,
-    GROUP,
     NATURAL,
     NATURALS,
     NOT_NEGATIVE,
     POSITIVE,
     TRUTH_VALUE,
+    Group,
     Kind,
-    check_keys,
+    absent,
+    check,
 )
 from ..io.errors import InputError
 from ..io.files import write_json
@@ -170,13 +171,14 @@ _BY_REFINEMENT = Kind(
     lambda value: isinstance(value, Mapping) and bool(value) and all(map(NATURAL.fits, (*value, *value.values()))),
     "whole numbers by refinement, one or more",
 )
-_LIMITS = {"refinements": NATURALS, "batches": NATURALS, "steps": NATURAL}
-_KEYS = {
+_LIMITS: dict[str, Kind | Group] = {"refinements": absent(NATURALS), "batches": absent(NATURALS), "steps": absent(NATURAL)}
+_KEYS: dict[str, Kind | Group] = {
+    **dict.fromkeys(SOLVERS, Group(_LIMITS, absent=True)),
     "quick": TRUTH_VALUE,
     "solvers": Kind(lambda value: isinstance(value, list) and bool(value), "a list of solvers"),
     "materials": Kind(lambda value: isinstance(value, list) and bool(value), "a list of materials"),
     "refinements": NATURALS,
-    "batches": GROUP,
+    "batches": Group({"cpu": NATURALS, "cuda": NATURALS}),
     "largest_batch": _BY_REFINEMENT,
     "steps": _BY_REFINEMENT,
     "relative_tolerance": POSITIVE,
@@ -196,13 +198,9 @@ def _check(settings: Mapping[str, Any]) -> None:
     Raises:
         InputError: a value of the wrong kind or out of range, an unknown key, or no batch to measure.
     """
-    check_keys("benchmark", settings, _KEYS, SOLVERS)
-    check_keys("benchmark.batches", settings["batches"], {"cpu": NATURALS, "cuda": NATURALS})
-    for solver in (solver for solver in SOLVERS if solver in settings):
-        known = {key: kind for key, kind in _LIMITS.items() if key in (settings[solver] or ())}
-        check_keys(f"benchmark.{solver}", settings[solver], known)
+    check("benchmark", settings, Group(_KEYS))
     for number, material in enumerate(settings["materials"]):
-        check_keys(f"benchmark.materials.{number}", material, {"poissons_ratio": FINITE, "youngs_modulus": POSITIVE})
+        check(f"benchmark.materials.{number}", material, Group({"poissons_ratio": FINITE, "youngs_modulus": POSITIVE}))
 
 
 def _quick(settings: Mapping[str, Any]) -> dict[str, Any]:

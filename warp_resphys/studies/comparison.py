@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from ..experiment.build import build_mesh
+from ..experiment.files import METRICS
 from ..experiment.report import EvaluatedSplit, read_rollouts
-from ..experiment.trajectories import METRICS, variation_of
+from ..experiment.trials import variation_of
 from ..io.files import read_json
 from ..learning.metrics import (
     PUBLISHED_MARKER_MEDIAN_MM,
@@ -149,7 +150,7 @@ def _setup(settings: Mapping[str, Any]) -> dict[str, float]:
         **{
             f"{key}, {which} beam": settings[source][constant]
             for key, constant in (("Poisson's ratio", "poissons_ratio"), ("Young's modulus", "youngs_modulus"))
-            for which, source in (("incorrect", "simulation"), ("correct", "reality"))
+            for which, source in (("incorrect", "simulation"), ("correct", "target"))
         },
         "step size": settings["time_step"],
         "time steps": data["steps"],
@@ -276,7 +277,7 @@ def ablation_section(config: Mapping[str, Any], name: str, results: Results) -> 
         rows.append(Row(str(count), [Cell(median), Cell(spread), *(Cell(number_text(value)) for value in values)]))
     vertices = len(surface_vertices(build_mesh(settings["mesh"])))
     note = (
-        f"Error over all vertices and {settings['data']['steps']} steps, in mm, of {settings['markers']['draws']} "
+        f"Error over all vertices and {settings['data']['steps']} steps, in mm, of {settings['ablation']['draws']} "
         f"random sets of markers among the {vertices} vertices of the surface. "
         f"Uncorrected: {number_text(metrics['uncorrected_mm'])} mm."
     )

@@ -17,23 +17,25 @@ from ..dynamics.integrator import State
 from ..dynamics.simulator import Simulator
 from ..energies.base import Quantity
 from ..experiment.build import build_simulator
-from ..experiment.kinds import COUNT, NATURAL, POSITIVE, Kind, check_keys, is_list
+from ..experiment.schema import COUNT, NATURAL, NUMBERS, POSITIVE, Group, Kind, check
 from ..io.errors import InputError
 from ..mesh.poses import twisted
 from .settings import settings_of
 
 POSES = ("rest", "bent", "twisted")
-_KEYS = {
-    "poses": Kind(lambda value: isinstance(value, list) and bool(value), "a list of poses"),
-    "poissons_ratios": Kind(lambda value: is_list(value) and bool(value), "a list of numbers"),
-    "steps": NATURAL,
-    "batch": NATURAL,
-    "seed": COUNT,
-    "tolerance": POSITIVE,
-    "relative_tolerance": POSITIVE,
-    "mass_damping": POSITIVE,
-    "stiffness_damping": POSITIVE,
-}
+_KEYS = Group(
+    {
+        "poses": Kind(lambda value: isinstance(value, list) and bool(value), "a list of poses"),
+        "poissons_ratios": Kind(lambda value: NUMBERS.fits(value) and bool(value), "a list of numbers"),
+        "steps": NATURAL,
+        "batch": NATURAL,
+        "seed": COUNT,
+        "tolerance": POSITIVE,
+        "relative_tolerance": POSITIVE,
+        "mass_damping": POSITIVE,
+        "stiffness_damping": POSITIVE,
+    }
+)
 _HALVINGS = 6  # of the step of a difference
 _ACCURACY = 1e-8  # relative, at which a difference is good enough
 
@@ -238,22 +240,22 @@ def check_configured(config: Mapping[str, Any]) -> Iterator[tuple[float, str, li
         InputError: a value that cannot be simulated, an unknown pose, or float32, whose rounding drowns differences.
         ConvergenceError: the solver does not reach the tolerance.
     """
-    check = config["gradcheck"]
-    check_keys("gradcheck", check, _KEYS)
-    for name in check["poses"]:
+    wanted = config["gradcheck"]
+    check("gradcheck", wanted, _KEYS)
+    for name in wanted["poses"]:
         if name not in POSES:
             raise InputError(f"gradcheck.poses has {name!r}: choose from {', '.join(POSES)}.")
     if config["dtype"] != "float64":
         raise InputError(f"dtype is {config['dtype']!r}: gradients are checked in float64.")
-    damping = {key: check[key] for key in ("mass_damping", "stiffness_damping")}
-    solver = {**config["solver"], "relative_tolerance": check["relative_tolerance"]}
+    damping = {key: wanted[key] for key in ("mass_damping", "stiffness_damping")}
+    solver = {**config["solver"], "relative_tolerance": wanted["relative_tolerance"]}
     simulator = build_simulator({**config, "solver": solver})
-    for poissons_ratio in check["poissons_ratios"]:
+    for poissons_ratio in wanted["poissons_ratios"]:
         changed: dict[str, Any] = {"poissons_ratio": poissons_ratio, **damping}
         material = replace(simulator.material, **changed)
         checked = replace(simulator, material=material)
-        for name in check["poses"]:
-            yield poissons_ratio, name, check_gradients(checked, name, check["steps"], check["batch"], check["seed"])
+        for name in wanted["poses"]:
+            yield poissons_ratio, name, check_gradients(checked, name, wanted["steps"], wanted["batch"], wanted["seed"])
 
 
 def gradient_table(rows: list[GradientRow], title: str, tolerance: float) -> Table:

@@ -19,7 +19,7 @@ from ..dynamics.simulator import GRAVITY, Simulator
 from ..energies.fibres import Fibres
 from ..energies.materials import make_material
 from ..energies.pressure import Pressure
-from ..experiment.kinds import NATURAL, check_kind
+from ..experiment.schema import NATURAL, check
 from ..fem.body import Body
 from ..io.errors import InputError
 from ..mesh.arm import mesh_arm
@@ -96,7 +96,7 @@ def measure(mesh: Mesh, study: Mapping[str, Any], timed: bool = True) -> dict[st
         ConvergenceError: an equilibrium was not found.
     """
     for key in ("chamber", "steps", "repeats"):
-        check_kind(f"study.{key}", study[key], NATURAL)
+        check(f"study.{key}", study[key], NATURAL)
     chambers = find_chambers(mesh)
     number = study["chamber"]
     if number > len(chambers):

@@ -18,7 +18,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from rich.console import Console
 
-from ..experiment.trajectories import METRICS
+from ..experiment.files import METRICS
 from ..io.errors import DataFileError, InputError, ResphysError
 from ..io.files import disk_full_error, is_disk_full, write_text
 from ..io.labels import run_label

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ...experiment.kinds import dotted
+from ...experiment.schema import dotted
 from ...io.errors import InputError
 
-SEARCHED_GROUPS = ("network", "trainer")
+SEARCHED_GROUPS = ("network", "trainer", "in_the_loop")
 _WRITTEN_AS = "write {low: 1.0e-4, high: 1.0e-2, log: true} or a list of values"
 
 

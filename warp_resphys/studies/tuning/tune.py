@@ -13,22 +13,21 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from ...experiment.actuated.checks import PRESSURE
-from ...experiment.checks import check_kind
-from ...experiment.experiment import prepare, stages
-from ...experiment.kinds import is_number, is_whole_number
-from ...experiment.measured.checks import RECORDINGS
-from ...experiment.train import Learning, Snapshot, next_state_learning, residual_force_learning, run_epochs
-from ...experiment.trajectories import MODELS, SIMFREE_TRAINING, TRAINING, training_settings
+from ...experiment.checks import check_training, training_settings
+from ...experiment.files import training_file
+from ...experiment.learn import Learning, Snapshot, run_epochs
+from ...experiment.pipeline import acquire, learning_stages, prepare
+from ...experiment.scene import LEARNED, Scene, models_of
+from ...experiment.schema import is_number, is_whole_number
+from ...experiment.trials import folds_of, split_of
 from ...io.errors import DataFileError, InputError
 from ...io.files import read_json
 from ...io.progress import clock
 from ...io.resumable import forget_checkpoint, keep_checkpoint, resume_checkpoint
-from ...io.stages import StageContext, StageInterrupted, run_stages
-from ...learning.networks import check_network
-from ...learning.training import Trainer, check_trainer
+from ...io.stages import Stage, StageInterrupted, run_stages
+from ...learning.training import EpochTrainer
 from .results import Tuning, print_best, ranked, write_pictures, write_results
-from .space import Dimension, fixed_settings, parse_space, with_settings
+from .space import SEARCHED_GROUPS, Dimension, fixed_settings, parse_space, with_settings
 from .study import Claim, SharedStudy
 from .workers import Watch, Worker, held
 
@@ -38,8 +37,6 @@ _POLL_SECONDS = 0.5
 _LEAST = {"trials": 1, "seed": 0}
 _PICTURE_SECONDS = 60.0
 _RESULTS_LOCK = "results.lock"
-_STAGES = {"resphys": ("generate", "reconstruct", "train"), "simfree": ("generate", "train_simfree")}
-_HISTORIES = {"resphys": TRAINING, "simfree": SIMFREE_TRAINING}
 
 
 class SlowError(Exception):
@@ -55,7 +52,7 @@ class _Bench:
     """What every trial of this process works with."""
 
     study: SharedStudy
-    learning: Learning[Any]
+    learning: Learning
     groups: Mapping[str, Any]
     checkpoints: Path
     fingerprint: str
@@ -76,23 +73,39 @@ def run_tuning(config: DictConfig) -> None:
     space = check_tuning(plain)
     tune = plain["tune"]
     model = tune["model"]
-    needed = [stage for stage in stages(plain) if stage.name in _STAGES[model]]
     groups = with_settings(training_settings(plain, model), fixed_settings(tune))
-    conditions = {"model": model, **{k: v for stage in needed for k, v in stage.settings.items()}, **groups}
-    for group in ("network", "trainer"):
-        conditions[group] = {k: v for k, v in groups[group].items() if f"{group}.{k}" not in space}
     folder = run_dir / "tune" / tune["study"]
-    context = StageContext("tune", run_dir, "", needed[-1].settings)
     with Worker(folder / "workers", tune["stale_after"]) as worker:
         watch = Watch(folder / "workers", tune["stale_after"])
+        needed = _stages_before(plain, model, run_dir)
+        conditions = {"model": model, **{k: v for stage in needed for k, v in stage.settings.items()}, **groups}
+        for group in _searched(groups):
+            conditions[group] = {k: v for k, v in groups[group].items() if f"{group}.{k}" not in space}
         study = SharedStudy(folder, space, conditions, tune["trials"], tune["seed"], worker.identity, watch)
         run_stages(needed, run_dir, wait=True)
-        configured = read_json(run_dir / _HISTORIES[model])["kept"]["validation_rollout_error_mm"]
+        configured = read_json(run_dir / training_file(model))["kept"]["validation_rollout_error_mm"]
         tuning = Tuning(plain, groups, space, folder, configured)
-        learning = residual_force_learning(context) if model == "resphys" else next_state_learning(context)
+        learning = Learning(Scene(needed[-1].settings, run_dir), model)
         limit = math.inf if tune["trial_seconds"] is None else tune["trial_seconds"]
         _work(_Bench(study, learning, groups, folder / "trials", _digest(conditions), limit), tuning)
     print_best(tuning, study)
+
+
+def _stages_before(config: Mapping[str, Any], model: str, run_dir: Path) -> list[Stage]:
+    """The stages of a run up to the training of a model; those that lead to the dataset are run."""
+    _, acquired = acquire(config, run_dir, wait=True)
+    stages = {stage.name: stage for stage in learning_stages(config, split_of(config), ".", acquired)}
+
+    def before(name: str) -> list[str]:
+        return [*(each for needed in stages[name].upstream for each in before(needed)), name]
+
+    wanted = set(before(f"train_{model}"))
+    return [stage for name, stage in stages.items() if name in wanted]
+
+
+def _searched(groups: Mapping[str, Any]) -> tuple[str, ...]:
+    """The groups that a model is trained with."""
+    return tuple(each for each in SEARCHED_GROUPS if each != ("trainer" if groups["in_the_loop"] else "in_the_loop"))
 
 
 def _digest(data: Mapping[str, Any]) -> str:
@@ -159,7 +172,7 @@ def _run_trial(bench: _Bench, claim: Claim) -> None:
 
     value: float | None = None
     try:
-        trainer = bench.learning.trainer(groups["network"], groups["trainer"], groups["seed"])
+        trainer = bench.learning.trainer(groups).trainer
         spent = _resume(trainer, bench.checkpoints, claim, fingerprint)
         run_epochs(f"trial {claim.number}", trainer, save, watch)
         trainer.use_best()
@@ -195,7 +208,7 @@ def _forget(bench: _Bench, claim: Claim) -> None:
         path.unlink(missing_ok=True)
 
 
-def _resume(trainer: Trainer[Any], folder: Path, claim: Claim, fingerprint: str) -> float:
+def _resume(trainer: EpochTrainer[Any], folder: Path, claim: Claim, fingerprint: str) -> float:
     """Goes on from the last checkpoint of a trial, if there is one; returns the seconds spent up to it."""
     for claims in range(claim.claims, 0, -1):
         found = resume_checkpoint(folder / f"{claim.number}.{claims}.safetensors", "training", fingerprint)
@@ -235,15 +248,16 @@ def check_tuning(config: Mapping[str, Any]) -> dict[str, Dimension]:
         InputError: a value of the wrong kind or out of range, also among those that may be tried.
     """
     tune = config["tune"]
-    if config["data"]["kind"] in (RECORDINGS, PRESSURE):
-        raise InputError(
-            f"tune does not search the networks of the experiment {config['name']}, which learns from recordings: "
-            "set network and in_the_loop, and simfree and trainer for the baseline, and compare runs with --multirun."
-        )
-    if "markers" in config:
+    if "ablation" in config:
         raise InputError(f"the experiment {config['name']} trains no network: tune another one.")
-    if tune["model"] not in MODELS:
-        raise InputError(f"tune.model is {tune['model']!r}: choose one of {', '.join(MODELS)}.")
+    if folds_of(config) is not None:
+        raise InputError(
+            "a search needs one split, and data.folds makes several: set data.folds to null, and data.train, "
+            "data.validation and data.test."
+        )
+    known = [model for model in models_of(config) if model in LEARNED]
+    if tune["model"] not in known:
+        raise InputError(f"tune.model is {tune['model']!r}: choose one of {', '.join(known)}.")
     for key in ("trials", "seed"):
         if not is_whole_number(tune[key]) or tune[key] < (key == "trials"):
             raise InputError(f"tune.{key} is {tune[key]!r}: it must be a whole number, {_LEAST[key]} or more.")
@@ -271,13 +285,11 @@ def _check_trial(config: Mapping[str, Any], settings: Mapping[str, Any]) -> None
     groups = training_settings(config, config["tune"]["model"])
     for key in settings:
         group, _, name = key.partition(".")
-        if name not in groups.get(group, {}):
-            raise InputError(f"unknown key '{key}' in the group tune: it must name a setting of network or trainer.")
+        known = _searched(groups)
+        if name not in (groups[group] if group in known else {}):
+            raise InputError(f"unknown key '{key}' in the group tune: it must name a setting of {', '.join(known)}.")
     groups = with_settings(groups, settings)
     try:
-        for key, value in settings.items():
-            check_kind(key, value)
-        check_network(groups["network"])
-        check_trainer(groups["trainer"])
+        check_training(groups)
     except InputError as error:
         raise InputError(f"tune: {error}") from error

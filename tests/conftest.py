@@ -8,7 +8,7 @@ import torch
 import warp as wp
 from main_job import IN_RUN, TINY, files, run
 
-from warp_resphys.experiment import experiment
+from warp_resphys.experiment import pipeline
 from warp_resphys.mesh.mesh import box_hexahedra
 from warp_resphys.report import render
 
@@ -63,7 +63,7 @@ def folder(tmp_path, monkeypatch):
 @pytest.fixture
 def no_report(monkeypatch):
     """The report takes most of a tiny run's time, and has tests of its own."""
-    monkeypatch.setattr(experiment, "make_report", lambda context: (context.run_dir / "report.html").write_text("-"))
+    monkeypatch.setattr(pipeline, "make_report", lambda context: (context.run_dir / "report.html").write_text("-"))
 
 
 @pytest.fixture(scope="session")

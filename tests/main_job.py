@@ -11,11 +11,11 @@ import numpy as np
 from warp_resphys import cli
 
 REPOSITORY = Path(__file__).parents[1]
-STAGES = ["generate", "reconstruct", "train", "train_simfree", "evaluate", "time", "report"]
-REFINED = ["generate", "reconstruct", "train", "refine", "train_simfree", "evaluate", "time", "report"]
+STAGES = ["simulate", "reconstruct_resphys", "train_resphys", "train_simfree", "evaluate", "time", "report"]
+REFINED = ["simulate", "reconstruct_resphys", "train_resphys", "refine_resphys", "train_simfree", "evaluate", "time", "report"]
 REFINE = ["refinement=solver_in_the_loop", "refinement.window=4", "refinement.epochs=3"]
-LEARNED = ["train", "train_simfree", "evaluate", "time", "report"]
-CORRECTED = ["reconstruct", "train", "evaluate", "time", "report"]
+LEARNED = ["train_resphys", "train_simfree", "evaluate", "time", "report"]
+CORRECTED = ["reconstruct_resphys", "train_resphys", "evaluate", "time", "report"]
 MODELS = ("simulation", "resphys", "reconstruction")
 SMALL = ["mesh.divisions=[4,2,2]"]
 SHORT = [

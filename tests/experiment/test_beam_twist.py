@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 from scipy.spatial.transform import Rotation
 
 from warp_resphys import box_hexahedra, cli
-from warp_resphys.experiment.trajectories import split_of
+from warp_resphys.experiment.trials import split_of
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_hdf5
 
@@ -44,7 +44,7 @@ def test_files_and_metrics(finished):
     assert [each["name"] for each in found["per_trajectory"]] == ["60°", "140°"]
     assert found["errors_mm"].keys() == {"simulation", "reconstruction", "resphys", "simfree"}
     assert all(each["trajectories"] == 2 for each in found["errors_mm"].values())
-    expected = {"trajectories.h5", "reconstruction.h5", "model.safetensors", "simfree.safetensors", "rollouts.h5"}
+    expected = {"dataset.h5", "reconstruction_resphys.h5", "resphys.safetensors", "simfree.safetensors", "rollouts.h5"}
     assert expected | {"errors.json", "times.json", "report.html"} <= {path.name for path in finished.iterdir()}
     page = (finished / "report.html").read_text()
     assert "Twisting beam" in page
@@ -61,7 +61,7 @@ def test_the_correction_corrects(finished):
 
 def test_the_beam_is_let_go_from_cross_sections_turned_rigidly_by_the_configured_angles(finished):
     rest = box_hexahedra((0.1, 0.03, 0.03), (4, 2, 2)).vertices
-    with read_hdf5(finished / "trajectories.h5", "trajectories") as file:
+    with read_hdf5(finished / "dataset.h5", "dataset") as file:
         names, q, v = list(file.attrs["names"]), file["q"][:], file["v"][:]
     angles = [angle for split in ANGLES.values() for angle in split]
     assert names == [f"{angle}°" for angle in angles]

@@ -15,6 +15,12 @@ import torch
 from hydra import compose, initialize_config_module
 from main_job import IN_RUN, run
 from omegaconf import OmegaConf
+from warp_resphys.experiment.actuated import experiment, reconstruct, train
+from warp_resphys.experiment.actuated.checks import check_driven
+from warp_resphys.experiment.actuated.evaluate import summary
+from warp_resphys.experiment.actuated.importing import import_driven
+from warp_resphys.experiment.actuated.reconstruct import replayed_errors
+from warp_resphys.experiment.actuated.scene import DrivenScene
 
 from warp_resphys.data.actuation import PressureSequences
 from warp_resphys.data.markers import bind_markers
@@ -22,12 +28,6 @@ from warp_resphys.data.recordings.arrays import write_recording
 from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.trials import Trials
 from warp_resphys.dynamics.inputs import Inputs
-from warp_resphys.experiment.actuated import experiment, reconstruct, train
-from warp_resphys.experiment.actuated.checks import check_driven
-from warp_resphys.experiment.actuated.evaluate import summary
-from warp_resphys.experiment.actuated.importing import import_driven
-from warp_resphys.experiment.actuated.reconstruct import replayed_errors
-from warp_resphys.experiment.actuated.scene import DrivenScene
 from warp_resphys.experiment.build import build_simulator, chambers_of
 from warp_resphys.experiment.checks import check_configuration
 from warp_resphys.io.errors import InputError

@@ -30,10 +30,11 @@ from main_job import (
 from omegaconf import OmegaConf
 
 from warp_resphys import box_hexahedra
-from warp_resphys.experiment import evaluate, experiment, train
+from warp_resphys.experiment import learn, models, pipeline
 from warp_resphys.experiment.build import build_simulator
 from warp_resphys.experiment.checks import check_configuration
-from warp_resphys.io.errors import InputError
+from warp_resphys.experiment.trials import split_of
+from warp_resphys.io.errors import InputError, MeshError
 from warp_resphys.io.files import read_checkpoint, read_hdf5
 from warp_resphys.io.stages import package_versions
 from warp_resphys.learning.networks import ResidualForce
@@ -44,15 +45,22 @@ class TestCompleteRun:
     def test_files(self, finished):
         names = set(finished[1]) - {f"stages/{name}.json" for name in STAGES}
         names = {name for name in names if not name.startswith("figures/")}
-        data = {"trajectories.h5", "reconstruction.h5", "rollouts.h5", "model.safetensors", "training.json"}
-        data |= {"simfree.safetensors", "simfree_training.json", "times.json"}
+        data = {"dataset.h5", "reconstruction_resphys.h5", "rollouts.h5", "resphys.safetensors"}
+        data |= {
+            "training_resphys.json",
+            "simfree.safetensors",
+            "training_simfree.json",
+            "times.json",
+            "reconstruction.json",
+        }
         assert names == data | {"errors.json", "metrics.json", "report.html"}
 
     def test_metrics(self, finished):
         found = metrics(finished[0])
-        keys = ["errors_mm", "errors_vs_reconstruction_mm", "per_trajectory", "networks", "seconds_per_test_trajectory"]
-        assert list(found) == [*keys, "seconds", "peak_memory_gib", "versions", "device"]
-        assert set(found["seconds_per_test_trajectory"]) == {"simulation", "true_parameters", "resphys", "inference"}
+        keys = {"errors_mm", "errors_vs_reconstruction_mm", "per_trajectory", "range", "networks", "parameters"}
+        keys |= {"reconstruction", "seconds_per_test_trajectory", "seconds", "peak_memory_gib", "versions", "device"}
+        assert set(found) == keys
+        assert set(found["seconds_per_test_trajectory"]) == {"simulation", "target", "resphys", "inference"}
         assert set(found["errors_mm"]) == {"simulation", "reconstruction", "resphys", "simfree"}
         assert set(found["errors_vs_reconstruction_mm"]) == {"simulation", "resphys", "simfree"}
         assert list(found["seconds"]) == STAGES
@@ -71,14 +79,14 @@ class TestCompleteRun:
         assert all(found[model]["diverged"] == 0 for model in MODELS)
 
     def test_errors_are_those_of_the_stored_positions(self, finished):
-        with read_hdf5(finished[0] / "trajectories.h5", "trajectories") as file:
+        with read_hdf5(finished[0] / "dataset.h5", "dataset") as file:
             assert list(file.attrs["names"]) == [f"{w} g" for w in (50, 90, 130, 110, 70, 150)]
-            target = file["q"][4:, 1:]
-            assert file["q"].shape == (6, 13, 45, 3)
-            assert file["q"].attrs["units"] == "m"
+            target = file["observed"][4:, 1:]
+            assert file["observed"].shape == (6, 13, 45, 3)
+            assert file["observed"].attrs["units"] == "m"
         with read_hdf5(finished[0] / "rollouts.h5", "rollouts") as file:
-            stored = {model: file[f"{model}_q"][:, 1:] for model in ("simulation", "resphys", "simfree")}
-        with read_hdf5(finished[0] / "reconstruction.h5", "reconstruction") as file:
+            stored = {model: file[f"{model}_observed"][:, 1:] for model in ("simulation", "resphys", "simfree")}
+        with read_hdf5(finished[0] / "reconstruction_resphys.h5", "reconstruction") as file:
             stored["reconstruction"] = file["q"][4:, 1:]
             assert not file["force"][:, 0].any()
         found = metrics(finished[0])
@@ -90,25 +98,25 @@ class TestCompleteRun:
         np.testing.assert_allclose(found["errors_vs_reconstruction_mm"]["resphys"]["mean"], against)
 
     def test_the_roll_out_starts_from_the_target_and_knows_nothing_else_of_it(self, finished):
-        with read_hdf5(finished[0] / "trajectories.h5", "trajectories") as file:
-            start, target = file["q"][4:, 0], file["q"][4:]
+        with read_hdf5(finished[0] / "dataset.h5", "dataset") as file:
+            start, target = file["observed"][4:, 0], file["observed"][4:]
         with read_hdf5(finished[0] / "rollouts.h5", "rollouts") as file:
-            np.testing.assert_array_equal(file["resphys_q"][:, 0], start)
-            np.testing.assert_array_equal(file["simulation_q"][:, 0], start)
-            assert np.abs(file["resphys_q"][:, -1] - target[:, -1]).max() > 0.0
+            np.testing.assert_array_equal(file["resphys_observed"][:, 0], start)
+            np.testing.assert_array_equal(file["simulation_observed"][:, 0], start)
+            assert np.abs(file["resphys_observed"][:, -1] - target[:, -1]).max() > 0.0
 
     def test_settings_and_seeds_are_saved(self, finished):
-        record = json.loads((finished[0] / "stages" / "train.json").read_text())
+        record = json.loads((finished[0] / "stages" / "train_resphys.json").read_text())
         assert record["settings"]["seed"] == 0
         assert record["settings"]["trainer"]["epochs"] == 40
         saved = OmegaConf.load(finished[0] / ".hydra" / "config.yaml")
         assert saved.network.width == 32
-        training = json.loads((finished[0] / "training.json").read_text())
+        training = json.loads((finished[0] / "training_resphys.json").read_text())
         history, kept = training["epochs"], training["kept"]
         assert [r["epoch"] for r in history if "rollout_error_mm" in r] == [10, 20, 30, 40]
         assert kept["validation_rollout_error_mm"] == min(r.get("rollout_error_mm", 1e9) for r in history)
         assert history[kept["epoch"] - 1]["rollout_error_mm"] == kept["validation_rollout_error_mm"]
-        _, metadata = read_checkpoint(finished[0] / "model.safetensors", "residual force")
+        _, metadata = read_checkpoint(finished[0] / "resphys.safetensors", "residual force")
         assert metadata.items() >= kept.items()
         assert metrics(finished[0])["networks"]["resphys"] == kept
 
@@ -135,7 +143,7 @@ class TestChanges:
             ("seed=3", LEARNED),
             ("reconstruction.regularisation=1e-9", CORRECTED),
             ("simulation.youngs_modulus=220e3", CORRECTED),
-            ("reality.youngs_modulus=270e3", STAGES),
+            ("target.youngs_modulus=270e3", STAGES),
             ("data.weights_g.test=[60]", STAGES),
             ("title=Another", ["report"]),
         ],
@@ -170,7 +178,7 @@ class TestChanges:
             ["trainer=published", *TINY, "trainer.learning_rate=1e-2"],
             ["integrator=bdf2", *TINY],
             ["integrator=midpoint", *TINY],
-            ["reality.model=stable_neo_hookean", "reality.stiffness_damping=1e-3", *TINY],
+            ["target.model=stable_neo_hookean", "target.stiffness_damping=1e-3", *TINY],
         ],
         ids=lambda options: options[0],
     )
@@ -186,7 +194,7 @@ class TestChanges:
         small = ["network=published", "network.width=16", "trainer.epochs=2", "trainer.rollout_every=1"]
         assert run(*short, *small, IN_RUN)[0] == 0
         for name, history, kind in (
-            ("model", "training", "residual force"),
+            ("resphys", "training", "residual force"),
             ("simfree", "simfree_training", "next state"),
         ):
             _, metadata = read_checkpoint(f"run/{name}.safetensors", kind)
@@ -197,39 +205,39 @@ class TestChanges:
         assert metrics()["errors_mm"].keys() == {*MODELS, "simfree"}
 
     def test_kept_weights_that_diverge_are_no_secret(self, folder, monkeypatch, caplog):
-        monkeypatch.setattr(train.Validation, "error_mm", lambda self, rollout: float("inf"))
+        monkeypatch.setattr(learn, "rollout_error", lambda *_: lambda _: float("inf"))
         assert run(*TINY, IN_RUN, "trainer.selection=validation_loss", "trainer.epochs=3")[0] == 0
-        assert "train: the weights that are kept diverge on the validation split" in caplog.text
+        assert "train_resphys: the weights that are kept diverge on the validation split" in caplog.text
         for name in ("resphys", "simfree"):
             kept = metrics()["networks"][name]
             assert (kept["selection"], kept["validation_rollout_error_mm"]) == ("validation_loss", None)
-        history = json.loads(Path("run/training.json").read_text())["epochs"]
+        history = json.loads(Path("run/training_resphys.json").read_text())["epochs"]
         assert min(history, key=lambda r: r["validation_loss"])["epoch"] == metrics()["networks"]["resphys"]["epoch"]
 
     def test_refinement_is_never_worse_on_the_validation_split(self, finished, copied):
         """Here it overfits three short trajectories, so that the weights from before it are taken."""
         assert run(*TINY, *REFINE, IN_RUN)[0] == 0
-        assert ran(copied) == ["refine", "evaluate", "time", "report"]
-        history = json.loads(Path("run/refinement.json").read_text())["epochs"]
+        assert ran(copied) == ["refine_resphys", "evaluate", "time", "report"]
+        history = json.loads(Path("run/refinement_resphys.json").read_text())["epochs"]
         assert [r["epoch"] for r in history] == [0, 1, 2, 3]
         assert history[3]["train_loss"] < history[0]["train_loss"]
         found, before = metrics()["networks"], metrics(finished[0])["networks"]
         assert found["resphys"] == before["resphys"]
-        assert found["refinement"]["epoch"] == 0
+        assert found["resphys_refined"]["epoch"] == 0
         start = found["resphys"]["validation_rollout_error_mm"]
-        assert found["refinement"]["validation_rollout_error_mm"] == pytest.approx(start, rel=1e-6)
+        assert found["resphys_refined"]["validation_rollout_error_mm"] == pytest.approx(start, rel=1e-6)
         same_errors(errors(), errors(finished[0]))
         before = files()
         assert run(*TINY, *REFINE, IN_RUN, "refinement.epochs=1")[0] == 0
-        assert ran(before) == ["refine", "evaluate", "time", "report"]
+        assert ran(before) == ["refine_resphys", "evaluate", "time", "report"]
 
     def test_refinement_helps_a_poor_network(self, folder):
         poor = [*TINY, "trainer.epochs=3", "trainer.linear_noise=null"]
         assert run(*poor, *REFINE, "hydra.run.dir=run")[0] == 0
         found, refined = metrics(), files()
-        assert found["networks"]["refinement"]["epoch"] > 0
+        assert found["networks"]["resphys_refined"]["epoch"] > 0
         start = found["networks"]["resphys"]["validation_rollout_error_mm"]
-        assert found["networks"]["refinement"]["validation_rollout_error_mm"] < 0.9 * start
+        assert found["networks"]["resphys_refined"]["validation_rollout_error_mm"] < 0.9 * start
         assert list(found["seconds"]) == REFINED
         assert run(*poor, IN_RUN)[0] == 0  # without it again
         assert ran(refined) == ["evaluate", "time", "report"]
@@ -246,7 +254,7 @@ class TestChanges:
                     found[1] *= torch.nan if step == 4 else 1.0
                 return found
 
-        monkeypatch.setattr(evaluate, "LearnedPredictor", Diverging)
+        monkeypatch.setattr(models, "LearnedPredictor", Diverging)
         Path("run/rollouts.h5").unlink()
         assert run(*TINY, IN_RUN)[0] == 0
         found, before = metrics(), metrics(finished[0])
@@ -260,8 +268,19 @@ class TestChanges:
         assert expected[1].pop("resphys") is not None
         assert rows[1] == pytest.approx(expected[1], rel=1e-6)
         with read_hdf5("run/rollouts.h5", "rollouts") as file:
-            assert np.isnan(file["resphys_q"][:]).all((2, 3)).tolist() == [13 * [False], 5 * [False] + 8 * [True]]
-            assert np.isfinite(file["resphys_q"][1, :5]).all()
+            found = file["resphys_observed"][:]
+        assert np.isnan(found).all((2, 3)).tolist() == [13 * [False], 5 * [False] + 8 * [True]]
+        assert np.isfinite(found[1, :5]).all()
+
+
+def stages_of(config):
+    """All stages of an experiment without folds."""
+    if "ablation" in config:
+        return pipeline.ablation_stages(config, pipeline.simulated(config), config)
+    return [
+        *pipeline.acquisition_stages(config),
+        *pipeline.learning_stages(config, split_of(config), ".", "fingerprint"),
+    ]
 
 
 def options(group):
@@ -288,7 +307,7 @@ class TestConfiguration:
             config = compose("config", overrides=list(overrides))
         return OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
 
-    @pytest.mark.parametrize(("name", "group", "option"), CHOICES, ids="-".join)
+    @pytest.mark.parametrize(("name", "group", "option"), CHOICES, ids=map("-".join, CHOICES))
     def test_every_option_of_every_experiment_is_accepted_and_built(self, folder, name, group, option):
         overrides = [f"experiment={name}", f"{group}={option}"]
         if group == "mesh" and option in ("file", "arm_published"):
@@ -296,11 +315,16 @@ class TestConfiguration:
             meshio.write("box.vtu", meshio.Mesh(box.vertices, [("hexahedron", box.cells)]))
             overrides.append("mesh.path=box.vtu")
         config = self.composed(*overrides)
+        if group == "mesh" and option.startswith(("arm", "segment")) and option != "arm_published":
+            with pytest.raises(MeshError, match=r"no vertex lies within .* of x = 0\.1"):
+                check_configuration(config)
+            return
         check_configuration(config)
-        real, wrong = (build_simulator(config, which) for which in ("reality", "simulation"))
+        real, wrong = (build_simulator(config, which) for which in ("target", "simulation"))
         assert real.material != wrong.material
         wanted = REFINED if option == "solver_in_the_loop" else STAGES
-        assert [stage.name for stage in experiment.stages(config)] == wanted
+        wanted = ["generate", "ablation", "report"] if name == "marker_ablation" else wanted
+        assert [stage.name for stage in stages_of(config)] == wanted
 
     @pytest.mark.parametrize("option", FROM_MARKERS)
     def test_reconstructions_from_markers_are_refused_where_whole_states_are_known(self, option):

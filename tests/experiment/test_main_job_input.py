@@ -20,40 +20,50 @@ class TestBadInput:
         ("overrides", "sentence"),
         [
             ("simulation.youngs_modulus=0", "simulation: youngs_modulus is 0: it must be positive, in Pa."),
-            ("reality.youngs_modulus=-1e5", "reality: youngs_modulus is -100000: it must be positive, in Pa."),
+            ("target.youngs_modulus=-1e5", "target: youngs_modulus is -100000: it must be positive, in Pa."),
             ("simulation.youngs_modulus=nan", "simulation: youngs_modulus is nan: it must be positive, in Pa."),
             ("simulation.poissons_ratio=0.5", "simulation: poissons_ratio is 0.5: it must be greater than -1 and less"),
             (
-                "reality.poissons_ratio=-1",
-                "reality: poissons_ratio is -1: it must be greater than -1 and less than 0.5.",
+                "target.poissons_ratio=-1",
+                "target: poissons_ratio is -1: it must be greater than -1 and less than 0.5.",
             ),
-            ("time_step=0", "time_step is 0: it must be positive, in seconds."),
-            ("time_step=-0.01", "time_step is -0.01: it must be positive, in seconds."),
+            ("time_step=0", "time_step is 0: it must be positive and at most 10, in s."),
+            ("time_step=-0.01", "time_step is -0.01: it must be positive and at most 10, in s."),
             ("experiment=beam_oscilation", "unknown experiment 'beam_oscilation', did you mean 'beam_oscillation'"),
             ("trainer.epoch=5", "unknown key 'trainer.epoch', did you mean 'trainer.epochs'"),
             ("+simulation.stiffness=5", "simulation: corotated has no constant 'stiffness': it has youngs_modulus, "),
             ("simulation.youngs_modulus=soft", "simulation.youngs_modulus is 'soft': it must be a number."),
-            ("trainer.epochs=2.5", "trainer.epochs is 2.5: it must be a whole number."),
-            ("trainer.learning_rate=0", "trainer.learning_rate is 0: it must be positive."),
-            ("trainer.schedule=2", "trainer.schedule is 2: it must be a word."),
-            ("trainer.step_epochs=1.5", "trainer.step_epochs is 1.5: it must be a whole number."),
+            ("trainer.epochs=2.5", "trainer.epochs is 2.5: it must be a whole number, one or more."),
+            ("trainer.learning_rate=0", "trainer.learning_rate is 0: it must be a positive number."),
+            ("trainer.schedule=2", "trainer.schedule is 2: it must be one of cosine, step."),
+            ("trainer.step_epochs=1.5", "trainer.step_epochs is 1.5: it must be a whole number, one or more."),
             ("refinement=solver", "unknown refinement 'solver'; known are none, solver_in_the_loop"),
-            ("refinement.kind=solver", "refinement.kind is 'solver': choose one of none, solver_in_the_loop."),
-            ("reconstruction.regularisation=-1", "reconstruction.regularisation is -1: it must be zero or more."),
-            ("network.kind=graph", "network.kind is 'graph': choose one of reduced, nodal."),
+            ("refinement.kind=solver", "refinement.kind is 'solver': it must be one of none, solver"),
+            (
+                "reconstruction.regularisation=-1",
+                "reconstruction.regularisation is -1: it must be a number, zero or more.",
+            ),
+            ("network.kind=graph", "network.kind is 'graph': it must be one of reduced, nodal."),
             ("network.force_modes=1000", "1000 modes were asked for, but 36 samples give 1 to 36."),
             ("solver.name=gradient_descent", "solver is 'gradient_descent': choose one of"),
-            ("integrator=rk4", "integrator is 'rk4': choose one of implicit_euler, bdf2, midpoint."),
+            ("integrator=rk4", "integrator is 'rk4': it must be one of implicit_euler, bdf2, midpoint."),
             ("device=tpu", "device is 'tpu': choose auto, cpu or cuda."),
             ("device=mps", "device is 'mps': choose auto, cpu or cuda."),
             ("dtype=float16", "dtype is 'float16': experiments need float64"),
-            ("seed=-1", "seed is -1: it must lie between 0 and 2^63 - 1."),
+            ("seed=-1", "seed is -1: it must be between 0 and 2^63 - 1."),
             ("gravity=[0,0]", "gravity is [0, 0]: it must be three finite numbers, in m/s^2."),
             ("gravity=[0,0,inf]", "gravity is [0, 0, inf]: it must be three finite numbers, in m/s^2."),
             ("fixed=null", "fixed is None: it must be a group of settings."),
             ("fixed.x=0.5", "no vertex lies within 1e-09 m of x = 0.5 m"),
             ("data.load.x=0.5", "no vertex lies within 1e-09 m of x = 0.5 m"),
-            ("data.steps=0", "data.steps is 0: it must be positive."),
+            ("data.steps=0", "data.steps is 0: it must be a whole number, one or more."),
+            ("solver.relative_tolerance=1", "solver.relative_tolerance is 1: it must be more than 0 and at most 0.1."),
+            ("tip={x:9}", "no vertex lies within 1e-09 m of x = 9 m"),
+            ("mesh.divisions=[10000,10000,1000]", "mesh.divisions gives 100,000,000,000 cells, which take"),
+            ("mesh.divisions=[1000000,1,1]", "mesh.divisions is [1000000, 1, 1]: it must be three whole numbers"),
+            ("network.width=1000000000", "network.width is 1000000000: it must be a whole number from 1 to 16,384."),
+            ("network.width=16000 network.layers=90 network.blocks=90", "network.width, layers and blocks make"),
+            ("simulation.density=1e30", "the mesh is"),
             ("data.weights_g.train=[]", "data.weights_g.train is empty: give the split at least one value."),
             ("data.weights_g.validation=[]", "data.weights_g.validation is empty"),
             ("data.weights_g.test=[]", "data.weights_g.test is empty"),
@@ -66,7 +76,7 @@ class TestBadInput:
         ],
     )
     def test_settings(self, folder, overrides, sentence):
-        code, err = run(*TINY, IN_RUN, overrides)
+        code, err = run(*TINY, IN_RUN, *overrides.split(" "))
         self.check(code, err, sentence)
 
     @pytest.mark.parametrize("content", [None, b"", b"not a mesh", b"\x89HDF\r\n\x1a\n", "truncated", "surface"])
@@ -94,7 +104,7 @@ class TestBadInput:
         assert len(lines) == 1
         assert lines[0].startswith(f"error: {sentence}")
         written = {path.name for path in Path("run").rglob("*") if path.is_file()} if Path("run").exists() else set()
-        assert not written & {"metrics.json", "report.html", "model.safetensors", "rollouts.h5"}
+        assert not written & {"metrics.json", "report.html", "resphys.safetensors", "rollouts.h5"}
         assert not [name for name in written if name.endswith(".partial")]
 
     def test_a_file_mesh_runs(self, folder, no_report, finished):
@@ -114,7 +124,7 @@ class TestBadInput:
     def test_a_damaged_file_in_the_run_folder_is_an_error_until_it_is_deleted(
         self, finished, copied, no_report, caplog, damage
     ):
-        path = Path("run/reconstruction.h5")
+        path = Path("run/dataset.h5")
         if damage == "truncated":
             path.write_bytes(path.read_bytes()[:-1000])
         elif damage == "foreign":
@@ -122,7 +132,7 @@ class TestBadInput:
             with h5py.File(path, "w") as file:
                 file["q"] = np.zeros(3)
         elif damage == "of another stage":
-            shutil.copy("run/trajectories.h5", path)
+            shutil.copy("run/rollouts.h5", path)
         else:
             content = bytearray(path.read_bytes())
             content[len(content) // 2] ^= 0xFF
@@ -131,28 +141,30 @@ class TestBadInput:
         code, err = run(*TINY, IN_RUN)
         assert code == 2
         assert err.splitlines()[-1].startswith("error: ")
-        assert "reconstruction.h5" in err.splitlines()[-1]
+        assert "dataset.h5" in err.splitlines()[-1]
         assert "Traceback" not in err
         assert path.read_bytes() == found
         path.unlink()
         assert run(*TINY, IN_RUN)[0] == 0
-        assert "reconstruct: missing or changed since they were written: reconstruction.h5" in caplog.text
-        assert ran(copied) == ["reconstruct"]  # the same forces as before: what follows is still valid
+        assert (
+            "simulate: missing or changed since they were written: dataset.h5" in caplog.text
+        )
+        assert ran(copied) == ["simulate"]  # the same forces as before: what follows is still valid
         same_errors(errors(), errors(finished[0]))
 
     def test_a_flipped_bit_in_a_network_is_an_error_until_it_is_deleted(self, finished, copied, no_report):
         """Its size and time are as before, as after a fault of the disk."""
-        path, content = Path("run/model.safetensors"), bytearray(copied["model.safetensors"][1])
+        path, content = Path("run/resphys.safetensors"), bytearray(copied["resphys.safetensors"][1])
         content[-2] ^= 0x20
         path.write_bytes(content)
-        os.utime(path, ns=(copied["model.safetensors"][0],) * 2)
+        os.utime(path, ns=(copied["resphys.safetensors"][0],) * 2)
         Path("run/rollouts.h5").unlink()
         code, err = run(*TINY, IN_RUN)
         assert code == 2
-        assert re.search("^error: .*model.safetensors is damaged .*: delete it and run the same command", err, re.M)
+        assert re.search("^error: .*resphys.safetensors is damaged .*: delete it and run the same command", err, re.M)
         path.unlink()
         assert run(*TINY, IN_RUN)[0] == 0
-        assert ran(copied)[0] == "train"
+        assert ran(copied)[0] == "train_resphys"
         same_errors(errors(), errors(finished[0]))
 
     @staticmethod
@@ -166,7 +178,7 @@ class TestBadInput:
 
     @pytest.mark.parametrize(
         ("kilobytes", "full"),
-        [(10, "trajectories.h5.journal"), (172, "trajectories.h5"), (230, "reconstruction.h5.journal")],
+        [(10, "dataset.h5.journal"), (172, "dataset.h5"), (230, "reconstruct_resphys_parts/part0_000.h5.journal")],
     )
     def test_full_disk(self, finished, folder, no_report, kilobytes, full):
         code, err = self.run_with_files_up_to(kilobytes)

@@ -59,10 +59,11 @@ class TestInterruption:
         arguments = [*TINY, f"integrator={integrator}"]
         assert run(*arguments, "hydra.run.dir=whole")[0] == 0
         whole = Counter(interruption.done)
-        assert whole == {"trajectories": 13, "reconstruction": 13, "epochs": 80, "rollouts": 13}
+        assert whole == {"dataset": 13, "reconstruct_resphys": 13, "epochs": 80, "evaluate": 39}
         interruption.done.clear()
-        cuts = {"trajectories": ("generate", 1), "reconstruction": ("reconstruct", 7), "epochs": ("train", 25)}
-        for kind, (stage, at) in {**cuts, "rollouts": ("evaluate", 5)}.items():
+        cuts = {"dataset": ("simulate", 1), "reconstruct_resphys": ("reconstruct_resphys", 7)}
+        cuts |= {"epochs": ("train_resphys", 25), "evaluate": ("evaluate", 18)}
+        for kind, (stage, at) in cuts.items():
             interruption.at = (kind, at)
             code, err = run(*arguments, IN_RUN)
             assert code == 130
@@ -76,8 +77,8 @@ class TestInterruption:
         repeated = interruption.done - whole
         assert sorted(repeated.elements()) in ([], ["epochs"])  # the epoch that the signal fell into
         same_errors(errors(), errors("whole"))
-        assert not list(Path("run").glob("*.journal"))
-        assert not list(Path("run").glob("train*.safetensors"))
+        assert not [*Path("run").rglob("*.journal"), *Path("run").rglob("*.state*"), *Path("run").glob("*_parts")]
+        assert not list(Path("run").glob("train_*.safetensors"))
 
     def test_ctrl_c_while_refining(self, finished, folder, interruption):
         shutil.copytree(finished[0], "run")
@@ -87,18 +88,18 @@ class TestInterruption:
         interruption.done.clear()
         interruption.at = ("epochs", 2)
         code, err = run(*TINY, *REFINE, IN_RUN)
-        assert (code, "interrupted in stage 'refine'" in err) == (130, True)
+        assert (code, "interrupted in stage 'refine_resphys'" in err) == (130, True)
         interruption.at = None
         assert run(*TINY, *REFINE, IN_RUN)[0] == 0
         assert interruption.done["epochs"] in (3, 4)
-        first, second = (json.loads(Path(f"{name}/refinement.json").read_text()) for name in ("run", "whole"))
+        first, second = (json.loads(Path(f"{name}/refinement_resphys.json").read_text()) for name in ("run", "whole"))
         losses = [[r["train_loss"] for r in found["epochs"]] for found in (first, second)]
         assert losses[0] == losses[1]
         same_errors(errors(), errors("whole"))
 
     def test_twice_in_one_stage_and_before_the_first_frame(self, finished, folder, interruption):
         for at in (1, 2, 9):
-            interruption.at = ("reconstruction", at)
+            interruption.at = ("reconstruct_resphys", at)
             assert run(*TINY, IN_RUN)[0] == 130
         interruption.at = None
         assert run(*TINY, IN_RUN)[0] == 0
@@ -113,10 +114,10 @@ class TestInterruption:
 
         monkeypatch.setattr(LBFGSB, "step", recorded)
         arguments = [*TINY, IN_RUN, "reconstruction=lbfgsb", "data.steps=4"]
-        interruption.at = ("reconstruction", 3)
+        interruption.at = ("reconstruct_resphys", 3)
         assert run(*arguments)[0] == 130
         assert run(*arguments)[0] == 0
-        with read_hdf5("run/reconstruction.h5", "reconstruction") as file:
+        with read_hdf5("run/reconstruction_resphys.h5", "reconstruction") as file:
             np.testing.assert_array_equal(np.stack(guesses, axis=1), file["force"][:, :-1])
 
     @staticmethod
@@ -132,7 +133,7 @@ class TestInterruption:
         return child
 
     def test_ctrl_c_in_a_real_process(self, finished, folder):
-        child = self.start("run/trajectories.h5.journal")
+        child = self.start("run/dataset.h5.journal")
         child.send_signal(signal.SIGINT)
         err = child.communicate(timeout=60)[1]
         assert child.returncode == 130, err
@@ -142,7 +143,7 @@ class TestInterruption:
         same_errors(errors(), errors(finished[0]))
 
     def test_killed_without_warning(self, finished, folder):
-        child = self.start("run/reconstruction.h5.journal")
+        child = self.start("run/reconstruct_resphys_parts/part0_000.h5.journal")
         child.kill()
         err = child.communicate(timeout=60)[1]
         assert child.returncode == -signal.SIGKILL, err

@@ -12,6 +12,11 @@ import pytest
 import torch
 from measured_run import configuration
 from scipy.spatial.transform import Rotation
+from warp_resphys.experiment.measured.files import MARKERS, QUALITY, REGISTRATION, TRUTH, read_motions, recording_file
+from warp_resphys.experiment.measured.importing import import_recordings
+from warp_resphys.experiment.measured.stages import import_stages
+from warp_resphys.experiment.measured.synthesise import make_scene, reality, simulate
+from warp_resphys.experiment.measured.trials import trials_of
 
 from warp_resphys import cli
 from warp_resphys.data.recordings.arrays import write_recording
@@ -19,11 +24,6 @@ from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.recordings.recording import Recording
 from warp_resphys.experiment.build import build_body
 from warp_resphys.experiment.checks import check_configuration
-from warp_resphys.experiment.measured.files import MARKERS, QUALITY, REGISTRATION, TRUTH, read_motions, recording_file
-from warp_resphys.experiment.measured.importing import import_recordings
-from warp_resphys.experiment.measured.stages import import_stages
-from warp_resphys.experiment.measured.synthesise import make_scene, reality, simulate
-from warp_resphys.experiment.measured.trials import trials_of
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.files import read_hdf5
 from warp_resphys.io.stages import StageContext, fingerprint, run_stages

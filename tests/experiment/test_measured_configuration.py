@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from measured_run import configuration
-
-from warp_resphys.experiment.checks import check_configuration
 from warp_resphys.experiment.kinds import dotted
 from warp_resphys.experiment.measured.trials import folds_of, split_of, trials_of, vertical
 from warp_resphys.experiment.trajectories import training_settings
+
+from warp_resphys.experiment.checks import check_configuration
 from warp_resphys.io.errors import InputError, ResphysError
 
 ROOT = Path(__file__).parents[2]

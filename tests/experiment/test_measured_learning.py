@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 import torch
+from warp_resphys.experiment.measured.evaluate import marker_errors, markers_at_frames
+from warp_resphys.experiment.measured.scene import at_steps
 
 from warp_resphys import Body, Simulator, State, box_hexahedra, select_vertices
 from warp_resphys.data.markers import bind_markers
 from warp_resphys.data.trials import Trials
 from warp_resphys.dynamics.inputs import Inputs
-from warp_resphys.experiment.measured.evaluate import marker_errors, markers_at_frames
-from warp_resphys.experiment.measured.scene import at_steps
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.io.files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.markers_in_the_loop import MarkersInTheLoop, MotionLoss, epochs_that_hold_up

@@ -14,12 +14,12 @@ import pytest
 from hydra import compose, initialize_config_module
 from main_job import run
 from omegaconf import OmegaConf
-
 from warp_resphys.experiment.measured import report
 from warp_resphys.experiment.measured.evaluate import marker_errors
 from warp_resphys.experiment.measured.experiment import learning_stages
 from warp_resphys.experiment.measured.files import MODELS, TRAINED
 from warp_resphys.experiment.measured.trials import split_of
+
 from warp_resphys.io.files import read_checkpoint, read_hdf5
 from warp_resphys.io.stages import StageInterrupted, run_stages
 from warp_resphys.learning.identification import Identifier

@@ -16,7 +16,7 @@ from main_job import IN_RUN, TINY, files, run
 from omegaconf import OmegaConf
 from test_tuning_study import Dead
 
-from warp_resphys.experiment import experiment
+from warp_resphys.experiment import pipeline
 from warp_resphys.io.files import read_checkpoint
 from warp_resphys.learning.training import Trainer
 from warp_resphys.studies.tuning import figures as tuning_figures
@@ -48,7 +48,7 @@ WIDTHS = {"network.width": Choice((8, 16, 32)), "trainer.gamma": Range(0.8, 1.0,
 def no_pictures(monkeypatch):
     """Pictures take most of a tiny search's time, and the report of a tiny run's."""
     monkeypatch.setattr(tune, "write_pictures", lambda tuning, study: None)
-    monkeypatch.setattr(experiment, "make_report", lambda context: (context.run_dir / "report.html").write_text("-"))
+    monkeypatch.setattr(pipeline, "make_report", lambda context: (context.run_dir / "report.html").write_text("-"))
 
 
 def table(folder=FOLDER):
@@ -87,7 +87,7 @@ class TestSearch:
         assert all(row["network.width"] in ("8", "16") for row in rows)
         best = json.loads((searched / FOLDER / "tune.json").read_text())["best"]
         assert best["rollout_error_mm"] == min(float(row["rollout_error_mm"]) for row in rows)
-        configured = json.loads((searched / "run" / "training.json").read_text())["kept"]["validation_rollout_error_mm"]
+        configured = json.loads((searched / "run" / "training_resphys.json").read_text())["kept"]["validation_rollout_error_mm"]
         assert json.loads((searched / FOLDER / "tune.json").read_text())["configured_rollout_error_mm"] == configured
         page = (searched / FOLDER / "tune.html").read_text()
         assert "tuned=beam_oscillation_resphys" in page
@@ -98,7 +98,7 @@ class TestSearch:
         best = json.loads((FOLDER / "tune.json").read_text())["best"]
         settings = [option for option in TINY if not option.startswith(("network", "trainer"))]
         assert run(*settings, "tuned=beam_oscillation_resphys", "hydra.run.dir=best")[0] == 0
-        _, metadata = read_checkpoint("best/model.safetensors", "residual force")
+        _, metadata = read_checkpoint("best/resphys.safetensors", "residual force")
         assert metadata["validation_rollout_error_mm"] == pytest.approx(best["rollout_error_mm"], rel=1e-6)
         config = OmegaConf.load("best/.hydra/config.yaml")
         assert config.network.width == best["settings"]["network.width"]
@@ -121,7 +121,7 @@ class TestSearch:
 
     def test_simfree_is_tuned_by_itself(self, folder, no_pictures):
         assert run(*SEARCH, IN_RUN, "tune.model=simfree", "tune.trials=2")[0] == 0
-        assert not Path("run/reconstruction.h5").exists()
+        assert not Path("run/reconstruction_resphys.h5").exists()
         found = OmegaConf.load("configs/tuned/beam_oscillation_simfree.yaml")
         assert set(found) == {"tuned", "simfree"}
         best = json.loads(Path("run/tune/simfree/tune.json").read_text())["best"]
@@ -295,7 +295,7 @@ class TestBadInput:
     )
     def test_a_study_of_something_else(self, searched, monkeypatch, override, sentence):
         monkeypatch.chdir(searched)
-        kept = (FOLDER / "study.journal", Path("run/trajectories.h5"))
+        kept = (FOLDER / "study.journal", Path("run/dataset.h5"))
         before = [path.read_bytes() for path in kept]
         code, err = run(*SEARCH, IN_RUN, override)
         assert code == 2
@@ -324,7 +324,7 @@ class TestBadInput:
         code, err = run(*SEARCH, IN_RUN, override)
         assert code == 2
         assert err.splitlines()[-1].startswith(f"error: {sentence}")
-        assert not Path("run/trajectories.h5").exists()
+        assert not Path("run/dataset.h5").exists()
 
     def test_the_other_space_is_a_study_of_its_own(self, searched, monkeypatch):
         monkeypatch.chdir(searched)

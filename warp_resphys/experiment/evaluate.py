@@ -134,6 +134,7 @@ class _RollingOut(March):
         self._constants = {"delay": (start.delay.cpu().numpy(), "s"), "shift": (shift.cpu().numpy(), "m")}
 
     @override
+    @torch.no_grad()
     def frame(self, number: int) -> tuple[dict[str, Any], dict[str, object]]:
         run = self._run
         if number == 0:

@@ -259,6 +259,7 @@ class _Played(March):
         self.frames = frames_of(settings, self._begins)
 
     @override
+    @torch.no_grad()
     def frame(self, number: int) -> tuple[dict[str, Any], dict[str, object]]:
         if number == 0:
             self._state = self._begin()

@@ -27,7 +27,6 @@ from ..io.resumable import Field, ResumableHDF5, forget_checkpoint, keep_checkpo
 from ..io.stages import StageContext
 from .build import choose_device
 
-_KIND = "part"
 _KEEP_SECONDS = 10.0
 
 
@@ -95,7 +94,7 @@ def march(
         constants: arrays with units that do not depend on the frame.
     """
     checkpoint = path.with_name(f"{path.stem}.state.safetensors")
-    with ResumableHDF5(path, kind, fingerprint, motion.frames, motion.fields) as file, torch.no_grad():
+    with ResumableHDF5(path, kind, fingerprint, motion.frames, motion.fields) as file:
         if file.done < file.steps:
             found = resume_checkpoint(checkpoint, "state", fingerprint)
             done = 0 if found is None else int(found[1]["done"])
@@ -103,24 +102,27 @@ def march(
             if found is not None and file.done:
                 motion.restore(found[0])
             advance(each * file.done)
-            kept, saved = (motion.snapshot() if file.done else {}), time.monotonic()
+            kept = following = (motion.snapshot() if file.done else {}, file.done)
+            saved = time.monotonic()
 
             def keep() -> None:
-                keep_checkpoint(checkpoint, "state", kept, {"done": file.done, "fingerprint": fingerprint})
+                tensors, frames = following if file.done == following[1] else kept
+                if 0 < frames < file.steps:
+                    keep_checkpoint(checkpoint, "state", tensors, {"done": frames, "fingerprint": fingerprint})
 
             try:
                 while file.done < file.steps:
                     arrays, shown = motion.frame(file.done)
+                    following = (motion.snapshot(), file.done + 1)
                     file.append(**arrays)
-                    kept = motion.snapshot()
+                    kept = following
                     if time.monotonic() - saved > _KEEP_SECONDS:
                         keep()
                         saved = time.monotonic()
                     advance(each, **shown)
             finally:
-                if 0 < file.done < file.steps and kept:
-                    keep()
-            file.finish(attributes, motion.constants() if constants is None else constants)
+                keep()
+        file.finish(attributes, motion.constants() if constants is None else constants)
     forget_checkpoint(checkpoint)
 
 
@@ -144,14 +146,14 @@ class Part:
 
     def march(self, motion: March, advance: Advance) -> None:
         """Writes the part's file."""
-        march(self.path, _KIND, self.context.fingerprint, motion, advance, len(self.names))
+        march(self.path, self.context.name, self.context.fingerprint, motion, advance, len(self.names))
 
     @property
     def done(self) -> bool:
         """Whether its file was made from the same settings."""
         if not self.path.is_file():
             return False
-        with read_hdf5(self.path, _KIND) as file:
+        with read_hdf5(self.path, self.context.name) as file:
             return str(file.attrs.get("fingerprint")) == self.context.fingerprint
 
 
@@ -224,7 +226,7 @@ def read_parts(parts: Sequence[Part], name: str) -> NDArray[Any]:
     """The arrays of that name of all parts, one after the other."""
     found = []
     for part in parts:
-        with read_hdf5(part.path, _KIND) as file:
+        with read_hdf5(part.path, part.context.name) as file:
             found.append(read_array(file, name))
     return np.concatenate(found)
 

@@ -162,7 +162,6 @@ def learning_stages(config: Mapping[str, Any], split: Split, shared: str, acquir
         **_pick(config, *_LEARNED_FROM),
         "data": _pick(config["data"], *_LEARNED_DATA),
         "identify": _pick(config["identify"], "integrator", "substeps", "elastic") if identifies else None,
-        "refinement": config["refinement"]["kind"],
         "batch": config["parallel"]["batch"],
         "shared": shared,
         "acquired": acquired,
@@ -181,9 +180,11 @@ def learning_stages(config: Mapping[str, Any], split: Split, shared: str, acquir
         known.append(stages[-1].name)
     settings = {**base, **training_settings(config, SIMFREE), "range_guard": config["range_guard"], "model": SIMFREE}
     outputs = (weights_file(SIMFREE), training_file(SIMFREE))
-    stages.append(Stage("train_simfree", train, outputs, settings, (*needs, "reconstruct_resphys")))
+    learned_from = ("reconstruct_resphys",) if sees_markers(config) else ()
+    stages.append(Stage("train_simfree", train, outputs, settings, (*needs, *learned_from)))
     known.append("train_simfree")
-    groups = {"groups": test_groups(config, split), "range_guard": config["range_guard"]}
+    groups = {"groups": test_groups(config, split), **_pick(config, "range_guard")}
+    groups["refinement"] = config["refinement"]["kind"]
     tested = {**base, **groups, **_pick(config, "published", "correct_uncorrected")}
     tested["data"] = {**base["data"], **_pick(config["data"], "horizons")}
     stages.append(

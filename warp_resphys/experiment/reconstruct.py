@@ -101,12 +101,13 @@ def reconstruct_part(part: Part, advance: Advance) -> None:
 
 
 def reconstructing_simulator(scene: Scene, model: str) -> Simulator:
-    """The simulator of a model, with an integrator whose velocities do not ring where positions are prescribed.
+    """The simulator of a model, with an integrator whose velocities do not ring where markers are prescribed.
 
     The midpoint rule's do: v+ = 2 (q+ - q) / h - v keeps every deviation.
     """
     simulator = scene.model_simulator(model)
-    return dataclasses.replace(simulator, integrator="bdf2") if simulator.integrator == "midpoint" else simulator
+    rings = simulator.integrator == "midpoint" and scene.dataset.bound is not None
+    return dataclasses.replace(simulator, integrator="bdf2") if rings else simulator
 
 
 class _Reconstructing(March):
@@ -131,14 +132,16 @@ class _Reconstructing(March):
     def frame(self, number: int) -> tuple[dict[str, Any], dict[str, object]]:
         shown: dict[str, object] = {}
         if number == 0:
-            self._state = self._replay.begin(self._start, self._constants, self._resting)
+            with torch.no_grad():
+                self._state = self._replay.begin(self._start, self._constants, self._resting)
         else:
             assert self._state is not None
             result = self._method.step(self._state, self._observed[:, number], self._inputs.at(number - 1), self._force)
             self._state, self._force = result.state.detach(), result.force
             shown["iterations"] = result.iterations
         kept = {"q": self._state.q, "v": self._state.v, "force": self._force}
-        reached = self._observe(self._state.q)
+        with torch.no_grad():
+            reached = self._observe(self._state.q)
         pairs = zip(reached.cpu().numpy(), self._observed[:, number].cpu().numpy(), strict=True)
         error = np.array([frame_error(x, y) for x, y in pairs])
         return {**{name: value.cpu().numpy() for name, value in kept.items()}, "error": error}, shown

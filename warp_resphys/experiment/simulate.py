@@ -63,6 +63,7 @@ class _Free(March):
         self.frames = self._data["steps"] + 1
 
     @override
+    @torch.no_grad()
     def frame(self, number: int) -> tuple[dict[str, Any], dict[str, object]]:
         if number == 0:
             self._state = initial_state(self._simulator, self._data, self._amounts)

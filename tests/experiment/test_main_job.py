@@ -194,8 +194,8 @@ class TestChanges:
         small = ["network=published", "network.width=16", "trainer.epochs=2", "trainer.rollout_every=1"]
         assert run(*short, *small, IN_RUN)[0] == 0
         for name, history, kind in (
-            ("resphys", "training", "residual force"),
-            ("simfree", "simfree_training", "next state"),
+            ("resphys", "training_resphys", "residual force"),
+            ("simfree", "training_simfree", "next state"),
         ):
             _, metadata = read_checkpoint(f"run/{name}.safetensors", kind)
             assert metadata["architecture"] == {"blocks": 5, "layers": 3, "width": 16, "activation": "normalised_elu"}

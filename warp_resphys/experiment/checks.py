@@ -19,14 +19,13 @@ from ..learning.replay import MASS_FACTOR, known_parameters
 from ..learning.sparse_reconstruction import make_sparse_reconstructor
 from ..mesh.mesh import select_vertices, surface_vertices
 from .build import build_body, build_material, build_simulator, chambers_of
-from .files import STATIC, attached_mass
+from .files import attached_mass
 from .identify import ELASTIC
 from .laboratory import laboratory_settings, substeps_of, vertical
 from .schema import IN_THE_LOOP, NAME, NETWORK, TRAINER, check, configuration_group
 from .trials import (
     folds_of,
     is_laboratory,
-    known_trials,
     sees_markers,
     split_of,
     trials_of,
@@ -177,16 +176,8 @@ def _check_recorded(config: Mapping[str, Any], body: Body) -> None:
     begins = {trial.begins for trial in trials}
     if begins & {"held", "released"} and data["seconds"] is None:
         raise InputError("data.seconds is not set: say how much of each trial counts after its release, in s.")
-    if begins & {"rest", STATIC} and data["steps"] is None:
+    if "rest" in begins and data["steps"] is None:
         raise InputError("data.steps is not set: say how many steps of the simulation are read of each recording.")
-    if STATIC in begins and config["in_the_loop"] is None:
-        split = split_of(config) if folds_of(config) is None else None
-        known = known_trials(config)
-        if split is not None and all(known[name].begins == STATIC for name in (*split.train, *split.validation)):
-            raise InputError(
-                "all trials of training and validation are poses, and a force is learned from motions or on whole "
-                "trials: set in_the_loop, as in conf/recordings/released.yaml."
-            )
     _check_release(config, begins)
     chambers = len(chambers_of(body))
     if chambers:

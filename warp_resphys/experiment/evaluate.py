@@ -58,7 +58,7 @@ def evaluate(context: StageContext, processes: int = 1) -> None:
             create(file, f"{model}_film", bodies[np.minimum(substeps * shown, len(bodies) - 1)], "m")
         create(file, "film_steps", shown)
     left = {
-        model: _by_name(some, read_parts(some, "left")[:, -1], names)
+        model: _by_name(some, np.concatenate([read_parts([part], "left")[:, -1] for part in some]), names)
         for model, some in parts.items()
         if model in LEARNED and settings["range_guard"]
     }

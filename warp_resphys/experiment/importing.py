@@ -208,10 +208,9 @@ class Importer:
 
     def _driven(self, trial: Trial, recording: Recording) -> Observed:
         """A body that rests until its inputs come, or one in a pose."""
-        counting = replace(recording, positions=recording.positions[: self.data["steps"] + 1])
         static = trial.begins == STATIC
         if not static:
-            check_motion(counting, self.tracked)
+            check_motion(replace(recording, positions=recording.positions[: self.data["steps"] + 1]), self.tracked)
         pressure = self._pressure(recording, trial) if self._chambers else None
         filled = fill_gaps(recording, self.data["longest_gap"], mask_long=True)
         loaded = trial.payload > 0.0 or (pressure is not None and not self._is_at_rest(pressure[:1])[0])

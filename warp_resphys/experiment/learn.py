@@ -26,7 +26,7 @@ from ..learning.refinement import Motion, SolverInTheLoop, WindowLoss
 from ..learning.replay import Replay
 from ..learning.training import EpochTrainer, Samples, Trainer
 from .build import choose_device
-from .files import reconstruction_file, training_file, weights_file
+from .files import STATIC, reconstruction_file, training_file, weights_file
 from .models import SIMFREE, Learned, kind_of, load, rollout_error
 from .reconstruct import reconstructing_simulator
 from .scene import Scene
@@ -38,48 +38,49 @@ Snapshot = tuple[dict[str, torch.Tensor], dict[str, Any]]
 
 
 @dataclass(frozen=True)
-class States:
-    """The states and forces of some trials that networks learn from, as they are kept.
+class Steps:
+    """S single steps that networks learn from, and poses, from which a body goes nowhere.
 
     Attributes:
-        q: (R, K + 1, N, 3) positions [m].
-        v: (R, K + 1, N, 3) velocities [m/s].
-        force: (R, K + 1, N, 3) that leads to each state [N]; None where the states were not reconstructed.
-        told: (R, K, A) what the networks are told of the inputs; None for nothing.
-        seen: (R, K) whether anything was seen where a step ends: what none saw has no force to learn.
+        q: (S, N, 3) positions where they begin [m].
+        v: (S, N, 3) velocities there [m/s].
+        told: (S, A) what the networks are told of the inputs; None for nothing.
+        force: (S, N, 3) that leads on [N]; None where the states were not reconstructed.
+        following: positions and velocities (S, N, 3) where they end.
     """
 
     q: torch.Tensor
     v: torch.Tensor
-    force: torch.Tensor | None
     told: torch.Tensor | None
-    seen: torch.Tensor
-
-    def starts(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
-        """Positions, velocities (S, N, 3) and what is told of the inputs (S, A) where steps begin."""
-        return self._of(self.q[:, :-1]), self._of(self.v[:, :-1]), None if self.told is None else self._of(self.told)
-
-    def ends(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Positions and velocities (S, N, 3) where they end."""
-        return self._of(self.q[:, 1:]), self._of(self.v[:, 1:])
-
-    def forces(self) -> torch.Tensor:
-        """(S, N, 3) that lead there."""
-        assert self.force is not None
-        return self._of(self.force[:, 1:])
-
-    def _of(self, field: torch.Tensor) -> torch.Tensor:
-        return field.flatten(0, 1) if bool(self.seen.all()) else field[self.seen]
+    force: torch.Tensor | None
+    following: tuple[torch.Tensor, torch.Tensor]
 
 
-def states_of(scene: Scene, model: str, names: Sequence[str], device: torch.device) -> States:
-    """The states of some trials that a model learns from: known ones, or what the reconstruction left."""
-    names = scene.moving(names)
+def steps_of(scene: Scene, model: str, names: Sequence[str], device: torch.device) -> Steps:
+    """The steps of some trials that a model learns from: known ones, or what the reconstruction left.
+
+    What no marker saw has no force to learn.
+    """
     dataset = scene.dataset
     if model == SIMFREE and dataset.velocity is not None:
         rows = dataset.rows(names)
         q, v = (torch.as_tensor(field[rows], device=device) for field in (dataset.observed, dataset.velocity))
-        return States(q, v, None, None, torch.ones(q.shape[0], q.shape[1] - 1, dtype=torch.bool, device=device))
+        return _steps(q, v, None, None, torch.ones(q.shape[0], q.shape[1] - 1, dtype=torch.bool))
+    found = []
+    for some in scene.alike(names):
+        q, v, force, seen = read_states(scene, model, some, device)
+        told = _told(scene, model, some, q.shape[1] - 1)
+        if scene.begins(some[0]) == STATIC:
+            q, v = q[:, 1:2].expand(-1, 2, -1, -1), torch.zeros_like(v[:, :2])
+            force, seen = force[:, :2], seen[:, :1]
+        found.append(_steps(q, v, force, None if told is None else told[:, : q.shape[1] - 1].to(device), seen))
+    return found[0] if len(found) == 1 else _together(found)
+
+
+def read_states(
+    scene: Scene, model: str, names: Sequence[str], device: torch.device
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Positions, velocities, forces (R, K + 1, N, 3) of trials that begin alike, and (R, K) whether steps were seen."""
     source = "resphys" if model == SIMFREE else model
     with read_hdf5(scene.folder / reconstruction_file(source), "reconstruction") as file:
         order = [str(name) for name in file.attrs["names"]]
@@ -87,23 +88,38 @@ def states_of(scene: Scene, model: str, names: Sequence[str], device: torch.devi
         index = slice(rows[0], rows[-1] + 1) if rows == [*range(rows[0], rows[-1] + 1)] else rows
         found = {key: read_array(file, key)[index] for key in ("q", "v", "force", "error")}
     q, v, force = (torch.as_tensor(found[key], device=device) for key in ("q", "v", "force"))
-    seen = torch.as_tensor(np.isfinite(found["error"][:, 1:]), device=device)
-    told = _told(scene, model, names, q.shape[1] - 1)
-    return States(q, v, force, None if told is None else told.to(device), seen)
+    return q, v, force, torch.as_tensor(np.isfinite(found["error"][:, 1:]), device=device)
+
+
+def _steps(
+    q: torch.Tensor, v: torch.Tensor, force: torch.Tensor | None, told: torch.Tensor | None, seen: torch.Tensor
+) -> Steps:
+    """The steps between (R, K + 1, N, 3) states of which the end was seen (R, K)."""
+    whole = bool(seen.all())
+
+    def pick(field: torch.Tensor) -> torch.Tensor:
+        return field.flatten(0, 1) if whole else field[seen]
+
+    now = (pick(q[:, :-1]), pick(v[:, :-1]), None if told is None else pick(told))
+    return Steps(*now, None if force is None else pick(force[:, 1:]), (pick(q[:, 1:]), pick(v[:, 1:])))
+
+
+def _together(parts: Sequence[Steps]) -> Steps:
+    def joined(fields: Sequence[torch.Tensor | None]) -> Any:
+        known = [each for each in fields if each is not None]
+        return torch.cat(known) if known else None
+
+    own = {name: joined([getattr(each, name) for each in parts]) for name in ("q", "v", "told", "force")}
+    return Steps(**own, following=(joined([p.following[0] for p in parts]), joined([p.following[1] for p in parts])))
 
 
 def _told(scene: Scene, model: str, names: Sequence[str], steps: int) -> torch.Tensor | None:
-    """(R, K, A) what a model is told of the inputs of some trials."""
-    parameters = scene.parameters(model)
-    each: dict[str, torch.Tensor] = {}
-    for some in scene.alike(names):
-        replay = Replay(scene.model_simulator(model), scene.observe, scene.trials(some))
-        told = scene.conditions(replay, parameters, model == SIMFREE)
-        if told is None:
-            return None
-        series = told[:steps].swapaxes(0, 1) if told.ndim == 3 else told[:, None].expand(-1, steps, -1)
-        each |= dict(zip(some, series.unbind(), strict=True))
-    return torch.stack([each[name] for name in names])
+    """(R, K, A) what a model is told of the inputs of some trials that begin alike."""
+    replay = Replay(scene.model_simulator(model), scene.observe, scene.trials(names))
+    told = scene.conditions(replay, scene.parameters(model), model == SIMFREE)
+    if told is None:
+        return None
+    return told[:steps].swapaxes(0, 1) if told.ndim == 3 else told[:, None].expand(-1, steps, -1)
 
 
 @dataclass(frozen=True)
@@ -135,11 +151,11 @@ class Learning:
         """
         split = self.scene.config["split"]
         device = choose_device(self.scene.config["device"])
-        train = states_of(self.scene, self.model, split["train"], device)
+        train = steps_of(self.scene, self.model, split["train"], device)
         if self.in_the_loop:
             return _in_the_loop(self.scene, self.model, train, groups)
         judged = split["validation"] or split["train"]
-        validation = states_of(self.scene, self.model, judged, device) if split["validation"] else train
+        validation = steps_of(self.scene, self.model, judged, device) if split["validation"] else train
         return _supervised(self.scene, self.model, {"train": train, "validation": validation}, judged, groups)
 
 
@@ -157,43 +173,40 @@ class Prepared:
 
 
 def new_network(
-    scene: Scene, model: str, states: States, groups: Mapping[str, Any], forces: torch.Tensor | None
+    scene: Scene, model: str, steps: Steps, groups: Mapping[str, Any], forces: torch.Tensor | None
 ) -> StateMap:
-    """An untrained network, with coders from the training states; the same for the same seed."""
-    q, v, told = states.starts()
-    rest = scene.simulator("simulation").rest_positions.to(q.device)
+    """An untrained network, with coders from the training steps; the same for the same seed."""
+    rest = scene.simulator("simulation").rest_positions.to(steps.q.device)
     config = groups["network"]
     torch.manual_seed(groups["seed"])
     if forces is None:
-        return build_next_state(config, rest, q, v, told)
+        return build_next_state(config, rest, steps.q, steps.v, steps.told)
     by_displacement = config["kind"] == "reduced" and config["force_basis"] == "displacement"
     stiffness = RestStiffness(scene.model_simulator(model)) if by_displacement else None
-    return build_model(config, rest, q, v, forces, told, stiffness)
+    return build_model(config, rest, steps.q, steps.v, forces, steps.told, stiffness)
 
 
-def _turned(scene: Scene, model: str, states: States) -> torch.Tensor:
+def _turned(scene: Scene, model: str, steps: Steps) -> torch.Tensor:
     """(S, N, 3) forces as a model is to learn them: those of the rest shape, where they turn with the body [N]."""
+    assert steps.force is not None
     frames = scene.frames(scene.model_simulator(model))
-    q, v, _ = states.starts()
-    return states.forces() if frames is None else frames.to_rest(q, v, states.forces())
+    return steps.force if frames is None else frames.to_rest(steps.q, steps.v, steps.force)
 
 
 def _supervised(
-    scene: Scene, model: str, states: Mapping[str, States], judged: Sequence[str], groups: Mapping[str, Any]
+    scene: Scene, model: str, steps: Mapping[str, Steps], judged: Sequence[str], groups: Mapping[str, Any]
 ) -> Prepared:
     """Training on single steps, judged by roll-outs."""
     samples = {}
-    for name, each in states.items():
-        q, v, told = each.starts()
+    for name, each in steps.items():
         if model == SIMFREE:
-            rest = scene.simulator("simulation").rest_positions.to(q)
-            following, speed = each.ends()
-            outputs: tuple[torch.Tensor, ...] = (following - rest, speed)
+            rest = scene.simulator("simulation").rest_positions.to(each.q)
+            outputs: tuple[torch.Tensor, ...] = (each.following[0] - rest, each.following[1])
         else:
             outputs = (_turned(scene, model, each),)
-        samples[name] = Samples(q, v, outputs, told)
+        samples[name] = Samples(each.q, each.v, outputs, each.told)
     train = samples["train"]
-    network = new_network(scene, model, states["train"], groups, None if model == SIMFREE else train.outputs[0])
+    network = new_network(scene, model, steps["train"], groups, None if model == SIMFREE else train.outputs[0])
     learned = Learned(network, _range_of(scene, network, train), scene.config["force_frame"])
     error = rollout_error(dataclasses.replace(scene, on_failure="count"), model, judged)
     trainer: Trainer[Any] = Trainer(
@@ -215,14 +228,14 @@ def _range_of(scene: Scene, network: StateMap, train: Samples) -> Range | None:
         return Range.of(network.encode(train.q, train.v, train.actuation))
 
 
-def _in_the_loop(scene: Scene, model: str, states: States, groups: Mapping[str, Any]) -> Prepared:
+def _in_the_loop(scene: Scene, model: str, steps: Steps, groups: Mapping[str, Any]) -> Prepared:
     """Training on whole trials through the simulator.
 
     The reconstruction says in which modes bodies move and forces act. Without validation trials, each training trial is
     held out once to find how long training serves others; no epoch at all is one of the choices.
     """
     config, split = groups["in_the_loop"], scene.config["split"]
-    parameters, forces = scene.parameters(model), _turned(scene, model, states)
+    parameters, forces = scene.parameters(model), _turned(scene, model, steps)
     simulator = scene.model_simulator(model)
     everyone = [(some, *scene.replay(simulator, some)) for some in scene.alike([*split["train"], *split["validation"]])]
     frames = scene.frames(simulator)
@@ -238,7 +251,7 @@ def _in_the_loop(scene: Scene, model: str, states: States, groups: Mapping[str, 
         return MotionLoss(watched, parameters)
 
     def make_network() -> ResidualForce:
-        found = new_network(scene, model, states, groups, forces)
+        found = new_network(scene, model, steps, groups, forces)
         assert isinstance(found, ResidualForce)
         return found.double()
 
@@ -251,8 +264,7 @@ def _in_the_loop(scene: Scene, model: str, states: States, groups: Mapping[str, 
     judged = loss(validation) if validation else None
     trainer = MarkersInTheLoop(make_network(), loss(train), judged, config, epochs)
     trainer.begin()
-    q, v, told = states.starts()
-    range_ = _range_of(scene, trainer.model, Samples(q, v, (), told))
+    range_ = _range_of(scene, trainer.model, Samples(steps.q, steps.v, (), steps.told))
     return Prepared(trainer, Learned(trainer.model, range_, scene.config["force_frame"]))
 
 
@@ -310,8 +322,8 @@ def _motions(scene: Scene, model: str, names: Sequence[str]) -> list[Motion]:
                 simulator.tensor(x[scene.dataset.rows(some)]) for x in (scene.dataset.observed, scene.dataset.velocity)
             )
         else:
-            states = states_of(scene, model, some, simulator.rest_positions.device)
-            q, v = states.q.to(simulator.rest_positions), states.v.to(simulator.rest_positions)
+            q, v, _, _ = read_states(scene, model, some, simulator.rest_positions.device)
+            q, v = (field[:, : target.shape[1]].to(simulator.rest_positions) for field in (q, v))
         told = scene.conditions(replay, scene.parameters(model))
         found.append(Motion(q, v, target, replay.trials, told))
     return found

@@ -30,6 +30,7 @@ log = logging.getLogger(__name__)
 FloatArray = NDArray[np.float64]
 
 _UNITS = {"q": "m", "v": "m/s", "force": "N"}
+_FOR_EVER = 1e6  # s
 _UNHELD = 0.1  # mm, by which replayed markers may be further off than reconstructed ones
 
 
@@ -44,15 +45,15 @@ def reconstruct(context: StageContext, processes: int = 1) -> None:
     """
     settings, model = context.settings, context.settings["model"]
     scene = Scene(settings, context.run_dir)
-    moving = scene.moving(settings["reconstructed"])
     parts: list[Part] = []
-    for number, names in enumerate(scene.alike(moving)):
+    for number, names in enumerate(scene.alike(settings["reconstructed"])):
         last = float(scene.trials(names).times.max()) / scene.model_simulator(model).time_step
-        frames = scene.learned_steps(int(last + 1e-6)) + 1
+        frames = max(scene.learned_steps(int(last + 1e-6)), 1) + 1
         parts += split_into_parts(context, names, settings["batch"], frames, f"part{number}")
     work_on(parts, reconstruct_part, processes)
     order = [name for part in parts for name in part.names]
-    rows = [row for row, name in enumerate(order) if name in settings["split"]["validation"]]
+    held = scene.moving(settings["split"]["validation"])
+    rows = [row for row, name in enumerate(order) if name in held]
     error, held_out = _together(parts, "error"), {}
     with atomic_hdf5(context.run_dir / reconstruction_file(model), "reconstruction", {"names": order}) as file:
         create(file, "error", error, "mm", time_axis=1)
@@ -114,12 +115,17 @@ class _Reconstructing(March):
     """Some trials, brought to what was observed of them step by step."""
 
     def __init__(self, scene: Scene, settings: Mapping[str, Any], names: Sequence[str]) -> None:
-        self._simulator = reconstructing_simulator(scene, settings["model"])
-        replay, self._start = scene.replay(self._simulator, names)
+        simulator = reconstructing_simulator(scene, settings["model"])
+        replay, self._start = scene.replay(simulator, names)
         self._replay, self._observe = replay, scene.observe
         self._constants, self._inputs, self._resting = replay.setting(scene.parameters(settings["model"]))
-        self._method = make_method(scene, self._simulator, settings["reconstruction"]).with_constants(self._constants)
-        self._observed = scene.explained(self._simulator, replay.trials, self._start)
+        self._observed = scene.explained(simulator, replay.trials, self._start)
+        if replay.is_static:  # A pose is where one step leads that lasts so long that inertia has no say.
+            simulator = dataclasses.replace(simulator, time_step=_FOR_EVER, integrator="implicit_euler")
+            self._observed = torch.cat([torch.full_like(self._observed, torch.nan), self._observed], 1)
+            self._inputs = self._resting
+        self._simulator = simulator
+        self._method = make_method(scene, simulator, settings["reconstruction"]).with_constants(self._constants)
         self._state: State | None = None
         self._force = torch.zeros_like(self._start.state.q)
         dtype = "float64" if scene.dataset.bound is None else "float32"
@@ -192,9 +198,10 @@ def replayed_errors(
 
     rollout = Rollout(simulator, predict, inputs, constants)
     errors: FloatArray = np.full(found["q"].shape[:2], np.inf)
+    errors[:, observed.shape[1] :] = np.nan  # Other trials last longer.
     with torch.no_grad():
         state = replay.begin(start, constants, resting)
-        for k in range(errors.shape[1]):
+        for k in range(min(errors.shape[1], observed.shape[1])):
             state = rollout.step(state) if k > 0 else state
             reached, seen = scene.observe(state.q).cpu().numpy(), observed[:, k].cpu().numpy()
             for row in np.flatnonzero(~rollout.lost(state).cpu().numpy()):

@@ -496,7 +496,8 @@ def check(name: str, value: Any, spec: Spec) -> None:
         return
     if isinstance(spec, Kind):
         if not spec.fits(value):
-            raise InputError(f"{name} is {value!r}: it must be {spec.wanted}.")
+            null = ", or null" if spec.optional and not spec.wanted.endswith("null") else ""
+            raise InputError(f"{name} is {value!r}: it must be {spec.wanted}{null}.")
         return
     if not isinstance(value, Mapping):
         raise InputError(f"{name} is {value!r}: it must be a group of settings.")

@@ -60,7 +60,8 @@ class LearnedPredictor:
 
     Args:
         model: that predicts a residual force, or the next state.
-        told: what the model is told of the inputs: (B, A) throughout, or (K, B, A) during each step; None for nothing.
+        told: what the model is told of the inputs: (B, A) throughout, or (K, B, A) during each step, past
+            the end the last; None for nothing.
         range_: of its inputs in training, in which it is held; None for no guard.
         frames: with which its forces turn; None if they do not.
 
@@ -81,7 +82,9 @@ class LearnedPredictor:
     def __call__(self, state: State, step: int) -> torch.Tensor | State:
         """The model's force (B, N, 3) [N], or the next state, on the simulator's device and in its type."""
         q, v, like = state.q, state.v, self.model.rest
-        told = self._told if self._told is None or self._told.ndim == 2 else self._told[step]
+        told = self._told
+        if told is not None and told.ndim == 3:
+            told = told[min(step, len(told) - 1)]
         parts = [None if t is None else t.to(like.device, like.dtype) for t in (q, v, told)]
         assert parts[0] is not None
         assert parts[1] is not None

@@ -171,7 +171,11 @@ _BY_REFINEMENT = Kind(
     lambda value: isinstance(value, Mapping) and bool(value) and all(map(NATURAL.fits, (*value, *value.values()))),
     "whole numbers by refinement, one or more",
 )
-_LIMITS: dict[str, Kind | Group] = {"refinements": absent(NATURALS), "batches": absent(NATURALS), "steps": absent(NATURAL)}
+_LIMITS: dict[str, Kind | Group] = {
+    "refinements": absent(NATURALS),
+    "batches": absent(NATURALS),
+    "steps": absent(NATURAL),
+}
 _KEYS: dict[str, Kind | Group] = {
     **dict.fromkeys(SOLVERS, Group(_LIMITS, absent=True)),
     "quick": TRUTH_VALUE,

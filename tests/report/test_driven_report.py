@@ -8,6 +8,16 @@ from chambered import hollow_box
 from driven_run import BASE, LIMIT, MODELS, STEP, arm_settings, bent, data, errors_of, write_run
 from matplotlib.image import imread
 from report_page import FAILING, Page
+from warp_resphys.report.driven_data import along_body, drawn_markers, mean_of, tip_markers
+from warp_resphys.report.driven_tables import (
+    driven_verdict,
+    factor_table,
+    largest_filtered,
+    published_growth,
+    range_texts,
+    reduction,
+    window_table,
+)
 
 from warp_resphys.experiment.actuated import report as stage
 from warp_resphys.experiment.actuated.report import read_actuation, read_rollouts, report_driven
@@ -20,16 +30,6 @@ from warp_resphys.mesh.chambers import find_chambers
 from warp_resphys.mesh.mesh import Mesh
 from warp_resphys.mesh.readers import write_mesh
 from warp_resphys.report import driven_figures, driven_page, mesh, registration_picture, video
-from warp_resphys.report.driven_data import along_body, drawn_markers, mean_of, tip_markers
-from warp_resphys.report.driven_tables import (
-    driven_verdict,
-    factor_table,
-    largest_filtered,
-    published_growth,
-    range_texts,
-    reduction,
-    window_table,
-)
 from warp_resphys.report.figures import CHAMBER_COLOURS, TONES
 from warp_resphys.report.mesh import MeshSummary
 from warp_resphys.report.page import Picture

@@ -20,15 +20,6 @@ from measured_run import (
     write_split,
 )
 from report_page import FAILING, Page
-
-from warp_resphys.experiment.measured.report import read_recordings, read_trials, report_folds, report_measured
-from warp_resphys.io.errors import DataFileError
-from warp_resphys.io.files import read_json, write_json
-from warp_resphys.io.stages import StageContext
-from warp_resphys.learning.metrics import PUBLISHED_MM
-from warp_resphys.mesh.mesh import box_hexahedra
-from warp_resphys.report import measured_figures, registration_picture, render, video
-from warp_resphys.report.figures import TONES
 from warp_resphys.report.measured_data import at_times, best_and_worst, mean_distance, shown_models
 from warp_resphys.report.measured_page import instants
 from warp_resphys.report.measured_tables import (
@@ -40,6 +31,15 @@ from warp_resphys.report.measured_tables import (
     uncertainty_text,
     verdict,
 )
+
+from warp_resphys.experiment.measured.report import read_recordings, read_trials, report_folds, report_measured
+from warp_resphys.io.errors import DataFileError
+from warp_resphys.io.files import read_json, write_json
+from warp_resphys.io.stages import StageContext
+from warp_resphys.learning.metrics import PUBLISHED_MM
+from warp_resphys.mesh.mesh import box_hexahedra
+from warp_resphys.report import measured_figures, registration_picture, render, video
+from warp_resphys.report.figures import TONES
 from warp_resphys.report.video import Motion, draw_instants, view_axes, write_video
 
 SETTINGS = config()

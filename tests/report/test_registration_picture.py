@@ -2,12 +2,12 @@ import matplotlib.colors
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from warp_resphys.report.render_markers import MEASURED
 
 from warp_resphys.data.registration import register_markers
 from warp_resphys.mesh.mesh import boundary_triangles, box_hexahedra, select_vertices
 from warp_resphys.report import registration_picture, render
 from warp_resphys.report.registration_picture import _VIEWS, _pictures, _round_length, _spread, _view, draw_registration
-from warp_resphys.report.render_markers import MEASURED
 
 MESH = box_hexahedra(divisions=(3, 2, 2))
 NAMES = ["Tip - 1", "Tip - 2", "Tip - 3", "Base - 1", "Base - 2", "a marker with a rather long name"]

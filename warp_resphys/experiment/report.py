@@ -74,7 +74,7 @@ def make_report(context: StageContext) -> None:
     channels = () if pressures is None else pressures.channels
     data = RunReport(
         **common,
-        tip=select_vertices(mesh, **config["tip"]) if config.get("tip") else np.empty(0, dtype=np.int64),
+        tip=_tip(mesh, config, trials),
         chambers=_driven_chambers(build_chambers(config.get("chambers"), mesh), channels),
         trials=trials,
         film=film,
@@ -113,6 +113,12 @@ def make_folds_report(context: StageContext) -> None:
         notes=error_notes(sideways, {}),
     )
     write_report(folder / REPORT, data)
+
+
+def _tip(mesh: Mesh, config: Mapping[str, Any], trials: Trials) -> NDArray[np.int64]:
+    """Vertices whose mean is the tip, where every vertex is observed."""
+    place = config.get("tip")
+    return np.empty(0, dtype=np.int64) if trials.labels or not place else select_vertices(mesh, **place)
 
 
 def _common_parts(context: StageContext, metrics: Mapping[str, Any]) -> tuple[dict[str, Any], Mesh]:

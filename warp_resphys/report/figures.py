@@ -222,7 +222,7 @@ def loss_histories(histories: Mapping[str, Sequence[Sequence[Mapping[str, float]
     with mpl.rc_context(STYLE):
         shape = (len(histories), 1) if narrow else (1, len(histories))
         figure = new_figure(2.6, 0.4 + 2.1 * len(histories), narrow=narrow)
-        panels = figure.subplots(*shape, sharey=True, squeeze=False).flat
+        panels = list(figure.subplots(*shape, sharey=True, squeeze=False).flat)
         for axes, (name, starts) in zip(panels, histories.items(), strict=True):
             ends = [each["loss"] for start in starts for each in start if each["loss"] is not None]
             for start in (each for each in starts if each):
@@ -231,12 +231,13 @@ def loss_histories(histories: Mapping[str, Sequence[Sequence[Mapping[str, float]
                 tone = TONES["sysid" if best else "muted"].light
                 count = np.arange(1, len(losses) + 1)
                 axes.plot(count, positive(losses), ".-", color=tone, linewidth=1.8 if best else 0.9, markersize=3.5)
-            use_logarithm(axes)
             axes.set_title(LABELS[name])
             axes.set_xlabel("evaluation")
             axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
-            if narrow or name == next(iter(histories)):
-                axes.set_ylabel("loss")
+        for axes in panels:  # With everything drawn, as they share their axis.
+            use_logarithm(axes)
+        for axes in panels if narrow else panels[:1]:
+            axes.set_ylabel("loss")
     return figure
 
 

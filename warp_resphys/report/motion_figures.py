@@ -231,7 +231,7 @@ def tip_planes(target: FloatArray, models: Mapping[str, FloatArray], *, narrow: 
         columns = min(count, 2 if narrow else 4)
         rows = -(-count // columns)
         width = (NARROW if narrow else WIDE) / columns
-        height = 0.55 + rows * (min(width, 3.4) + 0.05)
+        height = 0.75 + rows * (min(width, 3.4) + 0.15)
         figure = new_figure(height, height, narrow=narrow)
         panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
         centre, half = _range(target[:, :2])

@@ -341,8 +341,8 @@ def settle(figure: Figure) -> None:
     engine = figure.get_layout_engine()
     if engine is not None:
         with mpl.rc_context(STYLE):
-            figure.draw_without_rendering()
-        figure.set_layout_engine("none")
+            engine.execute(figure)
+        figure.set_layout_engine(None)
 
 
 def model_line(model: str, width: float = 1.4) -> dict[str, Any]:

@@ -97,7 +97,7 @@ def shape_comparison(bodies: Mapping[str, Body | None], *, narrow: bool) -> Figu
             if body is None:
                 axes.text(0.5, 0.5, "diverged before this time", ha="center", transform=axes.transAxes)
                 continue
-            axes.imshow(body.pixels)
+            axes.imshow((255.0 * body.pixels).astype(np.uint8))
             factor, unit = (1e3, "mm") if body.largest >= 1e-4 else (1e6, "µm")
             scale = ScalarMappable(Normalize(0.0, factor * body.largest), mpl.colormaps[COLOUR_MAP])
             bar = figure.colorbar(scale, ax=axes, orientation="horizontal", shrink=0.8, aspect=34, pad=0.02)

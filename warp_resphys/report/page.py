@@ -216,7 +216,8 @@ def draw_picture(folder: Path, name: str, draw: "Callable[..., Drawing]", alt: s
     from . import figures
 
     wide, narrow = draw(narrow=False), draw(narrow=True)
-    figures.settle(wide)  # Laid out once for both of its files.
+    figures.settle(wide)
+    figures.settle(narrow)
     figures.save_png(wide, folder / f"{name}.png")
     return Picture(svg_address(figures.themed_svg(wide, name)), svg_address(figures.themed_svg(narrow, name)), alt)
 

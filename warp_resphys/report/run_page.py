@@ -65,7 +65,9 @@ def write_report(path: Path, data: RunReport) -> None:
     with figures_beside(path) as folder, ThreadPoolExecutor(1) as pool:
         canvas = Canvas(folder)
         canvas.start(pool, moving_pictures(data))  # Other processes draw these, while this one draws the figures.
-        parts = [part for section in SECTIONS if (part := section(data, canvas)) is not None]
+        ready = sorted(SECTIONS, key=lambda section: section is motion_section)  # It waits for those.
+        found = {section: section(data, canvas) for section in ready}
+    parts = [part for section in SECTIONS if (part := found[section]) is not None]
     page = page_template("report.html").render(
         title=data.title,
         data=data,

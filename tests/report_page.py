@@ -23,8 +23,3 @@ class Page(HTMLParser):
 
     def handle_data(self, data):
         self.text += data
-
-
-def no_break(text):
-    """A text with ordinary spaces."""
-    return text.replace("\u00a0", " ")

@@ -14,12 +14,7 @@ from numpy.typing import NDArray
 from ..io.files import atomic_path
 from ..mesh.chambers import Chamber
 from ..mesh.elements import ELEMENTS
-from ..mesh.mesh import (
-    IntArray,
-    Mesh,
-    boundary_triangles,
-    face_triangles,
-)
+from ..mesh.mesh import IntArray, Mesh, boundary_triangles, face_triangles
 from ..mesh.quality import cell_volumes
 from .figures import CHAMBER_COLOURS, STYLE
 from .render import BODY, CLAMPED, INK, MEASURED, Layer, View, draw, face_edges, sharp_edges, view_axes
@@ -34,11 +29,9 @@ _DOT: Final = 0.011  # Radius of a marker, over the body's longest side.
 _MARGIN: Final = 1.04  # What a view shows, over the body.
 _LONGER_SIDE: Final = 1400  # of a view [px]
 _DPI: Final = 200
-_ON_PLANE: Final = 1e-9  # [m], as in `mesh.select_vertices`
 _NARROWEST: Final = 0.3  # width of a view over its height
 _ENTRY: Final = 1.9  # Width of an entry of the legend [inch]
 _LINE: Final = 0.24  # Height of a line of text [inch]
-_MILLI: Final = 1e3
 _CUBIC_CENTI: Final = 1e6
 
 

@@ -156,8 +156,8 @@ def _what_is_measured(data: RunReport) -> str:
         span = f", the frames of the first {data.seconds:g} s after the release,"
     if trials is None:
         said = (
-            f"Distance of the simulated markers from the measured ones, in millimetres{span}: mean over the folds, in "
-            "each of which one trial is the test and the others are what the models learn from, ± the standard "
+            "Distance of the simulated markers from the measured ones, in millimetres: mean over the folds, in each of "
+            f"which one trial{span} is the test and the others are what the models learn from, ± the standard "
             "deviation of the folds’ means."  # noqa: RUF001
         )
     elif data.sees_markers:

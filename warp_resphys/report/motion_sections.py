@@ -30,7 +30,8 @@ _MOST_MARKERS: Final = 6  # That are drawn coordinate by coordinate.
 _PLANE_SECONDS: Final = 5.0  # Of a path in the plane.
 _SPACE_SECONDS: Final = 2.5  # And in space, where a longer one cannot be told apart.
 _SEQUENCES: Final = 3  # Trials whose pressures are drawn.
-_FAST: Final = 2.5  # [s] that a motion lasts which is shown slowed down, and from its start only.
+_FAST: Final = 2.5  # [s] that a motion lasts which is shown slowed down, and from its start only,
+_FINE: Final = 0.025  # where its frames are no farther apart [s].
 _SLOWER, _LONGEST = {True: 4.0, False: 1.0}, {True: 1.5, False: 10.0}  # By whether it is fast; [s] that are shown.
 _HANGING: Final = 0.7  # Cosine between gravity and a body that hangs.
 
@@ -115,8 +116,13 @@ def instants(target: FloatArray, bound: FloatArray, simulated: FloatArray) -> li
     return sorted(chosen)
 
 
+def _is_fast(motion: Motion) -> bool:
+    """Whether a motion is shown slowed down."""
+    return bool(motion.times[-1] <= _FAST and np.diff(motion.times).max(initial=0.0) <= _FINE)
+
+
 def _write_video(motion: Motion, path: Path) -> Path:
-    fast = bool(motion.times[-1] <= _FAST)
+    fast = _is_fast(motion)
     names = {model: name for model, (name, _) in MODELS.items()}
     write_video(path, motion, names, _SLOWER[fast], _LONGEST[fast])
     return path
@@ -148,7 +154,7 @@ def motion_section(data: RunReport, canvas: Canvas) -> Part | None:
     models = list(motion.positions)
     film = data.film if data.sees_markers else None
     name = trials.names[trials.worst] if film is None else film.trial
-    fast = bool(motion.times[-1] <= _FAST)
+    fast = _is_fast(motion)
     colours = f"Grey: {MODELS[models[0]][0]}. " if len(models) > 1 else ""
     colours += f"Blue: {MODELS[models[-1]][0]}."
     blocks: list[Any] = []

@@ -24,7 +24,8 @@ from warp_resphys.report.data import along_body, drawn_markers, tip_markers
 from warp_resphys.report.figures import CHAMBER_COLOURS, TONES
 from warp_resphys.report.mesh import MeshSummary
 from warp_resphys.report.page import Cell, Picture
-from warp_resphys.report.run_page import horizon_table, largest_filtered, range_texts, scale_table
+from warp_resphys.report.run_page import largest_filtered, range_texts
+from warp_resphys.report.sections import horizon_table, scale_table
 from warp_resphys.report.verdict import (
     growth_text,
     marker_verdict,

@@ -32,8 +32,8 @@ from warp_resphys.report.data import at_times, best_and_worst, mean_distance, sh
 from warp_resphys.report.figures import TONES
 from warp_resphys.report.motion_sections import instants
 from warp_resphys.report.page import Cell
-from warp_resphys.report.run_page import against, published_beside
-from warp_resphys.report.sections import parameter_rows, quality_rows, residual_table, uncertainty_text
+from warp_resphys.report.run_page import published_beside
+from warp_resphys.report.sections import against, parameter_rows, quality_rows, residual_table, uncertainty_text
 from warp_resphys.report.verdict import marker_verdict
 from warp_resphys.report.video import Motion, draw_instants, view_axes, write_video
 

@@ -1,4 +1,4 @@
-"""Sections of the page of a run on what was identified and learned, and on its recordings."""
+"""Sections of the page of a run: errors by horizon and pressure, what was identified and learned, its recordings."""
 
 import math
 from collections.abc import Mapping
@@ -26,6 +26,103 @@ _PARAMETERS: Final[Mapping[str, tuple[str, str, float]]] = {
 }
 _WHOLE: Final = 99.5  # [%] of a parameter's range.
 _TIED: Final = 0.9  # From this correlation on, two parameters are named as not told apart.
+
+
+def against(errors: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
+    """Return the model that the others are compared with, and by how many per cent each is above or below it."""
+    base = next((m for m in ("sysid_elastic", "sysid") if m in errors and errors[m]["mean"]), "")
+    if not base:
+        return "", {}
+    ratios = {m: each["mean"] / errors[base]["mean"] - 1.0 for m, each in errors.items() if each["mean"] is not None}
+    return base, {m: NONE if m == base else percent_text(ratio) for m, ratio in ratios.items()}
+
+
+def horizons_section(data: RunReport, canvas: Canvas) -> Part | None:
+    """The errors by length of the roll-out."""
+    table = horizon_table(data.metrics, data.published_horizons)
+    if table is None:
+        return None
+    longer = data.settings["data"].get("train_fraction", 1.0) < 1.0
+    return Part("Longer than the training" if longer else "By length of the roll-out", [table])
+
+
+def horizon_table(metrics: Mapping[str, Any], published: Mapping[str, Mapping[str, Any]]) -> Table | None:
+    """Return the errors over the first seconds of the roll-outs and their growth, with the published ones below them.
+
+    Args:
+        metrics: With `horizons` (a summary by seconds and model) and `growth`.
+        published: Published errors by seconds and model.
+
+    Returns:
+        The table; None where there are no such errors.
+    """
+    horizons = sorted(metrics.get("horizons", {}), key=float)
+    if not horizons:
+        return None
+    models = [model for model in MODELS if model in metrics["horizons"][horizons[0]]]
+    rows = []
+    for horizon in horizons:
+        theirs = {model: " ".join(published_parts(each)) for model, each in published.get(horizon, {}).items()}
+        found = metrics["horizons"][horizon]
+        rows.append(Row(f"First {float(horizon):g} s", [Cell(_whole(found[m]), theirs.get(m, "")) for m in models]))
+    if len(horizons) > 1 and metrics.get("growth"):
+        growths = published_growth(published, horizons[0], horizons[-1])
+        shares = ((metrics["growth"].get(model), growths.get(model)) for model in models)
+        texts = [
+            (NONE if a is None else percent_text(a, 1), "" if b is None else percent_text(b, 1)) for a, b in shares
+        ]
+        rows.append(Row("Growth", [Cell(*each) for each in texts]))
+    note = "Growth is that of the mean error from the shortest to the longest part of the same roll-outs."
+    return Table(
+        "Mean error [mm]", [MODELS[m][0] for m in models], rows, note + (" Small: published." if published else "")
+    )
+
+
+def scales_section(data: RunReport, canvas: Canvas) -> Part | None:
+    """The errors at multiples of the pressures."""
+    found = data.metrics.get("scales", {})
+    table = scale_table(found)
+    if table is None:
+        return None
+    from . import figures
+
+    diverged = sum(summary["diverged"] for each in found.values() for summary in each.values())
+    means = {
+        model: {float(s): e[model]["mean"] for s, e in found.items() if model in e and e[model]["mean"] is not None}
+        for model in MODELS
+        if any(model in each for each in found.values())
+    }
+    figure = canvas.figure(
+        "error_over_scale",
+        partial(figures.error_over_scale, means),
+        "Mean marker error of the models against the scale of the pressures, on a logarithmic axis.",
+        f"Mean error over the roll-outs.{' Where a roll-out diverged, a point is missing.' if diverged else ''}",
+    )
+    return Part("Beyond the pressures of the training", [table, figure])
+
+
+def scale_table(found: Mapping[str, Mapping[str, Any]]) -> Table | None:
+    """Return the errors at multiples of the pressures, with how they stand to SysID; None where there are none.
+
+    Args:
+        found: A summary by scale and model.
+    """
+    scales = sorted(found, key=float)
+    if not scales:
+        return None
+    models = [model for model in MODELS if model in found[scales[0]]]
+    rows = []
+    for scale in scales:
+        shares = {model: "" if share == NONE else share for model, share in against(found[scale])[1].items()}
+        cells = [Cell(_whole(found[scale][model]), shares.get(model, "")) for model in models]
+        rows.append(Row(f"\N{MULTIPLICATION SIGN} {float(scale):g}", cells))
+    note = "The pressures of the test trials, multiplied; below the error, how it stands to that of SysID."
+    return Table("Pressures; mean error [mm]", [MODELS[model][0] for model in models], rows, note)
+
+
+def _whole(summary: Mapping[str, Any]) -> str:
+    """A mean with its deviation."""
+    return " ".join(error_parts(summary)).strip()
 
 
 def identification_section(data: RunReport, canvas: Canvas) -> Part | None:

@@ -9,7 +9,23 @@ from typing import Any, Final
 import numpy as np
 
 from .data import MODELS, FloatArray, RunReport
-from .page import MINUS, NO_BREAK_SPACE, NONE, Canvas, Cell, Drawn, Items, Part, Row, Table, Text
+from .page import (
+    MINUS,
+    NO_BREAK_SPACE,
+    NONE,
+    Canvas,
+    Cell,
+    Drawn,
+    Items,
+    Part,
+    Row,
+    Table,
+    Text,
+    error_parts,
+    percent_text,
+    published_parts,
+)
+from .verdict import published_growth
 
 _MOST_WIDE: Final = 8  # Markers that stand beside each other in a table.
 # A name, the unit that it is written in, and how many of these make an SI unit.

@@ -3,12 +3,12 @@
 from pathlib import Path
 
 import numpy as np
-from measured_run import configuration, describe_recordings
+from measured_run import describe_recordings, reported
 
 from warp_resphys.experiment.build import build_mesh
 from warp_resphys.io.files import atomic_hdf5, create, read_json, write_json
 from warp_resphys.learning.metrics import median_filter, summarise, summarise_each
-from warp_resphys.report.measured_data import mean_distance
+from warp_resphys.report.data import mean_distance
 
 MODELS = ("simulation", "sysid", "simfree", "resphys")
 STEP, LIMIT = 0.02, 20e3
@@ -25,11 +25,10 @@ _OFF = {
 def data(**changes):
     """The group of that name."""
     return {
-        "kind": "pressure",
         "folder": None,
         "pressure_limit": LIMIT,
         "train_fraction": 1.0,
-        "factors": [],
+        "pressure_scales": [],
         **changes,
     }
 
@@ -38,16 +37,17 @@ def arm_settings(name="sopra", chambers=6, **changes):
     """Settings of an experiment on the arm that comes with the package."""
     ring = {f"Ring {level + 1} - {at + 1}": (level, at) for level in range(3) for at in range(4)}
     heights, radii = (-0.13, -0.15, -0.27), (0.022, 0.022, 0.018)
-    followed = {
+    tracked = {
         label: [radii[k] * np.cos(0.3 + 1.6 * at), radii[k] * np.sin(0.3 + 1.6 * at), heights[k]]
         for label, (k, at) in ring.items()
     }
-    plain = configuration("mesh=arm_coarse", experiment="beam_oscillation")
+    plain = reported("mesh=arm_coarse")
     plain |= {
         "name": name,
         "title": "Pneumatic arm",
         "fixed": {"z": 0.0},
-        "markers": {"followed": followed, "others": BASE},
+        "markers": {"tracked": tracked, "reference": BASE},
+        "laboratory": {"fibres": {"angles": [8.0]}},
         "chambers": {"count": chambers, "axis": [0.0, 0.0, -1.0]},
         "data": data(),
         "time_step": STEP,
@@ -94,41 +94,48 @@ def write_run(
     steps=100,
     chambers=6,
     models=MODELS,
-    factors=(),
-    windows=(),
+    scales=(),
+    horizons=(),
     diverged=(),
-    synthetic=True,
+    simulated=True,
     sag=0.0,
 ):
     """All files of a run; bodies hang longer by the sag [m]."""
     mesh = build_mesh(settings["mesh"])
-    labels = list(settings["markers"]["followed"])
-    bound = np.array(list(settings["markers"]["followed"].values())) + 1e-4
+    labels = list(settings["markers"]["tracked"])
+    bound = np.array(list(settings["markers"]["tracked"].values())) + 1e-4
     nominal = [f"test_{number:02d}" for number in range(test)]
     driven = pressures([*(f"train_{n:02d}" for n in range(train)), *nominal], steps, chambers)
-    for factor in factors:
-        driven |= pressures([f"{name}_{factor:g}" for name in nominal], steps, chambers, factor)
+    for scale in scales:
+        driven |= pressures([f"{name}_{scale:g}" for name in nominal], steps, chambers, scale)
     rng = np.random.default_rng(0)
     markers = np.stack([bent(bound, each, None, sag) for each in driven.values()])
     markers += rng.normal(0.0, 5e-5, markers.shape)
     markers[:, 30:36, min(1, len(labels) - 1)] = np.nan
     attributes = {
         "labels": labels,
-        "chambers": [f"chamber_{number + 1}" for number in range(chambers)],
+        "inputs": ["pressure"],
+        "pressure_channels": [f"chamber_{number + 1}" for number in range(chambers)],
         "gravity": np.array([0.0, 0.0, -9.80709]),
         "time_step": STEP,
     }
     drawn, count = np.stack(list(driven.values())), train + test
-    parts = {"motions.h5": slice(None, count)} | ({"motions_raised.h5": slice(count, None)} if factors else {})
+    parts = {"dataset.h5": slice(None, count)} | ({"dataset_scaled.h5": slice(count, None)} if scales else {})
+    times = np.tile(STEP * np.arange(steps + 1), (len(driven), 1))
     for name, rows in parts.items():
-        with atomic_hdf5(folder / name, "motions", {**attributes, "names": list(driven)[rows]}) as file:
-            create(file, "markers", markers[rows], "m", 1)
+        names = list(driven)[rows]
+        with atomic_hdf5(
+            folder / name, "dataset", {**attributes, "names": names, "begins": ["rest"] * len(names)}
+        ) as file:
+            create(file, "times", times[rows], "s", 1)
+            create(file, "observed", markers[rows], "m", 1)
             create(file, "pressure", drawn[rows], "Pa", 1)
             create(file, "bound", bound, "m", 0)
     rolled = list(driven)[train:]
     film = np.arange(0, steps + 1, 2)
     simulated = {}
-    with atomic_hdf5(folder / "rollouts.h5", "rollouts", {"names": rolled, "time_step": STEP}) as file:
+    described = {"names": rolled, "time_step": STEP, "film_trial": rolled[0]}
+    with atomic_hdf5(folder / "rollouts.h5", "rollouts", described) as file:
         create(file, "film_steps", film, "1", 0)
         for model in models:
             each = np.stack([bent(bound, driven[name], model, sag) for name in rolled])
@@ -137,14 +144,13 @@ def write_run(
                 each[0, 60:] = np.nan
                 body[film >= 60] = np.nan
             simulated[model] = each
-            create(file, f"{model}_markers", each.astype(np.float32), "m", 1)
-            create(file, f"{model}_tip", each.mean(axis=2).astype(np.float32), "m", 1)
+            create(file, f"{model}_observed", each.astype(np.float32), "m", 1)
             create(file, f"{model}_film", body.astype(np.float32), "m", 0)
-    write_json(folder / "errors.json", _errors(simulated, markers[train:], rolled, test, labels, factors, windows))
-    _write_rest(folder, settings, dict(zip(labels, bound, strict=True)), list(driven)[:2], rng, models, synthetic)
+    write_json(folder / "errors.json", _errors(simulated, markers[train:], rolled, test, labels, scales, horizons))
+    _write_rest(folder, settings, dict(zip(labels, bound, strict=True)), list(driven)[:2], rng, models, simulated)
 
 
-def _errors(simulated, measured, names, test, labels, factors, windows):
+def _errors(simulated, measured, names, test, labels, scales, horizons):
     each = {model: mean_distance(markers, measured)[:, 1:] for model, markers in simulated.items()}
     for rows in each.values():
         rows[np.isinf(rows)] = np.nan
@@ -169,32 +175,32 @@ def _errors(simulated, measured, names, test, labels, factors, windows):
             for model in ("simfree", "resphys")
         },
     }
-    if windows:
-        found["windows"] = {
-            f"{w:g}": part({m: rows[:, : round(w / STEP)] for m, rows in nominal.items()}) for w in windows
+    if horizons:
+        found["horizons"] = {
+            f"{w:g}": part({m: rows[:, : round(w / STEP)] for m, rows in nominal.items()}) for w in horizons
         }
-        first, *_, last = found["windows"].values()
+        first, *_, last = found["horizons"].values()
         found["growth"] = {
             m: None if last[m]["mean"] is None else last[m]["mean"] / first[m]["mean"] - 1.0 for m in first
         }
-    if factors:
-        found["overpressure"] = {"1": found["errors_mm"]} | {
-            f"{factor:g}": part(each, test * (k + 1), test * (k + 2)) for k, factor in enumerate(factors)
+    if scales:
+        found["scales"] = {"1": found["errors_mm"]} | {
+            f"{scale:g}": part(each, test * (k + 1), test * (k + 2)) for k, scale in enumerate(scales)
         }
-        late = {"1": {}, f"{factors[0]:g}": {}, f"{factors[-1]:g}": {names[-1]: 0.4, names[-2]: 0.52}}
-        found["overpressure_range"] = {
-            factor: {m: {"left": len(first), "first_s": first} for m in ("simfree", "resphys")}
-            for factor, first in late.items()
+        late = {"1": {}, f"{scales[0]:g}": {}, f"{scales[-1]:g}": {names[-1]: 0.4, names[-2]: 0.52}}
+        found["scales_range"] = {
+            scale: {m: {"left": len(first), "first_s": first} for m in ("simfree", "resphys")}
+            for scale, first in late.items()
         }
     return found
 
 
-def _write_rest(folder, settings, followed, registered, rng, models, synthetic):
+def _write_rest(folder, settings, tracked, registered, rng, models, simulated):
     """Everything but motions, roll-outs and errors."""
-    quality, registration = describe_recordings(registered, followed, settings["markers"]["others"], rng, None)
+    quality, registration = describe_recordings(registered, tracked, settings["markers"]["reference"], rng, None)
     write_json(folder / "quality.json", quality)
     write_json(folder / "registration.json", registration)
-    if synthetic:
+    if simulated:
         material = {"model": "stable_neo_hookean", "youngs_modulus": 250e3, "poissons_ratio": 0.49}
         write_json(folder / "truth.json", {"material": material, "noise_mm": 0.08})
     found = {"youngs_modulus": 237e3, "poissons_ratio": 0.42}
@@ -205,6 +211,7 @@ def _write_rest(folder, settings, followed, registered, rng, models, synthetic):
         identified = {"parameters": found, "loss": 0.02, "history": history, "at_bounds": [], "uncertainty": None}
         grid = {"youngs_modulus": moduli, "poissons_ratio": ratios, "loss": loss}
         write_json(folder / "identification.json", {"sysid": identified, "landscape": grid})
+    kept = {"epoch": 30, "selection": "rollout", "validation_rollout_error_mm": 0.4}
     for model in {"simfree", "resphys"} & set(models):
         epochs = [
             {
@@ -215,8 +222,8 @@ def _write_rest(folder, settings, followed, registered, rng, models, synthetic):
             }
             for e in range(1, 31)
         ]
-        write_json(folder / f"training_{model}.json", {"kept": {"epoch": 30}, "epochs": epochs})
-    write_json(folder / "reconstruction.json", {"mean_mm": 0.12, "max_mm": 0.61, "replayed_mm": 0.17})
+        write_json(folder / f"training_{model}.json", {"kept": kept, "epochs": epochs})
+    write_json(folder / "reconstruction.json", {"resphys": {"mean_mm": 0.12, "max_mm": 0.61, "replayed_mm": 0.17}})
     write_json(folder / "stages" / "import.json", {"seconds": 75.0, "peak_memory_gib": 0.8})
 
 

@@ -17,8 +17,8 @@ from warp_resphys.mesh.mesh import box_hexahedra
 MODELS = ("published", "simulation", "sysid_elastic", "sysid", "simfree", "resphys_uncorrected", "resphys")
 LEARNED = ("simfree", "resphys_uncorrected", "resphys")
 TRIALS = {"bare": 0.0, "load52": 0.0520154, "load101": 0.1020303}
-FOLLOWED = {"Tip - 1": [0.1, 0.015, 0.036], "Tip - 2": [0.1, -0.006, 0.024], "Tip - 3": [0.1, 0.036, 0.006]}
-OTHERS = {"Base - 1": [0.006, -0.01, -0.001], "Base - 2": [0.006, 0.04, 0.0275], "Base - 3": [0.006, 0.04, 0.0]}
+TRACKED = {"Tip - 1": [0.1, 0.015, 0.036], "Tip - 2": [0.1, -0.006, 0.024], "Tip - 3": [0.1, 0.036, 0.006]}
+REFERENCE = {"Base - 1": [0.006, -0.01, -0.001], "Base - 2": [0.006, 0.04, 0.0275], "Base - 3": [0.006, 0.04, 0.0]}
 STEP, SECONDS, FRAMES = 0.01, 0.4, 45
 _OFF = {  # Period, damping and level of a model, over those of the reality.
     "published": (1.5, 1.0, 2.0),
@@ -42,27 +42,35 @@ def configuration(*overrides, experiment="beam_real"):
     return copy.deepcopy(composed(f"experiment={experiment}", *overrides))
 
 
+def reported(*overrides, experiment="beam_oscillation"):
+    """The same, with the names that the report reads."""
+    plain = configuration(*overrides, experiment=experiment)
+    names = {"reality": "target", "synthetic": "laboratory"}
+    return {names.get(key, key): value for key, value in plain.items()}
+
+
 def config(**data):
     """Settings of the experiment, as its stages get them."""
-    plain = configuration("mesh.divisions=[6,2,2]", experiment="beam_oscillation")
+    plain = reported("mesh.divisions=[6,2,2]")
     plain |= {
         "name": "beam_real",
         "title": "Real beam",
         "simulation": {**plain["simulation"], "youngs_modulus": 264e3, "poissons_ratio": 0.499},
         "published": {"simulation": {**plain["simulation"], "youngs_modulus": 215e3, "poissons_ratio": 0.45}},
-        "markers": {"followed": FOLLOWED, "others": OTHERS},
-        "data": {"kind": "recordings", "folder": "recordings", "seconds": SECONDS, "folds": None, **data},
+        "markers": {"tracked": TRACKED, "reference": REFERENCE},
+        "in_the_loop": {"epochs": 5},
+        "data": {"folder": "recordings", "seconds": SECONDS, "folds": None, **data},
         "time_step": STEP,
     }
     return plain
 
 
-def sag(rest, times, hung, model=None):
+def sag(rest, times, payload, model=None):
     """(T, P, 3) [m] where points at rest (P, 3) are: a beam along x that is let go, sags and swings."""
     period, damping, level = _OFF[model] if model else (1.0, 1.0, 1.0)
-    frequency = 2 * np.pi / (period * (0.13 + 1.5 * hung))
+    frequency = 2 * np.pi / (period * (0.13 + 1.5 * payload))
     swing = 1.0 - np.exp(-3.0 * damping * times) * np.cos(frequency * times)
-    tip = -(0.0065 + 0.3 * hung) * level * np.where(times > 0, swing, 0.0)
+    tip = -(0.0065 + 0.3 * payload) * level * np.where(times > 0, swing, 0.0)
     along = np.clip(rest[:, 0] / 0.1, 0.0, None)
     moved = np.repeat(rest[None], len(times), axis=0)
     moved[..., 2] += tip[:, None] * along**2
@@ -70,23 +78,23 @@ def sag(rest, times, hung, model=None):
     return moved
 
 
-def describe_recordings(trials, followed, others, rng, release=61.3):
+def describe_recordings(trials, tracked, reference, rng, release=61.3):
     """What quality.json and registration.json hold, from the places of the registered markers by label [m]."""
-    labels, places = [*followed, *others], np.array([*followed.values(), *others.values()])
-    second, first_other, last = labels[1 % len(followed)], next(iter(others)), labels[-1]
+    labels, places = [*tracked, *reference], np.array([*tracked.values(), *reference.values()])
+    second, first_standing, last = labels[1 % len(tracked)], next(iter(reference)), labels[-1]
     quality, registration = {}, {}
     for number, trial in enumerate(trials):
         rows = [
             {
                 "label": label,
-                "still": label in others,
+                "still": label in reference,
                 "seen": 0.99 if number == 0 and label == second else 1.0,
                 "gaps": int(number == 0 and label == second),
                 "longest_gap_frames": 7,
                 "masked_frames": 7,
-                "jumps": [{"frame": 80, "mm": 0.31}] if label == first_other else [],
+                "jumps": [{"frame": 80, "mm": 0.31}] if label == first_standing else [],
                 "noise_mm": 0.0071,
-                "drift_mm": 0.02 if label in others else None,
+                "drift_mm": 0.02 if label in reference else None,
                 "reach_mm": 7.0,
             }
             for label in labels
@@ -100,42 +108,49 @@ def describe_recordings(trials, followed, others, rng, release=61.3):
             "longest_gap_filled": 5,
             "markers": rows,
             "swaps": [],
-            "warnings": [f"{first_other} jumps once, by 0.31 mm, in frame 80."] if number < 2 else [],
+            "warnings": [f"{first_standing} jumps once, by 0.31 mm, in frame 80."] if number < 2 else [],
         }
         residual = dict(zip(labels, (0.8 + 0.1 * number) * rng.uniform(0.5, 1.5, len(labels)), strict=True))
         registration[trial] = {
             "rms_mm": 0.82 + 0.1 * number,
             "residual_mm": residual,
             "outliers": [last] if number == 2 else [],
-            "shift_mm": {label: [0.2, 0.2, 0.2] for label in followed},
+            "shift_mm": {label: [0.2, 0.2, 0.2] for label in tracked},
             "positions": dict(zip(labels, places.tolist(), strict=True)),
         }
     return quality, registration
 
 
 def write_recordings(folder: Path, trials=TRIALS):
-    """markers.h5, quality.json, registration.json and truth.json."""
-    bound = np.array(list(FOLLOWED.values())) + 1e-4
-    base = np.array(list(OTHERS.values()))
+    """dataset.h5, quality.json, registration.json and truth.json."""
+    bound = np.array(list(TRACKED.values())) + 1e-4
+    base = np.array(list(REFERENCE.values()))
     rng = np.random.default_rng(0)
     delays = rng.uniform(0.0, STEP, len(trials))
     times = np.arange(1, FRAMES + 1) * STEP - delays[:, None]
-    markers = np.stack([sag(bound, t, hung) for t, hung in zip(times, trials.values(), strict=True)])
+    markers = np.stack([sag(bound, t, payload) for t, payload in zip(times, trials.values(), strict=True)])
     markers += rng.normal(0.0, 5e-5, markers.shape)
     markers[0, 9:16, 1] = np.nan
     times[-1, -3:], markers[-1, -3:] = times[-1, -4], np.nan
     with atomic_hdf5(
-        folder / "markers.h5",
-        "markers",
-        {"names": list(trials), "labels": list(FOLLOWED), "gravity": np.array([0.0, 0.02, -9.8])},
+        folder / "dataset.h5",
+        "dataset",
+        {
+            "names": list(trials),
+            "labels": list(TRACKED),
+            "gravity": np.array([0.0, 0.02, -9.8]),
+            "begins": ["released"] * len(trials),
+            "time_step": STEP,
+            "inputs": [],
+        },
     ) as file:
         create(file, "times", times, "s", 1)
-        create(file, "markers", markers, "m", 1)
+        create(file, "observed", markers, "m", 1)
         create(file, "held", np.repeat(bound[None], len(trials), 0) + 2e-4, "m", 0)
         create(file, "bound", bound, "m", 0)
-        create(file, "load", list(trials.values()), "kg", 0)
+        create(file, "payload", list(trials.values()), "kg", 0)
     quality, registration = describe_recordings(
-        trials, dict(zip(FOLLOWED, bound + 2e-4, strict=True)), dict(zip(OTHERS, base + 5e-4, strict=True)), rng
+        trials, dict(zip(TRACKED, bound + 2e-4, strict=True)), dict(zip(REFERENCE, base + 5e-4, strict=True)), rng
     )
     write_json(folder / "quality.json", quality)
     write_json(folder / "registration.json", registration)
@@ -146,21 +161,23 @@ def write_recordings(folder: Path, trials=TRIALS):
 def write_split(folder: Path, test: Sequence[str], models=MODELS, trials=TRIALS, diverged=()):
     """identification.json, rollouts.h5, errors.json and the histories of the trainings."""
     mesh = box_hexahedra((0.1, 0.03, 0.03), (6, 2, 2))
-    bound = np.array(list(FOLLOWED.values())) + 1e-4
+    bound = np.array(list(TRACKED.values())) + 1e-4
     steps = np.arange(round(SECONDS / STEP) + 1) * STEP
     rng = np.random.default_rng(0)
     delays = dict(zip(trials, rng.uniform(0.0, STEP, len(trials)), strict=True))
     frames = {trial: np.arange(1, FRAMES + 1) * STEP - delays[trial] for trial in test}
     errors = {}
-    with atomic_hdf5(folder / "rollouts.h5", "rollouts", {"names": list(test)}) as file:
+    attributes = {"names": list(test), "time_step": STEP, "film_trial": test[-1]}
+    with atomic_hdf5(folder / "rollouts.h5", "rollouts", attributes) as file:
+        create(file, "film_steps", np.arange(len(steps)), "1")
         for model in models:
-            q = np.stack([sag(mesh.vertices, steps, trials[trial], model) for trial in test])
+            q = sag(mesh.vertices, steps, trials[test[-1]], model)
             m = np.stack([sag(bound, frames[trial], trials[trial], model) for trial in test])
             if model in diverged:
-                q[0, 20:] *= 1e200
+                q[20:] = np.nan
                 m[0, 20:] = np.nan
-            create(file, f"{model}_q", q, "m", 1)
-            create(file, f"{model}_markers", m, "m", 1)
+            create(file, f"{model}_film", q.astype(np.float32), "m")
+            create(file, f"{model}_observed", m, "m", 1)
             truth = np.stack([sag(bound, frames[trial], trials[trial]) for trial in test])
             errors[model] = 1e3 * np.linalg.norm(m - truth, axis=-1)[:, : round(SECONDS / STEP)]
     means = {model: [float(each.mean()) for each in rows] for model, rows in errors.items()}
@@ -171,7 +188,7 @@ def write_split(folder: Path, test: Sequence[str], models=MODELS, trials=TRIALS,
             for row, trial in enumerate(test)
         ],
         "per_marker": {
-            model: dict(zip(FOLLOWED, rows.mean(axis=(0, 1)).tolist(), strict=True)) for model, rows in errors.items()
+            model: dict(zip(TRACKED, rows.mean(axis=(0, 1)).tolist(), strict=True)) for model, rows in errors.items()
         },
     }
     write_json(folder / "errors.json", plain)
@@ -252,4 +269,4 @@ def write_folds(folder: Path, models=MODELS):
         }
         for model in models
     }
-    write_json(folder / "metrics.json", {"folds": folds, "errors_mm": over})
+    write_json(folder / "metrics.json", {"folds": folds, "errors_mm": over, "versions": {"numpy": "9"}})

@@ -5,13 +5,13 @@ import re
 import numpy as np
 import pytest
 from chambered import hollow_box
-from driven_run import BASE, LIMIT, MODELS, STEP, arm_settings, bent, data, errors_of, write_run
+from driven_run import BASE, LIMIT, MODELS, arm_settings, bent, data, errors_of, write_run
 from matplotlib.image import imread
 from report_page import FAILING, Page
 
-from warp_resphys.experiment.actuated import report as stage
-from warp_resphys.experiment.actuated.report import read_actuation, read_rollouts, report_driven
+from warp_resphys.experiment import report as stage
 from warp_resphys.experiment.build import shipped_arm
+from warp_resphys.experiment.report import make_report, read_film, read_pressures, read_trials
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.files import read_json, write_json
 from warp_resphys.io.stages import StageContext
@@ -19,20 +19,21 @@ from warp_resphys.learning.metrics import PUBLISHED_MM, PUBLISHED_WINDOWS_MM, me
 from warp_resphys.mesh.chambers import find_chambers
 from warp_resphys.mesh.mesh import Mesh
 from warp_resphys.mesh.readers import write_mesh
-from warp_resphys.report import driven_figures, driven_page, mesh, registration_picture, video
-from warp_resphys.report.driven_data import along_body, drawn_markers, mean_of, tip_markers
-from warp_resphys.report.driven_tables import (
-    driven_verdict,
-    factor_table,
-    largest_filtered,
-    published_growth,
-    range_texts,
-    reduction,
-    window_table,
-)
+from warp_resphys.report import figures, mesh, motion_figures, page, render
+from warp_resphys.report.data import along_body, drawn_markers, tip_markers
 from warp_resphys.report.figures import CHAMBER_COLOURS, TONES
 from warp_resphys.report.mesh import MeshSummary
-from warp_resphys.report.page import Picture
+from warp_resphys.report.page import Cell, Picture
+from warp_resphys.report.run_page import largest_filtered, range_texts
+from warp_resphys.report.sections import horizon_table, scale_table
+from warp_resphys.report.verdict import (
+    growth_text,
+    marker_verdict,
+    published_growth,
+    reduction,
+    reduction_text,
+    scale_text,
+)
 from warp_resphys.report.video import Motion, axes_from_below, draw_instants, view_axes
 
 DRAWN = {
@@ -52,8 +53,7 @@ DRAWN = {
 @pytest.fixture
 def no_drawing(monkeypatch):
     """Nothing is drawn in other processes, which takes seconds."""
-    for module in (video, registration_picture, mesh):
-        monkeypatch.setattr(module, "COMMAND", FAILING)
+    monkeypatch.setattr(render, "COMMAND", FAILING)
 
 
 @pytest.fixture
@@ -64,11 +64,11 @@ def no_figures(no_drawing, monkeypatch):
         (folder / f"{name}.png").touch()
         return Picture("data:,", "data:,", alt)
 
-    monkeypatch.setattr(driven_page, "draw_picture", draw)
+    monkeypatch.setattr(page, "draw_picture", draw)
 
 
 def report(folder, settings):
-    report_driven(StageContext("report", folder, "", {"config": settings}))
+    make_report(StageContext("report", folder, "", {"config": settings}))
     return Page(folder / "report.html")
 
 
@@ -99,7 +99,7 @@ def test_page_of_an_arm(tmp_path):
         "fibres around the chambers",
         "which this run has not seen",
         "The noise of the markers alone is 0.08 mm.",
-        "training trials to 0.120 mm from the measured ones, 0.610 mm at most",
+        "training trials to 0.120 mm from the observed ones, 0.610 mm at most; replayed in the simulator",
         "mean over 3 test trials of 4 s and 12 markers",
         "SimFree: 2 of 3 roll-outs left the states of the training, the first after 0.84 s (test_00).",
         "ResPhys: none of 3 roll-outs left the states of the training.",
@@ -117,7 +117,7 @@ def test_page_of_an_arm(tmp_path):
 @pytest.mark.usefixtures("no_figures")
 def test_page_of_longer_rollouts_of_which_one_diverged(tmp_path):
     settings = arm_settings("sopra_extrapolation", data=data(folder="recordings", train_fraction=0.5))
-    write_run(tmp_path, settings, windows=(1, 2), diverged=("simfree",), synthetic=False)
+    write_run(tmp_path, settings, horizons=(1, 2), diverged=("simfree",), simulated=False)
     page = report(tmp_path, settings)
     found = errors_of(tmp_path)
     growth = found["growth"]["resphys"]
@@ -136,21 +136,22 @@ def test_page_of_longer_rollouts_of_which_one_diverged(tmp_path):
 
 @pytest.mark.usefixtures("no_figures")
 def test_page_of_higher_pressures(tmp_path):
-    settings = arm_settings("sopra_overpressure", data=data(factors=[1.25, 1.75]))
-    write_run(tmp_path, settings, test=2, factors=(1.25, 1.75))
+    settings = arm_settings("sopra_overpressure", data=data(pressure_scales=[1.25, 1.75]))
+    write_run(tmp_path, settings, test=2, scales=(1.25, 1.75))
     page = report(tmp_path, settings)
-    found = errors_of(tmp_path)["overpressure"]
+    found = errors_of(tmp_path)["scales"]
     text = page.text
     assert f"At 1.75 times the pressures of the training the error is {found['1.75']['resphys']['mean']:.3f} mm" in text
     assert all(f"{found[f][m]['mean']:.3f} ± " in text for f in ("1", "1.25", "1.75") for m in MODELS)
     assert "At higher pressures it is none of 2 (1.25 times), 2 of 2 (1.75 times), the first after 0.40 s" in text
     assert "ResPhys: none of 2 roll-outs" in text
-    assert (tmp_path / "figures" / "error_over_factor.png").is_file()
-    known = read_actuation([tmp_path / "motions.h5", tmp_path / "motions_raised.h5"], LIMIT).pressure
-    trials, beyond, _ = read_rollouts(tmp_path, errors_of(tmp_path), STEP, [*known])
+    assert (tmp_path / "figures" / "error_over_scale.png").is_file()
+    trials = read_trials(tmp_path, settings)
     assert trials.names == ("test_00", "test_01")
-    assert len(beyond) == 4
-    rows = trials.errors_mm()["resphys"]
+    pressures = read_pressures(tmp_path, settings, trials)
+    assert len(pressures.scaled) == 4
+    assert set(pressures.scaled) < pressures.values.keys()
+    rows = trials.errors_mm["resphys"]
     assert rows[:, 1:].mean() == pytest.approx(found["1"]["resphys"]["mean"], rel=1e-5)
 
 
@@ -159,13 +160,13 @@ def test_page_of_one_chamber_one_trial_and_two_models(tmp_path):
     box = hollow_box("hexahedron")
     turned = box.vertices[:, [2, 1, 0]] * [1.0, 1.0, -1.0] - [0.01, 0.015, 0.0]
     write_mesh(tmp_path / "box.vtk", Mesh(turned, box.cells))
-    followed = {"Tip": [0.0, 0.01, -0.06]}
+    tracked = {"Tip": [0.0, 0.01, -0.06]}
     settings = arm_settings("segment_real", 2)
     settings["mesh"] = {"kind": "file", "path": str(tmp_path / "box.vtk"), "units": "m", "order": 1}
     settings["mesh"]["drop_unreferenced"] = True
-    settings["markers"] = {"followed": followed, "others": BASE}
+    settings["markers"] = {"tracked": tracked, "reference": BASE}
     settings["data"] = data(folder="recordings", pressure_limit=None)
-    write_run(tmp_path, settings, train=0, test=1, chambers=1, models=("simulation", "resphys"), synthetic=False)
+    write_run(tmp_path, settings, train=0, test=1, chambers=1, models=("simulation", "resphys"), simulated=False)
     page = report(tmp_path, settings)
     assert "On trial test_00, which no training or identification saw" in page.text
     assert "mean over 1 test trial of 2 s and 1 marker, ±" in page.text
@@ -181,7 +182,7 @@ def test_page_of_one_chamber_one_trial_and_two_models(tmp_path):
     }
 
 
-@pytest.mark.parametrize("name", ["motions.h5", "rollouts.h5", "errors.json", "registration.json"])
+@pytest.mark.parametrize("name", ["dataset.h5", "rollouts.h5", "errors.json", "registration.json"])
 def test_a_missing_file_is_one_sentence(tmp_path, name):
     settings = arm_settings()
     write_run(tmp_path, settings, test=1, steps=40, models=("resphys",))
@@ -195,12 +196,11 @@ def test_a_missing_file_is_one_sentence(tmp_path, name):
 def test_files_that_do_not_belong_together_are_refused(tmp_path):
     settings = arm_settings()
     write_run(tmp_path, settings, test=2, steps=40, models=("resphys",))
-    metrics = errors_of(tmp_path)
     other = tmp_path / "other"
     write_run(other, settings, test=3, steps=40, models=("resphys",))
     (other / "rollouts.h5").replace(tmp_path / "rollouts.h5")
     with pytest.raises(DataFileError, match=r"rollouts.h5 names trials that .* does not hold \(test_02\)"):
-        read_rollouts(tmp_path, metrics, STEP, ["test_00", "test_01"])
+        read_trials(tmp_path, settings)
     write_run(tmp_path, settings, test=2, steps=40, models=("resphys",), chambers=7)
     with pytest.raises(DataFileError, match=r"pressures of chamber_7, but the body's chambers are chamber_1, "):
         report(tmp_path, settings)
@@ -209,27 +209,27 @@ def test_files_that_do_not_belong_together_are_refused(tmp_path):
 def test_what_is_read(tmp_path):
     settings = arm_settings()
     write_run(tmp_path, settings, diverged=("simfree",))
-    actuation = read_actuation([tmp_path / "motions.h5"], LIMIT)
-    trials, beyond, film = read_rollouts(tmp_path, errors_of(tmp_path), STEP, [*actuation.pressure])
-    assert beyond == ()
+    trials, film = read_trials(tmp_path, settings), read_film(tmp_path)
+    pressures = read_pressures(tmp_path, settings, trials)
+    assert pressures.scaled == ()
     assert trials.times[0, [0, -1]].tolist() == [0.0, pytest.approx(2.0)]
-    assert np.isnan(trials.measured[0, 30:36, 1]).all()
-    rows = trials.errors_mm()
+    assert np.isnan(trials.target[0, 30:36, 1]).all()
+    rows = trials.errors_mm
     assert np.isinf(rows["simfree"][0, 60:]).all()
     expected = errors_of(tmp_path)["errors_mm"]
     for model in ("sysid", "resphys"):
         assert rows[model][:, 1:].mean() == pytest.approx(expected[model]["mean"], rel=1e-5)
-    assert film.positions["resphys"].shape[0] == len(film.steps) == 51
-    assert list(actuation.pressure) == ["train_00", "train_01", "test_00", "test_01", "test_02"]
-    assert actuation.pressure["test_00"].shape == (100, 6)
+    assert film.positions["resphys"].shape[0] == len(film.times) == 51
+    assert list(pressures.values) == ["train_00", "train_01", "test_00", "test_01", "test_02"]
+    assert pressures.values["test_00"].shape == (100, 6)
 
 
 def test_recordings_are_shown_on_the_body_as_it_hangs(tmp_path, monkeypatch):
     settings = arm_settings()
     write_run(tmp_path, settings, test=1, steps=40, models=("simulation",), sag=0.004)
     shown = []
-    monkeypatch.setattr(stage, "write_driven_report", lambda _, data: shown.append(data))
-    report_driven(StageContext("report", tmp_path, "", {"config": settings}))
+    monkeypatch.setattr(stage, "write_report", lambda _, data: shown.append(data))
+    make_report(StageContext("report", tmp_path, "", {"config": settings}))
     (found,) = shown
     assert found.mesh.vertices[:, 2].min() - found.recordings.mesh.vertices[:, 2].min() == pytest.approx(
         0.004, abs=1e-6
@@ -237,7 +237,7 @@ def test_recordings_are_shown_on_the_body_as_it_hangs(tmp_path, monkeypatch):
     nominal = dict(zip(found.recordings.registration.names, found.recordings.nominal[:, 2], strict=True))
     assert nominal["Base - 1"] == BASE["Base - 1"][2]
     low, high = ("Ring 3 - 1", "Ring 1 - 1")
-    places = settings["markers"]["followed"]
+    places = settings["markers"]["tracked"]
     assert nominal[low] - places[low][2] == pytest.approx(-0.004, abs=3e-4)
     assert nominal[high] - places[high][2] == pytest.approx(-0.001, abs=3e-4)
 
@@ -276,50 +276,49 @@ def test_published_numbers_are_those_of_the_same_experiment():
 
 
 def test_words():
-    windows = PUBLISHED_WINDOWS_MM["sopra_extrapolation"]
-
-    def said(metrics, published=PUBLISHED_MM["sopra"], windows=windows, extrapolated=True):
-        return driven_verdict(metrics, ["a", "b"], published, windows, extrapolated).replace("\u00a0", " ")
-
+    published, horizons = PUBLISHED_MM["sopra"], PUBLISHED_WINDOWS_MM["sopra_extrapolation"]
     errors = {"sysid": summary(2.0), "resphys": summary(2.1)}
-    text = said({"errors_mm": errors})
-    assert text.endswith("The error of ResPhys is 5.0 % larger than that of SysID (published: 21.1 % smaller).")
-    assert "published" not in said({"errors_mm": errors}, {}, {})
-    text = said({"errors_mm": {"sysid": summary(2.0), "resphys": summary(5.0)}})
-    assert "The error of ResPhys is 2.5 times that of SysID" in text
+    said = "The error of ResPhys is 5.0 % larger than that of SysID"
+    assert reduction_text(errors, published) == f"{said} (published: 21.1 % smaller)."
+    assert reduction_text(errors, {}) == f"{said}."
+    assert reduction_text({"sysid": summary(2.0), "resphys": summary(5.0)}, {}) == (
+        "The error of ResPhys is 2.5 times that of SysID."
+    )
+    assert growth_text({"resphys": -0.021}, ["10", "5"], horizons) == (
+        "From 5 s to 10 s the error of ResPhys falls by 2.1 % (published: 5.4 %)."
+    )
+    assert growth_text({"resphys": -0.021}, ["5"], horizons) == ""
+    lost = {"sysid": summary(2.0), "resphys": summary(None, 1)}
+    assert "ResPhys diverged in 1 of 3 roll-outs" in marker_verdict(lost, ["a", "b"], None)
+    assert reduction_text(lost, published) == ""
     over = {"1": errors, "1.5": {"sysid": summary(3.0), "resphys": summary(None, 2)}, "1.25": errors}
-    growth = {"errors_mm": errors, "windows": {"10": errors, "5": errors}, "growth": {"resphys": -0.021}}
-    assert said(growth).endswith("From 5 s to 10 s the error of ResPhys falls by 2.1 % (published: 5.4 %).")
-    assert "falls" not in said(growth, extrapolated=False)
-    text = said({"errors_mm": {"sysid": summary(2.0), "resphys": summary(None, 1)}, "overpressure": over})
-    assert "ResPhys diverged in 1 of 3 roll-outs" in text
-    assert "larger" not in text
-    assert text.endswith(
+    assert scale_text(over) == (
         "At 1.5 times the pressures of the training the error is diverged with ResPhys, 3.000 mm with SysID."
     )
+    assert scale_text({}) == ""
 
 
-def test_tables_of_windows_and_factors():
+def test_tables_of_horizons_and_scales():
     errors = {"sysid": summary(2.0), "resphys": summary(1.0)}
     more = {"sysid": summary(None, 1), "resphys": summary(1.5)}
-    metrics = {"windows": {"10": more, "5": errors}, "growth": {"sysid": None, "resphys": 0.5}}
-    table = window_table(metrics, PUBLISHED_WINDOWS_MM["sopra_extrapolation"])
+    metrics = {"horizons": {"10": more, "5": errors}, "growth": {"sysid": None, "resphys": 0.5}}
+    table = horizon_table(metrics, PUBLISHED_WINDOWS_MM["sopra_extrapolation"])
     assert table.columns == ["SysID", "ResPhys"]
-    assert table.rows == {
-        "First 5 s": [("2.000 ± 0.100", "7.51 ± 3.63"), ("1.000 ± 0.100", "5.79 ± 3.09")],
-        "First 10 s": [("1 of 3 diverged", "7.57 ± 3.59"), ("1.500 ± 0.100", "6.10 ± 3.22")],
-        "Growth": [("\N{EN DASH}", "+0.8 %"), ("+50.0 %", "+5.4 %")],
+    assert {row.head: row.cells for row in table.rows} == {
+        "First 5 s": [Cell("2.000 ± 0.100", "7.51 ± 3.63"), Cell("1.000 ± 0.100", "5.79 ± 3.09")],
+        "First 10 s": [Cell("1 of 3 diverged", "7.57 ± 3.59"), Cell("1.500 ± 0.100", "6.10 ± 3.22")],
+        "Growth": [Cell("\N{EN DASH}", "+0.8 %"), Cell("+50.0 %", "+5.4 %")],
     }
-    alone = window_table({"windows": {"5": errors}}, {})
-    assert alone.rows == {"First 5 s": [("2.000 ± 0.100", ""), ("1.000 ± 0.100", "")]}
-    assert window_table({}, {}) is None
-    table = factor_table({"overpressure": {"1.25": more, "1": errors}})
+    (row,) = horizon_table({"horizons": {"5": errors}}, {}).rows
+    assert row.cells == [Cell("2.000 ± 0.100"), Cell("1.000 ± 0.100")]
+    assert horizon_table({}, {}) is None
+    table = scale_table({"1.25": more, "1": errors})
     assert table.columns == ["SysID", "ResPhys"]
-    assert table.rows == {
-        "\N{MULTIPLICATION SIGN} 1": [("2.000 ± 0.100", ""), ("1.000 ± 0.100", "\N{MINUS SIGN}50 %")],
-        "\N{MULTIPLICATION SIGN} 1.25": [("1 of 3 diverged", ""), ("1.500 ± 0.100", "")],
+    assert {row.head: row.cells for row in table.rows} == {
+        "\N{MULTIPLICATION SIGN} 1": [Cell("2.000 ± 0.100"), Cell("1.000 ± 0.100", "\N{MINUS SIGN}50 %")],
+        "\N{MULTIPLICATION SIGN} 1.25": [Cell("1 of 3 diverged"), Cell("1.500 ± 0.100")],
     }
-    assert factor_table({}) is None
+    assert scale_table({}) is None
     assert largest_filtered({}) == ""
     filtered = {"median_filtered": {"resphys": 1.5, "sysid": None}}
     assert (
@@ -335,7 +334,7 @@ def test_trials_out_of_range_are_counted_where_they_belong():
     assert free == "SimFree: none of 3 roll-outs left the states of the training."
     assert force == "ResPhys: 2 of 3 roll-outs left the states of the training, the first after 1.00 s (a)."
     late = {"first_s": {"d": 0.25}}
-    found["overpressure_range"] = {
+    found["scales_range"] = {
         "1": {"resphys": some, "simfree": none},
         "1.5": {"resphys": late, "simfree": none},
         "1.25": {"resphys": none, "simfree": none},
@@ -362,32 +361,27 @@ def test_markers_that_are_drawn():
     measured[4, 3] = np.nan
     assert drawn_markers(measured, bound, clamped) == [2, 0]
     assert drawn_markers(measured[:, 1:2], bound[1:2], clamped) == [0]
-    measured[1, 1] = np.nan
-    mean = mean_of(measured, np.array([1, 3]))
-    assert np.isnan(mean[1]).all()
-    assert np.isnan(mean[4]).all()
-    np.testing.assert_allclose(mean[3], [0.005, 0.0, -0.21])
 
 
 def test_error_lines_are_filtered_and_thin_behind():
     rows = np.ones((2, 200))
     rows[:, 100:110] = 9.0
     rows[1, 180:] = np.inf
-    (axes,) = driven_figures.filtered_errors(0.01, {"resphys": rows}, 1.0, narrow=True).axes
+    (axes,) = figures.error_over_time({"resphys": rows}, 0.01, window=1.0, narrow=True).axes
     thin, thick = axes.lines
     assert thin.get_linewidth() < 1.0 < thick.get_linewidth()
     assert np.nanmax(thin.get_ydata()) == 9.0
     assert np.nanmax(thick.get_ydata()) == 1.0
     np.testing.assert_allclose(thick.get_xdata()[[0, -1]], [0.0, 1.99])
     assert np.isnan(thin.get_ydata()[180:]).all()
-    (axes,) = driven_figures.filtered_errors(0.01, {"resphys": rows}, None, narrow=False).axes
+    (axes,) = figures.error_over_time({"resphys": rows}, 0.01, narrow=False).axes
     (only,) = axes.lines
     assert np.nanmax(only.get_ydata()) == 9.0
 
 
 def test_points_are_missing_where_a_rollout_diverged():
     errors = {"resphys": {1.0: 2.0, 1.5: 3.0}, "simfree": {1.0: 4.0}}
-    (axes,) = driven_figures.errors_over_factor(errors, narrow=False).axes
+    (axes,) = figures.error_over_scale(errors, narrow=False).axes
     np.testing.assert_array_equal(axes.lines[0].get_ydata(), [2.0, 3.0])
     np.testing.assert_array_equal(axes.lines[1].get_ydata(), [4.0, np.nan])
 
@@ -398,10 +392,10 @@ def test_a_model_that_runs_away_does_not_set_the_scale_of_the_tip():
     measured[10] = np.nan
     wild = measured * np.exp(angle)[:, None]
     wild[40:] = np.nan
-    flat = driven_figures.tip_planes(measured, {"sysid": measured, "resphys": wild}, narrow=False)
+    flat = motion_figures.tip_planes(measured, {"sysid": measured, "resphys": wild}, narrow=False)
     for axes in flat.axes:
         assert np.ptp(axes.get_xlim()) == np.ptp(axes.get_ylim()) < 70.0  # [mm], of a motion of 40
-    figure = driven_figures.tip_in_space(0.01 * np.arange(50), measured, {"resphys": wild}, narrow=True)
+    figure = motion_figures.tip_in_space(0.01 * np.arange(50), measured, {"resphys": wild}, narrow=True)
     assert np.ptp(figure.axes[0].get_zlim()) < 40.0
     drawn = np.concatenate([np.stack(line.get_data_3d(), axis=1) for line in figure.axes[0].lines])
     assert np.nanmax(np.abs(drawn)) < 60.0
@@ -409,7 +403,7 @@ def test_a_model_that_runs_away_does_not_set_the_scale_of_the_tip():
 
 def test_pressures_are_in_kilopascal_in_the_chambers_colours():
     pressure = np.array([[0.0, 1e3], [2e4, 3e3]])
-    figure = driven_figures.pressure_sequences(
+    figure = motion_figures.pressure_sequences(
         0.5, {"a": pressure, "b": 2 * pressure}, ["one", "two"], 2e4, narrow=False
     )
     first, second = figure.axes
@@ -426,7 +420,7 @@ def test_markers_stand_over_the_pressures():
     times = 0.1 * np.arange(4)
     start = np.array([[0.0, 0.0, -0.2]])
     measured = start + np.array([0.0, 1e-3, 2e-3, 3e-3])[:, None, None]
-    figure = driven_figures.markers_and_pressures(
+    figure = motion_figures.markers_and_pressures(
         times, measured, {"resphys": measured}, ["A"], start, np.full((3, 1), 5e3), ["chamber_1"], None, narrow=False
     )
     *coordinates, below = figure.axes
@@ -462,7 +456,7 @@ def test_view_from_below_keeps_what_is_to_the_right():
 @pytest.mark.usefixtures("can_draw")
 def test_second_view_is_from_below():
     arm = shipped_arm("arm_hexahedra_500")
-    places = np.array(list(arm_settings()["markers"]["followed"].values()))
+    places = np.array(list(arm_settings()["markers"]["tracked"].values()))
     rest = np.zeros((1, 6))
     push = np.array([[LIMIT, 0.0, 0.0, 0.0, 0.0, 0.0]] * 30)  # Along x.
     moved = {
@@ -486,7 +480,7 @@ def test_second_view_is_from_below():
 def test_picture_of_the_arm_has_markers_where_it_is_whole(tmp_path):
     arm = shipped_arm("arm_hexahedra_500")
     body = MeshSummary(arm, 1070.0, np.flatnonzero(arm.vertices[:, 2] == 0.0), find_chambers(arm))
-    places = np.array(list(arm_settings()["markers"]["followed"].values()))
+    places = np.array(list(arm_settings()["markers"]["tracked"].values()))
     mesh.draw_mesh(tmp_path / "plain.png", body)
     mesh.draw_mesh(tmp_path / "dots.png", body, places)
     plain, dots = (imread(tmp_path / f"{name}.png")[..., :3] for name in ("plain", "dots"))

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from measured_run import (
-    FOLLOWED,
     FRAMES,
     MODELS,
     SECONDS,
     STEP,
+    TRACKED,
     TRIALS,
     config,
     sag,
@@ -21,25 +21,20 @@ from measured_run import (
 )
 from report_page import FAILING, Page
 
-from warp_resphys.experiment.measured.report import read_recordings, read_trials, report_folds, report_measured
+from warp_resphys.experiment.report import make_folds_report, make_report, read_recordings, read_trials
 from warp_resphys.io.errors import DataFileError
 from warp_resphys.io.files import read_json, write_json
 from warp_resphys.io.stages import StageContext
 from warp_resphys.learning.metrics import PUBLISHED_MM
 from warp_resphys.mesh.mesh import box_hexahedra
-from warp_resphys.report import measured_figures, registration_picture, render, video
+from warp_resphys.report import figures, motion_figures, render
+from warp_resphys.report.data import at_times, best_and_worst, mean_distance, shown_models
 from warp_resphys.report.figures import TONES
-from warp_resphys.report.measured_data import at_times, best_and_worst, mean_distance, shown_models
-from warp_resphys.report.measured_page import instants
-from warp_resphys.report.measured_tables import (
-    against,
-    parameter_rows,
-    published_beside,
-    quality_rows,
-    residual_rows,
-    uncertainty_text,
-    verdict,
-)
+from warp_resphys.report.motion_sections import instants
+from warp_resphys.report.page import Cell
+from warp_resphys.report.run_page import published_beside
+from warp_resphys.report.sections import against, parameter_rows, quality_rows, residual_table, uncertainty_text
+from warp_resphys.report.verdict import marker_verdict
 from warp_resphys.report.video import Motion, draw_instants, view_axes, write_video
 
 SETTINGS = config()
@@ -49,12 +44,11 @@ DOWN = np.array([0.0, 0.0, -9.8])
 @pytest.fixture
 def no_drawing(monkeypatch):
     """Nothing is drawn in other processes, which takes seconds."""
-    for module in (video, registration_picture):
-        monkeypatch.setattr(module, "COMMAND", FAILING)
+    monkeypatch.setattr(render, "COMMAND", FAILING)
 
 
 def report(folder, settings=SETTINGS):
-    report_measured(StageContext("report", folder, "", {"config": settings}))
+    make_report(StageContext("report", folder, "", {"config": settings}))
     return Page(folder / "report.html")
 
 
@@ -81,7 +75,7 @@ def test_page_of_a_split(tmp_path):
         "they cannot tell apart Young's modulus and Poisson's ratio (\N{MINUS SIGN}0.96)",
         "left out",
         "bare: Base - 1 jumps once, by 0.31 mm, in frame 80.",
-        "Trial load52, in which the last model of the table is farthest off",
+        "Trial load52, in which the last model of the table is farthest off: coordinates",
         "1 min 35 s",
         "no OpenGL here",
     ):
@@ -135,7 +129,7 @@ def test_a_learned_force_without_an_epoch_wins_nothing(tmp_path):
     assert "youngs_modulus was identified at its upper bound, 2e+06: widen identify.parameters" in head
     assert "no force: none of its training was kept" in page.text
     winners = re.findall(r'class="answer"><th scope="row">([^<]+)<', page.source)
-    assert set(winners) == {"SysID"}
+    assert winners == ["SysID"]
 
 
 @pytest.mark.usefixtures("no_drawing")
@@ -145,15 +139,18 @@ def test_page_over_folds_leads_to_theirs(tmp_path):
     metrics["folds"]["bare"]["errors_mm"]["resphys"]["mean"] = None
     del metrics["folds"]["load52"]["errors_mm"]["sysid"]
     write_json(tmp_path / "metrics.json", metrics)
-    report_folds(StageContext("report", tmp_path, "", {"config": SETTINGS}))
+    make_folds_report(StageContext("report", tmp_path, "", {"config": SETTINGS}))
     page = Page(tmp_path / "report.html")
     assert [link for link in page.links if not link.startswith("data:")] == [
         f"fold_{trial}/report.html" for trial in TRIALS
     ]
     said = page.text
     assert "On 3 trials, each of them kept back once" in said
-    assert "SysID0.198\N{EN DASH}0.633" in said.replace(" ", "")
-    assert "ResPhysdiverged0.1300.164" in said.replace(" ", "")
+    folds = metrics["folds"]
+    assert f"bare{folds['bare']['errors_mm']['simulation']['mean']:.3f}" in said
+    assert "diverged" in said[said.index("Test trial [mm]") : said.index("load52")]
+    assert f"load52{folds['load52']['errors_mm']['simulation']['mean']:.3f}\N{EN DASH}" in said
+    assert f"Mean{metrics['errors_mm']['simulation']['mean']:.3f}" in said
     assert "jumps once" in said
     assert "Root mean square" in said
 
@@ -162,18 +159,18 @@ def test_trials_are_read_as_long_as_they_count(tmp_path):
     write_folds(tmp_path, models=("simulation", "resphys"))
     trials = read_trials(tmp_path / "fold_load101", SETTINGS)
     assert trials.names == ("load101",)
-    assert trials.markers["resphys"].shape == trials.measured.shape
+    assert trials.positions["resphys"].shape == trials.target.shape
     assert trials.times[0, -1] <= SECONDS < trials.times[0, -1] + STEP
-    assert np.isfinite(trials.measured).all()
+    assert np.isfinite(trials.target).all()
     whole = read_trials(tmp_path / "fold_load101", {**SETTINGS, "data": {**SETTINGS["data"], "seconds": None}})
-    assert whole.measured.shape[1] == FRAMES
-    assert np.isnan(whole.measured[0, -3:]).all()
+    assert whole.target.shape[1] == FRAMES
+    assert np.isnan(whole.target[0, -3:]).all()
     expected = read_json(tmp_path / "fold_load101" / "errors.json")["errors_mm"]
-    for model, rows in trials.errors_mm().items():  # The markers have noise, the errors of the file have none.
+    for model, rows in trials.errors_mm.items():  # The markers have noise, the errors of the file have none.
         assert rows.mean() == pytest.approx(expected[model]["mean"], abs=0.1)
     hidden = read_trials(tmp_path / "fold_bare", SETTINGS)
-    assert np.isnan(hidden.measured[0, 9:16, 1]).all()
-    assert np.isfinite(hidden.errors_mm()["resphys"]).all()
+    assert np.isnan(hidden.target[0, 9:16, 1]).all()
+    assert np.isfinite(hidden.errors_mm["resphys"]).all()
 
 
 def test_rollouts_of_other_trials_are_refused(tmp_path):
@@ -185,11 +182,11 @@ def test_rollouts_of_other_trials_are_refused(tmp_path):
 
 def test_the_trial_that_fits_worst_is_drawn(tmp_path):
     write_recordings(tmp_path)
-    found = read_recordings(tmp_path, SETTINGS, box_hexahedra(divisions=(3, 1, 1)))
+    found = read_recordings(tmp_path, SETTINGS, box_hexahedra(divisions=(3, 1, 1)), {})
     assert found.drawn == "load101"
     assert found.registration.outliers == ("Base - 3",)
     assert found.registration.inliers.tolist() == [True] * 5 + [False]
-    assert found.nominal[0].tolist() == FOLLOWED["Tip - 1"]
+    assert found.nominal[0].tolist() == TRACKED["Tip - 1"]
     np.testing.assert_allclose(found.feet[0], [0.1, 0.0153, 0.03], atol=1e-12)
 
 
@@ -205,8 +202,11 @@ def test_errors_count_what_was_seen():
 
 def test_bodies_are_brought_to_the_frames():
     positions = np.arange(4.0)[:, None, None] * np.ones((1, 2, 3))
-    found = at_times(positions, 0.1, np.array([0.0, 0.05, 0.11, 0.3, 0.5]))
+    known = np.array([0.0, 0.1, 0.2, 0.3])
+    found = at_times(positions, known, np.array([0.0, 0.05, 0.11, 0.3, 0.5]))
     np.testing.assert_allclose(found[:, 0, 0], [0.0, 0.5, 1.1, 3.0, 3.0])
+    positions[2:] = np.nan
+    np.testing.assert_array_equal(at_times(positions, known, np.array([0.1, 0.11]))[:, 0, 0], [1.0, np.nan])
 
 
 def test_instants_lie_apart():
@@ -228,8 +228,8 @@ def test_words():
 
     means = {"simulation": 0.9, "sysid_elastic": 0.8, "sysid": None, "resphys": 0.2}
     errors = {model: summary(mean) for model, mean in means.items()}
-    assert verdict(errors, ["a"], 1.4, folds=True) == verdict(errors, ["a"], 1.4)
-    said = verdict(errors, ["a"], 1.4).replace("\u00a0", " ")
+    assert marker_verdict(errors, ["a"], 1.4, folds=True) == marker_verdict(errors, ["a"], 1.4)
+    said = marker_verdict(errors, ["a"], 1.4)
     assert "On trial a, " in said
     assert "0.200 mm from the measured ones over the first 1.4 s with ResPhys; diverged with SysID, " in said
     assert said.endswith("0.900 mm uncorrected.")
@@ -261,11 +261,14 @@ def test_parameters_and_what_the_data_cannot_tell():
         },
     }
     modulus, damping = parameter_rows(found, {"youngs_modulus": 264e3}, {"youngs_modulus": 250e3})
-    assert list(modulus.values()) == ["Young's modulus [kPa]", "264", "250", "251.3", "± 2.5", ""]
-    assert list(damping.values()) == ["Damping by stiffness [ms]", *["\N{EN DASH}"] * 2, "2.90", "± 0.10", "yes"]
+    assert modulus.head == "Young's modulus [kPa]"
+    assert modulus.cells == [Cell("264"), Cell("251.3", beside="± 2.5"), Cell("250"), Cell("")]
+    assert damping.head == "Damping by stiffness [ms]"
+    none = Cell("\N{EN DASH}")
+    assert damping.cells == [none, Cell("2.90", beside="± 0.10"), none, Cell("yes")]
     found["parameters"]["youngs_modulus"] = -3.0
-    assert parameter_rows(found, {}, {})[0]["identified"] == "0.0"
-    assert parameter_rows({**found, "uncertainty": None}, {}, {})[0]["identified"] == "\N{MINUS SIGN}0.003"
+    assert parameter_rows(found, {}, {})[0].cells[1].text == "0.0"
+    assert parameter_rows({**found, "uncertainty": None}, {}, {})[0].cells[1].text == "\N{MINUS SIGN}0.003"
     said = uncertainty_text("sysid", found).replace("\u00a0", " ")
     assert said == "SysID: the data tell least about damping by stiffness, to 3.4 % of the range."
     assert uncertainty_text("sysid", {**found, "uncertainty": None}) == ""
@@ -284,10 +287,16 @@ def test_rows_of_markers_that_were_never_seen():
         "noise_mm": None,
         "drift_mm": None,
     }
-    assert quality_rows({"t": {"markers": [marker]}}) == {"t": [["A", "0.0 %", "1", "9", "9", "0", "", ""]]}
-    labels, rows = residual_rows({"t": {"rms_mm": 0.5, "residual_mm": {"A": None, "B": 0.5}, "outliers": []}})
-    assert labels == ["A", "B"]
-    assert rows == [("t", "0.50", [("\N{EN DASH}", ""), ("0.50", "")])]
+    (row,) = quality_rows({"markers": [marker]})
+    assert [row.head, *(cell.text for cell in row.cells)] == ["A", "0.0 %", "1", "9", "9", "0", "", ""]
+    table = residual_table({"t": {"rms_mm": 0.5, "residual_mm": {"A": None, "B": 0.5}, "outliers": []}})
+    assert table.columns == ["A", "B", "Root mean square"]
+    assert table.rows[0].cells == [Cell("\N{EN DASH}"), Cell("0.50"), Cell("0.50")]
+    many = {str(marker): 0.1 for marker in range(9)}
+    table = residual_table({"t": {"rms_mm": 0.5, "residual_mm": many, "outliers": ["3"]}})
+    assert table.columns == ["t"]
+    assert [row.head for row in table.rows] == [*many, "Root mean square"]
+    assert table.rows[3].cells == [Cell("0.10", "left out")]
 
 
 def test_a_model_that_runs_away_does_not_set_the_scale():
@@ -295,7 +304,7 @@ def test_a_model_that_runs_away_does_not_set_the_scale():
     measured = np.zeros((20, 1, 3))
     measured[:, 0, 2] = 0.01 * np.sin(30.0 * times)
     wild = measured + np.exp(50.0 * times)[:, None, None]
-    figure = measured_figures.marker_paths(times, measured, {"resphys": wild}, ["A"], np.zeros((1, 3)), narrow=False)
+    figure = motion_figures.marker_paths(times, measured, {"resphys": wild}, ["A"], np.zeros((1, 3)), narrow=False)
     spans = [np.ptp(axes.get_ylim()) for axes in figure.axes[:3]]
     assert spans[2] < 50.0
     assert 0.05 * np.ptp(measured[..., 2]) * 1e3 < spans[1] < 5.0  # [mm]
@@ -303,7 +312,7 @@ def test_a_model_that_runs_away_does_not_set_the_scale():
 
 def test_error_lines_end_where_a_trial_diverged():
     rows = np.array([[1.0, 1.0, 1.0], [3.0, np.nan, np.inf]])
-    figure = measured_figures.errors_over_time(np.arange(1.0, 4.0), {"resphys": rows}, narrow=False)
+    figure = figures.error_over_time({"resphys": rows}, np.arange(1.0, 4.0), narrow=False)
     (line,) = figure.axes[0].lines
     np.testing.assert_allclose(line.get_ydata(), [2.0, 1.0, np.nan])
 
@@ -312,17 +321,17 @@ def test_landscape_marks_its_points():
     modulus, ratio = np.array([1e5, 2e5, 3e5]), np.array([0.4, 0.45])
     loss = np.array([[1.0, 2.0], [0.1, 0.2], [np.nan, 1.0]])
     points = {"data sheet": (2.64e5, 0.499), "lowest of the grid": (2e5, 0.4)}
-    surface = measured_figures.landscape(modulus, ratio, loss, points, narrow=True).axes[0]
+    surface = figures.landscape(modulus, ratio, loss, points, narrow=True).axes[0]
     assert [tuple(np.ravel(line.get_data())) for line in surface.lines] == [(264.0, 0.499), (200.0, 0.4)]
     assert len(surface.collections) == 2
-    curve = measured_figures.landscape(modulus, np.array([]), loss[:, 1], points, narrow=False).axes[0]
+    curve = figures.landscape(modulus, np.array([]), loss[:, 1], points, narrow=False).axes[0]
     assert curve.get_ylabel() == "loss"
     assert tuple(np.ravel(curve.lines[-1].get_data())) == (200.0, 0.2)
 
 
 def test_start_that_was_kept_is_bold():
     histories = {"sysid": [[{"loss": 1.0}, {"loss": 3.0}, {"loss": 0.5}], [{"loss": 2.0}, {"loss": 0.1}], []]}
-    (axes,) = measured_figures.loss_histories(histories, narrow=False).axes
+    (axes,) = figures.loss_histories(histories, narrow=False).axes
     colours = [line.get_color() for line in axes.lines]
     assert colours == [TONES["muted"].light, TONES["sysid"].light]
     np.testing.assert_allclose(axes.lines[0].get_ydata(), [1.0, 1.0, 0.5])
@@ -353,7 +362,7 @@ def test_views_have_the_free_end_on_the_right_and_gravity_down():
 
 def motion(frames=3, model="simulation"):
     mesh = box_hexahedra(divisions=(3, 1, 1))
-    bound = np.array(list(FOLLOWED.values()))
+    bound = np.array(list(TRACKED.values()))
     times = np.arange(1, frames + 1) * 0.02
     positions = {name: sag(mesh.vertices, times, 0.05, name) for name in (model, "resphys")}
     markers = {name: sag(bound, times, 0.05, name) for name in positions}
@@ -384,7 +393,7 @@ def test_film_moves_and_is_slower_than_the_motion(tmp_path, capsys):
     imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
     shown = motion(4)
     shown.measured[2, 1] = np.nan
-    write_video(tmp_path / "motion.mp4", shown, {"simulation": "Uncorrected", "resphys": "ResPhys"})
+    write_video(tmp_path / "motion.mp4", shown, {"simulation": "Uncorrected", "resphys": "ResPhys"}, 4.0, 1.5)
     assert "4/4 frames" in capsys.readouterr().err
     reader = imageio_ffmpeg.read_frames(str(tmp_path / "motion.mp4"))
     about = next(reader)
@@ -404,7 +413,7 @@ def test_film_moves_and_is_slower_than_the_motion(tmp_path, capsys):
     ],
 )
 def test_a_film_that_cannot_be_made_says_why(tmp_path, monkeypatch, script, reason):
-    monkeypatch.setattr(video, "COMMAND", (sys.executable, "-c", script))
+    monkeypatch.setattr(render, "COMMAND", (sys.executable, "-c", script))
     with pytest.raises(render.DrawingError, match=reason):
-        write_video(tmp_path / "motion.mp4", motion(), {"simulation": "a", "resphys": "b"})
+        write_video(tmp_path / "motion.mp4", motion(), {"simulation": "a", "resphys": "b"}, 4.0, 1.5)
     assert not list(Path(tmp_path).iterdir())

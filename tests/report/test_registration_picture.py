@@ -5,9 +5,17 @@ from matplotlib.image import imread
 
 from warp_resphys.data.registration import register_markers
 from warp_resphys.mesh.mesh import boundary_triangles, box_hexahedra, select_vertices
-from warp_resphys.report import registration_picture, render
-from warp_resphys.report.registration_picture import _VIEWS, _pictures, _round_length, _spread, _view, draw_registration
-from warp_resphys.report.render_markers import MEASURED
+from warp_resphys.report import registration_picture
+from warp_resphys.report.registration_picture import (
+    _VIEWS,
+    _layers,
+    _pictures,
+    _round_length,
+    _spread,
+    _view,
+    draw_registration,
+)
+from warp_resphys.report.render import MEASURED
 
 MESH = box_hexahedra(divisions=(3, 2, 2))
 NAMES = ["Tip - 1", "Tip - 2", "Tip - 3", "Base - 1", "Base - 2", "a marker with a rather long name"]
@@ -19,17 +27,9 @@ def test_markers_are_drawn_where_labels_and_rings_are_put():
     """Off the body and alone, a marker's pixels lie around its projection, in both views."""
     marker = np.array([[0.13, -0.02, 0.06]])
     views = [_view(*each, np.concatenate([MESH.vertices, marker]), 0.004) for each in _VIEWS]
-    scene = {
-        "vertices": MESH.vertices,
-        "triangles": boundary_triangles(MESH),
-        "edges": render.face_edges(MESH),
-        "clamped": boundary_triangles(MESH)[:0],
-        "markers": marker,
-        "feet": marker,
-        "radius": np.array(0.003),
-    }
+    layers = _layers(MESH, boundary_triangles(MESH)[:0], marker, marker, 0.003)
     ball = matplotlib.colors.rgb_to_hsv(matplotlib.colors.to_rgb(MEASURED))
-    for view, pixels in zip(views, _pictures(views, scene), strict=True):
+    for view, pixels in zip(views, _pictures(views, layers), strict=True):
         height, width = pixels.shape[:2]
         assert width / height == pytest.approx(view.extent[0] / view.extent[1], rel=0.01)
         colours = matplotlib.colors.rgb_to_hsv(pixels)

@@ -15,7 +15,7 @@ from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.recordings.recording import Recording
 from warp_resphys.data.recordings.release import Release
 from warp_resphys.io.errors import DataFileError, InputError
-from warp_resphys.report.recordings import inspect_recording, recording_quality
+from warp_resphys.studies.recording_quality import inspect_recording, recording_quality
 
 LABELS = ("tip", "base 1", "base 2")
 

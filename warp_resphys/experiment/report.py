@@ -1,15 +1,440 @@
-"""Stage: the report page."""
+"""Stage: the report page of a split, and the one over the folds; they show what the run folder holds."""
 
-from ..io.files import write_text
-from ..io.stages import StageContext
-from .files import REPORT
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from ..data.registration import Registration, RigidTransform
+from ..io.errors import DataFileError
+from ..io.files import read_array, read_hdf5, read_json
+from ..io.stages import StageContext, package_versions, resources_used
+from ..learning.metrics import PUBLISHED_WINDOWS_MM, published_errors
+from ..learning.replay import MASS_FACTOR
+from ..mesh.chambers import Chamber
+from ..mesh.mesh import Mesh, select_vertices
+from ..mesh.surface import closest_points
+from ..report.data import MODELS, Film, Pressures, Recordings, RunReport, Trials
+from ..report.page import number_text
+from ..report.run_page import write_report
+from .build import build_chambers, build_mesh, choose_device
+
+FloatArray = NDArray[np.float64]
+
+DATASET, SCALED, ROLLOUTS = "dataset.h5", "dataset_scaled.h5", "rollouts.h5"
+REPORT = "report.html"
+LEARNED = ("simfree", "resphys_uncorrected", "resphys")
+PRESSURE = "pressure"  # The name of an input.
+_SELECTED_BY = {"rollout": "roll-out error", "validation_loss": "validation loss"}
+_PUBLISHED_NETWORK = {"kind": "nodal", "blocks": 5, "layers": 3, "width": 512, "activation": "normalised_elu"}
+_PUBLISHED_TRAINER = {
+    "epochs": 1000,
+    "batch_size": 256,
+    "learning_rate": 1e-3,
+    "schedule": "step",
+    "weight_decay": 1e-5,
+    "noise": 0.0,
+    "linear_noise": None,
+    "scale_weight": 0.0,
+    "selection": "validation_loss",
+}
+_AGAINST = "The published errors are measured against the reconstructed trajectories, ours against the target."
+_MASS = {
+    "per_vertex": " This run computes masses and volumes as the published code does.",
+    "row_sum": (
+        " The published simulator doubles the beam's mass and locks (physics=published computes the same); "
+        "this run does not, so that its uncorrected error is another one."
+    ),
+}
+_OF_A_BEAM = (
+    "The published errors are those of other data: recordings with ten markers on the beam's sides, whose weight is "
+    "cut off at the release, compared with trajectories reconstructed from them; the published uncorrected simulation "
+    "has the published setting, the published SysID elastic parameters only."
+)
+_OF_AN_ARM = {
+    True: "The published errors are those of another body: recordings of a real arm, which this run has not seen.",
+    False: "The published errors are those of the published simulator, of 494 vertices, on the authors' recordings.",
+}
 
 
 def make_report(context: StageContext) -> None:
-    """Writes report.html."""
-    write_text(context.run_dir / REPORT, "-")
+    """Writes report.html of a split of the trials, with its figures and, where there is one, the video.
+
+    Raises:
+        DataFileError: a file of an earlier stage is missing or damaged, or one could not be written.
+    """
+    folder, config = context.run_dir, context.settings["config"]
+    metrics, truth = read_metrics(folder, config), _if_there(common_folder(folder) / "truth.json")
+    trials, identification = read_trials(folder, config), _if_there(folder / "identification.json")
+    film, pressures = read_film(folder), read_pressures(folder, config, trials)
+    common, mesh = _common_parts(context, metrics)
+    channels = () if pressures is None else pressures.channels
+    data = RunReport(
+        **common,
+        tip=_tip(mesh, config, trials),
+        chambers=_driven_chambers(build_chambers(config.get("chambers"), mesh), channels),
+        trials=trials,
+        film=film,
+        pressures=pressures,
+        recordings=read_recordings(folder, config, *_at_rest(mesh, trials, film)),
+        notes=error_notes(metrics.get("sideways_mm", {}), truth),
+        identification=identification,
+        start=data_sheet(config, identification),
+        truth=truth.get("material", {}),
+        training=_histories(folder, "training"),
+        refinement=_histories(folder, "refinement"),
+        network_note=""
+        if config.get("in_the_loop") or "resphys" not in metrics["errors_mm"]
+        else network_in_words(config),
+        kept_note=kept_in_words(metrics["networks"]) if "resphys" in metrics["networks"] else "",
+        simulator=_in_words(config["simulation"]),
+        target=_in_words(config["target"]) if config.get("target") else "",
+    )
+    write_report(folder / REPORT, data)
 
 
 def make_folds_report(context: StageContext) -> None:
-    """Writes report.html over the folds."""
-    write_text(context.run_dir / REPORT, "-")
+    """Writes report.html over the folds, from metrics.json and what is common to them.
+
+    Raises:
+        DataFileError: a file of an earlier stage is missing or damaged, or one could not be written.
+    """
+    folder, config = context.run_dir, context.settings["config"]
+    metrics = {"device": str(choose_device(config["device"])), **read_json(folder / "metrics.json")}
+    sideways = {trial: mm for fold in metrics["folds"].values() for trial, mm in fold.get("sideways_mm", {}).items()}
+    common, mesh = _common_parts(context, metrics)
+    data = RunReport(
+        **common,
+        pages={trial: f"fold_{trial}/{REPORT}" for trial in metrics["folds"]},
+        recordings=read_recordings(folder, config, mesh, {}),
+        notes=error_notes(sideways, {}),
+    )
+    write_report(folder / REPORT, data)
+
+
+def _tip(mesh: Mesh, config: Mapping[str, Any], trials: Trials) -> NDArray[np.int64]:
+    """Vertices whose mean is the tip, where every vertex is observed."""
+    place = config.get("tip")
+    return np.empty(0, dtype=np.int64) if trials.labels or not place else select_vertices(mesh, **place)
+
+
+def _common_parts(context: StageContext, metrics: Mapping[str, Any]) -> tuple[dict[str, Any], Mesh]:
+    """What all pages show, and the undeformed body."""
+    config = context.settings["config"]
+    mesh = build_mesh(config["mesh"])
+    return {
+        "experiment": config["name"],
+        "title": config["title"],
+        "metrics": metrics,
+        "settings": config,
+        "mesh": mesh,
+        "fixed": select_vertices(mesh, **config["fixed"]),
+        "published": published_errors(config["name"]),
+        "published_horizons": PUBLISHED_WINDOWS_MM.get(config["name"], {}),
+        "published_note": published_note(config),
+    }, mesh
+
+
+def common_folder(folder: Path) -> Path:
+    """Where the files lie that do not depend on the fold: here, or beside the folders of the folds."""
+    return folder if (folder / DATASET).is_file() else folder.parent
+
+
+def _if_there(path: Path) -> dict[str, Any]:
+    """What a JSON file holds; nothing where there is none."""
+    content: dict[str, Any] = read_json(path) if path.is_file() else {}
+    return content
+
+
+def _histories(folder: Path, what: str) -> dict[str, Any]:
+    """The epochs of the trainings, or of the refinements, by model."""
+    files = {model: folder / f"{what}_{model}.json" for model in LEARNED}
+    return {model: read_json(path)["epochs"] for model, path in files.items() if path.is_file()}
+
+
+def read_metrics(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
+    """What metrics.json of a split will hold.
+
+    Errors, which weights were kept, what was identified and reconstructed, time and memory of the stages that are
+    done in the order of their end, versions and device.
+
+    Args:
+        folder: of the split.
+        config: with the key ``device``.
+    """
+    files = {
+        f"{m}{s}": folder / f"{w}_{m}.json" for m in LEARNED for w, s in (("training", ""), ("refinement", "_refined"))
+    }
+    records = sorted((folder / "stages").glob("*.json"), key=lambda path: path.stat().st_mtime_ns)
+    names = [path.stem for path in records if not path.stem.endswith(".progress")]
+    identified = _if_there(folder / "identification.json")
+    more = {
+        "reconstruction": _if_there(folder / "reconstruction.json"),
+        "seconds_per_test_trajectory": _if_there(folder / "times.json").get("seconds", {}),
+    }
+    return {
+        **read_json(folder / "errors.json"),
+        "networks": {name: read_json(path)["kept"] for name, path in files.items() if path.is_file()},
+        "parameters": {name: each["parameters"] for name, each in identified.items() if "parameters" in each},
+        **{key: value for key, value in more.items() if value},
+        **resources_used(folder, names),
+        "versions": package_versions(),
+        "device": str(choose_device(config["device"])),
+    }
+
+
+def data_sheet(config: Mapping[str, Any], identification: Mapping[str, Any]) -> dict[str, float]:
+    """What the simulator has of all that was identified, and of what the landscape is drawn over."""
+    known = {MASS_FACTOR: 1.0, "fibre_stiffness": (config.get("fibres") or {}).get("stiffness", 0.0)}
+    known |= {key: value for key, value in config["simulation"].items() if key != "model"}
+    names = {name for found in identification.values() for name in found.get("parameters", {})}
+    return {name: known.get(name, 0.0) for name in (*names, "youngs_modulus", "poissons_ratio")}
+
+
+def error_notes(sideways: Mapping[str, float], truth: Mapping[str, Any]) -> list[str]:
+    """How the bodies of the test trials were held, and what of the errors is noise, as far as these are known."""
+    notes = []
+    if sideways:
+        each = ", ".join(f"{distance:.1f} mm ({trial})" for trial, distance in sideways.items())
+        notes.append(
+            "The first frames of a trial tell how far sideways its body was held: the markers by "
+            f"{each}, as the identified simulator has it. Every simulator begins with its own estimate."
+        )
+    if "noise_mm" in truth:
+        notes.append(f"The noise of the markers alone is {truth['noise_mm']:.2f} mm.")
+    return notes
+
+
+def published_note(config: Mapping[str, Any]) -> str:
+    """How the published errors of this experiment came about."""
+    if not config.get("markers"):
+        return _AGAINST + _MASS[config["physics"]["mass"]]
+    return _OF_AN_ARM[config["data"]["folder"] is None] if config.get("chambers") else _OF_A_BEAM
+
+
+def _texts(file: h5py.File, name: str) -> tuple[str, ...]:
+    return tuple(str(each) for each in file.attrs[name])
+
+
+def read_trials(folder: Path, config: Mapping[str, Any]) -> Trials:
+    """What was observed in the test trials and what the models made of them, as long as it counts.
+
+    Roll-outs at other pressures than those of the data set are left out.
+
+    Args:
+        folder: of the split.
+        config: with the group ``data``.
+
+    Raises:
+        DataFileError: a file is missing or damaged, or the two do not belong together.
+    """
+    path = common_folder(folder) / DATASET
+    with read_hdf5(path, "dataset") as file:
+        names, labels, begins = (_texts(file, key) for key in ("names", "labels", "begins"))
+        gravity, step = np.asarray(file.attrs["gravity"], dtype=np.float64), float(file.attrs["time_step"])
+        times = read_array(file, "times", (len(names), None))
+        observed = read_array(file, "observed", (*times.shape, len(labels) or None, 3))
+        bound = read_array(file, "bound", (len(labels), 3)) if labels else build_mesh(config["mesh"]).vertices
+    with read_hdf5(folder / ROLLOUTS, "rollouts") as file:
+        rolled = _texts(file, "names")
+        scaled = _scaled_names(folder)
+        test = [name for name in rolled if name not in scaled]
+        models = [model for model in MODELS if f"{model}_observed" in file]
+        unknown = sorted(set(test) - set(names))
+        if unknown or not models:
+            what = f"names trials that {path} does not hold ({', '.join(unknown)})" if unknown else "holds no model"
+            raise DataFileError(f"{folder / ROLLOUTS} {what}: delete it and run the same command again.")
+        shape = (len(rolled), *observed.shape[1:])
+        positions = {m: read_array(file, f"{m}_observed", shape)[: len(test)].astype(np.float64) for m in models}
+    rows = [names.index(name) for name in test]
+    times, target = times[rows], observed[rows]
+    seconds, length = config["data"].get("seconds"), times.shape[1]
+    if seconds is not None:
+        target = np.where((times <= seconds)[..., None, None], target, np.nan)
+        length = max(1, int((times <= seconds).any(axis=0).sum()))
+    return Trials(
+        names=tuple(test),
+        labels=labels,
+        begins=tuple(begins[row] for row in rows),
+        times=times[:, :length],
+        target=target[:, :length],
+        positions={model: each[:, :length] for model, each in positions.items()},
+        bound=bound,
+        gravity=gravity,
+        time_step=step,
+    )
+
+
+def _scaled_names(folder: Path) -> tuple[str, ...]:
+    """The trials at other pressures than those of the data set."""
+    path = common_folder(folder) / SCALED
+    if not path.is_file():
+        return ()
+    with read_hdf5(path, "dataset") as file:
+        return _texts(file, "names")
+
+
+def read_film(folder: Path) -> Film | None:
+    """The bodies of the film; None where there is none."""
+    with read_hdf5(folder / ROLLOUTS, "rollouts") as file:
+        if "film_steps" not in file:
+            return None
+        steps = read_array(file, "film_steps", (None,)).astype(np.float64)
+        models = [model for model in MODELS if f"{model}_film" in file]
+        shape = (len(steps), None, 3)
+        bodies = {model: read_array(file, f"{model}_film", shape).astype(np.float64) for model in models}
+        return Film(str(file.attrs["film_trial"]), float(file.attrs["time_step"]) * steps, bodies)
+
+
+def read_pressures(folder: Path, config: Mapping[str, Any], trials: Trials) -> Pressures | None:
+    """The pressures of all trials; None where no pressure drives them.
+
+    Args:
+        folder: of the split.
+        config: with the group ``data``.
+        trials: of the test.
+
+    Raises:
+        DataFileError: a file is missing or damaged.
+    """
+    values: dict[str, Any] = {}
+    channels: tuple[str, ...] = ()
+    scaled = _scaled_names(folder)
+    for name in (DATASET, *((SCALED,) if scaled else ())):
+        with read_hdf5(common_folder(folder) / name, "dataset") as file:
+            if PRESSURE not in _texts(file, "inputs"):
+                return None
+            names, channels = _texts(file, "names"), _texts(file, f"{PRESSURE}_channels")
+            rows = read_array(file, PRESSURE, (len(names), None, len(channels)))
+            values |= dict(zip(names, rows, strict=True))
+    return Pressures(channels, values, config["data"].get("pressure_limit"), scaled)
+
+
+def _driven_chambers(chambers: tuple[Chamber, ...], names: tuple[str, ...]) -> tuple[Chamber, ...]:
+    """Those of a body's chambers that are under pressure, in the order of the pressures."""
+    found = {chamber.name: chamber for chamber in chambers}
+    unknown = [name for name in names if name not in found]
+    if unknown:
+        raise DataFileError(
+            f"{DATASET} has pressures of {', '.join(unknown)}, but the body's chambers are "
+            f"{', '.join(found) or 'none'}: take the mesh that the trials were imported for."
+        )
+    return tuple(found[name] for name in names)
+
+
+def _at_rest(mesh: Mesh, trials: Trials, film: Film | None) -> tuple[Mesh, dict[str, FloatArray]]:
+    """The body as it rests, and how far each marker has moved there (3,) [m], by label.
+
+    Where trials begin at rest, that is how the first model has it before anything drives it; else it is undeformed.
+    """
+    model = next(iter(film.positions), None) if film is not None else None
+    if film is None or model is None or film.trial not in trials.names:
+        return mesh, {}
+    row = trials.names.index(film.trial)
+    if trials.begins[row] != "rest":
+        return mesh, {}
+    moved = trials.positions[model][row, 0] - trials.bound
+    return Mesh(film.positions[model][0], mesh.cells), dict(zip(trials.labels, moved, strict=True))
+
+
+def read_recordings(
+    folder: Path, config: Mapping[str, Any], mesh: Mesh, moved: Mapping[str, FloatArray]
+) -> Recordings | None:
+    """Quality and registration of all trials, and the trial that fits worst; None where there are no recordings.
+
+    Args:
+        folder: of the split.
+        config: with the group ``markers``, where markers are observed.
+        mesh: the body as it is at rest.
+        moved: (3,) how far nominal places, which are on the undeformed body, move until it is at rest, by label [m].
+
+    Raises:
+        DataFileError: a file is missing or damaged.
+    """
+    if not config.get("markers"):
+        return None
+    path = common_folder(folder) / "registration.json"
+    residuals = read_json(path)
+    worst = max(residuals, key=lambda trial: residuals[trial]["rms_mm"])
+    each = residuals[worst]
+    if "positions" not in each:
+        raise DataFileError(f"{path} has no positions: delete it and run the same command again.")
+    nominal: dict[str, Any] = {**config["markers"]["tracked"], **(config["markers"]["reference"] or {})}
+    labels = [label for label in each["positions"] if label in nominal]
+    places = np.array([_numbers(each["positions"][label]) for label in labels])
+    residual = np.array([np.nan if (r := each["residual_mm"].get(label)) is None else 1e-3 * r for label in labels])
+    registration = Registration(
+        names=tuple(labels),
+        transform=RigidTransform(np.eye(3), np.zeros(3)),
+        positions=places,
+        residual=residual,
+        inliers=np.array([label not in each["outliers"] for label in labels]),
+        outliers=tuple(each["outliers"]),
+        rms=1e-3 * each["rms_mm"],
+    )
+    seen = np.isfinite(places).all(axis=1)
+    feet = np.full_like(places, np.nan)
+    feet[seen] = closest_points(mesh, places[seen]).points
+    return Recordings(
+        quality=read_json(path.with_name("quality.json")),
+        residuals=residuals,
+        registration=registration,
+        drawn=worst,
+        nominal=np.array([np.add(nominal[label], moved.get(label, 0.0)) for label in labels], dtype=np.float64),
+        feet=feet,
+        mesh=mesh,
+    )
+
+
+def _numbers(point: Any) -> list[float]:
+    """Three coordinates; what JSON has as null was not seen."""
+    return [float("nan") if each is None else float(each) for each in point or (None,) * 3]
+
+
+def network_in_words(config: dict[str, Any]) -> str:
+    """Which network predicts the residual force, and how it is trained; says where it is the published one."""
+    network, trainer = config["network"], config["trainer"]
+    who = "The published network" if network.items() >= _PUBLISHED_NETWORK.items() else "Our network"
+    basis = "force, positions and velocities of every vertex"
+    if network["kind"] == "reduced":
+        sizes = (network[f"{name}_modes"] for name in ("position", "velocity", "force"))
+        basis = "a reduced basis of {} position, {} velocity and {} force modes".format(*sizes)
+    blocks = "1 block" if network["blocks"] == 1 else f"{network['blocks']} blocks"
+    how = "as published" if trainer.items() >= _PUBLISHED_TRAINER.items() else "our way"
+    linear = "" if trainer["linear_noise"] is None else ", beside a linear part from ridge regression"
+    said = (
+        f"ResPhys: {who[0].lower()}{who[1:]}, in {basis}, {blocks} of {network['layers']} hidden layers of "
+        f"{network['width']}{linear}; trained {how}, {trainer['epochs']} epochs, weights chosen by "
+        f"{_SELECTED_BY[trainer['selection']]}."
+    )
+    if config.get("refinement", {}).get("kind", "none") != "none":
+        said += f" Then refined through the simulator, over windows of {config['refinement']['window']} steps."
+    return said
+
+
+def kept_in_words(networks: dict[str, Any]) -> str:
+    """Which weights of the residual force were taken, and what they do on the validation split."""
+    kept = networks["resphys"]
+    said = f"Kept: epoch {kept['epoch']}, by {_SELECTED_BY[kept['selection']]}; {_validated(kept)}."
+    refined = networks.get("resphys_refined")
+    if refined is None:
+        return said
+    if refined["epoch"] == 0:
+        return f"{said} No epoch of the refinement was better: the weights are those from before it."
+    return f"{said} Taken in the end: epoch {refined['epoch']} of the refinement; {_validated(refined)}."
+
+
+def _validated(kept: dict[str, Any]) -> str:
+    error = kept["validation_rollout_error_mm"]
+    if error is None:
+        return "its roll-outs of the validation split diverge"
+    return f"its mean roll-out error on the validation split is {number_text(error)} mm"
+
+
+def _in_words(material: dict[str, Any]) -> str:
+    """Young's modulus and Poisson's ratio, and the model where it is not the usual one."""
+    words = f"E {material['youngs_modulus'] / 1e3:g} kPa, ν {material['poissons_ratio']:g}"  # noqa: RUF001
+    return words if material["model"] == "corotated" else f"{words}, {material['model'].replace('_', ' ')}"

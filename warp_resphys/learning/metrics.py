@@ -103,7 +103,7 @@ PUBLISHED_SETUP: Final[Mapping[str, Mapping[str, float]]] = {
 # mean and standard deviation [s].
 PUBLISHED_SECONDS: Final[Mapping[str, tuple[float, float]]] = {
     "simulation": (0.711, 0.002),
-    "true_parameters": (2.218, 0.005),
+    "target": (2.218, 0.005),
     "resphys": (1.393, 0.004),
     "inference": (0.112, 0.002),
 }

@@ -7,10 +7,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import matplotlib as mpl
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from ..io.files import write_text
+from .figures import STYLE, TONES, FloatArray, new_figure, use_logarithm
 from .page import (
     NO_BREAK_SPACE,
     Picture,
@@ -109,9 +112,7 @@ def _from_here_on(rows: Sequence[Mapping[str, Any]], key: str, below: float) -> 
 
 
 def _draw(data: AblationReport, folder: Path) -> Picture:
-    from . import figures
-
-    draw = partial(figures.marker_boxes, box_errors(data.metrics), data.metrics["uncorrected_mm"])
+    draw = partial(marker_boxes, box_errors(data.metrics), data.metrics["uncorrected_mm"])
     return draw_picture(folder, FIGURE, draw, describe_boxes(data.metrics))
 
 
@@ -128,3 +129,48 @@ def describe_boxes(metrics: Mapping[str, Any]) -> str:
     """
     medians = "; ".join(f"{row['markers']}: {number_text(row['median_mm'])} mm" for row in metrics["by_markers"])
     return f"Box plot of the mean vertex error by number of markers, on a logarithmic axis. Medians: {medians}."
+
+
+def marker_boxes(
+    errors: Mapping[int, FloatArray], uncorrected: float, published: tuple[int, float] | None = None, *, narrow: bool
+) -> Figure:
+    """Draw a box for each number of markers: median, quartiles, and whiskers to the smallest and largest draw.
+
+    Args:
+        errors: (D,) errors [mm] of the draws, by number of markers.
+        uncorrected: Error without any correction [mm].
+        published: From which number of markers on the published median is below what error [mm].
+        narrow: Whether the figure is for a narrow page.
+    """
+    ink, strong = {"color": TONES["ink"].light, "linewidth": 0.9}, TONES["simulation"].light
+    with mpl.rc_context(STYLE):
+        figure = new_figure(3.6, 3.4, narrow=narrow)
+        axes = figure.subplots()
+        places = range(1, len(errors) + 1)
+        axes.boxplot(
+            [*errors.values()],
+            positions=places,
+            widths=0.55,
+            whis=(0, 100),
+            boxprops=ink,
+            whiskerprops=ink,
+            capprops=ink,
+            medianprops={"color": strong, "linewidth": 2.0},
+        )
+        lines = {"uncorrected simulation": (0.5, uncorrected)}
+        if published is not None:
+            start = 0.5 + sum(count < published[0] for count in errors)
+            lines["published median: below" if narrow else "published: the median is below"] = (start, published[1])
+        for text, (start, level) in lines.items():
+            grey = TONES["muted"].light
+            axes.plot([start, len(errors) + 0.5], [level, level], color=grey, linewidth=1.1, linestyle="--")
+            place = (len(errors) + 0.5, level)
+            axes.annotate(text, place, (-2, 3), textcoords="offset points", ha="right", color=grey)
+        axes.set_xlim(0.5, len(errors) + 0.5)
+        axes.set_xticks([*places], [str(count) for count in errors])
+        axes.set_yscale("log")
+        axes.set_ylim(top=1.6 * max(uncorrected, *(row.max() for row in errors.values())))
+        use_logarithm(axes)
+        axes.grid(visible=False, axis="x")
+        axes.set(xlabel="number of markers", ylabel="mean vertex error [mm]")
+    return figure

@@ -1,4 +1,4 @@
-"""The report's figures: a function each, from arrays; `themed_svg` and `save_png` write them.
+"""The style of all figures, and those of errors and of learning: a function each, from arrays.
 
 Every figure exists in two widths, for a page and for a phone, and takes its colours from the reader's theme.
 """
@@ -14,13 +14,12 @@ from typing import Any, Final, NamedTuple
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
-from .render import COLOUR_MAP, Body
+from ..learning.metrics import median_filter
+from .data import MODELS
 
 FloatArray = NDArray[np.float64]
 
@@ -48,13 +47,8 @@ TONES: Final[Mapping[str, Tone]] = {
     "sysid_elastic": Tone("#a57cc4", "#d9bdf0"),
     "resphys_uncorrected": Tone("#1f93b0", "#6fd0e8"),
 }
-LABELS: Final[Mapping[str, str]] = {
-    "simulation": "Uncorrected simulation",
-    "reconstruction": "Reconstruction",
-    "sysid": "SysID",
-    "simfree": "SimFree",
-    "resphys": "Corrected (ResPhys)",
-    "published_network": "Published network",
+LABELS: Final[Mapping[str, str]] = {model: name for model, (name, _) in MODELS.items()} | {
+    "published_network": "Published network"
 }
 # Okabe and Ito (2008): everyone can tell them apart.
 CHAMBER_COLOURS: Final = ("#e69f00", "#56b4e9", "#009e73", "#d55e00", "#0072b2", "#cc79a7", "#f0e442", "#7f7f7f")
@@ -64,6 +58,9 @@ ROUND_STEPS: Final = (1, 2, 5, 10)  # Between two ticks, times a power of ten.
 WIDE: Final = 7.3  # [in]
 _LEGEND_ROW: Final = 5  # Most names in one row.
 NARROW: Final = 3.7  # [in]
+_DASHED: Final = {"published": (0, (1, 1.2)), "sysid_elastic": (0, (4, 2)), "resphys_uncorrected": (0, (4, 2))}
+_LEVELS: Final = 14  # Of a landscape.
+_KILO: Final = 1e-3
 STYLE: Final[dict[Any, Any]] = {
     "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans"],
@@ -95,68 +92,81 @@ STYLE: Final[dict[Any, Any]] = {
 }
 
 
-def tip_displacement(displacements: Mapping[str, FloatArray], time_step: float, *, narrow: bool) -> Figure:
-    """Draw how the tip moves, and below it how far each model's tip is from the target's.
-
-    Args:
-        displacements: (T+1, 3) displacement [m] of the tip from rest, of the "target" and of the models.
-        time_step: Time between two states [s].
-        narrow: Whether the figure is for a narrow page.
-    """
-    target = displacements["target"]
-    axis = int(np.argmax(np.ptp(target, axis=0)))
-    time = np.arange(len(target)) * time_step
-    with mpl.rc_context(STYLE):
-        figure = new_figure(3.9, 4.2, narrow=narrow)
-        motion, distance = figure.subplots(2, 1, sharex=True, height_ratios=[2, 1])
-        motion.plot(time, 1e3 * target[:, axis], color=TONES["target"].light, linewidth=4.0, label="Target")
-        for model in (name for name in displacements if name != "target"):
-            moved = displacements[model]
-            motion.plot(time, 1e3 * moved[:, axis], color=TONES[model].light, label=LABELS[model])
-            with np.errstate(over="ignore", invalid="ignore"):
-                gap = 1e3 * np.linalg.norm(moved - target, axis=1)
-            distance.plot(time, positive(gap), color=TONES[model].light)
-        lowest, highest = 1e3 * target[:, axis].min(), 1e3 * target[:, axis].max()
-        margin = 0.8 * (highest - lowest)  # Keeps a diverging roll-out from setting the scale.
-        bottom, top = motion.get_ylim()
-        motion.set_ylim(max(lowest - margin, bottom), min(highest + margin, top))
-        motion.set_ylabel(f"tip displacement\nalong {'xyz'[axis]} [mm]")
-        motion.yaxis.set_major_locator(MaxNLocator(5, steps=ROUND_STEPS))
-        use_logarithm(distance)
-        distance.set(xlabel="time [s]", ylabel="off target\n[mm]", xlim=(0.0, time[-1]))
-        legend_above(figure, motion, narrow=narrow)
-    return figure
-
-
 def error_over_time(
     errors: Mapping[str, FloatArray],
-    time_step: float,
+    times: FloatArray | float,
     published: Mapping[str, float] = MappingProxyType({}),
     *,
+    of: str = "vertex",
+    window: float | None = None,
     narrow: bool,
 ) -> Figure:
-    """Draw each model's mean error over time, and the range of the trajectories around it.
+    """Draw each model's mean error over time, and around the main ones the range of the trials.
 
     Args:
-        errors: For each model (R, T) errors [mm] of R trajectories at the steps 1 to T.
-        time_step: Time between two states [s].
+        errors: For each model (R, T) errors [mm] of R trials; NaN where nothing was seen, infinite where it diverged.
+        times: (T,) [s]; or the time between two frames, of which the first is at zero.
         published: Published errors of models [mm], means over time, drawn as dashed lines.
+        of: What is observed.
+        window: Of a median filter [s], for long trials: its result is drawn in place of the range, and thin behind it
+            what went in. None for no filter.
         narrow: Whether the figure is for a narrow page.
     """
     with mpl.rc_context(STYLE):
-        figure = new_figure(3.2, 3.4, narrow=narrow)
+        figure = new_figure(3.5, 3.9, narrow=narrow)
         axes = figure.subplots()
+        lowest = []
         for model, rows in errors.items():
-            tone = TONES[model].light
-            time = np.arange(1, rows.shape[1] + 1) * time_step
-            low, high = positive(rows.min(axis=0)), positive(rows.max(axis=0))
-            axes.fill_between(time, low, high, color=tone, alpha=0.18, linewidth=0)
-            axes.plot(time, positive(rows.mean(axis=0)), color=tone, label=LABELS[model])
+            time = times if isinstance(times, np.ndarray) else times * np.arange(rows.shape[1])
+            mean, line = mean_of_trials(rows), model_line(model)
+            shown = positive(mean)
+            if window is not None:
+                axes.plot(time, shown, color=line["color"], linewidth=0.6, alpha=0.45)
+                shown = positive(median_filter(mean, float(time[1] - time[0]), window))
+                settled = shown[len(shown) // 10 :]
+                lowest += [float(np.nanmin(settled))] if np.isfinite(settled).any() else []
+            elif len(rows) > 1 and model not in _DASHED:
+                low, high = (positive(extreme.reduce(rows, axis=0)) for extreme in (np.fmin, np.fmax))
+                axes.fill_between(time, low, high, color=line["color"], alpha=0.15, linewidth=0)
+            axes.plot(time, shown, **line)
             axes.set_xlim(0.0, time[-1])
         for model, error in published.items():
             axes.axhline(error, color=TONES[model].light, linewidth=1.1, linestyle=(0, (4, 3)))
+        use_logarithm(axes, 0.4 * min(lowest, default=0.0))  # Models begin close to the measured rest: not shown.
+        axes.set(xlabel="time [s]", ylabel=f"mean {of} error [mm]")
+        legend_above(figure, axes, narrow=narrow)
+    return figure
+
+
+def mean_of_trials(rows: FloatArray) -> FloatArray:
+    """Return the mean of the trials that have a value; infinite where one has diverged, NaN where none has a value.
+
+    Args:
+        rows: (R, T) of R trials.
+    """
+    held = ~np.isnan(rows)
+    count = held.sum(axis=0)
+    mean: FloatArray = np.where(count > 0, np.where(held, rows, 0.0).sum(axis=0) / np.maximum(count, 1), np.nan)
+    return mean
+
+
+def error_over_scale(errors: Mapping[str, Mapping[float, float]], *, narrow: bool) -> Figure:
+    """Draw the mean error against the scale of the pressures, a line a model.
+
+    Args:
+        errors: Mean errors [mm] by model and scale; one at which a roll-out diverged is left out.
+        narrow: Whether the figure is for a narrow page.
+    """
+    with mpl.rc_context(STYLE):
+        figure = new_figure(3.0, 3.6, narrow=narrow)
+        axes = figure.subplots()
+        scales = sorted({scale for each in errors.values() for scale in each})
+        for model, each in errors.items():
+            values = positive(np.array([each.get(scale, np.nan) for scale in scales]))
+            axes.plot(scales, values, marker="o", **model_line(model))
         use_logarithm(axes)
-        axes.set(xlabel="time [s]", ylabel="mean vertex error [mm]")
+        axes.set_xticks(scales, [f"{scale:g}" for scale in scales])
+        axes.set(xlabel="pressure over that of the training", ylabel="mean marker error [mm]")
         legend_above(figure, axes, narrow=narrow)
     return figure
 
@@ -202,80 +212,102 @@ def training_curves(records: Sequence[Mapping[str, Any]], *, narrow: bool) -> Fi
     return figure
 
 
-def marker_boxes(
-    errors: Mapping[int, FloatArray], uncorrected: float, published: tuple[int, float] | None = None, *, narrow: bool
+def loss_histories(histories: Mapping[str, Sequence[Sequence[Mapping[str, float]]]], *, narrow: bool) -> Figure:
+    """Draw the best loss so far over the evaluations of each start, a panel an identification.
+
+    Args:
+        histories: By identification: for every start the records with `loss`, one an evaluation.
+        narrow: Whether the figure is for a narrow page.
+    """
+    with mpl.rc_context(STYLE):
+        shape = (len(histories), 1) if narrow else (1, len(histories))
+        figure = new_figure(2.6, 0.4 + 2.1 * len(histories), narrow=narrow)
+        panels = list(figure.subplots(*shape, sharey=True, squeeze=False).flat)
+        for axes, (name, starts) in zip(panels, histories.items(), strict=True):
+            ends = [each["loss"] for start in starts for each in start if each["loss"] is not None]
+            for start in (each for each in starts if each):
+                losses = np.fmin.accumulate(np.array([record["loss"] for record in start], dtype=np.float64))
+                best = bool(ends) and losses[-1] <= min(ends)
+                tone = TONES["sysid" if best else "muted"].light
+                count = np.arange(1, len(losses) + 1)
+                axes.plot(count, positive(losses), ".-", color=tone, linewidth=1.8 if best else 0.9, markersize=3.5)
+            axes.set_title(LABELS[name])
+            axes.set_xlabel("evaluation")
+            axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
+        for axes in panels:  # With everything drawn, as they share their axis.
+            use_logarithm(axes)
+        for axes in panels if narrow else panels[:1]:
+            axes.set_ylabel("loss")
+    return figure
+
+
+def landscape(
+    modulus: FloatArray,
+    ratio: FloatArray,
+    loss: FloatArray,
+    points: Mapping[str, tuple[float, float]],
+    *,
+    narrow: bool,
 ) -> Figure:
-    """Draw a box for each number of markers: median, quartiles, and whiskers to the smallest and largest draw.
+    """Draw the loss over Young's modulus and Poisson's ratio; as a curve where the grid has one ratio only.
 
     Args:
-        errors: (D,) errors [mm] of the draws, by number of markers.
-        uncorrected: Error without any correction [mm].
-        published: From which number of markers on the published median is below what error [mm].
+        modulus: (A,) [Pa].
+        ratio: (B,); one value, or none, for a curve.
+        loss: (A, B) or (A,), NaN where the simulation failed.
+        points: Modulus and ratio to be marked, by name.
         narrow: Whether the figure is for a narrow page.
     """
-    ink, strong = {"color": TONES["ink"].light, "linewidth": 0.9}, TONES["simulation"].light
+    values = positive(np.asarray(loss, dtype=np.float64))
     with mpl.rc_context(STYLE):
-        figure = new_figure(3.6, 3.4, narrow=narrow)
+        figure = new_figure(3.6, 3.7, narrow=narrow)
         axes = figure.subplots()
-        places = range(1, len(errors) + 1)
-        axes.boxplot(
-            [*errors.values()],
-            positions=places,
-            widths=0.55,
-            whis=(0, 100),
-            boxprops=ink,
-            whiskerprops=ink,
-            capprops=ink,
-            medianprops={"color": strong, "linewidth": 2.0},
-        )
-        lines = {"uncorrected simulation": (0.5, uncorrected)}
-        if published is not None:
-            start = 0.5 + sum(count < published[0] for count in errors)
-            lines["published median: below" if narrow else "published: the median is below"] = (start, published[1])
-        for text, (start, level) in lines.items():
-            grey = TONES["muted"].light
-            axes.plot([start, len(errors) + 0.5], [level, level], color=grey, linewidth=1.1, linestyle="--")
-            place = (len(errors) + 0.5, level)
-            axes.annotate(text, place, (-2, 3), textcoords="offset points", ha="right", color=grey)
-        axes.set_xlim(0.5, len(errors) + 0.5)
-        axes.set_xticks([*places], [str(count) for count in errors])
-        axes.set_yscale("log")
-        axes.set_ylim(top=1.6 * max(uncorrected, *(row.max() for row in errors.values())))
-        use_logarithm(axes)
-        axes.grid(visible=False, axis="x")
-        axes.set(xlabel="number of markers", ylabel="mean vertex error [mm]")
+        if values.ndim == 2 and values.shape[1] > 1 and np.isfinite(values).any():
+            _contours(figure, axes, _KILO * modulus, ratio, values)
+            places = {name: (_KILO * e, nu) for name, (e, nu) in points.items()}
+        else:
+            curve = values.reshape(len(modulus), -1)[:, 0]
+            axes.plot(_KILO * modulus, curve, color=TONES["sysid"].light)
+            use_logarithm(axes)
+            axes.set_ylabel("loss")
+            known = np.isfinite(curve)
+            places = {
+                name: (_KILO * e, float(np.interp(e, modulus[known], curve[known])))
+                for name, (e, _) in points.items()
+                if known.any()
+            }
+        for (name, place), marker in zip(places.items(), "oDs^", strict=False):
+            tone = TONES["simulation"].light if marker == "D" else "white"
+            edge: dict[str, Any] = {"markeredgecolor": "black", "markeredgewidth": 0.9, "zorder": 5, "clip_on": False}
+            axes.plot(*place, marker, color=tone, markersize=7.0, linestyle="none", label=name, **edge)
+        if modulus.max() > 3.0 * modulus.min():
+            axes.set_xscale("log")
+            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axes.xaxis.set_major_formatter("{x:g}")
+            axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.set_xlabel("Young's modulus [kPa]")
+        if places:
+            handles, names = axes.get_legend_handles_labels()
+            figure.legend(handles, names, loc="outside upper left", ncols=1 if narrow else 3, columnspacing=1.6)
     return figure
 
 
-def shape_comparison(bodies: Mapping[str, Body | None], *, narrow: bool) -> Figure:
-    """Show each model's deformed body side by side, coloured by the distance from the target's vertices.
-
-    Args:
-        bodies: What `warp_resphys.report.render.draw_bodies` drew, by model; None for one that diverged.
-        narrow: Whether the figure is for a narrow page.
-    """
-    shapes = [body.pixels.shape for body in bodies.values() if body]
-    rise = shapes[0][0] / shapes[0][1] if shapes else 0.5  # Height over width.
-    height = (NARROW if narrow else WIDE / len(bodies)) * rise + 0.75
-    with mpl.rc_context(STYLE):
-        figure = new_figure(height, height * len(bodies), narrow=narrow)
-        grid = (len(bodies), 1) if narrow else (1, len(bodies))
-        panels = figure.subplots(*grid, squeeze=False).flat
-        for axes, (model, body) in zip(panels, bodies.items(), strict=True):
-            axes.set_title(LABELS[model])
-            axes.set_axis_off()
-            if body is None:
-                axes.text(0.5, 0.5, "diverged before this time", ha="center", transform=axes.transAxes)
-                continue
-            axes.imshow(body.pixels)
-            factor, unit = (1e3, "mm") if body.largest >= 1e-4 else (1e6, "µm")
-            scale = ScalarMappable(Normalize(0.0, factor * body.largest), mpl.colormaps[COLOUR_MAP])
-            bar = figure.colorbar(scale, ax=axes, orientation="horizontal", shrink=0.8, aspect=34, pad=0.02)
-            bar.outline.set_visible(False)
-            bar.set_label(f"distance from the target [{unit}]")
-            bar.locator = MaxNLocator(5, steps=ROUND_STEPS)
-            bar.update_ticks()
-    return figure
+def _contours(figure: Figure, axes: Axes, modulus: FloatArray, ratio: FloatArray, loss: FloatArray) -> None:
+    """Filled levels, evenly spaced in the logarithm of the loss, with lines between them."""
+    level = np.log10(loss)
+    low, high = float(np.nanmin(level)), float(np.nanmax(level))
+    levels = np.linspace(low - 1e-9, (high if high > low else low + 1.0) + 1e-9, _LEVELS)
+    masked = np.ma.masked_invalid(level.T)
+    filled = axes.contourf(modulus, ratio, masked, levels=levels, cmap="viridis")
+    axes.contour(modulus, ratio, masked, levels=levels, colors="white", linewidths=0.5, alpha=0.55)
+    axes.set_ylabel("Poisson's ratio")
+    axes.grid(visible=False)
+    bar = figure.colorbar(filled, ax=axes, pad=0.02, aspect=28)
+    bar.outline.set_visible(False)
+    whole = [tick for tick in (-6, -5, -4, -3, -2, -1, 0, 1, 2, 3) if low <= tick <= high]
+    ticks = whole if len(whole) > 1 else np.linspace(low, high, 4).tolist()
+    bar.set_ticks(ticks, labels=[f"{10.0**tick:.2g}" for tick in ticks])
+    bar.set_label("loss")
 
 
 def save_png(figure: Figure, path: Path) -> None:
@@ -302,6 +334,26 @@ def themed_svg(figure: Figure, name: str) -> bytes:
     dark = "".join(f"--{role}:{tone.dark};" for role, tone in TONES.items())
     style = f"<style>:root{{{light}}}@media (prefers-color-scheme:dark){{:root{{{dark}}}}}</style>"
     return re.sub(r"(<svg [^>]*>)", rf"\1{style}", svg, count=1).strip().encode()
+
+
+def settle(figure: Figure) -> None:
+    """Lay a figure out, once for all that is written of it."""
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        with mpl.rc_context(STYLE):
+            engine.execute(figure)
+        figure.set_layout_engine(None)
+
+
+def model_line(model: str, width: float = 1.4) -> dict[str, Any]:
+    """Return how a model's line looks, with its name; that of the residual force is the thickest."""
+    thick = 0.5 if model == "resphys" else 0.0
+    return {
+        "color": TONES[model].light,
+        "linestyle": _DASHED.get(model, "-"),
+        "linewidth": width + thick,
+        "label": LABELS[model],
+    }
 
 
 def new_figure(height: float, narrow_height: float, *, narrow: bool) -> Figure:

@@ -1,6 +1,5 @@
 """A picture of registered markers on a body, by which a user sees whether the registration is right."""
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ from ..data.registration import Registration
 from ..io.files import atomic_path
 from ..mesh.mesh import Mesh, boundary_triangles
 from . import render
-from .render_markers import BODY, CLAMPED, INK, MEASURED
+from .render import BODY, CLAMPED, INK, MEASURED, Layer
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,7 +21,6 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-COMMAND: Final = (sys.executable, "-P", "-m", "warp_resphys.report.render_markers")
 NOMINAL: Final = "#0072b2"  # Blue of Okabe and Ito (2008).
 _GREY: Final = "#5b6570"
 _VIEWS: Final = (("In perspective", (0.62, -1.0, 0.52), True), ("From the side", (0.0, -1.0, 0.0), False))
@@ -35,6 +33,10 @@ _HEAD, _STRIP, _LEGEND, _PAD = 0.42, 0.9, 0.42, 0.12  # [inch] above and below a
 _LABEL_HEIGHT: Final = 0.36  # [inch]
 _RADIUS: Final = 0.016  # Of a marker, over the longest side of the body.
 _RING: Final = 1.55  # Radius of a nominal position's ring, in radii of a marker.
+_FOOT: Final = 0.42  # That of the small ball at the foot of a stem.
+_NUDGE: Final = 0.1  # Lines are drawn this far before the surface, over the radius of a marker.
+_OPACITY: Final = {"body": 0.42, "clamped": 0.75, "edges": 0.22, "outline": 0.75}
+_LIGHT: Final = 0.55  # Its intensity.
 
 
 @dataclass(frozen=True)
@@ -102,18 +104,35 @@ def draw_registration(
     everything = [mesh.vertices, markers, *([] if nominal is None else [nominal])]
     radius = _RADIUS * float(np.ptp(mesh.vertices, axis=0).max())
     views = [_view(*each, np.concatenate(everything), 2.0 * radius) for each in _VIEWS]
-    scene = {
-        "vertices": mesh.vertices,
-        "triangles": boundary_triangles(mesh),
-        "edges": render.face_edges(mesh),
-        "clamped": _within(boundary_triangles(mesh), np.asarray(fixed, dtype=np.int64)),
-        "markers": markers,
-        "feet": markers if feet is None else feet[seen],
-        "radius": np.array(radius),
-    }
-    figure = _compose(views, _pictures(views, scene), registration, nominal, radius, bool(len(scene["clamped"])), title)
+    clamped = _within(boundary_triangles(mesh), np.asarray(fixed, dtype=np.int64))
+    layers = _layers(mesh, clamped, markers, markers if feet is None else feet[seen], radius)
+    figure = _compose(views, _pictures(views, layers), registration, nominal, radius, bool(len(clamped)), title)
     with atomic_path(path) as partial:
         figure.savefig(partial, dpi=_DPI, format="png", facecolor="white")
+
+
+def _layers(mesh: Mesh, clamped: IntArray, markers: FloatArray, feet: FloatArray, radius: float) -> list[Layer]:
+    """The translucent body with what is clamped (C, 3) of its triangles, and markers (M, 3) [m] on stems."""
+    q, triangles, lift = mesh.vertices, boundary_triangles(mesh), _NUDGE * radius
+    line = 2.0 * _FINER  # [px] of a thin one.
+    layers = [Layer("surface", q, triangles, BODY, opacity=_OPACITY["body"], light=(0.78, 0.5))]
+    if len(clamped):
+        rim = render.sharp_edges(q, clamped)  # Seen edge-on, this is all of it.
+        layers.append(Layer("surface", q, clamped, CLAMPED, opacity=_OPACITY["clamped"], light=(0.7, 0.4), shift=lift))
+        layers.append(Layer("lines", q, rim, CLAMPED, size=5.0 * line))
+    sharp = render.sharp_edges(q, triangles)
+    layers.append(Layer("lines", q, render.face_edges(mesh), INK, opacity=_OPACITY["edges"], size=line, shift=lift))
+    if len(sharp):
+        layers.append(Layer("lines", q, sharp, CLAMPED, opacity=_OPACITY["outline"], size=1.8 * line))
+    if len(markers):
+        stems = np.stack([feet, markers], axis=1).reshape(-1, 3)
+        pairs = np.arange(len(stems)).reshape(-1, 2)
+        layers += [
+            Layer("lines", stems, pairs, INK, size=3.0 * line),
+            Layer("balls", feet, None, INK, size=_FOOT * radius, light=(0.8, 0.3)),
+            Layer("balls", markers, None, MEASURED, size=radius, light=(0.72, 0.75)),
+        ]
+    return layers
 
 
 def _within(triangles: IntArray, vertices: IntArray) -> IntArray:
@@ -144,28 +163,20 @@ def _sizes(views: Sequence[_View]) -> list[FloatArray]:
     return [_LONGER_SIDE * view.extent / view.extent.max() for view in views]
 
 
-def _pictures(views: Sequence[_View], scene: dict[str, Any]) -> list[NDArray[np.float32]]:
+def _pictures(views: Sequence[_View], layers: Sequence[Layer]) -> list[NDArray[np.float32]]:
     """(H, W, 3) of each view, drawn by another process in windows of one size and cut out of these."""
     scales = [_FINER * _DPI * size[0] / view.extent[0] for view, size in zip(views, _sizes(views), strict=True)]
     halves = [np.maximum(np.abs(view.low), np.abs(view.high)) for view in views]
     window = np.max([np.ceil(half * scale) for half, scale in zip(halves, scales, strict=True)], axis=0).astype(int)
     window += -window % _FINER  # [px] half of it
-    far = [
-        10.0 * half.max() if np.isinf(view.distance) else view.distance
-        for view, half in zip(views, halves, strict=True)
+    cameras = [
+        render.View(
+            layers, each.axes, each.focus, window[1] / scale, None if np.isinf(each.distance) else each.distance
+        )
+        for each, scale in zip(views, scales, strict=True)
     ]
-    drawn = render.run(
-        COMMAND,
-        scene
-        | {
-            "size": 2 * window,
-            "eye": np.stack([view.focus + each * view.axes[2] for view, each in zip(views, far, strict=True)]),
-            "focus": np.stack([view.focus for view in views]),
-            "up": np.stack([view.axes[1] for view in views]),
-            "half_height": np.array([window[1] / scale for scale in scales]),
-            "perspective": np.array([np.isfinite(view.distance) for view in views]),
-        },
-    )
+    (frame,) = render.draw(cameras, 2 * window, background="white", samples=0, intensity=_LIGHT)
+    drawn = frame.astype(np.float32) / np.float32(255.0)
     out = []
     for column, (view, scale) in enumerate(zip(views, scales, strict=True)):
         pixels = drawn[:, 2 * window[0] * column : 2 * window[0] * (column + 1), :3]

@@ -1,9 +1,15 @@
-"""What a run shows, in words: which step helped, whether that is more than chance, and what to try next."""
+"""What a run shows, in words: how far its models are off, which step helped, by more than chance, what to try next."""
 
+import math
+import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean, stdev
 from typing import Any, Final
+
+from ..learning.metrics import PublishedError
+from .data import MODELS, RunReport
+from .page import NO_BREAK_SPACE, number_text, published_parts
 
 # By model: what it is called, and what it adds to the first of these models that there is.
 _STEPS: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = {
@@ -16,6 +22,7 @@ _STEPS: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = {
 _BASES: Final = {"simulation": "the uncorrected simulation", "sysid": "SysID"}
 _PLACES: Final = {"sysid": "parameters", "sysid_elastic": "elastic"}  # In the group `identify`.
 _CLOSE: Final = 1e-4  # of a parameter's range
+_REFINED: Final = "_refined"  # What a network refined through the simulator is called, after its model.
 
 
 @dataclass(frozen=True)
@@ -37,6 +44,179 @@ class Identified:
     start: float
 
 
+def verdict(data: RunReport) -> str:
+    """Say how far the models are from what was observed, and how that stands to what was published.
+
+    Args:
+        data: What the page shows.
+    """
+    metrics = data.metrics
+    without = untrained(epochs_kept(metrics))
+    errors = {model: each for model, each in metrics["errors_mm"].items() if model not in without}
+    if not data.sees_markers:
+        said = [vertex_verdict(metrics["errors_mm"], data.published, data.simulator, data.target)]
+    else:
+        trials = tuple(data.pages) if data.trials is None else data.trials.names
+        said = [marker_verdict(errors, trials, data.seconds, folds=data.trials is None)]
+        said.append(reduction_text(errors, data.published))
+    if data.settings["data"].get("train_fraction", 1.0) < 1.0:
+        said.append(growth_text(metrics.get("growth", {}), list(metrics.get("horizons", {})), data.published_horizons))
+    said.append(scale_text(metrics.get("scales", {})))
+    return unbroken(" ".join(each for each in said if each))
+
+
+def unbroken(said: str) -> str:
+    """Return a text whose numbers stay beside their units and symbols."""
+    return re.sub(r"(?<=\d) (?=(?:mm|kPa|s)\b|%)|(?<=\b[Eν]) (?=\d)", NO_BREAK_SPACE, said)  # noqa: RUF001
+
+
+def vertex_verdict(
+    errors: Mapping[str, Any], published: Mapping[str, PublishedError], simulator: str, target: str
+) -> str:
+    """Say in a sentence or two how far the learned force brings the simulator to its target.
+
+    Args:
+        errors: A summary [mm] a model.
+        published: Published errors [mm].
+        simulator: The corrected simulator in words.
+        target: Its target in words.
+    """
+    if not {"simulation", "resphys"} <= errors.keys():
+        each = (f"{number_text(errors[m]['mean'])} mm with {MODELS[m][0]}" for m in MODELS if m in errors)
+        return f"Mean vertex error: {', '.join(each)}."
+    before, after = errors["simulation"], errors["resphys"]
+    count = after["trajectories"]
+    trials = f"{count} test trial{'s' if count > 1 else ''}"
+    old, new = number_text(before["mean"]), number_text(after["mean"])
+    if after["mean"] is None:
+        said = (
+            f"With the learned residual force, {after['diverged']} of {count} test roll-outs diverged, so "
+            f"there is no mean error to report. Without it: {old}{'' if before['mean'] is None else ' mm'}."
+        )
+    elif before["mean"] is None:
+        said = (
+            f"Uncorrected, {before['diverged']} of {count} test roll-outs diverge; with the learned residual "
+            f"force, the mean vertex error is {new} mm."
+        )
+    elif after["mean"] >= before["mean"]:
+        said = (
+            f"The learned residual force does not help: the mean vertex error on {trials} is {new} mm with it and "
+            f"{old} mm without."
+        )
+    else:
+        said = (
+            f"The learned residual force brings the simulator ({simulator}) "
+            f"{_closer(before['mean'], after['mean'])} to its target ({target}): on {trials} that it never saw, the "
+            f"mean vertex error falls from {old} mm to {new} mm."
+        )
+    if "resphys" in published:
+        said += f" The published result is {published_parts(published['resphys'])[0]} mm."
+    return said
+
+
+def _closer(before: float, after: float) -> str:
+    """Two significant digits: a ratio of errors over a few trials is worth no more."""
+    if after == 0.0:
+        return "all the way"
+    digits = 1 - math.floor(math.log10(before / after))
+    return f"{round(before / after, digits):,.{max(0, digits)}f} times closer"
+
+
+def marker_verdict(
+    errors: Mapping[str, Any], trials: Sequence[str], seconds: float | None, *, folds: bool = False
+) -> str:
+    """Say how far the models are from what was measured.
+
+    Args:
+        errors: A summary [mm] a model.
+        trials: Names of the test trials.
+        seconds: How much of them counts.
+        folds: Whether each trial was the test of a fold of its own.
+    """
+    who = f"trial {trials[0]}" if len(trials) == 1 else f"{len(trials)} trials"
+    held = "each of them kept back once" if folds and len(trials) > 1 else "which no training or identification saw"
+    span = "" if seconds is None else f" over the first {seconds:g} s"
+    ranked = ("resphys", "resphys_uncorrected", "sysid", "sysid_elastic", "simulation")
+    main = next((m for m in ranked if m in errors), "")
+    if not main:
+        return f"There are no errors to report on {who}."
+    if errors[main]["mean"] is None:
+        return (
+            f"On {who}, {held}, {MODELS[main][0]} diverged in {errors[main]['diverged']} of "
+            f"{errors[main]['trajectories']} roll-outs, so that there is no mean error to report."
+        )
+    beside = [
+        f"{number_text(errors[m]['mean'])}{'' if errors[m]['mean'] is None else ' mm'} "
+        f"{'uncorrected' if m == 'simulation' else 'with ' + MODELS[m][0]}"
+        for m in ("sysid", "sysid_elastic", "simulation")
+        if m in errors and m != main
+    ]
+    return (
+        f"On {who}, {held}, the simulated markers are {number_text(errors[main]['mean'])} mm from the measured ones"
+        f"{span} with {MODELS[main][0]}{'; ' + ', '.join(beside) if beside else ''}."
+    )
+
+
+def reduction(means: Mapping[str, float | None]) -> float | None:
+    """Return by which share the mean error of ResPhys is below that of SysID; None where one is not known.
+
+    Args:
+        means: Mean errors by model; None where a roll-out diverged.
+    """
+    before, after = means.get("sysid"), means.get("resphys")
+    return None if before is None or after is None or before <= 0.0 else 1.0 - after / before
+
+
+def reduction_text(errors: Mapping[str, Any], published: Mapping[str, PublishedError]) -> str:
+    """Say how the error of ResPhys stands to that of SysID, here and as published; empty where it is not known."""
+    found = reduction({model: each["mean"] for model, each in errors.items()})
+    if found is None:
+        return ""
+    theirs = reduction({model: each.mean for model, each in published.items()})
+    beside = "" if theirs is None else f" (published: {100.0 * theirs:.1f} % smaller)"
+    if found < -1.0:
+        return f"The error of ResPhys is {1.0 - found:.1f} times that of SysID{beside}."
+    which = "smaller" if found >= 0.0 else "larger"
+    return f"The error of ResPhys is {100.0 * abs(found):.1f} % {which} than that of SysID{beside}."
+
+
+def growth_text(
+    growth: Mapping[str, float | None],
+    horizons: Sequence[str],
+    published: Mapping[str, Mapping[str, PublishedError]],
+) -> str:
+    """Say how the error of ResPhys grows with the length of the roll-outs; empty where it is not known."""
+    found = growth.get("resphys")
+    if found is None or len(horizons) < 2:
+        return ""
+    first, *_, last = sorted(horizons, key=float)
+    theirs = published_growth(published, first, last).get("resphys")
+    beside = "" if theirs is None else f" (published: {100.0 * theirs:.1f} %)"
+    by = f"{'grows' if found >= 0.0 else 'falls'} by {100.0 * abs(found):.1f} %{beside}"
+    return f"From {float(first):g} s to {float(last):g} s the error of ResPhys {by}."
+
+
+def published_growth(published: Mapping[str, Mapping[str, PublishedError]], first: str, last: str) -> dict[str, float]:
+    """Return by which share each published error grows from one length of the roll-outs [s] to another."""
+    before, after = published.get(first, {}), published.get(last, {})
+    return {model: after[model].mean / before[model].mean - 1.0 for model in before if model in after}
+
+
+def scale_text(errors: Mapping[str, Mapping[str, Any]]) -> str:
+    """Say what the errors are at the highest pressures; empty where there are none higher than in the training."""
+    if not errors:
+        return ""
+    largest = max(errors, key=float)
+    parts = [
+        f"{number_text(mean)}{'' if mean is None else ' mm'} with {MODELS[model][0]}"
+        for model in ("resphys", "sysid", "simfree")
+        if model in errors[largest]
+        for mean in [errors[largest][model]["mean"]]
+    ]
+    said = f"At {float(largest):g} times the pressures of the training the error is {', '.join(parts)}."
+    return said if parts else ""
+
+
 def judgement(metrics: Mapping[str, Any], settings: Mapping[str, Any]) -> list[str]:
     """Sentences on a run.
 
@@ -51,10 +231,16 @@ def judgement(metrics: Mapping[str, Any], settings: Mapping[str, Any]) -> list[s
 
 
 def epochs_kept(metrics: Mapping[str, Any]) -> dict[str, list[int]]:
-    """How many epochs the weights that were kept have been trained, by model and fold."""
+    """How many epochs the weights that were kept have been trained and refined, by model and fold."""
     folds = list(metrics.get("folds", {}).values()) or [metrics]
-    models = {model for fold in folds for model in fold.get("networks", {})}
-    return {m: [fold["networks"][m]["epoch"] for fold in folds if m in fold.get("networks", {})] for m in models}
+    networks: list[Mapping[str, Any]] = [fold.get("networks", {}) for fold in folds]
+    models = dict.fromkeys(model for each in networks for model in each if not model.endswith(_REFINED))
+
+    def epochs(model: str) -> list[int]:
+        refined = f"{model}{_REFINED}"
+        return [each[model]["epoch"] + each.get(refined, {}).get("epoch", 0) for each in networks if model in each]
+
+    return {model: epochs(model) for model in models}
 
 
 def untrained(epochs: Mapping[str, Sequence[int]]) -> set[str]:

@@ -1,14 +1,9 @@
 """A moving body with measured and simulated markers: pictures of a few instants, and a film."""
 
-import subprocess
-import sys
-import threading
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,15 +12,11 @@ from ..io.files import atomic_path
 from ..io.progress import Progress
 from ..mesh.mesh import Mesh, boundary_triangles
 from ..mesh.surface import closest_points
-from . import render
+from .render import INK, MEASURED, OUTLINE, Layer, Pixels, View, draw, face_edges, film, sharp_edges
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-COMMAND: Final = (sys.executable, "-P", "-m", "warp_resphys.report.render_motion")
-TIME_OUT: Final = 300.0  # [s]
-SLOWER: Final = 4.0  # Than what was measured.
-LONGEST: Final = 1.5  # [s] of the motion.
 LARGEST_RATE: Final = 25.0  # Frames a second, of the film.
 BODIES: Final = ("#6b7580", "#8db4e8")  # Of the bodies behind, and of the last one.
 RINGS: Final = ("#6b7580", "#1a5fb4")  # Of their markers.
@@ -37,6 +28,12 @@ _FILM_VIEW: Final = (560, 480)  # [px] of each of two.
 _PICTURE_VIEW: Final = (480, 408)
 _RADII: Final = {_FILM_VIEW: 0.013, _PICTURE_VIEW: 0.02}  # Of a dot, over the height of a view; pictures are small.
 _DIVERGED: Final = 10.0  # Distance from rest, over the body's size, beyond which nothing is drawn.
+_RING: Final = 1.9  # Radius of a simulated marker's ring, over that of a dot.
+_WIDER: Final = 0.35  # That of each other model's ring.
+_BEHIND: Final = 0.3  # Opacity of the bodies that the last one is compared with.
+_NUDGE: Final = 0.01  # Lines are drawn this far before a surface, over half the height of a view.
+_BACK: Final = 4.0  # Surfaces of the other bodies are drawn this far behind it, so that they show beside it only.
+_BEFORE: Final = 5.0  # Dots are drawn this far before all bodies.
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +75,7 @@ class Motion:
         )
 
 
-def draw_instants(motion: Motion) -> NDArray[np.uint8]:
+def draw_instants(motion: Motion) -> Pixels:
     """Draw a motion's frames: the whole body, and beside it the markers from nearby.
 
     Args:
@@ -90,22 +87,17 @@ def draw_instants(motion: Motion) -> NDArray[np.uint8]:
     Raises:
         DrawingError: There is no pyvista, or no OpenGL driver that works off screen.
     """
-    with TemporaryDirectory() as folder:
-        target = Path(folder) / "frames.npy"
-        _run(_scene(motion, _PICTURE_VIEW), target, Path(folder) / "scene.npz", None)
-        frames: NDArray[np.uint8] = np.load(target, allow_pickle=False)
+    frames = draw(_views(motion, _PICTURE_VIEW), _PICTURE_VIEW)
     return np.stack(np.split(frames, 2, axis=2), axis=1)
 
 
-def write_video(
-    path: Path, motion: Motion, names: Mapping[str, str], slower: float = SLOWER, longest: float = LONGEST
-) -> None:
+def write_video(path: Path, motion: Motion, names: Mapping[str, str], slower: float, longest: float) -> None:
     """Write a film (MP4, H.264) of the first seconds of a motion, slowed down, and show how far it is.
 
     Args:
         path: The file to write.
         motion: All frames.
-        names: What the legend says, by model.
+        names: What the legend says, by model; last, under no name, what it says of the dots.
         slower: Than the motion was, by this factor.
         longest: What is shown of the motion [s].
 
@@ -116,58 +108,23 @@ def write_video(
     step = float(np.median(np.diff(motion.times)))
     every = max(1, round(1.0 / (slower * step * LARGEST_RATE)))
     shown = motion.at(np.flatnonzero(motion.times <= longest + 1e-9)[::every])
-    legend = [*(names[model] for model in shown.positions), "measured"]
-    texts = [f"{time:.2f} s" for time in shown.times]
-    scene = _scene(shown, _FILM_VIEW) | {"texts": np.array(texts), "legend": np.array(legend)}
-    scene["fps"] = np.array(1.0 / (slower * step * every))
-    room = _HEADROOM * scene["half_height"][0]
-    scene["half_height"][0] += room
-    scene["focus"][0] += room * scene["axes"][0, 1]
-    with TemporaryDirectory() as folder, Progress("video", len(shown.times), "frames") as progress:
-        target = Path(folder) / "motion.mp4"
-        _run(scene, target, Path(folder) / "scene.npz", progress)
-        with atomic_path(path) as partial:
-            partial.write_bytes(target.read_bytes())
-
-
-def _run(scene: Mapping[str, Any], target: Path, source: Path, progress: Progress | None) -> None:
-    """Have another process draw, and count the frames that it says are done."""
-    np.savez(source, **scene)
-    try:
-        process = subprocess.Popen(
-            [*COMMAND, str(source), str(target)],
-            env=render.drawing_environment(),
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            errors="replace",
+    colours = [RINGS[0]] * (len(shown.positions) - 1) + [RINGS[1], MEASURED]
+    legend = list(zip([*(names[model] for model in shown.positions), names.get("", "measured")], colours, strict=True))
+    with Progress("video", len(shown.times), "frames") as progress:
+        content = film(
+            _views(shown, _FILM_VIEW, _HEADROOM),
+            _FILM_VIEW,
+            progress,
+            fps=1.0 / (slower * step * every),
+            texts=[f"{time:.2f} s" for time in shown.times],
+            legend=legend,
         )
-    except OSError as error:
-        raise render.failure(error.strerror or str(error)) from error
-    late = threading.Timer(TIME_OUT, process.kill)
-    late.start()
-    try:
-        with process:
-            said: list[str] = []
-            listener = threading.Thread(target=lambda: said.append(process.stderr.read() if process.stderr else ""))
-            listener.start()
-            for line in process.stdout or ():
-                if progress is not None and line.startswith("frame"):
-                    progress.advance()
-            listener.join()
-    except BaseException:
-        with suppress(ProcessLookupError):
-            process.kill()
-        raise
-    finally:
-        late.cancel()
-    if process.returncode:
-        raise render.failure(render.last_words(process.returncode, "".join(said)))
+    with atomic_path(path) as partial:
+        partial.write_bytes(content)
 
 
-def _scene(motion: Motion, size: tuple[int, int]) -> dict[str, Any]:
-    """What `warp_resphys.report.render_motion` asks for, without texts."""
+def _views(motion: Motion, size: tuple[int, int], headroom: float = 0.0) -> list[View]:
+    """The whole body, with room for text above it over half its height, and its markers from nearby or from below."""
     models = list(motion.positions)
     body = float(np.ptp(motion.mesh.vertices, axis=0).max())
     positions = np.stack([_whole(q, motion.mesh.vertices, _DIVERGED * body) for q in motion.positions.values()])
@@ -179,30 +136,57 @@ def _scene(motion: Motion, size: tuple[int, int]) -> dict[str, Any]:
     if motion.from_below:
         second = axes_from_below(axes, motion.gravity)
         near, near_half = _frame(everything, second, size)
-        near = np.broadcast_to(near, (len(motion.times), 3))
     else:
         second = axes
         near, near_half = _follow(motion.measured, simulated, axes, size)
         near = np.where(np.isfinite(near), near, middle)
-    return {
-        "positions": positions,
-        "rest": motion.mesh.vertices,
-        "triangles": boundary_triangles(motion.mesh),
-        "edges": render.face_edges(motion.mesh),
-        "colours": np.array([*[BODIES[0]] * (len(models) - 1), BODIES[1]]),
-        "rings": np.array([*[RINGS[0]] * (len(models) - 1), RINGS[1]]),
-        "simulated": simulated,
-        "measured": motion.measured,
-        "feet": _feet(motion.mesh, motion.bound, positions[-1]),
-        "axes": np.stack([axes, second]),
-        "focus": np.stack([np.broadcast_to(middle, near.shape), near]),
-        "half_height": np.array([half, near_half]),
-        "size": np.array(size),
-        "radius": np.array(_RADII[size]),
-        "texts": np.array([], dtype=str),
-        "legend": np.array([], dtype=str),
-        "fps": np.array(LARGEST_RATE),
-    }
+    room = headroom * half
+    feet = _feet(motion.mesh, motion.bound, positions[-1])
+    layers = _bodies(motion.mesh, positions, half) + [_stems(feet, simulated[-1])]
+    return [
+        View([*layers, *_dots(motion.measured, simulated, height, _RADII[size])], turned, focus, height)
+        for turned, focus, height in ((axes, middle + room * axes[1], half + room), (second, near, near_half))
+    ]
+
+
+def _bodies(mesh: Mesh, positions: FloatArray, half: float) -> list[Layer]:
+    """The last of some bodies (B, T, N, 3) solid with the lines around its faces, the others seen through behind it."""
+    triangles, edges = boundary_triangles(mesh), face_edges(mesh)
+    sharp = sharp_edges(mesh.vertices, triangles)
+    sharp = sharp if len(sharp) else edges
+    layers, light, nudge = [], (0.72, 0.3), _NUDGE * half
+    *others, solid = positions
+    for q in others:
+        layers.append(Layer("surface", q, triangles, BODIES[0], opacity=_BEHIND, light=light, shift=-_BACK * half))
+        layers.append(Layer("lines", q, sharp, BODIES[0], size=2.0, shift=nudge))
+    layers.append(Layer("surface", solid, triangles, BODIES[1], light=light))
+    layers.append(Layer("lines", solid, edges, INK, size=1.0, opacity=0.3, shift=nudge))
+    layers.append(Layer("lines", solid, sharp, INK, size=2.0, shift=nudge))
+    return layers
+
+
+def _stems(feet: FloatArray, simulated: FloatArray) -> Layer:
+    """Lines from (T, M, 3) feet to the last body's markers."""
+    frames, count = feet.shape[:2]
+    ends = np.stack([feet, simulated], axis=2).reshape(frames, 2 * count, 3)
+    return Layer("lines", ends, np.arange(2 * count).reshape(count, 2), OUTLINE, size=2.0)
+
+
+def _dots(measured: FloatArray, simulated: FloatArray, half: float, radius: float) -> list[Layer]:
+    """Dots of the measured markers (T, M, 3) and rings of the simulated ones (B, T, M, 3), in front of all else."""
+    size, last = 2.0 * half * radius, len(simulated) - 1
+    rings = [
+        Layer(
+            "rings",
+            places,
+            None,
+            RINGS[1 if body == last else 0],
+            size=(_RING + _WIDER * (last - body)) * size,
+            shift=0.5 * _BEFORE * half,
+        )
+        for body, places in enumerate(simulated)
+    ]
+    return [*rings, Layer("balls", measured, None, MEASURED, size=size, shift=_BEFORE * half)]
 
 
 def _whole(points: FloatArray, rest: FloatArray, largest: float) -> FloatArray:

@@ -9,7 +9,7 @@ from typing import Any
 
 from ..experiment.build import build_mesh
 from ..experiment.files import METRICS
-from ..experiment.report import EvaluatedSplit, read_rollouts
+from ..experiment.report import read_trials
 from ..experiment.trials import variation_of
 from ..io.files import read_json
 from ..learning.metrics import (
@@ -22,9 +22,10 @@ from ..learning.metrics import (
     PUBLISHED_SETUP,
 )
 from ..mesh.mesh import select_vertices, surface_vertices
-from ..report import ablation_page, figures
-from ..report.page import MODEL_NAMES, duration_text, error_parts, number_text, published_parts
-from ..report.reproduction_page import Cell, Figure, Row, Section, Table
+from ..report import ablation_page, figures, motion_figures
+from ..report.data import MODEL_NAMES, Trials
+from ..report.page import Cell, Row, Table, duration_text, error_parts, number_text, published_parts
+from .reproduction_page import Figure, Section
 
 _NONE = Cell("\N{EN DASH}")
 _SPLITS = {"train": "training", "validation": "validation", "test": "testing"}
@@ -35,7 +36,7 @@ _TITLES = {
 }
 _TIMED = {
     "simulation": "Uncorrected simulation",
-    "true_parameters": "Simulation with other parameters",
+    "target": "Simulation with other parameters",
     "resphys": "Residual physics simulation",
     "inference": "of it, the network alone",
 }
@@ -204,11 +205,11 @@ def study_section(config: Mapping[str, Any], name: str, results: Results) -> Sec
 
 def _study_figures(config: Mapping[str, Any], name: str, drawn: Mapping[str, Result]) -> list[Figure]:
     settings = drawn["models"].settings
-    test = read_rollouts(drawn["models"].folder, settings)
+    test = read_trials(drawn["models"].folder, settings)
     paths = {model: test.positions[model][test.worst] for model in ("simulation", "resphys")}
     errors = {model: test.errors_mm[model] for model in ("simulation", "simfree", "resphys")}
     if "published_network" in drawn:
-        other = read_rollouts(drawn["published_network"].folder, drawn["published_network"].settings)
+        other = read_trials(drawn["published_network"].folder, drawn["published_network"].settings)
         paths["published_network"] = other.positions["resphys"][test.worst]
         errors["published_network"] = other.errors_mm["resphys"]
     published = {model: each.mean for model, each in PUBLISHED_MM.get(name, {}).items() if model in errors}
@@ -225,7 +226,7 @@ def _study_figures(config: Mapping[str, Any], name: str, drawn: Mapping[str, Res
         ),
         Figure(
             f"{name}_trajectory",
-            partial(figures.tip_displacement, _tip_motion(settings, test, paths), settings["time_step"]),
+            partial(motion_figures.tip_displacement, _tip_motion(settings, test, paths), settings["time_step"]),
             "Tip displacement of target and models over time, and their distance from the target.",
             f"Tip displacement of the test trajectory {test.names[test.worst]} ({label}), the target drawn wide "
             "beneath the others. Lower panel: distance of the tip from the target's.",
@@ -233,7 +234,7 @@ def _study_figures(config: Mapping[str, Any], name: str, drawn: Mapping[str, Res
     ]
 
 
-def _tip_motion(settings: Mapping[str, Any], test: EvaluatedSplit, paths: Mapping[str, Any]) -> dict[str, Any]:
+def _tip_motion(settings: Mapping[str, Any], test: Trials, paths: Mapping[str, Any]) -> dict[str, Any]:
     """(T + 1, 3) displacement of the tip [m] of the target and the models."""
     mesh = build_mesh(settings["mesh"])
     tip = select_vertices(mesh, **settings["tip"])
@@ -283,7 +284,7 @@ def ablation_section(config: Mapping[str, Any], name: str, results: Results) -> 
     )
     columns = ["Published median", "Published spread", "Median here", "Interquartile range here", "Largest here"]
     published = (PUBLISHED_MARKERS, PUBLISHED_MARKER_MEDIAN_MM)
-    boxes = partial(figures.marker_boxes, ablation_page.box_errors(metrics), metrics["uncorrected_mm"], published)
+    boxes = partial(ablation_page.marker_boxes, ablation_page.box_errors(metrics), metrics["uncorrected_mm"], published)
     caption = "Box: lower quartile, median (orange), upper quartile; whiskers to the smallest and the largest error."
     return Section(
         group["title"],

@@ -7,8 +7,8 @@ from omegaconf import DictConfig
 from ..data.recordings.published import convert_arm, convert_beam
 from ..data.recordings.segment import convert_segment
 from ..io.errors import InputError
-from ..report import mesh as meshes
-from ..report.recordings import inspect_recording
+from . import mesh_inspection as meshes
+from .recording_quality import inspect_recording
 from .settings import settings_of
 
 _CONVERTERS = {"arm": convert_arm, "beam": convert_beam, "segment": convert_segment}

@@ -19,7 +19,7 @@ from ..data.recordings.reading import read_recording
 from ..data.recordings.recording import Recording
 from ..io.errors import InputError
 from ..io.files import atomic_path, write_json
-from .figures import NARROW, STYLE, TONES, WIDE
+from ..report.figures import NARROW, STYLE, TONES, WIDE
 
 FloatArray = NDArray[np.float64]
 

@@ -3,52 +3,13 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from ..io.files import write_text
-from .page import Picture, draw_picture, figures_beside, page_template
+from ..report.page import Picture, Table, draw_picture, figures_beside, page_template
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing
-
-
-class Cell(NamedTuple):
-    """One entry of a table, and what stands small beside it."""
-
-    text: str
-    small: str = ""
-
-
-@dataclass(frozen=True)
-class Row:
-    """One row of a table.
-
-    Attributes:
-        head: What the row is.
-        cells: One a column.
-        answer: Whether the row is the one that counts.
-    """
-
-    head: str
-    cells: Sequence[Cell]
-    answer: bool = False
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table.
-
-    Attributes:
-        head: Above the first column.
-        columns: Heads of the others.
-        rows: Its rows.
-        note: What stands below.
-    """
-
-    head: str
-    columns: Sequence[str]
-    rows: Sequence[Row]
-    note: str = ""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,310 @@
+"""What the page of a run may show; whatever a run does not have is left out."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..data.registration import Registration
+from ..learning.metrics import PublishedError
+from ..mesh.chambers import Chamber
+from ..mesh.mesh import Mesh
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+# In the order of the tables: a name, and what it means.
+MODELS: Final[Mapping[str, tuple[str, str]]] = {
+    "published": ("Published setting", "the simulator as the published code sets it up"),
+    "simulation": ("Uncorrected simulation", "the simulator as it is, with the values of the data sheet"),
+    "reconstruction": ("Reconstruction", "the simulator with forces fitted to the test trial itself"),
+    "sysid_elastic": ("SysID of E and ν", "the elastic parameters that fit best"),  # noqa: RUF001
+    "sysid": ("SysID", "the simulator with the parameters that fit best"),
+    "simfree": ("SimFree", "a network in place of the simulator"),
+    "resphys_uncorrected": ("ResPhys, data sheet", "the learned force on the uncorrected simulator"),
+    "resphys": ("ResPhys", "the simulator with the learned force, which sees only the simulated state"),
+}
+MODEL_NAMES: Final = {m: MODELS[m][0] for m in ("simulation", "reconstruction", "sysid", "simfree", "resphys")}
+_TIP: Final = 0.12  # Markers that are so close to the farthest one from the clamp are at the tip, over its distance.
+_OTHER: Final = 0.25  # How far from the tip's height another marker must be to tell more than those.
+
+
+@dataclass(frozen=True, eq=False)
+class Trials:
+    """What was observed in the R test trials, and what the models made of them.
+
+    Attributes:
+        names: Of the trials.
+        labels: Of the M markers; empty where all vertices are observed, so that M = N.
+        begins: How each begins: given (the state is known), released, rest or static (a pose without time).
+        times: (R, T) of the frames [s]; those that count.
+        target: (R, T, M, 3) [m] what was observed, NaN where it was not seen.
+        positions: (R, T, M, 3) [m] by model; not finite from where it diverged.
+        bound: (M, 3) [m] the markers on the undeformed body, or its vertices.
+        gravity: (3,) [m/s^2].
+        time_step: Of the simulation [s].
+    """
+
+    names: tuple[str, ...]
+    labels: tuple[str, ...]
+    begins: tuple[str, ...]
+    times: FloatArray
+    target: FloatArray
+    positions: Mapping[str, FloatArray]
+    bound: FloatArray
+    gravity: FloatArray
+    time_step: float
+
+    @cached_property
+    def errors_mm(self) -> dict[str, FloatArray]:
+        """(R, T) mean distances [mm] by model; see `mean_distance`."""
+        return {model: mean_distance(q, self.target) for model, q in self.positions.items()}
+
+    @cached_property
+    def worst(self) -> int:
+        """The trial of which the uncorrected simulation, or else the first model, makes most errors."""
+        errors = self.errors_mm.get("simulation", next(iter(self.errors_mm.values())))
+        means = [row[np.isfinite(row)].mean() if np.isfinite(row).any() else np.inf for row in errors]
+        return int(np.argmax(means))
+
+    @property
+    def moves(self) -> bool:
+        """Whether there is time in it, and not only poses."""
+        return self.target.shape[1] > 1
+
+
+@dataclass(frozen=True, eq=False)
+class Film:
+    """The bodies in one test trial.
+
+    Attributes:
+        trial: Its name.
+        times: (F,) of the frames [s].
+        positions: (F, N, 3) [m] by model, NaN from where it diverged.
+    """
+
+    trial: str
+    times: FloatArray
+    positions: Mapping[str, FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
+class Pressures:
+    """The pressures of all trials.
+
+    Attributes:
+        channels: C names of chambers.
+        values: (K, C) gauge pressure during each step [Pa], by trial.
+        limit: That none may exceed [Pa]; None where there is none.
+        scaled: Names of the trials at higher pressure than that of the training.
+    """
+
+    channels: tuple[str, ...]
+    values: Mapping[str, FloatArray]
+    limit: float | None
+    scaled: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Recordings:
+    """How the recordings are, and how they were registered.
+
+    Attributes:
+        quality: By trial, as `warp_resphys.data.recordings.quality.Quality.to_plain` gives it.
+        residuals: By trial: `rms_mm`, `residual_mm` and `shift_mm` by label, `outliers`.
+        registration: Of the trial that fits worst, for the picture.
+        drawn: That trial's name.
+        nominal: (M, 3) [m] where its markers should be.
+        feet: (M, 3) [m] the closest points of the body.
+        mesh: The body as it is at rest.
+    """
+
+    quality: Mapping[str, Any]
+    residuals: Mapping[str, Any]
+    registration: Registration
+    drawn: str
+    nominal: FloatArray
+    feet: FloatArray
+    mesh: Mesh
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RunReport:
+    """What the page of a run, of a fold, or over the folds may show.
+
+    Attributes:
+        experiment: Its name.
+        title: The page's heading.
+        metrics: What `metrics.json` holds of a split, or of all folds.
+        settings: The run's configuration, nested.
+        mesh: The undeformed body.
+        fixed: Its vertices that are clamped.
+        tip: (S,) vertices whose mean is called the tip, where all vertices are observed.
+        chambers: Its closed chambers that are under pressure.
+        trials: The test trials; None over the folds.
+        film: The bodies in one of them.
+        pressures: That drive it.
+        recordings: Quality and registration of all trials.
+        identification: What `identification.json` holds.
+        start: The values of the data sheet, by parameter.
+        truth: Those of the simulated laboratory, where there is one.
+        training: Records of the epochs by learned model.
+        refinement: The same of the refinement through the simulator.
+        published: Published errors, empty where there are none.
+        published_horizons: The same by length of the roll-out [s] and model.
+        published_note: How the published set-up differs from this run's.
+        notes: Sentences on the errors.
+        network_note: Which network ResPhys uses, and how it was trained.
+        kept_note: Which weights were taken.
+        simulator: The simulator that is corrected, in words, such as "E 215 kPa".
+        target: What it is brought to, in words.
+        pages: Address of each fold's page, by its test trial.
+    """
+
+    experiment: str
+    title: str
+    metrics: Mapping[str, Any]
+    settings: Mapping[str, Any]
+    mesh: Mesh
+    fixed: IntArray
+    tip: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    chambers: tuple[Chamber, ...] = ()
+    trials: Trials | None = None
+    film: Film | None = None
+    pressures: Pressures | None = None
+    recordings: Recordings | None = None
+    identification: Mapping[str, Any] = field(default_factory=dict)
+    start: Mapping[str, float] = field(default_factory=dict)
+    truth: Mapping[str, Any] = field(default_factory=dict)
+    training: Mapping[str, Sequence[Mapping[str, Any]]] = field(default_factory=dict)
+    refinement: Mapping[str, Sequence[Mapping[str, Any]]] = field(default_factory=dict)
+    published: Mapping[str, PublishedError] = field(default_factory=dict)
+    published_horizons: Mapping[str, Mapping[str, PublishedError]] = field(default_factory=dict)
+    published_note: str = ""
+    notes: Sequence[str] = ()
+    network_note: str = ""
+    kept_note: str = ""
+    simulator: str = ""
+    target: str = ""
+    pages: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def sees_markers(self) -> bool:
+        """Whether markers are observed, and not every vertex."""
+        return bool(self.trials.labels) if self.trials is not None else True
+
+    @property
+    def observed(self) -> str:
+        """What is observed, in a word."""
+        return "marker" if self.sees_markers else "vertex"
+
+    @property
+    def models(self) -> list[str]:
+        """Those that there are errors of, in the order of the tables."""
+        return [model for model in MODELS if model in self.metrics["errors_mm"]]
+
+    @property
+    def seconds(self) -> float | None:
+        """How much of each trial counts after its release; None for all of it."""
+        seconds: float | None = self.settings["data"].get("seconds")
+        return seconds
+
+    @property
+    def without_recordings(self) -> bool:
+        """Whether a simulated laboratory stands in for recordings of markers."""
+        return self.sees_markers and self.settings["data"].get("folder") is None
+
+
+def mean_distance(positions: FloatArray, target: FloatArray) -> FloatArray:
+    """Return (R, T) mean distances [mm] of the points that were seen.
+
+    Where none was seen it is NaN, where a simulated one has diverged infinite.
+
+    Args:
+        positions: (R, T, M, 3) [m].
+        target: (R, T, M, 3) [m], NaN where a point was not seen.
+    """
+    with np.errstate(invalid="ignore", over="ignore"):
+        distance = 1e3 * np.linalg.norm(positions - target, axis=3)
+        seen = np.isfinite(target).all(axis=3)
+        distance = np.where(seen, np.where(np.isfinite(distance), distance, np.inf), 0.0)
+        count = seen.sum(axis=2)
+        mean: FloatArray = np.where(count > 0, distance.sum(axis=2) / np.maximum(count, 1), np.nan)
+    return mean
+
+
+def best_and_worst(trials: Trials) -> list[int]:
+    """Return the trials in which the last model of the table is farthest off, and closest; one where there is one."""
+    errors = trials.errors_mm
+    model = next(m for m in reversed(list(MODELS)) if m in errors)
+    each = np.array([row[~np.isnan(row)].mean() if (~np.isnan(row)).any() else np.inf for row in errors[model]])
+    worst, best = int(np.argmax(each)), int(np.argmin(each))
+    return [worst] if worst == best else [worst, best]
+
+
+def shown_models(positions: Mapping[str, Any]) -> list[str]:
+    """Return the models that are drawn as bodies: the uncorrected one, and last the best that there is."""
+    plain = next((m for m in ("simulation", "published") if m in positions), None)
+    solid = next((m for m in ("resphys", "resphys_uncorrected", "sysid", "sysid_elastic") if m in positions), None)
+    return [m for m in (plain, solid) if m is not None]
+
+
+def at_times(positions: FloatArray, known: FloatArray, times: FloatArray) -> FloatArray:
+    """Return (T, N, 3) positions at some times, linear between those that are known.
+
+    Args:
+        positions: (F, N, 3) [m]; what is not finite is not used where it has no weight.
+        known: (F,) increasing times of these [s].
+        times: (T,) [s]; before the first and after the last one nothing moves.
+    """
+    at = np.interp(times, known, np.arange(len(known), dtype=np.float64))
+    low = np.floor(at + 1e-9).astype(int)
+    share = np.maximum(at - low, 0.0)[:, None, None]
+    after = positions[np.minimum(low + 1, len(positions) - 1)]
+    with np.errstate(invalid="ignore", over="ignore"):
+        between: FloatArray = np.where(share > 1e-9, (1.0 - share) * positions[low] + share * after, positions[low])
+    return between
+
+
+def tip_markers(bound: FloatArray, clamped: FloatArray) -> IntArray:
+    """Return which markers are at the tip: about as far along the body from its clamped end as any.
+
+    Args:
+        bound: (M, 3) [m] on the undeformed body.
+        clamped: (F, 3) [m] vertices of the clamped end.
+    """
+    away = along_body(bound, clamped)
+    found: IntArray = np.flatnonzero(away >= (1.0 - _TIP) * away.max())
+    return found
+
+
+def along_body(bound: FloatArray, clamped: FloatArray) -> FloatArray:
+    """Return (M,) how far markers are from the clamped end, in the direction from it to their middle [m].
+
+    Args:
+        bound: (M, 3) [m] on the undeformed body.
+        clamped: (F, 3) [m] vertices of the clamped end.
+    """
+    start = clamped.mean(axis=0)
+    axis = bound.mean(axis=0) - start
+    length = float(np.linalg.norm(axis))
+    along: FloatArray = (bound - start) @ (axis / length) if length > 0.0 else np.zeros(len(bound))
+    return along
+
+
+def drawn_markers(target: FloatArray, bound: FloatArray, clamped: FloatArray) -> list[int]:
+    """Return the marker at the tip that moves most and, where there is one well above the tip, that of those.
+
+    Args:
+        target: (T, M, 3) [m], NaN where a marker was not seen.
+        bound: (M, 3) [m] on the undeformed body.
+        clamped: (F, 3) [m] vertices of the clamped end.
+    """
+    moved = np.nanmax(np.linalg.norm(target - bound, axis=2), axis=0, initial=0.0)  # (M,) [m]
+    away = along_body(bound, clamped)
+    others = np.flatnonzero(away < (1.0 - _OTHER) * away.max())
+    groups = [group for group in (tip_markers(bound, clamped), others) if len(group)]
+    return [int(group[np.argmax(moved[group])]) for group in groups]

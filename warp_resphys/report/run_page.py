@@ -1,0 +1,360 @@
+"""The page of a run, of a fold or over the folds: its errors, and after them a section of whatever else there is."""
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from markupsafe import Markup
+
+from ..io.files import write_text
+from .data import MODELS, FloatArray, RunReport
+from .motion_sections import body_section, motion_section, moving_pictures, paths_section
+from .page import (
+    NO_BREAK_SPACE,
+    NONE,
+    Canvas,
+    Cell,
+    Items,
+    Part,
+    Row,
+    Table,
+    Text,
+    duration_text,
+    error_parts,
+    figures_beside,
+    flatten,
+    number_text,
+    page_template,
+    published_parts,
+)
+from .sections import (
+    against,
+    horizons_section,
+    identification_section,
+    quality_section,
+    registration_section,
+    scales_section,
+    training_section,
+)
+from .verdict import best, epochs_kept, judgement, unbroken, untrained, verdict
+
+_LOG = logging.getLogger(__name__)
+
+_PUBLISHED_BESIDE: Final = {"published": "simulation", "sysid_elastic": "sysid"}  # Where these are, they were meant.
+_TIMED: Final = {
+    "simulation": "Uncorrected simulation",
+    "target": "Simulation with the true parameters",
+    "resphys": "Simulation with the learned force",
+    "inference": "of it, the network alone",
+}
+_MOST_LABELS: Final = 6  # That are named one by one.
+_FILTER: Final = 1.0  # [s] of the median filter, as published.
+_LENGTHS: Final = 4.0  # Of the filter, that a roll-out must last for it.
+
+
+def write_report(path: Path, data: RunReport) -> None:
+    """Write the page, with its figures and the video in `figures/` beside it.
+
+    The page is whole or not there: it is written beside its final place first. What cannot be drawn on this machine is
+    replaced by a sentence that says why.
+
+    Args:
+        path: The page's file, such as `report.html`; missing folders are made.
+        data: What to show.
+
+    Raises:
+        DataFileError: A file could not be written.
+    """
+    with figures_beside(path) as folder, ThreadPoolExecutor(1) as pool:
+        canvas = Canvas(folder)
+        canvas.start(pool, moving_pictures(data))  # Other processes draw these, while this one draws the figures.
+        ready = sorted(SECTIONS, key=lambda section: section is motion_section)  # It waits for those.
+        found = {section: section(data, canvas) for section in ready}
+    parts = [part for section in SECTIONS if (part := found[section]) is not None]
+    page = page_template("report.html").render(
+        title=data.title,
+        data=data,
+        metrics=data.metrics,
+        verdict=verdict(data),
+        judged=judgement(data.metrics, data.settings),
+        parts=parts,
+        kind_of=lambda block: type(block).__name__,
+        timed=_timed(data.metrics.get("seconds_per_test_trajectory", {})),
+        duration=duration_text,
+        settings=list(flatten(data.settings)),
+    )
+    write_text(path, page)
+    _LOG.info("report written: %s", path)
+
+
+def results_section(data: RunReport, canvas: Canvas) -> Part:
+    """The errors of the models beside the published ones."""
+    blocks: list[Any] = []
+    if data.without_recordings:
+        blocks.append(Text(_without_recordings(data.settings.get("laboratory") or {}), "synthetic"))
+    blocks += [_errors_table(data), Text(_what_is_measured(data), "what", note=True)]
+    if data.network_note:
+        blocks.append(Text(data.network_note, "network", note=True))
+    if data.pages:
+        blocks.append(_folds_table(data))
+    if ranges := range_texts(data.metrics, [] if data.trials is None else data.trials.names):
+        blocks.append(Text("Roll-outs that leave the states of the training", heading=True))
+        blocks.append(Items(ranges, "ranges"))
+    return Part("", blocks)
+
+
+def _without_recordings(laboratory: Mapping[str, Any]) -> Markup:
+    fibres = ", fibres around the chambers" if laboratory.get("fibres") else ""
+    return Markup(
+        "No recordings are configured (<code>data.folder</code>): what is called measured here is a simulation with a "
+        "finer mesh and step, another material, viscosity{}, and noise on its markers."
+    ).format(fibres)
+
+
+def _errors_table(data: RunReport) -> Table:
+    errors, models = data.metrics["errors_mm"], data.models
+    idle = untrained(epochs_kept(data.metrics))
+    published = published_beside(data.published, models)
+    base, shares = against(errors) if data.sees_markers else ("", {})
+    columns = ["This run", *([f"Against {MODELS[base][0]}"] if base else []), *(["Published"] if published else [])]
+    rows = []
+    for model, (name, meaning) in MODELS.items():
+        if model not in errors and model not in published:
+            continue
+        if model in idle:
+            meaning = "no force: none of its training was kept"
+        elif model == "resphys" and "sysid" in errors:
+            meaning = "the learned force on the identified simulator"
+        cells = [_pair(error_parts(errors[model])) if model in errors else Cell(NONE)]
+        cells += [Cell(shares.get(model, NONE))] if base else []
+        cells += [_pair(published[model]) if model in published else Cell(NONE)] if published else []
+        rows.append(Row(name, cells, model == best(errors, idle), meaning))
+    what = "markers" if data.sees_markers else "vertices"
+    return Table(f"Error of the {what} [mm]", columns, rows)
+
+
+def _pair(parts: tuple[str, str]) -> Cell:
+    return Cell(parts[0], beside=parts[1])
+
+
+def published_beside(published: Mapping[str, Any], models: Sequence[str]) -> dict[str, tuple[str, str]]:
+    """Return the published errors by the model that they stand beside."""
+    taken = {theirs: ours for ours, theirs in _PUBLISHED_BESIDE.items() if ours in models}
+    return {taken.get(model, model): published_parts(each) for model, each in published.items()}
+
+
+def _what_is_measured(data: RunReport) -> str:
+    """Which distances the errors are means of, and what else there is to say of them."""
+    trials, span = data.trials, ""
+    if data.seconds is not None:
+        span = f", the frames of the first {data.seconds:g} s after the release,"
+    if trials is None:
+        said = (
+            "Distance of the simulated markers from the measured ones, in millimetres: mean over the folds, in each of "
+            f"which one trial{span} is the test and the others are what the models learn from, ± the standard "
+            "deviation of the folds’ means."  # noqa: RUF001
+        )
+    elif data.sees_markers:
+        count, labels = len(trials.names), trials.labels
+        length = f" of {trials.times.max():g} s" if not span and trials.moves else ""
+        named = f"the markers {', '.join(labels)}" if 1 < len(labels) <= _MOST_LABELS else _count(len(labels), "marker")
+        said = (
+            f"Distance of the simulated markers from the measured ones, in millimetres: mean over "
+            f"{_count(count, 'test trial')}{length}{span} and {named}, ± the standard deviation over trials and frames "
+            "of the mean over the markers. Frames in which a marker is hidden do not count for it."
+        )
+    else:
+        steps = trials.target.shape[1] - ("given" in trials.begins and trials.moves)
+        said = (
+            "Distance of the simulated vertices from those of the target, in millimetres: mean over "
+            f"{_count(len(trials.names), 'test trial')}, {_count(steps, 'step')} and {len(data.mesh.vertices)} "
+            "vertices, ± the standard deviation over trials and steps of the mean over the vertices."
+        )
+    learned = [
+        _reconstruction_text(model, found, data.observed)
+        for model, found in data.metrics.get("reconstruction", {}).items()
+    ]
+    published = [data.published_note] if data.published else []
+    return unbroken(" ".join([said, *data.notes, *learned, *published]))
+
+
+def _reconstruction_text(model: str, found: Mapping[str, Any], of: str) -> str:
+    of = "markers" if of == "marker" else "vertices"
+    said = (
+        f"The reconstruction for {MODELS[model][0]} brings the {of} of the training trials to "
+        f"{number_text(found['mean_mm'])} mm from the observed ones, {number_text(found['max_mm'])} mm at most"
+    )
+    if "replayed_mm" not in found:
+        return f"{said}."
+    if found["replayed_mm"] is None:
+        return f"{said}; replayed in the simulator, its forces make it fail on the validation trials."
+    return (
+        f"{said}; replayed in the simulator, its forces lead {number_text(found['replayed_mm'])} mm from the {of} of "
+        "the validation trials."
+    )
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'s' if number != 1 else ''}"
+
+
+def _models_table(
+    head: str,
+    rows: Mapping[str, Mapping[str, float | None]],
+    models: Sequence[str],
+    pages: Mapping[str, str],
+    note: str = "",
+) -> Table:
+    """Errors [mm] by what a row is and model."""
+
+    def cell(row: Mapping[str, float | None], model: str) -> Cell:
+        return Cell(number_text(row[model]) if model in row else NONE)
+
+    return Table(
+        head,
+        [MODELS[model][0] for model in models],
+        [Row(name, [cell(row, m) for m in models], address=pages.get(name, "")) for name, row in rows.items()],
+        note,
+    )
+
+
+def _folds_table(data: RunReport) -> Table:
+    means = {
+        trial: {model: each["mean"] for model, each in fold["errors_mm"].items()}
+        for trial, fold in data.metrics["folds"].items()
+    }
+    means["Mean"] = {model: each["mean"] for model, each in data.metrics["errors_mm"].items()}
+    note = "Each trial leads to the page of the fold that is tested on it: its motion, identification and training."
+    return _models_table("Test trial [mm]", means, data.models, data.pages, note)
+
+
+def range_texts(metrics: Mapping[str, Any], trials: Sequence[str]) -> list[str]:
+    """Say of each model how many of its roll-outs left the states that it was trained on, and when.
+
+    Args:
+        metrics: With `range`, by model `first_s`: when a trial left [s]; and `scales_range`, the same by scale of the
+            pressures.
+        trials: Names of the test trials.
+    """
+    said = []
+    found, beyond = metrics.get("range", {}), metrics.get("scales_range", {})
+    for model in (model for model in MODELS if model in found):
+        first = found[model]["first_s"]
+        count = f"{len(first) or 'none'} of {len(trials)} roll-outs" if len(trials) > 1 else "the roll-out"
+        never = " never" * (len(trials) == 1 and not first)
+        text = f"{MODELS[model][0]}: {count}{never} left the states of the training{_when(first)}."
+        scales = [scale for scale in sorted(beyond, key=float) if float(scale) != 1.0]
+        left = {scale: beyond[scale][model]["first_s"] for scale in scales}
+        if any(left.values()):
+            each = [f"{len(left[scale]) or 'none'} of {len(trials)} ({float(scale):g} times)" for scale in scales]
+            earliest = _when({trial: when for some in left.values() for trial, when in some.items()})
+            text += f" At higher pressures it is {', '.join(each)}{earliest}."
+        said.append(unbroken(text))
+    return said
+
+
+def _when(first: Mapping[str, float]) -> str:
+    if not first:
+        return ""
+    earliest = min(first, key=lambda trial: first[trial])
+    return f", the first after {first[earliest]:.2f} s ({earliest})"
+
+
+def error_section(data: RunReport, canvas: Canvas) -> Part | None:
+    """The errors over time, of each trial and of each marker."""
+    trials, metrics = data.trials, data.metrics
+    if trials is None:
+        return None
+    blocks: list[Any] = []
+    if trials.moves:
+        from . import figures
+
+        times = np.nanmean(trials.times, axis=0)
+        window = _FILTER if times[-1] >= _LENGTHS * _FILTER - 1e-9 else None
+        draw = partial(figures.error_over_time, trials.errors_mm, times, of=data.observed, window=window)
+        blocks.append(canvas.figure("error_over_time", draw, _describe(data), _error_caption(data, window)))
+    models, labels = data.models, metrics.get("per_marker", {})
+    rows = {row["name"]: row["errors_mm"] for row in metrics["per_trajectory"]}
+    if len(rows) > 1:
+        blocks.append(_models_table("Each trial [mm]", rows, models, {}))
+    if labels:
+        each = {label: {m: found.get(label) for m, found in labels.items()} for label in trials.labels}
+        blocks.append(_models_table("Each marker [mm]", each, [m for m in models if m in labels], {}))
+    return Part("Error over time" if trials.moves else "Each trial", blocks) if blocks else None
+
+
+def _error_caption(data: RunReport, window: float | None) -> str:
+    count = len(data.metrics["per_trajectory"])
+    said = f"Mean over the {'markers that are seen' if data.sees_markers else 'vertices, against the target'}"
+    if window is not None:
+        said += f" and {_count(count, 'test trial')}, after a median filter of 1 s; the thin lines are not filtered. "
+        said += largest_filtered(data.metrics)
+    elif count > 1:
+        said += f": the line is the mean of the {count} test trials, the band"
+        said += " of a solid line" if data.sees_markers else ""
+        said += " spans the smallest to the largest of them."
+    else:
+        said += "."
+    if any(summary["diverged"] for summary in data.metrics["errors_mm"].values()):
+        said += " A line ends where the first roll-out has diverged."
+    return unbroken(said)
+
+
+def _describe(data: RunReport) -> str:
+    """What the figure of the errors shows."""
+    assert data.trials is not None
+    reached = (f"{MODELS[model][0]} reaches {_largest(rows)}" for model, rows in data.trials.errors_mm.items())
+    return f"Mean {data.observed} error of the models over time, on a logarithmic axis. {'; '.join(reached)}."
+
+
+def _largest(rows: FloatArray) -> str:
+    known = rows[~np.isnan(rows)]
+    return f"{number_text(float(known.max()))} mm" if len(known) and np.isfinite(known).all() else "no end: it diverged"
+
+
+def largest_filtered(metrics: Mapping[str, Any]) -> str:
+    """Say how large the error of a single trial becomes with each model that did not diverge; empty where not known."""
+    found = {model: each for model, each in metrics.get("median_filtered", {}).items() if each is not None}
+    parts = [f"{number_text(found[m])}{NO_BREAK_SPACE}mm ({MODELS[m][0]})" for m in MODELS if m in found]
+    return f"In single trials the filtered error reaches {', '.join(parts)}." if parts else ""
+
+
+def reconstruction_section(data: RunReport, canvas: Canvas) -> Part | None:
+    """How far the roll-outs are from what the network learns."""
+    found = data.metrics.get("errors_vs_reconstruction_mm", {})
+    if not found:
+        return None
+    rows = [Row(MODELS[model][0], [_pair(error_parts(found[model]))]) for model in MODELS if model in found]
+    said = (
+        "The network learns from reconstructed trajectories. Their own distance from the target is in the first table; "
+        "this is how far the roll-outs are from them."
+    )
+    return Part(
+        "Against the reconstruction", [Text(said), Table("Error against the reconstruction [mm]", ["This run"], rows)]
+    )
+
+
+def _timed(seconds: Mapping[str, Any]) -> Table | None:
+    """The time that a test trial takes."""
+    rows = [Row(name, [Cell(duration_text(seconds[m]["mean"]))]) for m, name in _TIMED.items() if m in seconds]
+    return Table("Model", ["Wall time"], rows) if rows else None
+
+
+SECTIONS: Final[tuple[Callable[[RunReport, Canvas], Part | None], ...]] = (
+    results_section,
+    horizons_section,
+    scales_section,
+    motion_section,
+    error_section,
+    paths_section,
+    body_section,
+    reconstruction_section,
+    identification_section,
+    registration_section,
+    quality_section,
+    training_section,
+)

@@ -23,7 +23,7 @@ from warp_resphys.io.labels import run_label
 from warp_resphys.io.stages import StageInterrupted
 
 REPOSITORY = Path(__file__).parents[1]
-EXPERIMENT = "warp_resphys.experiment.experiment"
+EXPERIMENT = "warp_resphys.experiment.pipeline"
 CONFIG = {
     "config.yaml": """
         defaults:
@@ -405,8 +405,8 @@ class TestProcess:
             def run(config):
                 print("running", flush=True)
                 time.sleep(60)
-            sys.modules["warp_resphys.experiment.experiment"] = types.ModuleType("experiment")
-            sys.modules["warp_resphys.experiment.experiment"].run_experiment = run
+            sys.modules["warp_resphys.experiment.pipeline"] = types.ModuleType("experiment")
+            sys.modules["warp_resphys.experiment.pipeline"].run_experiment = run
         """
         child = self.start(config_dir, sleeping)
         assert child.stdout.readline() == "running\n"

@@ -59,7 +59,7 @@ def replay_of(sim, truth, masses=(0.0, 0.05), frames=25, noise=0.0, seed=0):
 
 def identify(noise=0.0, seed=0, bounds=RANGES, first=FIRST, truth=TRUTH, **options):
     replay, release = replay_of(simulator(), truth, noise=noise, seed=seed, **options)
-    return Identifier(replay, release, bounds).run([first], 40)
+    return Identifier([(replay, release)], bounds).run([first], 40)
 
 
 def test_stiffness_and_damping_are_recovered_from_sparse_noisy_markers():
@@ -91,7 +91,7 @@ def test_the_predicted_deviation_is_that_of_repetitions():
     for _ in range(10):
         markers = clean.observed + 3e-4 * torch.randn(clean.observed.shape, generator=generator, dtype=torch.float64)
         motions = replace(clean, observed=markers)
-        result = Identifier(Replay(replay.simulator, MARKERS, motions), release, RANGES).run([TRUTH], 2)
+        result = Identifier([(Replay(replay.simulator, MARKERS, motions), release)], RANGES).run([TRUTH], 2)
         found.append([result.parameters[name] for name in RANGES])
         predicted.append([result.uncertainty.deviation[name] for name in RANGES])
     ratio = np.std(found, axis=0, ddof=1) / np.mean(predicted, axis=0)
@@ -103,12 +103,12 @@ def test_stiffness_and_density_of_a_body_without_weights_cannot_be_told_apart():
     bounds = {"youngs_modulus": Bounds(1e5, 1e6), "density": Bounds(800.0, 1500.0)}
     truth = {"youngs_modulus": 215e3, "density": 1070.0}
     replay, release = replay_of(simulator(), truth, masses=(0.0,), noise=5e-5)
-    identifier = Identifier(replay, release, bounds)
+    identifier = Identifier([(replay, release)], bounds)
     uncertainty = identifier.uncertainty(np.array([identifier._unit(name, truth) for name in bounds]))
     assert uncertainty.correlation[0][1] > 0.999
     assert uncertainty.poorest_deviation > 1.0
     replay, release = replay_of(simulator(), truth, masses=(0.0, 0.05), noise=5e-5)
-    told = Identifier(replay, release, bounds).uncertainty(np.array([0.13, 0.39]))
+    told = Identifier([(replay, release)], bounds).uncertainty(np.array([0.13, 0.39]))
     assert told.poorest_deviation < 0.1
 
 
@@ -121,7 +121,7 @@ def test_a_parameter_outside_its_range_ends_on_the_bound():
 
 def test_a_grid_has_its_minimum_at_the_truth_and_the_axes_asked_for():
     replay, release = replay_of(simulator(), TRUTH, frames=20)
-    identifier = Identifier(replay, release, {**RANGES, "poissons_ratio": Bounds(0.4, 0.499)})
+    identifier = Identifier([(replay, release)], {**RANGES, "poissons_ratio": Bounds(0.4, 0.499)})
     others = {**TRUTH, "poissons_ratio": 0.499}
     losses = identifier.grid({"stiffness_damping": 3, "youngs_modulus": 7}, others)
     assert losses.shape == (3, 7)
@@ -139,9 +139,9 @@ def test_a_grid_has_its_minimum_at_the_truth_and_the_axes_asked_for():
 def test_failed_points_of_a_grid_are_infinite_and_the_others_unchanged():
     bounds = {"youngs_modulus": Bounds(1.0, 1e10, logarithmic=True)}
     replay, release = replay_of(simulator(), {"youngs_modulus": 215e3}, frames=5)
-    whole = Identifier(replay, release, bounds).grid({"youngs_modulus": 6}, {})
+    whole = Identifier([(replay, release)], bounds).grid({"youngs_modulus": 6}, {})
     few = Replay(simulator(solver=SolverSettings(max_iterations=10)), MARKERS, replay.trials)
-    losses = Identifier(few, release, bounds).grid({"youngs_modulus": 6}, {})
+    losses = Identifier([(few, release)], bounds).grid({"youngs_modulus": 6}, {})
     good = np.isfinite(losses)
     assert np.isfinite(whole).all()
     assert 0 < good.sum() < 6
@@ -159,7 +159,7 @@ def test_a_start_where_the_simulation_fails_is_passed_over(monkeypatch):
 
     monkeypatch.setattr(Replay, "__call__", fragile)
     soft = FIRST | {"youngs_modulus": 120e3}
-    identifier = Identifier(replay, release, RANGES)
+    identifier = Identifier([(replay, release)], RANGES)
     found = identifier.run([soft, FIRST], 20)
     assert found.parameters["youngs_modulus"] == pytest.approx(215e3, rel=1e-3)
     assert found.history[0] == []
@@ -169,7 +169,7 @@ def test_a_start_where_the_simulation_fails_is_passed_over(monkeypatch):
 
 def test_starts_are_the_first_guess_and_the_best_candidates():
     replay, release = replay_of(simulator(), TRUTH, frames=20)
-    identifier = Identifier(replay, release, RANGES)
+    identifier = Identifier([(replay, release)], RANGES)
     starts = identifier.starts(FIRST, 3, 8, seed=0)
     assert len(starts) == 3
     assert starts[0] == pytest.approx(FIRST)
@@ -181,9 +181,9 @@ def test_finished_starts_are_not_done_again():
     replay, release = replay_of(simulator(), TRUTH, frames=10)
     kept, calls = [], []
     starts = [FIRST, {"youngs_modulus": 150e3, "stiffness_damping": 0.01}]
-    whole = Identifier(replay, release, RANGES).run(starts, 2, keep=lambda a: kept.append(json.loads(json.dumps(a))))
+    whole = Identifier([(replay, release)], RANGES).run(starts, 2, keep=lambda a: kept.append(json.loads(json.dumps(a))))
     assert [len(attempts) for attempts in kept] == [1, 2]
-    again = Identifier(replay, release, RANGES).run(
+    again = Identifier([(replay, release)], RANGES).run(
         starts, 2, report=lambda number, *_: calls.append(number), finished=kept[0]
     )
     assert set(calls) == {1}
@@ -196,7 +196,7 @@ def test_only_the_first_seconds_count():
     spoilt = replay.trials.observed.clone()
     spoilt[:, 20:] += 1.0
     motions = replace(replay.trials, observed=spoilt)
-    identifier = Identifier(Replay(replay.simulator, MARKERS, motions), release, RANGES, seconds=0.19)
+    identifier = Identifier([(Replay(replay.simulator, MARKERS, motions), release)], RANGES, seconds=0.19)
     unit = replay.simulator.tensor([[identifier._unit(name, TRUTH) for name in RANGES]])
     assert float(identifier.losses(unit)) < 1e-12
 
@@ -211,7 +211,7 @@ def test_only_the_first_seconds_count():
 def test_what_cannot_be_identified_is_refused(bounds, sentence):
     replay, release = replay_of(simulator(), TRUTH, frames=3)
     with pytest.raises(InputError, match=sentence):
-        Identifier(replay, release, bounds)
+        Identifier([(replay, release)], bounds)
 
 
 def test_a_motion_that_stands_still_is_refused():
@@ -219,7 +219,7 @@ def test_a_motion_that_stands_still_is_refused():
     still = replay.trials.held[:, None].repeat(1, 3, 1, 1)
     motions = replace(replay.trials, observed=still)
     with pytest.raises(InputError, match="'m0' stay where they were held"):
-        Identifier(Replay(replay.simulator, MARKERS, motions), release, RANGES)
+        Identifier([(Replay(replay.simulator, MARKERS, motions), release)], RANGES)
 
 
 @pytest.mark.parametrize(

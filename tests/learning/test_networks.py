@@ -9,6 +9,7 @@ from warp_resphys import Body, Corotated, Simulator, State, box_hexahedra, selec
 from warp_resphys.dynamics import modes
 from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.dynamics.modes import RestStiffness, vibration_modes
+from warp_resphys.experiment.schema import NETWORK, check
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.networks import (
@@ -196,19 +197,19 @@ class TestResidualForce:
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
-        ({"kind": "graph"}, "network.kind is 'graph': choose one of reduced, nodal."),
-        ({"activation": "relu"}, "network.activation is 'relu': choose one of normalised_elu, silu."),
-        ({"blocks": 0}, "network.blocks is 0: it must be positive."),
-        ({"layers": -1}, "network.layers is -1: it must be zero or more."),
-        ({"width": 0}, "network.width is 0: it must be positive."),
-        ({"width": -1}, "network.width is -1: it must be positive."),
-        ({"force_modes": 0}, "network.force_modes is 0: it must be positive."),
+        ({"kind": "graph"}, "network.kind is 'graph': it must be one of reduced, nodal."),
+        ({"activation": "relu"}, "network.activation is 'relu': it must be one of normalised_elu, silu."),
+        ({"blocks": 0}, "network.blocks is 0: it must be a whole number from 1 to 100."),
+        ({"layers": -1}, "network.layers is -1: it must be a whole number from 0 to 100."),
+        ({"width": 0}, "network.width is 0: it must be a whole number from 1 to 16,384."),
+        ({"width": -1}, "network.width is -1: it must be a whole number from 1 to 16,384."),
+        ({"force_modes": 0}, "network.force_modes is 0: it must be a whole number, one or more."),
     ],
 )
 def test_bad_settings(settings, sentence):
-    samples = field(40)
+    check("network", KINDS["reduced"], NETWORK)
     with pytest.raises(InputError) as error:
-        build_model({**KINDS["reduced"], **settings}, samples[0], samples, samples, samples)
+        check("network", {**KINDS["reduced"], **settings}, NETWORK)
     assert str(error.value) == sentence
 
 

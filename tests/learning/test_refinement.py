@@ -5,10 +5,14 @@ from dataclasses import replace
 
 import pytest
 import torch
+from measured_run import configuration
 
 from warp_resphys import Body, Corotated, Simulator, box_hexahedra, select_vertices
+from warp_resphys.data.trials import Trials
 from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.dynamics.nonlinear_solver import SolverSettings
+from warp_resphys.experiment.checks import check_configuration
+from warp_resphys.experiment.schema import check, refinement_group
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.networks import build_model
@@ -34,10 +38,27 @@ def motion(integrator="implicit_euler", seed=0):
     random = torch.Generator().manual_seed(seed)
     load[:, select_vertices(MESH, x=0.06)] = 0.1 * torch.rand(2, 1, 3, generator=random, dtype=torch.float64) - 0.05
     found = real.rollout(real.static_equilibrium(Inputs(load)), FRAMES - 1)
-    return Motion(found.q.transpose(0, 1).contiguous(), found.v.transpose(0, 1).contiguous())
+    q, v = found.q.transpose(0, 1).contiguous(), found.v.transpose(0, 1).contiguous()
+    return motion_of(q, v, q)
+
+
+def motion_of(q, v, target, inputs=None, told=None):
+    """Two trials at the steps of the simulator, and what should be observed of them."""
+    times = real_time(target.shape[1]).expand(2, -1)
+    trials = Trials(("a", "b"), times, target, target[:, 0], Inputs() if inputs is None else inputs)
+    return Motion(q, v, target, trials, told)
+
+
+def real_time(frames):
+    return simulator().time_step * torch.arange(frames, dtype=torch.float64)
 
 
 TRAIN, VALIDATION = motion(), motion(seed=1)
+
+
+def windows_of(trials, frames):
+    """Windows of the only motion."""
+    return Windows(torch.zeros(len(trials), dtype=torch.int64), torch.tensor(trials), torch.tensor(frames))
 
 
 def network(seed=0):
@@ -71,9 +92,9 @@ def trainer(model=None, error=None, **settings):
     loss = window_loss(model, config["window"], config["batch_size"])
 
     def drift(model):
-        return loss.measure(loss.side_by_side(VALIDATION), VALIDATION)[0] ** 0.5
+        return loss.measure(loss.side_by_side([VALIDATION]), [VALIDATION])[0] ** 0.5
 
-    return SolverInTheLoop(model, loss, TRAIN, VALIDATION, error or drift, config)
+    return SolverInTheLoop(model, loss, [TRAIN], [VALIDATION], error or drift, config)
 
 
 def finish(trainer):
@@ -90,8 +111,8 @@ class TestLoss:
     def test_its_gradient_is_that_of_central_differences(self):
         model = network().double()
         loss = window_loss(model, window=4)
-        windows = Windows(torch.tensor([0, 1, 1]), torch.tensor([0, 2, 5]))
-        loss.backward(windows, TRAIN, 1e-3)
+        windows = windows_of([0, 1, 1], [0, 2, 5])
+        loss.backward(windows, [TRAIN], 1e-3)
         random = torch.Generator().manual_seed(3)
         for weight in model.network.parameters():
             direction = 1e-3 * torch.randn(weight.shape, generator=random, dtype=torch.float64)
@@ -99,7 +120,7 @@ class TestLoss:
 
             def along(k, weight=weight, start=start, direction=direction):
                 weight.copy_(start + k * direction)
-                return loss.measure(windows, TRAIN)[0] / 1e-3
+                return loss.measure(windows, [TRAIN])[0] / 1e-3
 
             with torch.no_grad():
                 expected, _ = central_difference(along)
@@ -112,16 +133,16 @@ class TestLoss:
         no_force = Formula(lambda q, v: torch.zeros_like(q))
         loss = WindowLoss(no_force, lambda: simulator(REALITY, integrator), 4, 3)
         target = motion(integrator)
-        windows = loss.side_by_side(target)
+        windows = loss.side_by_side([target])
         assert windows.frame.tolist() == 2 * ([1, 5] if integrator == "bdf2" else [0, 4])
-        assert loss.measure(windows, target)[0] < 1e-12  # mm^2
-        assert window_loss(no_force, 4, integrator=integrator).measure(windows, target)[0] > 1e-3
+        assert loss.measure(windows, [target])[0] < 1e-12  # mm^2
+        assert window_loss(no_force, 4, integrator=integrator).measure(windows, [target])[0] > 1e-3
 
     def test_it_is_the_mean_squared_distance_of_separate_roll_outs(self):
         model, sim = network(), simulator()
-        windows = Windows(torch.tensor([1, 0, 1]), torch.tensor([0, 3, 6]))
+        windows = windows_of([1, 0, 1], [0, 3, 6])
         squares = []
-        for run, frame in zip(windows.trajectory, windows.frame, strict=True):
+        for run, frame in zip(windows.trial, windows.frame, strict=True):
             state = replace(sim.rest_state(1), q=TRAIN.q[run, frame][None], v=TRAIN.v[run, frame][None])
             for step in (1, 2, 3):
                 with torch.no_grad():
@@ -129,8 +150,8 @@ class TestLoss:
                 squares.append(1e6 * (state.q[0] - TRAIN.q[run, frame + step]).square().sum(-1).mean())
         loss = window_loss(model, batch_size=2)
         expected = float(torch.stack(squares).mean())
-        assert loss.measure(windows, TRAIN)[0] == pytest.approx(expected, rel=1e-6)
-        assert loss.backward(windows, TRAIN, 2.0) == pytest.approx(expected / 2.0, rel=1e-6)
+        assert loss.measure(windows, [TRAIN])[0] == pytest.approx(expected, rel=1e-6)
+        assert loss.backward(windows, [TRAIN], 2.0) == pytest.approx(expected / 2.0, rel=1e-6)
 
     @pytest.mark.parametrize("value", [math.nan, 1e6])
     def test_a_window_that_fails_poisons_no_other(self, value):
@@ -141,20 +162,45 @@ class TestLoss:
             bad = (q - TRAIN.q[1, 4]).abs().flatten(1).amax(1) < 1e-9
             return torch.where(bad[:, None, None], value, model(q, v))
 
-        windows = Windows(torch.tensor([0, 1, 1, 0]), torch.tensor([0, 4, 1, 5]))
+        windows = windows_of([0, 1, 1, 0], [0, 4, 1, 5])
         others = windows.pick(torch.tensor([0, 2, 3]))
         whole, broken = window_loss(model, batch_size=4), window_loss(Formula(failing), batch_size=4)
-        measured, lost = broken.measure(windows, TRAIN)
+        measured, lost = broken.measure(windows, [TRAIN])
         assert lost.tolist() == [False, True, False, False]
-        expected = whole.measure(others, TRAIN)[0]
+        expected = whole.measure(others, [TRAIN])[0]
         assert measured == pytest.approx(expected, rel=1e-6)
-        whole.backward(others, TRAIN, 1.0)
+        whole.backward(others, [TRAIN], 1.0)
         gradients = [w.grad.clone() for w in model.parameters()]
         model.zero_grad()
-        loss = broken.backward(windows, TRAIN, 1.0)
+        loss = broken.backward(windows, [TRAIN], 1.0)
         assert loss == pytest.approx(0.75 * expected + 0.25 * (1e3 * 10.0 * 0.06) ** 2)
         for weight, gradient in zip(model.parameters(), gradients, strict=True):
             torch.testing.assert_close(weight.grad, 0.75 * gradient, rtol=1e-4, atol=1e-9)
+
+
+    def test_it_is_of_what_was_seen_under_the_inputs_of_each_window(self):
+        """Weights that grow in time: with them, the simulator that made the trials is off nowhere; without, it is."""
+        sim, frames = simulator(), 7
+        force = torch.zeros(frames - 1, 2, *sim.rest_positions.shape, dtype=torch.float64)
+        force[:, :, -1, 2] = -0.01 * torch.arange(frames - 1, dtype=torch.float64)[:, None]
+        found = sim.rollout(sim.rest_state(2), frames - 1, Inputs(force))
+        q, v = (x.transpose(0, 1).contiguous() for x in (found.q, found.v))
+        target = q[:, :, -2:].clone()  # two markers
+        target[0, 2:4, 0] = torch.nan
+        target[1, 1:4] = torch.nan
+        no_force = Formula(lambda q, v: torch.zeros_like(q))
+        loss = WindowLoss(no_force, simulator, 3, 3, observe=lambda q: q[:, -2:])
+        acting = motion_of(q, v, target, Inputs(force))
+        windows = loss.side_by_side([motion_of(q, v, target), acting])
+        assert windows.motion.tolist() == [0, 0, 0, 1, 1, 1]  # In the first three steps of the second nothing was seen.
+        assert list(zip(windows.trial.tolist(), windows.frame.tolist(), strict=True)) == 2 * [(0, 0), (0, 3), (1, 3)]
+        with_force, without = windows.pick(torch.tensor([3, 4, 5])), windows.pick(torch.tensor([0, 1, 2]))
+        motions = [motion_of(q, v, target), acting]
+        assert loss.measure(with_force, motions)[0] < 1e-12
+        assert loss.measure(without, motions)[0] > 1e-6
+        torch.testing.assert_close(
+            loss.measure(windows, motions)[0], 0.5 * loss.measure(without, motions)[0], rtol=1e-6, atol=0.0
+        )
 
 
 class TestTraining:
@@ -200,7 +246,7 @@ class TestTraining:
             return torch.where(bad[:, None, None], math.nan, model(q, v))
 
         def make():
-            return SolverInTheLoop(model, window_loss(Formula(failing)), TRAIN, VALIDATION, lambda model: 1.0, CONFIG)
+            return SolverInTheLoop(model, window_loss(Formula(failing)), [TRAIN], [VALIDATION], lambda model: 1.0, CONFIG)
 
         run = make()
         run.run_epoch()
@@ -214,24 +260,37 @@ class TestTraining:
 
     def test_nothing_can_be_simulated(self):
         loss = window_loss(Formula(lambda q, v: torch.full_like(q, math.nan)))
-        run = SolverInTheLoop(network(), loss, TRAIN, VALIDATION, lambda model: 1.0, CONFIG)
+        run = SolverInTheLoop(network(), loss, [TRAIN], [VALIDATION], lambda model: 1.0, CONFIG)
         with pytest.raises(InputError, match="the simulator fails in every window of the training split"):
             run.run_epoch()
+
+
+NATURAL = "it must be a whole number, one or more."
 
 
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
-        ({"kind": "adjoint"}, "refinement.kind is 'adjoint': choose one of none, solver_in_the_loop."),
-        ({"window": 0}, "refinement.window is 0: it must be positive."),
-        ({"window": 10}, "refinement.window is 10: it must be less than the data's 10 steps."),
-        ({"epochs": 0}, "refinement.epochs is 0: it must be positive."),
-        ({"batch_size": -1}, "refinement.batch_size is -1: it must be positive."),
-        ({"memory": 0}, "refinement.memory is 0: it must be positive."),
-        ({"rollout_every": 0}, "refinement.rollout_every is 0: it must be positive."),
+        ({"kind": "adjoint"}, "refinement.kind is 'adjoint': it must be one of none, solver_in_the_loop."),
+        ({"window": 0}, f"refinement.window is 0: {NATURAL}"),
+        ({"epochs": 0}, f"refinement.epochs is 0: {NATURAL}"),
+        ({"batch_size": -1}, f"refinement.batch_size is -1: {NATURAL}"),
+        ({"memory": 0}, f"refinement.memory is 0: {NATURAL}"),
+        ({"rollout_every": 0}, f"refinement.rollout_every is 0: {NATURAL}"),
     ],
 )
 def test_bad_settings(settings, sentence):
+    check("refinement", CONFIG, refinement_group(CONFIG))
     with pytest.raises(InputError) as error:
-        trainer(**settings)
+        check("refinement", {**CONFIG, **settings}, refinement_group({**CONFIG, **settings}))
     assert str(error.value) == sentence
+
+
+@pytest.mark.parametrize("experiment", ["beam_oscillation", "sopra"])
+def test_a_window_is_shorter_than_the_trials(experiment):
+    config = configuration("refinement=solver_in_the_loop", "data.steps=50", experiment=experiment)
+    config["data"] |= {"horizons": []} if experiment == "sopra" else {}
+    check_configuration(config | {"refinement": {**CONFIG, "window": 49}})
+    with pytest.raises(InputError) as error:
+        check_configuration(config | {"refinement": {**CONFIG, "window": 50}})
+    assert str(error.value) == "refinement.window is 50: it must be less than the data's 50 steps."

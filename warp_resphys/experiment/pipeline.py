@@ -31,7 +31,6 @@ from .files import (
     IDENTIFICATION,
     METRICS,
     QUALITY,
-    RECONSTRUCTION,
     REGISTRATION,
     REPORT,
     ROLLOUTS,
@@ -39,7 +38,6 @@ from .files import (
     TIMES,
     TRUTH,
     fold_folder,
-    read_if_there,
     reconstruction_file,
     training_file,
     weights_file,
@@ -51,7 +49,7 @@ from .learn import refine, train
 from .models import SIMFREE
 from .parts import processes_for
 from .reconstruct import reconstruct
-from .report import make_folds_report, make_report
+from .report import collect_metrics, make_folds_report, make_report
 from .scene import LEARNED, models_of
 from .simulate import simulate
 from .trials import Split, folds_of, is_laboratory, scaled_trials_of, sees_markers, split_of, test_groups, trials_of
@@ -260,7 +258,7 @@ def run_experiment(config: DictConfig) -> None:
     if folds is None:
         stages = learning_stages(plain, split_of(plain), ".", acquired)
         run_stages(stages, folder)
-        metrics = collect_metrics(plain, folder, folder, [*first, *stages])
+        metrics = collect_metrics(folder, plain, [stage.name for stage in (*first, *stages)])
     else:
         metrics = _run_folds(plain, folder, folds, first, acquired)
     write_json(folder / METRICS, metrics)
@@ -280,35 +278,12 @@ def _run_folds(
         inner = folder / fold_folder(trial)
         stages = learning_stages(config, split, "..", acquired)
         run_stages(stages, inner)
-        found[trial] = collect_metrics(config, inner, folder, stages)
+        found[trial] = collect_metrics(inner, config, [stage.name for stage in stages])
         write_json(inner / METRICS, found[trial])
     return {
         "errors_mm": summarise_folds([each["errors_mm"] for each in found.values()]),
         "folds": found,
         **resources_used(folder, [stage.name for stage in first]),
-        "versions": package_versions(),
-        "device": str(choose_device(config["device"])),
-    }
-
-
-def collect_metrics(config: Mapping[str, Any], folder: Path, shared: Path, stages: Sequence[Stage]) -> dict[str, Any]:
-    """Errors, the noise in them where known, what was kept and identified, time and memory of the stages, versions."""
-    networks = {
-        f"{model}_refined" if refined else model: read_json(path)["kept"]
-        for model in LEARNED
-        for refined in (False, True)
-        if (path := folder / training_file(model, refined)).is_file()
-    }
-    identified = read_if_there(folder / IDENTIFICATION)
-    truth, times = read_if_there(shared / TRUTH), read_if_there(folder / TIMES)
-    return {
-        **read_json(folder / ERRORS),
-        **({"noise_mm": truth["noise_mm"]} if "noise_mm" in truth else {}),
-        "networks": networks,
-        "parameters": {name: each["parameters"] for name, each in identified.items() if "parameters" in each},
-        "reconstruction": read_if_there(folder / RECONSTRUCTION),
-        **({"seconds_per_test_trajectory": times["seconds"]} if times else {}),
-        **resources_used(folder, [stage.name for stage in stages]),
         "versions": package_versions(),
         "device": str(choose_device(config["device"])),
     }

@@ -1,10 +1,9 @@
 """Stage: the report page of a split, and the one over the folds; they show what the run folder holds."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,7 +12,6 @@ from ..io.errors import DataFileError
 from ..io.files import read_array, read_hdf5, read_json
 from ..io.stages import StageContext, package_versions, resources_used
 from ..learning.metrics import PUBLISHED_WINDOWS_MM, published_errors
-from ..learning.replay import MASS_FACTOR
 from ..mesh.chambers import Chamber
 from ..mesh.mesh import Mesh, select_vertices
 from ..mesh.surface import closest_points
@@ -21,12 +19,30 @@ from ..report.data import MODELS, Film, Pressures, Recordings, RunReport, Trials
 from ..report.page import number_text
 from ..report.run_page import write_report
 from .build import build_chambers, build_mesh, choose_device
+from .files import (
+    DATASET,
+    ERRORS,
+    IDENTIFICATION,
+    METRICS,
+    QUALITY,
+    RECONSTRUCTION,
+    REGISTRATION,
+    REPORT,
+    ROLLOUTS,
+    SCALED_DATASET,
+    TIMES,
+    TRUTH,
+    fold_folder,
+    read_dataset,
+    read_if_there,
+    training_file,
+)
+from .identify import first_guess
+from .scene import LEARNED
+from .trials import is_laboratory, sees_markers
 
 FloatArray = NDArray[np.float64]
 
-DATASET, SCALED, ROLLOUTS = "dataset.h5", "dataset_scaled.h5", "rollouts.h5"
-REPORT = "report.html"
-LEARNED = ("simfree", "resphys_uncorrected", "resphys")
 PRESSURE = "pressure"  # The name of an input.
 _SELECTED_BY = {"rollout": "roll-out error", "validation_loss": "validation loss"}
 _PUBLISHED_NETWORK = {"kind": "nodal", "blocks": 5, "layers": 3, "width": 512, "activation": "normalised_elu"}
@@ -67,8 +83,8 @@ def make_report(context: StageContext) -> None:
         DataFileError: a file of an earlier stage is missing or damaged, or one could not be written.
     """
     folder, config = context.run_dir, context.settings["config"]
-    metrics, truth = read_metrics(folder, config), _if_there(common_folder(folder) / "truth.json")
-    trials, identification = read_trials(folder, config), _if_there(folder / "identification.json")
+    metrics, truth = collect_metrics(folder, config), read_if_there(common_folder(folder) / TRUTH)
+    trials, identification = read_trials(folder, config), read_if_there(folder / IDENTIFICATION)
     film, pressures = read_film(folder), read_pressures(folder, config, trials)
     common, mesh = _common_parts(context, metrics)
     channels = () if pressures is None else pressures.channels
@@ -84,8 +100,8 @@ def make_report(context: StageContext) -> None:
         identification=identification,
         start=data_sheet(config, identification),
         truth=truth.get("material", {}),
-        training=_histories(folder, "training"),
-        refinement=_histories(folder, "refinement"),
+        training=_histories(folder, False),
+        refinement=_histories(folder, True),
         network_note=""
         if config.get("in_the_loop") or "resphys" not in metrics["errors_mm"]
         else network_in_words(config),
@@ -103,12 +119,12 @@ def make_folds_report(context: StageContext) -> None:
         DataFileError: a file of an earlier stage is missing or damaged, or one could not be written.
     """
     folder, config = context.run_dir, context.settings["config"]
-    metrics = {"device": str(choose_device(config["device"])), **read_json(folder / "metrics.json")}
+    metrics = {"device": str(choose_device(config["device"])), **read_json(folder / METRICS)}
     sideways = {trial: mm for fold in metrics["folds"].values() for trial, mm in fold.get("sideways_mm", {}).items()}
     common, mesh = _common_parts(context, metrics)
     data = RunReport(
         **common,
-        pages={trial: f"fold_{trial}/{REPORT}" for trial in metrics["folds"]},
+        pages={trial: f"{fold_folder(trial)}/{REPORT}" for trial in metrics["folds"]},
         recordings=read_recordings(folder, config, mesh, {}),
         notes=error_notes(sideways, {}),
     )
@@ -143,44 +159,43 @@ def common_folder(folder: Path) -> Path:
     return folder if (folder / DATASET).is_file() else folder.parent
 
 
-def _if_there(path: Path) -> dict[str, Any]:
-    """What a JSON file holds; nothing where there is none."""
-    content: dict[str, Any] = read_json(path) if path.is_file() else {}
-    return content
-
-
-def _histories(folder: Path, what: str) -> dict[str, Any]:
+def _histories(folder: Path, refined: bool) -> dict[str, Any]:
     """The epochs of the trainings, or of the refinements, by model."""
-    files = {model: folder / f"{what}_{model}.json" for model in LEARNED}
+    files = {model: folder / training_file(model, refined) for model in LEARNED}
     return {model: read_json(path)["epochs"] for model, path in files.items() if path.is_file()}
 
 
-def read_metrics(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
-    """What metrics.json of a split will hold.
+def collect_metrics(folder: Path, config: Mapping[str, Any], stages: Sequence[str] | None = None) -> dict[str, Any]:
+    """What metrics.json of a split says.
 
-    Errors, which weights were kept, what was identified and reconstructed, time and memory of the stages that are
-    done in the order of their end, versions and device.
+    Errors, the noise in them where known, which weights were kept, what was identified and reconstructed, time and
+    memory of the stages, versions and device.
 
     Args:
         folder: of the split.
         config: with the key ``device``.
+        stages: names of the stages; those that are done in the order of their end, if left out.
     """
+    if stages is None:
+        records = sorted((folder / "stages").glob("*.json"), key=lambda path: path.stat().st_mtime_ns)
+        stages = [path.stem for path in records if not path.stem.endswith(".progress")]
     files = {
-        f"{m}{s}": folder / f"{w}_{m}.json" for m in LEARNED for w, s in (("training", ""), ("refinement", "_refined"))
+        f"{model}_refined" if refined else model: folder / training_file(model, refined)
+        for model in LEARNED
+        for refined in (False, True)
     }
-    records = sorted((folder / "stages").glob("*.json"), key=lambda path: path.stat().st_mtime_ns)
-    names = [path.stem for path in records if not path.stem.endswith(".progress")]
-    identified = _if_there(folder / "identification.json")
+    identified, truth = (read_if_there(each) for each in (folder / IDENTIFICATION, common_folder(folder) / TRUTH))
     more = {
-        "reconstruction": _if_there(folder / "reconstruction.json"),
-        "seconds_per_test_trajectory": _if_there(folder / "times.json").get("seconds", {}),
+        "reconstruction": read_if_there(folder / RECONSTRUCTION),
+        "seconds_per_test_trajectory": read_if_there(folder / TIMES).get("seconds", {}),
+        **({"noise_mm": truth["noise_mm"]} if "noise_mm" in truth else {}),
     }
     return {
-        **read_json(folder / "errors.json"),
+        **read_json(folder / ERRORS),
         "networks": {name: read_json(path)["kept"] for name, path in files.items() if path.is_file()},
         "parameters": {name: each["parameters"] for name, each in identified.items() if "parameters" in each},
         **{key: value for key, value in more.items() if value},
-        **resources_used(folder, names),
+        **resources_used(folder, stages),
         "versions": package_versions(),
         "device": str(choose_device(config["device"])),
     }
@@ -188,10 +203,8 @@ def read_metrics(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
 
 def data_sheet(config: Mapping[str, Any], identification: Mapping[str, Any]) -> dict[str, float]:
     """What the simulator has of all that was identified, and of what the landscape is drawn over."""
-    known = {MASS_FACTOR: 1.0, "fibre_stiffness": (config.get("fibres") or {}).get("stiffness", 0.0)}
-    known |= {key: value for key, value in config["simulation"].items() if key != "model"}
     names = {name for found in identification.values() for name in found.get("parameters", {})}
-    return {name: known.get(name, 0.0) for name in (*names, "youngs_modulus", "poissons_ratio")}
+    return first_guess(config, (*names, "youngs_modulus", "poissons_ratio"))
 
 
 def error_notes(sideways: Mapping[str, float], truth: Mapping[str, Any]) -> list[str]:
@@ -210,13 +223,9 @@ def error_notes(sideways: Mapping[str, float], truth: Mapping[str, Any]) -> list
 
 def published_note(config: Mapping[str, Any]) -> str:
     """How the published errors of this experiment came about."""
-    if not config.get("markers"):
+    if not sees_markers(config):
         return _AGAINST + _MASS[config["physics"]["mass"]]
-    return _OF_AN_ARM[config["data"]["folder"] is None] if config.get("chambers") else _OF_A_BEAM
-
-
-def _texts(file: h5py.File, name: str) -> tuple[str, ...]:
-    return tuple(str(each) for each in file.attrs[name])
+    return _OF_AN_ARM[is_laboratory(config)] if config.get("chambers") else _OF_A_BEAM
 
 
 def read_trials(folder: Path, config: Mapping[str, Any]) -> Trials:
@@ -232,49 +241,41 @@ def read_trials(folder: Path, config: Mapping[str, Any]) -> Trials:
         DataFileError: a file is missing or damaged, or the two do not belong together.
     """
     path = common_folder(folder) / DATASET
-    with read_hdf5(path, "dataset") as file:
-        names, labels, begins = (_texts(file, key) for key in ("names", "labels", "begins"))
-        gravity, step = np.asarray(file.attrs["gravity"], dtype=np.float64), float(file.attrs["time_step"])
-        times = read_array(file, "times", (len(names), None))
-        observed = read_array(file, "observed", (*times.shape, len(labels) or None, 3))
-        bound = read_array(file, "bound", (len(labels), 3)) if labels else build_mesh(config["mesh"]).vertices
+    dataset = read_dataset(path)
+    bound = build_mesh(config["mesh"]).vertices if dataset.bound is None else dataset.bound
     with read_hdf5(folder / ROLLOUTS, "rollouts") as file:
-        rolled = _texts(file, "names")
-        scaled = _scaled_names(folder)
-        test = [name for name in rolled if name not in scaled]
+        rolled = tuple(str(each) for each in file.attrs["names"])
+        test = [name for name in rolled if name not in _scaled_names(folder)]
         models = [model for model in MODELS if f"{model}_observed" in file]
-        unknown = sorted(set(test) - set(names))
+        unknown = sorted(set(test) - set(dataset.names))
         if unknown or not models:
             what = f"names trials that {path} does not hold ({', '.join(unknown)})" if unknown else "holds no model"
             raise DataFileError(f"{folder / ROLLOUTS} {what}: delete it and run the same command again.")
-        shape = (len(rolled), *observed.shape[1:])
+        shape = (len(rolled), *dataset.observed.shape[1:])
         positions = {m: read_array(file, f"{m}_observed", shape)[: len(test)].astype(np.float64) for m in models}
-    rows = [names.index(name) for name in test]
-    times, target = times[rows], observed[rows]
+    rows = dataset.rows(test)
+    times, target = dataset.times[rows], dataset.observed[rows]
     seconds, length = config["data"].get("seconds"), times.shape[1]
     if seconds is not None:
         target = np.where((times <= seconds)[..., None, None], target, np.nan)
         length = max(1, int((times <= seconds).any(axis=0).sum()))
     return Trials(
         names=tuple(test),
-        labels=labels,
-        begins=tuple(begins[row] for row in rows),
+        labels=dataset.labels,
+        begins=tuple(dataset.begins[row] for row in rows),
         times=times[:, :length],
         target=target[:, :length],
         positions={model: each[:, :length] for model, each in positions.items()},
         bound=bound,
-        gravity=gravity,
-        time_step=step,
+        gravity=dataset.gravity,
+        time_step=dataset.time_step,
     )
 
 
 def _scaled_names(folder: Path) -> tuple[str, ...]:
     """The trials at other pressures than those of the data set."""
-    path = common_folder(folder) / SCALED
-    if not path.is_file():
-        return ()
-    with read_hdf5(path, "dataset") as file:
-        return _texts(file, "names")
+    path = common_folder(folder) / SCALED_DATASET
+    return read_dataset(path).names if path.is_file() else ()
 
 
 def read_film(folder: Path) -> Film | None:
@@ -301,16 +302,13 @@ def read_pressures(folder: Path, config: Mapping[str, Any], trials: Trials) -> P
         DataFileError: a file is missing or damaged.
     """
     values: dict[str, Any] = {}
-    channels: tuple[str, ...] = ()
-    scaled = _scaled_names(folder)
-    for name in (DATASET, *((SCALED,) if scaled else ())):
-        with read_hdf5(common_folder(folder) / name, "dataset") as file:
-            if PRESSURE not in _texts(file, "inputs"):
-                return None
-            names, channels = _texts(file, "names"), _texts(file, f"{PRESSURE}_channels")
-            rows = read_array(file, PRESSURE, (len(names), None, len(channels)))
-            values |= dict(zip(names, rows, strict=True))
-    return Pressures(channels, values, config["data"].get("pressure_limit"), scaled)
+    common, scaled = common_folder(folder), _scaled_names(folder)
+    for name in (DATASET, *((SCALED_DATASET,) if scaled else ())):
+        dataset = read_dataset(common / name)
+        if PRESSURE not in dataset.inputs:
+            return None
+        values |= dict(zip(dataset.names, dataset.inputs[PRESSURE], strict=True))
+    return Pressures(dataset.channels[PRESSURE], values, config["data"].get("pressure_limit"), scaled)
 
 
 def _driven_chambers(chambers: tuple[Chamber, ...], names: tuple[str, ...]) -> tuple[Chamber, ...]:
@@ -354,9 +352,9 @@ def read_recordings(
     Raises:
         DataFileError: a file is missing or damaged.
     """
-    if not config.get("markers"):
+    if not sees_markers(config):
         return None
-    path = common_folder(folder) / "registration.json"
+    path = common_folder(folder) / REGISTRATION
     residuals = read_json(path)
     worst = max(residuals, key=lambda trial: residuals[trial]["rms_mm"])
     each = residuals[worst]
@@ -379,7 +377,7 @@ def read_recordings(
     feet = np.full_like(places, np.nan)
     feet[seen] = closest_points(mesh, places[seen]).points
     return Recordings(
-        quality=read_json(path.with_name("quality.json")),
+        quality=read_json(path.with_name(QUALITY)),
         residuals=residuals,
         registration=registration,
         drawn=worst,

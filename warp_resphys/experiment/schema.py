@@ -312,7 +312,7 @@ _MARKERS = Group(
 )
 _TRIAL = Group(
     {
-        "file": absent(WORD),
+        "file": absent(Kind(_is_word, "the name of a file")),
         "payload": absent(Kind(NOT_NEGATIVE.fits, "a mass, zero or more, in kg")),
         "begins": absent(one_of(*BEGINNINGS)),
         "pull": absent(_FORCE),

@@ -6,7 +6,7 @@ import logging
 import math
 import re
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -77,8 +77,8 @@ def run_tuning(config: DictConfig) -> None:
     folder = run_dir / "tune" / tune["study"]
     with Worker(folder / "workers", tune["stale_after"]) as worker:
         watch = Watch(folder / "workers", tune["stale_after"])
-        needed = _stages_before(plain, model, run_dir)
-        conditions = {"model": model, **{k: v for stage in needed for k, v in stage.settings.items()}, **groups}
+        acquired, needed = _stages_before(plain, model, run_dir)
+        conditions = {"model": model, **_settings_of([*acquired, *needed]), **groups}
         for group in _searched(groups):
             conditions[group] = {k: v for k, v in groups[group].items() if f"{group}.{k}" not in space}
         study = SharedStudy(folder, space, conditions, tune["trials"], tune["seed"], worker.identity, watch)
@@ -91,16 +91,25 @@ def run_tuning(config: DictConfig) -> None:
     print_best(tuning, study)
 
 
-def _stages_before(config: Mapping[str, Any], model: str, run_dir: Path) -> list[Stage]:
-    """The stages of a run up to the training of a model; those that lead to the dataset are run."""
-    _, acquired = acquire(config, run_dir, wait=True)
+def _stages_before(config: Mapping[str, Any], model: str, run_dir: Path) -> tuple[list[Stage], list[Stage]]:
+    """The stages of a run that lead to the dataset, which are run, and the others up to the training of a model."""
+    first, acquired = acquire(config, run_dir, wait=True)
     stages = {stage.name: stage for stage in learning_stages(config, split_of(config), ".", acquired)}
 
     def before(name: str) -> list[str]:
         return [*(each for needed in stages[name].upstream for each in before(needed)), name]
 
     wanted = set(before(f"train_{model}"))
-    return [stage for name, stage in stages.items() if name in wanted]
+    return first, [stage for name, stage in stages.items() if name in wanted]
+
+
+def _settings_of(stages: Sequence[Stage]) -> dict[str, Any]:
+    """The settings of some stages, in place of the fingerprint of the dataset that they lead to."""
+    found: dict[str, Any] = {}
+    for key, value in (item for stage in stages for item in stage.settings.items() if item[0] != "acquired"):
+        known = found.get(key)
+        found[key] = {**known, **value} if isinstance(known, dict) and isinstance(value, dict) else value
+    return found
 
 
 def _searched(groups: Mapping[str, Any]) -> tuple[str, ...]:

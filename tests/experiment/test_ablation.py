@@ -28,9 +28,9 @@ TINY = [
     "experiment=marker_ablation",
     "mesh.divisions=[4,2,2]",
     "data.steps=8",
-    f"markers.counts={COUNTS}".replace(" ", ""),
-    "markers.draws=5",
-    "markers.processes=1",
+    f"ablation.counts={COUNTS}".replace(" ", ""),
+    "ablation.draws=5",
+    "ablation.processes=1",
     "hydra/job_logging=none",
     "hydra/hydra_logging=none",
     "hydra.run.dir=run",
@@ -125,14 +125,14 @@ def test_an_interrupted_run_goes_on_and_a_set_does_not_depend_on_the_other_count
     np.testing.assert_allclose(errors(), errors(finished), rtol=1e-6)
     assert run(*TINY)[0] == 0
     assert reconstructed == COUNTS[2:]
-    assert run(*TINY, "markers.counts=[4]")[0] == 0
+    assert run(*TINY, "ablation.counts=[4]")[0] == 0
     np.testing.assert_allclose(errors(), errors(finished)[1:2], rtol=1e-6)
-    assert run(*TINY, "markers.counts=[4]", "seed=1")[0] == 0
+    assert run(*TINY, "ablation.counts=[4]", "seed=1")[0] == 0
     assert np.abs(errors() / errors(finished)[1:2] - 1.0).max() > 0.01
 
 
 def test_processes_give_the_same_numbers_in_the_same_order_and_do_not_count_as_a_change(finished, folder):
-    assert run(*TINY, "markers.processes=2")[0] == 0
+    assert run(*TINY, "ablation.processes=2")[0] == 0
     assert rows() == rows(finished)
     with (
         read_hdf5("run/ablation.h5", "marker ablation") as file,
@@ -143,7 +143,7 @@ def test_processes_give_the_same_numbers_in_the_same_order_and_do_not_count_as_a
     found = json.loads(Path("run/metrics.json").read_text())["peak_memory_gib"]
     assert found > 2.0 * json.loads((finished / "metrics.json").read_text())["peak_memory_gib"]
     written = Path("run/ablation.h5").stat().st_mtime_ns
-    assert run(*TINY, "markers.processes=3")[0] == 0
+    assert run(*TINY, "ablation.processes=3")[0] == 0
     assert Path("run/ablation.h5").stat().st_mtime_ns == written
 
 
@@ -172,7 +172,7 @@ def gone(pids):
 def test_workers_end_with_their_parent_and_what_they_finished_is_kept(finished, folder, sent):
     program = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
     program += "from warp_resphys.cli import main\nmain()"
-    command = [sys.executable, "-c", program, *TINY, "markers.processes=2"]
+    command = [sys.executable, "-c", program, *TINY, "ablation.processes=2"]
     journal = Path("run/ablation.h5.journal")
     for _ in range(5):  # On a busy machine it may be done before this process looks.
         shutil.rmtree("run", ignore_errors=True)
@@ -198,7 +198,7 @@ def test_workers_end_with_their_parent_and_what_they_finished_is_kept(finished, 
 
 
 def test_an_error_in_a_worker_is_one_sentence(folder):
-    code, err = run(*TINY, "markers.processes=2", "reconstruction.max_iterations=1")
+    code, err = run(*TINY, "ablation.processes=2", "reconstruction.max_iterations=1")
     assert code == 2
     assert err.splitlines()[-1].startswith("error: sparse Gauss-Newton reconstruction moved by ")
     assert "Traceback" not in err
@@ -206,17 +206,17 @@ def test_an_error_in_a_worker_is_one_sentence(folder):
 
 @pytest.mark.parametrize(
     "options",
-    [["markers.modes=8"], ["budget=quick", "data.steps=4"], ["mesh=beam_tetrahedra", "mesh.divisions=[2,1,1]"]],
+    [["ablation.modes=8"], ["budget=quick", "data.steps=4"], ["mesh=beam_tetrahedra", "mesh.divisions=[2,1,1]"]],
     ids=lambda options: options[0],
 )
 def test_other_options(folder, options):
     small = [option for option in TINY if not (option.startswith("mesh") and options[0].startswith("mesh="))]
-    assert run(*small, "markers.counts=[6]", "markers.draws=2", *options)[0] == 0
+    assert run(*small, "ablation.counts=[6]", "ablation.draws=2", *options)[0] == 0
     assert rows()[0]["median_mm"] < 0.5 * json.loads(Path("run/metrics.json").read_text())["uncorrected_mm"]
 
 
 def test_the_published_method_gives_the_same_errors(folder):
-    small = [*TINY, "markers.counts=[4]", "markers.draws=1", "data.steps=3", "reconstruction.regularisation=1e-4"]
+    small = [*TINY, "ablation.counts=[4]", "ablation.draws=1", "data.steps=3", "reconstruction.regularisation=1e-4"]
     assert run(*small)[0] == 0
     ours = errors()
     assert run(*small, "reconstruction=lbfgsb")[0] == 0
@@ -227,23 +227,26 @@ def test_the_published_method_gives_the_same_errors(folder):
 @pytest.mark.parametrize(
     ("overrides", "sentence"),
     [
-        ("markers.counts=[1,43]", "markers.counts asks for 43 markers, but the mesh has 42 surface vertices: ask for"),
-        ("markers.counts=[]", "markers.counts is []: it must be a list of different positive whole numbers."),
-        ("markers.counts=[0]", "markers.counts is [0]: it must be a list"),
-        ("markers.counts=[2,2]", "markers.counts is [2, 2]: it must be a list of different"),
-        ("markers.counts=4", "markers.counts is 4: it must be a list"),
-        ("markers.counts=[1.5]", "markers.counts is [1.5]: it must be a list"),
-        ("markers.draws=0", "markers.draws is 0: it must be a positive whole number."),
-        ("markers.modes=-1", "markers.modes is -1: it must be a positive whole number, or null."),
-        ("markers.modes=1000", "1000 vibration modes were asked for, but the body has 1 to 108."),
-        ("markers.processes=0", "markers.processes is 0: it must be a positive whole number, or null."),
-        ("markers=null", "markers is None: it must be a group of counts, draws, modes and processes."),
-        ("+markers.seeds=3", "it must be a group of counts, draws, modes and processes."),
-        ("data.steps=0", "data.steps is 0: it must be positive."),
+        (
+            "ablation.counts=[1,43]",
+            "ablation.counts asks for 43 markers, but the mesh has 42 surface vertices: ask for",
+        ),
+        ("ablation.counts=[]", "ablation.counts is []: it must be a list of different positive whole numbers."),
+        ("ablation.counts=[0]", "ablation.counts is [0]: it must be a list"),
+        ("ablation.counts=[2,2]", "ablation.counts is [2, 2]: it must be a list of different"),
+        ("ablation.counts=4", "ablation.counts is 4: it must be a list"),
+        ("ablation.counts=[1.5]", "ablation.counts is [1.5]: it must be a list"),
+        ("ablation.draws=0", "ablation.draws is 0: it must be a whole number, one or more."),
+        ("ablation.modes=-1", "ablation.modes is -1: it must be a whole number, one or more, or null."),
+        ("ablation.modes=1000", "1000 vibration modes were asked for, but the body has 1 to 108."),
+        ("ablation.processes=0", "ablation.processes is 0: it must be a whole number, one or more, or null."),
+        ("ablation=null", "ablation is None: it must be a group of settings."),
+        ("+ablation.seeds=3", "unknown key 'ablation.seeds': ablation has counts, draws, modes, processes."),
+        ("data.steps=0", "data.steps is 0: it must be a whole number, one or more."),
         ("data.weights_g.observed=[50,70]", "data.weights_g.observed is [50, 70]: it must be a list of one positive"),
         ("data.weights_g.observed=[-1]", "data.weights_g.observed is [-1]: it must be a list of one positive"),
         ("reconstruction.regularisation=0", "reconstruction.regularisation is 0: it must be positive, as markers"),
-        ("reconstruction=lbfgsb markers.modes=4", "4 modes are asked for, but reconstruction.method=lbfgsb has none"),
+        ("reconstruction=lbfgsb ablation.modes=4", "4 modes are asked for, but reconstruction.method=lbfgsb has none"),
     ],
 )
 def test_bad_input(folder, overrides, sentence):

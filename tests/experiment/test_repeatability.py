@@ -18,7 +18,7 @@ SMALL = {
         "data.angles_deg.validation=[60]",
         "data.angles_deg.test=[140]",
     ],
-    "marker_ablation": ["markers.counts=[1,4]", "markers.draws=3"],
+    "marker_ablation": ["ablation.counts=[1,4]", "ablation.draws=3"],
 }
 LEARNING = ["trainer.epochs=6", "trainer.rollout_every=2", "network.width=16"]
 NOT_COMPARED = {"seconds", "seconds_per_test_trajectory", "peak_memory_gib", "versions"}

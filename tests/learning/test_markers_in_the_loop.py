@@ -3,16 +3,17 @@
 import numpy as np
 import pytest
 import torch
-from warp_resphys.experiment.measured.evaluate import marker_errors, markers_at_frames
-from warp_resphys.experiment.measured.scene import at_steps
 
 from warp_resphys import Body, Simulator, State, box_hexahedra, select_vertices
 from warp_resphys.data.markers import bind_markers
 from warp_resphys.data.trials import Trials
 from warp_resphys.dynamics.inputs import Inputs
+from warp_resphys.experiment.scene import at_steps
+from warp_resphys.experiment.schema import IN_THE_LOOP, check
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.io.files import read_checkpoint, write_checkpoint
-from warp_resphys.learning.markers_in_the_loop import MarkersInTheLoop, MotionLoss, epochs_that_hold_up
+from warp_resphys.learning.markers_in_the_loop import MarkersInTheLoop, MotionLoss, Watched, epochs_that_hold_up
+from warp_resphys.learning.metrics import marker_errors
 from warp_resphys.learning.networks import build_model
 from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.studies.gradient_check import central_difference
@@ -33,7 +34,7 @@ NETWORK = {
     "layers": 0,
     "width": 8,
 }
-CONFIG = {"epochs": 4, "penalty": 1e-3, "memory": 5, "rollout_every": 1, "patience": 3}
+CONFIG = {"epochs": 4, "penalty": 1e-3, "hold_out": True, "memory": 5, "rollout_every": 1, "patience": 3}
 
 
 def simulator():
@@ -119,7 +120,8 @@ def test_markers_at_frames_follow_the_steps_and_are_lost_with_them():
     times = (0.004 + STEP * torch.arange(10, dtype=torch.float64)).repeat(2, 1)
     motions = motions_of(times, torch.as_tensor(POINTS).repeat(2, 10, 1, 1))
     release = Start(State(q[:, 0], torch.zeros_like(q[:, 0])), torch.tensor([0.0, 0.006], dtype=torch.float64))
-    found = markers_at_frames(q, sim, MARKERS, motions, release)
+    seen = torch.stack([MARKERS(each) for each in q])
+    found = Replay(sim, MARKERS, motions).at_frames(seen, release)
     since = (times - release.delay[:, None]).clamp_min(0.0)
     expected = torch.as_tensor(POINTS) + since[..., None, None] * velocity
     torch.testing.assert_close(found[0], expected[0], rtol=0.0, atol=1e-9)
@@ -142,7 +144,7 @@ def observed_motions(frames=8):
 @pytest.fixture(scope="module")
 def loss():
     motions, release = observed_motions()
-    return MotionLoss(Replay(simulator(), MARKERS, motions), release, {}, LOADS)
+    return MotionLoss([Watched(Replay(simulator(), MARKERS, motions), release, LOADS)], {})
 
 
 def network(seed=0, **changes):
@@ -221,7 +223,7 @@ class TestMarkersInTheLoop:
         def fragile(self, model):
             calls.append(torch.is_grad_enabled())
             if sum(calls) == 2:  # the first weights that the first line search tries
-                raise ConvergenceError("no", self._release.state.q, None)
+                raise ConvergenceError("no", torch.zeros(1), None)
             return call(self, model)
 
         monkeypatch.setattr(MotionLoss, "__call__", fragile)
@@ -249,7 +251,7 @@ class TestMarkersInTheLoop:
         sim = simulator()
         with torch.no_grad():
             exact = Replay(sim, MARKERS, motions)(release)[0]
-        other = MotionLoss(Replay(sim, MARKERS, motions_of(motions.times, exact)), release, {}, LOADS)
+        other = MotionLoss([Watched(Replay(sim, MARKERS, motions_of(motions.times, exact)), release, LOADS)], {})
         config, seen = {**CONFIG, "epochs": 3}, []
         assert epochs_that_hold_up(network, [(loss, loss)], config, lambda: seen.append(1)) == 3
         assert len(seen) == 3
@@ -272,6 +274,20 @@ class TestMarkersInTheLoop:
         assert loss.error_mm(trainer.use_best()) == pytest.approx(loss.error_mm(None), rel=1e-9)
 
     @pytest.mark.parametrize(("key", "value"), [("epochs", 0), ("memory", 0), ("patience", 0), ("penalty", -1.0)])
-    def test_bad_settings(self, loss, key, value):
+    def test_bad_settings(self, key, value):
+        check("in_the_loop", CONFIG, IN_THE_LOOP)
         with pytest.raises(InputError, match=rf"in_the_loop\.{key} is {value}: it must be"):
-            MarkersInTheLoop(network(), loss, None, {**CONFIG, key: value})
+            check("in_the_loop", {**CONFIG, key: value}, IN_THE_LOOP)
+
+    def test_groups_weigh_what_their_trials_do(self, loss):
+        """Motions in groups of their own, as those that begin otherwise are, give the loss and error of one group."""
+        motions, release = observed_motions()
+        sim, model = simulator(), network()
+        watched = [
+            Watched(Replay(sim, MARKERS, motions.select([row])), release.select([row]), LOADS[[row]]) for row in (1, 0)
+        ]
+        apart = MotionLoss(watched, {})
+        for each in (None, model):
+            assert float(apart(each).detach()) == pytest.approx(float(loss(each).detach()), rel=1e-9)
+            assert apart.error_mm(each) == pytest.approx(loss.error_mm(each), rel=1e-9)
+        assert [len(markers) for markers in apart.markers(None)] == [1, 1]

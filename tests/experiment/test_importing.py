@@ -12,33 +12,36 @@ import pytest
 import torch
 from measured_run import configuration
 from scipy.spatial.transform import Rotation
-from warp_resphys.experiment.measured.files import MARKERS, QUALITY, REGISTRATION, TRUTH, read_motions, recording_file
-from warp_resphys.experiment.measured.importing import import_recordings
-from warp_resphys.experiment.measured.stages import import_stages
-from warp_resphys.experiment.measured.synthesise import make_scene, reality, simulate
-from warp_resphys.experiment.measured.trials import trials_of
 
 from warp_resphys import cli
 from warp_resphys.data.recordings.arrays import write_recording
 from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.recordings.recording import Recording
-from warp_resphys.experiment.build import build_body
+from warp_resphys.data.trials import Trials
+from warp_resphys.dynamics.inputs import Inputs
+from warp_resphys.experiment.build import bound_markers, build_body
 from warp_resphys.experiment.checks import check_configuration
+from warp_resphys.experiment.files import DATASET, QUALITY, REGISTRATION, TRUTH, attached_mass, read_dataset
+from warp_resphys.experiment.importing import import_recordings
+from warp_resphys.experiment.laboratory import laboratory_simulator, make_setup
+from warp_resphys.experiment.pipeline import acquisition_stages
+from warp_resphys.experiment.trials import trials_of
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.files import read_hdf5
 from warp_resphys.io.stages import StageContext, fingerprint, run_stages
+from warp_resphys.learning.replay import Replay, Start
 
 ROOT = Path(__file__).parents[2]
 TIPS, BASES = tuple(f"Tip - {i}" for i in (1, 2, 3)), tuple(f"Base - {i}" for i in (1, 2, 3))
 RATE = 100.0
 SMALL = [
-    "synthetic.mesh.divisions=[6,2,2]",
-    "synthetic.time_step=0.005",
-    "synthetic.seconds=0.6",
+    "laboratory.mesh.divisions=[6,2,2]",
+    "laboratory.time_step=0.005",
+    "laboratory.seconds=0.6",
     "data.seconds=0.5",
-    "synthetic.train=[m0,m50]",
-    "synthetic.validation=[]",
-    "synthetic.test=[m90]",
+    "laboratory.train=[m0,m50]",
+    "laboratory.validation=[]",
+    "laboratory.test=[m90]",
 ]
 
 
@@ -52,28 +55,52 @@ def laboratory(tmp_path_factory):
     folder = tmp_path_factory.mktemp("laboratory")
     config = configuration(*SMALL)
     check_configuration(config)
-    run_stages(import_stages(config), folder)
+    run_stages(acquisition_stages(config), folder)
     return folder, config
+
+
+def true_markers(config, setup, trials, times):
+    """(R, T, M, 3) tracked markers in the frame of the body at times (R, T) since the release, as it was simulated [m]."""
+    simulator = laboratory_simulator(config, setup.gravity)
+    read = bound_markers(config["markers"], simulator.body.mesh, setup.tracked, TIPS).to(simulator.rest_positions)
+    masses = attached_mass(simulator.body, config["data"]["payload_at"], np.array([each.payload for each in trials]))
+    held = torch.as_tensor(setup.tracked).expand(len(trials), -1, -1)
+    blank = held[:, None].expand(-1, times.shape[1], -1, -1)
+    inputs = Inputs(attached_mass=torch.as_tensor(masses))
+    motions = Trials(tuple(each.name for each in trials), torch.as_tensor(times).clamp_min(0.0), blank, held, inputs)
+    start = Start(simulator.rest_state(len(trials)), torch.zeros(len(trials), dtype=torch.float64))
+    with torch.no_grad():
+        return Replay(simulator, read, motions)(start)[0].numpy()
+
+
+def read_motions(folder, config):
+    """The dataset of a run, and its trials as a simulator takes them."""
+    dataset = read_dataset(folder / DATASET)
+    return dataset, dataset.trials(dataset.names, build_body(config), config["data"]["payload_at"])
 
 
 def test_simulated_markers_come_back_within_noise(laboratory):
     folder, config = laboratory
-    motions, bound, labels, _ = read_motions(folder / MARKERS, build_body(config), config["data"]["hung_on"])
+    dataset, motions = read_motions(folder, config)
+    bound = dataset.bound
     assert motions.names == ("m0", "m50", "m90")
-    assert labels == TIPS
+    assert dataset.labels == TIPS
+    assert dataset.begins == 3 * ("released",)
+    assert dataset.inputs == dataset.channels == {}
+    np.testing.assert_allclose(dataset.payload, [0.0, 0.05, 0.09])
     np.testing.assert_allclose(motions.inputs.attached_mass.sum(1), [0.0, 0.05, 0.09], atol=1e-12)
-    scene = make_scene(config)
+    setup = make_setup(config)
     released = np.array(list(read_json(folder / TRUTH)["released_s"].values()))
     found = np.array([each["release_frame"] for each in read_json(folder / QUALITY).values()]) / RATE
     times = motions.times.numpy() + (found - released)[:, None]
-    true = simulate(config, reality(config, scene.gravity), scene, trials_of(config), times)
+    true = true_markers(config, setup, trials_of(config), times)
     # The nominal places turn the frame by a little; what has to come back is the motion in it.
-    turn, _ = Rotation.align_vectors(bound - bound.mean(0), scene.followed - scene.followed.mean(0))
+    turn, _ = Rotation.align_vectors(bound - bound.mean(0), setup.tracked - setup.tracked.mean(0))
     assert np.degrees(turn.magnitude()) < 1.0
-    moved = turn.apply((true - scene.followed).reshape(-1, 3)).reshape(true.shape)
+    moved = turn.apply((true - setup.tracked).reshape(-1, 3)).reshape(true.shape)
     off = (motions.observed.numpy() - bound - moved)[motions.seen.numpy()]
     assert float(motions.amplitude[2]) > 0.01
-    assert np.sqrt(np.mean(off**2)) < 2.5 * config["synthetic"]["noise"]
+    assert np.sqrt(np.mean(off**2)) < 2.5 * config["laboratory"]["noise"]
     torch.testing.assert_close(motions.held, torch.as_tensor(bound).expand(3, -1, -1), rtol=0.0, atol=1e-12)
     registration = read_json(folder / REGISTRATION)["m50"]
     assert 0.2 < registration["rms_mm"] < 0.6  # misplaced by 0.3 mm a coordinate, less what the motion takes up
@@ -82,8 +109,8 @@ def test_simulated_markers_come_back_within_noise(laboratory):
 
 def test_frames_end_with_what_counts(laboratory):
     folder, config = laboratory
-    with read_hdf5(folder / MARKERS, "markers") as file:
-        times, markers = file["times"][()], file["markers"][()]
+    with read_hdf5(folder / DATASET, "dataset") as file:
+        times, markers = file["times"][()], file["observed"][()]
     assert (np.diff(times, axis=1) >= 0.0).all()
     assert (times[:, 0] >= 0.0).all()
     assert (times[:, 0] < 1.0 / RATE).all()
@@ -96,14 +123,14 @@ def test_frames_end_with_what_counts(laboratory):
 def test_gravity_and_release_are_recovered(laboratory):
     folder, config = laboratory
     truth, quality = read_json(folder / TRUTH), read_json(folder / QUALITY)
-    with read_hdf5(folder / MARKERS, "markers") as file:
+    with read_hdf5(folder / DATASET, "dataset") as file:
         gravity = np.asarray(file.attrs["gravity"])
     true = np.array(truth["gravity"])
     lean = np.degrees(np.arccos(gravity @ true / np.linalg.norm(gravity) / np.linalg.norm(true)))
     assert lean < 0.5
     assert np.linalg.norm(gravity) == pytest.approx(9.80709)
     tilt = np.degrees(np.arccos(-true[2] / np.linalg.norm(true)))
-    assert tilt == pytest.approx(config["synthetic"]["tilt"])
+    assert tilt == pytest.approx(config["laboratory"]["tilt"])
     for name, at in truth["released_s"].items():
         assert quality[name]["release_frame"] == pytest.approx(RATE * at, abs=0.3)
         assert 40.0 < RATE * at < 41.0
@@ -111,9 +138,9 @@ def test_gravity_and_release_are_recovered(laboratory):
 
 def test_the_recordings_are_in_a_frame_of_their_own(laboratory):
     folder, config = laboratory
-    recording = read_recording(folder / recording_file("m0"))
+    recording = read_recording(folder / "recordings/m0.h5")
     assert recording.labels == (*TIPS, *BASES)
-    nominal = np.array([*config["markers"]["followed"].values(), *config["markers"]["others"].values()])
+    nominal = np.array([*config["markers"]["tracked"].values(), *config["markers"]["reference"].values()])
     assert np.linalg.norm(recording.positions[0] - nominal, axis=1).min() > 0.05
     sag = recording.positions[-1, :3].mean(0) - recording.positions[0, :3].mean(0)
     assert -sag[0] > 0.99 * np.linalg.norm(sag) - 2e-3  # up is x
@@ -122,20 +149,22 @@ def test_the_recordings_are_in_a_frame_of_their_own(laboratory):
 def test_a_trial_does_not_depend_on_the_others(tmp_path, laboratory):
     folder, config = laboratory
     alone = copy.deepcopy(config)
-    alone["synthetic"] |= {"train": ["m90"], "test": ["m50"]}
-    run_stages(import_stages(alone)[:1], tmp_path)
-    one, other = (read_recording(place / recording_file("m90")) for place in (folder, tmp_path))
+    alone["laboratory"] |= {"train": ["m90"], "test": ["m50"]}
+    run_stages(acquisition_stages(alone)[:1], tmp_path)
+    one, other = (read_recording(place / "recordings/m90.h5") for place in (folder, tmp_path))
     np.testing.assert_allclose(one.positions, other.positions, rtol=0.0, atol=1e-7)
     again = configuration(*SMALL, "seed=1")
-    assert fingerprint(import_stages(again)[0], {}) != fingerprint(import_stages(config)[0], {})
-    assert np.abs(make_scene(again).translation - make_scene(config).translation).min() > 1e-3
+    assert fingerprint(acquisition_stages(again)[0], {}) != fingerprint(acquisition_stages(config)[0], {})
+    assert np.abs(make_setup(again).translation - make_setup(config).translation).min() > 1e-3
 
 
 def test_without_a_known_vertical_gravity_is_as_configured(tmp_path):
-    config = configuration(*SMALL, "data.up=null", "synthetic.train=[m90]", "synthetic.test=[m50]", "data.seconds=0.1")
-    config["synthetic"]["seconds"] = 0.1
-    run_stages(import_stages(config), tmp_path)
-    with read_hdf5(tmp_path / MARKERS, "markers") as file:
+    config = configuration(
+        *SMALL, "data.up=null", "laboratory.train=[m90]", "laboratory.test=[m50]", "data.seconds=0.1"
+    )
+    config["laboratory"]["seconds"] = 0.1
+    run_stages(acquisition_stages(config), tmp_path)
+    with read_hdf5(tmp_path / DATASET, "dataset") as file:
         np.testing.assert_allclose(file.attrs["gravity"], config["gravity"])
     assert "vertical_deg" not in read_json(tmp_path / REGISTRATION)["m90"]
 
@@ -147,12 +176,12 @@ class Shelf:
         made, config = laboratory
         self.folder, self.config = folder, copy.deepcopy(config)
         names = {"bare": "m0", "load52": "m50", "load101": "m90"}
-        hung = config["synthetic"]["trials"]
+        hung = config["laboratory"]["trials"]
         self.config["data"] |= {
             "folder": str(folder),
-            "trials": {name: {"file": f"{name}.h5", "hung": hung[of]["hung"]} for name, of in names.items()},
+            "trials": {name: {"file": f"{name}.h5", "payload": hung[of]["payload"]} for name, of in names.items()},
         }
-        self.recordings = {name: read_recording(made / recording_file(of)) for name, of in names.items()}
+        self.recordings = {name: read_recording(made / f"recordings/{of}.h5") for name, of in names.items()}
         for name in names:
             self.write(name)
 
@@ -170,7 +199,7 @@ class Shelf:
 
     def bring_in(self):
         import_recordings(StageContext("import", self.folder, "", self.config))
-        with read_hdf5(self.folder / MARKERS, "markers") as file:
+        with read_hdf5(self.folder / DATASET, "dataset") as file:
             return {name: file[name][()] for name in file} | dict(file.attrs)
 
 
@@ -180,19 +209,30 @@ def shelf(tmp_path, laboratory):
 
 
 def test_recordings_of_a_folder_give_what_the_run_folder_gave(shelf, laboratory):
+    shelf.config["split"] = {"train": ["bare", "load52"], "validation": []}
     found = shelf.bring_in()
-    with read_hdf5(laboratory[0] / MARKERS, "markers") as file:
-        np.testing.assert_array_equal(found["markers"], file["markers"][()])
+    with read_hdf5(laboratory[0] / DATASET, "dataset") as file:
+        np.testing.assert_array_equal(found["observed"], file["observed"][()])
+        np.testing.assert_array_equal(found["bound"], file["bound"][()])
     assert list(found["names"]) == ["bare", "load52", "load101"]
-    np.testing.assert_array_equal(found["load"], [0.0, 0.05, 0.09])
+    np.testing.assert_array_equal(found["payload"], [0.0, 0.05, 0.09])
+
+
+def test_a_trial_that_is_tested_does_not_say_where_markers_sit(shelf):
+    shelf.config["split"] = {"train": ["bare"], "validation": ["load52"]}
+    first = shelf.bring_in()["bound"]
+    shelf.move("load101", "Tip - 2", [0.0, 0.001, 0.0])
+    np.testing.assert_array_equal(shelf.bring_in()["bound"], first)
+    shelf.move("load52", "Tip - 2", [0.0, 0.001, 0.0])
+    assert np.abs(shelf.bring_in()["bound"] - first).max() > 2e-4
 
 
 def test_short_gaps_are_filled_and_long_ones_masked(shelf):
-    whole = shelf.bring_in()["markers"]
+    whole = shelf.bring_in()["observed"]
     positions = shelf.recordings["load52"].positions.copy()
     positions[50:53, 0] = positions[60:70, 1] = np.nan
     shelf.write("load52", positions=positions)
-    found = shelf.bring_in()["markers"]
+    found = shelf.bring_in()["observed"]
     np.testing.assert_allclose(found[1, :, 0], whole[1, :, 0], rtol=0.0, atol=1e-3)
     first = 60 - int(np.ceil(read_json(shelf.folder / QUALITY)["load52"]["release_frame"]))
     hidden = np.zeros(found.shape[1], bool)
@@ -217,10 +257,10 @@ def test_each_trial_stands_where_the_mean_of_all_does(shelf):
     shelf.config["data"]["trials"].pop("load101")
     rest = shelf.bring_in()
     np.testing.assert_allclose(whole["bound"], rest["bound"], rtol=0.0, atol=3e-5)
-    np.testing.assert_allclose(whole["markers"][2, 0], whole["bound"], rtol=0.0, atol=1e-3)
+    np.testing.assert_allclose(whole["observed"][2, 0], whole["bound"], rtol=0.0, atol=1e-3)
     shelf.move("load52", "Tip - 2", [0.0, 0.0012, 0.0])
     moved = shelf.bring_in()
-    swing, same = (found["markers"][1] - found["bound"] for found in (rest, moved))
+    swing, same = (found["observed"][1] - found["bound"] for found in (rest, moved))
     np.testing.assert_allclose(swing, same, rtol=0.0, atol=4e-4)  # a registration that is turned a little
     assert moved["held"][1] == pytest.approx(moved["bound"])
     shift = read_json(shelf.folder / REGISTRATION)["load52"]["shift_mm"]["Tip - 2"]
@@ -241,9 +281,9 @@ def test_recordings_that_begin_with_the_release_of_a_deformed_body(shelf):
     shelf.config["data"] |= {"begins": "released", "rest": "file", "seconds": 0.4}
     found = shelf.bring_in()
     np.testing.assert_allclose(found["bound"], whole["bound"], rtol=0.0, atol=2e-5)
-    np.testing.assert_allclose(found["held"], found["markers"][:, 0], rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(found["held"], found["observed"][:, 0], rtol=0.0, atol=1e-12)
     np.testing.assert_allclose(found["times"], np.broadcast_to(np.arange(41) / RATE, (3, 41)), atol=1e-9)
-    np.testing.assert_allclose(found["markers"][2], whole["markers"][2, 3:44], rtol=0.0, atol=5e-5)
+    np.testing.assert_allclose(found["observed"][2], whole["observed"][2, 3:44], rtol=0.0, atol=5e-5)
     assert np.linalg.norm(found["held"] - found["bound"], axis=2).min() > 5e-4
 
 
@@ -265,7 +305,7 @@ def test_a_missing_file_is_named(shelf):
     (shelf.folder / "load52.h5").unlink()
     refuse(shelf, r"load52\.h5 does not exist")
     with pytest.raises(DataFileError, match=r"cannot read .*load52\.h5 .*data\.trials\.load52\.file"):
-        import_stages(shelf.config)
+        acquisition_stages(shelf.config)
 
 
 @pytest.mark.parametrize("share", [0.3, 0.9])
@@ -317,8 +357,8 @@ def test_what_moved_after_the_release_alone_is_no_fault_of_the_base(shelf):
 def test_a_residual_above_the_threshold_names_file_and_marker(shelf):
     for name in shelf.recordings:
         shelf.move(name, "Tip - 3", [0.0, 0.0, 0.012])
-    shelf.config["markers"]["others"].pop("Base - 3")
-    shelf.config["markers"]["others"].pop("Base - 2")
+    shelf.config["markers"]["reference"].pop("Base - 3")
+    shelf.config["markers"]["reference"].pop("Base - 2")
     refuse(shelf, r"bare\.h5: the markers at rest do not fit .* 4\.0 mm: 'Tip - 3' is \d+\.\d mm off")
 
 
@@ -372,24 +412,25 @@ def test_a_marker_far_from_the_body_is_named(shelf):
 
 
 def test_a_changed_recording_is_imported_again(shelf):
-    before = fingerprint(import_stages(shelf.config)[0], {})
-    assert fingerprint(import_stages(shelf.config)[0], {}) == before
+    before = fingerprint(acquisition_stages(shelf.config)[0], {})
+    assert fingerprint(acquisition_stages(shelf.config)[0], {}) == before
     shelf.move("load52", "Tip - 1", 1e-6)
-    assert fingerprint(import_stages(shelf.config)[0], {}) != before
+    assert fingerprint(acquisition_stages(shelf.config)[0], {}) != before
 
 
 def test_the_three_beams(shared_data, tmp_path):
     config = configuration(f"data.folder={shared_data / 'beam_mocap'}")
     check_configuration(config)
-    run_stages(import_stages(config), tmp_path)
+    run_stages(acquisition_stages(config), tmp_path)
     registration = read_json(tmp_path / REGISTRATION)
     rms = {name: round(each["rms_mm"], 2) for name, each in registration.items()}
     assert rms == {"bare": 0.81, "load52": 0.83, "load101": 1.13}  # docs/registration.md
-    motions, bound, _, gravity = read_motions(tmp_path / MARKERS, build_body(config), config["data"]["hung_on"])
+    dataset, motions = read_motions(tmp_path, config)
+    bound, gravity = dataset.bound, dataset.gravity
     assert bool(motions.seen[motions.times < 1.38].all())
     np.testing.assert_allclose(motions.inputs.attached_mass.sum(1) * 9.80709, [0.0, 0.51012, 1.00062], atol=1e-4)
     assert int((motions.inputs.attached_mass[1] > 0.0).sum()) == 4
-    nominal = np.array(list(config["markers"]["followed"].values()))
+    nominal = np.array(list(config["markers"]["tracked"].values()))
     assert np.linalg.norm(bound - nominal, axis=1).max() < 2e-3
     assert np.degrees(np.arccos(-gravity[2] / np.linalg.norm(gravity))) < 10.0
     for row, name in enumerate(("gravity", "load52", "load101")):  # a rigid motion keeps every distance
@@ -408,7 +449,7 @@ class TestCommand:
         """Runs the experiment on the shelf's recordings, through the command line."""
 
         def run(*overrides):
-            trials = [f"++data.trials.{name}={{file: {name}.h5, hung: 0.0}}" for name in shelf.recordings]
+            trials = [f"++data.trials.{name}={{file: {name}.h5, payload: 0.0}}" for name in shelf.recordings]
             quiet = ["hydra/job_logging=none", "hydra/hydra_logging=none"]
             places = [f"data.folder={shelf.folder}", f"hydra.run.dir={shelf.folder / 'run'}"]
             arguments = ["warp-resphys", "experiment=beam_real", *places, *quiet, *trials, *overrides]
@@ -426,7 +467,7 @@ class TestCommand:
         shelf.move("load52", "Base - 3", [0.002, 0.0, 0.0])
         sentence = r"^error: .*load52\.h5: base marker Base - 3 moved by 2\.00 mm .*\n$"
         assert re.search(sentence, command(), flags=re.MULTILINE)
-        assert not (shelf.folder / "run" / MARKERS).exists()
+        assert not (shelf.folder / "run" / DATASET).exists()
 
     def test_names_that_do_not_match(self, shelf, command):
         shelf.write("bare", labels=("a", *TIPS[1:], *BASES))
@@ -460,7 +501,7 @@ def test_the_tutorial(shared_data, tmp_path, monkeypatch):
     assert len(written.splitlines()) < 36
     config = configuration(f"hydra.searchpath=[file://{tmp_path / 'configs'}]", experiment="my_robot")
     check_configuration(config)
-    run_stages(import_stages(config), tmp_path)
+    run_stages(acquisition_stages(config), tmp_path)
     quality, registration = read_json(tmp_path / QUALITY), read_json(tmp_path / REGISTRATION)
     for line, (name, each) in zip(log, quality.items(), strict=True):
         rms = registration[name]["rms_mm"]

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from measured_run import configuration
-from warp_resphys.experiment.kinds import dotted
-from warp_resphys.experiment.measured.trials import folds_of, split_of, trials_of, vertical
-from warp_resphys.experiment.trajectories import training_settings
 
-from warp_resphys.experiment.checks import check_configuration
+from warp_resphys.experiment.checks import check_configuration, training_settings
+from warp_resphys.experiment.laboratory import vertical
+from warp_resphys.experiment.schema import dotted
+from warp_resphys.experiment.trials import folds_of, split_of, trials_of
 from warp_resphys.io.errors import InputError, ResphysError
 
 ROOT = Path(__file__).parents[2]
@@ -24,7 +24,7 @@ def changed(config, key, value):
     return config
 
 
-TRIALS = {"a": {"file": "a.c3d", "hung": 0.0}, "b": {"file": "b.c3d", "hung": 0.1}}
+TRIALS = {"a": {"file": "a.c3d", "payload": 0.0}, "b": {"file": "b.c3d", "payload": 0.1}}
 
 
 @pytest.mark.parametrize(
@@ -40,29 +40,48 @@ TRIALS = {"a": {"file": "a.c3d", "hung": 0.0}, "b": {"file": "b.c3d", "hung": 0.
         ("data/up", [0.0, 0.0, 0.0], "data.up is .*: give x, -x"),
         ("data/up", [0.0, 1.0], "data.up is .*: it must be x, -x"),
         ("data/begins", "later", "data.begins is 'later': it must be one of held, released"),
-        ("data/hung", {"x": 0.1}, "unknown key 'data.hung': data has kind, folder"),
-        ("data/hung_on", {"x": 0.07003}, "no vertex lies within"),
-        ("data/hung_on", {"x": 0.0}, "data.hung_on names fixed vertices alone"),
-        ("data/hung_on", {"w": 0.0}, "unknown key 'data.hung_on.w'"),
-        ("data/hung_on", {"x": "tip"}, "data.hung_on.x is 'tip': it must be a number"),
-        ("data/hung_on", None, "a trial has a load, but data.hung_on is not set"),
-        ("data/trials", {}, "data.trials is empty: name each trial"),
+        ("data/payload", {"x": 0.1}, "unknown key 'data.payload': data has folder, units"),
+        ("data/payload_at", {"x": 0.07003}, "no vertex lies within"),
+        ("data/payload_at", {"x": 0.0}, "data.payload_at names fixed vertices alone"),
+        ("data/payload_at", {"w": 0.0}, "unknown key 'data.payload_at.w'"),
+        ("data/payload_at", {"x": "tip"}, "data.payload_at.x is 'tip': it must be a finite number"),
+        ("data/payload_at", None, "a trial has a payload, but data.payload_at is not set"),
+        ("data/trials", {}, "recordings is no folder: set data.folder to that of the recordings"),
         ("data/trials", {"a/b": TRIALS["a"]}, "data.trials.a/b: files are named after trials"),
         ("data/trials", {7: TRIALS["a"]}, "data.trials.7: files are named after trials"),
-        ("data/trials", {"a": {"file": "a.c3d"}}, "data.trials.a is .*: it needs file and hung"),
-        ("data/trials", {"a": {"file": 3, "hung": 0.0}}, "data.trials.a.file is 3: it must be the name of a file"),
-        ("data/trials", {"a": {"file": "a.c3d", "hung": -0.1}}, "data.trials.a.hung is -0.1: it must be a mass"),
+        (
+            "data/trials",
+            {"a": {"payload": 0.0}},
+            "data.trials.a.file is missing: give the name of a file in data.folder",
+        ),
+        ("data/trials", {"a": "a.c3d"}, "data.trials.a is 'a.c3d': it must be a group of settings"),
+        (
+            "data/trials",
+            {"a": TRIALS["a"] | {"colour": 1}},
+            "unknown key 'data.trials.a.colour': data.trials.a has file",
+        ),
+        (
+            "data/trials",
+            {"a": TRIALS["a"] | {"begins": "now"}},
+            "data.trials.a.begins is 'now': it must be one of held",
+        ),
+        ("data/trials", {"a": {"file": 3, "payload": 0.0}}, "data.trials.a.file is 3: it must be the name of a file"),
+        ("data/trials", {"a": {"file": "a.c3d", "payload": -0.1}}, "data.trials.a.payload is -0.1: it must be a mass"),
         ("data/trials", {"a": TRIALS["a"], "b": TRIALS["a"]}, "the trials 'a' and 'b' have the same file, a.c3d"),
         ("data/trials", {"a": TRIALS["a"]}, "data.folds is leave_one_out, which needs two trials"),
         ("markers/bind", "glue", "markers.bind is 'glue': it must be one of normal, frame, rigid"),
         ("markers/bind_to", None, "markers.bind is rigid: set markers.bind_to"),
         ("markers/bind_to", {"x": 0.07003}, "no vertex lies within"),
-        ("markers/followed", {}, "markers.followed is empty"),
-        ("markers/followed/Tip - 1", [0.1, 0.0], r"markers.followed.Tip - 1 is \[0.1, 0.0\]: it must be three numbers"),
-        ("markers/others/Tip - 1", [0.1, 0.0, 0.0], "the marker 'Tip - 1' is in markers.followed and markers.others"),
-        ("markers/others", {"Base - 1": [0, 0, 0], "Base - 2": "x"}, "markers.others.Base - 2 is 'x'"),
+        ("markers/tracked", {}, "markers.tracked is empty"),
+        ("markers/tracked/Tip - 1", [0.1, 0.0], r"markers.tracked.Tip - 1 is \[0.1, 0.0\]: it must be three numbers"),
+        (
+            "markers/reference/Tip - 1",
+            [0.1, 0.0, 0.0],
+            "the marker 'Tip - 1' is in markers.tracked and markers.reference",
+        ),
+        ("markers/reference", {"Base - 1": [0, 0, 0], "Base - 2": "x"}, "markers.reference.Base - 2 is 'x'"),
         ("markers/largest_residual", -1.0, "markers.largest_residual is -1.0: it must be a positive number"),
-        ("published/simulation/colour", "red", "published.simulation: corotated has no constant 'colour': it has"),
+        ("published/simulation/colour", 1.0, "published.simulation: corotated has no constant 'colour': it has"),
         ("published/simulation/density", [1e3], r"published.simulation.density is \[1000.0\]: it must be a number"),
         ("published/simulation/model", ["red"], r"published.simulation.model is \['red'\]: it must be a word"),
         ("published/simulation/poissons_ratio", 0.6, "published.simulation: poissons_ratio is 0.6"),
@@ -108,23 +127,23 @@ def test_configuration_of_recordings_is_checked(key, value, message):
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("synthetic", None, "data.folder is not set: give the folder of the recordings"),
-        ("data/rest", "file", "data.rest is file, but simulated bodies are held undeformed"),
-        ("synthetic/tilt", 45.0, "synthetic.tilt is 45.0: it must be an angle from 0 to 20 degrees"),
-        ("synthetic/seconds", 1.0, "synthetic.seconds is 1.0, less than data.seconds"),
+        ("laboratory", None, "data.folder is not set: give the folder of the recordings"),
+        ("data/rest", "file", "release.sideways is 0.002 m, but data.rest is file"),
+        ("laboratory/tilt", 45.0, "laboratory.tilt is 45.0: it must be an angle from 0 to 20 degrees"),
+        ("laboratory/seconds", 1.0, "laboratory.seconds is 1.0, less than data.seconds"),
         (
-            "synthetic/material/youngs_modulus",
+            "laboratory/material/youngs_modulus",
             "soft",
-            "synthetic.material: youngs_modulus is 'soft': it must be a number",
+            "laboratory.material.youngs_modulus is 'soft': it must be a number",
         ),
-        ("synthetic/material/stiffness_damping", -1.0, "synthetic.material: stiffness_damping is -1"),
-        ("synthetic/integrator", "rk4", "synthetic.integrator is 'rk4'"),
-        ("synthetic/trials/m0", {"hung": -0.01}, "synthetic.trials.m0.hung is -0.01"),
-        ("synthetic/test", [], "synthetic.test is empty: name one of synthetic.trials"),
-        ("synthetic/test", ["m10", "m99"], "synthetic.test names the trial 'm99', which is not in synthetic.trials"),
-        ("synthetic/test", ["m10", "m20"], "the trial 'm20' is in synthetic.train and synthetic.test"),
-        ("synthetic/test", ["m10", "m10"], "the trial 'm10' is twice in synthetic.test"),
-        ("synthetic/mesh/kind", "sphere", "mesh.kind is 'sphere'"),
+        ("laboratory/material/stiffness_damping", -1.0, "laboratory.material: stiffness_damping is -1"),
+        ("laboratory/integrator", "rk4", "laboratory.integrator is 'rk4'"),
+        ("laboratory/trials/m0", {"payload": -0.01}, "laboratory.trials.m0.payload is -0.01"),
+        ("laboratory/test", [], "laboratory.test is empty: name one of laboratory.trials"),
+        ("laboratory/test", ["m10", "m99"], "laboratory.test names the trial 'm99', which is not in laboratory.trials"),
+        ("laboratory/test", ["m10", "m20"], "the trial 'm20' is in laboratory.train and laboratory.test"),
+        ("laboratory/test", ["m10", "m10"], "the trial 'm10' is twice in laboratory.test"),
+        ("laboratory/mesh/kind", "sphere", "mesh.kind is 'sphere'"),
     ],
 )
 def test_configuration_of_a_simulated_laboratory_is_checked(key, value, message):
@@ -141,9 +160,42 @@ def test_every_option_goes_with_recordings(group, option):
     check_configuration(configuration(f"{group}={option}"))
 
 
-def test_refinement_is_refused():
-    with pytest.raises(InputError, match="refinement is for simulated experiments"):
-        check_configuration(configuration("refinement=solver_in_the_loop"))
+@pytest.mark.parametrize("experiment", ["beam_real", "beam_synthetic", "beam_real_repeated"])
+def test_refinement_goes_with_recordings(experiment):
+    check_configuration(configuration("refinement=solver_in_the_loop", "data.folder=recordings", experiment=experiment))
+
+
+def test_a_trial_without_a_payload_carries_none(tmp_path):
+    trials = {"a": {"file": "a.c3d"}, "b": {"file": "b.c3d", "payload": 0.1, "begins": "released"}}
+    config = changed(
+        configuration(f"data.folder={tmp_path}", "data.rest=file", "release.sideways=0"), "data/trials", trials
+    )
+    check_configuration(config)
+    assert [(trial.payload, trial.begins) for trial in trials_of(config)] == [(0.0, "held"), (0.1, "released")]
+
+
+def test_a_folder_without_a_list_gives_all_its_recordings(tmp_path):
+    for name in ("b.c3d", "a.h5", "c.txt"):
+        (tmp_path / name).touch()
+    config = changed(configuration(f"data.folder={tmp_path}"), "data/trials", {})
+    check_configuration(config)
+    assert [(trial.name, trial.file) for trial in trials_of(config)] == [
+        ("a", tmp_path / "a.h5"),
+        ("b", tmp_path / "b.c3d"),
+    ]
+
+
+def test_bodies_of_the_laboratory_are_held_undeformed_or_pulled():
+    config = configuration("data.rest=file", "release.sideways=0")
+    with pytest.raises(InputError, match=r"data\.rest is file, but simulated bodies are held undeformed: set it to"):
+        check_configuration(config)
+    pulled = configuration("release.sideways=0")
+    pulled["laboratory"]["trials"]["m10"]["pull"] = [0.0, 0.1, 0.0]
+    with pytest.raises(InputError, match=r"laboratory\.trials\.m10\.pull deforms the body .*: set data\.rest to file"):
+        check_configuration(pulled)
+    for trial in config["laboratory"]["trials"].values():
+        trial["pull"] = [0.0, 0.1, 0.0]
+    check_configuration(config)
 
 
 def test_folds_and_splits(tmp_path):
@@ -221,7 +273,8 @@ def test_without_a_choice_few_recordings_train_a_small_network(experiment, modes
     config = configuration(experiment=experiment)
     check_configuration(config | {"data": config["data"] | ({} if layers else {"folder": "recordings"})})
     names = ("position_modes", "velocity_modes", "force_modes")
-    small = {"kind": "reduced", "blocks": 1, "layers": layers, "width": 16, "activation": "normalised_elu"}
+    small = {"kind": "reduced", "blocks": 1, "layers": layers, "width": 16}
+    small |= {"activation": "normalised_elu", "force_basis": "force"}
     assert config["network"] == small | dict(zip(names, modes, strict=True))
     simfree = training_settings(config, "simfree")
     own = {"position_modes": 6, "velocity_modes": 6, "layers": 3, "width": 128}

@@ -60,7 +60,7 @@ def laboratory(tmp_path_factory):
 
 
 def true_markers(config, setup, trials, times):
-    """(R, T, M, 3) tracked markers in the frame of the body at times (R, T) since the release, as it was simulated [m]."""
+    """(R, T, M, 3) tracked markers in the frame of the body at times (R, T) since the release, as simulated [m]."""
     simulator = laboratory_simulator(config, setup.gravity)
     read = bound_markers(config["markers"], simulator.body.mesh, setup.tracked, TIPS).to(simulator.rest_positions)
     masses = attached_mass(simulator.body, config["data"]["payload_at"], np.array([each.payload for each in trials]))

@@ -13,10 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from main_job import IN_RUN, TINY, files, run
+from measured_run import configuration
 from omegaconf import OmegaConf
 from test_tuning_study import Dead
 
-from warp_resphys.experiment import pipeline
+from warp_resphys.experiment import learn, pipeline
+from warp_resphys.experiment.checks import check_configuration
 from warp_resphys.io.files import read_checkpoint
 from warp_resphys.learning.training import Trainer
 from warp_resphys.studies.tuning import figures as tuning_figures
@@ -87,7 +89,9 @@ class TestSearch:
         assert all(row["network.width"] in ("8", "16") for row in rows)
         best = json.loads((searched / FOLDER / "tune.json").read_text())["best"]
         assert best["rollout_error_mm"] == min(float(row["rollout_error_mm"]) for row in rows)
-        configured = json.loads((searched / "run" / "training_resphys.json").read_text())["kept"]["validation_rollout_error_mm"]
+        configured = json.loads((searched / "run" / "training_resphys.json").read_text())["kept"][
+            "validation_rollout_error_mm"
+        ]
         assert json.loads((searched / FOLDER / "tune.json").read_text())["configured_rollout_error_mm"] == configured
         page = (searched / FOLDER / "tune.html").read_text()
         assert "tuned=beam_oscillation_resphys" in page
@@ -129,21 +133,15 @@ class TestSearch:
         assert run(*TINY, IN_RUN, "tuned=beam_oscillation_simfree", "network.width=12", "trainer.epochs=2")[0] == 0
         architectures = {
             name: read_checkpoint(f"run/{name}.safetensors", kind)
-            for name, kind in (("model", "residual force"), ("simfree", "next state"))
+            for name, kind in (("resphys", "residual force"), ("simfree", "next state"))
         }
-        assert architectures["model"][1]["architecture"]["width"] == 12
+        assert architectures["resphys"][1]["architecture"]["width"] == 12
         assert architectures["simfree"][1]["architecture"]["width"] == best["settings"]["network.width"]
         kept = architectures["simfree"][1]["validation_rollout_error_mm"]
         assert kept == pytest.approx(best["rollout_error_mm"], rel=1e-6)
 
     def test_a_diverged_trial_counts_and_is_not_the_best(self, folder, monkeypatch):
-        whole = tune.residual_force_learning
-
-        def diverging(context):
-            learning = whole(context)
-            return tune.Learning(learning.samples, learning.build, lambda model: math.inf)
-
-        monkeypatch.setattr(tune, "residual_force_learning", diverging)
+        monkeypatch.setattr(learn, "rollout_error", lambda scene, model, names: lambda learned: math.inf)
         assert run(*SEARCH, IN_RUN, "tune.trials=2")[0] == 0
         assert [row["rollout_error_mm"] for row in table()] == ["inf", "inf"]
         assert json.loads((FOLDER / "tune.json").read_text())["best"] is None
@@ -176,9 +174,9 @@ def start(hang: bool):
     program = """
 import time
 from warp_resphys.learning.training import Trainer
-from warp_resphys.experiment import train
+from warp_resphys.experiment import learn
 from warp_resphys.studies.tuning import tune
-train._CHECKPOINT_SECONDS = 0.0
+learn._CHECKPOINT_SECONDS = 0.0
 tune.write_pictures = lambda tuning, study: None
 run_epoch, done = Trainer.run_epoch, []
 def hanging(trainer):
@@ -307,17 +305,20 @@ class TestBadInput:
     @pytest.mark.parametrize(
         ("override", "sentence"),
         [
-            ("tune.model=sysid", "tune.model is 'sysid': choose one of resphys, simfree."),
+            ("tune.model=sysid", "tune.model is 'sysid': choose one of simfree, resphys."),
             ("tune.trials=0", "tune.trials is 0: it must be a whole number, 1 or more."),
             ("tune.stale_after=0", "tune.stale_after is 0: it must be positive, in seconds."),
             ("tune.trial_seconds=soon", "tune.trial_seconds is 'soon': it must be positive, in seconds."),
             ("tune.save_as=a/b", "tune.save_as is 'a/b': use letters, digits, _ and - alone."),
-            ("tune.space.trainer.gamma={low:0.8,high:1.2}", "tune: trainer.gamma is 1.2: it must be greater than 0"),
-            ("tune.space.network.width=[8.5,16]", "tune: network.width is 8.5: it must be a whole number."),
+            ("tune.space.trainer.gamma={low:0.8,high:1.2}", "tune: trainer.gamma is 1.2: it must be more than 0"),
+            (
+                "tune.space.network.width=[8.5,16]",
+                "tune: network.width is 8.5: it must be a whole number from 1 to 16,384.",
+            ),
             ("+tune.space.network.depth=[1,2]", "unknown key 'network.depth' in the group tune"),
             ("+tune.settings.network.width=8", "tune.settings.network.width and tune.space.network.width exclude"),
             ("simfree=3", "simfree is 3: it must be a group of settings."),
-            ("+simfree.network.width=-1", "simfree: network.width is -1: it must be positive."),
+            ("+simfree.network.width=-1", "simfree: network.width is -1: it must be a whole number from 1 to 16,384."),
         ],
     )
     def test_settings(self, folder, override, sentence):
@@ -342,14 +343,41 @@ class TestBadInput:
         assert code == 2
         assert "error: the experiment marker_ablation trains no network: tune another one." in err
 
-    @pytest.mark.parametrize("name", ["beam_real", "beam_real_repeated", "beam_synthetic"])
-    def test_an_experiment_on_recordings(self, folder, name):
-        code, err = run("tune", f"experiment={name}", "data.folder=recordings", IN_RUN)
+    @pytest.mark.parametrize("name", ["beam_real", "beam_synthetic"])
+    def test_an_experiment_with_folds(self, folder, name):
+        code, err = run("tune", f"experiment={name}", "data.folder=recordings", "tune=in_the_loop", IN_RUN)
         assert code == 2
         assert err.strip().splitlines()[-1] == (
-            f"error: tune does not search the networks of the experiment {name}, which learns from recordings: "
-            "set network and in_the_loop, and simfree and trainer for the baseline, and compare runs with --multirun."
+            "error: a search needs one split, and data.folds makes several: set data.folds to null, and data.train, "
+            "data.validation and data.test."
         )
+
+    def test_another_way_of_training(self, folder):
+        """The force of recordings is trained on whole trials, which has no batches."""
+        code, err = run("tune", "experiment=beam_real_repeated", "data.folder=recordings", IN_RUN)
+        assert code == 2
+        assert err.strip().splitlines()[-1] == (
+            "error: unknown key 'trainer.schedule' in the group tune: it must name a setting of network, in_the_loop."
+        )
+
+    @pytest.mark.parametrize(
+        ("overrides", "groups"),
+        [
+            (
+                ["experiment=beam_real_repeated", "data.folder=recordings", "tune=in_the_loop"],
+                {"in_the_loop", "network"},
+            ),
+            (["experiment=beam_synthetic", "tune=in_the_loop"], {"in_the_loop", "network"}),
+            (["experiment=beam_synthetic", "tune.model=simfree"], {"trainer", "network"}),
+            (["experiment=sopra"], {"trainer", "network"}),
+            (["experiment=sopra_extrapolation", "tune=reduced"], {"trainer", "network"}),
+        ],
+    )
+    def test_other_experiments_are_searched(self, overrides, groups):
+        experiment, *others = overrides
+        config = configuration(*others, experiment=experiment.partition("=")[2])
+        check_configuration(config)
+        assert {key.partition(".")[0] for key in tune.check_tuning(config)} == groups
 
     def test_settings_that_the_data_do_not_allow_end_the_search_and_the_trial_does_not_count(self, folder):
         code, err = run(*SEARCH, IN_RUN, "+tune.space.network.force_modes=[500,1000]")

@@ -15,12 +15,6 @@ import torch
 from hydra import compose, initialize_config_module
 from main_job import IN_RUN, run
 from omegaconf import OmegaConf
-from warp_resphys.experiment.actuated import experiment, reconstruct, train
-from warp_resphys.experiment.actuated.checks import check_driven
-from warp_resphys.experiment.actuated.evaluate import summary
-from warp_resphys.experiment.actuated.importing import import_driven
-from warp_resphys.experiment.actuated.reconstruct import replayed_errors
-from warp_resphys.experiment.actuated.scene import DrivenScene
 
 from warp_resphys.data.actuation import PressureSequences
 from warp_resphys.data.markers import bind_markers
@@ -28,8 +22,14 @@ from warp_resphys.data.recordings.arrays import write_recording
 from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.trials import Trials
 from warp_resphys.dynamics.inputs import Inputs
+from warp_resphys.experiment import learn, pipeline, reconstruct
 from warp_resphys.experiment.build import build_simulator, chambers_of
 from warp_resphys.experiment.checks import check_configuration
+from warp_resphys.experiment.evaluate import summary
+from warp_resphys.experiment.files import Dataset
+from warp_resphys.experiment.importing import import_recordings
+from warp_resphys.experiment.reconstruct import replayed_errors
+from warp_resphys.experiment.scene import Scene
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_array, read_checkpoint, read_hdf5
 from warp_resphys.io.stages import StageContext
@@ -46,10 +46,10 @@ tip: {z: -0.1}
 chambers: {count: 2}
 mesh: {size: 0.03, layers: 0.05, chambers: 2}
 data:
-  {steps: 12, sequences: 5, train: 2, validation: 1, test: 1, windows: [0.06, 0.12], rest_seconds: 0.01, cutoff: 20.0}
+  {steps: 12, sequences: 5, train: 2, validation: 1, test: 1, horizons: [0.06, 0.12], rest_seconds: 0.01, cutoff: 20.0}
 markers:
-  followed: null
-  others: {B1: [0.03, 0.0, 0.0], B2: [0.0, 0.03, 0.0], B3: [-0.03, -0.03, 0.0]}
+  tracked: null
+  reference: {B1: [0.03, 0.0, 0.0], B2: [0.0, 0.03, 0.0], B3: [-0.03, -0.03, 0.0]}
   bind: rigid
   bind_to: {z: -0.1}
 parallel: {processes: 1, batch: 2}
@@ -57,16 +57,25 @@ identify:
   {trials: 1, seconds: 0.05, max_evaluations: 3, grid: {youngs_modulus: {points: 2}, poissons_ratio: {points: 1}}}
 network: {position_modes: 2, velocity_modes: 0, force_modes: 2, width: 8}
 trainer: {epochs: 4, rollout_every: 2, batch_size: 16}
-synthetic:
+laboratory:
   mesh: {chamber_lengths: [0.09], caps: [0.005, 0.005], radii: [0.0222, 0.0222], chambers: 2, outline: round,
     size: 0.02, layers: 0.03, wall: 0.003, web: 0.003}
   sequences: {rest: 0.01, correlation_time: 0.03}
 """
-FOLLOWED = "markers.followed={T1:[0.02,0.0,-0.1],T2:[0.0,0.02,-0.1],T3:[-0.02,-0.01,-0.1]}"
+TRACKED = "markers.tracked={T1:[0.02,0.0,-0.1],T2:[0.0,0.02,-0.1],T3:[-0.02,-0.01,-0.1]}"
 QUIET = ["hydra/job_logging=none", "hydra/hydra_logging=none", IN_RUN]
-COMMAND = ["experiment=tiny", FOLLOWED, *QUIET]
-STAGES = ["synthesise", "import", "identify", "reconstruct", "train_simfree", "train_resphys", "evaluate", "report"]
-RAISED = ["synthesise_raised", "import_raised"]
+COMMAND = ["experiment=tiny", TRACKED, *QUIET]
+STAGES = [
+    "laboratory",
+    "import",
+    "identify",
+    "reconstruct_resphys",
+    "train_resphys",
+    "train_simfree",
+    "evaluate",
+    "report",
+]
+SCALED = ["laboratory_scaled", "import_scaled"]
 
 
 def place_experiment(folder):
@@ -87,11 +96,11 @@ def finished(tmp_path_factory):
     place_experiment(folder)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        patch.setattr(experiment, "report_driven", lambda context: (context.run_dir / "report.html").write_text("-"))
+        patch.setattr(pipeline, "make_report", lambda context: (context.run_dir / "report.html").write_text("-"))
         code, err = run(*COMMAND)
         assert (code, err[-500:] if code else "") == (0, "")
         before = {path: path.stat().st_mtime_ns for path in (folder / "run").rglob("*.h5")}
-        code, err = run(*COMMAND, "data.factors=[1.5]")
+        code, err = run(*COMMAND, "data.pressure_scales=[1.5]")
     assert (code, err[-500:] if code else "") == (0, "")
     changed = [path.name for path, at in before.items() if path.stat().st_mtime_ns != at]
     assert changed == ["rollouts.h5"]  # Nothing but the new trials is simulated again, and nothing learned.
@@ -101,10 +110,10 @@ def finished(tmp_path_factory):
 def motions(folder):
     """Names, markers and pressures of all trials, those at higher pressures last."""
     found = []
-    for name in ("motions.h5", "motions_raised.h5"):
-        with read_hdf5(folder / "run" / name, "motions") as file:
+    for name in ("dataset.h5", "dataset_scaled.h5"):
+        with read_hdf5(folder / "run" / name, "dataset") as file:
             names = [str(each) for each in file.attrs["names"]]
-            found.append((names, read_array(file, "markers"), read_array(file, "pressure")))
+            found.append((names, read_array(file, "observed"), read_array(file, "pressure")))
     (a, b) = found
     return a[0] + b[0], np.concatenate([a[1], b[1]]), np.concatenate([a[2], b[2]])
 
@@ -114,22 +123,22 @@ def metrics(folder):
 
 
 def test_every_stage_leaves_its_files_and_the_errors_are_those_of_the_roll_outs(finished):
-    assert sorted(path.stem for path in (finished / "run" / "stages").glob("*.json")) == sorted([*STAGES, *RAISED])
+    assert sorted(path.stem for path in (finished / "run" / "stages").glob("*.json")) == sorted([*STAGES, *SCALED])
     assert not list((finished / "run").glob("*_parts"))
     found = metrics(finished)
     names, observed, _ = motions(finished)
     with read_hdf5(finished / "run" / "rollouts.h5", "rollouts") as file:
         tested = [str(name) for name in file.attrs["names"]]
-        markers = {model: read_array(file, f"{model}_markers") for model in found["errors_mm"]}
+        markers = {model: read_array(file, f"{model}_observed") for model in found["errors_mm"]}
     assert names == ["t000", "t001", "t002", "t003", "t003_x1.5"]
     assert tested == names[3:]
     for model, x in markers.items():
         for row, factor in enumerate(("1", "1.5")):
             expected = 1e3 * np.linalg.norm(x[row] - observed[3 + row], axis=-1).mean()
-            assert found["overpressure"][factor][model]["mean"] == pytest.approx(expected, rel=1e-6)
+            assert found["scales"][factor][model]["mean"] == pytest.approx(expected, rel=1e-6)
         first = 1e3 * np.linalg.norm(x[0, :7] - observed[3, :7], axis=-1).mean()
-        assert found["windows"]["0.06"][model]["mean"] == pytest.approx(first, rel=1e-6)
-    growth = found["windows"]["0.12"]["sysid"]["mean"] / found["windows"]["0.06"]["sysid"]["mean"] - 1.0
+        assert found["horizons"]["0.06"][model]["mean"] == pytest.approx(first, rel=1e-6)
+    growth = found["horizons"]["0.12"]["sysid"]["mean"] / found["horizons"]["0.06"]["sysid"]["mean"] - 1.0
     assert found["growth"]["sysid"] == pytest.approx(growth)
 
 
@@ -140,7 +149,7 @@ def test_recordings_are_seen_by_cameras_and_registered_back(finished):
     recording = read_recording(finished / "run" / "recordings" / "t000.h5")
     assert np.linalg.norm(recording.positions[0, 0] - truth["bound"]["T1"]) > 0.01
     _, _, pressure = motions(finished)
-    with read_hdf5(finished / "run" / "motions.h5", "motions") as file:
+    with read_hdf5(finished / "run" / "dataset.h5", "dataset") as file:
         bound = read_array(file, "bound")
     np.testing.assert_allclose(bound, np.array(list(truth["bound"].values())), atol=1e-3)
     assert 0.0 < pressure[:4].max() <= 20e3
@@ -149,19 +158,19 @@ def test_recordings_are_seen_by_cameras_and_registered_back(finished):
 
 
 def test_the_reconstruction_reaches_the_smoothed_markers(finished):
-    found = json.loads((finished / "run" / "reconstruction.json").read_text())
+    found = json.loads((finished / "run" / "reconstruction.json").read_text())["resphys"]
     assert found["mean_mm"] < 0.2
-    with read_hdf5(finished / "run" / "reconstruction.h5", "reconstruction") as file:
+    with read_hdf5(finished / "run" / "reconstruction_resphys.h5", "reconstruction") as file:
         assert [str(name) for name in file.attrs["names"]] == ["t000", "t001", "t002"]
         assert read_array(file, "force").shape == (3, 13, read_array(file, "q").shape[2], 3)
 
 
 def test_forces_that_do_not_hold_the_body_are_named(finished, monkeypatch, tmp_path, caplog):
     """Replayed, the forces lead where they were found; a simulation that goes elsewhere with them is reported."""
-    summary = json.loads((finished / "run" / "reconstruction.json").read_text())
-    with read_hdf5(finished / "run" / "reconstruction.h5", "reconstruction") as file:
+    summary = json.loads((finished / "run" / "reconstruction.json").read_text())["resphys"]
+    with read_hdf5(finished / "run" / "reconstruction_resphys.h5", "reconstruction") as file:
         states = {name: read_array(file, name)[2:] for name in ("q", "v", "force")}
-    settings = json.loads((finished / "run" / "stages" / "reconstruct.json").read_text())["settings"]
+    settings = json.loads((finished / "run" / "stages" / "reconstruct_resphys.json").read_text())["settings"]
     replay = partial(replayed_errors, settings, finished / "run", ("t002",))
     found = replay(states)
     assert found.mean() == pytest.approx(summary["replayed_mm"], rel=1e-3)
@@ -171,12 +180,12 @@ def test_forces_that_do_not_hold_the_body_are_named(finished, monkeypatch, tmp_p
     np.testing.assert_array_equal(replay(begun), found[:, :7])
     states["force"][0, 6:] = np.nan
     assert np.isfinite(replay(states)).sum() == 6
-    for name in ("motions.h5", "identification.json"):
+    for name in ("dataset.h5", "identification.json"):
         shutil.copy(finished / "run" / name, tmp_path)
     monkeypatch.setattr(reconstruct, "replayed_errors", lambda *rest: np.full(rest[3]["force"].shape[:2], np.inf))
-    reconstruct.reconstruct_driven(StageContext("reconstruct", tmp_path, "", settings))
+    reconstruct.reconstruct(StageContext("reconstruct_resphys", tmp_path, "", settings))
     assert "the forces lead inf mm away from the markers" in caplog.text
-    assert json.loads((tmp_path / "reconstruction.json").read_text())["replayed_mm"] is None
+    assert json.loads((tmp_path / "reconstruction.json").read_text())["resphys"]["replayed_mm"] is None
 
 
 def test_forces_are_learned_as_they_are_in_the_rest_shape(finished, monkeypatch):
@@ -185,12 +194,12 @@ def test_forces_are_learned_as_they_are_in_the_rest_shape(finished, monkeypatch)
     assert read_checkpoint(finished / "run" / "resphys.safetensors", "residual force")[1]["force_frame"] == "corotated"
     learned = {}
     for frame in ("corotated", "world"):
-        keep = lambda context, scene, model, samples, *rest: learned.update({rest[-1]: samples})  # noqa: E731
-        monkeypatch.setattr(train, "_fit", keep)
-        train.train_driven(StageContext("train_resphys", finished / "run", "", {**settings, "force_frame": frame}))
-    turned, kept = (learned[frame]["train"] for frame in ("corotated", "world"))
-    scene = DrivenScene(settings, finished / "run")
-    back = scene.frames("corotated").to_world(turned.q, turned.v, turned.outputs[0])
+        keep = lambda network, train, *rest, frame=frame: learned.update({frame: train})  # noqa: E731
+        monkeypatch.setattr(learn, "Trainer", keep)
+        scene = Scene({**settings, "force_frame": frame}, finished / "run")
+        assert learn.Learning(scene, "resphys").trainer(settings).learned.force_frame == frame
+    turned, kept = (learned[frame] for frame in ("corotated", "world"))
+    back = scene.frames(scene.model_simulator("resphys"), "corotated").to_world(turned.q, turned.v, turned.outputs[0])
     size = float(kept.outputs[0].abs().max())
     np.testing.assert_allclose(back, kept.outputs[0], atol=1e-5 * size)
     assert float((turned.outputs[0] - kept.outputs[0]).abs().max()) > 1e-3 * size
@@ -198,22 +207,22 @@ def test_forces_are_learned_as_they_are_in_the_rest_shape(finished, monkeypatch)
 
 def test_the_same_command_does_nothing_again_and_other_windows_only_evaluate(finished, monkeypatch):
     monkeypatch.chdir(finished)
-    monkeypatch.setattr(experiment, "report_driven", lambda context: (context.run_dir / "report.html").write_text("-"))
+    monkeypatch.setattr(pipeline, "make_report", lambda context: (context.run_dir / "report.html").write_text("-"))
     before = {path: path.stat().st_mtime_ns for path in (finished / "run").glob("*.h5")}
-    code, _ = run(*COMMAND, "data.factors=[1.5]", "data.windows=[0.05,0.12]")
+    code, _ = run(*COMMAND, "data.pressure_scales=[1.5]", "data.horizons=[0.05,0.12]")
     assert code == 0
     after = {path.name for path, at in before.items() if path.stat().st_mtime_ns != at}
     assert after == {"rollouts.h5"}
-    assert "0.05" in metrics(finished)["windows"]
+    assert "0.05" in metrics(finished)["horizons"]
 
 
 def test_recordings_in_a_folder_give_what_the_simulation_that_made_them_gave(finished, monkeypatch, tmp_path):
     """The same trials from files, in two processes; those at higher pressures are not among them."""
     assert {path.stem for path in (finished / "run" / "recordings").iterdir()} == {"t000", "t001", "t002", "t003"}
-    assert [path.stem for path in (finished / "run" / "recordings_raised").iterdir()] == ["t003_x1.5"]
+    assert [path.stem for path in (finished / "run" / "recordings_scaled").iterdir()] == ["t003_x1.5"]
     place_experiment(tmp_path)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(experiment, "report_driven", lambda context: (context.run_dir / "report.html").write_text("-"))
+    monkeypatch.setattr(pipeline, "make_report", lambda context: (context.run_dir / "report.html").write_text("-"))
     places = [f"data.folder={finished / 'run' / 'recordings'}", "data.train=[t000,t001]", "data.validation=[t002]"]
     code, err = run(*COMMAND, *places, "data.test=[t003]", "parallel.processes=2", "parallel.batch=1")
     assert code == 0, err
@@ -243,38 +252,43 @@ def recorded(tmp_path, finished, change):
     [
         (["chambers.count=3"], "the mesh has 2 closed chambers, but chambers.count is 3"),
         (["data.train=9"], "data.train, data.validation and data.test ask for 11 trials, but there are 5"),
-        (["data.test=[t000]"], "the trial 't000' is in two splits"),
+        (["data.test=[t000]"], "the trial 't000' is in data.train and data.test: every trial is in one split, once."),
         (["data.test=[t777]"], "data.test names the trial 't777'"),
         (["data.folder=nowhere"], "nowhere is no folder"),
-        (["data.train=0"], "data.train is 0: it must be a number of trials, or a list"),
-        (["coupling=weak"], "coupling is 'weak': choose one of implicit, explicit"),
-        (["force_frame=rest"], "force_frame is 'rest': choose one of corotated, world."),
-        (["actuation.memory=[-1.0]"], "actuation.memory"),
-        (["synthetic.sequences.rest=1.0"], "leave no time between two rests"),
-        (["synthetic.sequences.limit=1.0"], "unknown key 'synthetic.sequences.limit'"),
-        (["synthetic.material.stiffness=1.0"], "unknown key 'synthetic.material.stiffness'"),
-        (["synthetic.fibres.angles=[90.0]"], "synthetic: fibre angles are"),
+        (["data.train=0"], "data.train is empty: name one of data.trials there"),
+        (["coupling=weak"], "coupling is 'weak': it must be one of implicit, explicit."),
+        (["force_frame=rest"], "force_frame is 'rest': it must be one of corotated, world."),
+        (["actuation.filter_time_constants=[-1.0]"], "actuation.filter_time_constants"),
+        (["laboratory.sequences.rest=1.0"], "leave no time between two rests"),
+        (["laboratory.sequences.limit=1.0"], "unknown key 'laboratory.sequences.limit'"),
+        (["laboratory.material.stiffness=1.0"], "unknown key 'laboratory.material.stiffness'"),
+        (["laboratory.fibres.angles=[90.0]"], "laboratory: fibre angles are"),
         (["simulation.youngs_modulus=264"], "is its unit millimetres"),
         (["+identify.parameters.stiffness={lower:0.0,upper:1.0}"], "identify.parameters names 'stiffness'"),
         (
             ["+identify.parameters.attached_mass_factor={lower:0.5,upper:2.0}"],
             "names 'attached_mass_factor': choose from",
         ),
-        (["refinement=solver_in_the_loop"], "refinement is for experiments without pressures"),
-        (["tune"], "tune does not search the networks of the experiment tiny"),
+        (["refinement=solver_in_the_loop", "refinement.window=12"], "it must be less than the data's 12 steps"),
+        (["tune", "tune.model=sysid"], "tune.model is 'sysid': choose one of simfree, resphys."),
+        (["data.train=-1"], "data.train is -1: it must be a number of trials, or a list of their names"),
+        (
+            ["data.folds=leave_one_out", "data.pressure_scales=[1.5]"],
+            "data.pressure_scales and data.folds exclude each",
+        ),
         (["+data.colour=red"], "unknown key 'data.colour'"),
-        (["data.windows=[0.06,5.0]"], "data.windows is [0.06, 5.0]: they must rise, up to the 0.12 s"),
+        (["data.horizons=[0.06,5.0]"], "data.horizons is [0.06, 5.0]: they must rise, up to the 0.12 s"),
         (["data.train_fraction=1.5"], "data.train_fraction is 1.5"),
         (["data.cutoff=80.0"], "data.cutoff is 80 Hz: it must be below 50 Hz"),
-        (["data.factors=[1.0]"], "data.factors is [1.0]"),
-        (["data.factors=[1.5]", "data.folder=run/recordings", "data.test=[t003]"], "recordings have their own"),
-        (["synthetic.time_step=0.003"], "the first must be a multiple of the second"),
+        (["data.pressure_scales=[1.0]"], "data.pressure_scales is [1.0]"),
+        (["data.pressure_scales=[1.5]", "data.folder=run/recordings", "data.test=[t003]"], "recordings have their own"),
+        (["laboratory.time_step=0.003"], "the first must be a multiple of the second"),
         (["+identify.parameters.fibre_stiffness={lower:1.0,upper:2.0}"], "but fibres is null"),
         (["data.chambers=[]"], "data.chambers is []: it must be a list of different chambers, from 1"),
-        (["synthetic.sequences.mean=high"], "synthetic.sequences.mean is 'high': it must be a finite number"),
-        (["synthetic.sequences.correlation=[[1.0],[0.0]]"], "it must be a finite number, or a matrix of them"),
+        (["laboratory.sequences.mean=high"], "laboratory.sequences.mean is 'high': it must be a finite number"),
+        (["laboratory.sequences.correlation=[[1.0],[0.0]]"], "it must be a finite number, or a matrix of them"),
         (["+identify.first_guess.youngs_modulus=soft"], "identify.first_guess.youngs_modulus is 'soft'"),
-        (["+identify.first_guess.pressure_rise=0.04"], "identify.first_guess.pressure_rise is of no use"),
+        (["+identify.first_guess.pressure=0.04"], "identify.first_guess names 'pressure': choose from youngs_modulus"),
         (["reconstruction=lbfgsb", "+reconstruction.modes=4"], "reconstruction.method=lbfgsb has none"),
     ],
 )
@@ -329,21 +343,21 @@ def test_a_short_recording_is_named_and_its_rest_counts_as_not_seen(finished, mo
 
     monkeypatch.chdir(finished)
     path = f"hydra.searchpath=[file://{finished / 'configs'}]"
-    config = configuration(path, FOLLOWED, *recorded(tmp_path, finished, shortened), experiment="tiny")
-    stages = {stage.name: stage for stage in experiment.driven_stages(config)}
-    import_driven(StageContext("import", tmp_path, "", stages["import"].settings))
-    with read_hdf5(tmp_path / "motions.h5", "motions") as file:
-        seen = np.isfinite(read_array(file, "markers")).all(axis=(2, 3))
+    config = configuration(path, TRACKED, *recorded(tmp_path, finished, shortened), experiment="tiny")
+    stages = {stage.name: stage for stage in pipeline.acquisition_stages(config)}
+    import_recordings(StageContext("import", tmp_path, "", stages["import"].settings))
+    with read_hdf5(tmp_path / "dataset.h5", "dataset") as file:
+        seen = np.isfinite(read_array(file, "observed")).all(axis=(2, 3))
     assert seen.sum(axis=1).tolist() == [9, 13, 13, 13]
     assert "t000.h5 ends after 8 of the 12 steps" in caplog.text
 
 
 def test_the_number_of_processes_is_no_setting_of_the_results(finished, monkeypatch):
     monkeypatch.chdir(finished)
-    monkeypatch.setattr(experiment, "report_driven", lambda context: (context.run_dir / "report.html").write_text("-"))
+    monkeypatch.setattr(pipeline, "make_report", lambda context: (context.run_dir / "report.html").write_text("-"))
     written = []
     for processes in (1, 2):
-        code, _ = run(*COMMAND, "data.factors=[1.5]", f"parallel.processes={processes}")
+        code, _ = run(*COMMAND, "data.pressure_scales=[1.5]", f"parallel.processes={processes}")
         assert code == 0
         written.append({path: path.stat().st_mtime_ns for path in (finished / "run").glob("*.h5")})
     assert written[0] == written[1]
@@ -354,7 +368,23 @@ def test_the_configurations_of_every_experiment_with_pressures_are_accepted(tmp_
         for overrides in ([], ["budget=quick"]):
             check_configuration(configuration(*overrides, experiment=name))
     recording = read_published(tmp_path)
-    check_driven(configuration(f"data.folder={recording}", experiment="segment_real"))
+    check_configuration(configuration(f"data.folder={recording}", experiment="segment_real"))
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["refinement=solver_in_the_loop"],
+        ["+identify.first_guess.pressure_rise=0.04"],
+        ["parallel.batch=null"],
+        ["range_guard=false", "timing=true"],
+        ["+in_the_loop={epochs: 2, penalty: 1e-3, hold_out: true, patience: 2, memory: 5, rollout_every: 1}"],
+        ["data.begins=static"],
+        ["data.payload_at={z: -0.276, tolerance: 1e-6}", "+laboratory.trials.t000={payload: 0.02, begins: static}"],
+    ],
+)
+def test_what_the_pipeline_has_for_others_goes_with_pressures(overrides):
+    check_configuration(configuration(*overrides))
 
 
 def read_published(folder):
@@ -398,12 +428,12 @@ def test_identification_finds_the_stiffness_that_made_motions_and_the_valves_lag
     motions, read = driven_motions(simulator)
     replay = Replay(tiny_simulator(), read, motions)
     bounds = {"youngs_modulus": Bounds(5e4, 5e5, True), "pressure_rise": Bounds(0.0, 0.1)}
-    identifier = Identifier(replay, at_rest(simulator, motions), bounds)
+    identifier = Identifier([(replay, at_rest(simulator, motions))], bounds)
     found = identifier.run([{"youngs_modulus": 264e3, "pressure_rise": 0.02}], 25)
     assert found.parameters["youngs_modulus"] == pytest.approx(150e3, rel=0.01)
     assert found.parameters["pressure_rise"] < 1e-3
     with pytest.raises(InputError, match="no parameter 'colour'"):
-        Identifier(replay, at_rest(simulator, motions), {"colour": Bounds(0.0, 1.0)})
+        Identifier([(replay, at_rest(simulator, motions))], {"colour": Bounds(0.0, 1.0)})
 
 
 def test_the_replays_gradient_is_that_of_differences():
@@ -428,14 +458,18 @@ def test_leaving_the_range_of_the_training_is_noticed():
     assert watched.left(probe).tolist() == [False, True, True, False]
 
 
-def test_a_diverged_roll_out_and_one_that_left_the_range_are_reported():
+def test_a_diverged_roll_out_and_one_that_left_the_range_are_reported(tmp_path):
     observed = np.zeros((2, 5, 1, 3))
     good, lost = observed + np.array([3e-3, 0.0, 4e-3]), observed.copy()
     lost[1, 3:] = np.nan
-    settings = {"data": {"windows": [0.02, 0.04]}}
+    settings = {"data": {"horizons": [0.02, 0.04]}, "time_step": 0.01}
     left = {"resphys": np.array([-1, 3])}
     markers = {"sysid": good, "resphys": lost}
-    found = summary(settings, {"1": ("a", "b")}, markers, observed, left, ("m",), 0.01)
+    scene = Scene(settings, tmp_path)
+    times = np.tile(0.01 * np.arange(5), (2, 1))
+    about = (times, observed, observed[:, 0], np.zeros(2), np.zeros(3), 0.01)
+    scene.__dict__["dataset"] = Dataset(("a", "b"), ("m",), ("rest", "rest"), *about, bound=np.zeros((1, 3)))
+    found = summary(StageContext("evaluate", tmp_path, "", settings), scene, {"1": ("a", "b")}, markers, left)
     assert found["errors_mm"]["sysid"]["mean"] == pytest.approx(5.0)
     assert found["errors_mm"]["resphys"]["diverged"] == 1
     assert found["range"]["resphys"] == {"left": 1, "first_s": {"b": pytest.approx(0.03)}}

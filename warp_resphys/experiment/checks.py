@@ -84,6 +84,8 @@ def check_configuration(config: Mapping[str, Any]) -> None:
     if refinement["kind"] != "none" and steps is not None and refinement["window"] >= steps:
         raise InputError(f"refinement.window is {refinement['window']}: it must be less than the data's {steps} steps.")
     if config["identify"] is not None:
+        if "fibre_stiffness" in config["identify"]["parameters"] and config["fibres"] is None:
+            raise InputError("identify.parameters names fibre_stiffness, but fibres is null: give the simulator some.")
         check_identification(config["identify"], _known(config, simulator))
 
 
@@ -335,10 +337,13 @@ def check_identification(identify: Mapping[str, Any], known: Sequence[str]) -> N
     Raises:
         InputError: no parameter, an unknown one, or a range or a first guess that does not fit.
     """
-    if not identify["parameters"]:
+    parameters = {name: each for name, each in identify["parameters"].items() if each is not None}
+    if not parameters:
         raise InputError(f"identify.parameters is empty: give a range of one or more of {', '.join(known)}.")
     for group, choice in (("parameters", known), ("elastic", ELASTIC), ("grid", ELASTIC)):
         for name, settings in (identify.get(group) or {}).items():
+            if settings is None:
+                continue
             if name not in choice:
                 raise InputError(f"identify.{group} names '{name}': choose from {', '.join(choice)}.")
             try:
@@ -346,11 +351,11 @@ def check_identification(identify: Mapping[str, Any], known: Sequence[str]) -> N
             except InputError as error:
                 raise InputError(f"identify.{group}.{name}: {error}") from error
     for name, value in identify["first_guess"].items():
-        if name not in identify["parameters"]:
+        if name not in parameters:
             if name not in known:
                 raise InputError(f"identify.first_guess names '{name}': choose from {', '.join(known)}.")
             continue
-        within = identify["parameters"][name]
+        within = parameters[name]
         if not within["lower"] <= value <= within["upper"]:
             raise InputError(
                 f"identify.first_guess.{name} is {value!r}: it must be a number from {within['lower']:g} to "

@@ -35,7 +35,7 @@ def identify(context: StageContext) -> None:
     names = settings["split"]["train"]
     names = evenly(names, config["trials"]) if config["trials"] is not None else names
     searches = {"sysid": config["parameters"], "sysid_elastic": config.get("elastic") or {}}
-    ranges = {model: {k: Bounds(**b) for k, b in each.items()} for model, each in searches.items() if each}
+    ranges = {model: {k: Bounds(**b) for k, b in each.items() if b} for model, each in searches.items() if each}
     kinds = {model: MODELS[model][0] for model in ranges}
     evaluations = len(ranges) * config["starts"] * config["max_evaluations"]
     done = sum(_evaluations_done(_kept_of(context, model)) for model in ranges)

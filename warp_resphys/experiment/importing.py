@@ -55,6 +55,7 @@ class Observed:
         registration: of the markers at rest.
         pressure: (T, C) in the chambers of the body at the frames [Pa]; None without chambers.
         release: when the body was let go; None of others.
+        tells_places: whether it shows where markers sit on the body at rest.
     """
 
     trial: Trial
@@ -64,6 +65,7 @@ class Observed:
     registration: Registration
     pressure: FloatArray | None = None
     release: Release | None = None
+    tells_places: bool = True
 
     @property
     def is_released(self) -> bool:
@@ -212,14 +214,15 @@ class Importer:
         if not static:
             check_motion(replace(recording, positions=recording.positions[: self.data["steps"] + 1]), self.tracked)
         pressure = self._pressure(recording, trial) if self._chambers else None
+        tells = self.tells_places(trial, pressure)
         filled = fill_gaps(recording, self.data["longest_gap"], mask_long=True)
-        loaded = trial.payload > 0.0 or (pressure is not None and not self._is_at_rest(pressure[:1])[0])
-        if static and loaded:  # From the first frame on: where the body is at rest, the other trials tell.
+        if static and pressure is not None and not self._is_at_rest(pressure[:1])[0]:
             still = _median(filled, self.tracked)
-            registration = self._register(still, recording, at_rest=True, only_reference=True)
         else:
             still = self._resting(filled, pressure)
-            registration = self._register(still, recording, at_rest=True, only_reference=False)
+        # Where the body is without what hangs on it, the other trials tell.
+        only_reference = not tells and len(self.markers["reference"]) > 2
+        registration = self._register(still, recording, at_rest=True, only_reference=only_reference)
         off = f"; left out: {listed(registration.outliers)}" if registration.outliers else ""
         log.debug("import: %s registered to %.2f mm%s", trial.name, _MILLI * registration.rms, off)
         moving = filled.select(self.tracked)
@@ -228,7 +231,13 @@ class Importer:
             last = replace(moving, positions=moving.positions[-frames:])
             moving = replace(moving, positions=_median(last, self.tracked)[None])
             pressure = None if pressure is None else np.median(pressure[-frames:], axis=0)[None]
-        return Observed(trial, recording, moving, still, registration, pressure)
+        return Observed(trial, recording, moving, still, registration, pressure, tells_places=tells)
+
+    def tells_places(self, trial: Trial, pressure: FloatArray | None) -> bool:
+        """Whether a trial shows the body at rest under nothing but gravity, or held undeformed."""
+        if _has_release(trial):
+            return True
+        return trial.payload == 0.0 and (pressure is None or bool(self._is_at_rest(pressure[:1])[0]))
 
     def _is_at_rest(self, pressure: FloatArray) -> NDArray[np.bool_]:
         """(T,) whether (T, C) pressures are what a gauge shows of none."""
@@ -297,8 +306,8 @@ def import_recordings(context: StageContext) -> None:
     split = settings.get("split")
     known = set(split["train"]) | set(split["validation"]) if split else {each.trial.name for each in observed}
     offsets = np.stack([_offset(importer, each) for each in observed])  # (R, M, 3) [m]
-    told = [row for row, each in enumerate(observed) if _tells_places(each) and each.trial.name in known]
-    told = told or [row for row, each in enumerate(observed) if _tells_places(each)]
+    told = [row for row, each in enumerate(observed) if each.tells_places and each.trial.name in known]
+    told = told or [row for row, each in enumerate(observed) if each.tells_places]
     mean = np.nanmean(offsets[told], axis=0) if told else np.zeros_like(importer.nominal)
     bound = importer.nominal + mean
     bound_markers(
@@ -330,11 +339,6 @@ def _places(markers: Mapping[str, Any]) -> FloatArray:
     return np.array([*markers.values()], dtype=np.float64).reshape(-1, 3)
 
 
-def _tells_places(each: Observed) -> bool:
-    """Whether a trial shows where markers sit on the body at rest; one that is loaded from its first frame does not."""
-    return each.is_released or each.trial.begins != STATIC or each.trial.payload == 0.0
-
-
 def _offset(importer: Importer, each: Observed) -> FloatArray:
     """(M, 3) how far the tracked markers of a trial are from where they should be, in the frame of the body [m]."""
     count = len(importer.tracked)
@@ -345,7 +349,7 @@ def _shifts(data: Mapping[str, Any], observed: Sequence[Observed], mean: FloatAr
     """(R, M, 3) by which each trial's markers are moved [m]: to where they sit on the whole, if they drift."""
     if data["alignment"] == "shared":
         return np.zeros_like(offsets)
-    own = np.array([_tells_places(each) for each in observed])
+    own = np.array([each.tells_places for each in observed])
     return np.where(own[:, None, None], mean - offsets, 0.0)
 
 
@@ -428,7 +432,7 @@ def _dataset(
             times[row] = np.minimum(np.arange(frames), steps) * settings["time_step"]
             held[row] = markers[row, 0]
         else:
-            held[row] = bound if each.trial.payload > 0.0 else held[row]
+            held[row] = held[row] if each.tells_places else bound
         if pressure is not None and each.pressure is not None:
             _fill_pressure(pressure[row], each)
     channels = {"pressure": tuple(chamber.name for chamber in chambers)} if pressure is not None else {}

@@ -240,10 +240,11 @@ def prepare(config: DictConfig) -> tuple[dict[str, Any], Path]:
 
 
 def acquire(config: Mapping[str, Any], folder: Path, wait: bool = False) -> tuple[list[Stage], str]:
-    """Runs the stages that lead to dataset.h5; returns them and the fingerprint of the last."""
+    """Runs the stages that lead to the trials; returns them, and the fingerprint of the one that writes dataset.h5."""
     stages = acquisition_stages(config)
     run_stages(stages, folder, wait)
-    return stages, str(read_json(folder / "stages" / f"{stages[-1].name}.json")["fingerprint"])
+    (written,) = (stage.name for stage in stages if DATASET in stage.outputs)
+    return stages, str(read_json(folder / "stages" / f"{written}.json")["fingerprint"])
 
 
 def run_experiment(config: DictConfig) -> None:

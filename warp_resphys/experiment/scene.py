@@ -211,7 +211,7 @@ class Scene:
         """
         if self.dataset.smoothed is not None and self.begins(trials.names[0]) == "rest":
             found = simulator.tensor(self.dataset.smoothed[self.dataset.rows(trials.names)])
-        elif self.begins(trials.names[0]) == GIVEN:
+        elif self.begins(trials.names[0]) in (GIVEN, STATIC):
             found = trials.observed
         else:
             found = start.bound(simulator.tensor(at_steps(trials, simulator.time_step, start.delay)))

@@ -274,8 +274,8 @@ _IDENTIFY = Group(
     {
         "integrator": optional(one_of(*INTEGRATORS)),
         "substeps": NATURAL,
-        "parameters": Group(each=Group(_RANGE)),
-        "elastic": optional(Group(each=Group(_RANGE))),
+        "parameters": Group(each=Group(_RANGE, optional=True)),
+        "elastic": optional(Group(each=Group(_RANGE, optional=True))),
         "first_guess": Group(each=FINITE),
         "trials": optional(NATURAL),
         "seconds": optional(POSITIVE),

@@ -348,7 +348,7 @@ def _identified(metrics: Mapping[str, Any], settings: Mapping[str, Any]) -> list
     for model, place in _PLACES.items():
         ranges = config.get(place) or {}
         for name, value in metrics.get("parameters", {}).get(model, {}).items():
-            if name in ranges:
+            if ranges.get(name):
                 start = guess.get(name, 1.0 if name == "attached_mass_factor" else 0.0)
                 lower, upper = ranges[name]["lower"], ranges[name]["upper"]
                 found.append(Identified(f"identify.{place}.{name}", value, lower, upper, start))

@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 from ...experiment.checks import check_training, training_settings
 from ...experiment.files import training_file
 from ...experiment.learn import Learning, Snapshot, run_epochs
-from ...experiment.pipeline import acquire, learning_stages, prepare
+from ...experiment.pipeline import acquire, acquisition_stages, learning_stages, prepare
 from ...experiment.scene import LEARNED, Scene, models_of
 from ...experiment.schema import is_number, is_whole_number
 from ...experiment.trials import folds_of, split_of
@@ -77,11 +77,13 @@ def run_tuning(config: DictConfig) -> None:
     folder = run_dir / "tune" / tune["study"]
     with Worker(folder / "workers", tune["stale_after"]) as worker:
         watch = Watch(folder / "workers", tune["stale_after"])
-        acquired, needed = _stages_before(plain, model, run_dir)
-        conditions = {"model": model, **_settings_of([*acquired, *needed]), **groups}
+        before = [*acquisition_stages(plain), *_stages_before(plain, model, "")]
+        conditions = {"model": model, **_settings_of(before), **groups}
         for group in _searched(groups):
             conditions[group] = {k: v for k, v in groups[group].items() if f"{group}.{k}" not in space}
         study = SharedStudy(folder, space, conditions, tune["trials"], tune["seed"], worker.identity, watch)
+        _, acquired = acquire(plain, run_dir, wait=True)
+        needed = _stages_before(plain, model, acquired)
         run_stages(needed, run_dir, wait=True)
         configured = read_json(run_dir / training_file(model))["kept"]["validation_rollout_error_mm"]
         tuning = Tuning(plain, groups, space, folder, configured)
@@ -91,16 +93,15 @@ def run_tuning(config: DictConfig) -> None:
     print_best(tuning, study)
 
 
-def _stages_before(config: Mapping[str, Any], model: str, run_dir: Path) -> tuple[list[Stage], list[Stage]]:
-    """The stages of a run that lead to the dataset, which are run, and the others up to the training of a model."""
-    first, acquired = acquire(config, run_dir, wait=True)
+def _stages_before(config: Mapping[str, Any], model: str, acquired: str) -> list[Stage]:
+    """The stages of a run from the dataset of a fingerprint up to the training of a model."""
     stages = {stage.name: stage for stage in learning_stages(config, split_of(config), ".", acquired)}
 
     def before(name: str) -> list[str]:
         return [*(each for needed in stages[name].upstream for each in before(needed)), name]
 
     wanted = set(before(f"train_{model}"))
-    return first, [stage for name, stage in stages.items() if name in wanted]
+    return [stage for name, stage in stages.items() if name in wanted]
 
 
 def _settings_of(stages: Sequence[Stage]) -> dict[str, Any]:

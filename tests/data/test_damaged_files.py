@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 
 import ezc3d
+import h5py
 import numpy as np
 import pytest
 
@@ -61,6 +62,13 @@ def write_npz(path):
     np.savez(path, positions=POSITIONS, actuation=np.ones((12, 2)), actuation_units="kPa", **known)
 
 
+def write_hdf5(path):
+    with h5py.File(path, "w") as file:
+        file.attrs.update({"rate_hz": 100.0, "labels": list("abc"), "format": "of another program", "start": 0.5})
+        file["positions"], file["actuation"], file["rest"] = POSITIONS, np.ones((12, 2)), POSITIONS[0]
+        file["positions"].attrs["units"], file["actuation"].attrs["units"] = "m", "kPa"
+
+
 def write_segment(path):
     markers = np.repeat(0.05 * np.random.default_rng(1).normal(size=(2, 1, 7, 3)), 30, axis=1)
     markers[:, 10:] += 1e-4 * (np.arange(20) ** 2)[:, None, None]
@@ -90,6 +98,7 @@ HERE = {
 }
 ELSEWHERE = {
     "a.c3d": (write_c3d, read_recording),
+    "a.h5": (write_hdf5, read_recording),
     "a.msh": (write_box, read_surfaces),
     "a.vtk": (write_box, read_mesh),
     "a.vtu": (write_box, read_mesh),

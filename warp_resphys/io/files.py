@@ -26,6 +26,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
+from .decoding import DecodingError, refuse_data_elsewhere
 from .errors import DataFileError
 
 if TYPE_CHECKING:
@@ -230,22 +231,25 @@ def open_hdf5(path: str | Path) -> Iterator[h5py.File]:
         with open(path, "rb"):
             file = h5py.File(path, "r")
     except OSError as error:
-        raise _hdf5_error(path, error) from error
+        raise hdf5_error(path, error) from error
     with file:
         try:
-            _refuse_outside_data(file, path)
-        except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
-            raise _hdf5_error(path, error) from error
+            refuse_data_elsewhere(file)
+        except (DecodingError, OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+            raise hdf5_error(path, error) from error
         try:
             yield file
         except OSError as error:
             if error.filename is not None:
                 raise
-            raise _hdf5_error(path, error) from error
+            raise hdf5_error(path, error) from error
 
 
-def _hdf5_error(path: Path, error: Exception) -> DataFileError:
+def hdf5_error(path: Path, error: Exception) -> DataFileError:
+    """The error to raise for one of h5py, or of decoding with it, in this file."""
     message = str(error)
+    if "data elsewhere" in message:
+        return DataFileError(f"{path}: {message}: use a file that holds its own data")
     if "signature not found" in message:
         return DataFileError(f"{path} is not an HDF5 file: check the path")
     if "truncated" in message:
@@ -256,25 +260,6 @@ def _hdf5_error(path: Path, error: Exception) -> DataFileError:
         return _read_error(path, error)
     detail = message.splitlines()[0] if message else type(error).__name__
     return DataFileError(f"{path} is damaged ({detail}): delete it and make or fetch it again")
-
-
-def _refuse_outside_data(file: h5py.File, path: Path) -> None:
-    """Visits every link and dataset; raises DataFileError for those that lead out of the file."""
-    groups: list[h5py.Group] = [file]
-    seen = set()
-    while groups:
-        group = groups.pop()
-        address = h5py.h5o.get_info(group.id).addr
-        if address in seen:
-            continue
-        seen.add(address)
-        for name in group:
-            item = group[name] if isinstance(group.get(name, getlink=True), h5py.HardLink) else None
-            if item is None or (isinstance(item, h5py.Dataset) and (item.external or item.is_virtual)):
-                place = f"{group.name.rstrip('/')}/{name}"
-                raise DataFileError(f"'{place}' of {path} refers to data elsewhere: use a file that holds its own data")
-            if isinstance(item, h5py.Group):
-                groups.append(item)
 
 
 @contextmanager
@@ -358,7 +343,7 @@ def read_array(
             raise DataFileError(f"'{name}' of {path} has the shape {found} where {wanted} is needed: check the path")
         return np.asarray(dataset[index])
     except OSError as error:
-        raise _hdf5_error(Path(path), error) from error
+        raise hdf5_error(Path(path), error) from error
 
 
 def write_checkpoint(

@@ -264,7 +264,7 @@ class Simulator:
                 known = ", ".join(self.inputs) or "none"
                 raise InputError(f"no energy of the body has the input {name}: they have {known}.")
             device = torch.device(self.device)
-            self._held[batch, name] = HeldEnergy(self.body, found[0], batch, device, self.dtype)
+            self._held[batch, name] = HeldEnergy(self.body, found[0], batch, device)
         return self._held[batch, name]
 
     def rest_state(self, batch: int = 1) -> State:

@@ -13,18 +13,16 @@ their sources are in ``kernels.materials``. Shape and volume terms may be integr
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from types import SimpleNamespace
+from types import ModuleType
 from typing import Any, ClassVar
 
 import torch
 from typing_extensions import override
 
 from ..io.errors import InputError
-from ..kernels.materials.corotated import corotated
-from ..kernels.materials.mooney_rivlin import mooney_rivlin
-from ..kernels.materials.stable_neo_hookean import stable_neo_hookean
+from ..kernels.materials import corotated, mooney_rivlin, stable_neo_hookean
 from .base import Parameter, Quantity
 
 
@@ -47,12 +45,12 @@ class Material(ABC):
         density: rho [kg/m^3].
         mass_damping: force -alpha M v [1/s].
         stiffness_damping: Kelvin-Voigt viscosity of retardation time beta [s]; for small strains the force -beta K v.
-        law: the factory of ``kernels.materials``.
+        law: the module of ``kernels.materials``.
         rules: for each modulus of the law, whether it belongs to the ``shape`` or the ``volume`` rule of integration.
         curvature: for each modulus, an upper bound of what it adds to the tangent's eigenvalues for small strains.
     """
 
-    law: ClassVar[Callable[[type], SimpleNamespace]]
+    law: ClassVar[ModuleType]
     rules: ClassVar[tuple[str, ...]]
     curvature: ClassVar[tuple[float, ...]]
 

@@ -108,7 +108,10 @@ class _Hookean(Material):
 
 @dataclass(frozen=True)
 class Corotated(_Hookean):
-    """The material of projective dynamics; its small-strain Poisson's ratio is `small_strain_poissons_ratio`."""
+    """The material of projective dynamics: for small strains, linear elasticity with lambda / 3.
+
+    It bends a little less stiffly than its nominal constants: nu 0.45 acts as 0.375, nu 0.499 as 0.497.
+    """
 
     law = corotated
 
@@ -165,12 +168,3 @@ def make_material(model: str = "corotated", **constants: Any) -> Material:
         if name not in known:
             raise InputError(f"{model} has no constant {name!r}: it has {', '.join(known)}.")
     return MATERIALS[model](**constants)
-
-
-def small_strain_poissons_ratio(poissons_ratio: float) -> float:
-    """Poisson's ratio that the corotated model shows for small strains: linear elasticity with lambda / 3.
-
-    It bends a little less stiffly than its nominal constants: nu 0.45 acts as 0.375, nu 0.499 as 0.497.
-    """
-    lame_over_mu = 2.0 * poissons_ratio / (1.0 - 2.0 * poissons_ratio) / 3.0
-    return lame_over_mu / (2.0 * (lame_over_mu + 1.0))

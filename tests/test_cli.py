@@ -406,7 +406,10 @@ class TestProcess:
         out, err = self.start(config_dir, heavy, "--help").communicate(timeout=60)
         assert "experiment: beam, beam_twist" in out
         names = out.splitlines()[-1].removeprefix("imported: ").split()
-        ours = {f"warp_resphys.{name}" for name in ("cli", "conf", "io", "io.errors", "io.files", "io.labels")}
+        ours = {
+            f"warp_resphys.{name}"
+            for name in ("cli", "conf", "io", "io.decoding", "io.errors", "io.files", "io.labels")
+        }
         assert {"warp_resphys", "warp_resphys.cli"} <= set(names) <= {"warp_resphys", *ours}
         assert err == ""
 

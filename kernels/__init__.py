@@ -1,8 +1,8 @@
 """Warp device code: energies at points, the gather, the Hessian blocks and their adjoints.
 
-Each factory takes a Warp scalar type and returns the kernels compiled for it, in Warp modules of that type (`modules`),
-so that a float64 run never compiles float32 code, nor a run without chambers that of pressure. Nothing here is
-differentiated by Warp itself: the adjoints are written out (``wp.svd3`` has a wrong adjoint at the rest state).
+All in float64: single precision leaves a nearly incompressible solid no digit of its forces. Pressure, fibres and each
+material are Warp modules of their own (`modules`), so that a run compiles what it needs. Nothing here is differentiated
+by Warp itself: the adjoints are written out (``wp.svd3`` has a wrong adjoint at the rest state).
 
 Array names used in every kernel, with B environments, N vertices, C cells of K nodes with Q points each, P = C Q:
 

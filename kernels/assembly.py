@@ -1,76 +1,68 @@
 """Hessian blocks of the cells, and their gather into the value array of a matrix layout."""
 
-import functools
-from types import SimpleNamespace
-
 import warp as wp
 
-from .matrices import matrix_functions
 from .modules import decorators
 
+ZERO = wp.float64(0.0)
 
-@functools.cache
-def assembly_kernels(scalar: type) -> SimpleNamespace:
-    """Kernels that build the Hessian for one scalar type (``wp.float64`` or ``wp.float32``)."""
-    kernel, _ = decorators(scalar)
-    functions = matrix_functions(scalar)
-    mat33, vec3 = functions.mat33, functions.vec3
-    zero = scalar(0.0)
+kernel, _ = decorators()
 
-    @kernel
-    def cell_blocks(
-        gradients: wp.array2d[vec3],
-        points_per_cell: int,
-        tangent_point: wp.array3d[mat33],  # (B, P, 6)
-        block_offset: int,
-        blocks_out: wp.array2d[mat33],  # (B, C K (K + 1) / 2 from block_offset on) [N/m], rows a >= columns c
-    ):
-        """Block (a, c) of a cell: d force_a / d x_c."""
-        b, cell, a = wp.tid()
-        k = gradients.shape[1]
-        first = block_offset + cell * (k * (k + 1)) / 2 + (a * (a + 1)) / 2
-        for q in range(points_per_cell):
-            p = cell * points_per_cell + q
-            g = gradients[p, a]
-            t = tangent_point[b, p]
-            x = g[0] * t[0] + g[1] * t[1] + g[2] * t[3]
-            y = g[0] * wp.transpose(t[1]) + g[1] * t[2] + g[2] * t[4]
-            z = g[0] * wp.transpose(t[3]) + g[1] * wp.transpose(t[4]) + g[2] * t[5]
-            for c in range(a + 1):
-                h = gradients[p, c]
-                block = h[0] * x + h[1] * y + h[2] * z
-                if q > 0:
-                    block += blocks_out[b, first + c]
-                blocks_out[b, first + c] = block
 
-    @kernel
-    def scatter_blocks(
-        block_start: wp.array[int],  # (blocks + 1) where a matrix block's contributions begin
-        contribution: wp.array[int],  # cell block, or -1 - cell block where it enters transposed
-        diagonal_vertex: wp.array[int],  # (blocks) the vertex of a diagonal block, else -1
-        address: wp.array2d[int],  # (blocks, 9) place in the layout's value array, or -1
-        cell_block: wp.array2d[mat33],
-        inertia: wp.array2d[scalar],  # (B, N) [N/m]
-        values_out: wp.array2d[scalar],  # (B, layout size) [N/m]
-    ):
-        b, block = wp.tid()
-        total = mat33(zero, zero, zero, zero, zero, zero, zero, zero, zero)
-        for entry in range(block_start[block], block_start[block + 1]):
-            source = contribution[entry]
-            if source >= 0:
-                total += cell_block[b, source]
-            else:
-                total += wp.transpose(cell_block[b, -1 - source])
-        i = diagonal_vertex[block]
-        if i >= 0:
-            k = inertia[b, i]
-            total[0, 0] += k
-            total[1, 1] += k
-            total[2, 2] += k
-        for r in range(3):
-            for c in range(3):
-                at = address[block, 3 * r + c]
-                if at >= 0:
-                    values_out[b, at] = total[r, c]
+@kernel
+def cell_blocks(
+    gradients: wp.array2d[wp.vec3d],
+    points_per_cell: int,
+    tangent_point: wp.array3d[wp.mat33d],  # (B, P, 6)
+    block_offset: int,
+    blocks_out: wp.array2d[wp.mat33d],  # (B, C K (K + 1) / 2 from block_offset on) [N/m], rows a >= columns c
+):
+    """Block (a, c) of a cell: d force_a / d x_c."""
+    b, cell, a = wp.tid()
+    k = gradients.shape[1]
+    first = block_offset + cell * (k * (k + 1)) / 2 + (a * (a + 1)) / 2
+    for q in range(points_per_cell):
+        p = cell * points_per_cell + q
+        g = gradients[p, a]
+        t = tangent_point[b, p]
+        x = g[0] * t[0] + g[1] * t[1] + g[2] * t[3]
+        y = g[0] * wp.transpose(t[1]) + g[1] * t[2] + g[2] * t[4]
+        z = g[0] * wp.transpose(t[3]) + g[1] * wp.transpose(t[4]) + g[2] * t[5]
+        for c in range(a + 1):
+            h = gradients[p, c]
+            block = h[0] * x + h[1] * y + h[2] * z
+            if q > 0:
+                block += blocks_out[b, first + c]
+            blocks_out[b, first + c] = block
 
-    return SimpleNamespace(cell_blocks=cell_blocks, scatter_blocks=scatter_blocks)
+
+@kernel
+def scatter_blocks(
+    block_start: wp.array[int],  # (blocks + 1) where a matrix block's contributions begin
+    contribution: wp.array[int],  # cell block, or -1 - cell block where it enters transposed
+    diagonal_vertex: wp.array[int],  # (blocks) the vertex of a diagonal block, else -1
+    address: wp.array2d[int],  # (blocks, 9) place in the layout's value array, or -1
+    cell_block: wp.array2d[wp.mat33d],
+    inertia: wp.array2d[wp.float64],  # (B, N) [N/m]
+    values_out: wp.array2d[wp.float64],  # (B, layout size) [N/m]
+):
+    """The entries of a layout: the sums of the blocks of the cells, and inertia on the diagonal."""
+    b, block = wp.tid()
+    total = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
+    for entry in range(block_start[block], block_start[block + 1]):
+        source = contribution[entry]
+        if source >= 0:
+            total += cell_block[b, source]
+        else:
+            total += wp.transpose(cell_block[b, -1 - source])
+    i = diagonal_vertex[block]
+    if i >= 0:
+        k = inertia[b, i]
+        total[0, 0] += k
+        total[1, 1] += k
+        total[2, 2] += k
+    for r in range(3):
+        for c in range(3):
+            at = address[block, 3 * r + c]
+            if at >= 0:
+                values_out[b, at] = total[r, c]

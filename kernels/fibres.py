@@ -1,121 +1,114 @@
 """Threads that only pull: stress, tangent and derivative by the stiffness."""
 
-import functools
-from types import SimpleNamespace
-
 import warp as wp
 
-from .matrices import matrix_functions
 from .modules import decorators
-from .points import point_kernels
+from .points import deformation_gradient
+
+ZERO, HALF, ONE = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0)
+SIXTH, TWENTY_FOURTH = wp.float64(1.0 / 6.0), wp.float64(1.0 / 24.0)
+
+kernel, function = decorators("fibres")
 
 
-@functools.cache
-def fibre_kernels(scalar: type) -> SimpleNamespace:
-    """Kernels for one scalar type (``wp.float64`` or ``wp.float32``)."""
-    kernel, function = decorators(scalar, "fibres")
-    functions = matrix_functions(scalar)
-    mat33, vec3 = functions.mat33, functions.vec3
-    deformation_gradient = point_kernels(scalar).deformation_gradient
-    zero, half, one = scalar(0.0), scalar(0.5), scalar(1.0)
-    sixth, twenty_fourth = scalar(1.0 / 6.0), scalar(1.0 / 24.0)
+@function
+def tension(strain: wp.float64, toe: wp.float64):
+    """Energy, force and slope of a thread of stiffness one: none below zero, linear in the strain past the toe."""
+    energy = ZERO
+    force = ZERO
+    slope = ZERO
+    if strain > toe:
+        force = strain - HALF * toe
+        energy = HALF * force * force + TWENTY_FOURTH * toe * toe
+        slope = ONE
+    elif strain > ZERO:
+        slope = strain / toe
+        force = HALF * strain * slope
+        energy = SIXTH * strain * strain * slope
+    return energy, force, slope
 
-    @function
-    def tension(strain: scalar, toe: scalar):
-        """Energy, force and slope of a thread of stiffness one: none below zero, linear in the strain past the toe."""
-        energy = zero
-        force = zero
-        slope = zero
-        if strain > toe:
-            force = strain - half * toe
-            energy = half * force * force + twenty_fourth * toe * toe
-            slope = one
-        elif strain > zero:
-            slope = strain / toe
-            force = half * strain * slope
-            energy = sixth * strain * strain * slope
-        return energy, force, slope
 
-    @kernel
-    def local_step(
-        nodes: wp.array2d[int],
-        gradients: wp.array2d[vec3],
-        weights: wp.array[scalar],  # (P) area [m^2]
-        chamber: wp.array[int],
-        stiffness: wp.array2d[scalar],  # (B, chambers) [N/m]
-        toe: scalar,
-        points_per_cell: int,
-        positions: wp.array2d[vec3],
-        stress_out: wp.array2d[mat33],
-        energy_out: wp.array2d[scalar],
-    ):
-        b, p = wp.tid()
-        f = deformation_gradient(positions, nodes, gradients, b, p, p / points_per_cell)
-        fibre = vec3(f[0, 0], f[1, 0], f[2, 0])
-        stretch = wp.length(fibre)
-        energy, force, _slope = tension(stretch - one, toe)
+@kernel
+def local_step(
+    nodes: wp.array2d[int],
+    gradients: wp.array2d[wp.vec3d],
+    weights: wp.array[wp.float64],  # (P) area [m^2]
+    chamber: wp.array[int],
+    stiffness: wp.array2d[wp.float64],  # (B, chambers) [N/m]
+    toe: wp.float64,
+    points_per_cell: int,
+    positions: wp.array2d[wp.vec3d],
+    stress_out: wp.array2d[wp.mat33d],
+    energy_out: wp.array2d[wp.float64],
+):
+    """The pull along the fibre, and its energy."""
+    b, p = wp.tid()
+    f = deformation_gradient(positions, nodes, gradients, b, p, p / points_per_cell)
+    fibre = wp.vec3d(f[0, 0], f[1, 0], f[2, 0])
+    stretch = wp.length(fibre)
+    energy, force, _slope = tension(stretch - ONE, toe)
+    scale = weights[p] * stiffness[b, chamber[p]]
+    pull = wp.vec3d(ZERO, ZERO, ZERO)
+    if stretch > ONE:
+        pull = (scale * force / stretch) * fibre
+    stress_out[b, p] = wp.mat33d(pull[0], ZERO, ZERO, pull[1], ZERO, ZERO, pull[2], ZERO, ZERO)
+    energy_out[b, p] = scale * energy
+
+
+@kernel
+def tangent(
+    nodes: wp.array2d[int],
+    gradients: wp.array2d[wp.vec3d],
+    weights: wp.array[wp.float64],
+    chamber: wp.array[int],
+    stiffness: wp.array2d[wp.float64],
+    toe: wp.float64,
+    points_per_cell: int,
+    positions: wp.array2d[wp.vec3d],
+    tangent_out: wp.array3d[wp.mat33d],
+):
+    """Block (0, 0) is k w (s / lambda (1 - u u^T) + s' u u^T), which is never indefinite: a thread only pulls."""
+    b, p = wp.tid()
+    f = deformation_gradient(positions, nodes, gradients, b, p, p / points_per_cell)
+    fibre = wp.vec3d(f[0, 0], f[1, 0], f[2, 0])
+    stretch = wp.length(fibre)
+    out = tangent_out[b, p]
+    nothing = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
+    for k in range(6):
+        out[k] = nothing
+    if stretch > ONE:
+        _energy, force, slope = tension(stretch - ONE, toe)
         scale = weights[p] * stiffness[b, chamber[p]]
-        pull = vec3(zero, zero, zero)
-        if stretch > one:
-            pull = (scale * force / stretch) * fibre
-        stress_out[b, p] = mat33(pull[0], zero, zero, pull[1], zero, zero, pull[2], zero, zero)
-        energy_out[b, p] = scale * energy
+        u = fibre / stretch
+        across = scale * force / stretch
+        block = (scale * slope - across) * wp.outer(u, u)
+        block[0, 0] += across
+        block[1, 1] += across
+        block[2, 2] += across
+        out[0] = block
 
-    @kernel
-    def tangent(
-        nodes: wp.array2d[int],
-        gradients: wp.array2d[vec3],
-        weights: wp.array[scalar],
-        chamber: wp.array[int],
-        stiffness: wp.array2d[scalar],
-        toe: scalar,
-        points_per_cell: int,
-        positions: wp.array2d[vec3],
-        tangent_out: wp.array3d[mat33],
-    ):
-        """Block (0, 0) is k w (s / lambda (1 - u u^T) + s' u u^T), which is never indefinite: a thread only pulls."""
-        b, p = wp.tid()
-        f = deformation_gradient(positions, nodes, gradients, b, p, p / points_per_cell)
-        fibre = vec3(f[0, 0], f[1, 0], f[2, 0])
-        stretch = wp.length(fibre)
-        out = tangent_out[b, p]
-        nothing = mat33(zero, zero, zero, zero, zero, zero, zero, zero, zero)
-        for k in range(6):
-            out[k] = nothing
-        if stretch > one:
-            _energy, force, slope = tension(stretch - one, toe)
-            scale = weights[p] * stiffness[b, chamber[p]]
-            u = fibre / stretch
-            across = scale * force / stretch
-            block = (scale * slope - across) * wp.outer(u, u)
-            block[0, 0] += across
-            block[1, 1] += across
-            block[2, 2] += across
-            out[0] = block
 
-    @kernel
-    def adjoint(
-        nodes: wp.array2d[int],
-        gradients: wp.array2d[vec3],
-        weights: wp.array[scalar],
-        toe: scalar,
-        points_per_cell: int,
-        positions: wp.array2d[vec3],
-        direction: wp.array2d[vec3],  # (B, N) z = H^-1 dL/dx [m]
-        stiffness_out: wp.array2d[scalar],  # (B, P) this point's part of dL/dk of its chamber
-    ):
-        """dL/dk = -z . dg/dk = -w s (u . dz)."""
-        b, p = wp.tid()
-        cell = p / points_per_cell
-        f = deformation_gradient(positions, nodes, gradients, b, p, cell)
-        dz = deformation_gradient(direction, nodes, gradients, b, p, cell)
-        fibre = vec3(f[0, 0], f[1, 0], f[2, 0])
-        along = vec3(dz[0, 0], dz[1, 0], dz[2, 0])
-        stretch = wp.length(fibre)
-        _energy, force, _slope = tension(stretch - one, toe)
-        result = zero
-        if stretch > one:
-            result = -weights[p] * force * wp.dot(fibre, along) / stretch
-        stiffness_out[b, p] = result
-
-    return SimpleNamespace(local_step=local_step, tangent=tangent, adjoint=adjoint)
+@kernel
+def adjoint(
+    nodes: wp.array2d[int],
+    gradients: wp.array2d[wp.vec3d],
+    weights: wp.array[wp.float64],
+    toe: wp.float64,
+    points_per_cell: int,
+    positions: wp.array2d[wp.vec3d],
+    direction: wp.array2d[wp.vec3d],  # (B, N) z = H^-1 dL/dx [m]
+    stiffness_out: wp.array2d[wp.float64],  # (B, P) this point's part of dL/dk of its chamber
+):
+    """dL/dk = -z . dg/dk = -w s (u . dz)."""
+    b, p = wp.tid()
+    cell = p / points_per_cell
+    f = deformation_gradient(positions, nodes, gradients, b, p, cell)
+    dz = deformation_gradient(direction, nodes, gradients, b, p, cell)
+    fibre = wp.vec3d(f[0, 0], f[1, 0], f[2, 0])
+    along = wp.vec3d(dz[0, 0], dz[1, 0], dz[2, 0])
+    stretch = wp.length(fibre)
+    _energy, force, _slope = tension(stretch - ONE, toe)
+    result = ZERO
+    if stretch > ONE:
+        result = -weights[p] * force * wp.dot(fibre, along) / stretch
+    stiffness_out[b, p] = result

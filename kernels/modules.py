@@ -1,4 +1,4 @@
-"""Where kernels are compiled: one Warp module a scalar type and a part, so that a run compiles what it launches."""
+"""Where kernels are compiled: one Warp module a part, so that a run compiles what it launches."""
 
 import functools
 from collections.abc import Callable
@@ -7,7 +7,7 @@ from typing import Any
 import warp as wp
 
 
-def decorators(scalar: type, part: str = "") -> tuple[Callable[..., Any], Callable[..., Any]]:
+def decorators(part: str = "") -> tuple[Callable[..., Any], Callable[..., Any]]:
     """``wp.kernel`` and ``wp.func`` for a part's module; nothing is differentiated by Warp itself."""
-    module = ".".join(filter(None, ("warp_resphys", scalar.__name__, part)))
+    module = f"warp_resphys.{part}" if part else "warp_resphys"
     return functools.partial(wp.kernel, module=module, enable_backward=False), functools.partial(wp.func, module=module)

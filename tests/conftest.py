@@ -16,7 +16,14 @@ wp.config.log_level = wp.LOG_WARNING
 wp.init()
 torch.set_num_threads(1)
 
+NUMERICAL = {"dynamics", "energies", "fem", "learning", "linalg"}  # folders of tests
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if item.path.parent.name in NUMERICAL:
+            item.add_marker("numerics")
 
 
 @pytest.fixture(params=DEVICES)

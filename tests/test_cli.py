@@ -382,6 +382,18 @@ class TestProcess:
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
         return subprocess.Popen(command, env=environment, cwd=config_dir.parent, text=True, **pipes)
 
+    def job(self, *lines: str) -> str:
+        """A program's beginning, by which the command runs these lines."""
+        return "\n".join(
+            [
+                "import signal, sys, time, types",
+                f"experiment = sys.modules[{EXPERIMENT!r}] = types.ModuleType('experiment')",
+                "def run(config):",
+                *(f"    {line}" for line in lines),
+                "experiment.run_experiment = run",
+            ]
+        )
+
     def test_help_imports_nothing_heavy(self, config_dir):
         heavy = """
             import atexit, sys
@@ -394,22 +406,38 @@ class TestProcess:
         out, err = self.start(config_dir, heavy, "--help").communicate(timeout=60)
         assert "experiment: beam, beam_twist" in out
         names = out.splitlines()[-1].removeprefix("imported: ").split()
-        ours = {f"warp_resphys.{name}" for name in ("cli", "conf", "io", "io.errors", "io.files", "io.labels")}
+        ours = {
+            f"warp_resphys.{name}"
+            for name in ("cli", "conf", "io", "io.decoding", "io.errors", "io.files", "io.labels")
+        }
         assert {"warp_resphys", "warp_resphys.cli"} <= set(names) <= {"warp_resphys", *ours}
         assert err == ""
 
     def test_ctrl_c(self, config_dir):
-        sleeping = """
-            import signal, sys, time, types
-            signal.signal(signal.SIGINT, signal.default_int_handler)
-            def run(config):
-                print("running", flush=True)
-                time.sleep(60)
-            sys.modules["warp_resphys.experiment.pipeline"] = types.ModuleType("experiment")
-            sys.modules["warp_resphys.experiment.pipeline"].run_experiment = run
-        """
+        handler = "signal.signal(signal.SIGINT, signal.default_int_handler)"
+        sleeping = self.job(handler, "print('running', flush=True)", "time.sleep(60)")
         child = self.start(config_dir, sleeping)
         assert child.stdout.readline() == "running\n"
         child.send_signal(signal.SIGINT)
         assert child.wait(timeout=20) == 130
         assert child.stderr.read() == "\ninterrupted\n"
+
+    @pytest.mark.parametrize(
+        ("arguments", "code", "lines"),
+        [
+            ("--help", 141, 0),
+            ("--cfg job", 141, 0),
+            ("seed=1", 141, 0),
+            ("--multirun seed=1,2", 141, 0),
+            ("sed=1", 2, 1),
+        ],
+    )
+    def test_nobody_reads_what_it_says(self, config_dir, arguments, code, lines):
+        child = self.start(config_dir, self.job('print("x" * 100_000)'), *arguments.split())
+        child.stdout.close()
+        assert child.wait(timeout=20) == code
+        assert child.stderr.read().count("\n") == lines
+
+    def test_another_pipe_that_breaks_is_a_fault_of_the_program(self, config_dir):
+        _, err = self.start(config_dir, self.job('raise BrokenPipeError(32, "Broken pipe")')).communicate(timeout=60)
+        assert err.endswith("BrokenPipeError: [Errno 32] Broken pipe\n")

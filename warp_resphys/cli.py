@@ -6,12 +6,14 @@ import difflib
 import logging
 import os
 import re
+import select
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib import import_module, resources
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any, Final, TextIO
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -33,6 +35,7 @@ from .io.labels import run_label
 CONFIG_PACKAGE = "pkg://warp_resphys.conf"
 USER_ERROR = 2
 INTERRUPTED = 130
+NOBODY_READS = 141  # 128 + SIGPIPE
 
 
 # Each command: its function below this package, which takes the configuration of the same name, and its purpose.
@@ -90,12 +93,41 @@ def main(command: str | None = None) -> None:
     """Does what the command line asks for.
 
     The process ends with exit code 2 and one sentence on stderr where the user can mend what is wrong, with
-    130 after Ctrl-C, and with 1 and a traceback for everything else. With HYDRA_FULL_ERROR=1 in the
-    environment, every error keeps its traceback.
+    130 after Ctrl-C, with 141 when whoever reads its output has left, as `head` does, and with 1 and a traceback for
+    everything else. With HYDRA_FULL_ERROR=1 in the environment, every error keeps its traceback.
 
     Args:
         command: one of COMMANDS; where left out, the first bare word of the command line, and without one, run.
     """
+    with _ends_where_nobody_reads():
+        _run(command)
+
+
+@contextmanager
+def _ends_where_nobody_reads() -> Iterator[None]:
+    """Ends the process without a word when its output breaks for want of a reader."""
+    try:
+        try:
+            yield
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        unread = [stream.fileno() for stream in (sys.stdout, sys.stderr) if _is_unread(stream)]
+        if not unread:
+            raise
+        for descriptor in unread:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)  # Python flushes once more at its end.
+        raise SystemExit(NOBODY_READS) from None
+
+
+def _is_unread(stream: TextIO) -> bool:
+    """Whether the stream is a pipe that nobody has open to read any more."""
+    poll = select.poll()
+    poll.register(stream, 0)
+    return any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0))
+
+
+def _run(command: str | None) -> None:
     reported: list[BaseException] = []
     started = False
 
@@ -106,7 +138,8 @@ def main(command: str | None = None) -> None:
             if old := next((key for key in RENAMED if OmegaConf.select(config, key) is not None), None):
                 raise InputError(_successor(old))
             module, _, function = COMMANDS[chosen][0].partition(":")
-            return getattr(import_module(f"{__package__}.{module}"), function)(config)
+            with _ends_where_nobody_reads():
+                return getattr(import_module(f"{__package__}.{module}"), function)(config)
         except Exception as error:
             sentence = _explain(error, started)
             if sentence is None or full_error:
@@ -204,6 +237,8 @@ def _explain(error: BaseException, started: bool) -> str | None:
     """
     if isinstance(error, ResphysError):
         return str(error)
+    if isinstance(error, BrokenPipeError):
+        return None
     if isinstance(error, InstantiationException) and error.__cause__ is not None:
         return _explain(error.__cause__, started)
     if isinstance(error, MissingConfigException):

@@ -1,10 +1,11 @@
 """Elastic energy densities, one module a material; `kernels.solid` makes the same kernels of each.
 
 The energy of a point is ``sum_t m_t W_t(F)``, the moduli m_t times the volume that the point carries for that term
-(shape terms and volume terms may be integrated at different points, so that a modulus may be zero). A factory takes a
-Warp scalar type and returns
+(shape terms and volume terms may be integrated at different points, so that a modulus may be zero). A module has
 
-- ``lame``: for each modulus, what it adds to the Lame constants (mu, lambda) of small strains,
+- ``NAME``, that of its Warp module,
+- ``LAME``: for each modulus, what it adds to the Lame constants (mu, lambda) of small strains,
+- ``moduli``, the vector type of the m_t,
 - ``response(f, m) -> energy, stress``,
 - ``slopes(f, df) -> dP/dm_t : df`` for every t,
 - ``tangent(f, m, positive, out)``: the blocks of dP/dF; with ``positive``, without negative eigenvalues.

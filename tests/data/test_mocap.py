@@ -7,8 +7,8 @@ import ezc3d
 import numpy as np
 import pytest
 
-from warp_resphys.data.recordings.c3d import read_c3d
 from warp_resphys.data.recordings.processing import fill_gaps
+from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.recordings.recording import Recording
 from warp_resphys.data.recordings.release import find_release
 from warp_resphys.io import decoding
@@ -37,7 +37,7 @@ def trajectory():
 
 def test_read_c3d_converts_units_and_keeps_occlusions(tmp_path, trajectory):
     trajectory[7:9, 1] = np.nan
-    recording = read_c3d(write_c3d(tmp_path / "small.c3d", trajectory, "abc"))
+    recording = read_recording(write_c3d(tmp_path / "small.c3d", trajectory, "abc"))
     assert recording.labels == ("a", "b", "c")
     assert recording.rate == 200.0
     np.testing.assert_allclose(recording.positions, 1e-3 * trajectory, rtol=1e-6, atol=1e-9)
@@ -46,7 +46,7 @@ def test_read_c3d_converts_units_and_keeps_occlusions(tmp_path, trajectory):
 
 
 def test_read_c3d_recording(shared_data):
-    recording = read_c3d(shared_data / "beam_mocap" / "beam_gravity_V2_a.c3d")
+    recording = read_recording(shared_data / "beam_mocap" / "beam_gravity_V2_a.c3d")
     assert recording.positions.shape == (500, 6, 3)
     assert recording.rate == 100.0
     np.testing.assert_allclose(recording.positions[0, 0], [0.074, 0.0306, 0.0748], atol=5e-5)
@@ -60,13 +60,13 @@ def test_missing_marker_names_it_and_what_is_there(trajectory):
 
 def test_missing_and_foreign_files(tmp_path):
     with pytest.raises(DataFileError, match="No such file"):
-        read_c3d(tmp_path / "absent.c3d")
+        read_recording(tmp_path / "absent.c3d")
     (tmp_path / "notes.c3d").write_text("this is no recording")
     with pytest.raises(DataFileError, match="not a C3D file"):
-        read_c3d(tmp_path / "notes.c3d")
+        read_recording(tmp_path / "notes.c3d")
     (tmp_path / "empty.c3d").touch()
     with pytest.raises(DataFileError, match="not a C3D file"):
-        read_c3d(tmp_path / "empty.c3d")
+        read_recording(tmp_path / "empty.c3d")
 
 
 @pytest.mark.parametrize("part", [0.001, 0.03, 0.3, 0.6, 0.9, 0.98])
@@ -75,7 +75,7 @@ def test_truncated_file(tmp_path, trajectory, part):
     cut = tmp_path / "cut.c3d"
     cut.write_bytes(content[: int(part * len(content))])
     with pytest.raises(DataFileError, match="truncated"):
-        read_c3d(cut)
+        read_recording(cut)
 
 
 @pytest.mark.parametrize(
@@ -96,7 +96,7 @@ def test_a_changed_byte_that_crashes_the_decoder_or_makes_it_claim_memory_or_tim
     for limit, given in limits.items():
         monkeypatch.setattr(decoding, limit, given)
     with pytest.raises(DataFileError, match=rf"whole\.c3d is damaged or truncated \(.*{message}\); copy"):
-        read_c3d(path)
+        read_recording(path)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -108,12 +108,12 @@ def test_bytes_overwritten_in_the_parameters_never_escape_as_anything_else(tmp_p
     path = tmp_path / "damaged.c3d"
     path.write_bytes(content)
     with contextlib.suppress(DataFileError):
-        assert read_c3d(path).positions.shape[2] == 3
+        assert read_recording(path).positions.shape[2] == 3
 
 
 def test_unknown_unit(tmp_path, trajectory):
     with pytest.raises(DataFileError, match="positions in 'inch'"):
-        read_c3d(write_c3d(tmp_path / "inch.c3d", trajectory, "abc", unit="inch"))
+        read_recording(write_c3d(tmp_path / "inch.c3d", trajectory, "abc", unit="inch"))
 
 
 def test_fill_gaps_interpolates_a_swing_and_refuses_a_long_gap():
@@ -153,7 +153,7 @@ def test_release_of_a_free_fall_is_found_between_frames(release):
 
 def test_release_of_recordings(shared_data):
     for name, first_moving in (("gravity", 71), ("load52", 44), ("load101", 52)):
-        recording = read_c3d(shared_data / "beam_mocap" / f"beam_{name}_V2_a.c3d").select(TIP)
+        recording = read_recording(shared_data / "beam_mocap" / f"beam_{name}_V2_a.c3d").select(TIP)
         found = find_release(recording.positions.mean(axis=1), recording.rate)
         assert first_moving - 1.1 <= found.frame < first_moving
         assert found.rest[0] >= 13

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from warp_resphys.data.oscillation import measure_oscillation, turning_points
-from warp_resphys.data.recordings.c3d import read_c3d
+from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.recordings.release import find_release
 from warp_resphys.io.errors import InputError
 
@@ -63,7 +63,7 @@ def test_turning_points_are_the_extremes_and_not_the_noise():
 def test_recordings(shared_data):
     """Periods of 13, 23 and 30 frames, as published with the data."""
     for name, frames in (("gravity", 13), ("load52", 23), ("load101", 30)):
-        recording = read_c3d(shared_data / "beam_mocap" / f"beam_{name}_V2_a.c3d")
+        recording = read_recording(shared_data / "beam_mocap" / f"beam_{name}_V2_a.c3d")
         path = recording.select(["Tip - 1", "Tip - 2", "Tip - 3"]).positions.mean(axis=1)
         start = round(find_release(path, recording.rate).frame)
         measured = measure_oscillation(path[start:, 0] - path[start, 0], recording.rate)

@@ -5,8 +5,8 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from warp_resphys.data.recordings.c3d import read_c3d
 from warp_resphys.data.recordings.processing import fill_gaps
+from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.recordings.release import find_release
 from warp_resphys.data.registration import (
     RigidTransform,
@@ -185,7 +185,7 @@ class TestRegisterMarkers:
     ("name", "rms"), [("gravity", 0.807e-3), ("load52", 0.832e-3), ("load101", 1.132e-3)], ids=["bare", "52g", "101g"]
 )
 def test_recordings_of_the_beam(shared_data, name, rms):
-    recording = read_c3d(shared_data / "beam_mocap" / f"beam_{name}_V2_a.c3d").select(NAMES)
+    recording = read_recording(shared_data / "beam_mocap" / f"beam_{name}_V2_a.c3d").select(NAMES)
     positions = fill_gaps(recording).positions
     release = find_release(positions[:, :3].mean(axis=1), recording.rate)
     held = np.median(positions[slice(*release.rest)], axis=0)

@@ -30,7 +30,7 @@ def potential_of(f):
     solid = Solid(TETRAHEDRON.discretisation, MooneyRivlin(), torch.device("cpu"), torch.float64)
     fixed = torch.zeros(0, dtype=torch.int64)
     sets = [(solid, solid.points(TETRAHEDRON.mesh))]
-    p = IncrementalPotential(sets, 4, fixed, len(f), torch.device("cpu"), torch.float64)
+    p = IncrementalPotential(sets, 4, fixed, len(f), torch.device("cpu"))
     zeros = torch.zeros(len(f), 4, 3, dtype=torch.float64)
     values = {"stiffness": torch.as_tensor(MODULI).expand(len(f), 1, 3), "viscosity": zeros[:, 0, 0]}
     p.set_terms(StepTerms(zeros, zeros[..., 0], zeros, {**values, "reference_strain": None}))

@@ -12,10 +12,22 @@ from warp_resphys.io.files import read_json
 from warp_resphys.mesh.arm import mesh_arm
 from warp_resphys.mesh.arm_geometry import ArmGeometry
 from warp_resphys.studies import locking_page as report
-from warp_resphys.studies.locking import HEXAHEDRA, LINEAR, QUADRATIC, cases, cheapest, converged, measure
+from warp_resphys.studies.locking import (
+    BIQUADRATIC,
+    HEXAHEDRA,
+    LINEAR,
+    QUADRATIC,
+    SERENDIPITY,
+    cases,
+    cheapest,
+    converged,
+    measure,
+)
 
 SMALL = (
     "study.hexahedra=[[0.01,0.06,true],[0.005,0.03,false]]",
+    "study.hexahedra_20=[]",
+    "study.hexahedra_27=[]",
     "study.linear_tetrahedra=[]",
     "study.quadratic_tetrahedra=[]",
     "study.steps=2",
@@ -106,6 +118,25 @@ def test_default_study_can_be_extrapolated_and_takes_a_file():
         for i, c in enumerate(known)
     ]
     assert converged(rows, "fibres")["mm"] == pytest.approx(-1.0)
+
+
+def test_quadratic_hexahedra_are_nearer_to_the_converged_deflection_than_linear_ones():
+    """31.63 mm under gravity, of docs/results/2026-11-20-arm-mesh.md."""
+    study, geometry = configured()["study"], configured()["mesh"]
+    keys = {SERENDIPITY: "hexahedra_20", BIQUADRATIC: "hexahedra_27", HEXAHEDRA: "hexahedra"}
+    found = {}
+    for element, key in keys.items():
+        (case,) = (
+            each
+            for each in cases(study | {name: [] for name in keys.values()} | {key: [[0.01, 0.06, False]]})
+            if each.element == element
+        )
+        mesh = case.mesh(geometry)
+        assert mesh.cells.shape[1] == int(element.partition("-")[0])
+        found[element] = measure(mesh, study, timed=False)["gravity_mm"]
+    assert found[HEXAHEDRA] < 0.9 * 31.63
+    assert found[SERENDIPITY] == pytest.approx(31.63, rel=0.03)
+    assert found[BIQUADRATIC] == pytest.approx(31.63, rel=0.03)
 
 
 def test_study_goes_on_where_it_was_interrupted(tmp_path, monkeypatch):

@@ -4,12 +4,13 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+import warp as wp
 from numpy.typing import NDArray
 
 from ..energies.launcher import warp_view
 from ..energies.potential import IncrementalPotential
 from ..fem.elements import Points
-from ..kernels.assembly import assembly_kernels
+from ..kernels import assembly as kernels
 from ..linalg.linear_solver import LinearSolver
 
 
@@ -71,27 +72,29 @@ class HessianAssembly:
     """Recorded launches from the tangent of a potential to the value array of a linear solver."""
 
     def __init__(self, potential: IncrementalPotential, solver: LinearSolver, pattern: BlockPattern) -> None:
-        p, k = potential, assembly_kernels(potential.scalar)
+        p = potential
         self._potential = p
         blocks = p.zeros(pattern.n_cell_blocks, 3, 3)
         self._values = p.zeros(solver.n_values)
         self._commands = []
         for s, offset in zip(p.sets, pattern.offsets, strict=True):
             inputs = [s.gradients, s.points_per_cell]
-            inputs += [p.points_view(p.tangent, s.part, p.mat33), offset]
+            inputs += [p.points_view(p.tangent, s.part, wp.mat33d), offset]
             self._commands.append(
-                p.record(k.cell_blocks, (p.batch, s.cells, s.nodes_per_cell), inputs, [warp_view(blocks, p.mat33)])
+                p.record(
+                    kernels.cell_blocks, (p.batch, s.cells, s.nodes_per_cell), inputs, [warp_view(blocks, wp.mat33d)]
+                )
             )
         inputs = [
             p.upload(pattern.start.astype(np.int32), int),
             p.upload(pattern.contribution.astype(np.int32), int),
             p.upload(pattern.diagonal_vertex.astype(np.int32), int),
             p.upload(solver.address, int),
-            warp_view(blocks, p.mat33),
-            warp_view(p.terms.inertia, p.scalar),
+            warp_view(blocks, wp.mat33d),
+            warp_view(p.terms.inertia, wp.float64),
         ]
         dim = (p.batch, len(pattern.rows))
-        self._commands.append(p.record(k.scatter_blocks, dim, inputs, [warp_view(self._values, p.scalar)]))
+        self._commands.append(p.record(kernels.scatter_blocks, dim, inputs, [warp_view(self._values, wp.float64)]))
 
     def __call__(self) -> torch.Tensor:
         """(B, n_values) from the potential's last `update_tangent`; overwritten by the next call."""

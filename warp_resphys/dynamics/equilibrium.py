@@ -45,7 +45,7 @@ class Workspace:
         dtype: torch.dtype,
     ) -> None:
         self.fixed = torch.as_tensor(fixed, device=device)
-        self.potential = IncrementalPotential(energies, n_vertices, self.fixed, batch, device, torch.float64)
+        self.potential = IncrementalPotential(energies, n_vertices, self.fixed, batch, device)
         self.pattern, self.dtype = pattern, dtype
         self._made: dict[Any, Any] = {}
 
@@ -71,7 +71,7 @@ class Workspace:
     def linear_solver(self, name: str) -> LinearSolver:
         """A new solver of the named kind for the Hessian's structure."""
         p, k = self.potential, self.pattern
-        return make_linear_solver(name, k.rows, k.cols, len(k.free), 3, p.device, p.dtype)
+        return make_linear_solver(name, k.rows, k.cols, len(k.free), 3, p.device, torch.float64)
 
 
 def equilibrium(
@@ -159,7 +159,7 @@ def _adjoint(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...
     potential.positions.copy_(x)
     metric = ctx.workspace.hessian(ctx.linear_solver)
     metric.refactor_exact()
-    gradient = gradient.to(potential.dtype)
+    gradient = gradient.double()
     z = metric.apply(gradient.reshape(len(x), -1)).view_as(x)
     product = potential.stiffness_product(z)
     _check_adjoint(potential, z, product, gradient)

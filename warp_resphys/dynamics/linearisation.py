@@ -94,7 +94,7 @@ class Linearisation:
         """(3 F, 3 F) H of the first environment on the free vertices, and (3 F,) the inertia in its diagonal [N/m]."""
         p, pattern = self._potential, self._workspace.pattern
         self.update(x)
-        solver = SparseSolver(pattern.rows, pattern.cols, len(pattern.free), 3, p.device, p.dtype)
+        solver = SparseSolver(pattern.rows, pattern.cols, len(pattern.free), 3, p.device, torch.float64)
         entries = solver.mirrored(HessianAssembly(p, solver, pattern)())[0]
         return solver.matrix(entries), np.repeat(p.inertia[0].cpu().numpy()[pattern.free], 3)
 

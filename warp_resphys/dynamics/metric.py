@@ -112,7 +112,7 @@ class ProjectiveMetric(Metric):
         gradients = points.source.gradients
         a, c = np.tril_indices(gradients.shape[2])
         products = np.einsum("cqpi,cqpi->cqp", gradients[:, :, a], gradients[:, :, c])
-        return torch.as_tensor(products, device=self._potential.device, dtype=self._potential.dtype)
+        return torch.as_tensor(products, device=self._potential.device, dtype=torch.float64)
 
     def _terms(self) -> tuple[torch.Tensor, ...]:
         t = self._potential.terms

@@ -15,7 +15,7 @@ from ..energies.materials import Corotated, Material
 from ..energies.potential import StepTerms
 from ..energies.solid import GreenStrain, Solid, device_matrix, spread
 from ..fem.body import Body
-from ..io.errors import InputError
+from ..io.errors import ConvergenceError, InputError
 from .assembly import BlockPattern
 from .equilibrium import Workspace, equilibrium
 from .inputs import Inputs, check_tensor
@@ -24,6 +24,7 @@ from .linearisation import Linearisation
 from .nonlinear_solver import SolveReport, SolverSettings
 
 GRAVITY = (0.0, 0.0, -9.80709)
+_MOST_LENGTHS = 100.0  # that a body at rest may be away from its rest shape
 COUPLINGS = ("implicit", "explicit")
 _NOTHING = Inputs()
 _GRAVITY = Quantity("gravity", "m/s^2", per="axis")
@@ -264,7 +265,7 @@ class Simulator:
                 known = ", ".join(self.inputs) or "none"
                 raise InputError(f"no energy of the body has the input {name}: they have {known}.")
             device = torch.device(self.device)
-            self._held[batch, name] = HeldEnergy(self.body, found[0], batch, device, self.dtype)
+            self._held[batch, name] = HeldEnergy(self.body, found[0], batch, device)
         return self._held[batch, name]
 
     def rest_state(self, batch: int = 1) -> State:
@@ -411,7 +412,8 @@ class Simulator:
 
         Raises:
             InputError: wrong shapes, values that are not finite, or a body without fixed vertices.
-            ConvergenceError: no equilibrium was found.
+            ConvergenceError: no equilibrium was found, or a body that only grows, as an inflated one whose material
+                cannot hold the pressure.
         """
         if not len(self.fixed):
             raise InputError("a body without fixed vertices has no static equilibrium: fix some vertices.")
@@ -434,7 +436,17 @@ class Simulator:
         )
         solver = workspace.solver("statics", replace(self.settings, name="newton", on_failure="raise"))
         at = state.q[:, self.fixed] if inputs.fixed_positions is None else inputs.fixed_positions
-        x, _ = equilibrium(workspace, solver, terms, state.q if start is None else start.detach(), at)
+        x, report = equilibrium(workspace, solver, terms, state.q if start is None else start.detach(), at)
+        lengths = self.rest_positions.amax(0) - self.rest_positions.amin(0)
+        furthest = (x.detach() - self.rest_positions).abs().flatten(1).amax(1)
+        if bool((grown := ~(furthest < _MOST_LENGTHS * float(lengths.max()))).any()):
+            report = replace(report, converged=report.converged & ~grown)
+            raise ConvergenceError(
+                f"{int(grown.sum())} of {batch} bodies have no equilibrium under these loads: they grow to more than "
+                f"{_MOST_LENGTHS:g} times their size; lower the loads, or take a stiffer material.",
+                x.detach(),
+                report,
+            )
         return State(x, torch.zeros_like(x))
 
     def rollout(

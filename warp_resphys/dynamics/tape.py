@@ -20,7 +20,6 @@ from typing import cast
 import torch
 import warp as wp
 
-from ..energies.launcher import SCALARS
 from ..io.errors import InputError
 from .inputs import Inputs
 from .integrator import State
@@ -28,6 +27,7 @@ from .nonlinear_solver import SolveReport
 from .simulator import Simulator
 
 _VECTOR_INPUTS = ("external_force", "fixed_positions")
+_SCALARS = {torch.float64: wp.float64, torch.float32: wp.float32}
 _VECTORS = {torch.float64: wp.vec3d, torch.float32: wp.vec3f}
 
 
@@ -118,7 +118,7 @@ class _Leaves:
 
     def scalars(self, name: str, array: wp.array) -> torch.Tensor:
         """Leaf of an array of numbers."""
-        return self._leaf(name, array, SCALARS[self.dtype])
+        return self._leaf(name, array, _SCALARS[self.dtype])
 
     def _leaf(self, name: str, array: wp.array, dtype: type) -> torch.Tensor:
         if not isinstance(array, wp.array) or array.dtype != dtype or array.device != self._warp_device:

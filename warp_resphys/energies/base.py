@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
+import warp as wp
 from numpy.typing import NDArray
 
 from ..fem.elements import Points
@@ -118,7 +119,7 @@ class PointSet:
         order = entries[np.argsort(owner[entries], kind="stable")]
         start = np.searchsorted(owner[order], np.arange(n_vertices + 1))
         self.nodes = launcher.upload(points.nodes.astype(np.int32), int)
-        self.gradients = launcher.upload(points.gradients.reshape(-1, self.nodes_per_cell, 3), launcher.vec3)
+        self.gradients = launcher.upload(points.gradients.reshape(-1, self.nodes_per_cell, 3), wp.vec3d)
         self.start = launcher.upload(start.astype(np.int32), int)
         self.incident = launcher.upload(order.astype(np.int32), int)
 
@@ -246,12 +247,12 @@ class PartTerm(Term):
     ) -> None:
         super().__init__(launcher, sets)
         self.value, self.count = value, count
-        self.weights = launcher.upload(weights, launcher.scalar)
+        self.weights = launcher.upload(weights, wp.float64)
         self.part = launcher.upload(part.astype(np.int32), int)
         own = np.eye(count)[part]
-        self._own = torch.as_tensor(own, device=launcher.device, dtype=launcher.dtype)  # (P, count) one in its part
+        self._own = torch.as_tensor(own, device=launcher.device)  # (P, count) one in its part
         self.part_of = torch.as_tensor(part, device=launcher.device)
-        self.weight = torch.as_tensor(weights, device=launcher.device, dtype=launcher.dtype)
+        self.weight = torch.as_tensor(weights, device=launcher.device)
 
     @property
     def shapes(self) -> Mapping[str, tuple[int, ...]]:
@@ -273,8 +274,8 @@ class PartTerm(Term):
         del values
         own, (s,) = self.launcher, self.sets
         out = own.zeros(self.n_points)
-        kernel, inputs = self.slope(s, warp_view(positions, own.vec3), warp_view(direction, own.vec3))
-        command = own.record(kernel, (own.batch, s.n_points), inputs, [warp_view(out, own.scalar)])
+        kernel, inputs = self.slope(s, warp_view(positions, wp.vec3d), warp_view(direction, wp.vec3d))
+        command = own.record(kernel, (own.batch, s.n_points), inputs, [warp_view(out, wp.float64)])
 
         def differentiate() -> dict[str, torch.Tensor]:
             own.launch(command)

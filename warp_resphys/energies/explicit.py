@@ -23,11 +23,10 @@ class HeldEnergy(Launcher):
         energy: such as `pressure.Pressure`.
         batch: environments B.
         device: of every tensor.
-        dtype: of every tensor.
     """
 
-    def __init__(self, body: Body, energy: Energy, batch: int, device: torch.device, dtype: torch.dtype) -> None:
-        super().__init__(batch, device, dtype)
+    def __init__(self, body: Body, energy: Energy, batch: int, device: torch.device) -> None:
+        super().__init__(batch, device)
         (points,) = energy.points(body.mesh)
         everything = slice(0, points.n_points)
         self._set = PointSet(self, points, body.n_vertices, everything, everything)
@@ -47,10 +46,11 @@ class HeldEnergy(Launcher):
 
     def evaluate(self, positions: torch.Tensor, values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Energy of each part (B, count) [J] and force (B, N, 3) [N], without gradients."""
+        positions, values = positions.double(), values.double()
         s, (stress, energy) = self._set, (self.zeros(self._set.n_points, 3, 3), self.zeros(self._set.n_points))
         kernel, inputs = self.term.step(s, {self.term.value: values.contiguous()}, self._view(positions))
-        view = warp_view(stress, self.mat33)
-        step = self.record(kernel, (self.batch, s.n_points), inputs, [view, warp_view(energy, self.scalar)])
+        view = warp_view(stress, wp.mat33d)
+        step = self.record(kernel, (self.batch, s.n_points), inputs, [view, warp_view(energy, wp.float64)])
         force = torch.zeros_like(positions)
         self.launch(step, self.gather(s, view, force))
         return self.term.sum_parts(energy), force.neg_()
@@ -59,11 +59,12 @@ class HeldEnergy(Launcher):
         self, positions: torch.Tensor, values: torch.Tensor, adjoint: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Transposed derivatives of `force` by positions and values, applied to (B, N, 3): (B, N, 3) and (B, count)."""
+        positions, values, adjoint = positions.double(), values.double(), adjoint.double()
         s, held = self._set, {self.term.value: values.contiguous()}
         blocks, stress = self.zeros(s.n_points, 6, 3, 3), self.zeros(s.n_points, 3, 3)
         exact = torch.zeros(self.batch, device=self.device, dtype=torch.int32)
         kernel, inputs = self.term.tangent(s, held, self._view(positions), warp_view(exact, wp.int32))
-        tangent, view, out = warp_view(blocks, self.mat33), warp_view(stress, self.mat33), torch.zeros_like(positions)
+        tangent, view, out = warp_view(blocks, wp.mat33d), warp_view(stress, wp.mat33d), torch.zeros_like(positions)
         self.launch(
             self.record(kernel, (self.batch, s.n_points), inputs, [tangent]),
             # The second derivative of an energy is symmetric: it is its own transpose.
@@ -74,7 +75,7 @@ class HeldEnergy(Launcher):
         return out.neg_(), slopes[self.term.value]
 
     def _view(self, field: torch.Tensor) -> Any:
-        return warp_view(field.contiguous(), self.vec3)
+        return warp_view(field.contiguous(), wp.vec3d)
 
 
 class _Conjugates(torch.autograd.Function):
@@ -85,7 +86,8 @@ class _Conjugates(torch.autograd.Function):
     def forward(ctx: Any, held: HeldEnergy, positions: torch.Tensor) -> torch.Tensor:
         ctx.held = held
         ctx.save_for_backward(positions)
-        return -held.evaluate(positions.detach(), held.zeros(held.term.count) + 1.0)[0]
+        volumes = -held.evaluate(positions.detach(), held.zeros(held.term.count) + 1.0)[0]
+        return volumes.to(positions.dtype)
 
     @override
     @staticmethod
@@ -103,7 +105,7 @@ class _Force(torch.autograd.Function):
     def forward(ctx: Any, held: HeldEnergy, positions: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
         ctx.held = held
         ctx.save_for_backward(positions, values)
-        return held.evaluate(positions.detach(), values.detach())[1]
+        return held.evaluate(positions.detach(), values.detach())[1].to(positions.dtype)
 
     @override
     @staticmethod

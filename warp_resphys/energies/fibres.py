@@ -10,12 +10,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
+import warp as wp
 from numpy.typing import NDArray
 from typing_extensions import override
 
 from ..fem.surface_elements import SurfacePoints, face_rule
 from ..io.errors import InputError, MeshError
-from ..kernels.fibres import fibre_kernels
+from ..kernels import fibres as kernels
 from ..mesh.chambers import Chamber
 from ..mesh.mesh import Mesh
 from .base import Energy, Parameter, PartTerm, PointSet, Quantity, Values
@@ -125,7 +126,7 @@ class Fibres(Energy):
         (s,) = sets
         assert isinstance(s.source, SurfacePoints)
         term = FibreTerm(launcher, sets, "fibre_stiffness", s.source.chamber, s.source.weights, self.count)
-        term.toe = launcher.scalar(self.toe)
+        term.toe = wp.float64(self.toe)
         return term
 
 
@@ -140,18 +141,18 @@ class FibreTerm(PartTerm):
 
     @override
     def step(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
-        return fibre_kernels(self.launcher.scalar).local_step, self._arguments(s, values, positions)
+        return kernels.local_step, self._arguments(s, values, positions)
 
     def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
         stiffness = values["fibre_stiffness"]
         assert stiffness is not None
         surface = [s.nodes, s.gradients, self.weights, self.part]
-        return [*surface, warp_view(stiffness, self.launcher.scalar), self.toe, s.points_per_cell, positions]
+        return [*surface, warp_view(stiffness, wp.float64), self.toe, s.points_per_cell, positions]
 
     @override
     def tangent(self, s: PointSet, values: Values, positions: Any, positive: Any) -> tuple[Any, list[Any]]:
         del positive  # A thread only pulls: its tangent has no negative eigenvalues.
-        return fibre_kernels(self.launcher.scalar).tangent, self._arguments(s, values, positions)
+        return kernels.tangent, self._arguments(s, values, positions)
 
     @override
     def curvature(self, values: Values) -> torch.Tensor:
@@ -162,7 +163,7 @@ class FibreTerm(PartTerm):
     @override
     def slope(self, s: PointSet, positions: Any, direction: Any) -> tuple[Any, list[Any]]:
         inputs = [s.nodes, s.gradients, self.weights, self.toe, s.points_per_cell, positions, direction]
-        return fibre_kernels(self.launcher.scalar).adjoint, inputs
+        return kernels.adjoint, inputs
 
 
 def _long_axis(chamber: Chamber, mesh: Mesh, near: Sequence[float] | None) -> NDArray[np.float64]:

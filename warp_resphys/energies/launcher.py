@@ -8,11 +8,9 @@ import warp as wp
 from numpy.typing import NDArray
 
 from ..io.kernel_cache import ensure_kernel_cache
-from ..kernels.points import point_kernels
+from ..kernels import points
 
 ensure_kernel_cache()  # Before Warp is first used, by this package or by who imports it.
-
-SCALARS: dict[torch.dtype, Any] = {torch.float64: wp.float64, torch.float32: wp.float32}
 
 
 def warp_view(tensor: torch.Tensor, dtype: Any) -> Any:
@@ -21,28 +19,20 @@ def warp_view(tensor: torch.Tensor, dtype: Any) -> Any:
 
 
 class Launcher:
-    """Buffers and launches for a batch, on one device and in one type.
+    """Buffers of float64 and launches for a batch, on one device.
 
     Args:
         batch: environments B.
         device: of every buffer.
-        dtype: ``torch.float64`` or ``torch.float32``.
-
-    Attributes:
-        scalar: Warp's number type; ``vec3`` and ``mat33`` are its vectors and matrices.
-        points: the kernels of `kernels.points`.
     """
 
-    def __init__(self, batch: int, device: torch.device, dtype: torch.dtype) -> None:
-        self.batch, self.device, self.dtype = batch, device, dtype
-        self.scalar = SCALARS[dtype]
-        self.points = point_kernels(self.scalar)
-        self.vec3, self.mat33 = self.points.vec3, self.points.mat33
+    def __init__(self, batch: int, device: torch.device) -> None:
+        self.batch, self.device = batch, device
         self._stream: tuple[torch.cuda.Stream, Any] | None = None
 
     def zeros(self, *shape: int) -> torch.Tensor:
-        """(B, *shape) on the launcher's device, in its type."""
-        return torch.zeros(self.batch, *shape, device=self.device, dtype=self.dtype)
+        """(B, *shape) on the launcher's device."""
+        return torch.zeros(self.batch, *shape, device=self.device, dtype=torch.float64)
 
     def upload(self, values: NDArray[Any], dtype: Any) -> Any:
         """A Warp array with a copy of the values."""
@@ -59,12 +49,12 @@ class Launcher:
     def gather(self, s: Any, stress: Any, out: torch.Tensor) -> Any:
         """A launch that adds the transposed operator of a set's stress, a view (B, P) mat33, to (B, N, 3)."""
         inputs = [s.nodes, s.gradients, s.points_per_cell, s.start, s.incident, stress]
-        return self.record(self.points.gather, (self.batch, out.shape[1]), inputs, [warp_view(out, self.vec3)])
+        return self.record(points.gather, (self.batch, out.shape[1]), inputs, [warp_view(out, wp.vec3d)])
 
     def product(self, s: Any, tangent: Any, direction: Any, stress: Any) -> Any:
         """A launch of a set's stress (B, P) from its tangent (B, P, 6) mat33 and a direction (B, N) vec3, all views."""
         inputs = [s.nodes, s.gradients, s.points_per_cell, tangent, direction]
-        return self.record(self.points.tangent_product, (self.batch, s.n_points), inputs, [stress])
+        return self.record(points.tangent_product, (self.batch, s.n_points), inputs, [stress])
 
     def launch(self, *commands: Any) -> None:
         """Makes recorded launches, on torch's stream."""

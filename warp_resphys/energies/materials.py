@@ -13,18 +13,16 @@ their sources are in ``kernels.materials``. Shape and volume terms may be integr
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from types import SimpleNamespace
+from types import ModuleType
 from typing import Any, ClassVar
 
 import torch
 from typing_extensions import override
 
 from ..io.errors import InputError
-from ..kernels.materials.corotated import corotated
-from ..kernels.materials.mooney_rivlin import mooney_rivlin
-from ..kernels.materials.stable_neo_hookean import stable_neo_hookean
+from ..kernels.materials import corotated, mooney_rivlin, stable_neo_hookean
 from .base import Parameter, Quantity
 
 
@@ -47,12 +45,12 @@ class Material(ABC):
         density: rho [kg/m^3].
         mass_damping: force -alpha M v [1/s].
         stiffness_damping: Kelvin-Voigt viscosity of retardation time beta [s]; for small strains the force -beta K v.
-        law: the factory of ``kernels.materials``.
+        law: the module of ``kernels.materials``.
         rules: for each modulus of the law, whether it belongs to the ``shape`` or the ``volume`` rule of integration.
         curvature: for each modulus, an upper bound of what it adds to the tangent's eigenvalues for small strains.
     """
 
-    law: ClassVar[Callable[[type], SimpleNamespace]]
+    law: ClassVar[ModuleType]
     rules: ClassVar[tuple[str, ...]]
     curvature: ClassVar[tuple[float, ...]]
 
@@ -110,7 +108,10 @@ class _Hookean(Material):
 
 @dataclass(frozen=True)
 class Corotated(_Hookean):
-    """The material of projective dynamics; its small-strain Poisson's ratio is `small_strain_poissons_ratio`."""
+    """The material of projective dynamics: for small strains, linear elasticity with lambda / 3.
+
+    It bends a little less stiffly than its nominal constants: nu 0.45 acts as 0.375, nu 0.499 as 0.497.
+    """
 
     law = corotated
 
@@ -167,12 +168,3 @@ def make_material(model: str = "corotated", **constants: Any) -> Material:
         if name not in known:
             raise InputError(f"{model} has no constant {name!r}: it has {', '.join(known)}.")
     return MATERIALS[model](**constants)
-
-
-def small_strain_poissons_ratio(poissons_ratio: float) -> float:
-    """Poisson's ratio that the corotated model shows for small strains: linear elasticity with lambda / 3.
-
-    It bends a little less stiffly than its nominal constants: nu 0.45 acts as 0.375, nu 0.499 as 0.497.
-    """
-    lame_over_mu = 2.0 * poissons_ratio / (1.0 - 2.0 * poissons_ratio) / 3.0
-    return lame_over_mu / (2.0 * (lame_over_mu + 1.0))

@@ -18,7 +18,7 @@ import torch
 import warp as wp
 
 from ..fem.elements import Points
-from ..kernels.assembly import assembly_kernels
+from ..kernels import points as kernels
 from .base import Energy, PointSet, Term
 from .launcher import Launcher, warp_view
 from .solid import SolidTerm
@@ -53,7 +53,6 @@ class IncrementalPotential(Launcher):
         fixed: (D,) fixed vertices.
         batch: environments B.
         device: of every buffer.
-        dtype: ``torch.float64`` or ``torch.float32``.
 
     Attributes:
         energies: their terms.
@@ -68,11 +67,8 @@ class IncrementalPotential(Launcher):
         fixed: torch.Tensor,
         batch: int,
         device: torch.device,
-        dtype: torch.dtype,
     ) -> None:
-        super().__init__(batch, device, dtype)
-        # Kernels join their Warp module before its first load: it would be compiled again otherwise.
-        assembly_kernels(self.scalar)
+        super().__init__(batch, device)
         self.n_vertices = n_vertices
         self.energies: list[Term] = []
         self.sets: list[PointSet] = []
@@ -89,7 +85,7 @@ class IncrementalPotential(Launcher):
             self.sets += mine
             self._loads.append(energy.is_load)
         self._n_points = first
-        self.free_mask = torch.ones(n_vertices, device=device, dtype=dtype)
+        self.free_mask = torch.ones(n_vertices, device=device, dtype=torch.float64)
         self.free_mask[fixed] = 0.0
         shapes = {name: shape for term in self.energies for name, shape in term.shapes.items()}
         values: dict[str, torch.Tensor | None] = {name: self.zeros(*shape) for name, shape in shapes.items()}
@@ -114,24 +110,24 @@ class IncrementalPotential(Launcher):
     def _record_evaluation(self) -> None:
         t, b = self.terms, self.batch
         self._inertia_command = self.record(
-            self.points.inertia_residual,
+            kernels.inertia_residual,
             (b, self.n_vertices),
             [
-                warp_view(t.inertia, self.scalar),
-                warp_view(t.target, self.vec3),
-                warp_view(t.force, self.vec3),
-                warp_view(self.positions, self.vec3),
+                warp_view(t.inertia, wp.float64),
+                warp_view(t.target, wp.vec3d),
+                warp_view(t.force, wp.vec3d),
+                warp_view(self.positions, wp.vec3d),
             ],
-            [warp_view(self.residual, self.vec3), warp_view(self._vertex_energy, self.scalar)],
+            [warp_view(self.residual, wp.vec3d), warp_view(self._vertex_energy, wp.float64)],
         )
         self._internal_commands: list[Any] = []
         self._load_commands: list[Any] = []
         for term, is_load in zip(self.energies, self._loads, strict=True):
             commands = self._load_commands if is_load else self._internal_commands
             for s in term.sets:
-                stress = self.points_view(self._stress, s.part, self.mat33)
-                outputs = [stress, self.points_view(self._point_energy, s.part, self.scalar)]
-                kernel, inputs = term.step(s, t.values, warp_view(self.positions, self.vec3))
+                stress = self.points_view(self._stress, s.part, wp.mat33d)
+                outputs = [stress, self.points_view(self._point_energy, s.part, wp.float64)]
+                kernel, inputs = term.step(s, t.values, warp_view(self.positions, wp.vec3d))
                 commands += [
                     self.record(kernel, (b, s.n_points), inputs, outputs),
                     self.gather(s, stress, self.residual),
@@ -179,7 +175,7 @@ class IncrementalPotential(Launcher):
         stiffness = self.terms.values["stiffness"]
         assert stiffness is not None
         energy = self._point_energy.abs().sum(1) + self._vertex_energy.abs().sum(1)
-        return 8.0 * torch.finfo(self.dtype).eps * (stiffness.sum((1, 2)) + 100.0 * energy)
+        return 8.0 * torch.finfo(torch.float64).eps * (stiffness.sum((1, 2)) + 100.0 * energy)
 
     def residual_rounding(self) -> torch.Tensor:
         """(B,) norm by which the residual last evaluated changes when every coordinate moves by one rounding unit [N].
@@ -188,7 +184,7 @@ class IncrementalPotential(Launcher):
         """
         positions, residual = self.positions.clone(), self.residual.clone()
         signs = np.random.default_rng(0).choice([-1.0, 1.0], positions.shape[1:])
-        unit = torch.finfo(self.dtype).eps * positions.abs().amax(dim=(1, 2), keepdim=True)
+        unit = torch.finfo(torch.float64).eps * positions.abs().amax(dim=(1, 2), keepdim=True)
         self.positions.addcmul_(unit, positions.new_tensor(signs))
         self.evaluate()
         change = torch.linalg.vector_norm((self.residual - residual).view(self.batch, -1), dim=1)
@@ -225,13 +221,13 @@ class IncrementalPotential(Launcher):
         self._product_stress = self.zeros(self._n_points, 3, 3)
         self._product = self.zeros(self.n_vertices, 3)
         self._tangent_commands, self._product_commands = [], []
-        positive, direction = warp_view(self._positive, wp.int32), warp_view(self._direction, self.vec3)
+        positive, direction = warp_view(self._positive, wp.int32), warp_view(self._direction, wp.vec3d)
         for term in self.energies:
             for s in term.sets:
-                tangent = self.points_view(blocks, s.part, self.mat33)
-                kernel, inputs = term.tangent(s, self.terms.values, warp_view(self.positions, self.vec3), positive)
+                tangent = self.points_view(blocks, s.part, wp.mat33d)
+                kernel, inputs = term.tangent(s, self.terms.values, warp_view(self.positions, wp.vec3d), positive)
                 self._tangent_commands.append(self.record(kernel, (self.batch, s.n_points), inputs, [tangent]))
-                stress = self.points_view(self._product_stress, s.part, self.mat33)
+                stress = self.points_view(self._product_stress, s.part, wp.mat33d)
                 self._product_commands += [
                     self.product(s, tangent, direction, stress),
                     self.gather(s, stress, self._product),

@@ -12,11 +12,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
+import warp as wp
 from typing_extensions import override
 
 from ..fem.surface_elements import SurfacePoints, face_rule, owners
 from ..io.errors import InputError
-from ..kernels.pressure import pressure_kernels
+from ..kernels import pressure as kernels
 from ..mesh.chambers import Chamber, check_chambers
 from ..mesh.mesh import Mesh
 from .base import Energy, PartTerm, PointSet, Quantity, Values
@@ -83,18 +84,18 @@ class PressureTerm(PartTerm):
 
     @override
     def step(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
-        return pressure_kernels(self.launcher.scalar).local_step, self._arguments(s, values, positions)
+        return kernels.local_step, self._arguments(s, values, positions)
 
     def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
         pressure = values["pressure"]
         assert pressure is not None
         surface = [s.nodes, s.gradients, self.weights, self.part]
-        return [*surface, warp_view(pressure, self.launcher.scalar), s.points_per_cell, positions]
+        return [*surface, warp_view(pressure, wp.float64), s.points_per_cell, positions]
 
     @override
     def tangent(self, s: PointSet, values: Values, positions: Any, positive: Any) -> tuple[Any, list[Any]]:
         inputs = [*self._arguments(s, values, positions), positive]
-        return pressure_kernels(self.launcher.scalar).tangent, inputs
+        return kernels.tangent, inputs
 
     @override
     def curvature(self, values: Values) -> torch.Tensor:
@@ -103,4 +104,4 @@ class PressureTerm(PartTerm):
     @override
     def slope(self, s: PointSet, positions: Any, direction: Any) -> tuple[Any, list[Any]]:
         inputs = [s.nodes, s.gradients, self.weights, s.points_per_cell, positions, direction]
-        return pressure_kernels(self.launcher.scalar).adjoint, inputs
+        return kernels.adjoint, inputs

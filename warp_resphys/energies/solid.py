@@ -11,7 +11,7 @@ from typing_extensions import override
 
 from ..fem.elements import Discretisation, Points
 from ..io.errors import InputError
-from ..kernels.solid import solid_kernels, strain_kernels
+from ..kernels import solid as kernels
 from ..mesh.mesh import Mesh
 from .base import Energy, PointSet, Quantity, Term, Values
 from .launcher import Launcher, warp_view
@@ -98,10 +98,9 @@ class SolidTerm(Term):
     def __init__(self, launcher: Launcher, sets: Sequence[PointSet], material: Material) -> None:
         super().__init__(launcher, sets)
         law = type(material).law
-        self._kernels, self._strain = solid_kernels(launcher.scalar, law), strain_kernels(launcher.scalar)
+        self._kernels, self._vector = kernels.solid_kernels(law), law.moduli
         self._moduli = len(material.rules)
-        self._vector = wp.types.vector(self._moduli, launcher.scalar)
-        self._curvature = torch.as_tensor(material.curvature, device=launcher.device, dtype=launcher.dtype)
+        self._curvature = torch.as_tensor(material.curvature, device=launcher.device, dtype=torch.float64)
 
     @property
     @override
@@ -118,8 +117,8 @@ class SolidTerm(Term):
         assert strain is not None
         views = [
             own.points_view(stiffness, s.own, self._vector),
-            warp_view(viscosity, own.scalar),
-            own.points_view(strain, s.own, own.mat33),
+            warp_view(viscosity, wp.float64),
+            own.points_view(strain, s.own, wp.mat33d),
         ]
         return [s.nodes, s.gradients, *views, s.points_per_cell, positions]
 
@@ -144,10 +143,10 @@ class SolidTerm(Term):
         own, shapes = self.launcher, self.shapes
         out = {name: own.zeros(*shapes[name]) for name in ("stiffness", "reference_strain")}
         out["viscosity"] = own.zeros(self.n_points)
-        types = {"stiffness": self._vector, "viscosity": own.scalar, "reference_strain": own.mat33}
+        types = {"stiffness": self._vector, "viscosity": wp.float64, "reference_strain": wp.mat33d}
         commands = []
         for s in self.sets:
-            inputs = [*self._arguments(s, values, warp_view(positions, own.vec3)), warp_view(direction, own.vec3)]
+            inputs = [*self._arguments(s, values, warp_view(positions, wp.vec3d)), warp_view(direction, wp.vec3d)]
             outputs = [own.points_view(out[name], s.own, kind) for name, kind in types.items()]
             commands.append(own.record(self._kernels.adjoint, (own.batch, s.n_points), inputs, outputs))
 
@@ -162,9 +161,9 @@ class SolidTerm(Term):
         own = self.launcher
         out = own.zeros(self.n_points, 3, 3)
         for s in self.sets:
-            inputs = [s.nodes, s.gradients, s.points_per_cell, warp_view(positions.contiguous(), own.vec3)]
-            outputs = [own.points_view(out, s.own, own.mat33)]
-            own.launch(own.record(self._strain.strain, (own.batch, s.n_points), inputs, outputs))
+            inputs = [s.nodes, s.gradients, s.points_per_cell, warp_view(positions.contiguous(), wp.vec3d)]
+            outputs = [own.points_view(out, s.own, wp.mat33d)]
+            own.launch(own.record(kernels.strain, (own.batch, s.n_points), inputs, outputs))
         return out
 
     def strain_adjoint(self, positions: torch.Tensor, adjoint: torch.Tensor) -> torch.Tensor:
@@ -173,10 +172,10 @@ class SolidTerm(Term):
         out, stress = torch.zeros_like(positions), own.zeros(self.n_points, 3, 3)
         adjoint = adjoint.contiguous()
         for s in self.sets:
-            inputs = [s.nodes, s.gradients, s.points_per_cell, warp_view(positions.contiguous(), own.vec3)]
-            inputs.append(own.points_view(adjoint, s.own, own.mat33))
-            view = own.points_view(stress, s.own, own.mat33)
-            launch = own.record(self._strain.strain_adjoint, (own.batch, s.n_points), inputs, [view])
+            inputs = [s.nodes, s.gradients, s.points_per_cell, warp_view(positions.contiguous(), wp.vec3d)]
+            inputs.append(own.points_view(adjoint, s.own, wp.mat33d))
+            view = own.points_view(stress, s.own, wp.mat33d)
+            launch = own.record(kernels.strain_adjoint, (own.batch, s.n_points), inputs, [view])
             own.launch(launch, own.gather(s, view, out))
         return out
 
@@ -189,7 +188,7 @@ class GreenStrain(torch.autograd.Function):
     def forward(ctx: Any, term: SolidTerm, positions: torch.Tensor) -> torch.Tensor:
         ctx.term = term
         ctx.save_for_backward(positions)
-        return term.strain(positions.detach().to(term.launcher.dtype))
+        return term.strain(positions.detach().double())
 
     @override
     @staticmethod

@@ -1,8 +1,8 @@
 """Files of other programs, decoded by the libraries for them in a process of little memory and time.
 
-A damaged file makes ezc3d, which is C++, crash, loop or claim gigabytes, and meshio loop over what was cut off. So this
-file is also a program: it decodes one file, within limits that its caller sets, and hands plain arrays on. It imports
-nothing of the package, which would take longer than most files do.
+A damaged file makes ezc3d and HDF5, which are C++ and C, crash, loop or claim gigabytes, and meshio loop over what was
+cut off. So this file is also a program: it decodes one file, within limits that its caller sets, and hands plain arrays
+on. It imports nothing of the package, which would take longer than most files do.
 """
 
 import contextlib
@@ -12,10 +12,13 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import h5py
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -31,19 +34,21 @@ class DecodingError(Exception):
     """A file that cannot be decoded; the message is the reason, for a sentence that names the file."""
 
 
-def decode(library: str, path: Path) -> Arrays:
-    """The arrays of `c3d_arrays` or `mesh_arrays`, made in a process of its own.
+def decode(library: str, path: Path, *names: str) -> Arrays:
+    """The arrays of `c3d_arrays`, `mesh_arrays` or `hdf5_arrays`, made in a process of its own.
 
     Args:
-        library: "ezc3d" or "meshio".
+        library: "ezc3d", "meshio" or "h5py".
         path: An existing file.
+        names: Of `hdf5_arrays`.
 
     Raises:
         DecodingError: The library refuses the file, crashes, or takes more memory or time than files of that size do.
     """
     size = path.stat().st_size
     memory, seconds = MEMORY[0] + MEMORY[1] * size, SECONDS[0] + SECONDS[1] * size
-    command = [sys.executable, "-P", __file__, library, str(path), str(memory), str(np.ceil(seconds).astype(int))]
+    limits = str(memory), str(np.ceil(seconds).astype(int))
+    command = [sys.executable, "-P", __file__, *limits, library, str(path), *names]
     one_thread = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")}  # each claims address space
     endless = f"decoding it does not end within {seconds:.0f} s"
     try:
@@ -72,6 +77,61 @@ def c3d_arrays(path: str) -> Arrays:
         "units": np.array(point["UNITS"]["value"] if "UNITS" in point else [], dtype=np.str_),
         "rate": np.array(point["RATE"]["value"], dtype=np.float64),
     }
+
+
+def hdf5_arrays(path: str, *names: str) -> Arrays:
+    """Of an HDF5 file: what its root has of these names, as datasets or attributes, and the units of datasets.
+
+    The units of the dataset "positions" are called "positions.units". Other errors are h5py's, of any kind.
+
+    Raises:
+        DecodingError: The file refers to data elsewhere, or what was asked for is neither numbers nor text.
+    """
+    import h5py
+
+    found = {}
+    with h5py.File(path, "r") as file:
+        refuse_data_elsewhere(file)
+        for name in names:
+            item = file.get(name)
+            if isinstance(item, h5py.Dataset):
+                found[name] = _plain(item[()], name)
+                if "units" in item.attrs:
+                    found[f"{name}.units"] = _plain(item.attrs["units"], f"{name}.units")
+            elif name in file.attrs:
+                found[name] = _plain(file.attrs[name], name)
+    return found
+
+
+def _plain(value: Any, name: str) -> NDArray[Any]:
+    """Numbers as they are, text as such."""
+    array = np.asarray(value)
+    if array.dtype == object:
+        words = [word.decode(errors="replace") if isinstance(word, bytes) else str(word) for word in array.flat]
+        return np.array(words, dtype=np.str_).reshape(array.shape)
+    if array.dtype.hasobject:
+        raise DecodingError(f"'{name}' holds neither numbers nor text")
+    return array
+
+
+def refuse_data_elsewhere(file: "h5py.File") -> None:
+    """Visits every link and dataset of an HDF5 file; raises DecodingError for those that lead out of it."""
+    import h5py
+
+    groups: list[h5py.Group] = [file]
+    seen = set()
+    while groups:
+        group = groups.pop()
+        address = h5py.h5o.get_info(group.id).addr
+        if address in seen:
+            continue
+        seen.add(address)
+        for name in group:
+            item = group[name] if isinstance(group.get(name, getlink=True), h5py.HardLink) else None
+            if item is None or (isinstance(item, h5py.Dataset) and (item.external or item.is_virtual)):
+                raise DecodingError(f"'{group.name.rstrip('/')}/{name}' refers to data elsewhere")
+            if isinstance(item, h5py.Group):
+                groups.append(item)
 
 
 def mesh_arrays(path: str, file_format: str | None = None) -> Arrays:
@@ -134,7 +194,7 @@ def _limit(memory: int, seconds: int) -> None:
                 resource.setrlimit(kind, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
 
 
-def _main(library: str, path: str, memory: str, seconds: str) -> int:
+def _main(memory: str, seconds: str, library: str, path: str, *names: str) -> int:
     """Decodes a file: its arrays to stdout, or one line with the reason to stderr and 1."""
     _limit(int(memory), int(seconds))
     answer, reason = (os.fdopen(os.dup(stream), "wb") for stream in (1, 2))
@@ -143,7 +203,9 @@ def _main(library: str, path: str, memory: str, seconds: str) -> int:
     os.dup2(nowhere, 2)
     too_much = f"it takes more than {int(memory) >> 20} MiB of memory"
     try:
-        arrays: dict[str, Any] = {"ezc3d": c3d_arrays, "meshio": mesh_arrays}[library](path)
+        arrays: dict[str, Any] = {"ezc3d": c3d_arrays, "meshio": mesh_arrays, "h5py": hdf5_arrays}[library](
+            path, *names
+        )
         np.savez(answer, **arrays)
         answer.close()
         return 0

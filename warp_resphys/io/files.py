@@ -26,6 +26,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
+from .decoding import DecodingError, refuse_data_elsewhere
 from .errors import DataFileError
 
 if TYPE_CHECKING:
@@ -35,6 +36,8 @@ FORMAT = "warp_resphys"
 FORMAT_VERSION = 1
 CHUNK_STEPS = 64
 OWN_OPTIONS = "configs"  # In the working directory: the user's configuration groups and their options.
+USER_BLOCK = 512  # bytes before an HDF5 file's own, which hold a checksum of those
+_CHECKSUM = b"warp_resphys, CRC-32 of what follows the first 512 bytes: "
 LARGEST_ARRAYS = 4 << 30  # bytes in one file
 # What numpy.load raises for a file that is damaged or made up.
 _ARRAY_FAULTS = (
@@ -177,19 +180,20 @@ def atomic_hdf5(path: str | Path, kind: str, attributes: Mapping[str, Any] | Non
     Raises:
         DataFileError: the disk is full, or the place cannot be written to.
     """
+    in_memory = {"driver": "core", "backing_store": False, "block_size": 1 << 20}
     with (
         atomic_path(path) as partial,
         open(partial, "wb") as output,
-        h5py.File(
-            partial.name, "w", driver="core", backing_store=False, block_size=1 << 20, libver=("v110", "v110")
-        ) as file,
+        h5py.File(partial.name, "w", libver=("v110", "v110"), userblock_size=USER_BLOCK, **in_memory) as file,
     ):
         file.attrs.update({**(attributes or {}), "format": FORMAT, "version": FORMAT_VERSION, "kind": kind})
         file.attrs["complete"] = False
         yield file
         file.attrs["complete"] = True
         file.flush()
-        output.write(file.id.get_file_image())
+        content = file.id.get_file_image()  # without the first block
+        output.write(_first_block(zlib.crc32(content)))
+        output.write(content)
 
 
 def create(group: h5py.Group, name: str, array: npt.ArrayLike, units: str = "1", time_axis: int = 0) -> h5py.Dataset:
@@ -230,22 +234,25 @@ def open_hdf5(path: str | Path) -> Iterator[h5py.File]:
         with open(path, "rb"):
             file = h5py.File(path, "r")
     except OSError as error:
-        raise _hdf5_error(path, error) from error
+        raise hdf5_error(path, error) from error
     with file:
         try:
-            _refuse_outside_data(file, path)
-        except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
-            raise _hdf5_error(path, error) from error
+            refuse_data_elsewhere(file)
+        except (DecodingError, OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+            raise hdf5_error(path, error) from error
         try:
             yield file
         except OSError as error:
             if error.filename is not None:
                 raise
-            raise _hdf5_error(path, error) from error
+            raise hdf5_error(path, error) from error
 
 
-def _hdf5_error(path: Path, error: Exception) -> DataFileError:
+def hdf5_error(path: Path, error: Exception) -> DataFileError:
+    """The error to raise for one of h5py, or of decoding with it, in this file."""
     message = str(error)
+    if "data elsewhere" in message:
+        return DataFileError(f"{path}: {message}: use a file that holds its own data")
     if "signature not found" in message:
         return DataFileError(f"{path} is not an HDF5 file: check the path")
     if "truncated" in message:
@@ -258,33 +265,36 @@ def _hdf5_error(path: Path, error: Exception) -> DataFileError:
     return DataFileError(f"{path} is damaged ({detail}): delete it and make or fetch it again")
 
 
-def _refuse_outside_data(file: h5py.File, path: Path) -> None:
-    """Visits every link and dataset; raises DataFileError for those that lead out of the file."""
-    groups: list[h5py.Group] = [file]
-    seen = set()
-    while groups:
-        group = groups.pop()
-        address = h5py.h5o.get_info(group.id).addr
-        if address in seen:
-            continue
-        seen.add(address)
-        for name in group:
-            item = group[name] if isinstance(group.get(name, getlink=True), h5py.HardLink) else None
-            if item is None or (isinstance(item, h5py.Dataset) and (item.external or item.is_virtual)):
-                place = f"{group.name.rstrip('/')}/{name}"
-                raise DataFileError(f"'{place}' of {path} refers to data elsewhere: use a file that holds its own data")
-            if isinstance(item, h5py.Group):
-                groups.append(item)
+def _check(path: Path) -> None:
+    """Refuses a file that does not match the checksum before it; files of earlier versions have none."""
+    try:
+        with path.open("rb") as file:
+            head, crc = file.read(USER_BLOCK), 0
+            if not head.startswith(_CHECKSUM):
+                return
+            while part := file.read(1 << 20):
+                crc = zlib.crc32(part, crc)
+    except OSError as error:
+        raise _read_error(path, error) from error
+    if head != _first_block(crc):
+        raise hdf5_error(path, ValueError("it does not match its checksum"))
+
+
+def _first_block(crc: int) -> bytes:
+    return (_CHECKSUM + b"%08x" % crc).ljust(USER_BLOCK, b"\n")
 
 
 @contextmanager
 def read_hdf5(path: str | Path, expected_kind: str) -> Iterator[h5py.File]:
     """Opens a file that `atomic_hdf5` wrote.
 
+    HDF5 itself has no checksum of texts of variable length, and reading damaged ones may not end.
+
     Raises:
         DataFileError: as `open_hdf5`; also a file of another program, kind or newer version, or an unfinished
             one.
     """
+    _check(Path(path))
     with open_hdf5(path) as file:
         attributes = file.attrs
         origin, version, kind, complete = (
@@ -358,7 +368,7 @@ def read_array(
             raise DataFileError(f"'{name}' of {path} has the shape {found} where {wanted} is needed: check the path")
         return np.asarray(dataset[index])
     except OSError as error:
-        raise _hdf5_error(Path(path), error) from error
+        raise hdf5_error(Path(path), error) from error
 
 
 def write_checkpoint(

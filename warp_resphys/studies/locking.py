@@ -4,7 +4,6 @@ Coarse and nearly incompressible meshes lock: they bend less than the arm that t
 error of the mesh is extrapolated from hexahedra that are refined evenly, and borne out by another kind of element.
 """
 
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import cos, pi, radians, sin
@@ -27,9 +26,13 @@ from ..mesh.arm_geometry import arm_geometry
 from ..mesh.chambers import find_chambers
 from ..mesh.mesh import Mesh, quadratic
 from ..mesh.readers import read_mesh
+from .stepping import step_time
 
 HEXAHEDRA, LINEAR, QUADRATIC = "8-node hexahedra", "4-node tetrahedra", "10-node tetrahedra"
+SERENDIPITY, BIQUADRATIC = "20-node hexahedra", "27-node hexahedra"
 LOADS = ("gravity", "fibres", "pressure")
+_QUADRATIC = {QUADRATIC: "tetrahedron10", SERENDIPITY: "hexahedron20", BIQUADRATIC: "hexahedron27"}
+_SWEPT = {"hexahedra": HEXAHEDRA, "hexahedra_20": SERENDIPITY, "hexahedra_27": BIQUADRATIC}
 
 
 @dataclass(frozen=True)
@@ -62,9 +65,9 @@ class Case:
         """
         if self.file is not None:
             return read_mesh(self.file, self.units, 2 if self.element == QUADRATIC else 1, drop_unreferenced=True)
-        cells = "hexahedra" if self.element == HEXAHEDRA else "tetrahedra"
+        cells = "hexahedra" if self.element in _SWEPT.values() else "tetrahedra"
         mesh, _ = mesh_arm(arm_geometry(geometry), float(self.size or 0.0), cells, self.layers)
-        return quadratic(mesh) if self.element == QUADRATIC else mesh
+        return quadratic(mesh, _QUADRATIC[self.element]) if self.element in _QUADRATIC else mesh
 
 
 def cases(study: Mapping[str, Any]) -> Iterator[Case]:
@@ -72,8 +75,9 @@ def cases(study: Mapping[str, Any]) -> Iterator[Case]:
     for element, name in ((LINEAR, "linear"), (QUADRATIC, "quadratic")):
         if study["file"] is not None:
             yield Case(f"file_{name}", element, file=str(study["file"]), units=study["units"])
-    for size, layers, timed in study["hexahedra"]:
-        yield Case(f"hexahedra_{1e3 * size:g}_{1e3 * layers:g}", HEXAHEDRA, size, layers, timed=timed)
+    for key, element in _SWEPT.items():
+        for size, layers, timed in study[key]:
+            yield Case(f"{key}_{1e3 * size:g}_{1e3 * layers:g}", element, size, layers, timed=timed)
     for key, element in (("linear_tetrahedra", LINEAR), ("quadratic_tetrahedra", QUADRATIC)):
         for size, timed in study[key]:
             yield Case(f"{key}_{1e3 * size:g}", element, size, timed=timed)
@@ -129,30 +133,17 @@ def measure(mesh: Mesh, study: Mapping[str, Any], timed: bool = True) -> dict[st
         "fibres_mm": deflection(reinforced, pressure),
         "pressure_mm": deflection(hanging, pressure) if timed else None,
     }
-    return {**result, **(step_time(hanging, pressure, study) if timed else {"step_ms": None, "iterations": None})}
+    return {**result, **(_swell(hanging, pressure, study) if timed else {"step_ms": None, "iterations": None})}
 
 
-def step_time(simulator: Simulator, pressure: torch.Tensor, study: Mapping[str, Any]) -> dict[str, float]:
-    """Milliseconds and solver iterations of a step while the pressure (1, C) swells and ebbs once.
-
-    Milliseconds are the mean over steps of the median over repetitions.
-    """
+def _swell(simulator: Simulator, pressure: torch.Tensor, study: Mapping[str, Any]) -> dict[str, float]:
+    """What a step costs while the pressure (1, C) swells and ebbs once."""
     steps = study["steps"]
-    times: list[list[float]] = []
-    iterations: list[float] = []
     ramp = 0.5 - 0.5 * np.cos(2.0 * pi * np.arange(1, steps + 1) / steps)
-    prepared = simulator.prepare()
+    inputs = [Inputs(pressure=float(share) * pressure) for share in ramp]
     with torch.no_grad():
         start = simulator.static_equilibrium()
-        for _ in range(1 + study["repeats"]):  # the first one warms up
-            state = start
-            times.append([])
-            for share in ramp:
-                began = time.perf_counter()
-                state, report = simulator.step(state, Inputs(pressure=float(share) * pressure), prepared)
-                times[-1].append(1e3 * (time.perf_counter() - began))
-                iterations.append(float(report.iterations[0]))
-    return {"step_ms": float(np.median(times[1:], axis=0).mean()), "iterations": float(np.mean(iterations))}
+    return step_time(simulator, start, inputs, study["repeats"])
 
 
 def converged(rows: Sequence[Mapping[str, Any]], load: str) -> dict[str, float] | None:

@@ -18,14 +18,37 @@ from rich.table import Table
 from ..io.files import atomic_path, digest, read_json, write_json, write_text
 from ..io.progress import Progress
 from ..report.figures import STYLE, TONES, new_figure, save_png
-from .locking import HEXAHEDRA, LINEAR, LOADS, QUADRATIC, Case, cases, cheapest, converged, measure
+from .locking import (
+    BIQUADRATIC,
+    HEXAHEDRA,
+    LINEAR,
+    LOADS,
+    QUADRATIC,
+    SERENDIPITY,
+    Case,
+    cases,
+    cheapest,
+    converged,
+    measure,
+)
 from .settings import settings_of
 
 TITLES: Final[Mapping[str, str]] = MappingProxyType(
     {"gravity": "gravity, base tilted", "fibres": "pressure, with fibres", "pressure": "pressure, without fibres"}
 )
-_MARKS: Final = MappingProxyType({LINEAR: ("simulation", "^"), QUADRATIC: ("resphys", "s"), HEXAHEDRA: ("sysid", "o")})
-_MEASURED: Final = ("hexahedra", "linear_tetrahedra", "quadratic_tetrahedra", "file", "units", "within")
+_MARKS: Final = MappingProxyType(
+    {
+        LINEAR: ("simulation", "^"),
+        QUADRATIC: ("resphys", "s"),
+        HEXAHEDRA: ("sysid", "o"),
+        SERENDIPITY: ("reconstruction", "D"),
+        BIQUADRATIC: ("simfree", "P"),
+    }
+)
+_MEASURED: Final = (
+    *("hexahedra", "hexahedra_20", "hexahedra_27", "linear_tetrahedra", "quadratic_tetrahedra"),
+    *("file", "units", "within"),
+)
 
 
 def locking_study(config: DictConfig) -> None:

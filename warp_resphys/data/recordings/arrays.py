@@ -4,12 +4,12 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from ...io.decoding import DecodingError, decode
 from ...io.errors import DataFileError
-from ...io.files import FORMAT, LARGEST_ARRAYS, atomic_hdf5, create, open_hdf5, read_arrays
+from ...io.files import FORMAT, atomic_hdf5, create, hdf5_error, read_arrays
 from .recording import SI_PER_ACTUATION_UNIT, RawRecording, Recording
 
 KIND = "recording"
@@ -36,24 +36,18 @@ def read_raw_hdf5(path: Path) -> RawRecording:
         DataFileError: The file is missing, no HDF5 file or damaged, refers to other files, was written for something
             else by this program, or an array is missing or wrong.
     """
-    with open_hdf5(path) as file:
-        kind = file.attrs.get("kind")
-        if file.attrs.get("format") == FORMAT and kind != KIND:
-            raise DataFileError(f"{path} holds '{kind}' where '{KIND}' is needed: check the path.")
-
-        def find(name: str) -> NDArray[Any] | None:
-            if name == "units" and "positions" in file and "units" in file["positions"].attrs:
-                return np.asarray(file["positions"].attrs["units"])
-            if name == "actuation_units" and "actuation" in file and "units" in file["actuation"].attrs:
-                return np.asarray(file["actuation"].attrs["units"])
-            item = file.get(name)
-            if isinstance(item, h5py.Dataset):
-                if item.nbytes > LARGEST_ARRAYS:
-                    raise DataFileError(f"{path}: '{name}' takes more than {LARGEST_ARRAYS >> 30} GiB: split the file.")
-                return np.asarray(item[()])
-            return np.asarray(file.attrs[name]) if name in file.attrs else None
-
-        return _assemble(find, path)
+    try:
+        path.open("rb").close()
+        found = decode("h5py", path, "format", "kind", *_NAMES)
+    except (OSError, DecodingError) as error:
+        raise hdf5_error(path, error) from error
+    kind = _word(found.get("kind"))
+    if _word(found.get("format")) == FORMAT and kind != KIND:
+        raise DataFileError(f"{path} holds '{kind}' where '{KIND}' is needed: check the path.")
+    for name, unit in (("positions", "units"), ("actuation", "actuation_units")):
+        if f"{name}.units" in found:
+            found[unit] = found[f"{name}.units"]
+    return _assemble(found.get, path)
 
 
 def write_recording(path: str | Path, recording: Recording, attributes: Mapping[str, Any] | None = None) -> None:

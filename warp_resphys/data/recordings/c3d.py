@@ -5,27 +5,18 @@ from pathlib import Path
 
 from ...io.decoding import DecodingError, decode
 from ...io.errors import DataFileError
-from .recording import RawRecording, Recording, to_recording
+from .recording import RawRecording
 
 _MAGIC = 0x50
 _BIG_ENDIAN_PROCESSOR = 86
 
 
-def read_c3d(path: str | Path) -> Recording:
-    """Reads the marker trajectories of a C3D file.
-
-    Args:
-        path: The file. Its own unit (m, cm or mm) is converted to metres; occluded samples become NaN.
+def read_raw_c3d(path: Path) -> RawRecording:
+    """What a C3D file holds, in its own unit.
 
     Raises:
         DataFileError: The file is missing, not C3D, damaged, truncated, or holds no marker trajectories.
     """
-    path = Path(path)
-    return to_recording(read_raw_c3d(path), path)
-
-
-def read_raw_c3d(path: Path) -> RawRecording:
-    """What a C3D file holds, in its own unit; raises DataFileError as `read_c3d`."""
     declared_frames = _declared_frames(path)
     try:
         decoded = decode("ezc3d", path)

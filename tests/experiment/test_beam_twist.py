@@ -6,12 +6,11 @@ import sys
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_module
-from omegaconf import OmegaConf
+from measured_run import configuration
 from scipy.spatial.transform import Rotation
 
 from warp_resphys import box_hexahedra, cli
-from warp_resphys.experiment.trials import split_of
+from warp_resphys.experiment.trials import split_of, trials_of
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_hdf5
 
@@ -62,7 +61,7 @@ def test_the_correction_corrects(finished):
 def test_the_beam_is_let_go_from_cross_sections_turned_rigidly_by_the_configured_angles(finished):
     rest = box_hexahedra((0.1, 0.03, 0.03), (4, 2, 2)).vertices
     with read_hdf5(finished / "dataset.h5", "dataset") as file:
-        names, q, v = list(file.attrs["names"]), file["q"][:], file["v"][:]
+        names, q, v = list(file.attrs["names"]), file["observed"][:], file["velocity"][:]
     angles = [angle for split in ANGLES.values() for angle in split]
     assert names == [f"{angle}°" for angle in angles]
     assert not v[:, 0].any()
@@ -77,23 +76,19 @@ def test_the_beam_is_let_go_from_cross_sections_turned_rigidly_by_the_configured
     assert np.abs(q[:, -1] - q[:, 0]).max((1, 2)).min() > 1e-3  # every beam swings back
 
 
-def data_of(*overrides):
-    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        config = compose("config", overrides=list(overrides))
-    return OmegaConf.to_container(config, resolve=True)["data"]
-
-
 @pytest.mark.parametrize(
     ("experiment", "key", "unit", "factor"),
     [("beam_twist", "angles_deg", "°", np.pi / 180.0), ("beam_oscillation", "weights_g", " g", 1e-3)],
 )
 def test_the_quick_budget_picks_evenly(experiment, key, unit, factor):
-    full, quick = (data_of(f"experiment={experiment}", f"budget={budget}") for budget in ("full", "quick"))
+    configs = [configuration(f"budget={budget}", experiment=experiment) for budget in ("full", "quick")]
+    full, quick = (config["data"] for config in configs)
     assert full["limit"] is None
     assert quick[key] == full[key]
     assert quick["steps"] < full["steps"]
-    split, values = split_of(quick)
-    whole, _ = split_of(full)
+    whole, split = map(split_of, configs)
+    amounts = {trial.name: trial.amount for trial in trials_of(configs[1])}
+    assert tuple(amounts) == split.names
     for name, limit in quick["limit"].items():
         row, picked = [f"{x:g}{unit}" for x in full[key][name]], list(getattr(split, name))
         assert list(getattr(whole, name)) == row
@@ -104,7 +99,7 @@ def test_the_quick_budget_picks_evenly(experiment, key, unit, factor):
             assert np.ptp(np.diff(places)) <= 1  # strides differ by one at most
             assert np.diff(places).min() >= 1
         chosen = np.array([full[key][name][place] for place in places])
-        np.testing.assert_allclose(values[split.indices(name)], factor * chosen)
+        np.testing.assert_allclose([amounts[each] for each in picked], factor * chosen)
 
 
 @pytest.mark.parametrize(
@@ -114,7 +109,7 @@ def test_limits(limit, picked):
     row = [10, 20, 30, 40, 50]
     angles = {"train": row, "validation": [60], "test": [70]}
     data = {"kind": "release_from_twist", "angles_deg": angles, "limit": {"train": limit, "validation": 1, "test": 1}}
-    split, _ = split_of(data)
+    split = split_of({"data": data})
     assert split.train == tuple(f"{angle}°" for angle in (picked if limit <= len(row) else row))
 
 
@@ -122,4 +117,4 @@ def test_a_limit_of_none_of_them_is_refused():
     angles = {"train": [10, 20], "validation": [60], "test": [70]}
     data = {"kind": "release_from_twist", "angles_deg": angles, "limit": {"train": 0, "validation": 1, "test": 1}}
     with pytest.raises(InputError, match=r"data\.limit is 0 for a split: it must be at least 1"):
-        split_of(data)
+        split_of({"data": data})

@@ -5,6 +5,7 @@ Reports are made of these files in test_measured_report.py; here they read them,
 
 import contextlib
 import json
+import re
 import shutil
 import signal
 
@@ -14,7 +15,7 @@ from hydra import compose, initialize_config_module
 from main_job import run
 from omegaconf import OmegaConf
 
-from warp_resphys.experiment import identify, pipeline
+from warp_resphys.experiment import identify, report
 from warp_resphys.experiment.pipeline import learning_stages
 from warp_resphys.experiment.scene import LEARNED, MODELS
 from warp_resphys.experiment.trials import split_of
@@ -86,16 +87,15 @@ def read(path):
 
 @pytest.fixture(scope="module")
 def pages():
-    """Settings of the stages that write reports, by their folders; nothing is drawn."""
+    """What the reports would have shown, by their folders."""
     shown = {}
 
-    def write(context):
-        shown[context.run_dir.name] = context.settings
-        (context.run_dir / "report.html").write_text("-")
+    def write(path, data):
+        shown[path.parent.name] = data
+        path.write_text("-")
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "make_report", write)
-        patch.setattr(pipeline, "make_folds_report", write)
+        patch.setattr(report, "write_report", write)
         yield shown
 
 
@@ -180,12 +180,21 @@ class TestCompleteRun:
             sysid = read(finished / "identification.json")["sysid"]["loss"]
             assert first["train_loss"] == pytest.approx(sysid, rel=1e-3)
 
-    def test_the_report_depends_on_the_configuration_and_the_trials(self, finished, pages):
-        # missing check: that the page's notes name how far bodies were held sideways, and the noise of the markers
+    def test_the_report_can_read_all_of_it(self, finished, pages):
         shown = pages["run"]
-        assert shown["config"]["name"] == "beam_real"
-        assert "tune" not in shown["config"]
-        assert shown["acquired"] == records(finished)["import"]["fingerprint"]
+        assert shown.truth["youngs_modulus"] == 250e3
+        assert len(shown.notes) == 2
+        assert re.search(r"the markers by 0\.\d mm \(m50\), as the identified simulator has it", shown.notes[0])
+        assert shown.notes[1] == "The noise of the markers alone is 0.08 mm."
+        assert set(shown.training) == set(LEARNED)
+        assert shown.models == list(MODELS)
+        assert len(shown.identification["sysid"]["history"]) == 1
+
+    def test_the_report_depends_on_the_configuration_and_the_trials(self, finished):
+        settings = records(finished)["report"]["settings"]
+        assert settings["config"]["name"] == "beam_real"
+        assert "tune" not in settings["config"]
+        assert settings["acquired"] == records(finished)["import"]["fingerprint"]
 
     def test_the_reconstruction_says_how_close_it_came_and_where_its_forces_lead(self, finished):
         found = read(finished / "reconstruction.json")
@@ -239,7 +248,9 @@ def test_folds(finished, tmp_path, monkeypatch, pages):
         settings = records(folder)["train_resphys"]["settings"]["split"]
         assert trial not in settings["train"] + settings["validation"]
     assert (tmp_path / "run" / "report.html").is_file()
-    assert pages["run"]["folds"] == {trial: fold["errors_mm"] for trial, fold in found["folds"].items()}
+    assert pages["run"].pages == {trial: f"fold_{trial}/report.html" for trial in found["folds"]}
+    settings = records(tmp_path / "run")["report"]["settings"]
+    assert settings["folds"] == {trial: fold["errors_mm"] for trial, fold in found["folds"].items()}
     assert {f"fold_{trial}" for trial in found["folds"]} <= set(pages)
     assert all((tmp_path / "run" / f"fold_{trial}" / "report.html").is_file() for trial in found["folds"])
 

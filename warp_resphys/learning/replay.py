@@ -139,11 +139,14 @@ class Replay:
         state = self.simulator.static_equilibrium(resting, constants, start=q)
         if force is None or not self.is_static:
             return state
+        share, before = 1.0, math.inf  # of the way that is gone: less where it leads past the goal
         for _ in range(_POSE_ITERATIONS):
-            before = state.q.detach()
-            state = self.simulator.static_equilibrium(resting.plus(force(state, 0)), constants, start=before)
-            if float((state.q.detach() - before).abs().max()) < _POSE_TOLERANCE:
-                return state
+            found = self.simulator.static_equilibrium(resting.plus(force(state, 0)), constants, start=state.q.detach())
+            change = float((found.q - state.q).detach().abs().max())
+            if change < _POSE_TOLERANCE:
+                return found
+            share, before = (0.5 * share if change > before else share), change
+            state = State(torch.lerp(state.q, found.q, share), state.v)
         raise ConvergenceError(
             f"a pose and the force that depends on it did not settle in {_POSE_ITERATIONS} iterations: the force "
             "is too large to be a correction.",

@@ -181,7 +181,9 @@ def test_finished_starts_are_not_done_again():
     replay, release = replay_of(simulator(), TRUTH, frames=10)
     kept, calls = [], []
     starts = [FIRST, {"youngs_modulus": 150e3, "stiffness_damping": 0.01}]
-    whole = Identifier([(replay, release)], RANGES).run(starts, 2, keep=lambda a: kept.append(json.loads(json.dumps(a))))
+    whole = Identifier([(replay, release)], RANGES).run(
+        starts, 2, keep=lambda a: kept.append(json.loads(json.dumps(a)))
+    )
     assert [len(attempts) for attempts in kept] == [1, 2]
     again = Identifier([(replay, release)], RANGES).run(
         starts, 2, report=lambda number, *_: calls.append(number), finished=kept[0]
@@ -279,3 +281,37 @@ def test_the_descent_turns_back_from_failures_and_copes_without_a_matrix():
     x, value = minimise(Valley(), np.array([0.4, 0.1]), lambda _: None, 200)
     assert value < 0.1
     assert minimise(Valley(wall=0.6), np.array([0.1, 0.1]), valley.matrix, 5)[1] == np.inf
+
+
+def test_groups_of_trials_weigh_what_their_trials_do():
+    """Trials in groups of their own, as those that begin otherwise are, give what one group of them gives."""
+    replay, release = replay_of(simulator(), TRUTH, masses=(0.0, 0.05, 0.1), frames=12, noise=5e-5)
+    apart = [
+        (Replay(replay.simulator, MARKERS, replay.trials.select(rows)), release.select(rows)) for rows in ([2], [0, 1])
+    ]
+    whole, groups = Identifier([(replay, release)], RANGES), Identifier(apart, RANGES)
+    unit = replay.simulator.tensor([[0.2, 0.1], [0.5, 0.3]])
+    torch.testing.assert_close(groups.losses(unit), whole.losses(unit), rtol=1e-6, atol=0.0)
+    one, other = (each.uncertainty(np.array([0.3, 0.1])) for each in (whole, groups))
+    assert other.deviation == pytest.approx(one.deviation, rel=1e-3)
+    np.testing.assert_allclose(other.correlation, one.correlation, atol=1e-3)
+
+
+def test_poses_tell_the_stiffness_beside_motions():
+    """A pose under a weight depends on the stiffness alone: the damping is still found, from the motion."""
+    motion, release = replay_of(simulator(), TRUTH, masses=(0.0,), frames=25)
+    sim = motion.simulator
+    held = torch.as_tensor(POINTS)[None]
+    still = Trials(
+        ("pose",), torch.zeros(1, 1, dtype=torch.float64), held[:, None], held, Inputs(attached_mass=hanging((0.1,)))
+    )
+    start = Start.resting(sim.rest_positions[None])
+    assert Replay(sim, MARKERS, still).is_static
+    with torch.no_grad():
+        seen = Replay(sim, MARKERS, still)(start, {name: one(value) for name, value in TRUTH.items()})[0]
+    pose = Replay(sim, MARKERS, replace(still, observed=seen))
+    found = Identifier([(motion, release), (pose, start)], RANGES).run([FIRST], 40)
+    assert found.parameters["youngs_modulus"] == pytest.approx(215e3, rel=1e-3)
+    assert found.parameters["stiffness_damping"] == pytest.approx(0.002, rel=0.02)
+    alone = Identifier([(pose, start)], {"youngs_modulus": RANGES["youngs_modulus"]}).run([FIRST], 40)
+    assert alone.parameters["youngs_modulus"] == pytest.approx(215e3, rel=1e-3)

@@ -41,7 +41,10 @@ class TestSpace:
         [
             ({}, "tune.space is {}: it must name at least one setting"),
             ({"network": {}}, "tune.space is empty"),
-            ({"data": {"steps": [1, 2]}}, "tune.space.data cannot be searched: name settings of network or trainer."),
+            (
+                {"data": {"steps": [1, 2]}},
+                "tune.space.data cannot be searched: name settings of network or trainer or in_the_loop.",
+            ),
             ({"network": 3}, "tune.space.network is 3: it must be a group"),
             ({"network": {"width": [8]}}, "tune.space.network.width is [8]: it must list two or more"),
             ({"network": {"width": [8, 8]}}, "tune.space.network.width is [8, 8]: it must list two or more different"),

@@ -177,7 +177,6 @@ class TestLoss:
         for weight, gradient in zip(model.parameters(), gradients, strict=True):
             torch.testing.assert_close(weight.grad, 0.75 * gradient, rtol=1e-4, atol=1e-9)
 
-
     def test_it_is_of_what_was_seen_under_the_inputs_of_each_window(self):
         """Weights that grow in time: with them, the simulator that made the trials is off nowhere; without, it is."""
         sim, frames = simulator(), 7
@@ -246,7 +245,9 @@ class TestTraining:
             return torch.where(bad[:, None, None], math.nan, model(q, v))
 
         def make():
-            return SolverInTheLoop(model, window_loss(Formula(failing)), [TRAIN], [VALIDATION], lambda model: 1.0, CONFIG)
+            return SolverInTheLoop(
+                model, window_loss(Formula(failing)), [TRAIN], [VALIDATION], lambda model: 1.0, CONFIG
+            )
 
         run = make()
         run.run_epoch()

@@ -164,7 +164,7 @@ _COLUMNS: Final = Kind(
 )
 
 PLACE: Final = Group({key: absent(optional(FINITE)) for key in ("x", "y", "z")} | {"tolerance": absent(POSITIVE)})
-MATERIAL: Final = Group({"model": WORD}, each=NUMBER)
+MATERIAL: Final = Group({"model": absent(WORD)}, each=NUMBER)
 _MESHES: Final[Mapping[str, Mapping[str, Spec]]] = {
     "box_hexahedra": {
         "size": _THREE_LENGTHS,

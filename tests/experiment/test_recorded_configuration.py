@@ -291,6 +291,22 @@ def test_the_identification_of_e_and_nu_alone_can_be_left_out():
     assert list(config["identify"]["parameters"]) == ["youngs_modulus", "stiffness_damping"]
 
 
+@pytest.mark.parametrize("experiment", ["beam_oscillation", "beam_real", "sopra"])
+def test_a_material_may_leave_out_its_model_and_its_constants(experiment):
+    config = configuration(experiment=experiment)
+    for material in ({}, {"youngs_modulus": 2e5}, {"model": "stable_neo_hookean", "density": 1000.0}):
+        check_configuration(config | {"simulation": material})
+    with pytest.raises(InputError, match=r"its own weight would strain it by .* or that of youngs_modulus not Pa"):
+        check_configuration(config | {"simulation": {"youngs_modulus": 264.0}})
+
+
+def test_a_material_without_youngs_modulus_is_believed_or_not():
+    config = configuration(experiment="beam_oscillation")
+    check_configuration(config | {"simulation": {"model": "mooney_rivlin"}})
+    with pytest.raises(InputError, match=r"with E = 0.264 kPa its own weight would strain it by .* that of c10 not Pa"):
+        check_configuration(config | {"simulation": {"model": "mooney_rivlin", "c10": 36.0, "c01": 8.0}})
+
+
 def test_an_experiment_may_choose_its_network(tmp_path):
     place = tmp_path / "experiment" / "own.yaml"
     place.parent.mkdir()

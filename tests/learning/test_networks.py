@@ -142,7 +142,7 @@ class TestResidualForce:
         left = y - x @ expected
         np.testing.assert_allclose(model.remainder, np.sqrt((left**2).mean()), rtol=1e-6)
         inputs = torch.tensor(x)
-        together = model.standardised(inputs)
+        together = model.standardised(inputs)[0]
         np.testing.assert_allclose(
             together.detach(), inputs @ model.linear + model.remainder * model.network(inputs).detach(), rtol=1e-6
         )

@@ -167,7 +167,8 @@ class _RollingOut(March):
     def snapshot(self) -> dict[str, torch.Tensor]:
         assert self._state is not None
         predictor, lost = self._run.predictor, self._run.rollout.lost(self._state)
-        left = {} if predictor is None or predictor.left_at is None else {"left": predictor.left_at}
+        known = {} if predictor is None else {"left": predictor.left_at, "hidden": predictor.hidden}
+        left = {name: value for name, value in known.items() if value is not None}
         return {**pack(self._state), "lost": lost, "done": torch.tensor(self._run.rollout.done), **left}
 
     @override
@@ -175,8 +176,9 @@ class _RollingOut(March):
         self._state = unpack(tensors, self._run.simulator.rest_positions)
         device = self._state.q.device
         self._run.rollout.resume(tensors["lost"].to(device), int(tensors["done"]))
-        if self._run.predictor is not None and "left" in tensors:
-            self._run.predictor.left_at = tensors["left"].to(device)
+        if (predictor := self._run.predictor) is not None:
+            found = {name: tensors[name].to(device) for name in ("left", "hidden") if name in tensors}
+            predictor.left_at, predictor.hidden = found.get("left"), found.get("hidden")
 
     @override
     def constants(self) -> dict[str, tuple[Any, str]]:

@@ -24,7 +24,7 @@ from ..learning.networks import ResidualForce, StateMap, build_model, build_next
 from ..learning.predictors import Range
 from ..learning.refinement import Motion, SolverInTheLoop, WindowLoss
 from ..learning.replay import Replay
-from ..learning.training import EpochTrainer, Samples, Trainer
+from ..learning.training import EpochTrainer, Samples, SequenceTrainer, Trainer
 from .build import choose_device
 from .files import STATIC, reconstruction_file, training_file, weights_file
 from .models import SIMFREE, Learned, kind_of, load, rollout_error
@@ -47,6 +47,7 @@ class Steps:
         told: (S, A) what the networks are told of the inputs; None for nothing.
         force: (S, N, 3) that leads on [N]; None where the states were not reconstructed.
         following: positions and velocities (S, N, 3) where they end.
+        lengths: of the series that the steps are, a trial each.
     """
 
     q: torch.Tensor
@@ -54,6 +55,7 @@ class Steps:
     told: torch.Tensor | None
     force: torch.Tensor | None
     following: tuple[torch.Tensor, torch.Tensor]
+    lengths: tuple[int, ...]
 
 
 def steps_of(scene: Scene, model: str, names: Sequence[str], device: torch.device) -> Steps:
@@ -101,7 +103,8 @@ def _steps(
         return field.flatten(0, 1) if whole else field[seen]
 
     now = (pick(q[:, :-1]), pick(v[:, :-1]), None if told is None else pick(told))
-    return Steps(*now, None if force is None else pick(force[:, 1:]), (pick(q[:, 1:]), pick(v[:, 1:])))
+    lengths = tuple(seen.sum(1).tolist())
+    return Steps(*now, None if force is None else pick(force[:, 1:]), (pick(q[:, 1:]), pick(v[:, 1:])), lengths)
 
 
 def _together(parts: Sequence[Steps]) -> Steps:
@@ -110,7 +113,8 @@ def _together(parts: Sequence[Steps]) -> Steps:
         return torch.cat(known) if known else None
 
     own = {name: joined([getattr(each, name) for each in parts]) for name in ("q", "v", "told", "force")}
-    return Steps(**own, following=(joined([p.following[0] for p in parts]), joined([p.following[1] for p in parts])))
+    following = (joined([p.following[0] for p in parts]), joined([p.following[1] for p in parts]))
+    return Steps(**own, following=following, lengths=tuple(n for each in parts for n in each.lengths))
 
 
 def _told(scene: Scene, model: str, names: Sequence[str], steps: int) -> torch.Tensor | None:
@@ -204,12 +208,13 @@ def _supervised(
             outputs: tuple[torch.Tensor, ...] = (each.following[0] - rest, each.following[1])
         else:
             outputs = (_turned(scene, model, each),)
-        samples[name] = Samples(each.q, each.v, outputs, each.told)
+        samples[name] = Samples(each.q, each.v, outputs, each.told, each.lengths)
     train = samples["train"]
     network = new_network(scene, model, steps["train"], groups, None if model == SIMFREE else train.outputs[0])
     learned = Learned(network, _range_of(scene, network, train), scene.config["force_frame"])
     error = rollout_error(dataclasses.replace(scene, on_failure="count"), model, judged)
-    trainer: Trainer[Any] = Trainer(
+    kind: type[Trainer[Any]] = Trainer if network.recurrent is None else SequenceTrainer
+    trainer = kind(
         network,
         train,
         samples["validation"],

@@ -239,6 +239,7 @@ NETWORK: Final = Group(
         "layers": Kind(lambda value: is_whole_number(value) and 0 <= value <= 100, "a whole number from 0 to 100"),
         "width": at_most(16_384),
         "activation": one_of(*ACTIVATIONS),
+        "recurrent": absent(optional(at_most(1_024))),
     }
 )
 TRAINER: Final = Group(
@@ -256,6 +257,7 @@ TRAINER: Final = Group(
         "scale_weight": NOT_NEGATIVE,
         "selection": one_of(*SELECTIONS),
         "rollout_every": NATURAL,
+        "sequence": absent(NATURAL),
     }
 )
 _RANGE = {"lower": FINITE, "upper": FINITE, "logarithmic": absent(TRUTH_VALUE)}

@@ -52,6 +52,39 @@ class SkipMLP(nn.Module):
         return x
 
 
+class RecurrentMLP(nn.Module):
+    """A gated recurrent unit beside which a perceptron sees the inputs: what was before has its say, however long ago.
+
+    Args:
+        n_in: inputs.
+        n_out: outputs.
+        recurrent: size of the hidden state.
+        architecture: of the `SkipMLP` that sees the inputs and the hidden state.
+    """
+
+    def __init__(self, n_in: int, n_out: int, recurrent: int, **architecture: Any) -> None:
+        super().__init__()
+        self.cell = nn.GRUCell(n_in, recurrent)
+        self.perceptron = SkipMLP(n_in + recurrent, n_out, **architecture)
+
+    @property
+    def blocks(self) -> nn.ModuleList:
+        """Those of the perceptron."""
+        return self.perceptron.blocks
+
+    def forward(self, x: torch.Tensor, hidden: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
+        """(S, n_out) outputs and the next hidden state (S, H), of (S, n_in) inputs and the last one; None at first.
+
+        Raises:
+            InputError: a hidden state of another size.
+        """
+        size = (len(x), self.cell.hidden_size)
+        if hidden is not None and tuple(hidden.shape) != size:
+            raise InputError(f"the hidden state is {tuple(hidden.shape)}: it must be {size}, or None to begin.")
+        following = self.cell(x, hidden)
+        return self.perceptron(torch.cat([x, following], 1)), following
+
+
 def _perceptron(n_in: int, n_out: int, layers: int, width: int, activation: str) -> nn.Sequential:
     modules: list[nn.Module] = []
     for i in range(layers):
@@ -178,7 +211,8 @@ class StateMap(nn.Module):
         position: coder of positions less the rest shape.
         velocity: coder of velocities.
         outputs: coder of each predicted field.
-        architecture: ``blocks``, ``layers``, ``width`` and ``activation``.
+        architecture: ``blocks``, ``layers``, ``width`` and ``activation``, and ``recurrent``, the size of a hidden
+            state that goes with the roll-out, or None.
         actuation: coder of what acts on the body, such as weights or pressures; None where nothing does.
     """
 
@@ -201,10 +235,14 @@ class StateMap(nn.Module):
         self.position, self.velocity, self.actuation = position, velocity, actuation
         self.outputs = nn.ModuleDict(outputs)
         self.architecture = {key: architecture[key] for key in ("blocks", "layers", "width", "activation")}
+        self.recurrent: int | None = architecture.get("recurrent")
         self._sizes = [coder.size for coder in outputs.values()]
         n_in = position.size + velocity.size + (0 if actuation is None else actuation.size)
         n_out = sum(self._sizes)
-        self.network = SkipMLP(n_in, n_out, **self.architecture).to(rest.device)
+        if self.recurrent is None:
+            self.network: SkipMLP | RecurrentMLP = SkipMLP(n_in, n_out, **self.architecture).to(rest.device)
+        else:
+            self.network = RecurrentMLP(n_in, n_out, self.recurrent, **self.architecture).to(rest.device)
         self.register_buffer("linear", torch.zeros(n_in, n_out, device=rest.device))
         self.register_buffer("remainder", torch.ones((), device=rest.device))
 
@@ -227,9 +265,23 @@ class StateMap(nn.Module):
         self.linear.copy_(linear)
         self.remainder.copy_((y - x @ linear).square().mean().sqrt())
 
-    def standardised(self, inputs: torch.Tensor) -> torch.Tensor:
-        """(S, n_out) standardised fields from (S, n_in) standardised inputs: linear part and network."""
-        return inputs @ self.linear + self.remainder * self.network(inputs)
+    def standardised(
+        self, inputs: torch.Tensor, hidden: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """(S, n_out) standardised fields from (S, n_in) standardised inputs: linear part and network.
+
+        Args:
+            inputs: (S, n_in).
+            hidden: (S, H) the last hidden state of a recurrent network; None at first.
+
+        Returns:
+            The fields, and the next hidden state; None without any.
+        """
+        if isinstance(self.network, RecurrentMLP):
+            found, hidden = self.network(inputs, hidden)
+        else:
+            found = self.network(inputs)
+        return inputs @ self.linear + self.remainder * found, hidden
 
     def encode(self, q: torch.Tensor, v: torch.Tensor, actuation: torch.Tensor | None = None) -> torch.Tensor:
         """(S, n_in) standardised inputs, as precise as the network.
@@ -251,19 +303,22 @@ class StateMap(nn.Module):
         pairs = zip(self.coders, fields, strict=True)
         return torch.cat([coder.encode(field) for coder, field in pairs], dim=1).to(self.linear.dtype)
 
-    def decode(self, inputs: torch.Tensor) -> list[torch.Tensor]:
-        """(S, N, 3) fields in order, from (S, n_in) standardised inputs."""
-        parts = self.standardised(inputs).split(self._sizes, dim=1)
-        return [coder.decode(part) for coder, part in zip(self.coders, parts, strict=True)]
+    def decode(
+        self, inputs: torch.Tensor, hidden: torch.Tensor | None = None
+    ) -> tuple[list[torch.Tensor], torch.Tensor | None]:
+        """(S, N, 3) fields in order, and the next hidden state; see `standardised`."""
+        outputs, hidden = self.standardised(inputs, hidden)
+        parts = outputs.split(self._sizes, dim=1)
+        return [coder.decode(part) for coder, part in zip(self.coders, parts, strict=True)], hidden
 
     def predict(self, q: torch.Tensor, v: torch.Tensor, actuation: torch.Tensor | None = None) -> list[torch.Tensor]:
         """(S, N, 3) fields in order, from a state as `encode` takes it."""
-        return self.decode(self.encode(q, v, actuation))
+        return self.decode(self.encode(q, v, actuation))[0]
 
     def description(self) -> dict[str, Any]:
         """What `restore` needs beside the tensors."""
         return {
-            "architecture": self.architecture,
+            "architecture": {**self.architecture, **({} if self.recurrent is None else {"recurrent": self.recurrent})},
             "reduced": self.position.basis is not None,
             "actuated": self.actuation is not None,
         }
@@ -292,10 +347,12 @@ class NextState(StateMap):
         return position, velocity
 
     @override
-    def decode(self, inputs: torch.Tensor) -> list[torch.Tensor]:
-        """(S, N, 3) positions [m] and velocities [m/s], from (S, n_in) standardised inputs."""
-        displacement, velocity = super().decode(inputs)
-        return [self.rest + displacement, velocity]
+    def decode(
+        self, inputs: torch.Tensor, hidden: torch.Tensor | None = None
+    ) -> tuple[list[torch.Tensor], torch.Tensor | None]:
+        """(S, N, 3) positions [m] and velocities [m/s], and the next hidden state; see `StateMap.standardised`."""
+        (displacement, velocity), hidden = super().decode(inputs, hidden)
+        return [self.rest + displacement, velocity], hidden
 
 
 def build_model(

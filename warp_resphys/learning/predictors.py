@@ -67,6 +67,7 @@ class LearnedPredictor:
 
     Attributes:
         left_at: (B,) step at which an environment left the range, -1 where it has not; None before the first step.
+        hidden: (B, H) state of a recurrent network, which goes with the roll-out; None before the first step.
     """
 
     def __init__(
@@ -78,6 +79,7 @@ class LearnedPredictor:
     ) -> None:
         self.model, self._told, self._range, self._frames = model, told, range_, frames
         self.left_at: torch.Tensor | None = None
+        self.hidden: torch.Tensor | None = None
 
     def __call__(self, state: State, step: int) -> torch.Tensor | State:
         """The model's force (B, N, 3) [N], or the next state, on the simulator's device and in its type."""
@@ -95,7 +97,8 @@ class LearnedPredictor:
                 self.left_at = torch.full((len(q),), -1, dtype=torch.int64, device=q.device)
             self.left_at = torch.where(outside & (self.left_at < 0), step, self.left_at)
             inputs = self._range.hold(inputs)
-        fields = [field.to(q.device, q.dtype) for field in self.model.decode(inputs)]
+        found, self.hidden = self.model.decode(inputs, self.hidden)
+        fields = [field.to(q.device, q.dtype) for field in found]
         if isinstance(self.model, NextState):
             return State(fields[0], fields[1])
         return fields[0] if self._frames is None else self._frames.to_world(q, v, fields[0])

@@ -2,7 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic
 
@@ -18,12 +18,21 @@ SELECTIONS = ("rollout", "validation_loss")
 
 @dataclass(frozen=True)
 class Samples:
-    """States and the fields that belong to them, each (S, N, 3), and (S, A) what else acts on the body, if anything."""
+    """States and the fields that belong to them.
+
+    Attributes:
+        q: (S, N, 3) positions [m].
+        v: (S, N, 3) velocities [m/s].
+        outputs: the fields, each (S, N, 3).
+        actuation: (S, A) what else acts on the body; None if nothing does.
+        lengths: of the series that the samples are, one after the other, if they are.
+    """
 
     q: torch.Tensor
     v: torch.Tensor
     outputs: tuple[torch.Tensor, ...]
     actuation: torch.Tensor | None = None
+    lengths: tuple[int, ...] = ()
 
 
 @dataclass
@@ -216,7 +225,7 @@ class Trainer(EpochTrainer[Model]):
 
     def _loss(self, inputs: torch.Tensor, outputs: torch.Tensor) -> torch.Tensor:
         """Weighted mean squared error of the standardised outputs, in units of what the linear part leaves."""
-        error = self._weights * (self.model.standardised(inputs) - outputs)
+        error = self._weights * (self.model.standardised(inputs)[0] - outputs)
         return (error / self.model.remainder).square().mean()
 
     @override
@@ -236,6 +245,89 @@ class Trainer(EpochTrainer[Model]):
             index, name = key.split(".")
             slots.setdefault(int(index), {})[name] = tensor
         self._optimiser.load_state_dict({**self._optimiser.state_dict(), "state": slots})
+
+
+class SequenceTrainer(Trainer[Model]):
+    """The same for a recurrent model, whose hidden state goes through the training trials.
+
+    All trials are run through side by side, in spans of ``sequence`` steps. A gradient reaches back to the beginning of
+    its span, the hidden state comes from before (truncated backpropagation through time).
+
+    Args:
+        model: a recurrent one.
+        train: training samples, as series.
+        validation: held-out samples, as series.
+        rollout_error: see `Trainer`.
+        config: the group ``trainer``.
+        seed: of the noise.
+
+    Raises:
+        InputError: an empty split.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        train: Samples,
+        validation: Samples,
+        rollout_error: Callable[[Model], float],
+        config: Mapping[str, Any],
+        seed: int,
+    ) -> None:
+        super().__init__(model, train, validation, rollout_error, config, seed)
+        self._series = [
+            _side_by_side(*self._train, train.lengths),
+            _side_by_side(*self._validation, validation.lengths),
+        ]
+
+    @override
+    def _run_epoch(self) -> dict[str, float]:
+        """One pass through the training trials."""
+        rate = self.learning_rate(self.state.epoch)
+        for group in self._optimiser.param_groups:
+            group["lr"] = rate
+        self.model.train()
+        inputs, outputs, inside = self._series[0]
+        hidden, total = None, 0.0
+        for span in torch.arange(len(inputs)).split(self.config["sequence"]):
+            x = inputs[span]
+            if self.config["noise"] > 0.0:
+                x = x + self.config["noise"] * torch.randn(x.shape, generator=self._random).to(x)
+            loss, hidden = self._through(x, outputs[span], inside[span], hidden)
+            self._optimiser.zero_grad()
+            loss.backward()
+            self._optimiser.step()
+            hidden = hidden.detach()
+            total += float(loss.detach()) * float(inside[span].sum())
+        train_loss = total / float(inside.sum()) * float(self.model.remainder) ** 2
+        return {"train_loss": train_loss, "validation_loss": self._validate(), "learning_rate": rate}
+
+    def _through(
+        self, inputs: torch.Tensor, outputs: torch.Tensor, inside: torch.Tensor, hidden: torch.Tensor | None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Mean loss of (L, R, .) steps that are inside (L, R) of their trial, and the hidden state after them."""
+        total = inputs.new_zeros(())
+        for x, y, known in zip(inputs, outputs, inside, strict=True):
+            found, hidden = self.model.standardised(x, hidden)
+            error = (self._weights * (found - y) / self.model.remainder).square().mean(1)
+            total = total + torch.where(known, error, 0.0).sum()
+        assert hidden is not None
+        return total / inside.sum().clamp_min(1), hidden
+
+    @override
+    def _validate(self) -> float:
+        self.model.eval()
+        with torch.no_grad():
+            return float(self._through(*self._series[1], None)[0]) * float(self.model.remainder) ** 2
+
+
+def _side_by_side(
+    inputs: torch.Tensor, outputs: torch.Tensor, lengths: Sequence[int]
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """(K, R, .) inputs and outputs of R series, and (K, R) whether a step is one of its series."""
+    parts = [torch.nn.utils.rnn.pad_sequence(list(x.split(list(lengths)))) for x in (inputs, outputs)]
+    ends = torch.tensor(lengths, device=inputs.device)
+    return parts[0], parts[1], torch.arange(len(parts[0]), device=inputs.device)[:, None] < ends
 
 
 def scale_weights(model: StateMap, exponent: float) -> torch.Tensor:

@@ -1,0 +1,131 @@
+"""A recurrent predictor learns what depends on the past, and its hidden state goes with the roll-out."""
+
+import pytest
+import torch
+
+from warp_resphys.dynamics.integrator import State
+from warp_resphys.io.errors import InputError
+from warp_resphys.learning.networks import ResidualForce, build_model, restore
+from warp_resphys.learning.predictors import LearnedPredictor
+from warp_resphys.learning.training import Samples, SequenceTrainer
+
+NETWORK = {
+    "kind": "reduced",
+    "position_modes": 1,
+    "velocity_modes": 0,
+    "force_modes": 1,
+    "blocks": 1,
+    "layers": 1,
+    "width": 16,
+    "activation": "silu",
+    "recurrent": 8,
+}
+TRAINER = {
+    "epochs": 150,
+    "batch_size": 8,
+    "learning_rate": 1e-2,
+    "schedule": "cosine",
+    "final_learning_rate": 1e-4,
+    "gamma": 1.0,
+    "step_epochs": 10,
+    "weight_decay": 0.0,
+    "noise": 0.0,
+    "linear_noise": 1e-3,
+    "scale_weight": 0.0,
+    "selection": "validation_loss",
+    "rollout_every": 1000,
+    "sequence": 10,
+}
+TRIALS, STEPS, LAG = 6, 40, 8.0
+REST = torch.zeros(2, 3, dtype=torch.float64)
+
+
+def series(seed):
+    """Inputs that jump, and a force that follows them with a lag: the input alone does not tell it."""
+    random = torch.Generator().manual_seed(seed)
+    levels = torch.rand(TRIALS, 4, generator=random, dtype=torch.float64)
+    inputs = levels.repeat_interleave(STEPS // 4, 1)  # (R, K)
+    force, behind = [], torch.zeros(TRIALS, dtype=torch.float64)
+    for k in range(STEPS):
+        behind = behind + (inputs[:, k] - behind) / LAG
+        force.append(behind)
+    shape = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
+    q = 1e-3 * inputs.flatten()[:, None, None] * shape
+    f = torch.stack(force, 1).flatten()[:, None, None] * shape
+    return Samples(q, torch.zeros_like(q), (f,), None, (STEPS,) * TRIALS)
+
+
+def trained(recurrent):
+    torch.manual_seed(0)
+    train, held_out = series(1), series(2)
+    model = build_model({**NETWORK, "recurrent": recurrent}, REST, train.q, train.v, train.outputs[0])
+    trainer = SequenceTrainer(model, train, held_out, lambda _: 0.0, TRAINER, 0)
+    while not trainer.finished:
+        trainer.run_epoch()
+    return trainer.use_best(), held_out
+
+
+@pytest.fixture(scope="module")
+def model():
+    return trained(8)
+
+
+def rolled_out(model, samples):
+    """(R, K) the first component of the predicted force, and of the true one, in closed loop."""
+    q = samples.q.unflatten(0, (TRIALS, STEPS))
+    predict = LearnedPredictor(model)
+    with torch.no_grad():
+        forces = [predict(State(q[:, k], torch.zeros_like(q[:, k])), k) for k in range(STEPS)]
+    return torch.stack(forces, 1)[:, :, 0, 0], samples.outputs[0].unflatten(0, (TRIALS, STEPS))[:, :, 0, 0]
+
+
+def test_it_learns_a_lag_that_a_map_of_the_present_cannot(model):
+    found, true = rolled_out(*model)
+    present = model[1].q[:, 0, 0].view(TRIALS, STEPS) * 1e3
+    ratio = ((found - true).square().mean() / (present - true).square().mean()).sqrt()
+    assert float(ratio) < 0.3
+
+
+def test_the_hidden_state_goes_with_each_environment(model):
+    """Trials that are rolled out alone give what they give in a batch, and each begins from nothing."""
+    learned, samples = model
+    together, _ = rolled_out(learned, samples)
+    q = samples.q.unflatten(0, (TRIALS, STEPS))[3:4]
+    for _ in range(2):
+        predict = LearnedPredictor(learned)
+        with torch.no_grad():
+            alone = [predict(State(q[:, k], torch.zeros_like(q[:, k])), k)[0, 0, 0] for k in range(STEPS)]
+        torch.testing.assert_close(torch.stack(alone), together[3])
+    assert predict.hidden.shape == (1, 8)
+
+
+def test_a_hidden_state_of_another_size_costs_one_sentence(model):
+    inputs = torch.zeros(3, 1)
+    for wrong in (torch.zeros(3, 7), torch.zeros(2, 8)):
+        with pytest.raises(InputError, match=r"the hidden state is \(.*\): it must be \(3, 8\), or None to begin"):
+            model[0].standardised(inputs, wrong)
+
+
+def test_it_comes_back_from_its_description(model):
+    learned, samples = model
+    again = restore(ResidualForce, learned.state_dict(), learned.description())
+    torch.testing.assert_close(rolled_out(again, samples)[0], rolled_out(learned, samples)[0])
+
+
+def test_an_interrupted_training_goes_on_with_the_same_losses():
+    train, held_out = series(1), series(2)
+
+    def trainer():
+        torch.manual_seed(0)
+        model = build_model(NETWORK, REST, train.q, train.v, train.outputs[0])
+        return SequenceTrainer(model, train, held_out, lambda _: 0.0, {**TRAINER, "epochs": 6, "noise": 1e-3}, 0)
+
+    whole = trainer()
+    losses = [whole.run_epoch()["train_loss"] for _ in range(6)]
+    first = trainer()
+    for _ in range(3):
+        first.run_epoch()
+    tensors, metadata = first.snapshot()
+    second = trainer()
+    second.resume({k: t.clone() for k, t in tensors.items()}, metadata)
+    assert [second.run_epoch()["train_loss"] for _ in range(3)] == losses[3:]

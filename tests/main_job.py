@@ -12,7 +12,16 @@ from warp_resphys import cli
 
 REPOSITORY = Path(__file__).parents[1]
 STAGES = ["simulate", "reconstruct_resphys", "train_resphys", "train_simfree", "evaluate", "time", "report"]
-REFINED = ["simulate", "reconstruct_resphys", "train_resphys", "refine_resphys", "train_simfree", "evaluate", "time", "report"]
+REFINED = [
+    "simulate",
+    "reconstruct_resphys",
+    "train_resphys",
+    "refine_resphys",
+    "train_simfree",
+    "evaluate",
+    "time",
+    "report",
+]
 REFINE = ["refinement=solver_in_the_loop", "refinement.window=4", "refinement.epochs=3"]
 LEARNED = ["train_resphys", "train_simfree", "evaluate", "time", "report"]
 CORRECTED = ["reconstruct_resphys", "train_resphys", "evaluate", "time", "report"]

@@ -146,9 +146,7 @@ class TestBadInput:
         assert path.read_bytes() == found
         path.unlink()
         assert run(*TINY, IN_RUN)[0] == 0
-        assert (
-            "simulate: missing or changed since they were written: dataset.h5" in caplog.text
-        )
+        assert "simulate: missing or changed since they were written: dataset.h5" in caplog.text
         assert ran(copied) == ["simulate"]  # the same forces as before: what follows is still valid
         same_errors(errors(), errors(finished[0]))
 

@@ -81,6 +81,11 @@ def check_configuration(config: Mapping[str, Any]) -> None:
         make_reconstructor(simulator, **config["reconstruction"])
     steps = config["data"].get("steps")
     refinement = config["refinement"]
+    if refinement["kind"] != "none" and config["network"].get("recurrent") is not None:
+        raise InputError(
+            "refinement begins anew in every window, and network.recurrent lives on what was before: set one of them "
+            "to none, or null."
+        )
     if refinement["kind"] != "none" and steps is not None and refinement["window"] >= steps:
         raise InputError(f"refinement.window is {refinement['window']}: it must be less than the data's {steps} steps.")
     if config["identify"] is not None:
@@ -143,6 +148,8 @@ def check_training(groups: Mapping[str, Any]) -> None:
         for key in ("position_modes", "velocity_modes", "force_modes"):
             if key not in network:
                 raise InputError(f"network.{key} is missing: a reduced network needs it.")
+    if network.get("recurrent") is not None and not groups["in_the_loop"] and "sequence" not in groups["trainer"]:
+        raise InputError("trainer.sequence is missing: a recurrent network needs it; trainer=sequences has one.")
 
 
 def _check_training(config: Mapping[str, Any], model: str) -> None:
@@ -180,7 +187,6 @@ def _check_recorded(config: Mapping[str, Any], body: Body) -> None:
         raise InputError("data.seconds is not set: say how much of each trial counts after its release, in s.")
     if "rest" in begins and data["steps"] is None:
         raise InputError("data.steps is not set: say how many steps of the simulation are read of each recording.")
-    _check_release(config, begins)
     chambers = len(chambers_of(body))
     if chambers:
         _check_pressures(config, chambers)
@@ -189,6 +195,7 @@ def _check_recorded(config: Mapping[str, Any], body: Body) -> None:
         _check_material(config["published"], "simulation", "published.")
     if is_laboratory(config):
         _check_laboratory(config, begins, chambers)
+    _check_release(config, begins)
 
 
 def _check_markers(config: Mapping[str, Any], body: Body) -> None:
@@ -222,6 +229,7 @@ def _check_trials(config: Mapping[str, Any]) -> None:
             raise InputError(f"{at}: files are named after trials: use letters, digits, _ and -, not digits alone.")
         if laboratory:
             continue
+        trial = {"file": trial} if isinstance(trial, str) else trial
         if "file" not in trial:
             raise InputError(f"{at}.file is missing: give the name of a file in data.folder.")
         other = files.setdefault(trial["file"], name)
@@ -318,12 +326,17 @@ def _check_size(body: Body, material: Material, gravity: Sequence[float]) -> Non
         InputError: strains of more than a few tenths.
     """
     length = float(np.linalg.norm(np.ptp(np.asarray(body.mesh.vertices), axis=0)))
-    density, stiffness = (float(np.mean(np.asarray(material.constants[x]))) for x in ("density", "youngs_modulus"))
+    constants = {name: torch.as_tensor(value, dtype=torch.float64) for name, value in material.constants.items()}
+    each = zip(material.moduli(constants), material.curvature, material.rules, strict=True)
+    shear = 0.5 * sum(float(modulus.mean()) * factor for modulus, factor, rule in each if rule == "shape")
+    density = float(constants["density"].mean())
+    stiffness = float(constants["youngs_modulus"].mean()) if "youngs_modulus" in constants else 3.0 * shear
     strain = density * float(np.linalg.norm(gravity)) * length / stiffness
     if strain > _LONGEST_STRETCH:
         raise InputError(
             f"the mesh is {length:.3g} m across: with E = {1e-3 * stiffness:.3g} kPa its own weight would strain it by "
-            f"{100.0 * strain:.0f} %; is its unit millimetres (mesh.units=mm), or that of youngs_modulus not Pa?"
+            f"{100.0 * strain:.0f} %; is its unit millimetres (mesh.units=mm), or that of {next(iter(constants))} not "
+            "Pa?"
         )
 
 
@@ -340,12 +353,14 @@ def check_identification(identify: Mapping[str, Any], known: Sequence[str]) -> N
     parameters = {name: each for name, each in identify["parameters"].items() if each is not None}
     if not parameters:
         raise InputError(f"identify.parameters is empty: give a range of one or more of {', '.join(known)}.")
-    for group, choice in (("parameters", known), ("elastic", ELASTIC), ("grid", ELASTIC)):
+    elastic = [name for name in ELASTIC if name in known]
+    for group, choice in (("parameters", known), ("elastic", elastic), ("grid", elastic)):
         for name, settings in (identify.get(group) or {}).items():
             if settings is None:
                 continue
             if name not in choice:
-                raise InputError(f"identify.{group} names '{name}': choose from {', '.join(choice)}.")
+                instead = f"choose from {', '.join(choice)}" if choice else f"set identify.{group} to null"
+                raise InputError(f"identify.{group} names '{name}': {instead}.")
             try:
                 Bounds(**{key: value for key, value in settings.items() if key != "points"})
             except InputError as error:

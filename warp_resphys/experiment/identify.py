@@ -45,8 +45,10 @@ def identify(context: StageContext) -> None:
             replays[model] = scene.replays(kinds[model], names)
             seconds = _seconds(settings, replays[model])
             found[model] = _search(context, model, replays[model], bounds, seconds, progress)
-    seconds = _seconds(settings, replays["sysid"]) if config["seconds"] is not None else None
-    found[_LANDSCAPE] = _landscape(context, replays["sysid"], ranges["sysid"], found["sysid"]["parameters"], seconds)
+    if config["grid"]:
+        seconds = _seconds(settings, replays["sysid"]) if config["seconds"] is not None else None
+        values = found["sysid"]["parameters"]
+        found[_LANDSCAPE] = _landscape(context, replays["sysid"], ranges["sysid"], values, seconds)
     write_json(context.run_dir / IDENTIFICATION, found)
     for part in (*ranges, _LANDSCAPE):
         _kept_file(context, part).unlink(missing_ok=True)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..data.registration import Registration, RigidTransform
+from ..energies.materials import make_material
 from ..io.errors import DataFileError
 from ..io.files import read_array, read_hdf5, read_json
 from ..io.stages import StageContext, package_versions, resources_used
@@ -433,6 +434,11 @@ def _validated(kept: dict[str, Any]) -> str:
 
 
 def _in_words(material: dict[str, Any]) -> str:
-    """Young's modulus and Poisson's ratio, and the model where it is not the usual one."""
-    words = f"E {material['youngs_modulus'] / 1e3:g} kPa, ν {material['poissons_ratio']:g}"  # noqa: RUF001
-    return words if material["model"] == "corotated" else f"{words}, {material['model'].replace('_', ' ')}"
+    """Young's modulus and Poisson's ratio, or what else it is given by, and the model where it is not the usual one."""
+    constants: dict[str, Any] = dict(make_material(**material).constants)
+    model = material.get("model", "corotated")
+    if "youngs_modulus" in constants:
+        words = f"E {constants['youngs_modulus'] / 1e3:g} kPa, ν {constants['poissons_ratio']:g}"  # noqa: RUF001
+    else:
+        words = ", ".join(f"{name.replace('_', ' ')} {constants[name] / 1e3:g} kPa" for name in [*constants][:-3])
+    return words if model == "corotated" else f"{words}, {model.replace('_', ' ')}"

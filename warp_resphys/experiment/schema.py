@@ -62,12 +62,14 @@ class Group:
         each: what the values of any other keys must be; None where there are none.
         optional: whether it may be null.
         absent: whether its key may be left out.
+        short: whether a word may stand for it.
     """
 
     keys: Mapping[str, "Kind | Group"] = field(default_factory=dict)
     each: "Kind | Group | None" = None
     optional: bool = False
     absent: bool = False
+    short: bool = False
 
 
 Spec = Kind | Group
@@ -142,7 +144,6 @@ _PLACE: Final = Kind(_is_place, "three numbers, in metres")
 _FORCE: Final = Kind(_is_place, "three numbers, in N")
 _AXIS: Final = Kind(lambda value: _is_place(value) and any(value), "three numbers, not all zero")
 _POSITIVES: Final = _list(POSITIVE.fits, "a list of positive numbers")
-_NOT_NEGATIVES: Final = _list(NOT_NEGATIVE.fits, "a list of numbers, zero or more")
 NUMBERS: Final = _list(is_number, "a list of numbers")
 _THREE_NATURALS: Final = Kind(
     lambda value: isinstance(value, list) and len(value) == 3 and all(at_most(10_000).fits(each) for each in value),
@@ -285,7 +286,7 @@ _IDENTIFY = Group(
         "candidates": COUNT,
         "max_evaluations": NATURAL,
         "tolerance": POSITIVE,
-        "grid": Group({"youngs_modulus": _GRID, "poissons_ratio": absent(_GRID)}),
+        "grid": optional(Group({"youngs_modulus": _GRID, "poissons_ratio": absent(_GRID)})),
     }
 )
 _RELEASE = Group(
@@ -340,7 +341,7 @@ _RECORDED = Group(
         "folder": optional(WORD),
         "units": optional(one_of(*METRES_PER_UNIT)),
         "rate": optional(POSITIVE),
-        "trials": Group(each=_TRIAL),
+        "trials": Group(each=replace(_TRIAL, short=True)),
         "sequences": COUNT,
         "begins": one_of(*BEGINNINGS),
         "rest": one_of("held", "file"),
@@ -500,6 +501,8 @@ def check(name: str, value: Any, spec: Spec) -> None:
         if not spec.fits(value):
             null = ", or null" if spec.optional and not spec.wanted.endswith("null") else ""
             raise InputError(f"{name} is {value!r}: it must be {spec.wanted}{null}.")
+        return
+    if spec.short and _is_word(value):
         return
     if not isinstance(value, Mapping):
         raise InputError(f"{name} is {value!r}: it must be a group of settings.")

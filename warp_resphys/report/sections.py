@@ -157,7 +157,7 @@ def identification_section(data: RunReport, canvas: Canvas) -> Part | None:
             "± is one standard deviation in the Gauss-Newton approximation, for residuals that are correlated in time."
         )
     if data.truth:
-        model = data.truth["model"].replace("_", " ")
+        model = data.truth.get("model", "corotated").replace("_", " ")
         notes.append(f"The true values are those of the simulated laboratory, whose material is {model}.")
     blocks += [Text(" ".join(notes), note=True)] if notes else []
     blocks += [Text(said) for said in uncertain]

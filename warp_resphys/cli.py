@@ -67,6 +67,7 @@ RENAMED: Final[Mapping[str, str]] = MappingProxyType(
         "synthetic.material.fibre_stiffness": "laboratory.fibres.stiffness",
         "reality": "target",
         "synthetic": "laboratory",
+        "laboratory.misplaced": "laboratory.placement_noise",
         "trajectory_source": "trial_source",
         "markers.followed": "markers.tracked",
         "markers.others": "markers.reference",

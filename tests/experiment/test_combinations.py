@@ -142,7 +142,7 @@ def test_an_arm_under_pressure_carries_payloads_that_the_networks_see():
     assert (code, "data.payload_at is not set" in err) == (2, True)
 
 
-def test_an_arm_that_is_pulled_aside_is_let_go():
+def test_an_arm_that_is_pulled_aside_is_initial_motion():
     pulls = "+laboratory.trials={a:{pull:[0.9,0,0]},b:{pull:[0,0.9,0]},c:{pull:[0.6,0.6,0]},d:{pull:[-0.6,0.4,0]}}"
     own = ["+laboratory.held_seconds=0.3", "+laboratory.seconds=0.15", pulls, "data.sequences=0", "data.cutoff=null"]
     found = segment("data.begins=held", "data.rest=file", "data.seconds=0.1", *own, "data.alignment=own")

@@ -12,7 +12,7 @@ from warp_resphys.experiment.scene import at_steps
 from warp_resphys.experiment.schema import IN_THE_LOOP, check
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.io.files import read_checkpoint, write_checkpoint
-from warp_resphys.learning.markers_in_the_loop import MarkersInTheLoop, MotionLoss, Watched, epochs_that_hold_up
+from warp_resphys.learning.markers_in_the_loop import MarkersInTheLoop, MotionLoss, Watched, cross_validated_epochs
 from warp_resphys.learning.metrics import marker_errors
 from warp_resphys.learning.networks import build_model
 from warp_resphys.learning.replay import Replay, Start
@@ -253,11 +253,11 @@ class TestMarkersInTheLoop:
             exact = Replay(sim, MARKERS, motions)(release)[0]
         other = MotionLoss([Watched(Replay(sim, MARKERS, motions_of(motions.times, exact)), release, LOADS)], {})
         config, seen = {**CONFIG, "epochs": 3}, []
-        assert epochs_that_hold_up(network, [(loss, loss)], config, lambda: seen.append(1)) == 3
+        assert cross_validated_epochs(network, [(loss, loss)], config, lambda: seen.append(1)) == 3
         assert len(seen) == 3
         for patience, spent in ((2, 2), (9, 3)):
             seen.clear()
-            chosen = epochs_that_hold_up(
+            chosen = cross_validated_epochs(
                 network, [(loss, other)], {**config, "patience": patience}, lambda: seen.append(1)
             )
             assert (chosen, len(seen)) == (0, spent)
@@ -267,7 +267,7 @@ class TestMarkersInTheLoop:
             histories.append([record["rollout_error_mm"] for record in alone.state.history])
         parts = [(loss, loss), (loss, loss), (loss, other)]  # The mean over them decides.
         mean = np.average(histories, axis=0, weights=[2, 1])
-        assert 0 < np.argmin(mean) == epochs_that_hold_up(network, parts, config, lambda: None)
+        assert 0 < np.argmin(mean) == cross_validated_epochs(network, parts, config, lambda: None)
         trainer = MarkersInTheLoop(network(), loss, None, config, epochs=0)
         trainer.begin()
         assert trainer.finished

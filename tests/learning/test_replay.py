@@ -255,7 +255,7 @@ def test_releases_within_twice_what_is_expected_are_recovered(seed):
     torch.testing.assert_close(found.delay, release.delay, rtol=0.0, atol=5e-4)
 
 
-def test_a_body_held_sideways_shows_it_once_it_is_let_go():
+def test_a_body_held_sideways_shows_it_once_it_is_initial_motion():
     sim, motions = simulator(), blank(frames=16)
     replay, shapes = Replay(sim, MARKERS, motions), sideways_shapes(sim)
     q = hold(replay, 6)

@@ -25,7 +25,7 @@ def configured(*overrides):
         return OmegaConf.to_container(compose("inspect", list(overrides)), resolve=True)
 
 
-def held_then_let_go(base=0.0):
+def held_then_initial_motion(base=0.0):
     time = np.maximum(np.arange(200) - 60.4, 0.0) / 100.0
     positions = np.tile([[0.1, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.04, base]], (200, 1, 1))
     positions[:, 0, 2] -= 0.01 * (1.0 - np.exp(-2.5 * time) * np.cos(48.0 * time))
@@ -38,7 +38,7 @@ def held_then_let_go(base=0.0):
 
 @pytest.fixture
 def path(tmp_path):
-    write_recording(tmp_path / "swing.h5", held_then_let_go())
+    write_recording(tmp_path / "swing.h5", held_then_initial_motion())
     return tmp_path / "swing.h5"
 
 
@@ -61,10 +61,10 @@ def test_table_and_files(tmp_path, path):
 
 def test_trials_are_compared(tmp_path, path):
     config = configured(f"recording.path={path}", "still=[base 1, base 2]", f"compare_with=[{tmp_path}/other.h5]")
-    write_recording(tmp_path / "other.h5", held_then_let_go(base=0.002))
+    write_recording(tmp_path / "other.h5", held_then_initial_motion(base=0.002))
     text = inspect_recording(config, tmp_path / "out")
     assert "other.h5: the base stands up to 2.00 mm from its place here; its markers moved by up to 0.0" in text
-    write_recording(tmp_path / "other.h5", held_then_let_go(base=0.03))
+    write_recording(tmp_path / "other.h5", held_then_initial_motion(base=0.03))
     with pytest.raises(DataFileError, match=r"other\.h5: base marker base 1 moved by \d+\.\d\d mm"):
         inspect_recording(config, tmp_path / "out")
     assert json.loads((tmp_path / "out" / "quality.json").read_text())["base"][0]["shift_mm"]["base 2"] > 29.0
@@ -72,7 +72,7 @@ def test_trials_are_compared(tmp_path, path):
 
 @pytest.mark.parametrize("narrow", [False, True])
 def test_picture_shows_what_is_seen_filled_and_masked(narrow):
-    recording = held_then_let_go()
+    recording = held_then_initial_motion()
     recording.positions[:, 2] = np.nan
     result = quality(recording, LABELS[1:], Release(60.4, (40, 60)))
     figure = recording_quality(recording, result, narrow=narrow)

@@ -15,7 +15,7 @@ from ..io.errors import ConvergenceError
 from ..linalg.linear_solver import LinearSolver, make_linear_solver
 from ..linalg.threads import threads_for
 from .assembly import BlockPattern
-from .metric import HessianMetric
+from .hessian import ExactHessian
 from .nonlinear_solver import NonlinearSolver, SolveReport, SolverSettings
 
 T = TypeVar("T")
@@ -62,10 +62,10 @@ class Workspace:
             (purpose, settings), lambda: NonlinearSolver(self.potential, self.pattern, settings, self.dtype)
         )
 
-    def hessian(self, linear_solver: str) -> HessianMetric:
+    def hessian(self, linear_solver: str) -> ExactHessian:
         """The exact Hessian, for adjoint solves."""
         return self.once(
-            linear_solver, lambda: HessianMetric(self.potential, self.pattern, self.linear_solver(linear_solver))
+            linear_solver, lambda: ExactHessian(self.potential, self.pattern, self.linear_solver(linear_solver))
         )
 
     def linear_solver(self, name: str) -> LinearSolver:
@@ -157,10 +157,10 @@ def _adjoint(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...
     potential = ctx.workspace.potential
     potential.set_terms(terms)
     potential.positions.copy_(x)
-    metric = ctx.workspace.hessian(ctx.linear_solver)
-    metric.refactor_exact()
+    hessian = ctx.workspace.hessian(ctx.linear_solver)
+    hessian.refactor_exact()
     gradient = gradient.double()
-    z = metric.apply(gradient.reshape(len(x), -1)).view_as(x)
+    z = hessian.apply(gradient.reshape(len(x), -1)).view_as(x)
     product = potential.stiffness_product(z)
     _check_adjoint(potential, z, product, gradient)
     _, _, _, _, _, fixed, target, inertia, force, *values = ctx.needs_input_grad

@@ -25,7 +25,7 @@ from ..io.errors import ConvergenceError, InputError
 from ..linalg.lbfgs import InverseHessianUpdate
 from ..linalg.linear_solver import LINEAR_SOLVERS, make_linear_solver
 from .assembly import BlockPattern
-from .metric import HessianMetric, Metric, ProjectiveMetric
+from .hessian import ExactHessian, HessianApproximation, ProjectiveHessian
 
 SOLVERS = ("projective_dynamics", "quasi_newton", "newton")
 _ARMIJO = 1e-4
@@ -110,15 +110,15 @@ class NonlinearSolver:
         self, potential: IncrementalPotential, pattern: BlockPattern, settings: SolverSettings, dtype: torch.dtype
     ) -> None:
         self.potential, self.settings, self.dtype = potential, settings, dtype
-        self.metric: Metric
+        self.hessian: HessianApproximation
         kind = settings.linear_solver
         where = (potential.device, dtype)
         if settings.name == "projective_dynamics":
             linear = make_linear_solver(kind, pattern.rows, pattern.cols, len(pattern.free), 1, *where)
-            self.metric = ProjectiveMetric(potential, pattern, linear)
+            self.hessian = ProjectiveHessian(potential, pattern, linear)
         else:
             linear = make_linear_solver(kind, pattern.rows, pattern.cols, len(pattern.free), 3, *where)
-            self.metric = HessianMetric(potential, pattern, linear)
+            self.hessian = ExactHessian(potential, pattern, linear)
         memory = 0 if settings.name == "newton" else settings.memory
         self._update = InverseHessianUpdate(memory, potential.positions.to(dtype))
         self._mean_iterations = float("inf")
@@ -152,7 +152,7 @@ class NonlinearSolver:
         if name == "newton":
             return True
         if iteration == 0:
-            return not self.metric.ready() or (name == "quasi_newton" and self._mean_iterations > limit)
+            return not self.hessian.ready() or (name == "quasi_newton" and self._mean_iterations > limit)
         return name == "quasi_newton" and iteration % (3 * limit) == 0
 
 
@@ -229,20 +229,20 @@ class _Run:
             direction = (-product.to(self.residual.dtype)).masked_fill_(resting[:, None], 0.0)
             return direction, torch.linalg.vecdot(self.residual, direction).masked_fill_(resting, 0.0)
 
-        direction, slope = along(solver._update.apply(residual, solver.metric))
+        direction, slope = along(solver._update.apply(residual, solver.hessian))
         if not bool((slope <= 0).all()):
             solver._update.reset()
-            direction, slope = along(solver.metric.apply(residual))
+            direction, slope = along(solver.hessian.apply(residual))
             if not self.factorisations and not bool(torch.isfinite(slope).all()):
                 self._refactor()
-                direction, slope = along(solver.metric.apply(residual))
+                direction, slope = along(solver.hessian.apply(residual))
             lost = ~torch.isfinite(slope)
             self.stuck |= lost
             direction, slope = direction.masked_fill_(lost[:, None], 0.0), slope.masked_fill_(lost, 0.0)
         return direction, slope
 
     def _refactor(self) -> None:
-        self.solver.metric.refactor(bool(self.clamp))
+        self.solver.hessian.refactor(bool(self.clamp))
         self.solver._update.reset()
         self.factorisations += 1
         self.clamp = None
@@ -279,4 +279,4 @@ class _Run:
         self.potential.positions.copy_(start).add_((step[:, None] * direction).view_as(start))
         self.clamp = self.factorisations > 0
         if self.clamp:
-            self.stuck |= failed & self.solver.metric.clamped
+            self.stuck |= failed & self.solver.hessian.clamped

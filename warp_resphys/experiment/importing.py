@@ -125,9 +125,31 @@ class Importer:
         ]
         self._check_reference(ready, releases)
         each = zip(trials, ready, releases, strict=True)
+        return self._beside_each_other(
+            [
+                self._driven(trial, recording) if release is None else self._released(trial, recording, release)
+                for trial, recording, release in each
+            ]
+        )
+
+    def _beside_each_other(self, observed: list[Observed]) -> list[Observed]:
+        """Trials that are loaded from their first frame on, registered to where the others have the reference markers.
+
+        These alone can be where they should be, and a third of a millimetre between nominal and true places would turn
+        a body by a millimetre at its tip, otherwise than in the trials that are registered by all markers.
+        """
+        count = len(self.tracked)
+        known = [each.registration.positions[count:] for each in observed if each.tells_places]
+        if not known or len(known) == len(observed) or len(self.markers["reference"]) < 3:
+            return observed
+        expected = self.expected(True)
+        seen = np.isfinite(np.stack(known)).all(-1).any(0)
+        expected[count:][seen] = np.nanmean(np.stack(known)[:, seen], axis=0)
         return [
-            self._driven(trial, recording) if release is None else self._released(trial, recording, release)
-            for trial, recording, release in each
+            each
+            if each.tells_places
+            else replace(each, registration=self._register(each.still, each.raw, expected, only_reference=True))
+            for each in observed
         ]
 
     def _read(self, trial: Trial) -> Recording:
@@ -174,10 +196,12 @@ class Importer:
                 largest_shift=self.markers["largest_shift"],
             )
 
-    def _register(self, places: FloatArray, recording: Recording, at_rest: bool, only_reference: bool) -> Registration:
+    def _register(
+        self, places: FloatArray, recording: Recording, expected: FloatArray, only_reference: bool = False
+    ) -> Registration:
         return register_markers(
             places,
-            self.expected(at_rest),
+            expected,
             self.labels,
             source=recording.source,
             largest_residual=self.markers["largest_residual"],
@@ -188,7 +212,7 @@ class Importer:
         """A body that was held, undeformed or as the file says, and let go."""
         still = _median(replace(recording, positions=recording.positions[slice(*release.rest)]), self.tracked)
         places = _rest_of(recording, self.tracked) if self.data["rest"] == "file" else still
-        registration = self._register(places, recording, at_rest=False, only_reference=False)
+        registration = self._register(places, recording, self.expected(False))
         off = f"; left out: {listed(registration.outliers)}" if registration.outliers else ""
         log.info(
             "import: %s is let go in frame %.1f, registered to %.2f mm%s",
@@ -222,7 +246,7 @@ class Importer:
             still = self._resting(filled, pressure)
         # Where the body is without what hangs on it, the other trials tell.
         only_reference = not tells and len(self.markers["reference"]) > 2
-        registration = self._register(still, recording, at_rest=True, only_reference=only_reference)
+        registration = self._register(still, recording, self.expected(True), only_reference)
         off = f"; left out: {listed(registration.outliers)}" if registration.outliers else ""
         log.debug("import: %s registered to %.2f mm%s", trial.name, _MILLI * registration.rms, off)
         moving = filled.select(self.tracked)
@@ -432,7 +456,7 @@ def _dataset(
             times[row] = np.minimum(np.arange(frames), steps) * settings["time_step"]
             held[row] = markers[row, 0]
         else:
-            held[row] = held[row] if each.tells_places else bound
+            held[row] = bound  # A pose is as large as it is far from the undeformed body.
         if pressure is not None and each.pressure is not None:
             _fill_pressure(pressure[row], each)
     channels = {"pressure": tuple(chamber.name for chamber in chambers)} if pressure is not None else {}

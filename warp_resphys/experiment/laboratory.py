@@ -100,18 +100,18 @@ def _record(
     context: StageContext, settings: Mapping[str, Any], setup: Setup, trial: Trial, series: FloatArray
 ) -> float:
     """Writes the recording of a trial; returns the mean distance that the noise moves its tracked markers [m]."""
-    synthetic = settings["laboratory"]
+    laboratory = settings["laboratory"]
     labels = (*settings["markers"]["tracked"], *settings["markers"]["reference"])
     draw = _draw_of(settings, trial)
     rate, released = rate_of(settings), released_at(settings, trial, draw)
     moving = series
     if released is not None:
-        times = np.arange(int((synthetic["held_seconds"] + synthetic["seconds"]) * rate) + 1) / rate
+        times = np.arange(int((laboratory["held_seconds"] + laboratory["seconds"]) * rate) + 1) / rate
         at = torch.from_numpy(np.maximum(times - released, 0.0))[None]
-        moving = sample(torch.from_numpy(series)[None], at, synthetic["time_step"])[0].numpy()
+        moving = sample(torch.from_numpy(series)[None], at, laboratory["time_step"])[0].numpy()
     standing = np.broadcast_to(setup.reference, (len(moving), *setup.reference.shape))
     positions = setup.recorded(np.concatenate([moving, standing], axis=1))
-    noise = synthetic["noise"] * draw.standard_normal(positions.shape)
+    noise = laboratory["noise"] * draw.standard_normal(positions.shape)
     actuation = None if trial.sequence is None else pressures_of(settings, trial)
     if actuation is not None and len(actuation) != len(positions):
         actuation = np.repeat(actuation[-1:], len(positions), axis=0)
@@ -143,12 +143,12 @@ def rate_of(settings: Mapping[str, Any]) -> float:
 
 def _truth(settings: Mapping[str, Any], setup: Setup, trials: Sequence[Trial], noise: float) -> dict[str, Any]:
     """What the recordings were made with; ``noise`` in metres."""
-    synthetic = settings["laboratory"]
-    fibres = synthetic.get("fibres") or {}
+    laboratory = settings["laboratory"]
+    fibres = laboratory.get("fibres") or {}
     wound = {"fibre_stiffness": fibres["stiffness"]} if "stiffness" in fibres else {}
     released = {trial.name: released_at(settings, trial, _draw_of(settings, trial)) for trial in trials}
     return {
-        "material": {**synthetic["material"], **wound},
+        "material": {**laboratory["material"], **wound},
         "fibre_angles": fibres.get("angles", []),
         "gravity": setup.gravity,
         "rotation": setup.rotation.as_matrix(),
@@ -165,7 +165,7 @@ def make_setup(settings: Mapping[str, Any]) -> Setup:
     The frame of the recordings keeps its vertical in ``data.up``, as that of levelled cameras; the body leans by
     ``laboratory.tilt``. Where ``data.up`` is null, the body stands level and the frame is any.
     """
-    synthetic, markers = settings["laboratory"], settings["markers"]
+    laboratory, markers = settings["laboratory"], settings["markers"]
     draw = np.random.default_rng([settings["seed"], 0])
     gravity = np.asarray(settings["gravity"], dtype=np.float64)
     up = vertical(settings["data"].get("up"))
@@ -175,22 +175,22 @@ def make_setup(settings: Mapping[str, Any]) -> Setup:
     if up is not None and strength > 0.0:
         across = np.linalg.svd(gravity[None])[2][1:]  # two unit vectors
         axis = np.cos(heading) * across[0] + np.sin(heading) * across[1]
-        gravity = Rotation.from_rotvec(np.radians(synthetic["tilt"]) * axis).apply(gravity)
+        gravity = Rotation.from_rotvec(np.radians(laboratory["tilt"]) * axis).apply(gravity)
         upright, _ = Rotation.align_vectors(up[None], -gravity[None] / strength)
         rotation = Rotation.from_rotvec(turn * up) * upright
     translation = draw.uniform(-_LARGEST_OFFSET, _LARGEST_OFFSET, 3)
     nominal = np.array([*markers["tracked"].values(), *markers["reference"].values()], dtype=np.float64)
-    places = nominal + synthetic["misplaced"] * draw.standard_normal(nominal.shape)
+    places = nominal + laboratory["placement_noise"] * draw.standard_normal(nominal.shape)
     count = len(markers["tracked"])
     return Setup(gravity, rotation, translation, places[:count], places[count:])
 
 
 def laboratory_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
     """A whole configuration of the body that plays the real one: with masses and volumes as they should be."""
-    synthetic = settings["laboratory"]
-    own = {key: synthetic[key] for key in ("mesh", "time_step", "integrator", "material")}
+    laboratory = settings["laboratory"]
+    own = {key: laboratory[key] for key in ("mesh", "time_step", "integrator", "material")}
     physics = {"mass": "row_sum", "volume_integration": "centre"}
-    return {**settings, **own, "fibres": synthetic.get("fibres"), "physics": physics, "coupling": "implicit"}
+    return {**settings, **own, "fibres": laboratory.get("fibres"), "physics": physics, "coupling": "implicit"}
 
 
 def laboratory_simulator(settings: Mapping[str, Any], gravity: FloatArray) -> Simulator:
@@ -215,8 +215,8 @@ def frames_of(settings: Mapping[str, Any], begins: str) -> int:
     if begins == STATIC:
         return max(int(_POSE_SECONDS * rate_of(settings)), 5)
     if begins in ("held", "released"):
-        synthetic = settings["laboratory"]
-        return max(int(synthetic["seconds"] / synthetic["time_step"]) + 1, 2) + 1
+        laboratory = settings["laboratory"]
+        return max(int(laboratory["seconds"] / laboratory["time_step"]) + 1, 2) + 1
     return int(settings["data"]["steps"]) + 1
 
 

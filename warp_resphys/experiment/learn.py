@@ -19,7 +19,7 @@ from ..io.files import read_array, read_hdf5, write_checkpoint, write_json
 from ..io.progress import Progress
 from ..io.resumable import forget_checkpoint, keep_checkpoint, resume_checkpoint
 from ..io.stages import StageContext
-from ..learning.markers_in_the_loop import MarkersInTheLoop, MotionLoss, Watched, epochs_that_hold_up
+from ..learning.markers_in_the_loop import MarkersInTheLoop, MotionLoss, Watched, cross_validated_epochs
 from ..learning.networks import ResidualForce, StateMap, build_model, build_next_state
 from ..learning.predictors import Range
 from ..learning.refinement import Motion, SolverInTheLoop, WindowLoss
@@ -264,7 +264,7 @@ def _in_the_loop(scene: Scene, model: str, steps: Steps, groups: Mapping[str, An
     if config["hold_out"] and not validation and len(train) > 1:
         parts = [(loss([name for name in train if name != out]), loss([out])) for out in train]
         with Progress(f"{model}: held out", len(train) * config["epochs"], "epochs at most") as progress:
-            epochs = epochs_that_hold_up(make_network, parts, config, progress.advance)
+            epochs = cross_validated_epochs(make_network, parts, config, progress.advance)
         log.info("%s: %d epochs serve trials that are held out best", model, epochs)
     judged = loss(validation) if validation else None
     trainer = MarkersInTheLoop(make_network(), loss(train), judged, config, epochs)

@@ -404,7 +404,7 @@ def laboratory_group(settings: Any) -> Group:
             "sequences": absent(_SEQUENCES),
             "rate": absent(optional(POSITIVE)),
             "noise": NOT_NEGATIVE,
-            "misplaced": NOT_NEGATIVE,
+            "placement_noise": NOT_NEGATIVE,
             "tilt": absent(_finite(lambda value: 0.0 <= value <= 20.0, "an angle from 0 to 20 degrees")),
             "held_seconds": absent(_finite(lambda value: value >= 0.25, "0.25 s or more")),
             "seconds": absent(optional(POSITIVE)),

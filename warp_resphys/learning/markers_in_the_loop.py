@@ -144,7 +144,7 @@ class MarkersInTheLoop(FullBatchTrainer):
         return float(loss.detach())
 
 
-def epochs_that_hold_up(
+def cross_validated_epochs(
     make_model: Callable[[], ResidualForce],
     parts: Sequence[tuple[MotionLoss, MotionLoss]],
     config: Mapping[str, Any],

@@ -81,7 +81,7 @@ def estimate_release(simulator: Simulator, markers: Observe, motions: Trials, se
     """
     q = hold(Replay(simulator, markers, motions), settings.hold_modes)
     release = Start(State(q, torch.zeros_like(q)), torch.zeros_like(motions.times[:, 0]))
-    return _let_go(simulator, markers, motions.first(settings.window), release, settings)
+    return _initial_motion(simulator, markers, motions.first(settings.window), release, settings)
 
 
 def hold(replay: Replay, modes: int) -> torch.Tensor:
@@ -157,13 +157,15 @@ def _derivatives(
     return torch.stack(rows, 1)
 
 
-def _let_go(simulator: Simulator, markers: Observe, motions: Trials, held: Start, settings: ReleaseSettings) -> Start:
-    """What explains the first frames (`_Beginning`), by Levenberg-Marquardt with differences over a batch.
+def _initial_motion(
+    simulator: Simulator, markers: Observe, motions: Trials, held: Start, settings: ReleaseSettings
+) -> Start:
+    """What explains the first frames (`_ReleaseModel`), by Levenberg-Marquardt with differences over a batch.
 
     A frame before the release sees the body at rest and one after it does not, so that the objective has a kink at the
     delay of every frame, and minima between them: several delays are tried, and the best one is kept.
     """
-    beginning = _Beginning(simulator, markers, held, settings)
+    beginning = _ReleaseModel(simulator, markers, held, settings)
     count, unknowns = len(motions.names), len(beginning.deviation)
     if not unknowns:
         return held
@@ -196,7 +198,7 @@ def _let_go(simulator: Simulator, markers: Observe, motions: Trials, held: Start
         return beginning(best.view(-1, count, unknowns)[chosen, torch.arange(count, device=chosen.device)])
 
 
-class _Beginning:
+class _ReleaseModel:
     """Releases of given delays, velocities and sideways displacements, each in units of its expected deviation.
 
     Args:

@@ -5,7 +5,7 @@ from typing import Protocol
 import torch
 
 
-class InverseMetric(Protocol):
+class InverseHessian(Protocol):
     """An approximate inverse Hessian that needs no memory."""
 
     def apply(self, residual: torch.Tensor) -> torch.Tensor:
@@ -54,14 +54,14 @@ class InverseHessianUpdate:
         self._r[:, k, k] += ~useful
         self.count += 1
 
-    def apply(self, residual: torch.Tensor, metric: InverseMetric) -> torch.Tensor:
+    def apply(self, residual: torch.Tensor, hessian: InverseHessian) -> torch.Tensor:
         """(B, n) product of the updated inverse Hessian with a residual."""
         k = self.count
         if k == 0:
-            return metric.apply(residual)
+            return hessian.apply(residual)
         s, y, r = self._s[:, :k], self._y[:, :k], self._r[:, :k, :k]
         a = torch.linalg.solve_triangular(r, s @ residual[:, :, None], upper=True)
-        z = metric.apply(residual - (a.mT @ y)[:, 0])
+        z = hessian.apply(residual - (a.mT @ y)[:, 0])
         right = r.diagonal(dim1=1, dim2=2)[:, :, None] * a - y @ z[:, :, None]
         b = torch.linalg.solve_triangular(r.mT, right, upper=False)
         return z + (b.mT @ s)[:, 0]

@@ -12,7 +12,7 @@ from ..linalg.linear_solver import Factor, LinearSolver
 from .assembly import BlockPattern, HessianAssembly
 
 
-class Metric(ABC):
+class HessianApproximation(ABC):
     """A factorised approximation of the potential's Hessian.
 
     Attributes:
@@ -35,7 +35,7 @@ class Metric(ABC):
         """(B, 3 N) displacement [m] for a (B, 3 N) residual [N]; zero at fixed vertices."""
 
 
-class HessianMetric(Metric):
+class ExactHessian(HessianApproximation):
     """The exact Hessian; its positive-definite clamp in environments whose Hessian is indefinite.
 
     Args:
@@ -89,7 +89,7 @@ class HessianMetric(Metric):
         return out
 
 
-class ProjectiveMetric(Metric):
+class ProjectiveHessian(HessianApproximation):
     """Inertia plus ``(2 mu + lambda) V G G^T`` at every point of the solid, the same in each coordinate.
 
     Fibres enter with their stiffness, pressure not at all.

@@ -54,7 +54,7 @@ TRIALS = {"a": {"file": "a.c3d", "payload": 0.0}, "b": {"file": "b.c3d", "payloa
             {"a": {"payload": 0.0}},
             "data.trials.a.file is missing: give the name of a file in data.folder",
         ),
-        ("data/trials", {"a": "a.c3d"}, "data.trials.a is 'a.c3d': it must be a group of settings"),
+        ("data/trials", {"a": 3}, "data.trials.a is 3: it must be a group of settings"),
         (
             "data/trials",
             {"a": TRIALS["a"] | {"colour": 1}},
@@ -128,7 +128,7 @@ def test_configuration_of_recordings_is_checked(key, value, message):
     ("key", "value", "message"),
     [
         ("laboratory", None, "data.folder is not set: give the folder of the recordings"),
-        ("data/rest", "file", "release.sideways is 0.002 m, but data.rest is file"),
+        ("data/rest", "file", "data.rest is file, but simulated bodies are held undeformed: set it to held"),
         ("laboratory/tilt", 45.0, "laboratory.tilt is 45.0: it must be an angle from 0 to 20 degrees"),
         ("laboratory/seconds", 1.0, "laboratory.seconds is 1.0, less than data.seconds"),
         (
@@ -157,7 +157,7 @@ OPTIONS = [(group, path.stem) for group in GROUPS for path in sorted((ROOT / "co
 
 @pytest.mark.parametrize(("group", "option"), OPTIONS)
 def test_every_option_goes_with_recordings(group, option):
-    check_configuration(configuration(f"{group}={option}"))
+    check_configuration(configuration(f"{group}={option}", *(["trainer=sequences"] if option == "recurrent" else [])))
 
 
 @pytest.mark.parametrize("experiment", ["beam_real", "beam_synthetic", "beam_real_repeated"])

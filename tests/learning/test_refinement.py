@@ -78,8 +78,8 @@ class Formula:
     def encode(self, q, v, told):
         return q, v
 
-    def decode(self, state):
-        return [self.force(*state)]
+    def decode(self, state, hidden=None):
+        return [self.force(*state)], hidden
 
 
 def window_loss(model, window=3, batch_size=4, integrator="implicit_euler"):

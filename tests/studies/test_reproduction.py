@@ -23,7 +23,7 @@ from warp_resphys.studies.reproduction import Run, _Pace, execute, plan
 
 TINY = [
     'overrides=["mesh.divisions=[4,2,2]","data.steps=8","trainer.epochs=4","trainer.rollout_every=2"]',
-    'experiments.marker_ablation.overrides=["markers.counts=[1,4]","markers.draws=3","markers.processes=1"]',
+    'experiments.marker_ablation.overrides=["ablation.counts=[1,4]","ablation.draws=3","ablation.processes=1"]',
     "budget=quick",
     "hydra/job_logging=none",
     "hydra/hydra_logging=none",
@@ -219,5 +219,5 @@ def test_ctrl_c_stops_the_run_and_keeps_what_it_has(folder):
     assert "interrupted in run 1 of 1, beam_oscillation/default" in err
     assert "Traceback" not in err
     assert not Path("outputs/reproduce/reproduction.html").exists()
-    assert "interrupted in stage 'generate'" in Path("outputs/reproduce/logs/beam_oscillation-default.log").read_text()
+    assert "interrupted in stage 'simulate'" in Path("outputs/reproduce/logs/beam_oscillation-default.log").read_text()
     assert found[0].stat().st_size > 0

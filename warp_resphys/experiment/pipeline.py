@@ -177,6 +177,8 @@ def learning_stages(config: Mapping[str, Any], split: Split, shared: str, acquir
         stages += _force_stages(config, {**base, "model": model}, observed, needs, processes)
         known.append(stages[-1].name)
     settings = {**base, **training_settings(config, SIMFREE), "range_guard": config["range_guard"], "model": SIMFREE}
+    if not sees_markers(config):  # What replaces a simulator depends on none, where states are known without.
+        settings["simulation"] = config["target"]
     outputs = (weights_file(SIMFREE), training_file(SIMFREE))
     learned_from = ("reconstruct_resphys",) if sees_markers(config) else ()
     stages.append(Stage("train_simfree", train, outputs, settings, (*needs, *learned_from)))

@@ -31,6 +31,7 @@ Pixels = NDArray[np.uint8]
 
 _LOG = logging.getLogger(__name__)
 COMMAND: Final = (sys.executable, "-P", "-m", "warp_resphys.report.render_scene")
+UNWRITTEN: Final = 74  # What a drawing process returns that found no room for its frames.
 TIME_OUT: Final = 300.0  # [s]; a picture takes about one.
 COLOUR_MAP: Final = "viridis"
 BODY: Final = "#a9bccf"
@@ -287,6 +288,11 @@ def _run(
     said = _listen(process, progress)
     if process.returncode:
         _LOG.debug("the drawing process wrote: %s", said)
+        if process.returncode == UNWRITTEN:
+            raise DrawingError(
+                "the deformed body cannot be drawn, since there was no room in the temporary folder "
+                f"{target.parent.parent} ({_last_words(UNWRITTEN, said)}): free some space there"
+            )
         raise failure(_last_words(process.returncode, said))
 
 

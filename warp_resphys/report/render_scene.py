@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from .render import COLOUR_MAP, INK, OUTLINE
+from .render import COLOUR_MAP, INK, OUTLINE, UNWRITTEN
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -35,7 +35,7 @@ def main(source: str, target: str) -> None:
     spec: dict[str, Any] = json.loads(str(held.pop("spec")))
     frames = _frames(spec, held)
     if not target.endswith(".mp4"):
-        np.save(target, np.stack(list(frames)))
+        write_frames(target, np.stack(list(frames)))
         return
     import imageio_ffmpeg
 
@@ -53,6 +53,15 @@ def main(source: str, target: str) -> None:
     for frame in frames:
         encoder.send(np.ascontiguousarray(frame))
     encoder.close()
+
+
+def write_frames(target: str, frames: Pixels) -> None:
+    """Write frames, or end the process with `UNWRITTEN` where there is no room for them."""
+    try:
+        np.save(target, frames)
+    except OSError as error:
+        print(error.strerror or error, file=sys.stderr)
+        sys.exit(UNWRITTEN)
 
 
 def _frames(spec: Mapping[str, Any], held: Mapping[str, NDArray[Any]]) -> Iterator[Pixels]:
@@ -124,7 +133,7 @@ class _Thing:
         if self.kind == "balls":
             import pyvista
 
-            ball = pyvista.Sphere(layer["size"], theta_resolution=20, phi_resolution=20)
+            ball = pyvista.Sphere(radius=layer["size"], theta_resolution=20, phi_resolution=20)
             self.around, cells = np.asarray(ball.points), np.asarray(ball.faces).reshape(-1, 4)[:, 1:]
         elif self.kind == "rings":
             angle = 2.0 * np.pi * np.arange(_CORNERS)[:, None] / _CORNERS

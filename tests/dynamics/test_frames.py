@@ -79,8 +79,8 @@ class Constant:
     def encode(self, q, v, actuation):
         return q.new_zeros(len(q), 1)
 
-    def decode(self, inputs):
-        return [self.force.expand(len(inputs), -1, -1)]
+    def decode(self, inputs, hidden):
+        return [self.force.expand(len(inputs), -1, -1)], hidden
 
 
 def test_what_a_model_predicts_turns_with_the_body_in_a_roll_out():

@@ -196,10 +196,10 @@ class TestMarkersInTheLoop:
         assert checked >= 4
 
     def test_it_descends_and_keeps_the_best_weights(self, loss):
-        trainer = finish(MarkersInTheLoop(network(), loss, loss, CONFIG))
+        trainer = finish(MarkersInTheLoop(network(), loss, loss, {**CONFIG, "epochs": 12}))
         losses = [record["train_loss"] for record in trainer.state.history]
         assert losses == sorted(losses, reverse=True)
-        assert losses[-1] < 0.5 * losses[0]
+        assert losses[-1] < 0.5 * losses[0]  # the way there hangs on rounding, from four epochs (0.53) to eight (0.42)
         errors = [record["rollout_error_mm"] for record in trainer.state.history]
         assert loss.error_mm(trainer.use_best()) == pytest.approx(min(errors), rel=1e-9)
 

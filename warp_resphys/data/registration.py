@@ -10,20 +10,17 @@ from math import comb
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from ..io.errors import DataFileError, InputError
-from ..mesh.mesh import Mesh, boundary_triangles
-from ..mesh.surface import ClosestPoints, closest_points
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from ..mesh.mesh import Mesh
+from ..mesh.surface import closest_points
+from .recordings.recording import BoolArray, FloatArray, listed
 
 _MILLI = 1e3
 _MOST_FITS = 20_000  # Sets of markers that are tried when outliers are sought.
-_SURFACE_ITERATIONS = 100
-_HALVINGS = 40
-_SURFACE_TOLERANCE = 1e-10  # [m] change of any marker at which the fit to a surface has settled.
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,16 +125,18 @@ def register_markers(
         DataFileError: Fewer than three of the markers are seen, or too many of them are too far off.
     """
     a, b = _checked(measured, nominal, names)
-    used = np.isfinite(a).all(axis=1) & _named(names, use)
-    _check_seen(used, names, use, source)
+    used = _used(a, names, use, source)
     if _distance_from_line(b[used]) <= largest_residual:
         raise InputError(
-            f"The nominal positions of {_listed(_pick(names, used))} lie on one line to within "
+            f"The nominal positions of {listed(_pick(names, used))} lie on one line to within "
             f"{_MILLI * largest_residual:.1f} mm, so that the rotation about it is open: register with another marker."
         )
     fitted = _consensus(a, b, used, largest_residual, most_outliers)
     if fitted is None:
-        raise DataFileError(_why_not(a, b, used, names, source, largest_residual))
+        raise DataFileError(
+            f"{source}: the markers at rest do not fit their nominal positions to {_MILLI * largest_residual:.1f} mm: "
+            f"{_worst(a, b, used, names)}; check its name, its nominal position and the unit."
+        )
     motion, _ = _fit(a[fitted], b[fitted], np.ones(np.count_nonzero(fitted)))
     moved = motion.apply(a)
     return _registration(names, motion, moved, np.linalg.norm(moved - b, axis=1), fitted, used & ~fitted)
@@ -157,9 +156,9 @@ def register_to_surface(
 ) -> Registration:
     """Moves registered markers on so that all of them stand equally far off the surface.
 
-    Gauss-Newton on the sum of (d(T p) - s)^2 + hold |T p - T0 p|^2 over the markers p, with d the signed distance from
-    the surface, s the length of the stems and T0 the start. A surface does not see what slides along it; the second
-    term keeps that part of the start.
+    Least squares of (d(T p) - s)^2 + hold |T p - T0 p|^2 over the markers p, with d the signed distance from the
+    surface, s the length of the stems and T0 the start. A surface does not see what slides along it; the second term
+    keeps that part of the start.
 
     Args:
         measured: (M, 3) [m] the markers while the body was at rest, in the frame of the recording; NaN if not seen.
@@ -175,83 +174,42 @@ def register_to_surface(
 
     Raises:
         InputError: Arrays that do not fit, a name in `use` that there is not, or a negative or zero `hold`.
-        DataFileError: Fewer than three of the markers are seen, one is left too far from the surface, or the fit does
-            not settle.
+        DataFileError: Fewer than three of the markers are seen, or one is left too far from the surface.
     """
     a, _ = _checked(measured, measured, names)
     if not hold > 0.0:
         raise InputError(f"hold is {hold:g}: it must be positive, as a surface does not see what slides along it.")
+    used = _used(a, names, use, source)
     seen = np.isfinite(a).all(axis=1)
-    used = seen & _named(names, use)
-    _check_seen(used, names, use, source)
-    stems = None if stem is None else np.broadcast_to(np.asarray(stem, dtype=np.float64), len(a))
-    motion, found = _slide(a[used], mesh, start, None if stems is None else stems[used], hold, source)
-    stems = np.full(len(a), found[0]) if stems is None else stems
-    moved = motion.apply(a)
-    residual = np.full(len(a), np.nan)
-    residual[seen] = np.abs(closest_points(mesh, moved[seen]).distances - stems[seen])
-    worst = int(np.argmax(np.where(used, residual, -1.0)))
-    if residual[worst] > largest_residual:
+    origin = start.apply(a[used])
+    centre = origin.mean(axis=0)
+    known = None if stem is None else np.broadcast_to(np.asarray(stem, dtype=np.float64), len(a))
+
+    def moved(x: FloatArray, points: FloatArray) -> FloatArray:
+        """What starts at points, turned about the centre by a vector x[:3] [rad] and moved by x[3:6] [m]."""
+        turned: FloatArray = Rotation.from_rotvec(x[:3]).apply(points - centre)
+        return turned + centre + x[3:6]
+
+    def residual(x: FloatArray) -> FloatArray:
+        now = moved(x, origin)
+        off = closest_points(mesh, now).distances - (x[6] if known is None else known[used])
+        return np.concatenate([off, np.sqrt(hold) * (now - origin).ravel()])
+
+    length = [closest_points(mesh, origin).distances.mean()] if known is None else []
+    x = least_squares(residual, np.concatenate([np.zeros(6), length]), x_scale="jac", xtol=1e-12, ftol=1e-12).x
+    stems = np.full(len(a), x[6]) if known is None else known
+    motion = kabsch(a[used], moved(x, origin))
+    placed = motion.apply(a)
+    off = np.full(len(a), np.nan)
+    off[seen] = np.abs(closest_points(mesh, placed[seen]).distances - stems[seen])
+    worst = int(np.argmax(np.where(used, off, -1.0)))
+    if off[worst] > largest_residual:
         raise DataFileError(
-            f"{source}: marker '{names[worst]}' is {_MILLI * residual[worst]:.1f} mm off a stem of "
+            f"{source}: marker '{names[worst]}' is {_MILLI * off[worst]:.1f} mm off a stem of "
             f"{_MILLI * stems[worst]:.1f} mm on the surface, more than {_MILLI * largest_residual:.1f} mm: check the "
             "mesh, its unit and the registration that this one starts from."
         )
-    return _registration(names, motion, moved, residual, used, np.zeros_like(used))
-
-
-def _slide(
-    points: FloatArray, mesh: Mesh, start: RigidTransform, stems: FloatArray | None, hold: float, source: str | Path
-) -> tuple[RigidTransform, FloatArray]:
-    """The motion of `register_to_surface` for P points, and the lengths (P,) of their stems [m]."""
-    triangles = boundary_triangles(mesh)
-    origin = start.apply(points)
-    found = closest_points(mesh, origin, triangles)
-
-    def objective(moved: FloatArray, length: FloatArray, found: ClosestPoints) -> float:
-        return float(np.sum((found.distances - length) ** 2) + hold * np.sum((moved - origin) ** 2))
-
-    moved = origin
-    length = np.full(len(points), found.distances.mean()) if stems is None else stems
-    value = objective(moved, length, found)
-    for _ in range(_SURFACE_ITERATIONS):
-        twist = _surface_step(moved, origin, found, length, stems is None, hold)
-        for halving in range(_HALVINGS):
-            share = 0.5**halving
-            trial = kabsch(points, moved + share * (np.cross(twist[:3], moved - moved.mean(axis=0)) + twist[3:6]))
-            trial_length = length + share * twist[6]
-            trial_moved = trial.apply(points)
-            found = closest_points(mesh, trial_moved, triangles)
-            trial_value = objective(trial_moved, trial_length, found)
-            if trial_value <= value:
-                break
-        change = max(float(np.abs(trial_moved - moved).max()), float(np.abs(trial_length - length).max()))
-        moved, length, value = trial_moved, trial_length, trial_value
-        if change <= _SURFACE_TOLERANCE:
-            return trial, length
-    raise DataFileError(
-        f"{source}: the registration to the surface does not settle: start nearer, or raise hold ({hold:g})."
-    )
-
-
-def _surface_step(
-    moved: FloatArray, origin: FloatArray, found: ClosestPoints, length: FloatArray, free_length: bool, hold: float
-) -> FloatArray:
-    """(7,) Gauss-Newton step: a rotation vector about the centre of the points, a translation, a change of length."""
-    offset = moved - found.points
-    away = np.abs(found.distances)[:, None] > 1e-12
-    # The distance grows fastest straight away from the closest point, which at an edge is not along a normal.
-    slope = np.where(away, offset / np.where(away, found.distances[:, None], 1.0), found.normals)
-    arms = moved - moved.mean(axis=0)
-    spin = np.stack([np.cross(axis, arms) for axis in np.eye(3)], axis=2)  # (P, 3, 3) d moved / d rotation
-    move = np.concatenate([spin, np.broadcast_to(np.eye(3), spin.shape)], axis=2)  # (P, 3, 6)
-    stems = np.full((len(moved), 1), -1.0 if free_length else 0.0)
-    surface = np.concatenate([np.einsum("pi,pij->pj", slope, move), stems], axis=1)
-    held = np.concatenate([move.reshape(-1, 6), np.zeros((3 * len(moved), 1))], axis=1)
-    root = np.sqrt(hold)
-    right = np.concatenate([length - found.distances, root * (origin - moved).ravel()])
-    step: FloatArray = np.linalg.lstsq(np.concatenate([surface, root * held]), right, rcond=None)[0]
-    return step
+    return _registration(names, motion, placed, off, used, np.zeros_like(used))
 
 
 def _checked(measured: ArrayLike, nominal: ArrayLike, names: Sequence[str]) -> tuple[FloatArray, FloatArray]:
@@ -264,21 +222,19 @@ def _checked(measured: ArrayLike, nominal: ArrayLike, names: Sequence[str]) -> t
     return a, b
 
 
-def _named(names: Sequence[str], use: Sequence[str] | None) -> BoolArray:
-    """(M,) whether a marker is in `use`."""
-    unknown = [] if use is None else [name for name in use if name not in names]
+def _used(measured: FloatArray, names: Sequence[str], use: Sequence[str] | None, source: str | Path) -> BoolArray:
+    """(M,) which markers can be fitted: those in `use` that are seen, three or more."""
+    unknown = [name for name in use or () if name not in names]
     if unknown:
-        raise InputError(f"Registration should use {_listed(unknown)}, but the markers are {_listed(names)}.")
-    return np.array([use is None or name in use for name in names], dtype=bool)
-
-
-def _check_seen(used: BoolArray, names: Sequence[str], use: Sequence[str] | None, source: str | Path) -> None:
-    if np.count_nonzero(used) < 3:
-        lost = [name for name, here in zip(names, used, strict=True) if not here and (use is None or name in use)]
+        raise InputError(f"Registration should use {listed(unknown)}, but the markers are {listed(names)}.")
+    wanted = np.array([use is None or name in use for name in names], dtype=bool)
+    seen = np.isfinite(measured).all(axis=1)
+    if np.count_nonzero(wanted & seen) < 3:
         raise DataFileError(
-            f"{source}: registration needs three markers at rest, but {np.count_nonzero(used)} are left to it; "
-            f"not seen: {_listed(lost)}."
+            f"{source}: registration needs three markers at rest, but {np.count_nonzero(wanted & seen)} are left to "
+            f"it; not seen: {listed(_pick(names, wanted & ~seen))}."
         )
+    return np.asarray(wanted & seen)
 
 
 def _fit(a: FloatArray, b: FloatArray, weights: FloatArray) -> tuple[RigidTransform, BoolArray]:
@@ -325,15 +281,8 @@ def _distance_from_line(points: FloatArray) -> float:
     return float(np.sqrt(np.sum(spread[1:] ** 2) / len(points)))
 
 
-def _why_not(
-    a: FloatArray,
-    b: FloatArray,
-    used: BoolArray,
-    names: Sequence[str],
-    source: str | Path,
-    largest_residual: float,
-) -> str:
-    """The sentence for markers that do not fit: names the one without which the others fit best."""
+def _worst(a: FloatArray, b: FloatArray, used: BoolArray, names: Sequence[str]) -> str:
+    """The marker without which the others fit best, and how far it is off, for a sentence."""
     members = np.flatnonzero(used).tolist()
     three = len(members) == 3
     fits: list[tuple[float, float, str]] = []
@@ -344,9 +293,8 @@ def _why_not(
         fits.append((float(np.sqrt(np.mean(off[others] ** 2))), -float(off[marker]), names[marker]))
     rms, off_worst, worst = min(fits)
     return (
-        f"{source}: the markers at rest do not fit their nominal positions to {_MILLI * largest_residual:.1f} mm: "
         f"'{worst}' is {-_MILLI * off_worst:.1f} mm off ({'all three' if three else 'the others'}: "
-        f"{_MILLI * rms:.1f} mm root mean square); check its name, its nominal position and the unit."
+        f"{_MILLI * rms:.1f} mm root mean square)"
     )
 
 
@@ -364,7 +312,3 @@ def _registration(
 
 def _pick(names: Sequence[str], chosen: BoolArray) -> list[str]:
     return [name for name, here in zip(names, chosen, strict=True) if here]
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(f"'{name}'" for name in names) if names else "none"

@@ -32,7 +32,7 @@ def read_raw_c3d(path: Path) -> RawRecording:
         )
     return RawRecording(
         positions=points[:3].transpose(2, 1, 0),
-        labels=tuple(str(label) for label in decoded["labels"][: points.shape[1]]),
+        labels=decoded["labels"][: points.shape[1]].tolist(),
         unit=str(decoded["units"][0]).strip() if decoded["units"].size else None,
         rate=float(decoded["rate"][0]) if decoded["rate"].size else None,
     )

@@ -39,10 +39,6 @@ class Markers(ABC):
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
         """(B, N, 3) positions of the vertices to (B, m, 3) positions of the markers [m]."""
 
-    @abstractmethod
-    def feet(self, positions: torch.Tensor) -> torch.Tensor:
-        """(B, m, 3) where on the body the markers' stems stand [m]."""
-
     @property
     @abstractmethod
     def used(self) -> torch.Tensor:
@@ -104,10 +100,6 @@ class MarkerMap(Markers):
         weights = self.weights.reshape(*self.weights.shape, *[1] * (positions.ndim - 2))
         return (positions[batch, self.vertices] * weights).sum(2)
 
-    @override
-    def feet(self, positions: torch.Tensor) -> torch.Tensor:
-        return self(positions)
-
     @property
     @override
     def used(self) -> torch.Tensor:
@@ -115,18 +107,7 @@ class MarkerMap(Markers):
 
     @override
     def transposed_jacobian(self, positions: torch.Tensor) -> torch.Tensor:
-        return self.transposed(positions.shape[1])
-
-    def transposed(self, n_vertices: int) -> torch.Tensor:
-        """(B, 3 N, 3 m) matrix of C^T."""
-        b, m, _ = self.vertices.shape
-        out = self.weights.new_zeros(b, n_vertices, 3, m, 3)
-        batch = torch.arange(b, device=out.device)[:, None, None]
-        marker = torch.arange(m, device=out.device)[:, None]
-        for axis in range(3):
-            where = (batch, self.vertices, torch.full_like(marker, axis), marker, torch.full_like(marker, axis))
-            out.index_put_(where, self.weights, accumulate=True)
-        return out.reshape(b, 3 * n_vertices, 3 * m)
+        return super().transposed_jacobian(positions[:1].expand(len(self.vertices), -1, -1))
 
 
 @dataclass(frozen=True)
@@ -151,10 +132,6 @@ class SurfaceMarkers(Markers):
         stems = torch.einsum("bmij,mj->bmi", tangent_frames(corners, self.unstretch), self.offsets)
         return torch.einsum("bmki,mk->bmi", corners, self.weights) + stems
 
-    @override
-    def feet(self, positions: torch.Tensor) -> torch.Tensor:
-        return torch.einsum("bmki,mk->bmi", positions[:, self.triangles], self.weights)
-
     @property
     @override
     def used(self) -> torch.Tensor:
@@ -169,32 +146,23 @@ class RigidMarkers(Markers):
         vertices: (S,) three or more, not on one line.
         rest: (S, 3) [m] where these are at rest, from their centre.
         offsets: (m, 3) [m] the markers at rest, from the centre of the vertices.
-        stands: (m, 3) [m] the feet at rest, from the centre of the vertices.
     """
 
     vertices: torch.Tensor
     rest: torch.Tensor
     offsets: torch.Tensor
-    stands: torch.Tensor
 
     @override
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
-        return self._carry(positions, self.offsets)
-
-    @override
-    def feet(self, positions: torch.Tensor) -> torch.Tensor:
-        return self._carry(positions, self.stands)
+        now = positions[:, self.vertices]  # (B, S, 3)
+        centre = now.mean(1, keepdim=True)
+        rotation = closest_rotation((now - centre).mT @ self.rest)
+        return centre + self.offsets @ rotation.mT
 
     @property
     @override
     def used(self) -> torch.Tensor:
         return self.vertices
-
-    def _carry(self, positions: torch.Tensor, offsets: torch.Tensor) -> torch.Tensor:
-        now = positions[:, self.vertices]  # (B, S, 3)
-        centre = now.mean(1, keepdim=True)
-        rotation = closest_rotation((now - centre).mT @ self.rest)
-        return centre + offsets @ rotation.mT
 
 
 @dataclass(frozen=True)
@@ -212,10 +180,6 @@ class JoinedMarkers(Markers):
     @override
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
         return torch.cat([part(positions) for part in self.parts], 1)[:, self.order]
-
-    @override
-    def feet(self, positions: torch.Tensor) -> torch.Tensor:
-        return torch.cat([part.feet(positions) for part in self.parts], 1)[:, self.order]
 
     @property
     @override
@@ -327,7 +291,7 @@ def bind_markers(
             _on_triangles(mesh, found.triangles[on_surface], points[on_surface], found.points[on_surface], flat)
         )
     if not on_surface.all():
-        parts.append(_on_vertices(mesh, vertices, points[~on_surface], found.points[~on_surface]))
+        parts.append(_on_vertices(mesh, vertices, points[~on_surface]))
     if len(parts) == 1:
         return parts[0]
     order = np.argsort(np.concatenate([np.flatnonzero(on_surface), np.flatnonzero(~on_surface)]))
@@ -368,7 +332,7 @@ def _on_triangles(
     return SurfaceMarkers(*map(torch.as_tensor, (triangles, weights, unstretch, offsets)))
 
 
-def _on_vertices(mesh: Mesh, vertices: ArrayLike | None, points: np.ndarray, feet: np.ndarray) -> RigidMarkers:
+def _on_vertices(mesh: Mesh, vertices: ArrayLike | None, points: np.ndarray) -> RigidMarkers:
     chosen = np.unique(np.asarray([] if vertices is None else vertices, dtype=np.int64))
     if len(chosen) < 3 or chosen[0] < 0 or chosen[-1] >= len(mesh.vertices):
         raise InputError(
@@ -380,4 +344,4 @@ def _on_vertices(mesh: Mesh, vertices: ArrayLike | None, points: np.ndarray, fee
     spread = np.linalg.svd(rest, compute_uv=False)
     if spread[1] <= 1e-6 * spread[0]:
         raise InputError("The vertices that rigid markers follow lie on one line: choose those of a face.")
-    return RigidMarkers(*map(torch.as_tensor, (chosen, rest, points - centre, feet - centre)))
+    return RigidMarkers(*map(torch.as_tensor, (chosen, rest, points - centre)))

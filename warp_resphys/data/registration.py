@@ -11,12 +11,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
 from ..io.errors import DataFileError, InputError
-from ..mesh.mesh import Mesh
-from ..mesh.surface import closest_points
 from .recordings.recording import BoolArray, FloatArray, listed
 
 _MILLI = 1e3
@@ -124,7 +120,12 @@ def register_markers(
         InputError: Arrays that do not fit, a name in `use` that there is not, or nominal positions on one line.
         DataFileError: Fewer than three of the markers are seen, or too many of them are too far off.
     """
-    a, b = _checked(measured, nominal, names)
+    a, b = np.asarray(measured, dtype=np.float64), np.asarray(nominal, dtype=np.float64)
+    if a.shape != (len(names), 3) or b.shape != a.shape:
+        raise InputError(
+            f"{len(names)} markers are named, with measured positions {a.shape} and nominal ones {b.shape}: both must "
+            "be (markers, 3)."
+        )
     used = _used(a, names, use, source)
     if _distance_from_line(b[used]) <= largest_residual:
         raise InputError(
@@ -139,87 +140,9 @@ def register_markers(
         )
     motion, _ = _fit(a[fitted], b[fitted], np.ones(np.count_nonzero(fitted)))
     moved = motion.apply(a)
-    return _registration(names, motion, moved, np.linalg.norm(moved - b, axis=1), fitted, used & ~fitted)
-
-
-def register_to_surface(
-    measured: ArrayLike,
-    mesh: Mesh,
-    start: RigidTransform,
-    names: Sequence[str],
-    *,
-    source: str | Path,
-    stem: ArrayLike | None = 0.0,
-    hold: float = 0.01,
-    largest_residual: float = 0.004,
-    use: Sequence[str] | None = None,
-) -> Registration:
-    """Moves registered markers on so that all of them stand equally far off the surface.
-
-    Least squares of (d(T p) - s)^2 + hold |T p - T0 p|^2 over the markers p, with d the signed distance from the
-    surface, s the length of the stems and T0 the start. A surface does not see what slides along it; the second term
-    keeps that part of the start.
-
-    Args:
-        measured: (M, 3) [m] the markers while the body was at rest, in the frame of the recording; NaN if not seen.
-        mesh: The body.
-        start: A registration that is near, such as that of `register_markers`.
-        names: M names.
-        source: The file that they come from, for messages.
-        stem: Distance of the markers from the surface [m], one for all or one for each (M,); one for all is found if
-            None.
-        hold: Weight of the start, relative to that of the surface.
-        largest_residual: How far a marker may be from its stem's end, measured along the normal [m].
-        use: The markers to fit; all if None.
-
-    Raises:
-        InputError: Arrays that do not fit, a name in `use` that there is not, or a negative or zero `hold`.
-        DataFileError: Fewer than three of the markers are seen, or one is left too far from the surface.
-    """
-    a, _ = _checked(measured, measured, names)
-    if not hold > 0.0:
-        raise InputError(f"hold is {hold:g}: it must be positive, as a surface does not see what slides along it.")
-    used = _used(a, names, use, source)
-    seen = np.isfinite(a).all(axis=1)
-    origin = start.apply(a[used])
-    centre = origin.mean(axis=0)
-    known = None if stem is None else np.broadcast_to(np.asarray(stem, dtype=np.float64), len(a))
-
-    def moved(x: FloatArray, points: FloatArray) -> FloatArray:
-        """What starts at points, turned about the centre by a vector x[:3] [rad] and moved by x[3:6] [m]."""
-        turned: FloatArray = Rotation.from_rotvec(x[:3]).apply(points - centre)
-        return turned + centre + x[3:6]
-
-    def residual(x: FloatArray) -> FloatArray:
-        now = moved(x, origin)
-        off = closest_points(mesh, now).distances - (x[6] if known is None else known[used])
-        return np.concatenate([off, np.sqrt(hold) * (now - origin).ravel()])
-
-    length = [closest_points(mesh, origin).distances.mean()] if known is None else []
-    x = least_squares(residual, np.concatenate([np.zeros(6), length]), x_scale="jac", xtol=1e-12, ftol=1e-12).x
-    stems = np.full(len(a), x[6]) if known is None else known
-    motion = kabsch(a[used], moved(x, origin))
-    placed = motion.apply(a)
-    off = np.full(len(a), np.nan)
-    off[seen] = np.abs(closest_points(mesh, placed[seen]).distances - stems[seen])
-    worst = int(np.argmax(np.where(used, off, -1.0)))
-    if off[worst] > largest_residual:
-        raise DataFileError(
-            f"{source}: marker '{names[worst]}' is {_MILLI * off[worst]:.1f} mm off a stem of "
-            f"{_MILLI * stems[worst]:.1f} mm on the surface, more than {_MILLI * largest_residual:.1f} mm: check the "
-            "mesh, its unit and the registration that this one starts from."
-        )
-    return _registration(names, motion, placed, off, used, np.zeros_like(used))
-
-
-def _checked(measured: ArrayLike, nominal: ArrayLike, names: Sequence[str]) -> tuple[FloatArray, FloatArray]:
-    a, b = np.asarray(measured, dtype=np.float64), np.asarray(nominal, dtype=np.float64)
-    if a.shape != (len(names), 3) or b.shape != a.shape:
-        raise InputError(
-            f"{len(names)} markers are named, with measured positions {a.shape} and nominal ones {b.shape}: both must "
-            "be (markers, 3)."
-        )
-    return a, b
+    outliers = tuple(_pick(names, used & ~fitted))
+    rms = root_mean_square((moved - b)[fitted])
+    return Registration(tuple(names), motion, moved, np.linalg.norm(moved - b, axis=1), fitted, outliers, rms)
 
 
 def _used(measured: FloatArray, names: Sequence[str], use: Sequence[str] | None, source: str | Path) -> BoolArray:
@@ -296,18 +219,6 @@ def _worst(a: FloatArray, b: FloatArray, used: BoolArray, names: Sequence[str]) 
         f"'{worst}' is {-_MILLI * off_worst:.1f} mm off ({'all three' if three else 'the others'}: "
         f"{_MILLI * rms:.1f} mm root mean square)"
     )
-
-
-def _registration(
-    names: Sequence[str],
-    motion: RigidTransform,
-    moved: FloatArray,
-    residual: FloatArray,
-    inliers: BoolArray,
-    outliers: BoolArray,
-) -> Registration:
-    rms = float(np.sqrt(np.mean(residual[inliers] ** 2)))
-    return Registration(tuple(names), motion, moved, residual, inliers, tuple(_pick(names, outliers)), rms)
 
 
 def _pick(names: Sequence[str], chosen: BoolArray) -> list[str]:

@@ -50,6 +50,16 @@ def read_raw_hdf5(path: Path) -> RawRecording:
     return _assemble(found, path)
 
 
+def decoded(library: str, path: Path) -> Arrays:
+    """What `io.decoding.decode` gives; raises DataFileError where that cannot read the file."""
+    try:
+        return decode(library, path)
+    except OSError as error:
+        raise DataFileError(f"Cannot read {path}: {error.strerror}; check the path.") from error
+    except DecodingError as error:
+        raise DataFileError(f"{path} cannot be decoded ({error}): copy or export it again.") from error
+
+
 def write_recording(path: str | Path, recording: Recording, attributes: Mapping[str, Any] | None = None) -> None:
     """Writes the HDF5 layout, in metres, so that `read_recording` gives the same recording back.
 

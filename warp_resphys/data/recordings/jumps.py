@@ -1,7 +1,6 @@
 """Samples gone astray: markers that jump, and markers that took over each other's names."""
 
 import dataclasses
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +16,6 @@ _TIMES_USUAL = 8.0  # A jump is so many times the median of the steps around it.
 _USUAL_FRAMES = 21
 _SHARE_OF_LARGEST = 0.75  # A step of 1 leaves 4/6 beside it, which is no jump of its own.
 _TAKEN_OVER = 0.25  # of the way that the marker went
-_RETURNED = 0.5  # of the way that it went, which the way back may leave
 _NEIGHBOURS = np.array([-1.0, 4.0, 4.0, -1.0]) / 6.0
 
 
@@ -29,13 +27,11 @@ class Jump:
         label: The marker.
         frame: The first frame after the jump.
         size: [m] how far it went beyond what its neighbours in time, and the other markers, explain.
-        step: (x, y, z) [m] what its neighbours in time do not explain.
     """
 
     label: str
     frame: int
     size: float
-    step: tuple[float, float, float]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,16 +61,13 @@ def find_jumps(recording: Recording, least: float = LEAST_JUMP) -> list[Jump]:
         recording: With or without gaps; these are bridged by a spline for this.
         least: The smallest jump [m].
     """
-    left, size = _unexplained(recording)
+    size = _unexplained(recording)
     if not len(size):
         return []
     usual = median_filter(size, size=(_USUAL_FRAMES, 1), mode="nearest")
     largest = maximum_filter1d(size, 5, axis=0, mode="nearest")
     found = (size > least) & (size > _TIMES_USUAL * usual) & (size >= _SHARE_OF_LARGEST * largest)
-    return [
-        Jump(recording.labels[column], int(at) + 1, float(size[at, column]), tuple(left[at, column].tolist()))
-        for at, column in np.argwhere(found)
-    ]
+    return [Jump(recording.labels[column], int(at) + 1, float(size[at, column])) for at, column in np.argwhere(found)]
 
 
 def find_swaps(recording: Recording, jumps: list[Jump]) -> list[Swap]:
@@ -104,29 +97,11 @@ def find_swaps(recording: Recording, jumps: list[Jump]) -> list[Swap]:
     return swaps
 
 
-def mask_spikes(recording: Recording, jumps: list[Jump], longest: int = 3) -> Recording:
-    """Makes samples NaN that lie between a jump away and the jump back, so that they are filled as a gap is.
-
-    Args:
-        recording: What to clean.
-        jumps: What `find_jumps` found in it.
-        longest: The longest time that a marker may have been away, in frames.
-    """
-    positions = recording.positions.copy()
-    for column, label in enumerate(recording.labels):
-        own = [jump for jump in jumps if jump.label == label]
-        for away, back in pairwise(own):
-            remains = np.linalg.norm(np.add(away.step, back.step))
-            if back.frame - away.frame <= longest and remains < _RETURNED * np.linalg.norm(away.step):
-                positions[away.frame : back.frame, column] = np.nan
-    return dataclasses.replace(recording, positions=positions)
-
-
-def _unexplained(recording: Recording) -> tuple[FloatArray, FloatArray]:
-    """(T-1, M, 3) the part of each step that is not smooth, (T-1, M) how much of it no other marker shares; [m]."""
+def _unexplained(recording: Recording) -> FloatArray:
+    """(T-1, M) [m] how much of each step is not smooth, and not shared by any other marker."""
     frames = len(recording.positions)
     if frames < 6:
-        return np.zeros((0, len(recording.labels), 3)), np.zeros((0, len(recording.labels)))
+        return np.zeros((0, len(recording.labels)))
     bridged = np.zeros_like(recording.positions)
     for column, known in enumerate(recording.seen.T):
         if np.count_nonzero(known) > 1:
@@ -142,7 +117,7 @@ def _unexplained(recording: Recording) -> tuple[FloatArray, FloatArray]:
         others = np.linalg.norm(np.delete(left, column, axis=1) - left[:, column, None], axis=2)
         if others.shape[1]:
             size[:, column] = np.minimum(size[:, column], others.min(axis=1))
-    return left, size
+    return size
 
 
 def mask_repeats(recording: Recording) -> Recording:

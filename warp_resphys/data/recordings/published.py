@@ -16,9 +16,8 @@ from ...io.errors import DataFileError
 from ...io.files import read_arrays, write_json
 from ...io.progress import Progress
 from ..registration import kabsch, root_mean_square
-from .arrays import numbers, write_recording
+from .arrays import decoded, numbers, write_recording
 from .recording import SI_PER_ACTUATION_UNIT, FloatArray, RawRecording, Recording, to_recording
-from .restricted_pickle import read_pickled_arrays
 
 RATE: Final = 100.0  # [Hz]
 CHAMBERS: Final = (5, 4, 2, 0, 1, 3)
@@ -61,10 +60,11 @@ def read_published_arm(path: str | Path) -> list[Recording]:
         path: A pickled dictionary of `data` (R, T, 15, 3) [m] and `p` (R, T, 6) [mbar].
 
     Raises:
-        DataFileError: As `read_pickled_arrays`, or the arrays are missing or have other shapes.
+        DataFileError: The file is missing, damaged or names anything but NumPy's arrays; or the arrays are missing or
+            have other shapes.
     """
     path = Path(path)
-    arrays = read_pickled_arrays(path)
+    arrays = decoded("pickle", path)
     data, pressure = numbers(arrays, "data", path), numbers(arrays, "p", path)
     if data.ndim != 4 or data.shape[2:] != (15, 3) or pressure.shape != (*data.shape[:2], 6):
         raise DataFileError(

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..io.errors import MeshError
 from .arm_geometry import ArmGeometry, numbers
-from .arm_section import SOLID, section_grids, section_points, section_quadrilaterals
+from .arm_section import SOLID, section_grids, section_quadrilaterals
 from .arm_tetrahedra import tetrahedra
 from .chambers import find_chambers
 from .mesh import IntArray, Mesh, boundary_faces, check_mesh
@@ -105,7 +105,7 @@ def _hexahedra(geometry: ArmGeometry, size: float, layer: float) -> Mesh:
     vertices = np.empty((len(heights), len(place), 3))
     for level, height in enumerate(heights):
         section = geometry.section(geometry.radius_at(float(height)))
-        points = turn * section_points(section_grids(section, divisions)[0])[place]
+        points = turn * np.concatenate([grid.ravel() for grid in section_grids(section, divisions)[0]])[place]
         vertices[level] = np.stack([points.real, points.imag, np.full(len(points), height)], axis=1)
     cells = []
     for level, part in enumerate(np.repeat(np.arange(len(counts)), counts)):

@@ -96,7 +96,6 @@ def register_markers(
     *,
     source: str | Path,
     largest_residual: float = 0.004,
-    most_outliers: int | None = None,
     use: Sequence[str] | None = None,
 ) -> Registration:
     """Registers markers at rest to their nominal positions, without those that are not where they should be.
@@ -113,7 +112,6 @@ def register_markers(
         names: M names.
         source: The file that they come from, for messages.
         largest_residual: How well the nominal positions are known [m].
-        most_outliers: How many markers may be left out at most; as many as possible if None.
         use: The markers to fit, such as those on the clamp; all if None.
 
     Raises:
@@ -132,7 +130,7 @@ def register_markers(
             f"The nominal positions of {listed(_pick(names, used))} lie on one line to within "
             f"{_MILLI * largest_residual:.1f} mm, so that the rotation about it is open: register with another marker."
         )
-    fitted = _consensus(a, b, used, largest_residual, most_outliers)
+    fitted = _consensus(a, b, used, largest_residual)
     if fitted is None:
         raise DataFileError(
             f"{source}: the markers at rest do not fit their nominal positions to {_MILLI * largest_residual:.1f} mm: "
@@ -171,16 +169,12 @@ def _fit(a: FloatArray, b: FloatArray, weights: FloatArray) -> tuple[RigidTransf
     return RigidTransform(rotation, translation), singular[..., 1] <= 1e-9 * singular[..., 0]
 
 
-def _consensus(
-    a: FloatArray, b: FloatArray, used: BoolArray, largest_residual: float, most_outliers: int | None
-) -> BoolArray | None:
+def _consensus(a: FloatArray, b: FloatArray, used: BoolArray, largest_residual: float) -> BoolArray | None:
     """(M,) the largest set of used markers that fit one motion, or None."""
     members = np.flatnonzero(used)
     count = len(members)
-    most = max(0, count - max(4, count // 2 + 1))
-    most = most if most_outliers is None else min(most, most_outliers)
     fits = 0
-    for left_out in range(most + 1):
+    for left_out in range(max(0, count - max(4, count // 2 + 1)) + 1):
         fits += comb(count, left_out)
         if fits > _MOST_FITS:
             return None

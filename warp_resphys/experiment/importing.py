@@ -120,7 +120,7 @@ class Importer:
         self._check_rates([each for each, trial in zip(recordings, trials, strict=True) if _has_release(trial)])
         releases = [self._release(each, trial) for each, trial in zip(recordings, trials, strict=True)]
         ready = [
-            each if _has_release(trial) else resample(each, 1.0 / self.settings["time_step"], interpolate=True)
+            each if _has_release(trial) else resample(each, 1.0 / self.settings["time_step"])
             for each, trial in zip(recordings, trials, strict=True)
         ]
         self._check_reference(ready, releases)

@@ -3,13 +3,9 @@
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 from scipy.ndimage import maximum_filter1d, median_filter
 
-from .recording import Recording, runs
-
-FloatArray = NDArray[np.float64]
+from .recording import FloatArray, Recording, bridged, runs
 
 LEAST_JUMP = 2e-4  # [m]
 _TIMES_USUAL = 8.0  # A jump is so many times the median of the steps around it.
@@ -102,13 +98,11 @@ def _unexplained(recording: Recording) -> FloatArray:
     frames = len(recording.positions)
     if frames < 6:
         return np.zeros((0, len(recording.labels)))
-    bridged = np.zeros_like(recording.positions)
+    positions = np.zeros_like(recording.positions)
     for column, known in enumerate(recording.seen.T):
         if np.count_nonzero(known) > 1:
-            at = np.flatnonzero(known)
-            spline = CubicSpline(at, recording.positions[known, column])
-            bridged[:, column] = spline(np.clip(np.arange(frames), at[0], at[-1]))
-    steps = np.diff(bridged, axis=0)
+            positions[:, column] = bridged(recording, column, np.arange(frames))
+    steps = np.diff(positions, axis=0)
     padded = np.pad(steps, ((2, 2), (0, 0), (0, 0)), mode="reflect")
     beside = (padded[:-4], padded[1:-3], padded[3:-1], padded[4:])
     left = steps - sum(weight * each for weight, each in zip(_NEIGHBOURS, beside, strict=True))

@@ -8,15 +8,11 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 from scipy.signal import butter, sosfiltfilt
 
 from ...io.errors import DataFileError, InputError
-from .recording import BoolArray, Recording, listed, runs
+from .recording import Recording, bridged, listed, runs
 from .release import Release, find_release
-
-FloatArray = NDArray[np.float64]
 
 _FIRST_SECONDS = 0.2  # A stretch may begin so much later than the first one.
 _WHOLE = 1e-6  # Relative; how near a ratio of rates must be to a whole number.
@@ -35,7 +31,6 @@ def fill_gaps(recording: Recording, longest: int = 5, *, mask_long: bool = False
         DataFileError: A marker is seen in fewer than two frames or, unless that is masked, occluded for longer.
     """
     positions = recording.positions.copy()
-    frames = np.arange(len(positions))
     for column, (label, seen) in enumerate(zip(recording.labels, recording.seen.T, strict=True)):
         if np.count_nonzero(seen) < 2:
             raise DataFileError(
@@ -52,42 +47,24 @@ def fill_gaps(recording: Recording, longest: int = 5, *, mask_long: bool = False
                 )
             wanted[start:stop] = stop - start <= longest and (inner or not mask_long)
         if wanted.any():
-            known = frames[seen]
-            inside = np.clip(frames[wanted], known[0], known[-1])
-            positions[wanted, column] = CubicSpline(known, positions[seen, column])(inside)
+            positions[wanted, column] = bridged(recording, column, np.flatnonzero(wanted))
     return dataclasses.replace(recording, positions=positions)
 
 
-def resample(recording: Recording, rate: float, *, interpolate: bool = False) -> Recording:
-    """Brings a recording to the simulator's rate 1/h.
+def resample(recording: Recording, rate: float) -> Recording:
+    """Brings a recording to the simulator's rate 1/h [Hz].
 
-    Where the recording's rate is a whole multiple, every n-th frame is kept, exactly as measured. Otherwise, if
-    `interpolate`, a cubic spline goes through the frames in which a marker was seen; a new frame is seen if the frames
-    on both sides of it were. Actuation is interpolated linearly. What is interpolated should move slowly beside the
-    frame rate: a spline follows a swing with n frames a period to about (2 pi / n)^4 / 384 of its amplitude.
-
-    Args:
-        recording: What to resample.
-        rate: Steps a second wanted [Hz].
-        interpolate: Whether the frames may be interpolated.
-
-    Raises:
-        InputError: The rate is not positive, or the recording's is no multiple of it and may not be interpolated.
+    Where the recording's rate is a whole multiple, every n-th frame is kept, exactly as measured. Otherwise a cubic
+    spline goes through the frames in which a marker was seen; a new frame is seen if the frames on both sides of it
+    were. Actuation is interpolated linearly. What is interpolated should move slowly beside the frame rate: a spline
+    follows a swing with n frames a period to about (2 pi / n)^4 / 384 of its amplitude.
     """
-    if not (np.isfinite(rate) and rate > 0.0):
-        raise InputError(f"The rate to resample to is {rate!r}: it must be a number above zero, in Hz.")
     ratio = recording.rate / rate
     every = round(ratio)
     if every >= 1 and abs(ratio - every) <= _WHOLE * ratio:
         actuation = None if recording.actuation is None else recording.actuation[::every]
         return dataclasses.replace(
             recording, positions=recording.positions[::every], actuation=actuation, rate=float(rate)
-        )
-    if not interpolate:
-        raise InputError(
-            f"{recording.source} has {recording.rate:g} frames a second, which is no multiple of the {rate:g} steps a "
-            f"second of the simulation: make time_step a multiple of {1.0 / recording.rate:g} s, or set "
-            "recording.interpolate to true."
         )
     old = np.arange(len(recording.positions))
     new = np.arange(int((len(old) - 1) / ratio * (1.0 + _WHOLE)) + 1) * ratio
@@ -97,8 +74,7 @@ def resample(recording: Recording, rate: float, *, interpolate: bool = False) ->
     for column, known in enumerate(recording.seen.T):
         kept = known[below] & known[above]
         if kept.any() and np.count_nonzero(known) > 1:
-            spline = CubicSpline(old[known], recording.positions[known, column])
-            positions[kept, column] = spline(new[kept])
+            positions[kept, column] = bridged(recording, column, new[kept])
     actuation = None
     if recording.actuation is not None:
         actuation = np.stack([np.interp(new, old, channel) for channel in recording.actuation.T], axis=1)
@@ -161,9 +137,7 @@ def release_of(recording: Recording, labels: Sequence[str], longest_gap: int = 5
     return Release(start + found.frame, (start + found.rest[0], start + found.rest[1]))
 
 
-def trim_to_release(
-    recording: Recording, release: Release, *, before: int = 0, seconds: float | None = None
-) -> Recording:
+def trim_to_release(recording: Recording, release: Release, seconds: float | None = None) -> Recording:
     """The frames from the release on, and where the markers were while the body was held.
 
     The release falls between two frames: `start` of the result is the time from it to the first frame that is kept.
@@ -171,7 +145,6 @@ def trim_to_release(
     Args:
         recording: The whole recording.
         release: Its release.
-        before: How many frames before the release to keep; `start` is negative then.
         seconds: How long to keep after the release [s]; everything if None.
 
     Raises:
@@ -185,7 +158,7 @@ def trim_to_release(
             f"{recording.source}: {listed(hidden)} cannot be seen while the body is held (frames {release.rest[0]} to "
             f"{release.rest[1] - 1}), so where it sits is not known; leave it out of the configured markers."
         )
-    first = max(0, int(np.ceil(release.frame)) - before)
+    first = max(0, int(np.ceil(release.frame)))
     last = len(recording.positions)
     if seconds is not None:
         last = min(last, int(np.floor(release.frame + seconds * recording.rate)) + 1)
@@ -201,8 +174,3 @@ def trim_to_release(
         rest=np.nanmedian(held, axis=0),
         start=(first - release.frame) / recording.rate,
     )
-
-
-def filled(before: Recording, after: Recording) -> BoolArray:
-    """(T, M) what `fill_gaps` filled."""
-    return np.asarray(after.seen & ~before.seen)

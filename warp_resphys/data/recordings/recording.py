@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline
 
 from ...io.errors import DataFileError, InputError
 
@@ -181,6 +182,16 @@ def _names(raw: RawRecording, path: Path, given: Sequence[str] | None) -> tuple[
     return tuple(
         name if counts[name] == 1 else f"{name} #{names[: place + 1].count(name)}" for place, name in enumerate(names)
     )
+
+
+def bridged(recording: Recording, column: int, frames: ArrayLike) -> FloatArray:
+    """(T', 3) [m] a marker at frames, by a cubic spline through those in which it was seen, two or more.
+
+    Before the first and after the last of them, it stays where it was seen there.
+    """
+    known = np.flatnonzero(recording.seen[:, column])
+    spline = CubicSpline(known, recording.positions[known, column])
+    return np.asarray(spline(np.clip(frames, known[0], known[-1])))
 
 
 def runs(mask: ArrayLike) -> list[tuple[int, int]]:

@@ -8,8 +8,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from ...io.errors import DataFileError
+from .recording import FloatArray
 
-FloatArray = NDArray[np.float64]
+_QUIET = 0.2  # [s] that the body must have been still
+_LEAST_DROP = 1e-3  # [m]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,9 +27,7 @@ class Release:
     rest: tuple[int, int]
 
 
-def find_release(
-    path: FloatArray, rate: float, *, quiet: float = 0.2, least_drop: float = 1e-3, source: str | Path = "the recording"
-) -> Release:
+def find_release(path: FloatArray, rate: float, source: str | Path = "the recording") -> Release:
     """Finds when a point that was held still was let go.
 
     The point moves fast for the first time where one frame's step reaches a third of the largest (of a path
@@ -39,20 +39,18 @@ def find_release(
     Args:
         path: (T, 3) [m], without NaN; a mean of several markers is best.
         rate: Frames a second [Hz].
-        quiet: How long the body must have been still [s].
-        least_drop: The smallest excursion that counts as a release [m].
         source: Where the path comes from, for messages.
 
     Raises:
         DataFileError: The path has no such moment.
     """
-    length = max(2, round(quiet * rate))
+    length = max(2, round(_QUIET * rate))
     smooth = median_filter(path, size=(3, 1), mode="nearest")
     steps = np.linalg.norm(np.diff(smooth, axis=0), axis=1)
     fast = int(np.argmax(3.0 * steps >= steps.max(initial=0.0))) + 1 if len(steps) else 0
     before = path[max(fast - 1, 0)] if len(path) else np.zeros(3)
     drop = float(np.linalg.norm(smooth[fast:] - before, axis=1).max(initial=0.0))
-    if drop < least_drop:
+    if drop < _LEAST_DROP:
         raise DataFileError(
             f"No release found in {source}: the tip never moves by more than {1e3 * drop:.2f} mm; give a recording in "
             "which the body is let go."
@@ -77,10 +75,22 @@ def _onset(path: FloatArray, rest: tuple[int, int], fast: int, drop: float) -> f
     still = np.flatnonzero(travelled[rest[0] : fast] < max(4.0 * noise, 0.005 * drop))
     last_still = rest[0] + int(still[-1])
     moving = np.arange(last_still + 1, min(last_still + 4, len(path)))
-    root = np.sqrt(np.maximum(travelled[moving], 0.0))
-    if len(moving) < 2 or root[-1] <= root[0]:
+    line = root_line(moving, travelled[moving])
+    if line is None:
         return float(last_still)
-    slope, intercept = np.polyfit(moving, root, 1)
+    slope, zero = line
     # A frame that noise hides may be the first of the motion: the line tells how long ago it was let go at most.
     moved = np.sqrt(max(travelled[last_still] + 2.0 * noise, 0.0))
-    return float(np.clip(-intercept / slope, last_still - min(moved / slope, 1.0), last_still + 1))
+    return float(np.clip(zero, last_still - min(moved / slope, 1.0), last_still + 1))
+
+
+def root_line(time: FloatArray | NDArray[np.int64], travelled: FloatArray) -> tuple[float, float] | None:
+    """Slope and zero of a line through the roots of (T,) ways [m]; None where these do not grow.
+
+    A body that starts from rest first moves by s = a (t - t0)^2 / 2, so that the zero is t0.
+    """
+    root = np.sqrt(np.maximum(travelled, 0.0))
+    if len(root) < 2 or root[-1] <= root[0]:
+        return None
+    slope, intercept = np.polyfit(time, root, 1)
+    return float(slope), float(-intercept / slope)

@@ -3,22 +3,22 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from ...io.errors import DataFileError
 from .recording import Recording
-
-FloatArray = NDArray[np.float64]
+from .release import root_line
 
 _FAST = 1.0 / 3.0  # of the largest speed: from there on the body certainly moves
 _STILL = 0.1  # of the largest speed: below that it does not yet
 _QUIET_SHARE = 0.2  # of the excursion: what a body at rest may wander
 _FITTED = 2  # frames of the motion; a line through more would begin too early, as sqrt(s) of a swing bends down
 _BEFORE = 1.0  # frames of it that noise and a slow start may hide
+_QUIET = 0.03  # [s] that the body must be seen at rest
+_LEAST = 5e-4  # [m] the smallest excursion that counts as a motion
 
 
-def valve_opening(recording: Recording, followed: Sequence[str], *, quiet: float = 0.03, least: float = 5e-4) -> float:
+def valve_opening(recording: Recording, followed: Sequence[str]) -> float:
     """Finds when a body at rest begins to move, between two frames.
 
     The mean of the followed markers moves fast for the first time where its speed reaches a third of the largest. The
@@ -31,8 +31,6 @@ def valve_opening(recording: Recording, followed: Sequence[str], *, quiet: float
         recording: frames in which one of the followed markers was not seen are left out; so should be those that repeat
             the one before (`jumps.mask_repeats`).
         followed: markers whose mean is followed.
-        quiet: how long the body must be seen at rest [s].
-        least: the smallest excursion that counts as a motion [m].
 
     Returns:
         The time [s], on the recording's own clock (`Recording.time`).
@@ -50,7 +48,7 @@ def valve_opening(recording: Recording, followed: Sequence[str], *, quiet: float
     path, time = chosen.positions[seen].mean(axis=1), recording.time[seen]
     smooth = median_filter(path, size=(3, 1), mode="nearest")
     excursion = float(np.linalg.norm(smooth - smooth[0], axis=1).max())
-    if excursion < least:
+    if excursion < _LEAST:
         raise DataFileError(
             f"No opening of the valve found in {recording.source}: the followed markers never move by more than "
             f"{1e3 * excursion:.2f} mm; follow markers that the pressure moves."
@@ -60,28 +58,14 @@ def valve_opening(recording: Recording, followed: Sequence[str], *, quiet: float
     slow = np.flatnonzero(speed[:fast] < _STILL * speed.max())
     last = int(slow[-1]) + 1 if len(slow) else 0
     wandered = float(np.ptp(smooth[: last + 1], axis=0).max())
-    if time[last] - time[0] < quiet - 0.5 / recording.rate or wandered > _QUIET_SHARE * excursion:
+    if time[last] - time[0] < _QUIET - 0.5 / recording.rate or wandered > _QUIET_SHARE * excursion:
         raise DataFileError(
             f"{recording.source}: the followed markers move from the first frame on, or too soon after it; give a "
-            f"recording that begins {quiet:g} s or more before the valve opens."
+            f"recording that begins {_QUIET:g} s or more before the valve opens."
         )
-    return _zero(time, path, last, 1.0 / recording.rate)
-
-
-def _zero(time: FloatArray, path: FloatArray, last: int, frame: float) -> float:
-    """Zero of a line through sqrt(s) of the first frames of the motion.
-
-    Args:
-        time: (T,) [s].
-        path: (T, 3) [m].
-        last: the last frame at rest.
-        frame: duration of one [s].
-    """
     moving = slice(last + 1, last + 1 + _FITTED)
     way = path[moving] - np.median(path[: last + 1], axis=0)
-    direction = way[-1] / np.linalg.norm(way[-1])
-    root = np.sqrt(np.maximum(way @ direction, 0.0))
-    if len(root) < 2 or root[-1] <= root[0]:
+    line = root_line(time[moving], way @ (way[-1] / np.linalg.norm(way[-1])))
+    if line is None:
         return float(time[last])
-    slope, intercept = np.polyfit(time[moving], root, 1)
-    return float(np.clip(-intercept / slope, max(time[last] - _BEFORE * frame, time[0]), time[last + 1]))
+    return float(np.clip(line[1], max(time[last] - _BEFORE / recording.rate, time[0]), time[last + 1]))

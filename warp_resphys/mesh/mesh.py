@@ -11,6 +11,7 @@ import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from ..io.errors import MeshError
 from .elements import BY_NODES, ELEMENTS, FACES, Element
@@ -192,12 +193,8 @@ def boundary_faces(mesh: Mesh) -> IntArray:
     element = mesh.element
     faces = mesh.cells[:, element.faces].reshape(-1, element.faces.shape[1])
     keys = np.sort(faces[:, : element.face.corners], axis=1)
-    order = np.lexsort(keys.T)
-    repeated = np.all(keys[order[1:]] == keys[order[:-1]], axis=1)
-    single = np.ones(len(faces), dtype=bool)
-    single[order[1:][repeated]] = False
-    single[order[:-1][repeated]] = False
-    return faces[single]
+    _, key, count = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
+    return faces[count[key.ravel()] == 1]
 
 
 def connected_parts(cells: IntArray) -> IntArray:
@@ -288,23 +285,11 @@ def _normalised_volumes(mesh: Mesh) -> tuple[FloatArray, FloatArray]:
 
 
 def _coincident(vertices: FloatArray) -> NDArray[np.bool_]:
-    """Flags of vertices that lie on another one, (N,); one of each pair.
-
-    Coincident points have close projections on any direction. Sorted along a skew one, each vertex is
-    compared with its successor, then with the one after it, until projections are apart or a pair is found.
-    """
+    """Flags of vertices that lie on another one of a lower number, (N,)."""
     offsets = vertices - vertices[0]
-    distance = COINCIDENT_DISTANCE * np.linalg.norm(np.ptp(offsets, axis=0))
-    heights = offsets @ np.sqrt([1 / 6, 2 / 6, 3 / 6])
-    order = np.argsort(heights)
-    found = np.zeros(len(vertices), dtype=bool)
-    for step in range(1, len(vertices)):
-        close = np.flatnonzero(heights[order[step:]] - heights[order[:-step]] <= distance)
-        pairs = order[close], order[close + step]
-        found[pairs[1]] = np.linalg.norm(offsets[pairs[1]] - offsets[pairs[0]], axis=1) <= distance
-        if not len(close) or found.any():
-            break
-    return found
+    distance = COINCIDENT_DISTANCE * float(np.linalg.norm(np.ptp(offsets, axis=0)))
+    _, nearest = cKDTree(offsets).query(offsets, k=2, distance_upper_bound=np.nextafter(distance, np.inf))
+    return np.asarray(nearest.min(axis=1) < np.arange(len(vertices)))
 
 
 def _refuse(broken: NDArray[np.bool_], nouns: str, problem: str) -> None:

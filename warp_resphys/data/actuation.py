@@ -24,22 +24,14 @@ class PressureSequences:
     ``exp(-(t - t')^2 / (2 correlation_time^2))`` and with the other chambers by `correlation`. It is conditioned on
     being zero, with zero slope, at the start and the end, where the body rests (Rasmussen and Williams 2006, section
     2.2); then what is below zero or above the limit is cut off.
-
-    Attributes:
-        mean: [Pa].
-        deviation: [Pa].
-        correlation_time: [s]; the longer, the smoother.
-        correlation: between each two chambers, less than 1; or a (C, C) matrix.
-        limit: [Pa].
-        rest: without pressure before the start and after the end [s].
     """
 
-    mean: float = 8e3
-    deviation: float = 9e3
-    correlation_time: float = 0.4
-    correlation: float | Sequence[Sequence[float]] = 0.0
-    limit: float = 20e3
-    rest: float = 0.1
+    mean: float = 8e3  # [Pa]
+    deviation: float = 9e3  # [Pa]
+    correlation_time: float = 0.4  # [s]; the longer, the smoother
+    correlation: float | Sequence[Sequence[float]] = 0.0  # between each two chambers, less than 1; or a (C, C) matrix
+    limit: float = 20e3  # [Pa]
+    rest: float = 0.1  # without pressure before the start and after the end [s]
 
     def __post_init__(self) -> None:
         """Checks the ranges.

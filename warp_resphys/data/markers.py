@@ -65,15 +65,10 @@ class Markers(ABC):
 
 @dataclass(frozen=True)
 class MarkerMap(Markers):
-    """Markers as weighted sums of vertices, other ones in every environment.
+    """Markers as weighted sums of vertices, other ones in every environment."""
 
-    Attributes:
-        vertices: (B, m, k) the vertices of each marker.
-        weights: (B, m, k) their weights; a marker whose weights are all zero is none.
-    """
-
-    vertices: torch.Tensor
-    weights: torch.Tensor
+    vertices: torch.Tensor  # (B, m, k) the vertices of each marker
+    weights: torch.Tensor  # (B, m, k) their weights; a marker whose weights are all zero is none
     linear: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
@@ -112,19 +107,13 @@ class MarkerMap(Markers):
 
 @dataclass(frozen=True)
 class SurfaceMarkers(Markers):
-    """Markers that stand on triangles of the surface; kinds ``normal`` and ``frame`` (see the module).
+    """Markers that stand on triangles of the surface; kinds ``normal`` and ``frame`` (see the module)."""
 
-    Attributes:
-        triangles: (m, 3) vertices, counter-clockwise seen from outside.
-        weights: (m, 3) barycentric coordinates of the feet, the sum of each row one.
-        unstretch: (m, 2, 2) from the triangle's edges to its tangents at rest: the inverse of their coordinates [1/m].
-        offsets: (m, 3) stems [m] along the first and second tangent and the normal.
-    """
-
-    triangles: torch.Tensor
-    weights: torch.Tensor
+    triangles: torch.Tensor  # (m, 3) vertices, counter-clockwise seen from outside
+    weights: torch.Tensor  # (m, 3) barycentric coordinates of the feet, the sum of each row one
+    # (m, 2, 2) from the triangle's edges to its tangents at rest: the inverse of their coordinates [1/m]
     unstretch: torch.Tensor
-    offsets: torch.Tensor
+    offsets: torch.Tensor  # (m, 3) stems [m] along the first and second tangent and the normal
 
     @override
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
@@ -140,17 +129,11 @@ class SurfaceMarkers(Markers):
 
 @dataclass(frozen=True)
 class RigidMarkers(Markers):
-    """Markers that follow the rigid motion of a set of vertices; kind ``rigid`` (see the module).
+    """Markers that follow the rigid motion of a set of vertices; kind ``rigid`` (see the module)."""
 
-    Attributes:
-        vertices: (S,) three or more, not on one line.
-        rest: (S, 3) [m] where these are at rest, from their centre.
-        offsets: (m, 3) [m] the markers at rest, from the centre of the vertices.
-    """
-
-    vertices: torch.Tensor
-    rest: torch.Tensor
-    offsets: torch.Tensor
+    vertices: torch.Tensor  # (S,) three or more, not on one line
+    rest: torch.Tensor  # (S, 3) [m] where these are at rest, from their centre
+    offsets: torch.Tensor  # (m, 3) [m] the markers at rest, from the centre of the vertices
 
     @override
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
@@ -167,15 +150,10 @@ class RigidMarkers(Markers):
 
 @dataclass(frozen=True)
 class JoinedMarkers(Markers):
-    """Markers of several kinds.
+    """Markers of several kinds."""
 
-    Attributes:
-        parts: the markers of each kind.
-        order: (m,) place of each marker in the parts laid end to end.
-    """
-
-    parts: tuple[Markers, ...]
-    order: torch.Tensor
+    parts: tuple[Markers, ...]  # the markers of each kind
+    order: torch.Tensor  # (m,) place of each marker in the parts laid end to end
 
     @override
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:

@@ -21,15 +21,10 @@ _MOST_FITS = 20_000  # Sets of markers that are tried when outliers are sought.
 
 @dataclasses.dataclass(frozen=True)
 class RigidTransform:
-    """The map p -> R p + t.
+    """The map p -> R p + t."""
 
-    Attributes:
-        rotation: (..., 3, 3), determinant +1.
-        translation: (..., 3) [m].
-    """
-
-    rotation: FloatArray
-    translation: FloatArray
+    rotation: FloatArray  # (..., 3, 3), determinant +1
+    translation: FloatArray  # (..., 3) [m]
 
     def apply(self, points: ArrayLike) -> FloatArray:
         """Transforms points (..., N, 3) [m]."""
@@ -39,25 +34,15 @@ class RigidTransform:
 
 @dataclasses.dataclass(frozen=True)
 class Registration:
-    """Measured markers in the frame of the body.
-
-    Attributes:
-        names: Of the M markers.
-        transform: From the frame of the recording to that of the body.
-        positions: (M, 3) [m] where the markers are in the frame of the body; NaN for one that was not seen.
-        residual: (M,) [m] how far each is from where it should be; NaN for one that was not seen.
-        inliers: (M,) whether it took part in the fit.
-        outliers: Names of markers that should have taken part, and were too far off.
-        rms: Root mean square [m] of the residuals of the inliers.
-    """
+    """Measured markers in the frame of the body."""
 
     names: tuple[str, ...]
-    transform: RigidTransform
-    positions: FloatArray
-    residual: FloatArray
-    inliers: BoolArray
-    outliers: tuple[str, ...]
-    rms: float
+    transform: RigidTransform  # From the frame of the recording to that of the body
+    positions: FloatArray  # (M, 3) [m] where the markers are in the frame of the body; NaN for one that was not seen
+    residual: FloatArray  # (M,) [m] how far each is from where it should be; NaN for one that was not seen
+    inliers: BoolArray  # (M,) whether it took part in the fit
+    outliers: tuple[str, ...]  # Names of markers that should have taken part, and were too far off
+    rms: float  # Root mean square [m] of the residuals of the inliers
 
 
 def kabsch(source: ArrayLike, target: ArrayLike) -> RigidTransform:

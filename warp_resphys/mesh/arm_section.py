@@ -31,17 +31,11 @@ _LARGEST_TURN = 1.15  # of an arc for which one straight edge stands [rad]
 
 
 class Piece(NamedTuple):
-    """A piece of an outline.
-
-    Attributes:
-        start: its first point.
-        end: its last point.
-        centre: of the circle that it is an arc of, shorter than half of it; None where it is straight.
-    """
+    """A piece of an outline."""
 
     start: complex
     end: complex
-    centre: complex | None
+    centre: complex | None  # of the circle that it is an arc of, shorter than half of it; None where it is straight
 
     def points(self, t: NDArray[np.float64]) -> ComplexArray:
         """Points at fractions (T,) of its length."""
@@ -97,24 +91,15 @@ class Section:
         W, (U)       the middle of the web opposite C (and E)
         V            the middle of the web on the outline; lobes meet there, and B0 is there as well
         Xm, Xc, X1, X2  inside of the chamber, next to M, C, A1 and A2: used where caps close it
-
-    Attributes:
-        radius: of the outline, where it is farthest from the axis [m].
-        count: number of chambers.
-        profile: of a chamber: ``half_disc``, its flat side towards the axis; ``disc``; or ``sector`` of an annulus.
-        outline: ``lobed``: around each chamber, at the distance of the wall; or ``round``: a circle.
-        wall: between a chamber and the outline [m].
-        web: between neighbouring chambers, where they are closest [m].
-        core: between the axis and a chamber [m]; None: the least that the webs allow.
     """
 
-    radius: float
-    count: int
-    profile: str
-    outline: str
-    wall: float
-    web: float
-    core: float | None = None
+    radius: float  # of the outline, where it is farthest from the axis [m]
+    count: int  # number of chambers
+    profile: str  # of a chamber: ``half_disc``, its flat side towards the axis; ``disc``; or ``sector`` of an annulus
+    outline: str  # ``lobed``: around each chamber, at the distance of the wall; or ``round``: a circle
+    wall: float  # between a chamber and the outline [m]
+    web: float  # between neighbouring chambers, where they are closest [m]
+    core: float | None = None  # between the axis and a chamber [m]; None: the least that the webs allow
 
     @property
     def half_angle(self) -> float:

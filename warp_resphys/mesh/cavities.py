@@ -17,15 +17,10 @@ _RAYS = 200_000  # pairs of a ray and a triangle that are looked at in one go, o
 
 @dataclass(frozen=True)
 class OpenCavity:
-    """A part of the outer surface from which little of the outside is seen.
+    """A part of the outer surface from which little of the outside is seen."""
 
-    Attributes:
-        centre: (3,) [m] mean of its triangles.
-        area: of it [m^2].
-    """
-
-    centre: FloatArray
-    area: float
+    centre: FloatArray  # (3,) [m] mean of its triangles
+    area: float  # of it [m^2]
 
 
 def open_cavities(mesh: Mesh) -> list[OpenCavity] | None:

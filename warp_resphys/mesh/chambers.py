@@ -15,15 +15,11 @@ _SAME_HEIGHT = 0.05  # of the body's length: chambers whose centres are closer t
 
 @dataclass(frozen=True, eq=False)
 class Chamber:
-    """A closed surface inside a body.
+    """A closed surface inside a body."""
 
-    Attributes:
-        name: by which results and messages call it.
-        faces: (F, 3 | 4 | 6) vertices of its faces, ordered as `mesh.boundary_faces` gives them: counter-clockwise seen
-            from outside of the solid, that is, from inside the chamber.
-    """
-
-    name: str
+    name: str  # by which results and messages call it
+    # (F, 3 | 4 | 6) vertices of its faces, ordered as `mesh.boundary_faces` gives them: counter-clockwise seen from
+    # outside of the solid, that is, from inside the chamber
     faces: NDArray[np.int64]
 
     @property

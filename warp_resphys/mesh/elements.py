@@ -48,15 +48,10 @@ def degree_two_tetrahedron() -> Rule:
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """Shape functions of a reference cell or face.
+    """Shape functions of a reference cell or face."""
 
-    Attributes:
-        nodes: (K, d) reference coordinates.
-        exponents: (K, d) of the monomials that span them.
-    """
-
-    nodes: Array
-    exponents: IntArray
+    nodes: Array  # (K, d) reference coordinates
+    exponents: IntArray  # (K, d) of the monomials that span them
 
     @cached_property
     def _coefficients(self) -> Array:
@@ -79,17 +74,11 @@ def _monomials(points: Array, exponents: IntArray) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Face:
-    """A kind of face.
+    """A kind of face."""
 
-    Attributes:
-        shape: functions on the reference triangle or square.
-        corners: nodes that come first.
-        triangles: (T, 3) that it is split into, counter-clockwise as it is.
-    """
-
-    shape: Shape
-    corners: int
-    triangles: IntArray
+    shape: Shape  # functions on the reference triangle or square
+    corners: int  # nodes that come first
+    triangles: IntArray  # (T, 3) that it is split into, counter-clockwise as it is
 
     def rule(self, degree: int) -> Rule:
         """A rule that is exact for linear faces, and for a polynomial degree on quadratic ones."""
@@ -101,28 +90,20 @@ class Face:
 
 @dataclass(frozen=True, eq=False)
 class Element:
-    """A kind of cell.
-
-    Attributes:
-        name: of the kind.
-        shape: its shape functions; corners come first.
-        parents: for each node that is no corner, the corners in whose middle it lies.
-        rule: points and weights of the shape term of an energy.
-        faces: (F, n) nodes, counter-clockwise seen from outside, corners first.
-        volume_modes: (m, 3) exponents of the polynomials that the deformation gradient of the volume term is projected
-            on, so that the element does not lock; None for means over the cells around each vertex.
-        volume_rule: points and weights of the volume term; where None, one point with the element's volume.
-        mass_rule: a rule that is exact for products of two shape functions, by which masses are lumped in proportion to
-            the consistent mass matrix's diagonal; None for row sums.
-    """
+    """A kind of cell."""
 
     name: str
-    shape: Shape
-    parents: list[list[int]]
-    rule: Rule
-    faces: IntArray
+    shape: Shape  # its shape functions; corners come first
+    parents: list[list[int]]  # for each node that is no corner, the corners in whose middle it lies
+    rule: Rule  # points and weights of the shape term of an energy
+    faces: IntArray  # (F, n) nodes, counter-clockwise seen from outside, corners first
+    # (m, 3) exponents of the polynomials that the deformation gradient of the volume term is projected on, so that the
+    # element does not lock; None for means over the cells around each vertex
     volume_modes: IntArray | None
+    # points and weights of the volume term; where None, one point with the element's volume
     volume_rule: Rule | None = None
+    # a rule that is exact for products of two shape functions, by which masses are lumped in proportion to the
+    # consistent mass matrix's diagonal; None for row sums
     mass_rule: Rule | None = None
 
     @property

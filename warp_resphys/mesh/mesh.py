@@ -30,16 +30,12 @@ class Mesh:
 
     Building one checks shapes and number types only; `check_mesh` checks what the numbers mean.
 
-    Attributes:
-        vertices: (N, 3) [m] rest positions.
-        cells: (M, K) vertex indices in VTK's order, of one of `elements.ELEMENTS`.
-
     Raises:
         MeshError: An array has the wrong shape, or the indices are not integers.
     """
 
-    vertices: FloatArray
-    cells: IntArray
+    vertices: FloatArray  # (N, 3) [m] rest positions
+    cells: IntArray  # (M, K) vertex indices in VTK's order, of one of `elements.ELEMENTS`
 
     def __post_init__(self) -> None:
         """Check shapes and number types, and store contiguous float64 and int64 arrays."""

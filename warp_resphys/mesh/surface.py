@@ -12,19 +12,12 @@ _TIE = 1e-9  # Triangles count as equally close up to this distance, over the di
 
 @dataclass(frozen=True)
 class ClosestPoints:
-    """What the surface has to say of P points.
+    """What the surface has to say of P points."""
 
-    Attributes:
-        triangles: (P, 3) vertices of the closest triangle, counter-clockwise seen from outside.
-        points: (P, 3) [m] the closest point of that triangle.
-        normals: (P, 3) the triangle's outer unit normal.
-        distances: (P,) [m] from the closest point; negative inside the body.
-    """
-
-    triangles: IntArray
-    points: FloatArray
-    normals: FloatArray
-    distances: FloatArray
+    triangles: IntArray  # (P, 3) vertices of the closest triangle, counter-clockwise seen from outside
+    points: FloatArray  # (P, 3) [m] the closest point of that triangle
+    normals: FloatArray  # (P, 3) the triangle's outer unit normal
+    distances: FloatArray  # (P,) [m] from the closest point; negative inside the body
 
 
 def closest_points(mesh: Mesh, points: FloatArray) -> ClosestPoints:

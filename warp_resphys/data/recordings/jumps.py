@@ -17,32 +17,20 @@ _NEIGHBOURS = np.array([-1.0, 4.0, 4.0, -1.0]) / 6.0
 
 @dataclasses.dataclass(frozen=True)
 class Jump:
-    """A step that a marker made alone.
-
-    Attributes:
-        label: The marker.
-        frame: The first frame after the jump.
-        size: [m] how far it went beyond what its neighbours in time, and the other markers, explain.
-    """
+    """A step that a marker made alone."""
 
     label: str
-    frame: int
-    size: float
+    frame: int  # The first frame after the jump
+    size: float  # [m] how far it went beyond what its neighbours in time, and the other markers, explain
 
 
 @dataclasses.dataclass(frozen=True)
 class Swap:
-    """A marker that appears where another one was.
-
-    Attributes:
-        label: The marker.
-        other: The marker in whose place it appears.
-        frame: The first frame of that.
-    """
+    """A marker that appears where another one was."""
 
     label: str
-    other: str
-    frame: int
+    other: str  # The marker in whose place it appears
+    frame: int  # The first frame of that
 
 
 def find_jumps(recording: Recording, least: float = LEAST_JUMP) -> list[Jump]:

@@ -26,31 +26,18 @@ _RELEASE_FRAMES = 1.5  # around the release, in which a marker that is alone on 
 
 @dataclasses.dataclass(frozen=True)
 class MarkerQuality:
-    """One marker of a recording.
-
-    Attributes:
-        label: The marker.
-        still: Whether it should not move.
-        seen: Share of the frames in which it was seen.
-        gaps: Number of occlusions.
-        longest_gap: The longest of them, in frames.
-        masked: Frames in gaps that are too long to be filled, or at either end.
-        jumps: Its jumps, in the order of time.
-        noise: [m] standard deviation of one coordinate, from third differences in the quietest parts.
-        drift: [m] from its place in the first tenth of the frames to that in the last; None if it may move.
-        reach: [m] largest distance from its median position.
-    """
+    """One marker of a recording."""
 
     label: str
-    still: bool
-    seen: float
-    gaps: int
-    longest_gap: int
-    masked: int
-    jumps: tuple[Jump, ...]
-    noise: float
-    drift: float | None
-    reach: float
+    still: bool  # Whether it should not move
+    seen: float  # Share of the frames in which it was seen
+    gaps: int  # Number of occlusions
+    longest_gap: int  # The longest of them, in frames
+    masked: int  # Frames in gaps that are too long to be filled, or at either end
+    jumps: tuple[Jump, ...]  # Its jumps, in the order of time
+    noise: float  # [m] standard deviation of one coordinate, from third differences in the quietest parts
+    drift: float | None  # [m] from its place in the first tenth of the frames to that in the last; None if it may move
+    reach: float  # [m] largest distance from its median position
 
     @property
     def largest_jump(self) -> Jump | None:
@@ -60,25 +47,15 @@ class MarkerQuality:
 
 @dataclasses.dataclass(frozen=True)
 class Quality:
-    """What `quality` found out about a recording.
-
-    Attributes:
-        source: The file.
-        rate: Frames a second [Hz].
-        frames: Their number.
-        release: When the body was let go, if that was looked for and found.
-        markers: One entry a marker.
-        swaps: Markers that took over each other's place.
-        longest_gap: The longest occlusion that counts as short, in frames.
-    """
+    """What `quality` found out about a recording."""
 
     source: Path
-    rate: float
+    rate: float  # Frames a second [Hz]
     frames: int
-    release: Release | None
-    markers: tuple[MarkerQuality, ...]
-    swaps: tuple[Swap, ...]
-    longest_gap: int
+    release: Release | None  # When the body was let go, if that was looked for and found
+    markers: tuple[MarkerQuality, ...]  # One entry a marker
+    swaps: tuple[Swap, ...]  # Markers that took over each other's place
+    longest_gap: int  # The longest occlusion that counts as short, in frames
 
     @property
     def warnings(self) -> list[str]:
@@ -219,17 +196,11 @@ def quality_table(result: Quality) -> list[list[str]]:
 
 @dataclasses.dataclass(frozen=True)
 class BaseMotion:
-    """How the base markers of a recording differ from those of the first one.
-
-    Attributes:
-        source: The file.
-        shift: (M,) [m] how far each marker stands from its place in the first recording.
-        changes: (M, M) [m] how much the distance between each two of them differs: of the shape they make.
-    """
+    """How the base markers of a recording differ from those of the first one."""
 
     source: Path
-    shift: FloatArray
-    changes: FloatArray
+    shift: FloatArray  # (M,) [m] how far each marker stands from its place in the first recording
+    changes: FloatArray  # (M, M) [m] how much the distance between each two of them differs: of the shape they make
 
     @property
     def distortion(self) -> FloatArray:

@@ -16,15 +16,10 @@ _LEAST_DROP = 1e-3  # [m]
 
 @dataclasses.dataclass(frozen=True)
 class Release:
-    """When a body that was held still began to move.
+    """When a body that was held still began to move."""
 
-    Attributes:
-        frame: The moment of release, in frames and parts of a frame.
-        rest: First and past-the-last frame of the quiet stretch before it, in which the body was held.
-    """
-
-    frame: float
-    rest: tuple[int, int]
+    frame: float  # The moment of release, in frames and parts of a frame
+    rest: tuple[int, int]  # First and past-the-last frame of the quiet stretch before it, in which the body was held
 
 
 def find_release(path: FloatArray, rate: float, source: str | Path = "the recording") -> Release:

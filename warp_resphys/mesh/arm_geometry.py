@@ -10,9 +10,9 @@ import numpy as np
 from ..io.errors import MeshError
 from .arm_section import Section
 
-PROFILES = ("half_disc", "disc", "sector")
-OUTLINES = ("lobed", "round")
-MOST_CHAMBERS = 8  # in a segment
+_PROFILES = ("half_disc", "disc", "sector")
+_OUTLINES = ("lobed", "round")
+_MOST_CHAMBERS = 8  # in a segment
 
 
 @dataclass(frozen=True)
@@ -47,24 +47,19 @@ class ArmGeometry:
         count = len(self.chamber_lengths)
         if not count:
             raise MeshError("the arm's chamber_lengths are empty: give one length for each segment.")
-        for name in ("caps", "radii"):
+        needed = {"caps": count + 1, "radii": count + 1, "rotations": count if self.rotations else 0}
+        for name, number in needed.items():
             given = len(getattr(self, name))
-            if given != count + 1:
-                raise MeshError(f"the arm's {name} are {given} numbers, but {count} chamber_lengths need {count + 1}.")
-        if self.rotations and len(self.rotations) != count:
-            raise MeshError(f"the arm's rotations are {len(self.rotations)} numbers, but it has {count} segments.")
-        for name in ("wall", "web", *(("core",) if self.core is not None else ())):
-            numbers(name, (getattr(self, name),))
-        for name, known in (("profile", PROFILES), ("outline", OUTLINES)):
+            if given != number:
+                raise MeshError(f"the arm's {name} are {given} numbers, but {count} chamber_lengths need {number}.")
+        for name in ("wall", "web", "core"):
+            numbers(name, (getattr(self, name),) if getattr(self, name) is not None else ())
+        for name, known in (("profile", _PROFILES), ("outline", _OUTLINES)):
             if getattr(self, name) not in known:
                 raise MeshError(f"the arm's {name} is {getattr(self, name)!r}: choose {', '.join(known)}.")
-        if (
-            isinstance(self.chambers, bool)
-            or not isinstance(self.chambers, int)
-            or not 2 <= self.chambers <= MOST_CHAMBERS
-        ):
+        if type(self.chambers) is not int or not 2 <= self.chambers <= _MOST_CHAMBERS:
             raise MeshError(
-                f"the arm's chambers are {self.chambers!r} a segment: choose a whole number, 2 to {MOST_CHAMBERS}."
+                f"the arm's chambers are {self.chambers!r} a segment: choose a whole number, 2 to {_MOST_CHAMBERS}."
             )
         if self.outline == "lobed" and (self.profile == "sector" or any(self.rotations)):
             what = "sectors" if self.profile == "sector" else "rotations"

@@ -95,7 +95,7 @@ def test_a_stem_along_the_normal_turns_with_it_and_keeps_its_length():
     q = poses(MESH)
     stem = markers(q) - feet(markers, q)
     np.testing.assert_allclose(stem.norm(dim=-1), 0.006, rtol=0, atol=1e-12)
-    corners = q[:, markers.triangles[0]]
+    corners = q[:, markers.vertices[0]]
     np.testing.assert_allclose(((corners - corners[:, :1]) @ stem.mT).abs().max(), 0.0, atol=1e-15)
     weights = torch.linalg.solve(corners.mT, feet(markers, q).mT)[:, :, 0]  # Barycentric, wherever the body goes.
     np.testing.assert_allclose(weights, markers.weights.expand(4, -1), rtol=0, atol=1e-9)
@@ -106,7 +106,7 @@ def test_a_frame_is_the_closest_rotation_of_the_tangent_plane():
     markers = bind_markers(MESH, [[0.103, 0.016, 0.035]], ["edge"], kind="frame")
     rest = torch.as_tensor(MESH.vertices)
     gradient = torch.tensor([[1.3, 0.4, 0.0], [0.1, 0.8, 0.0], [0.0, 0.0, 1.0]], dtype=rest.dtype)
-    normal = torch.linalg.cross(*(rest[markers.triangles[0]][1:] - rest[markers.triangles[0]][0]))
+    normal = torch.linalg.cross(*(rest[markers.vertices[0]][1:] - rest[markers.vertices[0]][0]))
     axis = int(normal.abs().argmax())
     gradient = torch.roll(gradient, (axis + 1, axis + 1), (0, 1))  # Leaves the plane of the triangle in itself.
     u, _, vt = torch.linalg.svd(gradient)
@@ -152,7 +152,7 @@ def test_precision_and_vertices():
     single = markers.to(like)(poses(MESH).float())
     assert single.dtype == torch.float32
     np.testing.assert_allclose(single, markers(poses(MESH)), rtol=0, atol=1e-6)
-    assert set(TIP) <= set(markers.used.tolist()) <= set(range(len(MESH.vertices)))
+    assert set(TIP) <= set(markers.vertices.tolist()) <= set(range(len(MESH.vertices)))
 
 
 def test_the_derivative_of_linear_ones_is_their_weights():

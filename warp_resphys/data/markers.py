@@ -26,23 +26,18 @@ from ..io.errors import InputError
 from ..mesh.mesh import Mesh
 from ..mesh.surface import closest_points
 
-SURFACE_KINDS = ("normal", "frame")
-KINDS = (*SURFACE_KINDS, "rigid")
+KINDS = ("normal", "frame", "rigid")
 
 
 class Markers(ABC):
     """A map from the vertices of a body to m markers."""
 
     linear: ClassVar[bool] = False  # Whether `transposed_jacobian` is the same everywhere.
+    vertices: torch.Tensor  # all that the markers depend on, in any shape
 
     @abstractmethod
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
         """(B, N, 3) positions of the vertices to (B, m, 3) positions of the markers [m]."""
-
-    @property
-    @abstractmethod
-    def used(self) -> torch.Tensor:
-        """(K,) all vertices that the markers depend on, perhaps repeated."""
 
     def transposed_jacobian(self, positions: torch.Tensor) -> torch.Tensor:
         """(B, 3 N, 3 m) the transposed derivative of the markers by the vertices at positions (B, N, 3)."""
@@ -95,11 +90,6 @@ class MarkerMap(Markers):
         weights = self.weights.reshape(*self.weights.shape, *[1] * (positions.ndim - 2))
         return (positions[batch, self.vertices] * weights).sum(2)
 
-    @property
-    @override
-    def used(self) -> torch.Tensor:
-        return self.vertices.flatten()
-
     @override
     def transposed_jacobian(self, positions: torch.Tensor) -> torch.Tensor:
         return super().transposed_jacobian(positions[:1].expand(len(self.vertices), -1, -1))
@@ -109,7 +99,7 @@ class MarkerMap(Markers):
 class SurfaceMarkers(Markers):
     """Markers that stand on triangles of the surface; kinds ``normal`` and ``frame`` (see the module)."""
 
-    triangles: torch.Tensor  # (m, 3) vertices, counter-clockwise seen from outside
+    vertices: torch.Tensor  # (m, 3) of a triangle each, counter-clockwise seen from outside
     weights: torch.Tensor  # (m, 3) barycentric coordinates of the feet, the sum of each row one
     # (m, 2, 2) from the triangle's edges to its tangents at rest: the inverse of their coordinates [1/m]
     unstretch: torch.Tensor
@@ -117,14 +107,9 @@ class SurfaceMarkers(Markers):
 
     @override
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
-        corners = positions[:, self.triangles]  # (B, m, 3, 3)
+        corners = positions[:, self.vertices]  # (B, m, 3, 3)
         stems = torch.einsum("bmij,mj->bmi", tangent_frames(corners, self.unstretch), self.offsets)
         return torch.einsum("bmki,mk->bmi", corners, self.weights) + stems
-
-    @property
-    @override
-    def used(self) -> torch.Tensor:
-        return self.triangles.flatten()
 
 
 @dataclass(frozen=True)
@@ -142,16 +127,12 @@ class RigidMarkers(Markers):
         rotation = closest_rotation((now - centre).mT @ self.rest)
         return centre + self.offsets @ rotation.mT
 
-    @property
-    @override
-    def used(self) -> torch.Tensor:
-        return self.vertices
-
 
 @dataclass(frozen=True)
 class JoinedMarkers(Markers):
     """Markers of several kinds."""
 
+    vertices: torch.Tensor  # (K,) those of all parts
     parts: tuple[Markers, ...]  # the markers of each kind
     order: torch.Tensor  # (m,) place of each marker in the parts laid end to end
 
@@ -159,14 +140,9 @@ class JoinedMarkers(Markers):
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
         return torch.cat([part(positions) for part in self.parts], 1)[:, self.order]
 
-    @property
-    @override
-    def used(self) -> torch.Tensor:
-        return torch.cat([part.used for part in self.parts])
-
     @override
     def to(self, like: torch.Tensor) -> Self:
-        return replace(self, parts=tuple(part.to(like) for part in self.parts), order=self.order.to(like.device))
+        return replace(super().to(like), parts=tuple(part.to(like) for part in self.parts))
 
 
 def tangent_frames(corners: torch.Tensor, unstretch: torch.Tensor) -> torch.Tensor:
@@ -261,19 +237,18 @@ def bind_markers(
             f"Marker '{names[worst]}' is {1e3 * abs(found.distances[worst]):.1f} mm from the surface of the body, more "
             f"than {1e3 * largest_distance:.1f} mm: check its position, the unit of the mesh and the registration."
         )
-    on_surface = np.array([each in SURFACE_KINDS for each in kinds], dtype=bool)
+    on_surface = np.array([each != "rigid" for each in kinds])
+    flat = np.array([each == "normal" for each in kinds])
     parts: list[Markers] = []
     if on_surface.any():
-        flat = np.array([each == "normal" for each in kinds])[on_surface]
-        parts.append(
-            _on_triangles(mesh, found.triangles[on_surface], points[on_surface], found.points[on_surface], flat)
-        )
+        bound = (found.triangles, points, found.points, flat)
+        parts.append(_on_triangles(mesh, *(each[on_surface] for each in bound)))
     if not on_surface.all():
         parts.append(_on_vertices(mesh, vertices, points[~on_surface]))
     if len(parts) == 1:
         return parts[0]
     order = np.argsort(np.concatenate([np.flatnonzero(on_surface), np.flatnonzero(~on_surface)]))
-    return JoinedMarkers(tuple(parts), torch.as_tensor(order))
+    return JoinedMarkers(torch.cat([part.vertices.flatten() for part in parts]), tuple(parts), torch.as_tensor(order))
 
 
 def _check_markers(points: np.ndarray, names: Sequence[str], kinds: Sequence[str]) -> None:

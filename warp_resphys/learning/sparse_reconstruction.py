@@ -320,7 +320,7 @@ def check_sparse(regularisation: float, markers: Markers, simulator: Simulator) 
             "force open."
         )
     last = simulator.body.n_vertices - 1
-    if int(markers.used.min()) < 0 or int(markers.used.max()) > last:
+    if int(markers.vertices.min()) < 0 or int(markers.vertices.max()) > last:
         raise InputError(f"a marker is on a vertex that the body does not have: its vertices are 0 to {last}.")
 
 

@@ -34,13 +34,7 @@ class PressureSequences:
     rest: float = 0.1  # without pressure before the start and after the end [s]
 
     def draw(self, steps: int, time_step: float, chambers: int, random: np.random.Generator) -> FloatArray:
-        """(K + 1, C) a sequence of pressures at the times 0, h, ..., K h [Pa].
-
-        Args:
-            steps: K.
-            time_step: h [s].
-            chambers: C.
-            random: of the sequence.
+        """(K + 1, C) a sequence of pressures [Pa] at the times 0, h, ..., K h of K steps h [s].
 
         Raises:
             InputError: there is no time between the rests, or the chambers' correlations are those of no distribution.

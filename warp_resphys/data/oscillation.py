@@ -77,12 +77,7 @@ def measure_oscillation(
 
 
 def turning_points(signal: FloatArray, threshold: float = 0.05) -> NDArray[np.int64]:
-    """Indices of the extremes that stand out by more than a part of the signal's range, in order.
-
-    Args:
-        signal: (T,).
-        threshold: The part; what noise or a higher mode adds stays below it.
-    """
+    """Indices of the extremes of (T,) that stand out by more than a part of its range, as noise does not; in order."""
     prominence = threshold * np.ptp(signal)
     if prominence == 0.0:
         return np.empty(0, dtype=np.int64)

@@ -60,9 +60,6 @@ def mesh_arm(
 def name_surfaces(mesh: Mesh) -> dict[str, IntArray]:
     """The surfaces of an arm that hangs along -z.
 
-    Args:
-        mesh: the arm.
-
     Returns:
         (F, 3 | 4 | 6) faces as `mesh.boundary_faces` gives them: ``base`` and ``tip`` on the planes of the highest and
         the lowest vertices, ``chamber_1`` and so on as `chambers.find_chambers` numbers them, ``outside``, the rest.

@@ -240,14 +240,11 @@ class Section:
         return 0j
 
     def divisions(self, size: float) -> Divisions:
-        """Into how many edges the lines between named points are divided, so that these have a length on average.
+        """Into how many edges the lines between named points are divided, so that these have a size [m] on average.
 
         Opposite sides of a block are divided alike, and so on through the blocks: walls, chambers' flat sides and arcs
         have numbers of their own, from the lengths of what is solid. No edge stands for more than about 65 degrees of
         an arc.
-
-        Args:
-            size: the length that is aimed at [m].
         """
         strips: list[list[Edge]] = []
         solid: set[Edge] = set()
@@ -275,11 +272,7 @@ class Section:
         return a, b
 
     def growth(self, divisions: Divisions) -> Growth:
-        """How far the corners of polygons move so that their areas are right.
-
-        Args:
-            divisions: number of straight edges in place of each line between two named points.
-        """
+        """How far the corners of polygons move so that their areas are right."""
         return Growth(*(self._polygon(sides, divisions)[1] for sides in (self._chamber_sides, self._outline_sides)))
 
     @property
@@ -370,10 +363,6 @@ class Section:
 def section_grids(section: Section, divisions: Divisions) -> tuple[list[ComplexArray], list[int]]:
     """Grids of points in the blocks of a section, by transfinite interpolation (Gordon and Hall 1973).
 
-    Args:
-        section: the section.
-        divisions: into how many quadrilaterals the lines between named points are divided, see `Section.divisions`.
-
     Returns:
         Of each block: (k + 1, l + 1) points, those along the second axis counter-clockwise of those along the first,
         and the chamber that it belongs to, counted from 0, or `SOLID`.
@@ -397,10 +386,7 @@ def section_grids(section: Section, divisions: Divisions) -> tuple[list[ComplexA
 
 
 def section_quadrilaterals(grids: Sequence[ComplexArray]) -> tuple[IntArray, list[IntArray]]:
-    """Numbers the points of grids that share sides.
-
-    Args:
-        grids: as from `section_grids`.
+    """Numbers the points of grids that share sides, as those of `section_grids` do.
 
     Returns:
         (S,) a place of each point among those of all grids, and of each block (Q, 4) the points of its quadrilaterals,

@@ -17,14 +17,9 @@ _TETRAHEDRON = 4  # gmsh's number of the 4-node tetrahedron
 
 
 def tetrahedra(geometry: ArmGeometry, size: float) -> Mesh:
-    """Meshes an arm: the body, lofted along each cap and segment, less its chambers.
+    """Meshes an arm with 4-node tetrahedra of a size [m]: the body, lofted along caps and segments, less its chambers.
 
-    Args:
-        geometry: the arm.
-        size: length of the edges that is aimed at [m].
-
-    Returns:
-        4-node tetrahedra; vertices are numbered from the base down.
+    Vertices are numbered from the base down.
 
     Raises:
         MeshError: there is no gmsh, or it fails.

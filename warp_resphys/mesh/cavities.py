@@ -29,9 +29,6 @@ def open_cavities(mesh: Mesh) -> list[OpenCavity] | None:
     From the middle of each triangle, straight lines go in evenly spread directions; where few of them leave without
     meeting the body again, the triangle is hidden. Hidden triangles that touch are one cavity.
 
-    Args:
-        mesh: The body.
-
     Returns:
         The cavities, largest first; None where the surface has more than `MOST_TRIANGLES`.
     """

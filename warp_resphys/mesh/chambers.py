@@ -34,13 +34,8 @@ def find_chambers(mesh: Mesh, axis: Sequence[float] = (0.0, 0.0, -1.0)) -> tuple
     A component is a chamber where its faces, seen from outside of the solid, enclose a negative volume. A cavity that
     is open to the outside is part of the outer surface, and no chamber.
 
-    Args:
-        mesh: the body.
-        axis: (3,) from its clamped end along it. Chambers are ordered along it; those side by side by their angle about
-            it, counter-clockwise seen against the axis, from the direction of x (of y where the axis is x).
-
-    Returns:
-        The chambers, named ``chamber_1`` and so on.
+    They are named ``chamber_1`` and so on along the axis, which leads from the clamped end along the body; those side
+    by side by their angle about it, counter-clockwise seen against it, from the direction of x, or y if the axis is x.
     """
     faces = boundary_faces(mesh)
     owner = connected_parts(faces)

@@ -79,9 +79,6 @@ def box_hexahedra(
         divisions: Numbers of bricks (nx, ny, nz) along the axes.
         nodes: Of a hexahedron: 8, 20 or 27; those beyond the corners are numbered after these.
 
-    Returns:
-        Mesh of nx ny nz hexahedra.
-
     Raises:
         MeshError: A length is not positive and finite, a number is not a positive integer, or there is no such element.
     """
@@ -104,13 +101,7 @@ def box_tetrahedra(
 ) -> Mesh:
     """Box whose bricks are split into six tetrahedra each (Kuhn 1960), conforming and of equal volume.
 
-    Args:
-        size: Lengths along x, y and z [m].
-        divisions: Numbers of bricks (nx, ny, nz) along the axes.
-        order: 1 for 4-node tetrahedra, 2 for 10-node ones.
-
-    Returns:
-        Mesh of 6 nx ny nz tetrahedra; its first vertices are those of `box_hexahedra`.
+    Its first vertices are those of `box_hexahedra` of that size and those divisions; of order 2 it has 10-node cells.
 
     Raises:
         MeshError: As in `box_hexahedra`, or the order is neither 1 nor 2.
@@ -123,14 +114,9 @@ def box_tetrahedra(
 
 
 def quadratic(mesh: Mesh, kind: str = "") -> Mesh:
-    """Add the nodes of an element of second order to a mesh of corners; neighbours share them.
+    """Add the nodes of an element of second order after those of a mesh of linear cells; neighbours share them.
 
-    Args:
-        mesh: Mesh of linear cells.
-        kind: Name of the element; by default 10-node tetrahedra or 27-node hexahedra.
-
-    Returns:
-        The mesh of that element; its first vertices are those of `mesh`, unchanged.
+    The kind of element is by default that of 10-node tetrahedra or 27-node hexahedra.
 
     Raises:
         MeshError: The cells have more than corners, or other corners than the element's.
@@ -156,9 +142,6 @@ def check_mesh(mesh: Mesh) -> None:
     The Jacobian determinant of each cell's map from its reference cell must be positive at the quadrature
     points and at the nodes.
 
-    Args:
-        mesh: The mesh.
-
     Raises:
         MeshError: The mesh is empty; a coordinate is not finite; an index is out of range; a vertex belongs
             to no cell; two vertices coincide; a cell is flat, inverted or folded.
@@ -177,14 +160,11 @@ def check_mesh(mesh: Mesh) -> None:
 
 
 def boundary_faces(mesh: Mesh) -> IntArray:
-    """Faces that belong to one cell only.
-
-    Args:
-        mesh: The mesh.
+    """Faces that belong to one cell only, ordered by cell.
 
     Returns:
         (F, n) vertex indices, such as (F, 4) for 8-node hexahedra: the corners, counter-clockwise seen from outside,
-        then the other nodes. Ordered by cell.
+        then the other nodes.
     """
     element = mesh.element
     faces = mesh.cells[:, element.faces].reshape(-1, element.faces.shape[1])
@@ -227,17 +207,7 @@ def select_vertices(
     z: float | None = None,
     tolerance: float = 1e-9,
 ) -> IntArray:
-    """Vertices on a plane, or where two or three planes meet.
-
-    Args:
-        mesh: The mesh.
-        x: Coordinate of a plane across the x axis [m], or None for any.
-        y: The same for the y axis.
-        z: The same for the z axis.
-        tolerance: Largest distance of a vertex from each plane [m].
-
-    Returns:
-        (S,) sorted vertex indices, at least one.
+    """(S,) sorted vertices within a tolerance [m] of planes across the axes at x, y and z [m], of one plane at least.
 
     Raises:
         MeshError: No coordinate is given, or no vertex lies there.

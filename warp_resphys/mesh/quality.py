@@ -12,9 +12,6 @@ def scaled_jacobian(mesh: Mesh) -> FloatArray:
     At each corner, it is the volume that the edges there span, over the product of their lengths. A tetrahedron's
     corners share one volume, and are compared by the largest product; nodes between corners are not looked at.
 
-    Args:
-        mesh: The mesh.
-
     Returns:
         (M,) from -1 to 1.
     """

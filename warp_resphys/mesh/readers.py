@@ -58,12 +58,6 @@ def read_surfaces(
 ) -> dict[str, IntArray]:
     """Read the named surfaces of a mesh file: gmsh's physical groups, or the cell sets of other formats.
 
-    Args:
-        path: The file; its extension tells the format.
-        units: As in `read_mesh`.
-        order: As in `read_mesh`.
-        drop_unreferenced: As in `read_mesh`.
-
     Returns:
         (F, 3 | 4 | 6) faces by name, of the mesh that `read_mesh` gives for the same arguments and as
         `mesh.boundary_faces` gives them; empty where the file names no surface.
@@ -92,12 +86,7 @@ def read_surfaces(
 
 
 def write_mesh(path: str | os.PathLike[str], mesh: Mesh, surfaces: Mapping[str, IntArray] | None = None) -> None:
-    """Write a mesh in metres.
-
-    Args:
-        path: The file; its extension tells the format. Only .msh, which is gmsh's, keeps named surfaces.
-        mesh: The mesh.
-        surfaces: (F, 3 | 4 | 6 | 8 | 9) faces by name.
+    """Write a mesh in metres, and its surfaces (F, 3 | 4 | 6 | 8 | 9) by name, which only .msh, gmsh's format, keeps.
 
     Raises:
         MeshError: The extension is unknown to meshio, or its format does not know such cells.

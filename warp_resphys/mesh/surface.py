@@ -26,12 +26,8 @@ def closest_points(mesh: Mesh, points: FloatArray) -> ClosestPoints:
     Faces with four nodes count as two triangles, those with six as four, through all of their nodes. A point beside an
     edge is equally close to the triangles that share it; of these the one that it lies most squarely above is taken.
 
-    Args:
-        mesh: The body.
-        points: (P, 3) [m], finite.
-
     Raises:
-        InputError: A point is not finite.
+        InputError: A point of (P, 3) [m] is not finite.
     """
     import trimesh
 

@@ -63,10 +63,7 @@ def decoded(library: str, path: Path) -> Arrays:
 def write_recording(path: str | Path, recording: Recording, attributes: Mapping[str, Any] | None = None) -> None:
     """Writes the HDF5 layout, in metres, so that `read_recording` gives the same recording back.
 
-    Args:
-        path: Where to write; missing folders are made.
-        recording: What to write.
-        attributes: What else is known of the trial, such as a load, as attributes of the root.
+    Attributes tell what else is known of the trial, such as a load. Missing folders are made.
 
     Raises:
         DataFileError: The file cannot be written.

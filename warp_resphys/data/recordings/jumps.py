@@ -39,11 +39,7 @@ def find_jumps(recording: Recording, least: float = LEAST_JUMP) -> list[Jump]:
     A step is predicted from the two steps on either side of it by a cubic: exact for a motion that is smooth over six
     frames. What is left is compared with what is left of every other marker, since a body that is let go, or hits
     something, jerks as a whole; the smallest difference counts. It is a jump if it is larger than `least` and than
-    eight times its median over 21 frames.
-
-    Args:
-        recording: With or without gaps; these are bridged by a spline for this.
-        least: The smallest jump [m].
+    eight times its median over 21 frames. Gaps are bridged by a spline for this.
     """
     size = _unexplained(recording)
     if not len(size):
@@ -55,12 +51,7 @@ def find_jumps(recording: Recording, least: float = LEAST_JUMP) -> list[Jump]:
 
 
 def find_swaps(recording: Recording, jumps: list[Jump]) -> list[Swap]:
-    """Finds markers that, after a jump or an occlusion, stand where another marker was before.
-
-    Args:
-        recording: With its gaps, not filled.
-        jumps: What `find_jumps` found in it.
-    """
+    """Finds markers that, after a jump or an occlusion, stand where another marker was before."""
     seen = recording.seen
     last_seen = np.maximum.accumulate(np.where(seen, np.arange(len(seen))[:, None], -1), axis=0)  # (T, M)
     swaps: list[Swap] = []

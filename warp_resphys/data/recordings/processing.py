@@ -87,12 +87,10 @@ def smooth(recording: Recording, cutoff: float) -> Recording:
     Its gain is one half at the cut-off, and falls by 48 dB an octave above it. Forces follow from accelerations, in
     which noise grows with the square of its frequency: without this, a force that explains every frame is mostly noise.
 
-    Args:
-        recording: gaps stay gaps; it is filtered through straight lines across them.
-        cutoff: [Hz], less than half of the frame rate.
+    Gaps stay gaps; they are crossed by straight lines.
 
     Raises:
-        InputError: a cut-off out of that range.
+        InputError: the cut-off [Hz] is not below half of the frame rate.
         DataFileError: too few frames.
     """
     if not 0.0 < cutoff < 0.5 * recording.rate:
@@ -114,12 +112,9 @@ def smooth(recording: Recording, cutoff: float) -> Recording:
 
 
 def release_of(recording: Recording, labels: Sequence[str], longest_gap: int = 5) -> Release:
-    """Finds when the body was let go, from the mean of the markers that are seen longest without a break at first.
+    """Finds when the body was let go, from the mean of those moving markers that are seen longest at first.
 
-    Args:
-        recording: With its frames from before the release.
-        labels: Markers that move, such as those of the tip.
-        longest_gap: The longest occlusion that is interpolated for this, in frames.
+    Occlusions of up to `longest_gap` frames are interpolated for this.
 
     Raises:
         DataFileError: A marker is missing, or nothing is let go before all of them are hidden.
@@ -141,11 +136,7 @@ def trim_to_release(recording: Recording, release: Release, seconds: float | Non
     """The frames from the release on, and where the markers were while the body was held.
 
     The release falls between two frames: `start` of the result is the time from it to the first frame that is kept.
-
-    Args:
-        recording: The whole recording.
-        release: Its release.
-        seconds: How long to keep after the release [s]; everything if None.
+    What is later than `seconds` after it is left out.
 
     Raises:
         DataFileError: A marker is not seen at all while the body is held, or too few frames are left.

@@ -211,11 +211,7 @@ class BaseMotion:
 
 
 def compare_base(recordings: Sequence[Recording], labels: Sequence[str]) -> list[BaseMotion]:
-    """Compares where markers on something rigid stand in several recordings, by their median positions.
-
-    Args:
-        recordings: Trials on one set-up.
-        labels: The markers on its base, two or more.
+    """Compares where two or more markers on something rigid stand, by their median positions in several recordings.
 
     Returns:
         An entry for each recording after the first.
@@ -246,14 +242,10 @@ def check_base(
     largest_distortion: float = 1e-3,
     largest_shift: float | None = None,
 ) -> None:
-    """Refuses trials between which a base marker was moved.
+    """Refuses trials on one set-up between which a marker on its base was moved.
 
-    Args:
-        recordings: Trials on one set-up.
-        labels: The markers on its base.
-        largest_distortion: How much the distance between two markers may change [m].
-        largest_shift: How far a marker may stand from its place in the first recording [m]; any distance if None,
-            which is right where each recording is registered by itself.
+    The distance between two markers may change by `largest_distortion` [m]. A marker may stand `largest_shift` [m] from
+    its place in the first recording; anywhere if None, which is right where each recording is registered by itself.
 
     Raises:
         DataFileError: A marker moved, is missing or is never seen.

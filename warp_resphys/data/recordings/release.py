@@ -34,7 +34,7 @@ def find_release(path: FloatArray, rate: float, source: str | Path = "the record
     Args:
         path: (T, 3) [m], without NaN; a mean of several markers is best.
         rate: Frames a second [Hz].
-        source: Where the path comes from, for messages.
+        source: Where the path comes from.
 
     Raises:
         DataFileError: The path has no such moment.

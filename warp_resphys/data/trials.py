@@ -61,10 +61,6 @@ class Trials:
         names = tuple(self.names[i] for i in indices)
         return Trials(names, *fields, self.inputs.select(pick), self.resting.select(pick))
 
-    def named(self, names: tuple[str, ...]) -> "Trials":
-        """Some of the trials, by name."""
-        return self.select([self.names.index(name) for name in names])
-
     def first(self, seconds: float) -> "Trials":
         """The frames of the first seconds; those past them count as not seen."""
         inside = self.times <= seconds + 1e-9

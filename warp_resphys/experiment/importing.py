@@ -18,8 +18,7 @@ from ..data.recordings.processing import fill_gaps, release_of, resample, smooth
 from ..data.recordings.quality import check_base, check_motion, check_passive, quality
 from ..data.recordings.reading import read_recording
 from ..data.recordings.recording import Recording, listed
-from ..data.recordings.release import Release
-from ..data.recordings.valve import valve_opening
+from ..data.recordings.release import Release, valve_opening
 from ..data.registration import Registration, register_markers
 from ..dynamics.simulator import Simulator
 from ..io.errors import DataFileError, InputError

@@ -16,7 +16,7 @@ from .arrays import numbers
 from .jumps import mask_repeats
 from .published import write_trials
 from .recording import SI_PER_ACTUATION_UNIT, RawRecording, Recording, to_recording
-from .valve import valve_opening
+from .release import valve_opening
 
 LENGTH: Final = 0.1  # [m]
 # [m] where the markers should be: four on the clamp, three at the tip, in the order of the labels.

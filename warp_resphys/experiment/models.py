@@ -100,7 +100,7 @@ class ModelRollout:
     ) -> None:
         self.scene, self.model = scene, model
         self.simulator = scene.model_simulator(model) if simulator is None else simulator
-        self.replay = Replay(self.simulator, scene.observe, scene.trials(names))
+        self.replay = Replay(self.simulator, scene.observe, scene.trials(names, self.simulator))
         self.start = scene.start(self.simulator, self.replay.trials) if start is None else start
         parameters = scene.parameters(model)
         self._constants, self._inputs, self._resting = self.replay.setting(parameters)
@@ -112,7 +112,8 @@ class ModelRollout:
         predict = None
         if learned is not None:
             frames = self._frames(learned)
-            predict = LearnedPredictor(learned.network, self._told, learned.range_, frames)
+            base = self.scene.base(self.replay.trials.names, self.simulator)
+            predict = LearnedPredictor(learned.network, self._told, learned.range_, frames, base)
         return Rollout(self.simulator, predict, self._inputs, self._constants), predict
 
     def _frames(self, learned: Learned) -> VertexFrames | None:

@@ -31,7 +31,9 @@ class Trial:
         pull: force that holds the body before the release, where the laboratory is simulated [N].
         sequence: number of its pressures, where they are drawn; None without any.
         scale: by which these are multiplied.
-        amount: what sets simulated trajectories apart: a weight [kg] or an angle [rad].
+        amount: what sets simulated trajectories apart: a weight [kg], an angle [rad], or a factor of `base_motion`.
+        base_motion: how what it is fixed to moves, if otherwise than ``data.base_motion`` says; see
+            `data.base_motion.prescribed`.
     """
 
     name: str
@@ -42,6 +44,7 @@ class Trial:
     sequence: int | None = None
     scale: float = 1.0
     amount: float = 0.0
+    base_motion: Mapping[str, Any] | None = None
 
     @property
     def recording(self) -> str:
@@ -89,6 +92,7 @@ class Variation:
 VARIATIONS: Final = {
     "release_from_load": Variation("weights_g", "g", 1e-3),
     "release_from_twist": Variation("angles_deg", "°", np.pi / 180.0),
+    "moving_base": Variation("amplitudes", "times", 1.0),
 }
 
 

@@ -70,7 +70,7 @@ class TestBadInput:
             ("data.weights_g.test=[90]", "data.weights_g names 90 g twice: every trajectory is in one split."),
             ("data.weights_g.test=[-4]", "data.weights_g.test holds a value that is not positive: [-4.0]."),
             ("data.weights_g.test=70", "data.weights_g.test is 70: it must be a list of numbers."),
-            ("data.kind=drop", "data.kind is 'drop': choose one of release_from_load, release_from_twist."),
+            ("data.kind=drop", "data.kind is 'drop': choose one of release_from_load, release_from_twist, moving_base."),
             ("solver.max_iterations=1", "the newton solver stopped after 1 iterations"),
             ("reconstruction.max_iterations=1", "Gauss-Newton reconstruction moved by"),
         ],

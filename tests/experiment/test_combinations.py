@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from main_job import IN_RUN, TINY, run
 
+from warp_resphys.data.base_motion import prescribed
 from warp_resphys.experiment import pipeline
 from warp_resphys.io.files import read_array, read_checkpoint, read_hdf5
 
@@ -231,3 +232,40 @@ def test_what_is_seen_is_held_in_the_range_of_the_training_or_not():
         assert ("range" in found) == (guard == "true")
         _, described = read_checkpoint(Path("run/resphys.safetensors"), "residual force")
         assert (described["range"] is not None) == (guard == "true")
+
+
+SWINGS = (
+    "+laboratory.trials={"
+    + ",".join(
+        f"{name}:{{base_motion:{{start:0.05,ramp:0.05,swings:{{a:{{frequency:{hertz},{motion}}}}}}}}}"
+        for name, hertz, motion in (
+            ("s0", 4.0, "translation:[0,0.01,0]"),
+            ("s1", 3.0, "rotation:[0.2,0.2,0]"),
+            ("s2", 5.0, "translation:[0,0,0.006]"),
+            ("s3", 4.0, "rotation:[0,0.1,0.2]"),
+        )
+    )
+    + "}"
+)
+MOVING = [
+    *(each for each in BEAM if not each.startswith(("laboratory.t", "laboratory.v", "data.seconds", "experiment"))),
+    "experiment=beam_moving_base",
+    "data.steps=30",
+    "laboratory.train=[s0,s1]",
+    "laboratory.validation=[s2]",
+    "laboratory.test=[s3]",
+    SWINGS,
+]
+
+
+@pytest.mark.parametrize("known", ["reference", "recorded"])
+def test_a_base_that_moves_is_told_by_markers_or_by_a_record(known):
+    found = done(*MOVING, f"data.base_motion={known}")
+    finite(found)
+    errors = {name: each["mean"] for name, each in found["errors_mm"].items()}
+    assert errors["sysid"] < 0.7 * errors["simulation"]
+    assert errors["resphys"] < 1.05 * errors["sysid"]
+    _, (base, times) = dataset("base", "times")
+    truth = prescribed({"start": 0.05, "ramp": 0.05, "swings": {"a": {"frequency": 3.0, "rotation": [0.2, 0.2, 0]}}}, times[1])
+    assert np.abs(base[1, : len(truth), 3:] - truth[:, 3:]).max() < (1e-9 if known == "recorded" else 5e-3)  # rad
+    assert np.abs(truth[:, 3:]).max() > 0.2

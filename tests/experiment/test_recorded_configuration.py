@@ -7,8 +7,8 @@ import pytest
 from measured_run import configuration
 
 from warp_resphys.experiment.checks import check_configuration, training_settings
-from warp_resphys.experiment.laboratory import vertical
 from warp_resphys.experiment.schema import dotted
+from warp_resphys.experiment.simulate import vertical
 from warp_resphys.experiment.trials import folds_of, split_of, trials_of
 from warp_resphys.io.errors import InputError, ResphysError
 

@@ -22,8 +22,8 @@ from ..mesh.mesh import select_vertices, surface_vertices
 from .build import build_body, build_material, build_simulator, chambers_of
 from .files import STATIC, attached_mass
 from .identify import ELASTIC
-from .laboratory import laboratory_settings, substeps_of, vertical
 from .schema import IN_THE_LOOP, NAME, NETWORK, TRAINER, check, configuration_group
+from .simulate import laboratory_settings, substeps_of, vertical
 from .trials import (
     Trial,
     folds_of,

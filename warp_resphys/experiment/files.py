@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ..data.base_motion import at_times
 from ..data.trials import Trials
@@ -35,7 +35,11 @@ REPORT: Final = "report.html"
 
 GIVEN: Final = "given"  # how trials begin whose state a simulation knows
 STATIC: Final = "static"
-DATASET_KIND: Final = "dataset"
+_KIND = "dataset"
+_UNITS = {
+    **dict.fromkeys(("observed", "smoothed", "held", "bound"), "m"),
+    **{"velocity": "m/s", "times": "s", "payload": "kg", "base": "m, rad"},
+}
 
 
 def reconstruction_file(model: str) -> str:
@@ -109,16 +113,16 @@ class Dataset:
         Raises:
             DataFileError: the file cannot be written.
         """
-        attributes = describe(self.names, self.labels, self.begins, self.gravity, self.time_step, self.channels)
-        with atomic_hdf5(path, DATASET_KIND, attributes) as file:
-            for name in ("observed", "smoothed"):
+        words = {"names": self.names, "labels": self.labels, "begins": self.begins, "inputs": tuple(self.inputs)}
+        words |= {f"{name}_channels": known for name, known in self.channels.items()}
+        attributes = {**{key: list(each) for key, each in words.items()}, "gravity": self.gravity}
+        with atomic_hdf5(path, _KIND, {**attributes, "time_step": self.time_step}) as file:
+            for name, unit in _UNITS.items():
                 if getattr(self, name) is not None:
-                    create(file, name, getattr(self, name), units="m", time_axis=1)
+                    axis = int(name in ("observed", "smoothed", "velocity"))
+                    create(file, name, getattr(self, name), units=unit, time_axis=axis)
             for name, values in self.inputs.items():
                 create(file, name, values, units="Pa", time_axis=1)
-            for name, unit in (("times", "s"), ("held", "m"), ("payload", "kg"), ("bound", "m"), ("base", "m, rad")):
-                if getattr(self, name) is not None:
-                    create(file, name, getattr(self, name), units=unit)
 
     def joined(self, other: "Dataset") -> "Dataset":
         """These trials and others of the same body after them, with as many frames."""
@@ -178,34 +182,18 @@ class Dataset:
         if poses is not None and not static:
             fixed = torch.from_numpy(np.asarray(body.mesh.vertices[body.fixed_vertices], dtype=np.float64))
             given["fixed_positions"] = (fixed @ rotations(poses[1:, :, 3:]).mT) + poses[1:, :, None, :3]
-        resting = (
-            Inputs(**{key: values[-1] for key, values in given.items() if key in self.inputs}) if static else Inputs()
-        )
+        resting = Inputs(**{key: given[key][-1] for key in self.inputs}) if static else Inputs()
         times, observed = (torch.from_numpy(x[rows][:, frames]) for x in (self.times, self.observed))
         return Trials(tuple(names), times, observed, torch.from_numpy(self.held[rows]), Inputs(**given), resting)
 
 
-def describe(
-    names: Sequence[str],
-    labels: Sequence[str],
-    begins: Sequence[str],
-    gravity: ArrayLike,
-    time_step: float,
-    channels: Mapping[str, Sequence[str]],
-) -> dict[str, Any]:
-    """Attributes of a dataset's file; see `Dataset`."""
-    words = {"names": list(names), "labels": list(labels), "begins": list(begins), "inputs": list(channels)}
-    of_inputs = {f"{name}_channels": list(known) for name, known in channels.items()}
-    return {**words, "gravity": np.asarray(gravity, dtype=np.float64), "time_step": time_step, **of_inputs}
-
-
 def read_dataset(path: Path) -> Dataset:
-    """Reads what `Dataset.write` wrote, or a simulation of trials.
+    """Reads what `Dataset.write` wrote.
 
     Raises:
         DataFileError: the file is missing, damaged or of another kind.
     """
-    with read_hdf5(path, DATASET_KIND) as file:
+    with read_hdf5(path, _KIND) as file:
         names, labels, begins, inputs = (
             tuple(str(each) for each in file.attrs[key]) for key in ("names", "labels", "begins", "inputs")
         )

@@ -28,7 +28,7 @@ from ..io.files import write_json
 from ..io.stages import StageContext
 from .build import bound_markers, build_simulator, chambers_of
 from .files import DATASET, QUALITY, REGISTRATION, SCALED_DATASET, STATIC, Dataset, read_dataset
-from .laboratory import vertical
+from .simulate import vertical
 from .trials import Trial, evenly, is_laboratory, scaled_trials_of, trials_of
 
 log = logging.getLogger(__name__)

@@ -44,14 +44,13 @@ from .files import (
 )
 from .identify import identify
 from .importing import import_recordings, import_scaled
-from .laboratory import run_laboratory
 from .learn import refine, train
 from .models import SIMFREE
 from .parts import processes_for
 from .reconstruct import reconstruct
 from .report import collect_metrics, make_folds_report, make_report
 from .scene import LEARNED, models_of
-from .simulate import simulate
+from .simulate import run_laboratory, simulate
 from .trials import Split, folds_of, is_laboratory, scaled_trials_of, sees_markers, split_of, test_groups, trials_of
 
 _SIMULATED = ("mesh", "physics", "fixed", "gravity", "time_step", "integrator", "solver", "device", "dtype")
@@ -96,7 +95,7 @@ def acquisition_stages(config: Mapping[str, Any]) -> list[Stage]:
     base, data = simulated(config), config["data"]
     if not sees_markers(config):
         return [Stage("simulate", simulate, (DATASET,), {**base, **_pick(config, "target", "data")})]
-    stages, processes = [], processes_for(config)
+    stages, processes = [], processes_for(config, config["parallel"]["processes"])
     imported = {**base, **_pick(config, "simulation", "markers")}
     imported["data"] = {key: value for key, value in data.items() if key not in _LATER_DATA} | {"pressure_scales": []}
     trials = trials_of(config)
@@ -154,7 +153,7 @@ def learning_stages(config: Mapping[str, Any], split: Split, shared: str, acquir
         shared: the folder of dataset.h5, relative to that of the split.
         acquired: fingerprint of the stage that wrote it.
     """
-    processes, models, identifies = processes_for(config), models_of(config), config["identify"] is not None
+    processes, identifies = processes_for(config, config["parallel"]["processes"]), config["identify"] is not None
     base: dict[str, Any] = {
         **simulated(config),
         **_pick(config, *_LEARNED_FROM),
@@ -173,7 +172,7 @@ def learning_stages(config: Mapping[str, Any], split: Split, shared: str, acquir
         needs = ("identify",)
     observed = [*split.train, *split.validation, *(() if sees_markers(config) else split.test)]
     known: list[str] = []
-    for model in (each for each in models if each in LEARNED and each != SIMFREE):
+    for model in (each for each in models_of(config) if each in LEARNED and each != SIMFREE):
         stages += _force_stages(config, {**base, "model": model}, observed, needs, processes)
         known.append(stages[-1].name)
     settings = {**base, **training_settings(config, SIMFREE), "range_guard": config["range_guard"], "model": SIMFREE}

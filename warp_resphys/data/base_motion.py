@@ -62,31 +62,45 @@ def prescribed(motion: Mapping[str, Any], times: ArrayLike, folder: str | Path =
     """(T, 6) poses at (T,) times [s] of a motion that is known beforehand.
 
     Args:
-        motion: ``file``, see `read_motion`, and ``about``; or what `swinging` takes.
+        motion: ``file``, see `_table`, or ``swings``, see `_swinging`; and ``about``, the point of the base, in the
+            frame of the mesh, whose translation is given, and which rotations leave where it is [m].
         times: (T,) [s].
         folder: that a path in ``file`` begins in.
-        scale: of the amplitudes of a function.
+        scale: of the whole motion.
 
     Raises:
         DataFileError: the file cannot be read.
     """
-    if "file" in motion:
-        return read_motion(Path(folder) / motion["file"], times, motion.get("about", (0.0, 0.0, 0.0)))
-    return swinging(motion, times, scale)
+    at = np.asarray(times, dtype=np.float64)
+    poses = scale * (_table(Path(folder) / motion["file"], at) if "file" in motion else _swinging(motion, at))
+    about = np.asarray(motion.get("about", (0.0, 0.0, 0.0)), dtype=np.float64)
+    poses[:, :3] += about - Rotation.from_rotvec(poses[:, 3:]).apply(about)
+    return np.asarray(poses)
 
 
-def read_motion(path: Path, times: ArrayLike, about: ArrayLike = (0.0, 0.0, 0.0)) -> FloatArray:
-    """(T, 6) poses from a table: a time [s], a place x, y, z [m] and a quaternion w, x, y, z in each line.
+def _swinging(motion: Mapping[str, Any], times: FloatArray) -> FloatArray:
+    """(T, 6) a sum of sinusoids, which begins where the body was.
 
-    The motion is that since the first line.
+    ``swings``, by any names, have each a ``frequency`` [Hz], amplitudes ``translation`` [m] and ``rotation`` [rad]
+    along and about x, y and z, and a ``phase`` [rad]; before ``start`` nothing moves, and during ``ramp`` after it the
+    amplitudes grow from nothing [s].
+    """
+    since = np.maximum(times - motion.get("start", 0.0), 0.0)
+    ramp = float(motion.get("ramp", 0.0))
+    share = np.clip(since / ramp, 0.0, 1.0) if ramp else np.ones_like(since)
+    grown = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+    poses = np.zeros((len(since), 6))
+    for swing in motion["swings"].values():
+        phase = float(swing.get("phase", 0.0))
+        wave = grown * (np.sin(2.0 * np.pi * swing["frequency"] * since + phase) - np.sin(phase))
+        poses += wave[:, None] * np.concatenate([swing.get(x, (0.0, 0.0, 0.0)) for x in ("translation", "rotation")])
+    return poses
 
-    Args:
-        path: a file of numbers with commas between them; lines that begin with # are not read.
-        times: (T,) [s]; before and after the table, its first and last pose.
-        about: (3,) the point of the base, in the frame of the mesh, whose places these are [m].
 
-    Raises:
-        DataFileError: the file cannot be read, has other columns, or its times do not rise.
+def _table(path: Path, times: FloatArray) -> FloatArray:
+    """(T, 6) the motion since the first line of a table: t [s], x, y, z [m] and a quaternion w, x, y, z in each line.
+
+    Lines that begin with # are not read; before and after the table, its first and last pose.
     """
     try:
         table = np.loadtxt(path, delimiter=",", ndmin=2)
@@ -97,8 +111,7 @@ def read_motion(path: Path, times: ArrayLike, about: ArrayLike = (0.0, 0.0, 0.0)
             f"{path} needs four lines or more of t, x, y, z, and a quaternion w, x, y, z, with commas between them, "
             "and times that rise."
         )
-    known = since_first(table[:, 1:4] - table[0, 1:4] + np.asarray(about), table[:, 4:], path)
-    return at_times(known, table[:, 0], np.asarray(times, dtype=np.float64))
+    return at_times(since_first(table[:, 1:4] - table[0, 1:4], table[:, 4:], path), table[:, 0], times)
 
 
 def since_first(places: ArrayLike, quaternions: ArrayLike, source: str | Path) -> FloatArray:

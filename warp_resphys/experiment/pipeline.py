@@ -58,7 +58,7 @@ _ACTING = ("chambers", "fibres", "coupling")
 _DRAWN = ("laboratory", "fixed", "chambers", "gravity", "time_step", "solver", "device", "dtype", "seed", "tip")
 _DRAWN_DATA = (
     *("folder", "trials", "sequences", "begins", "train", "validation", "test", "folds", "limit"),
-    *("payload_at", "up", "rest", "steps", "pressure_limit"),
+    *("payload_at", "up", "rest", "steps", "pressure_limit", "base_motion"),
 )
 _DRAWN_MARKERS = ("tracked", "reference", "bind", "bind_to", "largest_distance")
 _LATER_DATA = ("horizons", "train_fraction", "pressure_scales")
@@ -71,6 +71,12 @@ def simulated(config: Mapping[str, Any]) -> dict[str, Any]:
     base = {key: config[key] for key in (*_SIMULATED, *_ACTING)}
     if config["mesh"]["kind"] == "file":
         base["mesh_digest"] = digest(config["mesh"]["path"])
+    trials = config["data"].get("trials") or {}
+    motions = [each.get("base_motion") for each in (config["data"], *trials.values()) if isinstance(each, Mapping)]
+    files = [each["file"] for each in motions if isinstance(each, Mapping) and "file" in each]
+    if files:
+        folder = Path(config["data"].get("folder") or ".")
+        base["base_motions"] = {name: _digest(folder / name, "the file of base_motion") for name in files}
     return base
 
 
@@ -107,7 +113,7 @@ def acquisition_stages(config: Mapping[str, Any]) -> list[Stage]:
         play = partial(run_laboratory, processes=processes)
         stages.append(Stage("laboratory", play, files, _laboratory_settings(config, ())))
     else:
-        imported["recordings"] = {trial.name: _digest(trial.name, trial.file) for trial in trials}
+        imported["recordings"] = {trial.name: _digest(trial.file, f"data.trials.{trial.name}.file") for trial in trials}
     needs = tuple(stage.name for stage in stages)
     stages.append(Stage("import", import_recordings, (DATASET, QUALITY, REGISTRATION), imported, needs))
     scales = data["pressure_scales"]
@@ -135,13 +141,11 @@ def _laboratory_settings(config: Mapping[str, Any], scales: Sequence[float]) -> 
     return own
 
 
-def _digest(trial: str, path: Path | None) -> str:
+def _digest(path: Path | None, key: str) -> str:
     try:
         return digest(str(path))
     except OSError as error:
-        raise DataFileError(
-            f"cannot read {path} ({error.strerror}): check data.folder and data.trials.{trial}.file."
-        ) from error
+        raise DataFileError(f"cannot read {path} ({error.strerror}): check data.folder and {key}.") from error
 
 
 def learning_stages(config: Mapping[str, Any], split: Split, shared: str, acquired: str) -> list[Stage]:

@@ -44,7 +44,11 @@ TRIALS = {"a": {"file": "a.c3d", "payload": 0.0}, "b": {"file": "b.c3d", "payloa
         ("data/base_motion", 3, "data.base_motion is 3: it must be a group of settings"),
         ("data/base_motion", {"about": [0.0, 0.0, 0.0]}, "data.base_motion needs either file, .* or swings"),
         ("data/base_motion", {"swings": {}}, "data.base_motion.swings is empty: give it at least one"),
-        ("data/base_motion", {"swings": {"a": {"translation": [0, 0, 1]}}}, "data.base_motion.swings.a.frequency is mis"),
+        (
+            "data/base_motion",
+            {"swings": {"a": {"translation": [0, 0, 1]}}},
+            "data.base_motion.swings.a.frequency is mis",
+        ),
         ("data/base_motion", {"swings": {"a": {"frequency": -1.0}}}, "frequency is -1.0: it must be a positive number"),
         ("data/base_motion", {"file": "a.csv", "swings": {"a": {"frequency": 1.0}}}, "data.base_motion needs either"),
         ("data/payload", {"x": 0.1}, "unknown key 'data.payload': data has folder, units"),

@@ -48,7 +48,7 @@ from ..io.files import write_json
 from ..io.progress import Progress
 from ..io.stages import package_versions
 from ..linalg.linear_solver import make_linear_solver
-from .settings import settings_of
+from .command import settings_of
 
 PARTS = ("local_step", "tangent", "assembly", "factor", "solve")
 _YARDSTICK_SIZE = 480

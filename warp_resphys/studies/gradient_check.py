@@ -20,7 +20,7 @@ from ..experiment.build import build_simulator
 from ..experiment.schema import COUNT, NATURAL, NUMBERS, POSITIVE, Group, Kind, check
 from ..io.errors import InputError
 from ..mesh.poses import twisted
-from .settings import settings_of
+from .command import settings_of
 
 POSES = ("rest", "bent", "twisted")
 _KEYS = Group(

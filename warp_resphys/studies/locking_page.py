@@ -18,6 +18,7 @@ from rich.table import Table
 from ..io.files import atomic_path, digest, read_json, write_json, write_text
 from ..io.progress import Progress
 from ..report.figures import STYLE, TONES, new_figure, save_png
+from .command import settings_of
 from .locking import (
     BIQUADRATIC,
     HEXAHEDRA,
@@ -31,7 +32,6 @@ from .locking import (
     converged,
     measure,
 )
-from .settings import settings_of
 
 TITLES: Final[Mapping[str, str]] = MappingProxyType(
     {"gravity": "gravity, base tilted", "fibres": "pressure, with fibres", "pressure": "pressure, without fibres"}

@@ -8,8 +8,8 @@ from ..data.recordings.published import convert_arm, convert_beam
 from ..data.recordings.segment import convert_segment
 from ..io.errors import InputError
 from . import mesh_inspection as meshes
+from .command import settings_of
 from .recording_quality import inspect_recording
-from .settings import settings_of
 
 _CONVERTERS = {"arm": convert_arm, "beam": convert_beam, "segment": convert_segment}
 

@@ -23,7 +23,7 @@ from ..data.recordings.release import Release, find_release
 from ..data.registration import kabsch, root_mean_square
 from ..io.errors import DataFileError, InputError
 from ..io.files import atomic_path, write_json
-from .settings import settings_of
+from .command import settings_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

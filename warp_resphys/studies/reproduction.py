@@ -25,9 +25,9 @@ from ..io.labels import run_label
 from ..io.machine import commit, hardware
 from ..io.progress import clock
 from ..io.stages import package_versions, run_lock
+from .command import settings_of
 from .comparison import Result, compare
 from .reproduction_page import Reproduction, markdown, write_reproduction
-from .settings import settings_of
 
 log = logging.getLogger(__name__)
 

@@ -23,7 +23,7 @@ from ..fem.body import Body
 from ..io.errors import ConvergenceError, DataFileError, InputError
 from ..io.files import read_arrays
 from ..mesh.mesh import Mesh, box_hexahedra, select_vertices
-from .settings import settings_of
+from .command import settings_of
 
 LARGEST_ERROR = 1e-8  # m
 

@@ -12,8 +12,12 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.table import Table
 
+from ..experiment.schema import Kind
 from ..io.files import write_text
 
+WORDS: Final = Kind(
+    lambda value: isinstance(value, list) and all(isinstance(each, str) for each in value), "a list of words"
+)
 _LOG_WIDTH: Final = 140  # of tables that go to a file, in characters
 
 
@@ -47,7 +51,7 @@ def aligned(rows: Sequence[Sequence[str]], left: int = 1) -> str:
         "  ".join(
             cell.ljust(width) if at < left else cell.rjust(width)
             for at, (cell, width) in enumerate(zip(row, widths, strict=True))
-        )
+        ).rstrip()
         for row in rows
     )
 

@@ -112,7 +112,7 @@ class TestPage:
         assert len(names) == 3
         assert all(0 < (page.parent / name).stat().st_size < 200_000 for name in names)
         assert "warp-resphys reproduce " in text
-        assert "- processor: " in text
+        assert "| processor | " in text
         assert "&#39;" not in text
 
     def test_what_is_up_to_date_is_not_run_again(self, finished):

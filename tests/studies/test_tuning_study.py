@@ -42,7 +42,7 @@ class TestSpace:
             ({"network": {}}, "tune.space is empty"),
             (
                 {"data": {"steps": [1, 2]}},
-                "tune.space.data cannot be searched: name settings of network or trainer or in_the_loop.",
+                "unknown key 'tune.space.data': tune.space has network, trainer, in_the_loop.",
             ),
             ({"network": 3}, "tune.space.network is 3: it must be a group"),
             ({"network": {"width": [8]}}, "tune.space.network.width is [8]: it must list two or more"),

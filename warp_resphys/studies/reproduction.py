@@ -26,9 +26,10 @@ from ..io.labels import run_label
 from ..io.machine import commit, hardware
 from ..io.progress import clock
 from ..io.stages import package_versions, run_lock
-from ..report.page import NO_BREAK_SPACE, Canvas, Drawn, figures_beside, page_template
+from ..report.page import Canvas, Cell, Drawn, Items, Part, Row, Table, figures_beside
 from .command import WORDS, settings_of
 from .comparison import Run, compare
+from .page import markdown, write_page
 
 log = logging.getLogger(__name__)
 
@@ -57,20 +58,21 @@ def reproduce(config: DictConfig) -> None:
         page = folder / PAGE
         with figures_beside(page) as pictures:
             verdict, parts = compare(plain, results, Canvas(pictures))
-        shown = {
-            "title": "Reproduction",
-            "date": f"{datetime.now():%Y-%m-%d}",
-            "command": shlex.join(["warp-resphys", "reproduce", *HydraConfig.get().overrides.task]),
-            "machine": {**hardware(), "commit": commit() or "not known"},
-            "versions": package_versions(),
-            "verdict": verdict,
-            "parts": parts,
-            "kind_of": lambda block: type(block).__name__,
-        }
-        write_text(page, page_template("reproduction.html").render(shown))
-        write_text(page.with_name("results.md"), _markdown(shown, pictures.name))
+        parts.append(_made())
+        date = f"{datetime.now():%Y-%m-%d}"
+        write_page(page, title="Reproduction", kicker=date, verdict=verdict, parts=parts)
+
+        def in_markdown(folder: str) -> str:
+            return markdown(f"Reproduction of {date}", verdict, parts, folder)
+
+        write_text(page.with_name("results.md"), in_markdown(pictures.name))
         if plain["results"] is not None:
-            _write_results(Path(plain["results"]), shown, pictures)
+            name = f"{date}-reproduction"
+            place = Path(plain["results"]) / name
+            drawn = [block.name for part in parts for block in part.blocks if isinstance(block, Drawn)]
+            _copy([pictures / f"{figure}.png" for figure in drawn], place)
+            write_text(place.with_suffix(".md"), in_markdown(name))
+            print(f"Results: {place}.md")
     print(f"Page: {page}")
     if failed := [result.name for result in results if result.failure]:
         raise ResphysError(
@@ -79,26 +81,25 @@ def reproduce(config: DictConfig) -> None:
         )
 
 
-def _markdown(shown: Mapping[str, Any], folder: str) -> str:
-    """The page as Markdown, with its figures in a folder beside it."""
-    return page_template("results.md").render(shown, folder=folder).replace(NO_BREAK_SPACE, " ") + "\n"
+def _made() -> Part:
+    """How the page was made: by which command, on which machine, with which versions."""
+    command = shlex.join(["warp-resphys", "reproduce", *HydraConfig.get().overrides.task])
+    known = {**hardware(), "commit": commit() or "not known", **package_versions()}
+    table = Table("Machine and versions", ["Here"], [Row(name, [Cell(value)]) for name, value in known.items()])
+    return Part("Command, machine and versions", [Items([command], code=True), table])
 
 
-def _write_results(root: Path, shown: Mapping[str, Any], pictures: Path) -> None:
-    """The page as Markdown, with its figures in a folder of their own, both named by the date."""
-    name = f"{shown['date']}-reproduction"
+def _copy(figures: Sequence[Path], folder: Path) -> None:
+    """Files into a folder of their own, in place of what is there."""
     try:
-        shutil.rmtree(root / name, ignore_errors=True)
-        (root / name).mkdir(parents=True)
-        for block in (block for part in shown["parts"] for block in part.blocks):
-            if isinstance(block, Drawn):
-                shutil.copy(pictures / f"{block.name}.png", root / name)
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        for figure in figures:
+            shutil.copy(figure, folder)
     except OSError as error:
         if is_disk_full(error):
-            raise disk_full_error(root) from error
-        raise DataFileError(f"cannot write {root} ({error.strerror}): choose another folder for results.") from error
-    write_text(root / f"{name}.md", _markdown(shown, name))
-    print(f"Results: {root / name}.md")
+            raise disk_full_error(folder) from error
+        raise DataFileError(f"cannot write {folder} ({error.strerror}): choose another folder for results.") from error
 
 
 def plan(config: Mapping[str, Any]) -> list[Run]:

@@ -13,20 +13,23 @@ from typing import Any
 import numpy as np
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
-from rich.console import Console
-from rich.table import Table
 
 from ...io.files import OWN_OPTIONS, write_json, write_text
 from ...report.page import (
     NO_BREAK_SPACE,
-    Picture,
-    draw_picture,
+    Canvas,
+    Cell,
+    Drawn,
+    Part,
+    Row,
+    Table,
+    Text,
     duration_text,
     flatten,
     number_text,
-    page_template,
 )
-from ..command import write_csv
+from ..command import show, table_of, write_csv
+from ..page import write_page
 from .space import Dimension, with_settings
 from .study import Outcome, SharedStudy
 
@@ -40,22 +43,13 @@ _MODELS = {"resphys": "ResPhys", "simfree": "SimFree"}
 
 @dataclass(frozen=True)
 class Tuning:
-    """What is searched.
+    """What is searched."""
 
-    Attributes:
-        config: the whole configuration.
-        groups: ``network``, ``trainer`` and what else every trial is trained with, but for what is searched.
-        space: what each setting may be, by dotted key.
-        study: shared with the other workers.
-        configured_mm: roll-out error on the validation split of the network that is trained as configured [mm]; None
-            where it diverges.
-    """
-
-    config: Mapping[str, Any]
-    groups: Mapping[str, Any]
-    space: Mapping[str, Dimension]
+    config: Mapping[str, Any]  # all of it
+    groups: Mapping[str, Any]  # what every trial is trained with, such as ``network``, but for what is searched
+    space: Mapping[str, Dimension]  # what each setting may be, by dotted key
     study: SharedStudy
-    configured_mm: float | None
+    configured_mm: float | None  # roll-out error on the validation split of training as configured; None: it diverges
 
     @property
     def folder(self) -> Path:
@@ -79,12 +73,8 @@ class Tuning:
 
 def ranked(outcomes: Sequence[Outcome]) -> list[Outcome]:
     """The complete trials that did not diverge, the best one first."""
-    finite = [
-        (each.error, each.number, each)
-        for each in outcomes
-        if each.state == "complete" and each.error is not None and math.isfinite(each.error)
-    ]
-    return [each for *_, each in sorted(finite, key=lambda row: row[:2])]
+    finite = [each for each in outcomes if each.state == "complete" and math.isfinite(each.error or 0.0)]
+    return sorted(finite, key=lambda each: (each.error, each.number))
 
 
 def short_text(value: Any) -> str:
@@ -140,20 +130,21 @@ def _option_text(tuning: Tuning, best: Outcome, trials: int) -> str:
 def print_best(tuning: Tuning) -> None:
     """Prints the best trials, and how to use what was found."""
     best = ranked(tuning.study.outcomes())
-    console = Console()
     if not best:
-        console.print("Every trial diverged: search closer to settings that work, see tune.space.")
+        show("Every trial diverged: search closer to settings that work, see tune.space.")
         return
-    names = [name.rpartition(".")[2] for name in tuning.space]
-    table = Table("trial", "error [mm]", *names, title="Best trials: roll-out error on the validation split")
-    for each in best[:_PRINTED]:
-        values = (short_text(each.settings[name]) for name in tuning.space)
-        table.add_row(str(each.number), number_text(each.error), *values)
-    console.print(table)
-    console.print(f"Page: {os.path.relpath(tuning.folder / PAGE)}", soft_wrap=True)
-    console.print(f"To use the best settings: tuned={tuning.name} ({tuning.option})", soft_wrap=True)
-    as_configured = f"As configured: {number_text(tuning.configured_mm)} mm"
-    console.print(as_configured if tuning.beaten_by(best[0]) else f"{as_configured}, which no trial has beaten")
+    headings = ["trial", "error [mm]", *(key.rpartition(".")[2] for key in tuning.space)]
+    rows = [
+        [str(each.number), number_text(each.error), *(short_text(each.settings[key]) for key in tuning.space)]
+        for each in best[:_PRINTED]
+    ]
+    beaten = "" if tuning.beaten_by(best[0]) else ", which no trial has beaten"
+    show(
+        table_of("Best trials: roll-out error on the validation split", headings, rows),
+        f"Page: {os.path.relpath(tuning.folder / PAGE)}",
+        f"To use the best settings: tuned={tuning.name} ({tuning.option})",
+        f"As configured: {number_text(tuning.configured_mm)} mm{beaten}",
+    )
 
 
 def write_pictures(tuning: Tuning) -> None:
@@ -162,26 +153,39 @@ def write_pictures(tuning: Tuning) -> None:
     best = ranked(outcomes)
     last = [key.rpartition(".")[2] for key in tuning.space]
     names = {key: name if last.count(name) == 1 else key for key, name in zip(tuning.space, last, strict=True)}
-    common = {key: tuning.groups[key] for key in ("network", "trainer", "seed")}
-    page = page_template("tuning.html").render(
-        data={
-            "title": tuning.config["title"],
-            "experiment": tuning.config["name"],
-            "ranked": best,
-            "name": tuning.name,
-            "option": str(tuning.option),
-        },
-        pictures=_draw(tuning, outcomes, best, names),
-        model=_MODELS[tuning.config["tune"]["model"]],
+    trials = [
+        Row(
+            str(each.number),
+            [
+                Cell(number_text(each.error)),
+                *(Cell(short_text(each.settings[key])) for key in names),
+                Cell(duration_text(each.seconds or 0.0)),
+            ],
+        )
+        for each in best
+    ]
+    space = [Row(key, [Cell(str(dimension))]) for key, dimension in tuning.space.items()]
+    common = [
+        Row(key, [Cell(value)])
+        for key, value in flatten({key: tuning.groups[key] for key in ("network", "trainer", "seed")})
+        if key not in tuning.space
+    ]
+    use = f"To run with the best settings: tuned={tuning.name}, which stands in {tuning.option}."
+    table = Table("Trial", ["Error [mm]", *names.values(), "Wall time"], trials)
+    results: list[Drawn | Text | Table] = [*_drawn(tuning, outcomes, best, names)]
+    results += [Text(use), table] if best else []
+    searched = [
+        Table("Setting", ["Range"], space),
+        Table("Setting", ["Value"], common, summary="What all trials have in common"),
+    ]
+    write_page(
+        tuning.folder / PAGE,
+        title=tuning.config["title"],
+        kicker=f"experiment {tuning.config['name']}, search for the settings of "
+        f"{_MODELS[tuning.config['tune']['model']]}",
         verdict=_verdict(tuning, outcomes, best),
-        names=names,
-        space={key: str(dimension) for key, dimension in tuning.space.items()},
-        number=number_text,
-        duration=duration_text,
-        short=short_text,
-        settings=[(key, value) for key, value in flatten(common) if key not in tuning.space],
+        parts=[Part("", results), Part("What was searched", searched)],
     )
-    write_text(tuning.folder / PAGE, page)
 
 
 def _verdict(tuning: Tuning, outcomes: Sequence[Outcome], best: Sequence[Outcome]) -> str:
@@ -201,9 +205,9 @@ def _verdict(tuning: Tuning, outcomes: Sequence[Outcome], best: Sequence[Outcome
     return f"{found} {said}".replace(" mm", f"{NO_BREAK_SPACE}mm")
 
 
-def _draw(
+def _drawn(
     tuning: Tuning, outcomes: Sequence[Outcome], best: Sequence[Outcome], names: Mapping[str, str]
-) -> dict[str, Picture]:
+) -> list[Drawn]:
     from . import figures  # Matplotlib takes a second, which a worker need not wait for.
 
     errors, pruned = np.full((2, len(outcomes)), np.nan)
@@ -215,15 +219,26 @@ def _draw(
     space = {names[key]: dimension for key, dimension in tuning.space.items()}
     scatter = np.array([each.error for each in best], dtype=np.float64)
     told = ", ".join(f"{name} {share:.0%}" for name, share in shares.items())
-    drawings = {
-        "history": (
+    canvas = Canvas(tuning.folder)
+    return [
+        canvas.figure(
+            "history",
             partial(figures.search_history, errors, pruned, tuning.configured_mm),
             f"Validation roll-out error of {len(outcomes)} trials and the best so far, on a logarithmic axis.",
+            "What each trial came to: the mean vertex error of roll-outs of the validation split.",
         ),
-        "importance": (partial(figures.importance_bars, shares), f"Importance of each setting: {told}."),
-        "settings": (
+        canvas.figure(
+            "settings",
             partial(figures.setting_scatter, scatter, tried, space),
             "Validation roll-out error against each setting, a panel each, on a logarithmic axis.",
+            "The same errors against each setting; the orange point is the best trial. Trials that diverged or were "
+            "given up are left out.",
         ),
-    }
-    return {name: draw_picture(tuning.folder, name, draw, alt) for name, (draw, alt) in drawings.items()}
+        canvas.figure(
+            "importance",
+            partial(figures.importance_bars, shares),
+            f"Importance of each setting: {told}.",
+            "How much each setting tells the best quarter of the trials from the others (PED-ANOVA). With few trials, "
+            "an order of magnitude at best.",
+        ),
+    ]

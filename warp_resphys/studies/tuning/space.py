@@ -4,7 +4,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ...experiment.schema import dotted, is_finite
+from optuna.trial import Trial
+
+from ...experiment.schema import ANYTHING, Group, absent, check, dotted, is_finite
 from ...io.errors import InputError
 
 SEARCHED_GROUPS = ("network", "trainer", "in_the_loop")
@@ -12,24 +14,23 @@ SEARCHED_GROUPS = ("network", "trainer", "in_the_loop")
 
 @dataclass(frozen=True)
 class Range:
-    """All numbers between two.
-
-    Attributes:
-        low: smallest.
-        high: largest.
-        log: whether equal ratios count alike, instead of equal differences.
-        whole: whether only whole numbers are meant.
-    """
+    """All numbers between two."""
 
     low: float
     high: float
-    log: bool
-    whole: bool
+    log: bool  # whether equal ratios count alike, instead of equal differences
+    whole: bool  # whether only whole numbers are meant
 
     @property
     def ends(self) -> tuple[Any, ...]:
         """The values that limit the others."""
         return (self.low, self.high)
+
+    def suggest(self, trial: Trial, key: str) -> Any:
+        """What a sampler draws, or has drawn."""
+        if self.whole:
+            return trial.suggest_int(key, int(self.low), int(self.high), log=self.log)
+        return trial.suggest_float(key, self.low, self.high, log=self.log)
 
     def __str__(self) -> str:
         """In words."""
@@ -38,19 +39,28 @@ class Range:
 
 @dataclass(frozen=True)
 class Choice:
-    """One of some values; numbers stand in their order, from the smallest to the largest."""
+    """One of some values; numbers stand in their order, from the smallest to the largest.
+
+    Of numbers, the sampler draws the place, as neighbours resemble each other.
+    """
 
     values: tuple[Any, ...]
 
     @property
     def ordered(self) -> bool:
-        """Whether the values are numbers, so that neighbours resemble each other."""
+        """Whether the values are numbers."""
         return all(map(is_finite, self.values))
 
     @property
     def ends(self) -> tuple[Any, ...]:
         """All values."""
         return self.values
+
+    def suggest(self, trial: Trial, key: str) -> Any:
+        """What a sampler draws, or has drawn."""
+        if self.ordered:
+            return self.values[trial.suggest_int(key, 0, len(self.values) - 1)]
+        return trial.suggest_categorical(key, self.values)
 
     def __str__(self) -> str:
         """In words."""
@@ -73,16 +83,12 @@ def parse_space(space: Any) -> dict[str, Dimension]:
     Raises:
         InputError: a key outside of the groups that can be searched, or no range.
     """
-    if not isinstance(space, Mapping):
-        raise InputError(f"tune.space is {space!r}: it must be a group of settings.")
-    found: dict[str, Dimension] = {}
-    for group, ranges in space.items():
-        if group not in SEARCHED_GROUPS:
-            raise InputError(f"tune.space.{group} cannot be searched: name settings of {' or '.join(SEARCHED_GROUPS)}.")
-        if not isinstance(ranges, Mapping):
-            raise InputError(f"tune.space.{group} is {ranges!r}: it must be a group of settings with their ranges.")
-        for name, given in ranges.items():
-            found[f"{group}.{name}"] = _parse_dimension(f"tune.space.{group}.{name}", given)
+    check("tune.space", space, Group({group: absent(Group(each=ANYTHING)) for group in SEARCHED_GROUPS}))
+    found = {
+        f"{group}.{name}": _parse_dimension(f"tune.space.{group}.{name}", given)
+        for group, ranges in space.items()
+        for name, given in ranges.items()
+    }
     if not found:
         raise InputError("tune.space is empty: it must name at least one setting, such as network.width.")
     return dict(sorted(found.items()))

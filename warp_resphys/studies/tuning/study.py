@@ -24,7 +24,7 @@ from typing_extensions import override
 from ...experiment.schema import dotted
 from ...io.errors import DataFileError, InputError
 from ...io.files import to_plain
-from .space import Choice, Dimension
+from .space import Dimension
 from .workers import held
 
 JOURNAL = "study.journal"
@@ -47,38 +47,23 @@ class _NoLock(JournalFileOpenLock):
 
 @dataclass(frozen=True)
 class Claim:
-    """A trial that this worker runs.
+    """A trial that this worker runs."""
 
-    Attributes:
-        number: of the trial, from 0 on.
-        settings: what is tried, by dotted key.
-        claims: how many workers have had it so far, this one included.
-        trial: as the sampler knows it.
-    """
-
-    number: int
-    settings: Mapping[str, Any]
-    claims: int
-    trial: Trial
+    number: int  # from 0 on
+    settings: Mapping[str, Any]  # that are tried, by dotted key
+    claims: int  # how many workers have had it so far, this one included
+    trial: Trial  # as the sampler knows it
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What is known of a trial.
+    """What is known of a trial."""
 
-    Attributes:
-        number: of the trial, from 0 on.
-        state: ``complete``, ``pruned``, ``failed`` or ``running``.
-        error: the objective [mm]; infinite where everything diverged, None where it is not known.
-        settings: what was tried, by dotted key.
-        seconds: of computation, over all workers that had it [s]; None where it is not known.
-    """
-
-    number: int
-    state: str
-    error: float | None
-    settings: Mapping[str, Any]
-    seconds: float | None
+    number: int  # from 0 on
+    state: str  # complete, pruned, failed or running
+    error: float | None  # the objective [mm]; infinite where everything diverged, None where it is not known
+    settings: Mapping[str, Any]  # that were tried, by dotted key
+    seconds: float | None  # of computation, over all workers that had it [s]; None where it is not known
 
 
 class SharedStudy:
@@ -174,7 +159,8 @@ class SharedStudy:
     def _take(self, trial: Trial) -> Claim:
         claims = [*trial.user_attrs.get("claims", []), self._identity]
         trial.set_user_attr("claims", claims)
-        settings = {key: _decoded(each, _suggested(trial, key, each)) for key, each in self._space.items()}
+        settings = {key: each.suggest(trial, key) for key, each in self._space.items()}
+        trial.set_user_attr("settings", settings)
         return Claim(trial.number, settings, len(claims), trial)
 
     def owns(self, claim: Claim) -> bool:
@@ -183,24 +169,13 @@ class SharedStudy:
         return now.state == TrialState.RUNNING and now.user_attrs["claims"][-1] == self._identity
 
     def report(self, claim: Claim, step: int, value: float) -> None:
-        """Notes a value on the way, if the trial is still this worker's.
-
-        Args:
-            claim: the trial.
-            step: where it was measured, such as an epoch.
-            value: the smaller, the better; infinite where it diverged.
-        """
+        """Notes a value on the way, such as after an epoch, if the trial is still this worker's."""
         with self.lock():
             if self.owns(claim) and step not in self._trials()[claim.number].intermediate_values:
                 claim.trial.report(value, step)
 
     def tell(self, claim: Claim, value: float | None, seconds: float) -> bool:
-        """Ends a trial.
-
-        Args:
-            claim: the trial.
-            value: the objective, infinite where it diverged; None for a trial that is given up.
-            seconds: of computation.
+        """Ends a trial with its objective, infinite where it diverged; None for a trial that is given up.
 
         Returns:
             Whether it was this worker's to end; if not, nothing is changed.
@@ -224,10 +199,10 @@ class SharedStudy:
         return [self._outcome(trial) for trial in self._trials()]
 
     def _outcome(self, trial: FrozenTrial) -> Outcome:
-        settings = {key: _decoded(self._space[key], trial.params[key]) for key in self._space if key in trial.params}
         error = min(trial.intermediate_values.values(), default=None) if trial.value is None else trial.value
         state = _STATES.get(trial.state, "running")
-        return Outcome(trial.number, state, error, settings, trial.user_attrs.get("seconds"))
+        known = trial.user_attrs
+        return Outcome(trial.number, state, error, known.get("settings", {}), known.get("seconds"))
 
     def holders(self) -> list[str]:
         """Who runs a trial now, in words."""
@@ -237,27 +212,11 @@ class SharedStudy:
     def importance(self) -> dict[str, float]:
         """How much each setting matters for being among the best quarter, summing to one; empty if that is not known.
 
-        The method is PED-ANOVA (Watanabe et al., 2023, arXiv:2304.10255).
+        By PED-ANOVA (Watanabe et al., 2023, arXiv:2304.10255).
         """
-        values = {trial.value for trial in self._trials(TrialState.COMPLETE)}
-        if len([value for value in values if value is not None and math.isfinite(value)]) < 4:
+        values = {trial.value for trial in self._trials(TrialState.COMPLETE) if trial.value is not None}
+        if sum(map(math.isfinite, values)) < 4:
             return {}
         evaluator = optuna.importance.PedAnovaImportanceEvaluator(target_quantile=0.25)
         found = optuna.importance.get_param_importances(self._study, evaluator=evaluator)
         return {key: float(value) for key, value in found.items()}
-
-
-def _suggested(trial: Trial, key: str, dimension: Dimension) -> Any:
-    """What the sampler draws: of ordered values their place, as neighbours resemble each other."""
-    if isinstance(dimension, Choice):
-        if dimension.ordered:
-            return trial.suggest_int(key, 0, len(dimension.values) - 1)
-        return trial.suggest_categorical(key, dimension.values)
-    if dimension.whole:
-        return trial.suggest_int(key, int(dimension.low), int(dimension.high), log=dimension.log)
-    return trial.suggest_float(key, dimension.low, dimension.high, log=dimension.log)
-
-
-def _decoded(dimension: Dimension, value: Any) -> Any:
-    """The setting that a drawn value stands for."""
-    return dimension.values[value] if isinstance(dimension, Choice) and dimension.ordered else value

@@ -57,25 +57,15 @@ _NOT_MEASURED: Final = {*_ELEMENTS, "file", "units", "within"}  # what the resul
 
 @dataclass(frozen=True)
 class Case:
-    """A mesh of the study.
+    """A mesh of the study."""
 
-    Attributes:
-        name: of a file for its results.
-        element: its kind.
-        size: of the elements in the section [m]; None for a file.
-        layers: of hexahedra [m].
-        file: that it is read from.
-        units: of that file.
-        timed: whether steps are timed, and the deflection without fibres is computed.
-    """
-
-    name: str
+    name: str  # of a file for its results
     element: str
-    size: float | None = None
-    layers: float | None = None
-    file: str | None = None
-    units: str = "m"
-    timed: bool = True
+    size: float | None = None  # of the elements in the section [m]; None for a file
+    layers: float | None = None  # height of those of hexahedra [m]
+    file: str | None = None  # that it is read from
+    units: str = "m"  # of that file
+    timed: bool = True  # whether steps are timed, and the deflection without fibres is computed
 
     def mesh(self, geometry: Mapping[str, Any]) -> Mesh:
         """The mesh, of an arm with these measures.
@@ -214,14 +204,9 @@ def locking_study(config: DictConfig) -> None:
 
 
 def run_study(config: Mapping[str, Any], folder: Path) -> list[Table | str]:
-    """Measures every mesh that has no result yet, and writes study.json, study.csv and study.png.
+    """Measures every mesh that has no result yet, writes the files, and returns the table and what follows from it.
 
-    Args:
-        config: with the keys of ``conf/locking_study.yaml``.
-        folder: where they go; the result of each mesh is kept in its folder ``meshes``.
-
-    Returns:
-        The table, and what follows from it in one sentence.
+    The result of each mesh is kept in the folder ``meshes``.
 
     Raises:
         ResphysError: see `measure`.

@@ -24,18 +24,10 @@ _CUBIC_CENTI: Final = 1e6
 
 
 def make_arm(config: Mapping[str, Any], folder: Path) -> str:
-    """Generates an arm: writes the mesh and a picture.
-
-    Args:
-        config: With the keys of `conf/make_arm.yaml`.
-        folder: Where the picture goes, and the mesh where its path is relative.
-
-    Returns:
-        A table.
+    """Generates an arm, writes the mesh and a picture, and returns a table.
 
     Raises:
-        InputError: A setting of the wrong kind.
-        MeshError: The arm cannot be made.
+        ResphysError: A setting of the wrong kind, or an arm that cannot be made.
     """
     check("density", config["density"], POSITIVE)
     settings = config["mesh"]
@@ -53,19 +45,10 @@ def make_arm(config: Mapping[str, Any], folder: Path) -> str:
 
 
 def inspect_mesh(config: Mapping[str, Any], folder: Path, built: Mesh | None = None) -> str:
-    """Says what is in a mesh.
-
-    Args:
-        config: With the keys of `conf/inspect.yaml`.
-        folder: Where the picture goes.
-        built: The mesh, where it is not that of the file `mesh.path`.
-
-    Returns:
-        A table.
+    """Returns a table of what is in a mesh, that of the file `mesh.path` or one that was built, and draws it.
 
     Raises:
-        InputError: A setting of the wrong kind.
-        MeshError: A file that cannot be read, or a mesh that cannot be simulated.
+        ResphysError: A setting of the wrong kind, a file that cannot be read, or a mesh that cannot be simulated.
     """
     check("density", config["density"], POSITIVE)
     rows, names = [], ""

@@ -8,14 +8,7 @@ from ..report.page import NO_BREAK_SPACE, Part, page_template
 
 
 def write_page(path: Path, *, title: str, kicker: str, verdict: str, parts: Sequence[Part]) -> None:
-    """Writes a page.
-
-    Args:
-        path: its file.
-        title: its heading.
-        kicker: what stands above that.
-        verdict: what stands below it.
-        parts: its sections.
+    """Writes a page: its heading, what stands above and below that, and its sections.
 
     Raises:
         DataFileError: the file cannot be written.

@@ -28,7 +28,7 @@ from ..data.recordings.release import Release, find_release
 from ..data.registration import kabsch, root_mean_square
 from ..dynamics.simulator import Simulator
 from ..energies.materials import make_material
-from ..experiment.schema import ANYTHING, COUNT, FINITE, MATERIAL, NOT_NEGATIVE, POSITIVE, Group, check, optional
+from ..experiment.schema import ANYTHING, COUNT, FINITE, MATERIAL, NOT_NEGATIVE, POSITIVE, WORD, Group, check, optional
 from ..fem.body import Body, PointMass
 from ..io.errors import DataFileError, InputError
 from ..io.files import atomic_path, write_json
@@ -44,7 +44,10 @@ _KEYS: Final = Group(
         "registration": Group({"longest_gap": COUNT, "largest_residual": NOT_NEGATIVE}),
         "comparison": Group(dict.fromkeys(("fit_seconds", "tail_seconds", "error_seconds"), POSITIVE)),
         "recording": Group({"hung_weight": NOT_NEGATIVE, "release_frame": optional(FINITE)}, each=ANYTHING),
-        "simulation": Group({"time_step": POSITIVE, "gravity": POSITIVE}, each=ANYTHING),
+        "simulation": Group(
+            dict.fromkeys(("time_step", "gravity", "relative_tolerance"), POSITIVE)
+            | dict.fromkeys(("integrator", "solver", "device"), WORD)
+        ),
     },
     each=ANYTHING,
 )
@@ -65,23 +68,18 @@ _COMPARED: Final = (
 
 @dataclasses.dataclass(frozen=True)
 class Marker:
-    """A marker and its nominal position (x, y, z) [m] in the frame of the body."""
+    """A marker and its nominal position in the frame of the body."""
 
     name: str
-    position: tuple[float, float, float]
+    position: tuple[float, float, float]  # (x, y, z) [m]
 
 
 @dataclasses.dataclass(frozen=True)
 class Swing:
-    """Tip markers of a beam from its release on.
+    """Tip markers of a beam from its release on."""
 
-    Attributes:
-        time: (T,) [s] since the release.
-        displacement: (T, M, 3) [m] from where the markers were while the beam was held straight.
-    """
-
-    time: FloatArray
-    displacement: FloatArray
+    time: FloatArray  # (T,) [s] since the release
+    displacement: FloatArray  # (T, M, 3) [m] from where the markers were while the beam was held straight
 
     @property
     def deflection(self) -> FloatArray:
@@ -96,17 +94,11 @@ class Swing:
 
 @dataclasses.dataclass(frozen=True)
 class MeasuredSwing(Swing):
-    """The swing of a recording.
+    """The swing of a recording."""
 
-    Attributes:
-        rest_markers: (M, 3) [m] where the tip markers were while the beam was held, in the frame of the body.
-        release: The moment of release, in frames of the recording.
-        registration_residual: Root mean square [m] between measured and nominal markers at rest.
-    """
-
-    rest_markers: FloatArray
-    release: Release
-    registration_residual: float
+    rest_markers: FloatArray  # (M, 3) [m] of the tip while the beam was held, in the frame of the body
+    release: Release  # in frames of the recording
+    registration_residual: float  # [m] root mean square, between measured and nominal markers at rest
 
 
 def measured_swing(
@@ -129,8 +121,7 @@ def measured_swing(
         release_frame: The release, where it is known; found from the tip if None.
 
     Raises:
-        DataFileError: A marker is missing or occluded for long, nothing is let go, or the markers do not fit.
-        InputError: The given release is not in the recording.
+        ResphysError: A marker is missing or occluded for long, nothing is let go, or the markers do not fit.
     """
     markers = [*tip, *base]
     nominal = np.array([marker.position for marker in markers])
@@ -161,15 +152,12 @@ def measured_swing(
 
 
 def follow_face(face: FloatArray, rest_face: FloatArray, markers: FloatArray) -> FloatArray:
-    """Displacement of markers on stems that stand on a face and follow its rigid motion.
+    """Displacement (T, M, 3) [m] of markers (M, 3) [m] on stems that follow the rigid motion of a face.
 
     Args:
         face: (T, S, 3) [m] vertices of the face over time.
         rest_face: (S, 3) [m] the same at rest.
         markers: (M, 3) [m] at rest.
-
-    Returns:
-        (T, M, 3) [m].
     """
     return kabsch(np.broadcast_to(rest_face, face.shape), face).apply(markers) - markers
 
@@ -182,45 +170,32 @@ def marker_error(measured: Swing, simulated: Swing, seconds: float) -> float:
 
 
 def simulate_swing(config: Mapping[str, Any], rest_markers: FloatArray, seconds: float) -> Swing:
-    """Simulates the beam let go from straight and at rest, and follows the tip markers.
-
-    Args:
-        config: With the groups `body`, `material`, `simulation` and `recording` of compare.yaml.
-        rest_markers: (M, 3) [m] where the markers are at rest, in the frame of the body.
-        seconds: How long to simulate [s].
+    """Simulates the beam let go from straight and at rest for some seconds, and follows its markers (M, 3) [m].
 
     Raises:
-        InputError: A value in the configuration cannot be simulated.
-        ConvergenceError: A step did not converge.
+        ResphysError: A value in the configuration cannot be simulated, or a step did not converge.
     """
-    body_config, simulation = config["body"], config["simulation"]
-    length, _, height = body_config["size"]
-    mesh = box_hexahedra(body_config["size"], body_config["divisions"])
-    tip_face = select_vertices(mesh, x=length)
-    weights = []
-    if config["recording"]["hung_weight"] > 0.0:
-        mass = config["recording"]["hung_weight"] / simulation["gravity"]
-        weights.append(PointMass(mass, select_vertices(mesh, x=length, z=height).tolist()))
+    shape, simulation = config["body"], config["simulation"]
+    length, _, height = shape["size"]
+    mesh = box_hexahedra(shape["size"], shape["divisions"])
+    mass = config["recording"]["hung_weight"] / simulation["gravity"]
+    weights = [PointMass(mass, select_vertices(mesh, x=length, z=height).tolist())] if mass > 0.0 else []
     body = Body(
         mesh,
         fixed=select_vertices(mesh, x=0.0),
-        mass=body_config["mass"],
-        volume_integration=body_config["volume_integration"],
+        mass=shape["mass"],
+        volume_integration=shape["volume_integration"],
         point_masses=weights,
     )
     simulator = Simulator(
         body,
         make_material(**config["material"]),
-        time_step=simulation["time_step"],
-        gravity=(0.0, 0.0, -simulation["gravity"]),
-        integrator=simulation["integrator"],
-        solver=simulation["solver"],
-        relative_tolerance=simulation["relative_tolerance"],
-        device=simulation["device"],
+        **{**simulation, "gravity": (0.0, 0.0, -simulation["gravity"])},
     )
     steps = int(np.ceil(seconds / simulation["time_step"]))
     with torch.no_grad():
         positions = simulator.rollout(simulator.rest_state(), steps).q
+    tip_face = select_vertices(mesh, x=length)
     face = positions[:, 0, tip_face].cpu().numpy().astype(np.float64)
     time = simulation["time_step"] * np.arange(steps + 1)
     return Swing(time, follow_face(face, mesh.vertices[tip_face], rest_markers))
@@ -244,41 +219,25 @@ def comparison_table(result: Mapping[str, Any]) -> list[list[str]]:
 
 
 def compare_recording(config: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Measures and simulates a swing, and writes comparison.json and comparison.png.
-
-    Args:
-        config: The settings of compare.yaml, as plain containers.
-        folder: Where to write.
-
-    Returns:
-        What comparison.json holds.
+    """Measures and simulates a swing, and writes comparison.json, whose content it returns, and comparison.png.
 
     Raises:
-        DataFileError: The recording cannot be read or used, or a result cannot be written.
-        InputError: A value in the configuration is wrong.
-        ConvergenceError: A step of the simulation did not converge.
+        ResphysError: A value in the configuration is wrong, the recording cannot be used, a step of the simulation did
+            not converge, or a file cannot be written.
     """
     check("", config, _KEYS)
-    settings, registration, comparison = config["recording"], config["registration"], config["comparison"]
+    settings, comparison = config["recording"], config["comparison"]
     if settings["path"] is None:
         raise InputError("No recording given: set recording.path to one, as in recording.path=swing.c3d.")
     tip, base = ([Marker(**marker) for marker in config["markers"][part]] for part in ("tip", "base"))
     recording = read_recording(settings["path"])
     check_passive(recording)
     check_motion(recording, [marker.name for marker in tip])
-    measured = measured_swing(
-        recording,
-        tip,
-        base,
-        longest_gap=registration["longest_gap"],
-        largest_residual=registration["largest_residual"],
-        release_frame=settings["release_frame"],
-    )
+    measured = measured_swing(recording, tip, base, **config["registration"], release_frame=settings["release_frame"])
     simulated = simulate_swing(config, measured.rest_markers, float(measured.time[-1]))
+    window, tail = comparison["fit_seconds"], comparison["tail_seconds"]
     oscillations = {
-        name: measure_oscillation(
-            swing.deflection, swing.rate, window=comparison["fit_seconds"], tail=comparison["tail_seconds"]
-        )
+        name: measure_oscillation(swing.deflection, swing.rate, window=window, tail=tail)
         for name, swing in (("measured", measured), ("simulated", simulated))
     }
     error = marker_error(measured, simulated, comparison["error_seconds"])
@@ -291,13 +250,7 @@ def compare_recording(config: Mapping[str, Any], folder: Path) -> dict[str, Any]
 
 
 def draw_comparison(measured: Swing, simulated: Swing, result: Mapping[str, Any]) -> Figure:
-    """Draws the deflection of the tip over time with its numbers beside it, and each marker below.
-
-    Args:
-        measured: The recording, drawn as points.
-        simulated: The simulation, drawn as a line.
-        result: What comparison.json holds.
-    """
+    """Draws the deflection of the tip over time with what comparison.json holds beside it, and each marker below."""
     labels = [marker["name"] for marker in result["config"]["markers"]["tip"]]
     swings = {"measured": measured, "simulated": simulated}
     with rc_context(STYLE):
@@ -339,7 +292,7 @@ def _notes(result: Mapping[str, Any]) -> str:
 
 
 def _summary(measured: MeasuredSwing, oscillations: Mapping[str, Oscillation], error: float) -> dict[str, Any]:
-    """The content of comparison.json, in millimetres and seconds."""
+    """The content of comparison.json, in millimetres and seconds, with (simulated - measured) / measured."""
     return {
         "release_frame": measured.release.frame,
         "rest_frames": list(measured.release.rest),

@@ -46,11 +46,6 @@ def recording_quality(recording: Recording, result: Quality, *, narrow: bool) ->
 
     Markers that should stand still have a panel of their own, with their distance from the median place. A line
     breaks where a gap is masked; where it was filled, the line is thin. A triangle marks the first frame after a jump.
-
-    Args:
-        recording: As it was measured.
-        result: What `quality` found in it.
-        narrow: Whether the figure is for a narrow page.
     """
     bridged = fill_gaps(_visible(recording), result.longest_gap, mask_long=True)
     still = [marker.label for marker in result.markers if marker.still]
@@ -90,16 +85,12 @@ def recording_quality(recording: Recording, result: Quality, *, narrow: bool) ->
 def inspect_recording(config: Mapping[str, Any], folder: Path) -> str:
     """Examines a recording, and writes quality.json and quality.png.
 
-    Args:
-        config: With the keys of conf/inspect.yaml.
-        folder: Where to write.
-
     Returns:
         The table, and what a user should look at, as text.
 
     Raises:
-        DataFileError: A recording cannot be read, or a marker on the base was moved between two of them.
-        InputError: A value in the configuration cannot be used.
+        ResphysError: A value in the configuration cannot be used, a recording cannot be read, or a marker on the base
+            was moved between two of them.
     """
     check("", config, _KEYS)
     if config["compare_with"] and len(config["still"]) < 2:

@@ -24,8 +24,8 @@ def search_history(errors: FloatArray, pruned: FloatArray, configured: float | N
         errors: (R,) error [mm] of the trials that were trained to the end, by number; infinite where it diverged, NaN
             for the other trials.
         pruned: (R,) the smallest error [mm] of those that were given up; NaN for the other trials.
-        configured: Error as configured, to compare with [mm]; None where it diverges.
-        narrow: Whether the figure is for a narrow page.
+        configured: error as configured [mm], to compare with; None where it diverges.
+        narrow: whether the figure is for a narrow page, here and below.
     """
     numbers, finite, lost = np.arange(len(errors)), np.isfinite(errors), np.isposinf(errors)
     with mpl.rc_context(STYLE):
@@ -50,12 +50,7 @@ def search_history(errors: FloatArray, pruned: FloatArray, configured: float | N
 
 
 def importance_bars(importance: Mapping[str, float], *, narrow: bool) -> Figure:
-    """Draw how much each setting matters.
-
-    Args:
-        importance: Shares that sum to one, by setting; empty where too little is known.
-        narrow: Whether the figure is for a narrow page.
-    """
+    """Draw how much each setting matters, as shares that sum to one; empty where too little is known."""
     rows = sorted(importance.items(), key=lambda item: item[1])
     with mpl.rc_context(STYLE):
         height = 0.8 + 0.28 * max(len(rows), 3)
@@ -77,14 +72,7 @@ def importance_bars(importance: Mapping[str, float], *, narrow: bool) -> Figure:
 def setting_scatter(
     errors: FloatArray, settings: Sequence[Mapping[str, float | str]], space: Mapping[str, Dimension], *, narrow: bool
 ) -> Figure:
-    """Draw the error against each setting, a panel a setting; the best trial is marked.
-
-    Args:
-        errors: (R,) error [mm] of each trial; NaN where there is none to show.
-        settings: Of each trial, by name.
-        space: What each setting may be, by name.
-        narrow: Whether the figure is for a narrow page.
-    """
+    """Draw the error (R,) [mm] of each trial against each setting, a panel a setting; the best trial is marked."""
     columns = min(2 if narrow else 3, len(space))
     rows = math.ceil(len(space) / columns)
     shown = [i for i, error in enumerate(errors) if np.isfinite(error)]

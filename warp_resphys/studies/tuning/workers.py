@@ -55,12 +55,7 @@ def at_work(folder: Path) -> Iterator[dict[str, Any]]:
 
 
 def is_alive(folder: Path, identity: Mapping[str, Any]) -> bool:
-    """Whether a worker of a folder lives: its file is there, and locked.
-
-    Args:
-        folder: as for `at_work`.
-        identity: what that gave.
-    """
+    """Whether the worker lives that `at_work` gave this identity: its file is there, and locked."""
     try:
         descriptor = os.open(folder / f"{identity['token']}.alive", os.O_RDONLY)
     except FileNotFoundError:

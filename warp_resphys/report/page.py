@@ -95,10 +95,11 @@ class Text:
 
 @dataclass(frozen=True)
 class Items:
-    """A list."""
+    """A list, of commands where `code` says so."""
 
     items: Sequence[str]
     name: str = ""
+    code: bool = False
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """System identification: the physical parameters with which a simulator comes closest to observed motions.
 
 The loss is the mean square distance of simulated and observed markers, each motion in units of its own amplitude, over
-all motions at once. `descent` minimises it within bounds, from the best of a coarse set of starts, with gradients
-through the simulator.
+all motions at once. `linalg.least_squares` minimises it within bounds, from the best of a coarse set of starts, with
+gradients through the simulator.
 """
 
 import math
@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..io.errors import ConvergenceError, InputError
-from ..linalg.least_squares import minimise
+from ..linalg.least_squares import UnitBox, minimise
 from .replay import Replay, Start
 
 Report = Callable[[int, float, Mapping[str, float]], None]
@@ -278,10 +278,12 @@ class Identifier:
             found = self._linearise(unit)
             return None if found is None else 2.0 * np.stack([j.T @ j for _, j, _ in found]).sum(0)
 
-        first = np.array([self._unit(name, start) for name in self.bounds])
-        unit, loss = minimise(objective, first, matrix, max_evaluations, tolerance)
+        first = torch.tensor([[self._unit(name, start) for name in self.bounds]], dtype=torch.float64)
+        problem = UnitBox(objective, matrix)
+        found = minimise(problem, problem.evaluate(first), tolerance, max_evaluations - 1).point
+        loss = float(found.value)
         return {
-            "parameters": self._values(unit),
+            "parameters": self._values(found.x[0].tolist()),
             "loss": loss if np.isfinite(loss) else None,
             "history": history,
         }
@@ -290,8 +292,9 @@ class Identifier:
         """Infinite, and zero, where the simulation fails."""
         x = self.simulator.tensor(unit)[None].requires_grad_()
         try:
-            loss = self.losses(x)[0]
-            (gradient,) = torch.autograd.grad(loss, x)
+            with torch.enable_grad():
+                loss = self.losses(x)[0]
+                (gradient,) = torch.autograd.grad(loss, x)
         except ConvergenceError:
             return np.inf, np.zeros_like(unit)
         return float(loss.detach()), gradient[0].double().cpu().numpy()

@@ -124,8 +124,8 @@ class UnitBox(Problem):
 
     Args:
         objective: (P,) variables to value and gradient; the value is infinite where there is none.
-        matrix: (P,) variables to the (P, P) Gauss-Newton matrix 2 J^T J, or None where it cannot be had: the last one is
-            brought up to date by the change of the gradient then.
+        matrix: (P,) variables to the (P, P) Gauss-Newton matrix 2 J^T J, or None where it cannot be had: then the last
+            one is brought up to date by the change of the gradient.
     """
 
     def __init__(self, objective: Objective, matrix: Callable[[Array], Array | None]) -> None:

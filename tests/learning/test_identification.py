@@ -104,7 +104,7 @@ def test_stiffness_and_density_of_a_body_without_weights_cannot_be_told_apart():
     truth = {"youngs_modulus": 215e3, "density": 1070.0}
     replay, release = replay_of(simulator(), truth, masses=(0.0,), noise=5e-5)
     identifier = Identifier([(replay, release)], bounds)
-    uncertainty = identifier.uncertainty(np.array([identifier._unit(name, truth) for name in bounds]))
+    uncertainty = identifier.uncertainty(identifier._units(truth))
     assert uncertainty.correlation[0][1] > 0.999
     assert uncertainty.poorest_deviation > 1.0
     replay, release = replay_of(simulator(), truth, masses=(0.0, 0.05), noise=5e-5)
@@ -199,7 +199,7 @@ def test_only_the_first_seconds_count():
     spoilt[:, 20:] += 1.0
     motions = replace(replay.trials, observed=spoilt)
     identifier = Identifier([(Replay(replay.simulator, MARKERS, motions), release)], RANGES, seconds=0.19)
-    unit = replay.simulator.tensor([[identifier._unit(name, TRUTH) for name in RANGES]])
+    unit = replay.simulator.tensor(identifier._units(TRUTH))[None]
     assert float(identifier.losses(unit)) < 1e-12
 
 

@@ -20,10 +20,7 @@ _EVALUATIONS = 12  # of the loss, the most that an epoch takes
 class FullBatchTrainer(EpochTrainer[ResidualForce]):
     """Minimises a loss of the network's weights, of those that require a gradient, by L-BFGS.
 
-    Args:
-        model: to train.
-        rollout_error: mean roll-out error on the validation split [mm]; infinite where a roll-out diverged.
-        config: with ``epochs``, ``rollout_every`` and ``memory``, the pairs that L-BFGS keeps.
+    The ``config`` has ``memory`` beside the keys of `EpochTrainer`: the pairs that L-BFGS keeps.
     """
 
     def __init__(

@@ -172,7 +172,7 @@ class Trainer(EpochTrainer[Model]):
         model: to train; on the device of the samples.
         train: training samples.
         validation: held-out samples.
-        rollout_error: mean roll-out error on the validation split [mm]; infinite where a roll-out diverged.
+        rollout_error: see `EpochTrainer`.
         config: the group ``trainer``.
         seed: of the batches and the noise.
 
@@ -270,28 +270,12 @@ class Trainer(EpochTrainer[Model]):
 class SequenceTrainer(Trainer[Model]):
     """The same for a recurrent model, whose hidden state goes through the training trials.
 
-    All trials are run through side by side, in spans of ``sequence`` steps. A gradient reaches back to the beginning of
-    its span, the hidden state comes from before (truncated backpropagation through time).
-
-    Args:
-        model: a recurrent one.
-        train: training samples, as series.
-        validation: held-out samples, as series.
-        rollout_error: see `Trainer`, as the others.
-        config: the same.
-        seed: of the noise.
+    All trials, series of samples, are run through side by side, in spans of ``sequence`` steps. A gradient reaches back
+    to the beginning of its span, the hidden state comes from before (truncated backpropagation through time).
     """
 
-    def __init__(
-        self,
-        model: Model,
-        train: Samples,
-        validation: Samples,
-        rollout_error: Callable[[Model], float],
-        config: Mapping[str, Any],
-        seed: int,
-    ) -> None:
-        super().__init__(model, train, validation, rollout_error, config, seed)
+    def __init__(self, model: Model, train: Samples, validation: Samples, *settings: Any) -> None:
+        super().__init__(model, train, validation, *settings)
         self._train_series = _side_by_side(*self._train, train.lengths)
         self._validation_series = _side_by_side(*self._validation, validation.lengths)
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 import os
 import time
 import zlib
@@ -54,8 +53,8 @@ class Field:
         shape: Its shape in one step; () for a number.
         units: SI units, stored beside the dataset; "1" for numbers without a unit.
         dtype: NumPy's name of its type.
-        batch_axes: How many of its leading axes stand before the axes that count steps in the final dataset:
-            with 1, steps of (B, N, 3) become (B, T, N, 3), with 0 they become (T, B, N, 3).
+        batch_axes: How many of its leading axes stand before the one that counts steps in the final dataset: with 1,
+            steps of (B, N, 3) become (B, T, N, 3), with 0 they become (T, B, N, 3).
     """
 
     shape: tuple[int, ...]
@@ -70,9 +69,8 @@ class ResumableHDF5:
     Use it as a context manager. `done` says how many steps an earlier, interrupted run left; go on from
     there::
 
-        with ResumableHDF5(path, "forces", fingerprint, (trajectories, frames), fields) as file:
+        with ResumableHDF5(path, "forces", fingerprint, frames, fields) as file:
             for step in range(file.done, file.steps):
-                trajectory, frame = divmod(step, frames)
                 file.append(forces=...)
             file.finish()
 
@@ -83,26 +81,17 @@ class ResumableHDF5:
         path: Where the final HDF5 file is to appear.
         kind: What the file holds, as for `files.atomic_hdf5`.
         fingerprint: Identifies the inputs of the computation; steps of another fingerprint are not used.
-        steps: Number of steps, or the lengths of nested loops over them, the last one running fastest.
+        steps: How many there are.
         fields: The arrays of one step by name.
     """
 
-    def __init__(
-        self,
-        path: str | Path,
-        kind: str,
-        fingerprint: str,
-        steps: int | tuple[int, ...],
-        fields: Mapping[str, Field],
-    ) -> None:
+    def __init__(self, path: str | Path, kind: str, fingerprint: str, steps: int, fields: Mapping[str, Field]) -> None:
         self.path, self.kind, self.fingerprint = Path(path), kind, fingerprint
-        self.step_axes = (steps,) if isinstance(steps, int) else tuple(steps)
-        self.steps, self.done = math.prod(self.step_axes), 0
-        self.fields = dict(fields)
+        self.steps, self.done, self.fields = steps, 0, dict(fields)
         self.journal = self.path.with_name(self.path.name + ".journal")
         layout = {name: [f.shape, np.dtype(f.dtype).str, f.units, f.batch_axes] for name, f in self.fields.items()}
         header = {"format": "warp_resphys journal 1", "kind": kind, "fingerprint": fingerprint}
-        self._header = (json.dumps({**header, "steps": self.step_axes, "fields": layout}) + "\n").encode()
+        self._header = (json.dumps({**header, "steps": steps, "fields": layout}) + "\n").encode()
         parts = [(name, field.dtype, field.shape) for name, field in self.fields.items()]
         self._record = np.dtype([*parts, (_CHECKSUM, "<u4")])
         self._descriptor: int | None = None
@@ -180,12 +169,9 @@ class ResumableHDF5:
         if not 0 <= step < self.done:
             raise ValueError(f"step {step} of {self.path} is not among the {self.done} that are done")
         if self._finished:
-            index = np.unravel_index(step, self.step_axes)
             with read_hdf5(self.path, self.kind) as file:
-                return {
-                    name: read_array(file, name, index=(*(slice(None),) * field.batch_axes, *index))
-                    for name, field in self.fields.items()
-                }
+                places = {name: (*(slice(None),) * field.batch_axes, step) for name, field in self.fields.items()}
+                return {name: read_array(file, name, index=place) for name, place in places.items()}
         record = self._whole(step)
         if record is None:
             raise DataFileError(f"{self.journal} is damaged: delete it and run the same command again")
@@ -224,10 +210,8 @@ class ResumableHDF5:
                     values = np.empty((self.steps, *field.shape), field.dtype)
                     if records is not None:
                         values[places] = records[name]
-                    counted, ahead = len(self.step_axes), field.batch_axes
-                    values = values.reshape(*self.step_axes, *field.shape)
-                    values = np.moveaxis(values, range(counted), range(ahead, ahead + counted))
-                    create(file, name, values, field.units, time_axis=ahead + counted - 1)
+                    values = np.moveaxis(values, 0, field.batch_axes)
+                    create(file, name, values, field.units, time_axis=field.batch_axes)
         except DataFileError as error:
             if error.__cause__ is not None and is_disk_full(error.__cause__):
                 raise disk_full_error(self.path, self.journal) from error

@@ -275,7 +275,7 @@ class StateMap(nn.Module):
         return inputs @ self.linear + self.remainder * found, hidden
 
     def encode(self, q: torch.Tensor, v: torch.Tensor, actuation: torch.Tensor | None = None) -> torch.Tensor:
-        """(S, n_in) standardised inputs, as precise as the network, of (S, N, 3) [m] and [m/s] and, if asked for, (S, A).
+        """(S, n_in) standardised inputs, as precise as the network, of (S, N, 3) [m] and [m/s], and of (S, A) or None.
 
         Raises:
             ValueError: no actuation for a model that was built with one.

@@ -24,7 +24,7 @@ from ..io.processes import Advance, in_processes
 from ..io.progress import Progress
 from ..io.resumable import Field, ResumableHDF5
 from ..io.stages import Stage, StageContext, package_versions, resources_used
-from ..learning.sparse_reconstruction import make_sparse_reconstructor
+from ..learning.reconstruction import make_reconstructor
 from ..mesh.mesh import surface_vertices
 from ..report.ablation_page import AblationReport, write_ablation_report
 from ..report.page import number_text
@@ -194,7 +194,7 @@ def _reconstruct(
     """Mean distances (draws, T) from the motion (T + 1, N, 3), of all vertices and of the markers [m]."""
     markers = MarkerMap.at_vertices(torch.as_tensor(vertices, device=motion.device), motion.dtype)
     modes = settings["ablation"]["modes"]
-    reconstructor = make_sparse_reconstructor(simulator, markers, **settings["reconstruction"], modes=modes)
+    reconstructor = make_reconstructor(simulator, **settings["reconstruction"], modes=modes, markers=markers)
     q = motion[0].expand(len(vertices), -1, -1).clone()
     state, force = State(q, torch.zeros_like(q)), torch.zeros_like(q)
     errors, misfits = [], []

@@ -17,7 +17,6 @@ from ..io.memory import available_memory_gib
 from ..learning.identification import Bounds
 from ..learning.reconstruction import make_reconstructor
 from ..learning.replay import MASS_FACTOR, known_parameters
-from ..learning.sparse_reconstruction import make_sparse_reconstructor
 from ..mesh.mesh import select_vertices, surface_vertices
 from .build import build_body, build_material, build_simulator, chambers_of
 from .files import STATIC, attached_mass
@@ -71,15 +70,13 @@ def check_configuration(config: Mapping[str, Any]) -> None:
     if recorded:
         _check_recorded(config, body)
         probe = MarkerMap.at_vertices(torch.zeros(1, 1, dtype=torch.int64))
-        make_sparse_reconstructor(simulator, probe, **config["reconstruction"])
+        make_reconstructor(simulator, **config["reconstruction"], markers=probe)
     elif "ablation" in config:
         _check_ablation(config, body)
     else:
         split_of(config)
         if variation_of(config["data"]).key == "weights_g":
             select_vertices(body.mesh, **config["data"]["load"])
-        if "modes" in config["reconstruction"]:
-            raise InputError("reconstruction.modes is for bodies that are seen through markers: leave it out.")
         make_reconstructor(simulator, **config["reconstruction"])
     steps = config["data"].get("steps")
     refinement = config["refinement"]
@@ -422,6 +419,5 @@ def _check_ablation(config: Mapping[str, Any], body: Body) -> None:
     if not isinstance(observed, list) or len(observed) != 1 or not 0.0 < observed[0] < np.inf:
         raise InputError(f"data.weights_g.observed is {observed!r}: it must be a list of one positive weight, in g.")
     probe = MarkerMap.at_vertices(torch.zeros(1, 1, dtype=torch.int64))
-    make_sparse_reconstructor(
-        build_simulator(config), probe, **config["reconstruction"], modes=config["ablation"]["modes"]
-    )
+    modes = config["ablation"]["modes"]
+    make_reconstructor(build_simulator(config), **config["reconstruction"], modes=modes, markers=probe)

@@ -19,7 +19,6 @@ from ..io.stages import StageContext
 from ..learning.metrics import marker_errors
 from ..learning.reconstruction import Reconstructor, make_reconstructor
 from ..learning.rollout import Rollout
-from ..learning.sparse_reconstruction import make_sparse_reconstructor
 from .files import RECONSTRUCTION, read_if_there, reconstruction_file
 from .parts import March, Part, read_parts, remove_parts, split_into_parts, work_on
 from .scene import Scene
@@ -149,9 +148,8 @@ class _Reconstructing(March):
 
 def make_method(scene: Scene, simulator: Simulator, settings: Mapping[str, Any]) -> Reconstructor:
     """The configured reconstruction: of full states, which has a faster way, or of markers."""
-    if scene.dataset.bound is None:
-        return make_reconstructor(simulator, **settings)
-    return make_sparse_reconstructor(simulator, scene.observe, **settings)  # type: ignore[arg-type]
+    markers: Any = None if scene.dataset.bound is None else scene.observe
+    return make_reconstructor(simulator, **settings, markers=markers)
 
 
 def replayed_errors(

@@ -52,7 +52,7 @@ COMMANDS: Final[Mapping[str, tuple[str, str]]] = MappingProxyType(
         "gradcheck": ("studies.gradient_check:gradcheck", "compare adjoint gradients with central differences"),
         "benchmark": ("studies.benchmark:benchmark", "time steps, forward and backward, and what they consist of"),
         "element-study": ("studies.elements:element_study", "static sag of a beam, by element and refinement"),
-        "locking-study": ("studies.locking_page:locking_study", "deflection of an arm, by element and refinement"),
+        "locking-study": ("studies.locking:locking_study", "deflection of an arm, by element and refinement"),
     }
 )
 _CONFIGURATIONS: Final = {"run": "config"}  # where it is not called as the command is

@@ -96,8 +96,8 @@ def test_picture_shows_what_is_seen_filled_and_masked(narrow):
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["still=base 1"], "still is 'base 1': set it to a list"),
-        (["least_jump=small"], "least_jump is 'small': set it to a number"),
+        (["still=base 1"], "still is 'base 1': it must be a list"),
+        (["least_jump=small"], "least_jump is 'small': it must be a number"),
         (["longest_gap=-1"], "longest_gap is -1"),
         (["recording.rate=fast"], "recording.rate is 'fast'"),
         (["recording.labels=a"], "recording.labels is 'a'"),

@@ -112,7 +112,7 @@ class TestPage:
         assert len(names) == 3
         assert all(0 < (page.parent / name).stat().st_size < 200_000 for name in names)
         assert "warp-resphys reproduce " in text
-        assert "- processor: " in text
+        assert "| processor | " in text
         assert "&#39;" not in text
 
     def test_what_is_up_to_date_is_not_run_again(self, finished):
@@ -157,7 +157,7 @@ class TestPlan:
         [
             ("only=[beam_twst]", "only names 'beam_twst', which is no experiment or run: there are beam_oscillation, "),
             ("only=[]", "only is []: name at least one experiment or run"),
-            ("only=beam_twist", "only is 'beam_twist': it must be a list of words."),
+            ("only=beam_twist", "only is 'beam_twist': it must be a list of words, or null."),
             ("overrides=[1]", "overrides is [1]: it must be a list of words."),
             ("experiments.beam_twist.variants=[quick]", "experiments.beam_twist.variants names 'quick': there are "),
         ],

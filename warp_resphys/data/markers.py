@@ -15,7 +15,7 @@ All reproduce the markers at rest, and carry them rigidly where the body moves r
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -32,7 +32,6 @@ KINDS = ("normal", "frame", "rigid")
 class Markers(ABC):
     """A map from the vertices of a body to m markers."""
 
-    linear: ClassVar[bool] = False  # Whether `transposed_jacobian` is the same everywhere.
     vertices: torch.Tensor  # all that the markers depend on, in any shape
 
     @abstractmethod
@@ -64,7 +63,6 @@ class MarkerMap(Markers):
 
     vertices: torch.Tensor  # (B, m, k) the vertices of each marker
     weights: torch.Tensor  # (B, m, k) their weights; a marker whose weights are all zero is none
-    linear: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         """Checks that the shapes agree.
@@ -92,7 +90,10 @@ class MarkerMap(Markers):
 
     @override
     def transposed_jacobian(self, positions: torch.Tensor) -> torch.Tensor:
-        return super().transposed_jacobian(positions[:1].expand(len(self.vertices), -1, -1))
+        b, m, _ = self.vertices.shape
+        weights = self.weights.new_zeros(b, m, positions.shape[1]).scatter_add_(2, self.vertices, self.weights)
+        identity = torch.eye(3, device=weights.device, dtype=weights.dtype)
+        return torch.einsum("bmn,ij->bnimj", weights, identity).reshape(b, -1, 3 * m)
 
 
 @dataclass(frozen=True)

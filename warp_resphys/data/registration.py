@@ -10,10 +10,12 @@ from math import comb
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from ..io.errors import DataFileError, InputError
-from .recordings.recording import BoolArray, FloatArray, listed
+from ..io.errors import DataFileError, InputError, listed
+from ..mesh.mesh import FloatArray
+
+BoolArray = NDArray[np.bool_]
 
 _MILLI = 1e3
 _MOST_FITS = 20_000  # Sets of markers that are tried when outliers are sought.

@@ -1,5 +1,6 @@
 """What can go wrong in a way that the user can mend: one sentence each, exit code 2 on the command line."""
 
+from collections.abc import Sequence
 from typing import Any
 
 _LONGEST = 1000
@@ -41,3 +42,8 @@ class ConvergenceError(ResphysError, RuntimeError):
         super().__init__(message)
         self.positions = positions
         self.report = report
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names in quotation marks, separated by commas, for a message."""
+    return ", ".join(f"'{name}'" for name in names) or "none"

@@ -17,15 +17,25 @@ from ..data.recordings.processing import fill_gaps, release_of
 from ..data.recordings.quality import BaseMotion, Quality, check_base, compare_base, quality, quality_table
 from ..data.recordings.reading import read_recording
 from ..data.recordings.recording import Recording
+from ..experiment.schema import ANYTHING, COUNT, NOT_NEGATIVE, POSITIVE, WORD, Group, check, optional
 from ..io.errors import InputError
 from ..io.files import atomic_path, write_json
-from ..report.figures import NARROW, STYLE, TONES, WIDE
+from ..report.figures import STYLE, TONES, new_figure, save_png
+from .command import WORDS, aligned
 
 FloatArray = NDArray[np.float64]
 
 # Okabe and Ito (2008), without yellow: everyone can tell them apart.
 MARKER_COLOURS: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#1c2127")
 _STATES: Final = {"seen": "#dde1e6", "filled": "#e69f00", "masked": "#c4481b"}
+_KEYS: Final = Group(
+    {
+        "recording": Group({"path": WORD, "rate": optional(POSITIVE), "labels": optional(WORDS)}, each=ANYTHING),
+        **dict.fromkeys(("still", "moving", "compare_with"), WORDS),
+        **{"longest_gap": COUNT, "least_jump": NOT_NEGATIVE, "largest_distortion": NOT_NEGATIVE},
+    },
+    each=ANYTHING,
+)
 _MILLI: Final = 1e3
 _ROW: Final = 0.16  # [in] of a marker in the raster
 _LEGEND_COLUMNS: Final = {False: 6, True: 3}
@@ -36,11 +46,6 @@ def recording_quality(recording: Recording, result: Quality, *, narrow: bool) ->
 
     Markers that should stand still have a panel of their own, with their distance from the median place. A line
     breaks where a gap is masked; where it was filled, the line is thin. A triangle marks the first frame after a jump.
-
-    Args:
-        recording: As it was measured.
-        result: What `quality` found in it.
-        narrow: Whether the figure is for a narrow page.
     """
     bridged = fill_gaps(_visible(recording), result.longest_gap, mask_long=True)
     still = [marker.label for marker in result.markers if marker.still]
@@ -48,8 +53,7 @@ def recording_quality(recording: Recording, result: Quality, *, narrow: bool) ->
     panels = [*("xyz" if moving else ""), *(["still"] if still else []), "raster"]
     heights = [{"still": 1.2, "raster": _ROW * len(recording.labels) + 0.1}.get(panel, 1.5) for panel in panels]
     with mpl.rc_context(STYLE):
-        width = NARROW if narrow else WIDE
-        figure = Figure(figsize=(width, sum(heights) + (1.3 if narrow else 1.0)), layout="constrained")
+        figure = new_figure(sum(heights) + 1.0, sum(heights) + 1.3, narrow=narrow)
         rows = figure.subplots(len(panels), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
         colours = {label: MARKER_COLOURS[at % len(MARKER_COLOURS)] for at, label in enumerate(recording.labels)}
         for axes, panel in zip(rows, panels, strict=True):
@@ -81,18 +85,16 @@ def recording_quality(recording: Recording, result: Quality, *, narrow: bool) ->
 def inspect_recording(config: Mapping[str, Any], folder: Path) -> str:
     """Examines a recording, and writes quality.json and quality.png.
 
-    Args:
-        config: With the keys of conf/inspect.yaml.
-        folder: Where to write.
-
     Returns:
         The table, and what a user should look at, as text.
 
     Raises:
-        DataFileError: A recording cannot be read, or a marker on the base was moved between two of them.
-        InputError: A value in the configuration cannot be used.
+        ResphysError: A value in the configuration cannot be used, a recording cannot be read, or a marker on the base
+            was moved between two of them.
     """
-    _check(config)
+    check("", config, _KEYS)
+    if config["compare_with"] and len(config["still"]) < 2:
+        raise InputError("compare_with needs two or more markers on the base to compare: name them in still.")
     settings = config["recording"]
     given = (settings["units"], settings["rate"], settings["labels"])
     recording = read_recording(settings["path"], *given)
@@ -104,30 +106,10 @@ def inspect_recording(config: Mapping[str, Any], folder: Path) -> str:
     figure = recording_quality(recording, result, narrow=False)
     write_json(folder / "quality.json", {**result.to_plain(), "base": [_plain(motion, still) for motion in motions]})
     with atomic_path(folder / "quality.png") as partial:
-        figure.savefig(partial, format="png", dpi=160, facecolor="white")
+        save_png(figure, partial)
     if len(trials) > 1:
         check_base(trials, still, largest_distortion=config["largest_distortion"])
     return _text(result, motions)
-
-
-def _check(config: Mapping[str, Any]) -> None:
-    """Raises InputError for the first value of the configuration that cannot be used."""
-    for key in ("still", "moving", "compare_with"):
-        if not (isinstance(config[key], list) and all(isinstance(value, str) for value in config[key])):
-            raise InputError(f"{key} is {config[key]!r}: set it to a list, as in {key}='[Base - 1,Base - 2]'.")
-    for key, least in (("longest_gap", 0), ("least_jump", 0.0), ("largest_distortion", 0.0)):
-        value = config[key]
-        if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value < np.inf:
-            raise InputError(f"{key} is {value!r}: set it to a number, not below zero.")
-    rate, labels, path = (config["recording"][key] for key in ("rate", "labels", "path"))
-    if not isinstance(path, str):
-        raise InputError(f"recording.path is {path!r}: set it to a file, as in recording.path=swing.c3d.")
-    if rate is not None and (isinstance(rate, bool) or not isinstance(rate, int | float)):
-        raise InputError(f"recording.rate is {rate!r}: set it to the frames a second.")
-    if labels is not None and not isinstance(labels, list):
-        raise InputError(f"recording.labels is {labels!r}: set it to a list of names.")
-    if config["compare_with"] and len(config["still"]) < 2:
-        raise InputError("compare_with needs two or more markers on the base to compare: name them in still.")
 
 
 def _visible(recording: Recording) -> Recording:
@@ -189,14 +171,7 @@ def _legend(figure: Figure, colours: Mapping[str, str], *, narrow: bool) -> None
 
 def _text(result: Quality, motions: Sequence[BaseMotion]) -> str:
     """The table with a column for each quantity, then the warnings."""
-    rows = quality_table(result)
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    lines = [
-        "  ".join(
-            [row[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True))]
-        )
-        for row in rows
-    ]
+    lines = [aligned(quality_table(result))]
     seconds = result.frames / result.rate
     lines.append(f"{result.source}: {result.frames} frames, {seconds:.2f} s at {result.rate:g} Hz")
     if result.release is not None:

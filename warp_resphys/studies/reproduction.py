@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -19,15 +19,17 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from ..experiment.files import METRICS
+from ..experiment.schema import check, optional
 from ..io.errors import DataFileError, InputError, ResphysError
 from ..io.files import disk_full_error, is_disk_full, write_text
 from ..io.labels import run_label
 from ..io.machine import commit, hardware
 from ..io.progress import clock
 from ..io.stages import package_versions, run_lock
-from .comparison import Result, compare
-from .reproduction_page import Reproduction, markdown, write_reproduction
-from .settings import settings_of
+from ..report.page import Canvas, Cell, Drawn, Items, Part, Row, Table, figures_beside
+from .command import WORDS, settings_of
+from .comparison import Run, compare
+from .page import markdown, write_page
 
 log = logging.getLogger(__name__)
 
@@ -35,30 +37,6 @@ PAGE = "reproduction.html"
 _UP_TO_DATE_SECONDS = 8.0  # for a run that finds nothing to do
 _LINE_SECONDS = 60.0
 _PATIENCE = 60.0  # s that an interrupted run gets to save what it has
-
-
-@dataclass(frozen=True)
-class Run:
-    """One run of the ordinary command.
-
-    Attributes:
-        experiment: name of the experiment.
-        variant: name of the variant.
-        arguments: of the command.
-        folder: that it writes, the one that the ordinary command takes for the same arguments.
-        minutes: that it may take.
-    """
-
-    experiment: str
-    variant: str
-    arguments: tuple[str, ...]
-    folder: Path
-    minutes: float
-
-    @property
-    def name(self) -> str:
-        """As in the key ``only``."""
-        return f"{self.experiment}/{self.variant}"
 
 
 class ReproductionInterrupted(KeyboardInterrupt):
@@ -77,39 +55,51 @@ def reproduce(config: DictConfig) -> None:
     runs = plan(plain)
     with run_lock(folder):
         results = run_all(runs, folder / "logs")
-        page = Reproduction(
-            date=f"{datetime.now():%Y-%m-%d}",
-            command=shlex.join(["warp-resphys", "reproduce", *HydraConfig.get().overrides.task]),
-            hardware=hardware(),
-            commit=commit(),
-            versions=package_versions(),
-            **compare(plain, results),
-        )
-        write_reproduction(folder / PAGE, page)
+        page = folder / PAGE
+        with figures_beside(page) as pictures:
+            verdict, parts = compare(plain, results, Canvas(pictures))
+        parts.append(_made())
+        date = f"{datetime.now():%Y-%m-%d}"
+        write_page(page, title="Reproduction", kicker=date, verdict=verdict, parts=parts)
+
+        def in_markdown(folder: str) -> str:
+            return markdown(f"Reproduction of {date}", verdict, parts, folder)
+
+        write_text(page.with_name("results.md"), in_markdown(pictures.name))
         if plain["results"] is not None:
-            _write_results(Path(plain["results"]), folder, page)
-    print(f"Page: {folder / PAGE}")
-    if failed := [f"{result.experiment}/{result.variant}" for result in results if result.failure]:
+            name = f"{date}-reproduction"
+            place = Path(plain["results"]) / name
+            drawn = [block.name for part in parts for block in part.blocks if isinstance(block, Drawn)]
+            _copy([pictures / f"{figure}.png" for figure in drawn], place)
+            write_text(place.with_suffix(".md"), in_markdown(name))
+            print(f"Results: {place}.md")
+    print(f"Page: {page}")
+    if failed := [result.name for result in results if result.failure]:
         raise ResphysError(
             f"{len(failed)} of {len(runs)} runs failed ({', '.join(failed)}): the page says why; mend it and run the "
             "same command again."
         )
 
 
-def _write_results(root: Path, folder: Path, page: Reproduction) -> None:
-    """The page as Markdown, with its figures in a folder of their own, both named by the date."""
-    name = f"{page.date}-reproduction"
+def _made() -> Part:
+    """How the page was made: by which command, on which machine, with which versions."""
+    command = shlex.join(["warp-resphys", "reproduce", *HydraConfig.get().overrides.task])
+    known = {**hardware(), "commit": commit() or "not known", **package_versions()}
+    table = Table("Machine and versions", ["Here"], [Row(name, [Cell(value)]) for name, value in known.items()])
+    return Part("Command, machine and versions", [Items([command], code=True), table])
+
+
+def _copy(figures: Sequence[Path], folder: Path) -> None:
+    """Files into a folder of their own, in place of what is there."""
     try:
-        shutil.rmtree(root / name, ignore_errors=True)
-        (root / name).mkdir(parents=True)
-        for figure in (figure.name for section in page.sections for figure in section.figures):
-            shutil.copy(folder / "figures" / f"{figure}.png", root / name)
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        for figure in figures:
+            shutil.copy(figure, folder)
     except OSError as error:
         if is_disk_full(error):
-            raise disk_full_error(root) from error
-        raise DataFileError(f"cannot write {root} ({error.strerror}): choose another folder for results.") from error
-    write_text(root / f"{name}.md", markdown(page, name))
-    print(f"Results: {root / name}.md")
+            raise disk_full_error(folder) from error
+        raise DataFileError(f"cannot write {folder} ({error.strerror}): choose another folder for results.") from error
 
 
 def plan(config: Mapping[str, Any]) -> list[Run]:
@@ -118,13 +108,13 @@ def plan(config: Mapping[str, Any]) -> list[Run]:
     Raises:
         InputError: a value of the wrong kind, or a name that does not exist.
     """
-    for key in ("overrides", "only"):
-        value = config[key]
-        if not (key == "only" and value is None) and not (
-            isinstance(value, list) and all(isinstance(each, str) for each in value)
-        ):
-            raise InputError(f"{key} is {value!r}: it must be a list of words.")
-    runs = [_run(config, experiment, variant) for experiment, variant in _pairs(config)]
+    check("overrides", config["overrides"], WORDS)
+    check("only", config["only"], optional(WORDS))
+    runs = [
+        _run(config, experiment, variant)
+        for experiment, group in config["experiments"].items()
+        for variant in group["variants"]
+    ]
     wanted = config["only"]
     if wanted is None:
         return runs
@@ -140,17 +130,11 @@ def plan(config: Mapping[str, Any]) -> list[Run]:
     return chosen
 
 
-def _pairs(config: Mapping[str, Any]) -> list[tuple[str, str]]:
-    pairs = [(experiment, name) for experiment, group in config["experiments"].items() for name in group["variants"]]
-    for experiment, name in pairs:
-        if name not in config["variants"]:
-            raise InputError(
-                f"experiments.{experiment}.variants names {name!r}: there are {', '.join(config['variants'])}."
-            )
-    return pairs
-
-
 def _run(config: Mapping[str, Any], experiment: str, name: str) -> Run:
+    if name not in config["variants"]:
+        raise InputError(
+            f"experiments.{experiment}.variants names {name!r}: there are {', '.join(config['variants'])}."
+        )
     variant = config["variants"][name]
     overrides = [*variant["overrides"], *config["experiments"][experiment]["overrides"], *config["overrides"]]
     if config["budget"] != "full":
@@ -159,7 +143,7 @@ def _run(config: Mapping[str, Any], experiment: str, name: str) -> Run:
     return Run(experiment, name, (f"experiment={experiment}", *overrides), folder, variant["minutes"][config["budget"]])
 
 
-def run_all(runs: Sequence[Run], logs: Path) -> list[Result]:
+def run_all(runs: Sequence[Run], logs: Path) -> list[Run]:
     """Runs one after the other; one that fails does not keep the others from running.
 
     Raises:
@@ -167,7 +151,7 @@ def run_all(runs: Sequence[Run], logs: Path) -> list[Result]:
     """
     logs.mkdir(parents=True, exist_ok=True)
     console = Console(stderr=True)
-    results: list[Result] = []
+    results: list[Run] = []
     pace = _Pace(runs)
     for number, run in enumerate(runs, 1):
         head = f"[{number}/{len(runs)}] {run.name}"
@@ -184,7 +168,7 @@ def run_all(runs: Sequence[Run], logs: Path) -> list[Result]:
         pace.count(run, time.perf_counter() - start)
         if failure:
             console.print(f"{head} failed: {failure}", markup=False, highlight=False, soft_wrap=True)
-        results.append(Result(run.experiment, run.variant, run.arguments, run.folder, failure))
+        results.append(replace(run, failure=failure))
     return results
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from ...io.decoding import Arrays, DecodingError, decode
 from ...io.errors import DataFileError
@@ -13,7 +14,7 @@ from ...io.files import FORMAT, atomic_hdf5, create, hdf5_error, read_arrays
 from .recording import SI_PER_ACTUATION_UNIT, FloatArray, RawRecording, Recording
 
 KIND = "recording"
-_NAMES = ("positions", "labels", "rate_hz", "units", "actuation", "actuation_units", "rest", "start")
+_NAMES = ("positions", "labels", "rate_hz", "units", "actuation", "actuation_units", "rest", "base", "start")
 
 
 def read_raw_npz(path: Path) -> RawRecording:
@@ -75,6 +76,9 @@ def write_recording(path: str | Path, recording: Recording, attributes: Mapping[
             create(file, "rest", recording.rest, units="m")
         if recording.actuation is not None:
             create(file, "actuation", recording.actuation, units="1")
+        if recording.base is not None:
+            quaternions = Rotation.from_rotvec(recording.base[:, 3:]).as_quat()[:, [3, 0, 1, 2]]
+            create(file, "base", np.concatenate([recording.base[:, :3], quaternions], axis=1), units="m, 1")
 
 
 def numbers(found: Arrays, name: str, path: Path) -> FloatArray:
@@ -108,6 +112,7 @@ def _assemble(found: Arrays, path: Path) -> RawRecording:
         rate=_number(found, "rate_hz", path),
         actuation=actuation,
         rest=numbers(found, "rest", path) if "rest" in found else None,
+        base=numbers(found, "base", path) if "base" in found else None,
         start=_number(found, "start", path) or 0.0,
     )
 

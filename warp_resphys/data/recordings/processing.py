@@ -10,8 +10,9 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
-from ...io.errors import DataFileError, InputError
-from .recording import Recording, bridged, listed, runs
+from ...io.errors import DataFileError, InputError, listed
+from ..base_motion import at_times
+from .recording import Recording, bridged, runs
 from .release import Release, find_release
 
 _FIRST_SECONDS = 0.2  # A stretch may begin so much later than the first one.
@@ -63,8 +64,9 @@ def resample(recording: Recording, rate: float) -> Recording:
     every = round(ratio)
     if every >= 1 and abs(ratio - every) <= _WHOLE * ratio:
         actuation = None if recording.actuation is None else recording.actuation[::every]
+        base = None if recording.base is None else recording.base[::every]
         return dataclasses.replace(
-            recording, positions=recording.positions[::every], actuation=actuation, rate=float(rate)
+            recording, positions=recording.positions[::every], actuation=actuation, base=base, rate=float(rate)
         )
     old = np.arange(len(recording.positions))
     new = np.arange(int((len(old) - 1) / ratio * (1.0 + _WHOLE)) + 1) * ratio
@@ -78,7 +80,8 @@ def resample(recording: Recording, rate: float) -> Recording:
     actuation = None
     if recording.actuation is not None:
         actuation = np.stack([np.interp(new, old, channel) for channel in recording.actuation.T], axis=1)
-    return dataclasses.replace(recording, positions=positions, actuation=actuation, rate=float(rate))
+    base = None if recording.base is None else at_times(recording.base, old, new)
+    return dataclasses.replace(recording, positions=positions, actuation=actuation, base=base, rate=float(rate))
 
 
 def smooth(recording: Recording, cutoff: float) -> Recording:
@@ -162,6 +165,7 @@ def trim_to_release(recording: Recording, release: Release, seconds: float | Non
         recording,
         positions=recording.positions[first:last],
         actuation=None if recording.actuation is None else recording.actuation[first:last],
+        base=None if recording.base is None else recording.base[first:last],
         rest=np.nanmedian(held, axis=0),
         start=(first - release.frame) / recording.rate,
     )

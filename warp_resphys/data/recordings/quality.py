@@ -9,9 +9,9 @@ import numpy as np
 from scipy.ndimage import median_filter
 from scipy.spatial.distance import cdist
 
-from ...io.errors import DataFileError, InputError
+from ...io.errors import DataFileError, InputError, listed
 from .jumps import LEAST_JUMP, Jump, Swap, find_jumps, find_swaps
-from .recording import FloatArray, Recording, listed, runs
+from .recording import FloatArray, Recording, runs
 from .release import Release
 
 _LEAST_MOTION = 5e-4  # [m]

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...io.errors import DataFileError
-from .recording import SI_PER_ACTUATION_UNIT, FloatArray, RawRecording, listed
+from ...io.errors import DataFileError, listed
+from .recording import SI_PER_ACTUATION_UNIT, FloatArray, RawRecording
 
 Rows = list[list[str]]
 

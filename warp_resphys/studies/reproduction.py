@@ -212,10 +212,7 @@ class _Follower:
 def execute(run: Run, log_file: Path, follow: Callable[[str], None]) -> str | None:
     """Runs the ordinary command in a process of its own, out of reach of the terminal's Ctrl-C.
 
-    Args:
-        run: which.
-        log_file: for all that it says.
-        follow: takes each line that it writes to stderr.
+    All that it says goes to a file, and each line of stderr to `follow`.
 
     Returns:
         The sentence that it failed with, or None.

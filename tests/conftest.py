@@ -10,7 +10,7 @@ from main_job import IN_RUN, TINY, files, run
 
 from warp_resphys.experiment import pipeline
 from warp_resphys.mesh.mesh import box_hexahedra
-from warp_resphys.report import render
+from warp_resphys.report import bodies, render
 
 wp.config.log_level = wp.LOG_WARNING
 wp.init()
@@ -56,7 +56,7 @@ def can_draw() -> None:
     """Skips where bodies cannot be drawn."""
     mesh = box_hexahedra(divisions=(1, 1, 1))
     try:
-        render.draw_bodies(mesh, {"box": mesh.vertices}, mesh.vertices)
+        render.draw(bodies.distance_scene(mesh, {"box": mesh.vertices}, mesh.vertices))
     except render.DrawingError as error:
         pytest.skip(str(error))
 

@@ -23,8 +23,8 @@ from warp_resphys.experiment.build import bound_markers, build_body
 from warp_resphys.experiment.checks import check_configuration
 from warp_resphys.experiment.files import DATASET, QUALITY, REGISTRATION, TRUTH, attached_mass, read_dataset
 from warp_resphys.experiment.importing import import_recordings
-from warp_resphys.experiment.laboratory import laboratory_simulator, make_setup
 from warp_resphys.experiment.pipeline import acquisition_stages
+from warp_resphys.experiment.simulate import laboratory_simulator, make_setup
 from warp_resphys.experiment.trials import trials_of
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.files import read_hdf5

@@ -8,15 +8,10 @@ import torch
 from warp_resphys import Body, Corotated, Simulator, State, box_hexahedra, select_vertices
 from warp_resphys.data.markers import KINDS, MarkerMap, bind_markers
 from warp_resphys.dynamics.inputs import Inputs
+from warp_resphys.dynamics.modes import vibration_modes
 from warp_resphys.io.errors import ConvergenceError, InputError
-from warp_resphys.learning.reconstruction import make_reconstructor
-from warp_resphys.learning.sparse_reconstruction import (
-    SparseGaussNewton,
-    SparseLevenbergMarquardt,
-    make_sparse_reconstructor,
-    ridge,
-    vibration_modes,
-)
+from warp_resphys.learning.reconstruction import SparseGaussNewton, SparseLevenbergMarquardt, make_reconstructor
+from warp_resphys.linalg.least_squares import ridge
 
 MESH = box_hexahedra((0.06, 0.03, 0.03), (2, 1, 1))
 BODY = Body(MESH, fixed=select_vertices(MESH, x=0.0))
@@ -41,6 +36,10 @@ def observation(steps=1, weights=(0.1,), **settings):
 
 def markers_at(*rows):
     return MarkerMap.at_vertices(torch.tensor(rows))
+
+
+def make_sparse_reconstructor(sim, markers, *settings, **options):
+    return make_reconstructor(sim, *settings, markers=markers, **options)
 
 
 def reconstruct(solver, start, observed):

@@ -20,7 +20,8 @@ from warp_resphys.mesh.chambers import find_chambers
 from warp_resphys.mesh.mesh import Mesh
 from warp_resphys.mesh.readers import write_mesh
 from warp_resphys.report import figures, mesh, motion_figures, page, render
-from warp_resphys.report.data import along_body, drawn_markers, tip_markers
+from warp_resphys.report.bodies import Motion, axes_from_below, motion_axes
+from warp_resphys.report.data import Pressures, along_body, drawn_markers, tip_markers
 from warp_resphys.report.figures import CHAMBER_COLOURS, TONES
 from warp_resphys.report.mesh import MeshSummary
 from warp_resphys.report.page import Cell, Picture
@@ -34,7 +35,6 @@ from warp_resphys.report.verdict import (
     reduction_text,
     scale_text,
 )
-from warp_resphys.report.video import Motion, axes_from_below, draw_instants, view_axes
 
 DRAWN = {
     "error_over_time",
@@ -403,9 +403,8 @@ def test_a_model_that_runs_away_does_not_set_the_scale_of_the_tip():
 
 def test_pressures_are_in_kilopascal_in_the_chambers_colours():
     pressure = np.array([[0.0, 1e3], [2e4, 3e3]])
-    figure = motion_figures.pressure_sequences(
-        0.5, {"a": pressure, "b": 2 * pressure}, ["one", "two"], 2e4, narrow=False
-    )
+    driven = Pressures(("one", "two"), {"a": pressure, "b": 2 * pressure}, 2e4)
+    figure = motion_figures.pressure_sequences(0.5, driven, narrow=False)
     first, second = figure.axes
     assert second.get_xlim() == (0.0, 1.0)
     assert [line.get_ydata()[0] for line in first.lines] == [20.0]
@@ -418,11 +417,9 @@ def test_pressures_are_in_kilopascal_in_the_chambers_colours():
 
 def test_markers_stand_over_the_pressures():
     times = 0.1 * np.arange(4)
-    start = np.array([[0.0, 0.0, -0.2]])
-    measured = start + np.array([0.0, 1e-3, 2e-3, 3e-3])[:, None, None]
-    figure = motion_figures.markers_and_pressures(
-        times, measured, {"resphys": measured}, ["A"], start, np.full((3, 1), 5e3), ["chamber_1"], None, narrow=False
-    )
+    moved = np.repeat(np.array([0.0, 1e-3, 2e-3, 3e-3])[:, None, None], 3, axis=2)
+    driven = Pressures(("chamber_1",), {"Pressures": np.full((3, 1), 5e3)})
+    figure = motion_figures.marker_paths(times, moved, {"resphys": moved}, ["A"], driven, narrow=False)
     *coordinates, below = figure.axes
     assert len(coordinates) == 3
     assert all(axes.get_xlim() == below.get_xlim() for axes in coordinates)
@@ -430,7 +427,7 @@ def test_markers_stand_over_the_pressures():
     np.testing.assert_allclose(measured_line.get_ydata(), [0.0, 1.0, 2.0, 3.0], atol=1e-12)
     assert model_line.get_color() == TONES["resphys"].light
     assert not below.lines
-    assert [text.get_text() for text in figure.legends[1].get_texts()] == ["chamber 1"]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["chamber 1"]
 
 
 @pytest.mark.usefixtures("no_figures")
@@ -446,7 +443,7 @@ def test_settings_are_shown_and_what_diverged_is_said(tmp_path):
 
 
 def test_view_from_below_keeps_what_is_to_the_right():
-    axes = view_axes(np.array([0.0, 0.0, -9.8]), np.random.default_rng(0).normal(size=(3, 20, 3)))
+    axes = motion_axes(np.array([0.0, 0.0, -9.8]), np.random.default_rng(0).normal(size=(3, 20, 3)))
     below = axes_from_below(axes, np.array([0.0, 0.0, -9.8]))
     np.testing.assert_allclose(below[[0, 2]], [axes[0], [0.0, 0.0, -1.0]], atol=1e-12)
     assert np.linalg.det(below) == pytest.approx(1.0)
@@ -466,7 +463,8 @@ def test_second_view_is_from_below():
     shown = Motion(
         arm, np.arange(2.0), markers, moved, {"resphys": markers}, places, np.array([0.0, 0.0, -9.8]), from_below=True
     )
-    frames = draw_instants(shown).astype(int)
+    (frames,) = render.draw(shown.scene())
+    frames = np.stack(np.split(frames.astype(int), 2, axis=2), axis=1)
     dots = (frames[..., 3] > 200) & (frames[..., 0] > frames[..., 2] + 150)
     solid = frames[..., 3] > 200
     height, width = (np.ptp(np.argwhere(solid[0, 1]), axis=0) + 1).tolist()

@@ -28,6 +28,7 @@ from warp_resphys.io.stages import StageContext
 from warp_resphys.learning.metrics import PUBLISHED_MM
 from warp_resphys.mesh.mesh import box_hexahedra
 from warp_resphys.report import figures, motion_figures, render
+from warp_resphys.report.bodies import Motion, motion_axes, write_film
 from warp_resphys.report.data import at_times, best_and_worst, mean_distance, shown_models
 from warp_resphys.report.figures import TONES
 from warp_resphys.report.motion_sections import instants
@@ -35,7 +36,6 @@ from warp_resphys.report.page import Cell
 from warp_resphys.report.run_page import published_beside
 from warp_resphys.report.sections import against, parameter_rows, quality_rows, residual_table, uncertainty_text
 from warp_resphys.report.verdict import marker_verdict
-from warp_resphys.report.video import Motion, draw_instants, view_axes, write_video
 
 SETTINGS = config()
 DOWN = np.array([0.0, 0.0, -9.8])
@@ -304,7 +304,7 @@ def test_a_model_that_runs_away_does_not_set_the_scale():
     measured = np.zeros((20, 1, 3))
     measured[:, 0, 2] = 0.01 * np.sin(30.0 * times)
     wild = measured + np.exp(50.0 * times)[:, None, None]
-    figure = motion_figures.marker_paths(times, measured, {"resphys": wild}, ["A"], np.zeros((1, 3)), narrow=False)
+    figure = motion_figures.marker_paths(times, measured, {"resphys": wild}, ["A"], narrow=False)
     spans = [np.ptp(axes.get_ylim()) for axes in figure.axes[:3]]
     assert spans[2] < 50.0
     assert 0.05 * np.ptp(measured[..., 2]) * 1e3 < spans[1] < 5.0  # [mm]
@@ -349,15 +349,15 @@ def test_trials_in_order_of_their_errors(tmp_path):
 def test_views_have_the_free_end_on_the_right_and_gravity_down():
     rest = box_hexahedra(divisions=(4, 1, 1)).vertices
     times = np.arange(10) * STEP
-    axes = view_axes(DOWN, sag(rest, times, 0.05))
+    axes = motion_axes(DOWN, sag(rest, times, 0.05))
     np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
     assert axes[0, 0] > 0.9
     assert axes[1, 2] > 0.9
     mirrored = sag(rest, times, 0.05) * [-1.0, 1.0, 1.0]
-    assert view_axes(DOWN, mirrored)[0, 0] < -0.9
+    assert motion_axes(DOWN, mirrored)[0, 0] < -0.9
     hanging = sag(rest, times, 0.05)[..., [2, 1, 0]] * [1.0, 1.0, -1.0]
-    assert view_axes(DOWN, hanging)[1, 2] > 0.9
-    assert np.isfinite(view_axes(np.zeros(3), sag(rest, times, 0.05))).all()
+    assert motion_axes(DOWN, hanging)[1, 2] > 0.9
+    assert np.isfinite(motion_axes(np.zeros(3), sag(rest, times, 0.05))).all()
 
 
 def motion(frames=3, model="simulation"):
@@ -374,9 +374,9 @@ def test_instants_show_bodies_dots_and_rings():
     shown = motion(2)
     shown.positions["resphys"][1] *= 1e200
     shown.markers["resphys"][1] = np.nan
-    frames = draw_instants(shown)
-    assert frames.shape[:2] == (2, 2)
-    pixels = frames.astype(int)
+    (frames,) = render.draw(shown.scene())
+    pixels = np.stack(np.split(frames.astype(int), 2, axis=2), axis=1)
+    assert pixels.shape[:2] == (2, 2)
     solid = pixels[..., 3] > 200
     blue = solid & (pixels[..., 2] > pixels[..., 0] + 40)
     dots = solid & (pixels[..., 0] > pixels[..., 2] + 150)
@@ -393,7 +393,7 @@ def test_film_moves_and_is_slower_than_the_motion(tmp_path, capsys):
     imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
     shown = motion(4)
     shown.measured[2, 1] = np.nan
-    write_video(tmp_path / "motion.mp4", shown, {"simulation": "Uncorrected", "resphys": "ResPhys"}, 4.0, 1.5)
+    write_film(tmp_path / "motion.mp4", shown, {"simulation": "Uncorrected", "resphys": "ResPhys"}, 4.0, 1.5)
     assert "4/4 frames" in capsys.readouterr().err
     reader = imageio_ffmpeg.read_frames(str(tmp_path / "motion.mp4"))
     about = next(reader)
@@ -415,5 +415,5 @@ def test_film_moves_and_is_slower_than_the_motion(tmp_path, capsys):
 def test_a_film_that_cannot_be_made_says_why(tmp_path, monkeypatch, script, reason):
     monkeypatch.setattr(render, "COMMAND", (sys.executable, "-c", script))
     with pytest.raises(render.DrawingError, match=reason):
-        write_video(tmp_path / "motion.mp4", motion(), {"simulation": "a", "resphys": "b"}, 4.0, 1.5)
+        write_film(tmp_path / "motion.mp4", motion(), {"simulation": "a", "resphys": "b"}, 4.0, 1.5)
     assert not list(Path(tmp_path).iterdir())

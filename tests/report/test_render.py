@@ -9,28 +9,36 @@ from matplotlib import colormaps
 
 from warp_resphys.mesh.mesh import Mesh, boundary_triangles, box_hexahedra, box_tetrahedra
 from warp_resphys.report import render
+from warp_resphys.report.bodies import MARGIN, SHADE, TOWARDS_VIEWER, distance_scene, largest_distances, sharp_edges
 
 MESHES = {
     "hexahedra": box_hexahedra(divisions=(3, 2, 2)),
     "tetrahedra": box_tetrahedra((0.1, 0.03, 0.03), (3, 2, 2)),
     "tetrahedra10": box_tetrahedra((0.1, 0.03, 0.03), (3, 2, 2), order=2),
 }
-TOWARDS_VIEWER = np.asarray(render.TOWARDS_VIEWER) / np.linalg.norm(render.TOWARDS_VIEWER)
+VIEWER = np.asarray(TOWARDS_VIEWER) / np.linalg.norm(TOWARDS_VIEWER)
 
 
 def draw(mesh: Mesh, errors: np.ndarray, count: int = 1) -> list[np.ndarray]:
     """(H, W, 4) pictures of the undeformed body, with (N,) errors [m] along x."""
     target = mesh.vertices - errors[:, None] * [1.0, 0.0, 0.0]
-    bodies = render.draw_bodies(mesh, {str(each): mesh.vertices for each in range(count)}, target)
-    drawn = [body for body in bodies.values() if body]
-    assert [body.largest for body in drawn] == pytest.approx([errors.max()] * count, rel=1e-6)
-    return [body.pixels for body in drawn]
+    bodies = {str(each): mesh.vertices for each in range(count)}
+    assert [*largest_distances(mesh, bodies, target).values()] == pytest.approx([errors.max()] * count, rel=1e-6)
+    return drawn(mesh, bodies, target)
+
+
+def drawn(mesh: Mesh, bodies: dict[str, np.ndarray], target: np.ndarray) -> list[np.ndarray]:
+    """(H, W, 4) red, green, blue and opacity in [0, 1] of each body."""
+    scene = distance_scene(mesh, bodies, target)
+    assert scene is not None
+    ((picture,),) = render.draw(scene)
+    return np.split(picture / 255.0, len(bodies), axis=1)
 
 
 def shaded(value: float, normal: tuple[float, float, float]) -> np.ndarray:
     """(3,) colour of a value in [0, 1] on a face that looks along a normal."""
     facing = max(0.0, float(np.dot(normal, render.TOWARDS_LIGHT) / np.linalg.norm(render.TOWARDS_LIGHT)))
-    return np.asarray(colormaps[render.COLOUR_MAP](value)[:3]) * (1.0 - render.SHADE * (1.0 - facing))
+    return np.asarray(colormaps[render.COLOUR_MAP](value)[:3]) * (1.0 - SHADE * (1.0 - facing))
 
 
 def share(pixels: np.ndarray, colour: np.ndarray) -> float:
@@ -44,7 +52,7 @@ def share(pixels: np.ndarray, colour: np.ndarray) -> float:
 def test_a_body_is_drawn_whole_to_scale_and_in_the_colours_of_the_scale(mesh: Mesh) -> None:
     # With one error everywhere each visible face has one colour, in the share of the picture that it covers.
     faces = {(1.0, 0.0, 0.0): 0.03 * 0.03, (0.0, -1.0, 0.0): 0.1 * 0.03, (0.0, 0.0, 1.0): 0.1 * 0.03}  # [m²]
-    covered = {normal: area * float(np.dot(normal, TOWARDS_VIEWER)) for normal, area in faces.items()}
+    covered = {normal: area * float(np.dot(normal, VIEWER)) for normal, area in faces.items()}
     pictures = draw(mesh, np.full(len(mesh.vertices), 1e-3), count=2)
     for pixels in pictures:
         for normal, area in covered.items():
@@ -52,7 +60,7 @@ def test_a_body_is_drawn_whole_to_scale_and_in_the_colours_of_the_scale(mesh: Me
             assert share(pixels, shaded(1.0, normal)) == pytest.approx(expected, abs=0.06)  # Edges, outline.
         rows, columns = np.nonzero(pixels[..., 3] == 1.0)
         for seen, length in ((rows, pixels.shape[0]), (columns, pixels.shape[1])):
-            margin = render.MARGIN * max(pixels.shape)
+            margin = MARGIN * max(pixels.shape)
             assert seen.min() == pytest.approx(margin, abs=0.3 * margin)
             assert length - seen.max() == pytest.approx(margin, abs=0.3 * margin)
     np.testing.assert_allclose(*pictures, rtol=0, atol=0.05)  # A pixel may be rounded otherwise.
@@ -77,23 +85,26 @@ def test_colours_are_where_the_errors_are_and_what_stands_before_hides_what_is_b
 def test_the_undeformed_outline_shows_where_the_body_has_left() -> None:
     mesh = box_hexahedra(divisions=(3, 1, 1))
     moved = mesh.vertices + [0.0, 0.0, 0.05]
-    body = render.draw_bodies(mesh, {"moved": moved}, moved)["moved"]
-    assert body is not None
-    assert share(body.pixels, np.asarray(matplotlib.colors.to_rgb(render.OUTLINE))) > 0.03
+    (pixels,) = drawn(mesh, {"moved": moved}, moved)
+    assert share(pixels, np.asarray(matplotlib.colors.to_rgb(render.OUTLINE))) > 0.03
 
 
 def test_only_what_has_not_diverged_is_drawn() -> None:
     mesh = box_hexahedra(divisions=(1, 1, 1))
     diverged = {"far": mesh.vertices + 2.0, "gone": np.full_like(mesh.vertices, np.nan)}
-    assert render.draw_bodies(mesh, diverged, mesh.vertices) == {"far": None, "gone": None}
+    assert largest_distances(mesh, diverged, mesh.vertices) == {"far": None, "gone": None}
+    assert distance_scene(mesh, diverged, mesh.vertices) is None
+    some = distance_scene(mesh, {**diverged, "box": mesh.vertices}, mesh.vertices)
+    assert some is not None
+    assert len(some.views) == 1
 
 
 def test_sharp_edges_are_those_of_the_box_and_the_rim_of_a_part():
     mesh = box_hexahedra((0.1, 0.03, 0.03), (3, 2, 2))
     triangles = boundary_triangles(mesh)
-    assert len(render.sharp_edges(mesh.vertices, triangles)) == 4 * (3 + 2 + 2)
+    assert len(sharp_edges(mesh.vertices, triangles)) == 4 * (3 + 2 + 2)
     end = triangles[(mesh.vertices[triangles, 0] == 0.0).all(axis=1)]
-    assert len(render.sharp_edges(mesh.vertices, end)) == 4 * 2
+    assert len(sharp_edges(mesh.vertices, end)) == 4 * 2
 
 
 @pytest.mark.parametrize(
@@ -110,6 +121,6 @@ def test_why_nothing_can_be_drawn(monkeypatch, script, time_out, reason):
     monkeypatch.setattr(render, "TIME_OUT", time_out)
     mesh = box_hexahedra(divisions=(1, 1, 1))
     with pytest.raises(render.DrawingError, match=r"cannot draw .* on this machine \(") as caught:
-        render.draw_bodies(mesh, {"box": mesh.vertices}, mesh.vertices)
+        drawn(mesh, {"box": mesh.vertices}, mesh.vertices)
     assert reason in str(caught.value)
     assert "libegl1" in str(caught.value)

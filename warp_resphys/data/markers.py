@@ -15,7 +15,7 @@ All reproduce the markers at rest, and carry them rigidly where the body moves r
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -32,8 +32,6 @@ KINDS = (*SURFACE_KINDS, "rigid")
 
 class Markers(ABC):
     """A map from the vertices of a body to m markers."""
-
-    linear: ClassVar[bool] = False  # Whether `transposed_jacobian` is the same everywhere.
 
     @abstractmethod
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
@@ -78,7 +76,6 @@ class MarkerMap(Markers):
 
     vertices: torch.Tensor
     weights: torch.Tensor
-    linear: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         """Checks that the shapes agree.

@@ -20,16 +20,17 @@ from ..data.markers import MarkerMap
 from ..dynamics.integrator import State
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5, read_json, write_json, write_text
 from ..io.memory import WorkersMemory
-from ..io.processes import Advance, available_cores, in_processes
+from ..io.processes import Advance, in_processes
 from ..io.progress import Progress
 from ..io.resumable import Field, ResumableHDF5
 from ..io.stages import Stage, StageContext, package_versions, resources_used
-from ..learning.sparse_reconstruction import make_sparse_reconstructor
+from ..learning.reconstruction import make_reconstructor
 from ..mesh.mesh import surface_vertices
 from ..report.ablation_page import AblationReport, write_ablation_report
 from ..report.page import number_text
 from .build import build_mesh, build_simulator, choose_device
 from .files import METRICS, REPORT
+from .parts import processes_for
 from .simulate import held_state
 
 MOTION = "motion.h5"
@@ -53,7 +54,7 @@ def ablation_stages(config: Mapping[str, Any], base: Mapping[str, Any], shown: M
         return {**base, **{key: config[key] for key in keys}}
 
     own = dict(config["ablation"])
-    processes = _processes(own.pop("processes"), config)
+    processes = min(processes_for(config, own.pop("processes")), len(own["counts"]))
     return [
         Stage("generate", generate_motion, (MOTION,), pick("target", "simulation", "data")),
         Stage(
@@ -93,12 +94,6 @@ def generate_motion(context: StageContext) -> None:
     with atomic_hdf5(context.run_dir / MOTION, "motion", attributes) as file:
         for name, q in motion.items():
             create(file, name, q.cpu().numpy(), "m")
-
-
-def _processes(wanted: int | None, config: Mapping[str, Any]) -> int:
-    """How many processes share the counts: unless told, one a core, and a single one on a GPU."""
-    cores = 1 if config["device"].startswith("cuda") else available_cores()
-    return min(cores if wanted is None else wanted, len(config["ablation"]["counts"]))
 
 
 def ablate(context: StageContext, processes: int = 1) -> None:
@@ -199,7 +194,7 @@ def _reconstruct(
     """Mean distances (draws, T) from the motion (T + 1, N, 3), of all vertices and of the markers [m]."""
     markers = MarkerMap.at_vertices(torch.as_tensor(vertices, device=motion.device), motion.dtype)
     modes = settings["ablation"]["modes"]
-    reconstructor = make_sparse_reconstructor(simulator, markers, **settings["reconstruction"], modes=modes)
+    reconstructor = make_reconstructor(simulator, **settings["reconstruction"], modes=modes, markers=markers)
     q = motion[0].expand(len(vertices), -1, -1).clone()
     state, force = State(q, torch.zeros_like(q)), torch.zeros_like(q)
     errors, misfits = [], []

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from ..data.actuation import PressureSequences
+from ..data.base_motion import OBSERVED
 from ..data.markers import MarkerMap
 from ..energies.materials import Material
 from ..fem.body import Body
@@ -16,14 +17,14 @@ from ..io.memory import available_memory_gib
 from ..learning.identification import Bounds
 from ..learning.reconstruction import make_reconstructor
 from ..learning.replay import MASS_FACTOR, known_parameters
-from ..learning.sparse_reconstruction import make_sparse_reconstructor
 from ..mesh.mesh import select_vertices, surface_vertices
 from .build import build_body, build_material, build_simulator, chambers_of
-from .files import attached_mass
+from .files import STATIC, attached_mass
 from .identify import ELASTIC
-from .laboratory import laboratory_settings, substeps_of, vertical
 from .schema import IN_THE_LOOP, NAME, NETWORK, TRAINER, check, configuration_group
+from .simulate import laboratory_settings, substeps_of, vertical
 from .trials import (
+    Trial,
     folds_of,
     is_laboratory,
     sees_markers,
@@ -69,15 +70,13 @@ def check_configuration(config: Mapping[str, Any]) -> None:
     if recorded:
         _check_recorded(config, body)
         probe = MarkerMap.at_vertices(torch.zeros(1, 1, dtype=torch.int64))
-        make_sparse_reconstructor(simulator, probe, **config["reconstruction"])
+        make_reconstructor(simulator, **config["reconstruction"], markers=probe)
     elif "ablation" in config:
         _check_ablation(config, body)
     else:
         split_of(config)
         if variation_of(config["data"]).key == "weights_g":
             select_vertices(body.mesh, **config["data"]["load"])
-        if "modes" in config["reconstruction"]:
-            raise InputError("reconstruction.modes is for bodies that are seen through markers: leave it out.")
         make_reconstructor(simulator, **config["reconstruction"])
     steps = config["data"].get("steps")
     refinement = config["refinement"]
@@ -195,6 +194,7 @@ def _check_recorded(config: Mapping[str, Any], body: Body) -> None:
         _check_material(config["published"], "simulation", "published.")
     if is_laboratory(config):
         _check_laboratory(config, begins, chambers)
+    _check_base_motion(config, trials)
     _check_release(config, begins)
 
 
@@ -235,6 +235,35 @@ def _check_trials(config: Mapping[str, Any]) -> None:
         other = files.setdefault(trial["file"], name)
         if other != name:
             raise InputError(f"the trials '{other}' and '{name}' have the same file, {trial['file']}: name it once.")
+
+
+def _check_base_motion(config: Mapping[str, Any], trials: Sequence[Trial]) -> None:
+    """How what the body is fixed to moves, if it does."""
+    common, groups = config["data"].get("base_motion"), {}
+    if isinstance(common, str):
+        if common not in OBSERVED:
+            raise InputError(
+                f"data.base_motion is '{common}': it must be {' or '.join(OBSERVED)}, a group with file or swings, or "
+                "null."
+            )
+        if common == "reference" and len(config["markers"]["reference"]) < 3:
+            raise InputError(
+                "data.base_motion is reference: name three markers or more, not on a line, in markers.reference."
+            )
+    elif common is not None:
+        groups["data.base_motion"] = common
+    group = "laboratory" if is_laboratory(config) else "data"
+    groups |= {f"{group}.trials.{each.name}.base_motion": each.base_motion for each in trials if each.base_motion}
+    for key, motion in groups.items():
+        if isinstance(motion, str) or ("file" in motion) == ("swings" in motion):
+            raise InputError(f"{key} needs either file, a table of poses, or swings, by any names.")
+        if "swings" in motion and not motion["swings"]:
+            raise InputError(
+                f"{key}.swings is empty: give it at least one, as {{a: {{frequency: 1.0, translation: [0.01, 0, 0]}}}}."
+            )
+    for each in trials:
+        if each.begins == STATIC and (common is not None or each.base_motion):
+            raise InputError(f"the trial '{each.name}' is a pose, which has no time: its base cannot move.")
 
 
 def _check_release(config: Mapping[str, Any], begins: set[str]) -> None:
@@ -390,6 +419,5 @@ def _check_ablation(config: Mapping[str, Any], body: Body) -> None:
     if not isinstance(observed, list) or len(observed) != 1 or not 0.0 < observed[0] < np.inf:
         raise InputError(f"data.weights_g.observed is {observed!r}: it must be a list of one positive weight, in g.")
     probe = MarkerMap.at_vertices(torch.zeros(1, 1, dtype=torch.int64))
-    make_sparse_reconstructor(
-        build_simulator(config), probe, **config["reconstruction"], modes=config["ablation"]["modes"]
-    )
+    modes = config["ablation"]["modes"]
+    make_reconstructor(build_simulator(config), **config["reconstruction"], modes=modes, markers=probe)

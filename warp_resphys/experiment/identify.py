@@ -6,8 +6,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from ..io.files import read_json, write_json
+from ..io.files import write_json
 from ..io.progress import Progress
+from ..io.resumable import forget_checkpoint, keep_checkpoint, resume_checkpoint
 from ..io.stages import StageContext
 from ..learning.identification import Bounds, Identifier
 from ..learning.replay import MASS_FACTOR, Replay, Start
@@ -51,7 +52,7 @@ def identify(context: StageContext) -> None:
         found[_LANDSCAPE] = _landscape(context, replays["sysid"], ranges["sysid"], values, seconds)
     write_json(context.run_dir / IDENTIFICATION, found)
     for part in (*ranges, _LANDSCAPE):
-        _kept_file(context, part).unlink(missing_ok=True)
+        forget_checkpoint(_kept_file(context, part))
 
 
 def _seconds(settings: Mapping[str, Any], replays: Replays) -> float | None:
@@ -121,7 +122,7 @@ def _landscape(
     others = {name: b for name, b in bounds.items() if name not in axes}
     identifier = Identifier(replays, {**axes, **others}, seconds)
     counts = {name: int(each["points"]) for name, each in grid.items()}
-    finished = [math.inf if loss is None else loss for loss in _kept_of(context, _LANDSCAPE).get("losses", [])]
+    finished = _kept_of(context, _LANDSCAPE).get("losses", [])
     with Progress(f"{context.name}: landscape", math.prod(counts.values()), "points", len(finished)) as progress:
 
         def report(losses: list[float]) -> None:
@@ -135,16 +136,15 @@ def _landscape(
 
 def _kept_file(context: StageContext, part: str) -> Path:
     """Where what is finished of a part is kept until the stage is done."""
-    return context.run_dir / f"identify_{part}.json"
+    return context.run_dir / f"identify_{part}.safetensors"
 
 
 def _keep(context: StageContext, part: str, content: dict[str, Any]) -> dict[str, Any]:
-    write_json(_kept_file(context, part), {"fingerprint": context.fingerprint, **content})
+    keep_checkpoint(_kept_file(context, part), "identify", {}, {"fingerprint": context.fingerprint, **content})
     return content
 
 
 def _kept_of(context: StageContext, part: str) -> dict[str, Any]:
     """What an interrupted run kept of a part; nothing if it had other settings."""
-    path = _kept_file(context, part)
-    kept: dict[str, Any] = read_json(path) if path.is_file() else {}
-    return kept if kept.get("fingerprint") == context.fingerprint else {}
+    found = resume_checkpoint(_kept_file(context, part), "identify", context.fingerprint)
+    return {} if found is None else found[1]

@@ -44,14 +44,13 @@ from .files import (
 )
 from .identify import identify
 from .importing import import_recordings, import_scaled
-from .laboratory import run_laboratory
 from .learn import refine, train
 from .models import SIMFREE
 from .parts import processes_for
 from .reconstruct import reconstruct
 from .report import collect_metrics, make_folds_report, make_report
 from .scene import LEARNED, models_of
-from .simulate import simulate
+from .simulate import run_laboratory, simulate
 from .trials import Split, folds_of, is_laboratory, scaled_trials_of, sees_markers, split_of, test_groups, trials_of
 
 _SIMULATED = ("mesh", "physics", "fixed", "gravity", "time_step", "integrator", "solver", "device", "dtype")
@@ -59,7 +58,7 @@ _ACTING = ("chambers", "fibres", "coupling")
 _DRAWN = ("laboratory", "fixed", "chambers", "gravity", "time_step", "solver", "device", "dtype", "seed", "tip")
 _DRAWN_DATA = (
     *("folder", "trials", "sequences", "begins", "train", "validation", "test", "folds", "limit"),
-    *("payload_at", "up", "rest", "steps", "pressure_limit"),
+    *("payload_at", "up", "rest", "steps", "pressure_limit", "base_motion"),
 )
 _DRAWN_MARKERS = ("tracked", "reference", "bind", "bind_to", "largest_distance")
 _LATER_DATA = ("horizons", "train_fraction", "pressure_scales")
@@ -72,6 +71,12 @@ def simulated(config: Mapping[str, Any]) -> dict[str, Any]:
     base = {key: config[key] for key in (*_SIMULATED, *_ACTING)}
     if config["mesh"]["kind"] == "file":
         base["mesh_digest"] = digest(config["mesh"]["path"])
+    trials = config["data"].get("trials") or {}
+    motions = [each.get("base_motion") for each in (config["data"], *trials.values()) if isinstance(each, Mapping)]
+    files = [each["file"] for each in motions if isinstance(each, Mapping) and "file" in each]
+    if files:
+        folder = Path(config["data"].get("folder") or ".")
+        base["base_motions"] = {name: _digest(folder / name, "the file of base_motion") for name in files}
     return base
 
 
@@ -96,7 +101,7 @@ def acquisition_stages(config: Mapping[str, Any]) -> list[Stage]:
     base, data = simulated(config), config["data"]
     if not sees_markers(config):
         return [Stage("simulate", simulate, (DATASET,), {**base, **_pick(config, "target", "data")})]
-    stages, processes = [], processes_for(config)
+    stages, processes = [], processes_for(config, config["parallel"]["processes"])
     imported = {**base, **_pick(config, "simulation", "markers")}
     imported["data"] = {key: value for key, value in data.items() if key not in _LATER_DATA} | {"pressure_scales": []}
     trials = trials_of(config)
@@ -108,7 +113,7 @@ def acquisition_stages(config: Mapping[str, Any]) -> list[Stage]:
         play = partial(run_laboratory, processes=processes)
         stages.append(Stage("laboratory", play, files, _laboratory_settings(config, ())))
     else:
-        imported["recordings"] = {trial.name: _digest(trial.name, trial.file) for trial in trials}
+        imported["recordings"] = {trial.name: _digest(trial.file, f"data.trials.{trial.name}.file") for trial in trials}
     needs = tuple(stage.name for stage in stages)
     stages.append(Stage("import", import_recordings, (DATASET, QUALITY, REGISTRATION), imported, needs))
     scales = data["pressure_scales"]
@@ -136,13 +141,11 @@ def _laboratory_settings(config: Mapping[str, Any], scales: Sequence[float]) -> 
     return own
 
 
-def _digest(trial: str, path: Path | None) -> str:
+def _digest(path: Path | None, key: str) -> str:
     try:
         return digest(str(path))
     except OSError as error:
-        raise DataFileError(
-            f"cannot read {path} ({error.strerror}): check data.folder and data.trials.{trial}.file."
-        ) from error
+        raise DataFileError(f"cannot read {path} ({error.strerror}): check data.folder and {key}.") from error
 
 
 def learning_stages(config: Mapping[str, Any], split: Split, shared: str, acquired: str) -> list[Stage]:
@@ -154,7 +157,7 @@ def learning_stages(config: Mapping[str, Any], split: Split, shared: str, acquir
         shared: the folder of dataset.h5, relative to that of the split.
         acquired: fingerprint of the stage that wrote it.
     """
-    processes, models, identifies = processes_for(config), models_of(config), config["identify"] is not None
+    processes, identifies = processes_for(config, config["parallel"]["processes"]), config["identify"] is not None
     base: dict[str, Any] = {
         **simulated(config),
         **_pick(config, *_LEARNED_FROM),
@@ -173,7 +176,7 @@ def learning_stages(config: Mapping[str, Any], split: Split, shared: str, acquir
         needs = ("identify",)
     observed = [*split.train, *split.validation, *(() if sees_markers(config) else split.test)]
     known: list[str] = []
-    for model in (each for each in models if each in LEARNED and each != SIMFREE):
+    for model in (each for each in models_of(config) if each in LEARNED and each != SIMFREE):
         stages += _force_stages(config, {**base, "model": model}, observed, needs, processes)
         known.append(stages[-1].name)
     settings = {**base, **training_settings(config, SIMFREE), "range_guard": config["range_guard"], "model": SIMFREE}

@@ -31,6 +31,7 @@ from .files import (
     REPORT,
     ROLLOUTS,
     SCALED_DATASET,
+    STATIC,
     TIMES,
     TRUTH,
     fold_folder,
@@ -309,7 +310,8 @@ def read_pressures(folder: Path, config: Mapping[str, Any], trials: Trials) -> P
         if PRESSURE not in dataset.inputs:
             return None
         values |= dict(zip(dataset.names, dataset.inputs[PRESSURE], strict=True))
-    return Pressures(dataset.channels[PRESSURE], values, config["data"].get("pressure_limit"), scaled)
+    poses = tuple(name for name, begins in zip(dataset.names, dataset.begins, strict=True) if begins == STATIC)
+    return Pressures(dataset.channels[PRESSURE], values, config["data"].get("pressure_limit"), scaled, poses)
 
 
 def _driven_chambers(chambers: tuple[Chamber, ...], names: tuple[str, ...]) -> tuple[Chamber, ...]:

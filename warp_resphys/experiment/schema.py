@@ -313,12 +313,33 @@ _MARKERS = Group(
         "largest_shift": optional(POSITIVE),
     }
 )
+_SWING = Group(
+    {
+        "frequency": POSITIVE,
+        "translation": absent(_PLACE),
+        "rotation": absent(Kind(_is_place, "three numbers, in rad")),
+        "phase": absent(FINITE),
+    }
+)
+_BASE_MOTION = Group(
+    {
+        "file": absent(Kind(_is_word, "the name of a file")),
+        "swings": absent(Group(each=_SWING)),
+        "about": absent(_PLACE),
+        "start": absent(NOT_NEGATIVE),
+        "ramp": absent(NOT_NEGATIVE),
+    },
+    optional=True,
+    absent=True,
+    short=True,
+)
 _TRIAL = Group(
     {
         "file": absent(Kind(_is_word, "the name of a file")),
         "payload": absent(Kind(NOT_NEGATIVE.fits, "a mass, zero or more, in kg")),
         "begins": absent(one_of(*BEGINNINGS)),
         "pull": absent(_FORCE),
+        "base_motion": _BASE_MOTION,
     }
 )
 _SEQUENCES = Group(
@@ -359,6 +380,7 @@ _RECORDED = Group(
         "train_fraction": SHARE,
         "horizons": _POSITIVES,
         "pressure_scales": _POSITIVES,
+        "base_motion": _BASE_MOTION,
         "folds": optional(one_of(*FOLDS)),
         **_SPLIT,
         "limit": _LIMIT,
@@ -372,6 +394,8 @@ _SIMULATED = Group(
         "twist_axis": absent(one_of("x", "y", "z")),
         "weights_g": absent(Group(each=NUMBERS)),
         "angles_deg": absent(Group(each=NUMBERS)),
+        "amplitudes": absent(Group(each=NUMBERS)),
+        "base_motion": _BASE_MOTION,
         "folds": absent(optional(one_of(*FOLDS))),
         "limit": _LIMIT,
     }

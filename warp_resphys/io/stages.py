@@ -25,19 +25,11 @@ from typing import Any
 from .errors import DataFileError, InputError
 from .files import digest, read_json, to_plain, write_json
 from .memory import WorkersMemory, peak_memory_gib
+from .resumable import forget_checkpoint, keep_checkpoint, resume_checkpoint
 
 log = logging.getLogger(__name__)
 
-_RECORDED_PACKAGES = (
-    "warp-resphys",
-    "warp-lang",
-    "torch",
-    "numpy",
-    "scipy",
-    "cholespy",
-    "h5py",
-    "hydra-core",
-)
+_PACKAGES = ("warp-resphys", "warp-lang", "torch", "numpy", "scipy", "cholespy", "h5py", "hydra-core")
 
 
 @dataclass(frozen=True)
@@ -45,10 +37,10 @@ class StageContext:
     """What a stage is told when it runs.
 
     Attributes:
-        name: The stage's name.
+        name: The stage's.
         run_dir: The run folder; outputs are written there.
         fingerprint: Identifies everything the outputs depend on; resumable files are marked with it.
-        settings: The settings that the stage declared.
+        settings: That the stage declared.
         memory: Of its worker processes, which it is to count.
     """
 
@@ -130,34 +122,42 @@ def run_stages(stages: Sequence[Stage], run_dir: str | Path, wait: bool = False)
     return seconds
 
 
+def _record(run_dir: Path, name: str) -> Path:
+    return run_dir / "stages" / f"{name}.json"
+
+
 def _run_stage(stage: Stage, context: StageContext, finished: list[str]) -> float:
     """Runs one stage, writes its record and returns its seconds, those of interrupted runs included."""
-    progress = context.run_dir / "stages" / f"{stage.name}.progress.json"
-    before = _seconds_so_far(progress, context.fingerprint)
-    log.info("%s: %s", stage.name, f"going on after {before:.0f} s" if before else "started")
-    start = time.perf_counter()
+    spent = _record(context.run_dir, stage.name).with_suffix(".state.safetensors")
+    before = resume_checkpoint(spent, "stage", context.fingerprint)
+    seconds = 0.0 if before is None else float(before[1]["seconds"])
+    log.info("%s: %s", stage.name, f"going on after {seconds:.0f} s" if seconds else "started")
+    start = time.perf_counter() - seconds
     try:
         stage.function(context)
-        total = before + time.perf_counter() - start
-        _write_record(stage, context, total)
-    except KeyboardInterrupt as error:
-        _keep_seconds(progress, context, before + time.perf_counter() - start)
+        seconds = time.perf_counter() - start
+        _write_record(stage, context, seconds)
+    except (Exception, KeyboardInterrupt) as error:
+        metadata = {"fingerprint": context.fingerprint, "seconds": time.perf_counter() - start}
+        try:
+            keep_checkpoint(spent, "stage", {}, metadata)
+        except DataFileError as fault:  # It must not hide why the stage is unfinished.
+            log.warning("the time spent in '%s' is not kept: %s", context.name, fault)
+        if not isinstance(error, KeyboardInterrupt):
+            raise
         whole = f"finished and kept: {', '.join(finished)}; " if finished else ""
         raise StageInterrupted(
             f"interrupted in stage '{stage.name}' ({whole}what '{stage.name}' has saved is kept); "
             f"the same command goes on from there"
         ) from error
-    except Exception:
-        _keep_seconds(progress, context, before + time.perf_counter() - start)
-        raise
-    progress.unlink(missing_ok=True)
-    log.info("%s: done in %.1f s", stage.name, total)
-    return total
+    forget_checkpoint(spent)
+    log.info("%s: done in %.1f s", stage.name, seconds)
+    return seconds
 
 
 def _write_record(stage: Stage, context: StageContext, seconds: float) -> None:
     write_json(
-        context.run_dir / "stages" / f"{stage.name}.json",
+        _record(context.run_dir, stage.name),
         {
             "fingerprint": context.fingerprint,
             "seconds": seconds,
@@ -170,31 +170,12 @@ def _write_record(stage: Stage, context: StageContext, seconds: float) -> None:
     )
 
 
-def _seconds_so_far(progress: Path, expected: str) -> float:
-    if not progress.is_file():
-        return 0.0
-    try:
-        record = read_json(progress)
-        return float(record["seconds"]) if record["fingerprint"] == expected else 0.0
-    except (DataFileError, KeyError, TypeError, ValueError) as error:
-        log.warning("the time spent so far is not known (%s): %s", progress, error)
-        return 0.0
-
-
-def _keep_seconds(progress: Path, context: StageContext, seconds: float) -> None:
-    """Stores the time spent in an unfinished stage; a failure to do so must not hide why it is unfinished."""
-    try:
-        write_json(progress, {"fingerprint": context.fingerprint, "seconds": seconds})
-    except DataFileError as error:
-        log.warning("the time spent in '%s' is not kept: %s", context.name, error)
-
-
 def resources_used(run_dir: str | Path, names: Sequence[str]) -> dict[str, Any]:
     """What `metrics.json` says of the stages that are done: seconds of each, and the largest of their peaks of memory.
 
     A stage that was run before its memory was recorded does not count for the peak, which is None if there is no other.
     """
-    paths = {name: Path(run_dir) / "stages" / f"{name}.json" for name in names}
+    paths = {name: _record(Path(run_dir), name) for name in names}
     records = {name: read_json(path) for name, path in paths.items() if path.is_file()}
     peaks = [record["peak_memory_gib"] for record in records.values() if "peak_memory_gib" in record]
     return {
@@ -211,7 +192,7 @@ def _identity(path: Path) -> dict[str, Any]:
 
 def _valid_record(stage: Stage, context: StageContext) -> dict[str, Any] | None:
     """The record of an earlier run whose outputs are still the ones asked for, or None."""
-    path = context.run_dir / "stages" / f"{stage.name}.json"
+    path = _record(context.run_dir, stage.name)
     if not path.is_file():
         return None
     try:
@@ -279,7 +260,7 @@ def run_lock(run_dir: str | Path, wait: bool = False) -> Iterator[None]:
 def package_versions() -> dict[str, str]:
     """Versions of Python and of the packages that results depend on; absent packages are left out."""
     versions = {"python": platform.python_version()}
-    for name in _RECORDED_PACKAGES:
+    for name in _PACKAGES:
         try:
             versions[name] = version(name)
         except PackageNotFoundError:

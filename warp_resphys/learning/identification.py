@@ -1,8 +1,8 @@
 """System identification: the physical parameters with which a simulator comes closest to observed motions.
 
 The loss is the mean square distance of simulated and observed markers, each motion in units of its own amplitude, over
-all motions at once. `descent` minimises it within bounds, from the best of a coarse set of starts, with gradients
-through the simulator.
+all motions at once. `linalg.least_squares` minimises it within bounds, from the best of a coarse set of starts, with
+gradients through the simulator.
 """
 
 import math
@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..io.errors import ConvergenceError, InputError
-from ..linalg.least_squares import minimise
+from ..linalg.least_squares import UnitBox, minimise
 from .replay import Replay, Start
 
 Report = Callable[[int, float, Mapping[str, float]], None]
@@ -166,8 +166,10 @@ class Identifier:
         Returns:
             Losses with an axis for each of `axes`, in their order; infinite where a simulation failed.
         """
+        held = self._units({**others, **{name: self.bounds[name].lower for name in axes}})
         ticks = [
-            np.linspace(0.0, 1.0, axes[name]) if name in axes else [self._unit(name, others)] for name in self.bounds
+            np.linspace(0.0, 1.0, axes[name]) if name in axes else [unit]
+            for name, unit in zip(self.bounds, held, strict=True)
         ]
         points = np.array(list(product(*ticks)))
         losses = list(finished)
@@ -184,9 +186,10 @@ class Identifier:
         """The values of a parameter on `grid`."""
         return self.bounds[name].from_unit(torch.linspace(0.0, 1.0, count, dtype=torch.float64)).numpy()
 
-    def _unit(self, name: str, values: Mapping[str, float]) -> float:
-        bounds = self.bounds[name]
-        return bounds.to_unit(min(max(values[name], bounds.lower), bounds.upper))
+    def _units(self, values: Mapping[str, float]) -> NDArray[np.float64]:
+        """(P,) values as fractions of their ranges, those outside at the bound."""
+        pairs = ((b, min(max(values[name], b.lower), b.upper)) for name, b in self.bounds.items())
+        return np.array([b.to_unit(value) for b, value in pairs])
 
     def _losses_safe(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Losses without gradients; where some simulations fail, the others are done again without them."""
@@ -209,7 +212,7 @@ class Identifier:
             candidates: how many random sets are tried.
             seed: of the sets (Latin hypercube).
         """
-        units = [np.array([self._unit(name, first) for name in self.bounds])]
+        units = [self._units(first)]
         if count > 1:
             sampler = scipy.stats.qmc.LatinHypercube(len(self.bounds), rng=np.random.default_rng(seed))
             points = sampler.random(max(candidates, count - 1))
@@ -255,7 +258,7 @@ class Identifier:
         if not good:
             raise ConvergenceError("the simulation failed at every start of the identification.", None, None)
         best = min(good, key=lambda attempt: attempt["loss"])
-        unit = np.array([self._unit(name, best["parameters"]) for name in self.bounds])
+        unit = self._units(best["parameters"])
         at_bounds = tuple(n for n, u in zip(self.bounds, unit, strict=True) if min(u, 1.0 - u) < 1e-4)
         histories = [attempt["history"] for attempt in attempts]
         return Identification(best["parameters"], best["loss"], histories, at_bounds, self.uncertainty(unit))
@@ -278,20 +281,21 @@ class Identifier:
             found = self._linearise(unit)
             return None if found is None else 2.0 * np.stack([j.T @ j for _, j, _ in found]).sum(0)
 
-        first = np.array([self._unit(name, start) for name in self.bounds])
-        unit, loss = minimise(objective, first, matrix, max_evaluations, tolerance)
-        return {
-            "parameters": self._values(unit),
-            "loss": loss if np.isfinite(loss) else None,
-            "history": history,
-        }
+        problem = UnitBox(objective, matrix)
+        point = problem.evaluate(torch.as_tensor(self._units(start))[None])
+        simulated = math.isfinite(float(point.value))
+        if simulated:
+            point = minimise(problem, point, tolerance, max_evaluations - 1).point
+        loss = float(point.value) if simulated else None
+        return {"parameters": self._values(point.x[0].tolist()), "loss": loss, "history": history}
 
     def _loss_and_gradient(self, unit: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         """Infinite, and zero, where the simulation fails."""
         x = self.simulator.tensor(unit)[None].requires_grad_()
         try:
-            loss = self.losses(x)[0]
-            (gradient,) = torch.autograd.grad(loss, x)
+            with torch.enable_grad():
+                loss = self.losses(x)[0]
+                (gradient,) = torch.autograd.grad(loss, x)
         except ConvergenceError:
             return np.inf, np.zeros_like(unit)
         return float(loss.detach()), gradient[0].double().cpu().numpy()

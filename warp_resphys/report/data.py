@@ -34,40 +34,32 @@ _OTHER: Final = 0.25  # How far from the tip's height another marker must be to 
 
 @dataclass(frozen=True, eq=False)
 class Trials:
-    """What was observed in the R test trials, and what the models made of them.
-
-    Attributes:
-        names: Of the trials.
-        labels: Of the M markers; empty where all vertices are observed, so that M = N.
-        begins: How each begins: given (the state is known), released, rest or static (a pose without time).
-        times: (R, T) of the frames [s]; those that count.
-        target: (R, T, M, 3) [m] what was observed, NaN where it was not seen.
-        positions: (R, T, M, 3) [m] by model; not finite from where it diverged.
-        bound: (M, 3) [m] the markers on the undeformed body, or its vertices.
-        gravity: (3,) [m/s^2].
-        time_step: Of the simulation [s].
-    """
+    """What was observed in the R test trials, and what the models made of them."""
 
     names: tuple[str, ...]
-    labels: tuple[str, ...]
-    begins: tuple[str, ...]
-    times: FloatArray
-    target: FloatArray
-    positions: Mapping[str, FloatArray]
-    bound: FloatArray
-    gravity: FloatArray
-    time_step: float
+    labels: tuple[str, ...]  # Of the M markers; empty where all vertices are observed, so that M = N.
+    begins: tuple[str, ...]  # Of each: given (the state is known), released, rest or static (a pose without time).
+    times: FloatArray  # (R, T) of the frames [s]; those that count.
+    target: FloatArray  # (R, T, M, 3) [m] what was observed, NaN where it was not seen.
+    positions: Mapping[str, FloatArray]  # (R, T, M, 3) [m] by model; not finite from where it diverged.
+    bound: FloatArray  # (M, 3) [m] the markers on the undeformed body, or its vertices.
+    gravity: FloatArray  # (3,) [m/s^2]
+    time_step: float  # Of the simulation [s].
 
     @cached_property
     def errors_mm(self) -> dict[str, FloatArray]:
         """(R, T) mean distances [mm] by model; see `mean_distance`."""
         return {model: mean_distance(q, self.target) for model, q in self.positions.items()}
 
+    @property
+    def plain_errors_mm(self) -> FloatArray:
+        """(R, T) errors [mm] of the uncorrected simulation, or else of the first model."""
+        return self.errors_mm.get("simulation", next(iter(self.errors_mm.values())))
+
     @cached_property
     def worst(self) -> int:
         """The trial of which the uncorrected simulation, or else the first model, makes most errors."""
-        errors = self.errors_mm.get("simulation", next(iter(self.errors_mm.values())))
-        means = [row[np.isfinite(row)].mean() if np.isfinite(row).any() else np.inf for row in errors]
+        means = [row[np.isfinite(row)].mean() if np.isfinite(row).any() else np.inf for row in self.plain_errors_mm]
         return int(np.argmax(means))
 
     @property
@@ -78,128 +70,72 @@ class Trials:
 
 @dataclass(frozen=True, eq=False)
 class Film:
-    """The bodies in one test trial.
+    """The bodies in one test trial."""
 
-    Attributes:
-        trial: Its name.
-        times: (F,) of the frames [s].
-        positions: (F, N, 3) [m] by model, NaN from where it diverged.
-    """
-
-    trial: str
-    times: FloatArray
-    positions: Mapping[str, FloatArray]
+    trial: str  # Its name.
+    times: FloatArray  # (F,) of the frames [s].
+    positions: Mapping[str, FloatArray]  # (F, N, 3) [m] by model, NaN from where it diverged.
 
 
 @dataclass(frozen=True, eq=False)
 class Pressures:
-    """The pressures of all trials.
+    """The pressures of trials."""
 
-    Attributes:
-        channels: C names of chambers.
-        values: (K, C) gauge pressure during each step [Pa], by trial.
-        limit: That none may exceed [Pa]; None where there is none.
-        scaled: Names of the trials at higher pressure than that of the training.
-    """
-
-    channels: tuple[str, ...]
-    values: Mapping[str, FloatArray]
-    limit: float | None
-    scaled: tuple[str, ...] = ()
+    channels: tuple[str, ...]  # C names of chambers.
+    values: Mapping[str, FloatArray]  # (K, C) gauge pressure during each step [Pa], by trial.
+    limit: float | None = None  # That none may exceed [Pa].
+    scaled: tuple[str, ...] = ()  # Names of the trials at higher pressure than that of the training.
+    poses: tuple[str, ...] = ()  # Names of the trials without time, which the last pressures hold.
 
 
 @dataclass(frozen=True, eq=False)
 class Recordings:
-    """How the recordings are, and how they were registered.
+    """How the recordings are, and how they were registered."""
 
-    Attributes:
-        quality: By trial, as `warp_resphys.data.recordings.quality.Quality.to_plain` gives it.
-        residuals: By trial: `rms_mm`, `residual_mm` and `shift_mm` by label, `outliers`.
-        registration: Of the trial that fits worst, for the picture.
-        drawn: That trial's name.
-        nominal: (M, 3) [m] where its markers should be.
-        feet: (M, 3) [m] the closest points of the body.
-        mesh: The body as it is at rest.
-    """
-
-    quality: Mapping[str, Any]
-    residuals: Mapping[str, Any]
-    registration: Registration
-    drawn: str
-    nominal: FloatArray
-    feet: FloatArray
-    mesh: Mesh
+    quality: Mapping[str, Any]  # By trial, as `warp_resphys.data.recordings.quality.Quality.to_plain` gives it.
+    residuals: Mapping[str, Any]  # By trial: `rms_mm`, `residual_mm` and `shift_mm` by label, `outliers`.
+    registration: Registration  # Of the trial that fits worst, for the picture.
+    drawn: str  # That trial's name.
+    nominal: FloatArray  # (M, 3) [m] where its markers should be.
+    feet: FloatArray  # (M, 3) [m] the closest points of the body.
+    mesh: Mesh  # The body as it is at rest.
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RunReport:
-    """What the page of a run, of a fold, or over the folds may show.
+    """What the page of a run, of a fold, or over the folds may show."""
 
-    Attributes:
-        experiment: Its name.
-        title: The page's heading.
-        metrics: What `metrics.json` holds of a split, or of all folds.
-        settings: The run's configuration, nested.
-        mesh: The undeformed body.
-        fixed: Its vertices that are clamped.
-        tip: (S,) vertices whose mean is called the tip, where all vertices are observed.
-        chambers: Its closed chambers that are under pressure.
-        trials: The test trials; None over the folds.
-        film: The bodies in one of them.
-        pressures: That drive it.
-        recordings: Quality and registration of all trials.
-        identification: What `identification.json` holds.
-        start: The values of the data sheet, by parameter.
-        truth: Those of the simulated laboratory, where there is one.
-        training: Records of the epochs by learned model.
-        refinement: The same of the refinement through the simulator.
-        published: Published errors, empty where there are none.
-        published_horizons: The same by length of the roll-out [s] and model.
-        published_note: How the published set-up differs from this run's.
-        notes: Sentences on the errors.
-        network_note: Which network ResPhys uses, and how it was trained.
-        kept_note: Which weights were taken.
-        simulator: The simulator that is corrected, in words, such as "E 215 kPa".
-        target: What it is brought to, in words.
-        pages: Address of each fold's page, by its test trial.
-    """
-
-    experiment: str
-    title: str
-    metrics: Mapping[str, Any]
-    settings: Mapping[str, Any]
-    mesh: Mesh
-    fixed: IntArray
-    tip: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    chambers: tuple[Chamber, ...] = ()
-    trials: Trials | None = None
-    film: Film | None = None
-    pressures: Pressures | None = None
-    recordings: Recordings | None = None
-    identification: Mapping[str, Any] = field(default_factory=dict)
-    start: Mapping[str, float] = field(default_factory=dict)
-    truth: Mapping[str, Any] = field(default_factory=dict)
-    training: Mapping[str, Sequence[Mapping[str, Any]]] = field(default_factory=dict)
-    refinement: Mapping[str, Sequence[Mapping[str, Any]]] = field(default_factory=dict)
+    experiment: str  # Its name.
+    title: str  # The page's heading.
+    metrics: Mapping[str, Any]  # What `metrics.json` holds of a split, or of all folds.
+    settings: Mapping[str, Any]  # The run's configuration, nested.
+    mesh: Mesh  # The undeformed body.
+    fixed: IntArray  # Its vertices that are clamped.
+    tip: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))  # Where all vertices are observed.
+    chambers: tuple[Chamber, ...] = ()  # The closed ones that are under pressure.
+    trials: Trials | None = None  # Of the test; None over the folds.
+    film: Film | None = None  # The bodies in one of them.
+    pressures: Pressures | None = None  # That drive it.
+    recordings: Recordings | None = None  # Quality and registration of all trials.
+    identification: Mapping[str, Any] = field(default_factory=dict)  # What `identification.json` holds.
+    start: Mapping[str, float] = field(default_factory=dict)  # The values of the data sheet, by parameter.
+    truth: Mapping[str, Any] = field(default_factory=dict)  # Those of the simulated laboratory, where there is one.
+    training: Mapping[str, Sequence[Mapping[str, Any]]] = field(default_factory=dict)  # Epochs, by learned model.
+    refinement: Mapping[str, Sequence[Mapping[str, Any]]] = field(default_factory=dict)  # As well.
     published: Mapping[str, PublishedError] = field(default_factory=dict)
-    published_horizons: Mapping[str, Mapping[str, PublishedError]] = field(default_factory=dict)
-    published_note: str = ""
-    notes: Sequence[str] = ()
-    network_note: str = ""
-    kept_note: str = ""
-    simulator: str = ""
-    target: str = ""
-    pages: Mapping[str, str] = field(default_factory=dict)
+    published_horizons: Mapping[str, Mapping[str, PublishedError]] = field(default_factory=dict)  # By seconds.
+    published_note: str = ""  # How the published set-up differs from this run's.
+    notes: Sequence[str] = ()  # Sentences on the errors.
+    network_note: str = ""  # Which network ResPhys uses, and how it was trained.
+    kept_note: str = ""  # Which weights were taken.
+    simulator: str = ""  # The simulator that is corrected, in words, such as "E 215 kPa".
+    target: str = ""  # What it is brought to, in words.
+    pages: Mapping[str, str] = field(default_factory=dict)  # Address of each fold's page, by its test trial.
 
     @property
     def sees_markers(self) -> bool:
         """Whether markers are observed, and not every vertex."""
-        return bool(self.trials.labels) if self.trials is not None else True
-
-    @property
-    def observed(self) -> str:
-        """What is observed, in a word."""
-        return "marker" if self.sees_markers else "vertex"
+        return self.trials is None or bool(self.trials.labels)
 
     @property
     def models(self) -> list[str]:
@@ -211,11 +147,6 @@ class RunReport:
         """How much of each trial counts after its release; None for all of it."""
         seconds: float | None = self.settings["data"].get("seconds")
         return seconds
-
-    @property
-    def without_recordings(self) -> bool:
-        """Whether a simulated laboratory stands in for recordings of markers."""
-        return self.sees_markers and self.settings["data"].get("folder") is None
 
 
 def mean_distance(positions: FloatArray, target: FloatArray) -> FloatArray:
@@ -269,18 +200,6 @@ def at_times(positions: FloatArray, known: FloatArray, times: FloatArray) -> Flo
     return between
 
 
-def tip_markers(bound: FloatArray, clamped: FloatArray) -> IntArray:
-    """Return which markers are at the tip: about as far along the body from its clamped end as any.
-
-    Args:
-        bound: (M, 3) [m] on the undeformed body.
-        clamped: (F, 3) [m] vertices of the clamped end.
-    """
-    away = along_body(bound, clamped)
-    found: IntArray = np.flatnonzero(away >= (1.0 - _TIP) * away.max())
-    return found
-
-
 def along_body(bound: FloatArray, clamped: FloatArray) -> FloatArray:
     """Return (M,) how far markers are from the clamped end, in the direction from it to their middle [m].
 
@@ -293,6 +212,12 @@ def along_body(bound: FloatArray, clamped: FloatArray) -> FloatArray:
     length = float(np.linalg.norm(axis))
     along: FloatArray = (bound - start) @ (axis / length) if length > 0.0 else np.zeros(len(bound))
     return along
+
+
+def tip_markers(bound: FloatArray, clamped: FloatArray) -> IntArray:
+    """Return which markers are about as far along the body as any; see `along_body`."""
+    away = along_body(bound, clamped)
+    return np.flatnonzero(away >= (1.0 - _TIP) * away.max())
 
 
 def drawn_markers(target: FloatArray, bound: FloatArray, clamped: FloatArray) -> list[int]:

@@ -1,21 +1,23 @@
 """The style of all figures, and those of errors and of learning: a function each, from arrays.
 
-Every figure exists in two widths, for a page and for a phone, and takes its colours from the reader's theme.
+Every figure exists in two widths, for a page and, with `narrow`, for a phone, and takes its colours from the reader's
+theme.
 """
 
 import io
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 from numpy.typing import NDArray
 
 from ..learning.metrics import median_filter
@@ -69,6 +71,7 @@ STYLE: Final[dict[Any, Any]] = {
     "axes.labelcolor": TONES["ink"].light,
     "axes.titlesize": 9,
     "axes.titlelocation": "left",
+    "axes.titley": 1.0,  # Where it is anyway: looking for ticks in its way takes long.
     "axes.labelsize": 9,
     "axes.edgecolor": TONES["muted"].light,
     "axes.linewidth": 0.7,
@@ -92,10 +95,18 @@ STYLE: Final[dict[Any, Any]] = {
 }
 
 
+@contextmanager
+def in_style() -> Iterator[None]:
+    """Draw in the style of all figures; also as a decorator."""
+    with mpl.rc_context(STYLE):
+        yield
+
+
+@in_style()
 def error_over_time(
     errors: Mapping[str, FloatArray],
     times: FloatArray | float,
-    published: Mapping[str, float] = MappingProxyType({}),
+    published: Mapping[str, float] | None = None,
     *,
     of: str = "vertex",
     window: float | None = None,
@@ -112,65 +123,55 @@ def error_over_time(
             what went in. None for no filter.
         narrow: Whether the figure is for a narrow page.
     """
-    with mpl.rc_context(STYLE):
-        figure = new_figure(3.5, 3.9, narrow=narrow)
-        axes = figure.subplots()
-        lowest = []
-        for model, rows in errors.items():
-            time = times if isinstance(times, np.ndarray) else times * np.arange(rows.shape[1])
-            mean, line = mean_of_trials(rows), model_line(model)
-            shown = positive(mean)
-            if window is not None:
-                axes.plot(time, shown, color=line["color"], linewidth=0.6, alpha=0.45)
-                shown = positive(median_filter(mean, float(time[1] - time[0]), window))
-                settled = shown[len(shown) // 10 :]
-                lowest += [float(np.nanmin(settled))] if np.isfinite(settled).any() else []
-            elif len(rows) > 1 and model not in _DASHED:
-                low, high = (positive(extreme.reduce(rows, axis=0)) for extreme in (np.fmin, np.fmax))
-                axes.fill_between(time, low, high, color=line["color"], alpha=0.15, linewidth=0)
-            axes.plot(time, shown, **line)
-            axes.set_xlim(0.0, time[-1])
-        for model, error in published.items():
-            axes.axhline(error, color=TONES[model].light, linewidth=1.1, linestyle=(0, (4, 3)))
-        use_logarithm(axes, 0.4 * min(lowest, default=0.0))  # Models begin close to the measured rest: not shown.
-        axes.set(xlabel="time [s]", ylabel=f"mean {of} error [mm]")
-        legend_above(figure, axes, narrow=narrow)
+    figure = new_figure(3.5, 3.9, narrow=narrow)
+    axes, lowest = figure.subplots(), []
+    for model, rows in errors.items():
+        time = times if isinstance(times, np.ndarray) else times * np.arange(rows.shape[1])
+        mean, line = mean_of_trials(rows), model_line(model)
+        shown = positive(mean)
+        if window is not None:
+            axes.plot(time, shown, color=line["color"], linewidth=0.6, alpha=0.45)
+            shown = positive(median_filter(mean, float(time[1] - time[0]), window))
+            settled = shown[len(shown) // 10 :]
+            lowest += [float(np.nanmin(settled))] if np.isfinite(settled).any() else []
+        elif len(rows) > 1 and model not in _DASHED:
+            low, high = (positive(extreme.reduce(rows, axis=0)) for extreme in (np.fmin, np.fmax))
+            axes.fill_between(time, low, high, color=line["color"], alpha=0.15, linewidth=0)
+        axes.plot(time, shown, **line)
+        axes.set_xlim(0.0, time[-1])
+    for model, error in (published or {}).items():
+        axes.axhline(error, color=TONES[model].light, linewidth=1.1, linestyle=(0, (4, 3)))
+    use_logarithm(axes, 0.4 * min(lowest, default=0.0))  # Models begin close to the measured rest: not shown.
+    axes.set(xlabel="time [s]", ylabel=f"mean {of} error [mm]")
+    legend_above(figure, axes, narrow=narrow)
     return figure
 
 
 def mean_of_trials(rows: FloatArray) -> FloatArray:
-    """Return the mean of the trials that have a value; infinite where one has diverged, NaN where none has a value.
-
-    Args:
-        rows: (R, T) of R trials.
-    """
+    """Return (T,) the mean of the trials (R, T) with a value; infinite where one diverged, NaN where none has one."""
     held = ~np.isnan(rows)
     count = held.sum(axis=0)
     mean: FloatArray = np.where(count > 0, np.where(held, rows, 0.0).sum(axis=0) / np.maximum(count, 1), np.nan)
     return mean
 
 
+@in_style()
 def error_over_scale(errors: Mapping[str, Mapping[float, float]], *, narrow: bool) -> Figure:
-    """Draw the mean error against the scale of the pressures, a line a model.
-
-    Args:
-        errors: Mean errors [mm] by model and scale; one at which a roll-out diverged is left out.
-        narrow: Whether the figure is for a narrow page.
-    """
-    with mpl.rc_context(STYLE):
-        figure = new_figure(3.0, 3.6, narrow=narrow)
-        axes = figure.subplots()
-        scales = sorted({scale for each in errors.values() for scale in each})
-        for model, each in errors.items():
-            values = positive(np.array([each.get(scale, np.nan) for scale in scales]))
-            axes.plot(scales, values, marker="o", **model_line(model))
-        use_logarithm(axes)
-        axes.set_xticks(scales, [f"{scale:g}" for scale in scales])
-        axes.set(xlabel="pressure over that of the training", ylabel="mean marker error [mm]")
-        legend_above(figure, axes, narrow=narrow)
+    """Draw the mean errors [mm] by model against the scale of the pressures; one that diverged is left out."""
+    figure = new_figure(3.0, 3.6, narrow=narrow)
+    axes = figure.subplots()
+    scales = sorted({scale for each in errors.values() for scale in each})
+    for model, each in errors.items():
+        values = positive(np.array([each.get(scale, np.nan) for scale in scales]))
+        axes.plot(scales, values, marker="o", **model_line(model))
+    use_logarithm(axes)
+    axes.set_xticks(scales, [f"{scale:g}" for scale in scales])
+    axes.set(xlabel="pressure over that of the training", ylabel="mean marker error [mm]")
+    legend_above(figure, axes, narrow=narrow)
     return figure
 
 
+@in_style()
 def training_curves(records: Sequence[Mapping[str, Any]], *, narrow: bool) -> Figure:
     """Draw the losses and, where they were recorded, the validation roll-out error and the learning rate.
 
@@ -180,38 +181,36 @@ def training_curves(records: Sequence[Mapping[str, Any]], *, narrow: bool) -> Fi
         narrow: Whether the figure is for a narrow page.
     """
     heights = {"losses": 3, "rollout_error_mm": 3, "learning_rate": 1}
-    panels = [key for key in heights if key == "losses" or len(_measured(records, key)[0])]
+    heights = {key: each for key, each in heights.items() if key == "losses" or len(_measured(records, key)[0])}
     muted, strong = TONES["muted"].light, TONES["resphys"].light
-    with mpl.rc_context(STYLE):
-        height = 0.6 + 0.57 * sum(heights[key] for key in panels)
-        figure = new_figure(height, height + 0.2, narrow=narrow)
-        rows = figure.subplots(
-            len(panels), 1, sharex=True, squeeze=False, height_ratios=[heights[key] for key in panels]
-        )
-        axes = dict(zip(panels, rows[:, 0], strict=True))
-        for key, label, colour in (
-            ("train_loss", "Training loss", muted),
-            ("validation_loss", "Validation loss", strong),
-        ):
-            epochs, losses = _measured(records, key)
-            if len(epochs):
-                axes["losses"].plot(epochs, losses, color=colour, label=label, linewidth=1.1)
-        axes["losses"].set_ylabel("loss")
-        axes["losses"].legend(loc="lower right", bbox_to_anchor=(1.0, 1.02), ncols=2)
-        if "rollout_error_mm" in axes:
-            _rollout_curve(axes["rollout_error_mm"], *_measured(records, "rollout_error_mm"))
-        if "learning_rate" in axes:
-            rates = _measured(records, "learning_rate")
-            axes["learning_rate"].plot(*rates, color=muted, linewidth=1.1, drawstyle="steps-mid")
-            axes["learning_rate"].set_ylabel("learning\nrate")
-        for each in axes.values():
-            use_logarithm(each)
-        rows[-1, 0].set_xlabel("epoch")
-        rows[-1, 0].xaxis.set_major_locator(MaxNLocator(6, integer=True))
-        figure.align_ylabels()
+    thin: dict[str, Any] = {"linewidth": 1.1, "marker": "." if len(records) == 1 else ""}
+    height = 0.6 + 0.57 * sum(heights.values())
+    figure = new_figure(height, height + 0.2, narrow=narrow)
+    rows = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=[*heights.values()])[:, 0]
+    axes = dict(zip(heights, rows, strict=True))
+    for key, label, colour in (
+        ("train_loss", "Training loss", muted),
+        ("validation_loss", "Validation loss", strong),
+    ):
+        epochs, losses = _measured(records, key)
+        if len(epochs):
+            axes["losses"].plot(epochs, losses, color=colour, label=label, **thin)
+    axes["losses"].set_ylabel("loss")
+    axes["losses"].legend(loc="lower right", bbox_to_anchor=(1.0, 1.02), ncols=2)
+    if "rollout_error_mm" in axes:
+        _rollout_curve(axes["rollout_error_mm"], *_measured(records, "rollout_error_mm"))
+    if "learning_rate" in axes:
+        axes["learning_rate"].plot(*_measured(records, "learning_rate"), color=muted, drawstyle="steps-mid", **thin)
+        axes["learning_rate"].set_ylabel("learning\nrate")
+    for each in rows:
+        use_logarithm(each)
+    rows[-1].set_xlabel("epoch")
+    _count(rows[-1].xaxis, 6)
+    figure.align_ylabels()
     return figure
 
 
+@in_style()
 def loss_histories(histories: Mapping[str, Sequence[Sequence[Mapping[str, float]]]], *, narrow: bool) -> Figure:
     """Draw the best loss so far over the evaluations of each start, a panel an identification.
 
@@ -219,28 +218,28 @@ def loss_histories(histories: Mapping[str, Sequence[Sequence[Mapping[str, float]
         histories: By identification: for every start the records with `loss`, one an evaluation.
         narrow: Whether the figure is for a narrow page.
     """
-    with mpl.rc_context(STYLE):
-        shape = (len(histories), 1) if narrow else (1, len(histories))
-        figure = new_figure(2.6, 0.4 + 2.1 * len(histories), narrow=narrow)
-        panels = list(figure.subplots(*shape, sharey=True, squeeze=False).flat)
-        for axes, (name, starts) in zip(panels, histories.items(), strict=True):
-            ends = [each["loss"] for start in starts for each in start if each["loss"] is not None]
-            for start in (each for each in starts if each):
-                losses = np.fmin.accumulate(np.array([record["loss"] for record in start], dtype=np.float64))
-                best = bool(ends) and losses[-1] <= min(ends)
-                tone = TONES["sysid" if best else "muted"].light
-                count = np.arange(1, len(losses) + 1)
-                axes.plot(count, positive(losses), ".-", color=tone, linewidth=1.8 if best else 0.9, markersize=3.5)
-            axes.set_title(LABELS[name])
-            axes.set_xlabel("evaluation")
-            axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
-        for axes in panels:  # With everything drawn, as they share their axis.
-            use_logarithm(axes)
-        for axes in panels if narrow else panels[:1]:
-            axes.set_ylabel("loss")
+    shape = (len(histories), 1) if narrow else (1, len(histories))
+    figure = new_figure(2.6, 0.4 + 2.1 * len(histories), narrow=narrow)
+    panels = list(figure.subplots(*shape, sharey=True, squeeze=False).flat)
+    for axes, (name, starts) in zip(panels, histories.items(), strict=True):
+        ends = [each["loss"] for start in starts for each in start if each["loss"] is not None]
+        for start in (each for each in starts if each):
+            losses = np.fmin.accumulate(np.array([record["loss"] for record in start], dtype=np.float64))
+            best = bool(ends) and losses[-1] <= min(ends)
+            tone = TONES["sysid" if best else "muted"].light
+            count = np.arange(1, len(losses) + 1)
+            axes.plot(count, positive(losses), ".-", color=tone, linewidth=1.8 if best else 0.9, markersize=3.5)
+        axes.set_title(LABELS[name])
+        axes.set_xlabel("evaluation")
+        _count(axes.xaxis, 5)
+    for axes in panels:  # With everything drawn, as they share their axis.
+        use_logarithm(axes)
+    for axes in panels if narrow else panels[:1]:
+        axes.set_ylabel("loss")
     return figure
 
 
+@in_style()
 def landscape(
     modulus: FloatArray,
     ratio: FloatArray,
@@ -259,36 +258,32 @@ def landscape(
         narrow: Whether the figure is for a narrow page.
     """
     values = positive(np.asarray(loss, dtype=np.float64))
-    with mpl.rc_context(STYLE):
-        figure = new_figure(3.6, 3.7, narrow=narrow)
-        axes = figure.subplots()
-        if values.ndim == 2 and values.shape[1] > 1 and np.isfinite(values).any():
-            _contours(figure, axes, _KILO * modulus, ratio, values)
-            places = {name: (_KILO * e, nu) for name, (e, nu) in points.items()}
-        else:
-            curve = values.reshape(len(modulus), -1)[:, 0]
-            axes.plot(_KILO * modulus, curve, color=TONES["sysid"].light)
-            use_logarithm(axes)
-            axes.set_ylabel("loss")
-            known = np.isfinite(curve)
-            places = {
-                name: (_KILO * e, float(np.interp(e, modulus[known], curve[known])))
-                for name, (e, _) in points.items()
-                if known.any()
-            }
-        for (name, place), marker in zip(places.items(), "oDs^", strict=False):
-            tone = TONES["simulation"].light if marker == "D" else "white"
-            edge: dict[str, Any] = {"markeredgecolor": "black", "markeredgewidth": 0.9, "zorder": 5, "clip_on": False}
-            axes.plot(*place, marker, color=tone, markersize=7.0, linestyle="none", label=name, **edge)
-        if modulus.max() > 3.0 * modulus.min():
-            axes.set_xscale("log")
-            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-            axes.xaxis.set_major_formatter("{x:g}")
-            axes.xaxis.set_minor_formatter(NullFormatter())
-        axes.set_xlabel("Young's modulus [kPa]")
-        if places:
-            handles, names = axes.get_legend_handles_labels()
-            figure.legend(handles, names, loc="outside upper left", ncols=1 if narrow else 3, columnspacing=1.6)
+    figure = new_figure(3.6, 3.7, narrow=narrow)
+    axes = figure.subplots()
+    if values.ndim == 2 and values.shape[1] > 1 and np.isfinite(values).any():
+        _contours(figure, axes, _KILO * modulus, ratio, values)
+        places = {name: (_KILO * e, nu) for name, (e, nu) in points.items()}
+    else:
+        curve = values.reshape(len(modulus), -1)[:, 0]
+        axes.plot(_KILO * modulus, curve, color=TONES["sysid"].light)
+        use_logarithm(axes)
+        axes.set_ylabel("loss")
+        known, e = np.isfinite(curve), np.array([e for e, _ in points.values()])
+        heights = np.interp(e, modulus[known], curve[known]) if known.any() else []
+        places = {name: (_KILO * e, float(h)) for (name, (e, _)), h in zip(points.items(), heights, strict=False)}
+    for (name, place), marker in zip(places.items(), "oDs^", strict=False):
+        tone = TONES["simulation"].light if marker == "D" else "white"
+        edge: dict[str, Any] = {"markeredgecolor": "black", "markeredgewidth": 0.9, "zorder": 5, "clip_on": False}
+        axes.plot(*place, marker, color=tone, markersize=7.0, linestyle="none", label=name, **edge)
+    if modulus.max() > 3.0 * modulus.min():
+        axes.set_xscale("log")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.set_xlabel("Young's modulus [kPa]")
+    if places:
+        handles, names = axes.get_legend_handles_labels()
+        figure.legend(handles, names, loc="outside upper left", ncols=1 if narrow else 3, columnspacing=1.6)
     return figure
 
 
@@ -318,9 +313,7 @@ def save_png(figure: Figure, path: Path) -> None:
 def themed_svg(figure: Figure, name: str) -> bytes:
     """Return a figure as an SVG file whose colours follow the reader's theme, with text that stays text.
 
-    Args:
-        figure: What to write.
-        name: Makes the identifiers in the file the same in every run.
+    The name makes the identifiers in the file the same in every run.
     """
     buffer = io.StringIO()
     with mpl.rc_context({**STYLE, "svg.hashsalt": name}):
@@ -330,30 +323,24 @@ def themed_svg(figure: Figure, name: str) -> bytes:
     svg = re.sub(r"'DejaVu Sans'(, [^;\"]*)?", FONT, svg)
     for role, tone in TONES.items():
         svg = svg.replace(tone.light, f"var(--{role})")
-    light = "".join(f"--{role}:{tone.light};" for role, tone in TONES.items())
-    dark = "".join(f"--{role}:{tone.dark};" for role, tone in TONES.items())
+    light, dark = ("".join(f"--{role}:{tone[at]};" for role, tone in TONES.items()) for at in range(2))
     style = f"<style>:root{{{light}}}@media (prefers-color-scheme:dark){{:root{{{dark}}}}}</style>"
     return re.sub(r"(<svg [^>]*>)", rf"\1{style}", svg, count=1).strip().encode()
 
 
+@in_style()
 def settle(figure: Figure) -> None:
     """Lay a figure out, once for all that is written of it."""
-    engine = figure.get_layout_engine()
-    if engine is not None:
-        with mpl.rc_context(STYLE):
-            engine.execute(figure)
+    if (engine := figure.get_layout_engine()) is not None:
+        engine.execute(figure)
         figure.set_layout_engine(None)
 
 
 def model_line(model: str, width: float = 1.4) -> dict[str, Any]:
     """Return how a model's line looks, with its name; that of the residual force is the thickest."""
-    thick = 0.5 if model == "resphys" else 0.0
-    return {
-        "color": TONES[model].light,
-        "linestyle": _DASHED.get(model, "-"),
-        "linewidth": width + thick,
-        "label": LABELS[model],
-    }
+    width += 0.5 if model == "resphys" else 0.0
+    look = {"color": TONES[model].light, "linestyle": _DASHED.get(model, "-")}
+    return {**look, "linewidth": width, "label": LABELS[model]}
 
 
 def new_figure(height: float, narrow_height: float, *, narrow: bool) -> Figure:
@@ -367,6 +354,11 @@ def legend_above(figure: Figure, axes: Axes, *, narrow: bool) -> None:
     handles, labels = axes.get_legend_handles_labels()
     columns = 2 if narrow else len(labels) if len(labels) <= _LEGEND_ROW else _LEGEND_ROW - 1
     figure.legend(handles, labels, loc="outside upper left", ncols=columns, columnspacing=1.6)
+
+
+def _count(axis: Axis, most: int) -> None:
+    """Label an axis at whole numbers only, also where there is but one."""
+    axis.set_major_locator(MaxNLocator(most, integer=True, min_n_ticks=1))
 
 
 def _measured(records: Sequence[Mapping[str, Any]], key: str) -> tuple[FloatArray, FloatArray]:
@@ -392,14 +384,10 @@ def positive(values: FloatArray) -> FloatArray:
 
 
 def use_logarithm(axes: Axes, least: float = 0.0) -> None:
-    """A logarithmic axis of at least a decade, labelled 0.1, 1, 10 where that is short, else as powers.
+    """A logarithmic axis of at least a decade and from a least value, labelled 0.1, 1, 10 or, where long, as powers.
 
-    It is labelled at 2 and 5 as well where there would be a label or two. Where there is nothing that it can show, such
-    as errors that are all zero, the axis says so.
-
-    Args:
-        axes: With everything drawn.
-        least: That it begins with, at least.
+    Everything is drawn already. It is labelled at 2 and 5 as well where there would be a label or two. Where there is
+    nothing that it can show, such as errors that are all zero, the axis says so.
     """
     if not np.isfinite(axes.dataLim.minposy):
         axes.set(yticks=[], ylim=(0.0, 1.0))
@@ -414,13 +402,10 @@ def use_logarithm(axes: Axes, least: float = 0.0) -> None:
     plain = low >= 5e-5 and high <= 2e4
     decades = math.floor(math.log10(high) + 1e-9) - math.ceil(math.log10(low) - 1e-9) + 1
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if decades < 3 else (1.0,), numticks=6))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: _power(value, plain=plain)))
-    axes.yaxis.set_minor_formatter(NullFormatter())
-    axes.tick_params(which="minor", left=False)
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}" if plain else _power(value)))
+    axes.yaxis.set_minor_locator(NullLocator())
 
 
-def _power(value: float, *, plain: bool) -> str:
-    if plain:
-        return f"{value:g}"
+def _power(value: float) -> str:
     exponent = round(math.log10(value))
     return "10" + str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))

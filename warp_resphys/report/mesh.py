@@ -6,20 +6,17 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
 
 from ..io.files import atomic_path
 from ..mesh.chambers import Chamber
 from ..mesh.elements import ELEMENTS
-from ..mesh.mesh import IntArray, Mesh, boundary_triangles, face_triangles
+from ..mesh.mesh import Mesh, boundary_triangles, face_triangles
 from ..mesh.quality import cell_volumes
-from .figures import CHAMBER_COLOURS, STYLE
-from .render import BODY, CLAMPED, INK, MEASURED, Layer, View, draw, face_edges, sharp_edges, view_axes
-
-FloatArray = NDArray[np.float64]
+from .bodies import face_edges, sharp_edges
+from .figures import CHAMBER_COLOURS, in_style
+from .render import BODY, CLAMPED, INK, MEASURED, FloatArray, IntArray, Layer, Scene, View, draw, view_axes
 
 _TOWARDS_VIEWER: Final = (0.32, -1.0, 0.28)
 _TOWARDS_LIGHT: Final = (0.35, -0.9, 0.8)
@@ -37,19 +34,12 @@ _CUBIC_CENTI: Final = 1e6
 
 @dataclass(frozen=True, eq=False)
 class MeshSummary:
-    """What there is to know about a mesh.
-
-    Attributes:
-        mesh: The mesh.
-        density: Of its material [kg/m^3].
-        fixed: (P,) vertices that are clamped.
-        chambers: Its closed chambers.
-    """
+    """What there is to know about a mesh."""
 
     mesh: Mesh
-    density: float
-    fixed: IntArray
-    chambers: tuple[Chamber, ...]
+    density: float  # Of its material [kg/m^3].
+    fixed: IntArray  # (P,) vertices that are clamped.
+    chambers: tuple[Chamber, ...]  # Its closed ones.
 
     @property
     def volume(self) -> float:
@@ -62,6 +52,7 @@ class MeshSummary:
         return float(-np.linalg.det(corners - corners.mean(axis=(0, 1))).sum() / 6.0)
 
 
+@in_style()
 def draw_mesh(path: Path, summary: MeshSummary, markers: FloatArray | None = None) -> None:
     """Draws a body from outside, cut open along its length, and translucent, with its chambers in colours.
 
@@ -73,37 +64,33 @@ def draw_mesh(path: Path, summary: MeshSummary, markers: FloatArray | None = Non
     Raises:
         DrawingError: There is no pyvista, or no OpenGL driver that works off screen.
     """
-    mesh = summary.mesh
     axes = view_axes(_TOWARDS_VIEWER)
-    turned = mesh.vertices @ axes.T
+    turned = summary.mesh.vertices @ axes.T
     sides = _MARGIN * np.ptp(turned, axis=0)[:2]
     size = np.ceil(_LONGER_SIDE * np.maximum(sides, _NARROWEST * sides.max()) / sides.max()).astype(int)
     focus = 0.5 * (turned.min(axis=0) + turned.max(axis=0)) @ axes
     half = 0.5 * max(sides[1], sides[0] * size[1] / size[0])
     dots = np.empty((0, 3)) if markers is None else markers
     views = [View(layers, axes, focus, half) for layers in _layers(summary, dots, max(1.0, size[1] / 900.0))]
-    (picture,) = draw(views, size, background="white", samples=0, towards_light=_TOWARDS_LIGHT)
-    handles = [
-        Patch(
-            color=colour,
-            label=f"{chamber.name.replace('_', ' ')}: {_CUBIC_CENTI * summary.chamber_volume(chamber):.1f} cm³",
-        )
-        for chamber, colour in zip(summary.chambers, cycle(CHAMBER_COLOURS), strict=False)
-    ]
-    with rc_context(STYLE):
-        width, height = 3 * size[0] / _DPI, size[1] / _DPI
-        columns = max(1, int(width / _ENTRY))
-        legend = _LINE * -(-len(handles) // columns) + _LINE if handles else 0.0
-        figure = Figure(figsize=(width, height + legend + _LINE))
-        panel = figure.add_axes((0.0, legend / (height + legend + _LINE), 1.0, height / (height + legend + _LINE)))
-        panel.imshow(picture, aspect="auto", interpolation="antialiased")
-        panel.set_axis_off()
-        for at, title in enumerate(("Outside", "Cut open", "Chambers")):
-            figure.text((at + 0.5) / 3, 1.0, title, ha="center", va="top")
-        if handles:
-            figure.legend(handles=handles, loc="lower center", ncols=columns, frameon=False)
-        with atomic_path(path) as target:
-            figure.savefig(target, format="png", dpi=_DPI)
+    scene = Scene(views, size.tolist(), background="white", samples=0, towards_light=_TOWARDS_LIGHT)
+    ((picture,),) = draw(scene)
+    volumes = {each.name.replace("_", " "): _CUBIC_CENTI * summary.chamber_volume(each) for each in summary.chambers}
+    labels = (f"{name}: {volume:.1f} cm³" for name, volume in volumes.items())
+    handles = [Patch(color=tone, label=label) for label, tone in zip(labels, cycle(CHAMBER_COLOURS), strict=False)]
+    width, height = 3 * size[0] / _DPI, size[1] / _DPI
+    columns = max(1, int(width / _ENTRY))
+    legend = _LINE * -(-len(handles) // columns) + _LINE if handles else 0.0
+    total = height + legend + _LINE
+    figure = Figure(figsize=(width, total))
+    panel = figure.add_axes((0.0, legend / total, 1.0, height / total))
+    panel.imshow(picture, aspect="auto", interpolation="antialiased")
+    panel.set_axis_off()
+    for at, title in enumerate(("Outside", "Cut open", "Chambers")):
+        figure.text((at + 0.5) / 3, 1.0, title, ha="center", va="top")
+    if handles:
+        figure.legend(handles=handles, loc="lower center", ncols=columns, frameon=False)
+    with atomic_path(path) as target:
+        figure.savefig(target, format="png", dpi=_DPI)
 
 
 def _layers(summary: MeshSummary, markers: FloatArray, line: float) -> list[list[Layer]]:
@@ -116,15 +103,14 @@ def _layers(summary: MeshSummary, markers: FloatArray, line: float) -> list[list
     """
     mesh, triangles = summary.mesh, boundary_triangles(summary.mesh)
     vertices, size = mesh.vertices, float(np.ptp(mesh.vertices, axis=0).max())
-    inner = [face_triangles(chamber.faces) for chamber in summary.chambers]
-    within = np.unique(np.concatenate([np.empty(0, dtype=np.int64), *(each.ravel() for each in inner)]))
-    outer = triangles[~np.isin(triangles[:, 0], within)]
+    chambers = list(zip((face_triangles(chamber.faces) for chamber in summary.chambers), cycle(CHAMBER_COLOURS)))
+    inner = np.concatenate([np.empty(0, dtype=np.int64), *(faces.ravel() for faces, _ in chambers)])
+    outer = triangles[~np.isin(triangles[:, 0], inner)]
     normal = np.array(_TOWARDS_VIEWER)
     normal[np.ptp(vertices, axis=0).argmax()] = 0.0  # The body is cut along its longest side.
     plane = np.stack([normal, vertices.mean(axis=0)])
     solid = mesh.cells[:, : ELEMENTS[mesh.element.linear].nodes]
     lift, cut_light = _LIFT * size, (0.5, 0.55)
-    colours = [colour for _, colour in zip(inner, cycle(CHAMBER_COLOURS), strict=False)]
     balls = Layer("balls", markers, None, MEASURED, size=_DOT * size, light=(0.6, 0.5))
     clamped = Layer("balls", vertices[summary.fixed], None, CLAMPED, size=0.5 * _DOT * size, light=(0.7, 0.3))
     dots = [balls] if len(markers) else []
@@ -138,16 +124,12 @@ def _layers(summary: MeshSummary, markers: FloatArray, line: float) -> list[list
         Layer("surface", vertices, outer, BODY, light=cut_light, plane=plane),
         Layer("slice", vertices, solid, _CUT, light=(0.9, 0.1), plane=plane),
         Layer("slice_edges", vertices, solid, INK, size=line, opacity=0.55, shift=lift, plane=plane),
-    ]
-    cut += [
-        Layer("surface", vertices, each, colour, light=cut_light, plane=plane)
-        for each, colour in zip(inner, colours, strict=True)
+        *(Layer("surface", vertices, faces, colour, light=cut_light, plane=plane) for faces, colour in chambers),
     ]
     translucent = [
         Layer("surface", vertices, outer, BODY, opacity=0.22, light=(0.8, 0.4)),
         Layer("lines", vertices, sharp_edges(vertices, outer), CLAMPED, size=line, opacity=0.5),
+        *(Layer("surface", vertices, faces, colour, light=(0.55, 0.5)) for faces, colour in chambers),
+        *dots,
     ]
-    translucent += [
-        Layer("surface", vertices, each, colour, light=(0.55, 0.5)) for each, colour in zip(inner, colours, strict=True)
-    ]
-    return [outside, cut, [*translucent, *dots]]
+    return [outside, cut, translucent]

@@ -4,7 +4,7 @@ import base64
 import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, Future
+from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,55 +24,38 @@ _LOG = logging.getLogger(__name__)
 NO_BREAK_SPACE = "\u00a0"
 NONE = "\N{EN DASH}"
 MINUS = "\N{MINUS SIGN}"
-MOST_DECIMALS = 6  # What takes more is written with a power of ten.
+_MOST_DECIMALS = 6  # What takes more is written with a power of ten.
 
 
 class Cell(NamedTuple):
-    """One entry of a table, what stands small below it, and what stands beside it, such as a deviation."""
+    """One entry of a table."""
 
     text: str
-    small: str = ""
-    beside: str = ""
+    small: str = ""  # What stands small below it.
+    beside: str = ""  # What stands beside it, such as a deviation.
 
 
 @dataclass(frozen=True)
 class Row:
-    """One row of a table.
-
-    Attributes:
-        head: What the row is.
-        cells: One a column.
-        answer: Whether the row is the one that counts.
-        small: What stands small below the head.
-        address: Where the head leads to; may be empty.
-    """
+    """One row of a table."""
 
     head: str
-    cells: Sequence[Cell]
-    answer: bool = False
-    small: str = ""
-    address: str = ""
+    cells: Sequence[Cell]  # One a column.
+    answer: bool = False  # Whether the row is the one that counts.
+    small: str = ""  # What stands small below the head.
+    address: str = ""  # Where the head leads to; may be empty.
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table.
+    """A table."""
 
-    Attributes:
-        head: Above the first column.
-        columns: Heads of the others.
-        rows: Its rows.
-        note: What stands below.
-        summary: What unfolds the table; empty for one that is always seen.
-        unfolded: Whether it is at first.
-    """
-
-    head: str
-    columns: Sequence[str]
+    head: str  # Above the first column.
+    columns: Sequence[str]  # Heads of the others.
     rows: Sequence[Row]
-    note: str = ""
-    summary: str = ""
-    unfolded: bool = False
+    note: str = ""  # What stands below.
+    summary: str = ""  # What unfolds the table; empty for one that is always seen.
+    unfolded: bool = False  # Whether it is at first.
 
 
 class Picture(NamedTuple):
@@ -85,12 +68,12 @@ class Picture(NamedTuple):
 
 @dataclass(frozen=True)
 class Text:
-    """A paragraph; a note is written small, a heading large, and `name` is its identifier on the page."""
+    """A paragraph."""
 
     text: str
-    name: str = ""
-    note: bool = False
-    heading: bool = False
+    name: str = ""  # Its identifier on the page.
+    note: bool = False  # Whether it is written small,
+    heading: bool = False  # or large.
 
 
 @dataclass(frozen=True)
@@ -104,21 +87,16 @@ class Items:
 
 @dataclass(frozen=True)
 class Drawn:
-    """A picture or a film with its caption.
+    """A picture or a film with its caption."""
 
-    Attributes:
-        name: Of its file, and on the page.
-        caption: What stands below.
-        picture: What is shown.
-        film: Address of a film, in place of a picture.
-        scrolls: Whether it stays wide on a narrow page.
-    """
-
-    name: str
-    caption: str
+    name: str  # Of its file, and on the page.
+    caption: str  # What stands below.
     picture: Picture | None = None
-    film: str = ""
-    scrolls: bool = False
+    film: str = ""  # Address of a film, in place of a picture.
+    scrolls: bool = False  # Whether it stays wide on a narrow page.
+
+
+Block = Text | Items | Table | Drawn
 
 
 @dataclass(frozen=True)
@@ -126,66 +104,37 @@ class Part:
     """A section of a page: its heading, and blocks in their order."""
 
     title: str
-    blocks: Sequence[Text | Items | Table | Drawn]
+    blocks: Sequence[Block]
 
 
 @dataclass(frozen=True)
 class Canvas:
-    """Where the figures of a page are drawn.
+    """Where the figures of a page are drawn."""
 
-    Attributes:
-        folder: Of their files.
-        missing: By name, why something cannot be drawn on this machine.
-        started: By name, what is being drawn already.
-    """
-
-    folder: Path
-    missing: dict[str, str] = field(default_factory=dict)
-    started: dict[str, "Future[Any]"] = field(default_factory=dict)
-
-    def start(self, pool: Executor, drawings: Mapping[str, tuple[str, Callable[[Path], Any]]]) -> None:
-        """Begin to draw what takes other processes: by name, a file's name and what draws."""
-        for name, (file, draw) in drawings.items():
-            self.started[name] = pool.submit(draw, self.folder / file)
+    folder: Path  # Of their files.
+    started: Mapping[str, "Future[Any]"] = field(default_factory=dict)  # What other processes draw already, by name.
+    missing: set[str] = field(default_factory=set)  # Why something cannot be drawn on this machine.
 
     def figure(self, name: str, draw: "Callable[..., Drawing]", alt: str, caption: str) -> Drawn:
         """Return a figure in two widths; see `draw_picture`."""
         return Drawn(name, caption, draw_picture(self.folder, name, draw, alt))
 
-    def attempt(self, name: str, file: str, draw: Callable[[Path], Any] | None = None) -> Any:
-        """Return what a drawing gives, or None with the reason in `missing`; an earlier page's file is then removed.
+    def attempt(self, file: str, draw: Callable[[Path], Drawn]) -> list[Block]:
+        """Return what is drawn into a file, or why it cannot be, unless that was said before.
 
-        Args:
-            name: Of the drawing.
-            file: Its name.
-            draw: What draws it; None for one that was started.
+        A file that an earlier page has left there is then removed, as it would not belong to this one.
         """
         path = self.folder / file
         try:
-            return self.started[name].result() if draw is None else draw(path)
+            return [draw(path)]
         except DrawingError as error:
-            self.missing[name] = f"{error}, then delete this page and run the same command again."
+            path.unlink(missing_ok=True)
+            said = f"{error}, then delete this page and run the same command again."
+            if said in self.missing:
+                return []
             _LOG.warning("the report lacks a picture: %s", error)
-            path.unlink(missing_ok=True)  # Of an earlier report, it would not belong to this one.
-            return None
-
-    def file(self, name: str, draw: Callable[[Path], None], alt: str, caption: str) -> "list[Drawn | Text]":
-        """Return a picture that is drawn into a PNG file of its own, or why it is not there."""
-
-        def drawn(path: Path) -> str:
-            draw(path)
-            return file_address(path, "image/png")
-
-        address = self.attempt(name, f"{name}.png", drawn)
-        if address is None:
-            return list(self.reason(name))
-        return [Drawn(name, caption, Picture(address, address, alt), scrolls=True)]
-
-    def reason(self, name: str) -> list[Text]:
-        """Return why something is not there, unless the same was said of something else before."""
-        said = self.missing[name]
-        first = next(other for other, reason in self.missing.items() if reason == said)
-        return [Text(said, name, note=True)] if first == name else []
+            self.missing.add(said)
+            return [Text(said, path.stem, note=True)]
 
 
 @contextmanager
@@ -216,11 +165,12 @@ def draw_picture(folder: Path, name: str, draw: "Callable[..., Drawing]", alt: s
     """
     from . import figures
 
-    wide, narrow = draw(narrow=False), draw(narrow=True)
-    figures.settle(wide)
-    figures.settle(narrow)
-    figures.save_png(wide, folder / f"{name}.png")
-    return Picture(svg_address(figures.themed_svg(wide, name)), svg_address(figures.themed_svg(narrow, name)), alt)
+    both = [draw(narrow=narrow) for narrow in (False, True)]
+    for figure in both:
+        figures.settle(figure)
+    figures.save_png(both[0], folder / f"{name}.png")
+    wide, narrow = (svg_address(figures.themed_svg(figure, name)) for figure in both)
+    return Picture(wide, narrow, alt)
 
 
 def page_template(name: str) -> jinja2.Template:
@@ -237,13 +187,7 @@ def page_template(name: str) -> jinja2.Template:
 
 def number_text(value: float | None) -> str:
     """Return a number with three decimals, or two digits if that takes more; None stands for divergence."""
-    if value is None:
-        return "diverged"
-    decimals = _decimals(value)
-    if decimals <= MOST_DECIMALS:
-        return f"{value:.{decimals}f}"
-    exponent = math.floor(math.log10(value))
-    return f"{value / 10.0**exponent:.1f}{_times_power(exponent)}"
+    return "diverged" if value is None else _alike([value], value)[0]
 
 
 def error_parts(summary: Mapping[str, Any]) -> tuple[str, str]:
@@ -253,12 +197,17 @@ def error_parts(summary: Mapping[str, Any]) -> tuple[str, str]:
         return f"{summary['diverged']} of {summary['trajectories']} diverged", ""
     if std is None:
         return number_text(mean), ""
-    decimals = _decimals(min(mean, std) or mean)
-    if decimals <= MOST_DECIMALS:
-        return f"{mean:.{decimals}f}", f"± {std:.{decimals}f}"
-    exponent = math.floor(math.log10(mean))
-    power = _times_power(exponent)
-    return f"{mean / 10.0**exponent:.1f}{power}", f"± {std / 10.0**exponent:.1f}{power}"
+    written = _alike([mean, std], min(mean, std) or mean)
+    return written[0], f"± {written[1]}"
+
+
+def _alike(values: Sequence[float], least: float) -> list[str]:
+    """Numbers with three decimals, or as many as give one of them two digits, or the same power of ten."""
+    decimals, exponent, power = max(3, 1 - math.floor(math.log10(abs(least)))) if least else 3, 0, ""
+    if decimals > _MOST_DECIMALS:
+        decimals, exponent = 1, math.floor(math.log10(values[0]))
+        power = " \N{MULTIPLICATION SIGN} 10" + str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+    return [f"{value / 10.0**exponent:.{decimals}f}{power}" for value in values]
 
 
 def duration_text(seconds: float) -> str:
@@ -267,14 +216,6 @@ def duration_text(seconds: float) -> str:
         return f"{seconds:.2f} s" if seconds < 10.0 else f"{seconds:.1f} s"
     minutes, rest = divmod(round(seconds), 60)
     return f"{minutes} min {rest:02d} s"
-
-
-def _times_power(exponent: int) -> str:
-    return " \N{MULTIPLICATION SIGN} 10" + str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
-
-
-def _decimals(value: float) -> int:
-    return max(3, 1 - math.floor(math.log10(abs(value)))) if value else 3
 
 
 def published_parts(error: PublishedError) -> tuple[str, str]:
@@ -292,6 +233,12 @@ def flatten(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str
             yield f"{prefix}{key}", f"[{', '.join(str(each) for each in value)}]"
         else:
             yield f"{prefix}{key}", "null" if value is None else str(value)
+
+
+def drawn_file(path: Path, alt: str, caption: str) -> Drawn:
+    """Return a PNG file as a picture that stays wide on a narrow page."""
+    address = file_address(path, "image/png")
+    return Drawn(path.stem, caption, Picture(address, address, alt), scrolls=True)
 
 
 def svg_address(svg: bytes) -> str:

@@ -12,7 +12,7 @@ from markupsafe import Markup
 
 from ..io.files import write_text
 from .data import MODELS, FloatArray, RunReport
-from .motion_sections import body_section, motion_section, moving_pictures, paths_section
+from .motion_sections import body_section, motion_section, paths_section, start_drawing
 from .page import (
     NO_BREAK_SPACE,
     NONE,
@@ -51,6 +51,10 @@ _TIMED: Final = {
     "resphys": "Simulation with the learned force",
     "inference": "of it, the network alone",
 }
+_WITHOUT_RECORDINGS: Final = (
+    "No recordings are configured (<code>data.folder</code>): what is called measured here is a simulation with a "
+    "finer mesh and step, another material, viscosity{}, and noise on its markers."
+)
 _MOST_LABELS: Final = 6  # That are named one by one.
 _FILTER: Final = 1.0  # [s] of the median filter, as published.
 _LENGTHS: Final = 4.0  # Of the filter, that a roll-out must last for it.
@@ -70,11 +74,12 @@ def write_report(path: Path, data: RunReport) -> None:
         DataFileError: A file could not be written.
     """
     with figures_beside(path) as folder, ThreadPoolExecutor(1) as pool:
-        canvas = Canvas(folder)
-        canvas.start(pool, moving_pictures(data))  # Other processes draw these, while this one draws the figures.
+        canvas = Canvas(folder, start_drawing(data, folder, pool))  # In other processes, while this one draws figures.
         ready = sorted(SECTIONS, key=lambda section: section is motion_section)  # It waits for those.
         found = {section: section(data, canvas) for section in ready}
     parts = [part for section in SECTIONS if (part := found[section]) is not None]
+    seconds = data.metrics.get("seconds_per_test_trajectory", {})
+    timed = [Row(name, [Cell(duration_text(seconds[m]["mean"]))]) for m, name in _TIMED.items() if m in seconds]
     page = page_template("report.html").render(
         title=data.title,
         data=data,
@@ -83,7 +88,7 @@ def write_report(path: Path, data: RunReport) -> None:
         judged=judgement(data.metrics, data.settings),
         parts=parts,
         kind_of=lambda block: type(block).__name__,
-        timed=_timed(data.metrics.get("seconds_per_test_trajectory", {})),
+        timed=Table("Model", ["Wall time"], timed) if timed else None,
         duration=duration_text,
         settings=list(flatten(data.settings)),
     )
@@ -94,25 +99,20 @@ def write_report(path: Path, data: RunReport) -> None:
 def results_section(data: RunReport, canvas: Canvas) -> Part:
     """The errors of the models beside the published ones."""
     blocks: list[Any] = []
-    if data.without_recordings:
-        blocks.append(Text(_without_recordings(data.settings.get("laboratory") or {}), "synthetic"))
+    if data.sees_markers and data.settings["data"].get("folder") is None:
+        fibres = ", fibres around the chambers" if (data.settings.get("laboratory") or {}).get("fibres") else ""
+        blocks.append(Text(Markup(_WITHOUT_RECORDINGS).format(fibres), "synthetic"))
     blocks += [_errors_table(data), Text(_what_is_measured(data), "what", note=True)]
     if data.network_note:
         blocks.append(Text(data.network_note, "network", note=True))
     if data.pages:
-        blocks.append(_folds_table(data))
+        rows = {**data.metrics["folds"], "Mean": data.metrics}
+        means = {t: {model: e["mean"] for model, e in fold["errors_mm"].items()} for t, fold in rows.items()}
+        blocks.append(_models_table("Test trial [mm]", means, data.models, data.pages))
     if ranges := range_texts(data.metrics, [] if data.trials is None else data.trials.names):
         blocks.append(Text("Roll-outs that leave the states of the training", heading=True))
         blocks.append(Items(ranges, "ranges"))
     return Part("", blocks)
-
-
-def _without_recordings(laboratory: Mapping[str, Any]) -> Markup:
-    fibres = ", fibres around the chambers" if laboratory.get("fibres") else ""
-    return Markup(
-        "No recordings are configured (<code>data.folder</code>): what is called measured here is a simulation with a "
-        "finer mesh and step, another material, viscosity{}, and noise on its markers."
-    ).format(fibres)
 
 
 def _errors_table(data: RunReport) -> Table:
@@ -133,8 +133,11 @@ def _errors_table(data: RunReport) -> Table:
         cells += [Cell(shares.get(model, NONE))] if base else []
         cells += [_pair(published[model]) if model in published else Cell(NONE)] if published else []
         rows.append(Row(name, cells, model == best(errors, idle), meaning))
-    what = "markers" if data.sees_markers else "vertices"
-    return Table(f"Error of the {what} [mm]", columns, rows)
+    return Table(f"Error of the {_observed(data)} [mm]", columns, rows)
+
+
+def _observed(data: RunReport) -> str:
+    return "markers" if data.sees_markers else "vertices"
 
 
 def _pair(parts: tuple[str, str]) -> Cell:
@@ -174,16 +177,13 @@ def _what_is_measured(data: RunReport) -> str:
             f"{_count(len(trials.names), 'test trial')}, {_count(steps, 'step')} and {len(data.mesh.vertices)} "
             "vertices, ± the standard deviation over trials and steps of the mean over the vertices."
         )
-    learned = [
-        _reconstruction_text(model, found, data.observed)
-        for model, found in data.metrics.get("reconstruction", {}).items()
-    ]
+    found = data.metrics.get("reconstruction", {})
+    learned = [_reconstruction_text(model, each, _observed(data)) for model, each in found.items()]
     published = [data.published_note] if data.published else []
     return unbroken(" ".join([said, *data.notes, *learned, *published]))
 
 
 def _reconstruction_text(model: str, found: Mapping[str, Any], of: str) -> str:
-    of = "markers" if of == "marker" else "vertices"
     said = (
         f"The reconstruction for {MODELS[model][0]} brings the {of} of the training trials to "
         f"{number_text(found['mean_mm'])} mm from the observed ones, {number_text(found['max_mm'])} mm at most"
@@ -203,42 +203,21 @@ def _count(number: int, what: str) -> str:
 
 
 def _models_table(
-    head: str,
-    rows: Mapping[str, Mapping[str, float | None]],
-    models: Sequence[str],
-    pages: Mapping[str, str],
-    note: str = "",
+    head: str, found: Mapping[str, Mapping[str, float | None]], models: Sequence[str], pages: Mapping[str, str]
 ) -> Table:
-    """Errors [mm] by what a row is and model."""
-
-    def cell(row: Mapping[str, float | None], model: str) -> Cell:
-        return Cell(number_text(row[model]) if model in row else NONE)
-
-    return Table(
-        head,
-        [MODELS[model][0] for model in models],
-        [Row(name, [cell(row, m) for m in models], address=pages.get(name, "")) for name, row in rows.items()],
-        note,
-    )
-
-
-def _folds_table(data: RunReport) -> Table:
-    means = {
-        trial: {model: each["mean"] for model, each in fold["errors_mm"].items()}
-        for trial, fold in data.metrics["folds"].items()
-    }
-    means["Mean"] = {model: each["mean"] for model, each in data.metrics["errors_mm"].items()}
+    """Errors [mm] by what a row is and model; a row may lead to a page."""
+    rows = []
+    for name, row in found.items():
+        cells = [Cell(number_text(row[m]) if m in row else NONE) for m in models]
+        rows.append(Row(name, cells, address=pages.get(name, "")))
     note = "Each trial leads to the page of the fold that is tested on it: its motion, identification and training."
-    return _models_table("Test trial [mm]", means, data.models, data.pages, note)
+    return Table(head, [MODELS[model][0] for model in models], rows, note if pages else "")
 
 
 def range_texts(metrics: Mapping[str, Any], trials: Sequence[str]) -> list[str]:
-    """Say of each model how many of its roll-outs left the states that it was trained on, and when.
+    """Say of each model how many of the trials' roll-outs left the states that it was trained on, and when.
 
-    Args:
-        metrics: With `range`, by model `first_s`: when a trial left [s]; and `scales_range`, the same by scale of the
-            pressures.
-        trials: Names of the test trials.
+    Metrics may have `range`, by model `first_s`: when a trial left [s]; and `scales_range`, by scale of the pressures.
     """
     said = []
     found, beyond = metrics.get("range", {}), metrics.get("scales_range", {})
@@ -275,8 +254,11 @@ def error_section(data: RunReport, canvas: Canvas) -> Part | None:
 
         times = np.nanmean(trials.times, axis=0)
         window = _FILTER if times[-1] >= _LENGTHS * _FILTER - 1e-9 else None
-        draw = partial(figures.error_over_time, trials.errors_mm, times, of=data.observed, window=window)
-        blocks.append(canvas.figure("error_over_time", draw, _describe(data), _error_caption(data, window)))
+        of = "marker" if data.sees_markers else "vertex"
+        draw = partial(figures.error_over_time, trials.errors_mm, times, of=of, window=window)
+        reached = "; ".join(f"{MODELS[model][0]} reaches {_largest(e)}" for model, e in trials.errors_mm.items())
+        alt = f"Mean {of} error of the models over time, on a logarithmic axis. {reached}."
+        blocks.append(canvas.figure("error_over_time", draw, alt, _error_caption(data, window)))
     models, labels = data.models, metrics.get("per_marker", {})
     rows = {row["name"]: row["errors_mm"] for row in metrics["per_trajectory"]}
     if len(rows) > 1:
@@ -304,13 +286,6 @@ def _error_caption(data: RunReport, window: float | None) -> str:
     return unbroken(said)
 
 
-def _describe(data: RunReport) -> str:
-    """What the figure of the errors shows."""
-    assert data.trials is not None
-    reached = (f"{MODELS[model][0]} reaches {_largest(rows)}" for model, rows in data.trials.errors_mm.items())
-    return f"Mean {data.observed} error of the models over time, on a logarithmic axis. {'; '.join(reached)}."
-
-
 def _largest(rows: FloatArray) -> str:
     known = rows[~np.isnan(rows)]
     return f"{number_text(float(known.max()))} mm" if len(known) and np.isfinite(known).all() else "no end: it diverged"
@@ -336,12 +311,6 @@ def reconstruction_section(data: RunReport, canvas: Canvas) -> Part | None:
     return Part(
         "Against the reconstruction", [Text(said), Table("Error against the reconstruction [mm]", ["This run"], rows)]
     )
-
-
-def _timed(seconds: Mapping[str, Any]) -> Table | None:
-    """The time that a test trial takes."""
-    rows = [Row(name, [Cell(duration_text(seconds[m]["mean"]))]) for m, name in _TIMED.items() if m in seconds]
-    return Table("Model", ["Wall time"], rows) if rows else None
 
 
 SECTIONS: Final[tuple[Callable[[RunReport, Canvas], Part | None], ...]] = (

@@ -21,6 +21,7 @@ from .page import (
     Row,
     Table,
     Text,
+    drawn_file,
     error_parts,
     percent_text,
     published_parts,
@@ -66,11 +67,8 @@ def horizon_table(metrics: Mapping[str, Any], published: Mapping[str, Mapping[st
     """Return the errors over the first seconds of the roll-outs and their growth, with the published ones below them.
 
     Args:
-        metrics: With `horizons` (a summary by seconds and model) and `growth`.
+        metrics: With `horizons` (a summary by seconds and model) and `growth`; there is no table without them.
         published: Published errors by seconds and model.
-
-    Returns:
-        The table; None where there are no such errors.
     """
     horizons = sorted(metrics.get("horizons", {}), key=float)
     if not horizons:
@@ -82,16 +80,12 @@ def horizon_table(metrics: Mapping[str, Any], published: Mapping[str, Mapping[st
         found = metrics["horizons"][horizon]
         rows.append(Row(f"First {float(horizon):g} s", [Cell(_whole(found[m]), theirs.get(m, "")) for m in models]))
     if len(horizons) > 1 and metrics.get("growth"):
-        growths = published_growth(published, horizons[0], horizons[-1])
-        shares = ((metrics["growth"].get(model), growths.get(model)) for model in models)
-        texts = [
-            (NONE if a is None else percent_text(a, 1), "" if b is None else percent_text(b, 1)) for a, b in shares
-        ]
-        rows.append(Row("Growth", [Cell(*each) for each in texts]))
+        theirs = {m: percent_text(e, 1) for m, e in published_growth(published, horizons[0], horizons[-1]).items()}
+        ours = {m: percent_text(each, 1) for m, each in metrics["growth"].items() if each is not None}
+        rows.append(Row("Growth", [Cell(ours.get(m, NONE), theirs.get(m, "")) for m in models]))
     note = "Growth is that of the mean error from the shortest to the longest part of the same roll-outs."
-    return Table(
-        "Mean error [mm]", [MODELS[m][0] for m in models], rows, note + (" Small: published." if published else "")
-    )
+    note += " Small: published." if published else ""
+    return Table("Mean error [mm]", [MODELS[m][0] for m in models], rows, note)
 
 
 def scales_section(data: RunReport, canvas: Canvas) -> Part | None:
@@ -118,11 +112,7 @@ def scales_section(data: RunReport, canvas: Canvas) -> Part | None:
 
 
 def scale_table(found: Mapping[str, Mapping[str, Any]]) -> Table | None:
-    """Return the errors at multiples of the pressures, with how they stand to SysID; None where there are none.
-
-    Args:
-        found: A summary by scale and model.
-    """
+    """Return the errors at multiples of the pressures (a summary by scale and model), with how they stand to SysID."""
     scales = sorted(found, key=float)
     if not scales:
         return None
@@ -218,13 +208,7 @@ def _landscape_points(
 
 
 def parameter_rows(found: Mapping[str, Any], start: Mapping[str, float], truth: Mapping[str, Any]) -> list[Row]:
-    """Return a row a parameter: the data sheet's value, what was identified, the true one, and whether at a bound.
-
-    Args:
-        found: One identification.
-        start: The values of the data sheet.
-        truth: The true ones; empty where none is known.
-    """
+    """Return a row a parameter: the data sheet's value, what was identified, the true one if known, if at a bound."""
     deviations = (found.get("uncertainty") or {}).get("deviation", {})
     rows = []
     for parameter, value in found["parameters"].items():
@@ -260,12 +244,7 @@ def _in_a_sentence(parameter: str) -> str:
 
 
 def uncertainty_text(name: str, found: Mapping[str, Any]) -> str:
-    """Say which parameters the data cannot tell apart; empty where nothing is known about that.
-
-    Args:
-        name: The model that the identification is for.
-        found: The identification.
-    """
+    """Say which parameters the data of a model's identification cannot tell apart; empty where that is not known."""
     known = found.get("uncertainty")
     if not known:
         return ""
@@ -289,35 +268,30 @@ def uncertainty_text(name: str, found: Mapping[str, Any]) -> str:
 
 def registration_section(data: RunReport, canvas: Canvas) -> Part | None:
     """Where the markers are on the body at rest."""
-    recordings = data.recordings
-    if recordings is None:
+    found = data.recordings
+    if found is None:
         return None
-    from .registration_picture import draw_registration
-
-    def draw(path: Path) -> None:
-        places = (recordings.nominal, recordings.feet, data.fixed, recordings.drawn)
-        draw_registration(path, recordings.mesh, recordings.registration, *places)
-
-    alt = f"The body at rest with the registered markers of the trial {recordings.drawn}, from two sides."
+    alt = f"The body at rest with the registered markers of the trial {found.drawn}, from two sides."
     caption = (
-        f"The body at rest with the registered markers of the trial {recordings.drawn}, which fits worst. A ring "
+        f"The body at rest with the registered markers of the trial {found.drawn}, which fits worst. A ring "
         "stands where a marker should be."
     )
-    return Part(
-        "Registration",
-        [*canvas.file("registration", draw, alt, caption), residual_table(recordings.residuals)],
-    )
+
+    def picture(path: Path) -> Drawn:
+        from .registration_picture import draw_registration
+
+        draw_registration(path, found.mesh, found.registration, found.nominal, found.feet, data.fixed, found.drawn)
+        return drawn_file(path, alt, caption)
+
+    blocks = canvas.attempt("registration.png", picture)
+    return Part("Registration", [*blocks, residual_table(found.residuals)])
 
 
 def residual_table(residuals: Mapping[str, Any]) -> Table:
     """Return the residuals of the registration [mm] by trial and marker; many markers stand below each other."""
     labels = list(dict.fromkeys(label for each in residuals.values() for label in each["residual_mm"]))
-    head, note, last = (
-        "Residual [mm]",
-        "Distance of each marker at rest from its nominal position after ",
-        "Root mean square",
-    )
-    note += "the rigid motion that fits best."
+    head, last = "Residual [mm]", "Root mean square"
+    note = "Distance of each marker at rest from its nominal position after the rigid motion that fits best."
 
     def cell(each: Mapping[str, Any], label: str) -> Cell:
         value = each["residual_mm"].get(label)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from ...io.decoding import DecodingError, decode
 from ...io.errors import DataFileError
@@ -13,7 +14,7 @@ from ...io.files import FORMAT, atomic_hdf5, create, hdf5_error, read_arrays
 from .recording import SI_PER_ACTUATION_UNIT, RawRecording, Recording
 
 KIND = "recording"
-_NAMES = ("positions", "labels", "rate_hz", "units", "actuation", "actuation_units", "rest", "start")
+_NAMES = ("positions", "labels", "rate_hz", "units", "actuation", "actuation_units", "rest", "base", "start")
 
 
 def read_raw_npz(path: Path) -> RawRecording:
@@ -68,6 +69,9 @@ def write_recording(path: str | Path, recording: Recording, attributes: Mapping[
             create(file, "rest", recording.rest, units="m")
         if recording.actuation is not None:
             create(file, "actuation", recording.actuation, units="1")
+        if recording.base is not None:
+            quaternions = Rotation.from_rotvec(recording.base[:, 3:]).as_quat()[:, [3, 0, 1, 2]]
+            create(file, "base", np.concatenate([recording.base[:, :3], quaternions], axis=1), units="m, 1")
 
 
 def _assemble(find: Callable[[str], NDArray[Any] | None], path: Path) -> RawRecording:
@@ -93,6 +97,7 @@ def _assemble(find: Callable[[str], NDArray[Any] | None], path: Path) -> RawReco
         rate=rate,
         actuation=actuation,
         rest=_floats(find, "rest", path),
+        base=_floats(find, "base", path),
         start=start or 0.0,
     )
 

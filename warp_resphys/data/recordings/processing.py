@@ -13,6 +13,7 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import butter, sosfiltfilt
 
 from ...io.errors import DataFileError, InputError
+from ..base_motion import at_times
 from .recording import BoolArray, Recording, listed, runs
 from .release import Release, find_release
 
@@ -80,8 +81,9 @@ def resample(recording: Recording, rate: float, *, interpolate: bool = False) ->
     every = round(ratio)
     if every >= 1 and abs(ratio - every) <= _WHOLE * ratio:
         actuation = None if recording.actuation is None else recording.actuation[::every]
+        base = None if recording.base is None else recording.base[::every]
         return dataclasses.replace(
-            recording, positions=recording.positions[::every], actuation=actuation, rate=float(rate)
+            recording, positions=recording.positions[::every], actuation=actuation, base=base, rate=float(rate)
         )
     if not interpolate:
         raise InputError(
@@ -102,7 +104,8 @@ def resample(recording: Recording, rate: float, *, interpolate: bool = False) ->
     actuation = None
     if recording.actuation is not None:
         actuation = np.stack([np.interp(new, old, channel) for channel in recording.actuation.T], axis=1)
-    return dataclasses.replace(recording, positions=positions, actuation=actuation, rate=float(rate))
+    base = None if recording.base is None else at_times(recording.base, old, new)
+    return dataclasses.replace(recording, positions=positions, actuation=actuation, base=base, rate=float(rate))
 
 
 def smooth(recording: Recording, cutoff: float) -> Recording:
@@ -198,6 +201,7 @@ def trim_to_release(
         recording,
         positions=recording.positions[first:last],
         actuation=None if recording.actuation is None else recording.actuation[first:last],
+        base=None if recording.base is None else recording.base[first:last],
         rest=np.nanmedian(held, axis=0),
         start=(first - release.frame) / recording.rate,
     )

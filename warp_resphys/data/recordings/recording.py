@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...io.errors import DataFileError, InputError
+from ..base_motion import since_first
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -31,6 +32,8 @@ class Recording:
         source: The file it came from.
         actuation: (T, C) [Pa, N or without a unit] what drove the body in each frame, if that was recorded.
         rest: (M, 3) [m] the markers on the body at rest, if known; it tells where they sit on it.
+        base: (T, 6) the motion since the first frame of what the body is fixed to, if that was recorded; see
+            `data.base_motion`.
         start: Time of the first frame [s]; after `trim_to_release`, since the release.
     """
 
@@ -40,6 +43,7 @@ class Recording:
     source: Path
     actuation: FloatArray | None = None
     rest: FloatArray | None = None
+    base: FloatArray | None = None
     start: float = 0.0
 
     @property
@@ -80,6 +84,7 @@ class RawRecording:
         rate: [Hz].
         actuation: (T, C) [Pa, N or 1].
         rest: (M, 3) [unit].
+        base: (T, 7) a point of what the body is fixed to [m], and a quaternion of its rotation, w first.
         start: Time of the first frame [s].
     """
 
@@ -89,6 +94,7 @@ class RawRecording:
     rate: float | None
     actuation: FloatArray | None = None
     rest: FloatArray | None = None
+    base: FloatArray | None = None
     start: float = 0.0
 
 
@@ -141,7 +147,15 @@ def to_recording(
     if not np.isfinite(raw.start):
         raise DataFileError(f"{path}: its first frame is at {raw.start} s: give the time of each frame, or no start.")
     check_span(positions, path)
-    return Recording(names, positions, _rate(raw, path, rate), path, raw.actuation, rest, raw.start)
+    base = None
+    if raw.base is not None:
+        if raw.base.shape != (len(positions), 7):
+            raise DataFileError(
+                f"{path}: base has the shape {raw.base.shape}; it needs a place and a quaternion (w, x, y, z) for each "
+                f"of the {len(positions)} frames."
+            )
+        base = since_first(raw.base[:, :3], raw.base[:, 3:], path)
+    return Recording(names, positions, _rate(raw, path, rate), path, raw.actuation, rest, base, raw.start)
 
 
 def check_span(positions: FloatArray, path: Path) -> None:

@@ -83,10 +83,10 @@ def setting_scatter(
             axes.set_axis_off()
         for axes, (name, dimension) in zip(panels.flat, space.items(), strict=False):
             places = _places(axes, dimension, [settings[i][name] for i in shown])
-            axes.plot(places, errors[shown], "o", color=_TOLD, markersize=3.5, alpha=0.7, clip_on=False)
+            axes.plot(places, errors[shown], "o", color=_TOLD, markersize=3.5, alpha=0.7)
             if shown:
                 best = int(np.argmin(errors[shown]))
-                axes.plot(places[best], errors[shown][best], "o", color=_BEST, markersize=6, clip_on=False)
+                axes.plot(places[best], errors[shown][best], "o", color=_BEST, markersize=6)
             axes.set_xlabel(name.replace("_", " "))
         _errors_axis(panels[0, 0])
         for axes in panels[:, 0]:
@@ -109,10 +109,12 @@ def _places(axes: Axes, dimension: Dimension, values: Sequence[float | str]) -> 
         axes.set_xticks(range(len(dimension.values)), [str(value) for value in dimension.values])
         axes.set_xlim(-0.5, len(dimension.values) - 0.5)
         return np.array([dimension.values.index(value) for value in values], dtype=np.float64)
+    low, high = float(dimension.low), float(dimension.high)
     if dimension.log:
         axes.set_xscale("log", subs=[])
+        axes.set_xlim(low / (high / low) ** 0.06, high * (high / low) ** 0.06)
         axes.xaxis.set_major_locator(LogLocator(numticks=5))
     else:
+        axes.set_xlim(low - 0.06 * (high - low), high + 0.06 * (high - low))
         axes.xaxis.set_major_locator(MaxNLocator("auto" if dimension.whole else 5, integer=dimension.whole))
-    axes.set_xlim(dimension.low, dimension.high)
     return np.array(values, dtype=np.float64)

@@ -30,6 +30,7 @@ from ...report.page import (
 )
 from ..command import show, table_of, write_csv
 from ..page import write_page
+from . import figures
 from .space import Dimension, with_settings
 from .study import Outcome, SharedStudy
 
@@ -199,8 +200,6 @@ def _verdict(tuning: Tuning, outcomes: Sequence[Outcome], best: Sequence[Outcome
 def _drawn(
     tuning: Tuning, outcomes: Sequence[Outcome], best: Sequence[Outcome], names: Mapping[str, str]
 ) -> list[Drawn]:
-    from . import figures  # Matplotlib takes a second, which a worker need not wait for.
-
     errors, pruned = np.full((2, len(outcomes)), np.nan)
     for each in outcomes:
         if each.error is not None and each.state in ("complete", "pruned"):

@@ -18,7 +18,7 @@ from ..dynamics.integrator import State
 from ..dynamics.modes import resolved, vibration_modes, with_signs
 from ..dynamics.simulator import Simulator
 from ..io.errors import ConvergenceError, InputError
-from ..linalg.least_squares import Point, Problem, Step, damped, minimise
+from ..linalg.least_squares import Move, Point, Problem, damped, minimise
 from .replay import Observe, Replay, Start
 
 _HOLD_ITERATIONS = 100
@@ -141,7 +141,7 @@ class _Held(Problem):
         return Point(x, kept[1].square().sum(1) + (self._weight * x.square()).sum(1), kept)
 
     @override
-    def linearise(self, point: Point) -> Step:
+    def linearise(self, point: Point) -> Move:
         self._near, missing, slope = point.kept
         matrix = slope.mT @ slope + torch.diag_embed(self._weight.expand_as(point.x))
         right = -(slope.mT @ missing[..., None])[..., 0] - self._weight * point.x
@@ -199,7 +199,7 @@ class _FirstFrames(Problem):
         return Point(x, residual[0].square().sum(1) + x.square().sum(1), (slope.mT @ slope + identity, gradient))
 
     @override
-    def linearise(self, point: Point) -> Step:
+    def linearise(self, point: Point) -> Move:
         matrix, gradient = point.kept
 
         def step(damping: torch.Tensor) -> torch.Tensor:

@@ -18,7 +18,7 @@ from typing_extensions import override
 
 Array = NDArray[np.float64]
 Objective = Callable[[Array], tuple[float, Array]]
-Step = Callable[[torch.Tensor], torch.Tensor]
+Move = Callable[[torch.Tensor], torch.Tensor]
 
 _FADING, _GROWTH, _MOST_DAMPING = 0.1, 10.0, 1e12
 _MARQUARDT = 1e-2  # of a diagonal entry, what a damping of one adds to it
@@ -50,7 +50,7 @@ class Problem(ABC):
         """The point at unknowns (B, ...)."""
 
     @abstractmethod
-    def linearise(self, point: Point) -> Step:
+    def linearise(self, point: Point) -> Move:
         """Of a damping (B,), zero or more, to the unknowns that minimise the damped linearisation about the point."""
 
     @abstractmethod
@@ -138,7 +138,7 @@ class UnitBox(Problem):
         return Point(x, x.new_tensor([value]), (x.new_tensor(gradient)[None],))
 
     @override
-    def linearise(self, point: Point) -> Step:
+    def linearise(self, point: Point) -> Move:
         (x,), (gradient,) = point.x, point.kept[0]
         found = self._matrix(x.numpy())
         if found is None or not np.isfinite(found).all() or not np.trace(found) > 0.0:

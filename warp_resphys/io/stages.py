@@ -34,40 +34,24 @@ _PACKAGES = ("warp-resphys", "warp-lang", "torch", "numpy", "scipy", "cholespy",
 
 @dataclass(frozen=True)
 class StageContext:
-    """What a stage is told when it runs.
+    """What a stage is told when it runs."""
 
-    Attributes:
-        name: The stage's.
-        run_dir: The run folder; outputs are written there.
-        fingerprint: Identifies everything the outputs depend on; resumable files are marked with it.
-        settings: That the stage declared.
-        memory: Of its worker processes, which it is to count.
-    """
-
-    name: str
-    run_dir: Path
-    fingerprint: str
-    settings: Mapping[str, Any]
-    memory: WorkersMemory = field(default_factory=WorkersMemory)
+    name: str  # The stage's
+    run_dir: Path  # The run folder; outputs are written there
+    fingerprint: str  # Identifies everything the outputs depend on; resumable files are marked with it
+    settings: Mapping[str, Any]  # That the stage declared
+    memory: WorkersMemory = field(default_factory=WorkersMemory)  # Of its worker processes, which it is to count
 
 
 @dataclass(frozen=True)
 class Stage:
-    """A step of an experiment, from files to files.
+    """A step of an experiment, from files to files."""
 
-    Attributes:
-        name: Its name, also that of its record.
-        function: Does the work; it writes each output whole or not at all.
-        outputs: Names of the files that it writes, relative to the run folder.
-        settings: Plain nested settings that the outputs depend on, and no others.
-        upstream: Names of the stages whose outputs it reads.
-    """
-
-    name: str
-    function: Callable[[StageContext], None]
-    outputs: tuple[str, ...]
-    settings: Mapping[str, Any]
-    upstream: tuple[str, ...] = ()
+    name: str  # Its name, also that of its record
+    function: Callable[[StageContext], None]  # Does the work; it writes each output whole or not at all
+    outputs: tuple[str, ...]  # Names of the files that it writes, relative to the run folder
+    settings: Mapping[str, Any]  # Plain nested settings that the outputs depend on, and no others
+    upstream: tuple[str, ...] = ()  # Names of the stages whose outputs it reads
 
 
 class StageInterrupted(KeyboardInterrupt):

@@ -29,17 +29,11 @@ _DIFFERENCE = 1e-3  # of a range, for derivatives by differences
 
 @dataclass(frozen=True)
 class Bounds:
-    """The range of a parameter.
+    """The range of a parameter."""
 
-    Attributes:
-        lower: in the parameter's unit.
-        upper: the same.
-        logarithmic: whether it is searched on a logarithmic scale.
-    """
-
-    lower: float
-    upper: float
-    logarithmic: bool = False
+    lower: float  # in the parameter's unit
+    upper: float  # the same
+    logarithmic: bool = False  # whether it is searched on a logarithmic scale
 
     def __post_init__(self) -> None:
         """Checks the range.
@@ -66,38 +60,25 @@ class Bounds:
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """What the data say about the parameters near the minimum (Gauss-Newton approximation).
+    """What the data say about the parameters near the minimum (Gauss-Newton approximation)."""
 
-    Attributes:
-        deviation: standard deviation of each parameter, in its unit.
-        correlation: (P, P) of the parameters, in their order.
-        poorest: the direction that the data tell least about: weights of the parameters, in fractions of their ranges.
-        poorest_deviation: standard deviation along it, as a fraction of the ranges.
-    """
-
-    deviation: dict[str, float]
-    correlation: list[list[float]]
+    deviation: dict[str, float]  # standard deviation of each parameter, in its unit
+    correlation: list[list[float]]  # (P, P) of the parameters, in their order
+    # the direction that the data tell least about: weights of the parameters, in fractions of their ranges
     poorest: dict[str, float]
-    poorest_deviation: float
+    poorest_deviation: float  # standard deviation along it, as a fraction of the ranges
 
 
 @dataclass
 class Identification:
-    """Result of an identification.
+    """Result of an identification."""
 
-    Attributes:
-        parameters: the values of the smallest loss.
-        loss: that loss, relative to the motions' amplitudes.
-        history: for every start the records ``loss`` and the parameters, one an evaluation that did not fail.
-        at_bounds: parameters that ended on a bound.
-        uncertainty: see the class; None if the simulation fails beside the minimum.
-    """
-
-    parameters: dict[str, float]
-    loss: float
+    parameters: dict[str, float]  # the values of the smallest loss
+    loss: float  # that loss, relative to the motions' amplitudes
+    # for every start the records ``loss`` and the parameters, one an evaluation that did not fail
     history: list[list[dict[str, float]]] = field(default_factory=list)
-    at_bounds: tuple[str, ...] = ()
-    uncertainty: Uncertainty | None = None
+    at_bounds: tuple[str, ...] = ()  # parameters that ended on a bound
+    uncertainty: Uncertainty | None = None  # see the class; None if the simulation fails beside the minimum
 
 
 class Identifier:

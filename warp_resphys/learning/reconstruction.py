@@ -33,17 +33,11 @@ from .reconstruction_problems import FullStateProblem, MarkerForceProblem, Marke
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """One reconstructed step.
+    """One reconstructed step."""
 
-    Attributes:
-        state: where the simulator gets with the force.
-        force: (B, N, 3) [N]; zero at fixed vertices.
-        iterations: of the optimisation.
-    """
-
-    state: State
-    force: torch.Tensor
-    iterations: int
+    state: State  # where the simulator gets with the force
+    force: torch.Tensor  # (B, N, 3) [N]; zero at fixed vertices
+    iterations: int  # of the optimisation
 
 
 class Reconstructor(ABC):

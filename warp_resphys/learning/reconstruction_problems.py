@@ -20,27 +20,16 @@ from ..linalg.least_squares import Move, Point, Problem, ridge
 
 @dataclass(frozen=True)
 class Step:
-    """A step whose force is looked for.
+    """A step whose force is looked for."""
 
-    Attributes:
-        simulator: makes it.
-        constants: of the simulator.
-        state: where it starts.
-        inputs: what acts during it.
-        observed: (B, N, 3) positions, or (B, m, 3) markers, NaN where one was not seen [m].
-        weight: lambda [m^2/N^2].
-        markers: C, for as many environments as the state has; None for positions.
-        basis: (3 N, modes) of forces; None for every force on the free vertices.
-    """
-
-    simulator: Simulator
-    constants: Constants
-    state: State
-    inputs: Inputs
-    observed: torch.Tensor
-    weight: float
-    markers: Markers | None = None
-    basis: torch.Tensor | None = None
+    simulator: Simulator  # makes it
+    constants: Constants  # of the simulator
+    state: State  # where it starts
+    inputs: Inputs  # what acts during it
+    observed: torch.Tensor  # (B, N, 3) positions, or (B, m, 3) markers, NaN where one was not seen [m]
+    weight: float  # lambda [m^2/N^2]
+    markers: Markers | None = None  # C, for as many environments as the state has; None for positions
+    basis: torch.Tensor | None = None  # (3 N, modes) of forces; None for every force on the free vertices
 
     def linearise(self) -> Linearisation:
         """Of the step without a force."""

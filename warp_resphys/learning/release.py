@@ -31,29 +31,21 @@ _RELEASE_TOLERANCE, _DIFFERENCE, _LONGEST_STEP = 1e-4, 0.05, 3.0  # in expected 
 
 @dataclass(frozen=True)
 class ReleaseSettings:
-    """How the beginning of a motion is estimated.
+    """How the beginning of a motion is estimated."""
 
-    Attributes:
-        hold_modes: vibration modes whose inertial forces hold the body; 0 lets it go from where gravity leaves it.
-        velocity_modes: vibration modes that the velocity at the release is made of; 0 for none.
-        window: how much of the motion after the release is used [s].
-        noise: what a marker may be off for reasons that no release explains [m].
-        delay: expected deviation of the moment of release from the one found in the frames [s]; 0 keeps that one.
-        speed: expected size of the velocity of the fastest vertex [m/s].
-        sideways: expected displacement, across gravity, of a body that seems to be held undeformed [m]: as a sideways
-            acceleration bends it, at the vertex that moves furthest; 0 for none. Along gravity it would be mistaken for
-            a weight or a stiffness.
-        iterations: Levenberg-Marquardt steps.
-    """
-
+    # vibration modes whose inertial forces hold the body; 0 lets it go from where gravity leaves it
     hold_modes: int = 6
-    velocity_modes: int = 0
-    window: float = 0.13
-    noise: float = 3e-4
+    velocity_modes: int = 0  # vibration modes that the velocity at the release is made of; 0 for none
+    window: float = 0.13  # how much of the motion after the release is used [s]
+    noise: float = 3e-4  # what a marker may be off for reasons that no release explains [m]
+    # expected deviation of the moment of release from the one found in the frames [s]; 0 keeps that one
     delay: float = 0.0
-    speed: float = 0.05
+    speed: float = 0.05  # expected size of the velocity of the fastest vertex [m/s]
+    # expected displacement, across gravity, of a body that seems to be held undeformed [m]: as a sideways
+    # acceleration bends it, at the vertex that moves furthest; 0 for none. Along gravity it would be mistaken for
+    # a weight or a stiffness
     sideways: float = 0.0
-    iterations: int = 4
+    iterations: int = 4  # Levenberg-Marquardt steps
 
     def __post_init__(self) -> None:
         """Checks the ranges.

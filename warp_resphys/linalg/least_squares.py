@@ -29,17 +29,11 @@ _SMALL = 1e-4
 
 @dataclass(frozen=True)
 class Point:
-    """Where a batch of problems is.
+    """Where a batch of problems is."""
 
-    Attributes:
-        x: (B, ...) unknowns.
-        value: (B,) objective; infinite where there is none, as where a simulation fails.
-        kept: what the problem keeps of its evaluation, each (B, ...).
-    """
-
-    x: torch.Tensor
-    value: torch.Tensor
-    kept: tuple[torch.Tensor, ...] = ()
+    x: torch.Tensor  # (B, ...) unknowns
+    value: torch.Tensor  # (B,) objective; infinite where there is none, as where a simulation fails
+    kept: tuple[torch.Tensor, ...] = ()  # what the problem keeps of its evaluation, each (B, ...)
 
 
 class Problem(ABC):
@@ -60,19 +54,12 @@ class Problem(ABC):
 
 @dataclass(frozen=True)
 class Solution:
-    """What `minimise` found.
+    """What `minimise` found."""
 
-    Attributes:
-        point: the last one that was taken.
-        iterations: steps that were tried.
-        settled: whether every problem of the batch has.
-        moved: the furthest distance of the last step.
-    """
-
-    point: Point
-    iterations: int
-    settled: bool
-    moved: float
+    point: Point  # the last one that was taken
+    iterations: int  # steps that were tried
+    settled: bool  # whether every problem of the batch has
+    moved: float  # the furthest distance of the last step
 
 
 @torch.no_grad()

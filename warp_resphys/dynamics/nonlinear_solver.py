@@ -49,11 +49,7 @@ class SolverSettings:
     on_failure: str = "raise"  # ``raise`` a `ConvergenceError`, or ``count`` the failure in the report and go on
 
     def __post_init__(self) -> None:
-        """Checks the settings.
-
-        Raises:
-            InputError: an unknown name, or a number out of range.
-        """
+        """Checks the settings; raises InputError for an unknown name, or a number out of range."""
         if self.name not in SOLVERS:
             raise InputError(f"solver is {self.name!r}: choose one of {', '.join(SOLVERS)}.")
         if self.on_failure not in ("raise", "count"):

@@ -55,11 +55,7 @@ class Material(ABC):
     stiffness_damping: Parameter = constant(0.0, "stiffness_damping", "s", closed=True, per="", common=True)
 
     def __post_init__(self) -> None:
-        """Checks every constant.
-
-        Raises:
-            InputError: a constant outside its physical range.
-        """
+        """Checks every constant; raises InputError for a constant outside its physical range."""
         for name, quantity in self.quantities().items():
             quantity.check(getattr(self, name))
 

@@ -8,7 +8,7 @@ gradients through the simulator.
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import product
+from itertools import product, takewhile
 from typing import Any
 
 import numpy as np
@@ -56,6 +56,12 @@ class Bounds:
         if self.logarithmic:
             return self.lower * torch.exp(unit * math.log(self.upper / self.lower))
         return self.lower + unit * (self.upper - self.lower)
+
+    def slope(self, unit: float) -> float:
+        """Derivative of a value by its fraction."""
+        if self.logarithmic:
+            return self.lower * (self.upper / self.lower) ** unit * math.log(self.upper / self.lower)
+        return self.upper - self.lower
 
 
 @dataclass(frozen=True)
@@ -328,20 +334,14 @@ class Identifier:
         inverse = (vectors / np.maximum(values, 1e-12 * max(values[-1], 1e-300))) @ vectors.T
         covariance = inverse @ np.einsum("r,rpq->pq", variances, blocks) @ inverse
         deviation = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-        slopes = [self._slope(name, u) for name, u in zip(self.bounds, unit, strict=True)]
+        slopes = [bounds.slope(u) for bounds, u in zip(self.bounds.values(), unit, strict=True)]
         poorest = vectors[:, 0] * np.sign(vectors[np.abs(vectors[:, 0]).argmax(), 0])
         return Uncertainty(
-            deviation={n: float(d * s) for n, d, s in zip(self.bounds, deviation, slopes, strict=True)},
+            deviation=dict(zip(self.bounds, (deviation * slopes).tolist(), strict=True)),
             correlation=(covariance / np.outer(deviation, deviation)).tolist(),
             poorest=dict(zip(self.bounds, poorest.tolist(), strict=True)),
             poorest_deviation=float(np.sqrt(max(vectors[:, 0] @ covariance @ vectors[:, 0], 0.0))),
         )
-
-    def _slope(self, name: str, unit: float) -> float:
-        """Derivative of a parameter with respect to its fraction."""
-        x = torch.tensor(float(unit), dtype=torch.float64, requires_grad=True)
-        (slope,) = torch.autograd.grad(self.bounds[name].from_unit(x), x)
-        return float(slope)
 
 
 def _redundancy(series: NDArray[np.float64]) -> float:
@@ -351,9 +351,4 @@ def _redundancy(series: NDArray[np.float64]) -> float:
     products = [float((series[lag:] * series[: len(series) - lag]).sum()) for lag in range(len(series) // 2)]
     if products[0] <= 0.0:
         return 1.0
-    total = 1.0
-    for value in products[1:]:
-        if value <= 0.0:
-            break
-        total += 2.0 * value / products[0]
-    return total
+    return 1.0 + 2.0 * sum(takewhile(lambda value: value > 0.0, products[1:])) / products[0]

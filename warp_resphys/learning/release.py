@@ -48,11 +48,7 @@ class ReleaseSettings:
     iterations: int = 4  # Levenberg-Marquardt steps
 
     def __post_init__(self) -> None:
-        """Checks the ranges.
-
-        Raises:
-            InputError: a number out of range.
-        """
+        """Checks the ranges; raises InputError for a number out of range."""
         for name in ("window", "noise", "speed", "iterations"):
             if not getattr(self, name) > 0:
                 raise InputError(f"release.{name} is {getattr(self, name)}: it must be positive.")

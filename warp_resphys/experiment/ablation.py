@@ -25,7 +25,7 @@ from ..learning.reconstruction import make_reconstructor
 from ..mesh.mesh import surface_vertices
 from ..report.ablation_page import AblationReport, write_ablation_report
 from ..report.page import number_text
-from .build import build_mesh, build_simulator, choose_device
+from .build import build_mesh, build_simulator, simulation_device
 from .files import METRICS, REPORT
 from .parts import March, Part, processes_for, remove_parts, split_into_parts, work_on
 from .simulate import held_state
@@ -233,5 +233,5 @@ def collect_metrics(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
         **read_json(folder / SUMMARY),
         **resources_used(folder, _STAGES),
         "versions": package_versions(),
-        "device": str(choose_device("cpu" if config["device"] == "auto" else config["device"])),
+        "device": str(simulation_device(config)),
     }

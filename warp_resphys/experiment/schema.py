@@ -32,6 +32,11 @@ def is_number(value: Any) -> bool:
     return isinstance(value, numbers.Real) and not isinstance(value, bool)
 
 
+def is_finite(value: Any) -> bool:
+    """Whether it is a finite number."""
+    return is_number(value) and math.isfinite(value)
+
+
 @dataclass(frozen=True)
 class Kind:
     """What the value of a key must be.
@@ -87,7 +92,7 @@ def one_of(*words: Any) -> Kind:
 
 
 def _number(fits: Callable[[Any], bool], wanted: str) -> Kind:
-    return Kind(lambda value: is_number(value) and math.isfinite(value) and fits(value), wanted)
+    return Kind(lambda value: is_finite(value) and fits(value), wanted)
 
 
 def _whole(least: int, wanted: str, most: float = math.inf) -> Kind:
@@ -130,7 +135,7 @@ NAME: Final = Kind(
 ANYTHING: Final = Kind(lambda _: True, "anything", optional=True)
 TRUTH_VALUE: Final = Kind(lambda value: isinstance(value, bool), "true or false")
 NUMBER: Final = Kind(is_number, "a number")
-FINITE: Final = _number(lambda _: True, "a finite number")
+FINITE: Final = Kind(is_finite, "a finite number")
 POSITIVE: Final = _number(lambda value: value > 0.0, "a positive number")
 NOT_NEGATIVE: Final = _number(lambda value: value >= 0.0, "a number, zero or more")
 SHARE: Final = _number(lambda value: 0.0 < value <= 1.0, "more than 0 and at most 1")
@@ -300,7 +305,7 @@ _SEQUENCES = Group(
         "deviation": absent(POSITIVE),
         "correlation_time": absent(POSITIVE),
         "correlation": absent(
-            Kind(lambda value: FINITE.fits(value) or _is_matrix(value), "a finite number, or a matrix of them")
+            Kind(lambda value: is_finite(value) or _is_matrix(value), "a finite number, or a matrix of them")
         ),
         "rest": absent(NOT_NEGATIVE),
     }

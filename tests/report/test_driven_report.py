@@ -148,7 +148,7 @@ def test_page_of_higher_pressures(tmp_path):
     assert (tmp_path / "figures" / "error_over_scale.png").is_file()
     trials = read_trials(tmp_path, settings)
     assert trials.names == ("test_00", "test_01")
-    pressures = read_pressures(tmp_path, settings, trials)
+    pressures = read_pressures(tmp_path, settings)
     assert len(pressures.scaled) == 4
     assert set(pressures.scaled) < pressures.values.keys()
     rows = trials.errors_mm["resphys"]
@@ -210,7 +210,7 @@ def test_what_is_read(tmp_path):
     settings = arm_settings()
     write_run(tmp_path, settings, diverged=("simfree",))
     trials, film = read_trials(tmp_path, settings), read_film(tmp_path)
-    pressures = read_pressures(tmp_path, settings, trials)
+    pressures = read_pressures(tmp_path, settings)
     assert pressures.scaled == ()
     assert trials.times[0, [0, -1]].tolist() == [0.0, pytest.approx(2.0)]
     assert np.isnan(trials.target[0, 30:36, 1]).all()

@@ -70,12 +70,11 @@ def test_trials_are_compared(tmp_path, path):
     assert json.loads((tmp_path / "out" / "quality.json").read_text())["base"][0]["shift_mm"]["base 2"] > 29.0
 
 
-@pytest.mark.parametrize("narrow", [False, True])
-def test_picture_shows_what_is_seen_filled_and_masked(narrow):
+def test_picture_shows_what_is_seen_filled_and_masked():
     recording = held_then_initial_motion()
     recording.positions[:, 2] = np.nan
     result = quality(recording, LABELS[1:], Release(60.4, (40, 60)))
-    figure = recording_quality(recording, result, narrow=narrow)
+    figure = recording_quality(recording, result)
     *panels, raster = figure.axes
     assert len(panels) == 4  # x, y, z and the markers that should not move
     drawn = panels[2].lines[1].get_ydata()  # the frames that were seen

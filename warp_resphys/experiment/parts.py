@@ -25,7 +25,7 @@ from ..io.processes import Advance, available_cores, in_processes
 from ..io.progress import Progress
 from ..io.resumable import Field, ResumableHDF5, forget_checkpoint, keep_checkpoint, resume_checkpoint
 from ..io.stages import StageContext
-from .build import choose_device
+from .build import simulation_device
 
 _KEEP_SECONDS = 10.0
 _STATE = ("q", "v", "previous_q", "previous_v")
@@ -176,8 +176,7 @@ def processes_for(config: Mapping[str, Any], wanted: int | None) -> int:
     """Worker processes: as many as wanted; if that is not said, one a core, but one for all where a GPU simulates."""
     if wanted is not None:
         return wanted
-    device = "cpu" if config["device"] == "auto" else config["device"]
-    return available_cores() if choose_device(device).type == "cpu" else 1
+    return available_cores() if simulation_device(config).type == "cpu" else 1
 
 
 def work_on(parts: Sequence[Part], function: Callable[[Part], March], processes: int) -> None:

@@ -1,4 +1,7 @@
-"""Stage: the report page of a split, and the one over the folds; they show what the run folder holds."""
+"""Stage: the report page of a split, and the one over the folds; they show what the run folder holds.
+
+What reads a file raises a DataFileError where that is missing or damaged.
+"""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -34,6 +37,7 @@ from .files import (
     STATIC,
     TIMES,
     TRUTH,
+    Dataset,
     fold_folder,
     read_dataset,
     read_if_there,
@@ -87,12 +91,14 @@ def make_report(context: StageContext) -> None:
     folder, config = context.run_dir, context.settings["config"]
     metrics, truth = collect_metrics(folder, config), read_if_there(common_folder(folder) / TRUTH)
     trials, identification = read_trials(folder, config), read_if_there(folder / IDENTIFICATION)
-    film, pressures = read_film(folder), read_pressures(folder, config, trials)
-    common, mesh = _common_parts(context, metrics)
+    film, pressures = read_film(folder), read_pressures(folder, config)
+    mesh = build_mesh(config["mesh"])
     channels = () if pressures is None else pressures.channels
+    tip = {} if trials.labels else config.get("tip") or {}
+    learned = "resphys" in metrics["errors_mm"] and not config.get("in_the_loop")
     data = RunReport(
-        **common,
-        tip=_tip(mesh, config, trials),
+        **_common_parts(config, metrics, mesh),
+        tip=select_vertices(mesh, **tip) if tip else np.empty(0, dtype=np.int64),
         chambers=_driven_chambers(build_chambers(config.get("chambers"), mesh), channels),
         trials=trials,
         film=film,
@@ -104,9 +110,7 @@ def make_report(context: StageContext) -> None:
         truth=truth.get("material", {}),
         training=_histories(folder, False),
         refinement=_histories(folder, True),
-        network_note=""
-        if config.get("in_the_loop") or "resphys" not in metrics["errors_mm"]
-        else network_in_words(config),
+        network_note=network_in_words(config) if learned else "",
         kept_note=kept_in_words(metrics["networks"]) if "resphys" in metrics["networks"] else "",
         simulator=_in_words(config["simulation"]),
         target=_in_words(config["target"]) if config.get("target") else "",
@@ -123,9 +127,9 @@ def make_folds_report(context: StageContext) -> None:
     folder, config = context.run_dir, context.settings["config"]
     metrics = {"device": str(choose_device(config["device"])), **read_json(folder / METRICS)}
     sideways = {trial: mm for fold in metrics["folds"].values() for trial, mm in fold.get("sideways_mm", {}).items()}
-    common, mesh = _common_parts(context, metrics)
+    mesh = build_mesh(config["mesh"])
     data = RunReport(
-        **common,
+        **_common_parts(config, metrics, mesh),
         pages={trial: f"{fold_folder(trial)}/{REPORT}" for trial in metrics["folds"]},
         recordings=read_recordings(folder, config, mesh, {}),
         notes=error_notes(sideways, {}),
@@ -133,16 +137,8 @@ def make_folds_report(context: StageContext) -> None:
     write_report(folder / REPORT, data)
 
 
-def _tip(mesh: Mesh, config: Mapping[str, Any], trials: Trials) -> NDArray[np.int64]:
-    """Vertices whose mean is the tip, where every vertex is observed."""
-    place = config.get("tip")
-    return np.empty(0, dtype=np.int64) if trials.labels or not place else select_vertices(mesh, **place)
-
-
-def _common_parts(context: StageContext, metrics: Mapping[str, Any]) -> tuple[dict[str, Any], Mesh]:
-    """What all pages show, and the undeformed body."""
-    config = context.settings["config"]
-    mesh = build_mesh(config["mesh"])
+def _common_parts(config: Mapping[str, Any], metrics: Mapping[str, Any], mesh: Mesh) -> dict[str, Any]:
+    """What all pages show."""
     return {
         "experiment": config["name"],
         "title": config["title"],
@@ -153,7 +149,7 @@ def _common_parts(context: StageContext, metrics: Mapping[str, Any]) -> tuple[di
         "published": published_errors(config["name"]),
         "published_horizons": PUBLISHED_WINDOWS_MM.get(config["name"], {}),
         "published_note": published_note(config),
-    }, mesh
+    }
 
 
 def common_folder(folder: Path) -> Path:
@@ -171,12 +167,7 @@ def collect_metrics(folder: Path, config: Mapping[str, Any], stages: Sequence[st
     """What metrics.json of a split says.
 
     Errors, the noise in them where known, which weights were kept, what was identified and reconstructed, time and
-    memory of the stages, versions and device.
-
-    Args:
-        folder: of the split.
-        config: with the key ``device``.
-        stages: names of the stages; those that are done in the order of their end, if left out.
+    memory of the stages (those that are done in the order of their end, if left out), versions and device.
     """
     if stages is None:
         records = sorted((folder / "stages").glob("*.json"), key=lambda path: path.stat().st_mtime_ns)
@@ -231,13 +222,9 @@ def published_note(config: Mapping[str, Any]) -> str:
 
 
 def read_trials(folder: Path, config: Mapping[str, Any]) -> Trials:
-    """What was observed in the test trials and what the models made of them, as long as it counts.
+    """What was observed in the test trials of a split and what the models made of them, as long as it counts.
 
     Roll-outs at other pressures than those of the data set are left out.
-
-    Args:
-        folder: of the split.
-        config: with the group ``data``.
 
     Raises:
         DataFileError: a file is missing or damaged, or the two do not belong together.
@@ -247,7 +234,8 @@ def read_trials(folder: Path, config: Mapping[str, Any]) -> Trials:
     bound = build_mesh(config["mesh"]).vertices if dataset.bound is None else dataset.bound
     with read_hdf5(folder / ROLLOUTS, "rollouts") as file:
         rolled = tuple(str(each) for each in file.attrs["names"])
-        test = [name for name in rolled if name not in _scaled_names(folder)]
+        scaled = _read_scaled(folder)
+        test = [name for name in rolled if scaled is None or name not in scaled.names]
         models = [model for model in MODELS if f"{model}_observed" in file]
         unknown = sorted(set(test) - set(dataset.names))
         if unknown or not models:
@@ -274,10 +262,10 @@ def read_trials(folder: Path, config: Mapping[str, Any]) -> Trials:
     )
 
 
-def _scaled_names(folder: Path) -> tuple[str, ...]:
+def _read_scaled(folder: Path) -> Dataset | None:
     """The trials at other pressures than those of the data set."""
     path = common_folder(folder) / SCALED_DATASET
-    return read_dataset(path).names if path.is_file() else ()
+    return read_dataset(path) if path.is_file() else None
 
 
 def read_film(folder: Path) -> Film | None:
@@ -292,26 +280,21 @@ def read_film(folder: Path) -> Film | None:
         return Film(str(file.attrs["film_trial"]), float(file.attrs["time_step"]) * steps, bodies)
 
 
-def read_pressures(folder: Path, config: Mapping[str, Any], trials: Trials) -> Pressures | None:
-    """The pressures of all trials; None where no pressure drives them.
-
-    Args:
-        folder: of the split.
-        config: with the group ``data``.
-        trials: of the test.
-
-    Raises:
-        DataFileError: a file is missing or damaged.
-    """
+def read_pressures(folder: Path, config: Mapping[str, Any]) -> Pressures | None:
+    """The pressures of all trials of a split; None where no pressure drives them."""
+    dataset, scaled = read_dataset(common_folder(folder) / DATASET), _read_scaled(folder)
+    if PRESSURE not in dataset.inputs:
+        return None
     values: dict[str, Any] = {}
-    common, scaled = common_folder(folder), _scaled_names(folder)
-    for name in (DATASET, *((SCALED_DATASET,) if scaled else ())):
-        dataset = read_dataset(common / name)
-        if PRESSURE not in dataset.inputs:
-            return None
-        values |= dict(zip(dataset.names, dataset.inputs[PRESSURE], strict=True))
-    poses = tuple(name for name, begins in zip(dataset.names, dataset.begins, strict=True) if begins == STATIC)
-    return Pressures(dataset.channels[PRESSURE], values, config["data"].get("pressure_limit"), scaled, poses)
+    for each in (dataset, *([] if scaled is None else [scaled])):
+        values |= dict(zip(each.names, each.inputs[PRESSURE], strict=True))
+    return Pressures(
+        dataset.channels[PRESSURE],
+        values,
+        config["data"].get("pressure_limit"),
+        scaled=() if scaled is None else scaled.names,
+        poses=tuple(n for n, begins in zip(dataset.names, dataset.begins, strict=True) if begins == STATIC),
+    )
 
 
 def _driven_chambers(chambers: tuple[Chamber, ...], names: tuple[str, ...]) -> tuple[Chamber, ...]:
@@ -351,9 +334,6 @@ def read_recordings(
         config: with the group ``markers``, where markers are observed.
         mesh: the body as it is at rest.
         moved: (3,) how far nominal places, which are on the undeformed body, move until it is at rest, by label [m].
-
-    Raises:
-        DataFileError: a file is missing or damaged.
     """
     if not sees_markers(config):
         return None
@@ -365,8 +345,9 @@ def read_recordings(
         raise DataFileError(f"{path} has no positions: delete it and run the same command again.")
     nominal: dict[str, Any] = {**config["markers"]["tracked"], **(config["markers"]["reference"] or {})}
     labels = [label for label in each["positions"] if label in nominal]
-    places = np.array([_numbers(each["positions"][label]) for label in labels])
-    residual = np.array([np.nan if (r := each["residual_mm"].get(label)) is None else 1e-3 * r for label in labels])
+    # What JSON has as null was not seen.
+    places = np.array([each["positions"][label] or (None,) * 3 for label in labels], dtype=np.float64)
+    residual = 1e-3 * np.array([each["residual_mm"].get(label) for label in labels], dtype=np.float64)
     registration = Registration(
         names=tuple(labels),
         transform=RigidTransform(np.eye(3), np.zeros(3)),
@@ -388,11 +369,6 @@ def read_recordings(
         feet=feet,
         mesh=mesh,
     )
-
-
-def _numbers(point: Any) -> list[float]:
-    """Three coordinates; what JSON has as null was not seen."""
-    return [float("nan") if each is None else float(each) for each in point or (None,) * 3]
 
 
 def network_in_words(config: dict[str, Any]) -> str:

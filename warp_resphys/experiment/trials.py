@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -211,14 +212,10 @@ def _named(config: Mapping[str, Any], group: str) -> dict[str, list[str]]:
         raise InputError(
             f"{group}.train, {group}.validation and {group}.test ask for {asked} trials, but there are {len(known)}."
         )
-    counted, lists = 0, {}
+    rest, lists = iter(known), {}
     for name in SPLITS:
         wanted = settings[name]
-        if isinstance(wanted, int):
-            lists[name] = known[counted : counted + wanted]
-            counted += wanted
-        else:
-            lists[name] = [str(each) for each in wanted]
+        lists[name] = [*islice(rest, wanted)] if isinstance(wanted, int) else [str(each) for each in wanted]
         unknown = [each for each in lists[name] if each not in known]
         if unknown:
             raise InputError(
@@ -227,12 +224,14 @@ def _named(config: Mapping[str, Any], group: str) -> dict[str, list[str]]:
         if not lists[name] and not (name == "validation" and config["in_the_loop"]):
             more = ", or set data.folds to leave_one_out" if group == "data" else ""
             raise InputError(f"{group}.{name} is empty: name one of {group}.trials there{more}.")
-    everything = [(trial, name) for name, members in lists.items() for trial in members]
-    for place, (trial, name) in enumerate(everything):
-        before = [other for same, other in everything[:place] if same == trial]
-        if before:
-            where = f"twice in {group}.{name}" if before[0] == name else f"in {group}.{before[0]} and {group}.{name}"
+    seen: dict[str, str] = {}
+    for name, trial in ((name, trial) for name, members in lists.items() for trial in members):
+        if trial in seen:
+            where = (
+                f"twice in {group}.{name}" if seen[trial] == name else f"in {group}.{seen[trial]} and {group}.{name}"
+            )
             raise InputError(f"the trial '{trial}' is {where}: every trial is in one split, once.")
+        seen[trial] = name
     return lists
 
 

@@ -47,19 +47,13 @@ _CHECKSUM = "CRC-32"
 
 @dataclass(frozen=True)
 class Field:
-    """One array of every step.
+    """One array of every step."""
 
-    Attributes:
-        shape: Its shape in one step; () for a number.
-        units: SI units, stored beside the dataset; "1" for numbers without a unit.
-        dtype: NumPy's name of its type.
-        batch_axes: How many of its leading axes stand before the one that counts steps in the final dataset: with 1,
-            steps of (B, N, 3) become (B, T, N, 3), with 0 they become (T, B, N, 3).
-    """
-
-    shape: tuple[int, ...]
-    units: str
-    dtype: str = "float64"
+    shape: tuple[int, ...]  # Its shape in one step; () for a number
+    units: str  # SI units, stored beside the dataset; "1" for numbers without a unit
+    dtype: str = "float64"  # NumPy's name of its type
+    # How many of its leading axes stand before the one that counts steps in the final dataset: with 1, steps of
+    # (B, N, 3) become (B, T, N, 3), with 0 they become (T, B, N, 3)
     batch_axes: int = 0
 
 

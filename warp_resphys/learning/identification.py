@@ -8,7 +8,7 @@ gradients through the simulator.
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import product
+from itertools import product, takewhile
 from typing import Any
 
 import numpy as np
@@ -29,17 +29,11 @@ _DIFFERENCE = 1e-3  # of a range, for derivatives by differences
 
 @dataclass(frozen=True)
 class Bounds:
-    """The range of a parameter.
+    """The range of a parameter."""
 
-    Attributes:
-        lower: in the parameter's unit.
-        upper: the same.
-        logarithmic: whether it is searched on a logarithmic scale.
-    """
-
-    lower: float
-    upper: float
-    logarithmic: bool = False
+    lower: float  # in the parameter's unit
+    upper: float  # the same
+    logarithmic: bool = False  # whether it is searched on a logarithmic scale
 
     def __post_init__(self) -> None:
         """Checks the range.
@@ -63,41 +57,34 @@ class Bounds:
             return self.lower * torch.exp(unit * math.log(self.upper / self.lower))
         return self.lower + unit * (self.upper - self.lower)
 
+    def slope(self, unit: float) -> float:
+        """Derivative of a value by its fraction."""
+        if self.logarithmic:
+            return self.lower * (self.upper / self.lower) ** unit * math.log(self.upper / self.lower)
+        return self.upper - self.lower
+
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """What the data say about the parameters near the minimum (Gauss-Newton approximation).
+    """What the data say about the parameters near the minimum (Gauss-Newton approximation)."""
 
-    Attributes:
-        deviation: standard deviation of each parameter, in its unit.
-        correlation: (P, P) of the parameters, in their order.
-        poorest: the direction that the data tell least about: weights of the parameters, in fractions of their ranges.
-        poorest_deviation: standard deviation along it, as a fraction of the ranges.
-    """
-
-    deviation: dict[str, float]
-    correlation: list[list[float]]
+    deviation: dict[str, float]  # standard deviation of each parameter, in its unit
+    correlation: list[list[float]]  # (P, P) of the parameters, in their order
+    # the direction that the data tell least about: weights of the parameters, in fractions of their ranges
     poorest: dict[str, float]
-    poorest_deviation: float
+    poorest_deviation: float  # standard deviation along it, as a fraction of the ranges
 
 
 @dataclass
 class Identification:
-    """Result of an identification.
+    """Result of an identification."""
 
-    Attributes:
-        parameters: the values of the smallest loss.
-        loss: that loss, relative to the motions' amplitudes.
-        history: for every start the records ``loss`` and the parameters, one an evaluation that did not fail.
-        at_bounds: parameters that ended on a bound.
-        uncertainty: see the class; None if the simulation fails beside the minimum.
-    """
-
-    parameters: dict[str, float]
-    loss: float
+    parameters: dict[str, float]  # the values of the smallest loss
+    loss: float  # that loss, relative to the motions' amplitudes
+    # for every start the records ``loss`` and the parameters, one an evaluation that did not fail
     history: list[list[dict[str, float]]] = field(default_factory=list)
-    at_bounds: tuple[str, ...] = ()
-    uncertainty: Uncertainty | None = None
+    at_bounds: tuple[str, ...] = ()  # parameters that ended on a bound
+    uncertainty: Uncertainty | None = None  # see the class; None if the simulation fails beside the minimum
 
 
 class Identifier:
@@ -347,20 +334,14 @@ class Identifier:
         inverse = (vectors / np.maximum(values, 1e-12 * max(values[-1], 1e-300))) @ vectors.T
         covariance = inverse @ np.einsum("r,rpq->pq", variances, blocks) @ inverse
         deviation = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-        slopes = [self._slope(name, u) for name, u in zip(self.bounds, unit, strict=True)]
+        slopes = [bounds.slope(u) for bounds, u in zip(self.bounds.values(), unit, strict=True)]
         poorest = vectors[:, 0] * np.sign(vectors[np.abs(vectors[:, 0]).argmax(), 0])
         return Uncertainty(
-            deviation={n: float(d * s) for n, d, s in zip(self.bounds, deviation, slopes, strict=True)},
+            deviation=dict(zip(self.bounds, (deviation * slopes).tolist(), strict=True)),
             correlation=(covariance / np.outer(deviation, deviation)).tolist(),
             poorest=dict(zip(self.bounds, poorest.tolist(), strict=True)),
             poorest_deviation=float(np.sqrt(max(vectors[:, 0] @ covariance @ vectors[:, 0], 0.0))),
         )
-
-    def _slope(self, name: str, unit: float) -> float:
-        """Derivative of a parameter with respect to its fraction."""
-        x = torch.tensor(float(unit), dtype=torch.float64, requires_grad=True)
-        (slope,) = torch.autograd.grad(self.bounds[name].from_unit(x), x)
-        return float(slope)
 
 
 def _redundancy(series: NDArray[np.float64]) -> float:
@@ -370,9 +351,4 @@ def _redundancy(series: NDArray[np.float64]) -> float:
     products = [float((series[lag:] * series[: len(series) - lag]).sum()) for lag in range(len(series) // 2)]
     if products[0] <= 0.0:
         return 1.0
-    total = 1.0
-    for value in products[1:]:
-        if value <= 0.0:
-            break
-        total += 2.0 * value / products[0]
-    return total
+    return 1.0 + 2.0 * sum(takewhile(lambda value: value > 0.0, products[1:])) / products[0]

@@ -13,7 +13,7 @@ sees stays at zero.
 import copy
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar, Self
+from typing import Any, Self
 
 import numpy as np
 import scipy.optimize
@@ -28,22 +28,16 @@ from ..dynamics.simulator import Constants, Simulator
 from ..io.errors import ConvergenceError, InputError
 from ..linalg.least_squares import minimise
 from ..linalg.threads import threads_for
-from .reconstruction_problems import FullStateProblem, MarkerForceProblem, MarkerPositionProblem, StepProblem
+from .reconstruction_problems import FullStateProblem, MarkerForceProblem, MarkerPositionProblem, Step, StepProblem
 
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """One reconstructed step.
+    """One reconstructed step."""
 
-    Attributes:
-        state: where the simulator gets with the force.
-        force: (B, N, 3) [N]; zero at fixed vertices.
-        iterations: of the optimisation.
-    """
-
-    state: State
-    force: torch.Tensor
-    iterations: int
+    state: State  # where the simulator gets with the force
+    force: torch.Tensor  # (B, N, 3) [N]; zero at fixed vertices
+    iterations: int  # of the optimisation
 
 
 class Reconstructor(ABC):
@@ -107,14 +101,19 @@ class Reconstructor(ABC):
         """
 
 
-class _LeastSquares(Reconstructor):
-    """A method of `linalg.least_squares`; its ``tolerance`` is the last change of any position [m]."""
+class LeastSquares(Reconstructor):
+    """A method of `linalg.least_squares`; its ``tolerance`` is the last change of any position [m].
 
-    name: ClassVar[str]
-    remedies: ClassVar[str] = "reconstruction.regularisation or reconstruction.max_iterations"
+    Args:
+        problem: what it minimises.
+        modes: columns of B; every force on the free vertices where left out.
+        settings: see `Reconstructor`.
+    """
 
-    @abstractmethod
-    def _problem(self, state: State, observed: torch.Tensor, inputs: Inputs) -> StepProblem: ...
+    def __init__(self, problem: type[StepProblem], modes: int | None, *settings: Any) -> None:
+        super().__init__(*settings)
+        self._problem = problem
+        self._basis = None if modes is None else vibration_modes(self.simulator, modes)
 
     @override
     def step(
@@ -124,85 +123,20 @@ class _LeastSquares(Reconstructor):
         inputs: Inputs | None = None,
         first_guess: torch.Tensor | None = None,
     ) -> Reconstruction:
-        inputs = inputs or Inputs()
-        problem = self._problem(state, observed, inputs)
+        acting, constants = inputs or Inputs(), self._constants
+        step = Step(self.simulator, constants, state, acting, observed, self.regularisation, self.markers, self._basis)
         with threads_for(state.q.numel()), torch.no_grad():
+            problem = self._problem(step)
             found = minimise(problem, problem.start(first_guess), self.tolerance, self.max_iterations)
             x, force = (each.to(self.simulator.dtype) for each in problem.reached(found.point))
             if not found.settled:
                 raise ConvergenceError(
-                    f"{self.name} reconstruction moved by {found.moved:.1e} m in its last iteration, the "
-                    f"{found.iterations}th: raise {self.remedies}.",
+                    f"{problem.method} reconstruction moved by {found.moved:.1e} m in its last iteration, the "
+                    f"{found.iterations}th: raise {problem.remedies}.",
                     x,
                     None,
                 )
-            new = self.simulator.linearise(state, inputs, self._constants).finish(x)
-        return Reconstruction(new, force, found.iterations)
-
-
-class GaussNewton(_LeastSquares):
-    """In the positions of full states, from the observed ones on; see `FullStateProblem`.
-
-    Where x stands at a fraction e of the time step, |q+ - q*| is |x - x*| / e, and lambda e^2 takes lambda's place.
-    """
-
-    name = "Gauss-Newton"
-    remedies = "reconstruction.max_iterations or reconstruction.tolerance"
-
-    @override
-    def _problem(self, state: State, observed: torch.Tensor, inputs: Inputs) -> StepProblem:
-        step = self.simulator.linearise(state, inputs, self._constants)
-        target = step.hold(self.simulator.method.solution_for(state, observed))
-        return FullStateProblem(step, target, self.regularisation * step.stage.end**2)
-
-
-class SparseGaussNewton(_LeastSquares):
-    """Gauss-Newton in the positions and forces at once; see `MarkerPositionProblem`.
-
-    Args:
-        simulator: the one to correct.
-        markers: C.
-        regularisation: lambda.
-        tolerance: see above.
-        max_iterations: after which a step has failed.
-        modes: columns of B; every force on the free vertices where left out.
-    """
-
-    name = "sparse Gauss-Newton"
-
-    def __init__(
-        self,
-        simulator: Simulator,
-        markers: Markers | None,
-        regularisation: float,
-        tolerance: float,
-        max_iterations: int,
-        modes: int | None = None,
-    ) -> None:
-        super().__init__(simulator, markers, regularisation, tolerance, max_iterations)
-        self._basis = None if modes is None else vibration_modes(simulator, modes)
-
-    @override
-    def _problem(self, state: State, observed: torch.Tensor, inputs: Inputs) -> StepProblem:
-        assert self.markers is not None
-        step = self.simulator.linearise(state, inputs, self._constants)
-        return MarkerPositionProblem(step, self.markers, observed, self.regularisation, self._basis)
-
-
-class SparseLevenbergMarquardt(_LeastSquares):
-    """Levenberg-Marquardt in the forces, for motions that Gauss-Newton does not follow, such as jerks of real bodies.
-
-    Every trial force is followed by a whole step of the simulator, with its line search; see `MarkerForceProblem`.
-    """
-
-    name = "sparse Levenberg-Marquardt"
-
-    @override
-    def _problem(self, state: State, observed: torch.Tensor, inputs: Inputs) -> StepProblem:
-        assert self.markers is not None
-        return MarkerForceProblem(
-            self.simulator, self._constants, state, inputs, self.markers, observed, self.regularisation
-        )
+            return Reconstruction(step.linearise().finish(x), force, found.iterations)
 
 
 class LBFGSB(Reconstructor):
@@ -281,22 +215,16 @@ def make_reconstructor(
         InputError: an unknown method, modes for a method without them, a number out of range, or a marker on a vertex
             that the body does not have.
     """
-    methods: dict[str, type[Reconstructor]] = {"gauss_newton": GaussNewton, "lbfgsb": LBFGSB}
+    problems: dict[str, type[StepProblem]] = {"gauss_newton": FullStateProblem}
     if markers is not None:
-        methods = {
-            "gauss_newton": SparseGaussNewton,
-            "levenberg_marquardt": SparseLevenbergMarquardt,
-            "lbfgsb": LBFGSB,
-        }
-    if method not in methods:
-        raise InputError(f"reconstruction.method is {method!r}: choose one of {', '.join(methods)}.")
-    settings = (simulator, markers, regularisation, tolerance, max_iterations)
-    if modes is None:
-        return methods[method](*settings)
-    if markers is None:
+        problems = {"gauss_newton": MarkerPositionProblem, "levenberg_marquardt": MarkerForceProblem}
+    if method not in (*problems, "lbfgsb"):
+        raise InputError(f"reconstruction.method is {method!r}: choose one of {', '.join(problems)}, lbfgsb.")
+    if modes is not None and markers is None:
         raise InputError("reconstruction.modes is for bodies that are seen through markers: leave it out.")
-    if method != "gauss_newton":
+    if modes is not None and method != "gauss_newton":
         raise InputError(
             f"{modes} modes are asked for, but reconstruction.method={method} has none: take gauss_newton."
         )
-    return SparseGaussNewton(*settings, modes)
+    settings = (simulator, markers, regularisation, tolerance, max_iterations)
+    return LBFGSB(*settings) if method == "lbfgsb" else LeastSquares(problems[method], modes, *settings)

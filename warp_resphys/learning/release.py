@@ -18,7 +18,7 @@ from ..dynamics.integrator import State
 from ..dynamics.modes import resolved, vibration_modes, with_signs
 from ..dynamics.simulator import Simulator
 from ..io.errors import ConvergenceError, InputError
-from ..linalg.least_squares import Point, Problem, Step, damped, minimise
+from ..linalg.least_squares import Move, Point, Problem, damped, minimise
 from .replay import Observe, Replay, Start
 
 _HOLD_ITERATIONS = 100
@@ -31,36 +31,24 @@ _RELEASE_TOLERANCE, _DIFFERENCE, _LONGEST_STEP = 1e-4, 0.05, 3.0  # in expected 
 
 @dataclass(frozen=True)
 class ReleaseSettings:
-    """How the beginning of a motion is estimated.
+    """How the beginning of a motion is estimated."""
 
-    Attributes:
-        hold_modes: vibration modes whose inertial forces hold the body; 0 lets it go from where gravity leaves it.
-        velocity_modes: vibration modes that the velocity at the release is made of; 0 for none.
-        window: how much of the motion after the release is used [s].
-        noise: what a marker may be off for reasons that no release explains [m].
-        delay: expected deviation of the moment of release from the one found in the frames [s]; 0 keeps that one.
-        speed: expected size of the velocity of the fastest vertex [m/s].
-        sideways: expected displacement, across gravity, of a body that seems to be held undeformed [m]: as a sideways
-            acceleration bends it, at the vertex that moves furthest; 0 for none. Along gravity it would be mistaken for
-            a weight or a stiffness.
-        iterations: Levenberg-Marquardt steps.
-    """
-
+    # vibration modes whose inertial forces hold the body; 0 lets it go from where gravity leaves it
     hold_modes: int = 6
-    velocity_modes: int = 0
-    window: float = 0.13
-    noise: float = 3e-4
+    velocity_modes: int = 0  # vibration modes that the velocity at the release is made of; 0 for none
+    window: float = 0.13  # how much of the motion after the release is used [s]
+    noise: float = 3e-4  # what a marker may be off for reasons that no release explains [m]
+    # expected deviation of the moment of release from the one found in the frames [s]; 0 keeps that one
     delay: float = 0.0
-    speed: float = 0.05
+    speed: float = 0.05  # expected size of the velocity of the fastest vertex [m/s]
+    # expected displacement, across gravity, of a body that seems to be held undeformed [m]: as a sideways
+    # acceleration bends it, at the vertex that moves furthest; 0 for none. Along gravity it would be mistaken for
+    # a weight or a stiffness
     sideways: float = 0.0
-    iterations: int = 4
+    iterations: int = 4  # Levenberg-Marquardt steps
 
     def __post_init__(self) -> None:
-        """Checks the ranges.
-
-        Raises:
-            InputError: a number out of range.
-        """
+        """Checks the ranges; raises InputError for a number out of range."""
         for name in ("window", "noise", "speed", "iterations"):
             if not getattr(self, name) > 0:
                 raise InputError(f"release.{name} is {getattr(self, name)}: it must be positive.")
@@ -141,7 +129,7 @@ class _Held(Problem):
         return Point(x, kept[1].square().sum(1) + (self._weight * x.square()).sum(1), kept)
 
     @override
-    def linearise(self, point: Point) -> Step:
+    def linearise(self, point: Point) -> Move:
         self._near, missing, slope = point.kept
         matrix = slope.mT @ slope + torch.diag_embed(self._weight.expand_as(point.x))
         right = -(slope.mT @ missing[..., None])[..., 0] - self._weight * point.x
@@ -199,7 +187,7 @@ class _FirstFrames(Problem):
         return Point(x, residual[0].square().sum(1) + x.square().sum(1), (slope.mT @ slope + identity, gradient))
 
     @override
-    def linearise(self, point: Point) -> Step:
+    def linearise(self, point: Point) -> Move:
         matrix, gradient = point.kept
 
         def step(damping: torch.Tensor) -> torch.Tensor:

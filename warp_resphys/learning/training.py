@@ -19,41 +19,27 @@ SELECTIONS = ("rollout", "validation_loss")
 
 @dataclass(frozen=True)
 class Samples:
-    """States and the fields that belong to them.
+    """States and the fields that belong to them."""
 
-    Attributes:
-        q: (S, N, 3) positions [m].
-        v: (S, N, 3) velocities [m/s].
-        outputs: the fields, each (S, N, 3).
-        actuation: (S, A) what else acts on the body; None if nothing does.
-        lengths: of the series that the samples are, one after the other, if they are.
-    """
-
-    q: torch.Tensor
-    v: torch.Tensor
-    outputs: tuple[torch.Tensor, ...]
-    actuation: torch.Tensor | None = None
-    lengths: tuple[int, ...] = ()
+    q: torch.Tensor  # (S, N, 3) positions [m]
+    v: torch.Tensor  # (S, N, 3) velocities [m/s]
+    outputs: tuple[torch.Tensor, ...]  # the fields, each (S, N, 3)
+    actuation: torch.Tensor | None = None  # (S, A) what else acts on the body; None if nothing does
+    lengths: tuple[int, ...] = ()  # of the series that the samples are, one after the other, if they are
 
 
 @dataclass
 class TrainingState:
-    """All that training goes on from.
+    """All that training goes on from."""
 
-    Attributes:
-        epoch: epochs done.
-        history: one record an epoch: ``epoch``, ``train_loss``, ``validation_loss``, ``learning_rate``, and
-            ``rollout_error_mm`` where it was measured; infinite where a roll-out diverged.
-        best_score: smallest so far of what weights are selected by, a roll-out error [mm] or a validation loss.
-        best_epoch: after which it was reached.
-        best: weights that had it.
-    """
-
-    epoch: int = 0
+    epoch: int = 0  # epochs done
+    # one record an epoch: ``epoch``, ``train_loss``, ``validation_loss``, ``learning_rate``, and
+    # ``rollout_error_mm`` where it was measured; infinite where a roll-out diverged
     history: list[dict[str, float]] = field(default_factory=list)
+    # smallest so far of what weights are selected by, a roll-out error [mm] or a validation loss
     best_score: float = math.inf
-    best_epoch: int = 0
-    best: dict[str, torch.Tensor] = field(default_factory=dict)
+    best_epoch: int = 0  # after which it was reached
+    best: dict[str, torch.Tensor] = field(default_factory=dict)  # weights that had it
 
 
 class EpochTrainer(ABC, Generic[Model]):

@@ -18,7 +18,7 @@ from typing_extensions import override
 
 Array = NDArray[np.float64]
 Objective = Callable[[Array], tuple[float, Array]]
-Step = Callable[[torch.Tensor], torch.Tensor]
+Move = Callable[[torch.Tensor], torch.Tensor]
 
 _FADING, _GROWTH, _MOST_DAMPING = 0.1, 10.0, 1e12
 _MARQUARDT = 1e-2  # of a diagonal entry, what a damping of one adds to it
@@ -29,17 +29,11 @@ _SMALL = 1e-4
 
 @dataclass(frozen=True)
 class Point:
-    """Where a batch of problems is.
+    """Where a batch of problems is."""
 
-    Attributes:
-        x: (B, ...) unknowns.
-        value: (B,) objective; infinite where there is none, as where a simulation fails.
-        kept: what the problem keeps of its evaluation, each (B, ...).
-    """
-
-    x: torch.Tensor
-    value: torch.Tensor
-    kept: tuple[torch.Tensor, ...] = ()
+    x: torch.Tensor  # (B, ...) unknowns
+    value: torch.Tensor  # (B,) objective; infinite where there is none, as where a simulation fails
+    kept: tuple[torch.Tensor, ...] = ()  # what the problem keeps of its evaluation, each (B, ...)
 
 
 class Problem(ABC):
@@ -50,7 +44,7 @@ class Problem(ABC):
         """The point at unknowns (B, ...)."""
 
     @abstractmethod
-    def linearise(self, point: Point) -> Step:
+    def linearise(self, point: Point) -> Move:
         """Of a damping (B,), zero or more, to the unknowns that minimise the damped linearisation about the point."""
 
     @abstractmethod
@@ -60,19 +54,12 @@ class Problem(ABC):
 
 @dataclass(frozen=True)
 class Solution:
-    """What `minimise` found.
+    """What `minimise` found."""
 
-    Attributes:
-        point: the last one that was taken.
-        iterations: steps that were tried.
-        settled: whether every problem of the batch has.
-        moved: the furthest distance of the last step.
-    """
-
-    point: Point
-    iterations: int
-    settled: bool
-    moved: float
+    point: Point  # the last one that was taken
+    iterations: int  # steps that were tried
+    settled: bool  # whether every problem of the batch has
+    moved: float  # the furthest distance of the last step
 
 
 @torch.no_grad()
@@ -138,7 +125,7 @@ class UnitBox(Problem):
         return Point(x, x.new_tensor([value]), (x.new_tensor(gradient)[None],))
 
     @override
-    def linearise(self, point: Point) -> Step:
+    def linearise(self, point: Point) -> Move:
         (x,), (gradient,) = point.x, point.kept[0]
         found = self._matrix(x.numpy())
         if found is None or not np.isfinite(found).all() or not np.trace(found) > 0.0:

@@ -7,16 +7,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from ..io.files import write_text
-from .figures import STYLE, TONES, FloatArray, new_figure, use_logarithm
+from .figures import TONES, FloatArray, in_style, new_figure, use_logarithm
 from .page import (
     NO_BREAK_SPACE,
-    Picture,
     draw_picture,
     duration_text,
     figures_beside,
@@ -31,26 +28,15 @@ FIGURE = "marker_ablation"
 
 @dataclass(frozen=True)
 class AblationReport:
-    """Everything that the page shows.
+    """Everything that the page shows."""
 
-    Attributes:
-        title: The page's heading.
-        experiment: Name of the experiment.
-        metrics: What `metrics.json` holds: `uncorrected_mm`, `by_markers` (a row a number of markers), `seconds`,
-            `peak_memory_gib`, `versions` and `device`.
-        settings: The run's configuration, nested.
-        vertices: Vertices of the mesh.
-        surface: Those on its surface.
-        free_surface: Those of them that are not clamped.
-    """
-
-    title: str
-    experiment: str
-    metrics: Mapping[str, Any]
-    settings: Mapping[str, Any]
-    vertices: int
-    surface: int
-    free_surface: int
+    title: str  # The page's heading.
+    experiment: str  # Its name.
+    metrics: Mapping[str, Any]  # `uncorrected_mm`, `by_markers` (a row a number of markers), resources and versions.
+    settings: Mapping[str, Any]  # The run's configuration, nested.
+    vertices: int  # Of the mesh.
+    surface: int  # Those on its surface.
+    free_surface: int  # Those of them that are not clamped.
 
 
 def write_ablation_report(path: Path, data: AblationReport) -> None:
@@ -64,7 +50,8 @@ def write_ablation_report(path: Path, data: AblationReport) -> None:
         DataFileError: A file could not be written.
     """
     with figures_beside(path) as folder:
-        picture = _draw(data, folder)
+        draw = partial(marker_boxes, box_errors(data.metrics), data.metrics["uncorrected_mm"])
+        picture = draw_picture(folder, FIGURE, draw, describe_boxes(data.metrics))
     rows = data.metrics["by_markers"]
     page = page_template("ablation.html").render(
         title=data.title,
@@ -82,12 +69,7 @@ def write_ablation_report(path: Path, data: AblationReport) -> None:
 
 
 def verdict(rows: Sequence[Mapping[str, Any]], uncorrected: float) -> str:
-    """Say from how many markers on the error stays below the published thresholds.
-
-    Args:
-        rows: `by_markers` of the metrics.
-        uncorrected: Error without any correction [mm].
-    """
+    """Say from how many markers on the error stays below the published thresholds; uncorrected, it is this many mm."""
     enough = _from_here_on(rows, "median_mm", 0.1)
     said = (
         "With none of these numbers of markers does the median error stay below 0.1 mm."
@@ -111,26 +93,18 @@ def _from_here_on(rows: Sequence[Mapping[str, Any]], key: str, below: float) -> 
     return found
 
 
-def _draw(data: AblationReport, folder: Path) -> Picture:
-    draw = partial(marker_boxes, box_errors(data.metrics), data.metrics["uncorrected_mm"])
-    return draw_picture(folder, FIGURE, draw, describe_boxes(data.metrics))
-
-
-def box_errors(metrics: Mapping[str, Any]) -> dict[int, NDArray[np.float64]]:
+def box_errors(metrics: Mapping[str, Any]) -> dict[int, FloatArray]:
     """Return the draws' errors [mm] by number of markers."""
     return {int(row["markers"]): np.array(row["errors_mm"]) for row in metrics["by_markers"]}
 
 
 def describe_boxes(metrics: Mapping[str, Any]) -> str:
-    """Say what the box plot shows.
-
-    Args:
-        metrics: With `by_markers`.
-    """
+    """Say what the box plot shows, by `by_markers`."""
     medians = "; ".join(f"{row['markers']}: {number_text(row['median_mm'])} mm" for row in metrics["by_markers"])
     return f"Box plot of the mean vertex error by number of markers, on a logarithmic axis. Medians: {medians}."
 
 
+@in_style()
 def marker_boxes(
     errors: Mapping[int, FloatArray], uncorrected: float, published: tuple[int, float] | None = None, *, narrow: bool
 ) -> Figure:
@@ -142,35 +116,25 @@ def marker_boxes(
         published: From which number of markers on the published median is below what error [mm].
         narrow: Whether the figure is for a narrow page.
     """
-    ink, strong = {"color": TONES["ink"].light, "linewidth": 0.9}, TONES["simulation"].light
-    with mpl.rc_context(STYLE):
-        figure = new_figure(3.6, 3.4, narrow=narrow)
-        axes = figure.subplots()
-        places = range(1, len(errors) + 1)
-        axes.boxplot(
-            [*errors.values()],
-            positions=places,
-            widths=0.55,
-            whis=(0, 100),
-            boxprops=ink,
-            whiskerprops=ink,
-            capprops=ink,
-            medianprops={"color": strong, "linewidth": 2.0},
-        )
-        lines = {"uncorrected simulation": (0.5, uncorrected)}
-        if published is not None:
-            start = 0.5 + sum(count < published[0] for count in errors)
-            lines["published median: below" if narrow else "published: the median is below"] = (start, published[1])
-        for text, (start, level) in lines.items():
-            grey = TONES["muted"].light
-            axes.plot([start, len(errors) + 0.5], [level, level], color=grey, linewidth=1.1, linestyle="--")
-            place = (len(errors) + 0.5, level)
-            axes.annotate(text, place, (-2, 3), textcoords="offset points", ha="right", color=grey)
-        axes.set_xlim(0.5, len(errors) + 0.5)
-        axes.set_xticks([*places], [str(count) for count in errors])
-        axes.set_yscale("log")
-        axes.set_ylim(top=1.6 * max(uncorrected, *(row.max() for row in errors.values())))
-        use_logarithm(axes)
-        axes.grid(visible=False, axis="x")
-        axes.set(xlabel="number of markers", ylabel="mean vertex error [mm]")
+    ink: dict[str, Any] = {"color": TONES["ink"].light, "linewidth": 0.9}
+    median = {"color": TONES["simulation"].light, "linewidth": 2.0}
+    figure = new_figure(3.6, 3.4, narrow=narrow)
+    axes, count = figure.subplots(), len(errors)
+    lines: Any = {"boxprops": ink, "whiskerprops": ink, "capprops": ink, "medianprops": median}
+    axes.boxplot([*errors.values()], widths=0.55, whis=(0, 100), **lines)
+    levels = {"uncorrected simulation": (0.5, uncorrected)}
+    if published is not None:
+        start = 0.5 + sum(markers < published[0] for markers in errors)
+        levels["published median: below" if narrow else "published: the median is below"] = (start, published[1])
+    for text, (start, level) in levels.items():
+        grey = TONES["muted"].light
+        axes.plot([start, count + 0.5], [level, level], color=grey, linewidth=1.1, linestyle="--")
+        axes.annotate(text, (count + 0.5, level), (-2, 3), textcoords="offset points", ha="right", color=grey)
+    axes.set_xlim(0.5, count + 0.5)
+    axes.set_xticks(range(1, count + 1), [str(markers) for markers in errors])
+    axes.set_yscale("log")
+    axes.set_ylim(top=1.6 * max(uncorrected, *(row.max() for row in errors.values())))
+    use_logarithm(axes)
+    axes.grid(visible=False, axis="x")
+    axes.set(xlabel="number of markers", ylabel="mean vertex error [mm]")
     return figure

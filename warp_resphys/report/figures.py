@@ -407,5 +407,10 @@ def use_logarithm(axes: Axes, least: float = 0.0) -> None:
 
 
 def _power(value: float) -> str:
-    exponent = round(math.log10(value))
-    return "10" + str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+    exponent = math.floor(math.log10(value) + 1e-9)
+    times = round(value / 10.0**exponent)
+    return (
+        f"{times}·10" * (times > 1)
+        + "10" * (times == 1)
+        + str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+    )

@@ -295,15 +295,20 @@ def _pressures(axes: Axes, times: FloatArray, pressure: FloatArray, limit: float
 
 @in_style()
 def pose_pressures(pressures: Pressures, *, narrow: bool) -> Figure:
-    """Draw the pressures that poses are held by, the last ones of each, as bars beside its name."""
-    names, count = list(pressures.values), len(pressures.channels)
+    """Draw the pressures that poses are held by, the last ones of each, as bars beside its name.
+
+    Chambers that are never under pressure are left out.
+    """
+    names, values = list(pressures.values), _KILO * np.stack([rows[-1] for rows in pressures.values.values()])
+    used = np.flatnonzero(values.any(axis=0))
+    count = max(1, len(used))
     height = 0.9 + len(names) * max(0.25, 0.1 * count)
     figure = new_figure(height, height + 0.3, narrow=narrow)
     axes = figure.subplots()
-    thick, values = _BARS / count, _KILO * np.stack([rows[-1] for rows in pressures.values.values()])
-    for at, colour in zip(range(count), cycle(CHAMBER_COLOURS), strict=False):
-        middle = np.arange(len(names)) + (at + 0.5) * thick - 0.5 * _BARS
-        axes.barh(middle, values[:, at], 0.9 * thick, color=colour)
+    for place, chamber in enumerate(used):
+        middle = np.arange(len(names)) + _BARS * ((place + 0.5) / count - 0.5)
+        colour = CHAMBER_COLOURS[chamber % len(CHAMBER_COLOURS)]
+        axes.barh(middle, values[:, chamber], 0.9 * _BARS / count, color=colour)
     if pressures.limit is not None:
         axes.axvline(_KILO * pressures.limit, color=TONES["muted"].light, linewidth=1.0, linestyle=(0, (4, 3)))
     axes.set_yticks(range(len(names)), names)
@@ -311,15 +316,15 @@ def pose_pressures(pressures: Pressures, *, narrow: bool) -> Figure:
     axes.set(xlabel="pressure [kPa]", ylim=(len(names) - 0.5, -0.5))
     axes.xaxis.set_major_locator(MaxNLocator(6, steps=ROUND_STEPS))
     axes.grid(visible=False, axis="y")
-    _chamber_legend(figure, pressures, narrow=narrow)
+    _chamber_legend(figure, pressures, used.tolist(), narrow=narrow)
     return figure
 
 
-def _chamber_legend(figure: Figure, pressures: Pressures, *, narrow: bool) -> None:
-    """Names of the chambers, below the figure."""
+def _chamber_legend(figure: Figure, pressures: Pressures, used: Sequence[int] = (), *, narrow: bool) -> None:
+    """Names of the chambers, or of those that are used, below the figure."""
     handles: list[Any] = [
-        Line2D([], [], color=colour, label=name.replace("_", " "))
-        for name, colour in zip(pressures.channels, cycle(CHAMBER_COLOURS), strict=False)
+        Line2D([], [], color=CHAMBER_COLOURS[at % len(CHAMBER_COLOURS)], label=pressures.channels[at].replace("_", " "))
+        for at in used or range(len(pressures.channels))
     ]
     if pressures.limit is not None:
         handles.append(Line2D([], [], color=TONES["muted"].light, linestyle=(0, (4, 3)), label="limit"))

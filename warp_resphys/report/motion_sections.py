@@ -171,8 +171,9 @@ def _instants_figure(data: RunReport, motion: Motion, name: str, colours: str, c
 
     frames = canvas.started["pictures"].result()[0]
     titles = [f"{motion.times[frame]:.2f} s" for frame in _instants_of(motion)]
-    said = f"{name} at {len(titles)} instant{'s' if len(titles) > 1 else ''}"
-    said += "; in one of them the grey body is farthest off." if len(motion.times) > 1 else "."
+    said, when = f"{name} at {len(titles)} instants; in one of them the grey body is farthest off.", ", ".join(titles)
+    if len(motion.times) == 1:  # A pose has no time.
+        titles, said, when = [""], f"{name}.", "rest"
     said += f" Drawn to scale; {'below, the view from below' if motion.from_below else 'the second view follows'}"
     said += "." if motion.from_below else (" the markers." if data.sees_markers else " some vertices of the tip.")
     if not data.sees_markers:
@@ -180,7 +181,7 @@ def _instants_figure(data: RunReport, motion: Motion, name: str, colours: str, c
     last = list(motion.positions)[-1]
     if data.metrics["errors_mm"][last]["diverged"]:
         said += f" Where {MODELS[last][0]} is not drawn, it has diverged."
-    alt = f"The deformed body at {', '.join(titles)}, with observed and simulated markers."
+    alt = f"The deformed body at {when}, with observed and simulated markers."
     return canvas.figure("motion", partial(motion_figures.motion_instants, frames, titles), alt, said)
 
 
@@ -354,7 +355,7 @@ def _pressure_figures(pressures: Pressures, trials: Trials, canvas: Canvas) -> l
 
     over_time, poses = _sequences(pressures, trials), {}
     for name in pressures.poses:
-        poses[f"{name}, tested" if name in trials.names else name] = pressures.values[name]
+        poses[f"{name} (test)" if name in trials.names else name] = pressures.values[name]
     limit = "" if not pressures.limit else f"; dashed, the limit of {1e-3 * pressures.limit:g} kPa"
     whose = "a few trials" if len(pressures.values) > 1 else "the trial"
     what, blocks = f"Pressures in {len(pressures.channels)} chambers", []
@@ -364,7 +365,10 @@ def _pressure_figures(pressures: Pressures, trials: Trials, canvas: Canvas) -> l
         blocks.append(canvas.figure("pressures", drawn, alt, unbroken(said)))
     if poses:
         drawn = partial(motion_figures.pose_pressures, replace(pressures, values=poses))
-        alt, said = f"{what} by pose: {', '.join(poses)}.", f"Gauge pressures that hold the poses{limit}."
+        alt, said = (
+            f"{what} by pose: {', '.join(poses)}.",
+            f"Gauge pressures that hold the poses; chambers without any are left out{limit}.",
+        )
         blocks.append(canvas.figure("pose_pressures", drawn, alt, unbroken(said)))
     return blocks
 

@@ -35,6 +35,7 @@ from .sections import (
     against,
     horizons_section,
     identification_section,
+    model_table,
     quality_section,
     registration_section,
     scales_section,
@@ -54,6 +55,9 @@ _TIMED: Final = {
 _WITHOUT_RECORDINGS: Final = (
     "No recordings are configured (<code>data.folder</code>): what is called measured here is a simulation with a "
     "finer mesh and step, another material, viscosity{}, and noise on its markers."
+)
+_FOLDS: Final = (
+    "Each trial leads to the page of the fold that is tested on it: its motion, identification and training."
 )
 _MOST_LABELS: Final = 6  # That are named one by one.
 _FILTER: Final = 1.0  # [s] of the median filter, as published.
@@ -107,8 +111,8 @@ def results_section(data: RunReport, canvas: Canvas) -> Part:
         blocks.append(Text(data.network_note, "network", note=True))
     if data.pages:
         rows = {**data.metrics["folds"], "Mean": data.metrics}
-        means = {t: {model: e["mean"] for model, e in fold["errors_mm"].items()} for t, fold in rows.items()}
-        blocks.append(_models_table("Test trial [mm]", means, data.models, data.pages))
+        means = _numbers({t: {m: e["mean"] for m, e in fold["errors_mm"].items()} for t, fold in rows.items()})
+        blocks.append(model_table("Test trial [mm]", means, _FOLDS, data.pages))
     if ranges := range_texts(data.metrics, [] if data.trials is None else data.trials.names):
         blocks.append(Text("Roll-outs that leave the states of the training", heading=True))
         blocks.append(Items(ranges, "ranges"))
@@ -202,16 +206,8 @@ def _count(number: int, what: str) -> str:
     return f"{number} {what}{'s' if number != 1 else ''}"
 
 
-def _models_table(
-    head: str, found: Mapping[str, Mapping[str, float | None]], models: Sequence[str], pages: Mapping[str, str]
-) -> Table:
-    """Errors [mm] by what a row is and model; a row may lead to a page."""
-    rows = []
-    for name, row in found.items():
-        cells = [Cell(number_text(row[m]) if m in row else NONE) for m in models]
-        rows.append(Row(name, cells, address=pages.get(name, "")))
-    note = "Each trial leads to the page of the fold that is tested on it: its motion, identification and training."
-    return Table(head, [MODELS[model][0] for model in models], rows, note if pages else "")
+def _numbers(rows: Mapping[str, Mapping[str, float | None]]) -> dict[str, dict[str, Cell]]:
+    return {name: {m: Cell(number_text(value)) for m, value in row.items()} for name, row in rows.items()}
 
 
 def range_texts(metrics: Mapping[str, Any], trials: Sequence[str]) -> list[str]:
@@ -259,13 +255,12 @@ def error_section(data: RunReport, canvas: Canvas) -> Part | None:
         reached = "; ".join(f"{MODELS[model][0]} reaches {_largest(e)}" for model, e in trials.errors_mm.items())
         alt = f"Mean {of} error of the models over time, on a logarithmic axis. {reached}."
         blocks.append(canvas.figure("error_over_time", draw, alt, _error_caption(data, window)))
-    models, labels = data.models, metrics.get("per_marker", {})
     rows = {row["name"]: row["errors_mm"] for row in metrics["per_trajectory"]}
     if len(rows) > 1:
-        blocks.append(_models_table("Each trial [mm]", rows, models, {}))
-    if labels:
-        each = {label: {m: found.get(label) for m, found in labels.items()} for label in trials.labels}
-        blocks.append(_models_table("Each marker [mm]", each, [m for m in models if m in labels], {}))
+        blocks.append(model_table("Each trial [mm]", _numbers(rows)))
+    if found := metrics.get("per_marker"):
+        each = {label: {m: markers.get(label) for m, markers in found.items()} for label in trials.labels}
+        blocks.append(model_table("Each marker [mm]", _numbers(each)))
     return Part("Error over time" if trials.moves else "Each trial", blocks) if blocks else None
 
 

@@ -63,6 +63,15 @@ def horizons_section(data: RunReport, canvas: Canvas) -> Part | None:
     return Part("Longer than the training" if longer else "By length of the roll-out", [table])
 
 
+def model_table(
+    head: str, rows: Mapping[str, Mapping[str, Cell]], note: str = "", pages: Mapping[str, str] | None = None
+) -> Table:
+    """Return cells by what a row is and model; a row may lead to a page."""
+    models = [model for model in MODELS if any(model in row for row in rows.values())]
+    found = [Row(n, [r.get(m, Cell(NONE)) for m in models], address=(pages or {}).get(n, "")) for n, r in rows.items()]
+    return Table(head, [MODELS[model][0] for model in models], found, note)
+
+
 def horizon_table(metrics: Mapping[str, Any], published: Mapping[str, Mapping[str, Any]]) -> Table | None:
     """Return the errors over the first seconds of the roll-outs and their growth, with the published ones below them.
 
@@ -70,22 +79,17 @@ def horizon_table(metrics: Mapping[str, Any], published: Mapping[str, Mapping[st
         metrics: With `horizons` (a summary by seconds and model) and `growth`; there is no table without them.
         published: Published errors by seconds and model.
     """
-    horizons = sorted(metrics.get("horizons", {}), key=float)
-    if not horizons:
-        return None
-    models = [model for model in MODELS if model in metrics["horizons"][horizons[0]]]
-    rows = []
-    for horizon in horizons:
+    found, rows = metrics.get("horizons", {}), {}
+    for horizon in sorted(found, key=float):
         theirs = {model: " ".join(published_parts(each)) for model, each in published.get(horizon, {}).items()}
-        found = metrics["horizons"][horizon]
-        rows.append(Row(f"First {float(horizon):g} s", [Cell(_whole(found[m]), theirs.get(m, "")) for m in models]))
-    if len(horizons) > 1 and metrics.get("growth"):
-        theirs = {m: percent_text(e, 1) for m, e in published_growth(published, horizons[0], horizons[-1]).items()}
-        ours = {m: percent_text(each, 1) for m, each in metrics["growth"].items() if each is not None}
-        rows.append(Row("Growth", [Cell(ours.get(m, NONE), theirs.get(m, "")) for m in models]))
+        rows[f"First {float(horizon):g} s"] = {m: Cell(_whole(e), theirs.get(m, "")) for m, e in found[horizon].items()}
+    if len(rows) > 1 and metrics.get("growth"):
+        ours = {m: NONE if each is None else percent_text(each, 1) for m, each in metrics["growth"].items()}
+        shares = published_growth(published, min(found, key=float), max(found, key=float))
+        theirs = {m: percent_text(each, 1) for m, each in shares.items()}
+        rows["Growth"] = {m: Cell(ours.get(m, NONE), theirs.get(m, "")) for m in next(iter(rows.values()))}
     note = "Growth is that of the mean error from the shortest to the longest part of the same roll-outs."
-    note += " Small: published." if published else ""
-    return Table("Mean error [mm]", [MODELS[m][0] for m in models], rows, note)
+    return model_table("Mean error [mm]", rows, note + (" Small: published." if published else "")) if rows else None
 
 
 def scales_section(data: RunReport, canvas: Canvas) -> Part | None:
@@ -113,17 +117,13 @@ def scales_section(data: RunReport, canvas: Canvas) -> Part | None:
 
 def scale_table(found: Mapping[str, Mapping[str, Any]]) -> Table | None:
     """Return the errors at multiples of the pressures (a summary by scale and model), with how they stand to SysID."""
-    scales = sorted(found, key=float)
-    if not scales:
-        return None
-    models = [model for model in MODELS if model in found[scales[0]]]
-    rows = []
-    for scale in scales:
-        shares = {model: "" if share == NONE else share for model, share in against(found[scale])[1].items()}
-        cells = [Cell(_whole(found[scale][model]), shares.get(model, "")) for model in models]
-        rows.append(Row(f"\N{MULTIPLICATION SIGN} {float(scale):g}", cells))
+    rows = {}
+    for scale in sorted(found, key=float):
+        base, shares = against(found[scale])
+        cells = {m: Cell(_whole(e), "" if m == base else shares.get(m, "")) for m, e in found[scale].items()}
+        rows[f"\N{MULTIPLICATION SIGN} {float(scale):g}"] = cells
     note = "The pressures of the test trials, multiplied; below the error, how it stands to that of SysID."
-    return Table("Pressures; mean error [mm]", [MODELS[model][0] for model in models], rows, note)
+    return model_table("Pressures; mean error [mm]", rows, note) if rows else None
 
 
 def _whole(summary: Mapping[str, Any]) -> str:

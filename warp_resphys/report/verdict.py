@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean, stdev
@@ -27,29 +28,17 @@ _REFINED: Final = "_refined"  # What a network refined through the simulator is 
 
 @dataclass(frozen=True)
 class Identified:
-    """One identified parameter.
+    """One identified parameter, in SI units."""
 
-    Attributes:
-        key: where its range is configured, such as ``identify.parameters.density``.
-        value: that was found, in SI units like the others.
-        lower: end of its range.
-        upper: end of its range.
-        start: the first guess.
-    """
-
-    key: str
+    key: str  # Where its range is configured, such as ``identify.parameters.density``.
     value: float
-    lower: float
+    lower: float  # End of its range.
     upper: float
-    start: float
+    start: float  # The first guess.
 
 
 def verdict(data: RunReport) -> str:
-    """Say how far the models are from what was observed, and how that stands to what was published.
-
-    Args:
-        data: What the page shows.
-    """
+    """Say how far the models are from what was observed, and how that stands to what was published."""
     metrics = data.metrics
     without = untrained(epochs_kept(metrics))
     errors = {model: each for model, each in metrics["errors_mm"].items() if model not in without}
@@ -70,6 +59,11 @@ def unbroken(said: str) -> str:
     return re.sub(r"(?<=\d) (?=(?:mm|kPa|s)\b|%)|(?<=\b[Eν]) (?=\d)", NO_BREAK_SPACE, said)  # noqa: RUF001
 
 
+def _mm(value: float | None) -> str:
+    """A mean error in words, also of roll-outs that diverged."""
+    return number_text(value) + ("" if value is None else " mm")
+
+
 def vertex_verdict(
     errors: Mapping[str, Any], published: Mapping[str, PublishedError], simulator: str, target: str
 ) -> str:
@@ -82,32 +76,30 @@ def vertex_verdict(
         target: Its target in words.
     """
     if not {"simulation", "resphys"} <= errors.keys():
-        each = (f"{number_text(errors[m]['mean'])} mm with {MODELS[m][0]}" for m in MODELS if m in errors)
+        each = (f"{_mm(errors[m]['mean'])} with {MODELS[m][0]}" for m in MODELS if m in errors)
         return f"Mean vertex error: {', '.join(each)}."
-    before, after = errors["simulation"], errors["resphys"]
-    count = after["trajectories"]
-    trials = f"{count} test trial{'s' if count > 1 else ''}"
-    old, new = number_text(before["mean"]), number_text(after["mean"])
-    if after["mean"] is None:
+    before, after = errors["simulation"]["mean"], errors["resphys"]["mean"]
+    count = errors["resphys"]["trajectories"]
+    trials, old, new = f"{count} test trial{'s' if count > 1 else ''}", _mm(before), _mm(after)
+    if after is None:
         said = (
-            f"With the learned residual force, {after['diverged']} of {count} test roll-outs diverged, so "
-            f"there is no mean error to report. Without it: {old}{'' if before['mean'] is None else ' mm'}."
+            f"With the learned residual force, {errors['resphys']['diverged']} of {count} test roll-outs diverged, so "
+            f"there is no mean error to report. Without it: {old}."
         )
-    elif before["mean"] is None:
+    elif before is None:
         said = (
-            f"Uncorrected, {before['diverged']} of {count} test roll-outs diverge; with the learned residual "
-            f"force, the mean vertex error is {new} mm."
+            f"Uncorrected, {errors['simulation']['diverged']} of {count} test roll-outs diverge; with the learned "
+            f"residual force, the mean vertex error is {new}."
         )
-    elif after["mean"] >= before["mean"]:
+    elif after >= before:
         said = (
-            f"The learned residual force does not help: the mean vertex error on {trials} is {new} mm with it and "
-            f"{old} mm without."
+            f"The learned residual force does not help: the mean vertex error on {trials} is {new} with it and {old} "
+            "without."
         )
     else:
         said = (
-            f"The learned residual force brings the simulator ({simulator}) "
-            f"{_closer(before['mean'], after['mean'])} to its target ({target}): on {trials} that it never saw, the "
-            f"mean vertex error falls from {old} mm to {new} mm."
+            f"The learned residual force brings the simulator ({simulator}) {_closer(before, after)} to its target "
+            f"({target}): on {trials} that it never saw, the mean vertex error falls from {old} to {new}."
         )
     if "resphys" in published:
         said += f" The published result is {published_parts(published['resphys'])[0]} mm."
@@ -145,24 +137,19 @@ def marker_verdict(
             f"On {who}, {held}, {MODELS[main][0]} diverged in {errors[main]['diverged']} of "
             f"{errors[main]['trajectories']} roll-outs, so that there is no mean error to report."
         )
-    beside = [
-        f"{number_text(errors[m]['mean'])}{'' if errors[m]['mean'] is None else ' mm'} "
-        f"{'uncorrected' if m == 'simulation' else 'with ' + MODELS[m][0]}"
+    beside = "".join(
+        f", {_mm(errors[m]['mean'])} {'uncorrected' if m == 'simulation' else 'with ' + MODELS[m][0]}"
         for m in ("sysid", "sysid_elastic", "simulation")
         if m in errors and m != main
-    ]
+    )
     return (
-        f"On {who}, {held}, the simulated markers are {number_text(errors[main]['mean'])} mm from the measured ones"
-        f"{span} with {MODELS[main][0]}{'; ' + ', '.join(beside) if beside else ''}."
+        f"On {who}, {held}, the simulated markers are {_mm(errors[main]['mean'])} from the measured ones{span} with "
+        f"{MODELS[main][0]}{beside.replace(',', ';', 1)}."
     )
 
 
 def reduction(means: Mapping[str, float | None]) -> float | None:
-    """Return by which share the mean error of ResPhys is below that of SysID; None where one is not known.
-
-    Args:
-        means: Mean errors by model; None where a roll-out diverged.
-    """
+    """Return by which share the mean error of ResPhys is below that of SysID; None where one is not known."""
     before, after = means.get("sysid"), means.get("resphys")
     return None if before is None or after is None or before <= 0.0 else 1.0 - after / before
 
@@ -207,23 +194,13 @@ def scale_text(errors: Mapping[str, Mapping[str, Any]]) -> str:
     if not errors:
         return ""
     largest = max(errors, key=float)
-    parts = [
-        f"{number_text(mean)}{'' if mean is None else ' mm'} with {MODELS[model][0]}"
-        for model in ("resphys", "sysid", "simfree")
-        if model in errors[largest]
-        for mean in [errors[largest][model]["mean"]]
-    ]
-    said = f"At {float(largest):g} times the pressures of the training the error is {', '.join(parts)}."
-    return said if parts else ""
+    found = {m: errors[largest][m]["mean"] for m in ("resphys", "sysid", "simfree") if m in errors[largest]}
+    parts = ", ".join(f"{_mm(mean)} with {MODELS[model][0]}" for model, mean in found.items())
+    return f"At {float(largest):g} times the pressures of the training the error is {parts}." if parts else ""
 
 
 def judgement(metrics: Mapping[str, Any], settings: Mapping[str, Any]) -> list[str]:
-    """Sentences on a run.
-
-    Args:
-        metrics: what metrics.json holds: ``per_trajectory`` or ``folds``, ``networks`` and ``parameters``.
-        settings: its configuration.
-    """
+    """Sentences on a run, by what metrics.json holds of a split or of folds, and its configuration."""
     folds = list(metrics.get("folds", {}).values()) or [metrics]
     rows = [row["errors_mm"] for fold in folds for row in fold.get("per_trajectory", ())]
     errors = {model: [row.get(model) for row in rows] for model in (rows[0] if rows else ())}
@@ -236,11 +213,10 @@ def epochs_kept(metrics: Mapping[str, Any]) -> dict[str, list[int]]:
     networks: list[Mapping[str, Any]] = [fold.get("networks", {}) for fold in folds]
     models = dict.fromkeys(model for each in networks for model in each if not model.endswith(_REFINED))
 
-    def epochs(model: str) -> list[int]:
-        refined = f"{model}{_REFINED}"
-        return [each[model]["epoch"] + each.get(refined, {}).get("epoch", 0) for each in networks if model in each]
-
-    return {model: epochs(model) for model in models}
+    return {
+        model: [n[model]["epoch"] + n.get(f"{model}{_REFINED}", {}).get("epoch", 0) for n in networks if model in n]
+        for model in models
+    }
 
 
 def untrained(epochs: Mapping[str, Sequence[int]]) -> set[str]:
@@ -249,12 +225,7 @@ def untrained(epochs: Mapping[str, Sequence[int]]) -> set[str]:
 
 
 def best(errors: Mapping[str, Any], without: Collection[str] = ()) -> str:
-    """The model with the smallest mean error; of equal ones, the simplest; none of the published ones.
-
-    Args:
-        errors: a summary [mm] a model.
-        without: models that are not asked for.
-    """
+    """The model with the smallest mean error; of equal ones, the simplest; none that was published, or `without`."""
     means = {m: errors[m]["mean"] for m in ("simulation", *_STEPS) if m in errors and m not in without}
     known = {m: mean for m, mean in means.items() if mean is not None}
     return min(known, key=lambda m: known[m], default="")
@@ -312,32 +283,26 @@ def _gain(
 
 
 def advice(folds: Sequence[Sequence[Identified]]) -> list[str]:
-    """Say which identified values are no result but a bound or the first guess, and what to do.
-
-    Args:
-        folds: the identified parameters of each fold.
-    """
-    found: dict[str, int] = {}
-    for each in (each for fold in folds for each in fold):
-        close = _CLOSE * (each.upper - each.lower)
-        name = each.key.rpartition(".")[2]
-        for end, bound in (("lower", each.lower), ("upper", each.upper)):
-            if abs(each.value - bound) <= close:
-                widen = f"widen {each.key}.{end} if the body can be so" if bound else f"take it out (~{each.key})"
-                sentence = (
-                    f"{name} was identified at its {end} bound, {bound:g}: {widen}, or look for what it makes up for, "
-                    "such as a wrong weight, mesh or registration."
-                )
-                break
-        else:
-            if abs(each.value - each.start) > close:
-                continue
-            sentence = (
-                f"{name} stayed at its first guess, {each.start:g}: raise identify.max_evaluations or "
-                f"identify.starts, or take it out (~{each.key}) if the trials do not tell about it."
-            )
-        found[sentence] = found.get(sentence, 0) + 1
+    """Say which identified values of each fold are no result but a bound or the first guess, and what to do."""
+    found = Counter(said for fold in folds for each in fold if (said := _advice(each)))
     return [f"In {n} of {len(folds)} folds, {said}" if len(folds) > 1 else said for said, n in found.items()]
+
+
+def _advice(found: Identified) -> str:
+    close, name = _CLOSE * (found.upper - found.lower), found.key.rpartition(".")[2]
+    for end, bound in (("lower", found.lower), ("upper", found.upper)):
+        if abs(found.value - bound) <= close:
+            widen = f"widen {found.key}.{end} if the body can be so" if bound else f"take it out (~{found.key})"
+            return (
+                f"{name} was identified at its {end} bound, {bound:g}: {widen}, or look for what it makes up for, "
+                "such as a wrong weight, mesh or registration."
+            )
+    if abs(found.value - found.start) > close:
+        return ""
+    return (
+        f"{name} stayed at its first guess, {found.start:g}: raise identify.max_evaluations or identify.starts, or "
+        f"take it out (~{found.key}) if the trials do not tell about it."
+    )
 
 
 def _identified(metrics: Mapping[str, Any], settings: Mapping[str, Any]) -> list[Identified]:

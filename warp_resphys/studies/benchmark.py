@@ -243,13 +243,7 @@ def _at(values: Mapping[Any, int], refinement: int) -> int:
 
 
 def released(simulator: Simulator, mass: float, batch: int) -> State:
-    """Rest under a weight at the tip, lighter in each further environment of a batch.
-
-    Args:
-        simulator: of a body that is clamped at its smallest x.
-        mass: [kg].
-        batch: environments.
-    """
+    """Rest under a mass [kg] at the largest x, lighter in each further environment of a batch."""
     x = simulator.rest_positions[:, 0]
     tip = x >= x.max() - 1e-9 * (x.max() - x.min())
     share = tip.to(simulator.dtype) / tip.sum()  # (N,)
@@ -349,12 +343,7 @@ def cold_start(config: Mapping[str, Any]) -> dict[str, dict[str, float]]:
 
 
 def first_step(began: float, config: str) -> None:
-    """Prints what this new process has taken until it made its first step, as a line of JSON.
-
-    Args:
-        began: ``time.perf_counter()`` before the imports.
-        config: the whole configuration, as JSON.
-    """
+    """Prints as JSON what this new process took for its first step of a configuration [s], from before its imports."""
     imported = time.perf_counter()
     simulator = build_simulator(json.loads(config))
     state = simulator.rest_state()

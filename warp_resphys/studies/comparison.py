@@ -12,16 +12,7 @@ from ..experiment.files import METRICS
 from ..experiment.report import read_trials
 from ..experiment.trials import variation_of
 from ..io.files import read_json
-from ..learning.metrics import (
-    PUBLISHED_MARKER_MEDIAN_MM,
-    PUBLISHED_MARKERS,
-    PUBLISHED_MARKERS_OF_SMALL_SPREAD,
-    PUBLISHED_MM,
-    PUBLISHED_SECONDS,
-    PUBLISHED_SECONDS_STEPS,
-    PUBLISHED_SETUP,
-    PublishedError,
-)
+from ..learning import metrics as paper
 from ..mesh.mesh import select_vertices, surface_vertices
 from ..report import ablation_page, figures, motion_figures
 from ..report.data import MODEL_NAMES, Trials
@@ -100,7 +91,7 @@ def compare(config: Mapping[str, Any], results: Sequence[Run], canvas: Canvas) -
         if each.failure is None:
             done.setdefault(each.experiment, {})[each.variant] = each
     studies = {name: runs for name, runs in done.items() if "errors_mm" in next(iter(runs.values())).metrics}
-    set_up = {name: runs for name, runs in studies.items() if name in PUBLISHED_SETUP}
+    set_up = {name: runs for name, runs in studies.items() if name in paper.PUBLISHED_SETUP}
     parts = [setup_section(config, set_up)] if set_up else []
     parts += [study_section(config, name, runs, canvas) for name, runs in studies.items()]
     timing = config["timing"]
@@ -108,7 +99,7 @@ def compare(config: Mapping[str, Any], results: Sequence[Run], canvas: Canvas) -
         parts.append(timing_section(config, timed))
     parts += [ablation_section(config, name, runs, canvas) for name, runs in done.items() if name not in studies]
     parts.append(runs_section(config, results))
-    if missing := {name: errors for name, errors in PUBLISHED_MM.items() if name not in config["experiments"]}:
+    if missing := {name: errors for name, errors in paper.PUBLISHED_MM.items() if name not in config["experiments"]}:
         parts.append(missing_section(missing))
     return verdict(config, done), parts
 
@@ -123,7 +114,7 @@ def verdict(config: Mapping[str, Any], done: Mapping[str, Runs]) -> str:
         if "by_markers" in metrics:
             said.append(f"{title}: {ablation_page.verdict(metrics['by_markers'], metrics['uncorrected_mm'])}")
             continue
-        ours, published = number_text(metrics["errors_mm"]["resphys"]["mean"]), PUBLISHED_MM.get(name, {})
+        ours, published = number_text(metrics["errors_mm"]["resphys"]["mean"]), paper.PUBLISHED_MM.get(name, {})
         beside = f", published {published_parts(published['resphys'])[0]} mm" if "resphys" in published else ""
         said.append(f"{title}: with the learned force, the mean error is {ours} mm{beside}.")
     return " ".join(said).replace(" mm", f"{NO_BREAK_SPACE}mm") or "No run has succeeded."
@@ -147,7 +138,7 @@ def setup_section(config: Mapping[str, Any], studies: Mapping[str, Runs]) -> Par
     values: list[Mapping[str, float]] = []
     for name, runs in studies.items():
         columns += [f"{config['experiments'][name]['title']}, published", "here"]
-        values += [PUBLISHED_SETUP[name], _setup(next(iter(runs.values())).settings)]
+        values += [paper.PUBLISHED_SETUP[name], _setup(next(iter(runs.values())).settings)]
     rows = [
         Row(key[:1].upper() + key[1:], [Cell(_value(key, each[key])) if key in each else _NONE for each in values])
         for key in values[1]
@@ -186,7 +177,7 @@ def _value(key: str, value: float) -> str:
 def study_section(config: Mapping[str, Any], name: str, runs: Runs, canvas: Canvas) -> Part:
     """Roll-out errors of one experiment, and how they and the tip go over time."""
     group = config["experiments"][name]
-    published = PUBLISHED_MM.get(name, {})
+    published = paper.PUBLISHED_MM.get(name, {})
     measured = [run.metrics["errors_mm"] for run in runs.values()]
     rows = [
         Row(
@@ -219,7 +210,7 @@ def _study_figures(config: Mapping[str, Any], name: str, drawn: Mapping[str, Run
         other = read_trials(drawn["published_network"].folder, drawn["published_network"].settings)
         paths["published_network"] = other.positions["resphys"][test.worst]
         errors["published_network"] = other.errors_mm["resphys"]
-    published = {model: each.mean for model, each in PUBLISHED_MM.get(name, {}).items() if model in errors}
+    published = {model: each.mean for model, each in paper.PUBLISHED_MM.get(name, {}).items() if model in errors}
     label = _label(config, drawn["models"])
     lines = "; ".join(f"{MODEL_NAMES[model]} {error:g} mm" for model, error in published.items())
     beside = f" Dashed: the published means ({lines})." if published else ""
@@ -257,14 +248,14 @@ def timing_section(config: Mapping[str, Any], runs: Runs) -> Part:
         Row(
             label,
             [
-                _time_cell(*PUBLISHED_SECONDS[key], PUBLISHED_SECONDS_STEPS),
+                _time_cell(*paper.PUBLISHED_SECONDS[key], paper.PUBLISHED_SECONDS_STEPS),
                 *(_time_cell(seconds[key]["mean"], seconds[key]["std"], steps) for seconds, steps in measured),
             ],
         )
         for key, label in _TIMED.items()
     ]
     counts = " and ".join(sorted({str(steps) for _, steps in measured}))
-    note = f"Published: trajectories of {PUBLISHED_SECONDS_STEPS} steps; here: of {counts}."
+    note = f"Published: trajectories of {paper.PUBLISHED_SECONDS_STEPS} steps; here: of {counts}."
     table = Table("Time per trajectory [s]", _columns(config, runs), rows, note)
     return Part("Time benchmark", [table, *_reasons(config["timing"]["deviations"])])
 
@@ -280,8 +271,8 @@ def ablation_section(config: Mapping[str, Any], name: str, runs: Runs, canvas: C
     rows = []
     for row in metrics["by_markers"]:
         count = row["markers"]
-        median = f"below {PUBLISHED_MARKER_MEDIAN_MM:g}" if count >= PUBLISHED_MARKERS else "not said"
-        spread = "small" if count >= PUBLISHED_MARKERS_OF_SMALL_SPREAD else "high"
+        median = f"below {paper.PUBLISHED_MARKER_MEDIAN_MM:g}" if count >= paper.PUBLISHED_MARKERS else "not said"
+        spread = "small" if count >= paper.PUBLISHED_MARKERS_OF_SMALL_SPREAD else "high"
         ours = (number_text(row[key]) for key in ("median_mm", "interquartile_range_mm", "largest_mm"))
         rows.append(Row(str(count), [Cell(text) for text in (median, spread, *ours)]))
     vertices = len(surface_vertices(build_mesh(settings["mesh"])))
@@ -291,7 +282,7 @@ def ablation_section(config: Mapping[str, Any], name: str, runs: Runs, canvas: C
         f"Uncorrected: {number_text(metrics['uncorrected_mm'])} mm."
     )
     columns = ["Published median", "Published spread", "Median here", "Interquartile range here", "Largest here"]
-    published = (PUBLISHED_MARKERS, PUBLISHED_MARKER_MEDIAN_MM)
+    published = (paper.PUBLISHED_MARKERS, paper.PUBLISHED_MARKER_MEDIAN_MM)
     boxes = partial(ablation_page.marker_boxes, ablation_page.box_errors(metrics), metrics["uncorrected_mm"], published)
     caption = "Box: lower quartile, median (orange), upper quartile; whiskers to the smallest and the largest error."
     figure = canvas.figure(name, boxes, ablation_page.describe_boxes(metrics), caption)
@@ -319,7 +310,7 @@ def runs_section(config: Mapping[str, Any], results: Sequence[Run]) -> Part:
     return Part("Runs", [*failures, table, Text("Each by itself", heading=True), commands])
 
 
-def missing_section(published: Mapping[str, Mapping[str, PublishedError]]) -> Part:
+def missing_section(published: Mapping[str, Mapping[str, paper.PublishedError]]) -> Part:
     """The published experiments that no run reproduces yet."""
     models = {model: label for model, label in MODEL_NAMES.items() if model != "reconstruction"}
     rows = [

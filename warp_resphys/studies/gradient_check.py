@@ -216,15 +216,11 @@ def gradcheck(config: DictConfig) -> None:
 def check_configured(config: Mapping[str, Any]) -> Iterator[tuple[float, str, list[GradientRow]]]:
     """Checks the gradients of a configured body, material and solver.
 
-    Args:
-        config: with the keys of ``conf/gradcheck.yaml``.
-
     Yields:
         Poisson's ratio, pose, and the comparisons there.
 
     Raises:
-        InputError: a value that cannot be simulated, an unknown pose, or float32, whose rounding drowns differences.
-        ConvergenceError: the solver does not reach the tolerance.
+        ResphysError: a value that cannot be simulated, float32, whose rounding drowns differences, or no convergence.
     """
     wanted = config["gradcheck"]
     check("gradcheck", wanted, _KEYS)

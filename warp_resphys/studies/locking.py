@@ -92,20 +92,14 @@ def cases(study: Mapping[str, Any]) -> Iterator[Case]:
 
 
 def measure(mesh: Mesh, study: Mapping[str, Any], timed: bool = True) -> dict[str, Any]:
-    """Deflections of an arm, and the time of a step.
-
-    Args:
-        mesh: hangs along -z from its highest vertices, with chambers.
-        study: the group ``study``.
-        timed: as in `Case`.
+    """Deflections of an arm that hangs along -z from its highest vertices, and the time of a step.
 
     Returns:
         ``vertices``, ``chamber_cm3`` of the chamber under pressure, ``<load>_mm`` of each of `LOADS`: how far the tip
-        moves towards +x, ``step_ms`` and ``iterations`` of a step; None for what was left out.
+        moves towards +x, ``step_ms`` and ``iterations`` of a step; None for what was left out, as `Case.timed` says.
 
     Raises:
-        InputError: the mesh has no such chamber.
-        ConvergenceError: an equilibrium was not found.
+        ResphysError: the mesh has no such chamber, or an equilibrium was not found.
     """
     for key in ("chamber", "steps", "repeats"):
         check(f"study.{key}", study[key], NATURAL)

@@ -6,6 +6,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from ..experiment.build import build_mesh
 from ..experiment.schema import POSITIVE, check
 from ..io.errors import MeshError
 from ..mesh.arm import mesh_arm, name_surfaces
@@ -44,15 +45,16 @@ def make_arm(config: Mapping[str, Any], folder: Path) -> str:
     return aligned([*summary_rows(summary), ("clamped at the base", f"{len(summary.fixed)} vertices")], left=2)
 
 
-def inspect_mesh(config: Mapping[str, Any], folder: Path, built: Mesh | None = None) -> str:
-    """Returns a table of what is in a mesh, that of the file `mesh.path` or one that was built, and draws it.
+def inspect_mesh(config: Mapping[str, Any], folder: Path) -> str:
+    """Returns a table of what is in a mesh, and draws it.
 
     Raises:
         ResphysError: A setting of the wrong kind, a file that cannot be read, or a mesh that cannot be simulated.
     """
     check("density", config["density"], POSITIVE)
-    rows, names = [], ""
-    if built is None:
+    rows: list[tuple[str, str]] = []
+    read = config["mesh"]["kind"] == "file"
+    if read:
         path, units, order = (config["mesh"][key] for key in ("path", "units", "order"))
         points = read_vertices(path, units)
         mesh = read_mesh(path, units, order, drop_unreferenced=True)
@@ -63,7 +65,8 @@ def inspect_mesh(config: Mapping[str, Any], folder: Path, built: Mesh | None = N
         surfaces = read_surfaces(path, units, order, True)
         names = ", ".join(f"{name} ({len(faces)})" for name, faces in surfaces.items())
     else:
-        mesh, points = built, built.vertices
+        mesh = build_mesh(config["mesh"])
+        points = mesh.vertices
     chosen = {axis: at for axis, at in config["fixed"].items() if at is not None}
     fixed = select_vertices(mesh, **chosen) if chosen else np.empty(0, dtype=np.int64)
     summary = MeshSummary(mesh, config["density"], fixed, find_chambers(mesh))
@@ -72,7 +75,7 @@ def inspect_mesh(config: Mapping[str, Any], folder: Path, built: Mesh | None = N
         where = ", ".join(f"{axis} = {at:g} m" for axis, at in chosen.items())
         there = [np.abs(points[:, "xyz".index(axis)] - at) <= _ON_PLANE for axis, at in chosen.items()]
         rows.append(("fixed", f"{np.all(there, axis=0).sum()} vertices at {where}, {len(fixed)} of them used"))
-    if built is None:
+    if read:
         rows.append(("surfaces with a name", names or "none"))
     rows.append(("open cavities", _cavities(mesh)))
     if config["picture"]:

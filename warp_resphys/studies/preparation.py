@@ -6,7 +6,6 @@ from omegaconf import DictConfig
 
 from ..data.recordings.published import convert_arm, convert_beam
 from ..data.recordings.segment import convert_segment
-from ..experiment.build import build_mesh
 from ..experiment.schema import check, one_of
 from ..io.errors import InputError
 from . import mesh_inspection as meshes
@@ -29,14 +28,10 @@ def inspect(config: DictConfig) -> None:
     if recording is not None:
         print(inspect_recording(plain, folder))
         print(f"Written: {folder / 'quality.json'}, {folder / 'quality.png'}")
-    if mesh["kind"] != "file":
-        print(meshes.inspect_mesh(plain, folder, build_mesh(mesh)))
-    elif mesh["path"] is not None:
+    if mesh["kind"] != "file" or mesh["path"] is not None:
         print(meshes.inspect_mesh(plain, folder))
-    else:
-        return
-    if config.picture:
-        print(f"Written: {folder / 'mesh.png'}")
+        if config.picture:
+            print(f"Written: {folder / 'mesh.png'}")
 
 
 def make_arm(config: DictConfig) -> None:

@@ -58,12 +58,16 @@ _LINES: Final[Mapping[str, dict[str, Any]]] = {
     "measured": {"color": TONES["ink"].light, "linestyle": "none", "marker": "o", "markersize": 2.0},
     "simulated": {"color": TONES["simulation"].light, "linewidth": 1.3},
 }
-# What is told of both swings: its name, its key in comparison.json, and that of its relative difference.
-_COMPARED: Final = (
-    ("sag [mm]", "sag_mm", "sag"),
-    ("period [s]", "period_s", "period"),
-    ("decay [1/s]", "decay_rate_per_s", "decay_rate"),
-)
+# What comparison.json tells of an oscillation: by its attribute, the key and the factor of its unit.
+_NUMBERS: Final[Mapping[str, tuple[str, float]]] = {
+    "sag": ("sag_mm", _MILLI),
+    "period": ("period_s", 1.0),
+    "decay_rate": ("decay_rate_per_s", 1.0),
+    "damping_ratio": ("damping_ratio", 1.0),
+    "tail_spread": ("tail_spread_mm", _MILLI),
+    "fit_residual": ("fit_residual_mm", _MILLI),
+}
+_COMPARED: Final = {"sag [mm]": "sag", "period [s]": "period", "decay [1/s]": "decay_rate"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -212,9 +216,9 @@ def compare(config: DictConfig) -> None:
 def comparison_table(result: Mapping[str, Any]) -> list[list[str]]:
     """Sag, period and decay of both swings, and how far they are apart, from what comparison.json holds."""
     rows = [["", *_LINES, "difference"]]
-    for label, key, compared in _COMPARED:
-        values = [f"{result[name][key]:.4g}" for name in _LINES]
-        rows.append([label, *values, f"{result['relative_difference'][compared]:+.1%}"])
+    for label, number in _COMPARED.items():
+        values = [f"{result[name][_NUMBERS[number][0]]:.4g}" for name in _LINES]
+        rows.append([label, *values, f"{result['relative_difference'][number]:+.1%}"])
     return rows
 
 
@@ -298,14 +302,7 @@ def _summary(measured: MeasuredSwing, oscillations: Mapping[str, Oscillation], e
         "rest_frames": list(measured.release.rest),
         "registration_residual_mm": _MILLI * measured.registration_residual,
         **{
-            name: {
-                "sag_mm": _MILLI * found.sag,
-                "period_s": found.period,
-                "decay_rate_per_s": found.decay_rate,
-                "damping_ratio": found.damping_ratio,
-                "tail_spread_mm": _MILLI * found.tail_spread,
-                "fit_residual_mm": _MILLI * found.fit_residual,
-            }
+            name: {key: factor * getattr(found, number) for number, (key, factor) in _NUMBERS.items()}
             for name, found in oscillations.items()
         },
         "relative_difference": {

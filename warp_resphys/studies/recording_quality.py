@@ -1,6 +1,7 @@
 """The quality of a recording as a picture, and the command that makes it."""
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,7 +15,15 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from ..data.recordings.processing import fill_gaps, release_of
-from ..data.recordings.quality import BaseMotion, Quality, check_base, compare_base, quality, quality_table
+from ..data.recordings.quality import (
+    BaseMotion,
+    MarkerQuality,
+    Quality,
+    check_base,
+    compare_base,
+    quality,
+    quality_table,
+)
 from ..data.recordings.reading import read_recording
 from ..data.recordings.recording import Recording
 from ..experiment.schema import ANYTHING, COUNT, NOT_NEGATIVE, POSITIVE, WORD, Group, check, optional
@@ -38,48 +47,60 @@ _KEYS: Final = Group(
 )
 _MILLI: Final = 1e3
 _ROW: Final = 0.16  # [in] of a marker in the raster
-_LEGEND_COLUMNS: Final = {False: 6, True: 3}
+_LEGEND_COLUMNS: Final = 6
 
 
-def recording_quality(recording: Recording, result: Quality, *, narrow: bool) -> Figure:
+def recording_quality(recording: Recording, result: Quality) -> Figure:
     """Draw markers over time from their median place, what jumped, and what was hidden.
 
     Markers that should stand still have a panel of their own, with their distance from the median place. A line
     breaks where a gap is masked; where it was filled, the line is thin. A triangle marks the first frame after a jump.
     """
-    bridged = fill_gaps(_visible(recording), result.longest_gap, mask_long=True)
-    still = [marker.label for marker in result.markers if marker.still]
-    moving = [marker.label for marker in result.markers if not marker.still]
-    panels = [*("xyz" if moving else ""), *(["still"] if still else []), "raster"]
-    heights = [{"still": 1.2, "raster": _ROW * len(recording.labels) + 0.1}.get(panel, 1.5) for panel in panels]
+    several = [label for label, seen in zip(recording.labels, recording.seen.T, strict=True) if seen.sum() > 1]
+    bridged = fill_gaps(recording.select(several), result.longest_gap, mask_long=True)
+    still = {marker.label for marker in result.markers if marker.still}
+    panels = [*("xyz" if len(still) < len(recording.labels) else ""), *(["still"] if still else [])]
+    heights = [*(1.2 if panel == "still" else 1.5 for panel in panels), _ROW * len(recording.labels) + 0.1]
+    colours = dict(zip(recording.labels, cycle(MARKER_COLOURS), strict=False))
     with mpl.rc_context(STYLE):
-        figure = new_figure(sum(heights) + 1.0, sum(heights) + 1.3, narrow=narrow)
-        rows = figure.subplots(len(panels), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
-        colours = {label: MARKER_COLOURS[at % len(MARKER_COLOURS)] for at, label in enumerate(recording.labels)}
+        figure = new_figure(sum(heights) + 1.0, sum(heights) + 1.0, narrow=False)
+        *rows, last = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
         for axes, panel in zip(rows, panels, strict=True):
-            if panel == "raster":
-                _raster(axes, recording, bridged, result)
-                axes.set_title("" if narrow else "Seen by the cameras")
-                continue
-            for label in still if panel == "still" else moving:
-                if label in bridged.labels:
-                    path = _path(recording, bridged, label, panel)
-                    _line(axes, recording, result, label, path, colours[label])
-            name = "distance" if panel == "still" else panel
-            axes.set_ylabel(f"{name} [mm]")
+            for marker in result.markers:
+                if marker.label in several and marker.still == (panel == "still"):
+                    _draw_marker(axes, panel, recording, bridged, marker, colours[marker.label])
+            axes.set_ylabel("distance [mm]" if panel == "still" else f"{panel} [mm]")
             axes.yaxis.set_major_locator(MaxNLocator(4))
-            title = {"x": "Markers, from their median place", "still": "Markers that should not move"}.get(panel)
-            if title:
-                axes.set_title(title)
+            titles = {"x": "Markers, from their median place", "still": "Markers that should not move"}
+            axes.set_title(titles.get(panel, ""))
             if result.release is not None:
-                axes.axvline(
-                    result.release.frame / result.rate, color=TONES["ink"].light, linewidth=0.9, linestyle="--"
-                )
-        rows[-1].set_xlabel("time [s]; dashed: release" if result.release is not None else "time [s]")
-        rows[-1].set_xlim(0.0, len(recording.positions) / recording.rate)
-        _legend(figure, colours, narrow=narrow)
-        figure.align_ylabels(rows[:-1])
+                release = result.release.frame / result.rate
+                axes.axvline(release, color=TONES["ink"].light, linewidth=0.9, linestyle="--")
+        _draw_seen(last, recording, bridged, result)
+        last.set_xlabel("time [s]; dashed: release" if result.release is not None else "time [s]")
+        last.set_xlim(0.0, len(recording.positions) / recording.rate)
+        handles = [mpl.lines.Line2D([], [], color=colour, label=label) for label, colour in colours.items()]
+        columns = min(len(handles), _LEGEND_COLUMNS)
+        figure.legend(handles=handles, loc="outside upper left", ncols=columns, columnspacing=1.4)
+        figure.align_ylabels(rows)
     return figure
+
+
+def _draw_marker(
+    axes: Axes, panel: str, recording: Recording, bridged: Recording, marker: MarkerQuality, colour: str
+) -> None:
+    """What the panel shows of a marker: thin where it is filled, with a triangle above each jump."""
+    column = recording.labels.index(marker.label)
+    middle = np.nanmedian(recording.positions[:, column], axis=0)
+    moved = _MILLI * (bridged.positions[:, bridged.labels.index(marker.label)] - middle)
+    path = np.linalg.norm(moved, axis=1) if marker.still else moved[:, "xyz".index(panel)]
+    time = np.arange(len(path)) / recording.rate
+    axes.plot(time, path, color=colour, linewidth=0.5)
+    axes.plot(time, np.where(recording.seen[:, column], path, np.nan), color=colour, linewidth=1.1)
+    frames = [jump.frame for jump in marker.jumps]
+    axes.plot(
+        time[frames], path[frames], "v", color=colour, markersize=4.5, markeredgecolor="white", markeredgewidth=0.4
+    )
 
 
 def inspect_recording(config: Mapping[str, Any], folder: Path) -> str:
@@ -103,7 +124,7 @@ def inspect_recording(config: Mapping[str, Any], folder: Path) -> str:
     result = quality(recording, still, release, longest_gap=config["longest_gap"], least_jump=config["least_jump"])
     trials = [recording, *(read_recording(path, *given) for path in config["compare_with"])]
     motions = compare_base(trials, still) if len(trials) > 1 else []
-    figure = recording_quality(recording, result, narrow=False)
+    figure = recording_quality(recording, result)
     write_json(folder / "quality.json", {**result.to_plain(), "base": [_plain(motion, still) for motion in motions]})
     with atomic_path(folder / "quality.png") as partial:
         save_png(figure, partial)
@@ -112,32 +133,7 @@ def inspect_recording(config: Mapping[str, Any], folder: Path) -> str:
     return _text(result, motions)
 
 
-def _visible(recording: Recording) -> Recording:
-    """Without the markers that are seen in fewer than two frames, which cannot be drawn as a line."""
-    counts = recording.seen.sum(axis=0)
-    return recording.select([label for label, count in zip(recording.labels, counts, strict=True) if count > 1])
-
-
-def _path(recording: Recording, bridged: Recording, label: str, panel: str) -> FloatArray:
-    """(T,) [mm] what a panel shows of a marker."""
-    measured = recording.positions[:, recording.labels.index(label)]
-    moved = bridged.positions[:, bridged.labels.index(label)] - np.nanmedian(measured, axis=0)
-    return _MILLI * (np.linalg.norm(moved, axis=1) if panel == "still" else moved[:, "xyz".index(panel)])
-
-
-def _line(axes: Axes, recording: Recording, result: Quality, label: str, path: FloatArray, colour: str) -> None:
-    """One marker: thin where it is filled, with a triangle above each jump."""
-    time = np.arange(len(path)) / recording.rate
-    seen = recording.seen[:, recording.labels.index(label)]
-    axes.plot(time, path, color=colour, linewidth=0.5)
-    axes.plot(time, np.where(seen, path, np.nan), color=colour, linewidth=1.1)
-    frames = [jump.frame for marker in result.markers if marker.label == label for jump in marker.jumps]
-    axes.plot(
-        time[frames], path[frames], "v", color=colour, markersize=4.5, markeredgecolor="white", markeredgewidth=0.4
-    )
-
-
-def _raster(axes: Axes, recording: Recording, bridged: Recording, result: Quality) -> None:
+def _draw_seen(axes: Axes, recording: Recording, bridged: Recording, result: Quality) -> None:
     """A row for each marker: seen, filled or masked, and its jumps."""
     height = len(recording.labels)
     states = np.full((height, len(recording.positions)), 2)
@@ -154,19 +150,13 @@ def _raster(axes: Axes, recording: Recording, bridged: Recording, result: Qualit
         axes.plot(at, [row] * len(at), "|", color=TONES["ink"].light, markersize=6, markeredgewidth=0.9)
     for row in range(1, height):
         axes.axhline(row - 0.5, color="white", linewidth=1.2)
+    axes.set_title("Seen by the cameras")
     axes.set_yticks(range(height), recording.labels)
     axes.tick_params(axis="y", length=0)
     axes.grid(visible=False)
     handles: list[Artist] = [Patch(color=colour, label=name) for name, colour in _STATES.items()]
     handles.append(axes.plot([], [], "|", color=TONES["ink"].light, markersize=6, label="jump")[0])
     axes.legend(handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, handlelength=1.0)
-
-
-def _legend(figure: Figure, colours: Mapping[str, str], *, narrow: bool) -> None:
-    """Markers by colour, above the figure."""
-    handles = [mpl.lines.Line2D([], [], color=colour, label=label) for label, colour in colours.items()]
-    columns = min(len(handles), _LEGEND_COLUMNS[narrow])
-    figure.legend(handles=handles, loc="outside upper left", ncols=columns, columnspacing=1.4)
 
 
 def _text(result: Quality, motions: Sequence[BaseMotion]) -> str:

@@ -17,6 +17,7 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from rich.console import Console
+from rich.markup import escape
 
 from ..experiment.files import METRICS
 from ..experiment.schema import check, optional
@@ -36,6 +37,7 @@ log = logging.getLogger(__name__)
 PAGE = "reproduction.html"
 _UP_TO_DATE_SECONDS = 8.0  # for a run that finds nothing to do
 _LINE_SECONDS = 60.0
+_PLAIN: dict[str, Any] = {"markup": False, "highlight": False, "soft_wrap": True}
 _PATIENCE = 60.0  # s that an interrupted run gets to save what it has
 
 
@@ -119,15 +121,13 @@ def plan(config: Mapping[str, Any]) -> list[Run]:
     if wanted is None:
         return runs
     known = {run.experiment for run in runs} | {run.name for run in runs}
-    for name in wanted:
-        if name not in known:
-            raise InputError(
-                f"only names {name!r}, which is no experiment or run: there are {', '.join(sorted(known))}."
-            )
-    chosen = [run for run in runs if {run.experiment, run.name} & {*wanted}]
-    if not chosen:
+    if foreign := [name for name in wanted if name not in known]:
+        raise InputError(
+            f"only names {foreign[0]!r}, which is no experiment or run: there are {', '.join(sorted(known))}."
+        )
+    if not wanted:
         raise InputError("only is []: name at least one experiment or run, or leave it null for all.")
-    return chosen
+    return [run for run in runs if {run.experiment, run.name} & {*wanted}]
 
 
 def _run(config: Mapping[str, Any], experiment: str, name: str) -> Run:
@@ -155,11 +155,11 @@ def run_all(runs: Sequence[Run], logs: Path) -> list[Run]:
     pace = _Pace(runs)
     for number, run in enumerate(runs, 1):
         head = f"[{number}/{len(runs)}] {run.name}"
-        console.print(f"{head}, about {clock(pace.left())} left in all", markup=False, highlight=False, soft_wrap=True)
+        console.print(f"{head}, about {clock(pace.left())} left in all", **_PLAIN)
         start = time.perf_counter()
         try:
             with console.status(run.name) as status:
-                failure = execute(run, logs / f"{run.experiment}-{run.variant}.log", _Follower(console, status.update))
+                failure = execute(run, logs / f"{run.experiment}-{run.variant}.log", _follower(console, status.update))
         except KeyboardInterrupt as error:
             raise ReproductionInterrupted(
                 f"interrupted in run {number} of {len(runs)}, {run.name}; it keeps what it has, as do those before it, "
@@ -167,7 +167,7 @@ def run_all(runs: Sequence[Run], logs: Path) -> list[Run]:
             ) from error
         pace.count(run, time.perf_counter() - start)
         if failure:
-            console.print(f"{head} failed: {failure}", markup=False, highlight=False, soft_wrap=True)
+            console.print(f"{head} failed: {failure}", **_PLAIN)
         results.append(replace(run, failure=failure))
     return results
 
@@ -193,29 +193,25 @@ class _Pace:
             self._taken += seconds
 
 
-class _Follower:
+def _follower(console: Console, update: Callable[[str], None]) -> Callable[[str], None]:
     """Shows a run's own lines: the latest in a terminal, one a minute in a log."""
+    due = time.monotonic() + _LINE_SECONDS
 
-    def __init__(self, console: Console, update: Callable[[str], None]) -> None:
-        self._console = console
-        self._update = update
-        self._next = time.monotonic() + _LINE_SECONDS
+    def follow(line: str) -> None:
+        nonlocal due
+        if console.is_terminal:
+            update(escape(line))
+        elif time.monotonic() >= due:
+            console.print(f"    {line}", **_PLAIN)
+            due = time.monotonic() + _LINE_SECONDS
 
-    def __call__(self, line: str) -> None:
-        if self._console.is_terminal:
-            self._update(line.replace("[", r"\["))
-        elif time.monotonic() >= self._next:
-            self._console.print(f"    {line}", markup=False, highlight=False, soft_wrap=True)
-            self._next = time.monotonic() + _LINE_SECONDS
+    return follow
 
 
 def execute(run: Run, log_file: Path, follow: Callable[[str], None]) -> str | None:
     """Runs the ordinary command in a process of its own, out of reach of the terminal's Ctrl-C.
 
-    Args:
-        run: which.
-        log_file: for all that it says.
-        follow: takes each line that it writes to stderr.
+    All that it says goes to a file, and each line of stderr to `follow`.
 
     Returns:
         The sentence that it failed with, or None.

@@ -99,10 +99,7 @@ class Comparison:
 
 
 def read_reference(path: Path) -> ReferenceTrajectory:
-    """Reads a reference trajectory.
-
-    Args:
-        path: a NumPy archive (.npz) without pickled objects.
+    """Reads a reference trajectory from a NumPy archive (.npz) without pickled objects.
 
     Raises:
         DataFileError: the file is missing or no such archive; it lacks entries, has others, or has some of wrong shape,
@@ -186,11 +183,6 @@ def compare_with_reference(
 
     That is with implicit Euler, the mean element's mass at every vertex, full integration of both terms of the energy,
     and the face at the smallest x held.
-
-    Args:
-        reference: what to reproduce.
-        settings: the solver's.
-        device: a torch device.
 
     Raises:
         ConvergenceError: the solver failed.

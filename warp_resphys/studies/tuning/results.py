@@ -30,6 +30,7 @@ from ...report.page import (
 )
 from ..command import show, table_of, write_csv
 from ..page import write_page
+from . import figures
 from .space import Dimension, with_settings
 from .study import Outcome, SharedStudy
 
@@ -86,13 +87,9 @@ def write_results(tuning: Tuning) -> None:
     """Writes tune.json and trials.csv, and the best settings as a configuration."""
     outcomes = tuning.study.outcomes()
     rows = [
-        {
-            "trial": each.number,
-            "state": each.state,
-            "rollout_error_mm": each.error,
-            "seconds": None if each.seconds is None else round(each.seconds, 3),
-            **{name: each.settings.get(name) for name in tuning.space},
-        }
+        {"trial": each.number, "state": each.state, "rollout_error_mm": each.error}
+        | {"seconds": None if each.seconds is None else round(each.seconds, 3)}
+        | {name: each.settings.get(name) for name in tuning.space}
         for each in outcomes
     ]
     write_csv(tuning.folder / TABLE, rows)
@@ -134,10 +131,7 @@ def print_best(tuning: Tuning) -> None:
         show("Every trial diverged: search closer to settings that work, see tune.space.")
         return
     headings = ["trial", "error [mm]", *(key.rpartition(".")[2] for key in tuning.space)]
-    rows = [
-        [str(each.number), number_text(each.error), *(short_text(each.settings[key]) for key in tuning.space)]
-        for each in best[:_PRINTED]
-    ]
+    rows = [[str(each.number), *_values(tuning, each)] for each in best[:_PRINTED]]
     beaten = "" if tuning.beaten_by(best[0]) else ", which no trial has beaten"
     show(
         table_of("Best trials: roll-out error on the validation split", headings, rows),
@@ -147,6 +141,11 @@ def print_best(tuning: Tuning) -> None:
     )
 
 
+def _values(tuning: Tuning, trial: Outcome) -> list[str]:
+    """Error and settings of a trial."""
+    return [number_text(trial.error), *(short_text(trial.settings[key]) for key in tuning.space)]
+
+
 def write_pictures(tuning: Tuning) -> None:
     """Writes history.png, importance.png and settings.png, and tune.html, which shows them and the trials."""
     outcomes = tuning.study.outcomes()
@@ -154,14 +153,7 @@ def write_pictures(tuning: Tuning) -> None:
     last = [key.rpartition(".")[2] for key in tuning.space]
     names = {key: name if last.count(name) == 1 else key for key, name in zip(tuning.space, last, strict=True)}
     trials = [
-        Row(
-            str(each.number),
-            [
-                Cell(number_text(each.error)),
-                *(Cell(short_text(each.settings[key])) for key in names),
-                Cell(duration_text(each.seconds or 0.0)),
-            ],
-        )
+        Row(str(each.number), [Cell(text) for text in (*_values(tuning, each), duration_text(each.seconds or 0.0))])
         for each in best
     ]
     space = [Row(key, [Cell(str(dimension))]) for key, dimension in tuning.space.items()]
@@ -178,11 +170,11 @@ def write_pictures(tuning: Tuning) -> None:
         Table("Setting", ["Range"], space),
         Table("Setting", ["Value"], common, summary="What all trials have in common"),
     ]
+    model = _MODELS[tuning.config["tune"]["model"]]
     write_page(
         tuning.folder / PAGE,
         title=tuning.config["title"],
-        kicker=f"experiment {tuning.config['name']}, search for the settings of "
-        f"{_MODELS[tuning.config['tune']['model']]}",
+        kicker=f"experiment {tuning.config['name']}, search for the settings of {model}",
         verdict=_verdict(tuning, outcomes, best),
         parts=[Part("", results), Part("What was searched", searched)],
     )
@@ -208,8 +200,6 @@ def _verdict(tuning: Tuning, outcomes: Sequence[Outcome], best: Sequence[Outcome
 def _drawn(
     tuning: Tuning, outcomes: Sequence[Outcome], best: Sequence[Outcome], names: Mapping[str, str]
 ) -> list[Drawn]:
-    from . import figures  # Matplotlib takes a second, which a worker need not wait for.
-
     errors, pruned = np.full((2, len(outcomes)), np.nan)
     for each in outcomes:
         if each.error is not None and each.state in ("complete", "pruned"):

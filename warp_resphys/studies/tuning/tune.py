@@ -33,16 +33,8 @@ log = logging.getLogger(__name__)
 _POLL_SECONDS = 0.5
 _PICTURE_SECONDS = 60.0
 _KEYS = Group(
-    {
-        "model": WORD,
-        "trials": NATURAL,
-        "trial_seconds": optional(POSITIVE),
-        "seed": COUNT,
-        "study": NAME,
-        "save_as": NAME,
-        "space": ANYTHING,
-        "settings": Group(each=ANYTHING),
-    }
+    {"model": WORD, "trials": NATURAL, "trial_seconds": optional(POSITIVE), "seed": COUNT, "study": NAME}
+    | {"save_as": NAME, "space": ANYTHING, "settings": Group(each=ANYTHING)}
 )
 
 
@@ -114,39 +106,29 @@ def _digest(data: Mapping[str, Any]) -> str:
 
 def _work(tuning: Tuning, learning: Learning, fingerprint: str) -> None:
     """Runs trials until there are enough; then waits for those of others, which may have to be taken over."""
-    study, results = tuning.study, tuning.folder / "results.lock"
-    drawn = time.monotonic()
-    waiting = False
-    while True:
-        claim = study.claim()
-        if claim is not None:
-            waiting = False
-            _run_trial(tuning, learning, claim, f"{fingerprint} {_digest(claim.settings)}")
-            with held(results):
-                write_results(tuning)
-                if time.monotonic() - drawn > _PICTURE_SECONDS:
-                    write_pictures(tuning)
-                    drawn = time.monotonic()
+    study, drawn, told = tuning.study, time.monotonic(), False
+    results = tuning.folder / "results.lock"
+    while (claim := study.claim()) is not None or (holders := study.holders()):
+        if claim is None:
+            if not told:
+                log.info("waiting for the last trials, of %s; Ctrl-C leaves them alone", ", ".join(holders))
+            told = True
+            time.sleep(_POLL_SECONDS)
             continue
-        holders = study.holders()
-        if not holders:
-            break
-        if not waiting:
-            log.info("waiting for the last trials, of %s; Ctrl-C leaves them alone", ", ".join(holders))
-            waiting = True
-        time.sleep(_POLL_SECONDS)
+        told = False
+        _run_trial(tuning, learning, claim, f"{fingerprint} {_digest(claim.settings)}")
+        with held(results):
+            write_results(tuning)
+            if time.monotonic() - drawn > _PICTURE_SECONDS:
+                write_pictures(tuning)
+                drawn = time.monotonic()
     with held(results):
         write_results(tuning)
         write_pictures(tuning)
 
 
 def _run_trial(tuning: Tuning, learning: Learning, claim: Claim, fingerprint: str) -> None:
-    """Trains with the settings of a trial, from where another worker left it, and tells what came of it.
-
-    Raises:
-        InputError: settings that cannot be trained with.
-        StageInterrupted: the user pressed Ctrl-C.
-    """
+    """Trains with the settings of a trial, from where another worker left it, and tells what came of it."""
     start, spent, study = time.perf_counter(), 0.0, tuning.study
     limit = tuning.config["tune"]["trial_seconds"]
     path = tuning.folder / "trials" / f"{claim.number}.safetensors"
@@ -200,22 +182,18 @@ def _log_progress(study: SharedStudy, claim: Claim, value: float | None, seconds
     outcomes = study.outcomes()
     told = [each for each in outcomes if each.state in ("complete", "pruned")]
     came = "given up" if value is None else "diverged" if math.isinf(value) else f"{value:.3g} mm"
-    parts = [f"trial {claim.number}: {came} in {clock(seconds)}; {len(told)} of {study.trials} done"]
-    best = next(iter(ranked(outcomes)), None)
-    if best is not None:
-        parts.append(f"best {best.error:.3g} mm of trial {best.number}")
+    said = f"trial {claim.number}: {came} in {clock(seconds)}; {len(told)} of {study.trials} done"
+    if best := ranked(outcomes):
+        said += f", best {best[0].error:.3g} mm of trial {best[0].number}"
     if len(told) < study.trials:
         mean = sum(each.seconds or 0.0 for each in told) / len(told)
-        workers = max(1, len(study.holders()) + 1)
-        parts.append(f"about {clock(mean * (study.trials - len(told)) / workers)} left")
-    log.info(", ".join(parts))
+        left = mean * (study.trials - len(told)) / (1 + len(study.holders()))
+        said += f", about {clock(left)} left"
+    log.info("%s", said)
 
 
 def check_tuning(config: Mapping[str, Any]) -> dict[str, Dimension]:
     """Checks the group ``tune``; returns its search space.
-
-    Args:
-        config: a configuration that `check_configuration` accepts.
 
     Raises:
         InputError: a value of the wrong kind or out of range, also among those that may be tried.

@@ -90,12 +90,7 @@ def _table(path: Path, times: FloatArray) -> FloatArray:
 
 
 def since_first(places: ArrayLike, quaternions: ArrayLike, source: str | Path) -> FloatArray:
-    """(T, 6) motion since the first frame, of a base that was recorded.
-
-    Args:
-        places: (T, 3) of a point on it [m].
-        quaternions: (T, 4) of its rotation, w first.
-        source: the file, for messages.
+    """(T, 6) motion since the first frame of places (T, 3) [m] of a point, and quaternions (T, 4), w first.
 
     Raises:
         DataFileError: a value that is not finite, or a quaternion of no length.
@@ -119,7 +114,7 @@ def followed(markers: FloatArray, still: FloatArray, source: str | Path) -> Floa
     Args:
         markers: (T, M, 3) [m], NaN where not seen.
         still: (M, 3) before time zero [m], NaN for one that was not seen.
-        source: the file, for messages.
+        source: the file.
 
     Raises:
         DataFileError: three or more are seen in less than half of the frames.
@@ -144,12 +139,7 @@ def followed(markers: FloatArray, still: FloatArray, source: str | Path) -> Floa
 
 
 def in_frame(poses: FloatArray, frame: RigidTransform) -> FloatArray:
-    """(T, 6) the same motions as another frame has them: G D G^-1.
-
-    Args:
-        poses: (T, 6) D.
-        frame: G, from the frame of the poses to the other one.
-    """
+    """(T, 6) the same motions D as another frame has them, to which G leads from theirs: G D G^-1."""
     motion = rigid(poses)
     turned = frame.rotation @ motion.rotation @ frame.rotation.T
     origin = -frame.rotation.T @ frame.translation
@@ -165,12 +155,7 @@ def at_times(poses: FloatArray, times: NDArray[Any], new: NDArray[Any]) -> Float
 
 
 def check_steps(poses: FloatArray, points: FloatArray, source: str | Path) -> None:
-    """Refuses a motion that no simulation follows.
-
-    Args:
-        poses: (K + 1, 6) at the steps of a simulation.
-        points: (N, 3) the undeformed body [m].
-        source: what gave the motion, for messages.
+    """Refuses (K + 1, 6) poses at the steps of a simulation that no body of points (N, 3) [m] follows.
 
     Raises:
         DataFileError: a corner of the body moves by a fifth of its size in a single step.

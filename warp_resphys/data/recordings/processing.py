@@ -63,11 +63,7 @@ def resample(recording: Recording, rate: float) -> Recording:
     ratio = recording.rate / rate
     every = round(ratio)
     if every >= 1 and abs(ratio - every) <= _WHOLE * ratio:
-        actuation = None if recording.actuation is None else recording.actuation[::every]
-        base = None if recording.base is None else recording.base[::every]
-        return dataclasses.replace(
-            recording, positions=recording.positions[::every], actuation=actuation, base=base, rate=float(rate)
-        )
+        return dataclasses.replace(recording.frames(slice(None, None, every)), rate=float(rate))
     old = np.arange(len(recording.positions))
     new = np.arange(int((len(old) - 1) / ratio * (1.0 + _WHOLE)) + 1) * ratio
     new = np.minimum(new, old[-1])
@@ -161,11 +157,5 @@ def trim_to_release(recording: Recording, release: Release, seconds: float | Non
             f"{recording.source} ends {last - first} frames after its release in frame {release.frame:.1f}; give a "
             "recording of the motion that follows."
         )
-    return dataclasses.replace(
-        recording,
-        positions=recording.positions[first:last],
-        actuation=None if recording.actuation is None else recording.actuation[first:last],
-        base=None if recording.base is None else recording.base[first:last],
-        rest=np.nanmedian(held, axis=0),
-        start=(first - release.frame) / recording.rate,
-    )
+    start = (first - release.frame) / recording.rate
+    return dataclasses.replace(recording.frames(slice(first, last)), rest=np.nanmedian(held, axis=0), start=start)

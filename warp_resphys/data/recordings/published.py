@@ -106,9 +106,8 @@ def read_published_beam(folder: str | Path) -> dict[int, Recording]:
 
 def convert_arm(path: str | Path, folder: Path) -> list[dict[str, Any]]:
     """Writes each trajectory of the arm as arm_000.h5 and so on, and index.json; returns what that says of each."""
-    no_more: dict[str, Any] = {}
-    trials = [(trial, recording, no_more) for trial, recording in enumerate(read_published_arm(path))]
-    return write_trials(folder, "arm", trials, ARM_NOMINAL)
+    recordings = read_published_arm(path)
+    return write_trials(folder, "arm", [(trial, each, {}) for trial, each in enumerate(recordings)], ARM_NOMINAL)
 
 
 def convert_beam(source: str | Path, folder: Path) -> list[dict[str, Any]]:

@@ -25,28 +25,19 @@ RATES = (1e-3, 1e6)  # [Hz]
 
 @dataclasses.dataclass(frozen=True)
 class Recording:
-    """Markers followed over time.
+    """Markers followed over time."""
 
-    Attributes:
-        labels: Names of the M markers.
-        positions: (T, M, 3) [m], NaN where a marker is occluded.
-        rate: Frames a second [Hz].
-        source: The file it came from.
-        actuation: (T, C) [Pa, N or without a unit] what drove the body in each frame, if that was recorded.
-        rest: (M, 3) [m] the markers on the body at rest, if known; it tells where they sit on it.
-        base: (T, 6) the motion since the first frame of what the body is fixed to, if that was recorded; see
-            `data.base_motion`.
-        start: Time of the first frame [s]; after `trim_to_release`, since the release.
-    """
-
-    labels: tuple[str, ...]
-    positions: FloatArray
-    rate: float
-    source: Path
+    labels: tuple[str, ...]  # Names of the M markers
+    positions: FloatArray  # (T, M, 3) [m], NaN where a marker is occluded
+    rate: float  # Frames a second [Hz]
+    source: Path  # The file it came from
+    # (T, C) [Pa, N or without a unit] what drove the body in each frame, if that was recorded
     actuation: FloatArray | None = None
+    # (M, 3) [m] the markers on the body at rest, if known; it tells where they sit on it
     rest: FloatArray | None = None
+    # (T, 6) the motion since the first frame of what the body is fixed to, if that was recorded; see `data.base_motion`
     base: FloatArray | None = None
-    start: float = 0.0
+    start: float = 0.0  # Time of the first frame [s]; after `trim_to_release`, since the release
 
     @property
     def seen(self) -> BoolArray:
@@ -74,30 +65,25 @@ class Recording:
         rest = None if self.rest is None else self.rest[columns]
         return dataclasses.replace(self, labels=tuple(labels), positions=self.positions[:, columns], rest=rest)
 
+    def frames(self, chosen: slice) -> "Recording":
+        """Some of the frames; rate and start stay as they are."""
+        actuation, base = (None if each is None else each[chosen] for each in (self.actuation, self.base))
+        return dataclasses.replace(self, positions=self.positions[chosen], actuation=actuation, base=base)
+
 
 @dataclasses.dataclass(frozen=True)
 class RawRecording:
-    """What a file holds, in its own units; None for what it does not say.
+    """What a file holds, in its own units; None for what it does not say."""
 
-    Attributes:
-        positions: (T, M, 3) [unit].
-        labels: M names.
-        unit: m, cm or mm.
-        rate: [Hz].
-        actuation: (T, C) [Pa, N or 1].
-        rest: (M, 3) [unit].
-        base: (T, 7) a point of what the body is fixed to [m], and a quaternion of its rotation, w first.
-        start: Time of the first frame [s].
-    """
-
-    positions: FloatArray
-    labels: Sequence[str] | None
-    unit: str | None
-    rate: float | None
-    actuation: FloatArray | None = None
-    rest: FloatArray | None = None
+    positions: FloatArray  # (T, M, 3) [unit]
+    labels: Sequence[str] | None  # M names
+    unit: str | None  # m, cm or mm
+    rate: float | None  # [Hz]
+    actuation: FloatArray | None = None  # (T, C) [Pa, N or 1]
+    rest: FloatArray | None = None  # (M, 3) [unit]
+    # (T, 7) a point of what the body is fixed to [m], and a quaternion of its rotation, w first
     base: FloatArray | None = None
-    start: float = 0.0
+    start: float = 0.0  # Time of the first frame [s]
 
 
 def to_recording(

@@ -151,11 +151,7 @@ def tangent_frames(corners: torch.Tensor, unstretch: torch.Tensor) -> torch.Tens
 
     With f1, f2 the images of the orthonormal tangents and n the unit normal, f1 + f2 x n points along the first column
     of the rotation closest to the deformation of the plane: the polar factor of [[a, b], [c, d]] is the matrix
-    [[a + d, b - c], [c - b, a + d]], scaled to determinant one.
-
-    Args:
-        corners: (B, m, 3, 3) the corners' positions [m].
-        unstretch: (m, 2, 2) see `SurfaceMarkers`.
+    [[a + d, b - c], [c - b, a + d]], scaled to determinant one. Corners are (B, m, 3, 3) [m].
     """
     edges = corners[:, :, 1:] - corners[:, :, :1]  # (B, m, 2, 3)
     first, second = torch.einsum("bmki,mkj->jbmi", edges, unstretch)
@@ -165,7 +161,7 @@ def tangent_frames(corners: torch.Tensor, unstretch: torch.Tensor) -> torch.Tens
 
 
 def closest_rotation(matrix: torch.Tensor) -> torch.Tensor:
-    r"""(B, 3, 3) rotations R that maximise tr(R^T A), differentiable once.
+    r"""(B, 3, 3) rotations R that maximise tr(R^T A), differentiable once; the identity's for an A that is not finite.
 
     Where R is optimal, S = R^T A is symmetric. When A changes by dA, R becomes R (1 + [w]) with
 
@@ -175,9 +171,6 @@ def closest_rotation(matrix: torch.Tensor) -> torch.Tensor:
     s3 with the sign of det A: it is regular for every set of points that is not on a line, also for a plane and
     symmetric one, where the singular vectors themselves have no derivative. A step of Newton's method from the
     optimum moves nothing and has that derivative; so this is one, with all else constant.
-
-    Args:
-        matrix: (B, 3, 3) A. One that is not finite has the rotation of the identity.
     """
     identity = torch.eye(3, device=matrix.device, dtype=matrix.dtype)
     with torch.no_grad():
@@ -192,10 +185,7 @@ def closest_rotation(matrix: torch.Tensor) -> torch.Tensor:
     skew = turned - turned.mT
     axial = torch.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], -1)
     spin = (inverse @ axial[:, :, None])[:, :, 0]
-    zero = torch.zeros_like(spin[:, 0])
-    x, y, z = spin.unbind(-1)
-    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).view(-1, 3, 3)
-    return rotation + rotation @ cross
+    return rotation + torch.linalg.cross(rotation, spin[:, None].expand_as(rotation), dim=-1)
 
 
 def bind_markers(
@@ -209,9 +199,9 @@ def bind_markers(
 ) -> Markers:
     """Binds markers to a body at rest.
 
-    Faces with four nodes count as two triangles, those with six as four, through all of their nodes; a marker is bound
-    to one of these. Beside an edge, a ``normal`` marker stands on the plane of that adjacent triangle which it lies
-    most squarely above, outside of the triangle where need be, and a ``frame`` marker on the edge.
+    A marker is bound to a triangle of `surface.closest_points`. Beside an edge, a ``normal`` one stands on the plane of
+    that adjacent triangle which it lies most squarely above, outside of the triangle where need be, and a ``frame`` one
+    on the edge.
 
     Args:
         mesh: The body.

@@ -50,12 +50,8 @@ class Registration:
 def kabsch(source: ArrayLike, target: ArrayLike) -> RigidTransform:
     """The rigid motion that carries source points onto target points with the least sum of squares.
 
-    Kabsch, A solution for the best rotation to relate two sets of vectors, Acta Cryst. A32 (1976) 922;
-    leading axes of either argument are a batch.
-
-    Args:
-        source: (..., N, 3) [m].
-        target: (..., N, 3) [m].
+    Kabsch, A solution for the best rotation to relate two sets of vectors, Acta Cryst. A32 (1976) 922. Both are
+    (..., N, 3) [m]; leading axes of either are a batch.
 
     Raises:
         InputError: Fewer than three points, points on a line, unequal numbers of them, or a value not finite.

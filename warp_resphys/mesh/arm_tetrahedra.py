@@ -35,12 +35,11 @@ def tetrahedra(geometry: ArmGeometry, size: float) -> Mesh:
         raise MeshError("gmsh is in use in this process: call gmsh.finalize() before an arm is meshed.")
     gmsh.initialize(interruptible=False)  # so that Ctrl-C stays Python's
     try:
-        for option, value in (
-            *(("General.Terminal", 0), ("General.NumThreads", 1)),
-            *(("Mesh.MeshSizeMax", size), ("Mesh.MeshSizeMin", 0.5 * size)),
-            ("Mesh.Algorithm3D", 1),  # Delaunay, the same mesh every time
-            ("Mesh.OptimizeThreshold", 0.6),  # of the quality below which tetrahedra are improved
-        ):
+        options = {"General.Terminal": 0.0, "General.NumThreads": 1.0}
+        options |= {"Mesh.MeshSizeMax": size, "Mesh.MeshSizeMin": 0.5 * size}
+        options |= {"Mesh.Algorithm3D": 1.0}  # Delaunay, the same mesh every time
+        options |= {"Mesh.OptimizeThreshold": 0.6}  # of the quality below which tetrahedra are improved
+        for option, value in options.items():
             gmsh.option.setNumber(option, value)
         _build(gmsh.model.occ, geometry, size)
         gmsh.model.mesh.generate(3)

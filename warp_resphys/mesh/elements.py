@@ -171,9 +171,7 @@ _CONSTANT = np.zeros((1, 3), dtype=np.int64)
 _LINEAR = np.concatenate([_CONSTANT, np.eye(3, dtype=np.int64)])
 
 
-def _element(
-    name: str, corners: Array, exponents: IntArray, parents: list[list[int]], rule: Rule, **volume: Any
-) -> Element:
+def _element(name: str, corners: Array, exponents: IntArray, parents: list[list[int]], **rules: Any) -> Element:
     """With nodes in the middle of groups of corners, and so on the faces."""
     place = {frozenset(group): len(corners) + number for number, group in enumerate(parents)}
     faces = []
@@ -181,7 +179,7 @@ def _element(
         groups = map(frozenset, [*zip(face, face[1:] + face[:1], strict=True), face])
         faces.append([*face, *(place[group] for group in groups if group in place)])
     shape = Shape(_between(corners, parents), exponents)
-    return Element(name, shape, parents, rule, np.array(faces, dtype=np.int64), **volume)
+    return Element(name, shape, parents, faces=np.array(faces, dtype=np.int64), **rules)
 
 
 FACES: dict[int, Face] = {
@@ -204,26 +202,27 @@ FACES: dict[int, Face] = {
     )
 }
 
+_ONE_POINT: dict[str, Any] = {"rule": (np.full((1, 3), 0.25), np.full(1, 1.0 / 6.0)), "volume_modes": None}
+_KEAST: dict[str, Any] = {"rule": degree_two_tetrahedron(), "volume_modes": _CONSTANT, "mass_rule": conical_simplex(4)}
+_TRILINEAR: dict[str, Any] = {"rule": gauss_box(2), "volume_modes": _CONSTANT}
 # Four of the eight Gauss points, which integrate quadratic polynomials: as many as there are linear modes.
 _FOUR_POINTS = _HEXAHEDRON[[0, 2, 5, 7]] / np.sqrt(3.0), np.full(4, 2.0)
-_QUADRATIC: dict[str, Any] = {"volume_modes": _LINEAR, "volume_rule": _FOUR_POINTS, "mass_rule": gauss_box(3)}
-_ONE_POINT = np.full((1, 3), 0.25), np.full(1, 1.0 / 6.0)
+_TRIQUADRATIC: dict[str, Any] = {
+    "rule": gauss_box(3),
+    "mass_rule": gauss_box(3),
+    "volume_modes": _LINEAR,
+    "volume_rule": _FOUR_POINTS,
+}
 _MIDDLES = [*_HEXAHEDRON_EDGES, *_HEXAHEDRON_MIDDLES]
 
 ELEMENTS: dict[str, Element] = {
     element.name: element
     for element in (
-        _element("tetrahedron", _TETRAHEDRON, _exponents(1, total=1), [], _ONE_POINT, volume_modes=None),
-        _element(
-            *("tetrahedron10", _TETRAHEDRON, _exponents(2, total=2), _TETRAHEDRON_EDGES, degree_two_tetrahedron()),
-            volume_modes=_CONSTANT,
-            mass_rule=conical_simplex(4),
-        ),
-        _element("hexahedron", _HEXAHEDRON, _exponents(1), [], gauss_box(2), volume_modes=_CONSTANT),
-        _element(
-            *("hexahedron20", _HEXAHEDRON, _serendipity(_exponents(2)), _HEXAHEDRON_EDGES, gauss_box(3)), **_QUADRATIC
-        ),
-        _element("hexahedron27", _HEXAHEDRON, _exponents(2), _MIDDLES, gauss_box(3), **_QUADRATIC),
+        _element("tetrahedron", _TETRAHEDRON, _exponents(1, total=1), [], **_ONE_POINT),
+        _element("tetrahedron10", _TETRAHEDRON, _exponents(2, total=2), _TETRAHEDRON_EDGES, **_KEAST),
+        _element("hexahedron", _HEXAHEDRON, _exponents(1), [], **_TRILINEAR),
+        _element("hexahedron20", _HEXAHEDRON, _serendipity(_exponents(2)), _HEXAHEDRON_EDGES, **_TRIQUADRATIC),
+        _element("hexahedron27", _HEXAHEDRON, _exponents(2), _MIDDLES, **_TRIQUADRATIC),
     )
 }
 BY_NODES: dict[int, Element] = {element.nodes: element for element in ELEMENTS.values()}

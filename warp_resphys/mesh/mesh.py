@@ -201,11 +201,7 @@ def surface_vertices(mesh: Mesh) -> IntArray:
 
 
 def select_vertices(
-    mesh: Mesh,
-    x: float | None = None,
-    y: float | None = None,
-    z: float | None = None,
-    tolerance: float = 1e-9,
+    mesh: Mesh, x: float | None = None, y: float | None = None, z: float | None = None, tolerance: float = 1e-9
 ) -> IntArray:
     """(S,) sorted vertices within a tolerance [m] of planes across the axes at x, y and z [m], of one plane at least.
 

@@ -93,16 +93,10 @@ def to_recording(
     rate: float | None = None,
     labels: Sequence[str] | None = None,
 ) -> Recording:
-    """Brings what was read to metres and seconds, and checks it; what is given goes before what the file says.
+    """Brings what was read of a file to metres and seconds, and checks it.
 
-    A marker without a name becomes `marker 3`, those that share one `name #1`, `name #2` and so on.
-
-    Args:
-        raw: The content of the file.
-        path: The file, for messages.
-        units: m, cm or mm.
-        rate: Frames a second [Hz].
-        labels: A name for each marker, in the file's order.
+    What is given, as `reading.read_recording` describes it, goes before what the file says. A marker without a name
+    becomes `marker 3`, those that share one `name #1`, `name #2` and so on.
 
     Raises:
         DataFileError: The unit or the rate is missing or not known, an array has the wrong shape, or the positions are

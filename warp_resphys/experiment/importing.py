@@ -19,8 +19,7 @@ from ..data.recordings.processing import fill_gaps, release_of, resample, smooth
 from ..data.recordings.quality import check_base, check_motion, check_passive, quality
 from ..data.recordings.reading import read_recording
 from ..data.recordings.recording import Recording, listed
-from ..data.recordings.release import Release
-from ..data.recordings.valve import valve_opening
+from ..data.recordings.release import Release, valve_opening
 from ..data.registration import Registration, RigidTransform, register_markers
 from ..dynamics.simulator import Simulator
 from ..io.errors import DataFileError, InputError
@@ -124,7 +123,7 @@ class Importer:
         self._check_rates([each for each, trial in zip(recordings, trials, strict=True) if _has_release(trial)])
         releases = [self._release(each, trial) for each, trial in zip(recordings, trials, strict=True)]
         ready = [
-            each if _has_release(trial) else resample(each, 1.0 / self.settings["time_step"], interpolate=True)
+            each if _has_release(trial) else resample(each, 1.0 / self.settings["time_step"])
             for each, trial in zip(recordings, trials, strict=True)
         ]
         self._check_reference(trials, ready, releases)

@@ -71,7 +71,7 @@ class Reconstructor(ABC):
                 "of the force open."
             )
         last = self.simulator.body.n_vertices - 1
-        if int(markers.used.min()) < 0 or int(markers.used.max()) > last:
+        if int(markers.vertices.min()) < 0 or int(markers.vertices.max()) > last:
             raise InputError(f"a marker is on a vertex that the body does not have: its vertices are 0 to {last}.")
 
     def with_constants(self, constants: Constants) -> Self:

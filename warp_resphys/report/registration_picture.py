@@ -81,7 +81,7 @@ def draw_registration(
         mesh: The body at rest.
         registration: The measured markers in its frame; those that were not seen are not drawn.
         nominal: (M, 3) [m] where the markers should be.
-        feet: (M, 3) [m] where their stems stand, such as `Markers.feet` at rest.
+        feet: (M, 3) [m] where their stems stand; not drawn if left out.
         fixed: Vertices of the clamped region.
         title: What is drawn.
 

@@ -14,9 +14,7 @@ from scipy.interpolate import CubicSpline, make_smoothing_spline
 from scipy.spatial.transform import Rotation, Slerp
 
 from ..io.errors import DataFileError
-from .rigid import RigidTransform, kabsch
-
-FloatArray = NDArray[np.float64]
+from .rigid import FloatArray, RigidTransform, kabsch
 
 OBSERVED = ("recorded", "reference")  # the array `base` of a recording, or its reference markers, tell it
 _LARGEST_STEP = 0.2  # of the size of a body

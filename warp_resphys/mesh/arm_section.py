@@ -208,18 +208,13 @@ class Section:
         """Of the outline's arc opposite chamber 1."""
         return complex(self.arc_centre if self.outline == "lobed" else 0.0)
 
-    @property
-    def _arcs(self) -> tuple[set[str], ...]:
-        """Letters of further points with an arc of the chamber between them."""
-        return {"half_disc": ({"A", "C"},), "disc": ({"A", "C"}, {"M", "C"}), "sector": ({"M", "C"},)}[self.profile]
-
     def piece(self, first: str, last: str) -> Piece:
         """The line between two neighbouring named points."""
-        pair = {first[0], last[0]}
+        letters = "".join(sorted({first[0], last[0]}))
         centre: complex | None = None
-        if pair == {"B"} or (pair == {"B", "V"} and self.outline == "round"):
+        if letters == "B" or (letters == "BV" and self.outline == "round"):
             centre = self._outline_centre
-        elif pair == {"A"} or pair in self._arcs:
+        elif letters in {"half_disc": ("A", "AC"), "disc": ("A", "AC", "CM"), "sector": ("A", "CM")}[self.profile]:
             centre = complex(self.arc_centre)
         return Piece(self.points[first], self.points[last], centre)
 

@@ -104,15 +104,10 @@ def since_first(places: ArrayLike, quaternions: ArrayLike, source: str | Path) -
 
 
 def followed(markers: FloatArray, still: FloatArray, source: str | Path) -> FloatArray:
-    """(T, 6) motion of markers that stand on the base.
+    """(T, 6) motion of markers (T, M, 3) [m] on the base since they stood still at (M, 3) [m]; NaN where not seen.
 
     Frames in which fewer than three of them are seen are interpolated, and a spline smooths the motion as much as its
     noise asks for (generalised cross-validation): a body feels the acceleration of its base.
-
-    Args:
-        markers: (T, M, 3) [m], NaN where not seen.
-        still: (M, 3) before time zero [m], NaN for one that was not seen.
-        source: the file.
 
     Raises:
         DataFileError: three or more are seen in less than half of the frames.

@@ -33,7 +33,7 @@ class Release:
 
 
 def find_release(path: FloatArray, rate: float, source: str | Path = "the recording") -> Release:
-    """Finds when a point that was held still was let go.
+    """Finds when a point that was held still was let go, on a path (T, 3) [m] without NaN at a rate [Hz].
 
     The point moves fast for the first time where one frame's step reaches a third of the largest (of a path
     through a three-frame median, which a sample gone astray does not pass). The body was held in the last
@@ -41,10 +41,7 @@ def find_release(path: FloatArray, rate: float, source: str | Path = "the record
     rest first moves by s = a (t - t0)^2 / 2, so sqrt(s) of the first three frames of motion is a line, and
     its zero is the release.
 
-    Args:
-        path: (T, 3) [m], without NaN; a mean of several markers is best.
-        rate: Frames a second [Hz].
-        source: Where the path comes from.
+    A mean of several markers is the best path.
 
     Raises:
         DataFileError: The path has no such moment.

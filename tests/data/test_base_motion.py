@@ -14,7 +14,7 @@ from warp_resphys.data.base_motion import (
     rigid,
     since_first,
 )
-from warp_resphys.data.registration import RigidTransform
+from warp_resphys.data.rigid import RigidTransform
 from warp_resphys.io.errors import DataFileError
 
 TIMES = np.linspace(0.0, 2.0, 201)

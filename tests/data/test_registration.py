@@ -8,12 +8,8 @@ from scipy.spatial.transform import Rotation
 from warp_resphys.data.recordings.processing import fill_gaps
 from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.recordings.release import find_release
-from warp_resphys.data.registration import (
-    RigidTransform,
-    kabsch,
-    register_markers,
-    root_mean_square,
-)
+from warp_resphys.data.registration import register_markers
+from warp_resphys.data.rigid import RigidTransform, kabsch, root_mean_square
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.mesh.mesh import boundary_triangles, box_hexahedra, box_tetrahedra
 from warp_resphys.mesh.surface import closest_points

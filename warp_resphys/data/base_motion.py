@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline, make_smoothing_spline
 from scipy.spatial.transform import Rotation, Slerp
 
 from ..io.errors import DataFileError
-from .registration import RigidTransform, kabsch
+from .rigid import RigidTransform, kabsch
 
 FloatArray = NDArray[np.float64]
 

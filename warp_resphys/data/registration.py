@@ -14,22 +14,10 @@ from numpy.typing import ArrayLike
 
 from ..io.errors import DataFileError, InputError
 from .recordings.recording import BoolArray, FloatArray, listed
+from .rigid import RigidTransform, fit, root_mean_square
 
 _MILLI = 1e3
 _MOST_FITS = 20_000  # Sets of markers that are tried when outliers are sought.
-
-
-@dataclasses.dataclass(frozen=True)
-class RigidTransform:
-    """The map p -> R p + t."""
-
-    rotation: FloatArray  # (..., 3, 3), determinant +1
-    translation: FloatArray  # (..., 3) [m]
-
-    def apply(self, points: ArrayLike) -> FloatArray:
-        """Transforms points (..., N, 3) [m]."""
-        rotated: FloatArray = np.asarray(points, dtype=np.float64) @ np.swapaxes(self.rotation, -1, -2)
-        return rotated + self.translation[..., None, :]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,35 +31,6 @@ class Registration:
     inliers: BoolArray  # (M,) whether it took part in the fit
     outliers: tuple[str, ...]  # Names of markers that should have taken part, and were too far off
     rms: float  # Root mean square [m] of the residuals of the inliers
-
-
-def kabsch(source: ArrayLike, target: ArrayLike) -> RigidTransform:
-    """The rigid motion that carries source points onto target points with the least sum of squares.
-
-    Kabsch, A solution for the best rotation to relate two sets of vectors, Acta Cryst. A32 (1976) 922;
-    leading axes of either argument are a batch.
-
-    Args:
-        source: (..., N, 3) [m].
-        target: (..., N, 3) [m].
-
-    Raises:
-        InputError: Fewer than three points, points on a line, unequal numbers of them, or a value not finite.
-    """
-    a, b = np.asarray(source, dtype=np.float64), np.asarray(target, dtype=np.float64)
-    if a.shape[-2:] != b.shape[-2:] or a.shape[-1] != 3 or a.shape[-2] < 3:
-        raise InputError(f"Registration needs three or more pairs of points, not {a.shape} with {b.shape}.")
-    if not (np.isfinite(a).all() and np.isfinite(b).all()):
-        raise InputError("Registration needs finite points: leave occluded markers and frames out.")
-    motion, on_a_line = _fit(a, b, np.ones(a.shape[-2]))
-    if on_a_line.any():
-        raise InputError("Registration needs points that do not all lie on one line.")
-    return motion
-
-
-def root_mean_square(residual: FloatArray) -> float:
-    """Root of the mean squared length of vectors (..., 3)."""
-    return float(np.sqrt(np.mean(np.sum(np.square(residual), axis=-1))))
 
 
 def register_markers(
@@ -121,7 +80,7 @@ def register_markers(
             f"{source}: the markers at rest do not fit their nominal positions to {_MILLI * largest_residual:.1f} mm: "
             f"{_worst(a, b, used, names)}; check its name, its nominal position and the unit."
         )
-    motion, _ = _fit(a[fitted], b[fitted], np.ones(np.count_nonzero(fitted)))
+    motion, _ = fit(a[fitted], b[fitted], np.ones(np.count_nonzero(fitted)))
     moved = motion.apply(a)
     outliers = tuple(_pick(names, used & ~fitted))
     rms = root_mean_square((moved - b)[fitted])
@@ -143,17 +102,6 @@ def _used(measured: FloatArray, names: Sequence[str], use: Sequence[str] | None,
     return np.asarray(wanted & seen)
 
 
-def _fit(a: FloatArray, b: FloatArray, weights: FloatArray) -> tuple[RigidTransform, BoolArray]:
-    """Weighted least squares, in a batch; and whether the points lie on a line, where the motion is not determined."""
-    share = (weights / weights.sum(axis=-1, keepdims=True))[..., None]
-    centre_a, centre_b = (share * a).sum(axis=-2, keepdims=True), (share * b).sum(axis=-2, keepdims=True)
-    u, singular, vt = np.linalg.svd(np.swapaxes(share * (b - centre_b), -1, -2) @ (a - centre_a))
-    u[..., :, 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
-    rotation = u @ vt
-    translation = centre_b[..., 0, :] - (rotation @ centre_a[..., 0, :, None])[..., 0]
-    return RigidTransform(rotation, translation), singular[..., 1] <= 1e-9 * singular[..., 0]
-
-
 def _consensus(a: FloatArray, b: FloatArray, used: BoolArray, largest_residual: float) -> BoolArray | None:
     """(M,) the largest set of used markers that fit one motion, or None."""
     members = np.flatnonzero(used)
@@ -166,13 +114,13 @@ def _consensus(a: FloatArray, b: FloatArray, used: BoolArray, largest_residual: 
         kept = np.ones((comb(count, left_out), count), dtype=bool)
         for row, without in enumerate(combinations(range(count), left_out)):
             kept[row, list(without)] = False
-        motion, on_a_line = _fit(a[members], b[members], kept.astype(np.float64))
+        motion, on_a_line = fit(a[members], b[members], kept.astype(np.float64))
         squares = np.square(motion.apply(a[members]) - b[members]).sum(axis=-1) * kept  # (sets, markers) [m²]
-        fit = (squares.max(axis=1) <= largest_residual**2) & ~on_a_line
-        fit &= np.array([_distance_from_line(b[members[row]]) > largest_residual for row in kept])
-        if fit.any():
+        fits_all = (squares.max(axis=1) <= largest_residual**2) & ~on_a_line
+        fits_all &= np.array([_distance_from_line(b[members[row]]) > largest_residual for row in kept])
+        if fits_all.any():
             chosen = np.zeros_like(used)
-            chosen[members[kept[np.argmin(np.where(fit, squares.sum(axis=1), np.inf))]]] = True
+            chosen[members[kept[np.argmin(np.where(fits_all, squares.sum(axis=1), np.inf))]]] = True
             return chosen
     return None
 
@@ -190,7 +138,7 @@ def _worst(a: FloatArray, b: FloatArray, used: BoolArray, names: Sequence[str]) 
     fits: list[tuple[float, float, str]] = []
     for marker in members:
         others = [each for each in members if three or each != marker]
-        motion, _ = _fit(a[others], b[others], np.ones(len(others)))
+        motion, _ = fit(a[others], b[others], np.ones(len(others)))
         off = np.linalg.norm(motion.apply(a) - b, axis=1)
         fits.append((float(np.sqrt(np.mean(off[others] ** 2))), -float(off[marker]), names[marker]))
     rms, off_worst, worst = min(fits)

@@ -20,7 +20,8 @@ from ..data.recordings.quality import check_base, check_motion, check_passive, q
 from ..data.recordings.reading import read_recording
 from ..data.recordings.recording import Recording, listed
 from ..data.recordings.release import Release, valve_opening
-from ..data.registration import Registration, RigidTransform, register_markers
+from ..data.registration import Registration, register_markers
+from ..data.rigid import RigidTransform
 from ..dynamics.simulator import Simulator
 from ..io.errors import DataFileError, InputError
 from ..io.files import write_json

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.registration import Registration, RigidTransform
+from ..data.registration import Registration
+from ..data.rigid import RigidTransform
 from ..energies.materials import make_material
 from ..io.errors import DataFileError
 from ..io.files import read_array, read_hdf5, read_json

@@ -21,7 +21,7 @@ from ..data.actuation import PressureSequences
 from ..data.base_motion import check_steps, in_frame, prescribed, rigid
 from ..data.recordings.arrays import write_recording
 from ..data.recordings.recording import Recording
-from ..data.registration import RigidTransform
+from ..data.rigid import RigidTransform
 from ..dynamics.inputs import Inputs
 from ..dynamics.integrator import State
 from ..dynamics.simulator import Simulator

@@ -24,7 +24,7 @@ from ..data.recordings.quality import check_motion, check_passive
 from ..data.recordings.reading import read_recording
 from ..data.recordings.recording import Recording
 from ..data.recordings.release import Release, find_release
-from ..data.registration import kabsch, root_mean_square
+from ..data.rigid import kabsch, root_mean_square
 from ..dynamics.simulator import Simulator
 from ..energies.materials import make_material
 from ..experiment.schema import ANYTHING, COUNT, FINITE, MATERIAL, NOT_NEGATIVE, POSITIVE, WORD, Group, check, optional

@@ -15,7 +15,7 @@ from ...io.decoding import Arrays
 from ...io.errors import DataFileError
 from ...io.files import read_arrays, write_json
 from ...io.progress import Progress
-from ..registration import kabsch, root_mean_square
+from ..rigid import kabsch, root_mean_square
 from .arrays import decoded, numbers, write_recording
 from .recording import SI_PER_ACTUATION_UNIT, FloatArray, RawRecording, Recording, to_recording
 

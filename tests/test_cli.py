@@ -219,7 +219,8 @@ class TestUserErrors:
     def test_a_value_that_is_not_given(self, command):
         code, errors = command("material.density=???")
         assert code == 2
-        assert errors.startswith("error: ") and errors.count("\n") == 1
+        assert errors.startswith("error: ")
+        assert errors.count("\n") == 1
         assert "material.density" in errors
         assert command.outputs == []
 
@@ -392,7 +393,7 @@ class TestProcess:
             [
                 "import signal, sys, time, types",
                 f"experiment = sys.modules[{EXPERIMENT!r}] = types.ModuleType('experiment')",
-                "def run(config):",
+                "def run(config, folder):",
                 *(f"    {line}" for line in lines),
                 "experiment.run_experiment = run",
             ]

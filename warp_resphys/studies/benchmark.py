@@ -58,21 +58,16 @@ _LIMITS: Final = Group({"refinements": absent(NATURALS), "batches": absent(NATUR
 _KEYS: Final = Group(
     {
         **dict.fromkeys(SOLVERS, absent(_LIMITS)),
-        "quick": TRUTH_VALUE,
+        **dict.fromkeys(("quick", "cold_start"), TRUTH_VALUE),
         "solvers": Kind(lambda value: isinstance(value, list) and bool(value), "a list of solvers"),
         "materials": Kind(lambda value: isinstance(value, list) and bool(value), "a list of materials"),
         "refinements": NATURALS,
         "batches": Group({"cpu": NATURALS, "cuda": NATURALS}),
-        "largest_batch": _BY_REFINEMENT,
-        "steps": _BY_REFINEMENT,
-        "relative_tolerance": POSITIVE,
-        "max_iterations": NATURAL,
+        **dict.fromkeys(("largest_batch", "steps"), _BY_REFINEMENT),
+        **dict.fromkeys(("repeats", "parts_repeats", "max_iterations"), NATURAL),
+        **dict.fromkeys(("relative_tolerance", "seconds"), POSITIVE),
         "tip_mass": NOT_NEGATIVE,
         "pressure": FINITE,
-        "repeats": NATURAL,
-        "seconds": POSITIVE,
-        "parts_repeats": NATURAL,
-        "cold_start": TRUTH_VALUE,
     }
 )
 _MATERIAL: Final = Group({"poissons_ratio": FINITE, "youngs_modulus": POSITIVE})

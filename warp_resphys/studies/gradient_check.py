@@ -27,13 +27,9 @@ _KEYS = Group(
     {
         "poses": Kind(lambda value: isinstance(value, list) and bool(value), "a list of poses"),
         "poissons_ratios": Kind(lambda value: NUMBERS.fits(value) and bool(value), "a list of numbers"),
-        "steps": NATURAL,
-        "batch": NATURAL,
         "seed": COUNT,
-        "tolerance": POSITIVE,
-        "relative_tolerance": POSITIVE,
-        "mass_damping": POSITIVE,
-        "stiffness_damping": POSITIVE,
+        **dict.fromkeys(("steps", "batch"), NATURAL),
+        **dict.fromkeys(("tolerance", "relative_tolerance", "mass_damping", "stiffness_damping"), POSITIVE),
     }
 )
 _HALVINGS = 6  # of the step of a difference

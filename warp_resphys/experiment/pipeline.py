@@ -60,7 +60,8 @@ _DRAWN_DATA = (
 )
 _DRAWN_MARKERS = ("tracked", "reference", "bind", "bind_to", "largest_distance")
 _LATER_DATA = ("horizons", "train_fraction", "pressure_scales")
-_LEARNED_FROM = ("simulation", "markers", "actuation", "release", "force_frame")
+_LEARNED_FROM = ("simulation", "markers", "release", "force_frame")
+_OF_NETWORKS = ("actuation", "range_guard")
 _LEARNED_DATA = ("payload_at", "train_fraction", "seconds")
 
 
@@ -178,25 +179,25 @@ def learning_stages(config: Mapping[str, Any], split: Split, shared: str, acquir
     if needs:
         stages.append(Stage("identify", identify, (IDENTIFICATION,), {**base, **_pick(config, "identify", "seed")}))
     reconstructed = [*split.train, *split.validation, *(() if markers else split.test)]
-    guard, learned = _pick(config, "range_guard"), []
+    networks, learned = _pick(config, *_OF_NETWORKS), []
     for model in (each for each in models_of(config) if each in LEARNED and each != SIMFREE):
         own, first, second = {"model": model}, f"reconstruct_{model}", f"train_{model}"
         settings = {**own, **_pick(config, "reconstruction"), "reconstructed": reconstructed}
         add(first, partial(reconstruct, processes=processes), (reconstruction_file(model),), settings)
-        settings = {**own, **guard, **training_settings(config, model)}
+        settings = {**own, **networks, **training_settings(config, model)}
         add(second, train, (weights_file(model), training_file(model)), settings, first)
         if config["refinement"]["kind"] != "none":
             outputs = (weights_file(model, True), training_file(model, True))
-            settings = {**own, **guard, **_pick(config, "refinement", "seed")}
+            settings = {**own, **networks, **_pick(config, "refinement", "seed")}
             add(f"refine_{model}", refine, outputs, settings, first, second)
         learned.append(stages[-1].name)
-    settings = {"model": SIMFREE, **guard, **training_settings(config, SIMFREE)}
+    settings = {"model": SIMFREE, **networks, **training_settings(config, SIMFREE)}
     if not markers:  # What replaces a simulator depends on none, where states are known without.
         settings["simulation"] = config["target"]
     outputs = (weights_file(SIMFREE), training_file(SIMFREE))
     add("train_simfree", train, outputs, settings, *(("reconstruct_resphys",) if markers else ()))
     learned.append("train_simfree")
-    tested = {"groups": test_groups(config, split), **guard, "refinement": config["refinement"]["kind"]}
+    tested = {"groups": test_groups(config, split), **networks, "refinement": config["refinement"]["kind"]}
     settings = {**tested, **_pick(config, "published", "correct_uncorrected")}
     settings["data"] = {**base["data"], **_pick(config["data"], "horizons")}
     work = partial(evaluate, processes=processes)

@@ -211,7 +211,7 @@ class Scene:
             rows = self.dataset.rows(replay.trials.names)
             told.append(replay.trials.times.new_tensor(self.dataset.payload[rows])[:, None])
         constants = actuation["filter_time_constants"]
-        series = [remembered(each, constants, self.dataset.time_step) for each in inputs.actuation.values()]
+        series = [remembered(each, constants, replay.simulator.time_step) for each in inputs.actuation.values()]
         moving = self._base_movement(replay.trials.names, replay.simulator)
         series += [] if moving is None else [moving]
         if not series:

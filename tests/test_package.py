@@ -120,7 +120,8 @@ from warp_resphys.cli import main
 main()
 """
     out = call(installed / "python", "-c", program, folder=tmp_path)
-    assert "experiment: beam_oscillation" in out
+    assert "\nexperiment: beam_" in out
+    assert " beam_oscillation, " in out
     assert "budget=quick" in out
     assert not list(tmp_path.iterdir())
 

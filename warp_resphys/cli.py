@@ -38,7 +38,8 @@ INTERRUPTED = 130
 NOBODY_READS = 141  # 128 + SIGPIPE
 
 
-# Each command: its function below this package, which takes the configuration of the same name, and its purpose.
+# Each command: its function below this package, which takes the configuration of the same name as plain data and the
+# run folder, and its purpose.
 COMMANDS: Final[Mapping[str, tuple[str, str]]] = MappingProxyType(
     {
         "run": ("experiment.pipeline:run_experiment", "run an experiment; the word run may be left out"),
@@ -139,8 +140,10 @@ def _run(command: str | None) -> None:
             if old := next((key for key in RENAMED if OmegaConf.select(config, key) is not None), None):
                 raise InputError(_successor(old))
             module, _, function = COMMANDS[chosen][0].partition(":")
+            settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+            folder = Path(HydraConfig.get().runtime.output_dir)
             with _ends_where_nobody_reads():
-                return getattr(import_module(f"{__package__}.{module}"), function)(config)
+                return getattr(import_module(f"{__package__}.{module}"), function)(settings, folder)
         except Exception as error:
             sentence = _explain(error, started)
             if sentence is None or full_error:

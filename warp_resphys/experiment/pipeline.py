@@ -10,8 +10,6 @@ from typing import Any
 
 import torch
 import warp as wp
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.table import Table
 
@@ -211,18 +209,16 @@ def learning_stages(config: Mapping[str, Any], split: Split, shared: str, acquir
     return stages
 
 
-def prepare(config: DictConfig) -> tuple[dict[str, Any], Path]:
-    """The checked configuration as plain data, and the run folder.
+def prepare(config: Mapping[str, Any]) -> None:
+    """Checks a configuration, and sets up libraries for it.
 
     Raises:
         InputError: a value of the wrong kind or out of range, or an unknown key.
     """
     wp.config.log_level = wp.LOG_WARNING
-    if config.device == "cpu" or not torch.cuda.is_available():
+    if config["device"] == "cpu" or not torch.cuda.is_available():
         torch.set_num_threads(1)  # The networks are small: see threads.py.
-    plain: dict[str, Any] = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)  # type: ignore[assignment]
-    check_configuration(plain)
-    return plain, Path(HydraConfig.get().runtime.output_dir)
+    check_configuration(config)
 
 
 def acquire(config: Mapping[str, Any], folder: Path, wait: bool = False) -> tuple[list[Stage], str]:
@@ -233,9 +229,9 @@ def acquire(config: Mapping[str, Any], folder: Path, wait: bool = False) -> tupl
     return stages, str(read_json(folder / "stages" / f"{written}.json")["fingerprint"])
 
 
-def run_experiment(config: DictConfig) -> None:
-    """Runs what has changed, writes metrics.json and prints the errors."""
-    plain, folder = prepare(config)
+def run_experiment(plain: dict[str, Any], folder: Path) -> None:
+    """Runs what has changed, writes metrics.json into the run folder and prints the errors."""
+    prepare(plain)
     if "ablation" in plain:
         run_stages(ablation_stages(plain, simulated(plain), shown(plain)), folder)
         print_ablation(plain, folder)

@@ -13,12 +13,12 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from pathlib import Path
 from statistics import median
 from typing import Any, Final
 
 import numpy as np
 import torch
-from omegaconf import DictConfig
 from rich.table import Table
 from threadpoolctl import threadpool_limits
 
@@ -46,7 +46,7 @@ from ..io.machine import hardware
 from ..io.progress import Progress
 from ..io.stages import package_versions
 from ..linalg.linear_solver import make_linear_solver
-from .command import settings_of, show, table_of
+from .command import show, table_of
 
 PARTS: Final = ("local_step", "tangent", "assembly", "factor", "solve")
 _YARDSTICK_SIZE: Final = 480
@@ -58,21 +58,16 @@ _LIMITS: Final = Group({"refinements": absent(NATURALS), "batches": absent(NATUR
 _KEYS: Final = Group(
     {
         **dict.fromkeys(SOLVERS, absent(_LIMITS)),
-        "quick": TRUTH_VALUE,
+        **dict.fromkeys(("quick", "cold_start"), TRUTH_VALUE),
         "solvers": Kind(lambda value: isinstance(value, list) and bool(value), "a list of solvers"),
         "materials": Kind(lambda value: isinstance(value, list) and bool(value), "a list of materials"),
         "refinements": NATURALS,
         "batches": Group({"cpu": NATURALS, "cuda": NATURALS}),
-        "largest_batch": _BY_REFINEMENT,
-        "steps": _BY_REFINEMENT,
-        "relative_tolerance": POSITIVE,
-        "max_iterations": NATURAL,
+        **dict.fromkeys(("largest_batch", "steps"), _BY_REFINEMENT),
+        **dict.fromkeys(("repeats", "parts_repeats", "max_iterations"), NATURAL),
+        **dict.fromkeys(("relative_tolerance", "seconds"), POSITIVE),
         "tip_mass": NOT_NEGATIVE,
         "pressure": FINITE,
-        "repeats": NATURAL,
-        "seconds": POSITIVE,
-        "parts_repeats": NATURAL,
-        "cold_start": TRUTH_VALUE,
     }
 )
 _MATERIAL: Final = Group({"poissons_ratio": FINITE, "youngs_modulus": POSITIVE})
@@ -134,10 +129,9 @@ class Case:
         }
 
 
-def benchmark(config: DictConfig) -> None:
+def benchmark(config: Mapping[str, Any], folder: Path) -> None:
     """Writes benchmark.json into the run folder and prints its tables; see `run_benchmark`."""
-    plain, folder = settings_of(config)
-    result = run_benchmark(plain)
+    result = run_benchmark(config)
     write_json(folder / "benchmark.json", result)
     show(*benchmark_tables(result), f"Written: {folder / 'benchmark.json'}")
 

@@ -5,10 +5,8 @@ import io
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, Final
 
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.table import Table
 
@@ -19,12 +17,6 @@ WORDS: Final = Kind(
     lambda value: isinstance(value, list) and all(isinstance(each, str) for each in value), "a list of words"
 )
 _LOG_WIDTH: Final = 140  # of tables that go to a file, in characters
-
-
-def settings_of(config: DictConfig) -> tuple[dict[str, Any], Path]:
-    """A configuration as plain data, and the run folder."""
-    plain = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
-    return plain, Path(HydraConfig.get().runtime.output_dir)
 
 
 def show(*parts: Table | str) -> None:

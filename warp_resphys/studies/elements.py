@@ -1,12 +1,13 @@
 """Which element to take: static sag of the beam under its own weight and time of a step, by element and refinement."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 import warp as wp
-from omegaconf import DictConfig
 
 from ..dynamics.inputs import Inputs
 from ..dynamics.integrator import State
@@ -20,26 +21,26 @@ from .command import show, table_of
 _FINEST = 4
 
 
-def element_study(config: DictConfig) -> None:
+def element_study(config: Mapping[str, Any], folder: Path) -> None:
     """Prints the table.
 
     Raises:
         InputError: a value that cannot be used.
     """
-    check("finest", config.finest, at_most(_FINEST))
+    check("finest", config["finest"], at_most(_FINEST))
     wp.config.log_level = wp.LOG_WARNING
-    ratios = list(config.poissons_ratios)
+    ratios = list(config["poissons_ratios"])
     rows = []
-    for refinement in range(1, config.finest + 1):
-        for element, mesh in _meshes(config.size, config.divisions, refinement).items():
-            for integration in config.integrations:
+    for refinement in range(1, config["finest"] + 1):
+        for element, mesh in _meshes(config["size"], config["divisions"], refinement).items():
+            for integration in config["integrations"]:
                 body = Body(mesh, fixed=select_vertices(mesh, x=0.0), volume_integration=integration)
-                simulators = [Simulator(body, Corotated(config.youngs_modulus, ratio)) for ratio in ratios]
+                simulators = [Simulator(body, Corotated(config["youngs_modulus"], ratio)) for ratio in ratios]
                 sags = [f"{sag_mm(simulator):.3f}" for simulator in simulators]
-                falling = [Inputs()] * config.steps  # from its straight shape
-                cost = step_time(simulators[-1], simulators[-1].rest_state(), falling, config.repeats)
+                falling = [Inputs()] * config["steps"]  # from its straight shape
+                cost = step_time(simulators[-1], simulators[-1].rest_state(), falling, config["repeats"])
                 rows.append([element, integration, str(len(mesh.vertices)), *sags, f"{cost['step_ms']:.2f}"])
-    title = f"Static sag in mm, E {config.youngs_modulus / 1e3:g} kPa; what a step costs, nu {ratios[-1]:g}"
+    title = f"Static sag in mm, E {config['youngs_modulus'] / 1e3:g} kPa; what a step costs, nu {ratios[-1]:g}"
     headings = ["element", "volume term", "vertices", *(f"nu {ratio:g}" for ratio in ratios), "step (ms)"]
     show(table_of(title, headings, rows))
 

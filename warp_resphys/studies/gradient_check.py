@@ -4,11 +4,11 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
 import warp as wp
-from omegaconf import DictConfig
 from rich.table import Table
 
 from ..dynamics.inputs import Inputs
@@ -19,7 +19,7 @@ from ..experiment.build import build_simulator
 from ..experiment.schema import COUNT, NATURAL, NUMBERS, POSITIVE, Group, Kind, check
 from ..io.errors import InputError
 from ..mesh.poses import twisted
-from .command import settings_of, show, table_of
+from .command import show, table_of
 
 Loss = Callable[[torch.Tensor], torch.Tensor]
 POSES = ("rest", "bent", "twisted")
@@ -27,13 +27,9 @@ _KEYS = Group(
     {
         "poses": Kind(lambda value: isinstance(value, list) and bool(value), "a list of poses"),
         "poissons_ratios": Kind(lambda value: NUMBERS.fits(value) and bool(value), "a list of numbers"),
-        "steps": NATURAL,
-        "batch": NATURAL,
         "seed": COUNT,
-        "tolerance": POSITIVE,
-        "relative_tolerance": POSITIVE,
-        "mass_damping": POSITIVE,
-        "stiffness_damping": POSITIVE,
+        **dict.fromkeys(("steps", "batch"), NATURAL),
+        **dict.fromkeys(("tolerance", "relative_tolerance", "mass_damping", "stiffness_damping"), POSITIVE),
     }
 )
 _HALVINGS = 6  # of the step of a difference
@@ -199,13 +195,12 @@ class _Problem:
         return GradientRow(name, float((gradient * direction).sum()), *difference)
 
 
-def gradcheck(config: DictConfig) -> None:
+def gradcheck(config: Mapping[str, Any], folder: Path) -> None:
     """Prints a table for every Poisson's ratio and pose; exits with 1 where an error exceeds the tolerance."""
     wp.config.log_level = wp.LOG_WARNING
-    plain, _ = settings_of(config)
-    tolerance = plain["gradcheck"]["tolerance"]
+    tolerance = config["gradcheck"]["tolerance"]
     largest = 0.0
-    for poissons_ratio, pose, rows in check_configured(plain):
+    for poissons_ratio, pose, rows in check_configured(config):
         show(gradient_table(rows, f"nu = {poissons_ratio:g}, {pose}", tolerance))
         largest = max([largest, *(row.relative_error for row in rows)])
     show(f"Largest relative error: {largest:.1e}, {tolerance:.0e} allowed.")

@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from matplotlib import rc_context
 from matplotlib.figure import Figure
-from omegaconf import DictConfig
 from rich.table import Table
 
 from ..dynamics.inputs import Inputs
@@ -34,7 +33,7 @@ from ..mesh.chambers import find_chambers
 from ..mesh.mesh import Mesh, quadratic
 from ..mesh.readers import read_mesh
 from ..report.figures import STYLE, TONES, new_figure, save_png
-from .command import settings_of, show, table_of, write_csv
+from .command import show, table_of, write_csv
 from .elements import step_time
 
 HEXAHEDRA, SERENDIPITY, BIQUADRATIC = "8-node hexahedra", "20-node hexahedra", "27-node hexahedra"
@@ -191,10 +190,9 @@ def cheapest(rows: Sequence[Mapping[str, Any]], within: float) -> Mapping[str, A
     return min(good, key=lambda row: row["step_ms"], default=None)
 
 
-def locking_study(config: DictConfig) -> None:
+def locking_study(config: Mapping[str, Any], folder: Path) -> None:
     """Writes study.json, study.csv and study.png into the run folder and prints the table; see `run_study`."""
-    plain, folder = settings_of(config)
-    show(*run_study(plain, folder), f"Written: {folder}/study.json, study.csv, study.png")
+    show(*run_study(config, folder), f"Written: {folder}/study.json, study.csv, study.png")
 
 
 def run_study(config: Mapping[str, Any], folder: Path) -> list[Table | str]:

@@ -16,7 +16,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import Bbox
 from numpy.typing import NDArray
-from omegaconf import DictConfig
 from scipy.interpolate import CubicSpline
 
 from ..data.oscillation import Oscillation, measure_oscillation
@@ -34,7 +33,7 @@ from ..io.errors import DataFileError, InputError
 from ..io.files import atomic_path, write_json
 from ..mesh.mesh import box_hexahedra, select_vertices
 from ..report.figures import STYLE, TONES, save_png
-from .command import aligned, settings_of
+from .command import aligned
 
 FloatArray = NDArray[np.float64]
 
@@ -205,10 +204,9 @@ def simulate_swing(config: Mapping[str, Any], rest_markers: FloatArray, seconds:
     return Swing(time, follow_face(face, mesh.vertices[tip_face], rest_markers))
 
 
-def compare(config: DictConfig) -> None:
+def compare(config: Mapping[str, Any], folder: Path) -> None:
     """Writes comparison.json and comparison.png into the run folder and prints the numbers; see `compare_recording`."""
-    plain, folder = settings_of(config)
-    result = compare_recording(plain, folder)
+    result = compare_recording(config, folder)
     print(aligned(comparison_table(result)))
     print(f"Written: {folder / 'comparison.json'}, {folder / 'comparison.png'}")
 

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
 from rich.console import Console
 from rich.markup import escape
 
@@ -28,7 +27,7 @@ from ..io.machine import commit, hardware
 from ..io.progress import clock
 from ..io.stages import package_versions, run_lock
 from ..report.page import Canvas, Cell, Drawn, Items, Part, Row, Table, figures_beside
-from .command import WORDS, settings_of
+from .command import WORDS
 from .comparison import Run, compare
 from .page import markdown, write_page
 
@@ -45,7 +44,7 @@ class ReproductionInterrupted(KeyboardInterrupt):
     """Ctrl-C during a run; the message says what is kept."""
 
 
-def reproduce(config: DictConfig) -> None:
+def reproduce(config: Mapping[str, Any], folder: Path) -> None:
     """Runs what is configured; writes the page and logs into the run folder, and where asked a dated page of results.
 
     Raises:
@@ -53,13 +52,12 @@ def reproduce(config: DictConfig) -> None:
         ResphysError: a run failed; the others were run, and the page is written.
         ReproductionInterrupted: Ctrl-C.
     """
-    plain, folder = settings_of(config)
-    runs = plan(plain)
+    runs = plan(config)
     with run_lock(folder):
         results = run_all(runs, folder / "logs")
         page = folder / PAGE
         with figures_beside(page) as pictures:
-            verdict, parts = compare(plain, results, Canvas(pictures))
+            verdict, parts = compare(config, results, Canvas(pictures))
         parts.append(_made())
         date = f"{datetime.now():%Y-%m-%d}"
         write_page(page, title="Reproduction", kicker=date, verdict=verdict, parts=parts)
@@ -68,9 +66,9 @@ def reproduce(config: DictConfig) -> None:
             return markdown(f"Reproduction of {date}", verdict, parts, folder)
 
         write_text(page.with_name("results.md"), in_markdown(pictures.name))
-        if plain["results"] is not None:
+        if config["results"] is not None:
             name = f"{date}-reproduction"
-            place = Path(plain["results"]) / name
+            place = Path(config["results"]) / name
             drawn = [block.name for part in parts for block in part.blocks if isinstance(block, Drawn)]
             _copy([pictures / f"{figure}.png" for figure in drawn], place)
             write_text(place.with_suffix(".md"), in_markdown(name))

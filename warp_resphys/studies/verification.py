@@ -7,12 +7,12 @@ vertices only, in x-major order; the hexahedra between them follow from the dist
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 import warp as wp
 from numpy.typing import NDArray
-from omegaconf import DictConfig
 
 from ..dynamics.inputs import Inputs
 from ..dynamics.integrator import State
@@ -24,7 +24,6 @@ from ..fem.body import Body
 from ..io.errors import ConvergenceError, DataFileError, InputError
 from ..io.files import read_arrays
 from ..mesh.mesh import Mesh, box_hexahedra, select_vertices
-from .command import settings_of
 
 LARGEST_ERROR = 1e-8  # m
 
@@ -45,24 +44,23 @@ REFERENCE_SHAPES: dict[str, tuple[int | str, ...]] = {
 _GRID_TOLERANCE = 1e-9  # of the box's length: distance within which coordinates count as equal
 
 
-def verify(config: DictConfig) -> None:
+def verify(config: Mapping[str, Any], folder: Path) -> None:
     """Prints the largest vertex error of each file and solver; exits with 1 where one exceeds `LARGEST_ERROR`.
 
     Raises:
         InputError: no file is named, or a value cannot be used.
         DataFileError: see `read_reference`.
     """
-    given, _ = settings_of(config)
-    if not given["files"] or not isinstance(given["files"], list):
+    if not config["files"] or not isinstance(config["files"], list):
         raise InputError("name reference trajectories, as in warp-resphys verify FILE...")
     wp.config.log_level = wp.LOG_WARNING
-    device, tolerance = choose_device(given["device"]), given["tolerance"]
-    references = {path: read_reference(path) for path in map(Path, given["files"])}
+    device, tolerance = choose_device(config["device"]), config["tolerance"]
+    references = {path: read_reference(path) for path in map(Path, config["files"])}
     within = True
     print(f"{'file':32}{'solver':22}{'tolerance':>10}{'iterations':>12}{'largest error [m]':>20}")
     for path, reference in references.items():
-        for name in given["solvers"]:
-            settings = SolverSettings(name, relative_tolerance=tolerance, max_iterations=given["max_iterations"])
+        for name in config["solvers"]:
+            settings = SolverSettings(name, relative_tolerance=tolerance, max_iterations=config["max_iterations"])
             try:
                 result = compare_with_reference(reference, settings, device)
             except ConvergenceError as error:

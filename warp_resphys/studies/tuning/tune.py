@@ -7,9 +7,8 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
-
-from omegaconf import DictConfig
 
 from ...experiment.checks import check_training, training_settings
 from ...experiment.files import training_file
@@ -42,7 +41,7 @@ class SlowError(Exception):
     """A trial takes longer than trials may."""
 
 
-def run_tuning(config: DictConfig) -> None:
+def run_tuning(config: Mapping[str, Any], run_dir: Path) -> None:
     """Works on the configured study until it has its number of trials; the best settings become a configuration.
 
     The stages of a run come first, up to the training as configured: what the search has to beat.
@@ -52,25 +51,25 @@ def run_tuning(config: DictConfig) -> None:
         DataFileError: a file cannot be read or written.
         StageInterrupted: the user pressed Ctrl-C; what is done so far is kept.
     """
-    plain, run_dir = prepare(config)
-    space = check_tuning(plain)
-    tune = plain["tune"]
+    prepare(config)
+    space = check_tuning(config)
+    tune = config["tune"]
     model = tune["model"]
-    groups = with_settings(training_settings(plain, model), fixed_settings(tune))
+    groups = with_settings(training_settings(config, model), fixed_settings(tune))
     folder = run_dir / "tune" / tune["study"]
     workers = folder / "workers"
     with at_work(workers) as identity:
-        before = [*acquisition_stages(plain), *_stages_before(plain, model, "")]
+        before = [*acquisition_stages(config), *_stages_before(config, model, "")]
         conditions = {"model": model, **_settings_of(before), **groups}
         for group in _searched(groups):
             conditions[group] = {k: v for k, v in groups[group].items() if f"{group}.{k}" not in space}
         seed, alive = tune["seed"], partial(is_alive, workers)
         study = SharedStudy(folder, space, conditions, tune["trials"], seed, identity, alive)
-        _, acquired = acquire(plain, run_dir, wait=True)
-        needed = _stages_before(plain, model, acquired)
+        _, acquired = acquire(config, run_dir, wait=True)
+        needed = _stages_before(config, model, acquired)
         run_stages(needed, run_dir, wait=True)
         configured = read_json(run_dir / training_file(model))["kept"]["validation_rollout_error_mm"]
-        tuning = Tuning(plain, groups, space, study, configured)
+        tuning = Tuning(config, groups, space, study, configured)
         _work(tuning, Learning(Scene(needed[-1].settings, run_dir), model), _digest(conditions))
     print_best(tuning)
 

@@ -26,7 +26,7 @@ _DPI: Final = 160
 _FINER: Final = 2  # Drawn so many times finer, as smooth rims and translucency do not go together.
 _LONGER_SIDE: Final = 6.6  # Of a view [inch].
 _LETTER: Final = 0.088  # Widest that the letters of a name are on average [inch].
-_TITLE, _HEAD, _STRIP, _LEGEND = 0.5, 0.42, 0.9, 0.42  # [inch] for the title, above and below a view, the legend.
+_TITLE, _HEAD, _STRIP, _PAD = 0.7, 0.42, 0.9, 0.12  # [inch] of the title above, above and below a view, around all.
 _LABEL_HEIGHT: Final = 0.36  # [inch]
 _RADIUS: Final = 0.016  # Of a marker, over the longest side of the body.
 _RING: Final = 1.55  # Radius of a nominal position's ring, in radii of a marker.
@@ -100,9 +100,8 @@ def draw_registration(
     pictures = [frames[0] for frames in draw(*(view.scene(layers) for view in views))]
     with mpl.rc_context({"font.size": 9, "text.color": INK}):
         figure = _compose(views, pictures, registration, nominal, radius, title)
-        _legend(figure, bool(len(clamped)))
         with atomic_path(path) as partial:
-            figure.savefig(partial, dpi=_DPI, format="png", facecolor="white")
+            figure.savefig(partial, dpi=_DPI, format="png", facecolor="white", bbox_inches="tight", pad_inches=_PAD)
 
 
 def _view(title: str, towards: Sequence[float], points: FloatArray, margin: float) -> _View:
@@ -146,23 +145,21 @@ def _compose(
     radius: float,
     title: str,
 ) -> Figure:
-    """The views, one above the other or side by side, with names, rings, axes and a scale."""
-    sizes = [view.size for view in views]
-    stacked = sizes[0][0] + sizes[1][0] > 1.6 * max(size[1] for size in sizes)
+    """The views, one above the other or side by side, with names, rings, axes and a scale.
+
+    The figure has an inch, so that all places are in inches; how much of the plane is written is seen at the end.
+    """
+    (wide, tall), (other_wide, other_tall) = (view.size for view in views)
     longest = max(len(text) for each in range(len(registration.names)) for text in _label(registration, each))
-    margin = _LETTER * max(longest, 9) + 0.15  # [inch]
-    cells = np.array([size + [2.0 * margin, _HEAD + _STRIP] for size in sizes])
-    along = 1 if stacked else 0
-    space = cells.max(axis=0)  # (2,) [inch] of all cells.
-    space[along] = cells[:, along].sum()
-    total = space + [0.0, _TITLE + _LEGEND]
-    figure = Figure(figsize=tuple(total))
-    figure.text(0.5, 1.0 - 0.28 / total[1], title, ha="center", va="center", fontsize=12, fontweight="bold")
-    corner = np.array([0.0, total[1] - _TITLE])  # Upper left one of the next cell [inch].
-    for view, picture, size, cell in zip(views, pictures, sizes, cells, strict=True):
-        left = corner[0] + (0.5 * (space[0] - size[0]) if stacked else margin)
-        box = np.array([left, corner[1] - _HEAD - size[1], *size]) / np.tile(total, 2)
-        axes = figure.add_axes((box[0], box[1], box[2], box[3]))
+    margin = _LETTER * max(longest, 9) + 0.15
+    corners = [(0.0, 0.0), (wide + 2.0 * margin, tall - other_tall)]
+    if wide + other_wide > 1.6 * max(tall, other_tall):
+        corners[1] = (0.5 * (wide - other_wide), -_HEAD - _STRIP - other_tall)
+    figure = Figure(figsize=(1.0, 1.0))
+    middle, lowest = 0.5 * max(wide, corners[1][0] + other_wide), min(0.0, corners[1][1])
+    figure.text(middle, tall + _TITLE, title, ha="center", va="center", fontsize=12, fontweight="bold")
+    for view, picture, corner in zip(views, pictures, corners, strict=True):
+        axes = figure.add_axes((*corner, *view.size))
         low, high = view.corners
         axes.imshow(picture, extent=(low[0], high[0], low[1], high[1]), aspect="auto")
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
@@ -171,8 +168,10 @@ def _compose(
         _directions(axes, view, margin)
         _rings(axes, view, registration, nominal, radius)
         _names(axes, view, registration, radius)
-        corner += [0.0, -cell[1]] if stacked else [cell[0], 0.0]
     _scale(axes, view, margin)
+    handles = _legend()
+    place, columns = (middle, lowest - _STRIP), len(handles)
+    figure.legend(handles=handles, loc="upper center", bbox_to_anchor=place, ncols=columns, frameon=False, fontsize=9)
     return figure
 
 
@@ -246,22 +245,14 @@ def _spread(heights: FloatArray, least: float) -> FloatArray:
     return isotonic_regression(heights - apart).x + apart if len(heights) else heights
 
 
-def _legend(figure: Figure, clamped: bool) -> None:
-    """What the marks are, below the views."""
+def _legend() -> list[Any]:
+    """What the marks are."""
     none: dict[str, Any] = {"linestyle": "none", "marker": "o"}
-    ring = Line2D([], [], **none, markersize=9, markerfacecolor="none", color=NOMINAL, label="nominal")
-    ring.set_markeredgewidth(1.5)
-    stem = Line2D(
-        [], [], marker="o", markersize=3.5, markevery=[0], linewidth=1.4, color=INK, label="stem and its foot"
-    )
-    handles: list[Any] = [
+    hollow: dict[str, Any] = {"markerfacecolor": "none", "markeredgewidth": 1.5}
+    return [
         Line2D([], [], **none, markersize=7, color=MEASURED, label="measured, with residual"),
-        stem,
-        ring,
-        *([Patch(facecolor=CLAMPED, alpha=0.8, label="clamped")] if clamped else []),
+        Line2D([], [], marker="o", markersize=3.5, markevery=[0], linewidth=1.4, color=INK, label="stem and its foot"),
+        Line2D([], [], **none, **hollow, markersize=9, color=NOMINAL, label="nominal"),
+        Patch(facecolor=CLAMPED, alpha=0.8, label="clamped"),
         Patch(facecolor=BODY, alpha=0.6, label="body at rest"),
     ]
-    place = (0.5, 0.06 / figure.get_figheight())
-    figure.legend(
-        handles=handles, loc="lower center", bbox_to_anchor=place, ncols=len(handles), frameon=False, fontsize=9
-    )

@@ -15,7 +15,6 @@ from ..energies.materials import make_material
 from ..io.errors import DataFileError
 from ..io.files import read_array, read_hdf5, read_json
 from ..io.stages import StageContext, package_versions, resources_used
-from ..learning.metrics import PUBLISHED_WINDOWS_MM, published_errors
 from ..mesh.chambers import Chamber
 from ..mesh.mesh import Mesh, select_vertices
 from ..mesh.surface import closest_points
@@ -140,14 +139,10 @@ def make_folds_report(context: StageContext) -> None:
 def _common_parts(config: Mapping[str, Any], metrics: Mapping[str, Any], mesh: Mesh) -> dict[str, Any]:
     """What all pages show."""
     return {
-        "experiment": config["name"],
-        "title": config["title"],
         "metrics": metrics,
         "settings": config,
         "mesh": mesh,
         "fixed": select_vertices(mesh, **config["fixed"]),
-        "published": published_errors(config["name"]),
-        "published_horizons": PUBLISHED_WINDOWS_MM.get(config["name"], {}),
         "published_note": published_note(config),
     }
 

@@ -22,7 +22,7 @@ from .data import (
     shown_models,
     tip_markers,
 )
-from .page import Block, Canvas, Drawn, Part, drawn_file, file_address, number_text
+from .page import Block, Canvas, Drawn, Part, drawn_file, file_address, largest_text
 from .render import Pixels, draw
 from .verdict import unbroken
 
@@ -186,11 +186,10 @@ def _vertex_figures(data: RunReport, trials: Trials, canvas: Canvas) -> list[Blo
 
 
 def _largest(differences: FloatArray) -> str:
-    """The longest of (..., C) vectors [m], in words."""
-    if not np.isfinite(differences).all():
-        return "more than any number (it diverged)"
-    with np.errstate(over="ignore"):
-        return f"{number_text(1e3 * float(np.linalg.norm(differences, axis=-1).max()))} mm"
+    """The longest of (..., C) vectors [m], in words; not finite is infinite."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        distances = 1e3 * np.linalg.norm(differences, axis=-1)
+    return largest_text(np.where(np.isnan(distances), np.inf, distances))
 
 
 def paths_section(data: RunReport, canvas: Canvas) -> Part | None:

@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jinja2
+import numpy as np
+from numpy.typing import NDArray
 
 from ..io.errors import DataFileError
 from ..io.files import disk_full_error, is_disk_full
@@ -187,6 +189,17 @@ def page_template(name: str) -> jinja2.Template:
 def number_text(value: float | None) -> str:
     """Return a number with three decimals, or two digits if that takes more; None stands for divergence."""
     return "diverged" if value is None else _alike([value], value)[0]
+
+
+def mm_text(value: float | None) -> str:
+    """Return a mean error with its unit; None stands for divergence."""
+    return number_text(value) + ("" if value is None else " mm")
+
+
+def largest_text(errors: NDArray[np.float64]) -> str:
+    """Return the largest of errors [mm] in words; NaN is left out, what is infinite has diverged."""
+    known = errors[~np.isnan(errors)]
+    return mm_text(float(known.max())) if len(known) and np.isfinite(known).all() else "infinity (it diverged)"
 
 
 def error_parts(summary: Mapping[str, Any]) -> tuple[str, str]:

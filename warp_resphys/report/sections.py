@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from ..learning.metrics import PUBLISHED_WINDOWS_MM
 from .data import MODELS, FloatArray, RunReport
 from .page import (
     MINUS,
@@ -56,7 +57,7 @@ def against(errors: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
 
 def horizons_section(data: RunReport, canvas: Canvas) -> Part | None:
     """The errors by length of the roll-out."""
-    table = horizon_table(data.metrics, data.published_horizons)
+    table = horizon_table(data.metrics, PUBLISHED_WINDOWS_MM.get(data.experiment, {}))
     if table is None:
         return None
     longer = data.settings["data"].get("train_fraction", 1.0) < 1.0

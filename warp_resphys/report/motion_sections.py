@@ -12,6 +12,7 @@ from markupsafe import Markup
 from .bodies import Motion, distance_scene, largest_distances, write_film
 from .data import (
     MODELS,
+    Film,
     FloatArray,
     Pressures,
     RunReport,
@@ -54,17 +55,15 @@ def _draw_pictures(data: RunReport, motion: Motion) -> list[Pixels]:
 def motion_of(data: RunReport) -> Motion | None:
     """Return the motion that is drawn: that of the film; where vertices are observed, of the worst trial at its tip."""
     trials, film = data.trials, data.film
-    if trials is None or not shown_models(trials.positions):
+    if trials is None:
         return None
     hangs, away = _hangs(data, trials)
+    some = np.arange(len(trials.bound))
     if not trials.labels:
-        row, models = trials.worst, shown_models(trials.positions)
+        row = trials.worst
+        film = Film(trials.names[row], trials.times[row], {m: q[row] for m, q in trials.positions.items()})
         some = data.tip if len(data.tip) else np.flatnonzero(away >= away.max() - 1e-9)
         some = some[np.unique(np.linspace(0, len(some) - 1, _MOST_MARKERS).round().astype(int))]
-        bodies = {m: trials.positions[m][row] for m in models}
-        seen = {m: q[:, some] for m, q in bodies.items()}
-        times, target, bound = trials.times[row], trials.target[row][:, some], trials.bound[some]
-        return Motion(data.mesh, times, target, bodies, seen, bound, trials.gravity, hangs)
     if film is None or film.trial not in trials.names or not shown_models(film.positions):
         return None
     row, models = trials.names.index(film.trial), shown_models(film.positions)
@@ -74,9 +73,9 @@ def motion_of(data: RunReport) -> Motion | None:
         nearest = np.abs(times[frames][:, None] - film.times).argmin(axis=0)
         frames = frames[np.unique(nearest)]
     bodies = {m: at_times(film.positions[m], film.times, times[frames]) for m in models}
-    seen = {m: trials.positions[m][row][frames] for m in models}
-    target = trials.target[row][frames]
-    return Motion(data.mesh, times[frames], target, bodies, seen, trials.bound, trials.gravity, hangs)
+    target, *markers = (q[row][frames][:, some] for q in (trials.target, *(trials.positions[m] for m in models)))
+    seen = dict(zip(models, markers, strict=True))
+    return Motion(data.mesh, times[frames], target, bodies, seen, trials.bound[some], trials.gravity, hangs)
 
 
 def _hangs(data: RunReport, trials: Trials) -> tuple[bool, FloatArray]:

@@ -195,12 +195,9 @@ def _reconstruction_text(model: str, found: Mapping[str, Any], of: str) -> str:
     )
     if "replayed_mm" not in found:
         return f"{said}."
-    far = (
-        f"lead {mm_text(found['replayed_mm'])} from the {of} of"
-        if found["replayed_mm"] is not None
-        else "make it fail on"
-    )
-    return f"{said}; replayed in the simulator, its forces {far} the validation trials."
+    replayed = found["replayed_mm"]
+    lead = "make it fail on" if replayed is None else f"lead {mm_text(replayed)} from the {of} of"
+    return f"{said}; replayed in the simulator, its forces {lead} the validation trials."
 
 
 def _count(number: int, what: str) -> str:

@@ -234,7 +234,7 @@ def test_recordings_are_shown_on_the_body_as_it_hangs(tmp_path, monkeypatch):
     assert found.mesh.vertices[:, 2].min() - found.recordings.mesh.vertices[:, 2].min() == pytest.approx(
         0.004, abs=1e-6
     )
-    nominal = dict(zip(found.recordings.registration.names, found.recordings.nominal[:, 2], strict=True))
+    nominal = dict(zip(found.recordings.labels, found.recordings.nominal[:, 2], strict=True))
     assert nominal["Base - 1"] == BASE["Base - 1"][2]
     low, high = ("Ring 3 - 1", "Ring 1 - 1")
     places = settings["markers"]["tracked"]

@@ -183,8 +183,8 @@ def test_the_trial_that_fits_worst_is_drawn(tmp_path):
     write_recordings(tmp_path)
     found = read_recordings(tmp_path, SETTINGS, box_hexahedra(divisions=(3, 1, 1)), {})
     assert found.drawn == "load101"
-    assert found.registration.outliers == ("Base - 3",)
-    assert found.registration.inliers.tolist() == [True] * 5 + [False]
+    assert found.outliers == ("Base - 3",)
+    assert found.labels == (*TRACKED, "Base - 1", "Base - 2", "Base - 3")
     assert found.nominal[0].tolist() == TRACKED["Tip - 1"]
     np.testing.assert_allclose(found.feet[0], [0.1, 0.0153, 0.03], atol=1e-12)
 

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.registration import Registration, RigidTransform
 from ..energies.materials import make_material
 from ..io.errors import DataFileError
 from ..io.files import read_array, read_hdf5, read_json
@@ -342,24 +341,17 @@ def read_recordings(
     labels = [label for label in each["positions"] if label in nominal]
     # What JSON has as null was not seen.
     places = np.array([each["positions"][label] or (None,) * 3 for label in labels], dtype=np.float64)
-    residual = 1e-3 * np.array([each["residual_mm"].get(label) for label in labels], dtype=np.float64)
-    registration = Registration(
-        names=tuple(labels),
-        transform=RigidTransform(np.eye(3), np.zeros(3)),
-        positions=places,
-        residual=residual,
-        inliers=np.array([label not in each["outliers"] for label in labels]),
-        outliers=tuple(each["outliers"]),
-        rms=1e-3 * each["rms_mm"],
-    )
     seen = np.isfinite(places).all(axis=1)
     feet = np.full_like(places, np.nan)
     feet[seen] = closest_points(mesh, places[seen]).points
     return Recordings(
         quality=read_json(path.with_name(QUALITY)),
         residuals=residuals,
-        registration=registration,
         drawn=worst,
+        labels=tuple(labels),
+        positions=places,
+        residual_mm=np.array([each["residual_mm"].get(label) for label in labels], dtype=np.float64),
+        outliers=tuple(each["outliers"]),
         nominal=np.array([np.add(nominal[label], moved.get(label, 0.0)) for label in labels], dtype=np.float64),
         feet=feet,
         mesh=mesh,

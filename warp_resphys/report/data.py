@@ -8,7 +8,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.registration import Registration
 from ..learning.metrics import PublishedError, published_errors
 from ..mesh.chambers import Chamber
 from ..mesh.mesh import Mesh
@@ -94,9 +93,12 @@ class Recordings:
 
     quality: Mapping[str, Any]  # By trial, as `warp_resphys.data.recordings.quality.Quality.to_plain` gives it.
     residuals: Mapping[str, Any]  # By trial: `rms_mm`, `residual_mm` and `shift_mm` by label, `outliers`.
-    registration: Registration  # Of the trial that fits worst, for the picture.
-    drawn: str  # That trial's name.
-    nominal: FloatArray  # (M, 3) [m] where its markers should be.
+    drawn: str  # Name of the trial that fits worst, whose picture is drawn.
+    labels: tuple[str, ...]  # Of its M markers.
+    positions: FloatArray  # (M, 3) [m] where they are at rest, NaN for one that was not seen.
+    residual_mm: FloatArray  # (M,) [mm] how far from where they should be.
+    outliers: tuple[str, ...]  # That should have taken part in the fit, and were too far off.
+    nominal: FloatArray  # (M, 3) [m] where they should be.
     feet: FloatArray  # (M, 3) [m] the closest points of the body.
     mesh: Mesh  # The body as it is at rest.
 

@@ -13,10 +13,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch
 from scipy.optimize import isotonic_regression
 
-from ..data.registration import Registration
 from ..io.files import atomic_path
 from ..mesh.mesh import Mesh, boundary_triangles
 from .bodies import face_edges, sharp_edges
+from .data import Recordings
 from .render import BODY, CLAMPED, INK, MEASURED, FloatArray, IntArray, Layer, Pixels, Scene, View, draw, view_axes
 
 NOMINAL: Final = "#0072b2"  # Blue of Okabe and Ito (2008).
@@ -65,41 +65,28 @@ class _View:
         return Scene([view], self.pixels.astype(int).tolist(), background="white", samples=0, intensity=_LIGHT)
 
 
-def draw_registration(
-    path: Path,
-    mesh: Mesh,
-    registration: Registration,
-    nominal: FloatArray,
-    feet: FloatArray,
-    fixed: IntArray,
-    title: str,
-) -> None:
+def draw_registration(path: Path, found: Recordings, fixed: IntArray) -> None:
     """Draws the body, the measured markers and what they are bound to, from two sides, with names and residuals.
 
     Args:
         path: The PNG file to write.
-        mesh: The body at rest.
-        registration: The measured markers in its frame; those that were not seen are not drawn.
-        nominal: (M, 3) [m] where the markers should be.
-        feet: (M, 3) [m] where their stems stand, such as `Markers.feet` at rest.
+        found: Markers that were not seen are not drawn.
         fixed: Vertices of the clamped region.
-        title: What is drawn.
 
     Raises:
         DrawingError: There is no pyvista, or no OpenGL driver that works off screen.
         DataFileError: The file cannot be written.
     """
-    seen = np.isfinite(registration.positions).all(axis=1)
-    markers = registration.positions[seen]
-    points = np.concatenate([mesh.vertices, markers, nominal])
+    seen, mesh = np.isfinite(found.positions).all(axis=1), found.mesh
+    points = np.concatenate([mesh.vertices, found.positions[seen], found.nominal])
     radius = _RADIUS * float(np.ptp(mesh.vertices, axis=0).max())
     views = [_view(name, towards, points, 2.0 * radius) for name, towards in _VIEWS.items()]
     triangles = boundary_triangles(mesh)
     clamped = triangles[np.isin(triangles, fixed).all(axis=1)]
-    layers = _layers(mesh, clamped, markers, feet[seen], radius)
+    layers = _layers(mesh, clamped, found.positions[seen], found.feet[seen], radius)
     pictures = [frames[0] for frames in draw(*(view.scene(layers) for view in views))]
     with mpl.rc_context({"font.size": 9, "text.color": INK}):
-        figure = _compose(views, pictures, registration, nominal, radius, title)
+        figure = _compose(views, pictures, found, radius)
         with atomic_path(path) as partial:
             figure.savefig(partial, dpi=_DPI, format="png", facecolor="white", bbox_inches="tight", pad_inches=_PAD)
 
@@ -137,27 +124,20 @@ def _layers(mesh: Mesh, clamped: IntArray, markers: FloatArray, feet: FloatArray
     return layers
 
 
-def _compose(
-    views: Sequence[_View],
-    pictures: Sequence[Pixels],
-    registration: Registration,
-    nominal: FloatArray,
-    radius: float,
-    title: str,
-) -> Figure:
+def _compose(views: Sequence[_View], pictures: Sequence[Pixels], found: Recordings, radius: float) -> Figure:
     """The views, one above the other or side by side, with names, rings, axes and a scale.
 
     The figure has an inch, so that all places are in inches; how much of the plane is written is seen at the end.
     """
     (wide, tall), (other_wide, other_tall) = (view.size for view in views)
-    longest = max(len(text) for each in range(len(registration.names)) for text in _label(registration, each))
+    longest = max(len(text) for each in range(len(found.labels)) for text in _label(found, each))
     margin = _LETTER * max(longest, 9) + 0.15
     corners = [(0.0, 0.0), (wide + 2.0 * margin, tall - other_tall)]
     if wide + other_wide > 1.6 * max(tall, other_tall):
         corners[1] = (0.5 * (wide - other_wide), -_HEAD - _STRIP - other_tall)
     figure = Figure(figsize=(1.0, 1.0))
     middle, lowest = 0.5 * max(wide, corners[1][0] + other_wide), min(0.0, corners[1][1])
-    figure.text(middle, tall + _TITLE, title, ha="center", va="center", fontsize=12, fontweight="bold")
+    figure.text(middle, tall + _TITLE, found.drawn, ha="center", va="center", fontsize=12, fontweight="bold")
     for view, picture, corner in zip(views, pictures, corners, strict=True):
         axes = figure.add_axes((*corner, *view.size))
         low, high = view.corners
@@ -166,8 +146,8 @@ def _compose(
         axes.set_axis_off()
         axes.set_title(view.title, fontsize=10, color=_GREY, pad=14)
         _directions(axes, view, margin)
-        _rings(axes, view, registration, nominal, radius)
-        _names(axes, view, registration, radius)
+        _rings(axes, view, found, radius)
+        _names(axes, view, found, radius)
     _scale(axes, view, margin)
     handles = _legend()
     place, columns = (middle, lowest - _STRIP), len(handles)
@@ -205,17 +185,17 @@ def _round_length(longest: float) -> float:
     return float(max(factor * decade for factor in (1.0, 2.0, 5.0) if factor * decade <= longest * (1.0 + 1e-9)))
 
 
-def _rings(axes: Axes, view: _View, registration: Registration, nominal: FloatArray, radius: float) -> None:
+def _rings(axes: Axes, view: _View, found: Recordings, radius: float) -> None:
     """Rings at the nominal positions, with lines to the markers that are outside of them."""
-    for ring, marker in zip(view.project(nominal), view.project(registration.positions), strict=True):
+    for ring, marker in zip(view.project(found.nominal), view.project(found.positions), strict=True):
         axes.add_patch(Circle((ring[0], ring[1]), _RING * radius, fill=False, edgecolor=NOMINAL, linewidth=1.5))
         if np.linalg.norm(marker - ring) > _RING * radius:
             axes.plot(*np.stack([ring, marker]).T, color=NOMINAL, linewidth=1.0, linestyle=(0, (3, 2)))
 
 
-def _names(axes: Axes, view: _View, registration: Registration, radius: float) -> None:
+def _names(axes: Axes, view: _View, found: Recordings, radius: float) -> None:
     """Names and residuals of the markers that were seen in columns on both sides, with leaders to them."""
-    at = view.project(registration.positions)  # (M, 2) [m]
+    at = view.project(found.positions)  # (M, 2) [m]
     seen = np.flatnonzero(np.isfinite(at).all(axis=1))
     on_the_left = at[:, 0] < np.median(at[seen, 0])
     for side, edge in ((-1.0, view.corners[0][0]), (1.0, view.corners[1][0])):
@@ -227,16 +207,16 @@ def _names(axes: Axes, view: _View, registration: Registration, radius: float) -
             away = 1.2 * radius / float(np.linalg.norm(end - at[each]))
             start = at[each] + min(away, 1.0) * (end - at[each])
             axes.plot(*np.stack([start, end]).T, color=_GREY, linewidth=0.7, clip_on=False)
-            name, note = _label(registration, each)
-            colour = MEASURED if name in registration.outliers else _GREY
+            name, note = _label(found, each)
+            colour = MEASURED if name in found.outliers else _GREY
             axes.text(x, height, name, ha=align, va="bottom", fontweight="bold", clip_on=False)
             axes.text(x, height, note, ha=align, va="top", fontsize=8, color=colour, clip_on=False)
 
 
-def _label(registration: Registration, marker: int) -> tuple[str, str]:
+def _label(found: Recordings, marker: int) -> tuple[str, str]:
     """Name of a marker, and how well it fits."""
-    name = registration.names[marker]
-    return name, f"{1e3 * registration.residual[marker]:.2f} mm" + (", left out" * (name in registration.outliers))
+    name = found.labels[marker]
+    return name, f"{found.residual_mm[marker]:.2f} mm" + ", left out" * (name in found.outliers)
 
 
 def _spread(heights: FloatArray, least: float) -> FloatArray:

@@ -281,7 +281,7 @@ def registration_section(data: RunReport, canvas: Canvas) -> Part | None:
     def picture(path: Path) -> Drawn:
         from .registration_picture import draw_registration
 
-        draw_registration(path, found.mesh, found.registration, found.nominal, found.feet, data.fixed, found.drawn)
+        draw_registration(path, found, data.fixed)
         return drawn_file(path, alt, caption)
 
     blocks = canvas.attempt("registration.png", picture)

@@ -7,7 +7,7 @@ from measured_run import reported
 
 from warp_resphys.experiment.build import build_mesh
 from warp_resphys.io.files import atomic_hdf5, create, write_json
-from warp_resphys.learning.metrics import summarise, summarise_each, trajectory_errors
+from warp_resphys.learning.metrics import marker_errors, summarise, summarise_each
 
 STEPS, STEP = 40, 0.01
 TRIALS = {"0.05 kg": 0.008, "0.07 kg": 0.01, "0.12 <kg>": 0.02}  # The first one is of the training.
@@ -65,11 +65,8 @@ def write_run(folder: Path, config, *, models=tuple(PERIODS), diverged=(), steps
 def write_errors(folder, test, runs, target):
     """errors.json."""
     first = min(1, target.shape[1] - 1)
-    pad = [np.concatenate([x[:1], x]) for x in target] if not first else list(target)
-    errors = {
-        m: [trajectory_errors(np.concatenate([a[:1], a]) if not first else a, b) for a, b in zip(q, pad, strict=True)]
-        for m, q in runs.items()
-    }
+    pairs = {model: zip(q, target, strict=True) for model, q in runs.items()}
+    errors = {model: [marker_errors(a[first:], b[first:]) for a, b in each] for model, each in pairs.items()}
     summaries = {model: summarise(rows) for model, rows in errors.items()}
     write_json(
         folder / "errors.json",

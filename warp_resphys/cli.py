@@ -52,7 +52,7 @@ COMMANDS: Final[Mapping[str, tuple[str, str]]] = MappingProxyType(
         "gradcheck": ("studies.gradient_check:gradcheck", "compare adjoint gradients with central differences"),
         "benchmark": ("studies.benchmark:benchmark", "time steps, forward and backward, and what they consist of"),
         "element-study": ("studies.elements:element_study", "static sag of a beam, by element and refinement"),
-        "locking-study": ("studies.locking_page:locking_study", "deflection of an arm, by element and refinement"),
+        "locking-study": ("studies.locking:locking_study", "deflection of an arm, by element and refinement"),
     }
 )
 _CONFIGURATIONS: Final = {"run": "config"}  # where it is not called as the command is
@@ -214,10 +214,7 @@ def _purpose(command: str = "") -> str:
 
 
 def _own_options() -> list[str]:
-    """The arguments that add the user's own options to those of the package, if there are any.
-
-    Given first, they give way to a --config-dir of the user.
-    """
+    """The arguments that add the user's own options, if there are any; they give way to a --config-dir that follows."""
     folder = Path.cwd() / OWN_OPTIONS
     if not folder.is_dir():
         return []
@@ -232,19 +229,19 @@ def _own_options() -> list[str]:
 def _explain(error: BaseException, started: bool) -> str | None:
     """The sentence to print for an error that the user can mend; None for a fault of the program.
 
-    Args:
-        error: What was raised.
-        started: Whether the job had begun; before that, it is the command line that is wrong.
+    Before the job has started, it is the command line that is wrong.
     """
+    cause = error.__cause__
     if isinstance(error, ResphysError):
         return str(error)
     if isinstance(error, BrokenPipeError):
         return None
-    if isinstance(error, InstantiationException) and error.__cause__ is not None:
-        return _explain(error.__cause__, started)
-    if isinstance(error, MissingConfigException):
-        return _explain_missing(error)
-    cause = error.__cause__
+    if isinstance(error, InstantiationException) and cause is not None:
+        return _explain(cause, started)
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file is not None and error.options:
+        group, _, option = error.missing_cfg_file.rpartition("/")
+        known = ", ".join(error.options)
+        return f"unknown {group} '{option}'{_did_you_mean(option, error.options)}; known are {known}"
     if isinstance(error, HydraException) and isinstance(cause, (ConfigAttributeError, ConfigKeyError)):
         return _explain_key(error, cause)
     if isinstance(error, OverrideParseException):
@@ -255,29 +252,15 @@ def _explain(error: BaseException, started: bool) -> str | None:
         name = getattr(error, "filename", None)
         place = f" while writing {name}" if name else ""
         return f"disk is full{place}: free some space and run the same command again"
-    if isinstance(error, MarkedYAMLError) and not started:
-        return _explain_yaml(error)
-    if isinstance(error, OSError) and not started:
+    if started:
+        return None
+    if isinstance(error, MarkedYAMLError):
+        mark = error.problem_mark
+        place = "a configuration" if mark is None else f"{mark.name}, line {mark.line + 1}"
+        return f"{place} cannot be read as YAML ({error.problem}): mend it there or in the lines before"
+    if isinstance(error, OSError):
         return f"cannot write {error.filename} ({error.strerror}): choose another run folder"
-    if isinstance(error, ValueError) and not started:
-        return _sentence(error)
-    return None
-
-
-def _explain_missing(error: MissingConfigException) -> str:
-    """Names the options of a group where one was asked for that does not exist."""
-    if error.missing_cfg_file is None or not error.options:
-        return _sentence(error)
-    group, _, option = error.missing_cfg_file.rpartition("/")
-    known = ", ".join(error.options)
-    return f"unknown {group} '{option}'{_did_you_mean(option, error.options)}; known are {known}"
-
-
-def _explain_yaml(error: MarkedYAMLError) -> str:
-    """Names file and line where a configuration is no YAML."""
-    mark = error.problem_mark
-    place = "a configuration" if mark is None else f"{mark.name}, line {mark.line + 1}"
-    return f"{place} cannot be read as YAML ({error.problem}): mend it there or in the lines before"
+    return _sentence(error) if isinstance(error, ValueError) else None
 
 
 def _explain_key(error: HydraException, cause: OmegaConfBaseException) -> str:
@@ -286,19 +269,15 @@ def _explain_key(error: HydraException, cause: OmegaConfBaseException) -> str:
     wanted = named.group(1) if named else str(cause.full_key)
     root = {} if cause.parent_node is None else OmegaConf.to_container(cause.parent_node._get_root())
     known = [key for key in _keys(root) if key.partition(".")[0] != "hydra"]
-    if renamed := _renamed(wanted):
-        return _successor(renamed)
+    parts = wanted.split(".")
+    for length in range(len(parts), 0, -1):
+        if (name := ".".join(parts[:length])) in RENAMED:
+            return _successor(name)
     if wanted in known:  # The value has a key of its own that does not exist.
         wanted = str(cause.full_key)
     same_name = [key for key in known if key.rpartition(".")[2] == wanted.rpartition(".")[2]]
     hint = _did_you_mean(wanted, known, preferred=same_name)
     return f"unknown key '{wanted}'{hint} (--cfg job lists all keys, +{wanted}=... adds a new one)"
-
-
-def _renamed(key: str) -> str:
-    """The key that was renamed, of this name or one that this begins with; nothing if there is none."""
-    parts = key.split(".")
-    return next((name for n in range(len(parts), 0, -1) if (name := ".".join(parts[:n])) in RENAMED), "")
 
 
 def _successor(key: str) -> str:

@@ -47,9 +47,6 @@ def test_a_seed_gives_its_sequence_and_another_one_another():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"deviation": 0.0}, "deviation of the pressures is 0"),
-        ({"limit": -1.0}, "limit of the pressures"),
-        ({"rest": -0.1}, "rest of the pressures"),
         ({"rest": 2.0}, "leave no time between two rests"),
         ({"correlation": -0.6}, "no pressures of 3 chambers have the correlation -0.6: it must lie above -0.5"),
         ({"correlation": [[1.0, 0.0], [0.0, 1.0]]}, r"shape \(2, 2\).*3 chambers"),
@@ -68,9 +65,6 @@ def test_recorded_pressures_are_checked():
     high = good.copy()
     high[3, 1] = 2.5e4
     with pytest.raises(DataFileError, match=r"chamber 2 is 25 kPa in frame 3, beyond data.pressure_limit of 20 kPa"):
-        check_pressures(high, 2, 2e4, "a.h5")
-    high[1, 0] = np.nan
-    with pytest.raises(DataFileError, match="chamber 1 is not finite in frame 1"):
         check_pressures(high, 2, 2e4, "a.h5")
 
 

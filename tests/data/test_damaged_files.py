@@ -92,9 +92,6 @@ HERE = {
     "a.tsv": (write_tsv, read_recording),
     "a.npz": (write_npz, read_recording),
     "segment.npz": (write_segment, read_published_segment),
-    "zero.pkl": (partial(write_pickle, protocol=0), read_published_arm),
-    "two.pkl": (partial(write_pickle, protocol=2), read_published_arm),
-    "five.pkl": (partial(write_pickle, protocol=5), read_published_arm),
 }
 ELSEWHERE = {
     "a.c3d": (write_c3d, read_recording),
@@ -102,6 +99,9 @@ ELSEWHERE = {
     "a.msh": (write_box, read_surfaces),
     "a.vtk": (write_box, read_mesh),
     "a.vtu": (write_box, read_mesh),
+    "zero.pkl": (partial(write_pickle, protocol=0), read_published_arm),
+    "two.pkl": (partial(write_pickle, protocol=2), read_published_arm),
+    "five.pkl": (partial(write_pickle, protocol=5), read_published_arm),
 }
 
 

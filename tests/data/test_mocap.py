@@ -95,7 +95,7 @@ def test_a_changed_byte_that_crashes_the_decoder_or_makes_it_claim_memory_or_tim
     path.write_bytes(content)
     for limit, given in limits.items():
         monkeypatch.setattr(decoding, limit, given)
-    with pytest.raises(DataFileError, match=rf"whole\.c3d is damaged or truncated \(.*{message}\); copy"):
+    with pytest.raises(DataFileError, match=rf"whole\.c3d cannot be decoded \(.*{message}\): copy"):
         read_recording(path)
 
 

@@ -4,8 +4,6 @@ import os
 import pickle
 import subprocess
 import sys
-import time
-import tracemalloc
 from collections import OrderedDict
 from pathlib import Path
 
@@ -13,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from warp_resphys.data.recordings.arrays import decoded
 from warp_resphys.data.recordings.published import (
     ARM_NOMINAL,
     BEAM_NOMINAL,
@@ -22,7 +21,7 @@ from warp_resphys.data.recordings.published import (
     read_published_arm,
 )
 from warp_resphys.data.recordings.reading import read_recording
-from warp_resphys.data.recordings.restricted_pickle import read_pickled_arrays
+from warp_resphys.io import decoding
 from warp_resphys.io.errors import DataFileError
 
 ROOT = Path(__file__).parents[2]
@@ -62,7 +61,7 @@ def test_arrays_of_every_protocol_are_read(tmp_path, protocol):
     }
     path = tmp_path / "data.pkl"
     path.write_bytes(pickle.dumps(content, protocol=protocol))
-    arrays = read_pickled_arrays(path)
+    arrays = decoded("pickle", path)
     assert sorted(arrays) == list("abcdef")
     for name, array in arrays.items():
         assert array.dtype == np.float64
@@ -72,7 +71,7 @@ def test_arrays_of_every_protocol_are_read(tmp_path, protocol):
 def test_arrays_of_a_saved_dictionary_are_read(tmp_path, arm):
     """numpy.save makes an array of one object of it."""
     np.save(tmp_path / "data.npy", arm, allow_pickle=True)
-    arrays = read_pickled_arrays(tmp_path / "data.npy")
+    arrays = decoded("pickle", tmp_path / "data.npy")
     np.testing.assert_array_equal(arrays["data"], arm["data"])
 
 
@@ -81,7 +80,7 @@ def test_names_of_an_older_numpy_are_known(tmp_path):
     content = before.replace(b"numpy._core.multiarray", b"numpy.core.multiarray")
     assert content != before
     (tmp_path / "data.pkl").write_bytes(content)
-    np.testing.assert_array_equal(read_pickled_arrays(tmp_path / "data.pkl")["a"], [0.0, 1.0, 2.0])
+    np.testing.assert_array_equal(decoded("pickle", tmp_path / "data.pkl")["a"], [0.0, 1.0, 2.0])
 
 
 class Build:
@@ -107,8 +106,8 @@ def test_a_pickle_that_runs_a_command_is_refused_before_it_does(tmp_path, wrappe
         np.save(path, np.array([payload, payload], dtype=object), allow_pickle=True)
     else:
         path.write_bytes(pickle.dumps(payload if wrapped == "bare" else [payload]))
-    with pytest.raises(DataFileError, match=r"data\.npy is refused: it would construct 'posix\.mkdir'"):
-        read_pickled_arrays(path)
+    with pytest.raises(DataFileError, match=r"data\.npy cannot be .*it would construct 'posix\.mkdir'"):
+        decoded("pickle", path)
     assert not (tmp_path / "ran").exists()
     np.load(path, allow_pickle=True) if wrapped.endswith("ary") else pickle.loads(pickle.dumps(payload))
     assert (tmp_path / "ran").exists()  # the payload is a real one
@@ -128,8 +127,8 @@ def test_a_pickle_that_runs_a_command_is_refused_before_it_does(tmp_path, wrappe
 )
 def test_everything_else_is_refused(tmp_path, content):
     (tmp_path / "data.pkl").write_bytes(content)
-    with pytest.raises(DataFileError, match="is refused: it would construct"):
-        read_pickled_arrays(tmp_path / "data.pkl")
+    with pytest.raises(DataFileError, match="it would construct"):
+        decoded("pickle", tmp_path / "data.pkl")
 
 
 @pytest.mark.parametrize(
@@ -153,10 +152,10 @@ def test_everything_else_is_refused(tmp_path, content):
 )
 def test_damaged_and_useless_pickles_end_with_one_sentence(tmp_path, content):
     (tmp_path / "data.pkl").write_bytes(content)
-    with pytest.raises(DataFileError, match=r"data\.pkl (is damaged, or no pickle|holds no dictionary)"):
-        read_pickled_arrays(tmp_path / "data.pkl")
+    with pytest.raises(DataFileError, match=r"data\.pkl cannot be decoded"):
+        decoded("pickle", tmp_path / "data.pkl")
     with pytest.raises(DataFileError, match="No such file"):
-        read_pickled_arrays(tmp_path / "absent.pkl")
+        decoded("pickle", tmp_path / "absent.pkl")
 
 
 def test_a_size_that_is_claimed_is_not_allocated(tmp_path):
@@ -167,59 +166,32 @@ def test_a_size_that_is_claimed_is_not_allocated(tmp_path):
     )
     (tmp_path / "data.pkl").write_bytes(content)
     with pytest.raises(DataFileError, match="an array that does not hold numbers"):
-        read_pickled_arrays(tmp_path / "data.pkl")
+        decoded("pickle", tmp_path / "data.pkl")
 
 
 MIB = (1 << 20).to_bytes(4, "little")
-TEXT, NUMBER = b"X" + MIB + b"7" * (1 << 20), b"\x8b" + MIB + b"7" * (1 << 20)
-DEEP = b")" + 100_000 * b"\x85"  # (((...)))
-ENCODE = b"c_codecs\nencode\n"
-ARRAY = b"cnumpy._core.multiarray\n_reconstruct\n)R(K\x01J\x00\x00\x10\x00\x85"  # of 2^20 numbers
-ARRAY += b"cnumpy\ndtype\nX\x02\x00\x00\x00u1\x85R\x89h\x00tb"
-SHARED = b"".join(b"J" + n.to_bytes(4, "little") + ARRAY for n in range(2000))
+DEEP = b")" + 2_000_000 * b"\x85"  # (((...)))
+ENCODE = b"c_codecs\nencode\nq\x00X" + MIB + b"7" * (1 << 20) + b"X\x06\x00\x00\x00latin1\x86q\x01"
 
 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"}" + DEEP + b"Ns.", "keys that are neither short texts"),  # hashing it fills the stack
-        (b"})" + 60 * b"2\x86" + b"Ns.", "keys that are neither short texts"),  # 2^60 tuples to hash
-        (b"}" + TEXT + b"Ns.", "keys that are neither short texts"),
-        (b"}" + NUMBER + b"Ns.", "keys that are neither short texts"),
-        (DEEP + b")\x93.", "names a function by what is no text"),
-        (b"}Nr\xff\xff\xff\x7fa.", "appends to what is no list"),  # two thousand million memo entries
-        (b"}" + 1_000_001 * b"N" + b".", "more than 1000000 operations"),
-        (ENCODE + b"q\x00" + TEXT + b"\x85q\x01" + 10_000 * b"0h\x00h\x01R" + b".", "its texts take more than"),
-        (ENCODE + TEXT + b"\x85Rq\x000}(" + SHARED + b"u.", "its arrays take more than"),
+        (b"}" + DEEP + b"Ns.", "pickle ends with"),  # hashing it fills the stack
+        (b"})" + 60 * b"2\x86" + b"Ns.", "does not end within"),  # 2^60 tuples to hash
+        (DEEP + b")\x93.", "UnpicklingError"),
+        (b"}Nr\xff\xff\xff\x7fa.", "takes more than .* memory"),  # two thousand million memo entries
+        (ENCODE + b"0]" + 10_000 * b"h\x00h\x01Ra" + b".", "takes more than .* memory"),  # 10 GiB of texts
     ],
-    ids=lambda part: part if isinstance(part, str) else "",
+    ids=["deep", "wide", "name", "memo", "texts"],
 )
 def test_pickles_made_to_take_memory_or_time_end_soon_with_one_sentence(tmp_path, monkeypatch, content, message):
-    monkeypatch.setattr("warp_resphys.data.recordings.restricted_pickle.MOST_BYTES", 1 << 26)
+    monkeypatch.setattr(decoding, "MEMORY", (1 << 29, 64))
+    monkeypatch.setattr(decoding, "SECONDS", (2.0, 2e-6))
     (tmp_path / "data.pkl").write_bytes(b"\x80\x04" + content)
-    began = time.process_time()
-    tracemalloc.start()
-    try:
-        with pytest.raises(DataFileError, match=rf"data\.pkl is damaged, .*{message}.*\): fetch") as caught:
-            read_pickled_arrays(tmp_path / "data.pkl")
-        assert tracemalloc.get_traced_memory()[1] < 1 << 28
-    finally:
-        tracemalloc.stop()
-    assert time.process_time() - began < 20.0
+    with pytest.raises(DataFileError, match=rf"data\.pkl cannot be decoded \(.*{message}.*\): copy") as caught:
+        decoded("pickle", tmp_path / "data.pkl")
     assert len(str(caught.value)) < 500
-
-
-def test_values_that_lie_deep_in_each_other_are_passed_over(tmp_path):
-    deep = b"}X\x01\x00\x00\x00a]" + 100_000 * b"]" + 100_000 * b"a" + b"s."
-    (tmp_path / "data.pkl").write_bytes(b"\x80\x02" + deep)
-    assert read_pickled_arrays(tmp_path / "data.pkl") == {}
-
-
-def test_a_pickle_that_is_too_large_is_not_read(tmp_path):
-    with open(tmp_path / "data.pkl", "wb") as file:
-        file.truncate((1 << 30) + 1)
-    with pytest.raises(DataFileError, match="it has more than 1024 MiB"):
-        read_pickled_arrays(tmp_path / "data.pkl")
 
 
 def test_the_arm_comes_out_in_the_order_of_the_mesh(tmp_path, arm):

@@ -8,13 +8,8 @@ from scipy.spatial.transform import Rotation
 from warp_resphys.data.recordings.processing import fill_gaps
 from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.recordings.release import find_release
-from warp_resphys.data.registration import (
-    RigidTransform,
-    kabsch,
-    register_markers,
-    register_to_surface,
-    root_mean_square,
-)
+from warp_resphys.data.registration import register_markers
+from warp_resphys.data.rigid import RigidTransform, kabsch, root_mean_square
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.mesh.mesh import boundary_triangles, box_hexahedra, box_tetrahedra
 from warp_resphys.mesh.surface import closest_points
@@ -106,8 +101,6 @@ class TestRegisterMarkers:
         found = register_markers(points, NOMINAL, NAMES, source=SOURCE)
         assert_inverse(found.transform)
         assert found.outliers == ("Tip - 2", "Base - 2")
-        with pytest.raises(DataFileError, match=r"swing\.c3d: the markers at rest do not fit"):
-            register_markers(points, NOMINAL, NAMES, source=SOURCE, most_outliers=1)
 
     def test_seven_of_fifteen_may_be_anywhere(self):
         random = np.random.default_rng(0)
@@ -150,7 +143,7 @@ class TestRegisterMarkers:
         [
             (
                 measured(m1=[0.1, 0.0, 0.0]),
-                {"most_outliers": 0},
+                {"use": NAMES[:4]},  # of four, none can be left out
                 "swing.c3d: the markers at rest do not fit their nominal positions to 4.0 mm: 'Tip - 2' is 100.0 mm "
                 "off (the others: 0.0 mm root mean square); check its name",
             ),
@@ -225,53 +218,3 @@ def test_closest_points_of_a_box(mesh):
 def test_beside_an_edge_the_face_below_is_the_closest():
     found = closest_points(MESHES["hexahedra"], np.array([[0.1, 0.015, 0.036], [0.1, -0.006, 0.011]]))
     np.testing.assert_allclose(found.normals, [[0, 0, 1], [0, -1, 0]], atol=1e-12)
-
-
-class TestRegisterToSurface:
-    names = tuple(f"m{i}" for i in range(8))
-    mesh = box_hexahedra(divisions=(10, 3, 3))
-
-    def stems(self, length):
-        """Markers on stems of one length on five faces, two or one on each, in the body's frame."""
-        points = [[0.03, 0.01, 0.03], [0.07, 0.02, 0.03], [0.05, 0.0, 0.02], [0.02, 0.03, 0.01]]
-        points += [[0.1, 0.02, 0.01], [0.08, 0.01, 0.0], [0.01, 0.0, 0.01], [0.09, 0.03, 0.02]]
-        normals = [[0, 0, 1], [0, 0, 1], [0, -1, 0], [0, 1, 0], [1, 0, 0], [0, 0, -1], [0, -1, 0], [0, 1, 0]]
-        return np.array(points) + length * np.array(normals)
-
-    @pytest.mark.parametrize("stem", [0.006, None])
-    def test_it_finds_the_motion_and_the_length_of_the_stems(self, stem):
-        points = self.stems(0.006)
-        away = RigidTransform(Rotation.from_rotvec([0.03, -0.02, 0.04]).as_matrix(), np.array([1e-3, -2e-3, 1.5e-3]))
-        start = RigidTransform(np.eye(3), np.zeros(3))
-        found = register_to_surface(
-            away.apply(points), self.mesh, start, self.names, source=SOURCE, stem=stem, hold=1e-9, largest_residual=1e-5
-        )
-        assert found.rms < 1e-6
-        np.testing.assert_allclose(found.positions, points, rtol=0, atol=2e-5)
-
-    def test_stems_of_different_lengths(self):
-        lengths = np.linspace(0.002, 0.009, 8)
-        points = self.stems(lengths[:, None])
-        points[6] = np.nan
-        start = RigidTransform(Rotation.from_rotvec([0.02, 0.01, -0.02]).as_matrix(), np.array([1e-3, 1e-3, 0.0]))
-        found = register_to_surface(points, self.mesh, start, self.names, source=SOURCE, stem=lengths, hold=1e-9)
-        np.testing.assert_allclose(found.positions, points, rtol=0, atol=2e-5)
-        assert np.isnan(found.residual[6])
-        assert not found.inliers[6]
-
-    def test_what_slides_along_the_surface_stays_where_it_starts(self):
-        points = self.stems(0.006)[:4] + [2e-3, 0.0, 1e-3]  # None of these four sees x.
-        start = RigidTransform(np.eye(3), np.zeros(3))
-        found = register_to_surface(points, self.mesh, start, self.names[:4], source=SOURCE, stem=0.006)
-        moved = found.positions - points
-        np.testing.assert_allclose(moved[:, 0], 0.0, atol=1e-4)
-        np.testing.assert_allclose(moved[:, 2].mean(), -1e-3, atol=5e-5)
-
-    def test_a_marker_off_the_surface_is_named(self):
-        points = self.stems(0.006)
-        points[3] += [0.0, 0.03, 0.0]
-        start = RigidTransform(np.eye(3), np.zeros(3))
-        with pytest.raises(DataFileError, match=r"swing\.c3d: marker 'm3' is .* mm off a stem of 6\.0 mm on"):
-            register_to_surface(points, self.mesh, start, self.names, source=SOURCE, stem=0.006)
-        with pytest.raises(InputError, match="hold is 0: it must be positive"):
-            register_to_surface(points, self.mesh, start, self.names, source=SOURCE, hold=0.0)

@@ -10,6 +10,7 @@ import pytest
 from warp_resphys.data.recordings.jumps import mask_repeats
 from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.recordings.recording import Recording
+from warp_resphys.data.recordings.release import valve_opening
 from warp_resphys.data.recordings.segment import (
     CLAMP_LABELS,
     MARKERS,
@@ -19,7 +20,6 @@ from warp_resphys.data.recordings.segment import (
     convert_segment,
     read_published_segment,
 )
-from warp_resphys.data.recordings.valve import valve_opening
 from warp_resphys.io.errors import DataFileError
 
 RATE = 100.0

@@ -1,4 +1,4 @@
-"""Rotations around the vertices of a body, and forces that turn with them."""
+"""Rotations around the vertices of a body, forces that turn with them, and the frame of a base that moves."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,8 @@ from chambered import KINDS, chambered
 from scipy.spatial.transform import Rotation
 
 from warp_resphys import Body, Corotated, Simulator, box_hexahedra, select_vertices
-from warp_resphys.dynamics.frames import VertexFrames
+from warp_resphys.data.base_motion import prescribed, rigid
+from warp_resphys.dynamics.frames import BaseFrame, VertexFrames, base_movement
 from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.dynamics.integrator import State
 from warp_resphys.learning.predictors import LearnedPredictor, Range
@@ -95,3 +96,83 @@ def test_what_a_model_predicts_turns_with_the_body_in_a_roll_out():
     turned = LearnedPredictor(Constant(rest[0], force), nothing, range_, frames)(state, 0)
     assert torch.equal(kept, force)
     np.testing.assert_allclose(turned[0].numpy(), force[0].numpy() @ turn.T, atol=1e-12)
+
+
+STEP = 0.01
+SWINGS = [
+    {"swings": {"a": {"frequency": 1.0, "translation": [0.02, 0.0, 0.01], "rotation": [0.3, 0.0, 1.0]}}},
+    {"swings": {"b": {"frequency": 0.5, "translation": [0.0, 0.05, 0.0], "rotation": [0.0, -0.5, 0.2]}}, "start": 0.05},
+]
+
+
+def poses_of_two(steps=20):
+    """(K + 1, 2, 6)."""
+    return torch.from_numpy(np.stack([prescribed(each, STEP * np.arange(steps + 1)) for each in SWINGS], 1))
+
+
+class TestBaseFrame:
+    def test_a_body_that_goes_with_its_base_is_at_rest_in_its_frame(self):
+        poses = poses_of_two()
+        points = Body(box_hexahedra(divisions=(2, 1, 1))).mesh.vertices
+        world = torch.from_numpy(
+            np.stack([rigid(p.numpy()).apply(np.broadcast_to(points, (2, *points.shape))) for p in poses])
+        )
+        base = BaseFrame(poses, STEP)
+        for k in range(1, 21):
+            q, v = base.enter(world[k], (world[k] - world[k - 1]) / STEP, k)
+            np.testing.assert_allclose(q, np.stack([points, points]), atol=1e-14)
+            np.testing.assert_allclose(v, np.zeros_like(q), atol=1e-12)
+
+    def test_states_and_forces_come_back_from_it(self):
+        base, random = BaseFrame(poses_of_two(), STEP), torch.Generator().manual_seed(2)
+        q, v, force = (torch.randn(2, 7, 3, dtype=torch.float64, generator=random) for _ in range(3))
+        for k in (0, 1, 7, 20, 25):
+            for found, expected in zip(base.leave(*base.enter(q, v, k), k), (q, v), strict=True):
+                torch.testing.assert_close(found, expected, rtol=0.0, atol=1e-11)
+            torch.testing.assert_close(base.force_outside(base.force_inside(force, k), k), force, rtol=0.0, atol=1e-14)
+
+    def test_a_window_has_the_frames_of_its_steps(self):
+        whole, random = BaseFrame(poses_of_two(), STEP), torch.Generator().manual_seed(3)
+        q, v = (torch.randn(2, 5, 3, dtype=torch.float64, generator=random) for _ in range(2))
+        part = whole.during(torch.tensor([1, 0]), torch.tensor([0, 17]), 4)  # of the second body, then of the first
+        for k in range(4):
+            found = part.enter(q, v, k)
+            for row, (body, step) in enumerate([(1, k), (0, 17 + k)]):
+                expected = whole.enter(q[row].expand(2, -1, -1), v[row].expand(2, -1, -1), step)
+                for field, wanted in zip(found, expected, strict=True):
+                    torch.testing.assert_close(field[row], wanted[body], rtol=0.0, atol=1e-12)
+
+    def test_a_roll_out_does_not_depend_on_how_base_and_gravity_are_turned_together(self):
+        mesh = box_hexahedra(divisions=(3, 1, 1))
+        rest = torch.as_tensor(mesh.vertices)[None]
+        turn = Rotation.from_rotvec([0.4, -1.1, 0.7])
+        place = np.array([0.2, 0.1, -0.3])
+        force = 0.02 * torch.randn(rest.shape, dtype=rest.dtype, generator=torch.Generator().manual_seed(1))
+        fixed = select_vertices(mesh, x=0.0)
+        found = []
+        for rotation, at in ((Rotation.identity(), 0.0 * place), (turn, place)):
+            body = Body(mesh, fixed)
+            sim = Simulator(body, time_step=STEP, gravity=rotation.apply([0.0, 0.0, -9.81]), relative_tolerance=1e-12)
+            pose = torch.from_numpy(np.concatenate([at, rotation.as_rotvec()])).expand(2, 1, 6)
+            predict = LearnedPredictor(Constant(rest[0], force), torch.zeros(1, 0), base=BaseFrame(pose, STEP))
+            q = torch.from_numpy(rotation.apply(mesh.vertices) + at)[None]
+            state = State(q, 0.0 * q)
+            held = Inputs(fixed_positions=q[:, fixed])
+            for k in range(10):
+                state, _ = sim.step(state, held.plus(predict(state, k)))
+            found.append((rotation.inv().apply(state.q[0].numpy() - at), rotation.inv().apply(state.v[0].numpy())))
+        assert np.abs(found[0][0] - mesh.vertices).max() > 1e-3
+        for first, second in zip(*found, strict=True):
+            np.testing.assert_allclose(first, second, atol=1e-8)
+
+
+def test_what_networks_are_told_of_a_base_are_its_velocities_and_gravity():
+    times = STEP * np.arange(21)
+    velocity, rate = np.array([0.1, -0.2, 0.3]), np.array([0.0, 0.0, 2.0])
+    poses = torch.from_numpy(np.concatenate([times[:, None] * velocity, times[:, None] * rate], 1))[:, None]
+    told = base_movement(poses, STEP, torch.tensor([0.0, -9.81, 0.0], dtype=torch.float64))[:, 0].numpy()
+    turned = Rotation.from_rotvec(times[:, None] * rate)
+    np.testing.assert_allclose(told[:, :3], turned[:-1].inv().apply(velocity), atol=1e-12)
+    np.testing.assert_allclose(told[:, 3:6], np.tile(rate, (20, 1)), rtol=1e-4)
+    np.testing.assert_allclose(told[1:, 6:12], told[:-1, :6], atol=1e-15)
+    np.testing.assert_allclose(told[:, 12:], turned[1:].inv().apply([0.0, -1.0, 0.0]), atol=1e-12)

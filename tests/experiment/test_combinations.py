@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from main_job import IN_RUN, TINY, run
 
+from warp_resphys.data.base_motion import prescribed, rigid
 from warp_resphys.experiment import pipeline
 from warp_resphys.io.files import read_array, read_checkpoint, read_hdf5
 
@@ -231,3 +232,65 @@ def test_what_is_seen_is_held_in_the_range_of_the_training_or_not():
         assert ("range" in found) == (guard == "true")
         _, described = read_checkpoint(Path("run/resphys.safetensors"), "residual force")
         assert (described["range"] is not None) == (guard == "true")
+
+
+SWINGS = (
+    "+laboratory.trials={"
+    + ",".join(
+        f"{name}:{{base_motion:{{start:0.05,ramp:0.05,swings:{{a:{{frequency:{hertz},{motion}}}}}}}}}"
+        for name, hertz, motion in (
+            ("s0", 4.0, "translation:[0,0.01,0]"),
+            ("s1", 3.0, "rotation:[0.2,0.2,0]"),
+            ("s2", 5.0, "translation:[0,0,0.006]"),
+            ("s3", 4.0, "rotation:[0,0.1,0.2]"),
+        )
+    )
+    + "}"
+)
+MOVING = [
+    *(each for each in BEAM if not each.startswith(("laboratory.t", "laboratory.v", "data.seconds", "experiment"))),
+    "experiment=beam_moving_base",
+    "data.steps=30",
+    "laboratory.train=[s0,s1]",
+    "laboratory.validation=[s2]",
+    "laboratory.test=[s3]",
+    SWINGS,
+]
+
+
+@pytest.mark.parametrize("known", ["reference", "recorded"])
+def test_a_base_that_moves_is_told_by_markers_or_by_a_record(known):
+    found = done(*MOVING, f"data.base_motion={known}")
+    errors = {name: each["mean"] for name, each in found["errors_mm"].items()}
+    assert errors["simulation"] > 3.0  # mm
+    assert errors["sysid"] < 0.7 * errors["simulation"]
+    assert errors["resphys"] < 1.05 * errors["sysid"]
+    _, (base, times) = dataset("base", "times")
+    swing = {"frequency": 3.0, "rotation": [0.2, 0.2, 0.0]}
+    truth = prescribed({"start": 0.05, "ramp": 0.05, "swings": {"a": swing}}, times[1])
+    # Markers that are placed to 0.3 mm over 40 mm turn the frame by some 10 mrad, and its rotations by 0.3 of that.
+    assert np.abs(base[1, : len(truth), 3:] - truth[:, 3:]).max() < 0.01
+    assert np.abs(truth[:, 3:]).max() > 0.19
+
+
+def test_a_base_moves_as_a_table_says_where_every_vertex_is_known(tmp_path):
+    times = 0.01 * np.arange(14)
+    place = 0.01 * np.sin(25.0 * times) ** 2
+    Path("shaker.csv").write_text("".join(f"{t},0,0,{x},1,0,0,0\n" for t, x in zip(times, place, strict=True)))
+    amounts = "data.amplitudes={train:[1.0,2.0,3.0],validation:[1.5],test:[2.5,0.5]}"
+    moving = [each for each in TINY if not each.startswith("data.weights")]
+    swing = "data.base_motion={swings:{a:{frequency:4.0,translation:[0,0,0.01],rotation:[0,0.1,0]}}}"
+    for motion in (swing, "data.base_motion={file:shaker.csv}"):
+        more = ["+data.kind=moving_base", f"+{amounts}", f"+{motion}", "timing=false"]
+        more = [each.replace("+data.kind", "data.kind") for each in more]
+        found = done(*moving, *more)
+        finite(found)
+        assert found["errors_mm"]["resphys"]["mean"] < 0.7 * found["errors_mm"]["simulation"]["mean"]
+        _, (observed, base) = dataset("observed", "base")
+        assert base.shape == (6, 13, 6)
+        fixed = np.flatnonzero(observed[0, 0, :, 0] == 0.0)
+        carried = rigid(base[2]).apply(np.broadcast_to(observed[2, 0, fixed], (13, len(fixed), 3)))
+        np.testing.assert_allclose(observed[2, :, fixed].swapaxes(0, 1), carried, atol=1e-12)
+    torn = [each.replace("amplitudes={train:[1.0", "amplitudes={train:[9000.0") for each in (*moving, *more[:2])]
+    code, err = run(*torn, f"+{swing}", "timing=false", *QUIET)
+    assert (code, "data.base_motion: the base jumps by" in err) == (2, True)

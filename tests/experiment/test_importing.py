@@ -21,10 +21,10 @@ from warp_resphys.data.trials import Trials
 from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.experiment.build import bound_markers, build_body
 from warp_resphys.experiment.checks import check_configuration
-from warp_resphys.experiment.files import DATASET, QUALITY, REGISTRATION, TRUTH, attached_mass, read_dataset
+from warp_resphys.experiment.files import DATASET, QUALITY, REGISTRATION, TRUTH, Dataset, attached_mass, read_dataset
 from warp_resphys.experiment.importing import import_recordings
-from warp_resphys.experiment.laboratory import laboratory_simulator, make_setup
 from warp_resphys.experiment.pipeline import acquisition_stages
+from warp_resphys.experiment.simulate import laboratory_simulator, make_setup
 from warp_resphys.experiment.trials import trials_of
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.files import read_hdf5
@@ -516,3 +516,22 @@ def test_an_experiment_may_set_gravity(tmp_path):
     assert config["gravity"] == [9.81, 0.0, 0.0]
     given = configuration(f"hydra.searchpath=[file://{tmp_path}]", "gravity=[0,0,-1]", experiment="hanging")
     assert given["gravity"] == [0, 0, -1]
+
+
+@pytest.mark.parametrize(("ratio", "count"), [(0.25, 24), (0.5, 12), (1.0, 6)])
+def test_inputs_keep_their_time_at_steps_of_another_length(ratio, count):
+    """What a simulator with smaller steps is driven by lasts as long as it did, and so does the motion of a base."""
+    base = np.zeros((1, 7, 6))
+    base[0, :, 1] = 1e-3 * np.arange(7.0)
+    times, seen, weight = np.zeros((1, 7)), np.zeros((1, 7, 1, 3)), np.zeros(1)
+    inputs = {"pressure": np.arange(6.0)[None, :, None]}
+    words = (("a",), ("m",), ("rest",))
+    dataset = Dataset(*words, times, seen, seen[:, 0], weight, np.zeros(3), 0.01, inputs=inputs, base=base)
+    body = build_body(configuration("experiment=beam_real"))
+    given = dataset.trials(["a"], body, None, 0.01 * ratio).inputs.fields
+    times = 0.01 * ratio * (np.arange(count) + 1.0)
+    np.testing.assert_allclose(given["pressure"][:, 0, 0], ((times - 0.005 * ratio) / 0.01).astype(int))
+    moved = given["fixed_positions"][:, 0] - torch.from_numpy(body.mesh.vertices[body.fixed_vertices])
+    np.testing.assert_allclose(
+        moved[..., 1].numpy(), np.broadcast_to(0.1 * times[:, None], moved.shape[:2]), atol=1e-15
+    )

@@ -59,9 +59,9 @@ class TestInterruption:
         arguments = [*TINY, f"integrator={integrator}"]
         assert run(*arguments, "hydra.run.dir=whole")[0] == 0
         whole = Counter(interruption.done)
-        assert whole == {"dataset": 13, "reconstruct_resphys": 13, "epochs": 80, "evaluate": 39}
+        assert whole == {"simulate": 13, "reconstruct_resphys": 13, "epochs": 80, "evaluate": 39}
         interruption.done.clear()
-        cuts = {"dataset": ("simulate", 1), "reconstruct_resphys": ("reconstruct_resphys", 7)}
+        cuts = {"simulate": ("simulate", 1), "reconstruct_resphys": ("reconstruct_resphys", 7)}
         cuts |= {"epochs": ("train_resphys", 25), "evaluate": ("evaluate", 18)}
         for kind, (stage, at) in cuts.items():
             interruption.at = (kind, at)
@@ -133,7 +133,7 @@ class TestInterruption:
         return child
 
     def test_ctrl_c_in_a_real_process(self, finished, folder):
-        child = self.start("run/dataset.h5.journal")
+        child = self.start("run/simulate_parts/part_000.h5.journal")
         child.send_signal(signal.SIGINT)
         err = child.communicate(timeout=60)[1]
         assert child.returncode == 130, err

@@ -7,8 +7,8 @@ import pytest
 from measured_run import configuration
 
 from warp_resphys.experiment.checks import check_configuration, training_settings
-from warp_resphys.experiment.laboratory import vertical
 from warp_resphys.experiment.schema import dotted
+from warp_resphys.experiment.simulate import vertical
 from warp_resphys.experiment.trials import folds_of, split_of, trials_of
 from warp_resphys.io.errors import InputError, ResphysError
 
@@ -40,6 +40,17 @@ TRIALS = {"a": {"file": "a.c3d", "payload": 0.0}, "b": {"file": "b.c3d", "payloa
         ("data/up", [0.0, 0.0, 0.0], "data.up is .*: give x, -x"),
         ("data/up", [0.0, 1.0], "data.up is .*: it must be x, -x"),
         ("data/begins", "later", "data.begins is 'later': it must be one of held, released"),
+        ("data/base_motion", "video", "data.base_motion is 'video': it must be recorded or reference, a group"),
+        ("data/base_motion", 3, "data.base_motion is 3: it must be a group of settings"),
+        ("data/base_motion", {"about": [0.0, 0.0, 0.0]}, "data.base_motion needs either file, .* or swings"),
+        ("data/base_motion", {"swings": {}}, "data.base_motion.swings is empty: give it at least one"),
+        (
+            "data/base_motion",
+            {"swings": {"a": {"translation": [0, 0, 1]}}},
+            "data.base_motion.swings.a.frequency is mis",
+        ),
+        ("data/base_motion", {"swings": {"a": {"frequency": -1.0}}}, "frequency is -1.0: it must be a positive number"),
+        ("data/base_motion", {"file": "a.csv", "swings": {"a": {"frequency": 1.0}}}, "data.base_motion needs either"),
         ("data/payload", {"x": 0.1}, "unknown key 'data.payload': data has folder, units"),
         ("data/payload_at", {"x": 0.07003}, "no vertex lies within"),
         ("data/payload_at", {"x": 0.0}, "data.payload_at names fixed vertices alone"),

@@ -15,7 +15,7 @@ from warp_resphys.dynamics.nonlinear_solver import SolverSettings
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.learning.identification import Bounds, Identifier
 from warp_resphys.learning.replay import Replay, Start
-from warp_resphys.linalg.least_squares import minimise
+from warp_resphys.linalg.least_squares import UnitBox, minimise
 from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
 
 MESH = box_hexahedra(divisions=(4, 1, 1))
@@ -104,7 +104,7 @@ def test_stiffness_and_density_of_a_body_without_weights_cannot_be_told_apart():
     truth = {"youngs_modulus": 215e3, "density": 1070.0}
     replay, release = replay_of(simulator(), truth, masses=(0.0,), noise=5e-5)
     identifier = Identifier([(replay, release)], bounds)
-    uncertainty = identifier.uncertainty(np.array([identifier._unit(name, truth) for name in bounds]))
+    uncertainty = identifier.uncertainty(identifier._units(truth))
     assert uncertainty.correlation[0][1] > 0.999
     assert uncertainty.poorest_deviation > 1.0
     replay, release = replay_of(simulator(), truth, masses=(0.0, 0.05), noise=5e-5)
@@ -199,7 +199,7 @@ def test_only_the_first_seconds_count():
     spoilt[:, 20:] += 1.0
     motions = replace(replay.trials, observed=spoilt)
     identifier = Identifier([(Replay(replay.simulator, MARKERS, motions), release)], RANGES, seconds=0.19)
-    unit = replay.simulator.tensor([[identifier._unit(name, TRUTH) for name in RANGES]])
+    unit = replay.simulator.tensor(identifier._units(TRUTH))[None]
     assert float(identifier.losses(unit)) < 1e-12
 
 
@@ -266,9 +266,15 @@ class Valley:
         return 2.0 * self.jacobian(x).T @ self.jacobian(x)
 
 
+def descend(valley, start, matrix, max_iterations):
+    problem = UnitBox(valley, matrix)
+    found = minimise(problem, problem.evaluate(one(start)), 1e-6, max_iterations).point
+    return found.x[0].numpy(), float(found.value)
+
+
 def test_the_descent_follows_a_bent_valley():
     valley = Valley()
-    x, value = minimise(valley, np.array([0.05, 0.9]), valley.matrix, 50)
+    x, value = descend(valley, [0.05, 0.9], valley.matrix, 50)
     np.testing.assert_allclose(x, [0.7, 0.49], atol=1e-6)
     assert value < 1e-10
     assert valley.calls < 60
@@ -276,11 +282,11 @@ def test_the_descent_follows_a_bent_valley():
 
 def test_the_descent_turns_back_from_failures_and_copes_without_a_matrix():
     valley = Valley(wall=0.6)
-    x, _ = minimise(valley, np.array([0.99, 0.2]), valley.matrix, 50)
+    x, _ = descend(valley, [0.99, 0.2], valley.matrix, 50)
     np.testing.assert_allclose(x, [0.7, 0.49], atol=1e-5)
-    x, value = minimise(Valley(), np.array([0.4, 0.1]), lambda _: None, 200)
+    x, value = descend(Valley(), [0.4, 0.1], lambda _: None, 200)
     assert value < 0.1
-    assert minimise(Valley(wall=0.6), np.array([0.1, 0.1]), valley.matrix, 5)[1] == np.inf
+    assert descend(Valley(wall=0.6), [0.1, 0.1], valley.matrix, 5)[1] == np.inf
 
 
 def test_groups_of_trials_weigh_what_their_trials_do():

@@ -228,7 +228,7 @@ def test_without_gmsh_one_sentence(monkeypatch):
         ({"profile": "sector"}, "lobed outline does not go with sectors"),
         ({"wall": 0.02}, "3 chambers do not fit: make the wall"),
         ({"core": 0.002}, "a core of 1.167 mm leaves webs of|a core of 2 mm leaves webs of"),
-        ({"rotations": (10.0,)}, "rotations are 1 numbers, but it has 2 segments"),
+        ({"rotations": (10.0,)}, "rotations are 1 numbers, but 2 chamber_lengths need 2"),
         ({"chamber_lengths": 0.1}, "chamber_lengths are 0.1: give a list"),
         ({"wall": 0.0005, "web": 0.02}, "lobes of the outline do not meet"),
     ],

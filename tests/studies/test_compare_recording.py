@@ -192,10 +192,10 @@ def test_hung_weight_lengthens_the_period():
     [
         ("recording.path=null", "set recording.path to one"),
         ("recording.path=absent.c3d", "Cannot read absent.c3d: No such file"),
-        ("recording.hung_weight=-1", "recording.hung_weight is -1: set it to a number, not below zero"),
-        ("simulation.gravity=0", "simulation.gravity is 0: set it to a number, more than zero"),
-        ("recording.release_frame=soon", "release_frame is 'soon': set it to a number"),
-        ("material.density=heavy", "material.density is 'heavy': set it to a number"),
+        ("recording.hung_weight=-1", "recording.hung_weight is -1: it must be a number, zero or more"),
+        ("simulation.gravity=0", "simulation.gravity is 0: it must be a positive number"),
+        ("recording.release_frame=soon", "release_frame is 'soon': it must be a finite number"),
+        ("material.density=heavy", "material.density is 'heavy': it must be a number"),
     ],
 )
 def test_refused_settings(tmp_path, override, sentence):

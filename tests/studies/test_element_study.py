@@ -31,4 +31,4 @@ def test_table(folder, monkeypatch, capsys):
 
 
 def test_too_fine(folder, monkeypatch, capsys):
-    assert rows(monkeypatch, capsys, "finest=9") == "error: finest is 9: choose a whole number from 1 to 4.\n"
+    assert rows(monkeypatch, capsys, "finest=9") == "error: finest is 9: it must be a whole number from 1 to 4.\n"

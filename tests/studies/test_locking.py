@@ -11,7 +11,7 @@ from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_json
 from warp_resphys.mesh.arm import mesh_arm
 from warp_resphys.mesh.arm_geometry import ArmGeometry
-from warp_resphys.studies import locking_page as report
+from warp_resphys.studies import locking as report
 from warp_resphys.studies.locking import (
     BIQUADRATIC,
     HEXAHEDRA,

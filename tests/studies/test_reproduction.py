@@ -112,7 +112,7 @@ class TestPage:
         assert len(names) == 3
         assert all(0 < (page.parent / name).stat().st_size < 200_000 for name in names)
         assert "warp-resphys reproduce " in text
-        assert "- processor: " in text
+        assert "| processor | " in text
         assert "&#39;" not in text
 
     def test_what_is_up_to_date_is_not_run_again(self, finished):
@@ -157,7 +157,7 @@ class TestPlan:
         [
             ("only=[beam_twst]", "only names 'beam_twst', which is no experiment or run: there are beam_oscillation, "),
             ("only=[]", "only is []: name at least one experiment or run"),
-            ("only=beam_twist", "only is 'beam_twist': it must be a list of words."),
+            ("only=beam_twist", "only is 'beam_twist': it must be a list of words, or null."),
             ("overrides=[1]", "overrides is [1]: it must be a list of words."),
             ("experiments.beam_twist.variants=[quick]", "experiments.beam_twist.variants names 'quick': there are "),
         ],
@@ -212,7 +212,7 @@ def test_ctrl_c_stops_the_run_and_keeps_what_it_has(folder):
     found = []
     while not found and child.poll() is None:
         time.sleep(0.01)
-        found = [path for path in DEFAULT.glob("*/dataset.h5.journal") if path.stat().st_size]
+        found = [path for path in DEFAULT.glob("*/**/*.h5.journal") if path.stat().st_size]
     child.send_signal(signal.SIGINT)
     err = child.communicate(timeout=100)[1]
     assert child.returncode == 130, err

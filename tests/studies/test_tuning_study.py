@@ -4,18 +4,16 @@ import fcntl
 import json
 import math
 import os
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 
 from warp_resphys.io.errors import InputError
 from warp_resphys.studies.tuning.space import Choice, Range, parse_space
-from warp_resphys.studies.tuning.study import JOURNAL, JournalLock, SharedStudy
-from warp_resphys.studies.tuning.workers import Watch, Worker
+from warp_resphys.studies.tuning.study import JOURNAL, SharedStudy
+from warp_resphys.studies.tuning.workers import at_work, is_alive
 
 REPOSITORY = Path(__file__).parents[2]
 WIDTHS = {"network.width": Choice((8, 16, 32)), "trainer.gamma": Range(0.8, 1.0, log=False, whole=False)}
@@ -39,11 +37,12 @@ class TestSpace:
     @pytest.mark.parametrize(
         ("space", "sentence"),
         [
-            ({}, "tune.space is {}: it must name at least one setting"),
+            (3, "tune.space is 3: it must be a group of settings"),
+            ({}, "tune.space is empty: it must name at least one setting"),
             ({"network": {}}, "tune.space is empty"),
             (
                 {"data": {"steps": [1, 2]}},
-                "tune.space.data cannot be searched: name settings of network or trainer or in_the_loop.",
+                "unknown key 'tune.space.data': tune.space has network, trainer, in_the_loop.",
             ),
             ({"network": 3}, "tune.space.network is 3: it must be a group"),
             ({"network": {"width": [8]}}, "tune.space.network.width is [8]: it must list two or more"),
@@ -60,85 +59,42 @@ class TestSpace:
         assert sentence in str(refusal.value)
 
 
-def sleeping_worker(folder, stale_after):
-    program = f"""
-import json, time
-from pathlib import Path
-from warp_resphys.studies.tuning.workers import Worker
-with Worker(Path({str(folder)!r}), {stale_after}) as worker:
-    print(json.dumps(worker.identity), flush=True)
-    time.sleep(100)
-"""
-    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
-    child = subprocess.Popen([sys.executable, "-c", program], env=environment, text=True, stdout=subprocess.PIPE)
-    return child, json.loads(child.stdout.readline())
-
-
 class TestWorkers:
     def test_a_killed_one_is_known_to_be_dead_at_once(self, tmp_path):
-        child, identity = sleeping_worker(tmp_path, 1000.0)
-        watch = Watch(tmp_path, 1000.0)
+        program = f"""
+import json, time
+from pathlib import Path
+from warp_resphys.studies.tuning.workers import at_work
+with at_work(Path({str(tmp_path)!r})) as identity:
+    print(json.dumps(identity), flush=True)
+    time.sleep(100)
+"""
+        environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+        child = subprocess.Popen([sys.executable, "-c", program], env=environment, text=True, stdout=subprocess.PIPE)
+        identity = json.loads(child.stdout.readline())
         try:
-            assert watch.is_alive(identity)
+            assert is_alive(tmp_path, identity)
         finally:
             child.kill()
             child.wait()
-        assert not watch.is_alive(identity)
-
-    def test_a_stopped_one_is_taken_for_dead_until_it_wakes(self, tmp_path):
-        child, identity = sleeping_worker(tmp_path, 0.5)
-        watch = Watch(tmp_path, 0.5)
-        try:
-            child.send_signal(signal.SIGSTOP)
-            assert watch.is_alive(identity)
-            time.sleep(0.7)
-            assert watch.is_alive(identity) is False
-            child.send_signal(signal.SIGCONT)
-            time.sleep(0.5)
-            assert watch.is_alive(identity)
-        finally:
-            child.kill()
-            child.wait()
+        assert (tmp_path / f"{identity['token']}.alive").exists()
+        assert not is_alive(tmp_path, identity)
 
     def test_one_that_left_has_gone(self, tmp_path):
-        with Worker(tmp_path, 1000.0) as worker:
-            assert Watch(tmp_path, 1000.0).is_alive(worker.identity)
-        assert not Watch(tmp_path, 1000.0).is_alive(worker.identity)
+        with at_work(tmp_path) as identity:
+            assert is_alive(tmp_path, identity)
+        assert not is_alive(tmp_path, identity)
         assert not list(tmp_path.iterdir())
 
-    def test_of_another_machine_only_its_signs_of_life_are_seen(self, tmp_path):
-        watch = Watch(tmp_path, 0.4)
-        with Worker(tmp_path, 0.4) as worker:
-            distant = {**worker.identity, "kernel": "another"}
-            end = time.monotonic() + 1.2
-            while time.monotonic() < end:
-                assert watch.is_alive(distant)
-                time.sleep(0.02)
-        (tmp_path / f"{distant['token']}.alive").write_text("its last sign\n")  # as after a power cut
-        assert watch.is_alive(distant)
-        time.sleep(0.5)
-        assert not watch.is_alive(distant)
+
+def dead(identity):
+    """As if nobody lived."""
+    return False
 
 
-class Dead:
-    """A watch that sees nobody."""
-
-    def is_alive(self, identity):
-        return False
-
-
-class Living:
-    """A watch that sees everybody."""
-
-    def is_alive(self, identity):
-        return True
-
-
-def join(folder, name="a", watch=None, trials=3, space=None, conditions=None):
-    watch = Living() if watch is None else watch
+def join(folder, name="a", alive=lambda identity: True, trials=3, space=None, conditions=None):
     conditions = {"seed": 0} if conditions is None else conditions
-    identity = {"token": name, "host": name, "pid": 1, "kernel": "-"}
-    return SharedStudy(folder, space or WIDTHS, conditions, trials, 0, identity, watch)
+    return SharedStudy(folder, space or WIDTHS, conditions, trials, 0, {"token": name, "host": name, "pid": 1}, alive)
 
 
 class TestStudy:
@@ -148,14 +104,14 @@ import time
 from pathlib import Path
 from warp_resphys.studies.tuning.space import Choice, Range
 from warp_resphys.studies.tuning.study import SharedStudy
-from warp_resphys.studies.tuning.workers import Watch, Worker
+from warp_resphys.studies.tuning.workers import at_work, is_alive
 folder = Path({str(tmp_path)!r})
 space = {WIDTHS!r}
 print("ready", flush=True)
 while not (folder / "go").exists():
     time.sleep(1e-4)
-with Worker(folder / "workers", 60.0) as worker:
-    study = SharedStudy(folder, space, {{}}, 21, 0, worker.identity, Watch(folder / "workers", 60.0))
+with at_work(folder / "workers") as identity:
+    study = SharedStudy(folder, space, {{}}, 21, 0, identity, lambda other: is_alive(folder / "workers", other))
     while (claim := study.claim()) is not None:
         study.report(claim, 1, 2.0)
         assert study.tell(claim, claim.settings["trainer.gamma"], 1.0)
@@ -177,7 +133,7 @@ with Worker(folder / "workers", 60.0) as worker:
         assert [each.state for each in study.outcomes()] == 21 * ["complete"]
 
     def test_a_dead_workers_trial_is_taken_over_and_told_once(self, tmp_path):
-        first, second = join(tmp_path, "a"), join(tmp_path, "b", Dead())
+        first, second = join(tmp_path, "a"), join(tmp_path, "b", dead)
         begun = first.claim()
         taken = second.claim()
         assert (taken.number, taken.settings, taken.claims) == (begun.number, begun.settings, 2)
@@ -241,14 +197,11 @@ with Worker(folder / "workers", 60.0) as worker:
         assert journal.read_bytes().startswith(whole + b'{"op_code"')
         assert len(join(tmp_path).outcomes()) == 2
 
-    def test_the_journal_is_locked_while_it_is_written(self, tmp_path):
-        journal = tmp_path / JOURNAL
-        lock = JournalLock(journal)
-        lock.acquire()
-        with open(tmp_path / f"{JOURNAL}.lock") as file:
-            with pytest.raises(BlockingIOError):
+    def test_the_study_is_locked_while_it_is_written(self, tmp_path):
+        study = join(tmp_path)
+        with open(tmp_path / "study.lock") as file:
+            with study.lock(), pytest.raises(BlockingIOError):
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            lock.release()
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
     @pytest.mark.parametrize(

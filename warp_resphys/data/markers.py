@@ -15,7 +15,7 @@ All reproduce the markers at rest, and carry them rigidly where the body moves r
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -26,27 +26,17 @@ from ..io.errors import InputError
 from ..mesh.mesh import Mesh
 from ..mesh.surface import closest_points
 
-SURFACE_KINDS = ("normal", "frame")
-KINDS = (*SURFACE_KINDS, "rigid")
+KINDS = ("normal", "frame", "rigid")
 
 
 class Markers(ABC):
     """A map from the vertices of a body to m markers."""
 
-    linear: ClassVar[bool] = False  # Whether `transposed_jacobian` is the same everywhere.
+    vertices: torch.Tensor  # all that the markers depend on, in any shape
 
     @abstractmethod
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
         """(B, N, 3) positions of the vertices to (B, m, 3) positions of the markers [m]."""
-
-    @abstractmethod
-    def feet(self, positions: torch.Tensor) -> torch.Tensor:
-        """(B, m, 3) where on the body the markers' stems stand [m]."""
-
-    @property
-    @abstractmethod
-    def used(self) -> torch.Tensor:
-        """(K,) all vertices that the markers depend on, perhaps repeated."""
 
     def transposed_jacobian(self, positions: torch.Tensor) -> torch.Tensor:
         """(B, 3 N, 3 m) the transposed derivative of the markers by the vertices at positions (B, N, 3)."""
@@ -69,16 +59,10 @@ class Markers(ABC):
 
 @dataclass(frozen=True)
 class MarkerMap(Markers):
-    """Markers as weighted sums of vertices, other ones in every environment.
+    """Markers as weighted sums of vertices, other ones in every environment."""
 
-    Attributes:
-        vertices: (B, m, k) the vertices of each marker.
-        weights: (B, m, k) their weights; a marker whose weights are all zero is none.
-    """
-
-    vertices: torch.Tensor
-    weights: torch.Tensor
-    linear: ClassVar[bool] = True
+    vertices: torch.Tensor  # (B, m, k) the vertices of each marker
+    weights: torch.Tensor  # (B, m, k) their weights; a marker whose weights are all zero is none
 
     def __post_init__(self) -> None:
         """Checks that the shapes agree.
@@ -105,126 +89,58 @@ class MarkerMap(Markers):
         return (positions[batch, self.vertices] * weights).sum(2)
 
     @override
-    def feet(self, positions: torch.Tensor) -> torch.Tensor:
-        return self(positions)
-
-    @property
-    @override
-    def used(self) -> torch.Tensor:
-        return self.vertices.flatten()
-
-    @override
     def transposed_jacobian(self, positions: torch.Tensor) -> torch.Tensor:
-        return self.transposed(positions.shape[1])
-
-    def transposed(self, n_vertices: int) -> torch.Tensor:
-        """(B, 3 N, 3 m) matrix of C^T."""
-        b, m, _ = self.vertices.shape
-        out = self.weights.new_zeros(b, n_vertices, 3, m, 3)
-        batch = torch.arange(b, device=out.device)[:, None, None]
-        marker = torch.arange(m, device=out.device)[:, None]
-        for axis in range(3):
-            where = (batch, self.vertices, torch.full_like(marker, axis), marker, torch.full_like(marker, axis))
-            out.index_put_(where, self.weights, accumulate=True)
-        return out.reshape(b, 3 * n_vertices, 3 * m)
+        return super().transposed_jacobian(positions[:1].expand(len(self.vertices), -1, -1))
 
 
 @dataclass(frozen=True)
 class SurfaceMarkers(Markers):
-    """Markers that stand on triangles of the surface; kinds ``normal`` and ``frame`` (see the module).
+    """Markers that stand on triangles of the surface; kinds ``normal`` and ``frame`` (see the module)."""
 
-    Attributes:
-        triangles: (m, 3) vertices, counter-clockwise seen from outside.
-        weights: (m, 3) barycentric coordinates of the feet, the sum of each row one.
-        unstretch: (m, 2, 2) from the triangle's edges to its tangents at rest: the inverse of their coordinates [1/m].
-        offsets: (m, 3) stems [m] along the first and second tangent and the normal.
-    """
-
-    triangles: torch.Tensor
-    weights: torch.Tensor
+    vertices: torch.Tensor  # (m, 3) of a triangle each, counter-clockwise seen from outside
+    weights: torch.Tensor  # (m, 3) barycentric coordinates of the feet, the sum of each row one
+    # (m, 2, 2) from the triangle's edges to its tangents at rest: the inverse of their coordinates [1/m]
     unstretch: torch.Tensor
-    offsets: torch.Tensor
+    offsets: torch.Tensor  # (m, 3) stems [m] along the first and second tangent and the normal
 
     @override
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
-        corners = positions[:, self.triangles]  # (B, m, 3, 3)
+        corners = positions[:, self.vertices]  # (B, m, 3, 3)
         stems = torch.einsum("bmij,mj->bmi", tangent_frames(corners, self.unstretch), self.offsets)
         return torch.einsum("bmki,mk->bmi", corners, self.weights) + stems
-
-    @override
-    def feet(self, positions: torch.Tensor) -> torch.Tensor:
-        return torch.einsum("bmki,mk->bmi", positions[:, self.triangles], self.weights)
-
-    @property
-    @override
-    def used(self) -> torch.Tensor:
-        return self.triangles.flatten()
 
 
 @dataclass(frozen=True)
 class RigidMarkers(Markers):
-    """Markers that follow the rigid motion of a set of vertices; kind ``rigid`` (see the module).
+    """Markers that follow the rigid motion of a set of vertices; kind ``rigid`` (see the module)."""
 
-    Attributes:
-        vertices: (S,) three or more, not on one line.
-        rest: (S, 3) [m] where these are at rest, from their centre.
-        offsets: (m, 3) [m] the markers at rest, from the centre of the vertices.
-        stands: (m, 3) [m] the feet at rest, from the centre of the vertices.
-    """
-
-    vertices: torch.Tensor
-    rest: torch.Tensor
-    offsets: torch.Tensor
-    stands: torch.Tensor
+    vertices: torch.Tensor  # (S,) three or more, not on one line
+    rest: torch.Tensor  # (S, 3) [m] where these are at rest, from their centre
+    offsets: torch.Tensor  # (m, 3) [m] the markers at rest, from the centre of the vertices
 
     @override
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
-        return self._carry(positions, self.offsets)
-
-    @override
-    def feet(self, positions: torch.Tensor) -> torch.Tensor:
-        return self._carry(positions, self.stands)
-
-    @property
-    @override
-    def used(self) -> torch.Tensor:
-        return self.vertices
-
-    def _carry(self, positions: torch.Tensor, offsets: torch.Tensor) -> torch.Tensor:
         now = positions[:, self.vertices]  # (B, S, 3)
         centre = now.mean(1, keepdim=True)
         rotation = closest_rotation((now - centre).mT @ self.rest)
-        return centre + offsets @ rotation.mT
+        return centre + self.offsets @ rotation.mT
 
 
 @dataclass(frozen=True)
 class JoinedMarkers(Markers):
-    """Markers of several kinds.
+    """Markers of several kinds."""
 
-    Attributes:
-        parts: the markers of each kind.
-        order: (m,) place of each marker in the parts laid end to end.
-    """
-
-    parts: tuple[Markers, ...]
-    order: torch.Tensor
+    vertices: torch.Tensor  # (K,) those of all parts
+    parts: tuple[Markers, ...]  # the markers of each kind
+    order: torch.Tensor  # (m,) place of each marker in the parts laid end to end
 
     @override
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
         return torch.cat([part(positions) for part in self.parts], 1)[:, self.order]
 
     @override
-    def feet(self, positions: torch.Tensor) -> torch.Tensor:
-        return torch.cat([part.feet(positions) for part in self.parts], 1)[:, self.order]
-
-    @property
-    @override
-    def used(self) -> torch.Tensor:
-        return torch.cat([part.used for part in self.parts])
-
-    @override
     def to(self, like: torch.Tensor) -> Self:
-        return replace(self, parts=tuple(part.to(like) for part in self.parts), order=self.order.to(like.device))
+        return replace(super().to(like), parts=tuple(part.to(like) for part in self.parts))
 
 
 def tangent_frames(corners: torch.Tensor, unstretch: torch.Tensor) -> torch.Tensor:
@@ -319,19 +235,18 @@ def bind_markers(
             f"Marker '{names[worst]}' is {1e3 * abs(found.distances[worst]):.1f} mm from the surface of the body, more "
             f"than {1e3 * largest_distance:.1f} mm: check its position, the unit of the mesh and the registration."
         )
-    on_surface = np.array([each in SURFACE_KINDS for each in kinds], dtype=bool)
+    on_surface = np.array([each != "rigid" for each in kinds])
+    flat = np.array([each == "normal" for each in kinds])
     parts: list[Markers] = []
     if on_surface.any():
-        flat = np.array([each == "normal" for each in kinds])[on_surface]
-        parts.append(
-            _on_triangles(mesh, found.triangles[on_surface], points[on_surface], found.points[on_surface], flat)
-        )
+        bound = (found.triangles, points, found.points, flat)
+        parts.append(_on_triangles(mesh, *(each[on_surface] for each in bound)))
     if not on_surface.all():
-        parts.append(_on_vertices(mesh, vertices, points[~on_surface], found.points[~on_surface]))
+        parts.append(_on_vertices(mesh, vertices, points[~on_surface]))
     if len(parts) == 1:
         return parts[0]
     order = np.argsort(np.concatenate([np.flatnonzero(on_surface), np.flatnonzero(~on_surface)]))
-    return JoinedMarkers(tuple(parts), torch.as_tensor(order))
+    return JoinedMarkers(torch.cat([part.vertices.flatten() for part in parts]), tuple(parts), torch.as_tensor(order))
 
 
 def _check_markers(points: np.ndarray, names: Sequence[str], kinds: Sequence[str]) -> None:
@@ -368,7 +283,7 @@ def _on_triangles(
     return SurfaceMarkers(*map(torch.as_tensor, (triangles, weights, unstretch, offsets)))
 
 
-def _on_vertices(mesh: Mesh, vertices: ArrayLike | None, points: np.ndarray, feet: np.ndarray) -> RigidMarkers:
+def _on_vertices(mesh: Mesh, vertices: ArrayLike | None, points: np.ndarray) -> RigidMarkers:
     chosen = np.unique(np.asarray([] if vertices is None else vertices, dtype=np.int64))
     if len(chosen) < 3 or chosen[0] < 0 or chosen[-1] >= len(mesh.vertices):
         raise InputError(
@@ -380,4 +295,4 @@ def _on_vertices(mesh: Mesh, vertices: ArrayLike | None, points: np.ndarray, fee
     spread = np.linalg.svd(rest, compute_uv=False)
     if spread[1] <= 1e-6 * spread[0]:
         raise InputError("The vertices that rigid markers follow lie on one line: choose those of a face.")
-    return RigidMarkers(*map(torch.as_tensor, (chosen, rest, points - centre, feet - centre)))
+    return RigidMarkers(*map(torch.as_tensor, (chosen, rest, points - centre)))

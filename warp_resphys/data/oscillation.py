@@ -20,23 +20,14 @@ FloatArray = NDArray[np.float64]
 
 @dataclasses.dataclass(frozen=True)
 class Oscillation:
-    """What describes a decaying oscillation x(t) = c + b t + exp(-d t) (p cos w t + r sin w t).
+    """What describes a decaying oscillation x(t) = c + b t + exp(-d t) (p cos w t + r sin w t)."""
 
-    Attributes:
-        sag: Mean of the settled end of the signal [m], signed as the signal is.
-        tail_spread: Standard deviation of that end [m]: small where the signal has settled.
-        period: 2 pi / w [s].
-        decay_rate: d, of the envelope exp(-d t) [1/s].
-        damping_ratio: d / sqrt(d^2 + w^2).
-        fit_residual: Root mean square of what the fit leaves [m].
-    """
-
-    sag: float
-    tail_spread: float
-    period: float
-    decay_rate: float
-    damping_ratio: float
-    fit_residual: float
+    sag: float  # Mean of the settled end of the signal [m], signed as the signal is
+    tail_spread: float  # Standard deviation of that end [m]: small where the signal has settled
+    period: float  # 2 pi / w [s]
+    decay_rate: float  # d, of the envelope exp(-d t) [1/s]
+    damping_ratio: float  # d / sqrt(d^2 + w^2)
+    fit_residual: float  # Root mean square of what the fit leaves [m]
 
 
 def measure_oscillation(
@@ -86,12 +77,7 @@ def measure_oscillation(
 
 
 def turning_points(signal: FloatArray, threshold: float = 0.05) -> NDArray[np.int64]:
-    """Indices of the extremes that stand out by more than a part of the signal's range, in order.
-
-    Args:
-        signal: (T,).
-        threshold: The part; what noise or a higher mode adds stays below it.
-    """
+    """Indices of the extremes of (T,) that stand out by more than a part of its range, as noise does not; in order."""
     prominence = threshold * np.ptp(signal)
     if prominence == 0.0:
         return np.empty(0, dtype=np.int64)

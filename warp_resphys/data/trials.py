@@ -13,21 +13,15 @@ class Trials:
     """R trials of one body, observed at the same points, in the frame of the body.
 
     What is observed is a map of the positions, such as markers or all vertices. A static pose is a trial of one frame.
-
-    Attributes:
-        names: of the trials.
-        times: (R, T) of the frames since time zero; trials that end early repeat their last time [s].
-        observed: (R, T, M, 3) [m], NaN where nothing was seen and past a trial's end.
-        held: (R, M, 3) the same points before time zero [m].
-        inputs: what acts on the R environments, during each step of the simulation where it changes.
-        resting: what acts on them before time zero, where they begin at rest; weights act before as after.
     """
 
     names: tuple[str, ...]
-    times: torch.Tensor
-    observed: torch.Tensor
-    held: torch.Tensor
+    times: torch.Tensor  # (R, T) of the frames since time zero; trials that end early repeat their last time [s]
+    observed: torch.Tensor  # (R, T, M, 3) [m], NaN where nothing was seen and past a trial's end
+    held: torch.Tensor  # (R, M, 3) the same points before time zero [m]
+    # what acts on the R environments, during each step of the simulation where it changes
     inputs: Inputs = field(default_factory=Inputs)
+    # what acts on them before time zero, where they begin at rest; weights act before as after
     resting: Inputs = field(default_factory=Inputs)
 
     def __post_init__(self) -> None:
@@ -66,10 +60,6 @@ class Trials:
         fields = (self.times[pick], self.observed[pick], self.held[pick])
         names = tuple(self.names[i] for i in indices)
         return Trials(names, *fields, self.inputs.select(pick), self.resting.select(pick))
-
-    def named(self, names: tuple[str, ...]) -> "Trials":
-        """Some of the trials, by name."""
-        return self.select([self.names.index(name) for name in names])
 
     def first(self, seconds: float) -> "Trials":
         """The frames of the first seconds; those past them count as not seen."""

@@ -58,3 +58,88 @@ class VertexFrames:
         parts = zip(*(field.split(_AT_ONCE) for field in (q, v, force)), strict=True)
         turned = [torch.einsum("snji,snj->sni", self.rotations(x + self._ahead * w), f) for x, w, f in parts]
         return torch.cat(turned)
+
+
+class BaseFrame:
+    """States and forces in the frame of the base that a body is fixed to: x = R x_b + t at the steps 0, h, ..., K h.
+
+    Velocities are (x_b - x_b') / h, with x_b' the place of x - h v a step before: a body that goes with its base is at
+    rest. A force during a step is turned as the base is at its end.
+
+    Args:
+        poses: (K + 1, B, 6) translations t [m] and rotation vectors of R; past the end the last, before time zero the
+            first.
+        time_step: h [s].
+    """
+
+    def __init__(self, poses: torch.Tensor, time_step: float) -> None:
+        self._poses, self._step, self._first = poses, time_step, 0
+        self._rotation = rotations(poses[..., 3:])
+
+    def during(self, environments: torch.Tensor, first: torch.Tensor, steps: int) -> "BaseFrame":
+        """That of windows of some environments: each begins at a step of its own, which counts as step zero.
+
+        Args:
+            environments: (W,) numbers.
+            first: (W,) steps that the windows begin with.
+            steps: how long they are.
+        """
+        at = (first + torch.arange(-1, steps + 1)[:, None]).clamp(0, len(self._poses) - 1)
+        found = BaseFrame(self._poses[at.to(self._poses.device), environments.to(self._poses.device)], self._step)
+        found._first = 1
+        return found
+
+    def _at(self, step: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """(B, 3, 3) R and (B, 1, 3) t."""
+        at = min(max(self._first + step, 0), len(self._poses) - 1)
+        return self._rotation[at], self._poses[at][:, None, :3]
+
+    def enter(self, q: torch.Tensor, v: torch.Tensor, step: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Positions (B, N, 3) [m] and velocities [m/s] in the frame of the base, before a step."""
+        (now, at), (before, was) = self._at(step), self._at(step - 1)
+        inside = (q - at) @ now
+        return inside, (inside - (q - self._step * v - was) @ before) / self._step
+
+    def leave(self, q: torch.Tensor, v: torch.Tensor, step: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """The opposite of `enter`."""
+        (now, at), (before, was) = self._at(step), self._at(step - 1)
+        outside = q @ now.mT + at
+        return outside, (outside - (q - self._step * v) @ before.mT - was) / self._step
+
+    def force_inside(self, force: torch.Tensor, step: int) -> torch.Tensor:
+        """(B, N, 3) forces during a step, in the frame of the base [N]."""
+        return force @ self._at(step + 1)[0]
+
+    def force_outside(self, force: torch.Tensor, step: int) -> torch.Tensor:
+        """The opposite of `force_inside`."""
+        return force @ self._at(step + 1)[0].mT
+
+
+def rotations(vectors: torch.Tensor) -> torch.Tensor:
+    """(..., 3, 3) rotations of rotation vectors (..., 3) [rad], differentiable at zero too."""
+    zero, (x, y, z) = torch.zeros_like(vectors[..., 0]), vectors.unbind(-1)
+    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+    return torch.linalg.matrix_exp(skew)
+
+
+def base_movement(poses: torch.Tensor, time_step: float, gravity: torch.Tensor) -> torch.Tensor:
+    """(K, B, 15) what networks are told of the motion of a base during each step, as the base has it.
+
+    Velocity [m/s] and rate of rotation [rad/s] during the step and during the one before, whose difference is what a
+    body feels, and the direction of gravity [-].
+
+    Args:
+        poses: (K + 1, B, 6), see `BaseFrame`.
+        time_step: h [s].
+        gravity: (3,) [m/s^2].
+    """
+    translation, rotation = poses[..., :3], rotations(poses[..., 3:])
+    moved = ((translation[1:] - translation[:-1])[..., None, :] @ rotation[:-1]).squeeze(-2) / time_step
+    turned = rotation[:-1].mT @ rotation[1:]
+    rate = torch.stack([turned[..., i, j] - turned[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))], -1) / (
+        2.0 * time_step
+    )
+    during = torch.cat([moved, rate], -1)
+    before = torch.cat([torch.zeros_like(during[:1]), during[:-1]])
+    down = gravity / gravity.norm().clamp_min(1e-12)
+    return torch.cat([during, before, down @ rotation[1:]], -1)

@@ -18,17 +18,11 @@ INTEGRATORS = ("implicit_euler", "bdf2", "midpoint")
 
 @dataclass(frozen=True)
 class State:
-    """Positions and velocities of a batch, with the state before where a method looks back.
+    """Positions and velocities of a batch, with the state before where a method looks back."""
 
-    Attributes:
-        q: (B, N, 3) [m].
-        v: (B, N, 3) [m/s].
-        previous: (q, v) one step earlier, or None.
-    """
-
-    q: torch.Tensor
-    v: torch.Tensor
-    previous: tuple[torch.Tensor, torch.Tensor] | None = None
+    q: torch.Tensor  # (B, N, 3) [m]
+    v: torch.Tensor  # (B, N, 3) [m/s]
+    previous: tuple[torch.Tensor, torch.Tensor] | None = None  # (q, v) one step earlier, or None
 
     @property
     def batch(self) -> int:
@@ -43,21 +37,14 @@ class State:
 
 @dataclass(frozen=True)
 class ImplicitStage:
-    """The solve that a step comes down to.
+    """The solve that a step comes down to."""
 
-    Attributes:
-        step: effective step h_e [s].
-        target: (B, N, 3) y, where inertia alone would go [m].
-        velocity_reference: (B, N, 3) r with velocity (x - r) / h_e at the solution [m].
-        strain_weights: (position, weight) pairs whose weighted strains the strain rate starts from.
-        end: fraction of the time step that x stands at.
-    """
-
-    step: float
-    target: torch.Tensor
-    velocity_reference: torch.Tensor
+    step: float  # effective step h_e [s]
+    target: torch.Tensor  # (B, N, 3) y, where inertia alone would go [m]
+    velocity_reference: torch.Tensor  # (B, N, 3) r with velocity (x - r) / h_e at the solution [m]
+    # (position, weight) pairs whose weighted strains the strain rate starts from
     strain_weights: tuple[tuple[torch.Tensor, float], ...]
-    end: float = 1.0
+    end: float = 1.0  # fraction of the time step that x stands at
 
 
 class Integrator(ABC):

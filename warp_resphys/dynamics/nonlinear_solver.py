@@ -35,35 +35,21 @@ _STALLS = 3
 
 @dataclass(frozen=True)
 class SolverSettings:
-    """How to solve a step.
+    """How to solve a step."""
 
-    Attributes:
-        name: one of `SOLVERS`.
-        relative_tolerance: residual over balancing forces at which a solve has converged; where states are float32,
-            less than 1e-5 gains nothing.
-        absolute_tolerance: residual below which it has converged in any case [N].
-        max_iterations: after which it has failed.
-        memory: pairs that L-BFGS keeps.
-        refactor_after: mean iterations a step above which ``quasi_newton`` factorises anew.
-        linear_solver: ``auto``, ``banded``, ``dense`` or ``sparse``.
-        on_failure: ``raise`` a `ConvergenceError`, or ``count`` the failure in the report and go on.
-    """
-
-    name: str = "quasi_newton"
+    name: str = "quasi_newton"  # one of `SOLVERS`
+    # residual over balancing forces at which a solve has converged; where states are float32, less than 1e-5
+    # gains nothing
     relative_tolerance: float = 1e-8
-    absolute_tolerance: float = 1e-12
-    max_iterations: int = 2000
-    memory: int = 12
-    refactor_after: int = 4
-    linear_solver: str = "auto"
-    on_failure: str = "raise"
+    absolute_tolerance: float = 1e-12  # residual below which it has converged in any case [N]
+    max_iterations: int = 2000  # after which it has failed
+    memory: int = 12  # pairs that L-BFGS keeps
+    refactor_after: int = 4  # mean iterations a step above which ``quasi_newton`` factorises anew
+    linear_solver: str = "auto"  # ``auto``, ``banded``, ``dense`` or ``sparse``
+    on_failure: str = "raise"  # ``raise`` a `ConvergenceError`, or ``count`` the failure in the report and go on
 
     def __post_init__(self) -> None:
-        """Checks the settings.
-
-        Raises:
-            InputError: an unknown name, or a number out of range.
-        """
+        """Checks the settings; raises InputError for an unknown name, or a number out of range."""
         if self.name not in SOLVERS:
             raise InputError(f"solver is {self.name!r}: choose one of {', '.join(SOLVERS)}.")
         if self.on_failure not in ("raise", "count"):
@@ -81,19 +67,12 @@ class SolverSettings:
 
 @dataclass(frozen=True)
 class SolveReport:
-    """Outcome of a solve.
+    """Outcome of a solve."""
 
-    Attributes:
-        iterations: (B,) global steps of each environment.
-        relative_residual: (B,) last residual over balancing forces.
-        converged: (B,) bool.
-        factorisations: of the whole batch.
-    """
-
-    iterations: torch.Tensor
-    relative_residual: torch.Tensor
-    converged: torch.Tensor
-    factorisations: int
+    iterations: torch.Tensor  # (B,) global steps of each environment
+    relative_residual: torch.Tensor  # (B,) last residual over balancing forces
+    converged: torch.Tensor  # (B,) bool
+    factorisations: int  # of the whole batch
 
 
 class NonlinearSolver:

@@ -34,25 +34,15 @@ Parameters = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Constants:
-    """What parameters make of a body: differentiable tensors, computed once a roll-out.
+    """What parameters make of a body: differentiable tensors, computed once a roll-out."""
 
-    Attributes:
-        mass: (1 or B, N) [kg].
-        load_mass: (1 or B, N) what gravity acts on [kg].
-        gravity: (1 or B, 3) [m/s^2].
-        mass_damping: (1 or B, 1) [1/s].
-        stiffness_damping: (1 or B,) [s].
-        damped: whether stiffness damping acts at all.
-        values: what the energies need of them, by name.
-    """
-
-    mass: torch.Tensor
-    load_mass: torch.Tensor
-    gravity: torch.Tensor
-    mass_damping: torch.Tensor
-    stiffness_damping: torch.Tensor
-    damped: bool
-    values: Mapping[str, torch.Tensor]
+    mass: torch.Tensor  # (1 or B, N) [kg]
+    load_mass: torch.Tensor  # (1 or B, N) what gravity acts on [kg]
+    gravity: torch.Tensor  # (1 or B, 3) [m/s^2]
+    mass_damping: torch.Tensor  # (1 or B, 1) [1/s]
+    stiffness_damping: torch.Tensor  # (1 or B,) [s]
+    damped: bool  # whether stiffness damping acts at all
+    values: Mapping[str, torch.Tensor]  # what the energies need of them, by name
 
     @property
     def batch(self) -> int:
@@ -78,19 +68,12 @@ class Constants:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Result of a roll-out.
+    """Result of a roll-out."""
 
-    Attributes:
-        q: (T + 1, B, N, 3) positions, the start included [m].
-        v: (T + 1, B, N, 3) velocities [m/s].
-        reports: T outcomes of the solver.
-        final: the last state, from which a further roll-out goes on.
-    """
-
-    q: torch.Tensor
-    v: torch.Tensor
-    reports: list[SolveReport]
-    final: State
+    q: torch.Tensor  # (T + 1, B, N, 3) positions, the start included [m]
+    v: torch.Tensor  # (T + 1, B, N, 3) velocities [m/s]
+    reports: list[SolveReport]  # T outcomes of the solver
+    final: State  # the last state, from which a further roll-out goes on
 
 
 def _check_count(name: str, value: object) -> None:

@@ -33,17 +33,11 @@ _VECTORS = {torch.float64: wp.vec3d, torch.float32: wp.vec3f}
 
 @dataclass(frozen=True)
 class RecordedRollout:
-    """Result of a recorded roll-out.
+    """Result of a recorded roll-out."""
 
-    Attributes:
-        q: (T + 1, B, N) vec3 positions, the start included [m].
-        v: (T + 1, B, N) vec3 velocities [m/s].
-        reports: T outcomes of the solver.
-    """
-
-    q: wp.array
-    v: wp.array
-    reports: list[SolveReport]
+    q: wp.array  # (T + 1, B, N) vec3 positions, the start included [m]
+    v: wp.array  # (T + 1, B, N) vec3 velocities [m/s]
+    reports: list[SolveReport]  # T outcomes of the solver
 
 
 def record_rollout(

@@ -27,25 +27,16 @@ Values = Mapping[str, torch.Tensor | None]
 
 @dataclass(frozen=True)
 class Quantity:
-    """A number that a simulation depends on.
+    """A number that a simulation depends on."""
 
-    Attributes:
-        name: by which parameters and inputs are given.
-        unit: of its values.
-        lower: all values are greater.
-        upper: all values are less.
-        closed: whether `lower` itself is allowed.
-        per: what there may be a value each of, such as ``element`` or ``chamber``; without it, only environments.
-        typical: about how large an input is.
-    """
-
-    name: str
-    unit: str
-    lower: float = -np.inf
-    upper: float = np.inf
-    closed: bool = False
+    name: str  # by which parameters and inputs are given
+    unit: str  # of its values
+    lower: float = -np.inf  # all values are greater
+    upper: float = np.inf  # all values are less
+    closed: bool = False  # whether `lower` itself is allowed
+    # what there may be a value each of, such as ``element`` or ``chamber``; without it, only environments
     per: str = ""
-    typical: float = 1.0
+    typical: float = 1.0  # about how large an input is
 
     @property
     def wanted(self) -> str:

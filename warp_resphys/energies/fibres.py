@@ -34,24 +34,20 @@ class Fibres(Energy):
     The energy of an area of the surface is ``k/2 s(lambda - 1)^2`` for each family of windings, lambda being the
     stretch along it and k the stiffness of one thread [N] over the distance of its turns [m]. A thread cannot push: s
     is zero for lambda < 1, and reaches its full slope at the strain `toe`.
-
-    Attributes:
-        chambers: that it is wound around.
-        angles: (A,) of each family of windings from the direction around the chamber, in degrees; two opposite ones
-            make a double helix.
-        toe: strain over which a thread tightens.
-        axis: about along the chambers, which are wound around the one of their principal directions that is nearest to
-            it; None for that in which each reaches furthest.
-        stiffness: k [N/m], the parameter ``fibre_stiffness``: a number, (C,) values with one for each chamber, (B, 1),
-            or (B, C).
     """
 
     parameters: ClassVar[tuple[Quantity, ...]] = (Quantity("fibre_stiffness", "N/m", 0.0, closed=True, per="chamber"),)
 
-    chambers: Sequence[Chamber]
+    chambers: Sequence[Chamber]  # that it is wound around
+    # (A,) of each family of windings from the direction around the chamber, in degrees; two opposite ones make a
+    # double helix
     angles: Sequence[float] = (0.0,)
-    toe: float = 1e-3
+    toe: float = 1e-3  # strain over which a thread tightens
+    # about along the chambers, which are wound around the one of their principal directions that is nearest to
+    # it; None for that in which each reaches furthest
     axis: Sequence[float] | None = None
+    # k [N/m], the parameter ``fibre_stiffness``: a number, (C,) values with one for each chamber, (B, 1), or (B,
+    # C)
     stiffness: Parameter = 0.0
 
     def __post_init__(self) -> None:

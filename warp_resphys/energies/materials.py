@@ -40,30 +40,22 @@ class Material(ABC):
     The elastic constants and the density are numbers, (M,) tensors with a value for each element, (B, 1) tensors with a
     value for each environment of a batch, or (B, M) tensors; the damping constants are numbers or (B,) tensors. Tensors
     that require gradients receive them from every simulated quantity.
-
-    Attributes:
-        density: rho [kg/m^3].
-        mass_damping: force -alpha M v [1/s].
-        stiffness_damping: Kelvin-Voigt viscosity of retardation time beta [s]; for small strains the force -beta K v.
-        law: the module of ``kernels.materials``.
-        rules: for each modulus of the law, whether it belongs to the ``shape`` or the ``volume`` rule of integration.
-        curvature: for each modulus, an upper bound of what it adds to the tangent's eigenvalues for small strains.
     """
 
-    law: ClassVar[ModuleType]
+    law: ClassVar[ModuleType]  # the module of ``kernels.materials``
+    # for each modulus of the law, whether it belongs to the ``shape`` or the ``volume`` rule of integration
     rules: ClassVar[tuple[str, ...]]
+    # for each modulus, an upper bound of what it adds to the tangent's eigenvalues for small strains
     curvature: ClassVar[tuple[float, ...]]
 
-    density: Parameter = constant(1070.0, "density", "kg/m^3", common=True)
+    density: Parameter = constant(1070.0, "density", "kg/m^3", common=True)  # rho [kg/m^3]
+    # force -alpha M v [1/s]
     mass_damping: Parameter = constant(0.0, "mass_damping", "1/s", closed=True, per="", common=True)
+    # Kelvin-Voigt viscosity of retardation time beta [s]; for small strains the force -beta K v
     stiffness_damping: Parameter = constant(0.0, "stiffness_damping", "s", closed=True, per="", common=True)
 
     def __post_init__(self) -> None:
-        """Checks every constant.
-
-        Raises:
-            InputError: a constant outside its physical range.
-        """
+        """Checks every constant; raises InputError for a constant outside its physical range."""
         for name, quantity in self.quantities().items():
             quantity.check(getattr(self, name))
 
@@ -86,18 +78,13 @@ class Material(ABC):
 
 @dataclass(frozen=True)
 class _Hookean(Material):
-    """A material that is given by Young's modulus and Poisson's ratio.
-
-    Attributes:
-        youngs_modulus: E [Pa].
-        poissons_ratio: nu, between -1 and 0.5.
-    """
+    """A material that is given by Young's modulus and Poisson's ratio."""
 
     rules: ClassVar[tuple[str, ...]] = ("shape", "volume")
     curvature: ClassVar[tuple[float, ...]] = (2.0, 1.0)
 
-    youngs_modulus: Parameter = constant(264e3, "youngs_modulus", "Pa")
-    poissons_ratio: Parameter = constant(0.499, "poissons_ratio", "", lower=-1.0, upper=0.5)
+    youngs_modulus: Parameter = constant(264e3, "youngs_modulus", "Pa")  # E [Pa]
+    poissons_ratio: Parameter = constant(0.499, "poissons_ratio", "", lower=-1.0, upper=0.5)  # nu, between -1 and 0.5
 
     @override
     def moduli(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
@@ -125,21 +112,15 @@ class StableNeoHookean(_Hookean):
 
 @dataclass(frozen=True)
 class MooneyRivlin(Material):
-    """Rubber with two elastic constants and a bulk modulus; for small strains mu is 2 (c10 + c01).
-
-    Attributes:
-        c10: of the first invariant [Pa].
-        c01: of the second [Pa].
-        bulk_modulus: [Pa].
-    """
+    """Rubber with two elastic constants and a bulk modulus; for small strains mu is 2 (c10 + c01)."""
 
     law = mooney_rivlin
     rules: ClassVar[tuple[str, ...]] = ("shape", "shape", "volume")
     curvature: ClassVar[tuple[float, ...]] = (4.0, 4.0, 1.0)
 
-    c10: Parameter = constant(36e3, "c10", "Pa")
-    c01: Parameter = constant(8e3, "c01", "Pa", closed=True)
-    bulk_modulus: Parameter = constant(44e6, "bulk_modulus", "Pa")
+    c10: Parameter = constant(36e3, "c10", "Pa")  # of the first invariant [Pa]
+    c01: Parameter = constant(8e3, "c01", "Pa", closed=True)  # of the second [Pa]
+    bulk_modulus: Parameter = constant(44e6, "bulk_modulus", "Pa")  # [Pa]
 
     @override
     def moduli(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:

@@ -26,19 +26,13 @@ from .solid import SolidTerm
 
 @dataclass(frozen=True)
 class StepTerms:
-    """What distinguishes one step's potential from the next; see the equation of `potential`.
+    """What distinguishes one step's potential from the next; see the equation of `potential`."""
 
-    Attributes:
-        target: (B, N, 3) y [m].
-        inertia: (B, N) k [N/m].
-        force: (B, N, 3) f [N].
-        values: what the energies' terms need, by name; see their `Term.shapes`. The first axis is 1 or B. None leaves
-            out what another value makes needless.
-    """
-
-    target: torch.Tensor
-    inertia: torch.Tensor
-    force: torch.Tensor
+    target: torch.Tensor  # (B, N, 3) y [m]
+    inertia: torch.Tensor  # (B, N) k [N/m]
+    force: torch.Tensor  # (B, N, 3) f [N]
+    # what the energies' terms need, by name; see their `Term.shapes`. The first axis is 1 or B. None leaves out
+    # what another value makes needless
     values: dict[str, torch.Tensor | None] = field(default_factory=dict)
 
 

@@ -28,9 +28,6 @@ from .launcher import Launcher, warp_view
 class Pressure(Energy):
     """-p V of every chamber; its input ``pressure`` has a gauge pressure [Pa] for each.
 
-    Attributes:
-        chambers: closed surfaces (`mesh.chambers.find_chambers`).
-
     Raises:
         InputError: no chamber.
     """
@@ -38,7 +35,7 @@ class Pressure(Energy):
     inputs: ClassVar[tuple[Quantity, ...]] = (Quantity("pressure", "Pa", per="chamber", typical=1e4),)
     is_load: ClassVar[bool] = True
 
-    chambers: Sequence[Chamber]
+    chambers: Sequence[Chamber]  # closed surfaces (`mesh.chambers.find_chambers`)
 
     def __post_init__(self) -> None:
         """Checks that there is a chamber."""

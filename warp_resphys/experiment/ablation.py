@@ -3,33 +3,31 @@
 One motion is observed through random subsets of the surface vertices alone, and reconstructed from each of them.
 """
 
-from collections.abc import Generator, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-import warp as wp
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from rich.console import Console
 from rich.table import Table
+from typing_extensions import override
 
 from ..data.markers import MarkerMap
 from ..dynamics.integrator import State
+from ..dynamics.simulator import Simulator
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5, read_json, write_json, write_text
-from ..io.memory import WorkersMemory
-from ..io.processes import Advance, available_cores, in_processes
-from ..io.progress import Progress
-from ..io.resumable import Field, ResumableHDF5
+from ..io.resumable import Field
 from ..io.stages import Stage, StageContext, package_versions, resources_used
-from ..learning.sparse_reconstruction import make_sparse_reconstructor
+from ..learning.reconstruction import make_reconstructor
 from ..mesh.mesh import surface_vertices
 from ..report.ablation_page import AblationReport, write_ablation_report
 from ..report.page import number_text
-from .build import build_mesh, build_simulator, choose_device
+from .build import build_mesh, build_simulator, simulation_device
 from .files import METRICS, REPORT
+from .parts import March, Part, processes_for, remove_parts, split_into_parts, work_on
 from .simulate import held_state
 
 MOTION = "motion.h5"
@@ -48,21 +46,14 @@ def ablation_stages(config: Mapping[str, Any], base: Mapping[str, Any], shown: M
         base: the settings that every simulation depends on.
         shown: what the report says of the configuration.
     """
-
-    def pick(*keys: str) -> dict[str, Any]:
-        return {**base, **{key: config[key] for key in keys}}
-
     own = dict(config["ablation"])
-    processes = _processes(own.pop("processes"), config)
+    processes = min(processes_for(config, own.pop("processes")), len(own["counts"]))
+    moved = {**base, **{key: config[key] for key in ("target", "simulation", "data")}}
+    reconstructed = {**base, **{key: config[key] for key in ("simulation", "reconstruction", "seed")}, "ablation": own}
+    work = partial(ablate, processes=processes)
     return [
-        Stage("generate", generate_motion, (MOTION,), pick("target", "simulation", "data")),
-        Stage(
-            "ablation",
-            partial(ablate, processes=processes),
-            (DRAWS, SUMMARY, TABLE),
-            {**pick("simulation", "reconstruction", "seed"), "ablation": own},
-            ("generate",),
-        ),
+        Stage("generate", generate_motion, (MOTION,), moved),
+        Stage("ablation", work, (DRAWS, SUMMARY, TABLE), reconstructed, ("generate",)),
         Stage("report", report_ablation, (REPORT,), {"config": shown}, ("ablation",)),
     ]
 
@@ -95,42 +86,29 @@ def generate_motion(context: StageContext) -> None:
             create(file, name, q.cpu().numpy(), "m")
 
 
-def _processes(wanted: int | None, config: Mapping[str, Any]) -> int:
-    """How many processes share the counts: unless told, one a core, and a single one on a GPU."""
-    cores = 1 if config["device"].startswith("cuda") else available_cores()
-    return min(cores if wanted is None else wanted, len(config["ablation"]["counts"]))
-
-
 def ablate(context: StageContext, processes: int = 1) -> None:
     """Writes ablation.h5, with the sets of markers and the error of each at every step, and tables of the errors.
 
     Args:
         context: of the stage.
-        processes: that share the numbers of markers; 1 for this one alone.
+        processes: that share the numbers of markers.
+
+    Raises:
+        ConvergenceError, WorkerError: a step could not be reconstructed.
     """
-    settings = context.settings
-    counts, draws = settings["ablation"]["counts"], settings["ablation"]["draws"]
-    motion, uncorrected = read_fields(context.run_dir / MOTION, "motion", "q", "uncorrected_q")
-    steps = len(motion) - 1
-    fields = {
-        "count": Field((), "1", "int64"),
-        "markers": Field((draws, max(counts)), "1", "int64"),  # -1 where a set is smaller
-        "error": Field((draws, steps), "m"),
-        "misfit": Field((draws, steps), "m"),
-    }
-    with (
-        ResumableHDF5(context.run_dir / DRAWS, "marker ablation", context.fingerprint, len(counts), fields) as file,
-        Progress("ablation", len(counts) * steps, "frames", file.done * steps) as progress,
-    ):
-        done = [int(file.read(step)["count"]) for step in range(file.done)]
-        left = [(settings, context.run_dir / MOTION, count) for count in counts if count not in done]
-        with closing(_each_count(left, processes, progress.advance, context.memory)) as results:
-            for count, (vertices, error, misfit) in results:
-                padded = np.pad(vertices, ((0, 0), (0, max(counts) - count)), constant_values=-1)
-                file.append(count=count, markers=padded, error=error, misfit=misfit)
-                done.append(count)
-        file.finish(order=[counts.index(count) for count in done])
-    error, misfit = (_MM * values.mean(-1) for values in read_fields(file.path, "marker ablation", "error", "misfit"))
+    counts = context.settings["ablation"]["counts"]
+    motion, uncorrected = read_motion(context.run_dir)
+    parts = {}
+    for count in sorted(counts, reverse=True):  # The longest first, so that no process is left with it.
+        (parts[count],) = split_into_parts(context, (str(count),), len(motion), f"markers_{count}", count)
+    work_on([*parts.values()], _FromMarkers, processes)
+    found = {name: np.stack([parts[count].read(name) for count in counts]) for name in ("markers", "error", "misfit")}
+    found |= {name: found[name][..., 1:] for name in ("error", "misfit")}  # The first frame is given.
+    with atomic_hdf5(context.run_dir / DRAWS, "marker ablation", {"fingerprint": context.fingerprint}) as file:
+        create(file, "count", counts)
+        for name, values in found.items():
+            create(file, name, values, "1" if name == "markers" else "m")
+    error, misfit = (_MM * found[name].mean(-1) for name in ("error", "misfit"))
     distance = np.linalg.norm(uncorrected[1:] - motion[1:], axis=-1).mean()
     rows = [summarise_draws(count, e, m) for count, e, m in zip(counts, error, misfit, strict=True)]
     write_json(context.run_dir / SUMMARY, {"uncorrected_mm": _MM * float(distance), "by_markers": rows})
@@ -138,49 +116,72 @@ def ablate(context: StageContext, processes: int = 1) -> None:
     for count, e, m in zip(counts, error, misfit, strict=True):
         lines += [f"{count},{i},{a:.9g},{b:.9g}" for i, (a, b) in enumerate(zip(e, m, strict=True))]
     write_text(context.run_dir / TABLE, "\n".join(lines) + "\n")
+    remove_parts(context)
 
 
-def read_fields(path: Path, kind: str, *names: str) -> list[NDArray[np.float64]]:
-    """The named datasets of a file."""
-    with read_hdf5(path, kind) as file:
-        return [read_array(file, name) for name in names]
+def read_motion(folder: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Positions (T + 1, N, 3) of the motion, and of the uncorrected simulation [m]."""
+    with read_hdf5(folder / MOTION, "motion") as file:
+        return read_array(file, "q"), read_array(file, "uncorrected_q")
 
 
-_Task = tuple[Mapping[str, Any], Path, int]
+class _FromMarkers(March):
+    """The motion, reconstructed from random sets of as many markers.
 
-
-def _each_count(
-    tasks: Sequence[_Task], processes: int, advance: Advance, memory: WorkersMemory
-) -> Generator[tuple[int, Any], None, None]:
-    """Yields each number of markers with what `reconstruct_count` makes of it, in the order in which they finish."""
-    if processes == 1:
-        for task in tasks:
-            yield task[-1], reconstruct_count(task, advance)
-        return
-    tasks = sorted(tasks, key=lambda task: -task[-1])  # The longest first, so that no process is left with it.
-    with closing(in_processes(reconstruct_count, tasks, processes, advance, memory)) as results:
-        for number, result in results:
-            yield tasks[number][-1], result
-
-
-def reconstruct_count(
-    task: _Task, advance: Advance
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Sets of markers (draws, count), and the mean distances (draws, T) of all vertices and of the markers [m].
-
-    Args:
-        task: settings of the stage, file of the motion, number of markers.
-        advance: told of each step.
+    What is kept are the mean distances (draws,) of all vertices and of the markers [m], and the sets.
     """
-    settings, path, count = task
-    wp.config.log_level = wp.LOG_WARNING
-    simulator = build_simulator(settings, "simulation")
-    (motion,) = read_fields(path, "motion", "q")
-    vertices = draw_markers(simulator, count, settings["ablation"]["draws"], settings["seed"])
-    return vertices, *_reconstruct(simulator, settings, vertices, simulator.tensor(motion), advance)
+
+    def __init__(self, part: Part) -> None:
+        settings, self._count = part.context.settings, part.more
+        simulator = build_simulator(settings, "simulation")
+        self.like, draws = simulator.rest_positions, settings["ablation"]["draws"]
+        self._motion = simulator.tensor(read_motion(part.context.run_dir)[0])
+        self._vertices = draw_markers(simulator, self._count, draws, settings["seed"])
+        self._markers = MarkerMap.at_vertices(torch.as_tensor(self._vertices, device=self.like.device), self.like.dtype)
+        more = {**settings["reconstruction"], "modes": settings["ablation"]["modes"]}
+        self._reconstructor = make_reconstructor(simulator, **more, markers=self._markers)
+        self._force = self.like.new_zeros(draws, *self.like.shape)
+        self._padding = max(settings["ablation"]["counts"]) - self._count
+        self.fields = {name: Field((draws,), "m", batch_axes=1) for name in ("error", "misfit")}
+        self.frames = len(self._motion)
+
+    @override
+    def begin(self) -> State:
+        q = self._motion[0].expand_as(self._force)
+        return State(q, torch.zeros_like(q))
+
+    @override
+    @torch.enable_grad()
+    def step(self, number: int) -> State:
+        observed = self._markers(self._motion[number].expand_as(self._force))
+        result = self._reconstructor.step(self.state, observed, first_guess=self._force)
+        self._force, self.shown = result.force, {"markers": self._count, "iterations": result.iterations}
+        return result.state.detach()
+
+    @override
+    def kept(self, number: int) -> dict[str, ArrayLike]:
+        away = self.state.q - self._motion[number]
+        return {
+            "error": away.norm(dim=-1).mean(-1).cpu().numpy(),
+            "misfit": self._markers(away).norm(dim=-1).mean(-1).cpu().numpy(),
+        }
+
+    @override
+    def constants(self) -> dict[str, tuple[ArrayLike, str]]:
+        sets = np.pad(self._vertices, ((0, 0), (0, self._padding)), constant_values=-1)  # -1 where a set is smaller
+        return {"markers": (sets, "1")}
+
+    @override
+    def snapshot(self) -> dict[str, torch.Tensor]:
+        return {**super().snapshot(), "force": self._force}
+
+    @override
+    def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
+        super().restore(tensors)
+        self._force = tensors["force"].to(self.like)
 
 
-def draw_markers(simulator: Any, count: int, draws: int, seed: int) -> NDArray[np.int64]:
+def draw_markers(simulator: Simulator, count: int, draws: int, seed: int) -> NDArray[np.int64]:
     """(draws, count) vertices of the surface, each set without repetition.
 
     They are drawn from those that are free, or from all where these are too few. A set depends on the seed and its
@@ -191,26 +192,6 @@ def draw_markers(simulator: Any, count: int, draws: int, seed: int) -> NDArray[n
     pool = free if count <= len(free) else surface
     random = np.random.default_rng([seed, count])
     return np.stack([random.choice(pool, count, replace=False) for _ in range(draws)])
-
-
-def _reconstruct(
-    simulator: Any, settings: Mapping[str, Any], vertices: NDArray[np.int64], motion: torch.Tensor, advance: Advance
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean distances (draws, T) from the motion (T + 1, N, 3), of all vertices and of the markers [m]."""
-    markers = MarkerMap.at_vertices(torch.as_tensor(vertices, device=motion.device), motion.dtype)
-    modes = settings["ablation"]["modes"]
-    reconstructor = make_sparse_reconstructor(simulator, markers, **settings["reconstruction"], modes=modes)
-    q = motion[0].expand(len(vertices), -1, -1).clone()
-    state, force = State(q, torch.zeros_like(q)), torch.zeros_like(q)
-    errors, misfits = [], []
-    for frame in motion[1:]:
-        observed = markers(frame.expand_as(q))
-        result = reconstructor.step(state, observed, first_guess=force)
-        state, force = result.state.detach(), result.force
-        errors.append((state.q - frame).norm(dim=-1).mean(-1))
-        misfits.append((markers(state.q) - observed).norm(dim=-1).mean(-1))
-        advance(markers=vertices.shape[1], iterations=result.iterations)
-    return torch.stack(errors, 1).cpu().numpy(), torch.stack(misfits, 1).cpu().numpy()
 
 
 def summarise_draws(count: int, errors_mm: NDArray[np.float64], misfits_mm: NDArray[np.float64]) -> dict[str, Any]:
@@ -252,5 +233,5 @@ def collect_metrics(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
         **read_json(folder / SUMMARY),
         **resources_used(folder, _STAGES),
         "versions": package_versions(),
-        "device": str(choose_device("cpu" if config["device"] == "auto" else config["device"])),
+        "device": str(simulation_device(config)),
     }

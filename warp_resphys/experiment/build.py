@@ -1,5 +1,6 @@
 """Builds meshes, bodies, materials and simulators from configurations."""
 
+import re
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from typing import Any
@@ -14,7 +15,7 @@ from ..energies.base import Energy
 from ..energies.fibres import Fibres
 from ..energies.materials import Material, make_material
 from ..energies.pressure import Pressure
-from ..fem.body import Body, PointMass
+from ..fem.body import Body
 from ..io.errors import InputError
 from ..mesh.arm import mesh_arm
 from ..mesh.arm_geometry import arm_geometry
@@ -22,7 +23,6 @@ from ..mesh.chambers import Chamber, find_chambers
 from ..mesh.mesh import Mesh, box_hexahedra, box_tetrahedra, check_mesh, quadratic, select_vertices
 from ..mesh.readers import read_mesh
 
-_MESH_KINDS = ("box_hexahedra", "box_tetrahedra", "file", "arm", "arm_generated")
 _DTYPES = {"float64": torch.float64, "float32": torch.float32}
 
 
@@ -35,12 +35,9 @@ def choose_device(name: str) -> torch.device:
     available = torch.cuda.is_available()
     if name == "auto":
         return torch.device("cuda" if available else "cpu")
-    try:
-        device = torch.device(name)
-    except RuntimeError:
-        device = None
-    if device is None or device.type not in ("cpu", "cuda"):
+    if not re.fullmatch(r"(cpu|cuda)(:\d+)?", name):
         raise InputError(f"device is {name!r}: choose auto, cpu or cuda.")
+    device = torch.device(name)
     if device.type == "cuda" and not available:
         raise InputError(f"device is {name!r}, but torch finds no CUDA device: choose device=cpu.")
     if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
@@ -48,11 +45,16 @@ def choose_device(name: str) -> torch.device:
     return device
 
 
+def simulation_device(config: Mapping[str, Any]) -> torch.device:
+    """Where bodies are simulated: ``auto`` is the CPU."""
+    return choose_device("cpu" if config["device"] == "auto" else config["device"])
+
+
 def build_mesh(config: Mapping[str, Any]) -> Mesh:
-    """A mesh from the group ``mesh``.
+    """A mesh from the group ``mesh``; `schema.mesh_group` has what each kind takes.
 
     Raises:
-        InputError: an unknown kind.
+        InputError: an unknown kind, or shipped arm.
         MeshError: a mesh that cannot be read or simulated.
     """
     kind = config["kind"]
@@ -68,7 +70,7 @@ def build_mesh(config: Mapping[str, Any]) -> Mesh:
         mesh, _ = mesh_arm(arm_geometry(config), config["size"], config["cells"], config["layers"])
         mesh = quadratic(mesh) if config["order"] == 2 else mesh
     else:
-        raise InputError(f"mesh.kind is {kind!r}: choose {', '.join(_MESH_KINDS[:-1])} or {_MESH_KINDS[-1]}.")
+        raise InputError(f"mesh.kind is {kind!r}: choose one of those in conf/mesh.")
     check_mesh(mesh)
     return mesh
 
@@ -104,17 +106,6 @@ def build_chambers(config: Mapping[str, Any] | None, mesh: Mesh) -> tuple[Chambe
     return found
 
 
-def build_energies(config: Mapping[str, Any], mesh: Mesh) -> tuple[Energy, ...]:
-    """What acts in or on a body beside its material, from the groups that it has: ``chambers`` and ``fibres``."""
-    fibres, chambers = config.get("fibres"), build_chambers(config.get("chambers"), mesh)
-    if fibres is not None and not chambers:
-        raise InputError("fibres are wound around chambers, but there is no group chambers: leave the fibres out.")
-    energies: list[Energy] = [Pressure(chambers)] if chambers else []
-    if fibres is not None:
-        energies.append(Fibres(chambers, axis=config["chambers"]["axis"], **fibres))
-    return tuple(energies)
-
-
 def chambers_of(body: Body) -> Sequence[Chamber]:
     """The chambers that pressure acts in; none without any."""
     return [chamber for energy in body.energies if isinstance(energy, Pressure) for chamber in energy.chambers]
@@ -132,17 +123,21 @@ def build_material(config: Mapping[str, Any], key: str) -> Material:
         raise InputError(f"{key}: {error}") from error
 
 
-def build_body(config: Mapping[str, Any], point_masses: tuple[PointMass, ...] = ()) -> Body:
-    """A body from the groups ``mesh``, ``physics``, ``fixed``, and, where it has any, ``chambers`` and ``fibres``."""
-    mesh = build_mesh(config["mesh"])
-    return Body(
-        mesh,
-        energies=build_energies(config, mesh),
-        fixed=select_vertices(mesh, **config["fixed"]),
-        mass=config["physics"]["mass"],
-        volume_integration=config["physics"]["volume_integration"],
-        point_masses=point_masses,
-    )
+def build_body(config: Mapping[str, Any]) -> Body:
+    """A body from the groups ``mesh``, ``physics``, ``fixed``, and, where it has any, ``chambers`` and ``fibres``.
+
+    Raises:
+        InputError: fibres without chambers, or another number of chambers than the mesh has.
+        MeshError: a mesh that cannot be read or simulated, or no vertex where the body is fixed.
+    """
+    mesh, fibres = build_mesh(config["mesh"]), config.get("fibres")
+    chambers = build_chambers(config.get("chambers"), mesh)
+    if fibres is not None and not chambers:
+        raise InputError("fibres are wound around chambers, but there is no group chambers: leave the fibres out.")
+    energies: list[Energy] = [Pressure(chambers)] if chambers else []
+    if fibres is not None:
+        energies.append(Fibres(chambers, axis=config["chambers"]["axis"], **fibres))
+    return Body(mesh, energies=tuple(energies), fixed=select_vertices(mesh, **config["fixed"]), **config["physics"])
 
 
 def bound_markers(settings: Mapping[str, Any], mesh: Mesh, places: ArrayLike, labels: Sequence[str]) -> Markers:
@@ -159,14 +154,8 @@ def bound_markers(settings: Mapping[str, Any], mesh: Mesh, places: ArrayLike, la
         MeshError: no vertex lies where ``markers.bind_to`` says.
     """
     vertices = None if settings["bind_to"] is None else select_vertices(mesh, **settings["bind_to"])
-    return bind_markers(
-        mesh,
-        places,
-        labels,
-        kind=settings["bind"],
-        vertices=vertices,
-        largest_distance=settings["largest_distance"],
-    )
+    distance = settings["largest_distance"]
+    return bind_markers(mesh, places, labels, kind=settings["bind"], vertices=vertices, largest_distance=distance)
 
 
 def build_simulator(
@@ -179,7 +168,7 @@ def build_simulator(
 
     Args:
         config: with the keys of ``conf/config.yaml``.
-        material: the key of its material: ``simulation`` or ``reality``.
+        material: the key of its material, such as ``simulation`` or ``target``.
         body: the body, where it was built already.
         on_failure: in place of the configured one.
 
@@ -188,19 +177,15 @@ def build_simulator(
     """
     if config["dtype"] not in _DTYPES:
         raise InputError(f"dtype is {config['dtype']!r}: choose float64 or float32.")
-    constants = build_material(config, material)
-    settings = dict(config["solver"])
-    if on_failure is not None:
-        settings["on_failure"] = on_failure
-    device = "cpu" if config["device"] == "auto" else config["device"]
+    solver = {**config["solver"], **({} if on_failure is None else {"on_failure": on_failure})}
     return Simulator(
         build_body(config) if body is None else body,
-        constants,
+        build_material(config, material),
         time_step=config["time_step"],
         gravity=config["gravity"],
         integrator=config["integrator"],
-        solver=SolverSettings(**settings),
-        device=choose_device(device),
+        solver=SolverSettings(**solver),
+        device=simulation_device(config),
         dtype=_DTYPES[config["dtype"]],
         coupling=config.get("coupling", "implicit"),
     )

@@ -1,13 +1,14 @@
 """Checks of a whole configuration before anything is computed, so that a slip costs no stage that comes before it."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 import torch
 
-from ..data.actuation import PressureSequences
+from ..data.base_motion import OBSERVED
 from ..data.markers import MarkerMap
 from ..energies.materials import Material
 from ..fem.body import Body
@@ -16,14 +17,14 @@ from ..io.memory import available_memory_gib
 from ..learning.identification import Bounds
 from ..learning.reconstruction import make_reconstructor
 from ..learning.replay import MASS_FACTOR, known_parameters
-from ..learning.sparse_reconstruction import make_sparse_reconstructor
 from ..mesh.mesh import select_vertices, surface_vertices
 from .build import build_body, build_material, build_simulator, chambers_of
-from .files import attached_mass
+from .files import STATIC, attached_mass
 from .identify import ELASTIC
-from .laboratory import laboratory_settings, substeps_of, vertical
 from .schema import IN_THE_LOOP, NAME, NETWORK, TRAINER, check, configuration_group
+from .simulate import laboratory_settings, pressure_sequences, substeps_of, vertical
 from .trials import (
+    Trial,
     folds_of,
     is_laboratory,
     sees_markers,
@@ -35,7 +36,6 @@ from .trials import (
 _LONGEST_STRETCH = 0.3  # rho g L / E from which on the size of a body is not believed
 _BYTES_PER_CELL = 4_000  # that a mesh, its points and its matrix take at least
 _SHARE_OF_MEMORY = 0.8
-_GROUPS = {"network": NETWORK, "trainer": TRAINER, "in_the_loop": IN_THE_LOOP}
 
 
 def check_configuration(config: Mapping[str, Any]) -> None:
@@ -58,10 +58,11 @@ def check_configuration(config: Mapping[str, Any]) -> None:
     if config["dtype"] != "float64":
         raise InputError(f"dtype is {config['dtype']!r}: experiments need float64; float32 is for roll-outs in Python.")
     check_memory(config)
-    for model in ("resphys", "simfree"):
-        _check_training(config, model)
-    for key in ("simulation", *(("target",) if not recorded else ())):
-        _check_material(config, key, "")
+    check_training(training_settings(config, "resphys"))
+    with _naming("simfree: "):
+        check_training(training_settings(config, "simfree"))
+    if not recorded:
+        build_material(config, "target")
     body = build_body(config)
     select_vertices(body.mesh, **config["tip"])
     simulator = build_simulator(config, body=body)
@@ -69,29 +70,33 @@ def check_configuration(config: Mapping[str, Any]) -> None:
     if recorded:
         _check_recorded(config, body)
         probe = MarkerMap.at_vertices(torch.zeros(1, 1, dtype=torch.int64))
-        make_sparse_reconstructor(simulator, probe, **config["reconstruction"])
+        make_reconstructor(simulator, **config["reconstruction"], markers=probe)
     elif "ablation" in config:
         _check_ablation(config, body)
     else:
         split_of(config)
         if variation_of(config["data"]).key == "weights_g":
             select_vertices(body.mesh, **config["data"]["load"])
-        if "modes" in config["reconstruction"]:
-            raise InputError("reconstruction.modes is for bodies that are seen through markers: leave it out.")
         make_reconstructor(simulator, **config["reconstruction"])
-    steps = config["data"].get("steps")
-    refinement = config["refinement"]
-    if refinement["kind"] != "none" and config["network"].get("recurrent") is not None:
+    if config["refinement"]["kind"] != "none":
+        _check_refinement(config)
+    if config["identify"] is not None:
+        if "fibre_stiffness" in config["identify"]["parameters"] and config["fibres"] is None:
+            raise InputError("identify.parameters names fibre_stiffness, but fibres is null: give the simulator some.")
+        hangs = config["data"].get("payload_at") is not None
+        known = [name for name in known_parameters(simulator) if hangs or name != MASS_FACTOR]
+        check_identification(config["identify"], known)
+
+
+def _check_refinement(config: Mapping[str, Any]) -> None:
+    steps, window = config["data"].get("steps"), config["refinement"]["window"]
+    if config["network"].get("recurrent") is not None:
         raise InputError(
             "refinement begins anew in every window, and network.recurrent lives on what was before: set one of them "
             "to none, or null."
         )
-    if refinement["kind"] != "none" and steps is not None and refinement["window"] >= steps:
-        raise InputError(f"refinement.window is {refinement['window']}: it must be less than the data's {steps} steps.")
-    if config["identify"] is not None:
-        if "fibre_stiffness" in config["identify"]["parameters"] and config["fibres"] is None:
-            raise InputError("identify.parameters names fibre_stiffness, but fibres is null: give the simulator some.")
-        check_identification(config["identify"], _known(config, simulator))
+    if steps is not None and window >= steps:
+        raise InputError(f"refinement.window is {window}: it must be less than the data's {steps} steps.")
 
 
 def check_memory(config: Mapping[str, Any]) -> None:
@@ -101,12 +106,9 @@ def check_memory(config: Mapping[str, Any]) -> None:
         InputError: a mesh or a network that is too large.
     """
     limit = _SHARE_OF_MEMORY * available_memory_gib()
-    meshes = {
-        "mesh": config["mesh"],
-        **({"laboratory.mesh": config["laboratory"]["mesh"]} if config["laboratory"] else {}),
-    }
-    for key, mesh in meshes.items():
-        cells = math.prod(mesh["divisions"]) if "divisions" in mesh else 0
+    for key, group in (("mesh", config), ("laboratory.mesh", config["laboratory"] or {})):
+        divisions = group.get("mesh", {}).get("divisions")
+        cells = math.prod(divisions) if divisions else 0
         needed = cells * _BYTES_PER_CELL / 2**30
         if needed > limit:
             raise InputError(
@@ -140,7 +142,7 @@ def check_training(groups: Mapping[str, Any]) -> None:
     Raises:
         InputError: a value of the wrong kind or out of range.
     """
-    for key, spec in _GROUPS.items():
+    for key, spec in (("network", NETWORK), ("trainer", TRAINER), ("in_the_loop", IN_THE_LOOP)):
         if groups.get(key) is not None:
             check(key, groups[key], spec)
     network = groups["network"]
@@ -152,24 +154,13 @@ def check_training(groups: Mapping[str, Any]) -> None:
         raise InputError("trainer.sequence is missing: a recurrent network needs it; trainer=sequences has one.")
 
 
-def _check_training(config: Mapping[str, Any], model: str) -> None:
+@contextmanager
+def _naming(group: str) -> Iterator[None]:
+    """Errors of the values of a group begin with its name."""
     try:
-        check_training(training_settings(config, model))
-    except InputError as error:
-        raise (error if model == "resphys" else InputError(f"simfree: {error}")) from error
-
-
-def _check_material(config: Mapping[str, Any], key: str, group: str) -> None:
-    try:
-        build_material(config, key)
+        yield
     except InputError as error:
         raise InputError(f"{group}{error}") from error
-
-
-def _known(config: Mapping[str, Any], simulator: Any) -> list[str]:
-    """The parameters that may be identified: no factor on payloads where nothing hangs."""
-    hangs = config["data"].get("payload_at") is not None
-    return [name for name in known_parameters(simulator) if hangs or name != MASS_FACTOR]
 
 
 def _check_recorded(config: Mapping[str, Any], body: Body) -> None:
@@ -192,9 +183,11 @@ def _check_recorded(config: Mapping[str, Any], body: Body) -> None:
         _check_pressures(config, chambers)
     _check_times(config, begins)
     if config["published"] is not None:
-        _check_material(config["published"], "simulation", "published.")
+        with _naming("published."):
+            build_material(config["published"], "simulation")
     if is_laboratory(config):
         _check_laboratory(config, begins, chambers)
+    _check_base_motion(config, trials)
     _check_release(config, begins)
 
 
@@ -235,6 +228,35 @@ def _check_trials(config: Mapping[str, Any]) -> None:
         other = files.setdefault(trial["file"], name)
         if other != name:
             raise InputError(f"the trials '{other}' and '{name}' have the same file, {trial['file']}: name it once.")
+
+
+def _check_base_motion(config: Mapping[str, Any], trials: Sequence[Trial]) -> None:
+    """How what the body is fixed to moves, if it does."""
+    common, groups = config["data"].get("base_motion"), {}
+    if isinstance(common, str):
+        if common not in OBSERVED:
+            raise InputError(
+                f"data.base_motion is '{common}': it must be {' or '.join(OBSERVED)}, a group with file or swings, or "
+                "null."
+            )
+        if common == "reference" and len(config["markers"]["reference"]) < 3:
+            raise InputError(
+                "data.base_motion is reference: name three markers or more, not on a line, in markers.reference."
+            )
+    elif common is not None:
+        groups["data.base_motion"] = common
+    group = "laboratory" if is_laboratory(config) else "data"
+    groups |= {f"{group}.trials.{each.name}.base_motion": each.base_motion for each in trials if each.base_motion}
+    for key, motion in groups.items():
+        if isinstance(motion, str) or ("file" in motion) == ("swings" in motion):
+            raise InputError(f"{key} needs either file, a table of poses, or swings, by any names.")
+        if "swings" in motion and not motion["swings"]:
+            raise InputError(
+                f"{key}.swings is empty: give it at least one, as {{a: {{frequency: 1.0, translation: [0.01, 0, 0]}}}}."
+            )
+    for each in trials:
+        if each.begins == STATIC and (common is not None or each.base_motion):
+            raise InputError(f"the trial '{each.name}' is a pose, which has no time: its base cannot move.")
 
 
 def _check_release(config: Mapping[str, Any], begins: set[str]) -> None:
@@ -285,7 +307,8 @@ def _check_times(config: Mapping[str, Any], begins: set[str]) -> None:
 
 def _check_laboratory(config: Mapping[str, Any], begins: set[str], chambers: int) -> None:
     laboratory, data = config["laboratory"], config["data"]
-    _check_material(laboratory, "material", "laboratory.")
+    with _naming("laboratory."):
+        material = build_material(laboratory, "material")
     for trial in trials_of(config):
         if trial.pull is not None and data["rest"] != "file":
             raise InputError(
@@ -306,14 +329,10 @@ def _check_laboratory(config: Mapping[str, Any], begins: set[str], chambers: int
     if "rest" in begins:
         substeps_of(config)
         if chambers:
-            sequences = PressureSequences(limit=data["pressure_limit"], **laboratory.get("sequences", {}))
-            random = np.random.default_rng(0)
-            sequences.draw(data["steps"], config["time_step"], config["chambers"]["count"], random)
-    try:
-        material = build_material(laboratory, "material")
+            steps, count, random = data["steps"], config["chambers"]["count"], np.random.default_rng(0)
+            pressure_sequences(config).draw(steps, config["time_step"], count, random)
+    with _naming("laboratory: "):
         body = build_body(laboratory_settings(config))
-    except InputError as error:
-        raise InputError(f"laboratory: {error}") from error
     _check_size(body, material, config["gravity"])
 
 
@@ -361,17 +380,13 @@ def check_identification(identify: Mapping[str, Any], known: Sequence[str]) -> N
             if name not in choice:
                 instead = f"choose from {', '.join(choice)}" if choice else f"set identify.{group} to null"
                 raise InputError(f"identify.{group} names '{name}': {instead}.")
-            try:
+            with _naming(f"identify.{group}.{name}: "):
                 Bounds(**{key: value for key, value in settings.items() if key != "points"})
-            except InputError as error:
-                raise InputError(f"identify.{group}.{name}: {error}") from error
     for name, value in identify["first_guess"].items():
-        if name not in parameters:
-            if name not in known:
-                raise InputError(f"identify.first_guess names '{name}': choose from {', '.join(known)}.")
-            continue
-        within = parameters[name]
-        if not within["lower"] <= value <= within["upper"]:
+        within = parameters.get(name)
+        if name not in known:
+            raise InputError(f"identify.first_guess names '{name}': choose from {', '.join(known)}.")
+        if within is not None and not within["lower"] <= value <= within["upper"]:
             raise InputError(
                 f"identify.first_guess.{name} is {value!r}: it must be a number from {within['lower']:g} to "
                 f"{within['upper']:g}, its range."
@@ -390,6 +405,5 @@ def _check_ablation(config: Mapping[str, Any], body: Body) -> None:
     if not isinstance(observed, list) or len(observed) != 1 or not 0.0 < observed[0] < np.inf:
         raise InputError(f"data.weights_g.observed is {observed!r}: it must be a list of one positive weight, in g.")
     probe = MarkerMap.at_vertices(torch.zeros(1, 1, dtype=torch.int64))
-    make_sparse_reconstructor(
-        build_simulator(config), probe, **config["reconstruction"], modes=config["ablation"]["modes"]
-    )
+    modes = config["ablation"]["modes"]
+    make_reconstructor(build_simulator(config), **config["reconstruction"], modes=modes, markers=probe)

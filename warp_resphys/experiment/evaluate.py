@@ -8,20 +8,16 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from typing_extensions import override
 
 from ..dynamics.integrator import State
-from ..io.errors import ConvergenceError
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5, write_json
-from ..io.processes import Advance
 from ..io.progress import Progress
-from ..io.resumable import Field
 from ..io.stages import StageContext
 from ..learning.metrics import errors_per_marker, marker_errors, median_filter, summarise, summarise_each
 from ..learning.replay import Replay, Start
 from .files import ERRORS, ROLLOUTS, TIMES, reconstruction_file
 from .models import ModelRollout, first_frame, learned_of
-from .parts import March, Part, pack, read_parts, remove_parts, split_into_parts, unpack, work_on
+from .parts import Part, padded, remove_parts, split_into_parts, work_on
 from .scene import LEARNED, Scene, models_of
 
 FloatArray = NDArray[np.float64]
@@ -35,40 +31,53 @@ def evaluate(context: StageContext, processes: int = 1) -> None:
     """Writes rollouts.h5, what is observed of every model's roll-outs of the test trials, and errors.json."""
     settings = context.settings
     scene = Scene(settings, context.run_dir, "count")
-    groups = {scale: tuple(names) for scale, names in settings["groups"].items()}
-    names = [name for group in groups.values() for name in group]
-    models = models_of(settings)
-    filmed = film_trial(scene, groups["1"])
-    parts: dict[str, list[Part]] = {model: [] for model in models}
+    names = [name for group in settings["groups"].values() for name in group]
+    filmed = film_trial(scene, settings["groups"]["1"])
+    parts: dict[str, list[Part]] = {model: [] for model in models_of(settings)}
     for number, some in enumerate(scene.alike(names)):
-        for model in models:
+        for model in parts:
             frames = 1 + int(float(scene.trials(some).times.max()) / scene.model_simulator(model).time_step)
-            label = f"{model}{number}"
-            parts[model] += split_into_parts(context, some, settings["batch"], frames, label, (model, filmed))
-    work_on([part for some in parts.values() for part in some], roll_out_part, processes)
-    observed = {model: _observed(scene, model, some, names) for model, some in parts.items()}
-    single = scene.dataset.bound is not None  # markers
+            parts[model] += split_into_parts(context, some, frames, f"{model}{number}", (model, filmed))
+    work_on([part for some in parts.values() for part in some], _rolled_out, processes)
+    order = [name for some in scene.alike(names) for name in some]
+    rows, frames = [order.index(name) for name in names], scene.dataset.observed.shape[1]
+    observed = {
+        model: padded([_observed(scene, model, part) for part in some], frames)[rows] for model, some in parts.items()
+    }
+    shown = film_steps(int(float(scene.trials([filmed]).times.max()) / settings["time_step"] + 1e-6))
     attributes = {"names": names, "time_step": settings["time_step"], "film_trial": filmed}
     with atomic_hdf5(context.run_dir / ROLLOUTS, "rollouts", attributes) as file:
         for model, values in observed.items():
-            create(file, f"{model}_observed", values.astype(np.float32) if single else values, "m", time_axis=1)
-            bodies = next(read_parts([part], "film") for part in parts[model] if filmed in part.names)
+            single = values if scene.dataset.bound is None else values.astype(np.float32)  # markers
+            create(file, f"{model}_observed", single, "m", time_axis=1)
+            bodies = next(part.read("film") for part in parts[model] if filmed in part.names)
             substeps = round(settings["time_step"] / scene.model_simulator(model).time_step)
-            shown = film_steps(scene_steps(scene, filmed))
             create(file, f"{model}_film", bodies[np.minimum(substeps * shown, len(bodies) - 1)], "m")
         create(file, "film_steps", shown)
     left = {
-        model: _by_name(some, np.concatenate([read_parts([part], "left")[:, -1] for part in some]), names)
+        model: np.concatenate([part.read("left")[:, -1] for part in some])[rows]
         for model, some in parts.items()
         if model in LEARNED and settings["range_guard"]
     }
-    write_json(context.run_dir / ERRORS, summary(context, scene, groups, observed, left))
+    write_json(context.run_dir / ERRORS, summary(context, scene, settings["groups"], observed, left))
     remove_parts(context)
 
 
-def scene_steps(scene: Scene, name: str) -> int:
-    """Time steps that a trial lasts."""
-    return int(float(scene.trials([name]).times.max()) / scene.config["time_step"] + 1e-6)
+def _rolled_out(part: Part) -> ModelRollout:
+    """A model over the trials of a part."""
+    scene = Scene(part.context.settings, part.context.run_dir, "count")
+    model, filmed = part.more
+    learned = learned_of(scene, model, scene.model_simulator(model).rest_positions)
+    return ModelRollout(scene, model, part.names, learned, filmed=filmed)
+
+
+def _observed(scene: Scene, model: str, part: Part) -> FloatArray:
+    """(R, T, M, 3) what is observed of a model's roll-outs at the frames of the trials [m]."""
+    series, delay, shift = (torch.from_numpy(part.read(name)) for name in ("points", "delay", "shift"))
+    replay = Replay(scene.model_simulator(model), scene.observe, scene.trials(part.names))
+    start = Start(State(series[:, 0], series[:, 0]), delay, shift).to(replay.trials.observed)
+    series = (series[:, -1:] if replay.is_static else series).to(replay.trials.observed)
+    return np.asarray(replay.at_frames(series, start).cpu().numpy())
 
 
 def film_trial(scene: Scene, names: Sequence[str]) -> str:
@@ -82,107 +91,6 @@ def film_trial(scene: Scene, names: Sequence[str]) -> str:
 def film_steps(steps: int) -> IntArray:
     """Steps whose bodies are kept for pictures."""
     return np.arange(0, steps + 1, max(-(-steps // _FILM_FRAMES), 1))
-
-
-def _by_name(parts: Sequence[Part], rows: NDArray[Any], names: Sequence[str]) -> NDArray[Any]:
-    """Rows of all parts, in the order of the names."""
-    order = [name for part in parts for name in part.names]
-    return rows[[order.index(name) for name in names]]
-
-
-def _observed(scene: Scene, model: str, parts: Sequence[Part], names: Sequence[str]) -> FloatArray:
-    """(R, T, M, 3) what is observed of a model's roll-outs at the frames of the trials [m], NaN past their end."""
-    frames, found = scene.dataset.observed.shape[1], []
-    for part in parts:
-        series, delay, shift = (torch.from_numpy(read_parts([part], name)) for name in ("points", "delay", "shift"))
-        trials = scene.trials(part.names)
-        start = Start(State(series[:, 0], series[:, 0]), delay, shift)
-        run = Replay(scene.model_simulator(model), scene.observe, trials)
-        if run.is_static:
-            series = series[:, -1:]
-        values = run.at_frames(series.to(trials.observed), start.to(trials.observed)).cpu().numpy()
-        padding = [(0, 0), (0, frames - values.shape[1]), (0, 0), (0, 0)]
-        found.append(np.pad(values, padding, constant_values=np.nan))
-    return _by_name(parts, np.concatenate(found), names)
-
-
-def roll_out_part(part: Part, advance: Advance) -> None:
-    """What is observed of a model's roll-out of some trials, bodies of the filmed one, and when they left the range."""
-    scene = Scene(part.context.settings, part.context.run_dir, "count")
-    part.march(_RollingOut(scene, part), advance)
-
-
-class _RollingOut(March):
-    """A model over some trials."""
-
-    def __init__(self, scene: Scene, part: Part) -> None:
-        model, filmed = part.more
-        simulator = scene.model_simulator(model)
-        self._run = ModelRollout(scene, model, part.names, learned_of(scene, model, simulator.rest_positions))
-        self._filmed = part.names.index(filmed) if filmed in part.names else None
-        self._state: State | None = None
-        self._failed = False
-        start = self._run.start
-        batch, count = len(part.names), self._run.replay.trials.observed.shape[2]
-        self.frames = self._run.steps + 1
-        self.fields = {"points": Field((batch, count, 3), "m", batch_axes=1)}
-        if self._run.predictor is not None:
-            self.fields["left"] = Field((batch,), "1", "int64", batch_axes=1)
-        if self._filmed is not None:
-            self.fields["film"] = Field((simulator.body.n_vertices, 3), "m", "float32")
-        shift = torch.zeros(batch, count, 3) if start.shift is None else start.shift
-        self._constants = {"delay": (start.delay.cpu().numpy(), "s"), "shift": (shift.cpu().numpy(), "m")}
-
-    @override
-    @torch.no_grad()
-    def frame(self, number: int) -> tuple[dict[str, Any], dict[str, object]]:
-        run = self._run
-        if number == 0:
-            self._state = self._begin()
-        else:
-            assert self._state is not None
-            self._state = run.rollout.step(self._state)
-        points, bodies = run.points(self._state), run.rollout.positions(self._state)
-        if self._failed:
-            points, bodies = torch.full_like(points, torch.nan), torch.full_like(bodies, torch.nan)
-        kept: dict[str, Any] = {"points": points.cpu().numpy()}
-        if run.predictor is not None:
-            known = run.predictor.left_at
-            kept["left"] = np.full(len(points), -1) if known is None else known.cpu().numpy()
-        if self._filmed is not None:
-            kept["film"] = bodies[self._filmed].cpu().numpy()
-        return kept, {}
-
-    def _begin(self) -> State:
-        """The first state; a pose that does not settle has failed."""
-        try:
-            return self._run.begin()
-        except ConvergenceError:
-            if not self._run.replay.is_static:
-                raise
-            self._failed = True
-            return self._run.simulator.rest_state(len(self._run.replay.trials.names))
-
-    @override
-    def snapshot(self) -> dict[str, torch.Tensor]:
-        assert self._state is not None
-        predictor, lost = self._run.predictor, self._run.rollout.lost(self._state)
-        known = {} if predictor is None else {"left": predictor.left_at, "hidden": predictor.hidden}
-        left = {name: value for name, value in known.items() if value is not None}
-        return {**pack(self._state), "lost": lost, "done": torch.tensor(self._run.rollout.done), **left}
-
-    @override
-    def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
-        self._state = unpack(tensors, self._run.simulator.rest_positions)
-        device = self._state.q.device
-        self._run.rollout.resume(tensors["lost"].to(device), int(tensors["done"]))
-        if (predictor := self._run.predictor) is not None:
-            found = {name: tensors[name].to(device) for name in ("left", "hidden") if name in tensors}
-            predictor.left_at, predictor.hidden = found.get("left"), found.get("hidden")
-
-    @override
-    def constants(self) -> dict[str, tuple[Any, str]]:
-        return dict(self._constants)
 
 
 def summary(
@@ -202,8 +110,8 @@ def summary(
         left: by model, (R,) the step at which a trial left the range of the training, or -1.
     """
     settings, dataset = context.settings, scene.dataset
-    (_, names), *scaled = groups.items()
-    count, every = len(names), [name for group in groups.values() for name in group]
+    names, every = groups["1"], [name for group in groups.values() for name in group]
+    count, step = len(names), settings["time_step"]
     observed = dataset.observed[dataset.rows(every)]
     first = [first_frame(scene, [name]) for name in every]
     models = dict(simulated)
@@ -222,22 +130,20 @@ def summary(
     else:
         seen = observed[:count]
         found["per_marker"] = {model: errors_per_marker(x, seen, dataset.labels) for model, x in test.items()}
-    step = settings["time_step"]
     found |= _over_time(settings, test, observed, errors)
     if left:
         found["range"] = {model: _range(rows[:count], names, step) for model, rows in left.items()}
-    if scaled:
-        found["scales"] = {"1": found["errors_mm"]}
-        for number, (scale, _) in enumerate(scaled, start=1):
-            rows = slice(number * count, (number + 1) * count)
-            found["scales"][scale] = {
-                m: summarise(_errors(x[rows], observed[rows], first)) for m, x in simulated.items()
-            }
+    if len(groups) > 1:
+        at = {scale: slice(i * count, (i + 1) * count) for i, scale in enumerate(groups)}
+        found["scales"] = {
+            scale: {m: summarise(_errors(x[rows], observed[rows], first)) for m, x in simulated.items()}
+            for scale, rows in at.items()
+        }
         if left:
-            found["scales_range"] = {"1": found["range"]}
-            for number, (scale, some) in enumerate(scaled, start=1):
-                rows = slice(number * count, (number + 1) * count)
-                found["scales_range"][scale] = {m: _range(each[rows], some, step) for m, each in left.items()}
+            found["scales_range"] = {
+                scale: {m: _range(each[rows], groups[scale], step) for m, each in left.items()}
+                for scale, rows in at.items()
+            }
     sideways = _sideways(scene, names)
     return {**found, **({"sideways_mm": sideways} if sideways else {})}
 
@@ -333,7 +239,7 @@ def time_models(context: StageContext) -> None:
             runs = [ModelRollout(scene, model, [name], known, starts[name], stepping) for name in names]
             seconds = []
             for run in (runs[0], *runs):
-                state, steps = run.begin(), run.steps
+                state, steps = run.begin(), run.frames - 1
                 predictor, before = run.predictor, time.perf_counter()
                 for step in range(steps):
                     if row == "inference" and predictor is not None:

@@ -7,9 +7,11 @@ from typing import Any, Final
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
+from ..data.base_motion import at_times
 from ..data.trials import Trials
+from ..dynamics.frames import rotations
 from ..dynamics.inputs import Inputs
 from ..fem.body import Body
 from ..io.errors import InputError
@@ -33,7 +35,11 @@ REPORT: Final = "report.html"
 
 GIVEN: Final = "given"  # how trials begin whose state a simulation knows
 STATIC: Final = "static"
-DATASET_KIND: Final = "dataset"
+_KIND = "dataset"
+_UNITS = {
+    **dict.fromkeys(("observed", "smoothed", "held", "bound"), "m"),
+    **{"velocity": "m/s", "times": "s", "payload": "kg", "base": "m, rad"},
+}
 
 
 def reconstruction_file(model: str) -> str:
@@ -81,6 +87,8 @@ class Dataset:
         velocity: (R, T, N, 3) of the vertices [m/s], where a simulation knows them.
         inputs: (R, K, C) during each step, by name, such as ``pressure`` [Pa].
         channels: what the C are called, by input.
+        base: (R, K + 1, 6) how what the body is fixed to has moved at the steps, see `data.base_motion`; None where it
+            stands still.
     """
 
     names: tuple[str, ...]
@@ -97,6 +105,7 @@ class Dataset:
     velocity: FloatArray | None = None
     inputs: Mapping[str, FloatArray] = field(default_factory=dict)
     channels: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    base: FloatArray | None = None
 
     def write(self, path: Path) -> None:
         """Writes its file, for `read_dataset`.
@@ -104,16 +113,16 @@ class Dataset:
         Raises:
             DataFileError: the file cannot be written.
         """
-        attributes = describe(self.names, self.labels, self.begins, self.gravity, self.time_step, self.channels)
-        with atomic_hdf5(path, DATASET_KIND, attributes) as file:
-            for name in ("observed", "smoothed"):
+        words = {"names": self.names, "labels": self.labels, "begins": self.begins, "inputs": tuple(self.inputs)}
+        words |= {f"{name}_channels": known for name, known in self.channels.items()}
+        attributes = {**{key: list(each) for key, each in words.items()}, "gravity": self.gravity}
+        with atomic_hdf5(path, _KIND, {**attributes, "time_step": self.time_step}) as file:
+            for name, unit in _UNITS.items():
                 if getattr(self, name) is not None:
-                    create(file, name, getattr(self, name), units="m", time_axis=1)
+                    axis = int(name in ("observed", "smoothed", "velocity"))
+                    create(file, name, getattr(self, name), units=unit, time_axis=axis)
             for name, values in self.inputs.items():
                 create(file, name, values, units="Pa", time_axis=1)
-            for name, unit in (("times", "s"), ("held", "m"), ("payload", "kg"), ("bound", "m")):
-                if getattr(self, name) is not None:
-                    create(file, name, getattr(self, name), units=unit)
 
     def joined(self, other: "Dataset") -> "Dataset":
         """These trials and others of the same body after them, with as many frames."""
@@ -121,7 +130,7 @@ class Dataset:
             name: None
             if getattr(self, name) is None
             else np.concatenate([getattr(each, name) for each in (self, other)])
-            for name in ("times", "observed", "held", "payload", "smoothed", "velocity")
+            for name in ("times", "observed", "held", "payload", "smoothed", "velocity", "base")
         }
         inputs = {name: np.concatenate([values, other.inputs[name]]) for name, values in self.inputs.items()}
         words = {"names": self.names + other.names, "begins": self.begins + other.begins}
@@ -132,13 +141,32 @@ class Dataset:
         """Where trials are."""
         return [self.names.index(name) for name in names]
 
-    def trials(self, names: Sequence[str], body: Body, payload_at: Mapping[str, float] | None) -> Trials:
+    def _during(self, values: FloatArray, time_step: float) -> FloatArray:
+        """(K', R, C) inputs (R, K, C) during steps of another length: those of the step in whose middle theirs is."""
+        count = round(values.shape[1] * self.time_step / time_step)
+        at = ((np.arange(count) + 0.5) * time_step / self.time_step).astype(np.int64)
+        found: FloatArray = values[:, np.minimum(at, values.shape[1] - 1)].swapaxes(0, 1).copy()
+        return found
+
+    def base_at(self, names: Sequence[str], time_step: float) -> torch.Tensor | None:
+        """(K + 1, R, 6) the motion of the base in some of the trials, at steps of another length; None for none."""
+        if self.base is None:
+            return None
+        times = self.time_step * np.arange(self.base.shape[1])
+        new = time_step * np.arange(round(times[-1] / time_step) + 1)
+        rows = [at_times(self.base[row], times, new) for row in self.rows(names)]
+        return torch.from_numpy(np.stack(rows, axis=1))
+
+    def trials(
+        self, names: Sequence[str], body: Body, payload_at: Mapping[str, float] | None, time_step: float | None = None
+    ) -> Trials:
         """Some of the trials, which begin alike, in float64 on the CPU.
 
         Args:
             names: of the trials.
             body: that payloads hang on.
             payload_at: see `attached_mass`.
+            time_step: of the simulation, if another than that of the inputs [s].
 
         Raises:
             InputError: see `attached_mass`.
@@ -146,37 +174,26 @@ class Dataset:
         rows = self.rows(names)
         static = self.begins[rows[0]] == STATIC
         frames = slice(None, 1) if static else slice(None)
-        given = {key: torch.from_numpy(values[rows].swapaxes(0, 1).copy()) for key, values in self.inputs.items()}
+        step = self.time_step if time_step is None else time_step
+        given = {key: torch.from_numpy(self._during(values[rows], step)) for key, values in self.inputs.items()}
         if any(self.payload):
             given["attached_mass"] = torch.from_numpy(attached_mass(body, payload_at, self.payload[rows]))
-        resting = (
-            Inputs(**{key: values[-1] for key, values in given.items() if key in self.inputs}) if static else Inputs()
-        )
+        poses = self.base_at(names, step)
+        if poses is not None and not static:
+            fixed = torch.from_numpy(np.asarray(body.mesh.vertices[body.fixed_vertices], dtype=np.float64))
+            given["fixed_positions"] = (fixed @ rotations(poses[1:, :, 3:]).mT) + poses[1:, :, None, :3]
+        resting = Inputs(**{key: given[key][-1] for key in self.inputs}) if static else Inputs()
         times, observed = (torch.from_numpy(x[rows][:, frames]) for x in (self.times, self.observed))
         return Trials(tuple(names), times, observed, torch.from_numpy(self.held[rows]), Inputs(**given), resting)
 
 
-def describe(
-    names: Sequence[str],
-    labels: Sequence[str],
-    begins: Sequence[str],
-    gravity: ArrayLike,
-    time_step: float,
-    channels: Mapping[str, Sequence[str]],
-) -> dict[str, Any]:
-    """Attributes of a dataset's file; see `Dataset`."""
-    words = {"names": list(names), "labels": list(labels), "begins": list(begins), "inputs": list(channels)}
-    of_inputs = {f"{name}_channels": list(known) for name, known in channels.items()}
-    return {**words, "gravity": np.asarray(gravity, dtype=np.float64), "time_step": time_step, **of_inputs}
-
-
 def read_dataset(path: Path) -> Dataset:
-    """Reads what `Dataset.write` wrote, or a simulation of trials.
+    """Reads what `Dataset.write` wrote.
 
     Raises:
         DataFileError: the file is missing, damaged or of another kind.
     """
-    with read_hdf5(path, DATASET_KIND) as file:
+    with read_hdf5(path, _KIND) as file:
         names, labels, begins, inputs = (
             tuple(str(each) for each in file.attrs[key]) for key in ("names", "labels", "begins", "inputs")
         )
@@ -196,6 +213,7 @@ def read_dataset(path: Path) -> Dataset:
             payload=read_array(file, "payload", (r,)) if "payload" in file else np.zeros(r),
             gravity=np.asarray(file.attrs["gravity"], dtype=np.float64),
             time_step=float(file.attrs["time_step"]),
+            base=read_array(file, "base", (r, None, 6)) if "base" in file else None,
             inputs={name: read_array(file, name, (r, None, None)) for name in inputs},
             channels={name: tuple(str(each) for each in file.attrs[f"{name}_channels"]) for name in inputs},
             **optional,

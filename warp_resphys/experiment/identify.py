@@ -3,11 +3,11 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
-from ..io.files import read_json, write_json
+from ..io.files import write_json
 from ..io.progress import Progress
+from ..io.resumable import forget_checkpoint, keep_checkpoint, resume_checkpoint
 from ..io.stages import StageContext
 from ..learning.identification import Bounds, Identifier
 from ..learning.replay import MASS_FACTOR, Replay, Start
@@ -17,6 +17,7 @@ from .trials import evenly
 
 ELASTIC = ("youngs_modulus", "poissons_ratio")
 _LANDSCAPE = "landscape"
+_RANGE = ("lower", "upper", "logarithmic")
 _AT_ONCE = 4  # points of the landscape
 
 Replays = Sequence[tuple[Replay, Start]]
@@ -38,20 +39,43 @@ def identify(context: StageContext) -> None:
     ranges = {model: {k: Bounds(**b) for k, b in each.items() if b} for model, each in searches.items() if each}
     kinds = {model: MODELS[model][0] for model in ranges}
     evaluations = len(ranges) * config["starts"] * config["max_evaluations"]
-    done = sum(_evaluations_done(_kept_of(context, model)) for model in ranges)
+    kept = {part: _Kept(context, part) for part in (*ranges, _LANDSCAPE)}
+    done = sum(kept[model].evaluations for model in ranges)
     found, replays = {}, {}
     with Progress(context.name, evaluations, "evaluations at most", done) as progress:
         for model, bounds in ranges.items():
             replays[model] = scene.replays(kinds[model], names)
-            seconds = _seconds(settings, replays[model])
-            found[model] = _search(context, model, replays[model], bounds, seconds, progress)
+            identifier = Identifier(replays[model], bounds, _seconds(settings, replays[model]))
+            found[model] = _search(settings, identifier, kept[model], progress)
     if config["grid"]:
         seconds = _seconds(settings, replays["sysid"]) if config["seconds"] is not None else None
-        values = found["sysid"]["parameters"]
-        found[_LANDSCAPE] = _landscape(context, replays["sysid"], ranges["sysid"], values, seconds)
+        axes = {name: Bounds(*(grid[key] for key in _RANGE)) for name, grid in config["grid"].items()}
+        others = {name: bounds for name, bounds in ranges["sysid"].items() if name not in axes}
+        identifier = Identifier(replays["sysid"], {**axes, **others}, seconds)
+        counts = {name: int(grid["points"]) for name, grid in config["grid"].items()}
+        found[_LANDSCAPE] = _landscape(identifier, counts, found["sysid"]["parameters"], kept[_LANDSCAPE])
     write_json(context.run_dir / IDENTIFICATION, found)
-    for part in (*ranges, _LANDSCAPE):
-        _kept_file(context, part).unlink(missing_ok=True)
+    for each in kept.values():
+        forget_checkpoint(each.path)
+
+
+class _Kept:
+    """What is finished of a part, in a file until the stage is done; nothing of a run with other settings."""
+
+    def __init__(self, context: StageContext, part: str) -> None:
+        self.path, self._fingerprint = context.run_dir / f"identify_{part}.safetensors", context.fingerprint
+        found = resume_checkpoint(self.path, "identify", context.fingerprint)
+        self.content: dict[str, Any] = {} if found is None else found[1]
+
+    def keep(self, **content: Any) -> None:
+        """Adds what is finished."""
+        self.content |= {"fingerprint": self._fingerprint, **content}
+        keep_checkpoint(self.path, "identify", {}, self.content)
+
+    @property
+    def evaluations(self) -> int:
+        """How many went into the starts of a search that are finished."""
+        return sum(len(attempt["history"]) for attempt in self.content.get("attempts", ()))
 
 
 def _seconds(settings: Mapping[str, Any], replays: Replays) -> float | None:
@@ -70,81 +94,40 @@ def first_guess(settings: Mapping[str, Any], names: Any) -> dict[str, float]:
     return {name: values.get(name, 0.0) for name in names}
 
 
-def _search(
-    context: StageContext,
-    model: str,
-    replays: Replays,
-    bounds: Mapping[str, Bounds],
-    seconds: float | None,
-    progress: Progress,
-) -> dict[str, Any]:
+def _search(settings: Mapping[str, Any], identifier: Identifier, kept: _Kept, progress: Progress) -> dict[str, Any]:
     """The `Identification` of a model, as plain data; goes on from where an interrupted one ended."""
-    kept = _kept_of(context, model)
-    if "found" in kept:
-        return dict(kept["found"])
-    config = context.settings["identify"]
-    identifier = Identifier(replays, bounds, seconds)
-    if "starts" not in kept:
-        guess = first_guess(context.settings, bounds)
+    if "found" in kept.content:
+        return dict(kept.content["found"])
+    config, bounds = settings["identify"], identifier.bounds
+    if "starts" not in kept.content:
+        guess = first_guess(settings, bounds)
         guess |= {name: value for name, value in config["first_guess"].items() if name in bounds}
-        starts = identifier.starts(guess, config["starts"], config["candidates"], context.settings["seed"])
-        kept = _keep(context, model, {"starts": starts, "attempts": []})
+        starts = identifier.starts(guess, config["starts"], config["candidates"], settings["seed"])
+        kept.keep(starts=starts, attempts=[])
 
     def report(start: int, loss: float, values: Mapping[str, float]) -> None:
         progress.advance(1, start=start, loss=f"{loss:.3g}", E=f"{values.get('youngs_modulus', 0.0) / 1e3:.4g} kPa")
 
     def keep(attempts: list[Any]) -> None:
-        _keep(context, model, {**kept, "attempts": attempts})
+        kept.keep(attempts=attempts)
 
-    found = identifier.run(
-        kept["starts"], config["max_evaluations"], report, kept["attempts"], keep, config["tolerance"]
-    )
-    return dict(_keep(context, model, {"found": asdict(found)})["found"])
-
-
-def _evaluations_done(kept: Mapping[str, Any]) -> int:
-    """How many went into what is kept of a search."""
-    attempts = [each["history"] for each in kept.get("attempts", ())]
-    return sum(map(len, kept["found"]["history"] if "found" in kept else attempts))
+    starts, finished, most = kept.content["starts"], kept.content["attempts"], config["max_evaluations"]
+    found = identifier.run(starts, most, report, finished, keep, config["tolerance"])
+    kept.keep(found=asdict(found))
+    return dict(kept.content["found"])
 
 
 def _landscape(
-    context: StageContext,
-    replays: Replays,
-    bounds: Mapping[str, Bounds],
-    found: Mapping[str, float],
-    seconds: float | None,
+    identifier: Identifier, counts: Mapping[str, int], found: Mapping[str, float], kept: _Kept
 ) -> dict[str, Any]:
-    """Losses around the identified parameters: a range and a number of points for E, and for nu if that is wanted."""
-    grid = context.settings["identify"]["grid"]
-    axes = {name: Bounds(each["lower"], each["upper"], each["logarithmic"]) for name, each in grid.items()}
-    others = {name: b for name, b in bounds.items() if name not in axes}
-    identifier = Identifier(replays, {**axes, **others}, seconds)
-    counts = {name: int(each["points"]) for name, each in grid.items()}
-    finished = [math.inf if loss is None else loss for loss in _kept_of(context, _LANDSCAPE).get("losses", [])]
-    with Progress(f"{context.name}: landscape", math.prod(counts.values()), "points", len(finished)) as progress:
+    """Losses around the identified parameters, at so many points of the ranges of some of them."""
+    finished = kept.content.get("losses", [])
+    with Progress("identify: landscape", math.prod(counts.values()), "points", len(finished)) as progress:
 
         def report(losses: list[float]) -> None:
-            _keep(context, _LANDSCAPE, {"losses": losses})
+            kept.keep(losses=losses)
             progress.advance(len(losses) - progress.done)
 
         losses = identifier.grid(counts, found, _AT_ONCE, finished, report)
     ticks = {name: identifier.ticks(name, count).tolist() for name, count in counts.items()}
     return {**ticks, "loss": losses.tolist()}
-
-
-def _kept_file(context: StageContext, part: str) -> Path:
-    """Where what is finished of a part is kept until the stage is done."""
-    return context.run_dir / f"identify_{part}.json"
-
-
-def _keep(context: StageContext, part: str, content: dict[str, Any]) -> dict[str, Any]:
-    write_json(_kept_file(context, part), {"fingerprint": context.fingerprint, **content})
-    return content
-
-
-def _kept_of(context: StageContext, part: str) -> dict[str, Any]:
-    """What an interrupted run kept of a part; nothing if it had other settings."""
-    path = _kept_file(context, part)
-    kept: dict[str, Any] = read_json(path) if path.is_file() else {}
-    return kept if kept.get("fingerprint") == context.fingerprint else {}

@@ -14,20 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..data.actuation import check_pressures
+from ..data.base_motion import at_times, check_steps, followed, in_frame, prescribed
 from ..data.recordings.processing import fill_gaps, release_of, resample, smooth, trim_to_release
 from ..data.recordings.quality import check_base, check_motion, check_passive, quality
 from ..data.recordings.reading import read_recording
 from ..data.recordings.recording import Recording, listed
-from ..data.recordings.release import Release
-from ..data.recordings.valve import valve_opening
+from ..data.recordings.release import Release, valve_opening
 from ..data.registration import Registration, register_markers
+from ..data.rigid import RigidTransform
 from ..dynamics.simulator import Simulator
 from ..io.errors import DataFileError, InputError
 from ..io.files import write_json
 from ..io.stages import StageContext
 from .build import bound_markers, build_simulator, chambers_of
 from .files import DATASET, QUALITY, REGISTRATION, SCALED_DATASET, STATIC, Dataset, read_dataset
-from .laboratory import vertical
+from .simulate import vertical
 from .trials import Trial, evenly, is_laboratory, scaled_trials_of, trials_of
 
 log = logging.getLogger(__name__)
@@ -56,6 +57,8 @@ class Observed:
         pressure: (T, C) in the chambers of the body at the frames [Pa]; None without chambers.
         release: when the body was let go; None of others.
         tells_places: whether it shows where markers sit on the body at rest.
+        base: (T, 6) how what the body is fixed to has moved at the frames, in the frame of the body; None where it
+            stands still.
     """
 
     trial: Trial
@@ -66,6 +69,7 @@ class Observed:
     pressure: FloatArray | None = None
     release: Release | None = None
     tells_places: bool = True
+    base: FloatArray | None = None
 
     @property
     def is_released(self) -> bool:
@@ -120,10 +124,10 @@ class Importer:
         self._check_rates([each for each, trial in zip(recordings, trials, strict=True) if _has_release(trial)])
         releases = [self._release(each, trial) for each, trial in zip(recordings, trials, strict=True)]
         ready = [
-            each if _has_release(trial) else resample(each, 1.0 / self.settings["time_step"], interpolate=True)
+            each if _has_release(trial) else resample(each, 1.0 / self.settings["time_step"])
             for each, trial in zip(recordings, trials, strict=True)
         ]
-        self._check_reference(ready, releases)
+        self._check_reference(trials, ready, releases)
         each = zip(trials, ready, releases, strict=True)
         return self._beside_each_other(
             [
@@ -182,19 +186,57 @@ class Importer:
                     *(recording.source.name, recording.rate, 1.0 / self.settings["time_step"]),
                 )
 
-    def _check_reference(self, recordings: Sequence[Recording], releases: Sequence[Release | None]) -> None:
+    def _check_reference(
+        self, trials: Sequence[Trial], recordings: Sequence[Recording], releases: Sequence[Release | None]
+    ) -> None:
         """Refuses recordings whose reference markers moved against each other between trials."""
         if len(self.markers["reference"]) > 1:
-            still = [
-                each if at is None else replace(each, positions=each.positions[slice(*at.rest)])
-                for each, at in zip(recordings, releases, strict=True)
-            ]
+            still = []
+            for trial, each, release in zip(trials, recordings, releases, strict=True):
+                first, last = (0, self._rest_frames(each)) if release is None else release.rest
+                stands = release is None and self._base_motion(trial) is None
+                still.append(each if stands else replace(each, positions=each.positions[first:last]))
             check_base(
                 still,
                 list(self.markers["reference"]),
                 largest_distortion=self.markers["largest_distortion"],
                 largest_shift=self.markers["largest_shift"],
             )
+
+    def _rest_frames(self, recording: Recording) -> int:
+        return max(round(self.data["rest_seconds"] * recording.rate), 1)
+
+    def _base_motion(self, trial: Trial) -> Mapping[str, Any] | str | None:
+        """How the base of a trial moves; that of a laboratory's trial may have to be found out."""
+        common: Mapping[str, Any] | str | None = self.data.get("base_motion")
+        return common if trial.base_motion is None or isinstance(common, str) else trial.base_motion
+
+    def _base(
+        self, trial: Trial, whole: Recording, moving: Recording, still: FloatArray, transform: RigidTransform
+    ) -> FloatArray | None:
+        """(T, 6) how the base has moved at the frames of a trial, in the frame of the body; None if it stands still.
+
+        Args:
+            trial: what is configured of it.
+            whole: all markers at the same frames.
+            moving: the tracked ones, and the array `base`.
+            still: see `Observed`.
+            transform: from the frame of the recording to that of the body.
+        """
+        motion = self._base_motion(trial)
+        if motion is None:
+            return None
+        if isinstance(motion, Mapping):
+            return prescribed(motion, moving.time, self.data["folder"] or ".")
+        if motion == "reference":
+            count = len(self.tracked)
+            return in_frame(followed(whole.positions[:, count:], still[count:], whole.source), transform)
+        if moving.base is None:
+            raise DataFileError(
+                f"{whole.source} has no array 'base' that tells how what the body is fixed to moves: add it "
+                "(docs/recordings.md), or set data.base_motion to reference if markers.reference move with it."
+            )
+        return in_frame(moving.base, transform)
 
     def _register(
         self, places: FloatArray, recording: Recording, expected: FloatArray, only_reference: bool = False
@@ -230,7 +272,10 @@ class Importer:
         pressure = None
         if self._chambers:  # Constant: how a valve moves while a body swings is not told by this.
             pressure = self._pressure(moving, trial)[:1]
-        return Observed(trial, recording, moving, still, registration, pressure, release)
+        first = int(np.ceil(release.frame))
+        whole = replace(recording, positions=recording.positions[first : first + len(moving.positions)])
+        base = self._base(trial, whole, moving, still, registration.transform)
+        return Observed(trial, recording, moving, still, registration, pressure, release, base=base)
 
     def _driven(self, trial: Trial, recording: Recording) -> Observed:
         """A body that rests until its inputs come, or one in a pose."""
@@ -255,7 +300,8 @@ class Importer:
             last = replace(moving, positions=moving.positions[-frames:])
             moving = replace(moving, positions=_median(last, self.tracked)[None])
             pressure = None if pressure is None else np.median(pressure[-frames:], axis=0)[None]
-        return Observed(trial, recording, moving, still, registration, pressure, tells_places=tells)
+        base = None if static else self._base(trial, recording, moving, still, registration.transform)
+        return Observed(trial, recording, moving, still, registration, pressure, tells_places=tells, base=base)
 
     def tells_places(self, trial: Trial, pressure: FloatArray | None) -> bool:
         """Whether a trial shows the body at rest under nothing but gravity, or held undeformed."""
@@ -275,7 +321,7 @@ class Importer:
             raise DataFileError(
                 f"{recording.source} begins under pressure: its first frame must show the body at rest."
             )
-        count = max(min(until, round(self.data["rest_seconds"] * recording.rate)), 1)
+        count = min(until, self._rest_frames(recording))
         return _central(replace(recording, positions=recording.positions[:count]), self.tracked, np.mean, "rests")
 
     def _pressure(self, recording: Recording, trial: Trial) -> FloatArray:
@@ -459,6 +505,7 @@ def _dataset(
             held[row] = bound  # A pose is as large as it is far from the undeformed body.
         if pressure is not None and each.pressure is not None:
             _fill_pressure(pressure[row], each)
+    base = _bases(observed, times, settings["time_step"], importer.simulator.body.mesh.vertices)
     channels = {"pressure": tuple(chamber.name for chamber in chambers)} if pressure is not None else {}
     return Dataset(
         names=tuple(each.trial.name for each in observed),
@@ -474,7 +521,21 @@ def _dataset(
         smoothed=smoothed if cutoff is not None or all(each.trial.begins == "rest" for each in observed) else None,
         inputs={} if pressure is None else {"pressure": pressure},
         channels=channels,
+        base=base,
     )
+
+
+def _bases(observed: Sequence[Observed], times: FloatArray, time_step: float, points: FloatArray) -> FloatArray | None:
+    """(R, K + 1, 6) how the base of each trial moves, at the steps of the longest; None where all stand still."""
+    if all(each.base is None for each in observed):
+        return None
+    steps = time_step * np.arange(round(np.ceil(times.max() / time_step - 1e-6)) + 1)
+    found = np.zeros((len(observed), len(steps), 6))
+    for row, each in enumerate(observed):
+        if each.base is not None:
+            found[row] = at_times(each.base, each.moving.time, steps)
+            check_steps(found[row], points, each.raw.source)
+    return found
 
 
 def _fill_pressure(row: FloatArray, each: Observed) -> None:
@@ -545,7 +606,7 @@ def _write_quality(
     for row in shown:
         each = observed[row]
         name = each.trial.name
-        found = quality(each.raw, reference, each.release, longest_gap=gap)
+        found = quality(each.raw, reference if each.base is None else [], each.release, longest_gap=gap)
         qualities[name] = found.to_plain()
         if each.is_released:
             for warning in found.warnings:

@@ -39,7 +39,7 @@ Snapshot = tuple[dict[str, torch.Tensor], dict[str, Any]]
 
 @dataclass(frozen=True)
 class Steps:
-    """S single steps that networks learn from, and poses, from which a body goes nowhere.
+    """S single steps that networks learn from, and poses, from which a body goes nowhere, in the frame of the base.
 
     Attributes:
         q: (S, N, 3) positions where they begin [m].
@@ -67,10 +67,15 @@ def steps_of(scene: Scene, model: str, names: Sequence[str], device: torch.devic
     if model == SIMFREE and dataset.velocity is not None:
         rows = dataset.rows(names)
         q, v = (torch.as_tensor(field[rows], device=device) for field in (dataset.observed, dataset.velocity))
-        return _steps(q, v, None, None, torch.ones(q.shape[0], q.shape[1] - 1, dtype=torch.bool))
+        given = _told(scene, model, names, q.shape[1] - 1)
+        given = None if given is None else given.to(device)
+        q, v = _in_base(scene, model, names, q, v)
+        return _steps(q, v, None, given, torch.ones(q.shape[0], q.shape[1] - 1, dtype=torch.bool))
     found = []
     for some in scene.alike(names):
         q, v, force, seen = read_states(scene, model, some, device)
+        q, v = _in_base(scene, model, some, q, v)
+        force = _forces_in_base(scene, model, some, force)
         told = _told(scene, model, some, q.shape[1] - 1)
         if scene.begins(some[0]) == STATIC:
             q, v = q[:, 1:2].expand(-1, 2, -1, -1), torch.zeros_like(v[:, :2])
@@ -117,9 +122,33 @@ def _together(parts: Sequence[Steps]) -> Steps:
     return Steps(**own, following=following, lengths=tuple(n for each in parts for n in each.lengths))
 
 
+def _in_base(
+    scene: Scene, model: str, names: Sequence[str], q: torch.Tensor, v: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """States (R, K + 1, N, 3) of some trials in the frame of their base."""
+    simulator = scene.model_simulator(model)
+    base, like = scene.base(names, simulator), simulator.rest_positions
+    if base is None:
+        return q, v
+    steps = enumerate(zip(q.unbind(1), v.unbind(1), strict=True))
+    inside = [base.enter(x.to(like), w.to(like), step) for step, (x, w) in steps]
+    x, w = (torch.stack(each, 1).to(q) for each in zip(*inside, strict=True))
+    return x, w
+
+
+def _forces_in_base(scene: Scene, model: str, names: Sequence[str], force: torch.Tensor) -> torch.Tensor:
+    """Forces (R, K + 1, N, 3), each that of the step before, in the frame of their base."""
+    simulator = scene.model_simulator(model)
+    base, like = scene.base(names, simulator), simulator.rest_positions
+    if base is None:
+        return force
+    return torch.stack([base.force_inside(f.to(like), k - 1) for k, f in enumerate(force.unbind(1))], 1).to(force)
+
+
 def _told(scene: Scene, model: str, names: Sequence[str], steps: int) -> torch.Tensor | None:
     """(R, K, A) what a model is told of the inputs of some trials that begin alike."""
-    replay = Replay(scene.model_simulator(model), scene.observe, scene.trials(names))
+    simulator = scene.model_simulator(model)
+    replay = Replay(simulator, scene.observe, scene.trials(names, simulator))
     told = scene.conditions(replay, scene.parameters(model), model == SIMFREE)
     if told is None:
         return None
@@ -252,7 +281,8 @@ def _in_the_loop(scene: Scene, model: str, steps: Steps, groups: Mapping[str, An
             if rows:
                 part = Replay(simulator, replay.observe, replay.trials.select(rows))
                 told = scene.conditions(part, parameters)
-                watched.append(Watched(part, start.select(rows), told, frames))
+                base = scene.base(part.trials.names, simulator)
+                watched.append(Watched(part, start.select(rows), told, frames, base))
         return MotionLoss(watched, parameters)
 
     def make_network() -> ResidualForce:
@@ -330,7 +360,7 @@ def _motions(scene: Scene, model: str, names: Sequence[str]) -> list[Motion]:
             q, v, _, _ = read_states(scene, model, some, simulator.rest_positions.device)
             q, v = (field[:, : target.shape[1]].to(simulator.rest_positions) for field in (q, v))
         told = scene.conditions(replay, scene.parameters(model))
-        found.append(Motion(q, v, target, replay.trials, told))
+        found.append(Motion(q, v, target, replay.trials, told, scene.base(some, simulator)))
     return found
 
 

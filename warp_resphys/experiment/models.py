@@ -1,24 +1,32 @@
 """The models of an experiment, rolled out: a simulator, with a learned force, or a network in its place."""
 
+import contextlib
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import torch
+from numpy.typing import ArrayLike, NDArray
+from typing_extensions import override
 
-from ..dynamics.frames import VertexFrames
 from ..dynamics.integrator import State
 from ..dynamics.simulator import Simulator
 from ..io.errors import ConvergenceError
 from ..io.files import read_checkpoint
+from ..io.resumable import Field
 from ..learning.metrics import marker_errors, summarise
 from ..learning.networks import NextState, ResidualForce, StateMap, restore
 from ..learning.predictors import LearnedPredictor, Range
 from ..learning.replay import Replay, Start
 from ..learning.rollout import Rollout
 from .files import GIVEN, weights_file
+from .parts import March
 from .scene import LEARNED, Scene
+
+FloatArray = NDArray[np.float64]
 
 SIMFREE: Final = "simfree"
 _KINDS: Final[Mapping[bool, tuple[type[StateMap], str]]] = {
@@ -77,8 +85,8 @@ def load(folder: Path, model: str, refined: bool = False, like: torch.Tensor | N
     )
 
 
-class ModelRollout:
-    """A model over some trials that begin alike.
+class ModelRollout(March):
+    """A model over some trials that begin alike, step by step.
 
     Args:
         scene: of the experiment.
@@ -87,6 +95,7 @@ class ModelRollout:
         learned: what it has learned; None for a simulator alone.
         start: how the trials begin, where that is known; estimated if left out.
         simulator: in place of the model's.
+        filmed: the trial whose bodies are kept, too.
     """
 
     def __init__(
@@ -97,49 +106,58 @@ class ModelRollout:
         learned: Learned | None = None,
         start: Start | None = None,
         simulator: Simulator | None = None,
+        filmed: str | None = None,
     ) -> None:
         self.scene, self.model = scene, model
         self.simulator = scene.model_simulator(model) if simulator is None else simulator
-        self.replay = Replay(self.simulator, scene.observe, scene.trials(names))
+        self.like = self.simulator.rest_positions
+        self.replay = Replay(self.simulator, scene.observe, scene.trials(names, self.simulator))
         self.start = scene.start(self.simulator, self.replay.trials) if start is None else start
         parameters = scene.parameters(model)
         self._constants, self._inputs, self._resting = self.replay.setting(parameters)
         self._told = None if learned is None else scene.conditions(self.replay, parameters, model == SIMFREE)
         self._first: State | None = None
+        self._failed = False
+        self._filmed = names.index(filmed) if filmed in names else None
         self.rollout, self.predictor = self._make(learned)
+        self.frames, held = self._steps() + 1, self.replay.trials.held
+        self.fields = {"points": Field(tuple(held.shape), "m", batch_axes=1)}
+        if learned is not None:
+            self.fields["left"] = Field((len(held),), "1", "int64", batch_axes=1)
+        if self._filmed is not None:
+            self.fields["film"] = Field((self.simulator.body.n_vertices, 3), "m", "float32")
 
     def _make(self, learned: Learned | None) -> tuple[Rollout, LearnedPredictor | None]:
         predict = None
         if learned is not None:
-            frames = self._frames(learned)
-            predict = LearnedPredictor(learned.network, self._told, learned.range_, frames)
+            replaces = isinstance(learned.network, NextState)
+            frames = None if replaces else self.scene.frames(self.simulator, learned.force_frame)
+            base = self.scene.base(self.replay.trials.names, self.simulator)
+            predict = LearnedPredictor(learned.network, self._told, learned.range_, frames, base)
         return Rollout(self.simulator, predict, self._inputs, self._constants), predict
-
-    def _frames(self, learned: Learned) -> VertexFrames | None:
-        return (
-            None if isinstance(learned.network, NextState) else self.scene.frames(self.simulator, learned.force_frame)
-        )
 
     def with_learned(self, learned: Learned) -> "ModelRollout":
         """The same trials from their beginning, with something else learned."""
         if not self.replay.is_static:
-            self.begin()  # Once for all.
-        other = object.__new__(ModelRollout)
-        other.__dict__.update(self.__dict__)
+            self.beginning()  # Once for all.
+        other = copy.copy(self)
         other.rollout, other.predictor = self._make(learned)
         return other
 
-    @property
-    def steps(self) -> int:
-        """That reach past all frames; of whole time steps of the experiment."""
+    def _steps(self) -> int:
+        """Steps that reach past all frames; of whole time steps of the experiment."""
         if self.replay.is_static:
             return _POSE_STEPS if self.model == SIMFREE else 0
         substeps = round(self.scene.config["time_step"] / self.simulator.time_step)
         return -(-self.replay.steps(self.start) // substeps) * substeps
 
     @torch.no_grad()
-    def begin(self) -> State:
-        """The states that the trials begin with; poses end there too."""
+    def beginning(self) -> State:
+        """The states that the trials begin with; poses end there too.
+
+        Raises:
+            ConvergenceError: a body cannot be brought there.
+        """
         if self.replay.is_static and self.predictor is not None and self.model != SIMFREE:
             force: Any = self.predictor
             return self.replay.begin(self.start, self._constants, self._resting, force=force)
@@ -147,43 +165,81 @@ class ModelRollout:
             self._first = self.replay.begin(self.start, self._constants, self._resting)
         return self._first
 
-    def points(self, state: State) -> torch.Tensor:
-        """(R, M, 3) what is observed of a state [m]; NaN where the roll-out has diverged."""
-        lost = self.rollout.lost(state)[:, None, None]
-        return torch.where(lost, torch.nan, self.scene.observe(state.q))
-
-    def at_frames(self, series: torch.Tensor) -> torch.Tensor:
-        """(R, T, M, 3) at the frames [m], of (R, K + 1, M, 3) at the steps; see `Replay.at_frames`."""
-        last = series[:, -1:] if self.replay.is_static else series
-        return self.replay.at_frames(last, self.start)
-
-    @torch.no_grad()
-    def errors(self, learned_from: bool = False) -> list[Any]:
-        """Mean distances [mm] of what is observed at the frames of each trial; NaN where the roll-out diverged.
-
-        Args:
-            learned_from: whether only the part of each trial that is learned from counts.
-        """
-        observed = self.replay.trials.observed
-        if learned_from:
-            observed = observed[:, : self.scene.learned_steps(observed.shape[1] - 1) + 1]
-        steps = self.steps
-        if learned_from and self.scene.config["data"].get("train_fraction", 1.0) < 1.0:
-            steps = min(steps, self.scene.learned_steps(steps))
+    @override
+    def begin(self) -> State:
+        """The `beginning`; a pose that does not settle has failed."""
         try:
-            state = self.begin()
+            return self.beginning()
         except ConvergenceError:
-            return [torch.full((1,), torch.nan).numpy() for _ in observed]
-        series = [self.points(state)]
-        for _ in range(steps):
-            state = self.rollout.step(state)
-            if bool(self.rollout.lost(state).all()):
-                return [torch.full((1,), torch.nan).numpy() for _ in observed]
-            series.append(self.points(state))
-        found = self.at_frames(torch.stack(series, 1))[:, : observed.shape[1]]
+            if not self.replay.is_static:
+                raise
+            self._failed = True
+            return self.simulator.rest_state(len(self.replay.trials.names))
+
+    @override
+    def step(self, number: int) -> State:
+        return self.rollout.step(self.state)
+
+    @property
+    def _lost(self) -> torch.Tensor:
+        return self.rollout.lost(self.state) | self._failed
+
+    def points(self) -> torch.Tensor:
+        """(R, M, 3) what is observed of the last state [m]; NaN where the roll-out has diverged."""
+        return torch.where(self._lost[:, None, None], torch.nan, self.scene.observe(self.state.q))
+
+    @override
+    def kept(self, number: int) -> dict[str, ArrayLike]:
+        """Points, when each trial left the range of the training (-1 before that), and bodies of the film."""
+        points = self.points()
+        kept: dict[str, ArrayLike] = {"points": points.cpu().numpy()}
+        if self.predictor is not None:
+            left = self.predictor.left_at
+            kept["left"] = np.full(len(points), -1) if left is None else left.cpu().numpy()
+        if self._filmed is not None:
+            body = self.state.q[self._filmed].cpu().numpy()
+            kept["film"] = np.full_like(body, np.nan) if self._lost[self._filmed] else body
+        return kept
+
+    @override
+    def snapshot(self) -> dict[str, torch.Tensor]:
+        known = {"lost": self.rollout.lost(self.state), "done": torch.tensor(self.rollout.done)}
+        predictor = self.predictor
+        own = {} if predictor is None else {"left": predictor.left_at, "hidden": predictor.hidden}
+        return {**super().snapshot(), **known, **{name: value for name, value in own.items() if value is not None}}
+
+    @override
+    def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
+        super().restore(tensors)
+        known = {name: tensor.to(self.like.device) for name, tensor in tensors.items()}
+        self.rollout.resume(known["lost"], int(known["done"]))
+        if self.predictor is not None:
+            self.predictor.left_at, self.predictor.hidden = known.get("left"), known.get("hidden")
+
+    @override
+    def constants(self) -> dict[str, tuple[ArrayLike, str]]:
+        shift = torch.zeros_like(self.replay.trials.held) if self.start.shift is None else self.start.shift
+        return {"delay": (self.start.delay.cpu().numpy(), "s"), "shift": (shift.cpu().numpy(), "m")}
+
+    def errors(self) -> list[FloatArray]:
+        """Mean distances [mm] at those frames of each trial that are learned from; NaN where the roll-out diverged."""
+        observed, steps = self.replay.trials.observed, self.frames - 1
+        observed = observed[:, : self.scene.learned_steps(observed.shape[1] - 1) + 1]
+        if self.scene.config["data"].get("train_fraction", 1.0) < 1.0:
+            steps = min(steps, self.scene.learned_steps(steps))
+        series: list[torch.Tensor] = []
+        with contextlib.suppress(ConvergenceError):
+            self.state = self.beginning()
+            series.append(self.points())
+        while series and len(series) <= steps:
+            self.state = self.step(len(series))
+            series = [] if bool(self._lost.all()) else [*series, self.points()]
+        if not series:
+            return [np.full(1, np.nan) for _ in observed]
+        found = self.replay.at_frames(torch.stack(series[-1:] if self.replay.is_static else series, 1), self.start)
         first = first_frame(self.scene, self.replay.trials.names)
         pairs = zip(found[:, first:].cpu().numpy(), observed[:, first:].cpu().numpy(), strict=True)
-        return [marker_errors(x, y) for x, y in pairs]
+        return [marker_errors(x[: len(y)], y) for x, y in pairs]
 
 
 def first_frame(scene: Scene, names: Sequence[str]) -> int:
@@ -204,7 +260,7 @@ def rollout_error(scene: Scene, model: str, names: Sequence[str]) -> Callable[[L
     def error(learned: Learned) -> float:
         if not runs:  # The beginnings of trials are estimated once, and only where someone asks.
             runs.extend(ModelRollout(scene, model, some, learned) for some in scene.alike(names))
-        rows = [row for run in runs for row in run.with_learned(learned).errors(learned_from=True)]
+        rows = [row for run in runs for row in run.with_learned(learned).errors()]
         mean = summarise(rows)["mean"]
         return float("inf") if mean is None else mean
 

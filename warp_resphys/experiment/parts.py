@@ -25,9 +25,10 @@ from ..io.processes import Advance, available_cores, in_processes
 from ..io.progress import Progress
 from ..io.resumable import Field, ResumableHDF5, forget_checkpoint, keep_checkpoint, resume_checkpoint
 from ..io.stages import StageContext
-from .build import choose_device
+from .build import simulation_device
 
 _KEEP_SECONDS = 10.0
+_STATE = ("q", "v", "previous_q", "previous_v")
 
 
 class March(ABC):
@@ -36,94 +37,48 @@ class March(ABC):
     Attributes:
         frames: how many there are.
         fields: what is kept of each.
+        like: a tensor on the device of the trials.
+        state: of the last frame.
+        shown: beside the progress.
     """
 
     frames: int
     fields: Mapping[str, Field]
+    like: torch.Tensor
+    state: State
+    shown: Mapping[str, object] = {}
 
     @abstractmethod
-    def frame(self, number: int) -> tuple[dict[str, ArrayLike], dict[str, object]]:
-        """Goes on to a frame, from the one before; what is kept of it, and what is shown beside the progress."""
+    def begin(self) -> State:
+        """The state of the first frame."""
 
     @abstractmethod
-    def snapshot(self) -> dict[str, torch.Tensor]:
-        """What the next frame goes on from; none of it is changed in place."""
+    def step(self, number: int) -> State:
+        """The state of a frame, from that of the one before."""
 
     @abstractmethod
-    def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
-        """Goes back to a `snapshot`."""
+    def kept(self, number: int) -> dict[str, ArrayLike]:
+        """What is kept of a frame."""
 
     def constants(self) -> dict[str, tuple[ArrayLike, str]]:
         """What is kept beside the frames, with units."""
         return {}
 
+    def frame(self, number: int) -> dict[str, ArrayLike]:
+        """Goes on to a frame; what is kept of it."""
+        with torch.no_grad():
+            self.state = self.begin() if number == 0 else self.step(number)
+            return self.kept(number)
 
-def pack(state: State) -> dict[str, torch.Tensor]:
-    """A state as tensors by name."""
-    back = {} if state.previous is None else dict(zip(("previous_q", "previous_v"), state.previous, strict=True))
-    return {"q": state.q, "v": state.v, **back}
+    def snapshot(self) -> dict[str, torch.Tensor]:
+        """What the next frame goes on from; none of it is changed in place."""
+        values = (self.state.q, self.state.v, *(self.state.previous or ()))
+        return dict(zip(_STATE, values, strict=False))
 
-
-def unpack(tensors: Mapping[str, torch.Tensor], like: torch.Tensor) -> State:
-    """The state that `pack` took apart, on the device of a tensor."""
-    found = {name: tensors[name].to(like) for name in ("q", "v", "previous_q", "previous_v") if name in tensors}
-    previous = (found["previous_q"], found["previous_v"]) if "previous_q" in found else None
-    return State(found["q"], found["v"], previous)
-
-
-def march(
-    path: Path,
-    kind: str,
-    fingerprint: str,
-    motion: March,
-    advance: Advance,
-    each: int = 1,
-    attributes: Mapping[str, Any] | None = None,
-    constants: Mapping[str, tuple[ArrayLike, str]] | None = None,
-) -> None:
-    """Writes the file of a march, from where an interrupted one was.
-
-    Args:
-        path: the file.
-        kind: of its content.
-        fingerprint: of all that it depends on.
-        motion: the march.
-        advance: told of frames that are done.
-        each: times that a frame counts.
-        attributes: of the file.
-        constants: arrays with units that do not depend on the frame.
-    """
-    checkpoint = path.with_name(f"{path.stem}.state.safetensors")
-    with ResumableHDF5(path, kind, fingerprint, motion.frames, motion.fields) as file:
-        if file.done < file.steps:
-            found = resume_checkpoint(checkpoint, "state", fingerprint)
-            done = 0 if found is None else int(found[1]["done"])
-            file.rewind(done if found is not None and done <= file.done else 0)
-            if found is not None and file.done:
-                motion.restore(found[0])
-            advance(each * file.done)
-            kept = following = (motion.snapshot() if file.done else {}, file.done)
-            saved = time.monotonic()
-
-            def keep() -> None:
-                tensors, frames = following if file.done == following[1] else kept
-                if 0 < frames < file.steps:
-                    keep_checkpoint(checkpoint, "state", tensors, {"done": frames, "fingerprint": fingerprint})
-
-            try:
-                while file.done < file.steps:
-                    arrays, shown = motion.frame(file.done)
-                    following = (motion.snapshot(), file.done + 1)
-                    file.append(**arrays)
-                    kept = following
-                    if time.monotonic() - saved > _KEEP_SECONDS:
-                        keep()
-                        saved = time.monotonic()
-                    advance(each, **shown)
-            finally:
-                keep()
-        file.finish(attributes, motion.constants() if constants is None else constants)
-    forget_checkpoint(checkpoint)
+    def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
+        """Goes back to a `snapshot`."""
+        q, v, *previous = (tensors[name].to(self.like) for name in _STATE if name in tensors)
+        self.state = State(q, v, (previous[0], previous[1]) if previous else None)
 
 
 @dataclass(frozen=True)
@@ -144,9 +99,45 @@ class Part:
     frames: int
     more: Any = None
 
-    def march(self, motion: March, advance: Advance) -> None:
-        """Writes the part's file."""
-        march(self.path, self.context.name, self.context.fingerprint, motion, advance, len(self.names))
+    def write(self, motion: March, advance: Advance) -> None:
+        """Writes the part's file, from where an interrupted march was; tells of the frames that are done."""
+        fingerprint, each = self.context.fingerprint, len(self.names)
+        checkpoint = self.path.with_name(f"{self.path.stem}.state.safetensors")
+        with ResumableHDF5(self.path, self.context.name, fingerprint, motion.frames, motion.fields) as file:
+            if file.done < file.steps:
+                found = resume_checkpoint(checkpoint, "state", fingerprint)
+                done = 0 if found is None else int(found[1]["done"])
+                file.rewind(done if done <= file.done else 0)
+                if found is not None and file.done:
+                    motion.restore(found[0])
+                advance(each * file.done)
+                kept = following = (motion.snapshot() if file.done else {}, file.done)
+                saved = time.monotonic()
+
+                def keep() -> None:
+                    tensors, frames = following if file.done == following[1] else kept
+                    if 0 < frames < file.steps:
+                        keep_checkpoint(checkpoint, "state", tensors, {"done": frames, "fingerprint": fingerprint})
+
+                try:
+                    while file.done < file.steps:
+                        arrays = motion.frame(file.done)
+                        following = (motion.snapshot(), file.done + 1)
+                        file.append(**arrays)
+                        kept = following
+                        if time.monotonic() - saved > _KEEP_SECONDS:
+                            keep()
+                            saved = time.monotonic()
+                        advance(each, **motion.shown)
+                finally:
+                    keep()
+            file.finish(constants=motion.constants())
+        forget_checkpoint(checkpoint)
+
+    def read(self, name: str) -> NDArray[Any]:
+        """An array of its file."""
+        with read_hdf5(self.path, self.context.name) as file:
+            return read_array(file, name)
 
     @property
     def done(self) -> bool:
@@ -158,19 +149,18 @@ class Part:
 
 
 def split_into_parts(
-    context: StageContext, names: Sequence[str], batch: int | None, frames: int, label: str = "part", more: Any = None
+    context: StageContext, names: Sequence[str], frames: int, label: str = "part", more: Any = None
 ) -> list[Part]:
-    """Parts of at most so many trials.
+    """Parts of at most as many trials as the stage simulates at once (``batch``); all of them, if that is not set.
 
     Args:
         context: of the stage.
         names: of the trials.
-        batch: most trials of a part; None for one part.
         frames: of a trial.
         label: that the files' names begin with.
         more: see `Part`.
     """
-    folder, size = _folder(context), len(names) if batch is None else batch
+    folder, size = _folder(context), context.settings.get("batch") or len(names)
     return [
         Part(context, tuple(names[first : first + size]), folder / f"{label}_{first:03d}.h5", frames, more)
         for first in range(0, len(names), size)
@@ -182,25 +172,23 @@ def _folder(context: StageContext) -> Path:
     return context.run_dir / f"{context.name}_parts"
 
 
-def processes_for(settings: Mapping[str, Any]) -> int:
-    """Worker processes: as many as configured; one a core, but one for all where a GPU simulates."""
-    wanted = settings["parallel"]["processes"]
+def processes_for(config: Mapping[str, Any], wanted: int | None) -> int:
+    """Worker processes: as many as wanted; if that is not said, one a core, but one for all where a GPU simulates."""
     if wanted is not None:
-        return int(wanted)
-    device = "cpu" if settings["device"] == "auto" else settings["device"]
-    return available_cores() if choose_device(device).type == "cpu" else 1
+        return wanted
+    return available_cores() if simulation_device(config).type == "cpu" else 1
 
 
-def work_on(parts: Sequence[Part], function: Callable[[Part, Advance], None], processes: int) -> None:
-    """Works on those parts that are not done yet.
+def work_on(parts: Sequence[Part], function: Callable[[Part], March], processes: int) -> None:
+    """Marches through those parts that are not done yet.
 
     Args:
         parts: each with its own file.
-        function: of a part, and of what it calls with the frames that are done; defined at the top of a module.
+        function: makes the march of a part; defined at the top of a module.
         processes: at most so many at once.
 
     Raises:
-        WorkerError: a part could not be done.
+        ConvergenceError, WorkerError: a part could not be done.
         DataFileError: a part could not be written.
     """
     left = [part for part in parts if not part.done]
@@ -209,7 +197,7 @@ def work_on(parts: Sequence[Part], function: Callable[[Part, Advance], None], pr
         if processes == 1 or len(parts) == 1:
             with threadpool_limits(1):  # As in a worker process: the same numbers, however many there are.
                 for part in left:
-                    function(part, progress.advance)
+                    part.write(function(part), progress.advance)
             return
         crew, memory = max(min(processes, len(left)), 1), parts[0].context.memory
         work = partial(_quietly, function)
@@ -218,17 +206,22 @@ def work_on(parts: Sequence[Part], function: Callable[[Part, Advance], None], pr
                 pass
 
 
-def _quietly(function: Callable[[Part, Advance], None], part: Part, advance: Advance) -> None:
-    function(part, lambda count=1, **shown: advance(count))
+def _quietly(function: Callable[[Part], March], part: Part, advance: Advance) -> None:
+    part.write(function(part), lambda count=1, **shown: advance(count))
 
 
 def read_parts(parts: Sequence[Part], name: str) -> NDArray[Any]:
-    """The arrays of that name of all parts, one after the other."""
-    found = []
-    for part in parts:
-        with read_hdf5(part.path, part.context.name) as file:
-            found.append(read_array(file, name))
-    return np.concatenate(found)
+    """The (R, T, ...) arrays of that name of all parts; those with fewer frames are padded with NaN."""
+    return padded([part.read(name) for part in parts])
+
+
+def padded(found: Sequence[NDArray[Any]], frames: int = 0) -> NDArray[Any]:
+    """Arrays (R, T, ...) one after the other, with as many frames as the longest, or more: NaN past their ends."""
+    frames = max(frames, *(each.shape[1] for each in found))
+    ends = [[(0, 0), (0, frames - each.shape[1]), *[(0, 0)] * (each.ndim - 2)] for each in found]
+    return np.concatenate(
+        [np.pad(x, w, constant_values=np.nan) if any(map(any, w)) else x for x, w in zip(found, ends, strict=True)]
+    )
 
 
 def remove_parts(context: StageContext) -> None:

@@ -3,7 +3,7 @@
 A stage is there because the configuration asks for what it makes; its settings are all that its files depend on.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from rich.table import Table
 
 from ..io.errors import DataFileError
 from ..io.files import digest, read_json, write_json
-from ..io.stages import Stage, package_versions, resources_used, run_stages
+from ..io.stages import Stage, StageContext, package_versions, resources_used, run_stages
 from ..learning.metrics import summarise_folds
 from ..report.page import number_text
 from ..report.verdict import judgement
@@ -44,14 +44,13 @@ from .files import (
 )
 from .identify import identify
 from .importing import import_recordings, import_scaled
-from .laboratory import run_laboratory
 from .learn import refine, train
 from .models import SIMFREE
 from .parts import processes_for
 from .reconstruct import reconstruct
 from .report import collect_metrics, make_folds_report, make_report
 from .scene import LEARNED, models_of
-from .simulate import simulate
+from .simulate import run_laboratory, simulate
 from .trials import Split, folds_of, is_laboratory, scaled_trials_of, sees_markers, split_of, test_groups, trials_of
 
 _SIMULATED = ("mesh", "physics", "fixed", "gravity", "time_step", "integrator", "solver", "device", "dtype")
@@ -59,7 +58,7 @@ _ACTING = ("chambers", "fibres", "coupling")
 _DRAWN = ("laboratory", "fixed", "chambers", "gravity", "time_step", "solver", "device", "dtype", "seed", "tip")
 _DRAWN_DATA = (
     *("folder", "trials", "sequences", "begins", "train", "validation", "test", "folds", "limit"),
-    *("payload_at", "up", "rest", "steps", "pressure_limit"),
+    *("payload_at", "up", "rest", "steps", "pressure_limit", "base_motion"),
 )
 _DRAWN_MARKERS = ("tracked", "reference", "bind", "bind_to", "largest_distance")
 _LATER_DATA = ("horizons", "train_fraction", "pressure_scales")
@@ -67,11 +66,20 @@ _LEARNED_FROM = ("simulation", "markers", "actuation", "release", "force_frame")
 _LEARNED_DATA = ("payload_at", "train_fraction", "seconds")
 
 
+Work = Callable[[StageContext], None]
+
+
 def simulated(config: Mapping[str, Any]) -> dict[str, Any]:
     """The settings that every simulation of an experiment depends on."""
     base = {key: config[key] for key in (*_SIMULATED, *_ACTING)}
     if config["mesh"]["kind"] == "file":
         base["mesh_digest"] = digest(config["mesh"]["path"])
+    trials = config["data"].get("trials") or {}
+    motions = [each.get("base_motion") for each in (config["data"], *trials.values()) if isinstance(each, Mapping)]
+    files = [each["file"] for each in motions if isinstance(each, Mapping) and "file" in each]
+    if files:
+        folder = Path(config["data"].get("folder") or ".")
+        base["base_motions"] = {name: _digest(folder / name, "the file of base_motion") for name in files}
     return base
 
 
@@ -96,7 +104,7 @@ def acquisition_stages(config: Mapping[str, Any]) -> list[Stage]:
     base, data = simulated(config), config["data"]
     if not sees_markers(config):
         return [Stage("simulate", simulate, (DATASET,), {**base, **_pick(config, "target", "data")})]
-    stages, processes = [], processes_for(config)
+    stages, processes = [], processes_for(config, config["parallel"]["processes"])
     imported = {**base, **_pick(config, "simulation", "markers")}
     imported["data"] = {key: value for key, value in data.items() if key not in _LATER_DATA} | {"pressure_scales": []}
     trials = trials_of(config)
@@ -108,7 +116,7 @@ def acquisition_stages(config: Mapping[str, Any]) -> list[Stage]:
         play = partial(run_laboratory, processes=processes)
         stages.append(Stage("laboratory", play, files, _laboratory_settings(config, ())))
     else:
-        imported["recordings"] = {trial.name: _digest(trial.name, trial.file) for trial in trials}
+        imported["recordings"] = {trial.name: _digest(trial.file, f"data.trials.{trial.name}.file") for trial in trials}
     needs = tuple(stage.name for stage in stages)
     stages.append(Stage("import", import_recordings, (DATASET, QUALITY, REGISTRATION), imported, needs))
     scales = data["pressure_scales"]
@@ -136,13 +144,11 @@ def _laboratory_settings(config: Mapping[str, Any], scales: Sequence[float]) -> 
     return own
 
 
-def _digest(trial: str, path: Path | None) -> str:
+def _digest(path: Path | None, key: str) -> str:
     try:
         return digest(str(path))
     except OSError as error:
-        raise DataFileError(
-            f"cannot read {path} ({error.strerror}): check data.folder and data.trials.{trial}.file."
-        ) from error
+        raise DataFileError(f"cannot read {path} ({error.strerror}): check data.folder and {key}.") from error
 
 
 def learning_stages(config: Mapping[str, Any], split: Split, shared: str, acquired: str) -> list[Stage]:
@@ -154,77 +160,54 @@ def learning_stages(config: Mapping[str, Any], split: Split, shared: str, acquir
         shared: the folder of dataset.h5, relative to that of the split.
         acquired: fingerprint of the stage that wrote it.
     """
-    processes, models, identifies = processes_for(config), models_of(config), config["identify"] is not None
+    processes, markers = processes_for(config, config["parallel"]["processes"]), sees_markers(config)
+    needs = ("identify",) if config["identify"] is not None else ()
     base: dict[str, Any] = {
         **simulated(config),
         **_pick(config, *_LEARNED_FROM),
         "data": _pick(config["data"], *_LEARNED_DATA),
-        "identify": _pick(config["identify"], "integrator", "substeps", "elastic") if identifies else None,
+        "identify": _pick(config["identify"], "integrator", "substeps", "elastic") if needs else None,
         "batch": config["parallel"]["batch"],
         "shared": shared,
         "acquired": acquired,
         "split": split.plain(),
     }
-    needs: tuple[str, ...] = ()
-    stages = []
-    if identifies:
-        settings = {**base, **_pick(config, "identify", "seed")}
-        stages.append(Stage("identify", identify, (IDENTIFICATION,), settings))
-        needs = ("identify",)
-    observed = [*split.train, *split.validation, *(() if sees_markers(config) else split.test)]
-    known: list[str] = []
-    for model in (each for each in models if each in LEARNED and each != SIMFREE):
-        stages += _force_stages(config, {**base, "model": model}, observed, needs, processes)
-        known.append(stages[-1].name)
-    settings = {**base, **training_settings(config, SIMFREE), "range_guard": config["range_guard"], "model": SIMFREE}
-    if not sees_markers(config):  # What replaces a simulator depends on none, where states are known without.
+    stages: list[Stage] = []
+
+    def add(name: str, work: Work, outputs: tuple[str, ...], settings: Mapping[str, Any], *upstream: str) -> None:
+        stages.append(Stage(name, work, outputs, {**base, **settings}, (*needs, *upstream)))
+
+    if needs:
+        stages.append(Stage("identify", identify, (IDENTIFICATION,), {**base, **_pick(config, "identify", "seed")}))
+    reconstructed = [*split.train, *split.validation, *(() if markers else split.test)]
+    guard, learned = _pick(config, "range_guard"), []
+    for model in (each for each in models_of(config) if each in LEARNED and each != SIMFREE):
+        own, first, second = {"model": model}, f"reconstruct_{model}", f"train_{model}"
+        settings = {**own, **_pick(config, "reconstruction"), "reconstructed": reconstructed}
+        add(first, partial(reconstruct, processes=processes), (reconstruction_file(model),), settings)
+        settings = {**own, **guard, **training_settings(config, model)}
+        add(second, train, (weights_file(model), training_file(model)), settings, first)
+        if config["refinement"]["kind"] != "none":
+            outputs = (weights_file(model, True), training_file(model, True))
+            settings = {**own, **guard, **_pick(config, "refinement", "seed")}
+            add(f"refine_{model}", refine, outputs, settings, first, second)
+        learned.append(stages[-1].name)
+    settings = {"model": SIMFREE, **guard, **training_settings(config, SIMFREE)}
+    if not markers:  # What replaces a simulator depends on none, where states are known without.
         settings["simulation"] = config["target"]
     outputs = (weights_file(SIMFREE), training_file(SIMFREE))
-    learned_from = ("reconstruct_resphys",) if sees_markers(config) else ()
-    stages.append(Stage("train_simfree", train, outputs, settings, (*needs, *learned_from)))
-    known.append("train_simfree")
-    groups = {"groups": test_groups(config, split), **_pick(config, "range_guard")}
-    groups["refinement"] = config["refinement"]["kind"]
-    tested = {**base, **groups, **_pick(config, "published", "correct_uncorrected")}
-    tested["data"] = {**base["data"], **_pick(config["data"], "horizons")}
-    stages.append(
-        Stage(
-            "evaluate",
-            partial(evaluate, processes=processes),
-            (ROLLOUTS, ERRORS),
-            tested,
-            (*needs, *known, "reconstruct_resphys"),
-        )
-    )
+    add("train_simfree", train, outputs, settings, *(("reconstruct_resphys",) if markers else ()))
+    learned.append("train_simfree")
+    tested = {"groups": test_groups(config, split), **guard, "refinement": config["refinement"]["kind"]}
+    settings = {**tested, **_pick(config, "published", "correct_uncorrected")}
+    settings["data"] = {**base["data"], **_pick(config["data"], "horizons")}
+    work = partial(evaluate, processes=processes)
+    add("evaluate", work, (ROLLOUTS, ERRORS), settings, *learned, "reconstruct_resphys")
     if config["timing"]:
-        timed = {**base, **groups, **_pick(config, "target")}
-        stages.append(Stage("time", time_models, (TIMES,), timed, (*needs, *known)))
-    reported = {"config": shown(config), "acquired": acquired}
-    last = [stage.name for stage in stages if stage.name in ("evaluate", "time")]
-    stages.append(Stage("report", make_report, (REPORT,), reported, tuple(last)))
+        add("time", time_models, (TIMES,), {**tested, **_pick(config, "target")}, *learned)
+    last = tuple(stage.name for stage in stages if stage.name in ("evaluate", "time"))
+    stages.append(Stage("report", make_report, (REPORT,), {"config": shown(config), "acquired": acquired}, last))
     return stages
-
-
-def _force_stages(
-    config: Mapping[str, Any], base: dict[str, Any], observed: Sequence[str], needs: tuple[str, ...], processes: int
-) -> list[Stage]:
-    """Those that learn the residual force of one simulator: reconstruct, train, and refine where that is asked for."""
-    model = base["model"]
-    found = Stage(
-        f"reconstruct_{model}",
-        partial(reconstruct, processes=processes),
-        (reconstruction_file(model),),
-        {**base, **_pick(config, "reconstruction"), "reconstructed": list(observed)},
-        needs,
-    )
-    learned = {**base, **training_settings(config, model), "range_guard": config["range_guard"]}
-    outputs = (weights_file(model), training_file(model))
-    trained = Stage(f"train_{model}", train, outputs, learned, (*needs, found.name))
-    if config["refinement"]["kind"] == "none":
-        return [found, trained]
-    refined = {**base, **_pick(config, "refinement"), "range_guard": config["range_guard"], "seed": config["seed"]}
-    outputs = (weights_file(model, True), training_file(model, True))
-    return [found, trained, Stage(f"refine_{model}", refine, outputs, refined, (*needs, found.name, trained.name))]
 
 
 def prepare(config: DictConfig) -> tuple[dict[str, Any], Path]:

@@ -8,21 +8,19 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
 from ..dynamics.integrator import State
 from ..dynamics.simulator import Simulator
 from ..io.files import atomic_hdf5, create, write_json
-from ..io.processes import Advance
 from ..io.resumable import Field
 from ..io.stages import StageContext
 from ..learning.metrics import marker_errors
 from ..learning.reconstruction import Reconstructor, make_reconstructor
 from ..learning.rollout import Rollout
-from ..learning.sparse_reconstruction import make_sparse_reconstructor
 from .files import RECONSTRUCTION, read_if_there, reconstruction_file
-from .parts import March, Part, pack, read_parts, remove_parts, split_into_parts, unpack, work_on
+from .parts import March, Part, read_parts, remove_parts, split_into_parts, work_on
 from .scene import Scene
 
 log = logging.getLogger(__name__)
@@ -49,16 +47,16 @@ def reconstruct(context: StageContext, processes: int = 1) -> None:
     for number, names in enumerate(scene.alike(settings["reconstructed"])):
         last = float(scene.trials(names).times.max()) / scene.model_simulator(model).time_step
         frames = max(scene.learned_steps(int(last + 1e-6)), 1) + 1
-        parts += split_into_parts(context, names, settings["batch"], frames, f"part{number}")
-    work_on(parts, reconstruct_part, processes)
+        parts += split_into_parts(context, names, frames, f"part{number}")
+    work_on(parts, _Reconstructing, processes)
     order = [name for part in parts for name in part.names]
     held = scene.moving(settings["split"]["validation"])
     rows = [row for row, name in enumerate(order) if name in held]
-    error, held_out = _together(parts, "error"), {}
+    error, held_out = read_parts(parts, "error"), {}
     with atomic_hdf5(context.run_dir / reconstruction_file(model), "reconstruction", {"names": order}) as file:
         create(file, "error", error, "mm", time_axis=1)
         for name, unit in _UNITS.items():  # One after the other: those of many trials fill the memory.
-            values = _together(parts, name)
+            values = read_parts(parts, name)
             create(file, name, values, unit, time_axis=1)
             held_out[name] = values[rows].copy()
     summary = {"mean_mm": float(np.nanmean(error)), "max_mm": float(np.nanmax(error))}
@@ -68,14 +66,6 @@ def reconstruct(context: StageContext, processes: int = 1) -> None:
     finite = {key: value if np.isfinite(value) else None for key, value in summary.items()}
     write_json(context.run_dir / RECONSTRUCTION, {**found, model: finite})
     remove_parts(context)
-
-
-def _together(parts: Sequence[Part], name: str) -> FloatArray:
-    """The arrays of all parts; those with fewer frames are padded with NaN."""
-    found = [read_parts([part], name) for part in parts]
-    frames = max(each.shape[1] for each in found)
-    padding = [[(0, 0), (0, frames - each.shape[1]), *[(0, 0)] * (each.ndim - 2)] for each in found]
-    return np.concatenate([np.pad(x, w, constant_values=np.nan) for x, w in zip(found, padding, strict=True)])
 
 
 def _replay(context: StageContext, names: Sequence[str], found: Mapping[str, FloatArray]) -> float:
@@ -91,16 +81,6 @@ def _replay(context: StageContext, names: Sequence[str], found: Mapping[str, Flo
     return replayed
 
 
-def reconstruct_part(part: Part, advance: Advance) -> None:
-    """q, v, force (B, K + 1, N, 3) and the distance of what is observed (B, K + 1) [mm] of trials that begin alike.
-
-    Raises:
-        ConvergenceError: a step fails.
-    """
-    scene = Scene(part.context.settings, part.context.run_dir)
-    part.march(_Reconstructing(scene, part.context.settings, part.names), advance)
-
-
 def reconstructing_simulator(scene: Scene, model: str) -> Simulator:
     """The simulator of a model, with an integrator whose velocities do not ring where markers are prescribed.
 
@@ -112,62 +92,64 @@ def reconstructing_simulator(scene: Scene, model: str) -> Simulator:
 
 
 class _Reconstructing(March):
-    """Some trials, brought to what was observed of them step by step."""
+    """Trials that begin alike, brought to what was observed of them step by step.
 
-    def __init__(self, scene: Scene, settings: Mapping[str, Any], names: Sequence[str]) -> None:
+    What is kept are q, v and the force (B, N, 3), and the distance of what is observed (B,) [mm].
+    """
+
+    def __init__(self, part: Part) -> None:
+        settings = part.context.settings
+        scene = Scene(settings, part.context.run_dir)
         simulator = reconstructing_simulator(scene, settings["model"])
-        replay, self._start = scene.replay(simulator, names)
-        self._replay, self._observe = replay, scene.observe
+        replay, self._start = scene.replay(simulator, part.names)
+        self._replay, self._observe, self.like = replay, scene.observe, simulator.rest_positions
         self._constants, self._inputs, self._resting = replay.setting(scene.parameters(settings["model"]))
         self._observed = scene.explained(simulator, replay.trials, self._start)
         if replay.is_static:  # A pose is where one step leads that lasts so long that inertia has no say.
             simulator = dataclasses.replace(simulator, time_step=_FOR_EVER, integrator="implicit_euler")
             self._observed = torch.cat([torch.full_like(self._observed, torch.nan), self._observed], 1)
             self._inputs = self._resting
-        self._simulator = simulator
         self._method = make_method(scene, simulator, settings["reconstruction"]).with_constants(self._constants)
-        self._state: State | None = None
         self._force = torch.zeros_like(self._start.state.q)
         dtype = "float64" if scene.dataset.bound is None else "float32"
-        shape = (len(names), self._simulator.body.n_vertices, 3)
+        shape = (len(part.names), simulator.body.n_vertices, 3)
         self.fields = {name: Field(shape, unit, dtype, 1) for name, unit in _UNITS.items()}
-        self.fields["error"] = Field((len(names),), "mm", dtype, 1)
+        self.fields["error"] = Field((len(part.names),), "mm", dtype, 1)
         self.frames = self._observed.shape[1]
 
     @override
-    def frame(self, number: int) -> tuple[dict[str, Any], dict[str, object]]:
-        shown: dict[str, object] = {}
-        if number == 0:
-            with torch.no_grad():
-                self._state = self._replay.begin(self._start, self._constants, self._resting)
-        else:
-            assert self._state is not None
-            result = self._method.step(self._state, self._observed[:, number], self._inputs.at(number - 1), self._force)
-            self._state, self._force = result.state.detach(), result.force
-            shown["iterations"] = result.iterations
-        kept = {"q": self._state.q, "v": self._state.v, "force": self._force}
-        with torch.no_grad():
-            reached = self._observe(self._state.q)
-        pairs = zip(reached.cpu().numpy(), self._observed[:, number].cpu().numpy(), strict=True)
-        error = np.array([frame_error(x, y) for x, y in pairs])
-        return {**{name: value.cpu().numpy() for name, value in kept.items()}, "error": error}, shown
+    def begin(self) -> State:
+        return self._replay.begin(self._start, self._constants, self._resting)
+
+    @override
+    @torch.enable_grad()
+    def step(self, number: int) -> State:
+        inputs = self._inputs.at(number - 1)
+        result = self._method.step(self.state, self._observed[:, number], inputs, self._force)
+        self._force, self.shown = result.force, {"iterations": result.iterations}
+        return result.state.detach()
+
+    @override
+    def kept(self, number: int) -> dict[str, ArrayLike]:
+        values = {"q": self.state.q, "v": self.state.v, "force": self._force}
+        reached, seen = (x.cpu().numpy() for x in (self._observe(self.state.q), self._observed[:, number]))
+        error = np.array([frame_error(x, y) for x, y in zip(reached, seen, strict=True)])
+        return {**{name: value.cpu().numpy() for name, value in values.items()}, "error": error}
 
     @override
     def snapshot(self) -> dict[str, torch.Tensor]:
-        assert self._state is not None
-        return {**pack(self._state), "force": self._force}
+        return {**super().snapshot(), "force": self._force}
 
     @override
     def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
-        self._state = unpack(tensors, self._simulator.rest_positions)
-        self._force = tensors["force"].to(self._state.q)
+        super().restore(tensors)
+        self._force = tensors["force"].to(self.like)
 
 
 def make_method(scene: Scene, simulator: Simulator, settings: Mapping[str, Any]) -> Reconstructor:
     """The configured reconstruction: of full states, which has a faster way, or of markers."""
-    if scene.dataset.bound is None:
-        return make_reconstructor(simulator, **settings)
-    return make_sparse_reconstructor(simulator, scene.observe, **settings)  # type: ignore[arg-type]
+    markers: Any = None if scene.dataset.bound is None else scene.observe
+    return make_reconstructor(simulator, **settings, markers=markers)
 
 
 def replayed_errors(

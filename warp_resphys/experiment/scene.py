@@ -13,7 +13,7 @@ from scipy.interpolate import CubicSpline
 
 from ..data.actuation import remembered
 from ..data.trials import Trials
-from ..dynamics.frames import VertexFrames
+from ..dynamics.frames import BaseFrame, VertexFrames, base_movement
 from ..dynamics.integrator import State
 from ..dynamics.simulator import Simulator
 from ..fem.body import Body
@@ -36,6 +36,7 @@ MODELS: Final[Mapping[str, tuple[str, str | None]]] = {
     "resphys_uncorrected": ("simulation", None),
     "resphys": ("identified", "sysid"),
 }
+_STANDS_STILL = 1e-9  # m/s, rad/s
 Observe = Callable[[torch.Tensor], torch.Tensor]
 
 
@@ -118,10 +119,26 @@ class Scene:
         found = bound_markers(self.config["markers"], self.body.mesh, self.dataset.bound, self.dataset.labels)
         return found.to(self.simulator("simulation").rest_positions)
 
-    def trials(self, names: Sequence[str]) -> Trials:
-        """Some of the trials, which begin alike, on the simulators' device."""
+    def trials(self, names: Sequence[str], simulator: Simulator | None = None) -> Trials:
+        """Some of the trials, which begin alike, on the simulators' device, with inputs for a simulator's steps."""
         payload_at = self.config["data"].get("payload_at")
-        return self.dataset.trials(names, self.body, payload_at).to(self.simulator("simulation").rest_positions)
+        found = self.dataset.trials(names, self.body, payload_at, None if simulator is None else simulator.time_step)
+        return found.to(self.simulator("simulation").rest_positions)
+
+    def base(self, names: Sequence[str], simulator: Simulator) -> BaseFrame | None:
+        """The frame of what the body is fixed to in some of the trials; None where that stands still."""
+        poses = self.dataset.base_at(names, simulator.time_step)
+        return None if poses is None else BaseFrame(poses.to(simulator.rest_positions), simulator.time_step)
+
+    def _base_movement(self, names: Sequence[str], simulator: Simulator) -> torch.Tensor | None:
+        """(K, R, A) what networks are told of the base during each step: what differs between trials and times."""
+        poses = self.dataset.base_at(names, simulator.time_step)
+        everything = self.dataset.base_at(self.dataset.names, simulator.time_step)
+        if poses is None or everything is None:
+            return None
+        gravity = torch.from_numpy(self.dataset.gravity)
+        told, known = (base_movement(each, simulator.time_step, gravity) for each in (poses, everything))
+        return told[..., known.flatten(0, 1).std(0) > _STANDS_STILL].to(simulator.rest_positions)
 
     def alike(self, names: Sequence[str]) -> list[tuple[str, ...]]:
         """Trials in groups that begin alike, and can be simulated as one batch."""
@@ -154,7 +171,7 @@ class Scene:
 
     def replay(self, simulator: Simulator, names: Sequence[str]) -> tuple[Replay, Start]:
         """A simulator of some of the trials, which begin alike, and how they begin."""
-        trials = self.trials(names)
+        trials = self.trials(names, simulator)
         return Replay(simulator, self.observe, trials), self.start(simulator, trials)
 
     def replays(self, kind: str, names: Sequence[str]) -> list[tuple[Replay, Start]]:
@@ -185,18 +202,23 @@ class Scene:
             payload: whether they are told of it, whatever is configured (``actuation.sees_payload``).
 
         Returns:
-            (R, 1) the payloads [kg]; or (K, R, A) during each step, these and each input with its exponential means.
+            (R, 1) the payloads [kg]; or (K, R, A) during each step, these, each input with its exponential means, and
+            how the base moves (`base_movement`).
         """
         _, inputs, _ = replay.setting(parameters)
         actuation, told = self.config["actuation"], []
         if self.config["data"].get("payload_at") is not None and (payload or actuation["sees_payload"]):
             rows = self.dataset.rows(replay.trials.names)
             told.append(replay.trials.times.new_tensor(self.dataset.payload[rows])[:, None])
-        if not inputs.actuation:
-            return told[0] if told else None
         constants = actuation["filter_time_constants"]
         series = [remembered(each, constants, self.dataset.time_step) for each in inputs.actuation.values()]
-        return torch.cat([*(each.expand(len(series[0]), -1, -1) for each in told), *series], -1)
+        moving = self._base_movement(replay.trials.names, replay.simulator)
+        series += [] if moving is None else [moving]
+        if not series:
+            return told[0] if told else None
+        at = torch.arange(max(map(len, series)))
+        series = [each[at.clamp_max(len(each) - 1).to(each.device)] for each in series]
+        return torch.cat([*(each.expand(len(at), -1, -1) for each in told), *series], -1)
 
     def frames(self, simulator: Simulator, kind: str | None = None) -> VertexFrames | None:
         """With which residual forces turn; None where they keep their directions (``force_frame: world``)."""

@@ -3,7 +3,8 @@
 import math
 import numbers
 import re
-from collections.abc import Callable, Iterator, Mapping
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
@@ -75,27 +76,6 @@ class Group:
 Spec = Kind | Group
 
 
-def _finite(fits: Callable[[Any], bool], wanted: str) -> Kind:
-    return Kind(lambda value: is_finite(value) and fits(value), wanted)
-
-
-def _list(fits: Callable[[Any], bool], wanted: str, most: int | None = None) -> Kind:
-    def of_list(value: Any) -> bool:
-        return isinstance(value, list) and all(map(fits, value)) and (most is None or len(value) <= most)
-
-    return Kind(of_list, wanted)
-
-
-def one_of(*words: Any) -> Kind:
-    """One of some words."""
-    return Kind(lambda value: isinstance(value, str) and value in words, f"one of {', '.join(words)}")
-
-
-def at_most(limit: int) -> Kind:
-    """A whole number from one on, up to a limit beyond which nothing fits a machine."""
-    return Kind(lambda value: is_whole_number(value) and 0 < value <= limit, f"a whole number from 1 to {limit:,}")
-
-
 def optional(spec: Any) -> Any:
     """The same, or null."""
     return replace(spec, optional=True)
@@ -106,18 +86,45 @@ def absent(spec: Any) -> Any:
     return replace(spec, absent=True)
 
 
+def one_of(*words: Any) -> Kind:
+    """One of some words."""
+    return Kind(lambda value: isinstance(value, str) and value in words, f"one of {', '.join(words)}")
+
+
+def _number(fits: Callable[[Any], bool], wanted: str) -> Kind:
+    return Kind(lambda value: is_finite(value) and fits(value), wanted)
+
+
+def _whole(least: int, wanted: str, most: float = math.inf) -> Kind:
+    return Kind(lambda value: is_whole_number(value) and least <= value <= most, wanted)
+
+
+def _list(each: Kind, wanted: str, counts: Sequence[int] | None = None, different: bool = False) -> Kind:
+    """A list of values of a kind, of any length or one of these counts."""
+
+    def fits(value: Any) -> bool:
+        if not isinstance(value, list) or not all(map(each.fits, value)):
+            return False
+        return (counts is None or len(value) in counts) and not (different and len({*value}) < len(value))
+
+    return Kind(fits, wanted)
+
+
 def _is_word(value: Any) -> bool:
     return isinstance(value, str) and bool(value)
 
 
 def _is_matrix(value: Any) -> bool:
-    return isinstance(value, list) and all(
-        isinstance(row, list) and len(row) == len(value) and all(map(is_finite, row)) for row in value
-    )
+    return isinstance(value, list) and all(_list(FINITE, "", [len(value)]).fits(row) for row in value)
 
 
 def _is_place(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 3 and all(map(is_finite, value))
+    return _list(FINITE, "", [3]).fits(value)
+
+
+def at_most(limit: int) -> Kind:
+    """A whole number from one on, up to a limit beyond which nothing fits a machine."""
+    return _whole(1, f"a whole number from 1 to {limit:,}", limit)
 
 
 WORD: Final = Kind(_is_word, "a word")
@@ -126,79 +133,49 @@ NAME: Final = Kind(
     "letters, digits, _ and - alone, as a folder is named so",
 )
 ANYTHING: Final = Kind(lambda _: True, "anything", optional=True)
+TRUTH_VALUE: Final = Kind(lambda value: isinstance(value, bool), "true or false")
 NUMBER: Final = Kind(is_number, "a number")
 FINITE: Final = Kind(is_finite, "a finite number")
-POSITIVE: Final = _finite(lambda value: value > 0.0, "a positive number")
-NOT_NEGATIVE: Final = _finite(lambda value: value >= 0.0, "a number, zero or more")
-SHARE: Final = _finite(lambda value: 0.0 < value <= 1.0, "more than 0 and at most 1")
-NATURAL: Final = Kind(lambda value: is_whole_number(value) and value > 0, "a whole number, one or more")
-COUNT: Final = Kind(lambda value: is_whole_number(value) and value >= 0, "a whole number, zero or more")
-NATURALS: Final = Kind(
-    lambda value: isinstance(value, list) and bool(value) and all(map(NATURAL.fits, value)),
-    "a list of whole numbers, one or more",
-)
-TRUTH_VALUE: Final = Kind(lambda value: isinstance(value, bool), "true or false")
-_TOLERANCE: Final = _finite(lambda value: 0.0 < value <= 0.1, "more than 0 and at most 0.1")
-_STEP: Final = _finite(lambda value: 0.0 < value <= 10.0, "positive and at most 10, in s")
+POSITIVE: Final = _number(lambda value: value > 0.0, "a positive number")
+NOT_NEGATIVE: Final = _number(lambda value: value >= 0.0, "a number, zero or more")
+SHARE: Final = _number(lambda value: 0.0 < value <= 1.0, "more than 0 and at most 1")
+NATURAL: Final = _whole(1, "a whole number, one or more")
+COUNT: Final = _whole(0, "a whole number, zero or more")
+_SOME: Final = range(1, sys.maxsize)
+NATURALS: Final = _list(NATURAL, "a list of whole numbers, one or more", _SOME)
+NUMBERS: Final = _list(NUMBER, "a list of numbers")
+_TOLERANCE: Final = _number(lambda value: 0.0 < value <= 0.1, "more than 0 and at most 0.1")
+_STEP: Final = _number(lambda value: 0.0 < value <= 10.0, "positive and at most 10, in s")
 _PLACE: Final = Kind(_is_place, "three numbers, in metres")
 _FORCE: Final = Kind(_is_place, "three numbers, in N")
 _AXIS: Final = Kind(lambda value: _is_place(value) and any(value), "three numbers, not all zero")
-_POSITIVES: Final = _list(POSITIVE.fits, "a list of positive numbers")
-NUMBERS: Final = _list(is_number, "a list of numbers")
-_THREE_NATURALS: Final = Kind(
-    lambda value: isinstance(value, list) and len(value) == 3 and all(at_most(10_000).fits(each) for each in value),
-    "three whole numbers from 1 to 10,000",
-)
-_THREE_LENGTHS: Final = Kind(
-    lambda value: isinstance(value, list) and len(value) == 3 and all(map(POSITIVE.fits, value)),
-    "three positive numbers, in m",
-)
+_POSITIVES: Final = _list(POSITIVE, "a list of positive numbers")
+_COLUMNS: Final = _list(NATURAL, "a list of different chambers, from 1", _SOME, different=True)
+_ORDER: Final = Kind(lambda value: value in (1, 2), "1 or 2")
 _TRIALS: Final = Kind(
-    lambda value: (is_whole_number(value) and value >= 0) or (isinstance(value, list) and all(map(_is_word, value))),
+    lambda value: COUNT.fits(value) or (isinstance(value, list) and all(map(_is_word, value))),
     "a number of trials, or a list of their names",
-)
-_COLUMNS: Final = Kind(
-    lambda value: (
-        isinstance(value, list) and bool(value) and all(map(NATURAL.fits, value)) and len({*value}) == len(value)
-    ),
-    "a list of different chambers, from 1",
 )
 
 PLACE: Final = Group({key: absent(optional(FINITE)) for key in ("x", "y", "z")} | {"tolerance": absent(POSITIVE)})
 MATERIAL: Final = Group({"model": absent(WORD)}, each=NUMBER)
+_BOX: Final[Mapping[str, Spec]] = {
+    "size": _list(POSITIVE, "three positive numbers, in m", [3]),
+    "divisions": _list(at_most(10_000), "three whole numbers from 1 to 10,000", [3]),
+}
 _MESHES: Final[Mapping[str, Mapping[str, Spec]]] = {
-    "box_hexahedra": {
-        "size": _THREE_LENGTHS,
-        "divisions": _THREE_NATURALS,
-        "nodes": absent(Kind(lambda value: value in (8, 20, 27), "one of 8, 20, 27")),
-    },
-    "box_tetrahedra": {
-        "size": _THREE_LENGTHS,
-        "divisions": _THREE_NATURALS,
-        "order": absent(Kind(lambda value: value in (1, 2), "1 or 2")),
-    },
-    "file": {
-        "path": WORD,
-        "units": one_of(*METRES_PER_UNIT),
-        "order": Kind(lambda value: value in (1, 2), "1 or 2"),
-        "drop_unreferenced": TRUTH_VALUE,
-    },
+    "box_hexahedra": {**_BOX, "nodes": absent(Kind(lambda value: value in (8, 20, 27), "one of 8, 20, 27"))},
+    "box_tetrahedra": {**_BOX, "order": absent(_ORDER)},
+    "file": {"path": WORD, "units": one_of(*METRES_PER_UNIT), "order": _ORDER, "drop_unreferenced": TRUTH_VALUE},
     "arm": {"name": WORD},
     "arm_generated": {
-        "size": POSITIVE,
-        "cells": WORD,
-        "layers": optional(POSITIVE),
-        "order": Kind(lambda value: value in (1, 2), "1 or 2"),
-        "chamber_lengths": _POSITIVES,
-        "caps": _POSITIVES,
-        "radii": _POSITIVES,
+        **dict.fromkeys(("cells", "profile", "outline"), WORD),
+        **dict.fromkeys(("size", "wall", "web"), POSITIVE),
+        **dict.fromkeys(("layers", "core"), optional(POSITIVE)),
+        **dict.fromkeys(("chamber_lengths", "caps", "radii"), _POSITIVES),
         "chambers": NATURAL,
-        "profile": WORD,
-        "outline": WORD,
-        "wall": POSITIVE,
-        "web": POSITIVE,
-        "core": optional(POSITIVE),
         "rotations": NUMBERS,
+        "order": _ORDER,
     },
 }
 
@@ -218,26 +195,21 @@ def mesh_group(settings: Any) -> Group:
 
 _SOLVER = Group(
     {
-        "name": WORD,
+        **dict.fromkeys(("name", "linear_solver", "on_failure"), WORD),
+        **dict.fromkeys(("max_iterations", "memory", "refactor_after"), NATURAL),
         "relative_tolerance": _TOLERANCE,
         "absolute_tolerance": NOT_NEGATIVE,
-        "max_iterations": NATURAL,
-        "memory": NATURAL,
-        "refactor_after": NATURAL,
-        "linear_solver": WORD,
-        "on_failure": WORD,
     }
 )
 _PHYSICS = Group({"mass": one_of(*MASS_MODES), "volume_integration": one_of(*VOLUME_INTEGRATIONS)})
 NETWORK: Final = Group(
     {
         "kind": one_of(*NETWORK_KINDS),
-        "position_modes": absent(COUNT),
-        "velocity_modes": absent(COUNT),
+        **dict.fromkeys(("position_modes", "velocity_modes"), absent(COUNT)),
         "force_modes": absent(NATURAL),
         "force_basis": absent(one_of(*FORCE_BASES)),
         "blocks": at_most(100),
-        "layers": Kind(lambda value: is_whole_number(value) and 0 <= value <= 100, "a whole number from 0 to 100"),
+        "layers": _whole(0, "a whole number from 0 to 100", 100),
         "width": at_most(16_384),
         "activation": one_of(*ACTIVATIONS),
         "recurrent": absent(optional(at_most(1_024))),
@@ -245,59 +217,44 @@ NETWORK: Final = Group(
 )
 TRAINER: Final = Group(
     {
-        "epochs": NATURAL,
-        "batch_size": NATURAL,
-        "learning_rate": POSITIVE,
+        **dict.fromkeys(("epochs", "batch_size", "step_epochs", "rollout_every"), NATURAL),
+        **dict.fromkeys(("learning_rate", "final_learning_rate"), POSITIVE),
+        **dict.fromkeys(("weight_decay", "noise", "scale_weight"), NOT_NEGATIVE),
         "schedule": one_of(*SCHEDULES),
-        "final_learning_rate": POSITIVE,
         "gamma": SHARE,
-        "step_epochs": NATURAL,
-        "weight_decay": NOT_NEGATIVE,
-        "noise": NOT_NEGATIVE,
         "linear_noise": optional(POSITIVE),
-        "scale_weight": NOT_NEGATIVE,
         "selection": one_of(*SELECTIONS),
-        "rollout_every": NATURAL,
         "sequence": absent(NATURAL),
+    }
+)
+IN_THE_LOOP: Final = Group(
+    {
+        **dict.fromkeys(("epochs", "patience", "memory", "rollout_every"), NATURAL),
+        "penalty": NOT_NEGATIVE,
+        "hold_out": TRUTH_VALUE,
     }
 )
 _RANGE = {"lower": FINITE, "upper": FINITE, "logarithmic": absent(TRUTH_VALUE)}
 _GRID = Group({"lower": FINITE, "upper": FINITE, "logarithmic": TRUTH_VALUE, "points": NATURAL})
-IN_THE_LOOP: Final = Group(
-    {
-        "epochs": NATURAL,
-        "penalty": NOT_NEGATIVE,
-        "hold_out": TRUTH_VALUE,
-        "patience": NATURAL,
-        "memory": NATURAL,
-        "rollout_every": NATURAL,
-    }
-)
 _IDENTIFY = Group(
     {
         "integrator": optional(one_of(*INTEGRATORS)),
-        "substeps": NATURAL,
+        **dict.fromkeys(("substeps", "starts", "max_evaluations"), NATURAL),
         "parameters": Group(each=Group(_RANGE, optional=True)),
         "elastic": optional(Group(each=Group(_RANGE, optional=True))),
         "first_guess": Group(each=FINITE),
         "trials": optional(NATURAL),
         "seconds": optional(POSITIVE),
-        "starts": NATURAL,
         "candidates": COUNT,
-        "max_evaluations": NATURAL,
         "tolerance": POSITIVE,
         "grid": optional(Group({"youngs_modulus": _GRID, "poissons_ratio": absent(_GRID)})),
     }
 )
 _RELEASE = Group(
     {
-        "hold_modes": COUNT,
-        "velocity_modes": COUNT,
-        "window": POSITIVE,
-        "noise": POSITIVE,
-        "delay": NOT_NEGATIVE,
-        "speed": POSITIVE,
-        "sideways": NOT_NEGATIVE,
+        **dict.fromkeys(("hold_modes", "velocity_modes"), COUNT),
+        **dict.fromkeys(("window", "noise", "speed"), POSITIVE),
+        **dict.fromkeys(("delay", "sideways"), NOT_NEGATIVE),
         "iterations": NATURAL,
     }
 )
@@ -313,12 +270,33 @@ _MARKERS = Group(
         "largest_shift": optional(POSITIVE),
     }
 )
+_SWING = Group(
+    {
+        "frequency": POSITIVE,
+        "translation": absent(_PLACE),
+        "rotation": absent(Kind(_is_place, "three numbers, in rad")),
+        "phase": absent(FINITE),
+    }
+)
+_BASE_MOTION = Group(
+    {
+        "file": absent(Kind(_is_word, "the name of a file")),
+        "swings": absent(Group(each=_SWING)),
+        "about": absent(_PLACE),
+        "start": absent(NOT_NEGATIVE),
+        "ramp": absent(NOT_NEGATIVE),
+    },
+    optional=True,
+    absent=True,
+    short=True,
+)
 _TRIAL = Group(
     {
         "file": absent(Kind(_is_word, "the name of a file")),
         "payload": absent(Kind(NOT_NEGATIVE.fits, "a mass, zero or more, in kg")),
         "begins": absent(one_of(*BEGINNINGS)),
         "pull": absent(_FORCE),
+        "base_motion": _BASE_MOTION,
     }
 )
 _SEQUENCES = Group(
@@ -359,6 +337,7 @@ _RECORDED = Group(
         "train_fraction": SHARE,
         "horizons": _POSITIVES,
         "pressure_scales": _POSITIVES,
+        "base_motion": _BASE_MOTION,
         "folds": optional(one_of(*FOLDS)),
         **_SPLIT,
         "limit": _LIMIT,
@@ -372,6 +351,8 @@ _SIMULATED = Group(
         "twist_axis": absent(one_of("x", "y", "z")),
         "weights_g": absent(Group(each=NUMBERS)),
         "angles_deg": absent(Group(each=NUMBERS)),
+        "amplitudes": absent(Group(each=NUMBERS)),
+        "base_motion": _BASE_MOTION,
         "folds": absent(optional(one_of(*FOLDS))),
         "limit": _LIMIT,
     }
@@ -379,13 +360,9 @@ _SIMULATED = Group(
 _CHAMBERS = Group({"count": NATURAL, "axis": _AXIS}, optional=True)
 _ABLATION = Group(
     {
-        "counts": Kind(
-            lambda value: NATURALS.fits(value) and len({*value}) == len(value),
-            "a list of different positive whole numbers",
-        ),
+        "counts": _list(NATURAL, "a list of different positive whole numbers", _SOME, different=True),
         "draws": NATURAL,
-        "modes": optional(NATURAL),
-        "processes": optional(NATURAL),
+        **dict.fromkeys(("modes", "processes"), optional(NATURAL)),
     },
     absent=True,
 )
@@ -405,8 +382,8 @@ def laboratory_group(settings: Any) -> Group:
             "rate": absent(optional(POSITIVE)),
             "noise": NOT_NEGATIVE,
             "placement_noise": NOT_NEGATIVE,
-            "tilt": absent(_finite(lambda value: 0.0 <= value <= 20.0, "an angle from 0 to 20 degrees")),
-            "held_seconds": absent(_finite(lambda value: value >= 0.25, "0.25 s or more")),
+            "tilt": absent(_number(lambda value: 0.0 <= value <= 20.0, "an angle from 0 to 20 degrees")),
+            "held_seconds": absent(_number(lambda value: value >= 0.25, "0.25 s or more")),
             "seconds": absent(optional(POSITIVE)),
             "trials": Group(each=_TRIAL),
             **{name: absent(_TRIALS) for name in SPLITS},
@@ -417,33 +394,26 @@ def laboratory_group(settings: Any) -> Group:
 
 def configuration_group(config: Mapping[str, Any]) -> Group:
     """What a whole configuration must be, by what it asks for."""
-    recorded = config.get("markers") is not None
-    own: dict[str, Spec] = {"target": absent(optional(MATERIAL)), "data": _SIMULATED}
-    if recorded:
-        own = {"data": _RECORDED, "target": absent(optional(MATERIAL))}
     return Group(
         {
             "name": NAME,
-            "title": WORD,
-            "seed": Kind(lambda value: is_whole_number(value) and 0 <= value < 2**63, "between 0 and 2^63 - 1"),
-            "device": WORD,
-            "dtype": WORD,
+            **dict.fromkeys(("title", "device", "dtype"), WORD),
+            "seed": _whole(0, "between 0 and 2^63 - 1", 2**63 - 1),
             "gravity": Kind(_is_place, "three finite numbers, in m/s^2"),
             "time_step": _STEP,
             "integrator": one_of(*INTEGRATORS),
             "mesh": mesh_group(config.get("mesh")),
             "physics": _PHYSICS,
             "solver": _SOLVER,
-            "fixed": PLACE,
-            "tip": PLACE,
+            **dict.fromkeys(("fixed", "tip"), PLACE),
             "simulation": MATERIAL,
+            "target": absent(optional(MATERIAL)),
             "chambers": _CHAMBERS,
             "fibres": _FIBRES,
             "coupling": one_of(*COUPLINGS),
             "force_frame": one_of(*FORCE_FRAMES),
-            "range_guard": TRUTH_VALUE,
-            "correct_uncorrected": TRUTH_VALUE,
-            "timing": TRUTH_VALUE,
+            **dict.fromkeys(("range_guard", "correct_uncorrected", "timing"), TRUTH_VALUE),
+            "data": _SIMULATED if config.get("markers") is None else _RECORDED,
             "reconstruction": Group(
                 {
                     "method": WORD,
@@ -468,10 +438,8 @@ def configuration_group(config: Mapping[str, Any]) -> Group:
             ),
             "laboratory": laboratory_group(config.get("laboratory")),
             "ablation": _ABLATION,
-            "budget": absent(WORD),
-            "tuned": absent(WORD),
+            **dict.fromkeys(("budget", "tuned"), absent(WORD)),
             "tune": absent(Group(each=ANYTHING)),
-            **own,
         }
     )
 

@@ -1,118 +1,446 @@
-"""Stage: trajectories of the simulation that plays the real robot, every vertex of which is known."""
+"""Stages: trials of a simulation that plays the real body, known in every vertex, or recorded as a laboratory would.
+
+A simulated laboratory is for users without one. Its mesh is finer and its steps smaller than those of the simulator to
+correct, its material is another one, fibres may be wound around its chambers. Its body stands a little off level, its
+markers sit a little off their nominal places, and cameras see it in their frame, with noise.
+"""
 
 import logging
-from collections.abc import Mapping
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 from typing_extensions import override
 
+from ..data.actuation import PressureSequences
+from ..data.base_motion import check_steps, in_frame, prescribed, rigid
+from ..data.recordings.arrays import write_recording
+from ..data.recordings.recording import Recording
+from ..data.rigid import RigidTransform
 from ..dynamics.inputs import Inputs
 from ..dynamics.integrator import State
 from ..dynamics.simulator import Simulator
 from ..io.errors import InputError
-from ..io.progress import Progress
+from ..io.files import write_json
 from ..io.resumable import Field
 from ..io.stages import StageContext
+from ..learning.replay import sample
 from ..mesh.mesh import select_vertices
 from ..mesh.poses import twisted
-from .build import build_simulator
-from .files import DATASET, DATASET_KIND, GIVEN, describe
-from .parts import March, march, pack, unpack
-from .trials import trials_of
+from .build import bound_markers, build_body, build_simulator
+from .files import DATASET, GIVEN, STATIC, TRUTH, Dataset, attached_mass
+from .parts import March, Part, read_parts, remove_parts, split_into_parts, work_on
+from .trials import Trial, known_trials, scaled_trials_of, trials_of
 
 log = logging.getLogger(__name__)
 
+FloatArray = NDArray[np.float64]
+
+_LARGEST_OFFSET = 0.5  # m, of the cameras' frame
+_POSE_SECONDS = 0.25  # that a recording of a pose lasts
 _AXES = ("x", "y", "z")
 
 
 def simulate(context: StageContext) -> None:
-    """Writes dataset.h5: the positions (R, T + 1, N, 3) and velocities of all trials, the held state first."""
-    settings = context.settings
-    motion = _Free(settings)
-    trials = trials_of(settings)
-    times = settings["time_step"] * np.tile(np.arange(motion.frames, dtype=np.float64), (len(trials), 1))
+    """Writes dataset.h5: the positions and velocities (R, T + 1, N, 3) of all trials, the held state first."""
+    settings, trials = context.settings, trials_of(context.settings)
+    frames, names = settings["data"]["steps"] + 1, tuple(trial.name for trial in trials)
+    poses, times = None, settings["time_step"] * np.arange(frames, dtype=np.float64)
+    if settings["data"].get("base_motion") is not None:
+        poses = np.stack([base_of(settings, trial, times) for trial in trials])
+        for each in poses:
+            check_steps(each, build_body(settings).mesh.vertices, "data.base_motion")
+    parts = split_into_parts(context, names, frames)
+    work_on(parts, _Free, 1)
+    observed = read_parts(parts, "observed")
+    Dataset(
+        names,
+        labels=(),
+        begins=(GIVEN,) * len(names),
+        times=np.tile(times, (len(names), 1)),
+        observed=observed,
+        held=observed[:, 0],
+        payload=np.zeros(len(names)),
+        gravity=np.asarray(settings["gravity"], dtype=np.float64),
+        time_step=settings["time_step"],
+        velocity=read_parts(parts, "velocity"),
+        base=poses,
+    ).write(context.run_dir / DATASET)
+    remove_parts(context)
 
-    names = [trial.name for trial in trials]
-    attributes = describe(names, (), [GIVEN] * len(names), settings["gravity"], settings["time_step"], {})
-    with Progress(context.name, motion.frames, "frames") as progress:
-        march(
-            context.run_dir / DATASET,
-            DATASET_KIND,
-            context.fingerprint,
-            motion,
-            progress.advance,
-            1,
-            attributes,
-            {"times": (times, "s")},
-        )
+
+def base_of(settings: Mapping[str, Any], trial: Trial, times: NDArray[Any]) -> FloatArray:
+    """(T, 6) how what a body is fixed to really moves at some times [s], in the frame of the body."""
+    common = settings["data"].get("base_motion")
+    motion = common if trial.base_motion is None and isinstance(common, Mapping) else trial.base_motion
+    return np.zeros((len(times), 6)) if motion is None else prescribed(motion, times, scale=trial.amount or 1.0)
+
+
+def _carried(
+    simulator: Simulator, settings: Mapping[str, Any], trials: Sequence[Trial], times: NDArray[Any]
+) -> list[torch.Tensor | None]:
+    """(B, D, 3) the fixed vertices of some trials at each of some times [s]; None where all bases stand still."""
+    if settings["data"].get("base_motion") is None and all(trial.base_motion is None for trial in trials):
+        return [None] * len(times)
+    fixed = np.asarray(simulator.body.mesh.vertices[simulator.body.fixed_vertices], dtype=np.float64)
+    poses = np.stack([base_of(settings, trial, times) for trial in trials], axis=1)
+    return [simulator.tensor(rigid(each).apply(np.broadcast_to(fixed, (len(trials), *fixed.shape)))) for each in poses]
 
 
 class _Free(March):
-    """Bodies that are let go and swing on their own."""
+    """Bodies that are let go and swing on their own, or with what they are fixed to."""
 
-    def __init__(self, settings: Mapping[str, Any]) -> None:
+    def __init__(self, part: Part) -> None:
+        settings = part.context.settings
         self._data, self._simulator = settings["data"], build_simulator(settings, "target")
-        self._amounts = np.array([trial.amount for trial in trials_of(settings)])
-        self._constants = self._simulator.prepare()
-        self._state: State | None = None
-        shape = (len(self._amounts), self._simulator.body.n_vertices, 3)
+        self._trials = [trial for trial in trials_of(settings) if trial.name in part.names]
+        self._constants, self.like = self._simulator.prepare(), self._simulator.rest_positions
+        shape = (len(self._trials), self._simulator.body.n_vertices, 3)
         self.fields = {"observed": Field(shape, "m", batch_axes=1), "velocity": Field(shape, "m/s", batch_axes=1)}
-        self.frames = self._data["steps"] + 1
+        self.frames = part.frames
+        times = settings["time_step"] * np.arange(1, part.frames)
+        self._fixed = _carried(self._simulator, settings, self._trials, times)
 
     @override
-    @torch.no_grad()
-    def frame(self, number: int) -> tuple[dict[str, Any], dict[str, object]]:
-        if number == 0:
-            self._state = initial_state(self._simulator, self._data, self._amounts)
-        else:
-            assert self._state is not None
-            self._state, _ = self._simulator.step(self._state, parameters=self._constants)
-        return {"observed": self._state.q.cpu().numpy(), "velocity": self._state.v.cpu().numpy()}, {}
+    def begin(self) -> State:
+        return initial_state(self._simulator, self._data, np.array([trial.amount for trial in self._trials]))
 
     @override
-    def snapshot(self) -> dict[str, torch.Tensor]:
-        assert self._state is not None
-        return pack(self._state)
+    def step(self, number: int) -> State:
+        inputs = Inputs(fixed_positions=self._fixed[number - 1])
+        return self._simulator.step(self.state, inputs, self._constants)[0]
 
     @override
-    def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
-        self._state = unpack(tensors, self._simulator.rest_positions)
+    def kept(self, number: int) -> dict[str, ArrayLike]:
+        return {"observed": self.state.q.cpu().numpy(), "velocity": self.state.v.cpu().numpy()}
 
 
 def initial_state(simulator: Simulator, data: Mapping[str, Any], values: NDArray[Any]) -> State:
-    """The states from which a batch is let go.
+    """The states from which a batch begins.
 
     Args:
         simulator: of the body.
         data: the group ``data``.
-        values: (B,) weights [kg] or angles [rad], by the kind of data.
-
-    Raises:
-        InputError: an unknown axis or face.
+        values: (B,) weights [kg], angles [rad] or factors, by the kind of data.
     """
+    if data["kind"] == "moving_base":
+        return simulator.static_equilibrium(Inputs(), batch=len(values))
     if data["kind"] == "release_from_twist":
-        axis = _AXES.index(data["twist_axis"])
-        q = twisted(simulator.rest_positions, simulator.tensor(values), axis)
+        q = twisted(simulator.rest_positions, simulator.tensor(values), _AXES.index(data["twist_axis"]))
         return State(q, torch.zeros_like(q))
     return held_state(simulator, data["load"], values)
 
 
 def held_state(simulator: Simulator, load: Mapping[str, float], weights: NDArray[Any]) -> State:
-    """The body at rest under weights on a face, in equal shares.
+    """The body at rest under weights (B,) [kg] on a face such as ``{"x": 0.1}`` [m], in equal shares.
 
-    Args:
-        simulator: of the body.
-        load: the face, such as ``{"x": 0.1}`` [m].
-        weights: (B,) [kg].
+    Raises:
+        InputError: the face cannot move.
     """
     face = select_vertices(simulator.body.mesh, **load)
     if np.isin(face, simulator.body.fixed_vertices).all():
         raise InputError("data.load names fixed vertices alone: hang the weights on vertices that can move.")
-    shares = simulator.tensor(weights)[:, None, None] * simulator.tensor(simulator.gravity) / len(face)
-    force = simulator.rest_positions.new_zeros(len(shares), simulator.body.n_vertices, 3)
-    force[:, torch.as_tensor(face, device=force.device)] = shares
-    log.info("finding the equilibrium under %d weights", len(shares))
-    return simulator.static_equilibrium(Inputs(force))
+    log.info("finding the equilibrium under %d weights", len(weights))
+    forces = simulator.tensor(weights)[:, None] * simulator.tensor(simulator.gravity)
+    return simulator.static_equilibrium(Inputs(_shared(simulator, face, forces)))
+
+
+def _shared(simulator: Simulator, vertices: NDArray[np.int64], forces: torch.Tensor) -> torch.Tensor:
+    """(B, N, 3) forces on all vertices, of (B, 3) in equal shares on some [N]."""
+    found = simulator.rest_positions.new_zeros(len(forces), simulator.body.n_vertices, 3)
+    found[:, torch.as_tensor(vertices, device=found.device)] = forces[:, None] / len(vertices)
+    return found
+
+
+@dataclass(frozen=True)
+class Setup:
+    """The body as it stands in the laboratory.
+
+    Attributes:
+        gravity: (3,) in the frame of the body [m/s^2].
+        rotation: from the frame of the body to that of the recordings.
+        translation: (3,) [m].
+        tracked: (M, 3) where these markers are on the undeformed body [m].
+        reference: (S, 3) where the standing ones are [m].
+    """
+
+    gravity: FloatArray
+    rotation: Rotation
+    translation: FloatArray
+    tracked: FloatArray
+    reference: FloatArray
+
+    @property
+    def frame(self) -> RigidTransform:
+        """From the frame of the body to that of the recordings."""
+        return RigidTransform(self.rotation.as_matrix(), self.translation)
+
+    def recorded(self, positions: FloatArray, base: FloatArray) -> FloatArray:
+        """(T, M + S, 3) all markers as the cameras have them [m].
+
+        Args:
+            positions: (T, M, 3) the tracked ones in the frame of the body [m].
+            base: (T, 6) how the others have moved.
+        """
+        standing = rigid(base).apply(np.broadcast_to(self.reference, (len(positions), *self.reference.shape)))
+        return self.frame.apply(np.concatenate([positions, standing], axis=1))
+
+
+def run_laboratory(context: StageContext, processes: int = 1, scaled: bool = False) -> None:
+    """Writes the recording of every trial, and truth.json.
+
+    Args:
+        context: of the stage.
+        processes: that share the trials.
+        scaled: whether the trials are those at other pressures; truth.json is there then.
+
+    Raises:
+        InputError: a configured value that does not fit.
+        ConvergenceError, WorkerError: a step of the simulation fails.
+    """
+    settings = context.settings
+    trials = scaled_trials_of(settings) if scaled else trials_of(settings)
+    parts = []
+    for begins in dict.fromkeys(trial.begins for trial in trials):
+        names = [trial.name for trial in trials if trial.begins == begins]
+        parts += split_into_parts(context, names, _frames_of(settings, begins), begins)
+    work_on(parts, _Played, processes)
+    setup = make_setup(settings)
+    written = {name: row for part in parts for name, row in zip(part.names, part.read("markers"), strict=True)}
+    noise = [_record(context, setup, trial, written[trial.name]) for trial in trials]
+    if not scaled:
+        write_json(context.run_dir / TRUTH, _truth(settings, setup, trials, float(np.mean(noise))))
+    remove_parts(context)
+
+
+def _record(context: StageContext, setup: Setup, trial: Trial, series: FloatArray) -> float:
+    """Writes the recording of a trial; returns the mean distance that the noise moves its tracked markers [m]."""
+    settings, laboratory = context.settings, context.settings["laboratory"]
+    draw = _draw_of(settings, trial)
+    released = _released_at(settings, trial, draw)
+    rate = _rate_of(settings) if trial.is_released else 1.0 / settings["time_step"]
+    since = np.arange(len(series)) / rate
+    if released is not None:
+        times = np.arange(int((laboratory["held_seconds"] + laboratory["seconds"]) * rate) + 1) / rate
+        since = np.maximum(times - released, 0.0)
+        series = sample(torch.from_numpy(series)[None], torch.from_numpy(since)[None], laboratory["time_step"])[
+            0
+        ].numpy()
+    poses = base_of(settings, trial, since)
+    positions = setup.recorded(series, poses)
+    noise = laboratory["noise"] * draw.standard_normal(positions.shape)
+    actuation = None if trial.sequence is None else _pressures_of(settings, trial)
+    if actuation is not None and len(actuation) != len(positions):
+        actuation = np.repeat(actuation[-1:], len(positions), axis=0)
+    rest = None if trial.pull is None else setup.recorded(setup.tracked[None], np.zeros((1, 6)))[0]
+    base = in_frame(poses, setup.frame) if settings["data"].get("base_motion") == "recorded" else None
+    path = context.run_dir / trial.recording
+    labels = (*settings["markers"]["tracked"], *settings["markers"]["reference"])
+    recording = Recording(labels, positions + noise, rate, path, actuation=actuation, rest=rest, base=base)
+    write_recording(path, recording, {"payload_kg": trial.payload})
+    return float(np.linalg.norm(noise[:, : series.shape[1]], axis=-1).mean())
+
+
+def _draw_of(settings: Mapping[str, Any], trial: Trial) -> np.random.Generator:
+    return np.random.default_rng([settings["seed"], zlib.crc32(trial.name.encode())])
+
+
+def _released_at(settings: Mapping[str, Any], trial: Trial, draw: np.random.Generator) -> float | None:
+    """When a held body is let go, between two frames [s]; None for other trials."""
+    if trial.begins != "held":
+        return None
+    return float(settings["laboratory"]["held_seconds"] + draw.random() / _rate_of(settings))
+
+
+def _rate_of(settings: Mapping[str, Any]) -> float:
+    """Frames a second [Hz]."""
+    return float(settings["laboratory"].get("rate") or 1.0 / settings["time_step"])
+
+
+def _truth(settings: Mapping[str, Any], setup: Setup, trials: Sequence[Trial], noise: float) -> dict[str, Any]:
+    """What the recordings were made with; ``noise`` in metres."""
+    laboratory = settings["laboratory"]
+    fibres = laboratory.get("fibres") or {}
+    wound = {"fibre_stiffness": fibres["stiffness"]} if "stiffness" in fibres else {}
+    released = {trial.name: _released_at(settings, trial, _draw_of(settings, trial)) for trial in trials}
+    return {
+        "material": {**laboratory["material"], **wound},
+        "fibre_angles": fibres.get("angles", []),
+        "gravity": setup.gravity,
+        "rotation": setup.rotation.as_matrix(),
+        "translation": setup.translation,
+        "bound": dict(zip(settings["markers"]["tracked"], setup.tracked, strict=True)),
+        "noise_mm": 1e3 * noise,
+        "released_s": {name: at for name, at in released.items() if at is not None},
+    }
+
+
+def make_setup(settings: Mapping[str, Any]) -> Setup:
+    """Draws how the body stands, and where its markers are, from the seed.
+
+    The frame of the recordings keeps its vertical in ``data.up``, as that of levelled cameras; the body leans by
+    ``laboratory.tilt``. Where ``data.up`` is null, the body stands level and the frame is any.
+    """
+    laboratory, markers = settings["laboratory"], settings["markers"]
+    draw = np.random.default_rng([settings["seed"], 0])
+    gravity = np.asarray(settings["gravity"], dtype=np.float64)
+    up = vertical(settings["data"].get("up"))
+    rotation = Rotation.random(random_state=draw)
+    heading, turn = draw.uniform(0.0, 2.0 * np.pi, 2)
+    strength = float(np.linalg.norm(gravity))
+    if up is not None and strength > 0.0:
+        across = np.linalg.svd(gravity[None])[2][1:]  # two unit vectors
+        axis = np.cos(heading) * across[0] + np.sin(heading) * across[1]
+        gravity = Rotation.from_rotvec(np.radians(laboratory["tilt"]) * axis).apply(gravity)
+        upright, _ = Rotation.align_vectors(up[None], -gravity[None] / strength)
+        rotation = Rotation.from_rotvec(turn * up) * upright
+    translation = draw.uniform(-_LARGEST_OFFSET, _LARGEST_OFFSET, 3)
+    nominal = np.array([*markers["tracked"].values(), *markers["reference"].values()], dtype=np.float64)
+    places = nominal + laboratory["placement_noise"] * draw.standard_normal(nominal.shape)
+    count = len(markers["tracked"])
+    return Setup(gravity, rotation, translation, places[:count], places[count:])
+
+
+def laboratory_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """A whole configuration of the body that plays the real one: with masses and volumes as they should be."""
+    laboratory = settings["laboratory"]
+    own = {key: laboratory[key] for key in ("mesh", "time_step", "integrator", "material")}
+    physics = {"mass": "row_sum", "volume_integration": "centre"}
+    return {**settings, **own, "fibres": laboratory.get("fibres"), "physics": physics, "coupling": "implicit"}
+
+
+def laboratory_simulator(settings: Mapping[str, Any], gravity: FloatArray) -> Simulator:
+    """The simulator that plays the real body, under a gravity [m/s^2] in its frame."""
+    return build_simulator({**laboratory_settings(settings), "gravity": gravity.tolist()}, "material")
+
+
+def pressure_sequences(settings: Mapping[str, Any]) -> PressureSequences:
+    """Of the laboratory; see the class."""
+    return PressureSequences(limit=settings["data"]["pressure_limit"], **settings["laboratory"].get("sequences", {}))
+
+
+def _pressures_of(settings: Mapping[str, Any], trial: Trial) -> FloatArray:
+    """(K + 1, C) the pressures of a trial at the frames [Pa], drawn from the seed and the number of its sequence."""
+    draw = np.random.default_rng([settings["seed"], 1, trial.sequence or 0])
+    steps, chambers = settings["data"]["steps"], settings["chambers"]["count"]
+    drawn = pressure_sequences(settings).draw(steps, settings["time_step"], chambers, draw)
+    if trial.is_released:
+        drawn = np.zeros_like(drawn)
+    elif trial.begins == STATIC:
+        drawn = np.broadcast_to(drawn.mean(axis=0), drawn.shape)
+    return trial.scale * drawn
+
+
+def _frames_of(settings: Mapping[str, Any], begins: str) -> int:
+    """Frames, or steps of released bodies, that trials are simulated for; see `trials.BEGINNINGS`."""
+    if begins == STATIC:
+        return max(int(_POSE_SECONDS * _rate_of(settings)), 5)
+    if begins == "rest":
+        return int(settings["data"]["steps"]) + 1
+    laboratory = settings["laboratory"]
+    return max(int(laboratory["seconds"] / laboratory["time_step"]) + 1, 2) + 1
+
+
+class _Played(March):
+    """Bodies of the laboratory: released from where they are held, under pressures, or in a pose.
+
+    Released bodies are simulated step by step from time zero on; bodies under pressures are kept at the frames, with as
+    many smaller steps between these as fit. What is kept are the tracked markers, in the frame of the body.
+    """
+
+    def __init__(self, part: Part) -> None:
+        settings = part.context.settings
+        setup, markers = make_setup(settings), settings["markers"]
+        simulator = self._simulator = laboratory_simulator(settings, setup.gravity)
+        self._constants, self.like = simulator.prepare(), simulator.rest_positions
+        known = {**known_trials(settings), **{trial.name: trial for trial in scaled_trials_of(settings)}}
+        self._trials = [known[name] for name in part.names]
+        self._tip, self._substeps = settings["tip"], 1 if self._trials[0].is_released else substeps_of(settings)
+        found = bound_markers(markers, simulator.body.mesh, setup.tracked, tuple(markers["tracked"]))
+        self._read = found.to(self.like)
+        payload = np.array([trial.payload for trial in self._trials])
+        masses = attached_mass(simulator.body, settings["data"].get("payload_at"), payload)
+        self._payload = Inputs(attached_mass=simulator.tensor(masses)) if payload.any() else Inputs()
+        self._pressures: torch.Tensor | None = None
+        if self._trials[0].sequence is not None:
+            self._pressures = simulator.tensor(np.stack([_pressures_of(settings, each) for each in self._trials]))
+        self.fields = {"markers": Field((len(self._trials), len(setup.tracked), 3), "m", batch_axes=1)}
+        self.frames = part.frames
+        times = simulator.time_step * np.arange(1, (part.frames - 1) * self._substeps + 1)
+        self._fixed = _carried(simulator, settings, self._trials, times)
+
+    def _inputs(self, frame: int, share: float = 0.0) -> Inputs:
+        """What acts between a frame and the next; pressures change linearly, those of released bodies not at all."""
+        if self._pressures is None:
+            return self._payload
+        before, after = self._pressures[:, frame], self._pressures[:, frame + (share > 0.0)]
+        return self._payload.replace(pressure=torch.lerp(before, after, share))
+
+    @override
+    def begin(self) -> State:
+        """Undeformed, or pulled aside at the tip, where bodies are held; else in equilibrium with what acts."""
+        simulator, batch = self._simulator, len(self._trials)
+        if not self._trials[0].is_released:
+            return simulator.static_equilibrium(self._inputs(0), self._constants, batch=batch)
+        pulls = np.array([trial.pull or (0.0, 0.0, 0.0) for trial in self._trials])
+        if not any(trial.pull for trial in self._trials):
+            return simulator.rest_state(batch)
+        force = _shared(simulator, select_vertices(simulator.body.mesh, **self._tip), simulator.tensor(pulls))
+        held = simulator.static_equilibrium(self._inputs(0).plus(force), self._constants)
+        return State(held.q, torch.zeros_like(held.q))
+
+    @override
+    def step(self, number: int) -> State:
+        state, begins = self.state, self._trials[0].begins
+        if begins == STATIC:
+            return state
+        for i in range(1, self._substeps + 1):
+            # At the end of a smaller step, or in its middle.
+            share = (i - 0.5 * (self._simulator.integrator == "midpoint")) / self._substeps
+            inputs = self._inputs(number - 1, share) if begins == "rest" else self._inputs(0)
+            inputs = inputs.replace(fixed_positions=self._fixed[(number - 1) * self._substeps + i - 1])
+            state, _ = self._simulator.step(state, inputs, self._constants)
+        return state
+
+    @override
+    def kept(self, number: int) -> dict[str, ArrayLike]:
+        return {"markers": self._read(self.state.q).cpu().numpy()}
+
+
+def substeps_of(settings: Mapping[str, Any]) -> int:
+    """Steps of the laboratory's simulation that make one of the simulator.
+
+    Raises:
+        InputError: they do not fit.
+    """
+    ratio = settings["time_step"] / settings["laboratory"]["time_step"]
+    if abs(ratio - round(ratio)) > 1e-6 or round(ratio) < 1:
+        raise InputError(
+            f"time_step is {settings['time_step']:g} s and laboratory.time_step "
+            f"{settings['laboratory']['time_step']:g} s: the first must be a multiple of the second."
+        )
+    return round(ratio)
+
+
+def vertical(up: str | Sequence[float] | None) -> FloatArray | None:
+    """(3,) unit vector against gravity in the frame of the recordings; None if that is not known.
+
+    Args:
+        up: ``x``, ``-x``, ``y`` and so on, or three numbers.
+
+    Raises:
+        InputError: anything else, or a vector of no length.
+    """
+    if up is None:
+        return None
+    if isinstance(up, str) and (axis := up.removeprefix("-").removeprefix("+")) in _AXES:
+        return np.eye(3)[_AXES.index(axis)] * (-1.0 if up.startswith("-") else 1.0)
+    vector = np.zeros(3) if isinstance(up, str) else np.asarray(up, dtype=np.float64)
+    if vector.shape != (3,) or not np.isfinite(vector).all() or not vector.any():
+        raise InputError(f"data.up is {up!r}: give x, -x, y, -y, z, -z, three numbers, or null.")
+    return np.asarray(vector / np.linalg.norm(vector))

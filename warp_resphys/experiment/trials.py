@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -31,7 +32,9 @@ class Trial:
         pull: force that holds the body before the release, where the laboratory is simulated [N].
         sequence: number of its pressures, where they are drawn; None without any.
         scale: by which these are multiplied.
-        amount: what sets simulated trajectories apart: a weight [kg] or an angle [rad].
+        amount: what sets simulated trajectories apart: a weight [kg], an angle [rad], or a factor of `base_motion`.
+        base_motion: how what it is fixed to moves, if otherwise than ``data.base_motion`` says; see
+            `data.base_motion.prescribed`.
     """
 
     name: str
@@ -42,6 +45,12 @@ class Trial:
     sequence: int | None = None
     scale: float = 1.0
     amount: float = 0.0
+    base_motion: Mapping[str, Any] | None = None
+
+    @property
+    def is_released(self) -> bool:
+        """Whether it is let go at time zero."""
+        return self.begins in ("held", "released")
 
     @property
     def recording(self) -> str:
@@ -89,6 +98,7 @@ class Variation:
 VARIATIONS: Final = {
     "release_from_load": Variation("weights_g", "g", 1e-3),
     "release_from_twist": Variation("angles_deg", "°", np.pi / 180.0),
+    "moving_base": Variation("amplitudes", "times", 1.0),
 }
 
 
@@ -123,33 +133,15 @@ def known_trials(config: Mapping[str, Any]) -> dict[str, Trial]:
     data = config["data"]
     if not sees_markers(config):
         variation = variation_of(data)
-        values = [x for name in SPLITS for x in _values(variation, data, name)]
-        return {variation.name(x): Trial(variation.name(x), "given", amount=variation.factor * x) for x in values}
-    found: dict[str, Trial] = {}
-    if is_laboratory(config):
-        for number in range(data["sequences"]):
-            found[f"t{number:03d}"] = Trial(f"t{number:03d}", data["begins"], sequence=number)
-        for name, own in config["laboratory"]["trials"].items():
-            base = found.get(
-                str(name), Trial(str(name), data["begins"], sequence=len(found) if data["sequences"] else None)
-            )
-            found[str(name)] = _with(base, own)
-        return found
-    for name, own in _recordings(data).items():
-        found[name] = _with(Trial(name, data["begins"]), own)
+        amounts = {variation.name(x): variation.factor * x for name in SPLITS for x in data[variation.key][name]}
+        return {name: Trial(name, "given", amount=amount) for name, amount in amounts.items()}
+    if not is_laboratory(config):
+        return {name: replace(Trial(name, data["begins"]), **own) for name, own in _recordings(data).items()}
+    found = {f"t{n:03d}": Trial(f"t{n:03d}", data["begins"], sequence=n) for n in range(data["sequences"])}
+    for name, own in config["laboratory"]["trials"].items():
+        new = Trial(str(name), data["begins"], sequence=len(found) if data["sequences"] else None)
+        found[new.name] = replace(found.get(new.name, new), **own)
     return found
-
-
-def _values(variation: Variation, data: Mapping[str, Any], split: str) -> list[float]:
-    return [float(x) for x in data[variation.key][split]]
-
-
-def _with(trial: Trial, own: Mapping[str, Any]) -> Trial:
-    """A trial with what its entry in the configuration says."""
-    changed = {key: value for key, value in own.items() if value is not None}
-    if "pull" in changed:
-        changed["pull"] = tuple(map(float, changed["pull"]))
-    return replace(trial, **changed)
 
 
 def _recordings(data: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
@@ -187,9 +179,7 @@ def split_of(config: Mapping[str, Any]) -> Split:
     """
     data = config["data"]
     if not sees_markers(config):
-        _check_values(data)
-        variation = variation_of(data)
-        lists = {name: [variation.name(x) for x in _values(variation, data, name)] for name in SPLITS}
+        lists = _valued(data)
     else:
         group = "laboratory" if is_laboratory(config) and "train" in config["laboratory"] else "data"
         lists = _named(config, group)
@@ -198,9 +188,10 @@ def split_of(config: Mapping[str, Any]) -> Split:
     return Split(*(tuple(lists[name]) for name in SPLITS))
 
 
-def _check_values(data: Mapping[str, Any]) -> None:
+def _valued(data: Mapping[str, Any]) -> dict[str, list[str]]:
+    """The names of the trials that the splits of a simulated experiment list by their values."""
     kind = variation_of(data)
-    values = {name: _values(kind, data, name) for name in SPLITS}
+    values = {name: [float(x) for x in data[kind.key][name]] for name in SPLITS}
     for name, row in values.items():
         if not row:
             raise InputError(f"data.{kind.key}.{name} is empty: give the split at least one value.")
@@ -210,6 +201,7 @@ def _check_values(data: Mapping[str, Any]) -> None:
     twice = sorted({x for x in everything if everything.count(x) > 1})
     if twice:
         raise InputError(f"data.{kind.key} names {twice[0]:g} {kind.unit} twice: every trajectory is in one split.")
+    return {name: [kind.name(x) for x in row] for name, row in values.items()}
 
 
 def _named(config: Mapping[str, Any], group: str) -> dict[str, list[str]]:
@@ -220,14 +212,10 @@ def _named(config: Mapping[str, Any], group: str) -> dict[str, list[str]]:
         raise InputError(
             f"{group}.train, {group}.validation and {group}.test ask for {asked} trials, but there are {len(known)}."
         )
-    counted, lists = 0, {}
+    rest, lists = iter(known), {}
     for name in SPLITS:
         wanted = settings[name]
-        if isinstance(wanted, int):
-            lists[name] = known[counted : counted + wanted]
-            counted += wanted
-        else:
-            lists[name] = [str(each) for each in wanted]
+        lists[name] = [*islice(rest, wanted)] if isinstance(wanted, int) else [str(each) for each in wanted]
         unknown = [each for each in lists[name] if each not in known]
         if unknown:
             raise InputError(
@@ -236,12 +224,14 @@ def _named(config: Mapping[str, Any], group: str) -> dict[str, list[str]]:
         if not lists[name] and not (name == "validation" and config["in_the_loop"]):
             more = ", or set data.folds to leave_one_out" if group == "data" else ""
             raise InputError(f"{group}.{name} is empty: name one of {group}.trials there{more}.")
-    everything = [(trial, name) for name, members in lists.items() for trial in members]
-    for place, (trial, name) in enumerate(everything):
-        before = [other for same, other in everything[:place] if same == trial]
-        if before:
-            where = f"twice in {group}.{name}" if before[0] == name else f"in {group}.{before[0]} and {group}.{name}"
+    seen: dict[str, str] = {}
+    for name, trial in ((name, trial) for name, members in lists.items() for trial in members):
+        if trial in seen:
+            where = (
+                f"twice in {group}.{name}" if seen[trial] == name else f"in {group}.{seen[trial]} and {group}.{name}"
+            )
             raise InputError(f"the trial '{trial}' is {where}: every trial is in one split, once.")
+        seen[trial] = name
     return lists
 
 

@@ -47,17 +47,11 @@ def _vertex_indices(values: ArrayLike, n_vertices: int, what: str) -> NDArray[np
 
 @dataclass(frozen=True)
 class PointMass:
-    """A weight that moves with the body: it has inertia, and hangs in gravity.
+    """A weight that moves with the body: it has inertia, and hangs in gravity."""
 
-    Attributes:
-        mass: [kg].
-        vertices: (n,) the vertices that carry it.
-        weights: (n,) the share of each, summing to one; equal shares where left out.
-    """
-
-    mass: float
-    vertices: Sequence[int]
-    weights: Sequence[float] | None = None
+    mass: float  # [kg]
+    vertices: Sequence[int]  # (n,) the vertices that carry it
+    weights: Sequence[float] | None = None  # (n,) the share of each, summing to one; equal shares where left out
 
     def per_vertex(self, n_vertices: int) -> NDArray[np.float64]:
         """(N,) mass at each vertex [kg].
@@ -81,27 +75,21 @@ class PointMass:
 
 @dataclass(frozen=True)
 class Body:
-    """A mesh with its boundary conditions, masses and integration rule.
+    """A mesh with its boundary conditions, masses and integration rule."""
 
-    Attributes:
-        mesh: the rest shape.
-        fixed: vertices with prescribed positions (Dirichlet); they rest where they are unless moved. Their positions
-            are given in the order of ``fixed_vertices``.
-        mass: ``row_sum`` lumps each element's own mass on its vertices (HRZ for 10-node tetrahedra). ``per_vertex``
-            gives every vertex the density times the mean element volume, which is wrong by a factor of two on the
-            published beam and serves for comparison with the published code alone.
-        volume_integration: ``centre`` or ``full`` (see `elements.discretise`).
-        point_masses: attached weights.
-        energies: what acts in or on the body beside its material: pressure, fibres (`energies.base.Energy`).
-        energy_points: the sets of points of each of them.
-    """
-
-    mesh: Mesh
+    mesh: Mesh  # the rest shape
+    # vertices with prescribed positions (Dirichlet); they rest where they are unless moved. Their positions are
+    # given in the order of ``fixed_vertices``
     fixed: ArrayLike = ()
+    # ``row_sum`` lumps each element's own mass on its vertices (HRZ for 10-node tetrahedra). ``per_vertex`` gives
+    # every vertex the density times the mean element volume, which is wrong by a factor of two on the published
+    # beam and serves for comparison with the published code alone
     mass: str = "row_sum"
-    volume_integration: str = "centre"
-    point_masses: Sequence[PointMass] = field(default=())
+    volume_integration: str = "centre"  # ``centre`` or ``full`` (see `elements.discretise`)
+    point_masses: Sequence[PointMass] = field(default=())  # attached weights
+    # what acts in or on the body beside its material: pressure, fibres (`energies.base.Energy`)
     energies: Sequence[OnBody] = field(default=())
+    # the sets of points of each of them
     energy_points: tuple[tuple[Points, ...], ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:

@@ -20,15 +20,10 @@ VOLUME_INTEGRATIONS = ("centre", "full")
 
 @dataclass(frozen=True)
 class Points:
-    """Cells with the same number of nodes and of points, each point with the matrix F = sum_a x_a g_a^T.
+    """Cells with the same number of nodes and of points, each point with the matrix F = sum_a x_a g_a^T."""
 
-    Attributes:
-        nodes: (C, K) vertex of each node of a cell.
-        gradients: (C, Q, K, 3) operators g_a; in a solid, gradients of the shape functions in rest space [1/m].
-    """
-
-    nodes: NDArray[np.int64]
-    gradients: Array
+    nodes: NDArray[np.int64]  # (C, K) vertex of each node of a cell
+    gradients: Array  # (C, Q, K, 3) operators g_a; in a solid, gradients of the shape functions in rest space [1/m]
 
     @property
     def points_per_cell(self) -> int:
@@ -43,32 +38,22 @@ class Points:
 
 @dataclass(frozen=True)
 class PointSet(Points):
-    """Points of a solid.
+    """Points of a solid."""
 
-    Attributes:
-        shape_volume: (C Q, M) sparse; volume of each element that the point carries for the shape term [m^3].
-        volume_volume: (C Q, M) sparse; the same for the volume term [m^3].
-    """
-
+    # (C Q, M) sparse; volume of each element that the point carries for the shape term [m^3]
     shape_volume: scipy.sparse.csr_array
-    volume_volume: scipy.sparse.csr_array
+    volume_volume: scipy.sparse.csr_array  # (C Q, M) sparse; the same for the volume term [m^3]
 
 
 @dataclass(frozen=True)
 class Discretisation:
-    """All that a body's mesh and integration rule determine.
+    """All that a body's mesh and integration rule determine."""
 
-    Attributes:
-        point_sets: where the energy is evaluated.
-        element_volumes: (M,) [m^3].
-        load_volume: (N, M) sparse; integral of N_a over each element [m^3]: consistent body forces.
-        lumped_volume: (N, M) sparse; positive lumping of each element's volume [m^3]: masses.
-    """
-
-    point_sets: tuple[PointSet, ...]
-    element_volumes: Array
+    point_sets: tuple[PointSet, ...]  # where the energy is evaluated
+    element_volumes: Array  # (M,) [m^3]
+    # (N, M) sparse; integral of N_a over each element [m^3]: consistent body forces
     load_volume: scipy.sparse.csr_array
-    lumped_volume: scipy.sparse.csr_array
+    lumped_volume: scipy.sparse.csr_array  # (N, M) sparse; positive lumping of each element's volume [m^3]: masses
 
 
 def physical_gradients(vertices: Array, cells: NDArray[np.int64], reference_gradients: Array) -> tuple[Array, Array]:

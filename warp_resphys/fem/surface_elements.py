@@ -13,15 +13,10 @@ from .elements import Points
 
 @dataclass(frozen=True)
 class SurfacePoints(Points):
-    """Points on the surfaces of chambers.
+    """Points on the surfaces of chambers."""
 
-    Attributes:
-        weights: (P,) of each point: one third of the quadrature weight for pressure, the area for fibres [m^2].
-        chamber: (P,) number of its chamber.
-    """
-
-    weights: Array
-    chamber: NDArray[np.int64]
+    weights: Array  # (P,) of each point: one third of the quadrature weight for pressure, the area for fibres [m^2]
+    chamber: NDArray[np.int64]  # (P,) number of its chamber
 
 
 def face_rule(chambers: Sequence[Chamber], degree: int) -> tuple[Shape, Rule]:

@@ -8,17 +8,16 @@ exit. A file should therefore fit into memory two or three times. Long computati
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import hashlib
 import json
-import math
 import os
 import struct
 import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -61,11 +60,9 @@ def disk_full_error(path: str | Path, kept: str | Path | None = None) -> DataFil
     return DataFileError(f"disk is full while writing {path}: free some space and run the same command again{rest}")
 
 
-@contextmanager
+@contextlib.contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Gives a temporary path; what is written there takes the place of `path` when the block ends.
-
-    If the block raises, `path` stays as it was and the temporary file is removed.
+    """Gives a temporary path; what is written there takes the place of `path` when the block ends without an error.
 
     Raises:
         DataFileError: the disk is full, or the place cannot be written to.
@@ -123,13 +120,9 @@ def to_plain(data: Any) -> Any:
 
 
 def write_json(path: str | Path, data: Any) -> None:
-    """Writes standard JSON atomically; a number that is NaN or infinite becomes null, which JSON has instead.
-
-    Raises:
-        DataFileError: the file cannot be written.
-    """
-    text = json.dumps(_finite(to_plain(data)), indent=2, allow_nan=False)
-    write_text(path, text + "\n")
+    """Writes standard JSON as `write_text` does; a number that is NaN or infinite becomes null, as JSON has none."""
+    plain = json.loads(json.dumps(to_plain(data)), parse_constant=lambda _: None)
+    write_text(path, json.dumps(plain, indent=2) + "\n")
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -138,20 +131,8 @@ def write_text(path: str | Path, text: str) -> None:
         partial.write_text(text, encoding="utf-8")
 
 
-def _finite(data: Any) -> Any:
-    if isinstance(data, dict):
-        return {key: _finite(value) for key, value in data.items()}
-    if isinstance(data, list):
-        return [_finite(value) for value in data]
-    return None if isinstance(data, float) and not math.isfinite(data) else data
-
-
 def read_json(path: str | Path) -> Any:
-    """Reads a JSON file.
-
-    Raises:
-        DataFileError: the file is missing, cannot be read or is not JSON.
-    """
+    """Reads a JSON file; raises DataFileError when it is missing, cannot be read or is not JSON."""
     try:
         return json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
@@ -168,17 +149,14 @@ def _read_error(path: str | Path, error: OSError) -> DataFileError:
     return DataFileError(f"cannot read {path} ({error}): make or fetch it again")
 
 
-@contextmanager
+@contextlib.contextmanager
 def atomic_hdf5(path: str | Path, kind: str, attributes: Mapping[str, Any] | None = None) -> Iterator[h5py.File]:
-    """Gives an HDF5 file to fill in memory; it appears at `path` when the block ends without an error.
+    """Gives an HDF5 file to fill in memory; it appears at `path` as by `atomic_path`.
 
     Args:
         path: Where the file is to appear; missing folders are made.
         kind: What the file holds, such as "trajectories"; `read_hdf5` asks for it.
         attributes: Further attributes of the file's root (numbers, strings, small arrays).
-
-    Raises:
-        DataFileError: the disk is full, or the place cannot be written to.
     """
     in_memory = {"driver": "core", "backing_store": False, "block_size": 1 << 20}
     with (
@@ -204,8 +182,7 @@ def create(group: h5py.Group, name: str, array: npt.ArrayLike, units: str = "1",
         name: The dataset's name; a path makes the groups in between.
         array: Numbers of any shape.
         units: SI units of the values, stored as an attribute; "1" for numbers without a unit.
-        time_axis: The axis that counts steps. A chunk holds one index of each axis before it, all of those
-            after it.
+        time_axis: The axis that counts steps; see `chunk_shape`.
     """
     values = np.asarray(array)
     chunks = chunk_shape(values.shape, time_axis)
@@ -215,13 +192,13 @@ def create(group: h5py.Group, name: str, array: npt.ArrayLike, units: str = "1",
 
 
 def chunk_shape(shape: tuple[int, ...], time_axis: int = 0) -> tuple[int, ...] | None:
-    """The chunk for a dataset of this shape; None (no chunks) for scalars and empty arrays."""
+    """One index of the axes before the one of time, all of those after it; no chunks for scalars and empty arrays."""
     if not shape or 0 in shape:
         return None
     return (*(1,) * time_axis, min(CHUNK_STEPS, shape[time_axis]), *shape[time_axis + 1 :])
 
 
-@contextmanager
+@contextlib.contextmanager
 def open_hdf5(path: str | Path) -> Iterator[h5py.File]:
     """Opens an HDF5 file of any origin for reading; it may not point to data outside of itself.
 
@@ -230,13 +207,10 @@ def open_hdf5(path: str | Path) -> Iterator[h5py.File]:
             other files (external links, external storage, virtual datasets).
     """
     path = Path(path)
-    try:
-        with open(path, "rb"):
-            file = h5py.File(path, "r")
-    except OSError as error:
-        raise hdf5_error(path, error) from error
-    with file:
+    with contextlib.ExitStack() as stack:
         try:
+            with open(path, "rb"):
+                file = stack.enter_context(h5py.File(path, "r"))
             refuse_data_elsewhere(file)
         except (DecodingError, OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
             raise hdf5_error(path, error) from error
@@ -284,7 +258,7 @@ def _first_block(crc: int) -> bytes:
     return (_CHECKSUM + b"%08x" % crc).ljust(USER_BLOCK, b"\n")
 
 
-@contextmanager
+@contextlib.contextmanager
 def read_hdf5(path: str | Path, expected_kind: str) -> Iterator[h5py.File]:
     """Opens a file that `atomic_hdf5` wrote.
 
@@ -296,9 +270,8 @@ def read_hdf5(path: str | Path, expected_kind: str) -> Iterator[h5py.File]:
     """
     _check(Path(path))
     with open_hdf5(path) as file:
-        attributes = file.attrs
         origin, version, kind, complete = (
-            str(attributes.get(name)) for name in ("format", "version", "kind", "complete")
+            str(file.attrs.get(name)) for name in ("format", "version", "kind", "complete")
         )
         if origin != FORMAT:
             raise DataFileError(f"{path} was not written by {FORMAT}: check the path")
@@ -350,7 +323,7 @@ def read_array(
         group: Where the dataset is.
         name: Its name.
         shape: The shape that the whole dataset must have; None for an axis of any length.
-        index: What to read, as for a NumPy array; all of it by default.
+        index: What to read, as for a NumPy array.
 
     Raises:
         DataFileError: the dataset is missing, damaged or has another shape.
@@ -383,15 +356,9 @@ def write_checkpoint(
 
     own = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
     text = json.dumps(to_plain(metadata))
-    header = {
-        "format": FORMAT,
-        "version": str(FORMAT_VERSION),
-        "kind": kind,
-        "metadata": text,
-        "checksum": _checksum(own, text),
-    }
+    header = {"format": FORMAT, "version": str(FORMAT_VERSION), "kind": kind}
     with atomic_path(path) as partial:
-        partial.write_bytes(save(own, metadata=header))
+        partial.write_bytes(save(own, metadata={**header, "metadata": text, "checksum": _checksum(own, text)}))
 
 
 def _checksum(tensors: Mapping[str, torch.Tensor], metadata: str) -> str:

@@ -10,13 +10,9 @@ from pathlib import Path
 
 @dataclass
 class WorkersMemory:
-    """What the workers of a piece of work took.
+    """What the workers of a piece of work took."""
 
-    Attributes:
-        gib: the peaks of those that ran at once, added up [GiB]; 0 without any.
-    """
-
-    gib: float = 0.0
+    gib: float = 0.0  # the peaks of those that ran at once, added up [GiB]; 0 without any
 
     def count(self, peaks: Iterable[float]) -> None:
         """Keeps what workers that run at once say of their own `peak_memory_gib`, if it is more than before."""

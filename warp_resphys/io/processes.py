@@ -8,8 +8,7 @@ import multiprocessing
 import os
 import signal
 import traceback
-from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Generator, Sequence
 from itertools import islice
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
@@ -55,21 +54,15 @@ def in_processes(
         WorkerError: a task raised a ResphysError, whose sentence it has, or a worker was ended from outside.
         RuntimeError: a task failed in another way.
     """
-    context = multiprocessing.get_context("spawn")
     crew: dict[Connection, BaseProcess] = {}
     busy: dict[Connection, int] = {}
     peaks: dict[Connection, float] = {}
     waiting = iter(range(len(tasks)))
     try:
         for number in islice(waiting, processes):
-            with _interrupts_blocked():
-                ours, theirs = context.Pipe()
-                process = context.Process(target=_work, args=(function, theirs), daemon=True)
-                process.start()
-                crew[ours] = process
-            theirs.close()
-            ours.send(tasks[number])
-            busy[ours] = number
+            worker = _start(function, crew)
+            worker.send(tasks[number])
+            busy[worker] = number
         while busy:
             for connection in wait([*busy]):
                 assert isinstance(connection, Connection)
@@ -86,10 +79,26 @@ def in_processes(
     finally:
         if memory is not None:
             memory.count(peaks.values())
-        for connection, worker in crew.items():
-            connection.close()
-            worker.terminate()
-            worker.join()
+        for worker, process in crew.items():
+            worker.close()
+            process.terminate()
+            process.join()
+
+
+def _start(function: Callable[[Any, Advance], Any], crew: dict[Connection, BaseProcess]) -> Connection:
+    """Adds a worker, which never sees Ctrl-C, to the crew; this process sees it afterwards."""
+    context = multiprocessing.get_context("spawn")
+    resource_tracker.ensure_running()  # Else it is started with the first process, and unblocks them before that.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        ours, theirs = context.Pipe()
+        process = context.Process(target=_work, args=(function, theirs), daemon=True)
+        process.start()
+        crew[ours] = process
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    theirs.close()
+    return ours
 
 
 def _receive(connection: Connection, process: BaseProcess) -> tuple[str, Any]:
@@ -133,14 +142,3 @@ def _outcome(function: Callable[[Any, Advance], Any], task: Any, advance: Advanc
         return "error", str(error)
     except Exception:
         return "fault", traceback.format_exc()
-
-
-@contextmanager
-def _interrupts_blocked() -> Iterator[None]:
-    """What starts in here never sees Ctrl-C; this process sees it afterwards."""
-    resource_tracker.ensure_running()  # Else it is started with the first process, and unblocks them before that.
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -15,39 +15,26 @@ _LINE_SECONDS = 10.0
 
 
 class Progress:
-    """Shows count, rate, remaining time and the latest values of a loop, on stderr.
+    """Shows count, rate, remaining time and the latest values of a loop.
 
-    Use it as a context manager and call `advance` in the loop; a call costs about a microsecond, as most
-    calls only count::
+    Use it as a context manager and call `advance` in the loop; most calls only count, in about a microsecond. Where
+    there is no terminal (log files, continuous integration), it prints a line every ten seconds at most, and one at the
+    end.
 
-        with Progress("reconstruct", total=150, unit="frames", start_at=file.done) as progress:
-            for frame in range(file.done, 150):
-                ...
-                progress.advance(iterations=12)
-
-    Where stderr is no terminal (log files, continuous integration), it prints a line every ten seconds at
-    most, and one at the end.
+    Args:
+        description: What is being done.
+        total: Number of units that make the whole.
+        unit: What is counted, in the plural.
+        start_at: How many of them an interrupted run has done already; they do not count for the rate.
+        console: Where to show it; stderr by default.
     """
 
     def __init__(
         self, description: str, total: int, unit: str, start_at: int = 0, console: Console | None = None
     ) -> None:
-        """Describes the loop.
-
-        Args:
-            description: What is being done.
-            total: Number of units that make the whole.
-            unit: What is counted, in the plural.
-            start_at: How many of them an interrupted run has done already; they do not count for the rate.
-            console: Where to show it; stderr by default.
-        """
-        self.description = description
-        self.total = total
-        self.unit = unit
-        self.done = start_at
-        self._start_at = start_at
-        self._console = console if console is not None else Console(stderr=True)
-        self._shown = -1
+        self.description, self.total, self.unit, self.done = description, total, unit, start_at
+        self._start_at, self._shown = start_at, -1
+        self._console = Console(stderr=True) if console is None else console
         self._fields: dict[str, object] = {}
         self._start = self._next = 0.0
         self._bars: Bars | None = None
@@ -55,23 +42,14 @@ class Progress:
 
     def __enter__(self) -> Progress:
         """Starts the clock and shows the bar, if there is a terminal to show it in."""
-        self._start = time.perf_counter()
-        self._next = self._start
-        if self._console.is_terminal:
-            columns = (
-                TextColumn("{task.description}"),
-                BarColumn(bar_width=24),
-                TextColumn("{task.fields[status]}"),
-            )
-            self._bars = Bars(
-                *columns, console=self._console, refresh_per_second=5, redirect_stdout=sys.stdout.isatty()
-            )
-            self._bars.start()
-            self._task = self._bars.add_task(
-                self.description, total=self.total, completed=self.done, status=self.status()
-            )
-        else:
+        self._start = self._next = time.perf_counter()
+        if not self._console.is_terminal:
             self._next += _LINE_SECONDS
+            return self
+        columns = TextColumn("{task.description}"), BarColumn(bar_width=24), TextColumn("{task.fields[status]}")
+        self._bars = Bars(*columns, console=self._console, refresh_per_second=5, redirect_stdout=sys.stdout.isatty())
+        self._bars.start()
+        self._task = self._bars.add_task(self.description, total=self.total, completed=self.done, status=self.status())
         return self
 
     def __exit__(
@@ -94,17 +72,14 @@ class Progress:
 
     def status(self) -> str:
         """Count, rate, remaining time and latest values in one line."""
-        elapsed = time.perf_counter() - self._start
-        new = self.done - self._start_at
+        elapsed, new = time.perf_counter() - self._start, self.done - self._start_at
         parts = [f"{self.done}/{self.total} {self.unit}"]
         if new > 0 and elapsed > 0:
             rate = new / elapsed
             each = f"{1 / rate:.3g} s" if rate > 1 / 60 else clock(1 / rate)
             parts.append(f"{rate:.3g} {self.unit}/s" if rate >= 1 else f"{each} each")
-            if self.done < self.total:
-                parts.append(f"{clock((self.total - self.done) / rate)} left")
-            else:
-                parts.append(f"in {clock(elapsed)}")
+            left = (self.total - self.done) / rate
+            parts.append(f"{clock(left)} left" if left > 0 else f"in {clock(elapsed)}")
         for name, value in self._fields.items():
             parts.append(f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}")
         return ", ".join(parts)

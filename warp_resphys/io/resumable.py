@@ -1,18 +1,18 @@
-"""Datasets that are computed step by step and survive any interruption.
+"""Work that survives any interruption.
 
-The steps go to a journal beside the final file: a header that says what is being computed, then one record a
-step, appended with a checksum. A record that was cut short by a kill, a crash or a full disk does not match
-its checksum and is computed again; all whole ones are kept. The finished journal is turned into an HDF5 file
-and removed.
+`ResumableHDF5` is for what is computed step by step. The steps go to a journal beside the final file: a header that
+says what is being computed, then one record a step, appended with a checksum. A record that was cut short by a kill, a
+crash or a full disk does not match its checksum and is computed again; all whole ones are kept. The finished journal is
+turned into an HDF5 file and removed.
+
+`keep_checkpoint` is for all else: what the work goes on from, as a whole, in place of what was kept before.
 """
 
 from __future__ import annotations
 
 import json
 import logging
-import math
 import os
-import struct
 import time
 import zlib
 from collections.abc import Mapping, Sequence
@@ -37,30 +37,23 @@ from .files import (
 )
 
 if TYPE_CHECKING:
-    import h5py
     import torch
 
 log = logging.getLogger(__name__)
 
 _SYNC_SECONDS = 2.0
-_CHECKSUM = struct.Struct("<I")
+_CHECKSUM = "CRC-32"
 
 
 @dataclass(frozen=True)
 class Field:
-    """One array of every step.
+    """One array of every step."""
 
-    Attributes:
-        shape: Its shape in one step; () for a number.
-        units: SI units, stored beside the dataset; "1" for numbers without a unit.
-        dtype: NumPy's name of its type.
-        batch_axes: How many of its leading axes stand before the axes that count steps in the final dataset:
-            with 1, steps of (B, N, 3) become (B, T, N, 3), with 0 they become (T, B, N, 3).
-    """
-
-    shape: tuple[int, ...]
-    units: str
-    dtype: str = "float64"
+    shape: tuple[int, ...]  # Its shape in one step; () for a number
+    units: str  # SI units, stored beside the dataset; "1" for numbers without a unit
+    dtype: str = "float64"  # NumPy's name of its type
+    # How many of its leading axes stand before the one that counts steps in the final dataset: with 1, steps of
+    # (B, N, 3) become (B, T, N, 3), with 0 they become (T, B, N, 3)
     batch_axes: int = 0
 
 
@@ -70,46 +63,31 @@ class ResumableHDF5:
     Use it as a context manager. `done` says how many steps an earlier, interrupted run left; go on from
     there::
 
-        with ResumableHDF5(path, "forces", fingerprint, (trajectories, frames), fields) as file:
+        with ResumableHDF5(path, "forces", fingerprint, frames, fields) as file:
             for step in range(file.done, file.steps):
-                trajectory, frame = divmod(step, frames)
                 file.append(forces=...)
             file.finish()
 
     Work that belongs to another fingerprint, or to other fields, is discarded. An existing file at `path`
     stays in place until `finish` replaces it; if it is already the one asked for, all steps are done.
+
+    Args:
+        path: Where the final HDF5 file is to appear.
+        kind: What the file holds, as for `files.atomic_hdf5`.
+        fingerprint: Identifies the inputs of the computation; steps of another fingerprint are not used.
+        steps: How many there are.
+        fields: The arrays of one step by name.
     """
 
-    def __init__(
-        self,
-        path: str | Path,
-        kind: str,
-        fingerprint: str,
-        steps: int | tuple[int, ...],
-        fields: Mapping[str, Field],
-    ) -> None:
-        """Describes the file; nothing is opened before the `with` block.
-
-        Args:
-            path: Where the final HDF5 file is to appear.
-            kind: What the file holds, as for `files.atomic_hdf5`.
-            fingerprint: Identifies the inputs of the computation; steps of another fingerprint are not used.
-            steps: Number of steps, or the lengths of nested loops over them, the last one running fastest.
-            fields: The arrays of one step by name.
-        """
-        self.path = Path(path)
-        self.kind = kind
-        self.fingerprint = fingerprint
-        self.step_axes = (steps,) if isinstance(steps, int) else tuple(steps)
-        self.steps = math.prod(self.step_axes)
-        self.fields = dict(fields)
-        self.done = 0
+    def __init__(self, path: str | Path, kind: str, fingerprint: str, steps: int, fields: Mapping[str, Field]) -> None:
+        self.path, self.kind, self.fingerprint = Path(path), kind, fingerprint
+        self.steps, self.done, self.fields = steps, 0, dict(fields)
         self.journal = self.path.with_name(self.path.name + ".journal")
         layout = {name: [f.shape, np.dtype(f.dtype).str, f.units, f.batch_axes] for name, f in self.fields.items()}
         header = {"format": "warp_resphys journal 1", "kind": kind, "fingerprint": fingerprint}
-        self._header = (json.dumps({**header, "steps": self.step_axes, "fields": layout}) + "\n").encode()
-        sizes = [math.prod(f.shape) * np.dtype(f.dtype).itemsize for f in self.fields.values()]
-        self._record_size = sum(sizes) + _CHECKSUM.size
+        self._header = (json.dumps({**header, "steps": steps, "fields": layout}) + "\n").encode()
+        parts = [(name, field.dtype, field.shape) for name, field in self.fields.items()]
+        self._record = np.dtype([*parts, (_CHECKSUM, "<u4")])
         self._descriptor: int | None = None
         self._finished = False
         self._synced = 0.0
@@ -128,12 +106,11 @@ class ResumableHDF5:
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._descriptor = os.open(self.journal, os.O_RDWR | os.O_CREAT, 0o666)
-        except OSError as error:
-            raise self._write_error(error) from error
-        try:
             self.done = self._resume()
-        except BaseException:
+        except BaseException as error:
             self._close()
+            if isinstance(error, OSError):
+                raise self._write_error(error) from error
             raise
         self._synced = time.monotonic()
         return self
@@ -154,17 +131,21 @@ class ResumableHDF5:
             raise ValueError(f"{self.path} takes no further step: {self.done} of {self.steps} are written")
         if arrays.keys() != self.fields.keys():
             raise ValueError(f"a step of {self.path} consists of {[*self.fields]}, not of {[*arrays]}")
-        parts = []
+        record = np.zeros(1, self._record)
         for name, field in self.fields.items():
             values = np.asarray(arrays[name], dtype=field.dtype)
             if values.shape != field.shape:
                 raise ValueError(f"'{name}' has the shape {values.shape} where {field.shape} is needed")
-            parts.append(values.tobytes())
-        payload = b"".join(parts)
-        self._write(payload + _CHECKSUM.pack(zlib.crc32(payload, self.done)), self._offset(self.done))
-        self.done += 1
-        if time.monotonic() - self._synced > _SYNC_SECONDS:
-            self._sync()
+            record[name] = values
+        record[_CHECKSUM] = self._checksum(record, self.done)
+        try:
+            self._write(record.tobytes(), self._offset(self.done))
+            self.done += 1
+            if time.monotonic() - self._synced > _SYNC_SECONDS:  # A power cut loses a few seconds of work at most.
+                os.fsync(self._descriptor)
+                self._synced = time.monotonic()
+        except OSError as error:
+            raise self._write_error(error) from error
 
     def rewind(self, steps: int) -> None:
         """Forgets all but the first steps, which are written anew."""
@@ -182,22 +163,13 @@ class ResumableHDF5:
         if not 0 <= step < self.done:
             raise ValueError(f"step {step} of {self.path} is not among the {self.done} that are done")
         if self._finished:
-            index = np.unravel_index(step, self.step_axes)
             with read_hdf5(self.path, self.kind) as file:
-                return {
-                    name: read_array(file, name, index=(*(slice(None),) * field.batch_axes, *index))
-                    for name, field in self.fields.items()
-                }
-        payload = self._record(step)
-        if payload is None:
+                places = {name: (*(slice(None),) * field.batch_axes, step) for name, field in self.fields.items()}
+                return {name: read_array(file, name, index=place) for name, place in places.items()}
+        record = self._whole(step)
+        if record is None:
             raise DataFileError(f"{self.journal} is damaged: delete it and run the same command again")
-        arrays, start = {}, 0
-        for name, field in self.fields.items():
-            count = math.prod(field.shape)
-            values = np.frombuffer(payload, dtype=field.dtype, count=count, offset=start)
-            arrays[name] = values.reshape(field.shape).copy()
-            start += values.nbytes
-        return arrays
+        return {name: record[name][0].copy() for name in self.fields}
 
     def finish(
         self,
@@ -219,14 +191,21 @@ class ResumableHDF5:
             return
         if self.done != self.steps:
             raise ValueError(f"{self.path} cannot be finished: {self.done} of {self.steps} steps are written")
-        if order is not None and sorted(order) != [*range(self.steps)]:
+        places = np.arange(self.steps) if order is None else np.asarray(order)
+        if not np.array_equal(np.sort(places), np.arange(self.steps)):
             raise ValueError(f"{self.path} cannot be finished in the order {order}: each step has a place of its own")
         own = {**(attributes or {}), "fingerprint": self.fingerprint}
+        records = np.memmap(self.journal, self._record, "r", len(self._header), self.steps) if self.steps else None
         try:
             with atomic_hdf5(self.path, self.kind, own) as file:
                 for name, (array, units) in (constants or {}).items():
                     create(file, name, array, units)
-                self._assemble(file, range(self.steps) if order is None else order)
+                for name, field in self.fields.items():
+                    values = np.empty((self.steps, *field.shape), field.dtype)
+                    if records is not None:
+                        values[places] = records[name]
+                    values = np.moveaxis(values, 0, field.batch_axes)
+                    create(file, name, values, field.units, time_axis=field.batch_axes)
         except DataFileError as error:
             if error.__cause__ is not None and is_disk_full(error.__cause__):
                 raise disk_full_error(self.path, self.journal) from error
@@ -234,20 +213,6 @@ class ResumableHDF5:
         self._finished = True
         self._close()
         self.journal.unlink()
-
-    def _assemble(self, file: h5py.File, order: Sequence[int]) -> None:
-        """Fills the final datasets, one field after the other."""
-        collected = {
-            name: np.empty((self.steps, *field.shape), dtype=field.dtype) for name, field in self.fields.items()
-        }
-        for step, place in enumerate(order):
-            for name, values in self.read(step).items():
-                collected[name][place] = values
-        for name, field in self.fields.items():
-            counted, ahead = len(self.step_axes), field.batch_axes
-            values = collected.pop(name).reshape(*self.step_axes, *field.shape)
-            values = np.moveaxis(values, range(counted), range(ahead, ahead + counted))
-            create(file, name, values, field.units, time_axis=ahead + counted - 1)
 
     def _is_final(self) -> bool:
         """Whether the final file exists, belongs to the same computation and matches its checksums.
@@ -267,49 +232,39 @@ class ResumableHDF5:
     def _resume(self) -> int:
         """Counts the whole records of the journal and cuts off the rest; starts it anew if it is not ours."""
         assert self._descriptor is not None
-        found = os.pread(self._descriptor, len(self._header), 0)
-        if found != self._header:
-            if found:
-                log.warning("discarding %s: it belongs to other settings or was cut short", self.journal.name)
-            os.ftruncate(self._descriptor, 0)
-            self._write(self._header, 0)
-            return 0
-        done = 0
-        while done < self.steps and self._record(done) is not None:
-            done += 1
-        os.ftruncate(self._descriptor, self._offset(done))
-        return done
+        found, done = os.pread(self._descriptor, len(self._header), 0), 0
+        if found == self._header:
+            while done < self.steps and self._whole(done) is not None:
+                done += 1
+            os.ftruncate(self._descriptor, self._offset(done))
+            return done
+        if found:
+            log.warning("discarding %s: it belongs to other settings or was cut short", self.journal.name)
+        os.ftruncate(self._descriptor, 0)
+        self._write(self._header, 0)
+        return 0
 
-    def _record(self, step: int) -> bytes | None:
-        """The bytes of a step without their checksum, or None if they are incomplete or do not match it."""
+    def _whole(self, step: int) -> npt.NDArray[Any] | None:
+        """The record of a step, (1,), or None if it is incomplete or does not match its checksum."""
         assert self._descriptor is not None
-        record = os.pread(self._descriptor, self._record_size, self._offset(step))
-        if len(record) != self._record_size:
+        content = os.pread(self._descriptor, self._record.itemsize, self._offset(step))
+        if len(content) != self._record.itemsize:
             return None
-        payload, checksum = record[: -_CHECKSUM.size], record[-_CHECKSUM.size :]
-        return payload if checksum == _CHECKSUM.pack(zlib.crc32(payload, step)) else None
+        record = np.frombuffer(content, self._record)
+        return record if record[_CHECKSUM] == self._checksum(record, step) else None
+
+    def _checksum(self, record: npt.NDArray[Any], step: int) -> int:
+        return zlib.crc32(memoryview(record.tobytes())[:-4], step)
 
     def _offset(self, step: int) -> int:
-        return len(self._header) + step * self._record_size
+        return len(self._header) + step * self._record.itemsize
 
     def _write(self, data: bytes, offset: int) -> None:
         assert self._descriptor is not None
         rest = memoryview(data)
-        try:
-            while rest:
-                written = os.pwrite(self._descriptor, rest, offset)
-                rest, offset = rest[written:], offset + written
-        except OSError as error:
-            raise self._write_error(error) from error
-
-    def _sync(self) -> None:
-        """Brings the journal to the disk, so that a power cut loses a few seconds of work at most."""
-        assert self._descriptor is not None
-        try:
-            os.fsync(self._descriptor)
-        except OSError as error:
-            raise self._write_error(error) from error
-        self._synced = time.monotonic()
+        while rest:
+            written = os.pwrite(self._descriptor, rest, offset)
+            rest, offset = rest[written:], offset + written
 
     def _close(self) -> None:
         if self._descriptor is not None:

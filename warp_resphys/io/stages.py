@@ -15,7 +15,7 @@ import os
 import platform
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -23,61 +23,35 @@ from pathlib import Path
 from typing import Any
 
 from .errors import DataFileError, InputError
-from .files import digest, read_json, to_plain, write_json
+from .files import FORMAT_VERSION, digest, read_json, to_plain, write_json
 from .memory import WorkersMemory, peak_memory_gib
+from .resumable import forget_checkpoint, keep_checkpoint, resume_checkpoint
 
 log = logging.getLogger(__name__)
 
-_RECORDED_PACKAGES = (
-    "warp-resphys",
-    "warp-lang",
-    "torch",
-    "numpy",
-    "scipy",
-    "cholespy",
-    "h5py",
-    "hydra-core",
-)
+_PACKAGES = ("warp-resphys", "warp-lang", "torch", "numpy", "scipy", "cholespy", "h5py", "hydra-core")
 
 
 @dataclass(frozen=True)
 class StageContext:
-    """What a stage is told when it runs.
+    """What a stage is told when it runs."""
 
-    Attributes:
-        name: The stage's name.
-        run_dir: The run folder; outputs are written there.
-        fingerprint: Identifies everything the outputs depend on; resumable files are marked with it.
-        settings: The settings that the stage declared.
-        memory: Of its worker processes, which it is to count.
-    """
-
-    name: str
-    run_dir: Path
-    fingerprint: str
-    settings: Mapping[str, Any]
-    memory: WorkersMemory = field(default_factory=WorkersMemory)
+    name: str  # The stage's
+    run_dir: Path  # The run folder; outputs are written there
+    fingerprint: str  # Identifies everything the outputs depend on; resumable files are marked with it
+    settings: Mapping[str, Any]  # That the stage declared
+    memory: WorkersMemory = field(default_factory=WorkersMemory)  # Of its worker processes, which it is to count
 
 
 @dataclass(frozen=True)
 class Stage:
-    """A step of an experiment, from files to files.
+    """A step of an experiment, from files to files."""
 
-    Attributes:
-        name: Its name, also that of its record.
-        function: Does the work; it writes each output whole or not at all.
-        outputs: Names of the files that it writes, relative to the run folder.
-        settings: Plain nested settings that the outputs depend on, and no others.
-        upstream: Names of the stages whose outputs it reads.
-        format_version: To be raised when the stage's code changes what it writes.
-    """
-
-    name: str
-    function: Callable[[StageContext], None]
-    outputs: tuple[str, ...]
-    settings: Mapping[str, Any]
-    upstream: tuple[str, ...] = ()
-    format_version: int = 1
+    name: str  # Its name, also that of its record
+    function: Callable[[StageContext], None]  # Does the work; it writes each output whole or not at all
+    outputs: tuple[str, ...]  # Names of the files that it writes, relative to the run folder
+    settings: Mapping[str, Any]  # Plain nested settings that the outputs depend on, and no others
+    upstream: tuple[str, ...] = ()  # Names of the stages whose outputs it reads
 
 
 class StageInterrupted(KeyboardInterrupt):
@@ -88,7 +62,7 @@ def fingerprint(stage: Stage, upstream_fingerprints: Mapping[str, str]) -> str:
     """SHA-256 of all that a stage's outputs depend on, in hexadecimal."""
     content = {
         "name": stage.name,
-        "format_version": stage.format_version,
+        "format_version": FORMAT_VERSION,
         "settings": to_plain(stage.settings),
         "upstream": [upstream_fingerprints[name] for name in stage.upstream],
     }
@@ -121,43 +95,47 @@ def run_stages(stages: Sequence[Stage], run_dir: str | Path, wait: bool = False)
                 raise ValueError(f"stage '{stage.name}' is there twice or stands before a stage it reads from")
             known[stage.name] = fingerprint(stage, known)
             context = StageContext(stage.name, run_dir, known[stage.name], stage.settings)
-            record = _valid_record(stage, context)
-            if record is not None:
-                log.info("%s: up to date", stage.name)
-                seconds[stage.name] = record["seconds"]
-            else:
-                seconds[stage.name] = _run_stage(stage, context, finished=list(seconds))
+            took = _valid_seconds(stage, context)
+            seconds[stage.name] = _run_stage(stage, context, [*seconds]) if took is None else took
     return seconds
+
+
+def _record(run_dir: Path, name: str) -> Path:
+    return run_dir / "stages" / f"{name}.json"
 
 
 def _run_stage(stage: Stage, context: StageContext, finished: list[str]) -> float:
     """Runs one stage, writes its record and returns its seconds, those of interrupted runs included."""
-    progress = context.run_dir / "stages" / f"{stage.name}.progress.json"
-    before = _seconds_so_far(progress, context.fingerprint)
-    log.info("%s: %s", stage.name, f"going on after {before:.0f} s" if before else "started")
-    start = time.perf_counter()
+    spent = _record(context.run_dir, stage.name).with_suffix(".state.safetensors")
+    before = resume_checkpoint(spent, "stage", context.fingerprint)
+    seconds = 0.0 if before is None else float(before[1]["seconds"])
+    log.info("%s: %s", stage.name, f"going on after {seconds:.0f} s" if seconds else "started")
+    start = time.perf_counter() - seconds
     try:
         stage.function(context)
-        total = before + time.perf_counter() - start
-        _write_record(stage, context, total)
-    except KeyboardInterrupt as error:
-        _keep_seconds(progress, context, before + time.perf_counter() - start)
+        seconds = time.perf_counter() - start
+        _write_record(stage, context, seconds)
+    except (Exception, KeyboardInterrupt) as error:
+        metadata = {"fingerprint": context.fingerprint, "seconds": time.perf_counter() - start}
+        try:
+            keep_checkpoint(spent, "stage", {}, metadata)
+        except DataFileError as fault:  # It must not hide why the stage is unfinished.
+            log.warning("the time spent in '%s' is not kept: %s", context.name, fault)
+        if not isinstance(error, KeyboardInterrupt):
+            raise
         whole = f"finished and kept: {', '.join(finished)}; " if finished else ""
         raise StageInterrupted(
             f"interrupted in stage '{stage.name}' ({whole}what '{stage.name}' has saved is kept); "
             f"the same command goes on from there"
         ) from error
-    except Exception:
-        _keep_seconds(progress, context, before + time.perf_counter() - start)
-        raise
-    progress.unlink(missing_ok=True)
-    log.info("%s: done in %.1f s", stage.name, total)
-    return total
+    forget_checkpoint(spent)
+    log.info("%s: done in %.1f s", stage.name, seconds)
+    return seconds
 
 
 def _write_record(stage: Stage, context: StageContext, seconds: float) -> None:
     write_json(
-        context.run_dir / "stages" / f"{stage.name}.json",
+        _record(context.run_dir, stage.name),
         {
             "fingerprint": context.fingerprint,
             "seconds": seconds,
@@ -170,31 +148,9 @@ def _write_record(stage: Stage, context: StageContext, seconds: float) -> None:
     )
 
 
-def _seconds_so_far(progress: Path, expected: str) -> float:
-    if not progress.is_file():
-        return 0.0
-    try:
-        record = read_json(progress)
-        return float(record["seconds"]) if record["fingerprint"] == expected else 0.0
-    except (DataFileError, KeyError, TypeError, ValueError) as error:
-        log.warning("the time spent so far is not known (%s): %s", progress, error)
-        return 0.0
-
-
-def _keep_seconds(progress: Path, context: StageContext, seconds: float) -> None:
-    """Stores the time spent in an unfinished stage; a failure to do so must not hide why it is unfinished."""
-    try:
-        write_json(progress, {"fingerprint": context.fingerprint, "seconds": seconds})
-    except DataFileError as error:
-        log.warning("the time spent in '%s' is not kept: %s", context.name, error)
-
-
 def resources_used(run_dir: str | Path, names: Sequence[str]) -> dict[str, Any]:
-    """What `metrics.json` says of the stages that are done: seconds of each, and the largest of their peaks of memory.
-
-    A stage that was run before its memory was recorded does not count for the peak, which is None if there is no other.
-    """
-    paths = {name: Path(run_dir) / "stages" / f"{name}.json" for name in names}
+    """What `metrics.json` says of stages that are done: the seconds of each, and the largest known peak of memory."""
+    paths = {name: _record(Path(run_dir), name) for name in names}
     records = {name: read_json(path) for name, path in paths.items() if path.is_file()}
     peaks = [record["peak_memory_gib"] for record in records.values() if "peak_memory_gib" in record]
     return {
@@ -209,9 +165,9 @@ def _identity(path: Path) -> dict[str, Any]:
     return {"bytes": status.st_size, "modified_ns": status.st_mtime_ns, "sha256": digest(path)}
 
 
-def _valid_record(stage: Stage, context: StageContext) -> dict[str, Any] | None:
-    """The record of an earlier run whose outputs are still the ones asked for, or None."""
-    path = context.run_dir / "stages" / f"{stage.name}.json"
+def _valid_seconds(stage: Stage, context: StageContext) -> float | None:
+    """The seconds of an earlier run whose outputs are still the ones asked for, or None."""
+    path = _record(context.run_dir, stage.name)
     if not path.is_file():
         return None
     try:
@@ -220,14 +176,15 @@ def _valid_record(stage: Stage, context: StageContext) -> dict[str, Any] | None:
             log.info("%s: settings changed", stage.name)
             return None
         changed = [name for name in stage.outputs if not _is_same(context.run_dir / name, record["outputs"][name])]
-        float(record["seconds"])
+        seconds = float(record["seconds"])
     except (DataFileError, KeyError, TypeError, ValueError) as error:
         log.warning("%s: its record cannot be used (%s: %s)", stage.name, type(error).__name__, error)
         return None
     if changed:
         log.warning("%s: missing or changed since they were written: %s", stage.name, ", ".join(changed))
         return None
-    return dict(record)
+    log.info("%s: up to date", stage.name)
+    return seconds
 
 
 def _is_same(path: Path, identity: Mapping[str, Any]) -> bool:
@@ -241,9 +198,7 @@ def _is_same(path: Path, identity: Mapping[str, Any]) -> bool:
 def run_lock(run_dir: str | Path, wait: bool = False) -> Iterator[None]:
     """Holds a run folder for this process; the operating system lets go of it however the process ends.
 
-    Args:
-        run_dir: The run folder, made where it is missing.
-        wait: Whether to wait for another process that holds it, in place of raising.
+    See `run_stages` for the arguments.
 
     Raises:
         InputError: another process holds it.
@@ -279,9 +234,7 @@ def run_lock(run_dir: str | Path, wait: bool = False) -> Iterator[None]:
 def package_versions() -> dict[str, str]:
     """Versions of Python and of the packages that results depend on; absent packages are left out."""
     versions = {"python": platform.python_version()}
-    for name in _RECORDED_PACKAGES:
-        try:
+    for name in _PACKAGES:
+        with suppress(PackageNotFoundError):
             versions[name] = version(name)
-        except PackageNotFoundError:
-            continue
     return versions

@@ -12,7 +12,7 @@ import torch
 from typing_extensions import override
 
 from .networks import ResidualForce
-from .training import EpochTrainer, part_of
+from .training import EpochTrainer
 
 _EVALUATIONS = 12  # of the loss, the most that an epoch takes
 
@@ -20,10 +20,7 @@ _EVALUATIONS = 12  # of the loss, the most that an epoch takes
 class FullBatchTrainer(EpochTrainer[ResidualForce]):
     """Minimises a loss of the network's weights, of those that require a gradient, by L-BFGS.
 
-    Args:
-        model: to train.
-        rollout_error: mean roll-out error on the validation split [mm]; infinite where a roll-out diverged.
-        config: with ``epochs``, ``rollout_every`` and ``memory``, the pairs that L-BFGS keeps.
+    The ``config`` has ``memory`` beside the keys of `EpochTrainer`: the pairs that L-BFGS keeps.
     """
 
     def __init__(
@@ -32,9 +29,8 @@ class FullBatchTrainer(EpochTrainer[ResidualForce]):
         rollout_error: Callable[[ResidualForce], float],
         config: Mapping[str, Any],
     ) -> None:
-        super().__init__(model, rollout_error, config)
         self._weights = [w for w in model.network.parameters() if w.requires_grad]
-        self._optimiser = torch.optim.LBFGS(
+        optimiser = torch.optim.LBFGS(
             self._weights,
             max_iter=1,
             max_eval=_EVALUATIONS,
@@ -43,6 +39,7 @@ class FullBatchTrainer(EpochTrainer[ResidualForce]):
             tolerance_grad=0.0,
             tolerance_change=0.0,
         )
+        super().__init__(model, optimiser, rollout_error, config)
         self._last: tuple[list[torch.Tensor], list[torch.Tensor], torch.Tensor] | None = None
 
     @abstractmethod
@@ -51,7 +48,7 @@ class FullBatchTrainer(EpochTrainer[ResidualForce]):
 
     def _iterate(self) -> float:
         """One iteration; returns the loss that it led to."""
-        self._optimiser.step(self._evaluate)
+        self._optimiser.step(self._evaluate)  # type: ignore[arg-type]
         return float(self._evaluate())
 
     def _evaluate(self) -> torch.Tensor:
@@ -70,27 +67,6 @@ class FullBatchTrainer(EpochTrainer[ResidualForce]):
         return self._last[2]
 
     @override
-    def snapshot(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-        tensors, metadata = super().snapshot()
-        numbers = {}
-        for key, value in self._optimiser.state[self._weights[0]].items():
-            if isinstance(value, torch.Tensor):
-                tensors[f"lbfgs.{key}"] = value
-            elif not isinstance(value, list):
-                numbers[key] = value
-            elif key != "al":  # Scratch.
-                tensors |= {f"lbfgs.{key}.{i:04d}": t for i, t in enumerate(value)}
-        return tensors, {**metadata, "lbfgs": numbers}
-
-    @override
     def resume(self, tensors: Mapping[str, torch.Tensor], metadata: Mapping[str, Any]) -> None:
         super().resume(tensors, metadata)
         self._last = None
-        state = self._optimiser.state[self._weights[0]]
-        state.update(metadata["lbfgs"], old_dirs=[], old_stps=[], ro=[])
-        for key, tensor in sorted(part_of(tensors, "lbfgs.").items()):
-            name, _, index = key.partition(".")
-            if index:
-                state[name].append(tensor)
-            else:
-                state[name] = tensor

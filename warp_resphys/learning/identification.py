@@ -1,14 +1,14 @@
 """System identification: the physical parameters with which a simulator comes closest to observed motions.
 
 The loss is the mean square distance of simulated and observed markers, each motion in units of its own amplitude, over
-all motions at once. `descent` minimises it within bounds, from the best of a coarse set of starts, with gradients
-through the simulator.
+all motions at once. `linalg.least_squares` minimises it within bounds, from the best of a coarse set of starts, with
+gradients through the simulator.
 """
 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import product
+from itertools import product, takewhile
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..io.errors import ConvergenceError, InputError
-from ..linalg.least_squares import minimise
+from ..linalg.least_squares import UnitBox, minimise
 from .replay import Replay, Start
 
 Report = Callable[[int, float, Mapping[str, float]], None]
@@ -29,17 +29,11 @@ _DIFFERENCE = 1e-3  # of a range, for derivatives by differences
 
 @dataclass(frozen=True)
 class Bounds:
-    """The range of a parameter.
+    """The range of a parameter."""
 
-    Attributes:
-        lower: in the parameter's unit.
-        upper: the same.
-        logarithmic: whether it is searched on a logarithmic scale.
-    """
-
-    lower: float
-    upper: float
-    logarithmic: bool = False
+    lower: float  # in the parameter's unit
+    upper: float  # the same
+    logarithmic: bool = False  # whether it is searched on a logarithmic scale
 
     def __post_init__(self) -> None:
         """Checks the range.
@@ -63,41 +57,34 @@ class Bounds:
             return self.lower * torch.exp(unit * math.log(self.upper / self.lower))
         return self.lower + unit * (self.upper - self.lower)
 
+    def slope(self, unit: float) -> float:
+        """Derivative of a value by its fraction."""
+        if self.logarithmic:
+            return self.lower * (self.upper / self.lower) ** unit * math.log(self.upper / self.lower)
+        return self.upper - self.lower
+
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """What the data say about the parameters near the minimum (Gauss-Newton approximation).
+    """What the data say about the parameters near the minimum (Gauss-Newton approximation)."""
 
-    Attributes:
-        deviation: standard deviation of each parameter, in its unit.
-        correlation: (P, P) of the parameters, in their order.
-        poorest: the direction that the data tell least about: weights of the parameters, in fractions of their ranges.
-        poorest_deviation: standard deviation along it, as a fraction of the ranges.
-    """
-
-    deviation: dict[str, float]
-    correlation: list[list[float]]
+    deviation: dict[str, float]  # standard deviation of each parameter, in its unit
+    correlation: list[list[float]]  # (P, P) of the parameters, in their order
+    # the direction that the data tell least about: weights of the parameters, in fractions of their ranges
     poorest: dict[str, float]
-    poorest_deviation: float
+    poorest_deviation: float  # standard deviation along it, as a fraction of the ranges
 
 
 @dataclass
 class Identification:
-    """Result of an identification.
+    """Result of an identification."""
 
-    Attributes:
-        parameters: the values of the smallest loss.
-        loss: that loss, relative to the motions' amplitudes.
-        history: for every start the records ``loss`` and the parameters, one an evaluation that did not fail.
-        at_bounds: parameters that ended on a bound.
-        uncertainty: see the class; None if the simulation fails beside the minimum.
-    """
-
-    parameters: dict[str, float]
-    loss: float
+    parameters: dict[str, float]  # the values of the smallest loss
+    loss: float  # that loss, relative to the motions' amplitudes
+    # for every start the records ``loss`` and the parameters, one an evaluation that did not fail
     history: list[list[dict[str, float]]] = field(default_factory=list)
-    at_bounds: tuple[str, ...] = ()
-    uncertainty: Uncertainty | None = None
+    at_bounds: tuple[str, ...] = ()  # parameters that ended on a bound
+    uncertainty: Uncertainty | None = None  # see the class; None if the simulation fails beside the minimum
 
 
 class Identifier:
@@ -166,8 +153,10 @@ class Identifier:
         Returns:
             Losses with an axis for each of `axes`, in their order; infinite where a simulation failed.
         """
+        held = self._units({**others, **{name: self.bounds[name].lower for name in axes}})
         ticks = [
-            np.linspace(0.0, 1.0, axes[name]) if name in axes else [self._unit(name, others)] for name in self.bounds
+            np.linspace(0.0, 1.0, axes[name]) if name in axes else [unit]
+            for name, unit in zip(self.bounds, held, strict=True)
         ]
         points = np.array(list(product(*ticks)))
         losses = list(finished)
@@ -184,9 +173,10 @@ class Identifier:
         """The values of a parameter on `grid`."""
         return self.bounds[name].from_unit(torch.linspace(0.0, 1.0, count, dtype=torch.float64)).numpy()
 
-    def _unit(self, name: str, values: Mapping[str, float]) -> float:
-        bounds = self.bounds[name]
-        return bounds.to_unit(min(max(values[name], bounds.lower), bounds.upper))
+    def _units(self, values: Mapping[str, float]) -> NDArray[np.float64]:
+        """(P,) values as fractions of their ranges, those outside at the bound."""
+        pairs = ((b, min(max(values[name], b.lower), b.upper)) for name, b in self.bounds.items())
+        return np.array([b.to_unit(value) for b, value in pairs])
 
     def _losses_safe(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Losses without gradients; where some simulations fail, the others are done again without them."""
@@ -209,7 +199,7 @@ class Identifier:
             candidates: how many random sets are tried.
             seed: of the sets (Latin hypercube).
         """
-        units = [np.array([self._unit(name, first) for name in self.bounds])]
+        units = [self._units(first)]
         if count > 1:
             sampler = scipy.stats.qmc.LatinHypercube(len(self.bounds), rng=np.random.default_rng(seed))
             points = sampler.random(max(candidates, count - 1))
@@ -255,7 +245,7 @@ class Identifier:
         if not good:
             raise ConvergenceError("the simulation failed at every start of the identification.", None, None)
         best = min(good, key=lambda attempt: attempt["loss"])
-        unit = np.array([self._unit(name, best["parameters"]) for name in self.bounds])
+        unit = self._units(best["parameters"])
         at_bounds = tuple(n for n, u in zip(self.bounds, unit, strict=True) if min(u, 1.0 - u) < 1e-4)
         histories = [attempt["history"] for attempt in attempts]
         return Identification(best["parameters"], best["loss"], histories, at_bounds, self.uncertainty(unit))
@@ -278,20 +268,21 @@ class Identifier:
             found = self._linearise(unit)
             return None if found is None else 2.0 * np.stack([j.T @ j for _, j, _ in found]).sum(0)
 
-        first = np.array([self._unit(name, start) for name in self.bounds])
-        unit, loss = minimise(objective, first, matrix, max_evaluations, tolerance)
-        return {
-            "parameters": self._values(unit),
-            "loss": loss if np.isfinite(loss) else None,
-            "history": history,
-        }
+        problem = UnitBox(objective, matrix)
+        point = problem.evaluate(torch.as_tensor(self._units(start))[None])
+        simulated = math.isfinite(float(point.value))
+        if simulated:
+            point = minimise(problem, point, tolerance, max_evaluations - 1).point
+        loss = float(point.value) if simulated else None
+        return {"parameters": self._values(point.x[0].tolist()), "loss": loss, "history": history}
 
     def _loss_and_gradient(self, unit: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         """Infinite, and zero, where the simulation fails."""
         x = self.simulator.tensor(unit)[None].requires_grad_()
         try:
-            loss = self.losses(x)[0]
-            (gradient,) = torch.autograd.grad(loss, x)
+            with torch.enable_grad():
+                loss = self.losses(x)[0]
+                (gradient,) = torch.autograd.grad(loss, x)
         except ConvergenceError:
             return np.inf, np.zeros_like(unit)
         return float(loss.detach()), gradient[0].double().cpu().numpy()
@@ -343,20 +334,14 @@ class Identifier:
         inverse = (vectors / np.maximum(values, 1e-12 * max(values[-1], 1e-300))) @ vectors.T
         covariance = inverse @ np.einsum("r,rpq->pq", variances, blocks) @ inverse
         deviation = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-        slopes = [self._slope(name, u) for name, u in zip(self.bounds, unit, strict=True)]
+        slopes = [bounds.slope(u) for bounds, u in zip(self.bounds.values(), unit, strict=True)]
         poorest = vectors[:, 0] * np.sign(vectors[np.abs(vectors[:, 0]).argmax(), 0])
         return Uncertainty(
-            deviation={n: float(d * s) for n, d, s in zip(self.bounds, deviation, slopes, strict=True)},
+            deviation=dict(zip(self.bounds, (deviation * slopes).tolist(), strict=True)),
             correlation=(covariance / np.outer(deviation, deviation)).tolist(),
             poorest=dict(zip(self.bounds, poorest.tolist(), strict=True)),
             poorest_deviation=float(np.sqrt(max(vectors[:, 0] @ covariance @ vectors[:, 0], 0.0))),
         )
-
-    def _slope(self, name: str, unit: float) -> float:
-        """Derivative of a parameter with respect to its fraction."""
-        x = torch.tensor(float(unit), dtype=torch.float64, requires_grad=True)
-        (slope,) = torch.autograd.grad(self.bounds[name].from_unit(x), x)
-        return float(slope)
 
 
 def _redundancy(series: NDArray[np.float64]) -> float:
@@ -366,9 +351,4 @@ def _redundancy(series: NDArray[np.float64]) -> float:
     products = [float((series[lag:] * series[: len(series) - lag]).sum()) for lag in range(len(series) // 2)]
     if products[0] <= 0.0:
         return 1.0
-    total = 1.0
-    for value in products[1:]:
-        if value <= 0.0:
-            break
-        total += 2.0 * value / products[0]
-    return total
+    return 1.0 + 2.0 * sum(takewhile(lambda value: value > 0.0, products[1:])) / products[0]

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from typing_extensions import override
 
-from ..dynamics.frames import VertexFrames
+from ..dynamics.frames import BaseFrame, VertexFrames
 from ..io.errors import ConvergenceError
 from .full_batch import FullBatchTrainer
 from .networks import ResidualForce
@@ -31,12 +31,14 @@ class Watched:
         start: how they begin.
         told: what a model is told of the inputs (`LearnedPredictor`); None for nothing.
         frames: with which forces turn; None if they do not.
+        base: in whose frame the model predicts; None where that stands still.
     """
 
     replay: Replay
     start: Start
     told: torch.Tensor | None = None
     frames: VertexFrames | None = None
+    base: BaseFrame | None = None
 
 
 class MotionLoss:
@@ -61,7 +63,7 @@ class MotionLoss:
         """
         found = []
         for each in self._watched:
-            force: Any = None if model is None else LearnedPredictor(model, each.told, frames=each.frames)
+            force: Any = None if model is None else LearnedPredictor(model, each.told, None, each.frames, each.base)
             found.append(each.replay(each.start, self._parameters or None, force=force)[0])
         return found
 

@@ -1,6 +1,7 @@
 """Roll-out errors as the experiments define them, and the published numbers that stand beside them."""
 
 import math
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final, NamedTuple, TypedDict
 
@@ -8,8 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..io.errors import InputError
-
-MILLIMETRES_PER_METRE: Final = 1e3
 
 
 class PublishedError(NamedTuple):
@@ -114,51 +113,21 @@ PUBLISHED_MARKERS: Final = 4
 PUBLISHED_MARKERS_OF_SMALL_SPREAD: Final = 10
 
 
-def trajectory_errors(positions: ArrayLike, target: ArrayLike) -> NDArray[np.float64]:
-    """Return the error of one roll-out at each step: the mean distance of its vertices from the target's.
-
-    State 0 is given to the roll-out, so it is left out. A roll-out that diverged keeps its non-finite values,
-    and a caller that stopped one early pads it with NaN: `summarise` counts both.
-
-    Args:
-        positions: (T+1, N, 3) simulated vertices or markers [m], states 0 to T.
-        target: (T+1, N, 3) where they should have been [m].
-
-    Returns:
-        (T,) errors [mm] of the steps 1 to T.
-
-    Raises:
-        InputError: The shapes differ or are not (T+1, N, 3), or the target is not finite.
-    """
-    simulated = np.asarray(positions, dtype=np.float64)  # (T+1, N, 3) [m]
-    wanted = np.asarray(target, dtype=np.float64)  # (T+1, N, 3) [m]
-    if simulated.shape != wanted.shape or simulated.ndim != 3 or simulated.shape[2] != 3 or len(simulated) < 2:
-        raise InputError(
-            f"cannot compare positions of shape {simulated.shape} with a target of shape {wanted.shape}: "
-            "both must be (steps + 1, vertices, 3)"
-        )
-    if not np.isfinite(wanted).all():
-        state = int(np.argwhere(~np.isfinite(wanted))[0, 0])
-        raise InputError(f"the target trajectory is not finite at state {state}: leave out what was not observed")
-    with np.errstate(over="ignore", invalid="ignore"):  # A diverged roll-out reaches inf, and inf - inf.
-        distance = np.linalg.norm(simulated[1:] - wanted[1:], axis=2)  # (T, N) [m]
-        return np.asarray(distance.mean(axis=1) * MILLIMETRES_PER_METRE)
-
-
 def marker_errors(simulated: NDArray[np.float64], observed: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean distance of the markers that were seen, of the frames in which one was (the paper's eq. 7).
+    """Return the mean distance of the markers or vertices that were seen (the paper's eq. 4 and 7).
 
     Args:
         simulated: (T, M, 3) [m], NaN where the roll-out diverged.
         observed: (T, M, 3) [m], NaN where a marker was not seen.
 
     Returns:
-        (T',) errors [mm].
+        (T',) errors of the frames in which one was seen [mm].
     """
     seen = np.asarray(np.isfinite(observed).all(-1))
-    distance = np.where(seen, np.linalg.norm(simulated - np.where(seen[..., None], observed, 0.0), axis=-1), 0.0)
+    with np.errstate(over="ignore"):  # A diverged roll-out reaches infinity.
+        distance = np.where(seen, np.linalg.norm(simulated - np.where(seen[..., None], observed, 0.0), axis=-1), 0.0)
     any_seen = seen.any(1)
-    return np.asarray(MILLIMETRES_PER_METRE * distance.sum(1)[any_seen] / seen.sum(1)[any_seen])
+    return np.asarray(1e3 * distance.sum(1)[any_seen] / seen.sum(1)[any_seen])
 
 
 def errors_per_marker(
@@ -179,13 +148,12 @@ def errors_per_marker(
 
 
 def summarise(errors: Iterable[NDArray[np.float64]]) -> ErrorSummary:
-    """Return the mean error over trajectories, steps and vertices, with its standard deviation.
+    """Return the mean error over trajectories, steps and vertices: E_q of the published source.
 
-    The mean is E_q of the published source. The deviation is over trajectories and steps, of the mean over
-    the vertices.
+    The deviation is over trajectories and steps, of the mean over the vertices.
 
     Args:
-        errors: One (T,) array [mm] a trajectory, as `trajectory_errors` returns it; T may differ.
+        errors: One (T,) array [mm] a trajectory, as `marker_errors` returns it; T may differ.
 
     Raises:
         InputError: There is no trajectory, or one has no step.
@@ -220,18 +188,11 @@ def summarise_each(names: Sequence[str], errors: Mapping[str, Iterable[NDArray[n
     for model, rows in means.items():
         if len(rows) != len(names):
             raise InputError(f"{model} has {len(rows)} roll-outs for {len(names)} test trajectories")
-    return [
-        {"name": name, "errors_mm": {model: rows[index] for model, rows in means.items()}}
-        for index, name in enumerate(names)
-    ]
+    return [{"name": name, "errors_mm": {m: rows[i] for m, rows in means.items()}} for i, name in enumerate(names)]
 
 
 def summarise_folds(folds: Sequence[Mapping[str, ErrorSummary]]) -> dict[str, ErrorSummary]:
-    """Return the errors of a cross-validation: the mean of the folds' means, each fold weighing the same.
-
-    Args:
-        folds: The summaries of every model in every fold.
-    """
+    """Return the errors of a cross-validation, of every model's in every fold: the mean of the folds' means."""
     return {model: _over_folds([fold[model] for fold in folds]) for model in folds[0]}
 
 
@@ -261,10 +222,9 @@ def median_filter(values: ArrayLike, time_step: float, window: float = 1.0) -> N
     half = int(0.5 * window / time_step + 1e-9)
     blank = np.full((*rows.shape[:-1], half), np.nan)
     windows = np.lib.stride_tricks.sliding_window_view(np.concatenate([blank, rows, blank], axis=-1), 2 * half + 1, -1)
-    ordered = np.sort(windows, axis=-1)  # NaN comes last
-    count = (~np.isnan(ordered)).sum(axis=-1, keepdims=True)
-    low, high = (np.take_along_axis(ordered, np.maximum(count - 1 + up, 0) // 2, axis=-1)[..., 0] for up in (0, 1))
-    return np.where(low == high, low, 0.5 * (low + high))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # Windows of NaN alone.
+        return np.asarray(np.nanmedian(windows, axis=-1))
 
 
 def _over_folds(summaries: Sequence[ErrorSummary]) -> ErrorSummary:

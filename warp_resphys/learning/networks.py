@@ -59,7 +59,7 @@ class RecurrentMLP(nn.Module):
         n_in: inputs.
         n_out: outputs.
         recurrent: size of the hidden state.
-        architecture: of the `SkipMLP` that sees the inputs and the hidden state.
+        architecture: of the `SkipMLP` that sees both.
     """
 
     def __init__(self, n_in: int, n_out: int, recurrent: int, **architecture: Any) -> None:
@@ -140,11 +140,7 @@ class Coder(nn.Module):
 
 
 def pod_coder(samples: torch.Tensor, modes: int) -> Coder:
-    """Proper orthogonal decomposition about zero: the modes that hold most of the samples' energy.
-
-    Args:
-        samples: (S, N, 3), with S at least ``modes``.
-        modes: M.
+    """Proper orthogonal decomposition about zero: the M modes that hold most of the energy of samples (S, N, 3).
 
     Raises:
         InputError: more modes than samples or coordinates.
@@ -236,13 +232,13 @@ class StateMap(nn.Module):
         self.outputs = nn.ModuleDict(outputs)
         self.architecture = {key: architecture[key] for key in ("blocks", "layers", "width", "activation")}
         self.recurrent: int | None = architecture.get("recurrent")
+        if self.recurrent is not None:
+            self.architecture["recurrent"] = self.recurrent
         self._sizes = [coder.size for coder in outputs.values()]
         n_in = position.size + velocity.size + (0 if actuation is None else actuation.size)
         n_out = sum(self._sizes)
-        if self.recurrent is None:
-            self.network: SkipMLP | RecurrentMLP = SkipMLP(n_in, n_out, **self.architecture).to(rest.device)
-        else:
-            self.network = RecurrentMLP(n_in, n_out, self.recurrent, **self.architecture).to(rest.device)
+        kind: type[SkipMLP | RecurrentMLP] = SkipMLP if self.recurrent is None else RecurrentMLP
+        self.network = kind(n_in, n_out, **self.architecture).to(rest.device)
         self.register_buffer("linear", torch.zeros(n_in, n_out, device=rest.device))
         self.register_buffer("remainder", torch.ones((), device=rest.device))
 
@@ -252,7 +248,7 @@ class StateMap(nn.Module):
         return [coder for coder in self.outputs.values() if isinstance(coder, Coder)]
 
     def fit_linear(self, inputs: torch.Tensor, outputs: torch.Tensor, noise: float) -> None:
-        """Sets the linear part by least squares, as if the inputs had noise of that deviation (ridge regression).
+        """Sets the linear part by ridge regression: least squares, as if the inputs had noise of that deviation.
 
         Args:
             inputs: (S, n_in) standardised.
@@ -270,12 +266,7 @@ class StateMap(nn.Module):
     ) -> tuple[torch.Tensor, torch.Tensor | None]:
         """(S, n_out) standardised fields from (S, n_in) standardised inputs: linear part and network.
 
-        Args:
-            inputs: (S, n_in).
-            hidden: (S, H) the last hidden state of a recurrent network; None at first.
-
-        Returns:
-            The fields, and the next hidden state; None without any.
+        A recurrent network's last hidden state (S, H), None at first, goes in, and the next one comes out.
         """
         if isinstance(self.network, RecurrentMLP):
             found, hidden = self.network(inputs, hidden)
@@ -284,12 +275,10 @@ class StateMap(nn.Module):
         return inputs @ self.linear + self.remainder * found, hidden
 
     def encode(self, q: torch.Tensor, v: torch.Tensor, actuation: torch.Tensor | None = None) -> torch.Tensor:
-        """(S, n_in) standardised inputs, as precise as the network.
+        """(S, n_in) standardised inputs, as precise as the network, of (S, N, 3) [m] and [m/s], and of (S, A) or None.
 
-        Args:
-            q: (S, N, 3) positions [m].
-            v: (S, N, 3) velocities [m/s].
-            actuation: (S, A), for a model that was built with one.
+        Raises:
+            ValueError: no actuation for a model that was built with one.
         """
         parts = [self.position.encode(q - self.rest), self.velocity.encode(v)]
         if self.actuation is not None:
@@ -318,7 +307,7 @@ class StateMap(nn.Module):
     def description(self) -> dict[str, Any]:
         """What `restore` needs beside the tensors."""
         return {
-            "architecture": {**self.architecture, **({} if self.recurrent is None else {"recurrent": self.recurrent})},
+            "architecture": self.architecture,
             "reduced": self.position.basis is not None,
             "actuated": self.actuation is not None,
         }
@@ -396,18 +385,7 @@ def build_next_state(
     v: torch.Tensor,
     actuation: torch.Tensor | None = None,
 ) -> NextState:
-    """A data-driven baseline of the same family: in- and outputs share their coders.
-
-    Args:
-        config: the group ``network``.
-        rest: (N, 3) rest positions [m].
-        q: (S, N, 3) positions [m].
-        v: (S, N, 3) velocities [m/s].
-        actuation: (S, A) what acts on the body, or None.
-
-    Raises:
-        InputError: an unknown kind, or sizes that do not fit the samples.
-    """
+    """A data-driven baseline of the same family, whose in- and outputs share their coders; see `build_model`."""
     position, velocity = _state_coders(config, q - rest, v)
     outputs = dict(zip(NextState.fields, _state_coders(config, q - rest, v), strict=True))
     actuated = None if actuation is None else actuation_coder(actuation)
@@ -435,19 +413,11 @@ Model = TypeVar("Model", bound=StateMap)
 
 
 def restore(kind: type[Model], tensors: Mapping[str, torch.Tensor], description: Mapping[str, Any]) -> Model:
-    """A model from its ``state_dict`` and `StateMap.description`.
-
-    Args:
-        kind: `ResidualForce` or `NextState`.
-        tensors: the ``state_dict``.
-        description: what `StateMap.description` returned.
-    """
+    """A model from its ``state_dict`` and `StateMap.description`."""
 
     def coder(name: str) -> Coder:
-        parts = [tensors.get(f"{name}.{part}") for part in ("mean", "basis", "scale", "dual")]
-        assert parts[0] is not None
-        assert parts[2] is not None
-        return Coder(parts[0], parts[1], parts[2], parts[3])
+        basis, dual = (tensors.get(f"{name}.{part}") for part in ("basis", "dual"))
+        return Coder(tensors[f"{name}.mean"], basis, tensors[f"{name}.scale"], dual)
 
     outputs = {name: coder(f"outputs.{name}") for name in kind.fields}
     actuation = coder("actuation") if description["actuated"] else None

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import torch
 
-from ..dynamics.frames import VertexFrames
+from ..dynamics.frames import BaseFrame, VertexFrames
 from ..dynamics.integrator import State
 from .networks import NextState, StateMap
 
@@ -64,6 +64,7 @@ class LearnedPredictor:
             the end the last; None for nothing.
         range_: of its inputs in training, in which it is held; None for no guard.
         frames: with which its forces turn; None if they do not.
+        base: in whose frame it predicts; None where that stands still.
 
     Attributes:
         left_at: (B,) step at which an environment left the range, -1 where it has not; None before the first step.
@@ -76,14 +77,17 @@ class LearnedPredictor:
         told: torch.Tensor | None = None,
         range_: Range | None = None,
         frames: VertexFrames | None = None,
+        base: BaseFrame | None = None,
     ) -> None:
-        self.model, self._told, self._range, self._frames = model, told, range_, frames
+        self.model, self._told, self._range, self._frames, self._base = model, told, range_, frames, base
         self.left_at: torch.Tensor | None = None
         self.hidden: torch.Tensor | None = None
 
     def __call__(self, state: State, step: int) -> torch.Tensor | State:
         """The model's force (B, N, 3) [N], or the next state, on the simulator's device and in its type."""
         q, v, like = state.q, state.v, self.model.rest
+        if self._base is not None:
+            q, v = self._base.enter(q, v, step)
         told = self._told
         if told is not None and told.ndim == 3:
             told = told[min(step, len(told) - 1)]
@@ -100,5 +104,6 @@ class LearnedPredictor:
         found, self.hidden = self.model.decode(inputs, self.hidden)
         fields = [field.to(q.device, q.dtype) for field in found]
         if isinstance(self.model, NextState):
-            return State(fields[0], fields[1])
-        return fields[0] if self._frames is None else self._frames.to_world(q, v, fields[0])
+            return State(*(fields if self._base is None else self._base.leave(fields[0], fields[1], step + 1)))
+        force = fields[0] if self._frames is None else self._frames.to_world(q, v, fields[0])
+        return force if self._base is None else self._base.force_outside(force, step)

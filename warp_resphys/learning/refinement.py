@@ -14,7 +14,7 @@ import torch
 from typing_extensions import override
 
 from ..data.trials import Trials
-from ..dynamics.frames import VertexFrames
+from ..dynamics.frames import BaseFrame, VertexFrames
 from ..dynamics.integrator import State
 from ..dynamics.simulator import Simulator
 from ..io.errors import ConvergenceError, InputError
@@ -39,6 +39,7 @@ class Motion:
         target: (R, K + 1, M, 3) what should be observed [m], NaN where nothing was seen.
         trials: what acted on the bodies.
         told: what the model is told of that, see `LearnedPredictor`; None for nothing.
+        base: in whose frame the model predicts; None where that stands still.
     """
 
     q: torch.Tensor
@@ -46,6 +47,7 @@ class Motion:
     target: torch.Tensor
     trials: Trials
     told: torch.Tensor | None = None
+    base: BaseFrame | None = None
 
 
 @dataclass(frozen=True)
@@ -186,7 +188,8 @@ class WindowLoss:
             self._parameters
         )
         told = None if motion.told is None else _during(motion.told.index_select(-2, run), frame, self._window)
-        predict = LearnedPredictor(self._model, told, self._range, self._frames)
+        base = None if motion.base is None else motion.base.during(run, frame, self._window)
+        predict = LearnedPredictor(self._model, told, self._range, self._frames, base)
         acting = inputs.from_steps(frame, self._window)
         rollout = Rollout(simulator, predict, acting, constants)
         squares = state.q.new_zeros(len(windows))

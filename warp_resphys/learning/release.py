@@ -6,11 +6,11 @@ go between two frames, and not without a push, of a body that it may have bent s
 slow modes, and a sideways displacement are what best explains the first frames.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from typing_extensions import override
 
 from ..data.trials import Trials
 from ..dynamics.inputs import Inputs
@@ -18,47 +18,37 @@ from ..dynamics.integrator import State
 from ..dynamics.modes import resolved, vibration_modes, with_signs
 from ..dynamics.simulator import Simulator
 from ..io.errors import ConvergenceError, InputError
+from ..linalg.least_squares import Move, Point, Problem, damped, minimise
 from .replay import Observe, Replay, Start
 
-_HOLD_ITERATIONS = 30
+_HOLD_ITERATIONS = 100
 _HOLD_TOLERANCE = 1e-7  # m, change of any position in the last iteration
 _SIDEWAYS_STRAIN = 1e-3  # of the body's extent: how far it is bent to find how it bends
 _DELAYS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # that the search begins at, in expected deviations
 _HOLD_WEIGHT = 1e-6  # w, in units of the largest diagonal entry of the first J^T J
+_RELEASE_TOLERANCE, _DIFFERENCE, _LONGEST_STEP = 1e-4, 0.05, 3.0  # in expected deviations
 
 
 @dataclass(frozen=True)
 class ReleaseSettings:
-    """How the beginning of a motion is estimated.
+    """How the beginning of a motion is estimated."""
 
-    Attributes:
-        hold_modes: vibration modes whose inertial forces hold the body; 0 lets it go from where gravity leaves it.
-        velocity_modes: vibration modes that the velocity at the release is made of; 0 for none.
-        window: how much of the motion after the release is used [s].
-        noise: what a marker may be off for reasons that no release explains [m].
-        delay: expected deviation of the moment of release from the one found in the frames [s]; 0 keeps that one.
-        speed: expected size of the velocity of the fastest vertex [m/s].
-        sideways: expected displacement, across gravity, of a body that seems to be held undeformed [m]: as a sideways
-            acceleration bends it, at the vertex that moves furthest; 0 for none. Along gravity it would be mistaken for
-            a weight or a stiffness.
-        iterations: Levenberg-Marquardt steps.
-    """
-
+    # vibration modes whose inertial forces hold the body; 0 lets it go from where gravity leaves it
     hold_modes: int = 6
-    velocity_modes: int = 0
-    window: float = 0.13
-    noise: float = 3e-4
+    velocity_modes: int = 0  # vibration modes that the velocity at the release is made of; 0 for none
+    window: float = 0.13  # how much of the motion after the release is used [s]
+    noise: float = 3e-4  # what a marker may be off for reasons that no release explains [m]
+    # expected deviation of the moment of release from the one found in the frames [s]; 0 keeps that one
     delay: float = 0.0
-    speed: float = 0.05
+    speed: float = 0.05  # expected size of the velocity of the fastest vertex [m/s]
+    # expected displacement, across gravity, of a body that seems to be held undeformed [m]: as a sideways
+    # acceleration bends it, at the vertex that moves furthest; 0 for none. Along gravity it would be mistaken for
+    # a weight or a stiffness
     sideways: float = 0.0
-    iterations: int = 4
+    iterations: int = 4  # Levenberg-Marquardt steps
 
     def __post_init__(self) -> None:
-        """Checks the ranges.
-
-        Raises:
-            InputError: a number out of range.
-        """
+        """Checks the ranges; raises InputError for a number out of range."""
         for name in ("window", "noise", "speed", "iterations"):
             if not getattr(self, name) > 0:
                 raise InputError(f"release.{name} is {getattr(self, name)}: it must be positive.")
@@ -87,115 +77,128 @@ def estimate_release(simulator: Simulator, markers: Observe, motions: Trials, se
 def hold(replay: Replay, modes: int) -> torch.Tensor:
     """(R, N, 3) positions at rest under gravity, weights and the virtual force that holds the markers best [m].
 
-    Levenberg-Marquardt on |m(q(a)) - y|^2 + w |a|^2 with q(a) the equilibrium under the force B a. The weight w is so
-    small that it only keeps what no marker sees from moving.
-
     Args:
         replay: of the trials, which tell where the markers were held.
-        modes: columns of B, the inertial forces of the slowest vibrations.
+        modes: columns of B (see `_Held`), the inertial forces of the slowest vibrations.
 
     Raises:
         ConvergenceError: no equilibrium was found.
     """
-    simulator, count, target = replay.simulator, len(replay.trials.names), replay.trials.held
-    with torch.no_grad():
-        constants, _, resting = replay.setting()
     if modes == 0:
         with torch.no_grad():
-            return simulator.static_equilibrium(resting, constants, batch=count).q
-    basis = vibration_modes(simulator, modes)
-    identity = torch.eye(modes, dtype=target.dtype, device=target.device)
+            constants, _, resting = replay.setting()
+            return replay.simulator.static_equilibrium(resting, constants, batch=len(replay.trials.names)).q
+    problem = _Held(replay, modes)
+    return minimise(problem, problem.straight, _HOLD_TOLERANCE, _HOLD_ITERATIONS).point.kept[0]
 
-    def equilibrium(a: torch.Tensor, start: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Positions, and (R, 3 M) distances from where the markers were held."""
-        load = (a @ basis.mT).unflatten(1, (-1, 3))
-        q = simulator.static_equilibrium(resting.plus(load), constants, start=start).q
-        return q, torch.where(torch.isfinite(target), target - replay.observe(q), 0.0).flatten(1)
 
-    force = simulator.rest_positions.new_zeros(count, modes)
-    damping = force.new_full((count, 1, 1), 1e-3)  # in units of the largest diagonal entry
-    weight = None
-    with torch.no_grad():
-        q, missing = equilibrium(force, simulator.rest_state(count).q)
-    for _ in range(_HOLD_ITERATIONS):
-        jacobian = -_derivatives(equilibrium, force, q)
-        gram = jacobian.mT @ jacobian
-        scale = gram.diagonal(dim1=1, dim2=2).amax(1)[:, None, None]
-        weight = _HOLD_WEIGHT * scale if weight is None else weight
-        right = jacobian.mT @ missing[..., None] - weight * force[..., None]
-        change = torch.linalg.solve(gram + (weight + damping * scale) * identity, right)[..., 0]
+class _Held(Problem):
+    """|m(q(a)) - y|^2 + w |a|^2 over a (R, modes), q(a) being the equilibrium under the force B a.
+
+    The weight w is so small that it only keeps what no marker sees from moving. A point keeps the positions (R, N, 3),
+    what is missing to where the markers were held (R, 3 M), and its derivative (R, 3 M, modes) [m].
+    """
+
+    def __init__(self, replay: Replay, modes: int) -> None:
+        with torch.no_grad():
+            self._constants, _, self._resting = replay.setting()
+        self._replay, self._basis = replay, vibration_modes(replay.simulator, modes)
+        count = len(replay.trials.names)
+        self._near, none = replay.simulator.rest_state(count).q, self._basis.new_zeros(count, modes)
+        kept = self._equilibrium(none)
+        self.straight = Point(none, kept[1].square().sum(1), kept)
+        self._weight = _HOLD_WEIGHT * kept[2].square().sum(1).amax(1)[:, None]
+
+    def _equilibrium(self, a: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """What a point keeps."""
+        target = self._replay.trials.held
+        with torch.enable_grad():
+            a = a.detach().requires_grad_()
+            acting = self._resting.plus((a @ self._basis.mT).unflatten(1, (-1, 3)))
+            q = self._replay.simulator.static_equilibrium(acting, self._constants, start=self._near).q
+            missing = torch.where(torch.isfinite(target), target - self._replay.observe(q), 0.0).flatten(1)
+            rows = [torch.autograd.grad(each.sum(), a, retain_graph=True)[0] for each in missing.unbind(1)]
+        return q.detach(), missing.detach(), torch.stack(rows, 1)
+
+    @override
+    def evaluate(self, x: torch.Tensor) -> Point:
         try:
-            with torch.no_grad():
-                new_q, new_missing = equilibrium(force + change, q)
+            kept = self._equilibrium(x)
         except ConvergenceError:
-            damping = 10.0 * damping
-            continue
-        before, after = (
-            y.square().sum(1) + weight[:, 0, 0] * a.square().sum(1)
-            for y, a in ((missing, force), (new_missing, force + change))
-        )
-        better = after <= before
-        moved = float((new_q - q).abs().max())
-        force = torch.where(better[:, None], force + change, force)
-        q = torch.where(better[:, None, None], new_q, q)
-        missing = torch.where(better[:, None], new_missing, missing)
-        damping = torch.where(better[:, None, None], 0.2 * damping, 10.0 * damping).clamp(1e-9, 1e6)
-        if moved < _HOLD_TOLERANCE:
-            break
-    return q
+            return Point(x, torch.full_like(x[:, 0], torch.inf), self.straight.kept)
+        return Point(x, kept[1].square().sum(1) + (self._weight * x.square()).sum(1), kept)
 
+    @override
+    def linearise(self, point: Point) -> Move:
+        self._near, missing, slope = point.kept
+        matrix = slope.mT @ slope + torch.diag_embed(self._weight.expand_as(point.x))
+        right = -(slope.mT @ missing[..., None])[..., 0] - self._weight * point.x
+        return lambda damping: point.x + torch.linalg.solve(damped(matrix, damping), right)
 
-def _derivatives(
-    equilibrium: Callable[[torch.Tensor, torch.Tensor], tuple[torch.Tensor, torch.Tensor]],
-    force: torch.Tensor,
-    q: torch.Tensor,
-) -> torch.Tensor:
-    """(R, 3 M, modes) of what is missing by the (R, modes) force, at its equilibrium q."""
-    a = force.clone().requires_grad_()
-    _, missing = equilibrium(a, q)
-    rows = [torch.autograd.grad(missing[:, i].sum(), a, retain_graph=True)[0] for i in range(missing.shape[1])]
-    return torch.stack(rows, 1)
+    @override
+    def distance(self, old: Point, new: Point) -> torch.Tensor:
+        return (new.kept[0] - old.kept[0]).abs().amax((1, 2))
 
 
 def _initial_motion(
     simulator: Simulator, markers: Observe, motions: Trials, held: Start, settings: ReleaseSettings
 ) -> Start:
-    """What explains the first frames (`_ReleaseModel`), by Levenberg-Marquardt with differences over a batch.
+    """What explains the first frames (`_ReleaseModel`).
 
     A frame before the release sees the body at rest and one after it does not, so that the objective has a kink at the
     delay of every frame, and minima between them: several delays are tried, and the best one is kept.
     """
-    beginning = _ReleaseModel(simulator, markers, held, settings)
-    count, unknowns = len(motions.names), len(beginning.deviation)
+    model = _ReleaseModel(simulator, markers, held, settings)
+    count, unknowns = len(motions.names), len(model.deviation)
     if not unknowns:
         return held
-    starts = simulator.tensor(_DELAYS if settings.delay > 0.0 else (0.0,))
-    runs, size = len(starts) * count, 1 + unknowns
-    replay = Replay(simulator, markers, motions.select(list(range(count)) * len(starts) * size))
-    step = 0.05
-    identity = torch.eye(unknowns, dtype=starts.dtype, device=starts.device)
-    offsets = torch.cat([torch.zeros_like(identity[:1]), step * identity]).repeat_interleave(runs, 0)
-    trial = starts.repeat_interleave(count)[:, None] * identity[0]  # (runs, unknowns), in expected deviations
-    best, least, right = trial, torch.full_like(trial[:, 0], torch.inf), trial[..., None]
-    gram = identity.expand(runs, -1, -1)
-    damping = torch.full_like(gram[:, :1, :1], 1e-2)  # in units of the largest diagonal entry
-    with torch.no_grad():
-        for _ in range(settings.iterations + 1):  # The last one only tells whether the step before was good.
-            simulated = replay(beginning(trial.repeat(size, 1) + offsets))
-            residual = replay.errors(simulated)[0].flatten(1).unflatten(0, (size, runs)) / settings.noise
-            objective = residual[0].square().sum(1) + trial.square().sum(1)
-            better = objective < least
-            least, kept = torch.where(better, objective, least), better[:, None]
-            best, better = torch.where(kept, trial, best), kept[..., None]
-            jacobian = ((residual[1:] - residual[0]) / step).permute(1, 2, 0)
-            gram = torch.where(better, jacobian.mT @ jacobian + identity, gram)
-            right = torch.where(better, jacobian.mT @ residual[0][..., None] + trial[..., None], right)
-            damping = torch.where(better, 0.2 * damping, 10.0 * damping)
-            scale = gram.diagonal(dim1=1, dim2=2).amax(1)[:, None, None]
-            change = torch.linalg.solve(gram + damping * scale * identity, right)[..., 0]
-            trial = best - change * (3.0 / change.abs().amax(1, keepdim=True)).clamp_max(1.0)
-        chosen = least.view(-1, count).argmin(0)
-        return beginning(best.view(-1, count, unknowns)[chosen, torch.arange(count, device=chosen.device)])
+    delays = simulator.tensor(_DELAYS if settings.delay > 0.0 else (0.0,))
+    start = delays.repeat_interleave(count)[:, None] * torch.eye(unknowns).to(delays)[0]
+    copies = motions.select(list(range(count)) * len(delays) * (1 + unknowns))
+    problem = _FirstFrames(Replay(simulator, markers, copies), model, settings.noise)
+    found = minimise(problem, problem.evaluate(start), _RELEASE_TOLERANCE, settings.iterations).point
+    chosen = found.value.view(-1, count).argmin(0)
+    return model(found.x.view(-1, count, unknowns)[chosen, torch.arange(count, device=chosen.device)])
+
+
+class _FirstFrames(Problem):
+    """Distances of simulated from observed frames in units of their noise, over releases in their deviations.
+
+    A point keeps J^T J + 1 and the gradient, J by differences over a batch.
+
+    Args:
+        replay: of 1 + P copies of the trials for the P unknowns.
+        model: of unknowns to releases.
+        noise: see `ReleaseSettings` [m].
+    """
+
+    def __init__(self, replay: Replay, model: "_ReleaseModel", noise: float) -> None:
+        self._replay, self._model, self._noise = replay, model, noise
+
+    @override
+    def evaluate(self, x: torch.Tensor) -> Point:
+        runs, unknowns = x.shape
+        identity = torch.eye(unknowns, dtype=x.dtype, device=x.device)
+        offsets = torch.cat([torch.zeros_like(identity[:1]), _DIFFERENCE * identity]).repeat_interleave(runs, 0)
+        simulated = self._replay(self._model(x.repeat(1 + unknowns, 1) + offsets))
+        residual = self._replay.errors(simulated)[0].flatten(1).unflatten(0, (-1, runs)) / self._noise
+        slope = ((residual[1:] - residual[0]) / _DIFFERENCE).permute(1, 2, 0)
+        gradient = (slope.mT @ residual[0][..., None])[..., 0] + x
+        return Point(x, residual[0].square().sum(1) + x.square().sum(1), (slope.mT @ slope + identity, gradient))
+
+    @override
+    def linearise(self, point: Point) -> Move:
+        matrix, gradient = point.kept
+
+        def step(damping: torch.Tensor) -> torch.Tensor:
+            change = torch.linalg.solve(damped(matrix, damping), -gradient)
+            return point.x + change * (_LONGEST_STEP / change.abs().amax(1, keepdim=True)).clamp_max(1.0)
+
+        return step
+
+    @override
+    def distance(self, old: Point, new: Point) -> torch.Tensor:
+        return (new.x - old.x).abs().amax(1)
 
 
 class _ReleaseModel:

@@ -28,19 +28,14 @@ Parameters = Mapping[str, torch.Tensor]
 
 @dataclass(frozen=True)
 class Start:
-    """How trials begin.
+    """How trials begin."""
 
-    Attributes:
-        state: (R, N, 3) positions [m] and velocities [m/s]; a first guess where the trials begin at rest.
-        delay: (R,) by which the bodies were let go later than the time zero of the frames [s].
-        shift: (R, M, 3) from where the markers are bound to where they sit, on a body that only seemed to be held
-            undeformed [m]; None for no shift.
-        at_rest: whether the bodies are in equilibrium, which depends on the parameters as much as all that follows.
-    """
-
-    state: State
-    delay: torch.Tensor
+    state: State  # (R, N, 3) positions [m] and velocities [m/s]; a first guess where the trials begin at rest
+    delay: torch.Tensor  # (R,) by which the bodies were let go later than the time zero of the frames [s]
+    # (R, M, 3) from where the markers are bound to where they sit, on a body that only seemed to be held
+    # undeformed [m]; None for no shift
     shift: torch.Tensor | None = None
+    # whether the bodies are in equilibrium, which depends on the parameters as much as all that follows
     at_rest: bool = False
 
     @classmethod

@@ -1,8 +1,9 @@
 """Supervised training of a model, chosen by its roll-outs or, as published, by its validation loss."""
 
+import copy
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic
 
@@ -18,41 +19,27 @@ SELECTIONS = ("rollout", "validation_loss")
 
 @dataclass(frozen=True)
 class Samples:
-    """States and the fields that belong to them.
+    """States and the fields that belong to them."""
 
-    Attributes:
-        q: (S, N, 3) positions [m].
-        v: (S, N, 3) velocities [m/s].
-        outputs: the fields, each (S, N, 3).
-        actuation: (S, A) what else acts on the body; None if nothing does.
-        lengths: of the series that the samples are, one after the other, if they are.
-    """
-
-    q: torch.Tensor
-    v: torch.Tensor
-    outputs: tuple[torch.Tensor, ...]
-    actuation: torch.Tensor | None = None
-    lengths: tuple[int, ...] = ()
+    q: torch.Tensor  # (S, N, 3) positions [m]
+    v: torch.Tensor  # (S, N, 3) velocities [m/s]
+    outputs: tuple[torch.Tensor, ...]  # the fields, each (S, N, 3)
+    actuation: torch.Tensor | None = None  # (S, A) what else acts on the body; None if nothing does
+    lengths: tuple[int, ...] = ()  # of the series that the samples are, one after the other, if they are
 
 
 @dataclass
 class TrainingState:
-    """All that training goes on from.
+    """All that training goes on from."""
 
-    Attributes:
-        epoch: epochs done.
-        history: one record an epoch: ``epoch``, ``train_loss``, ``validation_loss``, ``learning_rate``, and
-            ``rollout_error_mm`` where it was measured; infinite where a roll-out diverged.
-        best_score: smallest so far of what weights are selected by, a roll-out error [mm] or a validation loss.
-        best_epoch: after which it was reached.
-        best: weights that had it.
-    """
-
-    epoch: int = 0
+    epoch: int = 0  # epochs done
+    # one record an epoch: ``epoch``, ``train_loss``, ``validation_loss``, ``learning_rate``, and
+    # ``rollout_error_mm`` where it was measured; infinite where a roll-out diverged
     history: list[dict[str, float]] = field(default_factory=list)
+    # smallest so far of what weights are selected by, a roll-out error [mm] or a validation loss
     best_score: float = math.inf
-    best_epoch: int = 0
-    best: dict[str, torch.Tensor] = field(default_factory=dict)
+    best_epoch: int = 0  # after which it was reached
+    best: dict[str, torch.Tensor] = field(default_factory=dict)  # weights that had it
 
 
 class EpochTrainer(ABC, Generic[Model]):
@@ -60,15 +47,22 @@ class EpochTrainer(ABC, Generic[Model]):
 
     Args:
         model: to train.
+        optimiser: of its network's weights.
         rollout_error: mean roll-out error on the validation split [mm]; infinite where a roll-out diverged.
         config: with ``epochs`` and ``rollout_every``.
     """
 
     selection = "rollout"
 
-    def __init__(self, model: Model, rollout_error: Callable[[Model], float], config: Mapping[str, Any]) -> None:
+    def __init__(
+        self,
+        model: Model,
+        optimiser: torch.optim.Optimizer,
+        rollout_error: Callable[[Model], float],
+        config: Mapping[str, Any],
+    ) -> None:
         self.model, self.config, self.rollout_error = model, config, rollout_error
-        self.state = TrainingState()
+        self._optimiser, self.state = optimiser, TrainingState()
 
     @abstractmethod
     def _run_epoch(self) -> dict[str, float]:
@@ -119,25 +113,39 @@ class EpochTrainer(ABC, Generic[Model]):
         """Tensors and metadata from which `resume` goes on exactly."""
         tensors = {f"model.{k}": t for k, t in self.model.state_dict().items()}
         tensors |= {f"best.{k}": t for k, t in self.state.best.items()}
-        best = self.state.best_score if math.isfinite(self.state.best_score) else None
+        numbers: dict[str, Any] = {}
+        for i, slot in self._optimiser.state_dict()["state"].items():
+            for key, value in slot.items():
+                name = f"{i}.{key}"
+                if isinstance(value, torch.Tensor):
+                    tensors[f"optimiser.{name}"] = value
+                elif not isinstance(value, list):
+                    numbers[name] = value
+                elif key != "al":  # Scratch of L-BFGS.
+                    numbers[name] = []
+                    tensors |= {f"optimiser.{name}.{k:04d}": t for k, t in enumerate(value)}
         return tensors, {
             "epoch": self.state.epoch,
-            "best_score": best,
+            "best_score": self.state.best_score,
             "best_epoch": self.state.best_epoch,
             "history": self.state.history,
+            "optimiser": numbers,
         }
 
     def resume(self, tensors: Mapping[str, torch.Tensor], metadata: Mapping[str, Any]) -> None:
         """Goes on from a `snapshot`."""
         self.model.load_state_dict(part_of(tensors, "model."))
-        best = metadata["best_score"]
-        self.state = TrainingState(
-            metadata["epoch"],
-            list(metadata["history"]),
-            math.inf if best is None else best,
-            metadata["best_epoch"],
-            part_of(tensors, "best."),
-        )
+        done = {key: metadata[key] for key in ("epoch", "history", "best_score", "best_epoch")}
+        self.state = TrainingState(**copy.deepcopy(done), best=part_of(tensors, "best."))
+        slots: dict[int, dict[str, Any]] = {}
+        for name, value in metadata["optimiser"].items():
+            index, key = name.split(".")
+            slots.setdefault(int(index), {})[key] = list(value) if isinstance(value, list) else value
+        for name, tensor in sorted(part_of(tensors, "optimiser.").items()):
+            index, key, *place = name.split(".")
+            slot = slots.setdefault(int(index), {})
+            slot[key] = [*slot[key], tensor] if place else tensor
+        self._optimiser.load_state_dict({**self._optimiser.state_dict(), "state": slots})
 
 
 class Trainer(EpochTrainer[Model]):
@@ -150,7 +158,7 @@ class Trainer(EpochTrainer[Model]):
         model: to train; on the device of the samples.
         train: training samples.
         validation: held-out samples.
-        rollout_error: mean roll-out error on the validation split [mm]; infinite where a roll-out diverged.
+        rollout_error: see `EpochTrainer`.
         config: the group ``trainer``.
         seed: of the batches and the noise.
 
@@ -170,12 +178,11 @@ class Trainer(EpochTrainer[Model]):
         for name, samples in (("training", train), ("validation", validation)):
             if not len(samples.q):
                 raise InputError(f"the {name} split is empty: give it at least one trajectory.")
-        super().__init__(model, rollout_error, config)
+        rate, decay = config["learning_rate"], config["weight_decay"]
+        optimiser = torch.optim.Adam(model.network.parameters(), lr=rate, weight_decay=decay)
+        super().__init__(model, optimiser, rollout_error, config)
         self.selection = config["selection"]
         self._random = torch.Generator().manual_seed(seed)
-        self._optimiser = torch.optim.Adam(
-            model.network.parameters(), lr=config["learning_rate"], weight_decay=config["weight_decay"]
-        )
         with torch.no_grad():
             self._train = (model.encode(train.q, train.v, train.actuation), model.encode_outputs(*train.outputs))
             self._validation = (
@@ -196,111 +203,77 @@ class Trainer(EpochTrainer[Model]):
 
     @override
     def _run_epoch(self) -> dict[str, float]:
-        """One pass over the training samples."""
         rate = self.learning_rate(self.state.epoch)
         for group in self._optimiser.param_groups:
             group["lr"] = rate
-        inputs, outputs = self._train
-        order = torch.randperm(len(inputs), generator=self._random).to(inputs.device)
-        total = torch.zeros((), device=inputs.device)
         self.model.train()
-        for batch in order.split(self.config["batch_size"]):
-            x = inputs[batch]
-            if self.config["noise"] > 0.0:
-                noise = torch.randn(x.shape, generator=self._random).to(x.device)
-                x = x + self.config["noise"] * noise
-            loss = self._loss(x, outputs[batch])
+        total, count = torch.zeros((), device=self.model.rest.device), 0.0
+        for loss, weight in self._batches():
             self._optimiser.zero_grad()
             loss.backward()
             self._optimiser.step()
-            total += loss.detach() * len(batch)
-        train_loss = float(total) / len(inputs) * float(self.model.remainder) ** 2
-        return {"train_loss": train_loss, "validation_loss": self._validate(), "learning_rate": rate}
-
-    def _validate(self) -> float:
+            total += loss.detach() * weight
+            count += weight
         self.model.eval()
+        unit = float(self.model.remainder) ** 2
         with torch.no_grad():
-            x, y = self._validation
-            return float(self._loss(x, y)) * float(self.model.remainder) ** 2
+            validation = float(self._validate()) * unit
+        return {"train_loss": float(total) / count * unit, "validation_loss": validation, "learning_rate": rate}
 
-    def _loss(self, inputs: torch.Tensor, outputs: torch.Tensor) -> torch.Tensor:
-        """Weighted mean squared error of the standardised outputs, in units of what the linear part leaves."""
-        error = self._weights * (self.model.standardised(inputs)[0] - outputs)
-        return (error / self.model.remainder).square().mean()
+    def _batches(self) -> Iterator[tuple[torch.Tensor, float]]:
+        """The mean loss of each batch of one pass over the training samples, and how many are in it."""
+        inputs, outputs = self._train
+        order = torch.randperm(len(inputs), generator=self._random).to(inputs.device)
+        for batch in order.split(self.config["batch_size"]):
+            found, _ = self.model.standardised(self._noisy(inputs[batch]))
+            yield self._squares(found, outputs[batch]).mean(), len(batch)
+
+    def _validate(self) -> torch.Tensor:
+        """The mean validation loss."""
+        inputs, outputs = self._validation
+        return self._squares(self.model.standardised(inputs)[0], outputs).mean()
+
+    def _noisy(self, inputs: torch.Tensor) -> torch.Tensor:
+        if not self.config["noise"] > 0.0:
+            return inputs
+        return inputs + self.config["noise"] * torch.randn(inputs.shape, generator=self._random).to(inputs.device)
+
+    def _squares(self, found: torch.Tensor, outputs: torch.Tensor) -> torch.Tensor:
+        """Weighted squared errors of the standardised outputs, in units of what the linear part leaves."""
+        return (self._weights * (found - outputs) / self.model.remainder).square()
 
     @override
     def snapshot(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
         tensors, metadata = super().snapshot()
-        tensors["random"] = self._random.get_state()
-        for i, slot in self._optimiser.state_dict()["state"].items():
-            tensors |= {f"adam.{i}.{k}": t for k, t in slot.items()}
-        return tensors, metadata
+        return {**tensors, "random": self._random.get_state()}, metadata
 
     @override
     def resume(self, tensors: Mapping[str, torch.Tensor], metadata: Mapping[str, Any]) -> None:
         super().resume(tensors, metadata)
         self._random.set_state(tensors["random"])
-        slots: dict[int, dict[str, torch.Tensor]] = {}
-        for key, tensor in part_of(tensors, "adam.").items():
-            index, name = key.split(".")
-            slots.setdefault(int(index), {})[name] = tensor
-        self._optimiser.load_state_dict({**self._optimiser.state_dict(), "state": slots})
 
 
 class SequenceTrainer(Trainer[Model]):
     """The same for a recurrent model, whose hidden state goes through the training trials.
 
-    All trials are run through side by side, in spans of ``sequence`` steps. A gradient reaches back to the beginning of
-    its span, the hidden state comes from before (truncated backpropagation through time).
-
-    Args:
-        model: a recurrent one.
-        train: training samples, as series.
-        validation: held-out samples, as series.
-        rollout_error: see `Trainer`.
-        config: the group ``trainer``.
-        seed: of the noise.
-
-    Raises:
-        InputError: an empty split.
+    All trials, series of samples, are run through side by side, in spans of ``sequence`` steps. A gradient reaches back
+    to the beginning of its span, the hidden state comes from before (truncated backpropagation through time).
     """
 
-    def __init__(
-        self,
-        model: Model,
-        train: Samples,
-        validation: Samples,
-        rollout_error: Callable[[Model], float],
-        config: Mapping[str, Any],
-        seed: int,
-    ) -> None:
-        super().__init__(model, train, validation, rollout_error, config, seed)
-        self._series = [
-            _side_by_side(*self._train, train.lengths),
-            _side_by_side(*self._validation, validation.lengths),
-        ]
+    def __init__(self, model: Model, train: Samples, validation: Samples, *settings: Any) -> None:
+        super().__init__(model, train, validation, *settings)
+        self._train_series = _side_by_side(*self._train, train.lengths)
+        self._validation_series = _side_by_side(*self._validation, validation.lengths)
 
     @override
-    def _run_epoch(self) -> dict[str, float]:
-        """One pass through the training trials."""
-        rate = self.learning_rate(self.state.epoch)
-        for group in self._optimiser.param_groups:
-            group["lr"] = rate
-        self.model.train()
-        inputs, outputs, inside = self._series[0]
-        hidden, total = None, 0.0
+    def _batches(self) -> Iterator[tuple[torch.Tensor, float]]:
+        inputs, outputs, inside = self._train_series
+        hidden = None
         for span in torch.arange(len(inputs)).split(self.config["sequence"]):
-            x = inputs[span]
-            if self.config["noise"] > 0.0:
-                x = x + self.config["noise"] * torch.randn(x.shape, generator=self._random).to(x)
+            x = self._noisy(inputs[span])
             loss, hidden = self._through(x, outputs[span], inside[span], hidden)
-            self._optimiser.zero_grad()
-            loss.backward()
-            self._optimiser.step()
+            yield loss, float(inside[span].sum())
             hidden = hidden.detach()
-            total += float(loss.detach()) * float(inside[span].sum())
-        train_loss = total / float(inside.sum()) * float(self.model.remainder) ** 2
-        return {"train_loss": train_loss, "validation_loss": self._validate(), "learning_rate": rate}
 
     def _through(
         self, inputs: torch.Tensor, outputs: torch.Tensor, inside: torch.Tensor, hidden: torch.Tensor | None
@@ -309,16 +282,13 @@ class SequenceTrainer(Trainer[Model]):
         total = inputs.new_zeros(())
         for x, y, known in zip(inputs, outputs, inside, strict=True):
             found, hidden = self.model.standardised(x, hidden)
-            error = (self._weights * (found - y) / self.model.remainder).square().mean(1)
-            total = total + torch.where(known, error, 0.0).sum()
+            total = total + torch.where(known, self._squares(found, y).mean(1), 0.0).sum()
         assert hidden is not None
         return total / inside.sum().clamp_min(1), hidden
 
     @override
-    def _validate(self) -> float:
-        self.model.eval()
-        with torch.no_grad():
-            return float(self._through(*self._series[1], None)[0]) * float(self.model.remainder) ** 2
+    def _validate(self) -> torch.Tensor:
+        return self._through(*self._validation_series, None)[0]
 
 
 def _side_by_side(

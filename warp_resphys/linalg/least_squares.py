@@ -1,135 +1,179 @@
-"""Minimisation of a sum of squares within bounds, by a quasi-Newton method that starts from the Gauss-Newton matrix.
+"""Nonlinear least squares for a batch at once: Gauss-Newton, and Levenberg-Marquardt where full steps lead astray.
 
-Physical parameters lie along narrow, bent valleys of their loss, such as stiffness against Poisson's ratio. A method
-that has to learn their direction from its steps (as L-BFGS-B has) creeps along them and stops early. The Gauss-Newton
-matrix knows it from the first step. BFGS keeps it up to date with gradients alone, until a step shows that the valley
-bends: then it is computed anew. A step minimises the quadratic model within the bounds and a trust box, and a line
-search along it makes sure of a decrease (Nocedal and Wright 2006, chapters 3, 6 and 10).
+A `Problem` knows its objective, where its linearisation about a point has its minimum, and how far apart two points
+are; `minimise` is the loop around it, with one rule for the damping (Nocedal and Wright 2006, section 10.3). It starts
+undamped, which is Gauss-Newton. A step that makes the objective larger is not taken, and the damping becomes one, or
+ten times what it was; after a step that is taken it is a tenth. What one means is the problem's choice.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.optimize
+import torch
 from numpy.typing import NDArray
+from typing_extensions import override
 
 Array = NDArray[np.float64]
 Objective = Callable[[Array], tuple[float, Array]]
+Move = Callable[[torch.Tensor], torch.Tensor]
 
-_ARMIJO = 1e-4
-_TRIALS = 10
-_LARGEST_STEP = 0.25  # of the range of a variable
+_FADING, _GROWTH, _MOST_DAMPING = 0.1, 10.0, 1e12
+_MARQUARDT = 1e-2  # of a diagonal entry, what a damping of one adds to it
 _RIDGE = 1e-10  # of the trace: keeps directions without influence from moving
-_CLOSE = 0.6  # of a step's curvature to the model's: what an update may mend
-_ABSOLUTE_DECREASE = 1e-10
+_LARGEST_STEP, _FIRST_STEP = 0.25, 0.1  # of the range of a variable
+_SMALL = 1e-4
 
 
-def minimise(
-    objective: Objective,
-    start: Array,
-    matrix: Callable[[Array], Array | None],
-    max_evaluations: int,
-    tolerance: float = 1e-6,
-) -> tuple[Array, float]:
-    """The minimum over the unit box that is downhill from a start.
+@dataclass(frozen=True)
+class Point:
+    """Where a batch of problems is."""
 
-    It ends where the model promises a relative decrease below the tolerance, or one of less than 1e-10.
+    x: torch.Tensor  # (B, ...) unknowns
+    value: torch.Tensor  # (B,) objective; infinite where there is none, as where a simulation fails
+    kept: tuple[torch.Tensor, ...] = ()  # what the problem keeps of its evaluation, each (B, ...)
+
+
+class Problem(ABC):
+    """A batch of sums of squares, independent of each other."""
+
+    @abstractmethod
+    def evaluate(self, x: torch.Tensor) -> Point:
+        """The point at unknowns (B, ...)."""
+
+    @abstractmethod
+    def linearise(self, point: Point) -> Move:
+        """Of a damping (B,), zero or more, to the unknowns that minimise the damped linearisation about the point."""
+
+    @abstractmethod
+    def distance(self, old: Point, new: Point) -> torch.Tensor:
+        """(B,) how far a step led, in the unit of the tolerance."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What `minimise` found."""
+
+    point: Point  # the last one that was taken
+    iterations: int  # steps that were tried
+    settled: bool  # whether every problem of the batch has
+    moved: float  # the furthest distance of the last step
+
+
+@torch.no_grad()
+def minimise(problem: Problem, start: Point, tolerance: float, max_iterations: int) -> Solution:
+    """The minimum that is downhill from a start.
+
+    A problem of the batch has settled, and is left alone, when a step leads no further than the tolerance and either is
+    hardly damped or leads nowhere better.
+
+    Args:
+        problem: see the class.
+        start: evaluated by the problem.
+        tolerance: of `Problem.distance`.
+        max_iterations: steps that are tried at most, each with one evaluation.
+    """
+    point = start
+    damping, moved = torch.zeros_like(point.value), torch.full_like(point.value, torch.inf)
+    done = torch.zeros_like(point.value, dtype=torch.bool)
+    taken = ~done
+    for iteration in range(1, max_iterations + 1):
+        if bool(taken.any()):
+            step = problem.linearise(point)
+        trial = problem.evaluate(_where(done, point.x, step(damping)))
+        simulated = torch.isfinite(trial.value)
+        better = simulated & (trial.value <= point.value)
+        moved = torch.where(simulated, problem.distance(point, trial), torch.inf)
+        settled = (moved <= tolerance) & (~better | (damping <= 1.0))
+        taken = better & ~done
+        kept = tuple(_where(taken, new, old) for new, old in zip(trial.kept, point.kept, strict=True))
+        point = Point(_where(taken, trial.x, point.x), _where(taken, trial.value, point.value), kept)
+        damping = torch.where(better, _FADING * damping, (_GROWTH * damping).clamp(1.0, _MOST_DAMPING))
+        done |= settled
+        if bool(done.all()):
+            return Solution(point, iteration, True, float(moved.max()))
+    return Solution(point, max_iterations, False, float(moved.max()))
+
+
+def _where(mask: torch.Tensor, new: torch.Tensor, old: torch.Tensor) -> torch.Tensor:
+    """Of (B, ...) the new rows where the mask (B,) is set."""
+    return torch.where(mask.view(-1, *[1] * (new.ndim - 1)), new, old)
+
+
+class UnitBox(Problem):
+    """One objective of a few variables between 0 and 1, whose steps stay within these bounds and a trust box.
+
+    Physical parameters lie along narrow, bent valleys of their loss, such as stiffness against Poisson's ratio. The
+    Gauss-Newton matrix knows their direction from the first step. The distance is the relative decrease of the
+    objective, or of 1e-4 where that is larger.
 
     Args:
         objective: (P,) variables to value and gradient; the value is infinite where there is none.
-        start: (P,) between 0 and 1.
-        matrix: (P,) variables to the (P, P) Gauss-Newton matrix 2 J^T J, or None where it cannot be had.
-        max_evaluations: of the objective; a matrix costs about as much as two.
-        tolerance: relative decrease that is still worth a step.
-
-    Returns:
-        The variables and the value; infinite if it was so at the start.
+        matrix: (P,) variables to the (P, P) Gauss-Newton matrix 2 J^T J, or None where it cannot be had: then the last
+            one is brought up to date by the change of the gradient.
     """
-    counted = _Counted(objective, max_evaluations)
-    x = np.clip(start, 0.0, 1.0)
-    value, gradient = counted(x)
-    if not np.isfinite(value):
-        return x, np.inf
-    model, fresh = _model(matrix(x), gradient), True
-    while counted.left > 0:
-        step = _box_step(model, gradient, x)
-        promised = -float(gradient @ step + 0.5 * step @ model @ step)
-        found = None
-        if promised > max(tolerance * value, _ABSOLUTE_DECREASE):
-            found = _search(counted, x, value, gradient, step, model)
-        if found is None:
-            if fresh:
-                break
-            model, fresh = _model(matrix(x), gradient), True
-            continue
-        new, value, slope = found
-        moved, change, gradient, x = new - x, slope - gradient, slope, new
-        curvature, expected = float(moved @ change), float(moved @ model @ moved)
-        if _CLOSE * expected <= curvature <= expected / _CLOSE:
-            model, fresh = _update(model, moved, change), False
-        else:  # The valley bends.
-            model, fresh = _model(matrix(x), gradient), True
-    return x, value
+
+    def __init__(self, objective: Objective, matrix: Callable[[Array], Array | None]) -> None:
+        self._objective, self._matrix = objective, matrix
+        self._last: tuple[torch.Tensor, torch.Tensor, torch.Tensor] | None = None
+
+    @override
+    def evaluate(self, x: torch.Tensor) -> Point:
+        value, gradient = self._objective(x[0].numpy())
+        return Point(x, x.new_tensor([value]), (x.new_tensor(gradient)[None],))
+
+    @override
+    def linearise(self, point: Point) -> Move:
+        (x,), (gradient,) = point.x, point.kept[0]
+        found = self._matrix(x.numpy())
+        if found is None or not np.isfinite(found).all() or not np.trace(found) > 0.0:
+            matrix = self._updated(x, gradient)
+        else:
+            matrix = torch.as_tensor(found) + _RIDGE * np.trace(found) * torch.eye(len(x), dtype=x.dtype)
+        self._last = x, gradient, matrix
+        bounds = (-x).clamp_min(-_LARGEST_STEP).numpy(), (1.0 - x).clamp_max(_LARGEST_STEP).numpy()
+
+        def step(damping: torch.Tensor) -> torch.Tensor:
+            root = torch.linalg.cholesky(damped(matrix[None], damping)[0])
+            right = -torch.linalg.solve_triangular(root, gradient[:, None], upper=False)[:, 0]
+            change = scipy.optimize.lsq_linear(root.mT.numpy(), right.numpy(), bounds=bounds, method="bvls").x
+            return (x + torch.as_tensor(change)).clamp(0.0, 1.0)[None]
+
+        return step
+
+    def _updated(self, x: torch.Tensor, gradient: torch.Tensor) -> torch.Tensor:
+        """The last matrix after a BFGS update; without one, that with which the first step goes a tenth of a range."""
+        if self._last is None:
+            return torch.eye(len(x), dtype=x.dtype) * (gradient.norm() / _FIRST_STEP).clamp_min(1e-12)
+        matrix = self._last[2]
+        moved, change = x - self._last[0], gradient - self._last[1]
+        if not moved @ change > 1e-10 * moved.norm() * change.norm():
+            return matrix
+        product = matrix @ moved
+        return matrix - product.outer(product) / (moved @ product) + change.outer(change) / (moved @ change)
+
+    @override
+    def distance(self, old: Point, new: Point) -> torch.Tensor:
+        return (new.value - old.value).abs() / old.value.clamp_min(_SMALL)
 
 
-class _Counted:
-    """An objective that knows how often it may still be evaluated."""
-
-    def __init__(self, objective: Objective, most: int) -> None:
-        self._objective, self.left = objective, most
-
-    def __call__(self, x: Array) -> tuple[float, Array]:
-        self.left -= 1
-        return self._objective(x)
+def damped(matrix: torch.Tensor, damping: torch.Tensor) -> torch.Tensor:
+    """(B, P, P) Gauss-Newton matrix with a damping (B,) in the units of its own diagonal (Marquardt 1963)."""
+    return matrix + torch.diag_embed(_MARQUARDT * damping[:, None] * matrix.diagonal(dim1=1, dim2=2))
 
 
-def _model(matrix: Array | None, gradient: Array) -> Array:
-    """A positive definite matrix; without one, that with which the first step goes a tenth of a range."""
-    if matrix is None or not np.isfinite(matrix).all() or not np.trace(matrix) > 0.0:
-        return np.eye(len(gradient)) * max(float(np.linalg.norm(gradient)) / 0.1, 1e-12)
-    return matrix + _RIDGE * np.trace(matrix) * np.eye(len(gradient))
+def ridge(matrix: torch.Tensor, right: torch.Tensor, weight: torch.Tensor | float) -> torch.Tensor:
+    """(B, n, 1) minimiser of |A x - b|^2 + w |x|^2, from the smaller of its two sets of normal equations.
 
-
-def _box_step(model: Array, gradient: Array, x: Array) -> Array:
-    """The step that minimises g . d + d . H d / 2 within the bounds and the trust box."""
-    root = np.linalg.cholesky(model)
-    right = -np.linalg.solve(root, gradient)
-    bounds = np.maximum(-x, -_LARGEST_STEP), np.minimum(1.0 - x, _LARGEST_STEP)
-    return np.asarray(scipy.optimize.lsq_linear(root.T, right, bounds=bounds, method="bvls").x)
-
-
-def _search(
-    objective: "_Counted", x: Array, value: float, gradient: Array, step: Array, model: Array
-) -> tuple[Array, float, Array] | None:
-    """Variables, value and gradient of the first sufficient decrease; None if there is none.
-
-    A full step that leaves a bent valley is followed by one back to its floor before it is shortened.
+    Args:
+        matrix: (B, m, n).
+        right: (B, m, 1).
+        weight: w, positive; a number or (B, 1, 1).
     """
-    slope, length = float(gradient @ step), 1.0
-    for _ in range(_TRIALS):
-        new = np.clip(x + length * step, 0.0, 1.0)
-        trial, at_trial = objective(new)
-        if trial <= value + _ARMIJO * length * slope:
-            return new, trial, at_trial
-        if objective.left <= 0:
-            return None
-        if length == 1.0 and np.isfinite(trial):
-            back = np.clip(new + _box_step(model, at_trial, new), 0.0, 1.0)
-            second, at_second = objective(back)
-            if second <= value + _ARMIJO * slope:
-                return back, second, at_second
-        lowest = 0.25
-        if np.isfinite(trial):  # Where the parabola through what is known has its minimum.
-            lowest = -0.5 * slope * length / (trial - value - slope * length)
-        length *= min(max(lowest, 0.1), 0.5)
-        if objective.left <= 0:
-            return None
-    return None
-
-
-def _update(model: Array, step: Array, change: Array) -> Array:
-    """The BFGS update, which keeps the matrix positive definite where the step shows a positive curvature."""
-    product = model @ step
-    return np.asarray(
-        model - np.outer(product, product) / (step @ product) + np.outer(change, change) / (step @ change)
-    )
+    rows, columns = matrix.shape[1:]
+    identity = torch.eye(min(rows, columns), device=matrix.device, dtype=matrix.dtype)
+    if rows <= columns:
+        return matrix.mT @ torch.linalg.solve(matrix @ matrix.mT + weight * identity, right)
+    return torch.linalg.solve(matrix.mT @ matrix + weight * identity, matrix.mT @ right)

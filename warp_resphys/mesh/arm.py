@@ -10,7 +10,7 @@ import numpy as np
 
 from ..io.errors import MeshError
 from .arm_geometry import ArmGeometry, numbers
-from .arm_section import SOLID, section_grids, section_points, section_quadrilaterals
+from .arm_section import SOLID, section_grids, section_quadrilaterals
 from .arm_tetrahedra import tetrahedra
 from .chambers import find_chambers
 from .mesh import IntArray, Mesh, boundary_faces, check_mesh
@@ -60,9 +60,6 @@ def mesh_arm(
 def name_surfaces(mesh: Mesh) -> dict[str, IntArray]:
     """The surfaces of an arm that hangs along -z.
 
-    Args:
-        mesh: the arm.
-
     Returns:
         (F, 3 | 4 | 6) faces as `mesh.boundary_faces` gives them: ``base`` and ``tip`` on the planes of the highest and
         the lowest vertices, ``chamber_1`` and so on as `chambers.find_chambers` numbers them, ``outside``, the rest.
@@ -105,7 +102,7 @@ def _hexahedra(geometry: ArmGeometry, size: float, layer: float) -> Mesh:
     vertices = np.empty((len(heights), len(place), 3))
     for level, height in enumerate(heights):
         section = geometry.section(geometry.radius_at(float(height)))
-        points = turn * section_points(section_grids(section, divisions)[0])[place]
+        points = turn * np.concatenate([grid.ravel() for grid in section_grids(section, divisions)[0]])[place]
         vertices[level] = np.stack([points.real, points.imag, np.full(len(points), height)], axis=1)
     cells = []
     for level, part in enumerate(np.repeat(np.arange(len(counts)), counts)):

@@ -10,9 +10,9 @@ import numpy as np
 from ..io.errors import MeshError
 from .arm_section import Section
 
-PROFILES = ("half_disc", "disc", "sector")
-OUTLINES = ("lobed", "round")
-MOST_CHAMBERS = 8  # in a segment
+_PROFILES = ("half_disc", "disc", "sector")
+_OUTLINES = ("lobed", "round")
+_MOST_CHAMBERS = 8  # in a segment
 
 
 @dataclass(frozen=True)
@@ -22,34 +22,22 @@ class ArmGeometry:
     From the base on, the arm is a cap, the chambers of a segment, a cap, and so on, and ends with a cap. It tapers
     evenly along chambers; caps are cylinders.
 
-    Attributes:
-        chamber_lengths: lengths of the chambers of each segment [m].
-        caps: heights of the solid parts before, between and after the chambers [m]; one more than there are segments.
-        radii: of the outline before the first chambers and after those of each segment [m]; one more than there are
-            segments. It is where the outline is farthest from the axis.
-        chambers: number of chambers of each segment, 2 to 8.
-        profile: of a chamber: ``half_disc``, its flat side towards the axis; ``disc``; or ``sector`` of an annulus.
-        outline: ``lobed``: around each chamber, at the distance of the wall; or ``round``: a circle.
-        wall: between a chamber and the outline [m].
-        web: between neighbouring chambers, where they are closest [m].
-        core: between the axis and the chambers, at the base [m]; it shrinks with the radius. None: as little as the
-            webs allow.
-        rotations: of the chambers of each segment about the axis [degrees], counter-clockwise seen from the base;
-            empty: all lie in line, the first towards +x.
-
     Raises:
         MeshError: a measure is not positive, numbers of measures do not fit, or the chambers do not.
     """
 
-    chamber_lengths: Sequence[float] = (0.120, 0.120)
+    chamber_lengths: Sequence[float] = (0.120, 0.120)  # of each segment [m]
+    # heights of the solid parts before, between and after the chambers [m]; one more than there are segments
     caps: Sequence[float] = (0.010, 0.021, 0.005)
+    # of the outline, where it is farthest from the axis, before the first chambers and after those of each segment [m]
     radii: Sequence[float] = (0.0283923, 0.0212942, 0.0165622)
-    chambers: int = 3
-    profile: str = "half_disc"
-    outline: str = "lobed"
-    wall: float = 0.004
-    web: float = 0.004
-    core: float | None = None
+    chambers: int = 3  # of each segment, 2 to 8
+    profile: str = "half_disc"  # of a chamber: this, its flat side towards the axis; disc; or sector of an annulus
+    outline: str = "lobed"  # around each chamber, at the distance of the wall; or round, a circle
+    wall: float = 0.004  # between a chamber and the outline [m]
+    web: float = 0.004  # between neighbouring chambers, where they are closest [m]
+    core: float | None = None  # between axis and chambers at the base [m], shrinks with the radius; None: the least
+    # of each segment's chambers about the axis [degrees], counter-clockwise seen from the base; empty: in line with +x
     rotations: Sequence[float] = ()
 
     def __post_init__(self) -> None:
@@ -59,24 +47,19 @@ class ArmGeometry:
         count = len(self.chamber_lengths)
         if not count:
             raise MeshError("the arm's chamber_lengths are empty: give one length for each segment.")
-        for name in ("caps", "radii"):
+        needed = {"caps": count + 1, "radii": count + 1, "rotations": count if self.rotations else 0}
+        for name, number in needed.items():
             given = len(getattr(self, name))
-            if given != count + 1:
-                raise MeshError(f"the arm's {name} are {given} numbers, but {count} chamber_lengths need {count + 1}.")
-        if self.rotations and len(self.rotations) != count:
-            raise MeshError(f"the arm's rotations are {len(self.rotations)} numbers, but it has {count} segments.")
-        for name in ("wall", "web", *(("core",) if self.core is not None else ())):
-            numbers(name, (getattr(self, name),))
-        for name, known in (("profile", PROFILES), ("outline", OUTLINES)):
+            if given != number:
+                raise MeshError(f"the arm's {name} are {given} numbers, but {count} chamber_lengths need {number}.")
+        for name in ("wall", "web", "core"):
+            numbers(name, (getattr(self, name),) if getattr(self, name) is not None else ())
+        for name, known in (("profile", _PROFILES), ("outline", _OUTLINES)):
             if getattr(self, name) not in known:
                 raise MeshError(f"the arm's {name} is {getattr(self, name)!r}: choose {', '.join(known)}.")
-        if (
-            isinstance(self.chambers, bool)
-            or not isinstance(self.chambers, int)
-            or not 2 <= self.chambers <= MOST_CHAMBERS
-        ):
+        if type(self.chambers) is not int or not 2 <= self.chambers <= _MOST_CHAMBERS:
             raise MeshError(
-                f"the arm's chambers are {self.chambers!r} a segment: choose a whole number, 2 to {MOST_CHAMBERS}."
+                f"the arm's chambers are {self.chambers!r} a segment: choose a whole number, 2 to {_MOST_CHAMBERS}."
             )
         if self.outline == "lobed" and (self.profile == "sector" or any(self.rotations)):
             what = "sectors" if self.profile == "sector" else "rotations"

@@ -23,6 +23,7 @@ ComplexArray = NDArray[np.complex128]
 IntArray = NDArray[np.int64]
 Edge = tuple[str, str]  # names of its ends, in the order of the alphabet where it is a key
 Divisions = Mapping[Edge, int]
+Corner = tuple[str, bool, int]  # name, whether it is mirrored at the middle of its chamber, and the chamber's wedge
 
 SOLID = -1  # instead of the number of a chamber
 _LEAST_ROOM = 0.1  # that a chamber takes of the radius
@@ -30,17 +31,11 @@ _LARGEST_TURN = 1.15  # of an arc for which one straight edge stands [rad]
 
 
 class Piece(NamedTuple):
-    """A piece of an outline.
-
-    Attributes:
-        start: its first point.
-        end: its last point.
-        centre: of the circle that it is an arc of, shorter than half of it; None where it is straight.
-    """
+    """A piece of an outline."""
 
     start: complex
     end: complex
-    centre: complex | None
+    centre: complex | None  # of the circle that it is an arc of, shorter than half of it; None where it is straight
 
     def points(self, t: NDArray[np.float64]) -> ComplexArray:
         """Points at fractions (T,) of its length."""
@@ -49,6 +44,14 @@ class Piece(NamedTuple):
         # A complex power turns and stretches evenly, so that ends at unlike distances from the centre do no harm.
         spoke = self.start - self.centre
         return np.asarray(self.centre + spoke * ((self.end - self.centre) / spoke) ** t, dtype=np.complex128)
+
+    def moves(self, t: NDArray[np.float64], first: complex, last: complex, share: float = 1.0) -> ComplexArray:
+        """How these points move with the ends: on an arc, away from its centre by a share of the distance."""
+        if self.centre is None:
+            return np.asarray(first * (1.0 - t) + last * t, dtype=np.complex128)
+        moves = share * (self.points(t) - self.centre)
+        moves[0], moves[-1] = first, last
+        return moves
 
     @property
     def turn(self) -> float:
@@ -63,31 +66,16 @@ class Piece(NamedTuple):
             return float(triangle)
         return float(triangle + 0.5 * abs(self.start - self.centre) ** 2 * (self.turn - sin(self.turn)))
 
-    def turned(self, angle: float) -> "Piece":
-        """The piece, turned about the axis by an angle [rad]."""
-        turn = complex(cos(angle), sin(angle))
-        return Piece(self.start * turn, self.end * turn, None if self.centre is None else self.centre * turn)
-
-    def mirrored(self) -> "Piece":
-        """The piece on the other side of the x axis."""
-        centre = None if self.centre is None else self.centre.conjugate()
-        return Piece(self.start.conjugate(), self.end.conjugate(), centre)
-
-    def reversed(self) -> "Piece":
-        """The same piece from its end to its start."""
-        return Piece(self.end, self.start, self.centre)
-
 
 class Growth(NamedTuple):
-    """How far the corners of the polygons lie outside the curves, as shares of the arcs' radii.
-
-    Attributes:
-        chamber: of a chamber.
-        outline: of the arm.
-    """
+    """How far the corners of the chambers' and of the arm's polygon lie outside the curves, over the arcs' radii."""
 
     chamber: float
     outline: float
+
+    def of(self, name: str) -> float:
+        """That of the curve on which a named point lies, or with which it moves."""
+        return self.outline if name[0] in "BV" else self.chamber
 
 
 @dataclass(frozen=True)
@@ -103,24 +91,15 @@ class Section:
         W, (U)       the middle of the web opposite C (and E)
         V            the middle of the web on the outline; lobes meet there, and B0 is there as well
         Xm, Xc, X1, X2  inside of the chamber, next to M, C, A1 and A2: used where caps close it
-
-    Attributes:
-        radius: of the outline, where it is farthest from the axis [m].
-        count: number of chambers.
-        profile: of a chamber: ``half_disc``, its flat side towards the axis; ``disc``; or ``sector`` of an annulus.
-        outline: ``lobed``: around each chamber, at the distance of the wall; or ``round``: a circle.
-        wall: between a chamber and the outline [m].
-        web: between neighbouring chambers, where they are closest [m].
-        core: between the axis and a chamber [m]; None: the least that the webs allow.
     """
 
-    radius: float
-    count: int
-    profile: str
-    outline: str
-    wall: float
-    web: float
-    core: float | None = None
+    radius: float  # of the outline, where it is farthest from the axis [m]
+    count: int  # number of chambers
+    profile: str  # of a chamber: ``half_disc``, its flat side towards the axis; ``disc``; or ``sector`` of an annulus
+    outline: str  # ``lobed``: around each chamber, at the distance of the wall; or ``round``: a circle
+    wall: float  # between a chamber and the outline [m]
+    web: float  # between neighbouring chambers, where they are closest [m]
+    core: float | None = None  # between the axis and a chamber [m]; None: the least that the webs allow
 
     @property
     def half_angle(self) -> float:
@@ -261,14 +240,11 @@ class Section:
         return 0j
 
     def divisions(self, size: float) -> Divisions:
-        """Into how many edges the lines between named points are divided, so that these have a length on average.
+        """Into how many edges the lines between named points are divided, so that these have a size [m] on average.
 
         Opposite sides of a block are divided alike, and so on through the blocks: walls, chambers' flat sides and arcs
         have numbers of their own, from the lengths of what is solid. No edge stands for more than about 65 degrees of
         an arc.
-
-        Args:
-            size: the length that is aimed at [m].
         """
         strips: list[list[Edge]] = []
         solid: set[Edge] = set()
@@ -295,13 +271,9 @@ class Section:
         a, b = sorted((same.get(first, first), same.get(last, last)))
         return a, b
 
-    def growth(self, divisions: Divisions) -> "Growth":
-        """How far the corners of polygons move so that their areas are right.
-
-        Args:
-            divisions: number of straight edges in place of each line between two named points.
-        """
-        return Growth(*(self._path_growth(sides, divisions) for sides in (self._chamber_sides, self._outline_sides)))
+    def growth(self, divisions: Divisions) -> Growth:
+        """How far the corners of polygons move so that their areas are right."""
+        return Growth(*(self._polygon(sides, divisions)[1] for sides in (self._chamber_sides, self._outline_sides)))
 
     @property
     def _chamber_sides(self) -> tuple[Edge, ...]:
@@ -315,8 +287,8 @@ class Section:
         arc = [f"B{i}" for i in range(self.rows, -1, -1)]
         return tuple(pairwise(arc if self.outline == "lobed" else [*arc, "V"]))
 
-    def _path_growth(self, sides: Sequence[Edge], divisions: Divisions) -> float:
-        """The share by which the points of neighbouring sides move.
+    def _polygon(self, sides: Sequence[Edge], divisions: Divisions) -> tuple[ComplexArray, float]:
+        """The corners along neighbouring sides, and the share by which they are moved.
 
         With points p + e w, a polygon has the area A0 + A1 e + A2 e^2, which is to be that of the curve.
         """
@@ -326,39 +298,41 @@ class Section:
             t = np.linspace(0.0, 1.0, divisions[self.edge(first, last)] + 1)
             area += piece.area
             start.append(piece.points(t))
-            moves = np.zeros_like(start[-1]) if piece.centre is None else start[-1] - piece.centre
-            ends = (self.motion(first), self.motion(last))
-            moves = ends[0] * (1 - t) + ends[1] * t if piece.centre is None else moves
-            moves[0], moves[-1] = ends
-            move.append(moves)
-        p, w = np.concatenate(start), np.concatenate(move)
+            move.append(piece.moves(t, self.motion(first), self.motion(last)))
+        p, w = (np.concatenate([each[0][:1], *(part[1:] for part in each)]) for each in (start, move))
         a0, a2 = _fan(p, p), _fan(w, w)
         a1 = _fan(p, w) + _fan(w, p)
         lack = area - a0
-        return float(2.0 * lack / (a1 + sqrt(a1**2 + 4.0 * a2 * lack)))
+        growth = float(2.0 * lack / (a1 + sqrt(a1**2 + 4.0 * a2 * lack)))
+        return np.asarray(p + growth * w, dtype=np.complex128), growth
 
     def chamber_polygon(self, divisions: Divisions) -> ComplexArray:
         """The corners of chamber 1, counter-clockwise from its crown."""
-        upper = self._polygon(self._chamber_sides, divisions)
+        upper, _ = self._polygon(self._chamber_sides, divisions)
         return np.concatenate([upper, upper[-2:0:-1].conj()])
 
     def body_polygon(self, divisions: Divisions) -> ComplexArray:
         """The corners of the arm's outline, counter-clockwise from chamber 1."""
-        half = self._polygon(self._outline_sides, divisions)
+        half, _ = self._polygon(self._outline_sides, divisions)
         turns = np.exp(2j * self.half_angle * np.arange(self.count))
         wedge = np.concatenate([half[:0:-1].conj(), half[:-1]])
         return np.asarray((turns[:, None] * wedge).ravel(), dtype=np.complex128)
 
-    def _polygon(self, sides: Sequence[Edge], divisions: Divisions) -> ComplexArray:
-        growth = self.growth(divisions)
-        points = []
-        for first, last in sides:
-            t = np.linspace(0.0, 1.0, divisions[self.edge(first, last)] + 1)
-            points.append(grown(self, growth, (first, False, 0), (last, False, 0), t))
-        return np.concatenate([points[0][:1], *(each[1:] for each in points)])
+    def line(self, first: Corner, last: Corner, t: NDArray[np.float64], growth: Growth) -> ComplexArray:
+        """Points at fractions (T,) of the line between two neighbouring corners, moved with their curves."""
+        start, end = (self._placed(self.points[corner[0]], corner) for corner in (first, last))
+        by_start, by_end = (self._placed(growth.of(each[0]) * self.motion(each[0]), each) for each in (first, last))
+        centre = self.piece(first[0], last[0]).centre
+        piece = Piece(start, end, None if centre is None else self._placed(centre, first))
+        return piece.points(t) + piece.moves(t, by_start, by_end, growth.of(first[0]))
 
-    def blocks(self) -> Iterator[tuple[list[tuple[str, bool, int]], int]]:
-        """Quadrilaterals that fill the section: four corners, each (name, mirrored or not, wedge), and the chamber."""
+    def _placed(self, point: complex, corner: Corner) -> complex:
+        """Where a corner has a point of the half wedge."""
+        _, mirrored, wedge = corner
+        return (point.conjugate() if mirrored else point) * complex(np.exp(2j * self.half_angle * wedge))
+
+    def blocks(self) -> Iterator[tuple[list[Corner], int]]:
+        """Quadrilaterals that fill the section: four corners, and the chamber that it belongs to, or `SOLID`."""
         m, n = self.rows, self.count
         inner, middle = self.inner_side, ("O", "W", "U")
         solid = [(middle[i], inner[i], inner[i + 1], middle[i + 1]) for i in range(len(inner) - 1)]
@@ -389,10 +363,6 @@ class Section:
 def section_grids(section: Section, divisions: Divisions) -> tuple[list[ComplexArray], list[int]]:
     """Grids of points in the blocks of a section, by transfinite interpolation (Gordon and Hall 1973).
 
-    Args:
-        section: the section.
-        divisions: into how many quadrilaterals the lines between named points are divided, see `Section.divisions`.
-
     Returns:
         Of each block: (k + 1, l + 1) points, those along the second axis counter-clockwise of those along the first,
         and the chamber that it belongs to, counted from 0, or `SOLID`.
@@ -405,7 +375,7 @@ def section_grids(section: Section, divisions: Divisions) -> tuple[list[ComplexA
             for a, b in ((0, 1), (0, 3))
         )
         sides = ((0, 1, along), (3, 2, along), (0, 3, across), (1, 2, across))
-        low, high, left, right = (grown(section, growth, corners[i], corners[k], t) for i, k, t in sides)
+        low, high, left, right = (section.line(corners[i], corners[k], t, growth) for i, k, t in sides)
         u, v = along[:, None], across[None, :]
         grid = (1 - v) * low[:, None] + v * high[:, None] + (1 - u) * left[None, :] + u * right[None, :]
         grid = grid - (1 - u) * ((1 - v) * low[0] + v * high[0]) - u * ((1 - v) * low[-1] + v * high[-1])
@@ -415,22 +385,14 @@ def section_grids(section: Section, divisions: Divisions) -> tuple[list[ComplexA
     return grids, chambers
 
 
-def section_points(grids: Sequence[ComplexArray]) -> ComplexArray:
-    """All points of grids, one after the other."""
-    return np.concatenate([grid.ravel() for grid in grids])
-
-
 def section_quadrilaterals(grids: Sequence[ComplexArray]) -> tuple[IntArray, list[IntArray]]:
-    """Numbers the points of grids that share sides.
-
-    Args:
-        grids: as from `section_grids`.
+    """Numbers the points of grids that share sides, as those of `section_grids` do.
 
     Returns:
-        (S,) a place of each point among `section_points`, and of each block (Q, 4) the points of its quadrilaterals,
+        (S,) a place of each point among those of all grids, and of each block (Q, 4) the points of its quadrilaterals,
         counter-clockwise.
     """
-    flat = section_points(grids)
+    flat = np.concatenate([grid.ravel() for grid in grids])
     unit = 1e-7 * np.abs(flat).max()
     keys = np.floor(np.stack([flat.real, flat.imag], axis=1) / unit + 0.1234567)  # no point of symmetry near a step
     _, place, number = np.unique(keys, axis=0, return_index=True, return_inverse=True)
@@ -441,27 +403,6 @@ def section_quadrilaterals(grids: Sequence[ComplexArray]) -> tuple[IntArray, lis
         corners = [i[:-1, :-1], i[1:, :-1], i[1:, 1:], i[:-1, 1:]]
         quads.append(np.stack(corners, axis=-1).reshape(-1, 4))
     return place, quads
-
-
-def grown(
-    section: Section, growth: Growth, first: tuple[str, bool, int], last: tuple[str, bool, int], t: NDArray[np.float64]
-) -> ComplexArray:
-    """Points at fractions (T,) of the line between two neighbouring corners, each (name, mirrored or not, wedge)."""
-    ends, moves = [], []
-    for (name, mirrored, wedge), other in ((first, last), (last, first)):
-        share = growth.outline if name[0] in "BV" else growth.chamber
-        piece, move = section.piece(name, other[0]), share * section.motion(name)
-        angle = 2.0 * section.half_angle * wedge
-        ends.append((piece.mirrored() if mirrored else piece).turned(angle))
-        moves.append((move.conjugate() if mirrored else move) * complex(cos(angle), sin(angle)))
-    exact = Piece(ends[0].start, ends[1].start, ends[0].centre)
-    points = exact.points(t)
-    if exact.centre is None:
-        return points + moves[0] * (1.0 - t) + moves[1] * t
-    share = growth.outline if first[0][0] in "BV" else growth.chamber
-    points += share * (points - exact.centre)
-    points[0], points[-1] = exact.start + moves[0], exact.end + moves[1]
-    return points
 
 
 def _fan(a: ComplexArray, b: ComplexArray) -> float:

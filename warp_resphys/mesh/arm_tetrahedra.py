@@ -17,28 +17,27 @@ _TETRAHEDRON = 4  # gmsh's number of the 4-node tetrahedron
 
 
 def tetrahedra(geometry: ArmGeometry, size: float) -> Mesh:
-    """Meshes an arm: the body, lofted along each cap and segment, less its chambers.
+    """Meshes an arm with 4-node tetrahedra of a size [m]: the body, lofted along caps and segments, less its chambers.
 
-    Args:
-        geometry: the arm.
-        size: length of the edges that is aimed at [m].
-
-    Returns:
-        4-node tetrahedra; vertices are numbered from the base down.
+    Vertices are numbered from the base down.
 
     Raises:
         MeshError: there is no gmsh, or it fails.
     """
-    gmsh = _import_gmsh()
+    try:
+        import gmsh
+    except (ImportError, OSError) as error:  # OSError: a system library that gmsh needs is missing
+        raise MeshError(
+            f"arms of tetrahedra need gmsh, which cannot be imported ({error}): install it with pip install gmsh, or "
+            "mesh the arm with hexahedra."
+        ) from error
     if gmsh.isInitialized():
         raise MeshError("gmsh is in use in this process: call gmsh.finalize() before an arm is meshed.")
     gmsh.initialize(interruptible=False)  # so that Ctrl-C stays Python's
     try:
         for option, value in (
-            ("General.Terminal", 0),
-            ("General.NumThreads", 1),
-            ("Mesh.MeshSizeMax", size),
-            ("Mesh.MeshSizeMin", 0.5 * size),
+            *(("General.Terminal", 0), ("General.NumThreads", 1)),
+            *(("Mesh.MeshSizeMax", size), ("Mesh.MeshSizeMin", 0.5 * size)),
             ("Mesh.Algorithm3D", 1),  # Delaunay, the same mesh every time
             ("Mesh.OptimizeThreshold", 0.6),  # of the quality below which tetrahedra are improved
         ):
@@ -56,18 +55,6 @@ def tetrahedra(geometry: ArmGeometry, size: float) -> Mesh:
     places = np.zeros(int(tags.max()) + 1, dtype=np.int64)
     places[tags.astype(np.int64)] = np.arange(len(tags))
     return _ordered(coordinates.reshape(-1, 3), places[nodes.astype(np.int64)].reshape(-1, 4))
-
-
-def _import_gmsh() -> Any:
-    """The module gmsh; MeshError where it is not installed or cannot be loaded."""
-    try:
-        import gmsh
-    except (ImportError, OSError) as error:  # OSError: a system library that gmsh needs is missing
-        raise MeshError(
-            f"arms of tetrahedra need gmsh, which cannot be imported ({error}): install it with pip install gmsh, or "
-            "mesh the arm with hexahedra."
-        ) from error
-    return gmsh
 
 
 def _build(occ: Any, geometry: ArmGeometry, size: float) -> None:
@@ -91,15 +78,12 @@ def _build(occ: Any, geometry: ArmGeometry, size: float) -> None:
 
 def _loft(occ: Any, ends: Sequence[tuple[ComplexArray, float, float]]) -> tuple[int, int]:
     """A solid between two polygons, each with its height [m] and angle about the axis [rad]."""
-    wires = [_wire(occ, polygon * cmath.exp(1j * angle), height) for polygon, height, angle in ends]
+    wires = []
+    for polygon, height, angle in ends:
+        tags = [occ.addPoint(point.real, point.imag, height) for point in polygon * cmath.exp(1j * angle)]
+        wires.append(occ.addWire([occ.addLine(a, b) for a, b in zip(tags, tags[1:] + tags[:1], strict=True)]))
     ((dimension, tag),) = (each for each in occ.addThruSections(wires, makeSolid=True, makeRuled=True) if each[0] == 3)
     return dimension, tag
-
-
-def _wire(occ: Any, polygon: ComplexArray, height: float) -> int:
-    """A polygon at a height [m]."""
-    tags = [occ.addPoint(point.real, point.imag, height) for point in polygon]
-    return int(occ.addWire([occ.addLine(a, b) for a, b in zip(tags, tags[1:] + tags[:1], strict=True)]))
 
 
 def _ordered(points: Any, cells: Any) -> Mesh:

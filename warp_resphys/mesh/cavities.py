@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .chambers import find_chambers
-from .mesh import FloatArray, IntArray, Mesh, boundary_triangles, connected_parts
+from .mesh import FloatArray, Mesh, boundary_triangles, connected_parts
 
 MOST_TRIANGLES = 10_000  # of a surface that is looked at
 _DIRECTIONS = 24  # from each triangle, over the half of all directions that it faces
@@ -17,15 +17,10 @@ _RAYS = 200_000  # pairs of a ray and a triangle that are looked at in one go, o
 
 @dataclass(frozen=True)
 class OpenCavity:
-    """A part of the outer surface from which little of the outside is seen.
+    """A part of the outer surface from which little of the outside is seen."""
 
-    Attributes:
-        centre: (3,) [m] mean of its triangles.
-        area: of it [m^2].
-    """
-
-    centre: FloatArray
-    area: float
+    centre: FloatArray  # (3,) [m] mean of its triangles
+    area: float  # of it [m^2]
 
 
 def open_cavities(mesh: Mesh) -> list[OpenCavity] | None:
@@ -34,46 +29,29 @@ def open_cavities(mesh: Mesh) -> list[OpenCavity] | None:
     From the middle of each triangle, straight lines go in evenly spread directions; where few of them leave without
     meeting the body again, the triangle is hidden. Hidden triangles that touch are one cavity.
 
-    Args:
-        mesh: The body.
-
     Returns:
         The cavities, largest first; None where the surface has more than `MOST_TRIANGLES`.
     """
+    import trimesh
+
     triangles = boundary_triangles(mesh)
     if len(triangles) > MOST_TRIANGLES:
         return None
-    inner = np.concatenate([np.empty(0, dtype=np.int64), *(chamber.vertices for chamber in find_chambers(mesh))])
-    outer = triangles[~np.isin(triangles[:, 0], inner)]
-    corners = mesh.vertices[outer]
-    normals = _normals(corners)
-    areas = 0.5 * np.linalg.norm(normals, axis=1)
-    normals = normals / (2.0 * areas[:, None])
-    starts = corners.mean(axis=1) + _LIFT * np.linalg.norm(np.ptp(mesh.vertices, axis=0)) * normals
-    candidates = np.flatnonzero(_blocked(starts, normals, corners))  # who sees the outside straight ahead is not hidden
-    if not len(candidates):
-        return []
-    directions = _half_sphere(normals[candidates])  # (C, D, 3)
-    blocked = _blocked(np.repeat(starts[candidates], _DIRECTIONS, axis=0), directions.reshape(-1, 3), corners)
-    hidden = outer[candidates][1.0 - blocked.reshape(-1, _DIRECTIONS).mean(axis=1) < _HIDDEN]
-    return _joined(mesh, hidden, _LEAST_AREA * float(areas.sum()))
-
-
-def _joined(mesh: Mesh, triangles: IntArray, least: float) -> list[OpenCavity]:
-    """Triangles (T, 3) that touch as one cavity each, those of a least area [m^2]."""
-    corners = mesh.vertices[triangles]
-    areas = 0.5 * np.linalg.norm(_normals(corners), axis=1)
-    parts, found = connected_parts(triangles), []
-    for part in np.unique(parts):
-        own = parts == part
-        centre = np.average(corners[own].mean(axis=1), axis=0, weights=areas[own])
-        found.append(OpenCavity(centre, float(areas[own].sum())))
-    return sorted((each for each in found if each.area >= least), key=lambda each: -each.area)
-
-
-def _normals(corners: FloatArray) -> FloatArray:
-    """(T, 3) normals of triangles (T, 3, 3), twice as long as their areas."""
-    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    inner = [chamber.vertices for chamber in find_chambers(mesh)]
+    outer = triangles[~np.isin(triangles[:, 0], np.concatenate(inner))] if inner else triangles
+    surface = trimesh.Trimesh(mesh.vertices, outer, process=False)
+    centres, normals, areas = surface.triangles_center, surface.face_normals, surface.area_faces
+    starts = centres + _LIFT * surface.scale * normals
+    hidden = np.flatnonzero(_blocked(starts, normals, surface.triangles))  # who sees the outside ahead is not hidden
+    directions = _half_sphere(normals[hidden]).reshape(-1, 3)
+    blocked = _blocked(np.repeat(starts[hidden], _DIRECTIONS, axis=0), directions, surface.triangles)
+    hidden = hidden[1.0 - blocked.reshape(-1, _DIRECTIONS).mean(axis=1) < _HIDDEN]
+    parts = connected_parts(outer[hidden])
+    cavities = []
+    for own in (hidden[parts == part] for part in np.unique(parts)):
+        if areas[own].sum() >= _LEAST_AREA * areas.sum():
+            cavities.append(OpenCavity(np.average(centres[own], axis=0, weights=areas[own]), float(areas[own].sum())))
+    return sorted(cavities, key=lambda each: -each.area)
 
 
 def _half_sphere(normals: FloatArray) -> FloatArray:

@@ -15,15 +15,11 @@ _SAME_HEIGHT = 0.05  # of the body's length: chambers whose centres are closer t
 
 @dataclass(frozen=True, eq=False)
 class Chamber:
-    """A closed surface inside a body.
+    """A closed surface inside a body."""
 
-    Attributes:
-        name: by which results and messages call it.
-        faces: (F, 3 | 4 | 6) vertices of its faces, ordered as `mesh.boundary_faces` gives them: counter-clockwise seen
-            from outside of the solid, that is, from inside the chamber.
-    """
-
-    name: str
+    name: str  # by which results and messages call it
+    # (F, 3 | 4 | 6) vertices of its faces, ordered as `mesh.boundary_faces` gives them: counter-clockwise seen from
+    # outside of the solid, that is, from inside the chamber
     faces: NDArray[np.int64]
 
     @property
@@ -38,13 +34,8 @@ def find_chambers(mesh: Mesh, axis: Sequence[float] = (0.0, 0.0, -1.0)) -> tuple
     A component is a chamber where its faces, seen from outside of the solid, enclose a negative volume. A cavity that
     is open to the outside is part of the outer surface, and no chamber.
 
-    Args:
-        mesh: the body.
-        axis: (3,) from its clamped end along it. Chambers are ordered along it; those side by side by their angle about
-            it, counter-clockwise seen against the axis, from the direction of x (of y where the axis is x).
-
-    Returns:
-        The chambers, named ``chamber_1`` and so on.
+    They are named ``chamber_1`` and so on along the axis, which leads from the clamped end along the body; those side
+    by side by their angle about it, counter-clockwise seen against it, from the direction of x, or y if the axis is x.
     """
     faces = boundary_faces(mesh)
     owner = connected_parts(faces)

@@ -11,6 +11,7 @@ import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from ..io.errors import MeshError
 from .elements import BY_NODES, ELEMENTS, FACES, Element
@@ -29,16 +30,12 @@ class Mesh:
 
     Building one checks shapes and number types only; `check_mesh` checks what the numbers mean.
 
-    Attributes:
-        vertices: (N, 3) [m] rest positions.
-        cells: (M, K) vertex indices in VTK's order, of one of `elements.ELEMENTS`.
-
     Raises:
         MeshError: An array has the wrong shape, or the indices are not integers.
     """
 
-    vertices: FloatArray
-    cells: IntArray
+    vertices: FloatArray  # (N, 3) [m] rest positions
+    cells: IntArray  # (M, K) vertex indices in VTK's order, of one of `elements.ELEMENTS`
 
     def __post_init__(self) -> None:
         """Check shapes and number types, and store contiguous float64 and int64 arrays."""
@@ -82,9 +79,6 @@ def box_hexahedra(
         divisions: Numbers of bricks (nx, ny, nz) along the axes.
         nodes: Of a hexahedron: 8, 20 or 27; those beyond the corners are numbered after these.
 
-    Returns:
-        Mesh of nx ny nz hexahedra.
-
     Raises:
         MeshError: A length is not positive and finite, a number is not a positive integer, or there is no such element.
     """
@@ -107,13 +101,7 @@ def box_tetrahedra(
 ) -> Mesh:
     """Box whose bricks are split into six tetrahedra each (Kuhn 1960), conforming and of equal volume.
 
-    Args:
-        size: Lengths along x, y and z [m].
-        divisions: Numbers of bricks (nx, ny, nz) along the axes.
-        order: 1 for 4-node tetrahedra, 2 for 10-node ones.
-
-    Returns:
-        Mesh of 6 nx ny nz tetrahedra; its first vertices are those of `box_hexahedra`.
+    Its first vertices are those of `box_hexahedra` of that size and those divisions; of order 2 it has 10-node cells.
 
     Raises:
         MeshError: As in `box_hexahedra`, or the order is neither 1 nor 2.
@@ -126,14 +114,9 @@ def box_tetrahedra(
 
 
 def quadratic(mesh: Mesh, kind: str = "") -> Mesh:
-    """Add the nodes of an element of second order to a mesh of corners; neighbours share them.
+    """Add the nodes of an element of second order after those of a mesh of linear cells; neighbours share them.
 
-    Args:
-        mesh: Mesh of linear cells.
-        kind: Name of the element; by default 10-node tetrahedra or 27-node hexahedra.
-
-    Returns:
-        The mesh of that element; its first vertices are those of `mesh`, unchanged.
+    The kind of element is by default that of 10-node tetrahedra or 27-node hexahedra.
 
     Raises:
         MeshError: The cells have more than corners, or other corners than the element's.
@@ -159,9 +142,6 @@ def check_mesh(mesh: Mesh) -> None:
     The Jacobian determinant of each cell's map from its reference cell must be positive at the quadrature
     points and at the nodes.
 
-    Args:
-        mesh: The mesh.
-
     Raises:
         MeshError: The mesh is empty; a coordinate is not finite; an index is out of range; a vertex belongs
             to no cell; two vertices coincide; a cell is flat, inverted or folded.
@@ -180,24 +160,17 @@ def check_mesh(mesh: Mesh) -> None:
 
 
 def boundary_faces(mesh: Mesh) -> IntArray:
-    """Faces that belong to one cell only.
-
-    Args:
-        mesh: The mesh.
+    """Faces that belong to one cell only, ordered by cell.
 
     Returns:
         (F, n) vertex indices, such as (F, 4) for 8-node hexahedra: the corners, counter-clockwise seen from outside,
-        then the other nodes. Ordered by cell.
+        then the other nodes.
     """
     element = mesh.element
     faces = mesh.cells[:, element.faces].reshape(-1, element.faces.shape[1])
     keys = np.sort(faces[:, : element.face.corners], axis=1)
-    order = np.lexsort(keys.T)
-    repeated = np.all(keys[order[1:]] == keys[order[:-1]], axis=1)
-    single = np.ones(len(faces), dtype=bool)
-    single[order[1:][repeated]] = False
-    single[order[:-1][repeated]] = False
-    return faces[single]
+    _, key, count = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
+    return faces[count[key.ravel()] == 1]
 
 
 def connected_parts(cells: IntArray) -> IntArray:
@@ -234,17 +207,7 @@ def select_vertices(
     z: float | None = None,
     tolerance: float = 1e-9,
 ) -> IntArray:
-    """Vertices on a plane, or where two or three planes meet.
-
-    Args:
-        mesh: The mesh.
-        x: Coordinate of a plane across the x axis [m], or None for any.
-        y: The same for the y axis.
-        z: The same for the z axis.
-        tolerance: Largest distance of a vertex from each plane [m].
-
-    Returns:
-        (S,) sorted vertex indices, at least one.
+    """(S,) sorted vertices within a tolerance [m] of planes across the axes at x, y and z [m], of one plane at least.
 
     Raises:
         MeshError: No coordinate is given, or no vertex lies there.
@@ -288,23 +251,11 @@ def _normalised_volumes(mesh: Mesh) -> tuple[FloatArray, FloatArray]:
 
 
 def _coincident(vertices: FloatArray) -> NDArray[np.bool_]:
-    """Flags of vertices that lie on another one, (N,); one of each pair.
-
-    Coincident points have close projections on any direction. Sorted along a skew one, each vertex is
-    compared with its successor, then with the one after it, until projections are apart or a pair is found.
-    """
+    """Flags of vertices that lie on another one of a lower number, (N,)."""
     offsets = vertices - vertices[0]
-    distance = COINCIDENT_DISTANCE * np.linalg.norm(np.ptp(offsets, axis=0))
-    heights = offsets @ np.sqrt([1 / 6, 2 / 6, 3 / 6])
-    order = np.argsort(heights)
-    found = np.zeros(len(vertices), dtype=bool)
-    for step in range(1, len(vertices)):
-        close = np.flatnonzero(heights[order[step:]] - heights[order[:-step]] <= distance)
-        pairs = order[close], order[close + step]
-        found[pairs[1]] = np.linalg.norm(offsets[pairs[1]] - offsets[pairs[0]], axis=1) <= distance
-        if not len(close) or found.any():
-            break
-    return found
+    distance = COINCIDENT_DISTANCE * float(np.linalg.norm(np.ptp(offsets, axis=0)))
+    _, nearest = cKDTree(offsets).query(offsets, k=2, distance_upper_bound=np.nextafter(distance, np.inf))
+    return np.asarray(nearest.min(axis=1) < np.arange(len(vertices)))
 
 
 def _refuse(broken: NDArray[np.bool_], nouns: str, problem: str) -> None:

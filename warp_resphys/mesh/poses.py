@@ -4,17 +4,9 @@ import torch
 
 
 def twisted(positions: torch.Tensor, angles: torch.Tensor, axis: int = 0) -> torch.Tensor:
-    """A body twisted about the centre line of its bounding box.
+    """(B, N, 3) a body (N, 3) [m] twisted about the centre line of its bounding box along an axis.
 
-    Every cross-section turns as a whole, by an angle that grows linearly along the axis from zero at the low end.
-
-    Args:
-        positions: (N, 3) [m].
-        angles: (B,) of the high end [rad].
-        axis: 0, 1 or 2.
-
-    Returns:
-        (B, N, 3) [m].
+    Every cross-section turns as a whole, by an angle that grows linearly from zero at the low end to one of (B,) [rad].
     """
     low, high = positions.amin(0), positions.amax(0)
     centred = positions - 0.5 * (low + high)

@@ -12,22 +12,18 @@ def scaled_jacobian(mesh: Mesh) -> FloatArray:
     At each corner, it is the volume that the edges there span, over the product of their lengths. A tetrahedron's
     corners share one volume, and are compared by the largest product; nodes between corners are not looked at.
 
-    Args:
-        mesh: The mesh.
-
     Returns:
         (M,) from -1 to 1.
     """
-    element = mesh.element
-    linear = ELEMENTS[element.linear]
+    linear = ELEMENTS[mesh.element.linear]
     corners = mesh.vertices[mesh.cells[:, : linear.nodes]]
     spokes = np.stack([_spokes(linear.edges, corner) for corner in range(linear.nodes)])  # (corners, 3)
     edges = corners[:, spokes] - corners[:, : linear.nodes, None]  # (M, corners, 3 edges, 3)
     spanned = np.einsum("qki,mkj->mqij", linear.shape(linear.shape.nodes)[1], corners)
     sizes = np.linalg.norm(edges, axis=-1).prod(axis=-1)
     lengths = np.linalg.norm(spanned, axis=-1).prod(axis=-1)
-    if linear.nodes == 4:  # whose Jacobian is the same everywhere
-        return np.asarray(element.regular_jacobian * np.linalg.det(spanned[:, 0]) / sizes.max(axis=1))
+    if linear.nodes == 4:  # whose Jacobian is the same everywhere; sqrt(1/2) of the product if it is regular
+        return np.asarray(np.sqrt(2.0) * np.linalg.det(spanned[:, 0]) / sizes.max(axis=1))
     return np.asarray((np.linalg.det(spanned) / lengths).min(axis=1))
 
 

@@ -58,12 +58,6 @@ def read_surfaces(
 ) -> dict[str, IntArray]:
     """Read the named surfaces of a mesh file: gmsh's physical groups, or the cell sets of other formats.
 
-    Args:
-        path: The file; its extension tells the format.
-        units: As in `read_mesh`.
-        order: As in `read_mesh`.
-        drop_unreferenced: As in `read_mesh`.
-
     Returns:
         (F, 3 | 4 | 6) faces by name, of the mesh that `read_mesh` gives for the same arguments and as
         `mesh.boundary_faces` gives them; empty where the file names no surface.
@@ -76,10 +70,8 @@ def read_surfaces(
     corners = mesh.element.face.corners
     face_of = {tuple(sorted(face)): number for number, face in enumerate(faces[:, :corners].tolist())}
     surfaces = {}
-    for key, nodes in content.items():
-        kind, _, name = key.partition("/")
-        if kind != "surface":
-            continue
+    for name in (key.removeprefix("surface/") for key in content if key.startswith("surface/")):
+        nodes = content[f"surface/{name}"]
         found = [face_of.get(tuple(sorted(places[face].tolist()))) for face in nodes]
         missing = found.count(None)
         if missing:
@@ -92,12 +84,7 @@ def read_surfaces(
 
 
 def write_mesh(path: str | os.PathLike[str], mesh: Mesh, surfaces: Mapping[str, IntArray] | None = None) -> None:
-    """Write a mesh in metres.
-
-    Args:
-        path: The file; its extension tells the format. Only .msh, which is gmsh's, keeps named surfaces.
-        mesh: The mesh.
-        surfaces: (F, 3 | 4 | 6 | 8 | 9) faces by name.
+    """Write a mesh in metres, and its surfaces (F, 3 | 4 | 6 | 8 | 9) by name, which only .msh, gmsh's format, keeps.
 
     Raises:
         MeshError: The extension is unknown to meshio, or its format does not know such cells.
@@ -144,8 +131,11 @@ def _read(path: Path, units: str, order: int, drop_unreferenced: bool) -> tuple[
     try:
         mesh = Mesh(content["points"], _volume_cells(content).copy())
         places = np.arange(len(mesh.vertices))
-        if drop_unreferenced:
-            mesh, places = _without_unreferenced(mesh)
+        used = np.unique(mesh.cells)
+        if drop_unreferenced and used[0] >= 0 and used[-1] < len(places):  # others are refused below
+            places[:] = -1
+            places[used] = np.arange(len(used))
+            mesh = Mesh(mesh.vertices[used], places[mesh.cells])
         check_mesh(mesh)
         mesh = Mesh(mesh.vertices * METRES[units], mesh.cells)
         _check_size(mesh, units)
@@ -186,23 +176,8 @@ def _volume_cells(arrays: Arrays) -> IntArray:
     return cells
 
 
-def _without_unreferenced(mesh: Mesh) -> tuple[Mesh, IntArray]:
-    """Drop vertices that belong to no cell; a mesh with invalid indices stays as it is, to be refused.
-
-    Returns:
-        The mesh, and the new number of each vertex, -1 where it was dropped.
-    """
-    count = len(mesh.vertices)
-    used, cells = np.unique(mesh.cells, return_inverse=True)
-    if used[0] < 0 or used[-1] >= count:
-        return mesh, np.arange(count)
-    places = np.full(count, -1)
-    places[used] = np.arange(len(used))
-    return Mesh(mesh.vertices[used], cells.reshape(mesh.cells.shape)), places
-
-
 def _check_size(mesh: Mesh, units: str) -> None:
-    """Raise MeshError if the bounding box is so small or large that the units are likely wrong."""
+    """Raises MeshError if the bounding box is so small or large that the units are likely wrong."""
     diagonal = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
     if not SHORTEST_DIAGONAL <= diagonal <= LONGEST_DIAGONAL:
         others = " or ".join(f"units={unit}" for unit in METRES if unit != units)

@@ -3,54 +3,38 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..io.errors import InputError
-from .mesh import Mesh, boundary_triangles
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from .mesh import FloatArray, IntArray, Mesh, boundary_triangles
 
 _TIE = 1e-9  # Triangles count as equally close up to this distance, over the diagonal of the mesh.
 
 
 @dataclass(frozen=True)
 class ClosestPoints:
-    """What the surface has to say of P points.
+    """What the surface has to say of P points."""
 
-    Attributes:
-        triangles: (P, 3) vertices of the closest triangle, counter-clockwise seen from outside.
-        points: (P, 3) [m] the closest point of that triangle.
-        normals: (P, 3) the triangle's outer unit normal.
-        distances: (P,) [m] from the closest point; negative inside the body.
-    """
-
-    triangles: IntArray
-    points: FloatArray
-    normals: FloatArray
-    distances: FloatArray
+    triangles: IntArray  # (P, 3) vertices of the closest triangle, counter-clockwise seen from outside
+    points: FloatArray  # (P, 3) [m] the closest point of that triangle
+    normals: FloatArray  # (P, 3) the triangle's outer unit normal
+    distances: FloatArray  # (P,) [m] from the closest point; negative inside the body
 
 
-def closest_points(mesh: Mesh, points: FloatArray, triangles: IntArray | None = None) -> ClosestPoints:
+def closest_points(mesh: Mesh, points: FloatArray) -> ClosestPoints:
     """Finds the closest points on the boundary at rest.
 
     Faces with four nodes count as two triangles, those with six as four, through all of their nodes. A point beside an
     edge is equally close to the triangles that share it; of these the one that it lies most squarely above is taken.
 
-    Args:
-        mesh: The body.
-        points: (P, 3) [m], finite.
-        triangles: (F, 3) the part of the boundary to look at; all of it if left out.
-
     Raises:
-        InputError: A point is not finite.
+        InputError: A point of (P, 3) [m] is not finite.
     """
     import trimesh
 
     points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     if not np.isfinite(points).all():
         raise InputError("The closest point of a surface was asked for of a point that is not finite.")
-    triangles = boundary_triangles(mesh) if triangles is None else triangles
+    triangles = boundary_triangles(mesh)
     corners = mesh.vertices[triangles]  # (F, 3, 3) [m]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)

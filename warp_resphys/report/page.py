@@ -80,10 +80,11 @@ class Text:
 
 @dataclass(frozen=True)
 class Items:
-    """A list."""
+    """A list, of commands where `code` says so."""
 
     items: Sequence[str]
     name: str = ""
+    code: bool = False
 
 
 @dataclass(frozen=True)

@@ -4,24 +4,21 @@ Machines differ, and so does one machine from minute to minute. The cases of a r
 are reported, and a fixed task of LAPACK, the *yardstick*, takes its turn with them: times over the yardstick's compare.
 """
 
-import datetime
 import json
 import os
-import platform
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from statistics import median
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
 from omegaconf import DictConfig
-from rich.console import Console
 from rich.table import Table
 from threadpoolctl import threadpool_limits
 
@@ -45,44 +42,60 @@ from ..experiment.schema import (
 )
 from ..io.errors import InputError
 from ..io.files import write_json
+from ..io.machine import hardware
 from ..io.progress import Progress
 from ..io.stages import package_versions
 from ..linalg.linear_solver import make_linear_solver
-from .settings import settings_of
+from .command import settings_of, show, table_of
 
-PARTS = ("local_step", "tangent", "assembly", "factor", "solve")
-_YARDSTICK_SIZE = 480
+PARTS: Final = ("local_step", "tangent", "assembly", "factor", "solve")
+_YARDSTICK_SIZE: Final = 480
+_BY_REFINEMENT: Final = Kind(
+    lambda value: isinstance(value, Mapping) and bool(value) and all(map(NATURAL.fits, (*value, *value.values()))),
+    "whole numbers by refinement, one or more",
+)
+_LIMITS: Final = Group({"refinements": absent(NATURALS), "batches": absent(NATURALS), "steps": absent(NATURAL)})
+_KEYS: Final = Group(
+    {
+        **dict.fromkeys(SOLVERS, absent(_LIMITS)),
+        "quick": TRUTH_VALUE,
+        "solvers": Kind(lambda value: isinstance(value, list) and bool(value), "a list of solvers"),
+        "materials": Kind(lambda value: isinstance(value, list) and bool(value), "a list of materials"),
+        "refinements": NATURALS,
+        "batches": Group({"cpu": NATURALS, "cuda": NATURALS}),
+        "largest_batch": _BY_REFINEMENT,
+        "steps": _BY_REFINEMENT,
+        "relative_tolerance": POSITIVE,
+        "max_iterations": NATURAL,
+        "tip_mass": NOT_NEGATIVE,
+        "pressure": FINITE,
+        "repeats": NATURAL,
+        "seconds": POSITIVE,
+        "parts_repeats": NATURAL,
+        "cold_start": TRUTH_VALUE,
+    }
+)
+_MATERIAL: Final = Group({"poissons_ratio": FINITE, "youngs_modulus": POSITIVE})
+# The coarsest mesh and a single environment, twice.
+_QUICK: Final = {"refinements": [1], "batches": {"cpu": [1], "cuda": [1]}, "repeats": 2, "parts_repeats": 10}
 
 
 @dataclass
 class Case:
-    """One row of the benchmark: a simulator at the state it starts from, and what was measured of it.
-
-    Attributes:
-        solver: its name.
-        material: Young's modulus [Pa] and Poisson's ratio.
-        refinement: of the configured box.
-        batch: environments.
-        steps: of a roll-out.
-        inputs: pressures in its chambers, if it has any.
-        forward: seconds of each roll-out.
-        backward: seconds of each adjoint.
-        iterations: mean a step.
-        factorisations: mean a step.
-    """
+    """One row of the benchmark: a simulator at the state it starts from, and what was measured of it."""
 
     solver: str
-    material: Mapping[str, float]
-    refinement: int
+    material: Mapping[str, float]  # Young's modulus [Pa] and Poisson's ratio
+    refinement: int  # of the configured box
     batch: int
-    steps: int
+    steps: int  # of a roll-out
     simulator: Simulator
     start: State
-    inputs: Inputs = field(default_factory=Inputs)
-    forward: list[float] = field(default_factory=list)
-    backward: list[float] = field(default_factory=list)
-    iterations: float = 0.0
-    factorisations: float = 0.0
+    inputs: Inputs  # pressures in its chambers, if it has any
+    forward: list[float] = field(default_factory=list)  # [s] of each roll-out
+    backward: list[float] = field(default_factory=list)  # [s] of each adjoint
+    iterations: float = 0.0  # mean a step
+    factorisations: float = 0.0  # mean a step
 
     def measure(self) -> None:
         """One roll-out, and its gradient by the start, the force at every step and Young's modulus."""
@@ -125,12 +138,8 @@ def benchmark(config: DictConfig) -> None:
     """Writes benchmark.json into the run folder and prints its tables; see `run_benchmark`."""
     plain, folder = settings_of(config)
     result = run_benchmark(plain)
-    file = folder / "benchmark.json"
-    write_json(file, result)
-    console = Console()
-    for table in benchmark_tables(result):
-        console.print(table)
-    console.print(f"Written: {file}")
+    write_json(folder / "benchmark.json", result)
+    show(*benchmark_tables(result), f"Written: {folder / 'benchmark.json'}")
 
 
 def run_benchmark(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -144,8 +153,12 @@ def run_benchmark(config: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         InputError: a configuration that cannot be simulated or refined.
     """
-    _check(config["benchmark"])
-    settings = _quick(config["benchmark"]) if config["benchmark"]["quick"] else dict(config["benchmark"])
+    settings = dict(config["benchmark"])
+    check("benchmark", settings, _KEYS)
+    for number, material in enumerate(settings["materials"]):
+        check(f"benchmark.materials.{number}", material, _MATERIAL)
+    if settings["quick"]:
+        settings |= _QUICK
     yardstick: list[float] = []
     steps: list[dict[str, Any]] = []
     parts: list[dict[str, Any]] = []
@@ -156,8 +169,8 @@ def run_benchmark(config: Mapping[str, Any]) -> dict[str, Any]:
         timed = {case.batch: case for case in reversed(cases)}
         parts += [_time_parts(timed[batch], settings["parts_repeats"]) for batch in sorted(timed)]
     return {
-        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "hardware": hardware(str(config["device"])),
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "hardware": {**hardware(), "torch threads": torch.get_num_threads()},
         "versions": package_versions(),
         "settings": {**settings, "device": config["device"], "dtype": config["dtype"]},
         "yardstick_ms": 1e3 * median(yardstick),
@@ -165,52 +178,6 @@ def run_benchmark(config: Mapping[str, Any]) -> dict[str, Any]:
         "parts": parts,
         "cold_start": cold_start(config) if settings["cold_start"] else None,
     }
-
-
-_BY_REFINEMENT = Kind(
-    lambda value: isinstance(value, Mapping) and bool(value) and all(map(NATURAL.fits, (*value, *value.values()))),
-    "whole numbers by refinement, one or more",
-)
-_LIMITS: dict[str, Kind | Group] = {
-    "refinements": absent(NATURALS),
-    "batches": absent(NATURALS),
-    "steps": absent(NATURAL),
-}
-_KEYS: dict[str, Kind | Group] = {
-    **dict.fromkeys(SOLVERS, Group(_LIMITS, absent=True)),
-    "quick": TRUTH_VALUE,
-    "solvers": Kind(lambda value: isinstance(value, list) and bool(value), "a list of solvers"),
-    "materials": Kind(lambda value: isinstance(value, list) and bool(value), "a list of materials"),
-    "refinements": NATURALS,
-    "batches": Group({"cpu": NATURALS, "cuda": NATURALS}),
-    "largest_batch": _BY_REFINEMENT,
-    "steps": _BY_REFINEMENT,
-    "relative_tolerance": POSITIVE,
-    "max_iterations": NATURAL,
-    "tip_mass": NOT_NEGATIVE,
-    "pressure": FINITE,
-    "repeats": NATURAL,
-    "seconds": POSITIVE,
-    "parts_repeats": NATURAL,
-    "cold_start": TRUTH_VALUE,
-}
-
-
-def _check(settings: Mapping[str, Any]) -> None:
-    """Checks the group ``benchmark``.
-
-    Raises:
-        InputError: a value of the wrong kind or out of range, an unknown key, or no batch to measure.
-    """
-    check("benchmark", settings, Group(_KEYS))
-    for number, material in enumerate(settings["materials"]):
-        check(f"benchmark.materials.{number}", material, Group({"poissons_ratio": FINITE, "youngs_modulus": POSITIVE}))
-
-
-def _quick(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The coarsest mesh and a single environment, twice."""
-    few = {"refinements": [1], "batches": {"cpu": [1], "cuda": [1]}, "repeats": 2, "parts_repeats": 10}
-    return {**settings, **few}
 
 
 def _cases(config: Mapping[str, Any], settings: Mapping[str, Any], refinement: int) -> list[Case]:
@@ -222,26 +189,20 @@ def _cases(config: Mapping[str, Any], settings: Mapping[str, Any], refinement: i
         limits = settings.get(solver, {})
         if refinement not in limits.get("refinements", [refinement]):
             continue
+        steps = limits.get("steps", _at(settings["steps"], refinement))
+        batches = limits.get("batches", settings["batches"][kind])
+        tolerances = {key: settings[key] for key in ("relative_tolerance", "max_iterations")}
         for material in settings["materials"]:
             changed = {
                 **config,
                 "simulation": {**config["simulation"], **material},
-                "solver": {
-                    **config["solver"],
-                    "name": solver,
-                    "relative_tolerance": settings["relative_tolerance"],
-                    "max_iterations": settings["max_iterations"],
-                },
+                "solver": {**config["solver"], "name": solver, **tolerances},
             }
-            batches = limits.get("batches", settings["batches"][kind])
             for batch in (b for b in batches if b <= _at(settings["largest_batch"], refinement)):
                 simulator = build_simulator(changed, body=body)
-                steps = limits.get("steps", _at(settings["steps"], refinement))
-                case = _at_start(
-                    Case(solver, material, refinement, batch, steps, simulator, simulator.rest_state()), settings
-                )
-                simulator.rollout(case.start, 2, Inputs(**{k: v[:2] for k, v in case.inputs.fields.items()}))
-                cases.append(case)
+                start, inputs = _start(simulator, settings, batch, steps)
+                simulator.rollout(start, 2, Inputs(**{k: v[:2] for k, v in inputs.fields.items()}))
+                cases.append(Case(solver, material, refinement, batch, steps, simulator, start, inputs))
     if not cases:
         raise InputError(
             f"benchmark.batches and benchmark.largest_batch leave none of refinement {refinement}: name a smaller one."
@@ -264,17 +225,15 @@ def _refined(config: Mapping[str, Any], refinement: int) -> dict[str, Any]:
     return mesh
 
 
-def _at_start(case: Case, settings: Mapping[str, Any]) -> Case:
-    """The case at its start: let go from a weight, or at rest before the pressures of its chambers come."""
-    simulator, batch = case.simulator, case.batch
+def _start(simulator: Simulator, settings: Mapping[str, Any], batch: int, steps: int) -> tuple[State, Inputs]:
+    """Let go from a weight, or at rest before the pressures of its chambers come, and these pressures."""
     chambers = simulator.counts.get("pressure", 0)
     if not chambers:
-        return replace(case, start=released(simulator, settings["tip_mass"], batch))
-    phase = simulator.tensor(np.arange(case.steps)[:, None, None] / case.steps)
+        return released(simulator, settings["tip_mass"], batch), Inputs()
+    phase = simulator.tensor(np.arange(steps)[:, None, None] / steps)
     shift = simulator.tensor(np.arange(chambers) / chambers + 0.1 * np.arange(batch)[:, None])
     pressures = 0.5 * settings["pressure"] * (1.0 - torch.cos(2.0 * torch.pi * (phase + shift)))
-    start = simulator.static_equilibrium(Inputs(pressure=pressures[0])).detach()
-    return replace(case, start=start, inputs=Inputs(pressure=pressures))
+    return simulator.static_equilibrium(Inputs(pressure=pressures[0])).detach(), Inputs(pressure=pressures)
 
 
 def _at(values: Mapping[Any, int], refinement: int) -> int:
@@ -284,13 +243,7 @@ def _at(values: Mapping[Any, int], refinement: int) -> int:
 
 
 def released(simulator: Simulator, mass: float, batch: int) -> State:
-    """Rest under a weight at the tip, lighter in each further environment of a batch.
-
-    Args:
-        simulator: of a body that is clamped at its smallest x.
-        mass: [kg].
-        batch: environments.
-    """
+    """Rest under a mass [kg] at the largest x, lighter in each further environment of a batch."""
     x = simulator.rest_positions[:, 0]
     tip = x >= x.max() - 1e-9 * (x.max() - x.min())
     share = tip.to(simulator.dtype) / tip.sum()  # (N,)
@@ -313,12 +266,8 @@ def measure_yardstick() -> float:
     """Seconds of a product and a Cholesky factor of 480 x 480 matrices in NumPy on one thread, the median of five."""
     n = _YARDSTICK_SIZE
     random = np.random.default_rng(0).standard_normal((n, n))
-
-    def task() -> None:
-        np.linalg.cholesky(random @ random.T + n * np.eye(n))
-
     with threadpool_limits(1):
-        return _median_seconds(task, 5, torch.device("cpu"))
+        return _median_seconds(lambda: np.linalg.cholesky(random @ random.T + n * np.eye(n)), 5, torch.device("cpu"))
 
 
 def _time_parts(case: Case, repeats: int) -> dict[str, Any]:
@@ -327,8 +276,9 @@ def _time_parts(case: Case, repeats: int) -> dict[str, Any]:
     workspace = sim.workspace(case.batch)
     potential, pattern = workspace.potential, workspace.pattern
     device = potential.device
-    kind = sim.settings.linear_solver
-    linear = make_linear_solver(kind, pattern.rows, pattern.cols, len(pattern.free), 3, device, sim.dtype)
+    linear = make_linear_solver(
+        sim.settings.linear_solver, pattern.rows, pattern.cols, len(pattern.free), 3, device, sim.dtype
+    )
     assemble = HessianAssembly(potential, linear, pattern)
     potential.update_tangent()
     values = assemble().to(sim.dtype, copy=True)
@@ -342,12 +292,7 @@ def _time_parts(case: Case, repeats: int) -> dict[str, Any]:
         "solve": lambda: factor.solve(right),
     }
     times = {f"{name}_ms": 1e3 * _median_seconds(tasks[name], repeats, device) for name in PARTS}
-    return {
-        "refinement": case.refinement,
-        "batch": case.batch,
-        "linear_solver": type(linear).__name__,
-        **times,
-    }
+    return {"refinement": case.refinement, "batch": case.batch, "linear_solver": type(linear).__name__, **times}
 
 
 def _median_seconds(task: Callable[[], object], repeats: int, device: torch.device) -> float:
@@ -366,18 +311,7 @@ def _now(device: torch.device) -> float:
     return time.perf_counter()
 
 
-def hardware(device: str) -> dict[str, Any]:
-    """Names and counts of the processors."""
-    name = platform.processor() or platform.machine()
-    info = Path("/proc/cpuinfo")
-    if info.is_file():
-        lines = info.read_text(encoding="utf-8").splitlines()
-        name = next((x.partition(":")[2].strip() for x in lines if x.startswith("model name")), name)
-    gpu = torch.cuda.get_device_name(torch.device(device)) if device.startswith("cuda") else None
-    return {"cpu": name, "cores": os.cpu_count(), "torch_threads": torch.get_num_threads(), "gpu": gpu}
-
-
-_COLD_START = """
+_COLD_START: Final = """
 import sys, time
 began = time.perf_counter()
 from warp_resphys.studies.benchmark import first_step
@@ -391,13 +325,12 @@ def cold_start(config: Mapping[str, Any]) -> dict[str, dict[str, float]]:
     Raises:
         RuntimeError: the process failed.
     """
-    given = {k: config[k] for k in _NEEDED}
     result = {}
     with tempfile.TemporaryDirectory() as cache:
         for name in ("cold", "warm"):
             run = subprocess.run(
                 [sys.executable, "-c", _COLD_START],
-                input=json.dumps(given),
+                input=json.dumps(config),
                 env={**os.environ, "WARP_CACHE_PATH": cache},
                 capture_output=True,
                 text=True,
@@ -409,27 +342,8 @@ def cold_start(config: Mapping[str, Any]) -> dict[str, dict[str, float]]:
     return result
 
 
-_NEEDED = (
-    "mesh",
-    "physics",
-    "fixed",
-    "solver",
-    "simulation",
-    "gravity",
-    "time_step",
-    "integrator",
-    "device",
-    "dtype",
-)
-
-
 def first_step(began: float, config: str) -> None:
-    """Prints what this new process has taken until it made its first step, as a line of JSON.
-
-    Args:
-        began: ``time.perf_counter()`` before the imports.
-        config: keys of the main configuration, as JSON.
-    """
+    """Prints as JSON what this new process took for its first step of a configuration [s], from before its imports."""
     imported = time.perf_counter()
     simulator = build_simulator(json.loads(config))
     state = simulator.rest_state()
@@ -439,39 +353,41 @@ def first_step(began: float, config: str) -> None:
     kernels = _now(potential.device)
     simulator.step(state)
     stepped = _now(potential.device)
-    times = {
-        "import_s": imported - began,
-        "build_s": built - imported,
-        "kernels_s": kernels - built,
-        "first_step_s": stepped - kernels,
-    }
-    print(json.dumps(times))
+    names = ("import_s", "build_s", "kernels_s", "first_step_s")
+    moments = (began, imported, built, kernels, stepped)
+    print(json.dumps(dict(zip(names, np.diff(moments).tolist(), strict=True))))
 
 
 def benchmark_tables(result: Mapping[str, Any]) -> list[Table]:
     """The result for a terminal."""
-    yardstick = result["yardstick_ms"]
-    where = result["hardware"]["gpu"] or result["hardware"]["cpu"]
-    steps = Table(title=f"Milliseconds a step of the whole batch, {where} (yardstick {yardstick:.2f} ms)")
-    for heading in ("solver", "nu", "unknowns", "batch", "forward", "backward", "forward / yardstick"):
-        steps.add_column(heading, justify="left" if heading == "solver" else "right")
-    steps.add_column("iterations", justify="right")
-    steps.add_column("factorisations", justify="right")
-    for row in result["steps"]:
-        forward = row["forward_ms"]
-        times = (f"{forward:.2f}", f"{row['backward_ms']:.2f}", f"{forward / yardstick:.2f}")
-        counts = (f"{row['iterations']:.1f}", f"{row['factorisations']:.2f}")
-        which = (row["solver"], f"{row['poissons_ratio']:g}", str(row["unknowns"]), str(row["batch"]))
-        steps.add_row(*which, *times, *counts)
-    parts = Table("refinement", "batch", *(p.replace("_", " ") for p in PARTS), title="Milliseconds of the parts")
-    for row in result["parts"]:
-        parts.add_row(str(row["refinement"]), str(row["batch"]), *(f"{row[f'{p}_ms']:.3f}" for p in PARTS))
-    tables = [steps, parts]
+    yardstick, machine = result["yardstick_ms"], result["hardware"]
+    where = machine["GPU" if str(result["settings"]["device"]).startswith("cuda") else "processor"]
+    steps = [
+        [
+            row["solver"],
+            f"{row['poissons_ratio']:g}",
+            str(row["unknowns"]),
+            str(row["batch"]),
+            f"{row['forward_ms']:.2f}",
+            f"{row['backward_ms']:.2f}",
+            f"{row['forward_ms'] / yardstick:.2f}",
+            f"{row['iterations']:.1f}",
+            f"{row['factorisations']:.2f}",
+        ]
+        for row in result["steps"]
+    ]
+    headings = ["solver", "nu", "unknowns", "batch", "forward", "backward", "forward / yardstick"]
+    title = f"Milliseconds a step of the whole batch, {where} (yardstick {yardstick:.2f} ms)"
+    tables = [table_of(title, [*headings, "iterations", "factorisations"], steps)]
+    parts = [
+        [str(row["refinement"]), str(row["batch"]), *(f"{row[f'{part}_ms']:.3f}" for part in PARTS)]
+        for row in result["parts"]
+    ]
+    headings = ["refinement", "batch", *(part.replace("_", " ") for part in PARTS)]
+    tables.append(table_of("Milliseconds of the parts", headings, parts))
     if result["cold_start"] is not None:
         names = list(result["cold_start"]["cold"])
-        start = Table("kernel cache", *(n.removesuffix("_s").replace("_", " ") for n in names))
-        start.title = "Seconds of a new process"
-        for kind, times in result["cold_start"].items():
-            start.add_row(kind, *(f"{times[n]:.2f}" for n in names))
-        tables.append(start)
+        starts = [[kind, *(f"{times[name]:.2f}" for name in names)] for kind, times in result["cold_start"].items()]
+        headings = ["kernel cache", *(name.removesuffix("_s").replace("_", " ") for name in names)]
+        tables.append(table_of("Seconds of a new process", headings, starts))
     return tables

@@ -12,22 +12,28 @@ from ..experiment.files import METRICS
 from ..experiment.report import read_trials
 from ..experiment.trials import variation_of
 from ..io.files import read_json
-from ..learning.metrics import (
-    PUBLISHED_MARKER_MEDIAN_MM,
-    PUBLISHED_MARKERS,
-    PUBLISHED_MARKERS_OF_SMALL_SPREAD,
-    PUBLISHED_MM,
-    PUBLISHED_SECONDS,
-    PUBLISHED_SECONDS_STEPS,
-    PUBLISHED_SETUP,
-)
+from ..learning import metrics as paper
 from ..mesh.mesh import select_vertices, surface_vertices
 from ..report import ablation_page, figures, motion_figures
 from ..report.data import MODEL_NAMES, Trials
-from ..report.page import Cell, Row, Table, duration_text, error_parts, number_text, published_parts
-from .reproduction_page import Figure, Section
+from ..report.page import (
+    NO_BREAK_SPACE,
+    NONE,
+    Canvas,
+    Cell,
+    Drawn,
+    Items,
+    Part,
+    Row,
+    Table,
+    Text,
+    duration_text,
+    error_parts,
+    number_text,
+    published_parts,
+)
 
-_NONE = Cell("\N{EN DASH}")
+_NONE = Cell(NONE)
 _SPLITS = {"train": "training", "validation": "validation", "test": "testing"}
 _TITLES = {
     "beam_real": "Real beam",
@@ -43,22 +49,20 @@ _TIMED = {
 
 
 @dataclass(frozen=True)
-class Result:
-    """A run that has ended.
-
-    Attributes:
-        experiment: name of the experiment.
-        variant: name of the variant.
-        arguments: of the command.
-        folder: that it wrote.
-        failure: the sentence that it failed with, or None.
-    """
+class Run:
+    """One run of the ordinary command."""
 
     experiment: str
     variant: str
-    arguments: tuple[str, ...]
-    folder: Path
-    failure: str | None
+    arguments: tuple[str, ...]  # of the command
+    folder: Path  # that it writes, the one that the ordinary command takes for the same arguments
+    minutes: float  # that it may take
+    failure: str | None = None  # the sentence that it failed with
+
+    @property
+    def name(self) -> str:
+        """As in the key ``only``."""
+        return f"{self.experiment}/{self.variant}"
 
     @property
     def metrics(self) -> dict[str, Any]:
@@ -71,74 +75,76 @@ class Result:
         return dict(read_json(self.folder / "stages" / "report.json")["settings"]["config"])
 
 
-Results = Mapping[str, Result]  # by variant
+Runs = Mapping[str, Run]  # by variant
 
 
-def compare(config: Mapping[str, Any], results: Sequence[Result]) -> dict[str, Any]:
-    """The page's ``verdict`` and ``sections``.
+def compare(config: Mapping[str, Any], results: Sequence[Run], canvas: Canvas) -> tuple[str, list[Part]]:
+    """The page's verdict and its sections.
 
     Args:
         config: with the keys of ``conf/reproduce.yaml``.
-        results: of the runs, in order.
+        results: runs that have ended, in order.
+        canvas: where the figures are drawn.
     """
-    done: dict[str, dict[str, Result]] = {}
+    done: dict[str, dict[str, Run]] = {}
     for each in results:
         if each.failure is None:
             done.setdefault(each.experiment, {})[each.variant] = each
-    studies = {name: group for name, group in done.items() if "errors_mm" in next(iter(group.values())).metrics}
-    set_up = {name: group for name, group in studies.items() if name in PUBLISHED_SETUP}
-    sections = [setup_section(config, set_up)] if set_up else []
-    sections += [study_section(config, name, group) for name, group in studies.items()]
+    studies = {name: runs for name, runs in done.items() if "errors_mm" in next(iter(runs.values())).metrics}
+    set_up = {name: runs for name, runs in studies.items() if name in paper.PUBLISHED_SETUP}
+    parts = [setup_section(config, set_up)] if set_up else []
+    parts += [study_section(config, name, runs, canvas) for name, runs in studies.items()]
     timing = config["timing"]
-    timed = {v: r for v, r in done.get(timing["experiment"], {}).items() if v in timing["variants"]}
-    if timed:
-        sections.append(timing_section(config, timed))
-    sections += [ablation_section(config, name, group) for name, group in done.items() if name not in studies]
-    sections.append(runs_section(config, results))
-    missing = missing_section(config)
-    return {"verdict": verdict(config, done), "sections": [*sections, *([missing] if missing else [])]}
+    if timed := {v: r for v, r in done.get(timing["experiment"], {}).items() if v in timing["variants"]}:
+        parts.append(timing_section(config, timed))
+    parts += [ablation_section(config, name, runs, canvas) for name, runs in done.items() if name not in studies]
+    parts.append(runs_section(config, results))
+    if missing := {name: errors for name, errors in paper.PUBLISHED_MM.items() if name not in config["experiments"]}:
+        parts.append(missing_section(missing))
+    return verdict(config, done), parts
 
 
-def verdict(config: Mapping[str, Any], done: Mapping[str, Results]) -> str:
+def verdict(config: Mapping[str, Any], done: Mapping[str, Runs]) -> str:
     """The first run of each experiment in a sentence."""
     said = []
-    for name, group in done.items():
-        result, known = next(iter(group.values())), config["experiments"][name]
-        label = config["variants"][result.variant]["label"].lower()
-        title = known["title"] if result.variant == known["variants"][0] else f"{known['title']} ({label})"
-        if "by_markers" in result.metrics:
-            said.append(
-                f"{title}: {ablation_page.verdict(result.metrics['by_markers'], result.metrics['uncorrected_mm'])}"
-            )
+    for name, runs in done.items():
+        run, known = next(iter(runs.values())), config["experiments"][name]
+        metrics = run.metrics
+        title = known["title"] if run.variant == known["variants"][0] else f"{known['title']} ({_label(config, run)})"
+        if "by_markers" in metrics:
+            said.append(f"{title}: {ablation_page.verdict(metrics['by_markers'], metrics['uncorrected_mm'])}")
             continue
-        errors, published = result.metrics["errors_mm"], PUBLISHED_MM.get(name, {})
-        ours = number_text(errors["resphys"]["mean"])
+        ours, published = number_text(metrics["errors_mm"]["resphys"]["mean"]), paper.PUBLISHED_MM.get(name, {})
         beside = f", published {published_parts(published['resphys'])[0]} mm" if "resphys" in published else ""
         said.append(f"{title}: with the learned force, the mean error is {ours} mm{beside}.")
-    return " ".join(said).replace(" mm", "\N{NO-BREAK SPACE}mm") or "No run has succeeded."
+    return " ".join(said).replace(" mm", f"{NO_BREAK_SPACE}mm") or "No run has succeeded."
 
 
-def _labels(config: Mapping[str, Any], results: Results) -> list[str]:
-    return [config["variants"][variant]["label"] for variant in results]
+def _label(config: Mapping[str, Any], run: Run) -> str:
+    return str(config["variants"][run.variant]["label"]).lower()
 
 
-def setup_section(config: Mapping[str, Any], studies: Mapping[str, Results]) -> Section:
+def _columns(config: Mapping[str, Any], runs: Runs) -> list[str]:
+    return ["Published", *(config["variants"][variant]["label"] for variant in runs)]
+
+
+def _reasons(deviations: Sequence[str]) -> list[Text | Items]:
+    return [Text("Why they differ", heading=True), Items(deviations)] if deviations else []
+
+
+def setup_section(config: Mapping[str, Any], studies: Mapping[str, Runs]) -> Part:
     """The published tables of parameters, each experiment beside its published set-up."""
-    columns, published, ours = [], [], []
-    for name, group in studies.items():
+    columns: list[str] = []
+    values: list[Mapping[str, float]] = []
+    for name, runs in studies.items():
         columns += [f"{config['experiments'][name]['title']}, published", "here"]
-        published.append(PUBLISHED_SETUP[name])
-        ours.append(_setup(next(iter(group.values())).settings))
-    rows = []
-    for key in ours[0]:
-        cells = [
-            _NONE if key not in each else Cell(_value(key, each[key]))
-            for pair in zip(published, ours, strict=True)
-            for each in pair
-        ]
-        rows.append(Row(key[:1].upper() + key[1:], cells))
+        values += [paper.PUBLISHED_SETUP[name], _setup(next(iter(runs.values())).settings)]
+    rows = [
+        Row(key[:1].upper() + key[1:], [Cell(_value(key, each[key])) if key in each else _NONE for each in values])
+        for key in values[1]
+    ]
     note = "The incorrect beam is the simulator to correct, the correct one is its target."
-    return Section("Set-up", tables=[Table("", columns, rows, note)])
+    return Part("Set-up", [Table("", columns, rows, note)])
 
 
 def _setup(settings: Mapping[str, Any]) -> dict[str, float]:
@@ -168,11 +174,11 @@ def _value(key: str, value: float) -> str:
     return f"{value:g} s" if key == "step size" else f"{value:g}"
 
 
-def study_section(config: Mapping[str, Any], name: str, results: Results) -> Section:
+def study_section(config: Mapping[str, Any], name: str, runs: Runs, canvas: Canvas) -> Part:
     """Roll-out errors of one experiment, and how they and the tip go over time."""
     group = config["experiments"][name]
-    published = PUBLISHED_MM.get(name, {})
-    measured = [result.metrics["errors_mm"] for result in results.values()]
+    published = paper.PUBLISHED_MM.get(name, {})
+    measured = [run.metrics["errors_mm"] for run in runs.values()]
     rows = [
         Row(
             label,
@@ -185,25 +191,17 @@ def study_section(config: Mapping[str, Any], name: str, results: Results) -> Sec
         for model, label in MODEL_NAMES.items()
         if model in published or any(model in errors for errors in measured)
     ]
-    table = Table(
-        "Roll-out error [mm]",
-        ["Published", *_labels(config, results)],
-        rows,
+    note = (
         "Mean distance of the vertices over all test trajectories and steps, ± its standard deviation. A roll-out that "
-        "diverged leaves no mean. Reconstruction: the simulator with forces fitted to the test trajectory itself.",
+        "diverged leaves no mean. Reconstruction: the simulator with forces fitted to the test trajectory itself."
     )
-    drawn = {role: results[variant] for role, variant in group["drawn"].items() if variant in results}
-    drawn.setdefault("models", next(iter(results.values())))
-    return Section(
-        group["title"],
-        tables=[table],
-        figures=_study_figures(config, name, drawn),
-        list_title="Why they differ",
-        items=group["deviations"],
-    )
+    table = Table("Roll-out error [mm]", _columns(config, runs), rows, note)
+    drawn = {role: runs[variant] for role, variant in group["drawn"].items() if variant in runs}
+    drawn.setdefault("models", next(iter(runs.values())))
+    return Part(group["title"], [table, *_study_figures(config, name, drawn, canvas), *_reasons(group["deviations"])])
 
 
-def _study_figures(config: Mapping[str, Any], name: str, drawn: Mapping[str, Result]) -> list[Figure]:
+def _study_figures(config: Mapping[str, Any], name: str, drawn: Mapping[str, Run], canvas: Canvas) -> list[Drawn]:
     settings = drawn["models"].settings
     test = read_trials(drawn["models"].folder, settings)
     paths = {model: test.positions[model][test.worst] for model in ("simulation", "resphys")}
@@ -212,19 +210,19 @@ def _study_figures(config: Mapping[str, Any], name: str, drawn: Mapping[str, Res
         other = read_trials(drawn["published_network"].folder, drawn["published_network"].settings)
         paths["published_network"] = other.positions["resphys"][test.worst]
         errors["published_network"] = other.errors_mm["resphys"]
-    published = {model: each.mean for model, each in PUBLISHED_MM.get(name, {}).items() if model in errors}
-    label = config["variants"][drawn["models"].variant]["label"].lower()
+    published = {model: each.mean for model, each in paper.PUBLISHED_MM.get(name, {}).items() if model in errors}
+    label = _label(config, drawn["models"])
     lines = "; ".join(f"{MODEL_NAMES[model]} {error:g} mm" for model, error in published.items())
     beside = f" Dashed: the published means ({lines})." if published else ""
     return [
-        Figure(
+        canvas.figure(
             f"{name}_error_over_time",
             partial(figures.error_over_time, errors, settings["time_step"], published),
             f"Mean vertex error of the models over time, on a logarithmic axis.{beside}",
             f"Error over time ({label}): mean over the vertices, against the target. The line is the mean of the "
             f"{len(test.names)} test trajectories, the band spans the smallest to the largest of them.{beside}",
         ),
-        Figure(
+        canvas.figure(
             f"{name}_trajectory",
             partial(motion_figures.tip_displacement, _tip_motion(settings, test, paths), settings["time_step"]),
             "Tip displacement of target and models over time, and their distance from the target.",
@@ -243,39 +241,40 @@ def _tip_motion(settings: Mapping[str, Any], test: Trials, paths: Mapping[str, A
     return {name: q[:, tip].mean(axis=1) - rest for name, q in whole.items()}
 
 
-def timing_section(config: Mapping[str, Any], results: Results) -> Section:
+def timing_section(config: Mapping[str, Any], runs: Runs) -> Part:
     """The published time benchmark."""
-    measured = [(result.metrics["seconds_per_test_trajectory"], result.settings) for result in results.values()]
-    rows = []
-    for key, label in _TIMED.items():
-        cells = [_time_cell(*PUBLISHED_SECONDS[key], PUBLISHED_SECONDS_STEPS)]
-        cells += [
-            _time_cell(seconds[key]["mean"], seconds[key]["std"], settings["data"]["steps"])
-            for seconds, settings in measured
-        ]
-        rows.append(Row(label, cells))
-    steps = " and ".join(sorted({str(settings["data"]["steps"]) for _, settings in measured}))
-    note = f"Published: trajectories of {PUBLISHED_SECONDS_STEPS} steps; here: of {steps}."
-    table = Table("Time per trajectory [s]", ["Published", *_labels(config, results)], rows, note)
-    return Section("Time benchmark", tables=[table], list_title="Why they differ", items=config["timing"]["deviations"])
+    measured = [(run.metrics["seconds_per_test_trajectory"], run.settings["data"]["steps"]) for run in runs.values()]
+    rows = [
+        Row(
+            label,
+            [
+                _time_cell(*paper.PUBLISHED_SECONDS[key], paper.PUBLISHED_SECONDS_STEPS),
+                *(_time_cell(seconds[key]["mean"], seconds[key]["std"], steps) for seconds, steps in measured),
+            ],
+        )
+        for key, label in _TIMED.items()
+    ]
+    counts = " and ".join(sorted({str(steps) for _, steps in measured}))
+    note = f"Published: trajectories of {paper.PUBLISHED_SECONDS_STEPS} steps; here: of {counts}."
+    table = Table("Time per trajectory [s]", _columns(config, runs), rows, note)
+    return Part("Time benchmark", [table, *_reasons(config["timing"]["deviations"])])
 
 
 def _time_cell(mean: float, std: float, steps: int) -> Cell:
     return Cell(f"{mean:.3f} ± {std:.3f}", f"{1e3 * mean / steps:.2g} ms a step")
 
 
-def ablation_section(config: Mapping[str, Any], name: str, results: Results) -> Section:
+def ablation_section(config: Mapping[str, Any], name: str, runs: Runs, canvas: Canvas) -> Part:
     """The published box plot of the marker ablation, as ours and in numbers."""
-    group = config["experiments"][name]
-    result = next(iter(results.values()))
-    metrics, settings = result.metrics, result.settings
+    group, run = config["experiments"][name], next(iter(runs.values()))
+    metrics, settings = run.metrics, run.settings
     rows = []
     for row in metrics["by_markers"]:
         count = row["markers"]
-        median = f"below {PUBLISHED_MARKER_MEDIAN_MM:g}" if count >= PUBLISHED_MARKERS else "not said"
-        spread = "small" if count >= PUBLISHED_MARKERS_OF_SMALL_SPREAD else "high"
-        values = (row[key] for key in ("median_mm", "interquartile_range_mm", "largest_mm"))
-        rows.append(Row(str(count), [Cell(median), Cell(spread), *(Cell(number_text(value)) for value in values)]))
+        median = f"below {paper.PUBLISHED_MARKER_MEDIAN_MM:g}" if count >= paper.PUBLISHED_MARKERS else "not said"
+        spread = "small" if count >= paper.PUBLISHED_MARKERS_OF_SMALL_SPREAD else "high"
+        ours = (number_text(row[key]) for key in ("median_mm", "interquartile_range_mm", "largest_mm"))
+        rows.append(Row(str(count), [Cell(text) for text in (median, spread, *ours)]))
     vertices = len(surface_vertices(build_mesh(settings["mesh"])))
     note = (
         f"Error over all vertices and {settings['data']['steps']} steps, in mm, of {settings['ablation']['draws']} "
@@ -283,65 +282,43 @@ def ablation_section(config: Mapping[str, Any], name: str, results: Results) -> 
         f"Uncorrected: {number_text(metrics['uncorrected_mm'])} mm."
     )
     columns = ["Published median", "Published spread", "Median here", "Interquartile range here", "Largest here"]
-    published = (PUBLISHED_MARKERS, PUBLISHED_MARKER_MEDIAN_MM)
+    published = (paper.PUBLISHED_MARKERS, paper.PUBLISHED_MARKER_MEDIAN_MM)
     boxes = partial(ablation_page.marker_boxes, ablation_page.box_errors(metrics), metrics["uncorrected_mm"], published)
     caption = "Box: lower quartile, median (orange), upper quartile; whiskers to the smallest and the largest error."
-    return Section(
-        group["title"],
-        tables=[Table("Markers", columns, rows, note)],
-        figures=[Figure(name, boxes, ablation_page.describe_boxes(metrics), caption)],
-        list_title="Why they differ",
-        items=group["deviations"],
-    )
+    figure = canvas.figure(name, boxes, ablation_page.describe_boxes(metrics), caption)
+    return Part(group["title"], [Table("Markers", columns, rows, note), figure, *_reasons(group["deviations"])])
 
 
-def runs_section(config: Mapping[str, Any], results: Sequence[Result]) -> Section:
+def runs_section(config: Mapping[str, Any], results: Sequence[Run]) -> Part:
     """What was run: time and memory of each run, or why it failed."""
     rows, failures = [], []
-    for each in results:
-        title = config["experiments"][each.experiment]["title"]
-        head = f"{title}: {config['variants'][each.variant]['label'].lower()}"
-        if each.failure is not None:
+    for run in results:
+        head = f"{config['experiments'][run.experiment]['title']}: {_label(config, run)}"
+        if run.failure is None:
+            metrics = run.metrics
+            memory = metrics["peak_memory_gib"]
+            taken = Cell(duration_text(sum(metrics["seconds"].values())))
+            rows.append(Row(head, [taken, _NONE if memory is None else Cell(f"{memory:.2f}")]))
+        else:
             rows.append(Row(head, [Cell("failed"), _NONE]))
-            failures.append(f"{head}: {each.failure}")
-            continue
-        metrics = each.metrics
-        memory = metrics["peak_memory_gib"]
-        cells = [
-            Cell(duration_text(sum(metrics["seconds"].values()))),
-            _NONE if memory is None else Cell(f"{memory:.2f}"),
-        ]
-        rows.append(Row(head, cells))
-    table = Table(
-        "Run",
-        ["All stages", "Peak memory [GiB]"],
-        rows,
-        "Time of each stage when it was last run, beside whatever else the machine did. Memory: with that of workers.",
+            failures.append(Text(f"Failed: {head}: {run.failure}"))
+    note = (
+        "Time of each stage when it was last run, beside whatever else the machine did. Memory: with that of workers."
     )
-    commands = [shlex.join(["warp-resphys", *each.arguments]) for each in results]
-    return Section(
-        "Runs",
-        text=[f"Failed: {sentence}" for sentence in failures],
-        tables=[table],
-        commands=commands,
-    )
+    table = Table("Run", ["All stages", "Peak memory [GiB]"], rows, note)
+    commands = Items([shlex.join(["warp-resphys", *run.arguments]) for run in results], code=True)
+    return Part("Runs", [*failures, table, Text("Each by itself", heading=True), commands])
 
 
-def missing_section(config: Mapping[str, Any]) -> Section | None:
+def missing_section(published: Mapping[str, Mapping[str, paper.PublishedError]]) -> Part:
     """The published experiments that no run reproduces yet."""
+    models = {model: label for model, label in MODEL_NAMES.items() if model != "reconstruction"}
     rows = [
         Row(
             _TITLES.get(name, name),
-            [
-                Cell(*published_parts(errors[model])) if model in errors else _NONE
-                for model in MODEL_NAMES
-                if model != "reconstruction"
-            ],
+            [Cell(*published_parts(errors[model])) if model in errors else _NONE for model in models],
         )
-        for name, errors in PUBLISHED_MM.items()
-        if name not in config["experiments"]
+        for name, errors in published.items()
     ]
-    if not rows:
-        return None
-    columns = [label for model, label in MODEL_NAMES.items() if model != "reconstruction"]
-    return Section("Published, and not reproduced yet", tables=[Table("Published error [mm]", columns, rows)])
+    table = Table("Published error [mm]", [*models.values()], rows)
+    return Part("Published, and not reproduced yet", [table])

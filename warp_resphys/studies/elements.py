@@ -1,19 +1,21 @@
 """Which element to take: static sag of the beam under its own weight and time of a step, by element and refinement."""
 
+import time
 from collections.abc import Sequence
 
+import numpy as np
+import torch
 import warp as wp
 from omegaconf import DictConfig
-from rich.console import Console
-from rich.table import Table
 
 from ..dynamics.inputs import Inputs
+from ..dynamics.integrator import State
 from ..dynamics.simulator import Simulator
 from ..energies.materials import Corotated
+from ..experiment.schema import at_most, check
 from ..fem.body import Body
-from ..io.errors import InputError
 from ..mesh.mesh import Mesh, box_hexahedra, box_tetrahedra, select_vertices
-from .stepping import step_time
+from .command import show, table_of
 
 _FINEST = 4
 
@@ -24,22 +26,22 @@ def element_study(config: DictConfig) -> None:
     Raises:
         InputError: a value that cannot be used.
     """
-    if config.finest not in range(1, _FINEST + 1):
-        raise InputError(f"finest is {config.finest!r}: choose a whole number from 1 to {_FINEST}.")
+    check("finest", config.finest, at_most(_FINEST))
     wp.config.log_level = wp.LOG_WARNING
     ratios = list(config.poissons_ratios)
-    table = Table("element", "volume term", "vertices", *(f"nu {ratio:g}" for ratio in ratios), "step (ms)")
-    table.title = f"Static sag in mm, E {config.youngs_modulus / 1e3:g} kPa; what a step costs, nu {ratios[-1]:g}"
+    rows = []
     for refinement in range(1, config.finest + 1):
         for element, mesh in _meshes(config.size, config.divisions, refinement).items():
             for integration in config.integrations:
                 body = Body(mesh, fixed=select_vertices(mesh, x=0.0), volume_integration=integration)
                 simulators = [Simulator(body, Corotated(config.youngs_modulus, ratio)) for ratio in ratios]
-                cells = [f"{sag_mm(simulator):.3f}" for simulator in simulators]
+                sags = [f"{sag_mm(simulator):.3f}" for simulator in simulators]
                 falling = [Inputs()] * config.steps  # from its straight shape
                 cost = step_time(simulators[-1], simulators[-1].rest_state(), falling, config.repeats)
-                table.add_row(element, integration, str(len(mesh.vertices)), *cells, f"{cost['step_ms']:.2f}")
-    Console().print(table)
+                rows.append([element, integration, str(len(mesh.vertices)), *sags, f"{cost['step_ms']:.2f}"])
+    title = f"Static sag in mm, E {config.youngs_modulus / 1e3:g} kPa; what a step costs, nu {ratios[-1]:g}"
+    headings = ["element", "volume term", "vertices", *(f"nu {ratio:g}" for ratio in ratios), "step (ms)"]
+    show(table_of(title, headings, rows))
 
 
 def sag_mm(simulator: Simulator) -> float:
@@ -47,6 +49,31 @@ def sag_mm(simulator: Simulator) -> float:
     mesh = simulator.body.mesh
     q = simulator.static_equilibrium().q[0].cpu().numpy()
     return float(1e3 * (q - mesh.vertices)[select_vertices(mesh, x=mesh.vertices[:, 0].max()), 2].mean())
+
+
+def step_time(simulator: Simulator, start: State, inputs: Sequence[Inputs], repeats: int) -> dict[str, float]:
+    """Milliseconds of a processor, and solver iterations, of a step, in the mean over a roll-out.
+
+    Milliseconds are the median over repetitions of each step.
+
+    Args:
+        simulator: that steps.
+        start: of the roll-out.
+        inputs: of each step.
+        repeats: of the roll-out, after a first one that is not timed.
+    """
+    times = np.empty((1 + repeats, len(inputs)))  # [ms]
+    iterations = []
+    prepared = simulator.prepare()
+    with torch.no_grad():
+        for row in times:
+            state = start
+            for step, each in enumerate(inputs):
+                began = time.process_time()
+                state, report = simulator.step(state, each, prepared)
+                row[step] = 1e3 * (time.process_time() - began)
+                iterations.append(float(report.iterations[0]))
+    return {"step_ms": float(np.median(times[1:], axis=0).mean()), "iterations": float(np.mean(iterations))}
 
 
 def _meshes(size: Sequence[float], divisions: Sequence[int], refinement: int) -> dict[str, Mesh]:

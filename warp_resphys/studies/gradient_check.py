@@ -9,7 +9,6 @@ from typing import Any
 import torch
 import warp as wp
 from omegaconf import DictConfig
-from rich.console import Console
 from rich.table import Table
 
 from ..dynamics.inputs import Inputs
@@ -20,8 +19,9 @@ from ..experiment.build import build_simulator
 from ..experiment.schema import COUNT, NATURAL, NUMBERS, POSITIVE, Group, Kind, check
 from ..io.errors import InputError
 from ..mesh.poses import twisted
-from .settings import settings_of
+from .command import settings_of, show, table_of
 
+Loss = Callable[[torch.Tensor], torch.Tensor]
 POSES = ("rest", "bent", "twisted")
 _KEYS = Group(
     {
@@ -42,19 +42,12 @@ _ACCURACY = 1e-8  # relative, at which a difference is good enough
 
 @dataclass(frozen=True)
 class GradientRow:
-    """One comparison.
-
-    Attributes:
-        parameter: its name.
-        adjoint: directional derivative of the loss by the adjoint.
-        difference: the same by central differences.
-        uncertainty: of the difference, by truncation and rounding.
-    """
+    """One comparison of a directional derivative of the loss."""
 
     parameter: str
     adjoint: float
-    difference: float
-    uncertainty: float = 0.0
+    difference: float  # central differences
+    uncertainty: float = 0.0  # of the difference, by truncation and rounding
 
     @property
     def relative_error(self) -> float:
@@ -132,7 +125,7 @@ def check_gradients(
         one value, and with one for each environment and for each element or part.
     """
     problem = _Problem(simulator, pose_name, steps, batch, seed)
-    return [problem.compare(name, *case) for name, case in problem.cases().items()]
+    return [problem.compare(*case) for case in problem.cases()]
 
 
 class _Problem:
@@ -170,40 +163,33 @@ class _Problem:
         trajectory = self.simulator.rollout(state, self.steps, inputs, parameters)
         return (self.weights[0] * trajectory.q).sum() + (self.weights[1] * trajectory.v).sum()
 
-    def cases(self) -> dict[str, tuple[Callable[[torch.Tensor], torch.Tensor], torch.Tensor, float]]:
-        """Loss, value and typical size of a change: of the state, and of every input and parameter of the simulator."""
+    def cases(self) -> Iterator[tuple[str, Loss, torch.Tensor, float]]:
+        """Name, loss, value and typical size of a change, of the state and every input and parameter."""
         simulator = self.simulator
         length = float((self.state.q[0].max(0).values - self.state.q[0].min(0).values).max())
-        fields = {"q": (self.state.q, 3e-4 * length), "v": (self.state.v, 0.3 * length)}
-        sizes = {"external_force": 1e-2, "fixed_positions": 3e-4 * length, "attached_mass": 5e-5}
-        for name, value in self.inputs.fields.items():
-            size = sizes[name] if name in sizes else 0.1 * simulator.inputs[name].typical
+        sizes = {"q": 3e-4 * length, "v": 0.3 * length}
+        sizes |= {"external_force": 1e-2, "fixed_positions": 3e-4 * length, "attached_mass": 5e-5}
+        sizes |= {name: 0.1 * quantity.typical for name, quantity in simulator.inputs.items()}
+        for name, value in {"q": self.state.q, "v": self.state.v, **self.inputs.fields}.items():
             if value.numel():
-                fields[name] = value, size
-        cases: dict[str, tuple[Callable[[torch.Tensor], torch.Tensor], torch.Tensor, float]] = {
-            name: (partial(self.loss, name), *pair) for name, pair in fields.items()
-        }
+                yield name, partial(self.loss, name), value, sizes[name]
         for name, quantity in simulator.parameters.items():
-            constant = simulator.tensor(simulator.constants[name])
-            shapes: dict[str, tuple[int, ...]] = {"environment": (self.batch, 1)}
-            if quantity.per:
-                shapes = {"one": (1,), quantity.per: (simulator.counts[name],), **shapes}
-            if name == "gravity":
-                shapes = {"environment": (self.batch, 3)}
-            base = constant if name == "gravity" else constant.mean()
+            base = simulator.tensor(simulator.constants[name])
+            shapes: dict[str, tuple[int, ...]] = {"environment": (self.batch, 3)}
+            if name != "gravity":
+                base, shapes = base.mean(), {"environment": (self.batch, 1)}
+                if quantity.per:
+                    shapes = {"one": (1,), quantity.per: (simulator.counts[name],), **shapes}
             for kind, shape in shapes.items():
                 vary = partial(self._varied, quantity, base)
                 title = f"{name}, each {kind}" if kind != "one" else name
-                cases[title] = vary, torch.zeros(shape, device=base.device, dtype=base.dtype), 0.7
-        return cases
+                yield title, vary, torch.zeros(shape, device=base.device, dtype=base.dtype), 0.7
 
     def _varied(self, quantity: Quantity, base: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
         """The loss by how a parameter varies in its range."""
         return self.loss(quantity.name, quantity.varied(base, x))
 
-    def compare(
-        self, name: str, loss: Callable[[torch.Tensor], torch.Tensor], value: torch.Tensor, size: float
-    ) -> GradientRow:
+    def compare(self, name: str, loss: Loss, value: torch.Tensor, size: float) -> GradientRow:
         direction = self.noise(*value.shape)
         direction *= size / direction.abs().max()
         variable = value.detach().clone().requires_grad_(True)
@@ -218,11 +204,11 @@ def gradcheck(config: DictConfig) -> None:
     wp.config.log_level = wp.LOG_WARNING
     plain, _ = settings_of(config)
     tolerance = plain["gradcheck"]["tolerance"]
-    console, largest = Console(), 0.0
+    largest = 0.0
     for poissons_ratio, pose, rows in check_configured(plain):
-        console.print(gradient_table(rows, f"nu = {poissons_ratio:g}, {pose}", tolerance))
+        show(gradient_table(rows, f"nu = {poissons_ratio:g}, {pose}", tolerance))
         largest = max([largest, *(row.relative_error for row in rows)])
-    console.print(f"Largest relative error: {largest:.1e}, {tolerance:.0e} allowed.")
+    show(f"Largest relative error: {largest:.1e}, {tolerance:.0e} allowed.")
     if not largest <= tolerance:
         raise SystemExit(1)
 
@@ -230,15 +216,11 @@ def gradcheck(config: DictConfig) -> None:
 def check_configured(config: Mapping[str, Any]) -> Iterator[tuple[float, str, list[GradientRow]]]:
     """Checks the gradients of a configured body, material and solver.
 
-    Args:
-        config: with the keys of ``conf/gradcheck.yaml``.
-
     Yields:
         Poisson's ratio, pose, and the comparisons there.
 
     Raises:
-        InputError: a value that cannot be simulated, an unknown pose, or float32, whose rounding drowns differences.
-        ConvergenceError: the solver does not reach the tolerance.
+        ResphysError: a value that cannot be simulated, float32, whose rounding drowns differences, or no convergence.
     """
     wanted = config["gradcheck"]
     check("gradcheck", wanted, _KEYS)
@@ -252,20 +234,15 @@ def check_configured(config: Mapping[str, Any]) -> Iterator[tuple[float, str, li
     simulator = build_simulator({**config, "solver": solver})
     for poissons_ratio in wanted["poissons_ratios"]:
         changed: dict[str, Any] = {"poissons_ratio": poissons_ratio, **damping}
-        material = replace(simulator.material, **changed)
-        checked = replace(simulator, material=material)
+        checked = replace(simulator, material=replace(simulator.material, **changed))
         for name in wanted["poses"]:
             yield poissons_ratio, name, check_gradients(checked, name, wanted["steps"], wanted["batch"], wanted["seed"])
 
 
 def gradient_table(rows: list[GradientRow], title: str, tolerance: float) -> Table:
     """Adjoint, difference, its uncertainty and relative error of each parameter, in red beyond the tolerance."""
-    table = Table(title=title, title_justify="left")
-    table.add_column("parameter", min_width=20)
-    for name in ("adjoint", "difference", "uncertain\nby", "relative\nerror"):
-        table.add_column(name, justify="right")
+    table = table_of(title, ["parameter", "adjoint", "difference", "uncertain\nby", "relative\nerror"], [])
     for row in rows:
-        failed = not row.relative_error <= tolerance
         values = (f"{row.adjoint:.6e}", f"{row.difference:.6e}", f"{row.uncertainty:.1e}", f"{row.relative_error:.1e}")
-        table.add_row(row.parameter, *values, style="red" if failed else None)
+        table.add_row(row.parameter, *values, style=None if row.relative_error <= tolerance else "red")
     return table

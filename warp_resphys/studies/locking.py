@@ -5,12 +5,17 @@ error of the mesh is extrapolated from hexahedra that are refined evenly, and bo
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from math import cos, pi, radians, sin
-from typing import Any
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 import torch
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from omegaconf import DictConfig
+from rich.table import Table
 
 from ..dynamics.inputs import Inputs
 from ..dynamics.nonlinear_solver import SolverSettings
@@ -21,41 +26,46 @@ from ..energies.pressure import Pressure
 from ..experiment.schema import NATURAL, check
 from ..fem.body import Body
 from ..io.errors import InputError
+from ..io.files import atomic_path, digest, read_json, write_json
+from ..io.progress import Progress
 from ..mesh.arm import mesh_arm
 from ..mesh.arm_geometry import arm_geometry
 from ..mesh.chambers import find_chambers
 from ..mesh.mesh import Mesh, quadratic
 from ..mesh.readers import read_mesh
-from .stepping import step_time
+from ..report.figures import STYLE, TONES, new_figure, save_png
+from .command import settings_of, show, table_of, write_csv
+from .elements import step_time
 
-HEXAHEDRA, LINEAR, QUADRATIC = "8-node hexahedra", "4-node tetrahedra", "10-node tetrahedra"
-SERENDIPITY, BIQUADRATIC = "20-node hexahedra", "27-node hexahedra"
-LOADS = ("gravity", "fibres", "pressure")
-_QUADRATIC = {QUADRATIC: "tetrahedron10", SERENDIPITY: "hexahedron20", BIQUADRATIC: "hexahedron27"}
-_SWEPT = {"hexahedra": HEXAHEDRA, "hexahedra_20": SERENDIPITY, "hexahedra_27": BIQUADRATIC}
+HEXAHEDRA, SERENDIPITY, BIQUADRATIC = "8-node hexahedra", "20-node hexahedra", "27-node hexahedra"
+LINEAR, QUADRATIC = "4-node tetrahedra", "10-node tetrahedra"
+LOADS: Final[Mapping[str, str]] = {
+    "gravity": "gravity, base tilted",
+    "fibres": "pressure, with fibres",
+    "pressure": "pressure, without fibres",
+}
+# By key of the group ``study``: the element, the kind of mesh where it is quadratic, and how it is drawn.
+_ELEMENTS: Final = {
+    "hexahedra": (HEXAHEDRA, None, "sysid", "o"),
+    "hexahedra_20": (SERENDIPITY, "hexahedron20", "reconstruction", "D"),
+    "hexahedra_27": (BIQUADRATIC, "hexahedron27", "simfree", "P"),
+    "linear_tetrahedra": (LINEAR, None, "simulation", "^"),
+    "quadratic_tetrahedra": (QUADRATIC, "tetrahedron10", "resphys", "s"),
+}
+_NOT_MEASURED: Final = {*_ELEMENTS, "file", "units", "within"}  # what the result of one mesh does not depend on
 
 
 @dataclass(frozen=True)
 class Case:
-    """A mesh of the study.
+    """A mesh of the study."""
 
-    Attributes:
-        name: of a file for its results.
-        element: its kind.
-        size: of the elements in the section [m]; None for a file.
-        layers: of hexahedra [m].
-        file: that it is read from.
-        units: of that file.
-        timed: whether steps are timed, and the deflection without fibres is computed.
-    """
-
-    name: str
+    name: str  # of a file for its results
     element: str
-    size: float | None = None
-    layers: float | None = None
-    file: str | None = None
-    units: str = "m"
-    timed: bool = True
+    size: float | None = None  # of the elements in the section [m]; None for a file
+    layers: float | None = None  # height of those of hexahedra [m]
+    file: str | None = None  # that it is read from
+    units: str = "m"  # of that file
+    timed: bool = True  # whether steps are timed, and the deflection without fibres is computed
 
     def mesh(self, geometry: Mapping[str, Any]) -> Mesh:
         """The mesh, of an arm with these measures.
@@ -65,39 +75,31 @@ class Case:
         """
         if self.file is not None:
             return read_mesh(self.file, self.units, 2 if self.element == QUADRATIC else 1, drop_unreferenced=True)
-        cells = "hexahedra" if self.element in _SWEPT.values() else "tetrahedra"
-        mesh, _ = mesh_arm(arm_geometry(geometry), float(self.size or 0.0), cells, self.layers)
-        return quadratic(mesh, _QUADRATIC[self.element]) if self.element in _QUADRATIC else mesh
+        mesh, _ = mesh_arm(arm_geometry(geometry), float(self.size or 0.0), self.element.split()[1], self.layers)
+        kind = next(kind for element, kind, *_ in _ELEMENTS.values() if element == self.element)
+        return quadratic(mesh, kind) if kind else mesh
 
 
 def cases(study: Mapping[str, Any]) -> Iterator[Case]:
     """The meshes of a study, from the group ``study``."""
-    for element, name in ((LINEAR, "linear"), (QUADRATIC, "quadratic")):
-        if study["file"] is not None:
+    if study["file"] is not None:
+        for element, name in ((LINEAR, "linear"), (QUADRATIC, "quadratic")):
             yield Case(f"file_{name}", element, file=str(study["file"]), units=study["units"])
-    for key, element in _SWEPT.items():
-        for size, layers, timed in study[key]:
-            yield Case(f"{key}_{1e3 * size:g}_{1e3 * layers:g}", element, size, layers, timed=timed)
-    for key, element in (("linear_tetrahedra", LINEAR), ("quadratic_tetrahedra", QUADRATIC)):
-        for size, timed in study[key]:
-            yield Case(f"{key}_{1e3 * size:g}", element, size, timed=timed)
+    for key, (element, *_) in _ELEMENTS.items():
+        for *lengths, timed in study[key]:
+            name = "_".join([key, *(f"{1e3 * length:g}" for length in lengths)])
+            yield Case(name, element, **dict(zip(("size", "layers"), lengths, strict=False)), timed=timed)
 
 
 def measure(mesh: Mesh, study: Mapping[str, Any], timed: bool = True) -> dict[str, Any]:
-    """Deflections of an arm, and the time of a step.
-
-    Args:
-        mesh: hangs along -z from its highest vertices, with chambers.
-        study: the group ``study``.
-        timed: as in `Case`.
+    """Deflections of an arm that hangs along -z from its highest vertices, and the time of a step.
 
     Returns:
         ``vertices``, ``chamber_cm3`` of the chamber under pressure, ``<load>_mm`` of each of `LOADS`: how far the tip
-        moves towards +x, ``step_ms`` and ``iterations`` of a step; None for what was left out.
+        moves towards +x, ``step_ms`` and ``iterations`` of a step; None for what was left out, as `Case.timed` says.
 
     Raises:
-        InputError: the mesh has no such chamber.
-        ConvergenceError: an equilibrium was not found.
+        ResphysError: the mesh has no such chamber, or an equilibrium was not found.
     """
     for key in ("chamber", "steps", "repeats"):
         check(f"study.{key}", study[key], NATURAL)
@@ -132,18 +134,14 @@ def measure(mesh: Mesh, study: Mapping[str, Any], timed: bool = True) -> dict[st
         "gravity_mm": deflection(tilted, None),
         "fibres_mm": deflection(reinforced, pressure),
         "pressure_mm": deflection(hanging, pressure) if timed else None,
+        "step_ms": None,
+        "iterations": None,
     }
-    return {**result, **(_swell(hanging, pressure, study) if timed else {"step_ms": None, "iterations": None})}
-
-
-def _swell(simulator: Simulator, pressure: torch.Tensor, study: Mapping[str, Any]) -> dict[str, float]:
-    """What a step costs while the pressure (1, C) swells and ebbs once."""
-    steps = study["steps"]
-    ramp = 0.5 - 0.5 * np.cos(2.0 * pi * np.arange(1, steps + 1) / steps)
-    inputs = [Inputs(pressure=float(share) * pressure) for share in ramp]
-    with torch.no_grad():
-        start = simulator.static_equilibrium()
-    return step_time(simulator, start, inputs, study["repeats"])
+    if timed:
+        ramp = 0.5 - 0.5 * np.cos(2.0 * pi * np.arange(1, study["steps"] + 1) / study["steps"])  # swells and ebbs once
+        inputs = [Inputs(pressure=float(share) * pressure) for share in ramp]
+        result |= step_time(hanging, hanging.static_equilibrium().detach(), inputs, study["repeats"])
+    return result
 
 
 def converged(rows: Sequence[Mapping[str, Any]], load: str) -> dict[str, float] | None:
@@ -191,3 +189,116 @@ def cheapest(rows: Sequence[Mapping[str, Any]], within: float) -> Mapping[str, A
         and all(abs(row.get(f"{load}_deviation", float("inf"))) <= within for load in ("gravity", "fibres"))
     ]
     return min(good, key=lambda row: row["step_ms"], default=None)
+
+
+def locking_study(config: DictConfig) -> None:
+    """Writes study.json, study.csv and study.png into the run folder and prints the table; see `run_study`."""
+    plain, folder = settings_of(config)
+    show(*run_study(plain, folder), f"Written: {folder}/study.json, study.csv, study.png")
+
+
+def run_study(config: Mapping[str, Any], folder: Path) -> list[Table | str]:
+    """Measures every mesh that has no result yet, writes the files, and returns the table and what follows from it.
+
+    The result of each mesh is kept in the folder ``meshes``.
+
+    Raises:
+        ResphysError: see `measure`.
+    """
+    study, within = config["study"], config["study"]["within"]
+    rows = _measured(config, folder)
+    limits = {load: converged(rows, load) for load in LOADS}
+    for row in rows:
+        for load, limit in limits.items():
+            if limit is not None and row[f"{load}_mm"] is not None:
+                row[f"{load}_deviation"] = row[f"{load}_mm"] / limit["mm"] - 1.0
+    best = cheapest(rows, within)
+    name = None if best is None else best["name"]
+    write_json(folder / "study.json", {"rows": rows, "converged": limits, "cheapest": name, "study": study})
+    write_csv(folder / "study.csv", rows)
+    with rc_context(STYLE), atomic_path(folder / "study.png") as partial:
+        save_png(deflections(rows, limits, within), partial)
+    return [study_table(rows), conclusion(limits, best, within)]
+
+
+def _measured(config: Mapping[str, Any], folder: Path) -> list[dict[str, Any]]:
+    """A row for each mesh: what an earlier study with the same settings has measured, or what is measured now."""
+    study, rows = config["study"], []
+    geometry = {key: value for key, value in config["mesh"].items() if key not in ("size", "layers", "cells", "order")}
+    loads = {key: value for key, value in study.items() if key not in _NOT_MEASURED}
+    chosen = list(cases(study))
+    with Progress("locking study", total=len(chosen), unit="meshes") as progress:
+        for case in chosen:
+            place = folder / "meshes" / f"{case.name}.json"
+            content = None if case.file is None else digest(case.file)
+            settings = {"case": asdict(case), "content": content, "mesh": geometry, "study": loads}
+            kept = read_json(place) if place.exists() else {}
+            if kept.get("settings") != settings:
+                row = {**asdict(case), **measure(case.mesh(config["mesh"]), study, case.timed)}
+                kept = {"settings": settings, "row": row}
+                write_json(place, kept)
+            rows.append(kept["row"])
+            progress.advance(mesh=case.name, tip=kept["row"]["fibres_mm"])
+    return rows
+
+
+def deflections(rows: Sequence[Mapping[str, Any]], limits: Mapping[str, Any], within: float) -> Figure:
+    """Deflection of the tip against the number of vertices, a panel for each load and a line for each element."""
+    figure = new_figure(3.2, 3.2, narrow=False)
+    for axes, (load, title) in zip(figure.subplots(1, len(LOADS)), LOADS.items(), strict=True):
+        axes.set(title=title, xscale="log", xlabel="vertices")
+        limit = limits[load]
+        value = 0.0 if limit is None else limit["mm"]
+        sign = -1.0 if value < 0.0 else 1.0
+        if limit is not None:
+            axes.axhline(sign * value, color=TONES["muted"].light, linewidth=1.0, label=f"converged, ±{within:.0%}")
+            ends = (sign * value * (1.0 - within), sign * value * (1.0 + within))
+            axes.axhspan(*ends, color=TONES["rule"].light, zorder=0)
+        for element, _, tone, mark in _ELEMENTS.values():
+            known = [row for row in rows if row["element"] == element and row[f"{load}_mm"] is not None]
+            for own, label in ((True, element), (False, f"{element}, your file")):
+                points = sorted((r["vertices"], sign * r[f"{load}_mm"]) for r in known if (r["file"] is None) == own)
+                if points:
+                    face = TONES[tone].light if own else "white"
+                    style = {"color": TONES[tone].light, "markerfacecolor": face, "markersize": 5, "label": label}
+                    axes.plot(*zip(*points, strict=True), mark, **style)
+        axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
+    figure.axes[0].set_ylabel("deflection of the tip [mm]")
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=3)
+    return figure
+
+
+def study_table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """Every mesh, with its deflections [mm] and, in per cent, how far they are from converged."""
+    lines = []
+    for row in sorted(rows, key=lambda row: (row["element"], row["file"] is not None, row["vertices"])):
+        sizes = ", ".join(f"{1e3 * row[key]:.3g}" for key in ("size", "layers") if row[key])
+        cells = []
+        for load in LOADS:
+            value, deviation = row[f"{load}_mm"], row.get(f"{load}_deviation")
+            percent = "" if deviation is None else f" ({100.0 * deviation:+.1f} %)"
+            cells.append("-" if value is None else f"{value:.2f}{percent}")
+        duration = "-" if row["step_ms"] is None else f"{row['step_ms']:.1f}"
+        where = Path(row["file"]).name if row["file"] else sizes
+        lines.append([row["element"], where, str(row["vertices"]), f"{row['chamber_cm3']:.2f}", *cells, duration])
+    headings = ["element", "size, layers (mm)", "vertices", "chamber (cm3)", *LOADS.values(), "step (ms)"]
+    return table_of("Deflection of the tip in mm, and its deviation from the converged value", headings, lines)
+
+
+def conclusion(limits: Mapping[str, Any], best: Mapping[str, Any] | None, within: float) -> str:
+    """The converged values, and the mesh to take."""
+    known = [
+        f"{LOADS[load]} {limit['mm']:.2f} mm (finest hexahedra {limit['finest_mm']:.2f}, finest 10-node tetrahedra "
+        f"{limit['other_mm']:.2f})"
+        for load, limit in limits.items()
+        if limit is not None
+    ]
+    if not known:
+        return "No two hexahedral meshes have one ratio of sizes, so nothing was extrapolated."
+    text = f"Converged, extrapolated from hexahedra: {'; '.join(known)}."
+    if best is None:
+        return f"{text} No mesh whose steps were timed is within {within:.0%} under gravity and with fibres."
+    return (
+        f"{text} Cheapest mesh within {within:.0%} under gravity and with fibres: {best['name']}, {best['vertices']} "
+        f"vertices, {best['step_ms']:.1f} ms a step."
+    )

@@ -6,15 +6,18 @@ from typing import Any, Final
 
 import numpy as np
 
-from ..io.errors import InputError, MeshError
+from ..experiment.build import build_mesh
+from ..experiment.schema import POSITIVE, check
+from ..io.errors import MeshError
 from ..mesh.arm import mesh_arm, name_surfaces
 from ..mesh.arm_geometry import arm_geometry
 from ..mesh.cavities import MOST_TRIANGLES, open_cavities
 from ..mesh.chambers import find_chambers
-from ..mesh.mesh import Mesh, boundary_triangles, connected_parts, quadratic, select_vertices
+from ..mesh.mesh import FloatArray, Mesh, boundary_triangles, connected_parts, quadratic, select_vertices
 from ..mesh.quality import scaled_jacobian
 from ..mesh.readers import read_mesh, read_surfaces, read_vertices, write_mesh
 from ..report.mesh import MeshSummary, draw_mesh
+from .command import aligned
 
 _ON_PLANE: Final = 1e-9  # [m], as in `mesh.select_vertices`
 _MILLI: Final = 1e3
@@ -22,20 +25,13 @@ _CUBIC_CENTI: Final = 1e6
 
 
 def make_arm(config: Mapping[str, Any], folder: Path) -> str:
-    """Generates an arm: writes the mesh and a picture.
-
-    Args:
-        config: With the keys of `conf/make_arm.yaml`.
-        folder: Where the picture goes, and the mesh where its path is relative.
-
-    Returns:
-        A table.
+    """Generates an arm, writes the mesh and a picture, and returns a table.
 
     Raises:
-        InputError: A setting of the wrong kind.
-        MeshError: The arm cannot be made.
+        ResphysError: A setting of the wrong kind, or an arm that cannot be made.
     """
-    settings, density = config["mesh"], _positive(config, "density")
+    check("density", config["density"], POSITIVE)
+    settings = config["mesh"]
     if settings["order"] not in (1, 2) or (settings["order"] == 2 and settings["cells"] != "tetrahedra"):
         raise MeshError(f"mesh.order is {settings['order']!r}: choose 1, or 2 for tetrahedra with edge midpoints.")
     mesh, surfaces = mesh_arm(arm_geometry(settings), settings["size"], settings["cells"], settings["layers"])
@@ -43,29 +39,22 @@ def make_arm(config: Mapping[str, Any], folder: Path) -> str:
         mesh = quadratic(mesh)
         surfaces = name_surfaces(mesh)
     write_mesh(folder / config["file"], mesh, surfaces)
-    summary = MeshSummary(mesh, density, np.unique(surfaces["base"]), find_chambers(mesh))
+    summary = MeshSummary(mesh, config["density"], np.unique(surfaces["base"]), find_chambers(mesh))
     if config["picture"]:
         draw_mesh(folder / "arm.png", summary)
-    return _table([*summary_rows(summary), ("clamped at the base", f"{len(summary.fixed)} vertices")])
+    return aligned([*summary_rows(summary), ("clamped at the base", f"{len(summary.fixed)} vertices")], left=2)
 
 
-def inspect_mesh(config: Mapping[str, Any], folder: Path, built: Mesh | None = None) -> str:
-    """Says what is in a mesh.
-
-    Args:
-        config: With the keys of `conf/inspect.yaml`.
-        folder: Where the picture goes.
-        built: The mesh, where it is not that of the file `mesh.path`.
-
-    Returns:
-        A table.
+def inspect_mesh(config: Mapping[str, Any], folder: Path) -> str:
+    """Returns a table of what is in a mesh, and draws it.
 
     Raises:
-        InputError: A setting of the wrong kind.
-        MeshError: A file that cannot be read, or a mesh that cannot be simulated.
+        ResphysError: A setting of the wrong kind, a file that cannot be read, or a mesh that cannot be simulated.
     """
-    density, rows, names = _positive(config, "density"), [], ""
-    if built is None:
+    check("density", config["density"], POSITIVE)
+    rows: list[tuple[str, str]] = []
+    read = config["mesh"]["kind"] == "file"
+    if read:
         path, units, order = (config["mesh"][key] for key in ("path", "units", "order"))
         points = read_vertices(path, units)
         mesh = read_mesh(path, units, order, drop_unreferenced=True)
@@ -76,21 +65,22 @@ def inspect_mesh(config: Mapping[str, Any], folder: Path, built: Mesh | None = N
         surfaces = read_surfaces(path, units, order, True)
         names = ", ".join(f"{name} ({len(faces)})" for name, faces in surfaces.items())
     else:
-        mesh, points = built, built.vertices
+        mesh = build_mesh(config["mesh"])
+        points = mesh.vertices
     chosen = {axis: at for axis, at in config["fixed"].items() if at is not None}
     fixed = select_vertices(mesh, **chosen) if chosen else np.empty(0, dtype=np.int64)
-    summary = MeshSummary(mesh, density, fixed, find_chambers(mesh))
+    summary = MeshSummary(mesh, config["density"], fixed, find_chambers(mesh))
     rows += summary_rows(summary)
     if chosen:
         where = ", ".join(f"{axis} = {at:g} m" for axis, at in chosen.items())
         there = [np.abs(points[:, "xyz".index(axis)] - at) <= _ON_PLANE for axis, at in chosen.items()]
         rows.append(("fixed", f"{np.all(there, axis=0).sum()} vertices at {where}, {len(fixed)} of them used"))
-    if built is None:
+    if read:
         rows.append(("surfaces with a name", names or "none"))
     rows.append(("open cavities", _cavities(mesh)))
     if config["picture"]:
         draw_mesh(folder / "mesh.png", summary)
-    return _table(rows)
+    return aligned(rows, left=2)
 
 
 def _cavities(mesh: Mesh) -> str:
@@ -98,50 +88,34 @@ def _cavities(mesh: Mesh) -> str:
     found = open_cavities(mesh)
     if found is None:
         return f"not looked for on a boundary of more than {MOST_TRIANGLES:,} triangles"
-    places = [
-        f"{1e4 * cavity.area:.1f} cm2 around ({', '.join(f'{_MILLI * x:.1f}' for x in cavity.centre)}) mm"
-        for cavity in found
-    ]
+    places = [f"{1e4 * cavity.area:.1f} cm2 around ({_millimetres(cavity.centre)}) mm" for cavity in found]
     return f"{'; '.join(places)}: pressure needs a closed chamber" if places else "none"
 
 
-def _pieces(mesh: Mesh) -> tuple[int, int]:
-    """Numbers of pieces that do not touch: of the body, and of its boundary."""
-    body, boundary = (connected_parts(cells) for cells in (mesh.cells, boundary_triangles(mesh)))
-    return int(body.max()) + 1, int(boundary.max()) + 1
+def _millimetres(point: FloatArray) -> str:
+    return ", ".join(f"{_MILLI * x:.1f}" for x in point)
 
 
 def summary_rows(summary: MeshSummary) -> list[tuple[str, str]]:
     """Names and values of a table."""
-    count, sides = len(summary.mesh.vertices), _MILLI * np.ptp(summary.mesh.vertices, axis=0)
-    low = ", ".join(f"{_MILLI * x:.1f}" for x in summary.mesh.vertices.min(axis=0))
+    mesh, (width, depth, height) = summary.mesh, _MILLI * np.ptp(summary.mesh.vertices, axis=0)
+    body, boundary = (connected_parts(cells).max() + 1 for cells in (mesh.cells, boundary_triangles(mesh)))
     rows = [
-        ("vertices", f"{count:,} = {3 * count:,} degrees of freedom"),
-        ("cells", f"{len(summary.mesh.cells):,} of kind {summary.mesh.kind}"),
-        ("bounding box", f"{sides[0]:.1f} x {sides[1]:.1f} x {sides[2]:.1f} mm from ({low}) mm"),
+        ("vertices", f"{len(mesh.vertices):,} = {mesh.vertices.size:,} degrees of freedom"),
+        ("cells", f"{len(mesh.cells):,} of kind {mesh.kind}"),
+        (
+            "bounding box",
+            f"{width:.1f} x {depth:.1f} x {height:.1f} mm from ({_millimetres(mesh.vertices.min(axis=0))}) mm",
+        ),
         ("volume", f"{_CUBIC_CENTI * summary.volume:.1f} cm3"),
         ("mass", f"{1e3 * summary.volume * summary.density:.1f} g at {summary.density:g} kg/m3"),
-        ("smallest scaled Jacobian", f"{scaled_jacobian(summary.mesh).min():.3f} (1 is ideal, 0 is flat)"),
-        ("pieces", "{} of the body, {} of its boundary".format(*_pieces(summary.mesh))),
+        ("smallest scaled Jacobian", f"{scaled_jacobian(mesh).min():.3f} (1 is ideal, 0 is flat)"),
+        ("pieces", f"{body} of the body, {boundary} of its boundary"),
     ]
     for chamber in summary.chambers:
-        centre = ", ".join(f"{_MILLI * x:.1f}" for x in summary.mesh.vertices[chamber.vertices].mean(axis=0))
+        centre = _millimetres(mesh.vertices[chamber.vertices].mean(axis=0))
         volume = _CUBIC_CENTI * summary.chamber_volume(chamber)
         rows.append((chamber.name, f"{len(chamber.faces)} faces, {volume:.2f} cm3, centre ({centre}) mm"))
     if not summary.chambers:
         rows.append(("chambers", "none is closed"))
     return rows
-
-
-def _table(rows: list[tuple[str, str]]) -> str:
-    """Rows of two columns."""
-    width = max(len(name) for name, _ in rows)
-    return "\n".join(f"{name:<{width}}  {value}" for name, value in rows)
-
-
-def _positive(config: Mapping[str, Any], key: str) -> float:
-    """A positive number from the configuration; InputError where it is none."""
-    value = config[key]
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < np.inf:
-        raise InputError(f"{key} is {value!r}: it must be a positive number.")
-    return float(value)

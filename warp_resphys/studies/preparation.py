@@ -6,10 +6,11 @@ from omegaconf import DictConfig
 
 from ..data.recordings.published import convert_arm, convert_beam
 from ..data.recordings.segment import convert_segment
+from ..experiment.schema import check, one_of
 from ..io.errors import InputError
 from . import mesh_inspection as meshes
+from .command import settings_of
 from .recording_quality import inspect_recording
-from .settings import settings_of
 
 _CONVERTERS = {"arm": convert_arm, "beam": convert_beam, "segment": convert_segment}
 
@@ -27,16 +28,10 @@ def inspect(config: DictConfig) -> None:
     if recording is not None:
         print(inspect_recording(plain, folder))
         print(f"Written: {folder / 'quality.json'}, {folder / 'quality.png'}")
-    if mesh["kind"] != "file":
-        from ..experiment.build import build_mesh  # Torch and Warp take seconds.
-
-        print(meshes.inspect_mesh(plain, folder, build_mesh(mesh)))
-    elif mesh["path"] is not None:
+    if mesh["kind"] != "file" or mesh["path"] is not None:
         print(meshes.inspect_mesh(plain, folder))
-    else:
-        return
-    if config.picture:
-        print(f"Written: {folder / 'mesh.png'}")
+        if config.picture:
+            print(f"Written: {folder / 'mesh.png'}")
 
 
 def make_arm(config: DictConfig) -> None:
@@ -53,8 +48,7 @@ def convert(config: DictConfig) -> None:
         InputError: an unknown layout.
         DataFileError: a file cannot be read or written.
     """
-    if config.layout not in _CONVERTERS:
-        raise InputError(f"layout is {config.layout!r}: set it to {', '.join(_CONVERTERS)}.")
+    check("layout", config.layout, one_of(*_CONVERTERS))
     folder = Path(config.output)
     index = _CONVERTERS[config.layout](config.source, folder)
     residuals = [entry["registration_residual_mm"] for entry in index if entry["registration_residual_mm"] is not None]

@@ -7,75 +7,83 @@ gravity points along -z. Arrays are in metres; T frames or steps, M markers, N v
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Final
 
 import numpy as np
+import torch
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from matplotlib.transforms import Bbox
 from numpy.typing import NDArray
 from omegaconf import DictConfig
 from scipy.interpolate import CubicSpline
 
 from ..data.oscillation import Oscillation, measure_oscillation
-from ..data.recordings.processing import fill_gaps
+from ..data.recordings.processing import fill_gaps, trim_to_release
 from ..data.recordings.quality import check_motion, check_passive
 from ..data.recordings.reading import read_recording
 from ..data.recordings.recording import Recording
 from ..data.recordings.release import Release, find_release
-from ..data.registration import kabsch, root_mean_square
+from ..data.rigid import kabsch, root_mean_square
+from ..dynamics.simulator import Simulator
+from ..energies.materials import make_material
+from ..experiment.schema import ANYTHING, COUNT, FINITE, MATERIAL, NOT_NEGATIVE, POSITIVE, WORD, Group, check, optional
+from ..fem.body import Body, PointMass
 from ..io.errors import DataFileError, InputError
 from ..io.files import atomic_path, write_json
-from .settings import settings_of
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from ..mesh.mesh import box_hexahedra, select_vertices
+from ..report.figures import STYLE, TONES, save_png
+from .command import aligned, settings_of
 
 FloatArray = NDArray[np.float64]
 
-_MILLI = 1e3
-_CLOSE_UP_SECONDS = 1.4
-_POSITIVE_GROUPS = ("simulation", "comparison")
-_HELD_FRAMES = 20  # that give the rest position where the release is configured
-# Ink and the vermilion of Okabe and Ito (2008), which everyone can tell apart.
-_LINES: dict[str, dict[str, Any]] = {
-    "measured": {"color": "#1c2127", "linestyle": "none", "marker": "o", "markersize": 2.0},
-    "simulated": {"color": "#d55e00", "linewidth": 1.3},
+_KEYS: Final = Group(
+    {
+        "material": MATERIAL,
+        "registration": Group({"longest_gap": COUNT, "largest_residual": NOT_NEGATIVE}),
+        "comparison": Group(dict.fromkeys(("fit_seconds", "tail_seconds", "error_seconds"), POSITIVE)),
+        "recording": Group({"hung_weight": NOT_NEGATIVE, "release_frame": optional(FINITE)}, each=ANYTHING),
+        "simulation": Group(
+            dict.fromkeys(("time_step", "gravity", "relative_tolerance"), POSITIVE)
+            | dict.fromkeys(("integrator", "solver", "device"), WORD)
+        ),
+    },
+    each=ANYTHING,
+)
+_MILLI: Final = 1e3
+_CLOSE_UP_SECONDS: Final = 1.4
+_HELD_FRAMES: Final = 20  # that give the rest position where the release is configured
+_LINES: Final[Mapping[str, dict[str, Any]]] = {
+    "measured": {"color": TONES["ink"].light, "linestyle": "none", "marker": "o", "markersize": 2.0},
+    "simulated": {"color": TONES["simulation"].light, "linewidth": 1.3},
 }
-_STYLE: Any = {
-    "font.size": 9,
-    "text.color": "#1c2127",
-    "axes.titlelocation": "left",
-    "axes.titlesize": 9,
-    "axes.edgecolor": "#5c6670",
-    "axes.linewidth": 0.7,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": "#dde1e6",
-    "grid.linewidth": 0.6,
-    "legend.frameon": False,
+# What comparison.json tells of an oscillation: by its attribute, the key and the factor of its unit.
+_NUMBERS: Final[Mapping[str, tuple[str, float]]] = {
+    "sag": ("sag_mm", _MILLI),
+    "period": ("period_s", 1.0),
+    "decay_rate": ("decay_rate_per_s", 1.0),
+    "damping_ratio": ("damping_ratio", 1.0),
+    "tail_spread": ("tail_spread_mm", _MILLI),
+    "fit_residual": ("fit_residual_mm", _MILLI),
 }
+_COMPARED: Final = {"sag [mm]": "sag", "period [s]": "period", "decay [1/s]": "decay_rate"}
 
 
 @dataclasses.dataclass(frozen=True)
 class Marker:
-    """A marker and its nominal position (x, y, z) [m] in the frame of the body."""
+    """A marker and its nominal position in the frame of the body."""
 
     name: str
-    position: tuple[float, float, float]
+    position: tuple[float, float, float]  # (x, y, z) [m]
 
 
 @dataclasses.dataclass(frozen=True)
 class Swing:
-    """Tip markers of a beam from its release on.
+    """Tip markers of a beam from its release on."""
 
-    Attributes:
-        time: (T,) [s] since the release.
-        displacement: (T, M, 3) [m] from where the markers were while the beam was held straight.
-    """
-
-    time: FloatArray
-    displacement: FloatArray
+    time: FloatArray  # (T,) [s] since the release
+    displacement: FloatArray  # (T, M, 3) [m] from where the markers were while the beam was held straight
 
     @property
     def deflection(self) -> FloatArray:
@@ -90,17 +98,11 @@ class Swing:
 
 @dataclasses.dataclass(frozen=True)
 class MeasuredSwing(Swing):
-    """The swing of a recording.
+    """The swing of a recording."""
 
-    Attributes:
-        rest_markers: (M, 3) [m] where the tip markers were while the beam was held, in the frame of the body.
-        release: The moment of release, in frames of the recording.
-        registration_residual: Root mean square [m] between measured and nominal markers at rest.
-    """
-
-    rest_markers: FloatArray
-    release: Release
-    registration_residual: float
+    rest_markers: FloatArray  # (M, 3) [m] of the tip while the beam was held, in the frame of the body
+    release: Release  # in frames of the recording
+    registration_residual: float  # [m] root mean square, between measured and nominal markers at rest
 
 
 def measured_swing(
@@ -123,8 +125,7 @@ def measured_swing(
         release_frame: The release, where it is known; found from the tip if None.
 
     Raises:
-        DataFileError: A marker is missing or occluded for long, nothing is let go, or the markers do not fit.
-        InputError: The given release is not in the recording.
+        ResphysError: A marker is missing or occluded for long, nothing is let go, or the markers do not fit.
     """
     markers = [*tip, *base]
     nominal = np.array([marker.position for marker in markers])
@@ -147,24 +148,20 @@ def measured_swing(
             f"their nominal positions, more than {1e3 * largest_residual:.1f} mm; check the configured names "
             "and positions."
         )
-    first = int(np.ceil(release.frame))
-    frames = np.arange(first, len(positions))
     rest_markers = motion.apply(held)[: len(tip)]
-    displacement = motion.apply(positions[first:])[:, : len(tip)] - rest_markers
-    time = np.asarray((frames - release.frame) / recording.rate, dtype=np.float64)
+    swing = trim_to_release(recording, release)
+    displacement = motion.apply(swing.positions)[:, : len(tip)] - rest_markers
+    time = swing.start + np.arange(len(displacement)) / recording.rate
     return MeasuredSwing(time, displacement, rest_markers, release, residual)
 
 
 def follow_face(face: FloatArray, rest_face: FloatArray, markers: FloatArray) -> FloatArray:
-    """Displacement of markers on stems that stand on a face and follow its rigid motion.
+    """Displacement (T, M, 3) [m] of markers (M, 3) [m] on stems that follow the rigid motion of a face.
 
     Args:
         face: (T, S, 3) [m] vertices of the face over time.
         rest_face: (S, 3) [m] the same at rest.
         markers: (M, 3) [m] at rest.
-
-    Returns:
-        (T, M, 3) [m].
     """
     return kabsch(np.broadcast_to(rest_face, face.shape), face).apply(markers) - markers
 
@@ -177,52 +174,32 @@ def marker_error(measured: Swing, simulated: Swing, seconds: float) -> float:
 
 
 def simulate_swing(config: Mapping[str, Any], rest_markers: FloatArray, seconds: float) -> Swing:
-    """Simulates the beam let go from straight and at rest, and follows the tip markers.
-
-    Args:
-        config: With the groups `body`, `material`, `simulation` and `recording` of compare.yaml.
-        rest_markers: (M, 3) [m] where the markers are at rest, in the frame of the body.
-        seconds: How long to simulate [s].
+    """Simulates the beam let go from straight and at rest for some seconds, and follows its markers (M, 3) [m].
 
     Raises:
-        InputError: A value in the configuration cannot be simulated.
-        ConvergenceError: A step did not converge.
+        ResphysError: A value in the configuration cannot be simulated, or a step did not converge.
     """
-    import torch
-
-    from ..dynamics.simulator import Simulator
-    from ..energies.materials import make_material
-    from ..fem.body import Body, PointMass
-    from ..mesh.mesh import box_hexahedra, select_vertices
-
-    body_config, simulation = config["body"], config["simulation"]
-    length, _, height = body_config["size"]
-    mesh = box_hexahedra(body_config["size"], body_config["divisions"])
-    tip_face = select_vertices(mesh, x=length)
-    weights = []
-    if config["recording"]["hung_weight"] > 0.0:
-        mass = config["recording"]["hung_weight"] / simulation["gravity"]
-        weights.append(PointMass(mass, select_vertices(mesh, x=length, z=height).tolist()))
+    shape, simulation = config["body"], config["simulation"]
+    length, _, height = shape["size"]
+    mesh = box_hexahedra(shape["size"], shape["divisions"])
+    mass = config["recording"]["hung_weight"] / simulation["gravity"]
+    weights = [PointMass(mass, select_vertices(mesh, x=length, z=height).tolist())] if mass > 0.0 else []
     body = Body(
         mesh,
         fixed=select_vertices(mesh, x=0.0),
-        mass=body_config["mass"],
-        volume_integration=body_config["volume_integration"],
+        mass=shape["mass"],
+        volume_integration=shape["volume_integration"],
         point_masses=weights,
     )
     simulator = Simulator(
         body,
         make_material(**config["material"]),
-        time_step=simulation["time_step"],
-        gravity=(0.0, 0.0, -simulation["gravity"]),
-        integrator=simulation["integrator"],
-        solver=simulation["solver"],
-        relative_tolerance=simulation["relative_tolerance"],
-        device=simulation["device"],
+        **{**simulation, "gravity": (0.0, 0.0, -simulation["gravity"])},
     )
     steps = int(np.ceil(seconds / simulation["time_step"]))
     with torch.no_grad():
         positions = simulator.rollout(simulator.rest_state(), steps).q
+    tip_face = select_vertices(mesh, x=length)
     face = positions[:, 0, tip_face].cpu().numpy().astype(np.float64)
     time = simulation["time_step"] * np.arange(steps + 1)
     return Swing(time, follow_face(face, mesh.vertices[tip_face], rest_markers))
@@ -232,54 +209,39 @@ def compare(config: DictConfig) -> None:
     """Writes comparison.json and comparison.png into the run folder and prints the numbers; see `compare_recording`."""
     plain, folder = settings_of(config)
     result = compare_recording(plain, folder)
-    print(f"{'':16}{'measured':>12}{'simulated':>12}{'difference':>12}")
-    for label, key, compared in (
-        ("sag [mm]", "sag_mm", "sag"),
-        ("period [s]", "period_s", "period"),
-        ("decay [1/s]", "decay_rate_per_s", "decay_rate"),
-    ):
-        measured, simulated = result["measured"][key], result["simulated"][key]
-        difference = result["relative_difference"][compared]
-        print(f"{label:16}{measured:12.4g}{simulated:12.4g}{difference:12.1%}")
+    print(aligned(comparison_table(result)))
     print(f"Written: {folder / 'comparison.json'}, {folder / 'comparison.png'}")
 
 
+def comparison_table(result: Mapping[str, Any]) -> list[list[str]]:
+    """Sag, period and decay of both swings, and how far they are apart, from what comparison.json holds."""
+    rows = [["", *_LINES, "difference"]]
+    for label, number in _COMPARED.items():
+        values = [f"{result[name][_NUMBERS[number][0]]:.4g}" for name in _LINES]
+        rows.append([label, *values, f"{result['relative_difference'][number]:+.1%}"])
+    return rows
+
+
 def compare_recording(config: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Measures and simulates a swing, and writes comparison.json and comparison.png.
-
-    Args:
-        config: The settings of compare.yaml, as plain containers.
-        folder: Where to write.
-
-    Returns:
-        What comparison.json holds.
+    """Measures and simulates a swing, and writes comparison.json, whose content it returns, and comparison.png.
 
     Raises:
-        DataFileError: The recording cannot be read or used, or a result cannot be written.
-        InputError: A value in the configuration is wrong.
-        ConvergenceError: A step of the simulation did not converge.
+        ResphysError: A value in the configuration is wrong, the recording cannot be used, a step of the simulation did
+            not converge, or a file cannot be written.
     """
-    _check_numbers(config)
-    settings, registration, comparison = config["recording"], config["registration"], config["comparison"]
+    check("", config, _KEYS)
+    settings, comparison = config["recording"], config["comparison"]
     if settings["path"] is None:
         raise InputError("No recording given: set recording.path to one, as in recording.path=swing.c3d.")
     tip, base = ([Marker(**marker) for marker in config["markers"][part]] for part in ("tip", "base"))
     recording = read_recording(settings["path"])
     check_passive(recording)
     check_motion(recording, [marker.name for marker in tip])
-    measured = measured_swing(
-        recording,
-        tip,
-        base,
-        longest_gap=registration["longest_gap"],
-        largest_residual=registration["largest_residual"],
-        release_frame=settings["release_frame"],
-    )
+    measured = measured_swing(recording, tip, base, **config["registration"], release_frame=settings["release_frame"])
     simulated = simulate_swing(config, measured.rest_markers, float(measured.time[-1]))
+    window, tail = comparison["fit_seconds"], comparison["tail_seconds"]
     oscillations = {
-        name: measure_oscillation(
-            swing.deflection, swing.rate, window=comparison["fit_seconds"], tail=comparison["tail_seconds"]
-        )
+        name: measure_oscillation(swing.deflection, swing.rate, window=window, tail=tail)
         for name, swing in (("measured", measured), ("simulated", simulated))
     }
     error = marker_error(measured, simulated, comparison["error_seconds"])
@@ -287,116 +249,65 @@ def compare_recording(config: Mapping[str, Any], folder: Path) -> dict[str, Any]
     figure = draw_comparison(measured, simulated, result)
     write_json(folder / "comparison.json", result)
     with atomic_path(folder / "comparison.png") as partial:
-        figure.savefig(partial, dpi=160, format="png")
+        save_png(figure, partial)
     return result
 
 
-def draw_comparison(measured: Swing, simulated: Swing, result: Mapping[str, Any]) -> "Figure":
-    """Draws the deflection of the tip over time with its numbers beside it, and each marker below.
-
-    Args:
-        measured: The recording, drawn as points.
-        simulated: The simulation, drawn as a line.
-        result: What comparison.json holds.
-    """
-    import matplotlib as mpl
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import MaxNLocator
-
+def draw_comparison(measured: Swing, simulated: Swing, result: Mapping[str, Any]) -> Figure:
+    """Draws the deflection of the tip over time with what comparison.json holds beside it, and each marker below."""
     labels = [marker["name"] for marker in result["config"]["markers"]["tip"]]
-    with mpl.rc_context(_STYLE):
+    swings = {"measured": measured, "simulated": simulated}
+    with rc_context(STYLE):
         figure = Figure(figsize=(10.0, 6.2), layout="constrained")
         rows = figure.add_gridspec(2, 1, height_ratios=[1.5, 1.0])
         top = rows[0].subgridspec(1, 2, width_ratios=[2.2, 1.0])
-        whole = figure.add_subplot(top[0])
-        for name, swing in (("measured", measured), ("simulated", simulated)):
+        whole, numbers = figure.add_subplot(top[0]), figure.add_subplot(top[1])
+        panels = rows[1].subgridspec(1, len(labels)).subplots(sharey=True, squeeze=False)[0]
+        for name, swing in swings.items():
             whole.plot(swing.time, _MILLI * swing.deflection, label=name, **_LINES[name])
             whole.axhline(result[name]["sag_mm"], color=_LINES[name]["color"], linewidth=0.7, linestyle=":")
+            for marker, axes in enumerate(panels):
+                axes.plot(swing.time, _MILLI * swing.displacement[:, marker, 2], **_LINES[name])
         whole.set(xlabel="time since release [s]", ylabel="deflection, mean of the tip markers [mm]")
         whole.set_xlim(0.0, measured.time[-1])
         whole.set_title(result["config"]["recording"]["title"], fontsize=11, fontweight="bold")
         whole.legend(loc="lower right", ncols=2)
-        _write_numbers(figure.add_subplot(top[1]), result)
-        panels = rows[1].subgridspec(1, len(labels)).subplots(sharey=True, squeeze=False)[0]
-        for marker, (axes, label) in enumerate(zip(panels, labels, strict=True)):
-            for name, swing in (("measured", measured), ("simulated", simulated)):
-                axes.plot(swing.time, _MILLI * swing.displacement[:, marker, 2], **_LINES[name])
+        for axes, label in zip(panels, labels, strict=True):
             axes.set(xlabel="time since release [s]", xlim=(0.0, min(_CLOSE_UP_SECONDS, measured.time[-1])))
             axes.xaxis.set_major_locator(MaxNLocator(5))
             axes.set_title(label)
         panels[0].set_ylabel("vertical displacement [mm]")
+        numbers.set_axis_off()
+        table = numbers.table(
+            comparison_table(result), loc="upper left", edges="open", bbox=Bbox.from_bounds(0.0, 0.6, 1.2, 0.35)
+        )
+        table.auto_set_font_size(False)
+        numbers.text(0.0, 0.5, _notes(result), verticalalignment="top", fontsize=8, linespacing=1.5)
     return figure
 
 
-def _check_numbers(config: Mapping[str, Any]) -> None:
-    """Raises InputError for the first number that is not one or out of range."""
-    names = [f"{group}.{key}" for group in ("material", "registration", "comparison") for key in config[group]]
-    names += ["recording.hung_weight", "simulation.time_step", "simulation.gravity"]
-    if config["recording"]["release_frame"] is not None:
-        names.append("recording.release_frame")
-    for name in names:
-        group, _, key = name.partition(".")
-        value = config[group][key]
-        least, wanted = (1e-12, "more than zero") if group in _POSITIVE_GROUPS else (0.0, "not below zero")
-        if name != "material.model" and not (isinstance(value, int | float) and least <= value < np.inf):
-            raise InputError(f"{name} is {value!r}: set it to a number, {wanted}.")
-
-
-def _write_numbers(axes: "Axes", result: Mapping[str, Any]) -> None:
-    """Writes sag, period and decay of both swings, and how far they are apart, as a small table."""
-    axes.set_axis_off()
-    lines: list[tuple[str, ...]] = [("", "measured", "simulated", "difference")]
-    for label, key, scale, decimals, compared in (
-        ("sag [mm]", "sag_mm", 1.0, 2, "sag"),
-        ("period [ms]", "period_s", _MILLI, 1, "period"),
-        ("decay [1/s]", "decay_rate_per_s", 1.0, 2, "decay_rate"),
-    ):
-        numbers = [f"{scale * result[name][key]:.{decimals}f}" for name in ("measured", "simulated")]
-        lines.append((label, *numbers, f"{100.0 * result['relative_difference'][compared]:+.1f} %"))
-    columns = (0.0, 0.5, 0.82, 1.14)
-    for line, cells in enumerate(lines):
-        for x, cell, name in zip(columns, cells, lines[0], strict=True):
-            axes.text(
-                x,
-                0.9 - 0.1 * line,
-                cell.replace("-", "\N{MINUS SIGN}"),
-                transform=axes.transAxes,
-                horizontalalignment="right" if name else "left",
-                color=_LINES[name]["color"] if name in _LINES else _STYLE["text.color"],
-                fontweight="normal" if line else "bold",
-            )
+def _notes(result: Mapping[str, Any]) -> str:
     seconds = result["config"]["comparison"]["error_seconds"]
-    notes = (
+    return (
         f"Tip markers {result['marker_error_mm']:.2f} mm apart on average in the first {seconds:g} s.\n"
         f"Released in frame {result['release_frame']:.1f}; registered to nominal markers\n"
         f"with {result['registration_residual_mm']:.2f} mm left (root mean square)."
     )
-    axes.text(0.0, 0.46, notes, transform=axes.transAxes, verticalalignment="top", fontsize=8, linespacing=1.5)
 
 
 def _summary(measured: MeasuredSwing, oscillations: Mapping[str, Oscillation], error: float) -> dict[str, Any]:
-    """The content of comparison.json, in millimetres and seconds."""
+    """The content of comparison.json, in millimetres and seconds, with (simulated - measured) / measured."""
     return {
         "release_frame": measured.release.frame,
         "rest_frames": list(measured.release.rest),
         "registration_residual_mm": _MILLI * measured.registration_residual,
         **{
-            name: {
-                "sag_mm": _MILLI * found.sag,
-                "period_s": found.period,
-                "decay_rate_per_s": found.decay_rate,
-                "damping_ratio": found.damping_ratio,
-                "tail_spread_mm": _MILLI * found.tail_spread,
-                "fit_residual_mm": _MILLI * found.fit_residual,
-            }
+            name: {key: factor * getattr(found, number) for number, (key, factor) in _NUMBERS.items()}
             for name, found in oscillations.items()
         },
-        "relative_difference": _relative_difference(oscillations["measured"], oscillations["simulated"]),
+        "relative_difference": {
+            name: getattr(oscillations["simulated"], name) / getattr(oscillations["measured"], name) - 1.0
+            for name in ("sag", "period", "decay_rate", "damping_ratio")
+        },
         "marker_error_mm": _MILLI * error,
     }
-
-
-def _relative_difference(measured: Oscillation, simulated: Oscillation) -> dict[str, float]:
-    """(simulated - measured) / measured of each number."""
-    names = ("sag", "period", "decay_rate", "damping_ratio")
-    return {name: getattr(simulated, name) / getattr(measured, name) - 1.0 for name in names}

@@ -1,6 +1,7 @@
 """The quality of a recording as a picture, and the command that makes it."""
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,85 +15,107 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from ..data.recordings.processing import fill_gaps, release_of
-from ..data.recordings.quality import BaseMotion, Quality, check_base, compare_base, quality, quality_table
+from ..data.recordings.quality import (
+    BaseMotion,
+    MarkerQuality,
+    Quality,
+    check_base,
+    compare_base,
+    quality,
+    quality_table,
+)
 from ..data.recordings.reading import read_recording
 from ..data.recordings.recording import Recording
+from ..experiment.schema import ANYTHING, COUNT, NOT_NEGATIVE, POSITIVE, WORD, Group, check, optional
 from ..io.errors import InputError
 from ..io.files import atomic_path, write_json
-from ..report.figures import NARROW, STYLE, TONES, WIDE
+from ..report.figures import STYLE, TONES, new_figure, save_png
+from .command import WORDS, aligned
 
 FloatArray = NDArray[np.float64]
 
 # Okabe and Ito (2008), without yellow: everyone can tell them apart.
 MARKER_COLOURS: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#1c2127")
 _STATES: Final = {"seen": "#dde1e6", "filled": "#e69f00", "masked": "#c4481b"}
+_KEYS: Final = Group(
+    {
+        "recording": Group({"path": WORD, "rate": optional(POSITIVE), "labels": optional(WORDS)}, each=ANYTHING),
+        **dict.fromkeys(("still", "moving", "compare_with"), WORDS),
+        **{"longest_gap": COUNT, "least_jump": NOT_NEGATIVE, "largest_distortion": NOT_NEGATIVE},
+    },
+    each=ANYTHING,
+)
 _MILLI: Final = 1e3
 _ROW: Final = 0.16  # [in] of a marker in the raster
-_LEGEND_COLUMNS: Final = {False: 6, True: 3}
+_LEGEND_COLUMNS: Final = 6
 
 
-def recording_quality(recording: Recording, result: Quality, *, narrow: bool) -> Figure:
+def recording_quality(recording: Recording, result: Quality) -> Figure:
     """Draw markers over time from their median place, what jumped, and what was hidden.
 
     Markers that should stand still have a panel of their own, with their distance from the median place. A line
     breaks where a gap is masked; where it was filled, the line is thin. A triangle marks the first frame after a jump.
-
-    Args:
-        recording: As it was measured.
-        result: What `quality` found in it.
-        narrow: Whether the figure is for a narrow page.
     """
-    bridged = fill_gaps(_visible(recording), result.longest_gap, mask_long=True)
-    still = [marker.label for marker in result.markers if marker.still]
-    moving = [marker.label for marker in result.markers if not marker.still]
-    panels = [*("xyz" if moving else ""), *(["still"] if still else []), "raster"]
-    heights = [{"still": 1.2, "raster": _ROW * len(recording.labels) + 0.1}.get(panel, 1.5) for panel in panels]
+    several = [label for label, seen in zip(recording.labels, recording.seen.T, strict=True) if seen.sum() > 1]
+    bridged = fill_gaps(recording.select(several), result.longest_gap, mask_long=True)
+    still = {marker.label for marker in result.markers if marker.still}
+    panels = [*("xyz" if len(still) < len(recording.labels) else ""), *(["still"] if still else [])]
+    heights = [*(1.2 if panel == "still" else 1.5 for panel in panels), _ROW * len(recording.labels) + 0.1]
+    colours = dict(zip(recording.labels, cycle(MARKER_COLOURS), strict=False))
     with mpl.rc_context(STYLE):
-        width = NARROW if narrow else WIDE
-        figure = Figure(figsize=(width, sum(heights) + (1.3 if narrow else 1.0)), layout="constrained")
-        rows = figure.subplots(len(panels), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
-        colours = {label: MARKER_COLOURS[at % len(MARKER_COLOURS)] for at, label in enumerate(recording.labels)}
+        figure = new_figure(sum(heights) + 1.0, sum(heights) + 1.0, narrow=False)
+        *rows, last = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
         for axes, panel in zip(rows, panels, strict=True):
-            if panel == "raster":
-                _raster(axes, recording, bridged, result)
-                axes.set_title("" if narrow else "Seen by the cameras")
-                continue
-            for label in still if panel == "still" else moving:
-                if label in bridged.labels:
-                    path = _path(recording, bridged, label, panel)
-                    _line(axes, recording, result, label, path, colours[label])
-            name = "distance" if panel == "still" else panel
-            axes.set_ylabel(f"{name} [mm]")
+            for marker in result.markers:
+                if marker.label in several and marker.still == (panel == "still"):
+                    _draw_marker(axes, panel, recording, bridged, marker, colours[marker.label])
+            axes.set_ylabel("distance [mm]" if panel == "still" else f"{panel} [mm]")
             axes.yaxis.set_major_locator(MaxNLocator(4))
-            title = {"x": "Markers, from their median place", "still": "Markers that should not move"}.get(panel)
-            if title:
-                axes.set_title(title)
+            titles = {"x": "Markers, from their median place", "still": "Markers that should not move"}
+            axes.set_title(titles.get(panel, ""))
             if result.release is not None:
-                axes.axvline(
-                    result.release.frame / result.rate, color=TONES["ink"].light, linewidth=0.9, linestyle="--"
-                )
-        rows[-1].set_xlabel("time [s]; dashed: release" if result.release is not None else "time [s]")
-        rows[-1].set_xlim(0.0, len(recording.positions) / recording.rate)
-        _legend(figure, colours, narrow=narrow)
-        figure.align_ylabels(rows[:-1])
+                release = result.release.frame / result.rate
+                axes.axvline(release, color=TONES["ink"].light, linewidth=0.9, linestyle="--")
+        _draw_seen(last, recording, bridged, result)
+        last.set_xlabel("time [s]; dashed: release" if result.release is not None else "time [s]")
+        last.set_xlim(0.0, len(recording.positions) / recording.rate)
+        handles = [mpl.lines.Line2D([], [], color=colour, label=label) for label, colour in colours.items()]
+        columns = min(len(handles), _LEGEND_COLUMNS)
+        figure.legend(handles=handles, loc="outside upper left", ncols=columns, columnspacing=1.4)
+        figure.align_ylabels(rows)
     return figure
+
+
+def _draw_marker(
+    axes: Axes, panel: str, recording: Recording, bridged: Recording, marker: MarkerQuality, colour: str
+) -> None:
+    """What the panel shows of a marker: thin where it is filled, with a triangle above each jump."""
+    column = recording.labels.index(marker.label)
+    middle = np.nanmedian(recording.positions[:, column], axis=0)
+    moved = _MILLI * (bridged.positions[:, bridged.labels.index(marker.label)] - middle)
+    path = np.linalg.norm(moved, axis=1) if marker.still else moved[:, "xyz".index(panel)]
+    time = np.arange(len(path)) / recording.rate
+    axes.plot(time, path, color=colour, linewidth=0.5)
+    axes.plot(time, np.where(recording.seen[:, column], path, np.nan), color=colour, linewidth=1.1)
+    frames = [jump.frame for jump in marker.jumps]
+    axes.plot(
+        time[frames], path[frames], "v", color=colour, markersize=4.5, markeredgecolor="white", markeredgewidth=0.4
+    )
 
 
 def inspect_recording(config: Mapping[str, Any], folder: Path) -> str:
     """Examines a recording, and writes quality.json and quality.png.
 
-    Args:
-        config: With the keys of conf/inspect.yaml.
-        folder: Where to write.
-
     Returns:
         The table, and what a user should look at, as text.
 
     Raises:
-        DataFileError: A recording cannot be read, or a marker on the base was moved between two of them.
-        InputError: A value in the configuration cannot be used.
+        ResphysError: A value in the configuration cannot be used, a recording cannot be read, or a marker on the base
+            was moved between two of them.
     """
-    _check(config)
+    check("", config, _KEYS)
+    if config["compare_with"] and len(config["still"]) < 2:
+        raise InputError("compare_with needs two or more markers on the base to compare: name them in still.")
     settings = config["recording"]
     given = (settings["units"], settings["rate"], settings["labels"])
     recording = read_recording(settings["path"], *given)
@@ -101,61 +124,16 @@ def inspect_recording(config: Mapping[str, Any], folder: Path) -> str:
     result = quality(recording, still, release, longest_gap=config["longest_gap"], least_jump=config["least_jump"])
     trials = [recording, *(read_recording(path, *given) for path in config["compare_with"])]
     motions = compare_base(trials, still) if len(trials) > 1 else []
-    figure = recording_quality(recording, result, narrow=False)
+    figure = recording_quality(recording, result)
     write_json(folder / "quality.json", {**result.to_plain(), "base": [_plain(motion, still) for motion in motions]})
     with atomic_path(folder / "quality.png") as partial:
-        figure.savefig(partial, format="png", dpi=160, facecolor="white")
+        save_png(figure, partial)
     if len(trials) > 1:
         check_base(trials, still, largest_distortion=config["largest_distortion"])
     return _text(result, motions)
 
 
-def _check(config: Mapping[str, Any]) -> None:
-    """Raises InputError for the first value of the configuration that cannot be used."""
-    for key in ("still", "moving", "compare_with"):
-        if not (isinstance(config[key], list) and all(isinstance(value, str) for value in config[key])):
-            raise InputError(f"{key} is {config[key]!r}: set it to a list, as in {key}='[Base - 1,Base - 2]'.")
-    for key, least in (("longest_gap", 0), ("least_jump", 0.0), ("largest_distortion", 0.0)):
-        value = config[key]
-        if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value < np.inf:
-            raise InputError(f"{key} is {value!r}: set it to a number, not below zero.")
-    rate, labels, path = (config["recording"][key] for key in ("rate", "labels", "path"))
-    if not isinstance(path, str):
-        raise InputError(f"recording.path is {path!r}: set it to a file, as in recording.path=swing.c3d.")
-    if rate is not None and (isinstance(rate, bool) or not isinstance(rate, int | float)):
-        raise InputError(f"recording.rate is {rate!r}: set it to the frames a second.")
-    if labels is not None and not isinstance(labels, list):
-        raise InputError(f"recording.labels is {labels!r}: set it to a list of names.")
-    if config["compare_with"] and len(config["still"]) < 2:
-        raise InputError("compare_with needs two or more markers on the base to compare: name them in still.")
-
-
-def _visible(recording: Recording) -> Recording:
-    """Without the markers that are seen in fewer than two frames, which cannot be drawn as a line."""
-    counts = recording.seen.sum(axis=0)
-    return recording.select([label for label, count in zip(recording.labels, counts, strict=True) if count > 1])
-
-
-def _path(recording: Recording, bridged: Recording, label: str, panel: str) -> FloatArray:
-    """(T,) [mm] what a panel shows of a marker."""
-    measured = recording.positions[:, recording.labels.index(label)]
-    moved = bridged.positions[:, bridged.labels.index(label)] - np.nanmedian(measured, axis=0)
-    return _MILLI * (np.linalg.norm(moved, axis=1) if panel == "still" else moved[:, "xyz".index(panel)])
-
-
-def _line(axes: Axes, recording: Recording, result: Quality, label: str, path: FloatArray, colour: str) -> None:
-    """One marker: thin where it is filled, with a triangle above each jump."""
-    time = np.arange(len(path)) / recording.rate
-    seen = recording.seen[:, recording.labels.index(label)]
-    axes.plot(time, path, color=colour, linewidth=0.5)
-    axes.plot(time, np.where(seen, path, np.nan), color=colour, linewidth=1.1)
-    frames = [jump.frame for marker in result.markers if marker.label == label for jump in marker.jumps]
-    axes.plot(
-        time[frames], path[frames], "v", color=colour, markersize=4.5, markeredgecolor="white", markeredgewidth=0.4
-    )
-
-
-def _raster(axes: Axes, recording: Recording, bridged: Recording, result: Quality) -> None:
+def _draw_seen(axes: Axes, recording: Recording, bridged: Recording, result: Quality) -> None:
     """A row for each marker: seen, filled or masked, and its jumps."""
     height = len(recording.labels)
     states = np.full((height, len(recording.positions)), 2)
@@ -172,6 +150,7 @@ def _raster(axes: Axes, recording: Recording, bridged: Recording, result: Qualit
         axes.plot(at, [row] * len(at), "|", color=TONES["ink"].light, markersize=6, markeredgewidth=0.9)
     for row in range(1, height):
         axes.axhline(row - 0.5, color="white", linewidth=1.2)
+    axes.set_title("Seen by the cameras")
     axes.set_yticks(range(height), recording.labels)
     axes.tick_params(axis="y", length=0)
     axes.grid(visible=False)
@@ -180,23 +159,9 @@ def _raster(axes: Axes, recording: Recording, bridged: Recording, result: Qualit
     axes.legend(handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, handlelength=1.0)
 
 
-def _legend(figure: Figure, colours: Mapping[str, str], *, narrow: bool) -> None:
-    """Markers by colour, above the figure."""
-    handles = [mpl.lines.Line2D([], [], color=colour, label=label) for label, colour in colours.items()]
-    columns = min(len(handles), _LEGEND_COLUMNS[narrow])
-    figure.legend(handles=handles, loc="outside upper left", ncols=columns, columnspacing=1.4)
-
-
 def _text(result: Quality, motions: Sequence[BaseMotion]) -> str:
     """The table with a column for each quantity, then the warnings."""
-    rows = quality_table(result)
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    lines = [
-        "  ".join(
-            [row[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True))]
-        )
-        for row in rows
-    ]
+    lines = [aligned(quality_table(result))]
     seconds = result.frames / result.rate
     lines.append(f"{result.source}: {result.frames} frames, {seconds:.2f} s at {result.rate:g} Hz")
     if result.release is not None:

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -17,48 +17,28 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from rich.console import Console
+from rich.markup import escape
 
 from ..experiment.files import METRICS
+from ..experiment.schema import check, optional
 from ..io.errors import DataFileError, InputError, ResphysError
 from ..io.files import disk_full_error, is_disk_full, write_text
 from ..io.labels import run_label
 from ..io.machine import commit, hardware
 from ..io.progress import clock
 from ..io.stages import package_versions, run_lock
-from .comparison import Result, compare
-from .reproduction_page import Reproduction, markdown, write_reproduction
-from .settings import settings_of
+from ..report.page import Canvas, Cell, Drawn, Items, Part, Row, Table, figures_beside
+from .command import WORDS, settings_of
+from .comparison import Run, compare
+from .page import markdown, write_page
 
 log = logging.getLogger(__name__)
 
 PAGE = "reproduction.html"
 _UP_TO_DATE_SECONDS = 8.0  # for a run that finds nothing to do
 _LINE_SECONDS = 60.0
+_PLAIN: dict[str, Any] = {"markup": False, "highlight": False, "soft_wrap": True}
 _PATIENCE = 60.0  # s that an interrupted run gets to save what it has
-
-
-@dataclass(frozen=True)
-class Run:
-    """One run of the ordinary command.
-
-    Attributes:
-        experiment: name of the experiment.
-        variant: name of the variant.
-        arguments: of the command.
-        folder: that it writes, the one that the ordinary command takes for the same arguments.
-        minutes: that it may take.
-    """
-
-    experiment: str
-    variant: str
-    arguments: tuple[str, ...]
-    folder: Path
-    minutes: float
-
-    @property
-    def name(self) -> str:
-        """As in the key ``only``."""
-        return f"{self.experiment}/{self.variant}"
 
 
 class ReproductionInterrupted(KeyboardInterrupt):
@@ -77,39 +57,51 @@ def reproduce(config: DictConfig) -> None:
     runs = plan(plain)
     with run_lock(folder):
         results = run_all(runs, folder / "logs")
-        page = Reproduction(
-            date=f"{datetime.now():%Y-%m-%d}",
-            command=shlex.join(["warp-resphys", "reproduce", *HydraConfig.get().overrides.task]),
-            hardware=hardware(),
-            commit=commit(),
-            versions=package_versions(),
-            **compare(plain, results),
-        )
-        write_reproduction(folder / PAGE, page)
+        page = folder / PAGE
+        with figures_beside(page) as pictures:
+            verdict, parts = compare(plain, results, Canvas(pictures))
+        parts.append(_made())
+        date = f"{datetime.now():%Y-%m-%d}"
+        write_page(page, title="Reproduction", kicker=date, verdict=verdict, parts=parts)
+
+        def in_markdown(folder: str) -> str:
+            return markdown(f"Reproduction of {date}", verdict, parts, folder)
+
+        write_text(page.with_name("results.md"), in_markdown(pictures.name))
         if plain["results"] is not None:
-            _write_results(Path(plain["results"]), folder, page)
-    print(f"Page: {folder / PAGE}")
-    if failed := [f"{result.experiment}/{result.variant}" for result in results if result.failure]:
+            name = f"{date}-reproduction"
+            place = Path(plain["results"]) / name
+            drawn = [block.name for part in parts for block in part.blocks if isinstance(block, Drawn)]
+            _copy([pictures / f"{figure}.png" for figure in drawn], place)
+            write_text(place.with_suffix(".md"), in_markdown(name))
+            print(f"Results: {place}.md")
+    print(f"Page: {page}")
+    if failed := [result.name for result in results if result.failure]:
         raise ResphysError(
             f"{len(failed)} of {len(runs)} runs failed ({', '.join(failed)}): the page says why; mend it and run the "
             "same command again."
         )
 
 
-def _write_results(root: Path, folder: Path, page: Reproduction) -> None:
-    """The page as Markdown, with its figures in a folder of their own, both named by the date."""
-    name = f"{page.date}-reproduction"
+def _made() -> Part:
+    """How the page was made: by which command, on which machine, with which versions."""
+    command = shlex.join(["warp-resphys", "reproduce", *HydraConfig.get().overrides.task])
+    known = {**hardware(), "commit": commit() or "not known", **package_versions()}
+    table = Table("Machine and versions", ["Here"], [Row(name, [Cell(value)]) for name, value in known.items()])
+    return Part("Command, machine and versions", [Items([command], code=True), table])
+
+
+def _copy(figures: Sequence[Path], folder: Path) -> None:
+    """Files into a folder of their own, in place of what is there."""
     try:
-        shutil.rmtree(root / name, ignore_errors=True)
-        (root / name).mkdir(parents=True)
-        for figure in (figure.name for section in page.sections for figure in section.figures):
-            shutil.copy(folder / "figures" / f"{figure}.png", root / name)
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        for figure in figures:
+            shutil.copy(figure, folder)
     except OSError as error:
         if is_disk_full(error):
-            raise disk_full_error(root) from error
-        raise DataFileError(f"cannot write {root} ({error.strerror}): choose another folder for results.") from error
-    write_text(root / f"{name}.md", markdown(page, name))
-    print(f"Results: {root / name}.md")
+            raise disk_full_error(folder) from error
+        raise DataFileError(f"cannot write {folder} ({error.strerror}): choose another folder for results.") from error
 
 
 def plan(config: Mapping[str, Any]) -> list[Run]:
@@ -118,39 +110,31 @@ def plan(config: Mapping[str, Any]) -> list[Run]:
     Raises:
         InputError: a value of the wrong kind, or a name that does not exist.
     """
-    for key in ("overrides", "only"):
-        value = config[key]
-        if not (key == "only" and value is None) and not (
-            isinstance(value, list) and all(isinstance(each, str) for each in value)
-        ):
-            raise InputError(f"{key} is {value!r}: it must be a list of words.")
-    runs = [_run(config, experiment, variant) for experiment, variant in _pairs(config)]
+    check("overrides", config["overrides"], WORDS)
+    check("only", config["only"], optional(WORDS))
+    runs = [
+        _run(config, experiment, variant)
+        for experiment, group in config["experiments"].items()
+        for variant in group["variants"]
+    ]
     wanted = config["only"]
     if wanted is None:
         return runs
     known = {run.experiment for run in runs} | {run.name for run in runs}
-    for name in wanted:
-        if name not in known:
-            raise InputError(
-                f"only names {name!r}, which is no experiment or run: there are {', '.join(sorted(known))}."
-            )
-    chosen = [run for run in runs if {run.experiment, run.name} & {*wanted}]
-    if not chosen:
+    if foreign := [name for name in wanted if name not in known]:
+        raise InputError(
+            f"only names {foreign[0]!r}, which is no experiment or run: there are {', '.join(sorted(known))}."
+        )
+    if not wanted:
         raise InputError("only is []: name at least one experiment or run, or leave it null for all.")
-    return chosen
-
-
-def _pairs(config: Mapping[str, Any]) -> list[tuple[str, str]]:
-    pairs = [(experiment, name) for experiment, group in config["experiments"].items() for name in group["variants"]]
-    for experiment, name in pairs:
-        if name not in config["variants"]:
-            raise InputError(
-                f"experiments.{experiment}.variants names {name!r}: there are {', '.join(config['variants'])}."
-            )
-    return pairs
+    return [run for run in runs if {run.experiment, run.name} & {*wanted}]
 
 
 def _run(config: Mapping[str, Any], experiment: str, name: str) -> Run:
+    if name not in config["variants"]:
+        raise InputError(
+            f"experiments.{experiment}.variants names {name!r}: there are {', '.join(config['variants'])}."
+        )
     variant = config["variants"][name]
     overrides = [*variant["overrides"], *config["experiments"][experiment]["overrides"], *config["overrides"]]
     if config["budget"] != "full":
@@ -159,7 +143,7 @@ def _run(config: Mapping[str, Any], experiment: str, name: str) -> Run:
     return Run(experiment, name, (f"experiment={experiment}", *overrides), folder, variant["minutes"][config["budget"]])
 
 
-def run_all(runs: Sequence[Run], logs: Path) -> list[Result]:
+def run_all(runs: Sequence[Run], logs: Path) -> list[Run]:
     """Runs one after the other; one that fails does not keep the others from running.
 
     Raises:
@@ -167,15 +151,15 @@ def run_all(runs: Sequence[Run], logs: Path) -> list[Result]:
     """
     logs.mkdir(parents=True, exist_ok=True)
     console = Console(stderr=True)
-    results: list[Result] = []
+    results: list[Run] = []
     pace = _Pace(runs)
     for number, run in enumerate(runs, 1):
         head = f"[{number}/{len(runs)}] {run.name}"
-        console.print(f"{head}, about {clock(pace.left())} left in all", markup=False, highlight=False, soft_wrap=True)
+        console.print(f"{head}, about {clock(pace.left())} left in all", **_PLAIN)
         start = time.perf_counter()
         try:
             with console.status(run.name) as status:
-                failure = execute(run, logs / f"{run.experiment}-{run.variant}.log", _Follower(console, status.update))
+                failure = execute(run, logs / f"{run.experiment}-{run.variant}.log", _follower(console, status.update))
         except KeyboardInterrupt as error:
             raise ReproductionInterrupted(
                 f"interrupted in run {number} of {len(runs)}, {run.name}; it keeps what it has, as do those before it, "
@@ -183,8 +167,8 @@ def run_all(runs: Sequence[Run], logs: Path) -> list[Result]:
             ) from error
         pace.count(run, time.perf_counter() - start)
         if failure:
-            console.print(f"{head} failed: {failure}", markup=False, highlight=False, soft_wrap=True)
-        results.append(Result(run.experiment, run.variant, run.arguments, run.folder, failure))
+            console.print(f"{head} failed: {failure}", **_PLAIN)
+        results.append(replace(run, failure=failure))
     return results
 
 
@@ -209,29 +193,25 @@ class _Pace:
             self._taken += seconds
 
 
-class _Follower:
+def _follower(console: Console, update: Callable[[str], None]) -> Callable[[str], None]:
     """Shows a run's own lines: the latest in a terminal, one a minute in a log."""
+    due = time.monotonic() + _LINE_SECONDS
 
-    def __init__(self, console: Console, update: Callable[[str], None]) -> None:
-        self._console = console
-        self._update = update
-        self._next = time.monotonic() + _LINE_SECONDS
+    def follow(line: str) -> None:
+        nonlocal due
+        if console.is_terminal:
+            update(escape(line))
+        elif time.monotonic() >= due:
+            console.print(f"    {line}", **_PLAIN)
+            due = time.monotonic() + _LINE_SECONDS
 
-    def __call__(self, line: str) -> None:
-        if self._console.is_terminal:
-            self._update(line.replace("[", r"\["))
-        elif time.monotonic() >= self._next:
-            self._console.print(f"    {line}", markup=False, highlight=False, soft_wrap=True)
-            self._next = time.monotonic() + _LINE_SECONDS
+    return follow
 
 
 def execute(run: Run, log_file: Path, follow: Callable[[str], None]) -> str | None:
     """Runs the ordinary command in a process of its own, out of reach of the terminal's Ctrl-C.
 
-    Args:
-        run: which.
-        log_file: for all that it says.
-        follow: takes each line that it writes to stderr.
+    All that it says goes to a file, and each line of stderr to `follow`.
 
     Returns:
         The sentence that it failed with, or None.

@@ -4,6 +4,7 @@ The format is a NumPy archive without pickled objects that holds the keys of `RE
 vertices only, in x-major order; the hexahedra between them follow from the distinct coordinates.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,7 +24,7 @@ from ..fem.body import Body
 from ..io.errors import ConvergenceError, DataFileError, InputError
 from ..io.files import read_arrays
 from ..mesh.mesh import Mesh, box_hexahedra, select_vertices
-from .settings import settings_of
+from .command import settings_of
 
 LARGEST_ERROR = 1e-8  # m
 
@@ -62,115 +63,75 @@ def verify(config: DictConfig) -> None:
     for path, reference in references.items():
         for name in given["solvers"]:
             settings = SolverSettings(name, relative_tolerance=tolerance, max_iterations=given["max_iterations"])
-            label = f"{path.stem:32}{name:22}{tolerance:10.0e}"
             try:
                 result = compare_with_reference(reference, settings, device)
             except ConvergenceError as error:
-                print(f"{label}  not converged: {error}")
-                within = False
-                continue
-            passed = result.largest_error <= LARGEST_ERROR
+                passed, said = False, f"  not converged: {error}"
+            else:
+                passed = result.largest_error <= LARGEST_ERROR
+                said = f"{result.iterations:12.1f}{result.largest_error:20.2e}"
+                said += "" if passed else f"  exceeds {LARGEST_ERROR:.0e}"
             within &= passed
-            verdict = "" if passed else f"  exceeds {LARGEST_ERROR:.0e}"
-            print(f"{label}{result.iterations:12.1f}{result.largest_error:20.2e}{verdict}", flush=True)
+            print(f"{path.stem:32}{name:22}{tolerance:10.0e}{said}", flush=True)
     if not within:
         raise SystemExit(1)
 
 
 @dataclass(frozen=True)
 class ReferenceTrajectory:
-    """A recorded simulation of a box whose face at the smallest x is held.
-
-    Attributes:
-        material: its constants.
-        time_step: [s].
-        gravity: (3,) [m/s^2].
-        mesh: the box of hexahedra, with the file's vertices.
-        forces: (T, N, 3) external force held during each step [N].
-        q: (T + 1, N, 3) positions [m].
-        v: (T + 1, N, 3) velocities [m/s].
-    """
+    """A recorded simulation of a box whose face at the smallest x is held."""
 
     material: Material
-    time_step: float
-    gravity: FloatArray
-    mesh: Mesh
-    forces: FloatArray
-    q: FloatArray
-    v: FloatArray
+    time_step: float  # [s]
+    gravity: FloatArray  # (3,) [m/s^2]
+    mesh: Mesh  # the box of hexahedra, with the file's vertices
+    forces: FloatArray  # (T, N, 3) external force held during each step [N]
+    q: FloatArray  # (T + 1, N, 3) [m]
+    v: FloatArray  # (T + 1, N, 3) [m/s]
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Outcome of a comparison.
+    """Outcome of a comparison."""
 
-    Attributes:
-        largest_error: largest distance of a vertex from the reference over all steps [m].
-        iterations: mean global steps of the solver a time step.
-    """
-
-    largest_error: float
-    iterations: float
+    largest_error: float  # distance of a vertex from the reference, over all steps [m]
+    iterations: float  # mean global steps of the solver a time step
 
 
 def read_reference(path: Path) -> ReferenceTrajectory:
-    """Reads a reference trajectory.
-
-    Args:
-        path: a NumPy archive (.npz) without pickled objects.
+    """Reads a reference trajectory from a NumPy archive (.npz) without pickled objects.
 
     Raises:
         DataFileError: the file is missing or no such archive; it lacks entries, has others, or has some of wrong shape,
             type or range; or its vertices are no box grid in x-major order.
     """
-    values = _read_archive(path)
-    if not values["dt"] > 0.0:
-        raise DataFileError(f"{path}: dt is {float(values['dt']):g}: it must be positive, in seconds.")
-    try:
-        material = Corotated(
-            youngs_modulus=float(values["youngs_modulus"]),
-            poissons_ratio=float(values["poissons_ratio"]),
-            density=float(values["density"]),
-        )
-    except InputError as error:
-        raise DataFileError(f"{path}: {error}") from None
-    mesh = box_of_vertices(values["vertices"], str(path))
-    return ReferenceTrajectory(
-        material,
-        float(values["dt"]),
-        values["gravity"],
-        mesh,
-        values["f_ext"],
-        values["q"],
-        values["v"],
-    )
-
-
-def _read_archive(path: Path) -> dict[str, FloatArray]:
-    """The entries of `REFERENCE_SHAPES`, checked."""
-    values = read_arrays(path)
-    if "" in values:
+    read = read_arrays(path)
+    if "" in read:
         raise DataFileError(f"{path} is a single array: give a reference trajectory (.npz).")
-    _check_names(values, path)
-    _check_values(values, path)
-    return {name: np.asarray(value, dtype=np.float64) for name, value in values.items()}
-
-
-def _check_names(values: dict[str, NDArray[np.generic]], path: Path) -> None:
-    missing = [name for name in REFERENCE_SHAPES if name not in values]
-    foreign = sorted(name for name in values if name not in REFERENCE_SHAPES)
+    missing = [name for name in REFERENCE_SHAPES if name not in read]
+    foreign = sorted(name for name in read if name not in REFERENCE_SHAPES)
     found = [f"{problem} {', '.join(names)}" for problem, names in (("lacks", missing), ("has", foreign)) if names]
     if found:
         raise DataFileError(
             f"{path} {' and '.join(found)}: a reference trajectory has {', '.join(REFERENCE_SHAPES)} and no more."
         )
+    _check_values(read, path)
+    values = {name: np.asarray(value, dtype=np.float64) for name, value in read.items()}
+    dt = float(values["dt"])
+    if not dt > 0.0:
+        raise DataFileError(f"{path}: dt is {dt:g}: it must be positive, in seconds.")
+    try:
+        material = Corotated(**{key: float(values[key]) for key in ("youngs_modulus", "poissons_ratio", "density")})
+    except InputError as error:
+        raise DataFileError(f"{path}: {error}") from None
+    mesh = box_of_vertices(values["vertices"], str(path))
+    return ReferenceTrajectory(material, dt, values["gravity"], mesh, values["f_ext"], values["q"], values["v"])
 
 
-def _check_values(values: dict[str, NDArray[np.generic]], path: Path) -> None:
+def _check_values(values: Mapping[str, NDArray[np.generic]], path: Path) -> None:
     """Refuses entries of another shape or type; f_ext and vertices say what T and N are."""
-    steps, vertices = np.shape(values["f_ext"])[:1], np.shape(values["vertices"])[:1]
-    sizes = {"T": steps[0] if steps else 0, "N": vertices[0] if vertices else 0}
-    sizes["T + 1"] = sizes["T"] + 1
+    steps, vertices = (next(iter(np.shape(values[name])), 0) for name in ("f_ext", "vertices"))
+    sizes = {"T": steps, "N": vertices, "T + 1": steps + 1}
     for name, wanted in REFERENCE_SHAPES.items():
         value = values[name]
         shape = tuple(sizes[size] if isinstance(size, str) else size for size in wanted)
@@ -223,25 +184,13 @@ def compare_with_reference(
     That is with implicit Euler, the mean element's mass at every vertex, full integration of both terms of the energy,
     and the face at the smallest x held.
 
-    Args:
-        reference: what to reproduce.
-        settings: the solver's.
-        device: a torch device.
-
     Raises:
         ConvergenceError: the solver failed.
     """
-    mesh = reference.mesh
+    mesh, gravity = reference.mesh, [float(g) for g in reference.gravity]
     fixed = select_vertices(mesh, x=float(mesh.vertices[:, 0].min()))
     body = Body(mesh, fixed=fixed, mass="per_vertex", volume_integration="full")
-    simulator = Simulator(
-        body,
-        reference.material,
-        time_step=reference.time_step,
-        gravity=[float(g) for g in reference.gravity],
-        solver=settings,
-        device=device,
-    )
+    simulator = Simulator(body, reference.material, reference.time_step, gravity, solver=settings, device=device)
     q, v, forces = (simulator.tensor(x) for x in (reference.q, reference.v, reference.forces))
     with torch.no_grad():
         trajectory = simulator.rollout(State(q[:1], v[:1]), len(forces), Inputs(external_force=forces[:, None]))

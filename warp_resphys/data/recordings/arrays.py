@@ -1,19 +1,20 @@
 """Recordings as arrays: NumPy archives (.npz) and HDF5 files, with the layout of docs/recordings.md."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from ...io.decoding import DecodingError, decode
+from ...io.decoding import Arrays, DecodingError, decode
 from ...io.errors import DataFileError
 from ...io.files import FORMAT, atomic_hdf5, create, hdf5_error, read_arrays
-from .recording import SI_PER_ACTUATION_UNIT, RawRecording, Recording
+from .recording import SI_PER_ACTUATION_UNIT, FloatArray, RawRecording, Recording
 
 KIND = "recording"
-_NAMES = ("positions", "labels", "rate_hz", "units", "actuation", "actuation_units", "rest", "start")
+_NAMES = ("positions", "labels", "rate_hz", "units", "actuation", "actuation_units", "rest", "base", "start")
 
 
 def read_raw_npz(path: Path) -> RawRecording:
@@ -26,7 +27,7 @@ def read_raw_npz(path: Path) -> RawRecording:
     found = read_arrays(path, _NAMES)
     if "" in found:
         raise DataFileError(f"{path} is a single array, not an archive: save it with numpy.savez.")
-    return _assemble(found.get, path)
+    return _assemble(found, path)
 
 
 def read_raw_hdf5(path: Path) -> RawRecording:
@@ -47,16 +48,23 @@ def read_raw_hdf5(path: Path) -> RawRecording:
     for name, unit in (("positions", "units"), ("actuation", "actuation_units")):
         if f"{name}.units" in found:
             found[unit] = found[f"{name}.units"]
-    return _assemble(found.get, path)
+    return _assemble(found, path)
+
+
+def decoded(library: str, path: Path) -> Arrays:
+    """What `io.decoding.decode` gives; raises DataFileError where that cannot read the file."""
+    try:
+        return decode(library, path)
+    except OSError as error:
+        raise DataFileError(f"Cannot read {path}: {error.strerror}; check the path.") from error
+    except DecodingError as error:
+        raise DataFileError(f"{path} cannot be decoded ({error}): copy or export it again.") from error
 
 
 def write_recording(path: str | Path, recording: Recording, attributes: Mapping[str, Any] | None = None) -> None:
     """Writes the HDF5 layout, in metres, so that `read_recording` gives the same recording back.
 
-    Args:
-        path: Where to write; missing folders are made.
-        recording: What to write.
-        attributes: What else is known of the trial, such as a load, as attributes of the root.
+    Attributes tell what else is known of the trial, such as a load. Missing folders are made.
 
     Raises:
         DataFileError: The file cannot be written.
@@ -68,46 +76,49 @@ def write_recording(path: str | Path, recording: Recording, attributes: Mapping[
             create(file, "rest", recording.rest, units="m")
         if recording.actuation is not None:
             create(file, "actuation", recording.actuation, units="1")
+        if recording.base is not None:
+            quaternions = Rotation.from_rotvec(recording.base[:, 3:]).as_quat()[:, [3, 0, 1, 2]]
+            create(file, "base", np.concatenate([recording.base[:, :3], quaternions], axis=1), units="m, 1")
 
 
-def _assemble(find: Callable[[str], NDArray[Any] | None], path: Path) -> RawRecording:
+def numbers(found: Arrays, name: str, path: Path) -> FloatArray:
+    """One of the arrays of a file, if it is there and holds numbers; raises DataFileError otherwise."""
+    if name not in found:
+        raise DataFileError(
+            f"{path} has no array '{name}'; it has {', '.join(found) or 'none'}: check the path, or see "
+            "docs/recordings.md."
+        )
+    if found[name].dtype.kind not in "fiu":
+        raise DataFileError(f"{path}: '{name}' does not hold numbers (it is {found[name].dtype}); save numbers there.")
+    return np.asarray(found[name], dtype=np.float64)
+
+
+def _assemble(found: Arrays, path: Path) -> RawRecording:
     """A recording from arrays of the layout, by name."""
-    positions = _floats(find, "positions", path)
-    if positions is None:
-        raise DataFileError(f"{path} has no array 'positions' (frames, markers, 3): see docs/recordings.md.")
-    actuation = _floats(find, "actuation", path)
+    actuation = numbers(found, "actuation", path) if "actuation" in found else None
     if actuation is not None:
-        unit = _word(find("actuation_units")) or "1"
+        unit = _word(found.get("actuation_units")) or "1"
         if unit not in SI_PER_ACTUATION_UNIT:
             raise DataFileError(
                 f"{path} gives its actuation in '{unit}': give it in one of {', '.join(SI_PER_ACTUATION_UNIT)}."
             )
         with np.errstate(over="ignore"):
             actuation = actuation * SI_PER_ACTUATION_UNIT[unit]
-    labels = find("labels")
-    rate, start = _number(find, "rate_hz", path), _number(find, "start", path)
+    labels = found.get("labels")
     return RawRecording(
-        positions=positions,
-        labels=None if labels is None else tuple(_text(label) for label in np.ravel(labels)),
-        unit=_word(find("units")) or "m",
-        rate=rate,
+        positions=numbers(found, "positions", path),
+        labels=None if labels is None else [_text(label) for label in np.ravel(labels)],
+        unit=_word(found.get("units")) or "m",
+        rate=_number(found, "rate_hz", path),
         actuation=actuation,
-        rest=_floats(find, "rest", path),
-        start=start or 0.0,
+        rest=numbers(found, "rest", path) if "rest" in found else None,
+        base=numbers(found, "base", path) if "base" in found else None,
+        start=_number(found, "start", path) or 0.0,
     )
 
 
-def _floats(find: Callable[[str], NDArray[Any] | None], name: str, path: Path) -> NDArray[np.float64] | None:
-    array = find(name)
-    if array is None:
-        return None
-    if array.dtype.kind not in "fiu":
-        raise DataFileError(f"{path}: '{name}' does not hold numbers (it is {array.dtype}); save numbers there.")
-    return np.asarray(array, dtype=np.float64)
-
-
-def _number(find: Callable[[str], NDArray[Any] | None], name: str, path: Path) -> float | None:
-    array = _floats(find, name, path)
+def _number(found: Arrays, name: str, path: Path) -> float | None:
+    array = numbers(found, name, path) if name in found else None
     if array is not None and array.size != 1:
         raise DataFileError(f"{path}: '{name}' has the shape {array.shape}; it must be one number.")
     return None if array is None else array.item()

@@ -3,8 +3,8 @@
 import struct
 from pathlib import Path
 
-from ...io.decoding import DecodingError, decode
 from ...io.errors import DataFileError
+from .arrays import decoded
 from .recording import RawRecording
 
 _MAGIC = 0x50
@@ -18,11 +18,8 @@ def read_raw_c3d(path: Path) -> RawRecording:
         DataFileError: The file is missing, not C3D, damaged, truncated, or holds no marker trajectories.
     """
     declared_frames = _declared_frames(path)
-    try:
-        decoded = decode("ezc3d", path)
-    except DecodingError as error:
-        raise DataFileError(f"{path} is damaged or truncated ({error}); copy or export it again.") from error
-    points = decoded["points"]
+    found = decoded("ezc3d", path)
+    points = found["points"]
     if points.ndim != 3 or points.shape[1] == 0 or points.shape[2] == 0:
         raise DataFileError(f"{path} holds no marker trajectories: give a C3D file with 3D points.")
     if points.shape[2] < declared_frames:
@@ -32,9 +29,9 @@ def read_raw_c3d(path: Path) -> RawRecording:
         )
     return RawRecording(
         positions=points[:3].transpose(2, 1, 0),
-        labels=tuple(str(label) for label in decoded["labels"][: points.shape[1]]),
-        unit=str(decoded["units"][0]).strip() if decoded["units"].size else None,
-        rate=float(decoded["rate"][0]) if decoded["rate"].size else None,
+        labels=found["labels"][: points.shape[1]].tolist(),
+        unit=str(found["units"][0]).strip() if found["units"].size else None,
+        rate=float(found["rate"][0]) if found["rate"].size else None,
     )
 
 

@@ -1,56 +1,36 @@
 """Samples gone astray: markers that jump, and markers that took over each other's names."""
 
 import dataclasses
-from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 from scipy.ndimage import maximum_filter1d, median_filter
 
-from .recording import Recording, runs
-
-FloatArray = NDArray[np.float64]
+from .recording import FloatArray, Recording, bridged, runs
 
 LEAST_JUMP = 2e-4  # [m]
 _TIMES_USUAL = 8.0  # A jump is so many times the median of the steps around it.
 _USUAL_FRAMES = 21
 _SHARE_OF_LARGEST = 0.75  # A step of 1 leaves 4/6 beside it, which is no jump of its own.
 _TAKEN_OVER = 0.25  # of the way that the marker went
-_RETURNED = 0.5  # of the way that it went, which the way back may leave
 _NEIGHBOURS = np.array([-1.0, 4.0, 4.0, -1.0]) / 6.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Jump:
-    """A step that a marker made alone.
-
-    Attributes:
-        label: The marker.
-        frame: The first frame after the jump.
-        size: [m] how far it went beyond what its neighbours in time, and the other markers, explain.
-        step: (x, y, z) [m] what its neighbours in time do not explain.
-    """
+    """A step that a marker made alone."""
 
     label: str
-    frame: int
-    size: float
-    step: tuple[float, float, float]
+    frame: int  # The first frame after the jump
+    size: float  # [m] how far it went beyond what its neighbours in time, and the other markers, explain
 
 
 @dataclasses.dataclass(frozen=True)
 class Swap:
-    """A marker that appears where another one was.
-
-    Attributes:
-        label: The marker.
-        other: The marker in whose place it appears.
-        frame: The first frame of that.
-    """
+    """A marker that appears where another one was."""
 
     label: str
-    other: str
-    frame: int
+    other: str  # The marker in whose place it appears
+    frame: int  # The first frame of that
 
 
 def find_jumps(recording: Recording, least: float = LEAST_JUMP) -> list[Jump]:
@@ -59,31 +39,19 @@ def find_jumps(recording: Recording, least: float = LEAST_JUMP) -> list[Jump]:
     A step is predicted from the two steps on either side of it by a cubic: exact for a motion that is smooth over six
     frames. What is left is compared with what is left of every other marker, since a body that is let go, or hits
     something, jerks as a whole; the smallest difference counts. It is a jump if it is larger than `least` and than
-    eight times its median over 21 frames.
-
-    Args:
-        recording: With or without gaps; these are bridged by a spline for this.
-        least: The smallest jump [m].
+    eight times its median over 21 frames. Gaps are bridged by a spline for this.
     """
-    left, size = _unexplained(recording)
+    size = _unexplained(recording)
     if not len(size):
         return []
     usual = median_filter(size, size=(_USUAL_FRAMES, 1), mode="nearest")
     largest = maximum_filter1d(size, 5, axis=0, mode="nearest")
     found = (size > least) & (size > _TIMES_USUAL * usual) & (size >= _SHARE_OF_LARGEST * largest)
-    return [
-        Jump(recording.labels[column], int(at) + 1, float(size[at, column]), tuple(left[at, column].tolist()))
-        for at, column in np.argwhere(found)
-    ]
+    return [Jump(recording.labels[column], int(at) + 1, float(size[at, column])) for at, column in np.argwhere(found)]
 
 
 def find_swaps(recording: Recording, jumps: list[Jump]) -> list[Swap]:
-    """Finds markers that, after a jump or an occlusion, stand where another marker was before.
-
-    Args:
-        recording: With its gaps, not filled.
-        jumps: What `find_jumps` found in it.
-    """
+    """Finds markers that, after a jump or an occlusion, stand where another marker was before."""
     seen = recording.seen
     last_seen = np.maximum.accumulate(np.where(seen, np.arange(len(seen))[:, None], -1), axis=0)  # (T, M)
     swaps: list[Swap] = []
@@ -104,36 +72,16 @@ def find_swaps(recording: Recording, jumps: list[Jump]) -> list[Swap]:
     return swaps
 
 
-def mask_spikes(recording: Recording, jumps: list[Jump], longest: int = 3) -> Recording:
-    """Makes samples NaN that lie between a jump away and the jump back, so that they are filled as a gap is.
-
-    Args:
-        recording: What to clean.
-        jumps: What `find_jumps` found in it.
-        longest: The longest time that a marker may have been away, in frames.
-    """
-    positions = recording.positions.copy()
-    for column, label in enumerate(recording.labels):
-        own = [jump for jump in jumps if jump.label == label]
-        for away, back in pairwise(own):
-            remains = np.linalg.norm(np.add(away.step, back.step))
-            if back.frame - away.frame <= longest and remains < _RETURNED * np.linalg.norm(away.step):
-                positions[away.frame : back.frame, column] = np.nan
-    return dataclasses.replace(recording, positions=positions)
-
-
-def _unexplained(recording: Recording) -> tuple[FloatArray, FloatArray]:
-    """(T-1, M, 3) the part of each step that is not smooth, (T-1, M) how much of it no other marker shares; [m]."""
+def _unexplained(recording: Recording) -> FloatArray:
+    """(T-1, M) [m] how much of each step is not smooth, and not shared by any other marker."""
     frames = len(recording.positions)
     if frames < 6:
-        return np.zeros((0, len(recording.labels), 3)), np.zeros((0, len(recording.labels)))
-    bridged = np.zeros_like(recording.positions)
+        return np.zeros((0, len(recording.labels)))
+    positions = np.zeros_like(recording.positions)
     for column, known in enumerate(recording.seen.T):
         if np.count_nonzero(known) > 1:
-            at = np.flatnonzero(known)
-            spline = CubicSpline(at, recording.positions[known, column])
-            bridged[:, column] = spline(np.clip(np.arange(frames), at[0], at[-1]))
-    steps = np.diff(bridged, axis=0)
+            positions[:, column] = bridged(recording, column, np.arange(frames))
+    steps = np.diff(positions, axis=0)
     padded = np.pad(steps, ((2, 2), (0, 0), (0, 0)), mode="reflect")
     beside = (padded[:-4], padded[1:-3], padded[3:-1], padded[4:])
     left = steps - sum(weight * each for weight, each in zip(_NEIGHBOURS, beside, strict=True))
@@ -142,7 +90,7 @@ def _unexplained(recording: Recording) -> tuple[FloatArray, FloatArray]:
         others = np.linalg.norm(np.delete(left, column, axis=1) - left[:, column, None], axis=2)
         if others.shape[1]:
             size[:, column] = np.minimum(size[:, column], others.min(axis=1))
-    return left, size
+    return size
 
 
 def mask_repeats(recording: Recording) -> Recording:

@@ -8,15 +8,12 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 from scipy.signal import butter, sosfiltfilt
 
 from ...io.errors import DataFileError, InputError
-from .recording import BoolArray, Recording, listed, runs
+from ..base_motion import at_times
+from .recording import Recording, bridged, listed, runs
 from .release import Release, find_release
-
-FloatArray = NDArray[np.float64]
 
 _FIRST_SECONDS = 0.2  # A stretch may begin so much later than the first one.
 _WHOLE = 1e-6  # Relative; how near a ratio of rates must be to a whole number.
@@ -35,7 +32,6 @@ def fill_gaps(recording: Recording, longest: int = 5, *, mask_long: bool = False
         DataFileError: A marker is seen in fewer than two frames or, unless that is masked, occluded for longer.
     """
     positions = recording.positions.copy()
-    frames = np.arange(len(positions))
     for column, (label, seen) in enumerate(zip(recording.labels, recording.seen.T, strict=True)):
         if np.count_nonzero(seen) < 2:
             raise DataFileError(
@@ -52,42 +48,25 @@ def fill_gaps(recording: Recording, longest: int = 5, *, mask_long: bool = False
                 )
             wanted[start:stop] = stop - start <= longest and (inner or not mask_long)
         if wanted.any():
-            known = frames[seen]
-            inside = np.clip(frames[wanted], known[0], known[-1])
-            positions[wanted, column] = CubicSpline(known, positions[seen, column])(inside)
+            positions[wanted, column] = bridged(recording, column, np.flatnonzero(wanted))
     return dataclasses.replace(recording, positions=positions)
 
 
-def resample(recording: Recording, rate: float, *, interpolate: bool = False) -> Recording:
-    """Brings a recording to the simulator's rate 1/h.
+def resample(recording: Recording, rate: float) -> Recording:
+    """Brings a recording to the simulator's rate 1/h [Hz].
 
-    Where the recording's rate is a whole multiple, every n-th frame is kept, exactly as measured. Otherwise, if
-    `interpolate`, a cubic spline goes through the frames in which a marker was seen; a new frame is seen if the frames
-    on both sides of it were. Actuation is interpolated linearly. What is interpolated should move slowly beside the
-    frame rate: a spline follows a swing with n frames a period to about (2 pi / n)^4 / 384 of its amplitude.
-
-    Args:
-        recording: What to resample.
-        rate: Steps a second wanted [Hz].
-        interpolate: Whether the frames may be interpolated.
-
-    Raises:
-        InputError: The rate is not positive, or the recording's is no multiple of it and may not be interpolated.
+    Where the recording's rate is a whole multiple, every n-th frame is kept, exactly as measured. Otherwise a cubic
+    spline goes through the frames in which a marker was seen; a new frame is seen if the frames on both sides of it
+    were. Actuation is interpolated linearly. What is interpolated should move slowly beside the frame rate: a spline
+    follows a swing with n frames a period to about (2 pi / n)^4 / 384 of its amplitude.
     """
-    if not (np.isfinite(rate) and rate > 0.0):
-        raise InputError(f"The rate to resample to is {rate!r}: it must be a number above zero, in Hz.")
     ratio = recording.rate / rate
     every = round(ratio)
     if every >= 1 and abs(ratio - every) <= _WHOLE * ratio:
         actuation = None if recording.actuation is None else recording.actuation[::every]
+        base = None if recording.base is None else recording.base[::every]
         return dataclasses.replace(
-            recording, positions=recording.positions[::every], actuation=actuation, rate=float(rate)
-        )
-    if not interpolate:
-        raise InputError(
-            f"{recording.source} has {recording.rate:g} frames a second, which is no multiple of the {rate:g} steps a "
-            f"second of the simulation: make time_step a multiple of {1.0 / recording.rate:g} s, or set "
-            "recording.interpolate to true."
+            recording, positions=recording.positions[::every], actuation=actuation, base=base, rate=float(rate)
         )
     old = np.arange(len(recording.positions))
     new = np.arange(int((len(old) - 1) / ratio * (1.0 + _WHOLE)) + 1) * ratio
@@ -97,12 +76,12 @@ def resample(recording: Recording, rate: float, *, interpolate: bool = False) ->
     for column, known in enumerate(recording.seen.T):
         kept = known[below] & known[above]
         if kept.any() and np.count_nonzero(known) > 1:
-            spline = CubicSpline(old[known], recording.positions[known, column])
-            positions[kept, column] = spline(new[kept])
+            positions[kept, column] = bridged(recording, column, new[kept])
     actuation = None
     if recording.actuation is not None:
         actuation = np.stack([np.interp(new, old, channel) for channel in recording.actuation.T], axis=1)
-    return dataclasses.replace(recording, positions=positions, actuation=actuation, rate=float(rate))
+    base = None if recording.base is None else at_times(recording.base, old, new)
+    return dataclasses.replace(recording, positions=positions, actuation=actuation, base=base, rate=float(rate))
 
 
 def smooth(recording: Recording, cutoff: float) -> Recording:
@@ -111,12 +90,10 @@ def smooth(recording: Recording, cutoff: float) -> Recording:
     Its gain is one half at the cut-off, and falls by 48 dB an octave above it. Forces follow from accelerations, in
     which noise grows with the square of its frequency: without this, a force that explains every frame is mostly noise.
 
-    Args:
-        recording: gaps stay gaps; it is filtered through straight lines across them.
-        cutoff: [Hz], less than half of the frame rate.
+    Gaps stay gaps; they are crossed by straight lines.
 
     Raises:
-        InputError: a cut-off out of that range.
+        InputError: the cut-off [Hz] is not below half of the frame rate.
         DataFileError: too few frames.
     """
     if not 0.0 < cutoff < 0.5 * recording.rate:
@@ -138,12 +115,9 @@ def smooth(recording: Recording, cutoff: float) -> Recording:
 
 
 def release_of(recording: Recording, labels: Sequence[str], longest_gap: int = 5) -> Release:
-    """Finds when the body was let go, from the mean of the markers that are seen longest without a break at first.
+    """Finds when the body was let go, from the mean of those moving markers that are seen longest at first.
 
-    Args:
-        recording: With its frames from before the release.
-        labels: Markers that move, such as those of the tip.
-        longest_gap: The longest occlusion that is interpolated for this, in frames.
+    Occlusions of up to `longest_gap` frames are interpolated for this.
 
     Raises:
         DataFileError: A marker is missing, or nothing is let go before all of them are hidden.
@@ -161,18 +135,11 @@ def release_of(recording: Recording, labels: Sequence[str], longest_gap: int = 5
     return Release(start + found.frame, (start + found.rest[0], start + found.rest[1]))
 
 
-def trim_to_release(
-    recording: Recording, release: Release, *, before: int = 0, seconds: float | None = None
-) -> Recording:
+def trim_to_release(recording: Recording, release: Release, seconds: float | None = None) -> Recording:
     """The frames from the release on, and where the markers were while the body was held.
 
     The release falls between two frames: `start` of the result is the time from it to the first frame that is kept.
-
-    Args:
-        recording: The whole recording.
-        release: Its release.
-        before: How many frames before the release to keep; `start` is negative then.
-        seconds: How long to keep after the release [s]; everything if None.
+    What is later than `seconds` after it is left out.
 
     Raises:
         DataFileError: A marker is not seen at all while the body is held, or too few frames are left.
@@ -185,7 +152,7 @@ def trim_to_release(
             f"{recording.source}: {listed(hidden)} cannot be seen while the body is held (frames {release.rest[0]} to "
             f"{release.rest[1] - 1}), so where it sits is not known; leave it out of the configured markers."
         )
-    first = max(0, int(np.ceil(release.frame)) - before)
+    first = max(0, int(np.ceil(release.frame)))
     last = len(recording.positions)
     if seconds is not None:
         last = min(last, int(np.floor(release.frame + seconds * recording.rate)) + 1)
@@ -198,11 +165,7 @@ def trim_to_release(
         recording,
         positions=recording.positions[first:last],
         actuation=None if recording.actuation is None else recording.actuation[first:last],
+        base=None if recording.base is None else recording.base[first:last],
         rest=np.nanmedian(held, axis=0),
         start=(first - release.frame) / recording.rate,
     )
-
-
-def filled(before: Recording, after: Recording) -> BoolArray:
-    """(T, M) what `fill_gaps` filled."""
-    return np.asarray(after.seen & ~before.seen)

@@ -5,21 +5,19 @@ publication.
 """
 
 import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...io.decoding import Arrays
 from ...io.errors import DataFileError
 from ...io.files import read_arrays, write_json
 from ...io.progress import Progress
-from ..registration import kabsch, root_mean_square
-from .arrays import write_recording
-from .recording import SI_PER_ACTUATION_UNIT, RawRecording, Recording, to_recording
-from .restricted_pickle import read_pickled_arrays
-
-FloatArray = NDArray[np.float64]
+from ..rigid import kabsch, root_mean_square
+from .arrays import decoded, numbers, write_recording
+from .recording import SI_PER_ACTUATION_UNIT, FloatArray, RawRecording, Recording, to_recording
 
 RATE: Final = 100.0  # [Hz]
 CHAMBERS: Final = (5, 4, 2, 0, 1, 3)
@@ -40,12 +38,8 @@ BEAM_NOMINAL: Final = np.array(
         *((0.0247, 0.03, 0.006), (0.0247, 0.03, 0.024), (0.0447, 0.03, 0.006), (0.0648, 0.03, 0.015)),
     ]
 )
-BEAM_MARKERS: Final = len(BEAM_NOMINAL)
-BEAM_LABELS: Final = tuple(f"Beam - {number}" for number in range(1, BEAM_MARKERS + 1))
-ARM_LABELS: Final = (
-    *(f"Base - {number}" for number in range(1, 4)),
-    *(f"Arm - {number}" for number in range(1, 13)),
-)
+BEAM_LABELS: Final = tuple(f"Beam - {number}" for number in range(1, 11))
+ARM_LABELS: Final = (*(f"Base - {number}" for number in (1, 2, 3)), *(f"Arm - {number}" for number in range(1, 13)))
 # [kg] by trial; trial 1 was not published.
 WEIGHTS: Final = (
     *(0.05, 0.06, 0.07, 0.10, 0.09, 0.08, 0.11, 0.12, 0.15),
@@ -66,21 +60,16 @@ def read_published_arm(path: str | Path) -> list[Recording]:
         path: A pickled dictionary of `data` (R, T, 15, 3) [m] and `p` (R, T, 6) [mbar].
 
     Raises:
-        DataFileError: As `read_pickled_arrays`, or the arrays are missing or have other shapes.
+        DataFileError: The file is missing, damaged or names anything but NumPy's arrays; or the arrays are missing or
+            have other shapes.
     """
     path = Path(path)
-    arrays = read_pickled_arrays(path)
-    missing = [name for name in ("data", "p") if name not in arrays]
-    if missing:
+    arrays = decoded("pickle", path)
+    data, pressure = numbers(arrays, "data", path), numbers(arrays, "p", path)
+    if data.ndim != 4 or data.shape[2:] != (15, 3) or pressure.shape != (*data.shape[:2], 6):
         raise DataFileError(
-            f"{path} has no array '{missing[0]}'; it has {', '.join(arrays) or 'none'}: check the path."
-        )
-    data, pressure = arrays["data"], arrays["p"]
-    wanted = (len(MARKERS), 3)
-    if data.ndim != 4 or data.shape[2:] != wanted or pressure.shape != (*data.shape[:2], len(CHAMBERS)):
-        raise DataFileError(
-            f"{path}: data {data.shape} and p {pressure.shape} must have the shapes (trials, frames, {wanted[0]}, "
-            f"3) and (trials, frames, {len(CHAMBERS)}): check the path."
+            f"{path}: data {data.shape} and p {pressure.shape} must have the shapes (trials, frames, 15, 3) and "
+            "(trials, frames, 6): check the path."
         )
     # `MARKERS` says which marker of the mesh each recorded one is; `CHAMBERS` which recorded one each of the mesh is.
     in_mesh_order = data[:, :, np.argsort(MARKERS)]
@@ -109,18 +98,16 @@ def read_published_beam(folder: str | Path) -> dict[int, Recording]:
     rests = read_arrays(rest_file) if rest_file.exists() else {}
     recordings = {}
     for trial, file in sorted(files.items()):
-        frames = _beam_frames(read_arrays(file)[""], file)
-        rest = _beam_frames(rests[f"arr_{trial}"], rest_file)[-1] if f"arr_{trial}" in rests else None
+        frames = _beam_frames(read_arrays(file), "", file)
+        rest = _beam_frames(rests, f"arr_{trial}", rest_file)[-1] if f"arr_{trial}" in rests else None
         recordings[trial] = to_recording(RawRecording(frames, BEAM_LABELS, "mm", RATE, rest=rest), file)
     return recordings
 
 
 def convert_arm(path: str | Path, folder: Path) -> list[dict[str, Any]]:
     """Writes each trajectory of the arm as arm_000.h5 and so on, and index.json; returns what that says of each."""
-    recordings = read_published_arm(path)
-    trials: list[tuple[int, Recording, dict[str, Any]]] = [
-        (trial, recording, {}) for trial, recording in enumerate(recordings)
-    ]
+    no_more: dict[str, Any] = {}
+    trials = [(trial, recording, no_more) for trial, recording in enumerate(read_published_arm(path))]
     return write_trials(folder, "arm", trials, ARM_NOMINAL)
 
 
@@ -135,7 +122,7 @@ def convert_beam(source: str | Path, folder: Path) -> list[dict[str, Any]]:
 
 
 def write_trials(
-    folder: Path, name: str, trials: list[tuple[int, Recording, dict[str, Any]]], nominal: FloatArray
+    folder: Path, name: str, trials: Sequence[tuple[int, Recording, Mapping[str, Any]]], nominal: FloatArray
 ) -> list[dict[str, Any]]:
     """Writes the recordings, and how far their rest shape is from the nominal markers: large if the order is wrong."""
     index = []
@@ -155,10 +142,11 @@ def write_trials(
     return index
 
 
-def _beam_frames(array: NDArray[Any], path: Path) -> FloatArray:
+def _beam_frames(arrays: Arrays, name: str, path: Path) -> FloatArray:
     """(T, 10, 3) from (10, 3, T)."""
-    if array.ndim != 3 or array.shape[:2] != (BEAM_MARKERS, 3) or array.dtype.kind not in "fiu" or not array.shape[2]:
+    array = numbers(arrays, name, path)
+    if array.ndim != 3 or array.shape[:2] != (10, 3) or not array.shape[2]:
         raise DataFileError(
-            f"{path}: an array has the shape {array.shape} where ({BEAM_MARKERS}, 3, frames) is needed: check the path."
+            f"{path}: an array has the shape {array.shape} where (10, 3, frames) is needed: check the path."
         )
-    return np.asarray(array.transpose(2, 0, 1), dtype=np.float64)
+    return array.transpose(2, 0, 1)

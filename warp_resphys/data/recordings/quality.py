@@ -6,17 +6,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import median_filter
+from scipy.spatial.distance import cdist
 
 from ...io.errors import DataFileError, InputError
 from .jumps import LEAST_JUMP, Jump, Swap, find_jumps, find_swaps
-from .recording import Recording, listed, runs
+from .recording import FloatArray, Recording, listed, runs
 from .release import Release
 
-FloatArray = NDArray[np.float64]
-
-LEAST_MOTION = 5e-4  # [m]
+_LEAST_MOTION = 5e-4  # [m]
 _MILLI = 1e3
 _NOISE_FRAMES = 25
 _LEAST_NOISE_FRAMES = 10
@@ -28,54 +26,36 @@ _RELEASE_FRAMES = 1.5  # around the release, in which a marker that is alone on 
 
 @dataclasses.dataclass(frozen=True)
 class MarkerQuality:
-    """One marker of a recording.
-
-    Attributes:
-        label: The marker.
-        still: Whether it should not move.
-        seen: Share of the frames in which it was seen.
-        gaps: Number of occlusions.
-        longest_gap: The longest of them, in frames.
-        masked: Frames in gaps that are too long to be filled, or at either end.
-        jumps: Its jumps, in the order of time.
-        noise: [m] standard deviation of one coordinate, from third differences in the quietest parts.
-        drift: [m] from its place in the first tenth of the frames to that in the last; None if it may move.
-        reach: [m] largest distance from its median position.
-    """
+    """One marker of a recording."""
 
     label: str
-    still: bool
-    seen: float
-    gaps: int
-    longest_gap: int
-    masked: int
-    jumps: tuple[Jump, ...]
-    noise: float
-    drift: float | None
-    reach: float
+    still: bool  # Whether it should not move
+    seen: float  # Share of the frames in which it was seen
+    gaps: int  # Number of occlusions
+    longest_gap: int  # The longest of them, in frames
+    masked: int  # Frames in gaps that are too long to be filled, or at either end
+    jumps: tuple[Jump, ...]  # Its jumps, in the order of time
+    noise: float  # [m] standard deviation of one coordinate, from third differences in the quietest parts
+    drift: float | None  # [m] from its place in the first tenth of the frames to that in the last; None if it may move
+    reach: float  # [m] largest distance from its median position
+
+    @property
+    def largest_jump(self) -> Jump | None:
+        """The jump that went farthest, if there is one."""
+        return max(self.jumps, key=lambda jump: jump.size, default=None)
 
 
 @dataclasses.dataclass(frozen=True)
 class Quality:
-    """What `quality` found out about a recording.
-
-    Attributes:
-        source: The file.
-        rate: Frames a second [Hz].
-        frames: Their number.
-        release: When the body was let go, if that was looked for and found.
-        markers: One entry a marker.
-        swaps: Markers that took over each other's place.
-        longest_gap: The longest occlusion that counts as short, in frames.
-    """
+    """What `quality` found out about a recording."""
 
     source: Path
-    rate: float
+    rate: float  # Frames a second [Hz]
     frames: int
-    release: Release | None
-    markers: tuple[MarkerQuality, ...]
-    swaps: tuple[Swap, ...]
-    longest_gap: int
+    release: Release | None  # When the body was let go, if that was looked for and found
+    markers: tuple[MarkerQuality, ...]  # One entry a marker
+    swaps: tuple[Swap, ...]  # Markers that took over each other's place
+    longest_gap: int  # The longest occlusion that counts as short, in frames
 
     @property
     def warnings(self) -> list[str]:
@@ -90,13 +70,11 @@ class Quality:
                     f"{marker.label} is hidden for up to {marker.longest_gap} frames; {marker.masked} frames are "
                     "masked."
                 )
-            if marker.jumps:
-                largest = max(marker.jumps, key=lambda jump: jump.size)
-                most = f"by {_MILLI * largest.size:.2f} mm, in frame {largest.frame}"
-                if len(marker.jumps) == 1:
-                    found.append(f"{marker.label} jumps once, {most}.")
-                else:
-                    found.append(f"{marker.label} jumps {len(marker.jumps)} times, farthest {most}.")
+            if largest := marker.largest_jump:
+                often = "once," if len(marker.jumps) == 1 else f"{len(marker.jumps)} times, farthest"
+                found.append(
+                    f"{marker.label} jumps {often} by {_MILLI * largest.size:.2f} mm, in frame {largest.frame}."
+                )
             if marker.drift is not None and marker.drift > max(_MUCH_DRIFT, 5.0 * marker.noise):
                 found.append(f"{marker.label} should not move and drifts by {_MILLI * marker.drift:.2f} mm.")
         return found
@@ -180,15 +158,9 @@ def quality(
                 reach=float(np.linalg.norm(path - np.median(path, axis=0), axis=1).max()) if len(path) else np.nan,
             )
         )
-    return Quality(
-        recording.source,
-        recording.rate,
-        len(recording.positions),
-        release,
-        tuple(markers),
-        tuple(find_swaps(recording, jumps)),
-        longest_gap,
-    )
+    swaps = tuple(find_swaps(recording, jumps))
+    frames = len(recording.positions)
+    return Quality(recording.source, recording.rate, frames, release, tuple(markers), swaps, longest_gap)
 
 
 def noise_level(recording: Recording) -> FloatArray:
@@ -214,52 +186,32 @@ def quality_table(result: Quality) -> list[list[str]]:
     header = ["marker", "seen", "gaps", "longest", "masked", "jumps", "largest [mm]", "noise [mm]", "drift [mm]"]
     rows = [header]
     for marker in result.markers:
-        largest = max((jump.size for jump in marker.jumps), default=None)
-        rows.append(
-            [
-                marker.label,
-                f"{100.0 * marker.seen:.1f} %",
-                str(marker.gaps),
-                str(marker.longest_gap),
-                str(marker.masked),
-                str(len(marker.jumps)),
-                "" if largest is None else f"{_MILLI * largest:.2f}",
-                f"{_MILLI * marker.noise:.4f}" if np.isfinite(marker.noise) else "",
-                "" if marker.drift is None else f"{_MILLI * marker.drift:.3f}",
-            ]
-        )
+        counts = map(str, (marker.gaps, marker.longest_gap, marker.masked, len(marker.jumps)))
+        jump = f"{_MILLI * marker.largest_jump.size:.2f}" if marker.largest_jump else ""
+        noise = f"{_MILLI * marker.noise:.4f}" if np.isfinite(marker.noise) else ""
+        drift = "" if marker.drift is None else f"{_MILLI * marker.drift:.3f}"
+        rows.append([marker.label, f"{100.0 * marker.seen:.1f} %", *counts, jump, noise, drift])
     return rows
 
 
 @dataclasses.dataclass(frozen=True)
 class BaseMotion:
-    """How the base markers of a recording differ from those of the first one.
-
-    Attributes:
-        source: The file.
-        shift: (M,) [m] how far each marker stands from its place in the first recording.
-        changes: (M, M) [m] how much the distance between each two of them differs: of the shape they make.
-    """
+    """How the base markers of a recording differ from those of the first one."""
 
     source: Path
-    shift: FloatArray
-    changes: FloatArray
+    shift: FloatArray  # (M,) [m] how far each marker stands from its place in the first recording
+    changes: FloatArray  # (M, M) [m] how much the distance between each two of them differs: of the shape they make
 
     @property
     def distortion(self) -> FloatArray:
         """(M,) [m] median change of each marker's distance to the other ones."""
-        others = ~np.eye(len(self.changes), dtype=np.bool_)
-        return np.array(
-            [np.median(row[use]) if use.any() else 0.0 for row, use in zip(self.changes, others, strict=True)]
-        )
+        count = len(self.changes)
+        others = self.changes[~np.eye(count, dtype=np.bool_)].reshape(count, count - 1)
+        return np.asarray(np.median(others, axis=1))
 
 
 def compare_base(recordings: Sequence[Recording], labels: Sequence[str]) -> list[BaseMotion]:
-    """Compares where markers on something rigid stand in several recordings, by their median positions.
-
-    Args:
-        recordings: Trials on one set-up.
-        labels: The markers on its base, two or more for the shape.
+    """Compares where two or more markers on something rigid stand, by their median positions in several recordings.
 
     Returns:
         An entry for each recording after the first.
@@ -276,14 +228,10 @@ def compare_base(recordings: Sequence[Recording], labels: Sequence[str]) -> list
                 f"{recording.source}: {listed(absent)} is never seen; leave it out of the base markers."
             )
         places.append(np.nanmedian(base.positions, axis=0))
-    first = _distances(places[0])
+    distances = [cdist(place, place) for place in places]
     return [
-        BaseMotion(
-            recording.source,
-            np.linalg.norm(place - places[0], axis=1),
-            np.abs(_distances(place) - first),
-        )
-        for recording, place in zip(recordings[1:], places[1:], strict=True)
+        BaseMotion(recording.source, np.linalg.norm(place - places[0], axis=1), np.abs(between - distances[0]))
+        for recording, place, between in zip(recordings[1:], places[1:], distances[1:], strict=True)
     ]
 
 
@@ -294,14 +242,10 @@ def check_base(
     largest_distortion: float = 1e-3,
     largest_shift: float | None = None,
 ) -> None:
-    """Refuses trials between which a base marker was moved.
+    """Refuses trials on one set-up between which a marker on its base was moved.
 
-    Args:
-        recordings: Trials on one set-up.
-        labels: The markers on its base.
-        largest_distortion: How much the distance between two markers may change [m].
-        largest_shift: How far a marker may stand from its place in the first recording [m]; any distance if None,
-            which is right where each recording is registered by itself.
+    The distance between two markers may change by `largest_distortion` [m]. A marker may stand `largest_shift` [m] from
+    its place in the first recording; anywhere if None, which is right where each recording is registered by itself.
 
     Raises:
         DataFileError: A marker moved, is missing or is never seen.
@@ -327,13 +271,10 @@ def check_base(
             )
 
 
-def check_motion(recording: Recording, labels: Sequence[str], least: float = LEAST_MOTION) -> None:
-    """Refuses a recording in which nothing moves, as of a stream that froze, or of the wrong markers.
+def check_motion(recording: Recording, labels: Sequence[str]) -> None:
+    """Refuses a recording in which none of these markers moves, as of a stream that froze, or of the wrong ones.
 
-    Args:
-        recording: Gaps are NaN.
-        labels: Markers that should move.
-        least: Distance from its first position [m] that one of them must reach, in the median of three frames.
+    One of them must move by half a millimetre from its first position, in the median of three frames.
 
     Raises:
         DataFileError: A marker is not in the recording, or none of them moves so far.
@@ -343,7 +284,7 @@ def check_motion(recording: Recording, labels: Sequence[str], least: float = LEA
         if seen.any():
             smooth = median_filter(path[seen], size=(3, 1), mode="nearest")
             farthest = max(farthest, float(np.linalg.norm(smooth - smooth[0], axis=1).max()))
-    if farthest < least:
+    if farthest < _LEAST_MOTION:
         raise DataFileError(
             f"{recording.source}: {listed(labels)} never move by more than {_MILLI * farthest:.2f} mm in the "
             f"{len(recording.positions) / recording.rate:.3g} s that count: follow markers that move, or leave the "
@@ -358,11 +299,6 @@ def check_passive(recording: Recording) -> None:
             f"{recording.source} holds an actuation, {recording.actuation.shape[1]} in each frame, which nothing here "
             "uses: take an experiment with pressures (data.kind: pressure), or leave it out of the file."
         )
-
-
-def _distances(places: FloatArray) -> FloatArray:
-    """(M, M) [m] between markers (M, 3)."""
-    return np.asarray(np.linalg.norm(places[:, None] - places[None], axis=2))
 
 
 def _drift(path: FloatArray) -> float:

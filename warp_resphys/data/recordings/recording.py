@@ -1,13 +1,16 @@
 """What every reader returns: labelled markers over time, in metres and seconds, with occlusions as NaN."""
 
 import dataclasses
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline
 
 from ...io.errors import DataFileError, InputError
+from ..base_motion import since_first
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -31,6 +34,8 @@ class Recording:
         source: The file it came from.
         actuation: (T, C) [Pa, N or without a unit] what drove the body in each frame, if that was recorded.
         rest: (M, 3) [m] the markers on the body at rest, if known; it tells where they sit on it.
+        base: (T, 6) the motion since the first frame of what the body is fixed to, if that was recorded; see
+            `data.base_motion`.
         start: Time of the first frame [s]; after `trim_to_release`, since the release.
     """
 
@@ -40,6 +45,7 @@ class Recording:
     source: Path
     actuation: FloatArray | None = None
     rest: FloatArray | None = None
+    base: FloatArray | None = None
     start: float = 0.0
 
     @property
@@ -80,15 +86,17 @@ class RawRecording:
         rate: [Hz].
         actuation: (T, C) [Pa, N or 1].
         rest: (M, 3) [unit].
+        base: (T, 7) a point of what the body is fixed to [m], and a quaternion of its rotation, w first.
         start: Time of the first frame [s].
     """
 
     positions: FloatArray
-    labels: tuple[str, ...] | None
+    labels: Sequence[str] | None
     unit: str | None
     rate: float | None
     actuation: FloatArray | None = None
     rest: FloatArray | None = None
+    base: FloatArray | None = None
     start: float = 0.0
 
 
@@ -119,41 +127,48 @@ def to_recording(
         raise InputError(f"units is {units!r}: set it to m, cm or mm, the unit of {path}.")
     if rate is not None and not RATES[0] <= rate <= RATES[1]:
         raise InputError(f"rate is {rate!r}: set it to the frames a second of {path}.")
-    markers = raw.positions.shape[1] if raw.positions.ndim == 3 else 0
-    if raw.positions.ndim != 3 or raw.positions.shape[2] != 3 or 0 in raw.positions.shape:
+    shape = raw.positions.shape
+    if len(shape) != 3 or shape[2] != 3 or 0 in shape:
         raise DataFileError(
-            f"{path} holds no marker trajectories: positions must be (frames, markers, 3), not {raw.positions.shape}."
+            f"{path} holds no marker trajectories: positions must be (frames, markers, 3), not {shape}."
         )
-    factor = METRES_PER_UNIT[_unit(raw, path, units)]
-    names = _names(raw, path, labels, markers)
+    unit, rate = raw.unit if units is None else units, raw.rate if rate is None else rate
+    if unit is None or unit not in METRES_PER_UNIT:
+        said = "does not say in which unit its positions are" if unit is None else f"gives positions in '{unit}'"
+        raise DataFileError(f"{path} {said}: export it in m, cm or mm, or set units.")
+    if rate is None or not RATES[0] <= rate <= RATES[1]:
+        said = "does not say how many frames a second it has" if rate is None else f"gives a frame rate of {rate} Hz"
+        raise DataFileError(f"{path} {said}: export it with its rate, or set rate, in Hz.")
+    names = _names(raw, path, labels)
+    factor = METRES_PER_UNIT[unit]
     positions = np.ascontiguousarray(raw.positions, dtype=np.float64) * factor
     positions[~np.isfinite(positions).all(axis=2)] = np.nan
     rest = None if raw.rest is None else np.asarray(raw.rest, dtype=np.float64) * factor
-    if rest is not None and rest.shape != (markers, 3):
-        raise DataFileError(f"{path}: rest has the shape {rest.shape} where {(markers, 3)} is needed.")
-    if raw.actuation is not None and (raw.actuation.ndim != 2 or len(raw.actuation) != len(positions)):
+    if rest is not None and rest.shape != shape[1:]:
+        raise DataFileError(f"{path}: rest has the shape {rest.shape} where {shape[1:]} is needed.")
+    driven = raw.actuation
+    if driven is not None and (driven.ndim != 2 or len(driven) != len(positions)):
         raise DataFileError(
-            f"{path}: actuation has the shape {raw.actuation.shape}; it needs a row for each of the "
-            f"{len(positions)} frames."
+            f"{path}: actuation has the shape {driven.shape}; it needs a row for each of the {len(positions)} frames."
         )
-    if raw.actuation is not None and not np.isfinite(raw.actuation).all():
+    if driven is not None and not np.isfinite(driven).all():
         raise DataFileError(f"{path}: an actuation is NaN or infinite; every frame needs one.")
     if not np.isfinite(raw.start):
         raise DataFileError(f"{path}: its first frame is at {raw.start} s: give the time of each frame, or no start.")
-    check_span(positions, path)
-    return Recording(names, positions, _rate(raw, path, rate), path, raw.actuation, rest, raw.start)
+    _check_span(positions, path)
+    base = None
+    if raw.base is not None:
+        if raw.base.shape != (len(positions), 7):
+            raise DataFileError(
+                f"{path}: base has the shape {raw.base.shape}; it needs a place and a quaternion (w, x, y, z) for each "
+                f"of the {len(positions)} frames."
+            )
+        base = since_first(raw.base[:, :3], raw.base[:, 3:], path)
+    return Recording(names, positions, float(rate), path, driven, rest, base, raw.start)
 
 
-def check_span(positions: FloatArray, path: Path) -> None:
-    """Refuses positions that no marker system records of a body of a laboratory, as those in a wrong unit.
-
-    Args:
-        positions: (T, M, 3) [m].
-        path: Their file, for messages.
-
-    Raises:
-        DataFileError: No marker is ever seen, or the positions span less than 1 mm or more than 100 m.
-    """
+def _check_span(positions: FloatArray, path: Path) -> None:
+    """Refuses positions [m] that no marker system records of a body of a laboratory, as those in a wrong unit."""
     seen = positions[np.isfinite(positions).all(axis=2)]
     if not len(seen):
         raise DataFileError(f"{path}: no marker is seen in any frame; check how it was exported.")
@@ -167,6 +182,32 @@ def check_span(positions: FloatArray, path: Path) -> None:
         )
 
 
+def _names(raw: RawRecording, path: Path, given: Sequence[str] | None) -> tuple[str, ...]:
+    """M different names."""
+    markers = raw.positions.shape[1]
+    if given is not None and len(given) != markers:
+        raise InputError(f"labels has {len(given)} names; {path} has {markers} markers: name each of them.")
+    names = raw.labels if given is None else given
+    names = [""] * markers if names is None else names
+    if len(names) != markers:
+        raise DataFileError(f"{path} has {markers} markers and {len(names)} labels: export it with a label for each.")
+    names = [str(name).strip() or f"marker {number}" for number, name in enumerate(names, start=1)]
+    counts = Counter(names)
+    return tuple(
+        name if counts[name] == 1 else f"{name} #{names[: place + 1].count(name)}" for place, name in enumerate(names)
+    )
+
+
+def bridged(recording: Recording, column: int, frames: ArrayLike) -> FloatArray:
+    """(T', 3) [m] a marker at frames, by a cubic spline through those in which it was seen, two or more.
+
+    Before the first and after the last of them, it stays where it was seen there.
+    """
+    known = np.flatnonzero(recording.seen[:, column])
+    spline = CubicSpline(known, recording.positions[known, column])
+    return np.asarray(spline(np.clip(frames, known[0], known[-1])))
+
+
 def runs(mask: ArrayLike) -> list[tuple[int, int]]:
     """First and past-the-last index of every run of True."""
     edges = np.flatnonzero(np.diff(np.pad(np.asarray(mask, dtype=np.int8), 1)))
@@ -175,37 +216,4 @@ def runs(mask: ArrayLike) -> list[tuple[int, int]]:
 
 def listed(names: Sequence[str]) -> str:
     """Names in quotation marks, separated by commas."""
-    return ", ".join(f"'{name}'" for name in names) if names else "none"
-
-
-def _unit(raw: RawRecording, path: Path, given: str | None) -> str:
-    unit = given if given is not None else raw.unit
-    if unit is None:
-        raise DataFileError(f"{path} does not say in which unit its positions are: set units to m, cm or mm.")
-    if unit not in METRES_PER_UNIT:
-        raise DataFileError(f"{path} gives positions in '{unit}': export it in m, cm or mm, or set units.")
-    return unit
-
-
-def _rate(raw: RawRecording, path: Path, given: float | None) -> float:
-    rate = given if given is not None else raw.rate
-    if rate is None:
-        raise DataFileError(f"{path} does not say how many frames a second it has: set rate, in Hz.")
-    if not RATES[0] <= rate <= RATES[1]:
-        raise DataFileError(f"{path} gives a frame rate of {rate} Hz: export it with its rate, or set rate.")
-    return float(rate)
-
-
-def _names(raw: RawRecording, path: Path, given: Sequence[str] | None, markers: int) -> tuple[str, ...]:
-    if given is not None and len(given) != markers:
-        raise InputError(f"labels has {len(given)} names; {path} has {markers} markers: name each of them.")
-    names = given if given is not None else raw.labels
-    if names is None:
-        names = [""] * markers
-    if len(names) != markers:
-        raise DataFileError(f"{path} has {markers} markers and {len(names)} labels: export it with a label for each.")
-    names = [str(name).strip() or f"marker {number}" for number, name in enumerate(names, start=1)]
-    counts = {name: names.count(name) for name in names}
-    return tuple(
-        name if counts[name] == 1 else f"{name} #{names[: place + 1].count(name)}" for place, name in enumerate(names)
-    )
+    return ", ".join(f"'{name}'" for name in names) or "none"

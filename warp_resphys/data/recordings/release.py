@@ -1,6 +1,7 @@
-"""The moment in which a body that was held is let go."""
+"""The moment in which a body begins to move: one that was held is let go, or a valve opens."""
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -8,26 +9,30 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from ...io.errors import DataFileError
+from .recording import FloatArray, Recording
 
-FloatArray = NDArray[np.float64]
+# Of a release:
+_QUIET = 0.2  # [s] that the body must have been still
+_LEAST_DROP = 1e-3  # [m]
+# Of an opening valve:
+_LEAST_REST = 0.03  # [s] that the body must be seen at rest
+_LEAST_MOTION = 5e-4  # [m]
+_FAST = 1.0 / 3.0  # of the largest speed: from there on the body certainly moves
+_STILL = 0.1  # of the largest speed: below that it does not yet
+_QUIET_SHARE = 0.2  # of the excursion: what a body at rest may wander
+_FITTED = 2  # frames of the motion; a line through more would begin too early, as sqrt(s) of a swing bends down
+_BEFORE = 1.0  # frames of it that noise and a slow start may hide
 
 
 @dataclasses.dataclass(frozen=True)
 class Release:
-    """When a body that was held still began to move.
+    """When a body that was held still began to move."""
 
-    Attributes:
-        frame: The moment of release, in frames and parts of a frame.
-        rest: First and past-the-last frame of the quiet stretch before it, in which the body was held.
-    """
-
-    frame: float
-    rest: tuple[int, int]
+    frame: float  # The moment of release, in frames and parts of a frame
+    rest: tuple[int, int]  # First and past-the-last frame of the quiet stretch before it, in which the body was held
 
 
-def find_release(
-    path: FloatArray, rate: float, *, quiet: float = 0.2, least_drop: float = 1e-3, source: str | Path = "the recording"
-) -> Release:
+def find_release(path: FloatArray, rate: float, source: str | Path = "the recording") -> Release:
     """Finds when a point that was held still was let go.
 
     The point moves fast for the first time where one frame's step reaches a third of the largest (of a path
@@ -39,20 +44,18 @@ def find_release(
     Args:
         path: (T, 3) [m], without NaN; a mean of several markers is best.
         rate: Frames a second [Hz].
-        quiet: How long the body must have been still [s].
-        least_drop: The smallest excursion that counts as a release [m].
-        source: Where the path comes from, for messages.
+        source: Where the path comes from.
 
     Raises:
         DataFileError: The path has no such moment.
     """
-    length = max(2, round(quiet * rate))
+    length = max(2, round(_QUIET * rate))
     smooth = median_filter(path, size=(3, 1), mode="nearest")
     steps = np.linalg.norm(np.diff(smooth, axis=0), axis=1)
     fast = int(np.argmax(3.0 * steps >= steps.max(initial=0.0))) + 1 if len(steps) else 0
     before = path[max(fast - 1, 0)] if len(path) else np.zeros(3)
     drop = float(np.linalg.norm(smooth[fast:] - before, axis=1).max(initial=0.0))
-    if drop < least_drop:
+    if drop < _LEAST_DROP:
         raise DataFileError(
             f"No release found in {source}: the tip never moves by more than {1e3 * drop:.2f} mm; give a recording in "
             "which the body is let go."
@@ -77,10 +80,73 @@ def _onset(path: FloatArray, rest: tuple[int, int], fast: int, drop: float) -> f
     still = np.flatnonzero(travelled[rest[0] : fast] < max(4.0 * noise, 0.005 * drop))
     last_still = rest[0] + int(still[-1])
     moving = np.arange(last_still + 1, min(last_still + 4, len(path)))
-    root = np.sqrt(np.maximum(travelled[moving], 0.0))
-    if len(moving) < 2 or root[-1] <= root[0]:
+    line = _root_line(moving, travelled[moving])
+    if line is None:
         return float(last_still)
-    slope, intercept = np.polyfit(moving, root, 1)
+    slope, zero = line
     # A frame that noise hides may be the first of the motion: the line tells how long ago it was let go at most.
     moved = np.sqrt(max(travelled[last_still] + 2.0 * noise, 0.0))
-    return float(np.clip(-intercept / slope, last_still - min(moved / slope, 1.0), last_still + 1))
+    return float(np.clip(zero, last_still - min(moved / slope, 1.0), last_still + 1))
+
+
+def valve_opening(recording: Recording, followed: Sequence[str]) -> float:
+    """Finds when a body at rest begins to move, between two frames.
+
+    The mean of the followed markers moves fast for the first time where its speed reaches a third of the largest. The
+    last frame before that which is slower than a tenth of it ends the rest. As pressure builds up, the body first moves
+    by about s = a (t - t0)^2 / 2, so sqrt(s) of the next two frames is a line, and its zero is the opening; it may lie
+    up to a frame before the end of the rest, as noise hides a slow start. Frames that are missing there cost up to
+    their number. A slow drift, as of a valve that leaks, is not taken for the opening.
+
+    Frames in which one of these markers was not seen are left out; so should be those that repeat the one before
+    (`jumps.mask_repeats`).
+
+    Returns:
+        The time [s], on the recording's own clock (`Recording.time`).
+
+    Raises:
+        DataFileError: a marker is not in the recording, nothing moves, or it moves from the first frame on.
+    """
+    chosen = recording.select(followed)
+    seen = np.flatnonzero(chosen.seen.all(axis=1))
+    if len(seen) < 2 + _FITTED:
+        raise DataFileError(
+            f"No opening of the valve found in {recording.source}: the followed markers are seen together in "
+            f"{len(seen)} frames; follow markers that are seen."
+        )
+    path, time = chosen.positions[seen].mean(axis=1), recording.time[seen]
+    smooth = median_filter(path, size=(3, 1), mode="nearest")
+    excursion = float(np.linalg.norm(smooth - smooth[0], axis=1).max())
+    if excursion < _LEAST_MOTION:
+        raise DataFileError(
+            f"No opening of the valve found in {recording.source}: the followed markers never move by more than "
+            f"{1e3 * excursion:.2f} mm; follow markers that the pressure moves."
+        )
+    speed = np.linalg.norm(np.diff(smooth, axis=0), axis=1) / np.diff(time)
+    fast = int(np.argmax(speed >= _FAST * speed.max()))
+    slow = np.flatnonzero(speed[:fast] < _STILL * speed.max())
+    last = int(slow[-1]) + 1 if len(slow) else 0
+    wandered = float(np.ptp(smooth[: last + 1], axis=0).max())
+    if time[last] - time[0] < _LEAST_REST - 0.5 / recording.rate or wandered > _QUIET_SHARE * excursion:
+        raise DataFileError(
+            f"{recording.source}: the followed markers move from the first frame on, or too soon after it; give a "
+            f"recording that begins {_LEAST_REST:g} s or more before the valve opens."
+        )
+    moving = slice(last + 1, last + 1 + _FITTED)
+    way = path[moving] - np.median(path[: last + 1], axis=0)
+    line = _root_line(time[moving], way @ (way[-1] / np.linalg.norm(way[-1])))
+    if line is None:
+        return float(time[last])
+    return float(np.clip(line[1], max(time[last] - _BEFORE / recording.rate, time[0]), time[last + 1]))
+
+
+def _root_line(time: FloatArray | NDArray[np.int64], travelled: FloatArray) -> tuple[float, float] | None:
+    """Slope and zero of a line through the roots of (T,) ways [m]; None where these do not grow.
+
+    A body that starts from rest first moves by s = a (t - t0)^2 / 2, so that the zero is t0.
+    """
+    root = np.sqrt(np.maximum(travelled, 0.0))
+    if len(root) < 2 or root[-1] <= root[0]:
+        return None
+    slope, intercept = np.polyfit(time, root, 1)
+    return float(slope), float(-intercept / slope)

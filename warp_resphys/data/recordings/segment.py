@@ -9,16 +9,14 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...io.errors import DataFileError
 from ...io.files import read_arrays
+from .arrays import numbers
 from .jumps import mask_repeats
 from .published import write_trials
 from .recording import SI_PER_ACTUATION_UNIT, RawRecording, Recording, to_recording
-from .valve import valve_opening
-
-FloatArray = NDArray[np.float64]
+from .release import valve_opening
 
 LENGTH: Final = 0.1  # [m]
 # [m] where the markers should be: four on the clamp, three at the tip, in the order of the labels.
@@ -50,21 +48,12 @@ def read_published_segment(path: str | Path) -> dict[int, Recording]:
     """
     path = Path(path)
     arrays = read_arrays(path)
-    missing = [name for name in ("pressure_mbar", "markers", "rate_hz") if name not in arrays]
-    if missing:
-        raise DataFileError(
-            f"{path} has no array '{missing[0]}'; it has {', '.join(arrays) or 'none'}: check the path."
-        )
-    pressure, markers, rate = arrays["pressure_mbar"], arrays["markers"], arrays["rate_hz"]
-    wanted = (len(MARKERS), 3)
-    if markers.ndim != 4 or markers.shape[2:] != wanted or pressure.shape != markers.shape[:1] or rate.size != 1:
+    pressure, markers, rate = (numbers(arrays, name, path) for name in ("pressure_mbar", "markers", "rate_hz"))
+    if markers.ndim != 4 or markers.shape[2:] != (7, 3) or pressure.shape != markers.shape[:1] or rate.size != 1:
         raise DataFileError(
             f"{path}: markers {markers.shape}, pressure_mbar {pressure.shape} and rate_hz {rate.shape} must have the "
-            f"shapes (trials, frames, {wanted[0]}, 3), (trials,) and (): check the path."
+            "shapes (trials, frames, 7, 3), (trials,) and (): check the path."
         )
-    for name in ("pressure_mbar", "markers", "rate_hz"):
-        if arrays[name].dtype.kind not in "fiu":
-            raise DataFileError(f"{path}: '{name}' does not hold numbers (it is {arrays[name].dtype}): check the path.")
     if not (np.abs(pressure) <= _LARGEST_PRESSURE).all():
         raise DataFileError(f"{path}: 'pressure_mbar' must be finite, and at most {_LARGEST_PRESSURE:g} mbar.")
     names = np.rint(pressure).astype(int).tolist()
@@ -78,7 +67,7 @@ def read_published_segment(path: str | Path) -> dict[int, Recording]:
 
 def convert_segment(source: str | Path, folder: Path) -> list[dict[str, Any]]:
     """Writes each trial as segment_050.h5 (50 mbar) and so on, and index.json; returns what that says of each."""
-    trials: list[tuple[int, Recording, dict[str, Any]]] = [
+    trials = [
         (mbar, recording, {"pressure_mbar": mbar, "valve_opening_s": -recording.start})
         for mbar, recording in read_published_segment(source).items()
     ]

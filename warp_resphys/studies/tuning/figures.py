@@ -7,10 +7,10 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, LogLocator, MaxNLocator, NullFormatter, NullLocator, PercentFormatter
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator, PercentFormatter
 
 from ...report.figures import STYLE, TONES, FloatArray, new_figure, use_logarithm
-from .space import Choice, Dimension, Range
+from .space import Choice, Dimension
 
 _GIVEN_UP = TONES["muted"].light
 _TOLD = TONES["resphys"].light
@@ -24,26 +24,21 @@ def search_history(errors: FloatArray, pruned: FloatArray, configured: float | N
         errors: (R,) error [mm] of the trials that were trained to the end, by number; infinite where it diverged, NaN
             for the other trials.
         pruned: (R,) the smallest error [mm] of those that were given up; NaN for the other trials.
-        configured: Error as configured, to compare with [mm]; None where it diverges.
-        narrow: Whether the figure is for a narrow page.
+        configured: error as configured [mm], to compare with; None where it diverges.
+        narrow: whether the figure is for a narrow page, here and below.
     """
-    numbers = np.arange(len(errors))
-    told = ~np.isnan(errors)
+    numbers, finite, lost = np.arange(len(errors)), np.isfinite(errors), np.isposinf(errors)
     with mpl.rc_context(STYLE):
         figure = new_figure(3.2, 3.2, narrow=narrow)
         axes = figure.subplots()
-        finite = np.isfinite(errors)
-        best = np.fmin.accumulate(np.where(finite, errors, np.inf))
-        axes.step(
-            numbers, np.where(np.isfinite(best), best, np.nan), where="post", color=_BEST, label="Best so far", zorder=1
-        )
+        best = np.fmin.accumulate(np.where(finite, errors, np.nan))
+        axes.step(numbers, best, where="post", color=_BEST, label="Best so far", zorder=1)
         axes.plot(numbers[finite], errors[finite], "o", color=_TOLD, markersize=4.5, label="Trial")
         if np.isfinite(pruned).any():
             axes.plot(numbers, pruned, "o", color=_GIVEN_UP, markersize=4.0, fillstyle="none", label="Given up")
         if configured is not None:
             axes.axhline(configured, color=_GIVEN_UP, linewidth=1.1, linestyle="--", label="As configured")
         _errors_axis(axes)
-        lost = told & ~finite
         if lost.any():
             top = axes.get_ylim()[1]
             axes.plot(numbers[lost], np.full(lost.sum(), top), "x", color=_GIVEN_UP, clip_on=False, label="Diverged")
@@ -55,12 +50,7 @@ def search_history(errors: FloatArray, pruned: FloatArray, configured: float | N
 
 
 def importance_bars(importance: Mapping[str, float], *, narrow: bool) -> Figure:
-    """Draw how much each setting matters.
-
-    Args:
-        importance: Shares that sum to one, by setting; empty where too little is known.
-        narrow: Whether the figure is for a narrow page.
-    """
+    """Draw how much each setting matters, as shares that sum to one; empty where too little is known."""
     rows = sorted(importance.items(), key=lambda item: item[1])
     with mpl.rc_context(STYLE):
         height = 0.8 + 0.28 * max(len(rows), 3)
@@ -82,14 +72,7 @@ def importance_bars(importance: Mapping[str, float], *, narrow: bool) -> Figure:
 def setting_scatter(
     errors: FloatArray, settings: Sequence[Mapping[str, float | str]], space: Mapping[str, Dimension], *, narrow: bool
 ) -> Figure:
-    """Draw the error against each setting, a panel a setting; the best trial is marked.
-
-    Args:
-        errors: (R,) error [mm] of each trial; NaN where there is none to show.
-        settings: Of each trial, by name.
-        space: What each setting may be, by name.
-        narrow: Whether the figure is for a narrow page.
-    """
+    """Draw the error (R,) [mm] of each trial against each setting, a panel a setting; the best trial is marked."""
     columns = min(2 if narrow else 3, len(space))
     rows = math.ceil(len(space) / columns)
     shown = [i for i, error in enumerate(errors) if np.isfinite(error)]
@@ -121,26 +104,17 @@ def _errors_axis(axes: Axes) -> None:
 
 def _places(axes: Axes, dimension: Dimension, values: Sequence[float | str]) -> FloatArray:
     """Where the values of a setting lie on an axis, which is labelled with them."""
+    axes.xaxis.set_minor_locator(NullLocator())
     if isinstance(dimension, Choice):
         axes.set_xticks(range(len(dimension.values)), [str(value) for value in dimension.values])
         axes.set_xlim(-0.5, len(dimension.values) - 0.5)
         return np.array([dimension.values.index(value) for value in values], dtype=np.float64)
-    _scale(axes, dimension)
-    return np.array(values, dtype=np.float64)
-
-
-def _scale(axes: Axes, dimension: Range) -> None:
     low, high = float(dimension.low), float(dimension.high)
     if dimension.log:
-        axes.set_xscale("log")
+        axes.set_xscale("log", subs=[])
         axes.set_xlim(low / (high / low) ** 0.06, high * (high / low) ** 0.06)
         axes.xaxis.set_major_locator(LogLocator(numticks=5))
-        axes.xaxis.set_minor_formatter(NullFormatter())
-        axes.xaxis.set_minor_locator(NullLocator())
-        return
-    axes.set_xlim(low - 0.06 * (high - low), high + 0.06 * (high - low))
-    if dimension.whole and high - low <= 10:
-        axes.xaxis.set_major_locator(FixedLocator([*range(int(low), int(high) + 1)]))
     else:
-        axes.xaxis.set_major_locator(MaxNLocator(5, integer=dimension.whole))
-    axes.xaxis.set_minor_locator(NullLocator())
+        axes.set_xlim(low - 0.06 * (high - low), high + 0.06 * (high - low))
+        axes.xaxis.set_major_locator(MaxNLocator("auto" if dimension.whole else 5, integer=dimension.whole))
+    return np.array(values, dtype=np.float64)

@@ -1,55 +1,70 @@
 """Search spaces: which settings vary, and over what."""
 
-import math
-import numbers
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ...experiment.schema import dotted
+from optuna.trial import Trial
+
+from ...experiment.schema import ANYTHING, Group, absent, check, dotted, is_finite
 from ...io.errors import InputError
 
 SEARCHED_GROUPS = ("network", "trainer", "in_the_loop")
-_WRITTEN_AS = "write {low: 1.0e-4, high: 1.0e-2, log: true} or a list of values"
 
 
 @dataclass(frozen=True)
 class Range:
-    """All numbers between two.
-
-    Attributes:
-        low: smallest.
-        high: largest.
-        log: whether equal ratios count alike, instead of equal differences.
-        whole: whether only whole numbers are meant.
-    """
+    """All numbers between two."""
 
     low: float
     high: float
-    log: bool
-    whole: bool
+    log: bool  # whether equal ratios count alike, instead of equal differences
+    whole: bool  # whether only whole numbers are meant
 
     @property
     def ends(self) -> tuple[Any, ...]:
         """The values that limit the others."""
         return (self.low, self.high)
 
+    def suggest(self, trial: Trial, key: str) -> Any:
+        """What a sampler draws, or has drawn."""
+        if self.whole:
+            return trial.suggest_int(key, int(self.low), int(self.high), log=self.log)
+        return trial.suggest_float(key, self.low, self.high, log=self.log)
+
+    def __str__(self) -> str:
+        """In words."""
+        return f"{self.low:g} to {self.high:g}{' (log)' if self.log else ''}"
+
 
 @dataclass(frozen=True)
 class Choice:
-    """One of some values; numbers stand in their order, from the smallest to the largest."""
+    """One of some values; numbers stand in their order, from the smallest to the largest.
+
+    Of numbers, the sampler draws the place, as neighbours resemble each other.
+    """
 
     values: tuple[Any, ...]
 
     @property
     def ordered(self) -> bool:
-        """Whether the values are numbers, so that neighbours resemble each other."""
-        return all(_is_number(value) for value in self.values)
+        """Whether the values are numbers."""
+        return all(map(is_finite, self.values))
 
     @property
     def ends(self) -> tuple[Any, ...]:
         """All values."""
         return self.values
+
+    def suggest(self, trial: Trial, key: str) -> Any:
+        """What a sampler draws, or has drawn."""
+        if self.ordered:
+            return self.values[trial.suggest_int(key, 0, len(self.values) - 1)]
+        return trial.suggest_categorical(key, self.values)
+
+    def __str__(self) -> str:
+        """In words."""
+        return f"one of {', '.join(map(str, self.values))}"
 
 
 Dimension = Range | Choice
@@ -68,16 +83,12 @@ def parse_space(space: Any) -> dict[str, Dimension]:
     Raises:
         InputError: a key outside of the groups that can be searched, or no range.
     """
-    if not isinstance(space, Mapping) or not space:
-        raise InputError(f"tune.space is {space!r}: it must name at least one setting, such as network.width.")
-    found: dict[str, Dimension] = {}
-    for group, ranges in space.items():
-        if group not in SEARCHED_GROUPS:
-            raise InputError(f"tune.space.{group} cannot be searched: name settings of {' or '.join(SEARCHED_GROUPS)}.")
-        if not isinstance(ranges, Mapping):
-            raise InputError(f"tune.space.{group} is {ranges!r}: it must be a group of settings with their ranges.")
-        for name, given in ranges.items():
-            found[f"{group}.{name}"] = _parse_dimension(f"tune.space.{group}.{name}", given)
+    check("tune.space", space, Group({group: absent(Group(each=ANYTHING)) for group in SEARCHED_GROUPS}))
+    found = {
+        f"{group}.{name}": _parse_dimension(f"tune.space.{group}.{name}", given)
+        for group, ranges in space.items()
+        for name, given in ranges.items()
+    }
     if not found:
         raise InputError("tune.space is empty: it must name at least one setting, such as network.width.")
     return dict(sorted(found.items()))
@@ -87,42 +98,22 @@ def _parse_dimension(key: str, given: Any) -> Dimension:
     if isinstance(given, list):
         if len(given) < 2 or any(given.count(value) > 1 for value in given):
             raise InputError(f"{key} is {given}: it must list two or more different values.")
-        if not all(isinstance(value, (str, bool)) or _is_number(value) for value in given):
+        if not all(isinstance(value, (str, bool)) or is_finite(value) for value in given):
             raise InputError(f"{key} is {given}: it must list numbers or words.")
         choice = Choice(tuple(given))
         return Choice(tuple(sorted(given))) if choice.ordered else choice
     if not isinstance(given, Mapping) or not {"low", "high"} <= given.keys() <= {"low", "high", "log"}:
-        raise InputError(f"{key} is {given!r}: {_WRITTEN_AS}.")
+        raise InputError(f"{key} is {given!r}: write {{low: 1.0e-4, high: 1.0e-2, log: true}} or a list of values.")
     low, high, log = given["low"], given["high"], given.get("log", False)
-    if not (_is_number(low) and _is_number(high) and low < high):
+    if not (is_finite(low) and is_finite(high) and low < high):
         raise InputError(f"{key} is {dict(given)}: low and high must be finite numbers, and low the smaller one.")
     if not isinstance(log, bool) or (log and low <= 0):
         raise InputError(f"{key} is {dict(given)}: log must be true or false, and true needs positive numbers.")
     return Range(low, high, log, whole=isinstance(low, int) and isinstance(high, int))
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def described(space: Mapping[str, Dimension]) -> dict[str, str]:
-    """A search space in words, by dotted key."""
-    words = {}
-    for key, dimension in space.items():
-        if isinstance(dimension, Choice):
-            words[key] = f"one of {', '.join(str(value) for value in dimension.values)}"
-        else:
-            words[key] = f"{dimension.low:g} to {dimension.high:g}{' (log)' if dimension.log else ''}"
-    return words
-
-
 def with_settings(groups: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Groups of settings with some of them replaced.
-
-    Args:
-        groups: ``network`` and ``trainer``, and what else there is.
-        settings: by dotted key.
-    """
+    """Groups of settings, with those of some dotted keys replaced."""
     result = dict(groups)
     for key, value in settings.items():
         group, _, name = key.partition(".")
@@ -131,9 +122,5 @@ def with_settings(groups: Mapping[str, Any], settings: Mapping[str, Any]) -> dic
 
 
 def fixed_settings(tune: Mapping[str, Any]) -> dict[str, Any]:
-    """What all trials have otherwise than a run, by dotted key.
-
-    Args:
-        tune: the group of that name.
-    """
+    """What all trials have otherwise than a run, by dotted key, from the group ``tune``."""
     return {key: value for key, value in dotted(tune["settings"]) if value not in ({}, None) or "." in key}

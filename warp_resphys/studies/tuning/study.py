@@ -1,15 +1,15 @@
 """A study that any number of processes keep together in one folder.
 
-What is tried and what came of it stands in a journal to which every process appends. Who decides anything about the
-whole study (what to try next, whether enough was tried, whose trial is whose) holds the study's lock meanwhile, so that
-no trial is begun, told or taken over twice. A trial belongs to the worker that claimed it last.
+What is tried and what came of it stands in a journal. Who writes to it holds the study's lock, so that no trial is
+begun, told or taken over twice. A trial belongs to the worker that claimed it last.
 """
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,89 +21,49 @@ from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 from optuna.trial import FrozenTrial, Trial, TrialState
 from typing_extensions import override
 
+from ...experiment.schema import dotted
 from ...io.errors import DataFileError, InputError
 from ...io.files import to_plain
-from .space import Choice, Dimension, described, dotted
-from .workers import Watch, held
+from .space import Dimension
+from .workers import held
 
 JOURNAL = "study.journal"
 _LOCK = "study.lock"
 _NAME = "tuning"
-_COUNTED = (TrialState.COMPLETE, TrialState.PRUNED)
-_MISSING = object()
+_STATES = {TrialState.COMPLETE: "complete", TrialState.PRUNED: "pruned", TrialState.FAIL: "failed"}
 
 
-class JournalLock(JournalFileOpenLock):
-    """Lets one process at a time append to a journal, and removes what a killed one left half written.
-
-    Optuna's own locks stay behind when their holder is killed, for half a minute; this one does not.
-    """
-
-    def __init__(self, journal: Path) -> None:
-        """Describes the lock of a journal."""
-        super().__init__(str(journal))
-        self._journal = journal
-        self._held: Any = None
+class _NoLock(JournalFileOpenLock):
+    """For a journal whose writers hold a lock already; Optuna's own stays behind for a while when its holder dies."""
 
     @override
     def acquire(self) -> bool:
-        """Waits for the lock, and cuts off a last line without an end."""
-        self._held = held(self._journal.with_name(f"{self._journal.name}.lock"))
-        self._held.__enter__()
-        self._mend()
         return True
 
     @override
     def release(self) -> None:
-        """Lets go."""
-        self._held.__exit__(None, None, None)
-
-    def _mend(self) -> None:
-        descriptor = os.open(self._journal, os.O_RDWR | os.O_CREAT, 0o666)
-        try:
-            size = os.fstat(descriptor).st_size
-            if size and os.pread(descriptor, 1, size - 1) != b"\n":
-                os.ftruncate(descriptor, os.pread(descriptor, size, 0).rfind(b"\n") + 1)
-        finally:
-            os.close(descriptor)
+        pass
 
 
 @dataclass(frozen=True)
 class Claim:
-    """A trial that this worker runs.
+    """A trial that this worker runs."""
 
-    Attributes:
-        number: of the trial, from 0 on.
-        settings: what is tried, by dotted key.
-        claims: how many workers have had it so far, this one included.
-        trial: as the sampler knows it.
-    """
-
-    number: int
-    settings: Mapping[str, Any]
-    claims: int
-    trial: Trial
+    number: int  # from 0 on
+    settings: Mapping[str, Any]  # that are tried, by dotted key
+    claims: int  # how many workers have had it so far, this one included
+    trial: Trial  # as the sampler knows it
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What is known of a trial.
+    """What is known of a trial."""
 
-    Attributes:
-        number: of the trial, from 0 on.
-        state: ``complete``, ``pruned``, ``failed`` or ``running``.
-        error: the objective [mm]; infinite where everything diverged, None where it is not known.
-        settings: what was tried, by dotted key.
-        seconds: of computation, over all workers that had it [s]; None where it is not known.
-        reports: values on the way by step.
-    """
-
-    number: int
-    state: str
-    error: float | None
-    settings: Mapping[str, Any]
-    seconds: float | None
-    reports: Mapping[int, float]
+    number: int  # from 0 on
+    state: str  # complete, pruned, failed or running
+    error: float | None  # the objective [mm]; infinite where everything diverged, None where it is not known
+    settings: Mapping[str, Any]  # that were tried, by dotted key
+    seconds: float | None  # of computation, over all workers that had it [s]; None where it is not known
 
 
 class SharedStudy:
@@ -116,7 +76,7 @@ class SharedStudy:
         trials: how many are to be finished, over all workers.
         seed: of the sampler.
         identity: of this worker.
-        watch: tells which other workers live.
+        is_alive: tells which other workers live.
 
     Raises:
         InputError: the study that is there has another space or other conditions.
@@ -131,29 +91,33 @@ class SharedStudy:
         trials: int,
         seed: int,
         identity: Mapping[str, Any],
-        watch: Watch,
+        is_alive: Callable[[Mapping[str, Any]], bool],
     ) -> None:
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         self.folder, self.trials = folder, trials
-        self._space, self._seed, self._identity, self._watch = space, seed, dict(identity), watch
-        folder.mkdir(parents=True, exist_ok=True)
+        self._space, self._seed, self._identity, self._is_alive = space, seed, dict(identity), is_alive
         journal = folder / JOURNAL
         with self.lock():
             try:
-                storage = JournalStorage(JournalFileBackend(str(journal), lock_obj=JournalLock(journal)))
+                self._storage = JournalStorage(JournalFileBackend(str(journal), lock_obj=_NoLock(str(journal))))
             except (ValueError, KeyError, AssertionError) as error:
                 raise DataFileError(f"{journal} is damaged ({error}): delete it to start the study anew") from error
-            self._storage = storage
-            if any(study.study_name == _NAME for study in storage.get_all_studies()):
-                self._study = optuna.load_study(study_name=_NAME, storage=storage)
-            else:
-                self._study = optuna.create_study(study_name=_NAME, storage=storage)
-            self._id = storage.get_study_id_from_name(_NAME)
-            self._agree({"space": described(space), **to_plain(conditions)})
+            known = [study.study_name for study in self._storage.get_all_studies()]
+            open_study = optuna.load_study if _NAME in known else optuna.create_study
+            self._study = open_study(study_name=_NAME, storage=self._storage)
+            self._id = self._storage.get_study_id_from_name(_NAME)
+            self._agree({"space": {key: str(each) for key, each in space.items()}, **to_plain(conditions)})
 
-    def lock(self) -> Any:
-        """A context in which no other worker decides anything about the study."""
-        return held(self.folder / _LOCK)
+    @contextmanager
+    def lock(self) -> Iterator[None]:
+        """No other worker writes meanwhile; what a killed one left half written is gone."""
+        with held(self.folder / _LOCK):
+            journal = self.folder / JOURNAL
+            content = journal.read_bytes() if journal.exists() else b""
+            if not content.endswith(b"\n"):
+                journal.touch()
+                os.truncate(journal, content.rfind(b"\n") + 1)
+            yield
 
     def _agree(self, conditions: dict[str, Any]) -> None:
         """Marks a new study with its conditions, and compares those of an old one."""
@@ -162,66 +126,56 @@ class SharedStudy:
             self._study.set_user_attr("conditions", conditions)
             return
         there, here = dict(dotted(found)), dict(dotted(conditions))
-        different = [key for key in sorted({*there, *here}) if there.get(key, _MISSING) != here.get(key, _MISSING)]
+        different = [key for key in sorted({*there, *here}) if there.get(key, "absent") != here.get(key, "absent")]
         if not different:
             return
         key = next((key for key in different if key.startswith("space.")), different[0])
-        old, new = (_told(side.get(key, _MISSING)) for side in (there, here))
         what = f"the search space of {key.removeprefix('space.')}" if key.startswith("space.") else key
         raise InputError(
-            f"the study in {self.folder} has another setting: {what} was {old}, now it is {new}; go on with the old "
-            f"setting, delete the folder, or name another study with tune.study=..."
+            f"the study in {self.folder} has another setting: {what} was {there.get(key, 'absent')}, now it is "
+            f"{here.get(key, 'absent')}; go on with the old setting, delete the folder, or name another study with "
+            "tune.study=..."
         )
+
+    def _trials(self, *states: TrialState) -> list[FrozenTrial]:
+        return self._study.get_trials(deepcopy=False, states=states or None)
 
     def claim(self) -> Claim | None:
         """A trial for this worker: one that a dead worker left, or a new one; None if there is none to take now."""
         with self.lock():
-            trials = self._study.get_trials(deepcopy=False)
-            running = [trial for trial in trials if trial.state == TrialState.RUNNING]
+            running = self._trials(TrialState.RUNNING)
             for trial in running:
                 claims = trial.user_attrs.get("claims", [])
-                if not claims or not self._watch.is_alive(claims[-1]):
+                if not claims or not self._is_alive(claims[-1]):
                     number = self._storage.get_trial_id_from_study_id_trial_number(self._id, trial.number)
                     return self._take(Trial(self._study, number))
-            if len(running) + sum(trial.state in _COUNTED for trial in trials) >= self.trials:
+            if len(running) + len(self._trials(TrialState.COMPLETE, TrialState.PRUNED)) >= self.trials:
                 return None
             # Each trial draws numbers of its own, so that workers with the same seed do not try the same.
-            seed = int(np.random.SeedSequence([self._seed, len(trials)]).generate_state(1)[0])
+            seed = int(np.random.SeedSequence([self._seed, len(self._trials())]).generate_state(1)[0])
             self._study.sampler = optuna.samplers.TPESampler(seed=seed)
             return self._take(self._study.ask())
 
     def _take(self, trial: Trial) -> Claim:
         claims = [*trial.user_attrs.get("claims", []), self._identity]
         trial.set_user_attr("claims", claims)
-        settings = {key: _decoded(each, _suggested(trial, key, each)) for key, each in self._space.items()}
+        settings = {key: each.suggest(trial, key) for key, each in self._space.items()}
+        trial.set_user_attr("settings", settings)
         return Claim(trial.number, settings, len(claims), trial)
 
     def owns(self, claim: Claim) -> bool:
         """Whether a trial is still this worker's: nobody took it over."""
-        now = self._find(claim)
+        now = self._trials()[claim.number]
         return now.state == TrialState.RUNNING and now.user_attrs["claims"][-1] == self._identity
 
-    def _find(self, claim: Claim) -> FrozenTrial:
-        return self._study.get_trials(deepcopy=False)[claim.number]
-
     def report(self, claim: Claim, step: int, value: float) -> None:
-        """Notes a value on the way.
-
-        Args:
-            claim: the trial.
-            step: where it was measured, such as an epoch.
-            value: the smaller, the better; infinite where it diverged.
-        """
-        if step not in self._find(claim).intermediate_values:
-            claim.trial.report(value, step)
+        """Notes a value on the way, such as after an epoch, if the trial is still this worker's."""
+        with self.lock():
+            if self.owns(claim) and step not in self._trials()[claim.number].intermediate_values:
+                claim.trial.report(value, step)
 
     def tell(self, claim: Claim, value: float | None, seconds: float) -> bool:
-        """Ends a trial.
-
-        Args:
-            claim: the trial.
-            value: the objective, infinite where it diverged; None for a trial that is given up.
-            seconds: of computation.
+        """Ends a trial with its objective, infinite where it diverged; None for a trial that is given up.
 
         Returns:
             Whether it was this worker's to end; if not, nothing is changed.
@@ -242,54 +196,27 @@ class SharedStudy:
 
     def outcomes(self) -> list[Outcome]:
         """All trials so far."""
-        return [self._outcome(trial) for trial in self._study.get_trials(deepcopy=False)]
+        return [self._outcome(trial) for trial in self._trials()]
 
     def _outcome(self, trial: FrozenTrial) -> Outcome:
-        settings = {key: _decoded(self._space[key], trial.params[key]) for key in self._space if key in trial.params}
-        state = {TrialState.COMPLETE: "complete", TrialState.PRUNED: "pruned", TrialState.FAIL: "failed"}
         error = min(trial.intermediate_values.values(), default=None) if trial.value is None else trial.value
-        return Outcome(
-            trial.number,
-            state.get(trial.state, "running"),
-            error,
-            settings,
-            trial.user_attrs.get("seconds"),
-            trial.intermediate_values,
-        )
+        state = _STATES.get(trial.state, "running")
+        known = trial.user_attrs
+        return Outcome(trial.number, state, error, known.get("settings", {}), known.get("seconds"))
 
     def holders(self) -> list[str]:
         """Who runs a trial now, in words."""
-        trials = self._study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
-        return [f"{c[-1]['host']}:{c[-1]['pid']}" for c in (t.user_attrs.get("claims") for t in trials) if c]
+        claims = [trial.user_attrs.get("claims") for trial in self._trials(TrialState.RUNNING)]
+        return [f"{each[-1]['host']}:{each[-1]['pid']}" for each in claims if each]
 
     def importance(self) -> dict[str, float]:
         """How much each setting matters for being among the best quarter, summing to one; empty if that is not known.
 
-        The method is PED-ANOVA (Watanabe et al., 2023, arXiv:2304.10255).
+        By PED-ANOVA (Watanabe et al., 2023, arXiv:2304.10255).
         """
-        values = [trial.value for trial in self._study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))]
-        if len({value for value in values if value is not None and math.isfinite(value)}) < 4:
+        values = {trial.value for trial in self._trials(TrialState.COMPLETE) if trial.value is not None}
+        if sum(map(math.isfinite, values)) < 4:
             return {}
         evaluator = optuna.importance.PedAnovaImportanceEvaluator(target_quantile=0.25)
         found = optuna.importance.get_param_importances(self._study, evaluator=evaluator)
         return {key: float(value) for key, value in found.items()}
-
-
-def _suggested(trial: Trial, key: str, dimension: Dimension) -> Any:
-    """What the sampler draws: of ordered values their place, as neighbours resemble each other."""
-    if isinstance(dimension, Choice):
-        if dimension.ordered:
-            return trial.suggest_int(key, 0, len(dimension.values) - 1)
-        return trial.suggest_categorical(key, dimension.values)
-    if dimension.whole:
-        return trial.suggest_int(key, int(dimension.low), int(dimension.high), log=dimension.log)
-    return trial.suggest_float(key, dimension.low, dimension.high, log=dimension.log)
-
-
-def _decoded(dimension: Dimension, value: Any) -> Any:
-    """The setting that a drawn value stands for."""
-    return dimension.values[value] if isinstance(dimension, Choice) and dimension.ordered else value
-
-
-def _told(value: Any) -> str:
-    return "absent" if value is _MISSING else str(value)

@@ -4,11 +4,9 @@ import hashlib
 import json
 import logging
 import math
-import re
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 from omegaconf import DictConfig
@@ -18,45 +16,30 @@ from ...experiment.files import training_file
 from ...experiment.learn import Learning, Snapshot, run_epochs
 from ...experiment.pipeline import acquire, acquisition_stages, learning_stages, prepare
 from ...experiment.scene import LEARNED, Scene, models_of
-from ...experiment.schema import is_number, is_whole_number
+from ...experiment.schema import ANYTHING, COUNT, NAME, NATURAL, POSITIVE, WORD, Group, check, optional
 from ...experiment.trials import folds_of, split_of
 from ...io.errors import DataFileError, InputError
 from ...io.files import read_json
 from ...io.progress import clock
 from ...io.resumable import forget_checkpoint, keep_checkpoint, resume_checkpoint
 from ...io.stages import Stage, StageInterrupted, run_stages
-from ...learning.training import EpochTrainer
-from .results import Tuning, print_best, ranked, write_pictures, write_results
+from .results import Tuning, print_best, ranked, short_text, write_pictures, write_results
 from .space import SEARCHED_GROUPS, Dimension, fixed_settings, parse_space, with_settings
 from .study import Claim, SharedStudy
-from .workers import Watch, Worker, held
+from .workers import at_work, held, is_alive
 
 log = logging.getLogger(__name__)
 
 _POLL_SECONDS = 0.5
-_LEAST = {"trials": 1, "seed": 0}
 _PICTURE_SECONDS = 60.0
-_RESULTS_LOCK = "results.lock"
+_KEYS = Group(
+    {"model": WORD, "trials": NATURAL, "trial_seconds": optional(POSITIVE), "seed": COUNT, "study": NAME}
+    | {"save_as": NAME, "space": ANYTHING, "settings": Group(each=ANYTHING)}
+)
 
 
 class SlowError(Exception):
     """A trial takes longer than trials may."""
-
-
-class LostError(Exception):
-    """Another worker took a trial over, because this one gave no sign of life."""
-
-
-@dataclass(frozen=True)
-class _Bench:
-    """What every trial of this process works with."""
-
-    study: SharedStudy
-    learning: Learning
-    groups: Mapping[str, Any]
-    checkpoints: Path
-    fingerprint: str
-    trial_seconds: float
 
 
 def run_tuning(config: DictConfig) -> None:
@@ -75,22 +58,21 @@ def run_tuning(config: DictConfig) -> None:
     model = tune["model"]
     groups = with_settings(training_settings(plain, model), fixed_settings(tune))
     folder = run_dir / "tune" / tune["study"]
-    with Worker(folder / "workers", tune["stale_after"]) as worker:
-        watch = Watch(folder / "workers", tune["stale_after"])
+    workers = folder / "workers"
+    with at_work(workers) as identity:
         before = [*acquisition_stages(plain), *_stages_before(plain, model, "")]
         conditions = {"model": model, **_settings_of(before), **groups}
         for group in _searched(groups):
             conditions[group] = {k: v for k, v in groups[group].items() if f"{group}.{k}" not in space}
-        study = SharedStudy(folder, space, conditions, tune["trials"], tune["seed"], worker.identity, watch)
+        seed, alive = tune["seed"], partial(is_alive, workers)
+        study = SharedStudy(folder, space, conditions, tune["trials"], seed, identity, alive)
         _, acquired = acquire(plain, run_dir, wait=True)
         needed = _stages_before(plain, model, acquired)
         run_stages(needed, run_dir, wait=True)
         configured = read_json(run_dir / training_file(model))["kept"]["validation_rollout_error_mm"]
-        tuning = Tuning(plain, groups, space, folder, configured)
-        learning = Learning(Scene(needed[-1].settings, run_dir), model)
-        limit = math.inf if tune["trial_seconds"] is None else tune["trial_seconds"]
-        _work(_Bench(study, learning, groups, folder / "trials", _digest(conditions), limit), tuning)
-    print_best(tuning, study)
+        tuning = Tuning(plain, groups, space, study, configured)
+        _work(tuning, Learning(Scene(needed[-1].settings, run_dir), model), _digest(conditions))
+    print_best(tuning)
 
 
 def _stages_before(config: Mapping[str, Any], model: str, acquired: str) -> list[Stage]:
@@ -122,77 +104,60 @@ def _digest(data: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
 
 
-def _work(bench: _Bench, tuning: Tuning) -> None:
+def _work(tuning: Tuning, learning: Learning, fingerprint: str) -> None:
     """Runs trials until there are enough; then waits for those of others, which may have to be taken over."""
-    study = bench.study
-    drawn = time.monotonic()
-    waiting = False
-    while True:
-        claim = study.claim()
-        if claim is not None:
-            waiting = False
-            _run_trial(bench, claim)
-            with held(tuning.folder / _RESULTS_LOCK):
-                write_results(tuning, study)
-                if time.monotonic() - drawn > _PICTURE_SECONDS:
-                    write_pictures(tuning, study)
-                    drawn = time.monotonic()
+    study, drawn, told = tuning.study, time.monotonic(), False
+    results = tuning.folder / "results.lock"
+    while (claim := study.claim()) is not None or (holders := study.holders()):
+        if claim is None:
+            if not told:
+                log.info("waiting for the last trials, of %s; Ctrl-C leaves them alone", ", ".join(holders))
+            told = True
+            time.sleep(_POLL_SECONDS)
             continue
-        holders = study.holders()
-        if not holders:
-            break
-        if not waiting:
-            log.info("waiting for the last trials, of %s; Ctrl-C leaves them alone", ", ".join(holders))
-            waiting = True
-        time.sleep(_POLL_SECONDS)
-    with held(tuning.folder / _RESULTS_LOCK):
-        write_results(tuning, study)
-        write_pictures(tuning, study)
+        told = False
+        _run_trial(tuning, learning, claim, f"{fingerprint} {_digest(claim.settings)}")
+        with held(results):
+            write_results(tuning)
+            if time.monotonic() - drawn > _PICTURE_SECONDS:
+                write_pictures(tuning)
+                drawn = time.monotonic()
+    with held(results):
+        write_results(tuning)
+        write_pictures(tuning)
 
 
-def _run_trial(bench: _Bench, claim: Claim) -> None:
-    """Trains with the settings of a trial, from where another worker left it, and tells what came of it.
-
-    Raises:
-        InputError: settings that cannot be trained with.
-        StageInterrupted: the user pressed Ctrl-C.
-    """
-    start = time.perf_counter()
-    spent = 0.0
-    path = bench.checkpoints / f"{claim.number}.{claim.claims}.safetensors"
-    groups = with_settings(bench.groups, claim.settings)
-    fingerprint = f"{bench.fingerprint} {_digest(claim.settings)}"
-    words = ", ".join(f"{key} {_short(value)}" for key, value in claim.settings.items())
+def _run_trial(tuning: Tuning, learning: Learning, claim: Claim, fingerprint: str) -> None:
+    """Trains with the settings of a trial, from where another worker left it, and tells what came of it."""
+    start, spent, study = time.perf_counter(), 0.0, tuning.study
+    limit = tuning.config["tune"]["trial_seconds"]
+    path = tuning.folder / "trials" / f"{claim.number}.safetensors"
+    words = ", ".join(f"{key} {short_text(value)}" for key, value in claim.settings.items())
     log.info("trial %d%s: %s", claim.number, "" if claim.claims == 1 else " goes on", words)
 
     def seconds() -> float:
         return spent + time.perf_counter() - start
 
     def save(kept: Snapshot) -> None:
-        metadata = {**kept[1], "seconds": seconds(), "fingerprint": fingerprint}
-        keep_checkpoint(path, "training", kept[0], metadata)
+        keep_checkpoint(path, "training", kept[0], {**kept[1], "seconds": seconds(), "fingerprint": fingerprint})
 
     def watch(record: Mapping[str, float]) -> None:
-        if seconds() > bench.trial_seconds:
+        if limit is not None and seconds() > limit:
             raise SlowError
         if "rollout_error_mm" in record:
-            if not bench.study.owns(claim):
-                raise LostError
-            bench.study.report(claim, int(record["epoch"]), record["rollout_error_mm"])
+            study.report(claim, int(record["epoch"]), record["rollout_error_mm"])
 
     value: float | None = None
     try:
-        trainer = bench.learning.trainer(groups).trainer
-        spent = _resume(trainer, bench.checkpoints, claim, fingerprint)
+        trainer = learning.trainer(with_settings(tuning.groups, claim.settings)).trainer
+        if found := resume_checkpoint(path, "training", fingerprint):
+            trainer.resume(*found)
+            spent = float(found[1]["seconds"])
         run_epochs(f"trial {claim.number}", trainer, save, watch)
         trainer.use_best()
         value = trainer.best_error if math.isfinite(trainer.best_error) else math.inf
     except SlowError:
         pass
-    except LostError:
-        forget_checkpoint(path)
-        log.warning("trial %d was taken over by another process: this one gave no sign of life", claim.number)
-        return
     except KeyboardInterrupt as error:
         raise StageInterrupted(
             f"interrupted in trial {claim.number} (its whole epochs are kept); the same command goes on from there"
@@ -200,32 +165,16 @@ def _run_trial(bench: _Bench, claim: Claim) -> None:
     except (DataFileError, OSError):
         raise  # Not the trial's fault: the next process goes on with it.
     except Exception as error:
-        if bench.study.fail(claim, seconds()):
-            _forget(bench, claim)
+        if study.fail(claim, seconds()):
+            forget_checkpoint(path)
         if isinstance(error, InputError):
             raise InputError(f"trial {claim.number} ({words}): {error}") from error
         raise
-    if bench.study.tell(claim, value, seconds()):
-        _forget(bench, claim)
-        _log_progress(bench.study, claim, value, seconds())
+    if study.tell(claim, value, seconds()):
+        _log_progress(study, claim, value, seconds())
     else:
-        forget_checkpoint(path)
-
-
-def _forget(bench: _Bench, claim: Claim) -> None:
-    """Removes the checkpoints of a trial that is over."""
-    for path in bench.checkpoints.glob(f"{claim.number}.*.safetensors"):
-        path.unlink(missing_ok=True)
-
-
-def _resume(trainer: EpochTrainer[Any], folder: Path, claim: Claim, fingerprint: str) -> float:
-    """Goes on from the last checkpoint of a trial, if there is one; returns the seconds spent up to it."""
-    for claims in range(claim.claims, 0, -1):
-        found = resume_checkpoint(folder / f"{claim.number}.{claims}.safetensors", "training", fingerprint)
-        if found is not None:
-            trainer.resume(*found)
-            return float(found[1]["seconds"])
-    return 0.0
+        log.warning("trial %d was taken over by another process: this one was taken for dead", claim.number)
+    forget_checkpoint(path)
 
 
 def _log_progress(study: SharedStudy, claim: Claim, value: float | None, seconds: float) -> None:
@@ -233,26 +182,18 @@ def _log_progress(study: SharedStudy, claim: Claim, value: float | None, seconds
     outcomes = study.outcomes()
     told = [each for each in outcomes if each.state in ("complete", "pruned")]
     came = "given up" if value is None else "diverged" if math.isinf(value) else f"{value:.3g} mm"
-    parts = [f"trial {claim.number}: {came} in {clock(seconds)}; {len(told)} of {study.trials} done"]
-    best = next(iter(ranked(outcomes)), None)
-    if best is not None:
-        parts.append(f"best {best.error:.3g} mm of trial {best.number}")
+    said = f"trial {claim.number}: {came} in {clock(seconds)}; {len(told)} of {study.trials} done"
+    if best := ranked(outcomes):
+        said += f", best {best[0].error:.3g} mm of trial {best[0].number}"
     if len(told) < study.trials:
         mean = sum(each.seconds or 0.0 for each in told) / len(told)
-        workers = max(1, len(study.holders()) + 1)
-        parts.append(f"about {clock(mean * (study.trials - len(told)) / workers)} left")
-    log.info(", ".join(parts))
-
-
-def _short(value: Any) -> str:
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
+        left = mean * (study.trials - len(told)) / (1 + len(study.holders()))
+        said += f", about {clock(left)} left"
+    log.info("%s", said)
 
 
 def check_tuning(config: Mapping[str, Any]) -> dict[str, Dimension]:
     """Checks the group ``tune``; returns its search space.
-
-    Args:
-        config: a configuration that `check_configuration` accepts.
 
     Raises:
         InputError: a value of the wrong kind or out of range, also among those that may be tried.
@@ -265,23 +206,11 @@ def check_tuning(config: Mapping[str, Any]) -> dict[str, Dimension]:
             "a search needs one split, and data.folds makes several: set data.folds to null, and data.train, "
             "data.validation and data.test."
         )
+    check("tune", tune, _KEYS)
     known = [model for model in models_of(config) if model in LEARNED]
     if tune["model"] not in known:
         raise InputError(f"tune.model is {tune['model']!r}: choose one of {', '.join(known)}.")
-    for key in ("trials", "seed"):
-        if not is_whole_number(tune[key]) or tune[key] < (key == "trials"):
-            raise InputError(f"tune.{key} is {tune[key]!r}: it must be a whole number, {_LEAST[key]} or more.")
-    for key in ("stale_after", "trial_seconds"):
-        given = tune[key]
-        if (given is not None or key == "stale_after") and not (is_number(given) and 0.0 < given < math.inf):
-            raise InputError(f"tune.{key} is {given!r}: it must be positive, in seconds.")
-    for key in ("study", "save_as"):
-        if not isinstance(tune[key], str) or not re.fullmatch(r"[\w-]+", tune[key]):
-            raise InputError(f"tune.{key} is {tune[key]!r}: use letters, digits, _ and - alone.")
-    space = parse_space(tune["space"])
-    if not isinstance(tune["settings"], Mapping):
-        raise InputError(f"tune.settings is {tune['settings']!r}: it must be a group of settings.")
-    fixed = fixed_settings(tune)
+    space, fixed = parse_space(tune["space"]), fixed_settings(tune)
     for key in fixed.keys() & space.keys():
         raise InputError(f"tune.settings.{key} and tune.space.{key} exclude each other: take one of them out.")
     tried = [{key: value} for key, dimension in space.items() for value in dimension.ends]

@@ -1,0 +1,150 @@
+"""Rigid motion of a base: as a function, from a table, recorded, and followed by markers."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from warp_resphys.data.base_motion import (
+    at_times,
+    check_steps,
+    followed,
+    in_frame,
+    poses_of,
+    prescribed,
+    rigid,
+    since_first,
+)
+from warp_resphys.data.rigid import RigidTransform
+from warp_resphys.io.errors import DataFileError
+
+TIMES = np.linspace(0.0, 2.0, 201)
+SWING = {
+    "swings": {
+        "across": {"frequency": 1.5, "translation": (0.02, 0.0, -0.01)},
+        "about": {"frequency": 0.7, "rotation": (0.1, 0.3, -0.2), "phase": 0.4},
+    },
+    "about": (0.05, -0.02, 0.01),
+    "start": 0.3,
+    "ramp": 0.2,
+}
+POINTS = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.08, 0.0], [0.0, 0.02, 0.05]])
+
+
+def moved(poses, points=POINTS):
+    return rigid(poses).apply(np.broadcast_to(points, (len(poses), *points.shape)))
+
+
+class TestFunctions:
+    def test_nothing_moves_before_the_start_and_then_as_it_says(self):
+        poses = prescribed(SWING, TIMES)
+        assert not poses[TIMES <= 0.3].any()
+        after = TIMES >= 0.5
+        since = TIMES[after] - 0.3
+        turned = np.sin(2 * np.pi * 0.7 * since + 0.4) - np.sin(0.4)
+        np.testing.assert_allclose(poses[after, 3:], turned[:, None] * [0.1, 0.3, -0.2], atol=1e-12)
+        centre = moved(poses, np.array([SWING["about"]]))[:, 0] - SWING["about"]
+        expected = np.sin(2 * np.pi * 1.5 * since)[:, None] * [0.02, 0.0, -0.01]
+        np.testing.assert_allclose(centre[after], expected, atol=1e-12)
+
+    def test_it_begins_without_a_jump(self):
+        fine = prescribed(SWING, np.linspace(0.29, 0.51, 2201))
+        assert np.abs(np.diff(fine, 2, axis=0)).max() < 1e-5 * np.abs(prescribed(SWING, TIMES)).max()
+
+    def test_a_factor_scales_the_amplitudes(self):
+        whole, half = prescribed(SWING, TIMES), prescribed(SWING, TIMES, scale=0.5)
+        np.testing.assert_allclose(half[:, 3:], 0.5 * whole[:, 3:], atol=1e-15)
+
+
+class TestTables:
+    def test_a_table_gives_the_motion_of_its_point(self, tmp_path):
+        known = prescribed(SWING, TIMES)
+        place, offset = np.array([0.03, 0.01, -0.02]), np.array([5.0, -2.0, 1.0])
+        quaternions = Rotation.from_rotvec(known[:, 3:]).as_quat()[:, [3, 0, 1, 2]]
+        table = np.column_stack([TIMES, moved(known, place[None])[:, 0] + offset, quaternions])
+        np.savetxt(tmp_path / "shaker.csv", table, delimiter=",", header="t, x, y, z, w, i, j, k")
+        found = prescribed({"file": "shaker.csv", "about": place}, TIMES[3:-3] + 0.004, tmp_path)
+        np.testing.assert_allclose(moved(found), moved(prescribed(SWING, TIMES[3:-3] + 0.004)), atol=2e-5)
+
+    @pytest.mark.parametrize(
+        "text", ["1,2,3\n", "a,b\n", "0,0,0,0,1,0,0,0\n" * 5, "0,0,0,0,0,0,0,0\n1,0,0,0,1,0,0,0\n" * 2]
+    )
+    def test_what_is_no_table_of_poses_is_one_sentence(self, tmp_path, text):
+        (tmp_path / "bad.csv").write_text(text)
+        with pytest.raises(DataFileError, match=r"bad\.csv.*(\.$|to be)"):
+            prescribed({"file": "bad.csv"}, TIMES, tmp_path)
+
+    def test_a_table_that_is_not_there(self, tmp_path):
+        with pytest.raises(DataFileError, match="cannot be read"):
+            prescribed({"file": "none.csv"}, TIMES, tmp_path)
+
+
+class TestRecorded:
+    def test_places_and_quaternions_give_the_motion_since_the_first_frame(self):
+        known = prescribed(SWING, TIMES + 0.8)
+        start = rigid(known[:1])
+        turned = rigid(known).rotation @ start.rotation[0].T
+        quaternions = Rotation.from_matrix(rigid(known).rotation).as_quat()[:, [3, 0, 1, 2]]
+        quaternions[::3] *= -2.0  # the same rotations
+        found = rigid(since_first(known[:, :3], quaternions, "a.npz"))
+        np.testing.assert_allclose(found.rotation, turned, atol=1e-12)
+        again = found.apply(np.broadcast_to(start.apply(POINTS[None]), (len(known), *POINTS.shape)))
+        np.testing.assert_allclose(again, moved(known), atol=1e-12)
+
+    @pytest.mark.parametrize("wrong", [np.nan, 0.0])
+    def test_a_quaternion_that_is_none(self, wrong):
+        quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (5, 1))
+        quaternions[2] = wrong
+        with pytest.raises(DataFileError, match="'base' needs, in every frame"):
+            since_first(np.zeros((5, 3)), quaternions, "a.npz")
+
+    def test_rotation_vectors_go_on_beyond_half_a_turn(self):
+        angles = np.linspace(0.0, 4.0 * np.pi, 200)
+        poses = poses_of(Rotation.from_rotvec(angles[:, None] * [0.0, 0.6, 0.8]).as_matrix(), np.zeros((200, 3)))
+        np.testing.assert_allclose(poses[:, 3:], angles[:, None] * [0.0, 0.6, 0.8], atol=1e-9)
+
+
+class TestFollowed:
+    NOISE = 1e-4  # m
+
+    def test_markers_tell_the_motion_with_less_than_their_noise(self):
+        draw = np.random.default_rng(0)
+        known = prescribed(SWING, TIMES)
+        markers = moved(known) + self.NOISE * draw.standard_normal((len(TIMES), *POINTS.shape))
+        markers[20:25, 1] = markers[100, :2] = np.nan  # three of them are seen, then two
+        found = followed(markers, POINTS, "a.npz")
+        error = np.linalg.norm(moved(found) - moved(known), axis=-1)
+        assert error.mean() < self.NOISE
+        jerky = np.diff(moved(found), 2, axis=0) - np.diff(moved(known), 2, axis=0)
+        assert np.abs(jerky).mean() < 0.2 * self.NOISE  # unsmoothed, 2.4 times the noise over the root of their number
+
+    def test_a_base_that_stands_still_stays_where_it_is(self):
+        found = followed(np.broadcast_to(POINTS, (50, *POINTS.shape)), POINTS, "a.npz")
+        assert np.abs(found).max() < 1e-12
+
+    def test_too_few_markers(self):
+        markers = moved(prescribed(SWING, TIMES))
+        markers[:150, :2] = np.nan
+        with pytest.raises(DataFileError, match=r"a\.npz: the base moves, and three .* in 25 % of the frames"):
+            followed(markers, POINTS, "a.npz")
+
+    def test_another_frame_sees_the_same_motion(self):
+        known = prescribed(SWING, TIMES)
+        to_body = RigidTransform(Rotation.from_rotvec([0.5, -1.0, 2.0]).as_matrix(), np.array([0.3, -0.1, 0.7]))
+        seen = in_frame(known, to_body)
+        elsewhere = to_body.apply(POINTS)
+        np.testing.assert_allclose(moved(seen, elsewhere), to_body.apply(moved(known)), atol=1e-12)
+
+
+def test_times_between_frames_and_beyond_them():
+    poses = prescribed(SWING, TIMES)
+    found = at_times(poses, TIMES, TIMES[:-1] + 0.003)
+    np.testing.assert_allclose(found, prescribed(SWING, TIMES[:-1] + 0.003), atol=2e-5)
+    np.testing.assert_array_equal(at_times(poses, TIMES, np.array([-1.0, 3.0])), poses[[0, -1]])
+
+
+def test_a_motion_that_tears_a_body_is_refused():
+    steps = prescribed(SWING, np.arange(0.0, 2.0, 0.01))
+    check_steps(steps, POINTS, "a.npz")
+    steps[50:, 0] += 0.03
+    with pytest.raises(DataFileError, match=r"a\.npz: the base jumps by .* mm in step 50,"):
+        check_steps(steps, POINTS, "a.npz")

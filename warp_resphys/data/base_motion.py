@@ -1,0 +1,230 @@
+"""Rigid motion of what a body is fixed to: as a function of time, from a file, recorded, or followed by markers on it.
+
+A pose is a translation t [m] and a rotation vector [rad] of R, side by side: what was at x before time zero is at
+R x + t.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline, make_smoothing_spline
+from scipy.spatial.transform import Rotation, Slerp
+
+from ..io.errors import DataFileError
+from .rigid import RigidTransform, kabsch
+
+FloatArray = NDArray[np.float64]
+
+OBSERVED = ("recorded", "reference")  # the array `base` of a recording, or its reference markers, tell it
+_LARGEST_STEP = 0.2  # of the size of a body
+_MILLI = 1e3
+
+
+def swinging(motion: Mapping[str, Any], times: ArrayLike, scale: float = 1.0) -> FloatArray:
+    """(T, 6) poses of a sum of sinusoids, which begins where the body was.
+
+    Args:
+        motion: ``swings``, by any names, each with ``frequency`` [Hz] and amplitudes: ``translation`` [m] and
+            ``rotation`` [rad] along and about x, y and z, and a ``phase`` [rad]; ``about``, the point that rotations
+            leave where it is [m]; ``start``, before which nothing moves, and ``ramp``, during which the amplitudes
+            grow from nothing after that [s].
+        times: (T,) [s].
+        scale: of the amplitudes.
+    """
+    since = np.maximum(np.asarray(times, dtype=np.float64) - motion.get("start", 0.0), 0.0)
+    ramp, about = float(motion.get("ramp", 0.0)), np.asarray(motion.get("about", (0.0, 0.0, 0.0)), dtype=np.float64)
+    share = np.clip(since / ramp, 0.0, 1.0) if ramp else np.ones_like(since)
+    grown = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+    poses = np.zeros((len(since), 6))
+    for swing in motion["swings"].values():
+        phase = float(swing.get("phase", 0.0))
+        wave = grown * (np.sin(2.0 * np.pi * swing["frequency"] * since + phase) - np.sin(phase))
+        amplitudes = [swing.get(name, (0.0, 0.0, 0.0)) for name in ("translation", "rotation")]
+        poses += scale * wave[:, None] * np.concatenate(amplitudes)
+    poses[:, :3] += about - Rotation.from_rotvec(poses[:, 3:]).apply(about)
+    return poses
+
+
+def poses_of(rotation: FloatArray, translation: FloatArray) -> FloatArray:
+    """(T, 6) poses of (T, 3, 3) rotations and (T, 3) translations [m], their rotation vectors without jumps."""
+    return np.concatenate([translation, _unwrapped(Rotation.from_matrix(rotation).as_rotvec())], axis=1)
+
+
+def rigid(poses: FloatArray) -> RigidTransform:
+    """The motions that (T, 6) poses stand for."""
+    return RigidTransform(Rotation.from_rotvec(poses[:, 3:]).as_matrix(), poses[:, :3])
+
+
+def prescribed(motion: Mapping[str, Any], times: ArrayLike, folder: str | Path = ".", scale: float = 1.0) -> FloatArray:
+    """(T, 6) poses at (T,) times [s] of a motion that is known beforehand.
+
+    Args:
+        motion: ``file``, see `_table`, or ``swings``, see `_swinging`; and ``about``, the point of the base, in the
+            frame of the mesh, whose translation is given, and which rotations leave where it is [m].
+        times: (T,) [s].
+        folder: that a path in ``file`` begins in.
+        scale: of the whole motion.
+
+    Raises:
+        DataFileError: the file cannot be read.
+    """
+    at = np.asarray(times, dtype=np.float64)
+    poses = scale * (_table(Path(folder) / motion["file"], at) if "file" in motion else _swinging(motion, at))
+    about = np.asarray(motion.get("about", (0.0, 0.0, 0.0)), dtype=np.float64)
+    poses[:, :3] += about - Rotation.from_rotvec(poses[:, 3:]).apply(about)
+    return np.asarray(poses)
+
+
+def _swinging(motion: Mapping[str, Any], times: FloatArray) -> FloatArray:
+    """(T, 6) a sum of sinusoids, which begins where the body was.
+
+    ``swings``, by any names, have each a ``frequency`` [Hz], amplitudes ``translation`` [m] and ``rotation`` [rad]
+    along and about x, y and z, and a ``phase`` [rad]; before ``start`` nothing moves, and during ``ramp`` after it the
+    amplitudes grow from nothing [s].
+    """
+    since = np.maximum(times - motion.get("start", 0.0), 0.0)
+    ramp = float(motion.get("ramp", 0.0))
+    share = np.clip(since / ramp, 0.0, 1.0) if ramp else np.ones_like(since)
+    grown = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+    poses = np.zeros((len(since), 6))
+    for swing in motion["swings"].values():
+        phase = float(swing.get("phase", 0.0))
+        wave = grown * (np.sin(2.0 * np.pi * swing["frequency"] * since + phase) - np.sin(phase))
+        poses += wave[:, None] * np.concatenate([swing.get(x, (0.0, 0.0, 0.0)) for x in ("translation", "rotation")])
+    return poses
+
+
+def _table(path: Path, times: FloatArray) -> FloatArray:
+    """(T, 6) the motion since the first line of a table: t [s], x, y, z [m] and a quaternion w, x, y, z in each line.
+
+    Lines that begin with # are not read; before and after the table, its first and last pose.
+    """
+    try:
+        table = np.loadtxt(path, delimiter=",", ndmin=2)
+    except (OSError, ValueError) as error:
+        raise DataFileError(f"{path} cannot be read as a table of numbers: {error}.") from error
+    if table.shape[1:] != (8,) or len(table) < 4 or not (np.diff(table[:, 0]) > 0.0).all():
+        raise DataFileError(
+            f"{path} needs four lines or more of t, x, y, z, and a quaternion w, x, y, z, with commas between them, "
+            "and times that rise."
+        )
+    return at_times(since_first(table[:, 1:4] - table[0, 1:4], table[:, 4:], path), table[:, 0], times)
+
+
+def since_first(places: ArrayLike, quaternions: ArrayLike, source: str | Path) -> FloatArray:
+    """(T, 6) motion since the first frame, of a base that was recorded.
+
+    Args:
+        places: (T, 3) of a point on it [m].
+        quaternions: (T, 4) of its rotation, w first.
+        source: the file, for messages.
+
+    Raises:
+        DataFileError: a value that is not finite, or a quaternion of no length.
+    """
+    x, turned = np.asarray(places, dtype=np.float64), np.asarray(quaternions, dtype=np.float64)
+    if not (np.isfinite(x).all() and np.isfinite(turned).all() and (np.linalg.norm(turned, axis=1) > 0.0).all()):
+        raise DataFileError(
+            f"{source}: 'base' needs, in every frame, a place in metres and a quaternion (w, x, y, z) that is not zero."
+        )
+    rotations = Rotation.from_quat(turned[:, [1, 2, 3, 0]])
+    matrices = (rotations * rotations[0].inv()).as_matrix()
+    return poses_of(matrices, x - matrices @ x[0])
+
+
+def followed(markers: FloatArray, still: FloatArray, source: str | Path) -> FloatArray:
+    """(T, 6) motion of markers that stand on the base.
+
+    Frames in which fewer than three of them are seen are interpolated, and a spline smooths the motion as much as its
+    noise asks for (generalised cross-validation): a body feels the acceleration of its base.
+
+    Args:
+        markers: (T, M, 3) [m], NaN where not seen.
+        still: (M, 3) before time zero [m], NaN for one that was not seen.
+        source: the file, for messages.
+
+    Raises:
+        DataFileError: three or more are seen in less than half of the frames.
+    """
+    seen = np.asarray(np.isfinite(markers).all(-1) & np.isfinite(still).all(-1))
+    enough = seen.sum(1) >= 3
+    if not enough.any() or enough.mean() < 0.5:
+        raise DataFileError(
+            f"{source}: the base moves, and three of its reference markers are seen in {100.0 * enough.mean():.0f} % "
+            "of the frames: fill their gaps, or give more of them in markers.reference."
+        )
+    rotation, translation = np.zeros((len(markers), 3, 3)), np.zeros((len(markers), 3))
+    for frame in np.flatnonzero(enough).tolist():
+        found = kabsch(still[seen[frame]], markers[frame, seen[frame]])
+        rotation[frame], translation[frame] = found.rotation, found.translation
+    frames, known = np.arange(len(markers)), np.flatnonzero(enough)
+    inside = np.clip(frames, known[0], known[-1])
+    turned = Slerp(known, Rotation.from_matrix(rotation[known]))(inside) if len(known) > 1 else None
+    matrices = np.broadcast_to(rotation[known[0]], rotation.shape) if turned is None else turned.as_matrix()
+    moved = np.stack([np.interp(frames, known, x) for x in translation[known].T], axis=1)
+    return _smoothed(poses_of(matrices, moved))
+
+
+def in_frame(poses: FloatArray, frame: RigidTransform) -> FloatArray:
+    """(T, 6) the same motions as another frame has them: G D G^-1.
+
+    Args:
+        poses: (T, 6) D.
+        frame: G, from the frame of the poses to the other one.
+    """
+    motion = rigid(poses)
+    turned = frame.rotation @ motion.rotation @ frame.rotation.T
+    origin = -frame.rotation.T @ frame.translation
+    return poses_of(turned, frame.apply(motion.rotation @ origin + motion.translation))
+
+
+def at_times(poses: FloatArray, times: NDArray[Any], new: NDArray[Any]) -> FloatArray:
+    """(T', 6) poses between frames, by cubic splines; before and after them, the first and the last."""
+    if len(poses) < 2:
+        return np.repeat(poses, len(new), axis=0)
+    kept = np.clip(new, times[0], times[-1])
+    return np.asarray(CubicSpline(times, poses)(kept))
+
+
+def check_steps(poses: FloatArray, points: FloatArray, source: str | Path) -> None:
+    """Refuses a motion that no simulation follows.
+
+    Args:
+        poses: (K + 1, 6) at the steps of a simulation.
+        points: (N, 3) the undeformed body [m].
+        source: what gave the motion, for messages.
+
+    Raises:
+        DataFileError: a corner of the body moves by a fifth of its size in a single step.
+    """
+    low, high = points.min(axis=0), points.max(axis=0)
+    corners = np.stack(np.meshgrid(*np.stack([low, high], axis=1), indexing="ij"), axis=-1).reshape(-1, 3)
+    moved = rigid(poses).apply(np.broadcast_to(corners, (len(poses), *corners.shape)))
+    steps = np.linalg.norm(np.diff(moved, axis=0), axis=-1).max(axis=1, initial=0.0)
+    if len(steps) and steps.max() > _LARGEST_STEP * float((high - low).max()):
+        raise DataFileError(
+            f"{source}: the base jumps by {_MILLI * steps.max():.0f} mm in step {int(steps.argmax()) + 1}, more than a "
+            "body follows without being torn: check the unit of the motion, or take a smaller time_step."
+        )
+
+
+def _smoothed(poses: FloatArray) -> FloatArray:
+    if len(poses) < 5:
+        return poses
+    frames = np.arange(len(poses), dtype=np.float64)
+    return np.stack([make_smoothing_spline(frames, x)(frames) if np.ptp(x) > 0.0 else x for x in poses.T], axis=1)
+
+
+def _unwrapped(vectors: FloatArray) -> FloatArray:
+    """(T, 3) rotation vectors, each the nearest to the one before of those of its rotation."""
+    found = vectors.copy()
+    for row in range(1, len(found)):
+        angle = np.linalg.norm(found[row])
+        if angle > 0.0:
+            axis = found[row] / angle
+            turns = np.round((found[row - 1] @ axis - angle) / (2.0 * np.pi))
+            found[row] = (angle + 2.0 * np.pi * turns) * axis
+    return found

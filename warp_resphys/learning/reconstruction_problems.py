@@ -1,0 +1,234 @@
+"""A step's residual force as a problem of least squares, for full states and for sparse markers."""
+
+import math
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from typing_extensions import override
+
+from ..data.markers import Markers
+from ..dynamics.inputs import Inputs
+from ..dynamics.integrator import State
+from ..dynamics.linearisation import Linearisation
+from ..dynamics.simulator import Constants, Simulator
+from ..io.errors import ConvergenceError
+from ..linalg.conjugate_gradients import conjugate_gradients
+from ..linalg.least_squares import Move, Point, Problem, ridge
+
+
+@dataclass(frozen=True)
+class Step:
+    """A step whose force is looked for."""
+
+    simulator: Simulator  # makes it
+    constants: Constants  # of the simulator
+    state: State  # where it starts
+    inputs: Inputs  # what acts during it
+    observed: torch.Tensor  # (B, N, 3) positions, or (B, m, 3) markers, NaN where one was not seen [m]
+    weight: float  # lambda [m^2/N^2]
+    markers: Markers | None = None  # C, for as many environments as the state has; None for positions
+    basis: torch.Tensor | None = None  # (3 N, modes) of forces; None for every force on the free vertices
+
+    def linearise(self) -> Linearisation:
+        """Of the step without a force."""
+        return self.simulator.linearise(self.state, self.inputs, self.constants)
+
+    def missing(self, end: torch.Tensor) -> torch.Tensor:
+        """(B, 3 m, 1) y - C(q+), zero where not seen [m]."""
+        assert self.markers is not None
+        return torch.where(torch.isfinite(self.observed), self.observed - self.markers(end), 0.0).flatten(1)[..., None]
+
+    def transposed_jacobian(self, end: torch.Tensor) -> torch.Tensor:
+        """(B, 3 N, 3 m) C'^T of the markers that were seen."""
+        assert self.markers is not None
+        return self.markers.transposed_jacobian(end) * torch.isfinite(self.observed).flatten(1)[:, None]
+
+
+class StepProblem(Problem):
+    """The search of a step's force; points are as far apart as the positions of their stages [m]."""
+
+    method: ClassVar[str]
+    remedies: ClassVar[str] = "reconstruction.regularisation or reconstruction.max_iterations"
+
+    @abstractmethod
+    def __init__(self, step: Step) -> None: ...
+
+    @abstractmethod
+    def start(self, first_guess: torch.Tensor | None) -> Point:
+        """Where to start, perhaps at a force (B, N, 3) [N]."""
+
+    @abstractmethod
+    def reached(self, point: Point) -> tuple[torch.Tensor, torch.Tensor]:
+        """(B, N, 3) solution x of the stage [m], and the force [N]."""
+
+    @override
+    def distance(self, old: Point, new: Point) -> torch.Tensor:
+        return (self.reached(new)[0] - self.reached(old)[0]).abs().amax((1, 2))
+
+
+class FullStateProblem(StepProblem):
+    """|x - x*|^2 + w |g(x)|^2 over positions x, g(x) being the force that the step lacks to end there.
+
+    With H = dg/dx, a step of Gauss-Newton solves
+
+        (I + w H^2) dx = -(x - x*) - w H g(x)
+
+    by conjugate gradients, preconditioned with (I + sqrt(w) H)^2: for every eigenvalue h of H the quotient
+    (1 + w h^2) / (1 + sqrt(w) h)^2 lies between 1/2 and 1, so that a dozen iterations do for any w. Damping is in units
+    of the matrix on the left: it shortens the step to dx / (1 + d). The search starts at x*, and needs no force.
+
+    Where x stands at a fraction e of the time step, |q+ - q*| is |x - x*| / e: w is lambda e^2.
+    """
+
+    method = "Gauss-Newton"
+    remedies = "reconstruction.max_iterations or reconstruction.tolerance"
+
+    @override
+    def __init__(self, step: Step) -> None:
+        self._step = step.linearise()
+        self._target = self._step.hold(step.simulator.method.solution_for(step.state, step.observed))
+        self._weight = step.weight * self._step.stage.end**2
+
+    @override
+    def start(self, first_guess: torch.Tensor | None) -> Point:
+        return self.evaluate(self._target)
+
+    @override
+    def reached(self, point: Point) -> tuple[torch.Tensor, torch.Tensor]:
+        return point.x, point.kept[0]
+
+    @override
+    def evaluate(self, x: torch.Tensor) -> Point:
+        force = self._step.residual(x)
+        missed = (x - self._target).square().sum((1, 2))
+        return Point(x, missed + self._weight * force.square().sum((1, 2)), (force,))
+
+    @override
+    def linearise(self, point: Point) -> Move:
+        step, weight, x, (force,) = self._step, self._weight, point.x, point.kept
+        step.update(x)
+        factor = step.shifted(math.sqrt(weight))
+
+        def preconditioner(r: torch.Tensor) -> torch.Tensor:
+            right = r[:, step.free].reshape(len(r), -1, 1)
+            solved = factor.solve(factor.solve(right)).reshape(len(r), -1, 3)
+            return torch.zeros_like(r).index_copy(1, step.free, solved)
+
+        change = conjugate_gradients(
+            lambda d: d + weight * step.product(step.product(d)),
+            preconditioner,
+            self._target - x - weight * step.product(force),
+            tolerance=1e-6,
+        )
+        return lambda damping: x + change / (1.0 + damping)[:, None, None]
+
+
+class MarkerPositionProblem(StepProblem):
+    """Positions and forces at once, by full steps: |y - C(q+)|^2 + lambda |f|^2 of sparse markers.
+
+    The step with a force f ends where the residual g of the step without it equals f. Linearised at an iterate x, with
+    the exact Hessian H = dg/dx, that is
+
+        x+ = x - H^-1 g + H^-1 f
+
+    so that f solves a ridge regression with J = C' H^-1 and r = y - C(x) + C' H^-1 g, C' being the derivative of C:
+    f = J^T (J J^T + lambda I)^-1 r. One factorisation and 3 m + 2 back-substitutions an iteration, no inner solve, and
+    at convergence f = g(x) holds as it does for a step of the simulator. Restricted to forces B a with orthonormal
+    columns B (see `vibration_modes`), J is C' H^-1 B, which takes a back-substitution a column where these are fewer.
+
+    Where x stands at a fraction e of the time step, q+ moves 1/e times as far as x, so that e (y - C(q+)) takes the
+    place of y - C(x), and lambda e^2 that of lambda. The objective is zero everywhere: every step is taken.
+    """
+
+    method = "sparse Gauss-Newton"
+
+    @override
+    def __init__(self, step: Step) -> None:
+        self._task, self._step = step, step.linearise()
+
+    @override
+    def start(self, first_guess: torch.Tensor | None) -> Point:
+        return self.evaluate(torch.stack([self._step.start, torch.zeros_like(self._step.start)], 1))
+
+    @override
+    def reached(self, point: Point) -> tuple[torch.Tensor, torch.Tensor]:
+        return point.x[:, 0], point.x[:, 1]
+
+    @override
+    def evaluate(self, x: torch.Tensor) -> Point:
+        return Point(x, x.new_zeros(len(x)))
+
+    @override
+    def linearise(self, point: Point) -> Move:
+        x, step, basis = point.x[:, 0], self._step, self._task.basis
+        end = step.finish(x).q
+        residual = step.residual(x).reshape(len(x), -1, 1).to(x.dtype)
+        step.factorise(x)
+        transposed = self._task.transposed_jacobian(end)
+        columns = transposed
+        if basis is not None and basis.shape[1] < transposed.shape[2]:
+            columns = basis.expand(len(x), -1, -1)
+        response, settling = step.solve(torch.cat([columns, residual], dim=2)).tensor_split([-1], dim=2)
+        jacobian = response.mT if columns is transposed else transposed.mT @ response
+        if basis is not None and columns is transposed:
+            jacobian = jacobian @ basis
+        right = step.stage.end * self._task.missing(end) + transposed.mT @ settling
+        force = ridge(jacobian, right, self._task.weight * step.stage.end**2)
+        force = force if basis is None else basis @ force
+        new = x + (step.solve(force) - settling).view_as(x)
+        return lambda _: torch.stack([new, force.view_as(x)], 1)
+
+
+class MarkerForceProblem(StepProblem):
+    """Forces, for motions that full steps do not follow, such as jerks of real bodies.
+
+    Each trial force is followed by a whole step of the simulator, with its line search, so that an iterate is always a
+    state that it reaches. With J = C' H^-1 there, the next force minimises
+    |r - J (f - f0)|^2 + lambda |f|^2 + d lambda |f - f0|^2.
+    """
+
+    method = "sparse Levenberg-Marquardt"
+
+    @override
+    def __init__(self, step: Step) -> None:
+        self._task = step
+
+    @override
+    def start(self, first_guess: torch.Tensor | None) -> Point:
+        """A first guess that the simulator does not follow is left."""
+        if first_guess is not None and bool(torch.isfinite((found := self.evaluate(first_guess)).value).all()):
+            return found
+        return self.evaluate(torch.zeros_like(self._task.state.q))
+
+    @override
+    def reached(self, point: Point) -> tuple[torch.Tensor, torch.Tensor]:
+        return self._task.simulator.method.solution_for(self._task.state, point.kept[0]), point.x
+
+    @override
+    def evaluate(self, x: torch.Tensor) -> Point:
+        task = self._task
+        try:
+            end = task.simulator.step(task.state, task.inputs.plus(x), task.constants)[0].q
+        except ConvergenceError:
+            return Point(x, x.new_full((len(x),), torch.inf), (task.state.q,))
+        value = task.missing(end).square().sum((1, 2)) + task.weight * x.square().sum((1, 2))
+        return Point(x, value, (end,))
+
+    @override
+    def linearise(self, point: Point) -> Move:
+        force, (end,) = point.x.flatten(1)[..., None], point.kept
+        step = self._task.linearise()
+        step.factorise(self.reached(point)[0])
+        # q+ moves 1 / end times as far as the solution.
+        jacobian = step.solve(self._task.transposed_jacobian(end)).mT / step.stage.end
+        missing = self._task.missing(end)
+
+        def damped_step(damping: torch.Tensor) -> torch.Tensor:
+            own = (1.0 + damping)[:, None, None]
+            centre = force - force / own
+            change = ridge(jacobian, missing + jacobian @ (force / own), self._task.weight * own)
+            return (centre + change).view_as(point.x)
+
+        return damped_step

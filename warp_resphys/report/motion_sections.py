@@ -23,7 +23,7 @@ from .data import (
     shown_models,
     tip_markers,
 )
-from .page import Block, Canvas, Drawn, Part, drawn_file, file_address, largest_text
+from .page import Block, Canvas, Drawn, Part, data_address, drawn_file, largest_text
 from .render import Pixels, draw
 from .verdict import unbroken
 
@@ -119,7 +119,7 @@ def motion_section(data: RunReport, canvas: Canvas) -> Part | None:
 
         def film(path: Path) -> Drawn:
             canvas.started["video"].result()
-            return Drawn("video", said, film=file_address(path, "video/mp4"))
+            return Drawn("video", said, film=data_address(path.read_bytes(), "video/mp4"))
 
         blocks += canvas.attempt("motion.mp4", film)
     same = "The same trial" if blocks else f"The trial {name}"

@@ -197,14 +197,11 @@ def _landscape_points(
     if np.isfinite(loss).any():
         row, *column = np.unravel_index(int(np.nanargmin(loss)), loss.shape)
         points["lowest of the grid"] = (float(modulus[row]), float(ratio[column[0]]) if column else 0.0)
-    e, nu = "youngs_modulus", "poissons_ratio"
-    if e in data.start and nu in data.start:
-        points["data sheet"] = (data.start[e], data.start[nu])
-    identified = data.identification.get("sysid", {}).get("parameters", {})
-    if e in identified:
-        points["identified"] = (identified[e], identified.get(nu, data.start.get(nu, 0.0)))
-    if e in data.truth and nu in data.truth:
-        points["true"] = (data.truth[e], data.truth[nu])
+    found = data.identification.get("sysid", {}).get("parameters", {})
+    found = {"poissons_ratio": data.start.get("poissons_ratio", 0.0), **found}
+    for name, values in {"data sheet": data.start, "identified": found, "true": data.truth}.items():
+        if {"youngs_modulus", "poissons_ratio"} <= values.keys():
+            points[name] = (values["youngs_modulus"], values["poissons_ratio"])
     return points
 
 

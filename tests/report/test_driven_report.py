@@ -1,6 +1,8 @@
 """The report of motions that pressure drives, on made-up runs."""
 
 import re
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,6 +26,7 @@ from warp_resphys.report.bodies import Motion, axes_from_below, motion_axes
 from warp_resphys.report.data import Pressures, along_body, drawn_markers, tip_markers
 from warp_resphys.report.figures import CHAMBER_COLOURS, TONES
 from warp_resphys.report.mesh import MeshSummary
+from warp_resphys.report.motion_sections import _sequences
 from warp_resphys.report.page import Cell, Picture
 from warp_resphys.report.run_page import largest_filtered, range_texts
 from warp_resphys.report.sections import horizon_table, scale_table
@@ -234,7 +237,7 @@ def test_recordings_are_shown_on_the_body_as_it_hangs(tmp_path, monkeypatch):
     assert found.mesh.vertices[:, 2].min() - found.recordings.mesh.vertices[:, 2].min() == pytest.approx(
         0.004, abs=1e-6
     )
-    nominal = dict(zip(found.recordings.registration.names, found.recordings.nominal[:, 2], strict=True))
+    nominal = dict(zip(found.recordings.labels, found.recordings.nominal[:, 2], strict=True))
     assert nominal["Base - 1"] == BASE["Base - 1"][2]
     low, high = ("Ring 3 - 1", "Ring 1 - 1")
     places = settings["markers"]["tracked"]
@@ -413,6 +416,27 @@ def test_pressures_are_in_kilopascal_in_the_chambers_colours():
     np.testing.assert_allclose(steps[1].get_data().edges, [0.0, 0.5, 1.0])
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["one", "two", "limit"]
     assert [line.get_color() for line in figure.legends[0].get_lines()[:2]] == list(CHAMBER_COLOURS[:2])
+
+
+def test_pressures_of_poses_are_bars_of_the_chambers_in_use():
+    poses = {"a": np.array([[9e3, 0.0, 1e3]]), "b (test)": np.array([[0.0, 0.0, 0.0], [3e3, 0.0, 5e3]])}
+    figure = motion_figures.pose_pressures(Pressures(("one", "two", "three"), poses, 2e4), narrow=False)
+    (axes,) = figure.axes
+    assert axes.get_xlabel() == "pressure [kPa]"
+    assert [tick.get_text() for tick in axes.get_yticklabels()] == ["a", "b (test)"]
+    assert [bar.get_width() for bar in axes.patches] == [9.0, 3.0, 1.0, 5.0]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["one", "three", "limit"]
+    assert [line.get_xdata()[0] for line in axes.lines] == [20.0]
+
+
+def test_poses_are_not_drawn_over_time():
+    rows = np.ones((3, 1))
+    driven = Pressures(("one",), {"p": rows, "a": rows, "b": rows, "q": rows}, poses=("p", "q"))
+    assert list(_sequences(driven, SimpleNamespace(names=("b", "q")))) == [
+        "a, a trial of the training",
+        "b, a test trial",
+    ]
+    assert _sequences(replace(driven, poses=tuple("pabq")), SimpleNamespace(names=("b", "q"))) == {}
 
 
 def test_markers_stand_over_the_pressures():

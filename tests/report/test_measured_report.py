@@ -28,10 +28,9 @@ from warp_resphys.io.stages import StageContext
 from warp_resphys.learning.metrics import PUBLISHED_MM
 from warp_resphys.mesh.mesh import box_hexahedra
 from warp_resphys.report import figures, motion_figures, render
-from warp_resphys.report.bodies import Motion, motion_axes, write_film
+from warp_resphys.report.bodies import Motion, instants, motion_axes, write_film
 from warp_resphys.report.data import at_times, best_and_worst, mean_distance, shown_models
 from warp_resphys.report.figures import TONES
-from warp_resphys.report.motion_sections import instants
 from warp_resphys.report.page import Cell
 from warp_resphys.report.run_page import published_beside
 from warp_resphys.report.sections import against, parameter_rows, quality_rows, residual_table, uncertainty_text
@@ -184,8 +183,8 @@ def test_the_trial_that_fits_worst_is_drawn(tmp_path):
     write_recordings(tmp_path)
     found = read_recordings(tmp_path, SETTINGS, box_hexahedra(divisions=(3, 1, 1)), {})
     assert found.drawn == "load101"
-    assert found.registration.outliers == ("Base - 3",)
-    assert found.registration.inliers.tolist() == [True] * 5 + [False]
+    assert found.outliers == ("Base - 3",)
+    assert found.labels == (*TRACKED, "Base - 1", "Base - 2", "Base - 3")
     assert found.nominal[0].tolist() == TRACKED["Tip - 1"]
     np.testing.assert_allclose(found.feet[0], [0.1, 0.0153, 0.03], atol=1e-12)
 
@@ -393,7 +392,7 @@ def test_film_moves_and_is_slower_than_the_motion(tmp_path, capsys):
     imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
     shown = motion(4)
     shown.measured[2, 1] = np.nan
-    write_film(tmp_path / "motion.mp4", shown, {"simulation": "Uncorrected", "resphys": "ResPhys"}, 4.0, 1.5)
+    write_film(tmp_path / "motion.mp4", shown)
     assert "4/4 frames" in capsys.readouterr().err
     reader = imageio_ffmpeg.read_frames(str(tmp_path / "motion.mp4"))
     about = next(reader)
@@ -415,5 +414,5 @@ def test_film_moves_and_is_slower_than_the_motion(tmp_path, capsys):
 def test_a_film_that_cannot_be_made_says_why(tmp_path, monkeypatch, script, reason):
     monkeypatch.setattr(render, "COMMAND", (sys.executable, "-c", script))
     with pytest.raises(render.DrawingError, match=reason):
-        write_film(tmp_path / "motion.mp4", motion(), {"simulation": "a", "resphys": "b"}, 4.0, 1.5)
+        write_film(tmp_path / "motion.mp4", motion())
     assert not list(Path(tmp_path).iterdir())

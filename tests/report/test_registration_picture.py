@@ -6,6 +6,7 @@ from matplotlib.image import imread
 from warp_resphys.data.registration import register_markers
 from warp_resphys.mesh.mesh import boundary_triangles, box_hexahedra, select_vertices
 from warp_resphys.report import registration_picture
+from warp_resphys.report.data import Recordings
 from warp_resphys.report.registration_picture import (
     _VIEWS,
     _layers,
@@ -47,7 +48,8 @@ def test_picture_with_an_outlier_and_a_marker_that_was_not_seen(tmp_path):
     measured[4] = np.nan
     found = register_markers(measured, POINTS, NAMES, source="swing.c3d", largest_residual=0.002)
     fixed = select_vertices(MESH, x=0.0)
-    draw_registration(tmp_path / "beam.png", MESH, found, POINTS, POINTS, fixed, "Beam")
+    drawn = (found.names, found.positions, 1e3 * found.residual, found.outliers)
+    draw_registration(tmp_path / "beam.png", Recordings({}, {}, "Beam", *drawn, POINTS, POINTS, MESH), fixed)
     picture = imread(tmp_path / "beam.png")[..., :3]
     blue = np.all(np.abs(picture - matplotlib.colors.to_rgb(registration_picture.NOMINAL)) < 0.05, -1)
     assert blue.sum() > 1000

@@ -252,12 +252,21 @@ def test_a_page_that_cannot_be_written_is_one_sentence(tmp_path):
         report(tmp_path)
 
 
+def test_one_epoch_is_seen_and_named_by_a_whole_number():
+    record = {"epoch": 1, "train_loss": 3e-5, "validation_loss": 1.5e-4, "learning_rate": 1e-3}
+    losses, rate = figures.training_curves([record], narrow=False).axes
+    assert all(line.get_marker() == "." for line in (*losses.lines, *rate.lines))
+    low, high = rate.get_xlim()
+    assert [tick for tick in rate.get_xticks() if low <= tick <= high] == [1.0]
+
+
 @pytest.mark.parametrize(
     ("errors", "labels"),
     [
         ((0.3, 6.0), ["0.5", "1", "2", "5"]),
         ((2.0, 3.0), ["1", "2", "5", "10"]),
         ((1e-3, 50.0), ["0.001", "0.01", "0.1", "1", "10"]),
+        ((1.2e-5, 9e-5), ["10⁻⁵", "2·10⁻⁵", "5·10⁻⁵", "10⁻⁴"]),
     ],
 )
 def test_a_logarithmic_axis_has_enough_labels(errors, labels):

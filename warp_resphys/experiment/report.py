@@ -10,13 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.registration import Registration
-from ..data.rigid import RigidTransform
 from ..energies.materials import make_material
 from ..io.errors import DataFileError
 from ..io.files import read_array, read_hdf5, read_json
 from ..io.stages import StageContext, package_versions, resources_used
-from ..learning.metrics import PUBLISHED_WINDOWS_MM, published_errors
 from ..mesh.chambers import Chamber
 from ..mesh.mesh import Mesh, select_vertices
 from ..mesh.surface import closest_points
@@ -141,14 +138,10 @@ def make_folds_report(context: StageContext) -> None:
 def _common_parts(config: Mapping[str, Any], metrics: Mapping[str, Any], mesh: Mesh) -> dict[str, Any]:
     """What all pages show."""
     return {
-        "experiment": config["name"],
-        "title": config["title"],
         "metrics": metrics,
         "settings": config,
         "mesh": mesh,
         "fixed": select_vertices(mesh, **config["fixed"]),
-        "published": published_errors(config["name"]),
-        "published_horizons": PUBLISHED_WINDOWS_MM.get(config["name"], {}),
         "published_note": published_note(config),
     }
 
@@ -348,24 +341,17 @@ def read_recordings(
     labels = [label for label in each["positions"] if label in nominal]
     # What JSON has as null was not seen.
     places = np.array([each["positions"][label] or (None,) * 3 for label in labels], dtype=np.float64)
-    residual = 1e-3 * np.array([each["residual_mm"].get(label) for label in labels], dtype=np.float64)
-    registration = Registration(
-        names=tuple(labels),
-        transform=RigidTransform(np.eye(3), np.zeros(3)),
-        positions=places,
-        residual=residual,
-        inliers=np.array([label not in each["outliers"] for label in labels]),
-        outliers=tuple(each["outliers"]),
-        rms=1e-3 * each["rms_mm"],
-    )
     seen = np.isfinite(places).all(axis=1)
     feet = np.full_like(places, np.nan)
     feet[seen] = closest_points(mesh, places[seen]).points
     return Recordings(
         quality=read_json(path.with_name(QUALITY)),
         residuals=residuals,
-        registration=registration,
         drawn=worst,
+        labels=tuple(labels),
+        positions=places,
+        residual_mm=np.array([each["residual_mm"].get(label) for label in labels], dtype=np.float64),
+        outliers=tuple(each["outliers"]),
         nominal=np.array([np.add(nominal[label], moved.get(label, 0.0)) for label in labels], dtype=np.float64),
         feet=feet,
         mesh=mesh,

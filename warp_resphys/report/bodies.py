@@ -11,6 +11,7 @@ from ..io.files import atomic_path
 from ..io.progress import Progress
 from ..mesh.mesh import Mesh, boundary_faces, boundary_triangles
 from ..mesh.surface import closest_points
+from .data import MODELS, mean_distance
 from .render import INK, MEASURED, OUTLINE, FloatArray, IntArray, Layer, Scene, View, film, view_axes
 
 LONGER_SIDE: Final = 1100  # Of a picture of a body coloured by its distance [px].
@@ -19,10 +20,12 @@ _WIDTHS: Final = (0.0034, 0.0018)  # Of the outline, and of the lines around fac
 NUDGE: Final = 0.005  # The outline is drawn this far behind the body where they coincide.
 TOWARDS_VIEWER: Final = (0.40, -1.0, 0.40)  # A body along x is seen from the side, the end of high x nearer.
 SHADE: Final = 0.25  # Share of the colour that depends on the light; the rest stays readable as a value.
-FEATURE_ANGLE: Final = 30.0  # Faces that meet at a sharper angle [degrees] share an edge of the outline.
+_SHARP: Final = 30.0  # Between the normals of faces that share an edge of the outline [degrees].
 _RIMS: Final = {3: [0, 1, 2], 4: [0, 1, 2, 3], 6: [0, 3, 1, 4, 2, 5]}  # Nodes along the rim of a face.
 _DIVERGED: Final = 10.0  # Distance from the target, or from rest, over the body's, beyond which nothing is drawn.
 
+_FAST: Final = 2.5  # [s] that a motion lasts which is shown slowed down, and from its start only,
+_FINE: Final = 0.025  # where its frames are no farther apart [s].
 LARGEST_RATE: Final = 25.0  # Frames a second, of the film.
 BODIES: Final = ("#6b7580", "#8db4e8")  # Of the bodies behind, and of the last one.
 RINGS: Final = ("#6b7580", "#1a5fb4")  # Of their markers.
@@ -89,14 +92,8 @@ def face_edges(mesh: Mesh) -> IntArray:
     return np.asarray(np.unique(edges, axis=0))
 
 
-def sharp_edges(points: FloatArray, triangles: IntArray, angle: float = FEATURE_ANGLE) -> IntArray:
-    """(E, 2) vertices of the edges at which triangles meet at more than an angle, or at which a surface ends.
-
-    Args:
-        points: (P, 3) [m].
-        triangles: (S, 3).
-        angle: Between the normals [degrees].
-    """
+def sharp_edges(points: FloatArray, triangles: IntArray) -> IntArray:
+    """(E, 2) edges at which triangles (S, 3) of points (P, 3) meet at a sharp angle, or at which a surface ends."""
     corners = points[triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
@@ -105,7 +102,7 @@ def sharp_edges(points: FloatArray, triangles: IntArray, angle: float = FEATURE_
     together = np.zeros((len(edges), 3))
     np.add.at(together, which.ravel(), np.repeat(normals, 3, axis=0))
     # Two unit vectors at an angle a have a sum of length 2 cos(a / 2).
-    smooth = (count == 2) & (np.linalg.norm(together, axis=1) >= 2.0 * np.cos(0.5 * np.radians(angle)))
+    smooth = (count == 2) & (np.linalg.norm(together, axis=1) >= 2.0 * np.cos(0.5 * np.radians(_SHARP)))
     return np.asarray(edges[~smooth])
 
 
@@ -122,6 +119,16 @@ class Motion:
     gravity: FloatArray  # (3,) which way is down.
     from_below: bool = False  # Whether the second view is from below, where a hanging body moves, not from nearby.
 
+    @property
+    def is_fast(self) -> bool:
+        """Whether it is shown slowed down."""
+        return bool(self.times[-1] <= _FAST and np.diff(self.times).max(initial=0.0) <= _FINE)
+
+    @property
+    def instants(self) -> list[int]:
+        """The frames that are shown, as `instants` chooses them for the first model."""
+        return instants(self.measured, self.bound, next(iter(self.markers.values())))
+
     def at(self, frames: Sequence[int] | IntArray) -> "Motion":
         """Some of the frames."""
         chosen = np.asarray(frames, dtype=np.int64)
@@ -130,28 +137,44 @@ class Motion:
         return replace(self, times=times, measured=measured, positions=positions, markers=markers)
 
     def scene(self) -> Scene:
-        """The whole body, and beside it the markers from nearby, or the body from below."""
-        return Scene(_views(self, _PICTURE_VIEW), _PICTURE_VIEW)
+        """The whole body at some instants, and beside it the markers from nearby, or the body from below."""
+        return Scene(_views(self.at(self.instants), _PICTURE_VIEW), _PICTURE_VIEW)
 
 
-def write_film(path: Path, motion: Motion, names: Mapping[str, str], slower: float, longest: float) -> None:
-    """Write a film (MP4, H.264) of the first seconds of a motion, slowed down, and show how far it is.
+def instants(target: FloatArray, bound: FloatArray, simulated: FloatArray) -> list[int]:
+    """Return three frames that lie apart, or fewer of a short motion.
+
+    They are where the simulation is farthest off, where the markers have moved most, and the last one; where two of
+    these are close to each other, one from between is taken.
 
     Args:
-        path: The file to write.
-        motion: All frames.
-        names: What the legend says, by model.
-        slower: Than the motion was, by this factor.
-        longest: What is shown of the motion [s].
+        target: (T, M, 3) [m], NaN where a marker was not seen.
+        bound: (M, 3) [m] on the undeformed body.
+        simulated: (T, M, 3) [m].
+    """
+    count = len(target)
+    moved = np.nan_to_num(np.linalg.norm(target - bound, axis=2)).mean(axis=1)
+    off = mean_distance(simulated[None], target[None])[0]
+    worst = int(np.argmax(np.where(np.isfinite(off), off, -1.0)))
+    chosen: list[int] = []
+    for frame in (worst, int(np.argmax(moved)), count - 1, count // 2, count // 4):
+        if len(chosen) < 3 and all(abs(frame - other) > count // 10 for other in chosen):
+            chosen.append(frame)
+    return sorted(chosen)
+
+
+def write_film(path: Path, motion: Motion) -> None:
+    """Write a film (MP4, H.264) of the first seconds of a motion, slowed down if it is fast, and show how far it is.
 
     Raises:
         DrawingError: There is no pyvista, no OpenGL driver that works off screen, or no encoder.
         DataFileError: The file cannot be written.
     """
+    slower, longest = (4.0, 1.5) if motion.is_fast else (1.0, 10.0)  # [s] that are shown.
     step = float(np.median(np.diff(motion.times)))
     every = max(1, round(1.0 / (slower * step * LARGEST_RATE)))
     shown = motion.at(np.flatnonzero(motion.times <= longest + 1e-9)[::every])
-    *others, last = (names[model] for model in shown.positions)
+    *others, last = (MODELS[model][0] for model in shown.positions)
     scene = Scene(
         _views(shown, _FILM_VIEW, _HEADROOM),
         _FILM_VIEW,

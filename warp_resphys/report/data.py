@@ -8,8 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.registration import Registration
-from ..learning.metrics import PublishedError
+from ..learning.metrics import PublishedError, published_errors
 from ..mesh.chambers import Chamber
 from ..mesh.mesh import Mesh
 
@@ -94,9 +93,12 @@ class Recordings:
 
     quality: Mapping[str, Any]  # By trial, as `warp_resphys.data.recordings.quality.Quality.to_plain` gives it.
     residuals: Mapping[str, Any]  # By trial: `rms_mm`, `residual_mm` and `shift_mm` by label, `outliers`.
-    registration: Registration  # Of the trial that fits worst, for the picture.
-    drawn: str  # That trial's name.
-    nominal: FloatArray  # (M, 3) [m] where its markers should be.
+    drawn: str  # Name of the trial that fits worst, whose picture is drawn.
+    labels: tuple[str, ...]  # Of its M markers.
+    positions: FloatArray  # (M, 3) [m] where they are at rest, NaN for one that was not seen.
+    residual_mm: FloatArray  # (M,) [mm] how far from where they should be.
+    outliers: tuple[str, ...]  # That should have taken part in the fit, and were too far off.
+    nominal: FloatArray  # (M, 3) [m] where they should be.
     feet: FloatArray  # (M, 3) [m] the closest points of the body.
     mesh: Mesh  # The body as it is at rest.
 
@@ -105,8 +107,6 @@ class Recordings:
 class RunReport:
     """What the page of a run, of a fold, or over the folds may show."""
 
-    experiment: str  # Its name.
-    title: str  # The page's heading.
     metrics: Mapping[str, Any]  # What `metrics.json` holds of a split, or of all folds.
     settings: Mapping[str, Any]  # The run's configuration, nested.
     mesh: Mesh  # The undeformed body.
@@ -122,8 +122,6 @@ class RunReport:
     truth: Mapping[str, Any] = field(default_factory=dict)  # Those of the simulated laboratory, where there is one.
     training: Mapping[str, Sequence[Mapping[str, Any]]] = field(default_factory=dict)  # Epochs, by learned model.
     refinement: Mapping[str, Sequence[Mapping[str, Any]]] = field(default_factory=dict)  # As well.
-    published: Mapping[str, PublishedError] = field(default_factory=dict)
-    published_horizons: Mapping[str, Mapping[str, PublishedError]] = field(default_factory=dict)  # By seconds.
     published_note: str = ""  # How the published set-up differs from this run's.
     notes: Sequence[str] = ()  # Sentences on the errors.
     network_note: str = ""  # Which network ResPhys uses, and how it was trained.
@@ -131,6 +129,16 @@ class RunReport:
     simulator: str = ""  # The simulator that is corrected, in words, such as "E 215 kPa".
     target: str = ""  # What it is brought to, in words.
     pages: Mapping[str, str] = field(default_factory=dict)  # Address of each fold's page, by its test trial.
+
+    @property
+    def experiment(self) -> str:
+        """Its name."""
+        return str(self.settings["name"])
+
+    @property
+    def published(self) -> Mapping[str, PublishedError]:
+        """Published errors of this experiment by model; empty where there are none."""
+        return published_errors(self.experiment)
 
     @property
     def sees_markers(self) -> bool:

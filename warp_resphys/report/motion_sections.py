@@ -12,6 +12,7 @@ from markupsafe import Markup
 from .bodies import Motion, distance_scene, largest_distances, write_film
 from .data import (
     MODELS,
+    Film,
     FloatArray,
     Pressures,
     RunReport,
@@ -19,11 +20,10 @@ from .data import (
     at_times,
     best_and_worst,
     drawn_markers,
-    mean_distance,
     shown_models,
     tip_markers,
 )
-from .page import Block, Canvas, Drawn, Part, drawn_file, file_address, number_text
+from .page import Block, Canvas, Drawn, Part, data_address, drawn_file, largest_text
 from .render import Pixels, draw
 from .verdict import unbroken
 
@@ -32,9 +32,6 @@ _MOST_MARKERS: Final = 6  # That are drawn coordinate by coordinate.
 _PLANE_SECONDS: Final = 5.0  # Of a path in the plane.
 _SPACE_SECONDS: Final = 2.5  # And in space, where a longer one cannot be told apart.
 _SEQUENCES: Final = 3  # Trials whose pressures are drawn over time.
-_FAST: Final = 2.5  # [s] that a motion lasts which is shown slowed down, and from its start only,
-_FINE: Final = 0.025  # where its frames are no farther apart [s].
-_SLOWER, _LONGEST = {True: 4.0, False: 1.0}, {True: 1.5, False: 10.0}  # By whether it is fast; [s] that are shown.
 _HANGING: Final = 0.7  # Cosine between gravity and a body that hangs.
 
 
@@ -46,31 +43,27 @@ def start_drawing(data: RunReport, folder: Path, pool: Executor) -> "dict[str, F
     started: dict[str, Future[Any]] = {"pictures": pool.submit(_draw_pictures, data, motion)}
     # A film takes longer than all else on the page; of vertices, it shows no more than the instants.
     if data.sees_markers and len(motion.times) > 1:
-        fast, names = _is_fast(motion), {model: name for model, (name, _) in MODELS.items()}
-        film = (folder / "motion.mp4", motion, names, _SLOWER[fast], _LONGEST[fast])
-        started["video"] = pool.submit(write_film, *film)
+        started["video"] = pool.submit(write_film, folder / "motion.mp4", motion)
     return started
 
 
 def _draw_pictures(data: RunReport, motion: Motion) -> list[Pixels]:
     shape = None if data.trials is None or data.sees_markers else distance_scene(data.mesh, *_bodies(data.trials))
-    return draw(motion.at(_instants_of(motion)).scene(), *([] if shape is None else [shape]))
+    return draw(motion.scene(), *([] if shape is None else [shape]))
 
 
 def motion_of(data: RunReport) -> Motion | None:
     """Return the motion that is drawn: that of the film; where vertices are observed, of the worst trial at its tip."""
     trials, film = data.trials, data.film
-    if trials is None or not shown_models(trials.positions):
+    if trials is None:
         return None
     hangs, away = _hangs(data, trials)
+    some = np.arange(len(trials.bound))
     if not trials.labels:
-        row, models = trials.worst, shown_models(trials.positions)
+        row = trials.worst
+        film = Film(trials.names[row], trials.times[row], {m: q[row] for m, q in trials.positions.items()})
         some = data.tip if len(data.tip) else np.flatnonzero(away >= away.max() - 1e-9)
         some = some[np.unique(np.linspace(0, len(some) - 1, _MOST_MARKERS).round().astype(int))]
-        bodies = {m: trials.positions[m][row] for m in models}
-        seen = {m: q[:, some] for m, q in bodies.items()}
-        times, target, bound = trials.times[row], trials.target[row][:, some], trials.bound[some]
-        return Motion(data.mesh, times, target, bodies, seen, bound, trials.gravity, hangs)
     if film is None or film.trial not in trials.names or not shown_models(film.positions):
         return None
     row, models = trials.names.index(film.trial), shown_models(film.positions)
@@ -80,9 +73,9 @@ def motion_of(data: RunReport) -> Motion | None:
         nearest = np.abs(times[frames][:, None] - film.times).argmin(axis=0)
         frames = frames[np.unique(nearest)]
     bodies = {m: at_times(film.positions[m], film.times, times[frames]) for m in models}
-    seen = {m: trials.positions[m][row][frames] for m in models}
-    target = trials.target[row][frames]
-    return Motion(data.mesh, times[frames], target, bodies, seen, trials.bound, trials.gravity, hangs)
+    target, *markers = (q[row][frames][:, some] for q in (trials.target, *(trials.positions[m] for m in models)))
+    seen = dict(zip(models, markers, strict=True))
+    return Motion(data.mesh, times[frames], target, bodies, seen, trials.bound[some], trials.gravity, hangs)
 
 
 def _hangs(data: RunReport, trials: Trials) -> tuple[bool, FloatArray]:
@@ -92,37 +85,6 @@ def _hangs(data: RunReport, trials: Trials) -> tuple[bool, FloatArray]:
     axis, down = away.mean(axis=0), trials.gravity
     size = float(np.linalg.norm(axis) * np.linalg.norm(down))
     return bool(size > 0.0 and axis @ down > _HANGING * size), np.linalg.norm(away, axis=1)
-
-
-def _instants_of(motion: Motion) -> list[int]:
-    return instants(motion.measured, motion.bound, next(iter(motion.markers.values())))
-
-
-def instants(target: FloatArray, bound: FloatArray, simulated: FloatArray) -> list[int]:
-    """Return three frames that lie apart, or fewer of a short motion.
-
-    They are where the simulation is farthest off, where the markers have moved most, and the last one; where two of
-    these are close to each other, one from between is taken.
-
-    Args:
-        target: (T, M, 3) [m], NaN where a marker was not seen.
-        bound: (M, 3) [m] on the undeformed body.
-        simulated: (T, M, 3) [m].
-    """
-    count = len(target)
-    moved = np.nan_to_num(np.linalg.norm(target - bound, axis=2)).mean(axis=1)
-    off = mean_distance(simulated[None], target[None])[0]
-    worst = int(np.argmax(np.where(np.isfinite(off), off, -1.0)))
-    chosen: list[int] = []
-    for frame in (worst, int(np.argmax(moved)), count - 1, count // 2, count // 4):
-        if len(chosen) < 3 and all(abs(frame - other) > count // 10 for other in chosen):
-            chosen.append(frame)
-    return sorted(chosen)
-
-
-def _is_fast(motion: Motion) -> bool:
-    """Whether a motion is shown slowed down."""
-    return bool(motion.times[-1] <= _FAST and np.diff(motion.times).max(initial=0.0) <= _FINE)
 
 
 def worst_state(trials: Trials, row: int) -> int:
@@ -149,7 +111,7 @@ def motion_section(data: RunReport, canvas: Canvas) -> Part | None:
     blocks = [] if data.sees_markers else _vertex_figures(data, trials, canvas)
     if "video" in canvas.started:
         views = "from the side and from below" if motion.from_below else "the whole body, and its markers from nearby"
-        pace = "four times slower than it was" if _is_fast(motion) else "as fast as it was"
+        pace = "four times slower than it was" if motion.is_fast else "as fast as it was"
         said = Markup(
             "The trial {}, {}: {}. {} Dots: measured; rings: simulated. The film lies in "
             "<code>figures/motion.mp4</code>."
@@ -157,7 +119,7 @@ def motion_section(data: RunReport, canvas: Canvas) -> Part | None:
 
         def film(path: Path) -> Drawn:
             canvas.started["video"].result()
-            return Drawn("video", said, film=file_address(path, "video/mp4"))
+            return Drawn("video", said, film=data_address(path.read_bytes(), "video/mp4"))
 
         blocks += canvas.attempt("motion.mp4", film)
     same = "The same trial" if blocks else f"The trial {name}"
@@ -170,7 +132,7 @@ def _instants_figure(data: RunReport, motion: Motion, name: str, colours: str, c
     from . import motion_figures
 
     frames = canvas.started["pictures"].result()[0]
-    titles = [f"{motion.times[frame]:.2f} s" for frame in _instants_of(motion)]
+    titles = [f"{motion.times[frame]:.2f} s" for frame in motion.instants]
     said, when = f"{name} at {len(titles)} instants; in one of them the grey body is farthest off.", ", ".join(titles)
     if len(motion.times) == 1:  # A pose has no time.
         titles, said, when = [""], f"{name}.", "rest"
@@ -223,11 +185,10 @@ def _vertex_figures(data: RunReport, trials: Trials, canvas: Canvas) -> list[Blo
 
 
 def _largest(differences: FloatArray) -> str:
-    """The longest of (..., C) vectors [m], in words."""
-    if not np.isfinite(differences).all():
-        return "more than any number (it diverged)"
-    with np.errstate(over="ignore"):
-        return f"{number_text(1e3 * float(np.linalg.norm(differences, axis=-1).max()))} mm"
+    """The longest of (..., C) vectors [m], in words; not finite is infinite."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        distances = 1e3 * np.linalg.norm(differences, axis=-1)
+    return largest_text(np.where(np.isnan(distances), np.inf, distances))
 
 
 def paths_section(data: RunReport, canvas: Canvas) -> Part | None:

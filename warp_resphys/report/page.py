@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jinja2
+import numpy as np
+from numpy.typing import NDArray
 
 from ..io.errors import DataFileError
 from ..io.files import disk_full_error, is_disk_full
@@ -169,7 +171,7 @@ def draw_picture(folder: Path, name: str, draw: "Callable[..., Drawing]", alt: s
     for figure in both:
         figures.settle(figure)
     figures.save_png(both[0], folder / f"{name}.png")
-    wide, narrow = (svg_address(figures.themed_svg(figure, name)) for figure in both)
+    wide, narrow = (data_address(figures.themed_svg(figure, name), "image/svg+xml") for figure in both)
     return Picture(wide, narrow, alt)
 
 
@@ -188,6 +190,17 @@ def page_template(name: str) -> jinja2.Template:
 def number_text(value: float | None) -> str:
     """Return a number with three decimals, or two digits if that takes more; None stands for divergence."""
     return "diverged" if value is None else _alike([value], value)[0]
+
+
+def mm_text(value: float | None) -> str:
+    """Return a mean error with its unit; None stands for divergence."""
+    return number_text(value) + ("" if value is None else " mm")
+
+
+def largest_text(errors: NDArray[np.float64]) -> str:
+    """Return the largest of errors [mm] in words; NaN is left out, what is infinite has diverged."""
+    known = errors[~np.isnan(errors)]
+    return mm_text(float(known.max())) if len(known) and np.isfinite(known).all() else "infinity (it diverged)"
 
 
 def error_parts(summary: Mapping[str, Any]) -> tuple[str, str]:
@@ -237,18 +250,13 @@ def flatten(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str
 
 def drawn_file(path: Path, alt: str, caption: str) -> Drawn:
     """Return a PNG file as a picture that stays wide on a narrow page."""
-    address = file_address(path, "image/png")
+    address = data_address(path.read_bytes(), "image/png")
     return Drawn(path.stem, caption, Picture(address, address, alt), scrolls=True)
 
 
-def svg_address(svg: bytes) -> str:
-    """Return a picture as a data address, for a page that needs no other file."""
-    return "data:image/svg+xml;base64," + base64.b64encode(svg).decode("ascii")
-
-
-def file_address(path: Path, kind: str) -> str:
-    """Return a file as a data address."""
-    return f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode('ascii')}"
+def data_address(content: bytes, kind: str) -> str:
+    """Return a file's content as a data address, for a page that needs no other file."""
+    return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
 
 
 def percent_text(ratio: float, decimals: int = 0) -> str:

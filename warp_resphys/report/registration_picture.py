@@ -13,10 +13,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch
 from scipy.optimize import isotonic_regression
 
-from ..data.registration import Registration
 from ..io.files import atomic_path
 from ..mesh.mesh import Mesh, boundary_triangles
 from .bodies import face_edges, sharp_edges
+from .data import Recordings
 from .render import BODY, CLAMPED, INK, MEASURED, FloatArray, IntArray, Layer, Pixels, Scene, View, draw, view_axes
 
 NOMINAL: Final = "#0072b2"  # Blue of Okabe and Ito (2008).
@@ -26,7 +26,7 @@ _DPI: Final = 160
 _FINER: Final = 2  # Drawn so many times finer, as smooth rims and translucency do not go together.
 _LONGER_SIDE: Final = 6.6  # Of a view [inch].
 _LETTER: Final = 0.088  # Widest that the letters of a name are on average [inch].
-_TITLE, _HEAD, _STRIP, _LEGEND = 0.5, 0.42, 0.9, 0.42  # [inch] for the title, above and below a view, the legend.
+_TITLE, _HEAD, _STRIP, _PAD = 0.7, 0.42, 0.9, 0.12  # [inch] of the title above, above and below a view, around all.
 _LABEL_HEIGHT: Final = 0.36  # [inch]
 _RADIUS: Final = 0.016  # Of a marker, over the longest side of the body.
 _RING: Final = 1.55  # Radius of a nominal position's ring, in radii of a marker.
@@ -65,44 +65,30 @@ class _View:
         return Scene([view], self.pixels.astype(int).tolist(), background="white", samples=0, intensity=_LIGHT)
 
 
-def draw_registration(
-    path: Path,
-    mesh: Mesh,
-    registration: Registration,
-    nominal: FloatArray,
-    feet: FloatArray,
-    fixed: IntArray,
-    title: str,
-) -> None:
+def draw_registration(path: Path, found: Recordings, fixed: IntArray) -> None:
     """Draws the body, the measured markers and what they are bound to, from two sides, with names and residuals.
 
     Args:
         path: The PNG file to write.
-        mesh: The body at rest.
-        registration: The measured markers in its frame; those that were not seen are not drawn.
-        nominal: (M, 3) [m] where the markers should be.
-        feet: (M, 3) [m] where their stems stand.
+        found: Markers that were not seen are not drawn.
         fixed: Vertices of the clamped region.
-        title: What is drawn.
 
     Raises:
         DrawingError: There is no pyvista, or no OpenGL driver that works off screen.
         DataFileError: The file cannot be written.
     """
-    seen = np.isfinite(registration.positions).all(axis=1)
-    markers = registration.positions[seen]
-    points = np.concatenate([mesh.vertices, markers, nominal])
+    seen, mesh = np.isfinite(found.positions).all(axis=1), found.mesh
+    points = np.concatenate([mesh.vertices, found.positions[seen], found.nominal])
     radius = _RADIUS * float(np.ptp(mesh.vertices, axis=0).max())
     views = [_view(name, towards, points, 2.0 * radius) for name, towards in _VIEWS.items()]
     triangles = boundary_triangles(mesh)
     clamped = triangles[np.isin(triangles, fixed).all(axis=1)]
-    layers = _layers(mesh, clamped, markers, feet[seen], radius)
+    layers = _layers(mesh, clamped, found.positions[seen], found.feet[seen], radius)
     pictures = [frames[0] for frames in draw(*(view.scene(layers) for view in views))]
     with mpl.rc_context({"font.size": 9, "text.color": INK}):
-        figure = _compose(views, pictures, registration, nominal, radius, title)
-        _legend(figure, bool(len(clamped)))
+        figure = _compose(views, pictures, found, radius)
         with atomic_path(path) as partial:
-            figure.savefig(partial, dpi=_DPI, format="png", facecolor="white")
+            figure.savefig(partial, dpi=_DPI, format="png", facecolor="white", bbox_inches="tight", pad_inches=_PAD)
 
 
 def _view(title: str, towards: Sequence[float], points: FloatArray, margin: float) -> _View:
@@ -138,41 +124,34 @@ def _layers(mesh: Mesh, clamped: IntArray, markers: FloatArray, feet: FloatArray
     return layers
 
 
-def _compose(
-    views: Sequence[_View],
-    pictures: Sequence[Pixels],
-    registration: Registration,
-    nominal: FloatArray,
-    radius: float,
-    title: str,
-) -> Figure:
-    """The views, one above the other or side by side, with names, rings, axes and a scale."""
-    sizes = [view.size for view in views]
-    stacked = sizes[0][0] + sizes[1][0] > 1.6 * max(size[1] for size in sizes)
-    longest = max(len(text) for each in range(len(registration.names)) for text in _label(registration, each))
-    margin = _LETTER * max(longest, 9) + 0.15  # [inch]
-    cells = np.array([size + [2.0 * margin, _HEAD + _STRIP] for size in sizes])
-    along = 1 if stacked else 0
-    space = cells.max(axis=0)  # (2,) [inch] of all cells.
-    space[along] = cells[:, along].sum()
-    total = space + [0.0, _TITLE + _LEGEND]
-    figure = Figure(figsize=tuple(total))
-    figure.text(0.5, 1.0 - 0.28 / total[1], title, ha="center", va="center", fontsize=12, fontweight="bold")
-    corner = np.array([0.0, total[1] - _TITLE])  # Upper left one of the next cell [inch].
-    for view, picture, size, cell in zip(views, pictures, sizes, cells, strict=True):
-        left = corner[0] + (0.5 * (space[0] - size[0]) if stacked else margin)
-        box = np.array([left, corner[1] - _HEAD - size[1], *size]) / np.tile(total, 2)
-        axes = figure.add_axes((box[0], box[1], box[2], box[3]))
+def _compose(views: Sequence[_View], pictures: Sequence[Pixels], found: Recordings, radius: float) -> Figure:
+    """The views, one above the other or side by side, with names, rings, axes and a scale.
+
+    The figure has an inch, so that all places are in inches; how much of the plane is written is seen at the end.
+    """
+    (wide, tall), (other_wide, other_tall) = (view.size for view in views)
+    longest = max(len(text) for each in range(len(found.labels)) for text in _label(found, each))
+    margin = _LETTER * max(longest, 9) + 0.15
+    corners = [(0.0, 0.0), (wide + 2.0 * margin, tall - other_tall)]
+    if wide + other_wide > 1.6 * max(tall, other_tall):
+        corners[1] = (0.5 * (wide - other_wide), -_HEAD - _STRIP - other_tall)
+    figure = Figure(figsize=(1.0, 1.0))
+    middle, lowest = 0.5 * max(wide, corners[1][0] + other_wide), min(0.0, corners[1][1])
+    figure.text(middle, tall + _TITLE, found.drawn, ha="center", va="center", fontsize=12, fontweight="bold")
+    for view, picture, corner in zip(views, pictures, corners, strict=True):
+        axes = figure.add_axes((*corner, *view.size))
         low, high = view.corners
         axes.imshow(picture, extent=(low[0], high[0], low[1], high[1]), aspect="auto")
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         axes.set_axis_off()
         axes.set_title(view.title, fontsize=10, color=_GREY, pad=14)
         _directions(axes, view, margin)
-        _rings(axes, view, registration, nominal, radius)
-        _names(axes, view, registration, radius)
-        corner += [0.0, -cell[1]] if stacked else [cell[0], 0.0]
+        _rings(axes, view, found, radius)
+        _names(axes, view, found, radius)
     _scale(axes, view, margin)
+    handles = _legend()
+    place, columns = (middle, lowest - _STRIP), len(handles)
+    figure.legend(handles=handles, loc="upper center", bbox_to_anchor=place, ncols=columns, frameon=False, fontsize=9)
     return figure
 
 
@@ -206,17 +185,17 @@ def _round_length(longest: float) -> float:
     return float(max(factor * decade for factor in (1.0, 2.0, 5.0) if factor * decade <= longest * (1.0 + 1e-9)))
 
 
-def _rings(axes: Axes, view: _View, registration: Registration, nominal: FloatArray, radius: float) -> None:
+def _rings(axes: Axes, view: _View, found: Recordings, radius: float) -> None:
     """Rings at the nominal positions, with lines to the markers that are outside of them."""
-    for ring, marker in zip(view.project(nominal), view.project(registration.positions), strict=True):
+    for ring, marker in zip(view.project(found.nominal), view.project(found.positions), strict=True):
         axes.add_patch(Circle((ring[0], ring[1]), _RING * radius, fill=False, edgecolor=NOMINAL, linewidth=1.5))
         if np.linalg.norm(marker - ring) > _RING * radius:
             axes.plot(*np.stack([ring, marker]).T, color=NOMINAL, linewidth=1.0, linestyle=(0, (3, 2)))
 
 
-def _names(axes: Axes, view: _View, registration: Registration, radius: float) -> None:
+def _names(axes: Axes, view: _View, found: Recordings, radius: float) -> None:
     """Names and residuals of the markers that were seen in columns on both sides, with leaders to them."""
-    at = view.project(registration.positions)  # (M, 2) [m]
+    at = view.project(found.positions)  # (M, 2) [m]
     seen = np.flatnonzero(np.isfinite(at).all(axis=1))
     on_the_left = at[:, 0] < np.median(at[seen, 0])
     for side, edge in ((-1.0, view.corners[0][0]), (1.0, view.corners[1][0])):
@@ -228,16 +207,16 @@ def _names(axes: Axes, view: _View, registration: Registration, radius: float) -
             away = 1.2 * radius / float(np.linalg.norm(end - at[each]))
             start = at[each] + min(away, 1.0) * (end - at[each])
             axes.plot(*np.stack([start, end]).T, color=_GREY, linewidth=0.7, clip_on=False)
-            name, note = _label(registration, each)
-            colour = MEASURED if name in registration.outliers else _GREY
+            name, note = _label(found, each)
+            colour = MEASURED if name in found.outliers else _GREY
             axes.text(x, height, name, ha=align, va="bottom", fontweight="bold", clip_on=False)
             axes.text(x, height, note, ha=align, va="top", fontsize=8, color=colour, clip_on=False)
 
 
-def _label(registration: Registration, marker: int) -> tuple[str, str]:
+def _label(found: Recordings, marker: int) -> tuple[str, str]:
     """Name of a marker, and how well it fits."""
-    name = registration.names[marker]
-    return name, f"{1e3 * registration.residual[marker]:.2f} mm" + (", left out" * (name in registration.outliers))
+    name = found.labels[marker]
+    return name, f"{found.residual_mm[marker]:.2f} mm" + ", left out" * (name in found.outliers)
 
 
 def _spread(heights: FloatArray, least: float) -> FloatArray:
@@ -246,22 +225,14 @@ def _spread(heights: FloatArray, least: float) -> FloatArray:
     return isotonic_regression(heights - apart).x + apart if len(heights) else heights
 
 
-def _legend(figure: Figure, clamped: bool) -> None:
-    """What the marks are, below the views."""
+def _legend() -> list[Any]:
+    """What the marks are."""
     none: dict[str, Any] = {"linestyle": "none", "marker": "o"}
-    ring = Line2D([], [], **none, markersize=9, markerfacecolor="none", color=NOMINAL, label="nominal")
-    ring.set_markeredgewidth(1.5)
-    stem = Line2D(
-        [], [], marker="o", markersize=3.5, markevery=[0], linewidth=1.4, color=INK, label="stem and its foot"
-    )
-    handles: list[Any] = [
+    hollow: dict[str, Any] = {"markerfacecolor": "none", "markeredgewidth": 1.5}
+    return [
         Line2D([], [], **none, markersize=7, color=MEASURED, label="measured, with residual"),
-        stem,
-        ring,
-        *([Patch(facecolor=CLAMPED, alpha=0.8, label="clamped")] if clamped else []),
+        Line2D([], [], marker="o", markersize=3.5, markevery=[0], linewidth=1.4, color=INK, label="stem and its foot"),
+        Line2D([], [], **none, **hollow, markersize=9, color=NOMINAL, label="nominal"),
+        Patch(facecolor=CLAMPED, alpha=0.8, label="clamped"),
         Patch(facecolor=BODY, alpha=0.6, label="body at rest"),
     ]
-    place = (0.5, 0.06 / figure.get_figheight())
-    figure.legend(
-        handles=handles, loc="lower center", bbox_to_anchor=place, ncols=len(handles), frameon=False, fontsize=9
-    )

@@ -11,10 +11,9 @@ import numpy as np
 from markupsafe import Markup
 
 from ..io.files import write_text
-from .data import MODELS, FloatArray, RunReport
+from .data import MODELS, RunReport
 from .motion_sections import body_section, motion_section, paths_section, start_drawing
 from .page import (
-    NO_BREAK_SPACE,
     NONE,
     Canvas,
     Cell,
@@ -27,6 +26,8 @@ from .page import (
     error_parts,
     figures_beside,
     flatten,
+    largest_text,
+    mm_text,
     number_text,
     page_template,
     published_parts,
@@ -85,7 +86,7 @@ def write_report(path: Path, data: RunReport) -> None:
     seconds = data.metrics.get("seconds_per_test_trajectory", {})
     timed = [Row(name, [Cell(duration_text(seconds[m]["mean"]))]) for m, name in _TIMED.items() if m in seconds]
     page = page_template("report.html").render(
-        title=data.title,
+        title=data.settings["title"],
         data=data,
         metrics=data.metrics,
         verdict=verdict(data),
@@ -190,16 +191,13 @@ def _what_is_measured(data: RunReport) -> str:
 def _reconstruction_text(model: str, found: Mapping[str, Any], of: str) -> str:
     said = (
         f"The reconstruction for {MODELS[model][0]} brings the {of} of the training trials to "
-        f"{number_text(found['mean_mm'])} mm from the observed ones, {number_text(found['max_mm'])} mm at most"
+        f"{mm_text(found['mean_mm'])} from the observed ones, {mm_text(found['max_mm'])} at most"
     )
     if "replayed_mm" not in found:
         return f"{said}."
-    if found["replayed_mm"] is None:
-        return f"{said}; replayed in the simulator, its forces make it fail on the validation trials."
-    return (
-        f"{said}; replayed in the simulator, its forces lead {number_text(found['replayed_mm'])} mm from the {of} of "
-        "the validation trials."
-    )
+    replayed = found["replayed_mm"]
+    lead = "make it fail on" if replayed is None else f"lead {mm_text(replayed)} from the {of} of"
+    return f"{said}; replayed in the simulator, its forces {lead} the validation trials."
 
 
 def _count(number: int, what: str) -> str:
@@ -252,7 +250,7 @@ def error_section(data: RunReport, canvas: Canvas) -> Part | None:
         window = _FILTER if times[-1] >= _LENGTHS * _FILTER - 1e-9 else None
         of = "marker" if data.sees_markers else "vertex"
         draw = partial(figures.error_over_time, trials.errors_mm, times, of=of, window=window)
-        reached = "; ".join(f"{MODELS[model][0]} reaches {_largest(e)}" for model, e in trials.errors_mm.items())
+        reached = "; ".join(f"{MODELS[model][0]} reaches {largest_text(e)}" for model, e in trials.errors_mm.items())
         alt = f"Mean {of} error of the models over time, on a logarithmic axis. {reached}."
         blocks.append(canvas.figure("error_over_time", draw, alt, _error_caption(data, window)))
     rows = {row["name"]: row["errors_mm"] for row in metrics["per_trajectory"]}
@@ -281,15 +279,10 @@ def _error_caption(data: RunReport, window: float | None) -> str:
     return unbroken(said)
 
 
-def _largest(rows: FloatArray) -> str:
-    known = rows[~np.isnan(rows)]
-    return f"{number_text(float(known.max()))} mm" if len(known) and np.isfinite(known).all() else "no end: it diverged"
-
-
 def largest_filtered(metrics: Mapping[str, Any]) -> str:
     """Say how large the error of a single trial becomes with each model that did not diverge; empty where not known."""
-    found = {model: each for model, each in metrics.get("median_filtered", {}).items() if each is not None}
-    parts = [f"{number_text(found[m])}{NO_BREAK_SPACE}mm ({MODELS[m][0]})" for m in MODELS if m in found]
+    found = metrics.get("median_filtered", {})
+    parts = [f"{mm_text(found[m])} ({MODELS[m][0]})" for m in MODELS if found.get(m) is not None]
     return f"In single trials the filtered error reaches {', '.join(parts)}." if parts else ""
 
 

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from ..learning.metrics import PUBLISHED_WINDOWS_MM
 from .data import MODELS, FloatArray, RunReport
 from .page import (
     MINUS,
@@ -56,7 +57,7 @@ def against(errors: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
 
 def horizons_section(data: RunReport, canvas: Canvas) -> Part | None:
     """The errors by length of the roll-out."""
-    table = horizon_table(data.metrics, data.published_horizons)
+    table = horizon_table(data.metrics, PUBLISHED_WINDOWS_MM.get(data.experiment, {}))
     if table is None:
         return None
     longer = data.settings["data"].get("train_fraction", 1.0) < 1.0
@@ -196,14 +197,11 @@ def _landscape_points(
     if np.isfinite(loss).any():
         row, *column = np.unravel_index(int(np.nanargmin(loss)), loss.shape)
         points["lowest of the grid"] = (float(modulus[row]), float(ratio[column[0]]) if column else 0.0)
-    e, nu = "youngs_modulus", "poissons_ratio"
-    if e in data.start and nu in data.start:
-        points["data sheet"] = (data.start[e], data.start[nu])
-    identified = data.identification.get("sysid", {}).get("parameters", {})
-    if e in identified:
-        points["identified"] = (identified[e], identified.get(nu, data.start.get(nu, 0.0)))
-    if e in data.truth and nu in data.truth:
-        points["true"] = (data.truth[e], data.truth[nu])
+    found = data.identification.get("sysid", {}).get("parameters", {})
+    found = {"poissons_ratio": data.start.get("poissons_ratio", 0.0), **found}
+    for name, values in {"data sheet": data.start, "identified": found, "true": data.truth}.items():
+        if {"youngs_modulus", "poissons_ratio"} <= values.keys():
+            points[name] = (values["youngs_modulus"], values["poissons_ratio"])
     return points
 
 
@@ -280,7 +278,7 @@ def registration_section(data: RunReport, canvas: Canvas) -> Part | None:
     def picture(path: Path) -> Drawn:
         from .registration_picture import draw_registration
 
-        draw_registration(path, found.mesh, found.registration, found.nominal, found.feet, data.fixed, found.drawn)
+        draw_registration(path, found, data.fixed)
         return drawn_file(path, alt, caption)
 
     blocks = canvas.attempt("registration.png", picture)

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from statistics import fmean, stdev
 from typing import Any, Final
 
-from ..learning.metrics import PublishedError
+from ..learning.metrics import PUBLISHED_WINDOWS_MM, PublishedError
 from .data import MODELS, RunReport
-from .page import NO_BREAK_SPACE, number_text, published_parts
+from .page import NO_BREAK_SPACE, mm_text, published_parts
 
 # By model: what it is called, and what it adds to the first of these models that there is.
 _STEPS: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = {
@@ -49,7 +49,8 @@ def verdict(data: RunReport) -> str:
         said = [marker_verdict(errors, trials, data.seconds, folds=data.trials is None)]
         said.append(reduction_text(errors, data.published))
     if data.settings["data"].get("train_fraction", 1.0) < 1.0:
-        said.append(growth_text(metrics.get("growth", {}), list(metrics.get("horizons", {})), data.published_horizons))
+        published = PUBLISHED_WINDOWS_MM.get(data.experiment, {})
+        said.append(growth_text(metrics.get("growth", {}), list(metrics.get("horizons", {})), published))
     said.append(scale_text(metrics.get("scales", {})))
     return unbroken(" ".join(each for each in said if each))
 
@@ -57,11 +58,6 @@ def verdict(data: RunReport) -> str:
 def unbroken(said: str) -> str:
     """Return a text whose numbers stay beside their units and symbols."""
     return re.sub(r"(?<=\d) (?=(?:mm|kPa|s)\b|%)|(?<=\b[Eν]) (?=\d)", NO_BREAK_SPACE, said)  # noqa: RUF001
-
-
-def _mm(value: float | None) -> str:
-    """A mean error in words, also of roll-outs that diverged."""
-    return number_text(value) + ("" if value is None else " mm")
 
 
 def vertex_verdict(
@@ -76,11 +72,11 @@ def vertex_verdict(
         target: Its target in words.
     """
     if not {"simulation", "resphys"} <= errors.keys():
-        each = (f"{_mm(errors[m]['mean'])} with {MODELS[m][0]}" for m in MODELS if m in errors)
+        each = (f"{mm_text(errors[m]['mean'])} with {MODELS[m][0]}" for m in MODELS if m in errors)
         return f"Mean vertex error: {', '.join(each)}."
     before, after = errors["simulation"]["mean"], errors["resphys"]["mean"]
     count = errors["resphys"]["trajectories"]
-    trials, old, new = f"{count} test trial{'s' if count > 1 else ''}", _mm(before), _mm(after)
+    trials, old, new = f"{count} test trial{'s' if count > 1 else ''}", mm_text(before), mm_text(after)
     if after is None:
         said = (
             f"With the learned residual force, {errors['resphys']['diverged']} of {count} test roll-outs diverged, so "
@@ -138,13 +134,13 @@ def marker_verdict(
             f"{errors[main]['trajectories']} roll-outs, so that there is no mean error to report."
         )
     beside = "".join(
-        f", {_mm(errors[m]['mean'])} {'uncorrected' if m == 'simulation' else 'with ' + MODELS[m][0]}"
+        f", {mm_text(errors[m]['mean'])} {'uncorrected' if m == 'simulation' else 'with ' + MODELS[m][0]}"
         for m in ("sysid", "sysid_elastic", "simulation")
         if m in errors and m != main
     )
     return (
-        f"On {who}, {held}, the simulated markers are {_mm(errors[main]['mean'])} from the measured ones{span} with "
-        f"{MODELS[main][0]}{beside.replace(',', ';', 1)}."
+        f"On {who}, {held}, the simulated markers are {mm_text(errors[main]['mean'])} from the measured ones{span} "
+        f"with {MODELS[main][0]}{beside.replace(',', ';', 1)}."
     )
 
 
@@ -195,7 +191,7 @@ def scale_text(errors: Mapping[str, Mapping[str, Any]]) -> str:
         return ""
     largest = max(errors, key=float)
     found = {m: errors[largest][m]["mean"] for m in ("resphys", "sysid", "simfree") if m in errors[largest]}
-    parts = ", ".join(f"{_mm(mean)} with {MODELS[model][0]}" for model, mean in found.items())
+    parts = ", ".join(f"{mm_text(mean)} with {MODELS[model][0]}" for model, mean in found.items())
     return f"At {float(largest):g} times the pressures of the training the error is {parts}." if parts else ""
 
 

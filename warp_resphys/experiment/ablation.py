@@ -39,13 +39,7 @@ _MM = 1e3
 
 
 def ablation_stages(config: Mapping[str, Any], base: Mapping[str, Any], shown: Mapping[str, Any]) -> list[Stage]:
-    """The stages of the study.
-
-    Args:
-        config: the whole configuration.
-        base: the settings that every simulation depends on.
-        shown: what the report says of the configuration.
-    """
+    """The stages of the study; ``base`` has what every simulation depends on, ``shown`` goes into the report."""
     own = dict(config["ablation"])
     processes = min(processes_for(config, own.pop("processes")), len(own["counts"]))
     moved = {**base, **{key: config[key] for key in ("target", "simulation", "data")}}
@@ -60,7 +54,7 @@ def ablation_stages(config: Mapping[str, Any], base: Mapping[str, Any], shown: M
 
 def print_ablation(config: Mapping[str, Any], folder: Path) -> None:
     """Writes metrics.json and prints the errors."""
-    metrics = collect_metrics(folder, config)
+    metrics = _metrics(folder, config)
     write_json(folder / METRICS, metrics)
     table = Table("markers", "median [mm]", "quartiles [mm]", title="Error of the reconstructed motion, all vertices")
     for row in metrics["by_markers"]:
@@ -88,10 +82,6 @@ def generate_motion(context: StageContext) -> None:
 
 def ablate(context: StageContext, processes: int = 1) -> None:
     """Writes ablation.h5, with the sets of markers and the error of each at every step, and tables of the errors.
-
-    Args:
-        context: of the stage.
-        processes: that share the numbers of markers.
 
     Raises:
         ConvergenceError, WorkerError: a step could not be reconstructed.
@@ -218,7 +208,7 @@ def report_ablation(context: StageContext) -> None:
     data = AblationReport(
         title=config["title"],
         experiment=config["name"],
-        metrics=collect_metrics(context.run_dir, config),
+        metrics=_metrics(context.run_dir, config),
         settings=config,
         vertices=len(mesh.vertices),
         surface=len(surface),
@@ -227,7 +217,7 @@ def report_ablation(context: StageContext) -> None:
     write_ablation_report(context.run_dir / REPORT, data)
 
 
-def collect_metrics(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
+def _metrics(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
     """Errors, time and memory of the stages that are done, versions and device."""
     return {
         **read_json(folder / SUMMARY),

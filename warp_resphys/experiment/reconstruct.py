@@ -17,7 +17,7 @@ from ..io.files import atomic_hdf5, create, write_json
 from ..io.resumable import Field
 from ..io.stages import StageContext
 from ..learning.metrics import marker_errors
-from ..learning.reconstruction import Reconstructor, make_reconstructor
+from ..learning.reconstruction import make_reconstructor
 from ..learning.rollout import Rollout
 from .files import RECONSTRUCTION, read_if_there, reconstruction_file
 from .parts import March, Part, read_parts, remove_parts, split_into_parts, work_on
@@ -109,7 +109,9 @@ class _Reconstructing(March):
             simulator = dataclasses.replace(simulator, time_step=_FOR_EVER, integrator="implicit_euler")
             self._observed = torch.cat([torch.full_like(self._observed, torch.nan), self._observed], 1)
             self._inputs = self._resting
-        self._method = make_method(scene, simulator, settings["reconstruction"]).with_constants(self._constants)
+        markers: Any = None if scene.dataset.bound is None else scene.observe  # Full states have a faster way.
+        method = make_reconstructor(simulator, **settings["reconstruction"], markers=markers)
+        self._method = method.with_constants(self._constants)
         self._force = torch.zeros_like(self._start.state.q)
         dtype = "float64" if scene.dataset.bound is None else "float32"
         shape = (len(part.names), simulator.body.n_vertices, 3)
@@ -144,12 +146,6 @@ class _Reconstructing(March):
     def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
         super().restore(tensors)
         self._force = tensors["force"].to(self.like)
-
-
-def make_method(scene: Scene, simulator: Simulator, settings: Mapping[str, Any]) -> Reconstructor:
-    """The configured reconstruction: of full states, which has a faster way, or of markers."""
-    markers: Any = None if scene.dataset.bound is None else scene.observe
-    return make_reconstructor(simulator, **settings, markers=markers)
 
 
 def replayed_errors(

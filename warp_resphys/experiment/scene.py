@@ -52,11 +52,6 @@ def models_of(config: Mapping[str, Any]) -> list[str]:
     return [model for model in MODELS if not absent.get(model)]
 
 
-def every_vertex(positions: torch.Tensor) -> torch.Tensor:
-    """What is observed where a simulation knows the full state: the identity."""
-    return positions
-
-
 @dataclass(frozen=True)
 class Scene:
     """The trials and the simulators of an experiment.
@@ -96,12 +91,8 @@ class Scene:
             kind: ``simulation`` (uncorrected), ``target`` (which made the trials), ``published``, or ``identified``,
                 which may step with another integrator, and take shorter steps.
         """
-        if kind not in self._simulators:
-            self._simulators[kind] = self.new_simulator(kind)
-        return self._simulators[kind]
-
-    def new_simulator(self, kind: str, on_failure: str | None = None) -> Simulator:
-        """One of its own, whose solver has seen nothing yet; see `simulator`."""
+        if kind in self._simulators:
+            return self._simulators[kind]
         config = {**self.config, "gravity": self.dataset.gravity.tolist()}
         identify = config.get("identify") or {}
         if kind == "published":
@@ -109,21 +100,27 @@ class Scene:
         elif kind == "identified" and identify.get("integrator") is not None:
             config |= {"integrator": identify["integrator"], "time_step": config["time_step"] / identify["substeps"]}
         material, body = ("target" if kind == "target" else "simulation"), (None if kind == "published" else self.body)
-        return build_simulator(config, material, body, on_failure or self.on_failure)
+        self._simulators[kind] = build_simulator(config, material, body, self.on_failure)
+        return self._simulators[kind]
+
+    @property
+    def like(self) -> torch.Tensor:
+        """A tensor on the device and in the type of the simulators."""
+        return self.simulator("simulation").rest_positions
 
     @cached_property
     def observe(self) -> Observe:
         """(B, N, 3) positions to what is observed of them: (B, M, 3) markers, or all of them."""
         if self.dataset.bound is None:
-            return every_vertex
+            return lambda positions: positions
         found = bound_markers(self.config["markers"], self.body.mesh, self.dataset.bound, self.dataset.labels)
-        return found.to(self.simulator("simulation").rest_positions)
+        return found.to(self.like)
 
     def trials(self, names: Sequence[str], simulator: Simulator | None = None) -> Trials:
         """Some of the trials, which begin alike, on the simulators' device, with inputs for a simulator's steps."""
         payload_at = self.config["data"].get("payload_at")
         found = self.dataset.trials(names, self.body, payload_at, None if simulator is None else simulator.time_step)
-        return found.to(self.simulator("simulation").rest_positions)
+        return found.to(self.like)
 
     def base(self, names: Sequence[str], simulator: Simulator) -> BaseFrame | None:
         """The frame of what the body is fixed to in some of the trials; None where that stands still."""
@@ -142,11 +139,9 @@ class Scene:
 
     def alike(self, names: Sequence[str]) -> list[tuple[str, ...]]:
         """Trials in groups that begin alike, and can be simulated as one batch."""
-        kinds = [self.dataset.begins[row] for row in self.dataset.rows(names)]
-        each = zip(names, kinds, strict=True)
         found: dict[str, list[str]] = {}
-        for name, kind in each:
-            found.setdefault(kind, []).append(name)
+        for name in names:
+            found.setdefault(self.begins(name), []).append(name)
         return [tuple(some) for some in found.values()]
 
     def moving(self, names: Sequence[str]) -> tuple[str, ...]:
@@ -184,7 +179,7 @@ class Scene:
         if key is None or self.config.get("identify") is None:
             return {}
         values = read_json(self.folder / IDENTIFICATION)[key]["parameters"]
-        return {name: torch.tensor([x]).to(self.simulator("simulation").rest_positions) for name, x in values.items()}
+        return {name: torch.tensor([x]).to(self.like) for name, x in values.items()}
 
     def model_simulator(self, model: str) -> Simulator:
         """The one that a model is, or corrects."""

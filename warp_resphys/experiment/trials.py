@@ -256,12 +256,7 @@ def folds_of(config: Mapping[str, Any]) -> dict[str, Split] | None:
 
 
 def trials_of(config: Mapping[str, Any]) -> tuple[Trial, ...]:
-    """The trials of an experiment, in the order of the files: that of the split, or, with folds, as configured.
-
-    Raises:
-        InputError: see `split_of`.
-        DataFileError: see `known_trials`.
-    """
+    """The trials of an experiment, in the order of the files: that of the split, or, with folds, as configured."""
     known = known_trials(config)
     return tuple(known[name] for name in (known if folds_of(config) else split_of(config).names))
 
@@ -272,11 +267,7 @@ def scaled_name(name: str, scale: float) -> str:
 
 
 def scaled_trials_of(config: Mapping[str, Any]) -> tuple[Trial, ...]:
-    """The test trials at ``data.pressure_scales``, scale by scale.
-
-    Raises:
-        InputError: see `split_of`.
-    """
+    """The test trials at ``data.pressure_scales``, scale by scale."""
     scales = [float(scale) for scale in config["data"].get("pressure_scales") or ()]
     if not scales:
         return ()

@@ -27,7 +27,8 @@ from ..report.ablation_page import AblationReport, write_ablation_report
 from ..report.page import number_text
 from .build import build_mesh, build_simulator, simulation_device
 from .files import METRICS, REPORT
-from .parts import March, Part, processes_for, remove_parts, split_into_parts, work_on
+from .parts import Part, processes_for, remove_parts, split_into_parts, work_on
+from .reconstruct import Reconstructing
 from .simulate import held_state
 
 MOTION = "motion.h5"
@@ -115,7 +116,7 @@ def read_motion(folder: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]
         return read_array(file, "q"), read_array(file, "uncorrected_q")
 
 
-class _FromMarkers(March):
+class _FromMarkers(Reconstructing):
     """The motion, reconstructed from random sets of as many markers.
 
     What is kept are the mean distances (draws,) of all vertices and of the markers [m], and the sets.
@@ -129,24 +130,20 @@ class _FromMarkers(March):
         self._vertices = draw_markers(simulator, self._count, draws, settings["seed"])
         self._markers = MarkerMap.at_vertices(torch.as_tensor(self._vertices, device=self.like.device), self.like.dtype)
         more = {**settings["reconstruction"], "modes": settings["ablation"]["modes"]}
-        self._reconstructor = make_reconstructor(simulator, **more, markers=self._markers)
-        self._force = self.like.new_zeros(draws, *self.like.shape)
+        self.method = make_reconstructor(simulator, **more, markers=self._markers)
+        self.force = self.like.new_zeros(draws, *self.like.shape)
         self._padding = max(settings["ablation"]["counts"]) - self._count
         self.fields = {name: Field((draws,), "m", batch_axes=1) for name in ("error", "misfit")}
         self.frames = len(self._motion)
 
     @override
     def begin(self) -> State:
-        q = self._motion[0].expand_as(self._force)
+        q = self._motion[0].expand_as(self.force)
         return State(q, torch.zeros_like(q))
 
     @override
-    @torch.enable_grad()
     def step(self, number: int) -> State:
-        observed = self._markers(self._motion[number].expand_as(self._force))
-        result = self._reconstructor.step(self.state, observed, first_guess=self._force)
-        self._force, self.shown = result.force, {"markers": self._count, "iterations": result.iterations}
-        return result.state.detach()
+        return self.bring_to(self._markers(self._motion[number].expand_as(self.force)))
 
     @override
     def kept(self, number: int) -> dict[str, ArrayLike]:
@@ -160,15 +157,6 @@ class _FromMarkers(March):
     def constants(self) -> dict[str, tuple[ArrayLike, str]]:
         sets = np.pad(self._vertices, ((0, 0), (0, self._padding)), constant_values=-1)  # -1 where a set is smaller
         return {"markers": (sets, "1")}
-
-    @override
-    def snapshot(self) -> dict[str, torch.Tensor]:
-        return {**super().snapshot(), "force": self._force}
-
-    @override
-    def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
-        super().restore(tensors)
-        self._force = tensors["force"].to(self.like)
 
 
 def draw_markers(simulator: Simulator, count: int, draws: int, seed: int) -> NDArray[np.int64]:

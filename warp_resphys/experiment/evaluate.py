@@ -14,7 +14,7 @@ from ..io.files import atomic_hdf5, create, read_array, read_hdf5, write_json
 from ..io.progress import Progress
 from ..io.stages import StageContext
 from ..learning.metrics import errors_per_marker, marker_errors, median_filter, summarise, summarise_each
-from ..learning.replay import Replay, Start
+from ..learning.replay import Start
 from .files import ERRORS, ROLLOUTS, TIMES, reconstruction_file
 from .models import ModelRollout, first_frame, learned_of
 from .parts import Part, padded, remove_parts, split_into_parts, work_on
@@ -73,7 +73,7 @@ def _rolled_out(part: Part) -> ModelRollout:
 def _observed(scene: Scene, model: str, part: Part) -> FloatArray:
     """(R, T, M, 3) what is observed of a model's roll-outs at the frames of the trials [m]."""
     series, delay, shift = (torch.from_numpy(part.read(name)) for name in ("points", "delay", "shift"))
-    replay = Replay(scene.model_simulator(model), scene.observe, scene.trials(part.names))
+    replay = scene.replay(scene.model_simulator(model), part.names)
     start = Start(State(series[:, 0], series[:, 0]), delay, shift).to(replay.trials.observed)
     series = (series[:, -1:] if replay.is_static else series).to(replay.trials.observed)
     return np.asarray(replay.at_frames(series, start).cpu().numpy())
@@ -206,7 +206,9 @@ def _sideways(scene: Scene, names: Sequence[str]) -> dict[str, float]:
     simulator = scene.model_simulator("resphys")
     found: dict[str, float] = {}
     for some in scene.alike(names):
-        shift = scene.start(simulator, scene.trials(some)).shift if scene.begins(some[0]) == "released" else None
+        if scene.begins(some[0]) != "released":
+            continue
+        shift = scene.start(scene.replay(simulator, some)).shift
         if shift is not None:
             found |= dict(zip(some, (1e3 * shift.norm(dim=2).mean(1)).tolist(), strict=True))
     return found
@@ -223,7 +225,7 @@ def time_models(context: StageContext) -> None:
     names = scene.moving(context.settings["groups"]["1"])
     simulator = scene.model_simulator("resphys")
     learned = learned_of(scene, "resphys")
-    starts = {name: scene.start(simulator, scene.trials([name])) for name in names}
+    starts = {name: scene.start(scene.replay(simulator, [name])) for name in names}
     rows: dict[str, tuple[str, Any, Any]] = {"simulation": ("simulation", None, scene.simulator("simulation"))}
     if scene.config.get("target") is not None:
         rows["target"] = ("simulation", None, scene.simulator("target"))

@@ -75,8 +75,7 @@ def _samples(scene: Scene, model: str, names: Sequence[str], device: torch.devic
     def pick(field: torch.Tensor) -> torch.Tensor:
         return field.flatten(0, 1) if whole else field[seen]
 
-    replay = Replay(simulator, scene.observe, scene.trials(names, simulator))
-    told = scene.conditions(replay, scene.parameters(model), model == SIMFREE)
+    told = scene.conditions(scene.replay(simulator, names), scene.parameters(model), model == SIMFREE)
     if told is not None:  # (K, R, A), or (R, A) that is the same all the time
         told = told[:steps].swapaxes(0, 1) if told.ndim == 3 else told[:, None].expand(-1, steps, -1)
         told = pick(told.to(device))
@@ -202,12 +201,12 @@ def _in_the_loop(scene: Scene, model: str, samples: Samples, groups: Mapping[str
     """
     config, split = groups["in_the_loop"], scene.config["split"]
     parameters, simulator = scene.parameters(model), scene.model_simulator(model)
-    everyone = [(some, *scene.replay(simulator, some)) for some in scene.alike([*split["train"], *split["validation"]])]
-    frames = scene.frames(simulator)
+    everyone, frames = scene.replays(simulator, [*split["train"], *split["validation"]]), scene.frames(simulator)
 
     def loss(names: Sequence[str]) -> MotionLoss:
         watched = []
-        for some, replay, start in everyone:
+        for replay, start in everyone:
+            some = replay.trials.names
             rows = [some.index(name) for name in names if name in some]
             if rows:
                 part = Replay(simulator, replay.observe, replay.trials.select(rows))
@@ -272,10 +271,9 @@ def refine(context: StageContext) -> None:
 def _motions(scene: Scene, model: str, names: Sequence[str]) -> list[Motion]:
     """What windows of some trials start from, and where they should go: a motion for those that begin alike."""
     found = []
-    for some in scene.alike(scene.moving(names)):
-        simulator = reconstructing_simulator(scene, model)
-        replay, start = scene.replay(simulator, some)
-        target = scene.explained(simulator, replay.trials, start)
+    simulator = reconstructing_simulator(scene, model)
+    for replay, start in scene.replays(simulator, scene.moving(names)):
+        some, target = replay.trials.names, scene.explained(replay, start)
         known, device = scene.dataset.velocity is not None, simulator.rest_positions.device
         q, v, *_ = _known(scene, some, device) if known else _reconstructed(scene, model, some, device)
         q, v = (field[:, : target.shape[1]].to(simulator.rest_positions) for field in (q, v))

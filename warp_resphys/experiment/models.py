@@ -20,7 +20,7 @@ from ..io.resumable import Field
 from ..learning.metrics import marker_errors, summarise
 from ..learning.networks import NextState, ResidualForce, StateMap, restore
 from ..learning.predictors import LearnedPredictor, Range
-from ..learning.replay import Replay, Start
+from ..learning.replay import Start
 from ..learning.rollout import Rollout
 from .files import GIVEN, weights_file
 from .parts import March
@@ -102,8 +102,8 @@ class ModelRollout(March):
         self.scene, self.model = scene, model
         self.simulator = scene.model_simulator(model) if simulator is None else simulator
         self.like = self.simulator.rest_positions
-        self.replay = Replay(self.simulator, scene.observe, scene.trials(names, self.simulator))
-        self.start = scene.start(self.simulator, self.replay.trials) if start is None else start
+        self.replay = scene.replay(self.simulator, names)
+        self.start = scene.start(self.replay) if start is None else start
         parameters = scene.parameters(model)
         self._constants, self._inputs, self._resting = self.replay.setting(parameters)
         self._told = None if learned is None else scene.conditions(self.replay, parameters, model == SIMFREE)

@@ -152,8 +152,9 @@ class Scene:
         """How a trial begins."""
         return self.dataset.begins[self.dataset.names.index(name)]
 
-    def start(self, simulator: Simulator, trials: Trials) -> Start:
+    def start(self, replay: Replay) -> Start:
         """How trials begin, as a simulator would have it."""
+        simulator, trials = replay.simulator, replay.trials
         begins = self.begins(trials.names[0])
         if begins == GIVEN:
             q = trials.observed[:, 0]
@@ -164,14 +165,14 @@ class Scene:
             return estimate_release(simulator, self.observe, trials, ReleaseSettings(**self.config["release"]))
         return Start.resting(simulator.rest_positions.expand(len(trials.names), -1, -1))
 
-    def replay(self, simulator: Simulator, names: Sequence[str]) -> tuple[Replay, Start]:
-        """A simulator of some of the trials, which begin alike, and how they begin."""
-        trials = self.trials(names, simulator)
-        return Replay(simulator, self.observe, trials), self.start(simulator, trials)
+    def replay(self, simulator: Simulator, names: Sequence[str]) -> Replay:
+        """A simulator of some of the trials, which begin alike."""
+        return Replay(simulator, self.observe, self.trials(names, simulator))
 
-    def replays(self, kind: str, names: Sequence[str]) -> list[tuple[Replay, Start]]:
-        """A simulator of any of the trials, a replay for those that begin alike."""
-        return [self.replay(self.simulator(kind), some) for some in self.alike(names)]
+    def replays(self, simulator: Simulator, names: Sequence[str]) -> list[tuple[Replay, Start]]:
+        """A simulator of any of the trials, a replay for those that begin alike, and how they begin."""
+        found = [self.replay(simulator, some) for some in self.alike(names)]
+        return [(each, self.start(each)) for each in found]
 
     def parameters(self, model: str) -> dict[str, torch.Tensor]:
         """(1,) identified parameters of a model's simulator; none for one that is not identified."""
@@ -221,11 +222,12 @@ class Scene:
             return None
         return VertexFrames(simulator.body, simulator.time_step, simulator.rest_positions)
 
-    def explained(self, simulator: Simulator, trials: Trials, start: Start) -> torch.Tensor:
+    def explained(self, replay: Replay, start: Start) -> torch.Tensor:
         """(R, K + 1, M, 3) what forces are to explain at a simulator's steps [m], NaN where nothing was seen.
 
         That is the part of each trial that is learned from.
         """
+        simulator, trials = replay.simulator, replay.trials
         if self.dataset.smoothed is not None and self.begins(trials.names[0]) == "rest":
             found = simulator.tensor(self.dataset.smoothed[self.dataset.rows(trials.names)])
         elif self.begins(trials.names[0]) in (GIVEN, STATIC):

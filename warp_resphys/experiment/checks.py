@@ -77,6 +77,8 @@ def check_configuration(config: Mapping[str, Any]) -> None:
         split_of(config)
         if variation_of(config["data"]).key == "weights_g":
             select_vertices(body.mesh, **config["data"]["load"])
+        if "modes" in config["reconstruction"]:
+            raise InputError("reconstruction.modes is for bodies that are seen through markers: leave it out.")
         make_reconstructor(simulator, **config["reconstruction"])
     if config["refinement"]["kind"] != "none":
         _check_refinement(config)

@@ -27,7 +27,8 @@ from ..report.ablation_page import AblationReport, write_ablation_report
 from ..report.page import number_text
 from .build import build_mesh, build_simulator, simulation_device
 from .files import METRICS, REPORT
-from .parts import March, Part, processes_for, remove_parts, split_into_parts, work_on
+from .parts import Part, processes_for, remove_parts, split_into_parts, work_on
+from .reconstruct import Reconstructing
 from .simulate import held_state
 
 MOTION = "motion.h5"
@@ -39,13 +40,7 @@ _MM = 1e3
 
 
 def ablation_stages(config: Mapping[str, Any], base: Mapping[str, Any], shown: Mapping[str, Any]) -> list[Stage]:
-    """The stages of the study.
-
-    Args:
-        config: the whole configuration.
-        base: the settings that every simulation depends on.
-        shown: what the report says of the configuration.
-    """
+    """The stages of the study; ``base`` has what every simulation depends on, ``shown`` goes into the report."""
     own = dict(config["ablation"])
     processes = min(processes_for(config, own.pop("processes")), len(own["counts"]))
     moved = {**base, **{key: config[key] for key in ("target", "simulation", "data")}}
@@ -60,7 +55,7 @@ def ablation_stages(config: Mapping[str, Any], base: Mapping[str, Any], shown: M
 
 def print_ablation(config: Mapping[str, Any], folder: Path) -> None:
     """Writes metrics.json and prints the errors."""
-    metrics = collect_metrics(folder, config)
+    metrics = _metrics(folder, config)
     write_json(folder / METRICS, metrics)
     table = Table("markers", "median [mm]", "quartiles [mm]", title="Error of the reconstructed motion, all vertices")
     for row in metrics["by_markers"]:
@@ -88,10 +83,6 @@ def generate_motion(context: StageContext) -> None:
 
 def ablate(context: StageContext, processes: int = 1) -> None:
     """Writes ablation.h5, with the sets of markers and the error of each at every step, and tables of the errors.
-
-    Args:
-        context: of the stage.
-        processes: that share the numbers of markers.
 
     Raises:
         ConvergenceError, WorkerError: a step could not be reconstructed.
@@ -125,7 +116,7 @@ def read_motion(folder: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]
         return read_array(file, "q"), read_array(file, "uncorrected_q")
 
 
-class _FromMarkers(March):
+class _FromMarkers(Reconstructing):
     """The motion, reconstructed from random sets of as many markers.
 
     What is kept are the mean distances (draws,) of all vertices and of the markers [m], and the sets.
@@ -139,24 +130,20 @@ class _FromMarkers(March):
         self._vertices = draw_markers(simulator, self._count, draws, settings["seed"])
         self._markers = MarkerMap.at_vertices(torch.as_tensor(self._vertices, device=self.like.device), self.like.dtype)
         more = {**settings["reconstruction"], "modes": settings["ablation"]["modes"]}
-        self._reconstructor = make_reconstructor(simulator, **more, markers=self._markers)
-        self._force = self.like.new_zeros(draws, *self.like.shape)
+        self.method = make_reconstructor(simulator, **more, markers=self._markers)
+        self.force = self.like.new_zeros(draws, *self.like.shape)
         self._padding = max(settings["ablation"]["counts"]) - self._count
         self.fields = {name: Field((draws,), "m", batch_axes=1) for name in ("error", "misfit")}
         self.frames = len(self._motion)
 
     @override
     def begin(self) -> State:
-        q = self._motion[0].expand_as(self._force)
+        q = self._motion[0].expand_as(self.force)
         return State(q, torch.zeros_like(q))
 
     @override
-    @torch.enable_grad()
     def step(self, number: int) -> State:
-        observed = self._markers(self._motion[number].expand_as(self._force))
-        result = self._reconstructor.step(self.state, observed, first_guess=self._force)
-        self._force, self.shown = result.force, {"markers": self._count, "iterations": result.iterations}
-        return result.state.detach()
+        return self.bring_to(self._markers(self._motion[number].expand_as(self.force)))
 
     @override
     def kept(self, number: int) -> dict[str, ArrayLike]:
@@ -170,15 +157,6 @@ class _FromMarkers(March):
     def constants(self) -> dict[str, tuple[ArrayLike, str]]:
         sets = np.pad(self._vertices, ((0, 0), (0, self._padding)), constant_values=-1)  # -1 where a set is smaller
         return {"markers": (sets, "1")}
-
-    @override
-    def snapshot(self) -> dict[str, torch.Tensor]:
-        return {**super().snapshot(), "force": self._force}
-
-    @override
-    def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
-        super().restore(tensors)
-        self._force = tensors["force"].to(self.like)
 
 
 def draw_markers(simulator: Simulator, count: int, draws: int, seed: int) -> NDArray[np.int64]:
@@ -218,7 +196,7 @@ def report_ablation(context: StageContext) -> None:
     data = AblationReport(
         title=config["title"],
         experiment=config["name"],
-        metrics=collect_metrics(context.run_dir, config),
+        metrics=_metrics(context.run_dir, config),
         settings=config,
         vertices=len(mesh.vertices),
         surface=len(surface),
@@ -227,7 +205,7 @@ def report_ablation(context: StageContext) -> None:
     write_ablation_report(context.run_dir / REPORT, data)
 
 
-def collect_metrics(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
+def _metrics(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
     """Errors, time and memory of the stages that are done, versions and device."""
     return {
         **read_json(folder / SUMMARY),

@@ -51,7 +51,7 @@ def simulation_device(config: Mapping[str, Any]) -> torch.device:
 
 
 def build_mesh(config: Mapping[str, Any]) -> Mesh:
-    """A mesh from the group ``mesh``; `schema.mesh_group` has what each kind takes.
+    """A mesh from the group ``mesh``; `schema` has what each kind takes.
 
     Raises:
         InputError: an unknown kind, or shipped arm.
@@ -141,13 +141,7 @@ def build_body(config: Mapping[str, Any]) -> Body:
 
 
 def bound_markers(settings: Mapping[str, Any], mesh: Mesh, places: ArrayLike, labels: Sequence[str]) -> Markers:
-    """Markers at places on the undeformed body, in float64 on the CPU.
-
-    Args:
-        settings: the group ``markers``.
-        mesh: of the body.
-        places: (M, 3) [m].
-        labels: M names.
+    """Markers at places (M, 3) on the undeformed body [m], in float64 on the CPU, from the group ``markers``.
 
     Raises:
         InputError: see `bind_markers`.

@@ -57,7 +57,7 @@ def check_configuration(config: Mapping[str, Any]) -> None:
     check("", config, configuration_group(config))
     if config["dtype"] != "float64":
         raise InputError(f"dtype is {config['dtype']!r}: experiments need float64; float32 is for roll-outs in Python.")
-    check_memory(config)
+    _check_memory(config)
     check_training(training_settings(config, "resphys"))
     with _naming("simfree: "):
         check_training(training_settings(config, "simfree"))
@@ -77,6 +77,8 @@ def check_configuration(config: Mapping[str, Any]) -> None:
         split_of(config)
         if variation_of(config["data"]).key == "weights_g":
             select_vertices(body.mesh, **config["data"]["load"])
+        if "modes" in config["reconstruction"]:
+            raise InputError("reconstruction.modes is for bodies that are seen through markers: leave it out.")
         make_reconstructor(simulator, **config["reconstruction"])
     if config["refinement"]["kind"] != "none":
         _check_refinement(config)
@@ -85,7 +87,7 @@ def check_configuration(config: Mapping[str, Any]) -> None:
             raise InputError("identify.parameters names fibre_stiffness, but fibres is null: give the simulator some.")
         hangs = config["data"].get("payload_at") is not None
         known = [name for name in known_parameters(simulator) if hangs or name != MASS_FACTOR]
-        check_identification(config["identify"], known)
+        _check_identification(config["identify"], known)
 
 
 def _check_refinement(config: Mapping[str, Any]) -> None:
@@ -99,12 +101,8 @@ def _check_refinement(config: Mapping[str, Any]) -> None:
         raise InputError(f"refinement.window is {window}: it must be less than the data's {steps} steps.")
 
 
-def check_memory(config: Mapping[str, Any]) -> None:
-    """Refuses what this machine has no memory for, before it is tried.
-
-    Raises:
-        InputError: a mesh or a network that is too large.
-    """
+def _check_memory(config: Mapping[str, Any]) -> None:
+    """Refuses what this machine has no memory for, before it is tried."""
     limit = _SHARE_OF_MEMORY * available_memory_gib()
     for key, group in (("mesh", config), ("laboratory.mesh", config["laboratory"] or {})):
         divisions = group.get("mesh", {}).get("divisions")
@@ -340,9 +338,6 @@ def _check_size(body: Body, material: Material, gravity: Sequence[float]) -> Non
     """Refuses a body that would sag under its own weight beyond belief, as one whose unit was mistaken does.
 
     A body of length L under its weight has strains of rho g L / E: a percent for an arm of silicone.
-
-    Raises:
-        InputError: strains of more than a few tenths.
     """
     length = float(np.linalg.norm(np.ptp(np.asarray(body.mesh.vertices), axis=0)))
     constants = {name: torch.as_tensor(value, dtype=torch.float64) for name, value in material.constants.items()}
@@ -359,16 +354,8 @@ def _check_size(body: Body, material: Material, gravity: Sequence[float]) -> Non
         )
 
 
-def check_identification(identify: Mapping[str, Any], known: Sequence[str]) -> None:
-    """Checks the group ``identify``, whose values are of their kinds.
-
-    Args:
-        identify: the group.
-        known: parameters that may be identified.
-
-    Raises:
-        InputError: no parameter, an unknown one, or a range or a first guess that does not fit.
-    """
+def _check_identification(identify: Mapping[str, Any], known: Sequence[str]) -> None:
+    """Checks the group ``identify``, given the parameters that may be identified."""
     parameters = {name: each for name, each in identify["parameters"].items() if each is not None}
     if not parameters:
         raise InputError(f"identify.parameters is empty: give a range of one or more of {', '.join(known)}.")

@@ -14,7 +14,7 @@ from ..io.files import atomic_hdf5, create, read_array, read_hdf5, write_json
 from ..io.progress import Progress
 from ..io.stages import StageContext
 from ..learning.metrics import errors_per_marker, marker_errors, median_filter, summarise, summarise_each
-from ..learning.replay import Replay, Start
+from ..learning.replay import Start
 from .files import ERRORS, ROLLOUTS, TIMES, reconstruction_file
 from .models import ModelRollout, first_frame, learned_of
 from .parts import Part, padded, remove_parts, split_into_parts, work_on
@@ -32,7 +32,7 @@ def evaluate(context: StageContext, processes: int = 1) -> None:
     settings = context.settings
     scene = Scene(settings, context.run_dir, "count")
     names = [name for group in settings["groups"].values() for name in group]
-    filmed = film_trial(scene, settings["groups"]["1"])
+    filmed = _film_trial(scene, settings["groups"]["1"])
     parts: dict[str, list[Part]] = {model: [] for model in models_of(settings)}
     for number, some in enumerate(scene.alike(names)):
         for model in parts:
@@ -44,8 +44,8 @@ def evaluate(context: StageContext, processes: int = 1) -> None:
     observed = {
         model: padded([_observed(scene, model, part) for part in some], frames)[rows] for model, some in parts.items()
     }
-    shown = film_steps(int(float(scene.trials([filmed]).times.max()) / settings["time_step"] + 1e-6))
-    attributes = {"names": names, "time_step": settings["time_step"], "film_trial": filmed}
+    shown = _film_steps(int(float(scene.trials([filmed]).times.max()) / settings["time_step"] + 1e-6))
+    attributes = {"names": names, "time_step": settings["time_step"], "_film_trial": filmed}
     with atomic_hdf5(context.run_dir / ROLLOUTS, "rollouts", attributes) as file:
         for model, values in observed.items():
             single = values if scene.dataset.bound is None else values.astype(np.float32)  # markers
@@ -53,7 +53,7 @@ def evaluate(context: StageContext, processes: int = 1) -> None:
             bodies = next(part.read("film") for part in parts[model] if filmed in part.names)
             substeps = round(settings["time_step"] / scene.model_simulator(model).time_step)
             create(file, f"{model}_film", bodies[np.minimum(substeps * shown, len(bodies) - 1)], "m")
-        create(file, "film_steps", shown)
+        create(file, "_film_steps", shown)
     left = {
         model: np.concatenate([part.read("left")[:, -1] for part in some])[rows]
         for model, some in parts.items()
@@ -67,20 +67,19 @@ def _rolled_out(part: Part) -> ModelRollout:
     """A model over the trials of a part."""
     scene = Scene(part.context.settings, part.context.run_dir, "count")
     model, filmed = part.more
-    learned = learned_of(scene, model, scene.model_simulator(model).rest_positions)
-    return ModelRollout(scene, model, part.names, learned, filmed=filmed)
+    return ModelRollout(scene, model, part.names, learned_of(scene, model), filmed=filmed)
 
 
 def _observed(scene: Scene, model: str, part: Part) -> FloatArray:
     """(R, T, M, 3) what is observed of a model's roll-outs at the frames of the trials [m]."""
     series, delay, shift = (torch.from_numpy(part.read(name)) for name in ("points", "delay", "shift"))
-    replay = Replay(scene.model_simulator(model), scene.observe, scene.trials(part.names))
+    replay = scene.replay(scene.model_simulator(model), part.names)
     start = Start(State(series[:, 0], series[:, 0]), delay, shift).to(replay.trials.observed)
     series = (series[:, -1:] if replay.is_static else series).to(replay.trials.observed)
     return np.asarray(replay.at_frames(series, start).cpu().numpy())
 
 
-def film_trial(scene: Scene, names: Sequence[str]) -> str:
+def _film_trial(scene: Scene, names: Sequence[str]) -> str:
     """The test trial that moves most; its bodies are drawn."""
     found: dict[str, float] = {}
     for some in scene.alike(names):
@@ -88,7 +87,7 @@ def film_trial(scene: Scene, names: Sequence[str]) -> str:
     return max(names, key=lambda name: found[name])
 
 
-def film_steps(steps: int) -> IntArray:
+def _film_steps(steps: int) -> IntArray:
     """Steps whose bodies are kept for pictures."""
     return np.arange(0, steps + 1, max(-(-steps // _FILM_FRAMES), 1))
 
@@ -186,16 +185,13 @@ def _over_time(
 
 def _largest_filtered(errors: Sequence[FloatArray], step: float) -> float | None:
     """Largest error of any trial after a median over a second of time [mm]; None where a roll-out diverged."""
-    if not all(np.isfinite(each).all() for each in errors):
-        return None
-    return max(float(median_filter(each, step).max()) for each in errors)
+    diverged = not all(np.isfinite(each).all() for each in errors)
+    return None if diverged else max(float(median_filter(each, step).max()) for each in errors)
 
 
 def _growth(first: Mapping[str, Any], last: Mapping[str, Any]) -> float | None:
     """By how much of itself the mean error grows; None where a roll-out diverged."""
-    if first["mean"] is None or last["mean"] is None:
-        return None
-    return float(last["mean"] / first["mean"] - 1.0)
+    return None if None in (first["mean"], last["mean"]) else float(last["mean"] / first["mean"] - 1.0)
 
 
 def _range(left: IntArray, names: Sequence[str], step: float) -> dict[str, Any]:
@@ -210,7 +206,9 @@ def _sideways(scene: Scene, names: Sequence[str]) -> dict[str, float]:
     simulator = scene.model_simulator("resphys")
     found: dict[str, float] = {}
     for some in scene.alike(names):
-        shift = scene.start(simulator, scene.trials(some)).shift if scene.begins(some[0]) == "released" else None
+        if scene.begins(some[0]) != "released":
+            continue
+        shift = scene.start(scene.replay(simulator, some)).shift
         if shift is not None:
             found |= dict(zip(some, (1e3 * shift.norm(dim=2).mean(1)).tolist(), strict=True))
     return found
@@ -226,8 +224,8 @@ def time_models(context: StageContext) -> None:
     scene = Scene(context.settings, context.run_dir, "count")
     names = scene.moving(context.settings["groups"]["1"])
     simulator = scene.model_simulator("resphys")
-    learned = learned_of(scene, "resphys", simulator.rest_positions)
-    starts = {name: scene.start(simulator, scene.trials([name])) for name in names}
+    learned = learned_of(scene, "resphys")
+    starts = {name: scene.start(scene.replay(simulator, [name])) for name in names}
     rows: dict[str, tuple[str, Any, Any]] = {"simulation": ("simulation", None, scene.simulator("simulation"))}
     if scene.config.get("target") is not None:
         rows["target"] = ("simulation", None, scene.simulator("target"))

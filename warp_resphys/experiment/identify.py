@@ -44,7 +44,7 @@ def identify(context: StageContext) -> None:
     found, replays = {}, {}
     with Progress(context.name, evaluations, "evaluations at most", done) as progress:
         for model, bounds in ranges.items():
-            replays[model] = scene.replays(kinds[model], names)
+            replays[model] = scene.replays(scene.simulator(kinds[model]), names)
             identifier = Identifier(replays[model], bounds, _seconds(settings, replays[model]))
             found[model] = _search(settings, identifier, kept[model], progress)
     if config["grid"]:

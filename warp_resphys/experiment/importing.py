@@ -56,7 +56,7 @@ class Observed:
         registration: of the markers at rest.
         pressure: (T, C) in the chambers of the body at the frames [Pa]; None without chambers.
         release: when the body was let go; None of others.
-        tells_places: whether it shows where markers sit on the body at rest.
+        tells_places: whether it shows where markers sit on the body, held undeformed or under nothing but gravity.
         base: (T, 6) how what the body is fixed to has moved at the frames, in the frame of the body; None where it
             stands still.
     """
@@ -70,11 +70,6 @@ class Observed:
     release: Release | None = None
     tells_places: bool = True
     base: FloatArray | None = None
-
-    @property
-    def is_released(self) -> bool:
-        """Whether it was let go."""
-        return self.release is not None
 
     def to_body(self, points: FloatArray, shift: FloatArray) -> FloatArray:
         """(..., M, 3) points of the recording in the frame of the body, moved by (M, 3) [m]."""
@@ -120,19 +115,12 @@ class Importer:
         Raises:
             DataFileError: a recording that cannot be read or used; the sentence names the file and the marker.
         """
-        recordings = [self._read(trial) for trial in trials]
-        self._check_rates([each for each, trial in zip(recordings, trials, strict=True) if _has_release(trial)])
-        releases = [self._release(each, trial) for each, trial in zip(recordings, trials, strict=True)]
-        ready = [
-            each if _has_release(trial) else resample(each, 1.0 / self.settings["time_step"])
-            for each, trial in zip(recordings, trials, strict=True)
-        ]
-        self._check_reference(trials, ready, releases)
-        each = zip(trials, ready, releases, strict=True)
+        ready = [self._read(trial) for trial in trials]
+        self._check_reference(trials, ready)
         return self._beside_each_other(
             [
                 self._driven(trial, recording) if release is None else self._released(trial, recording, release)
-                for trial, recording, release in each
+                for trial, (recording, release) in zip(trials, ready, strict=True)
             ]
         )
 
@@ -156,52 +144,49 @@ class Importer:
             for each in observed
         ]
 
-    def _read(self, trial: Trial) -> Recording:
+    def _read(self, trial: Trial) -> tuple[Recording, Release | None]:
+        """A recording, at the steps of the simulation if the body is driven, and when the body is let go if it is."""
         if is_laboratory(self.settings) or trial.file is None:
             recording = read_recording(self.context.run_dir / trial.recording)
         else:
             recording = read_recording(trial.file, self.data["units"], self.data["rate"])
         if not self._chambers:
             check_passive(recording)
-        return recording.select(self.labels)
+        recording = recording.select(self.labels)
+        if not trial.is_released:
+            return resample(recording, 1.0 / self.settings["time_step"]), None
+        self._check_rate(recording)
+        if trial.begins == "released":
+            return recording, _START
+        return recording, release_of(recording, self.tracked, self.data["longest_gap"])
 
-    def _release(self, recording: Recording, trial: Trial) -> Release | None:
-        if not _has_release(trial):
-            return None
-        return _START if trial.begins == "released" else release_of(recording, self.tracked, self.data["longest_gap"])
-
-    def _check_rates(self, recordings: Sequence[Recording]) -> None:
-        """Refuses recordings that are too slow, and says which frames fall between the steps of the simulation."""
-        for recording in recordings:
-            if recording.rate < _LEAST_RATE:
-                raise DataFileError(
-                    f"{recording.source} has {recording.rate:g} frames a second, too few to tell how the body was let "
-                    f"go: record {_LEAST_RATE:g} or more, or set data.rate if the file is wrong."
-                )
-            ratio = recording.rate * self.settings["time_step"]
-            if abs(max(ratio, 1.0 / ratio) - round(max(ratio, 1.0 / ratio))) > 1e-6:
-                log.info(
-                    "import: %s has %g frames a second and the simulation %g steps: it is read off at the times of the "
-                    "frames, between its steps",
-                    *(recording.source.name, recording.rate, 1.0 / self.settings["time_step"]),
-                )
-
-    def _check_reference(
-        self, trials: Sequence[Trial], recordings: Sequence[Recording], releases: Sequence[Release | None]
-    ) -> None:
-        """Refuses recordings whose reference markers moved against each other between trials."""
-        if len(self.markers["reference"]) > 1:
-            still = []
-            for trial, each, release in zip(trials, recordings, releases, strict=True):
-                first, last = (0, self._rest_frames(each)) if release is None else release.rest
-                stands = release is None and self._base_motion(trial) is None
-                still.append(each if stands else replace(each, positions=each.positions[first:last]))
-            check_base(
-                still,
-                list(self.markers["reference"]),
-                largest_distortion=self.markers["largest_distortion"],
-                largest_shift=self.markers["largest_shift"],
+    def _check_rate(self, recording: Recording) -> None:
+        """Refuses a recording that is too slow, and says whether frames fall between the steps of the simulation."""
+        if recording.rate < _LEAST_RATE:
+            raise DataFileError(
+                f"{recording.source} has {recording.rate:g} frames a second, too few to tell how the body was let "
+                f"go: record {_LEAST_RATE:g} or more, or set data.rate if the file is wrong."
             )
+        ratio = recording.rate * self.settings["time_step"]
+        if abs(max(ratio, 1.0 / ratio) - round(max(ratio, 1.0 / ratio))) > 1e-6:
+            log.info(
+                "import: %s has %g frames a second and the simulation %g steps: it is read off at the times of the "
+                "frames, between its steps",
+                *(recording.source.name, recording.rate, 1.0 / self.settings["time_step"]),
+            )
+
+    def _check_reference(self, trials: Sequence[Trial], ready: Sequence[tuple[Recording, Release | None]]) -> None:
+        """Refuses recordings whose reference markers moved against each other between trials."""
+        reference, still = list(self.markers["reference"]), []
+        for trial, (recording, release) in zip(trials, ready, strict=True):
+            if release is not None:
+                still.append(_frames(recording, *release.rest))
+            else:
+                stands = self._base_motion(trial) is None
+                still.append(recording if stands else _frames(recording, 0, self._rest_frames(recording)))
+        if len(reference) > 1:
+            limits = {key: self.markers[key] for key in ("largest_distortion", "largest_shift")}
+            check_base(still, reference, **limits)
 
     def _rest_frames(self, recording: Recording) -> int:
         return max(round(self.data["rest_seconds"] * recording.rate), 1)
@@ -214,15 +199,7 @@ class Importer:
     def _base(
         self, trial: Trial, whole: Recording, moving: Recording, still: FloatArray, transform: RigidTransform
     ) -> FloatArray | None:
-        """(T, 6) how the base has moved at the frames of a trial, in the frame of the body; None if it stands still.
-
-        Args:
-            trial: what is configured of it.
-            whole: all markers at the same frames.
-            moving: the tracked ones, and the array `base`.
-            still: see `Observed`.
-            transform: from the frame of the recording to that of the body.
-        """
+        """(T, 6) how the base has moved at the frames, in the frame of the body; ``whole`` has all of their markers."""
         motion = self._base_motion(trial)
         if motion is None:
             return None
@@ -241,18 +218,13 @@ class Importer:
     def _register(
         self, places: FloatArray, recording: Recording, expected: FloatArray, only_reference: bool = False
     ) -> Registration:
-        return register_markers(
-            places,
-            expected,
-            self.labels,
-            source=recording.source,
-            largest_residual=self.markers["largest_residual"],
-            use=list(self.markers["reference"]) if only_reference else None,
-        )
+        use = list(self.markers["reference"]) if only_reference else None
+        largest, source = self.markers["largest_residual"], recording.source
+        return register_markers(places, expected, self.labels, source=source, largest_residual=largest, use=use)
 
     def _released(self, trial: Trial, recording: Recording, release: Release) -> Observed:
         """A body that was held, undeformed or as the file says, and let go."""
-        still = _median(replace(recording, positions=recording.positions[slice(*release.rest)]), self.tracked)
+        still = _median(_frames(recording, *release.rest), self.tracked)
         places = _rest_of(recording, self.tracked) if self.data["rest"] == "file" else still
         registration = self._register(places, recording, self.expected(False))
         off = f"; left out: {listed(registration.outliers)}" if registration.outliers else ""
@@ -269,11 +241,10 @@ class Importer:
                 "leave it out of markers.tracked."
             )
         check_motion(moving, self.tracked)
-        pressure = None
-        if self._chambers:  # Constant: how a valve moves while a body swings is not told by this.
-            pressure = self._pressure(moving, trial)[:1]
+        # Constant: how a valve moves while a body swings is not told by this.
+        pressure = self._pressure(moving, trial)[:1] if self._chambers else None
         first = int(np.ceil(release.frame))
-        whole = replace(recording, positions=recording.positions[first : first + len(moving.positions)])
+        whole = _frames(recording, first, first + len(moving.positions))
         base = self._base(trial, whole, moving, still, registration.transform)
         return Observed(trial, recording, moving, still, registration, pressure, release, base=base)
 
@@ -281,33 +252,23 @@ class Importer:
         """A body that rests until its inputs come, or one in a pose."""
         static = trial.begins == STATIC
         if not static:
-            check_motion(replace(recording, positions=recording.positions[: self.data["steps"] + 1]), self.tracked)
+            check_motion(_frames(recording, 0, self.data["steps"] + 1), self.tracked)
         pressure = self._pressure(recording, trial) if self._chambers else None
-        tells = self.tells_places(trial, pressure)
+        loaded = pressure is not None and not self._is_at_rest(pressure[:1])[0]
+        tells = trial.payload == 0.0 and not loaded
         filled = fill_gaps(recording, self.data["longest_gap"], mask_long=True)
-        if static and pressure is not None and not self._is_at_rest(pressure[:1])[0]:
-            still = _median(filled, self.tracked)
-        else:
-            still = self._resting(filled, pressure)
+        still = _median(filled, self.tracked) if static and loaded else self._resting(filled, pressure)
         # Where the body is without what hangs on it, the other trials tell.
         only_reference = not tells and len(self.markers["reference"]) > 2
         registration = self._register(still, recording, self.expected(True), only_reference)
-        off = f"; left out: {listed(registration.outliers)}" if registration.outliers else ""
-        log.debug("import: %s registered to %.2f mm%s", trial.name, _MILLI * registration.rms, off)
         moving = filled.select(self.tracked)
         if static:
             frames = max(round(_POSE_SECONDS * moving.rate), 1)
-            last = replace(moving, positions=moving.positions[-frames:])
+            last = _frames(moving, -frames, None)
             moving = replace(moving, positions=_median(last, self.tracked)[None])
             pressure = None if pressure is None else np.median(pressure[-frames:], axis=0)[None]
         base = None if static else self._base(trial, recording, moving, still, registration.transform)
         return Observed(trial, recording, moving, still, registration, pressure, tells_places=tells, base=base)
-
-    def tells_places(self, trial: Trial, pressure: FloatArray | None) -> bool:
-        """Whether a trial shows the body at rest under nothing but gravity, or held undeformed."""
-        if _has_release(trial):
-            return True
-        return trial.payload == 0.0 and (pressure is None or bool(self._is_at_rest(pressure[:1])[0]))
 
     def _is_at_rest(self, pressure: FloatArray) -> NDArray[np.bool_]:
         """(T,) whether (T, C) pressures are what a gauge shows of none."""
@@ -321,36 +282,31 @@ class Importer:
             raise DataFileError(
                 f"{recording.source} begins under pressure: its first frame must show the body at rest."
             )
-        count = min(until, self._rest_frames(recording))
-        return _central(replace(recording, positions=recording.positions[:count]), self.tracked, np.mean, "rests")
+        resting = _frames(recording, 0, min(until, self._rest_frames(recording)))
+        return _central(resting, self.tracked, np.mean, "rests")
 
     def _pressure(self, recording: Recording, trial: Trial) -> FloatArray:
-        """(T, C) in the chambers of the body [Pa].
-
-        Raises:
-            DataFileError: no pressures, of another number of chambers, or beyond the limit.
-        """
+        """(T, C) in the chambers of the body [Pa]; refuses those of another number of chambers, or beyond the limit."""
         data, chambers = self.data, len(self._chambers)
         found = recording.actuation
         if found is None:
-            if trial.begins in ("held", "released"):
+            if trial.is_released:
                 return np.zeros((len(recording.positions), chambers))
             raise DataFileError(
                 f"{recording.source} has no array 'actuation' with the pressures of the chambers: add it "
                 "(docs/recordings.md)."
             )
         if data["chambers"] is not None:
-            columns = list(data["chambers"])
+            columns = np.array(data["chambers"]) - 1
             if len(columns) != found.shape[1]:
                 raise DataFileError(
                     f"{recording.source} has pressures of {found.shape[1]} chambers, but data.chambers names "
                     f"{len(columns)}: name the mesh's chamber of each column of the file."
                 )
-            placed = np.zeros((len(found), chambers))
-            placed[:, [int(number) - 1 for number in columns]] = found
-            found = placed
+            given, found = found, np.zeros((len(found), chambers))
+            found[:, columns] = given
         values = check_pressures(found, chambers, trial.scale * data["pressure_limit"], recording.source)
-        if data["valve"] == "detected" and not _has_release(trial):
+        if data["valve"] == "detected" and not trial.is_released:
             opening = valve_opening(recording, self.tracked)
             # Commanded pressures from that moment on; the step in which the valve opens has its share.
             frame = (opening - recording.start) * recording.rate
@@ -358,8 +314,9 @@ class Importer:
         return values
 
 
-def _has_release(trial: Trial) -> bool:
-    return trial.begins in ("held", "released")
+def _frames(recording: Recording, first: int, last: int | None) -> Recording:
+    """The markers of some of the frames."""
+    return replace(recording, positions=recording.positions[first:last])
 
 
 def import_recordings(context: StageContext) -> None:
@@ -379,10 +336,8 @@ def import_recordings(context: StageContext) -> None:
     told = [row for row, each in enumerate(observed) if each.tells_places and each.trial.name in known]
     told = told or [row for row, each in enumerate(observed) if each.tells_places]
     mean = np.nanmean(offsets[told], axis=0) if told else np.zeros_like(importer.nominal)
-    bound = importer.nominal + mean
-    bound_markers(
-        settings["markers"], importer.simulator.body.mesh, bound, tracked
-    )  # Refuses a marker that is far off.
+    mesh, bound = importer.simulator.body.mesh, importer.nominal + mean
+    bound_markers(settings["markers"], mesh, bound, tracked)  # Refuses a marker that is far off.
     shifts = _shifts(settings["data"], observed, mean, offsets)
     verticals = _verticals(observed, settings)
     gravity = _gravity(verticals, settings)
@@ -412,7 +367,7 @@ def _places(markers: Mapping[str, Any]) -> FloatArray:
 def _offset(importer: Importer, each: Observed) -> FloatArray:
     """(M, 3) how far the tracked markers of a trial are from where they should be, in the frame of the body [m]."""
     count = len(importer.tracked)
-    return each.registration.positions[:count] - importer.expected(not each.is_released)[:count]
+    return each.registration.positions[:count] - importer.expected(not each.trial.is_released)[:count]
 
 
 def _shifts(data: Mapping[str, Any], observed: Sequence[Observed], mean: FloatArray, offsets: FloatArray) -> FloatArray:
@@ -430,9 +385,8 @@ def _median(recording: Recording, tracked: Sequence[str]) -> FloatArray:
 
 def _central(recording: Recording, tracked: Sequence[str], centre: Any, while_it: str) -> FloatArray:
     seen: NDArray[np.bool_] = recording.seen
-    ever = np.any(seen, axis=0)
-    hidden = [label for label, ok in zip(recording.labels, ever.tolist(), strict=True) if not ok]
-    lost = [label for label in hidden if label in tracked]
+    hidden = np.flatnonzero(~seen.any(axis=0))
+    lost = [recording.labels[column] for column in hidden if recording.labels[column] in tracked]
     if lost:
         raise DataFileError(
             f"{recording.source}: {listed(lost)} cannot be seen while the body {while_it}, so where it sits is not "
@@ -459,11 +413,7 @@ def _rest_of(recording: Recording, tracked: Sequence[str]) -> FloatArray:
 
 
 def _check_unit(pressures: Sequence[FloatArray], data: Mapping[str, Any]) -> None:
-    """Refuses recordings under which the body would hardly move, as those do whose unit was mistaken.
-
-    Raises:
-        DataFileError: no pressure is near the limit.
-    """
+    """Refuses recordings under which the body would hardly move, as those do whose unit was mistaken."""
     if not pressures or all(len(each) == 1 for each in pressures):
         return
     highest, limit = max(float(np.abs(each).max()) for each in pressures), data["pressure_limit"]
@@ -482,7 +432,7 @@ def _dataset(
     settings, chambers = importer.settings, chambers_of(importer.simulator.body)
     data, cutoff = settings["data"], settings["data"].get("cutoff")
     steps = data.get("steps")
-    frames = max(len(each.moving.positions) if each.is_released else 1 for each in observed)
+    frames = max(len(each.moving.positions) if each.trial.is_released else 1 for each in observed)
     if any(each.trial.begins == "rest" for each in observed):
         frames = max(frames, steps + 1)
     shape = (len(observed), frames, len(importer.tracked), 3)
@@ -490,13 +440,13 @@ def _dataset(
     times, held = np.zeros(shape[:2]), np.zeros((shape[0], *shape[2:]))
     pressure = np.zeros((len(observed), steps if steps else 1, len(chambers))) if chambers else None
     for row, each in enumerate(observed):
-        limit = frames if each.is_released or steps is None else steps + 1
+        limit = frames if each.trial.is_released or steps is None else steps + 1
         seen = each.moving.positions[:limit]
         slow = each.moving if cutoff is None or len(seen) == 1 else smooth(each.moving, cutoff)
         markers[row, : len(seen)] = each.to_body(seen, shifts[row])
         smoothed[row, : len(seen)] = each.to_body(slow.positions[:limit], shifts[row])
         held[row] = each.to_body(each.still[: shape[2]], shifts[row])
-        if each.is_released:
+        if each.trial.is_released:
             times[row] = np.pad(each.moving.time, (0, frames - len(seen)), mode="edge")
         elif each.trial.begins == "rest":
             times[row] = np.minimum(np.arange(frames), steps) * settings["time_step"]
@@ -510,7 +460,7 @@ def _dataset(
     return Dataset(
         names=tuple(each.trial.name for each in observed),
         labels=tuple(importer.tracked),
-        begins=tuple("released" if each.is_released else each.trial.begins for each in observed),
+        begins=tuple("released" if each.trial.is_released else each.trial.begins for each in observed),
         times=times,
         observed=markers,
         held=held,
@@ -547,18 +497,12 @@ def _fill_pressure(row: FloatArray, each: Observed) -> None:
     if 1 < len(series) < len(row):
         log.warning(
             "import: %s ends after %d of the %d steps of data.steps; the rest counts as not seen.",
-            each.raw.source.name,
-            len(series),
-            len(row),
+            *(each.raw.source.name, len(series), len(row)),
         )
 
 
 def _verticals(observed: Sequence[Observed], settings: Mapping[str, Any]) -> FloatArray | None:
-    """(R, 3) the vertical of each recording in the frame of the body; None if it is not known.
-
-    Raises:
-        InputError: it points elsewhere than the configured gravity.
-    """
+    """(R, 3) the vertical of each recording in the frame of the body, near the configured one; None if not known."""
     up = vertical(settings["data"].get("up"))
     if up is None:
         return None
@@ -599,34 +543,33 @@ def _write_quality(
 ) -> None:
     """quality.json and registration.json: of all released trials, and of a few driven ones."""
     reference, gap = list(context.settings["markers"]["reference"]), context.settings["data"]["longest_gap"]
-    released = [row for row, each in enumerate(observed) if each.is_released]
-    driven = [row for row, each in enumerate(observed) if not each.is_released]
-    shown = sorted(released + (evenly(driven, _SHOWN) if driven else []))
+    driven = [row for row, each in enumerate(observed) if not each.trial.is_released]
+    shown = evenly(driven, _SHOWN) if driven else []
     qualities, registrations = {}, {}
-    for row in shown:
-        each = observed[row]
+    for row, each in enumerate(observed):
+        if row in driven and row not in shown:
+            continue
         name = each.trial.name
         found = quality(each.raw, reference if each.base is None else [], each.release, longest_gap=gap)
         qualities[name] = found.to_plain()
-        if each.is_released:
+        if each.trial.is_released:
             for warning in found.warnings:
                 log.warning("%s: %s", found.source.name, warning)
         elif found.warnings:
             log.info("import: %s: %d remarks on its quality in the report", found.source.name, len(found.warnings))
-        registrations[name] = registration_summary(each.registration, tracked, -shifts[row])
+        registrations[name] = _summary(each.registration, tracked, -shifts[row])
         if verticals is not None:
             registrations[name]["vertical_deg"] = _angle(verticals[row], -gravity)
     write_json(context.run_dir / QUALITY, qualities)
     write_json(context.run_dir / REGISTRATION, registrations)
 
 
-def registration_summary(registration: Registration, tracked: Sequence[str], shift: FloatArray) -> dict[str, Any]:
+def _summary(registration: Registration, tracked: Sequence[str], shift: FloatArray) -> dict[str, Any]:
     """For registration.json: lengths in millimetres, but for the positions in the frame of the body, in metres."""
-    residual = dict(zip(registration.names, _MILLI * registration.residual, strict=True))
     return {
         "positions": dict(zip(registration.names, registration.positions.tolist(), strict=True)),
         "rms_mm": _MILLI * registration.rms,
-        "residual_mm": residual,
+        "residual_mm": dict(zip(registration.names, _MILLI * registration.residual, strict=True)),
         "outliers": list(registration.outliers),
         "shift_mm": dict(zip(tracked, (_MILLI * shift).tolist(), strict=True)),
     }

@@ -7,14 +7,12 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
 from ..dynamics.modes import RestStiffness
-from ..dynamics.simulator import Simulator
 from ..io.files import read_array, read_hdf5, write_checkpoint, write_json
 from ..io.progress import Progress
 from ..io.resumable import forget_checkpoint, keep_checkpoint, resume_checkpoint
@@ -37,56 +35,69 @@ _CHECKPOINT_SECONDS = 10.0
 Snapshot = tuple[dict[str, torch.Tensor], dict[str, Any]]
 
 
-@dataclass(frozen=True)
-class Steps:
-    """S single steps that networks learn from, and poses, from which a body goes nowhere, in the frame of the base.
+def samples_of(scene: Scene, model: str, names: Sequence[str], device: torch.device) -> Samples:
+    """The single steps of some trials that a model learns from, and poses, from which a body goes nowhere.
 
-    Attributes:
-        q: (S, N, 3) positions where they begin [m].
-        v: (S, N, 3) velocities there [m/s].
-        told: (S, A) what the networks are told of the inputs; None for nothing.
-        force: (S, N, 3) that leads on [N]; None where the states were not reconstructed.
-        following: positions and velocities (S, N, 3) where they end.
-        lengths: of the series that the steps are, a trial each.
+    States are in the frame of the base. The force that leads on is that of the rest shape where forces turn with the
+    body; what replaces a simulator learns the displacement and the velocity where a step ends. What no marker saw has
+    nothing to teach.
     """
-
-    q: torch.Tensor
-    v: torch.Tensor
-    told: torch.Tensor | None
-    force: torch.Tensor | None
-    following: tuple[torch.Tensor, torch.Tensor]
-    lengths: tuple[int, ...]
-
-
-def steps_of(scene: Scene, model: str, names: Sequence[str], device: torch.device) -> Steps:
-    """The steps of some trials that a model learns from: known ones, or what the reconstruction left.
-
-    What no marker saw has no force to learn.
-    """
-    dataset = scene.dataset
-    if model == SIMFREE and dataset.velocity is not None:
-        rows = dataset.rows(names)
-        q, v = (torch.as_tensor(field[rows], device=device) for field in (dataset.observed, dataset.velocity))
-        given = _told(scene, model, names, q.shape[1] - 1)
-        given = None if given is None else given.to(device)
-        q, v = _in_base(scene, model, names, q, v)
-        return _steps(q, v, None, given, torch.ones(q.shape[0], q.shape[1] - 1, dtype=torch.bool))
-    found = []
-    for some in scene.alike(names):
-        q, v, force, seen = read_states(scene, model, some, device)
-        q, v = _in_base(scene, model, some, q, v)
-        force = _forces_in_base(scene, model, some, force)
-        told = _told(scene, model, some, q.shape[1] - 1)
-        if scene.begins(some[0]) == STATIC:
-            q, v = q[:, 1:2].expand(-1, 2, -1, -1), torch.zeros_like(v[:, :2])
-            force, seen = force[:, :2], seen[:, :1]
-        found.append(_steps(q, v, force, None if told is None else told[:, : q.shape[1] - 1].to(device), seen))
-    return found[0] if len(found) == 1 else _together(found)
+    parts = [_samples(scene, model, some, device) for some in scene.alike(names)]
+    found = parts[0] if len(parts) == 1 else _joined(parts)
+    frames = None if model == SIMFREE else scene.frames(scene.model_simulator(model))
+    if frames is None:
+        return found
+    return dataclasses.replace(found, outputs=(frames.to_rest(found.q, found.v, *found.outputs),))
 
 
-def read_states(
-    scene: Scene, model: str, names: Sequence[str], device: torch.device
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+def _joined(parts: Sequence[Samples]) -> Samples:
+    q, v = torch.cat([each.q for each in parts]), torch.cat([each.v for each in parts])
+    outputs = tuple(map(torch.cat, zip(*(each.outputs for each in parts), strict=True)))
+    told = [each.actuation for each in parts if each.actuation is not None]
+    return Samples(q, v, outputs, torch.cat(told) if told else None, tuple(n for each in parts for n in each.lengths))
+
+
+def _samples(scene: Scene, model: str, names: Sequence[str], device: torch.device) -> Samples:
+    """Those of trials that begin alike; forces as they are."""
+    simulator, known = scene.model_simulator(model), model == SIMFREE and scene.dataset.velocity is not None
+    q, v, force, seen = _known(scene, names, device) if known else _reconstructed(scene, model, names, device)
+    base, like = scene.base(names, simulator), simulator.rest_positions
+    if base is not None:
+        pairs = enumerate(zip(q.unbind(1), v.unbind(1), strict=True))
+        inside = [base.enter(x.to(like), w.to(like), k) for k, (x, w) in pairs]
+        q, v = (torch.stack(each, 1).to(q) for each in zip(*inside, strict=True))
+        forces = enumerate(force.unbind(1))  # That of a frame belongs to the step before.
+        force = torch.stack([base.force_inside(f.to(like), k - 1) for k, f in forces], 1).to(force)
+    if scene.begins(names[0]) == STATIC:
+        q, v, force, seen = q[:, 1:2].expand(-1, 2, -1, -1), torch.zeros_like(v[:, :2]), force[:, :2], seen[:, :1]
+    steps, whole = q.shape[1] - 1, bool(seen.all())
+
+    def pick(field: torch.Tensor) -> torch.Tensor:
+        return field.flatten(0, 1) if whole else field[seen]
+
+    told = scene.conditions(scene.replay(simulator, names), scene.parameters(model), model == SIMFREE)
+    if told is not None:  # (K, R, A), or (R, A) that is the same all the time
+        told = told[:steps].swapaxes(0, 1) if told.ndim == 3 else told[:, None].expand(-1, steps, -1)
+        told = pick(told.to(device))
+    now = pick(q[:, :-1]), pick(v[:, :-1])
+    lengths = tuple(seen.sum(1).tolist())
+    if model != SIMFREE:
+        return Samples(*now, (pick(force[:, 1:]),), told, lengths)
+    return Samples(*now, (pick(q[:, 1:]) - scene.like.to(q), pick(v[:, 1:])), told, lengths)
+
+
+States = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
+
+
+def _known(scene: Scene, names: Sequence[str], device: torch.device) -> States:
+    """The same as `_reconstructed`, of trials whose states a simulation knows, and without forces."""
+    dataset, rows = scene.dataset, scene.dataset.rows(names)
+    assert dataset.velocity is not None
+    q, v = (torch.as_tensor(field[rows], device=device) for field in (dataset.observed, dataset.velocity))
+    return q, v, torch.zeros((), device=device).expand_as(q), torch.ones(q.shape[0], q.shape[1] - 1, dtype=torch.bool)
+
+
+def _reconstructed(scene: Scene, model: str, names: Sequence[str], device: torch.device) -> States:
     """Positions, velocities, forces (R, K + 1, N, 3) of trials that begin alike, and (R, K) whether steps were seen."""
     source = "resphys" if model == SIMFREE else model
     with read_hdf5(scene.folder / reconstruction_file(source), "reconstruction") as file:
@@ -96,63 +107,6 @@ def read_states(
         found = {key: read_array(file, key)[index] for key in ("q", "v", "force", "error")}
     q, v, force = (torch.as_tensor(found[key], device=device) for key in ("q", "v", "force"))
     return q, v, force, torch.as_tensor(np.isfinite(found["error"][:, 1:]), device=device)
-
-
-def _steps(
-    q: torch.Tensor, v: torch.Tensor, force: torch.Tensor | None, told: torch.Tensor | None, seen: torch.Tensor
-) -> Steps:
-    """The steps between (R, K + 1, N, 3) states of which the end was seen (R, K)."""
-    whole = bool(seen.all())
-
-    def pick(field: torch.Tensor) -> torch.Tensor:
-        return field.flatten(0, 1) if whole else field[seen]
-
-    now = (pick(q[:, :-1]), pick(v[:, :-1]), None if told is None else pick(told))
-    lengths = tuple(seen.sum(1).tolist())
-    return Steps(*now, None if force is None else pick(force[:, 1:]), (pick(q[:, 1:]), pick(v[:, 1:])), lengths)
-
-
-def _together(parts: Sequence[Steps]) -> Steps:
-    def joined(fields: Sequence[torch.Tensor | None]) -> Any:
-        known = [each for each in fields if each is not None]
-        return torch.cat(known) if known else None
-
-    own = {name: joined([getattr(each, name) for each in parts]) for name in ("q", "v", "told", "force")}
-    following = (joined([p.following[0] for p in parts]), joined([p.following[1] for p in parts]))
-    return Steps(**own, following=following, lengths=tuple(n for each in parts for n in each.lengths))
-
-
-def _in_base(
-    scene: Scene, model: str, names: Sequence[str], q: torch.Tensor, v: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """States (R, K + 1, N, 3) of some trials in the frame of their base."""
-    simulator = scene.model_simulator(model)
-    base, like = scene.base(names, simulator), simulator.rest_positions
-    if base is None:
-        return q, v
-    steps = enumerate(zip(q.unbind(1), v.unbind(1), strict=True))
-    inside = [base.enter(x.to(like), w.to(like), step) for step, (x, w) in steps]
-    x, w = (torch.stack(each, 1).to(q) for each in zip(*inside, strict=True))
-    return x, w
-
-
-def _forces_in_base(scene: Scene, model: str, names: Sequence[str], force: torch.Tensor) -> torch.Tensor:
-    """Forces (R, K + 1, N, 3), each that of the step before, in the frame of their base."""
-    simulator = scene.model_simulator(model)
-    base, like = scene.base(names, simulator), simulator.rest_positions
-    if base is None:
-        return force
-    return torch.stack([base.force_inside(f.to(like), k - 1) for k, f in enumerate(force.unbind(1))], 1).to(force)
-
-
-def _told(scene: Scene, model: str, names: Sequence[str], steps: int) -> torch.Tensor | None:
-    """(R, K, A) what a model is told of the inputs of some trials that begin alike."""
-    simulator = scene.model_simulator(model)
-    replay = Replay(simulator, scene.observe, scene.trials(names, simulator))
-    told = scene.conditions(replay, scene.parameters(model), model == SIMFREE)
-    if told is None:
-        return None
-    return told[:steps].swapaxes(0, 1) if told.ndim == 3 else told[:, None].expand(-1, steps, -1)
 
 
 @dataclass(frozen=True)
@@ -184,12 +138,12 @@ class Learning:
         """
         split = self.scene.config["split"]
         device = choose_device(self.scene.config["device"])
-        train = steps_of(self.scene, self.model, split["train"], device)
+        train = samples_of(self.scene, self.model, split["train"], device)
         if self.in_the_loop:
             return _in_the_loop(self.scene, self.model, train, groups)
         judged = split["validation"] or split["train"]
-        validation = steps_of(self.scene, self.model, judged, device) if split["validation"] else train
-        return _supervised(self.scene, self.model, {"train": train, "validation": validation}, judged, groups)
+        validation = samples_of(self.scene, self.model, judged, device) if split["validation"] else train
+        return _supervised(self.scene, self.model, train, validation, judged, groups)
 
 
 @dataclass(frozen=True)
@@ -205,53 +159,30 @@ class Prepared:
     learned: Learned
 
 
-def new_network(
-    scene: Scene, model: str, steps: Steps, groups: Mapping[str, Any], forces: torch.Tensor | None
-) -> StateMap:
+def _new_network(scene: Scene, model: str, train: Samples, groups: Mapping[str, Any]) -> StateMap:
     """An untrained network, with coders from the training steps; the same for the same seed."""
-    rest = scene.simulator("simulation").rest_positions.to(steps.q.device)
-    config = groups["network"]
+    rest, config = scene.like.to(train.q.device), groups["network"]
     torch.manual_seed(groups["seed"])
-    if forces is None:
-        return build_next_state(config, rest, steps.q, steps.v, steps.told)
+    if model == SIMFREE:
+        return build_next_state(config, rest, train.q, train.v, train.actuation)
     by_displacement = config["kind"] == "reduced" and config["force_basis"] == "displacement"
     stiffness = RestStiffness(scene.model_simulator(model)) if by_displacement else None
-    return build_model(config, rest, steps.q, steps.v, forces, steps.told, stiffness)
-
-
-def _turned(scene: Scene, model: str, steps: Steps) -> torch.Tensor:
-    """(S, N, 3) forces as a model is to learn them: those of the rest shape, where they turn with the body [N]."""
-    assert steps.force is not None
-    frames = scene.frames(scene.model_simulator(model))
-    return steps.force if frames is None else frames.to_rest(steps.q, steps.v, steps.force)
+    return build_model(config, rest, train.q, train.v, train.outputs[0], train.actuation, stiffness)
 
 
 def _supervised(
-    scene: Scene, model: str, steps: Mapping[str, Steps], judged: Sequence[str], groups: Mapping[str, Any]
+    scene: Scene, model: str, train: Samples, validation: Samples, judged: Sequence[str], groups: Mapping[str, Any]
 ) -> Prepared:
     """Training on single steps, judged by roll-outs."""
-    samples = {}
-    for name, each in steps.items():
-        if model == SIMFREE:
-            rest = scene.simulator("simulation").rest_positions.to(each.q)
-            outputs: tuple[torch.Tensor, ...] = (each.following[0] - rest, each.following[1])
-        else:
-            outputs = (_turned(scene, model, each),)
-        samples[name] = Samples(each.q, each.v, outputs, each.told, each.lengths)
-    train = samples["train"]
-    network = new_network(scene, model, steps["train"], groups, None if model == SIMFREE else train.outputs[0])
+    network = _new_network(scene, model, train, groups)
     learned = Learned(network, _range_of(scene, network, train), scene.config["force_frame"])
     error = rollout_error(dataclasses.replace(scene, on_failure="count"), model, judged)
     kind: type[Trainer[Any]] = Trainer if network.recurrent is None else SequenceTrainer
-    trainer = kind(
-        network,
-        train,
-        samples["validation"],
-        lambda weights: error(dataclasses.replace(learned, network=weights)),
-        groups["trainer"],
-        groups["seed"],
-    )
-    return Prepared(trainer, learned)
+
+    def judge(weights: StateMap) -> float:
+        return error(dataclasses.replace(learned, network=weights))
+
+    return Prepared(kind(network, train, validation, judge, groups["trainer"], groups["seed"]), learned)
 
 
 def _range_of(scene: Scene, network: StateMap, train: Samples) -> Range | None:
@@ -262,21 +193,20 @@ def _range_of(scene: Scene, network: StateMap, train: Samples) -> Range | None:
         return Range.of(network.encode(train.q, train.v, train.actuation))
 
 
-def _in_the_loop(scene: Scene, model: str, steps: Steps, groups: Mapping[str, Any]) -> Prepared:
+def _in_the_loop(scene: Scene, model: str, samples: Samples, groups: Mapping[str, Any]) -> Prepared:
     """Training on whole trials through the simulator.
 
     The reconstruction says in which modes bodies move and forces act. Without validation trials, each training trial is
     held out once to find how long training serves others; no epoch at all is one of the choices.
     """
     config, split = groups["in_the_loop"], scene.config["split"]
-    parameters, forces = scene.parameters(model), _turned(scene, model, steps)
-    simulator = scene.model_simulator(model)
-    everyone = [(some, *scene.replay(simulator, some)) for some in scene.alike([*split["train"], *split["validation"]])]
-    frames = scene.frames(simulator)
+    parameters, simulator = scene.parameters(model), scene.model_simulator(model)
+    everyone, frames = scene.replays(simulator, [*split["train"], *split["validation"]]), scene.frames(simulator)
 
     def loss(names: Sequence[str]) -> MotionLoss:
         watched = []
-        for some, replay, start in everyone:
+        for replay, start in everyone:
+            some = replay.trials.names
             rows = [some.index(name) for name in names if name in some]
             if rows:
                 part = Replay(simulator, replay.observe, replay.trials.select(rows))
@@ -286,7 +216,7 @@ def _in_the_loop(scene: Scene, model: str, steps: Steps, groups: Mapping[str, An
         return MotionLoss(watched, parameters)
 
     def make_network() -> ResidualForce:
-        found = new_network(scene, model, steps, groups, forces)
+        found = _new_network(scene, model, samples, groups)
         assert isinstance(found, ResidualForce)
         return found.double()
 
@@ -299,15 +229,14 @@ def _in_the_loop(scene: Scene, model: str, steps: Steps, groups: Mapping[str, An
     judged = loss(validation) if validation else None
     trainer = MarkersInTheLoop(make_network(), loss(train), judged, config, epochs)
     trainer.begin()
-    range_ = _range_of(scene, trainer.model, Samples(steps.q, steps.v, (), steps.told))
-    return Prepared(trainer, Learned(trainer.model, range_, scene.config["force_frame"]))
+    learned = Learned(trainer.model, _range_of(scene, trainer.model, samples), scene.config["force_frame"])
+    return Prepared(trainer, learned)
 
 
 def train(context: StageContext) -> None:
     """Trains a model: <model>.safetensors, with the weights that are selected, and training_<model>.json."""
     settings, model = context.settings, context.settings["model"]
-    prepared = Learning(Scene(settings, context.run_dir), model).trainer(settings)
-    fit(context, prepared)
+    fit(context, Learning(Scene(settings, context.run_dir), model).trainer(settings))
 
 
 def refine(context: StageContext) -> None:
@@ -315,7 +244,7 @@ def refine(context: StageContext) -> None:
     settings, model = context.settings, context.settings["model"]
     scene = Scene(settings, context.run_dir, "count")
     simulator = scene.model_simulator(model)
-    learned = load(context.run_dir, model, like=torch.zeros((), device=choose_device(settings["device"])))
+    learned = load(context.run_dir, model, choose_device(settings["device"]))
     network, config = learned.network, settings["refinement"]
     assert isinstance(network, ResidualForce)
     split = settings["split"]
@@ -324,7 +253,7 @@ def refine(context: StageContext) -> None:
     error = rollout_error(scene, model, judged)
     loss = WindowLoss(
         network,
-        partial(_fresh, scene, model),
+        partial(dataclasses.replace, simulator),  # One whose solver has seen nothing yet.
         config["window"],
         config["batch_size"],
         observe=scene.observe,
@@ -339,26 +268,15 @@ def refine(context: StageContext) -> None:
         log.warning("%s: %d windows could not be simulated and were left out", context.name, left_out)
 
 
-def _fresh(scene: Scene, model: str) -> Simulator:
-    """A simulator of a model whose solver has seen nothing yet."""
-    simulator = scene.model_simulator(model)
-    return dataclasses.replace(simulator)
-
-
 def _motions(scene: Scene, model: str, names: Sequence[str]) -> list[Motion]:
     """What windows of some trials start from, and where they should go: a motion for those that begin alike."""
     found = []
-    for some in scene.alike(scene.moving(names)):
-        simulator = reconstructing_simulator(scene, model)
-        replay, start = scene.replay(simulator, some)
-        target = scene.explained(simulator, replay.trials, start)
-        if scene.dataset.velocity is not None:
-            q, v = (
-                simulator.tensor(x[scene.dataset.rows(some)]) for x in (scene.dataset.observed, scene.dataset.velocity)
-            )
-        else:
-            q, v, _, _ = read_states(scene, model, some, simulator.rest_positions.device)
-            q, v = (field[:, : target.shape[1]].to(simulator.rest_positions) for field in (q, v))
+    simulator = reconstructing_simulator(scene, model)
+    for replay, start in scene.replays(simulator, scene.moving(names)):
+        some, target = replay.trials.names, scene.explained(replay, start)
+        known, device = scene.dataset.velocity is not None, simulator.rest_positions.device
+        q, v, *_ = _known(scene, some, device) if known else _reconstructed(scene, model, some, device)
+        q, v = (field[:, : target.shape[1]].to(simulator.rest_positions) for field in (q, v))
         told = scene.conditions(replay, scene.parameters(model))
         found.append(Motion(q, v, target, replay.trials, told, scene.base(some, simulator)))
     return found
@@ -377,7 +295,11 @@ def fit(context: StageContext, prepared: Prepared, refined: bool = False) -> Non
     found = resume_checkpoint(checkpoint, "training", context.fingerprint)
     if found is not None:
         trainer.resume(*found)
-    run_epochs(context.name, trainer, lambda kept: save_training(checkpoint, kept, context.fingerprint))
+
+    def save(kept: Snapshot) -> None:
+        keep_checkpoint(checkpoint, "training", kept[0], {**kept[1], "fingerprint": context.fingerprint})
+
+    run_epochs(context.name, trainer, save)
     best = trainer.use_best()
     kept = {
         "selection": trainer.selection,
@@ -433,12 +355,5 @@ def run_epochs(
 def _copy(snapshot: Snapshot) -> Snapshot:
     """The next epoch changes the tensors in place."""
     tensors, metadata = snapshot
-    return {k: t.detach().clone() for k, t in tensors.items()}, {
-        **metadata,
-        "history": list(metadata["history"]),
-    }
-
-
-def save_training(checkpoint: Path, kept: Snapshot, fingerprint: str) -> None:
-    """Writes a checkpoint that `resume_checkpoint` reads under the same fingerprint."""
-    keep_checkpoint(checkpoint, "training", kept[0], {**kept[1], "fingerprint": fingerprint})
+    copies = {name: tensor.detach().clone() for name, tensor in tensors.items()}
+    return copies, {**metadata, "history": list(metadata["history"])}

@@ -20,7 +20,7 @@ from ..io.resumable import Field
 from ..learning.metrics import marker_errors, summarise
 from ..learning.networks import NextState, ResidualForce, StateMap, restore
 from ..learning.predictors import LearnedPredictor, Range
-from ..learning.replay import Replay, Start
+from ..learning.replay import Start
 from ..learning.rollout import Rollout
 from .files import GIVEN, weights_file
 from .parts import March
@@ -29,16 +29,12 @@ from .scene import LEARNED, Scene
 FloatArray = NDArray[np.float64]
 
 SIMFREE: Final = "simfree"
-_KINDS: Final[Mapping[bool, tuple[type[StateMap], str]]] = {
-    True: (NextState, "next state"),
-    False: (ResidualForce, "residual force"),
-}
 _POSE_STEPS = 200  # in which a network in place of a simulator is taken to come to rest
 
 
 def kind_of(model: str) -> tuple[type[StateMap], str]:
     """The class of a learned model, and what its checkpoints hold."""
-    return _KINDS[model == SIMFREE]
+    return (NextState, "next state") if model == SIMFREE else (ResidualForce, "residual force")
 
 
 @dataclass(frozen=True)
@@ -57,32 +53,27 @@ class Learned:
 
     def description(self) -> dict[str, Any]:
         """What `load` needs beside the network's own."""
-        return {
-            "range": None if self.range_ is None else self.range_.description(),
-            "force_frame": self.force_frame,
-        }
+        known = None if self.range_ is None else self.range_.description()
+        return {"range": known, "force_frame": self.force_frame}
 
 
-def load(folder: Path, model: str, refined: bool = False, like: torch.Tensor | None = None) -> Learned:
-    """What a model has learned, from its checkpoint.
+def load(folder: Path, model: str, device: torch.device, refined: bool = False) -> Learned:
+    """What a model of `LEARNED` has learned, refined through the simulator or not, from its checkpoint.
 
     Args:
         folder: of the split.
-        model: one of `LEARNED`.
+        model: its name.
+        device: of the network.
         refined: whether through the simulator, too.
-        like: a tensor on the device; that of the checkpoint if left out.
 
     Raises:
         DataFileError: the file is missing or damaged.
     """
     network_type, kind = kind_of(model)
     tensors, description = read_checkpoint(folder / weights_file(model, refined), kind)
-    network = restore(network_type, tensors, description)
-    network = network if like is None else network.to(like.device)
-    known = description["range"]
-    return Learned(
-        network, None if known is None else Range.restore(known, network.linear), str(description["force_frame"])
-    )
+    network, known = restore(network_type, tensors, description).to(device), description["range"]
+    range_ = None if known is None else Range.restore(known, network.linear)
+    return Learned(network, range_, str(description["force_frame"]))
 
 
 class ModelRollout(March):
@@ -111,8 +102,8 @@ class ModelRollout(March):
         self.scene, self.model = scene, model
         self.simulator = scene.model_simulator(model) if simulator is None else simulator
         self.like = self.simulator.rest_positions
-        self.replay = Replay(self.simulator, scene.observe, scene.trials(names, self.simulator))
-        self.start = scene.start(self.simulator, self.replay.trials) if start is None else start
+        self.replay = scene.replay(self.simulator, names)
+        self.start = scene.start(self.replay) if start is None else start
         parameters = scene.parameters(model)
         self._constants, self._inputs, self._resting = self.replay.setting(parameters)
         self._told = None if learned is None else scene.conditions(self.replay, parameters, model == SIMFREE)
@@ -267,7 +258,7 @@ def rollout_error(scene: Scene, model: str, names: Sequence[str]) -> Callable[[L
     return error
 
 
-def learned_of(scene: Scene, model: str, like: torch.Tensor) -> Learned | None:
+def learned_of(scene: Scene, model: str) -> Learned | None:
     """What a model has learned in this run; None for those that are simulators alone."""
     refined = model != SIMFREE and scene.config["refinement"] != "none"
-    return load(scene.folder, model, refined, like) if model in LEARNED else None
+    return load(scene.folder, model, scene.like.device, refined) if model in LEARNED else None

@@ -51,8 +51,10 @@ from .scene import LEARNED, models_of
 from .simulate import run_laboratory, simulate
 from .trials import Split, folds_of, is_laboratory, scaled_trials_of, sees_markers, split_of, test_groups, trials_of
 
-_SIMULATED = ("mesh", "physics", "fixed", "gravity", "time_step", "integrator", "solver", "device", "dtype")
-_ACTING = ("chambers", "fibres", "coupling")
+_SIMULATED = (
+    *("mesh", "physics", "fixed", "gravity", "time_step", "integrator", "solver", "device", "dtype"),
+    *("chambers", "fibres", "coupling"),
+)
 _DRAWN = ("laboratory", "fixed", "chambers", "gravity", "time_step", "solver", "device", "dtype", "seed", "tip")
 _DRAWN_DATA = (
     *("folder", "trials", "sequences", "begins", "train", "validation", "test", "folds", "limit"),
@@ -70,7 +72,7 @@ Work = Callable[[StageContext], None]
 
 def simulated(config: Mapping[str, Any]) -> dict[str, Any]:
     """The settings that every simulation of an experiment depends on."""
-    base = {key: config[key] for key in (*_SIMULATED, *_ACTING)}
+    base = _pick(config, *_SIMULATED)
     if config["mesh"]["kind"] == "file":
         base["mesh_digest"] = digest(config["mesh"]["path"])
     trials = config["data"].get("trials") or {}

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
+from ..dynamics.inputs import Inputs
 from ..dynamics.integrator import State
 from ..dynamics.simulator import Simulator
 from ..io.files import atomic_hdf5, create, write_json
@@ -48,7 +49,7 @@ def reconstruct(context: StageContext, processes: int = 1) -> None:
         last = float(scene.trials(names).times.max()) / scene.model_simulator(model).time_step
         frames = max(scene.learned_steps(int(last + 1e-6)), 1) + 1
         parts += split_into_parts(context, names, frames, f"part{number}")
-    work_on(parts, _Reconstructing, processes)
+    work_on(parts, _OfTrials, processes)
     order = [name for part in parts for name in part.names]
     held = scene.moving(settings["split"]["validation"])
     rows = [row for row, name in enumerate(order) if name in held]
@@ -91,8 +92,36 @@ def reconstructing_simulator(scene: Scene, model: str) -> Simulator:
     return dataclasses.replace(simulator, integrator="bdf2") if rings else simulator
 
 
-class _Reconstructing(March):
-    """Trials that begin alike, brought to what was observed of them step by step.
+class Reconstructing(March):
+    """Bodies that are brought to what was observed of them, each step from the force of the one before.
+
+    Attributes:
+        method: of reconstruction.
+        force: (B, N, 3) that led to the last state [N].
+    """
+
+    method: Reconstructor
+    force: torch.Tensor
+
+    @torch.enable_grad()
+    def bring_to(self, observed: torch.Tensor, inputs: Inputs | None = None) -> State:
+        """The next state, near (B, M, 3) observed points [m]."""
+        result = self.method.step(self.state, observed, inputs, self.force)
+        self.force, self.shown = result.force, {"iterations": result.iterations}
+        return result.state.detach()
+
+    @override
+    def snapshot(self) -> dict[str, torch.Tensor]:
+        return {**super().snapshot(), "force": self.force}
+
+    @override
+    def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
+        super().restore(tensors)
+        self.force = tensors["force"].to(self.like)
+
+
+class _OfTrials(Reconstructing):
+    """Trials that begin alike.
 
     What is kept are q, v and the force (B, N, 3), and the distance of what is observed (B,) [mm].
     """
@@ -101,16 +130,18 @@ class _Reconstructing(March):
         settings = part.context.settings
         scene = Scene(settings, part.context.run_dir)
         simulator = reconstructing_simulator(scene, settings["model"])
-        replay, self._start = scene.replay(simulator, part.names)
-        self._replay, self._observe, self.like = replay, scene.observe, simulator.rest_positions
+        replay = self._replay = scene.replay(simulator, part.names)
+        self._start, self.like = scene.start(replay), simulator.rest_positions
         self._constants, self._inputs, self._resting = replay.setting(scene.parameters(settings["model"]))
-        self._observed = scene.explained(simulator, replay.trials, self._start)
+        self._observed = scene.explained(replay, self._start)
         if replay.is_static:  # A pose is where one step leads that lasts so long that inertia has no say.
             simulator = dataclasses.replace(simulator, time_step=_FOR_EVER, integrator="implicit_euler")
             self._observed = torch.cat([torch.full_like(self._observed, torch.nan), self._observed], 1)
             self._inputs = self._resting
-        self._method = make_method(scene, simulator, settings["reconstruction"]).with_constants(self._constants)
-        self._force = torch.zeros_like(self._start.state.q)
+        markers: Any = None if scene.dataset.bound is None else scene.observe  # Full states have a faster way.
+        method = make_reconstructor(simulator, **settings["reconstruction"], markers=markers)
+        self.method = method.with_constants(self._constants)
+        self.force = torch.zeros_like(self._start.state.q)
         dtype = "float64" if scene.dataset.bound is None else "float32"
         shape = (len(part.names), simulator.body.n_vertices, 3)
         self.fields = {name: Field(shape, unit, dtype, 1) for name, unit in _UNITS.items()}
@@ -122,34 +153,15 @@ class _Reconstructing(March):
         return self._replay.begin(self._start, self._constants, self._resting)
 
     @override
-    @torch.enable_grad()
     def step(self, number: int) -> State:
-        inputs = self._inputs.at(number - 1)
-        result = self._method.step(self.state, self._observed[:, number], inputs, self._force)
-        self._force, self.shown = result.force, {"iterations": result.iterations}
-        return result.state.detach()
+        return self.bring_to(self._observed[:, number], self._inputs.at(number - 1))
 
     @override
     def kept(self, number: int) -> dict[str, ArrayLike]:
-        values = {"q": self.state.q, "v": self.state.v, "force": self._force}
-        reached, seen = (x.cpu().numpy() for x in (self._observe(self.state.q), self._observed[:, number]))
+        values = {"q": self.state.q, "v": self.state.v, "force": self.force}
+        reached, seen = (x.cpu().numpy() for x in (self._replay.observe(self.state.q), self._observed[:, number]))
         error = np.array([frame_error(x, y) for x, y in zip(reached, seen, strict=True)])
         return {**{name: value.cpu().numpy() for name, value in values.items()}, "error": error}
-
-    @override
-    def snapshot(self) -> dict[str, torch.Tensor]:
-        return {**super().snapshot(), "force": self._force}
-
-    @override
-    def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
-        super().restore(tensors)
-        self._force = tensors["force"].to(self.like)
-
-
-def make_method(scene: Scene, simulator: Simulator, settings: Mapping[str, Any]) -> Reconstructor:
-    """The configured reconstruction: of full states, which has a faster way, or of markers."""
-    markers: Any = None if scene.dataset.bound is None else scene.observe
-    return make_reconstructor(simulator, **settings, markers=markers)
 
 
 def replayed_errors(
@@ -167,9 +179,10 @@ def replayed_errors(
     """
     scene = Scene(settings, run_dir, "count")
     simulator = reconstructing_simulator(scene, settings["model"])
-    replay, start = scene.replay(simulator, names)
+    replay = scene.replay(simulator, names)
+    start = scene.start(replay)
     constants, inputs, resting = replay.setting(scene.parameters(settings["model"]))
-    observed = scene.explained(simulator, replay.trials, start)
+    observed = scene.explained(replay, start)
     frames = scene.frames(simulator)
     steps = (found["q"][:, :-1], found["v"][:, :-1], found["force"][:, 1:])
     known = [torch.from_numpy(each).to(simulator.rest_positions).unbind(1) for each in steps]

@@ -52,11 +52,6 @@ def models_of(config: Mapping[str, Any]) -> list[str]:
     return [model for model in MODELS if not absent.get(model)]
 
 
-def every_vertex(positions: torch.Tensor) -> torch.Tensor:
-    """What is observed where a simulation knows the full state: the identity."""
-    return positions
-
-
 @dataclass(frozen=True)
 class Scene:
     """The trials and the simulators of an experiment.
@@ -96,12 +91,8 @@ class Scene:
             kind: ``simulation`` (uncorrected), ``target`` (which made the trials), ``published``, or ``identified``,
                 which may step with another integrator, and take shorter steps.
         """
-        if kind not in self._simulators:
-            self._simulators[kind] = self.new_simulator(kind)
-        return self._simulators[kind]
-
-    def new_simulator(self, kind: str, on_failure: str | None = None) -> Simulator:
-        """One of its own, whose solver has seen nothing yet; see `simulator`."""
+        if kind in self._simulators:
+            return self._simulators[kind]
         config = {**self.config, "gravity": self.dataset.gravity.tolist()}
         identify = config.get("identify") or {}
         if kind == "published":
@@ -109,21 +100,27 @@ class Scene:
         elif kind == "identified" and identify.get("integrator") is not None:
             config |= {"integrator": identify["integrator"], "time_step": config["time_step"] / identify["substeps"]}
         material, body = ("target" if kind == "target" else "simulation"), (None if kind == "published" else self.body)
-        return build_simulator(config, material, body, on_failure or self.on_failure)
+        self._simulators[kind] = build_simulator(config, material, body, self.on_failure)
+        return self._simulators[kind]
+
+    @property
+    def like(self) -> torch.Tensor:
+        """A tensor on the device and in the type of the simulators."""
+        return self.simulator("simulation").rest_positions
 
     @cached_property
     def observe(self) -> Observe:
         """(B, N, 3) positions to what is observed of them: (B, M, 3) markers, or all of them."""
         if self.dataset.bound is None:
-            return every_vertex
+            return lambda positions: positions
         found = bound_markers(self.config["markers"], self.body.mesh, self.dataset.bound, self.dataset.labels)
-        return found.to(self.simulator("simulation").rest_positions)
+        return found.to(self.like)
 
     def trials(self, names: Sequence[str], simulator: Simulator | None = None) -> Trials:
         """Some of the trials, which begin alike, on the simulators' device, with inputs for a simulator's steps."""
         payload_at = self.config["data"].get("payload_at")
         found = self.dataset.trials(names, self.body, payload_at, None if simulator is None else simulator.time_step)
-        return found.to(self.simulator("simulation").rest_positions)
+        return found.to(self.like)
 
     def base(self, names: Sequence[str], simulator: Simulator) -> BaseFrame | None:
         """The frame of what the body is fixed to in some of the trials; None where that stands still."""
@@ -142,11 +139,9 @@ class Scene:
 
     def alike(self, names: Sequence[str]) -> list[tuple[str, ...]]:
         """Trials in groups that begin alike, and can be simulated as one batch."""
-        kinds = [self.dataset.begins[row] for row in self.dataset.rows(names)]
-        each = zip(names, kinds, strict=True)
         found: dict[str, list[str]] = {}
-        for name, kind in each:
-            found.setdefault(kind, []).append(name)
+        for name in names:
+            found.setdefault(self.begins(name), []).append(name)
         return [tuple(some) for some in found.values()]
 
     def moving(self, names: Sequence[str]) -> tuple[str, ...]:
@@ -157,8 +152,9 @@ class Scene:
         """How a trial begins."""
         return self.dataset.begins[self.dataset.names.index(name)]
 
-    def start(self, simulator: Simulator, trials: Trials) -> Start:
+    def start(self, replay: Replay) -> Start:
         """How trials begin, as a simulator would have it."""
+        simulator, trials = replay.simulator, replay.trials
         begins = self.begins(trials.names[0])
         if begins == GIVEN:
             q = trials.observed[:, 0]
@@ -169,14 +165,14 @@ class Scene:
             return estimate_release(simulator, self.observe, trials, ReleaseSettings(**self.config["release"]))
         return Start.resting(simulator.rest_positions.expand(len(trials.names), -1, -1))
 
-    def replay(self, simulator: Simulator, names: Sequence[str]) -> tuple[Replay, Start]:
-        """A simulator of some of the trials, which begin alike, and how they begin."""
-        trials = self.trials(names, simulator)
-        return Replay(simulator, self.observe, trials), self.start(simulator, trials)
+    def replay(self, simulator: Simulator, names: Sequence[str]) -> Replay:
+        """A simulator of some of the trials, which begin alike."""
+        return Replay(simulator, self.observe, self.trials(names, simulator))
 
-    def replays(self, kind: str, names: Sequence[str]) -> list[tuple[Replay, Start]]:
-        """A simulator of any of the trials, a replay for those that begin alike."""
-        return [self.replay(self.simulator(kind), some) for some in self.alike(names)]
+    def replays(self, simulator: Simulator, names: Sequence[str]) -> list[tuple[Replay, Start]]:
+        """A simulator of any of the trials, a replay for those that begin alike, and how they begin."""
+        found = [self.replay(simulator, some) for some in self.alike(names)]
+        return [(each, self.start(each)) for each in found]
 
     def parameters(self, model: str) -> dict[str, torch.Tensor]:
         """(1,) identified parameters of a model's simulator; none for one that is not identified."""
@@ -184,7 +180,7 @@ class Scene:
         if key is None or self.config.get("identify") is None:
             return {}
         values = read_json(self.folder / IDENTIFICATION)[key]["parameters"]
-        return {name: torch.tensor([x]).to(self.simulator("simulation").rest_positions) for name, x in values.items()}
+        return {name: torch.tensor([x]).to(self.like) for name, x in values.items()}
 
     def model_simulator(self, model: str) -> Simulator:
         """The one that a model is, or corrects."""
@@ -226,11 +222,12 @@ class Scene:
             return None
         return VertexFrames(simulator.body, simulator.time_step, simulator.rest_positions)
 
-    def explained(self, simulator: Simulator, trials: Trials, start: Start) -> torch.Tensor:
+    def explained(self, replay: Replay, start: Start) -> torch.Tensor:
         """(R, K + 1, M, 3) what forces are to explain at a simulator's steps [m], NaN where nothing was seen.
 
         That is the part of each trial that is learned from.
         """
+        simulator, trials = replay.simulator, replay.trials
         if self.dataset.smoothed is not None and self.begins(trials.names[0]) == "rest":
             found = simulator.tensor(self.dataset.smoothed[self.dataset.rows(trials.names)])
         elif self.begins(trials.names[0]) in (GIVEN, STATIC):

@@ -180,12 +180,8 @@ _MESHES: Final[Mapping[str, Mapping[str, Spec]]] = {
 }
 
 
-def mesh_group(settings: Any) -> Group:
-    """What the group ``mesh`` must be, by its kind.
-
-    Raises:
-        InputError: an unknown kind.
-    """
+def _mesh_group(settings: Any) -> Group:
+    """What the group ``mesh`` must be, by its kind."""
     kind = settings.get("kind") if isinstance(settings, Mapping) else None
     if isinstance(settings, Mapping) and kind not in _MESHES:
         *some, last = _MESHES
@@ -260,13 +256,10 @@ _RELEASE = Group(
 )
 _MARKERS = Group(
     {
-        "tracked": Group(each=_PLACE),
-        "reference": Group(each=_PLACE),
+        **dict.fromkeys(("tracked", "reference"), Group(each=_PLACE)),
         "bind": one_of(*BINDINGS),
         "bind_to": optional(PLACE),
-        "largest_residual": POSITIVE,
-        "largest_distance": POSITIVE,
-        "largest_distortion": POSITIVE,
+        **dict.fromkeys(("largest_residual", "largest_distance", "largest_distortion"), POSITIVE),
         "largest_shift": optional(POSITIVE),
     }
 )
@@ -283,8 +276,7 @@ _BASE_MOTION = Group(
         "file": absent(Kind(_is_word, "the name of a file")),
         "swings": absent(Group(each=_SWING)),
         "about": absent(_PLACE),
-        "start": absent(NOT_NEGATIVE),
-        "ramp": absent(NOT_NEGATIVE),
+        **dict.fromkeys(("start", "ramp"), absent(NOT_NEGATIVE)),
     },
     optional=True,
     absent=True,
@@ -302,8 +294,7 @@ _TRIAL = Group(
 _SEQUENCES = Group(
     {
         "mean": absent(FINITE),
-        "deviation": absent(POSITIVE),
-        "correlation_time": absent(POSITIVE),
+        **dict.fromkeys(("deviation", "correlation_time"), absent(POSITIVE)),
         "correlation": absent(
             Kind(lambda value: is_finite(value) or _is_matrix(value), "a finite number, or a matrix of them")
         ),
@@ -318,25 +309,20 @@ _RECORDED = Group(
     {
         "folder": optional(WORD),
         "units": optional(one_of(*METRES_PER_UNIT)),
-        "rate": optional(POSITIVE),
+        **dict.fromkeys(("rate", "seconds", "pressure_limit", "cutoff"), optional(POSITIVE)),
         "trials": Group(each=replace(_TRIAL, short=True)),
-        "sequences": COUNT,
+        **dict.fromkeys(("sequences", "longest_gap"), COUNT),
         "begins": one_of(*BEGINNINGS),
         "rest": one_of("held", "file"),
         "alignment": one_of("shared", "own"),
         "payload_at": optional(PLACE),
         "up": _UP,
-        "seconds": optional(POSITIVE),
         "rest_seconds": NOT_NEGATIVE,
-        "longest_gap": COUNT,
         "steps": optional(NATURAL),
         "chambers": optional(_COLUMNS),
-        "pressure_limit": optional(POSITIVE),
         "valve": one_of("recorded", "detected"),
-        "cutoff": optional(POSITIVE),
         "train_fraction": SHARE,
-        "horizons": _POSITIVES,
-        "pressure_scales": _POSITIVES,
+        **dict.fromkeys(("horizons", "pressure_scales"), _POSITIVES),
         "base_motion": _BASE_MOTION,
         "folds": optional(one_of(*FOLDS)),
         **_SPLIT,
@@ -349,9 +335,7 @@ _SIMULATED = Group(
         "steps": NATURAL,
         "load": absent(PLACE),
         "twist_axis": absent(one_of("x", "y", "z")),
-        "weights_g": absent(Group(each=NUMBERS)),
-        "angles_deg": absent(Group(each=NUMBERS)),
-        "amplitudes": absent(Group(each=NUMBERS)),
+        **dict.fromkeys(("weights_g", "angles_deg", "amplitudes"), absent(Group(each=NUMBERS))),
         "base_motion": _BASE_MOTION,
         "folds": absent(optional(one_of(*FOLDS))),
         "limit": _LIMIT,
@@ -368,25 +352,24 @@ _ABLATION = Group(
 )
 
 
-def laboratory_group(settings: Any) -> Group:
+def _laboratory_group(settings: Any) -> Group:
     """What the group ``laboratory`` must be."""
     mesh = settings.get("mesh") if isinstance(settings, Mapping) else None
     return Group(
         {
-            "mesh": mesh_group(mesh),
+            "mesh": _mesh_group(mesh),
             "time_step": _STEP,
             "integrator": one_of(*INTEGRATORS),
             "material": MATERIAL,
             "fibres": absent(_FIBRES),
             "sequences": absent(_SEQUENCES),
             "rate": absent(optional(POSITIVE)),
-            "noise": NOT_NEGATIVE,
-            "placement_noise": NOT_NEGATIVE,
+            **dict.fromkeys(("noise", "placement_noise"), NOT_NEGATIVE),
             "tilt": absent(_number(lambda value: 0.0 <= value <= 20.0, "an angle from 0 to 20 degrees")),
             "held_seconds": absent(_number(lambda value: value >= 0.25, "0.25 s or more")),
             "seconds": absent(optional(POSITIVE)),
             "trials": Group(each=_TRIAL),
-            **{name: absent(_TRIALS) for name in SPLITS},
+            **dict.fromkeys(SPLITS, absent(_TRIALS)),
         },
         optional=True,
     )
@@ -402,7 +385,7 @@ def configuration_group(config: Mapping[str, Any]) -> Group:
             "gravity": Kind(_is_place, "three finite numbers, in m/s^2"),
             "time_step": _STEP,
             "integrator": one_of(*INTEGRATORS),
-            "mesh": mesh_group(config.get("mesh")),
+            "mesh": _mesh_group(config.get("mesh")),
             "physics": _PHYSICS,
             "solver": _SOLVER,
             **dict.fromkeys(("fixed", "tip"), PLACE),
@@ -425,18 +408,18 @@ def configuration_group(config: Mapping[str, Any]) -> Group:
             ),
             "network": NETWORK,
             "trainer": TRAINER,
-            "simfree": Group({"network": Group(each=ANYTHING), "trainer": Group(each=ANYTHING)}),
+            "simfree": Group(dict.fromkeys(("network", "trainer"), Group(each=ANYTHING))),
             "refinement": refinement_group(config.get("refinement")),
             "in_the_loop": optional(IN_THE_LOOP),
             "identify": optional(_IDENTIFY),
             "release": _RELEASE,
             "markers": optional(_MARKERS),
             "actuation": Group({"filter_time_constants": _POSITIVES, "sees_payload": TRUTH_VALUE}),
-            "parallel": Group({"processes": optional(NATURAL), "batch": optional(NATURAL)}),
+            "parallel": Group(dict.fromkeys(("processes", "batch"), optional(NATURAL))),
             "published": Group(
                 {"simulation": MATERIAL, "physics": _PHYSICS, "integrator": one_of(*INTEGRATORS)}, optional=True
             ),
-            "laboratory": laboratory_group(config.get("laboratory")),
+            "laboratory": _laboratory_group(config.get("laboratory")),
             "ablation": _ABLATION,
             **dict.fromkeys(("budget", "tuned"), absent(WORD)),
             "tune": absent(Group(each=ANYTHING)),

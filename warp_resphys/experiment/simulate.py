@@ -121,13 +121,7 @@ class _Free(March):
 
 
 def initial_state(simulator: Simulator, data: Mapping[str, Any], values: NDArray[Any]) -> State:
-    """The states from which a batch begins.
-
-    Args:
-        simulator: of the body.
-        data: the group ``data``.
-        values: (B,) weights [kg], angles [rad] or factors, by the kind of data.
-    """
+    """The states from which a batch begins, of (B,) weights [kg], angles [rad] or factors, by ``data.kind``."""
     if data["kind"] == "moving_base":
         return simulator.static_equilibrium(Inputs(), batch=len(values))
     if data["kind"] == "release_from_twist":

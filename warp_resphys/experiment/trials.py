@@ -127,7 +127,6 @@ def known_trials(config: Mapping[str, Any]) -> dict[str, Trial]:
     """All trials there are, by name.
 
     Raises:
-        InputError: a value that cannot be simulated.
         DataFileError: there is no folder of recordings, or none in it.
     """
     data = config["data"]
@@ -227,9 +226,8 @@ def _named(config: Mapping[str, Any], group: str) -> dict[str, list[str]]:
     seen: dict[str, str] = {}
     for name, trial in ((name, trial) for name, members in lists.items() for trial in members):
         if trial in seen:
-            where = (
-                f"twice in {group}.{name}" if seen[trial] == name else f"in {group}.{seen[trial]} and {group}.{name}"
-            )
+            other = seen[trial]
+            where = f"twice in {group}.{name}" if other == name else f"in {group}.{other} and {group}.{name}"
             raise InputError(f"the trial '{trial}' is {where}: every trial is in one split, once.")
         seen[trial] = name
     return lists
@@ -256,12 +254,7 @@ def folds_of(config: Mapping[str, Any]) -> dict[str, Split] | None:
 
 
 def trials_of(config: Mapping[str, Any]) -> tuple[Trial, ...]:
-    """The trials of an experiment, in the order of the files: that of the split, or, with folds, as configured.
-
-    Raises:
-        InputError: see `split_of`.
-        DataFileError: see `known_trials`.
-    """
+    """The trials of an experiment, in the order of the files: that of the split, or, with folds, as configured."""
     known = known_trials(config)
     return tuple(known[name] for name in (known if folds_of(config) else split_of(config).names))
 
@@ -272,11 +265,7 @@ def scaled_name(name: str, scale: float) -> str:
 
 
 def scaled_trials_of(config: Mapping[str, Any]) -> tuple[Trial, ...]:
-    """The test trials at ``data.pressure_scales``, scale by scale.
-
-    Raises:
-        InputError: see `split_of`.
-    """
+    """The test trials at ``data.pressure_scales``, scale by scale."""
     scales = [float(scale) for scale in config["data"].get("pressure_scales") or ()]
     if not scales:
         return ()
@@ -292,12 +281,6 @@ def test_groups(config: Mapping[str, Any], split: Split) -> dict[str, list[str]]
 
 
 def evenly(row: Sequence[T], limit: int) -> list[T]:
-    """At most that many values of a row, spread over it.
-
-    Raises:
-        InputError: the limit is below one.
-    """
-    if limit < 1:
-        raise InputError(f"data.limit is {limit} for a split: it must be at least 1.")
+    """At most that many values of a row, one or more, spread over it."""
     places = np.linspace(0, len(row) - 1, min(limit, len(row))).round().astype(int)
     return [row[i] for i in places]

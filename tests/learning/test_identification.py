@@ -15,7 +15,6 @@ from warp_resphys.dynamics.nonlinear_solver import SolverSettings
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.learning.identification import Bounds, Identifier
 from warp_resphys.learning.replay import Replay, Start
-from warp_resphys.linalg.least_squares import UnitBox, minimise
 from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
 
 MESH = box_hexahedra(divisions=(4, 1, 1))
@@ -239,54 +238,6 @@ def test_bounds_there_and_back(bounds):
     assert [bounds.to_unit(float(v)) for v in values] == pytest.approx(unit.tolist(), abs=1e-12)
     assert float(values[0]) == bounds.lower
     assert float(values[-1]) == pytest.approx(bounds.upper)
-
-
-class Valley:
-    """|r|^2 with a bent narrow floor: r = (100 (y - x^2), x - 0.7), failing left of a wall."""
-
-    def __init__(self, wall=-1.0):
-        self.wall, self.calls = wall, 0
-
-    def residuals(self, x):
-        return np.array([100.0 * (x[1] - x[0] ** 2), x[0] - 0.7])
-
-    def jacobian(self, x):
-        return np.array([[-200.0 * x[0], 100.0], [1.0, 0.0]])
-
-    def __call__(self, x):
-        self.calls += 1
-        assert (x >= 0.0).all()
-        assert (x <= 1.0).all()
-        if x[0] < self.wall:
-            return np.inf, np.zeros(2)
-        r = self.residuals(x)
-        return float(r @ r), 2.0 * self.jacobian(x).T @ r
-
-    def matrix(self, x):
-        return 2.0 * self.jacobian(x).T @ self.jacobian(x)
-
-
-def descend(valley, start, matrix, max_iterations):
-    problem = UnitBox(valley, matrix)
-    found = minimise(problem, problem.evaluate(one(start)), 1e-6, max_iterations).point
-    return found.x[0].numpy(), float(found.value)
-
-
-def test_the_descent_follows_a_bent_valley():
-    valley = Valley()
-    x, value = descend(valley, [0.05, 0.9], valley.matrix, 50)
-    np.testing.assert_allclose(x, [0.7, 0.49], atol=1e-6)
-    assert value < 1e-10
-    assert valley.calls < 60
-
-
-def test_the_descent_turns_back_from_failures_and_copes_without_a_matrix():
-    valley = Valley(wall=0.6)
-    x, _ = descend(valley, [0.99, 0.2], valley.matrix, 50)
-    np.testing.assert_allclose(x, [0.7, 0.49], atol=1e-5)
-    x, value = descend(Valley(), [0.4, 0.1], lambda _: None, 200)
-    assert value < 0.1
-    assert descend(Valley(wall=0.6), [0.1, 0.1], valley.matrix, 5)[1] == np.inf
 
 
 def test_groups_of_trials_weigh_what_their_trials_do():

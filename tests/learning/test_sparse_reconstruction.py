@@ -11,7 +11,6 @@ from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.dynamics.modes import vibration_modes
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.learning.reconstruction import make_reconstructor
-from warp_resphys.linalg.least_squares import ridge
 
 MESH = box_hexahedra((0.06, 0.03, 0.03), (2, 1, 1))
 BODY = Body(MESH, fixed=select_vertices(MESH, x=0.0))
@@ -263,16 +262,6 @@ def test_the_published_method_leaves_out_markers_that_were_not_seen():
     published = make_sparse_reconstructor(sim, markers, "lbfgsb", 1e-5, 1e-15, 3000).step(start, seen)
     ours = gauss_newton(sim, markers, 1e-5, **TIGHT).step(start, seen)
     np.testing.assert_allclose(published.force, ours.force, rtol=0, atol=2e-3 * float(ours.force.abs().max()))
-
-
-@pytest.mark.parametrize("shape", [(3, 7), (7, 3)])
-def test_ridge(shape):
-    random = np.random.default_rng(0)
-    matrix, right = random.normal(size=shape), random.normal(size=shape[0])
-    stacked = np.vstack([matrix, 0.3 * np.eye(shape[1])])
-    expected = np.linalg.lstsq(stacked, np.concatenate([right, np.zeros(shape[1])]), rcond=None)[0]
-    found = ridge(torch.tensor(matrix)[None], torch.tensor(right)[None, :, None], 0.09)
-    np.testing.assert_allclose(found[0, :, 0], expected, rtol=1e-10)
 
 
 class TestModes:

@@ -1,0 +1,128 @@
+"""Nonlinear least squares: bent valleys, failures, batches whose problems do not see each other."""
+
+import numpy as np
+import pytest
+import torch
+
+from warp_resphys.linalg.least_squares import Point, Problem, UnitBox, damped, minimise, ridge
+
+
+class Valley:
+    """|r|^2 with a bent narrow floor: r = (100 (y - x^2), x - 0.7), failing left of a wall."""
+
+    def __init__(self, wall=-1.0):
+        self.wall, self.calls = wall, 0
+
+    def residuals(self, x):
+        return np.array([100.0 * (x[1] - x[0] ** 2), x[0] - 0.7])
+
+    def jacobian(self, x):
+        return np.array([[-200.0 * x[0], 100.0], [1.0, 0.0]])
+
+    def __call__(self, x):
+        self.calls += 1
+        assert (x >= 0.0).all()
+        assert (x <= 1.0).all()
+        if x[0] < self.wall:
+            return np.inf, np.zeros(2)
+        r = self.residuals(x)
+        return float(r @ r), 2.0 * self.jacobian(x).T @ r
+
+    def matrix(self, x):
+        return 2.0 * self.jacobian(x).T @ self.jacobian(x)
+
+
+def descend(valley, start, matrix, max_iterations):
+    problem = UnitBox(valley, matrix)
+    found = minimise(problem, problem.evaluate(torch.tensor([start], dtype=torch.float64)), 1e-6, max_iterations).point
+    return found.x[0].numpy(), float(found.value)
+
+
+def test_the_descent_follows_a_bent_valley():
+    valley = Valley()
+    x, value = descend(valley, [0.05, 0.9], valley.matrix, 50)
+    np.testing.assert_allclose(x, [0.7, 0.49], atol=1e-6)
+    assert value < 1e-10
+    assert valley.calls < 60
+
+
+def test_the_descent_turns_back_from_failures_and_copes_without_a_matrix():
+    valley = Valley(wall=0.6)
+    x, _ = descend(valley, [0.99, 0.2], valley.matrix, 50)
+    np.testing.assert_allclose(x, [0.7, 0.49], atol=1e-5)
+    x, value = descend(Valley(), [0.4, 0.1], lambda _: None, 200)
+    assert value < 0.1
+    assert descend(Valley(wall=0.6), [0.1, 0.1], valley.matrix, 5)[1] == np.inf
+
+
+class Rosenbrock(Problem):
+    """|r|^2 with r = (10 (y - x^2), 1 - x), failing left of a wall; unknowns (B, 2)."""
+
+    def __init__(self, wall=-10.0):
+        self.wall, self.evaluated = wall, []
+
+    def evaluate(self, x):
+        self.evaluated.append(x.clone())
+        r = torch.stack([10.0 * (x[:, 1] - x[:, 0] ** 2), 1.0 - x[:, 0]], 1)
+        return Point(x, torch.where(x[:, 0] < self.wall, torch.inf, r.square().sum(1)), (r,))
+
+    def linearise(self, point):
+        (x,), (r,) = (point.x,), point.kept
+        zero = torch.zeros_like(x[:, 0])
+        j = torch.stack([torch.stack([-20.0 * x[:, 0], zero + 10.0], 1), torch.stack([zero - 1.0, zero], 1)], 1)
+        gradient = (j.mT @ r[..., None])[..., 0]
+        return lambda damping: x - torch.linalg.solve(damped(j.mT @ j, damping), gradient)
+
+    def distance(self, old, new):
+        return (new.x - old.x).abs().amax(1)
+
+
+STARTS = torch.tensor([[-1.2, 1.0], [0.9, 0.8], [2.0, -3.0], [1.0, 1.0]], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("wall", [-10.0, -1.3])
+def test_problems_of_a_batch_do_not_see_each_other(wall):
+    problem = Rosenbrock(wall)
+    together = minimise(problem, problem.evaluate(STARTS), 1e-10, 100)
+    assert together.settled
+    torch.testing.assert_close(together.point.x, torch.ones_like(STARTS), rtol=0.0, atol=1e-8)
+    counts = []
+    for start, x in zip(STARTS, together.point.x, strict=True):
+        problem = Rosenbrock(wall)
+        alone = minimise(problem, problem.evaluate(start[None]), 1e-10, 100)
+        torch.testing.assert_close(alone.point.x[0], x, rtol=0.0, atol=1e-12)
+        counts.append(alone.iterations)
+        assert len(problem.evaluated) == alone.iterations + 1
+    assert together.iterations == max(counts) < 60
+    assert counts[3] == 1  # It is there already.
+
+
+def test_one_that_has_settled_is_left_alone():
+    problem = Rosenbrock()
+    minimise(problem, problem.evaluate(STARTS), 1e-10, 100)
+    assert all(torch.equal(x[3], STARTS[3]) for x in problem.evaluated)
+
+
+def test_it_says_how_far_the_last_step_led():
+    problem = Rosenbrock()
+    found = minimise(problem, problem.evaluate(STARTS[:1]), 1e-10, 2)
+    assert (found.settled, found.iterations) == (False, 2)
+    assert found.moved > 1e-3
+    assert minimise(problem, problem.evaluate(STARTS), 1e-10, 0).iterations == 0
+
+
+def test_a_start_that_fails_everywhere_stays():
+    problem = Rosenbrock(wall=np.inf)
+    found = minimise(problem, problem.evaluate(STARTS), 1e-10, 5)
+    assert not found.settled
+    assert torch.equal(found.point.x, STARTS)
+
+
+@pytest.mark.parametrize("shape", [(3, 7), (7, 3)])
+def test_ridge(shape):
+    random = np.random.default_rng(0)
+    matrix, right = random.normal(size=shape), random.normal(size=shape[0])
+    stacked = np.vstack([matrix, 0.3 * np.eye(shape[1])])
+    expected = np.linalg.lstsq(stacked, np.concatenate([right, np.zeros(shape[1])]), rcond=None)[0]
+    found = ridge(torch.tensor(matrix)[None], torch.tensor(right)[None, :, None], 0.09)
+    np.testing.assert_allclose(found[0, :, 0], expected, rtol=1e-10)

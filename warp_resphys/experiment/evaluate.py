@@ -48,8 +48,7 @@ def evaluate(context: StageContext, processes: int = 1) -> None:
     attributes = {"names": names, "time_step": settings["time_step"], "_film_trial": filmed}
     with atomic_hdf5(context.run_dir / ROLLOUTS, "rollouts", attributes) as file:
         for model, values in observed.items():
-            single = values if scene.dataset.bound is None else values.astype(np.float32)  # markers
-            create(file, f"{model}_observed", single, "m", time_axis=1)
+            create(file, f"{model}_observed", values, "m", time_axis=1)
             bodies = next(part.read("film") for part in parts[model] if filmed in part.names)
             substeps = round(settings["time_step"] / scene.model_simulator(model).time_step)
             create(file, f"{model}_film", bodies[np.minimum(substeps * shown, len(bodies) - 1)], "m")

@@ -236,7 +236,7 @@ def read_trials(folder: Path, config: Mapping[str, Any]) -> Trials:
             what = f"names trials that {path} does not hold ({', '.join(unknown)})" if unknown else "holds no model"
             raise DataFileError(f"{folder / ROLLOUTS} {what}: delete it and run the same command again.")
         shape = (len(rolled), *dataset.observed.shape[1:])
-        positions = {m: read_array(file, f"{m}_observed", shape)[: len(test)].astype(np.float64) for m in models}
+        positions = {m: read_array(file, f"{m}_observed", shape)[: len(test)] for m in models}
     rows = dataset.rows(test)
     times, target = dataset.times[rows], dataset.observed[rows]
     seconds, length = config["data"].get("seconds"), times.shape[1]

@@ -130,6 +130,8 @@ def test_poses_have_no_time(tmp_path):
     page = report(tmp_path)
     assert "2 test trials, 1 step and" in page.text
     assert {path.stem for path in (tmp_path / "figures").iterdir()} == {"training_resphys"}
+    write_run(tmp_path, SETTINGS, steps=3, begins="static", models=("simulation", "resphys"))  # As beside motions.
+    assert not read_trials(tmp_path, SETTINGS).moves
 
 
 @pytest.mark.parametrize(

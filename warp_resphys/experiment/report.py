@@ -239,14 +239,17 @@ def read_trials(folder: Path, config: Mapping[str, Any]) -> Trials:
         positions = {m: read_array(file, f"{m}_observed", shape)[: len(test)] for m in models}
     rows = dataset.rows(test)
     times, target = dataset.times[rows], dataset.observed[rows]
+    begins = tuple(dataset.begins[row] for row in rows)
     seconds, length = config["data"].get("seconds"), times.shape[1]
     if seconds is not None:
         target = np.where((times <= seconds)[..., None, None], target, np.nan)
         length = max(1, int((times <= seconds).any(axis=0).sum()))
+    if set(begins) == {STATIC}:  # Beside motions, poses have as many frames, of one time.
+        length = 1
     return Trials(
         names=tuple(test),
         labels=dataset.labels,
-        begins=tuple(dataset.begins[row] for row in rows),
+        begins=begins,
         times=times[:, :length],
         target=target[:, :length],
         positions={model: each[:, :length] for model, each in positions.items()},

@@ -176,11 +176,11 @@ def mean_distance(positions: FloatArray, target: FloatArray) -> FloatArray:
 
 
 def best_and_worst(trials: Trials) -> list[int]:
-    """Return the trials in which the last model of the table is farthest off, and closest; one where there is one."""
-    errors = trials.errors_mm
-    model = next(m for m in reversed(list(MODELS)) if m in errors)
-    each = np.array([row[~np.isnan(row)].mean() if (~np.isnan(row)).any() else np.inf for row in errors[model]])
-    worst, best = int(np.argmax(each)), int(np.argmin(each))
+    """Return the motions in which the last model of the table is farthest off, and closest; one where there is one."""
+    moving = [row for row, begins in enumerate(trials.begins) if begins != "static"]
+    errors = trials.errors_mm[next(m for m in reversed(list(MODELS)) if m in trials.positions)][moving]
+    each = np.array([row[~np.isnan(row)].mean() if (~np.isnan(row)).any() else np.inf for row in errors])
+    worst, best = moving[int(np.argmax(each))], moving[int(np.argmin(each))]
     return [worst] if worst == best else [worst, best]
 
 

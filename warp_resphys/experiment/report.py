@@ -309,10 +309,11 @@ def _driven_chambers(chambers: tuple[Chamber, ...], names: tuple[str, ...]) -> t
 def _at_rest(mesh: Mesh, trials: Trials, film: Film | None) -> tuple[Mesh, dict[str, FloatArray]]:
     """The body as it rests, and how far each marker has moved there (3,) [m], by label.
 
-    Where trials begin at rest, that is how the first model has it before anything drives it; else it is undeformed.
+    Where trials begin at rest, that is how the simulator to correct has it before anything drives it; else it is
+    undeformed.
     """
-    model = next(iter(film.positions), None) if film is not None else None
-    if film is None or model is None or film.trial not in trials.names:
+    model = "simulation"
+    if film is None or model not in film.positions or film.trial not in trials.names:
         return mesh, {}
     row = trials.names.index(film.trial)
     if trials.begins[row] != "rest":

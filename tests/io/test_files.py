@@ -250,11 +250,18 @@ class TestCheckpoints:
         assert all(torch.equal(tensors[name], shared[name]) for name in shared)
         assert metadata == {"epoch": 3, "mean": 0.5, "fingerprint": "f"}
         tensors["weight"] += 1  # own memory, not the file's
-        resumed = resume_checkpoint(path, "network", "f")
-        assert resumed is not None
-        assert torch.equal(resumed[0]["weight"], self.tensors["weight"])
+        assert torch.equal(files.read_checkpoint(path, "network")[0]["weight"], self.tensors["weight"])
+
+    def test_what_another_version_kept_is_not_gone_on_from(self, tmp_path, caplog):
+        path = tmp_path / "a.safetensors"
+        keep_checkpoint(path, "network", self.tensors, {"fingerprint": "f"})
+        assert torch.equal(resume_checkpoint(path, "network", "f")[0]["weight"], self.tensors["weight"])
         assert resume_checkpoint(path, "network", "g") is None
         assert resume_checkpoint(tmp_path / "none", "network", "f") is None
+        assert "belongs to other settings" in caplog.text
+        files.write_checkpoint(path, "network", self.tensors, {"fingerprint": "f"})
+        assert resume_checkpoint(path, "network", "f") is None
+        assert f"not going on from {path}: another version of warp_resphys wrote it" in caplog.text
 
     def test_no_flipped_bit_passes(self, tmp_path):
         path = tmp_path / "a.safetensors"

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _SYNC_SECONDS = 2.0
+_LAYOUT = 2  # of what stages keep in checkpoints
 _CHECKSUM = "CRC-32"
 
 
@@ -279,7 +280,7 @@ def keep_checkpoint(path: Path, kind: str, tensors: Mapping[str, torch.Tensor], 
     """
     if path.exists():
         os.replace(path, _before(path))
-    write_checkpoint(path, kind, tensors, metadata)
+    write_checkpoint(path, kind, tensors, {**metadata, "layout": _LAYOUT})
 
 
 def resume_checkpoint(path: Path, kind: str, fingerprint: str) -> tuple[dict[str, torch.Tensor], dict[str, Any]] | None:
@@ -292,9 +293,12 @@ def resume_checkpoint(path: Path, kind: str, fingerprint: str) -> tuple[dict[str
         except DataFileError as error:
             log.warning("not going on from a checkpoint: %s", error)
             continue
-        if metadata.get("fingerprint") == fingerprint:
+        if metadata.get("layout") != _LAYOUT:
+            log.warning("not going on from %s: another version of warp_resphys wrote it", candidate)
+        elif metadata.get("fingerprint") != fingerprint:
+            log.warning("not going on from %s: it belongs to other settings", candidate)
+        else:
             return tensors, metadata
-        log.warning("not going on from %s: it belongs to other settings", candidate)
     return None
 
 

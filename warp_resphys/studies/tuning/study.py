@@ -30,6 +30,7 @@ from .workers import held
 JOURNAL = "study.journal"
 _LOCK = "study.lock"
 _NAME = "tuning"
+_LAYOUT = 2  # of what trials keep in the journal
 _STATES = {TrialState.COMPLETE: "complete", TrialState.PRUNED: "pruned", TrialState.FAIL: "failed"}
 
 
@@ -106,7 +107,8 @@ class SharedStudy:
             open_study = optuna.load_study if _NAME in known else optuna.create_study
             self._study = open_study(study_name=_NAME, storage=self._storage)
             self._id = self._storage.get_study_id_from_name(_NAME)
-            self._agree({"space": {key: str(each) for key, each in space.items()}, **to_plain(conditions)})
+            named = {"layout of the journal": _LAYOUT, **to_plain(conditions)}
+            self._agree({"space": {key: str(each) for key, each in space.items()}, **named})
 
     @contextmanager
     def lock(self) -> Iterator[None]:

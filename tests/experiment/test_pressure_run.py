@@ -133,7 +133,6 @@ def test_every_stage_leaves_its_files_and_the_errors_are_those_of_the_roll_outs(
     assert names == ["t000", "t001", "t002", "t003", "t003_x1.5"]
     assert tested == names[3:]
     for model, x in markers.items():
-        rounding = 1e3 * np.sqrt(3.0) * 2.0**-24 * np.abs(x).max()  # of positions in single precision [mm]
         for row, factor in enumerate(("1", "1.5")):
             expected = 1e3 * np.linalg.norm(x[row] - observed[3 + row], axis=-1).mean()
             assert found["scales"][factor][model]["mean"] == pytest.approx(expected, rel=1e-9)

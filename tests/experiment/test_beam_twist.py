@@ -111,10 +111,3 @@ def test_limits(limit, picked):
     data = {"kind": "release_from_twist", "angles_deg": angles, "limit": {"train": limit, "validation": 1, "test": 1}}
     split = split_of({"data": data})
     assert split.train == tuple(f"{angle}°" for angle in (picked if limit <= len(row) else row))
-
-
-def test_a_limit_of_none_of_them_is_refused():
-    angles = {"train": [10, 20], "validation": [60], "test": [70]}
-    data = {"kind": "release_from_twist", "angles_deg": angles, "limit": {"train": 0, "validation": 1, "test": 1}}
-    with pytest.raises(InputError, match=r"data\.limit is 0 for a split: it must be at least 1"):
-        split_of({"data": data})

@@ -103,6 +103,11 @@ TRIALS = {"a": {"file": "a.c3d", "payload": 0.0}, "b": {"file": "b.c3d", "payloa
         ("data/rest", "file", "release.sideways is 0.002 m, but data.rest is file"),
         ("gravity", [0.0, 0.0, 0.0], "release.sideways is across gravity, but gravity is zero"),
         ("data/limit", {"train": 2}, "data.limit.validation is missing"),
+        (
+            "data/limit",
+            {"train": 0, "validation": 1, "test": 1},
+            "data.limit.train is 0: it must be a whole number, one",
+        ),
         ("data/limit", 2, "data.limit is 2: it must be a group of settings"),
         ("release/sideways", -1.0, "release.sideways is -1.0: it must be a number, zero or more"),
         ("identify/substeps", 0, "identify.substeps is 0: it must be a whole number, one or more"),

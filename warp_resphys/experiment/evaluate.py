@@ -45,14 +45,14 @@ def evaluate(context: StageContext, processes: int = 1) -> None:
         model: padded([_observed(scene, model, part) for part in some], frames)[rows] for model, some in parts.items()
     }
     shown = _film_steps(int(float(scene.trials([filmed]).times.max()) / settings["time_step"] + 1e-6))
-    attributes = {"names": names, "time_step": settings["time_step"], "_film_trial": filmed}
+    attributes = {"names": names, "time_step": settings["time_step"], "film_trial": filmed}
     with atomic_hdf5(context.run_dir / ROLLOUTS, "rollouts", attributes) as file:
         for model, values in observed.items():
             create(file, f"{model}_observed", values, "m", time_axis=1)
             bodies = next(part.read("film") for part in parts[model] if filmed in part.names)
             substeps = round(settings["time_step"] / scene.model_simulator(model).time_step)
             create(file, f"{model}_film", bodies[np.minimum(substeps * shown, len(bodies) - 1)], "m")
-        create(file, "_film_steps", shown)
+        create(file, "film_steps", shown)
     left = {
         model: np.concatenate([part.read("left")[:, -1] for part in some])[rows]
         for model, some in parts.items()

@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from warp_resphys import box_hexahedra, cli
 from warp_resphys.experiment.trials import split_of, trials_of
-from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_hdf5
 
 ANGLES = {"train": (40, 80, 120, 160), "validation": (100,), "test": (60, 140)}  # degrees

@@ -75,6 +75,7 @@ def check_configuration(config: Mapping[str, Any]) -> None:
         _check_ablation(config, body)
     else:
         split_of(config)
+        _check_base_motion(config, trials_of(config))
         if variation_of(config["data"]).key == "weights_g":
             select_vertices(body.mesh, **config["data"]["load"])
         if "modes" in config["reconstruction"]:
@@ -231,6 +232,12 @@ def _check_trials(config: Mapping[str, Any]) -> None:
 def _check_base_motion(config: Mapping[str, Any], trials: Sequence[Trial]) -> None:
     """How what the body is fixed to moves, if it does."""
     common, groups = config["data"].get("base_motion"), {}
+    if not sees_markers(config) and (
+        isinstance(common, str) or (config["data"]["kind"] == "moving_base" and not common)
+    ):
+        raise InputError(
+            f"data.base_motion is {common!r}: where every vertex is known, it needs file, a table of poses, or swings."
+        )
     if isinstance(common, str):
         if common not in OBSERVED:
             raise InputError(
@@ -252,6 +259,12 @@ def _check_base_motion(config: Mapping[str, Any], trials: Sequence[Trial]) -> No
             raise InputError(
                 f"{key}.swings is empty: give it at least one, as {{a: {{frequency: 1.0, translation: [0.01, 0, 0]}}}}."
             )
+        for name, swing in motion.get("swings", {}).items():
+            if 2.0 * swing["frequency"] * config["time_step"] >= 1.0:
+                raise InputError(
+                    f"{key}.swings.{name}.frequency is {swing['frequency']:g}: steps of {config['time_step']:g} s "
+                    f"follow less than {0.5 / config['time_step']:g} Hz."
+                )
     for each in trials:
         if each.begins == STATIC and (common is not None or each.base_motion):
             raise InputError(f"the trial '{each.name}' is a pose, which has no time: its base cannot move.")

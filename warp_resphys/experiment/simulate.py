@@ -78,7 +78,8 @@ def base_of(settings: Mapping[str, Any], trial: Trial, times: NDArray[Any]) -> F
     """(T, 6) how what a body is fixed to really moves at some times [s], in the frame of the body."""
     common = settings["data"].get("base_motion")
     motion = common if trial.base_motion is None and isinstance(common, Mapping) else trial.base_motion
-    return np.zeros((len(times), 6)) if motion is None else prescribed(motion, times, scale=trial.amount or 1.0)
+    scale = trial.amount if settings["data"].get("kind") == "moving_base" else 1.0
+    return np.zeros((len(times), 6)) if motion is None else prescribed(motion, times, scale=scale)
 
 
 def _carried(

@@ -120,7 +120,13 @@ def variation_of(data: Mapping[str, Any]) -> Variation:
     """
     if data.get("kind") not in VARIATIONS:
         raise InputError(f"data.kind is {data.get('kind')!r}: choose one of {', '.join(VARIATIONS)}.")
-    return VARIATIONS[data["kind"]]
+    found = VARIATIONS[data["kind"]]
+    if found.key not in data:
+        raise InputError(
+            f"data.{found.key} is missing: data.kind {data['kind']} needs it, as "
+            f"{{train: [..], validation: [..], test: [..]}} in {found.unit}."
+        )
+    return found
 
 
 def known_trials(config: Mapping[str, Any]) -> dict[str, Trial]:

@@ -45,7 +45,9 @@ def prescribed(motion: Mapping[str, Any], times: ArrayLike, folder: str | Path =
         DataFileError: the file cannot be read.
     """
     at = np.asarray(times, dtype=np.float64)
-    poses = scale * (_table(Path(folder) / motion["file"], at) if "file" in motion else _swinging(motion, at))
+    poses = scale * (
+        _table(Path(folder).expanduser() / motion["file"], at) if "file" in motion else _swinging(motion, at)
+    )
     about = np.asarray(motion.get("about", (0.0, 0.0, 0.0)), dtype=np.float64)
     poses[:, :3] += about - Rotation.from_rotvec(poses[:, 3:]).apply(about)
     return np.asarray(poses)

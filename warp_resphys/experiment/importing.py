@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..data.actuation import check_pressures
-from ..data.base_motion import at_times, check_steps, followed, in_frame, prescribed
+from ..data.base_motion import at_times, check_steps, followed, in_frame, prescribed, rigid
 from ..data.recordings.processing import fill_gaps, release_of, resample, smooth, trim_to_release
 from ..data.recordings.quality import check_base, check_motion, check_passive, quality
 from ..data.recordings.reading import read_recording
@@ -204,16 +204,25 @@ class Importer:
         if motion is None:
             return None
         if isinstance(motion, Mapping):
-            return prescribed(motion, moving.time, self.data["folder"] or ".")
-        if motion == "reference":
+            poses = prescribed(motion, moving.time, self.data["folder"] or ".")
+        elif motion == "reference":
             count = len(self.tracked)
-            return in_frame(followed(whole.positions[:, count:], still[count:], whole.source), transform)
-        if moving.base is None:
+            poses = in_frame(followed(whole.positions[:, count:], still[count:], whole.source), transform)
+        elif moving.base is not None:
+            poses = in_frame(moving.base, transform)
+        else:
             raise DataFileError(
                 f"{whole.source} has no array 'base' that tells how what the body is fixed to moves: add it "
                 "(docs/recordings.md), or set data.base_motion to reference if markers.reference move with it."
             )
-        return in_frame(moving.base, transform)
+        early = poses[: 1 if trial.is_released else self._rest_frames(whole)]
+        moved = rigid(early).apply(np.broadcast_to(self.nominal, (len(early), *self.nominal.shape))) - self.nominal
+        if (furthest := float(np.linalg.norm(moved, axis=-1).max())) > self.markers["largest_residual"]:
+            raise DataFileError(
+                f"{whole.source}: the base has moved the body by {_MILLI * furthest:.1f} mm while that is registered: "
+                "let it stand still until the release, or in the first data.rest_seconds."
+            )
+        return poses
 
     def _register(
         self, places: FloatArray, recording: Recording, expected: FloatArray, only_reference: bool = False

@@ -79,7 +79,7 @@ def simulated(config: Mapping[str, Any]) -> dict[str, Any]:
     motions = [each.get("base_motion") for each in (config["data"], *trials.values()) if isinstance(each, Mapping)]
     files = [each["file"] for each in motions if isinstance(each, Mapping) and "file" in each]
     if files:
-        folder = Path(config["data"].get("folder") or ".")
+        folder = Path(config["data"].get("folder") or ".").expanduser()
         base["base_motions"] = {name: _digest(folder / name, "the file of base_motion") for name in files}
     return base
 

@@ -32,7 +32,7 @@ from ..io.stages import StageContext
 from ..learning.replay import sample
 from ..mesh.mesh import select_vertices
 from ..mesh.poses import twisted
-from .build import bound_markers, build_body, build_simulator
+from .build import bound_markers, build_mesh, build_simulator
 from .files import DATASET, GIVEN, STATIC, TRUTH, Dataset, attached_mass
 from .parts import March, Part, read_parts, remove_parts, split_into_parts, work_on
 from .trials import Trial, known_trials, scaled_trials_of, trials_of
@@ -53,8 +53,9 @@ def simulate(context: StageContext) -> None:
     poses, times = None, settings["time_step"] * np.arange(frames, dtype=np.float64)
     if settings["data"].get("base_motion") is not None:
         poses = np.stack([base_of(settings, trial, times) for trial in trials])
+        points = build_mesh(settings["mesh"]).vertices
         for each in poses:
-            check_steps(each, build_body(settings).mesh.vertices, "data.base_motion")
+            check_steps(each, points, "data.base_motion")
     parts = split_into_parts(context, names, frames)
     work_on(parts, _Free, 1)
     observed = read_parts(parts, "observed")

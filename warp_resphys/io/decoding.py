@@ -234,11 +234,9 @@ def pickled_arrays(path: str) -> Arrays:
         DecodingError: It is no dictionary, has other arrays, or names anything but what NumPy's arrays need.
     """
     with open(path, "rb") as file:
-        if (
-            file.read(6) == np.lib.format.MAGIC_PREFIX
-        ):  # a version, then the header's length in 2 (version 1) or 4 bytes
+        if file.read(6) == np.lib.format.MAGIC_PREFIX:  # then a version, and the length of the header that follows
             version = file.read(2)
-            length = file.read(2 if version[:1] == b"\x01" else 4)  # of the header that follows
+            length = file.read(2 if version[:1] == b"\x01" else 4)
             file.seek(int.from_bytes(length, "little"), os.SEEK_CUR)
         else:
             file.seek(0)

@@ -50,9 +50,9 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
     mu_of, lambda_of = (moduli(*(wp.float64(pair[i]) for pair in law.LAME)) for i in (0, 1))
 
     @function
-    def isotropic(strain: wp.mat33d, shape: wp.float64, volume: wp.float64) -> wp.mat33d:
-        """2 mu E + lambda tr(E) I."""
-        t = volume * wp.trace(strain)
+    def isotropic(strain: wp.mat33d, dilation: wp.float64, shape: wp.float64, volume: wp.float64) -> wp.mat33d:
+        """2 mu E + lambda e I."""
+        t = volume * dilation
         return TWO * shape * strain + wp.mat33d(t, ZERO, ZERO, ZERO, t, ZERO, ZERO, ZERO, t)
 
     @kernel
@@ -60,8 +60,9 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         nodes: wp.array2d[int],
         gradients: wp.array2d[wp.vec3d],
         stiffness: wp.array2d[moduli],  # (B, P) moduli times the point's volumes [J]
-        viscosity: wp.array[wp.float64],  # (B) stiffness damping over the effective time step, -
-        reference_strain: wp.array2d[wp.mat33d],  # (B, P) Green strain that the viscous strain rate starts from
+        viscosity: wp.array[wp.vec2d],  # (B) c and d of `dynamics.viscosity`, -
+        strain_offset: wp.array2d[wp.mat33d],  # (B, P) W there
+        dilation_offset: wp.array2d[wp.float64],  # (B, P) w there
         points_per_cell: int,
         positions: wp.array2d[wp.vec3d],
         stress_out: wp.array2d[wp.mat33d],
@@ -72,11 +73,14 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         m = stiffness[b, p]
         energy, stress = response(f, m)
         c = viscosity[b]
-        if c > ZERO:
-            rate = green_strain(f) - reference_strain[b, p]
-            viscous = c * isotropic(rate, wp.dot(mu_of, m), wp.dot(lambda_of, m))
-            energy += HALF * wp.ddot(viscous, rate)
-            stress += f * viscous
+        if c[0] + c[1] > ZERO:
+            shape, bulk = wp.dot(mu_of, m), wp.dot(lambda_of, m)
+            strain = green_strain(f)
+            dilation = wp.trace(strain)
+            left, rest = c[0] * strain - strain_offset[b, p], c[1] * dilation - dilation_offset[b, p]
+            energy += shape * wp.ddot(left - strain_offset[b, p], strain)
+            energy += HALF * bulk * (rest - dilation_offset[b, p]) * dilation
+            stress += f * isotropic(left, rest, shape, bulk)
         stress_out[b, p] = stress
         energy_out[b, p] = energy
 
@@ -102,8 +106,9 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         nodes: wp.array2d[int],
         gradients: wp.array2d[wp.vec3d],
         stiffness: wp.array2d[moduli],
-        viscosity: wp.array[wp.float64],
-        reference_strain: wp.array2d[wp.mat33d],
+        viscosity: wp.array[wp.vec2d],
+        strain_offset: wp.array2d[wp.mat33d],
+        dilation_offset: wp.array2d[wp.float64],
         points_per_cell: int,
         positions: wp.array2d[wp.vec3d],
         positive: wp.array[int],  # (B) 1: clamp the eigenvalues at zero
@@ -115,28 +120,31 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         out = tangent_out[b, p]
         elastic_tangent(f, m, positive[b], out)
         c = viscosity[b]
-        if c > ZERO:
-            shape = c * wp.dot(mu_of, m)
-            bulk = c * wp.dot(lambda_of, m)
-            stress = isotropic(green_strain(f) - reference_strain[b, p], shape, bulk)
+        if c[0] + c[1] > ZERO:
+            shape, bulk = wp.dot(mu_of, m), wp.dot(lambda_of, m)
+            strain = green_strain(f)
+            rest = c[1] * wp.trace(strain) - dilation_offset[b, p]
+            stress = isotropic(c[0] * strain - strain_offset[b, p], rest, shape, bulk)
             if positive[b] == 1:
                 # The stress part of the viscous Hessian may be indefinite: a clamped Hessian leaves it out.
                 stress = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
-            add_viscous_tangent(f, stress, shape, bulk, out)
+            add_viscous_tangent(f, stress, c[0] * shape, c[1] * bulk, out)
 
     @kernel
     def adjoint(
         nodes: wp.array2d[int],
         gradients: wp.array2d[wp.vec3d],
         stiffness: wp.array2d[moduli],
-        viscosity: wp.array[wp.float64],
-        reference_strain: wp.array2d[wp.mat33d],
+        viscosity: wp.array[wp.vec2d],
+        strain_offset: wp.array2d[wp.mat33d],
+        dilation_offset: wp.array2d[wp.float64],
         points_per_cell: int,
         positions: wp.array2d[wp.vec3d],
         direction: wp.array2d[wp.vec3d],  # (B, N) z = H^-1 dL/dx [m]
         stiffness_out: wp.array2d[moduli],  # (B, P) dL/d stiffness
-        viscosity_out: wp.array2d[wp.float64],  # (B, P) this point's part of dL/d viscosity
-        reference_out: wp.array2d[wp.mat33d],  # (B, P) dL/d reference_strain
+        viscosity_out: wp.array2d[wp.vec2d],  # (B, P) this point's part of dL/d viscosity
+        strain_out: wp.array2d[wp.mat33d],  # (B, P) dL/d strain_offset
+        dilation_out: wp.array2d[wp.float64],  # (B, P) dL/d dilation_offset
     ):
         """dL/dtheta = -z . d(internal residual)/dtheta = -dP/dtheta : grad z, at fixed positions."""
         b, p = wp.tid()
@@ -149,15 +157,16 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         c = viscosity[b]
         # A stiffness of zero has a derivative too (nu = 0), so nothing is skipped here.
         result = -slopes(f, dz)
-        reference = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
         rise = wp.transpose(f) * dz
         rise = HALF * (rise + wp.transpose(rise))
-        rate = green_strain(f) - reference_strain[b, p]
-        viscosity_out[b, p] = -wp.ddot(isotropic(rate, shape, bulk), rise)
-        if c > ZERO:
-            result -= (c * TWO * wp.ddot(rate, rise)) * mu_of + (c * wp.trace(rate) * wp.trace(rise)) * lambda_of
-            reference = c * isotropic(rise, shape, bulk)
-        stiffness_out[b, p] = result
-        reference_out[b, p] = reference
+        swelling = wp.trace(rise)
+        strain = green_strain(f)
+        dilation = wp.trace(strain)
+        by_shape = TWO * wp.ddot(c[0] * strain - strain_offset[b, p], rise)
+        by_volume = (c[1] * dilation - dilation_offset[b, p]) * swelling
+        viscosity_out[b, p] = -wp.vec2d(TWO * shape * wp.ddot(strain, rise), bulk * dilation * swelling)
+        stiffness_out[b, p] = result - by_shape * mu_of - by_volume * lambda_of
+        strain_out[b, p] = (TWO * shape) * rise
+        dilation_out[b, p] = bulk * swelling
 
     return SimpleNamespace(local_step=local_step, tangent=tangent, adjoint=adjoint)

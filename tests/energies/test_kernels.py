@@ -38,8 +38,13 @@ def potential_of(body, model, batch, device):
     return IncrementalPotential([(solid, solid.points(body.mesh))], body.n_vertices, fixed, batch, device)
 
 
-def unit_potential(gradients, model="corotated", shape=SHAPE, volume=VOLUME, viscosity=0.0, reference=None, **where):
-    """Potential of the unit tetrahedron, whose residual on vertices 1 to 3 is V times the stress's columns."""
+def unit_potential(
+    gradients, model="corotated", shape=SHAPE, volume=VOLUME, viscosity=(0.0, 0.0), reference=None, **where
+):
+    """Potential of the unit tetrahedron, whose residual on vertices 1 to 3 is V times the stress's columns.
+
+    `viscosity` is that of shape and that of volume, `reference` the strain from which both act.
+    """
     count = len(gradients)
     where = {"device": torch.device("cpu"), "dtype": torch.float64} | where
     potential = potential_of(TETRAHEDRON, model, count, where["device"])
@@ -47,10 +52,12 @@ def unit_potential(gradients, model="corotated", shape=SHAPE, volume=VOLUME, vis
     def full(value, *size):
         return torch.full((count, *size), float(value), **where)
 
-    strain = None if reference is None else torch.as_tensor(reference, **where).reshape(count, 1, 3, 3)
+    viscous = torch.as_tensor(viscosity, **where).expand(count, 2)
+    strain = torch.as_tensor(np.zeros((count, 3, 3)) if reference is None else reference, **where)[:, None]
     sizes = {"shape": shape, "volume": volume}
     stiffness = torch.stack([full(sizes[rule], 1) for rule in MATERIALS[model].rules], dim=-1)
-    values = {"stiffness": stiffness, "viscosity": full(viscosity), "reference_strain": strain}
+    values = {"stiffness": stiffness, "viscosity": viscous, "strain_offset": viscous[0, 0] * strain}
+    values["dilation_offset"] = viscous[0, 1] * strain.diagonal(dim1=-2, dim2=-1).sum(-1)
     potential.set_terms(StepTerms(full(0, 4, 3), full(0, 4), full(0, 4, 3), values))
     potential.positions.copy_(torch.as_tensor(UNIT @ gradients.transpose(0, 2, 1), **where))
     return potential
@@ -127,16 +134,20 @@ def test_stress_is_the_derivative_of_the_energy(model):
 
 
 def viscous_energy(f, reference, viscosity, lame_factor):
-    rate = (f.transpose(0, 2, 1) @ f - np.eye(3)) / 2 - reference
-    squared = 2 * SHAPE * (rate**2).sum((1, 2)) + lame_factor * VOLUME * np.trace(rate, axis1=1, axis2=2) ** 2
-    return viscosity / 2 * squared
+    """That of the strain from the reference, less that of the undeformed tetrahedron."""
+
+    def potential(rate):
+        volume = lame_factor * VOLUME * np.trace(rate, axis1=1, axis2=2) ** 2
+        return viscosity[0] * SHAPE * (rate**2).sum((1, 2)) + viscosity[1] / 2 * volume
+
+    return potential((f.transpose(0, 2, 1) @ f - np.eye(3)) / 2 - reference) - potential(-reference)
 
 
 @pytest.mark.parametrize(("model", "lame_factor"), [("corotated", 1 / 3), ("stable_neo_hookean", 1.0)])
 def test_viscous_stress_is_the_derivative_of_the_dissipation_potential(model, lame_factor):
     rng = np.random.default_rng(2)
     noise = rng.normal(scale=0.1, size=GRADIENTS.shape)
-    viscous = {"viscosity": 0.6, "reference": noise + noise.transpose(0, 2, 1)}
+    viscous = {"viscosity": (0.6, 0.4), "reference": noise + noise.transpose(0, 2, 1)}
     stress, energy = stress_and_energy(GRADIENTS, model, **viscous)
     elastic_stress, elastic_energy = stress_and_energy(GRADIENTS, model)
     arguments = (viscous["reference"], viscous["viscosity"], lame_factor)
@@ -147,7 +158,7 @@ def test_viscous_stress_is_the_derivative_of_the_dissipation_potential(model, la
     np.testing.assert_allclose((ahead - behind) / (2 * step), slope, rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize("viscosity", [0.0, 0.6])
+@pytest.mark.parametrize("viscosity", [(0.0, 0.0), (0.6, 0.4), (0.6, 0.0)])
 @pytest.mark.parametrize("model", MATERIALS)
 def test_tangent_is_the_derivative_of_the_stress(model, viscosity):
     rng = np.random.default_rng(3)
@@ -196,7 +207,7 @@ def test_each_environment_is_clamped_on_its_own():
 
 def test_clamped_viscous_tangent_is_positive_semidefinite():
     reference = np.tile(0.5 * np.eye(3), (len(GRADIENTS), 1, 1))  # compression rate: a negative geometric part
-    potential = unit_potential(GRADIENTS, viscosity=5.0, reference=reference)
+    potential = unit_potential(GRADIENTS, viscosity=(5.0, 5.0), reference=reference)
     everywhere = torch.ones(potential.batch, dtype=torch.bool)
     assert np.linalg.eigvalsh(dense_tangent(potential)).min() < -1.0
     assert np.linalg.eigvalsh(dense_tangent(potential, everywhere)).min() > -1e-9
@@ -243,7 +254,7 @@ def loaded_potential(mesh):
     stiffness = [torch.as_tensor(v) * (1.0 + noise(b, 1)) * scale for v, scale in zip(volumes, (1e5, 1e6), strict=True)]
     strain = 0.01 * noise(b, potential.solid.n_points, 3, 3)
     main = noise(b, n, 3), 1e4 * (1 + noise(b, n)), noise(b, n, 3)
-    values = {"viscosity": noise(b), "reference_strain": strain + strain.mT}
+    values = {"viscosity": noise(b, 2), "strain_offset": strain + strain.mT, "dilation_offset": strain[..., 0, 0]}
     potential.set_terms(StepTerms(*main, {"stiffness": torch.stack(stiffness, dim=-1), **values}))
     potential.positions.copy_(torch.as_tensor(mesh.vertices) + 1e-3 * noise(b, n, 3))
     pattern = BlockPattern(n, body.fixed_vertices, sets)

@@ -32,8 +32,8 @@ def potential_of(f):
     sets = [(solid, solid.points(TETRAHEDRON.mesh))]
     p = IncrementalPotential(sets, 4, fixed, len(f), torch.device("cpu"))
     zeros = torch.zeros(len(f), 4, 3, dtype=torch.float64)
-    values = {"stiffness": torch.as_tensor(MODULI).expand(len(f), 1, 3), "viscosity": zeros[:, 0, 0]}
-    p.set_terms(StepTerms(zeros, zeros[..., 0], zeros, {**values, "reference_strain": None}))
+    values = {"stiffness": torch.as_tensor(MODULI).expand(len(f), 1, 3), "viscosity": zeros[:, 0, :2]}
+    p.set_terms(StepTerms(zeros, zeros[..., 0], zeros, {**values, "strain_offset": None, "dilation_offset": None}))
     p.positions.copy_(torch.as_tensor(UNIT @ f.transpose(0, 2, 1)))
     return p
 

@@ -138,6 +138,17 @@ class TestLoss:
         assert loss.measure(windows, [target])[0] < 1e-12  # mm^2
         assert window_loss(no_force, 4, integrator=integrator).measure(windows, [target])[0] > 1e-3
 
+    @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
+    def test_windows_of_a_material_that_relaxes_begin_with_what_it_carries(self, integrator):
+        no_force, creeping = Formula(lambda q, v: torch.zeros_like(q)), replace(REALITY, prony=[(0.5, 0.05)])
+        sim = simulator(creeping, integrator)
+        load = Inputs(torch.full((2, len(MESH.vertices), 3), -1e-3, dtype=torch.float64))
+        found = sim.rollout(sim.static_equilibrium(load), FRAMES - 1)
+        q, v = found.q.transpose(0, 1).contiguous(), found.v.transpose(0, 1).contiguous()
+        loss = WindowLoss(no_force, lambda: simulator(creeping, integrator), 4, 3)
+        target = motion_of(q, v, q)
+        assert loss.measure(loss.side_by_side([target]), [target])[0] < 1e-12  # mm^2
+
     def test_it_is_the_mean_squared_distance_of_separate_roll_outs(self):
         model, sim = network(), simulator()
         windows = windows_of([1, 0, 1], [0, 3, 6])

@@ -6,6 +6,7 @@ is five lines, and its gradients follow from those of the one nonlinear solve.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -23,16 +24,35 @@ class State:
     q: torch.Tensor  # (B, N, 3) [m]
     v: torch.Tensor  # (B, N, 3) [m/s]
     previous: tuple[torch.Tensor, torch.Tensor] | None = None  # (q, v) one step earlier, or None
+    # (B, K, P, 3, 3) strain that each Prony branch of the material still carries at each of the solid's points; None
+    # where all have relaxed, as in a body that has been at rest for long
+    overstrain: torch.Tensor | None = None
 
     @property
     def batch(self) -> int:
         """B."""
         return self.q.shape[0]
 
+    def map(self, change: Callable[[torch.Tensor], torch.Tensor]) -> "State":
+        """The state with every tensor changed."""
+        return State.from_tensors({name: change(each) for name, each in self.tensors().items()})
+
     def detach(self) -> "State":
         """The same state, cut off from the autograd graph."""
-        previous = None if self.previous is None else (self.previous[0].detach(), self.previous[1].detach())
-        return State(self.q.detach(), self.v.detach(), previous)
+        return self.map(torch.Tensor.detach)
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """What it consists of, by name."""
+        found = {"q": self.q, "v": self.v}
+        if self.previous is not None:
+            found |= {"previous_q": self.previous[0], "previous_v": self.previous[1]}
+        return found if self.overstrain is None else {**found, "overstrain": self.overstrain}
+
+    @classmethod
+    def from_tensors(cls, tensors: Mapping[str, torch.Tensor]) -> "State":
+        """The state of `tensors`; others than its own are left out."""
+        previous = (tensors["previous_q"], tensors["previous_v"]) if "previous_q" in tensors else None
+        return cls(tensors["q"], tensors["v"], previous, tensors.get("overstrain"))
 
 
 @dataclass(frozen=True)

@@ -11,17 +11,19 @@ import torch
 
 from ..energies.base import Energy, Quantity
 from ..energies.explicit import HeldEnergy
-from ..energies.materials import Corotated, Material
+from ..energies.materials import PRONY_RATIO, PRONY_TIME, Corotated, Material
 from ..energies.potential import StepTerms
-from ..energies.solid import GreenStrain, Solid, device_matrix, spread
+from ..energies.solid import Solid, device_matrix, spread
 from ..fem.body import Body
 from ..io.errors import ConvergenceError, InputError
 from .assembly import BlockPattern
+from .constants import Constants
 from .equilibrium import Workspace, equilibrium
 from .inputs import Inputs, check_tensor
 from .integrator import ImplicitStage, State, make_integrator
 from .linearisation import Linearisation
 from .nonlinear_solver import SolveReport, SolverSettings
+from .viscosity import check_overstrain, relaxed, viscous_values, without_viscosity
 
 GRAVITY = (0.0, 0.0, -9.80709)
 _MOST_LENGTHS = 100.0  # that a body at rest may be away from its rest shape
@@ -30,40 +32,6 @@ _NOTHING = Inputs()
 _GRAVITY = Quantity("gravity", "m/s^2", per="axis")
 
 Parameters = Mapping[str, Any]
-
-
-@dataclass(frozen=True)
-class Constants:
-    """What parameters make of a body: differentiable tensors, computed once a roll-out."""
-
-    mass: torch.Tensor  # (1 or B, N) [kg]
-    load_mass: torch.Tensor  # (1 or B, N) what gravity acts on [kg]
-    gravity: torch.Tensor  # (1 or B, 3) [m/s^2]
-    mass_damping: torch.Tensor  # (1 or B, 1) [1/s]
-    stiffness_damping: torch.Tensor  # (1 or B,) [s]
-    damped: bool  # whether stiffness damping acts at all
-    values: Mapping[str, torch.Tensor]  # what the energies need of them, by name
-
-    @property
-    def batch(self) -> int:
-        """Environments that they are for; 1 where they are the same for all."""
-        return max(map(len, self._tensors))
-
-    @property
-    def _tensors(self) -> tuple[torch.Tensor, ...]:
-        return (self.mass, self.gravity, self.mass_damping, self.stiffness_damping, *self.values.values())
-
-    def check_batch(self, batch: int) -> None:
-        """Refuses constants of another number of environments.
-
-        Raises:
-            InputError: some constant has neither one value nor one for each environment.
-        """
-        for tensor in self._tensors:
-            if len(tensor) not in (1, batch):
-                raise InputError(
-                    f"a material parameter has values for {len(tensor)} environments, but the state has {batch}."
-                )
 
 
 @dataclass(frozen=True)
@@ -167,11 +135,11 @@ class Simulator:
             body.n_vertices, body.fixed_vertices, [points for _, sets in self._energies for points in sets]
         )
         own = [quantity for energy in body.energies for quantity in energy.parameters]
-        self.parameters: dict[str, Quantity] = {**self.material.quantities(), **{each.name: each for each in own}}
+        self.parameters: dict[str, Quantity] = {**self.material.quantities, **{each.name: each for each in own}}
         self.parameters["gravity"] = _GRAVITY
         self.inputs: dict[str, Quantity] = {each.name: each for energy in body.energies for each in energy.inputs}
         self.constants: dict[str, Any] = {**self.material.constants, "gravity": [list(self.gravity)]}
-        self.counts = dict.fromkeys(self.material.quantities(), len(body.mesh.cells)) | {"gravity": 3}
+        self.counts = dict.fromkeys(self.material.quantities, len(body.mesh.cells)) | {"gravity": 3}
         for energy in own_energies:
             self.constants |= energy.constants
             self.counts |= {each.name: energy.count for each in (*energy.parameters, *energy.inputs)}
@@ -216,8 +184,8 @@ class Simulator:
         given = {**self.constants, **(parameters or {})}
         tensors = {name: self.parameters[name].shaped(self.tensor(value)) for name, value in given.items()}
         values = {name: v for energy, _ in self._energies for name, v in energy.prepare(tensors).items()}
-        damping = values.pop("stiffness_damping")
-        density = tensors["density"]
+        density, damping = tensors["density"], tensors["stiffness_damping"][:, 0]
+        ratio, time = (self._branches(tensors, quantity) for quantity in (PRONY_RATIO, PRONY_TIME))
         return Constants(
             mass=spread(self._mass_volume, density) + self._attached_mass,
             load_mass=spread(self._load_volume, density) + self._attached_mass,
@@ -225,8 +193,16 @@ class Simulator:
             mass_damping=tensors["mass_damping"],
             stiffness_damping=damping,
             damped=bool((damping > 0).any()) or damping.requires_grad,
+            prony_ratio=ratio,
+            prony_time=time,
+            relaxes=bool((ratio > 0).any()) or ratio.requires_grad,
             values=values,
         )
+
+    def _branches(self, tensors: Mapping[str, torch.Tensor], quantity: Quantity) -> torch.Tensor:
+        """(1 or B, K) a constant of the material's Prony branches."""
+        found = [tensors[f"{quantity.name}_{k + 1}"] for k in range(len(self.material.prony))]
+        return torch.cat(torch.broadcast_tensors(*found), 1) if found else self.rest_positions.new_zeros(1, 0)
 
     def workspace(self, batch: int) -> Workspace:
         """Buffers for a batch size, made at their first use."""
@@ -286,22 +262,34 @@ class Simulator:
         terms = self._terms(state, stage, inputs, constants)
         solver = workspace.solver("dynamics", self.settings)
         x, report = equilibrium(workspace, solver, terms, stage.target, self._fixed_at(state, stage, inputs))
-        return self._finish(state, stage, inputs, x), report
+        return self._finish(state, stage, inputs, constants, x), report
 
     def _fixed_at(self, state: State, stage: ImplicitStage, inputs: Inputs) -> torch.Tensor:
         """(B, D, 3) where the fixed vertices are at the stage [m]."""
         now = state.q[:, self.fixed]
         return now if inputs.fixed_positions is None else now + stage.end * (inputs.fixed_positions - now)
 
-    def _finish(self, state: State, stage: ImplicitStage, inputs: Inputs, x: torch.Tensor) -> State:
+    def _finish(
+        self, state: State, stage: ImplicitStage, inputs: Inputs, constants: Constants, x: torch.Tensor
+    ) -> State:
         """The state that the stage's solution leads to."""
         new = self.method.finish(state, x, self.time_step)
+        new = replace(new, overstrain=self.relaxed(constants, state, new.q))
         if stage.end == 1.0 or not len(self.fixed):
             return new
         # A prescribed motion has a velocity of its own; extrapolated from mid-step it would ring.
         now = state.q[:, self.fixed]
         moved = torch.zeros_like(now) if inputs.fixed_positions is None else inputs.fixed_positions - now
         return replace(new, v=new.v.index_copy(1, self.fixed, moved / self.time_step))
+
+    def relaxed(self, constants: Constants, state: State, q: torch.Tensor) -> torch.Tensor | None:
+        """(B, K, P, 3, 3) strains of the Prony branches where a step leads from a state to positions q (B, N, 3).
+
+        None where the material has no branch that acts.
+        """
+        if not constants.relaxes:
+            return None
+        return relaxed(self.workspace(state.batch).potential.solid, constants, state, q, self.time_step)
 
     def linearise(
         self, state: State, inputs: Inputs | None = None, parameters: Parameters | Constants | None = None
@@ -325,7 +313,7 @@ class Simulator:
             self._terms(state, stage, inputs, constants),
             stage,
             self._fixed_at(state, stage, inputs),
-            partial(self._finish, state, stage, inputs),
+            partial(self._finish, state, stage, inputs, constants),
             self.settings.linear_solver,
         )
 
@@ -335,13 +323,11 @@ class Simulator:
         solid = self.workspace(batch).potential.solid
         # Mass damping is linear in x: it joins inertia and moves the target.
         damping = constants.mass_damping[..., None] * h  # (1 or B, 1, 1)
-        strain = None
-        if constants.damped:
-            strain = sum(w * GreenStrain.apply(solid, q) for q, w in stage.strain_weights)
         mass, force = constants.mass, self._loads(inputs, constants)
         if inputs.attached_mass is not None:
             mass = mass + inputs.attached_mass
-        values = self._values(constants, inputs, batch, constants.stiffness_damping / h, strain)
+        viscous = viscous_values(solid, constants, state, stage, self.time_step)
+        values = self._values(constants, inputs, batch, viscous)
         if self.coupling == "explicit":
             for energy, _ in self._energies:
                 for quantity in energy.inputs if energy.is_load else ():
@@ -355,15 +341,10 @@ class Simulator:
         )
 
     def _values(
-        self,
-        constants: Constants,
-        inputs: Inputs,
-        batch: int,
-        viscosity: torch.Tensor,
-        strain: torch.Tensor | None,
+        self, constants: Constants, inputs: Inputs, batch: int, viscous: Mapping[str, torch.Tensor | None]
     ) -> dict[str, Any]:
         """What the energies' terms need in a step."""
-        values: dict[str, Any] = {**constants.values, "viscosity": viscosity.expand(batch), "reference_strain": strain}
+        values: dict[str, Any] = {**constants.values, **viscous}
         for energy, _ in self._energies:
             for quantity in energy.inputs:
                 given = inputs.actuation.get(quantity.name)
@@ -410,12 +391,12 @@ class Simulator:
         if start is not None:
             check_tensor("start", start, tuple(state.q.shape), "m", "vertex", state.q)
         workspace = self.workspace(batch)
-        nothing = self.rest_positions.new_zeros(batch)
+        still = without_viscosity(batch, self.rest_positions)
         terms = StepTerms(
             target=state.q,
             inertia=self.rest_positions.new_zeros(batch, self.body.n_vertices),
             force=self._loads(inputs, constants).expand(batch, -1, -1),
-            values=self._values(constants, inputs, batch, nothing, None),
+            values=self._values(constants, inputs, batch, still),
         )
         solver = workspace.solver("statics", replace(self.settings, name="newton", on_failure="raise"))
         at = state.q[:, self.fixed] if inputs.fixed_positions is None else inputs.fixed_positions
@@ -480,3 +461,6 @@ class Simulator:
             raise InputError(f"the inputs are a {type(inputs).__name__}: give Inputs(external_force=...), say.")
         inputs.check([energy for energy, _ in self._energies], batch, n, len(self.fixed), like)
         constants.check_batch(batch)
+        if state.overstrain is not None:
+            solid = self.workspace(batch).potential.solid
+            check_overstrain(state.overstrain, (batch, len(self.material.prony), solid.n_points, 3, 3))

@@ -12,9 +12,11 @@ R is the rotation of the polar decomposition, D the nearest matrix of determinan
 their sources are in ``kernels.materials``. Shape and volume terms may be integrated at different points.
 """
 
+import re
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from itertools import chain
 from types import ModuleType
 from typing import Any, ClassVar
 
@@ -33,9 +35,13 @@ def constant(default: float, name: str, unit: str, lower: float = 0.0, **more: A
     return field(default=default, kw_only=common, metadata={"quantity": quantity})
 
 
+PRONY_RATIO = Quantity("prony_ratio", "", 0.0, closed=True)
+PRONY_TIME = Quantity("prony_time", "s", 0.0)
+
+
 @dataclass(frozen=True)
 class Material(ABC):
-    """Constants of an elastic material with Rayleigh damping.
+    """Constants of an elastic material with Rayleigh damping and relaxation.
 
     The elastic constants and the density are numbers, (M,) tensors with a value for each element, (B, 1) tensors with a
     value for each environment of a batch, or (B, M) tensors; the damping constants are numbers or (B,) tensors. Tensors
@@ -53,23 +59,42 @@ class Material(ABC):
     mass_damping: Parameter = constant(0.0, "mass_damping", "1/s", closed=True, per="", common=True)
     # Kelvin-Voigt viscosity of retardation time beta [s]; for small strains the force -beta K v
     stiffness_damping: Parameter = constant(0.0, "stiffness_damping", "s", closed=True, per="", common=True)
+    # generalised Maxwell (Prony) branches, each of the ratio of its shear modulus to mu, which is what is left after a
+    # long time, and its relaxation time [s]; see `dynamics.viscosity`
+    prony: Sequence[tuple[Parameter, Parameter]] = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
         """Checks every constant; raises InputError for a constant outside its physical range."""
-        for name, quantity in self.quantities().items():
-            quantity.check(getattr(self, name))
+        if not all(isinstance(each, Sequence) and len(each) == 2 for each in self.prony):
+            raise InputError(f"prony is {self.prony!r}: give a (ratio, time) for each branch, - and s.")
+        constants = self.constants
+        for name, quantity in self.quantities.items():
+            quantity.check(constants[name])
 
     @classmethod
-    def quantities(cls) -> dict[str, Quantity]:
-        """Its constants by name: those of the law first."""
-        found = {each.name: each.metadata["quantity"] for each in fields(cls)}
+    def own_quantities(cls) -> dict[str, Quantity]:
+        """Its constants by name, those of the law first, without those of any branches."""
+        found = {each.name: each.metadata["quantity"] for each in fields(cls) if each.metadata}
         common = [each.name for each in fields(cls) if each.kw_only]
         return {name: found[name] for name in sorted(found, key=common.__contains__)}
 
     @property
+    def quantities(self) -> dict[str, Quantity]:
+        """Its constants by name: those of the law first, and ``prony_ratio_1``, ``prony_time_1``, ... last."""
+        branches = [replace(q, name=name) for name, q in self._branches]
+        return {**self.own_quantities(), **{each.name: each for each in branches}}
+
+    @property
+    def _branches(self) -> list[tuple[str, Quantity]]:
+        both = (PRONY_RATIO, PRONY_TIME)
+        return [(f"{q.name}_{k}", q) for k in range(1, 1 + len(self.prony)) for q in both]
+
+    @property
     def constants(self) -> dict[str, Parameter]:
         """Their values."""
-        return {name: getattr(self, name) for name in self.quantities()}
+        branches = zip(self._branches, chain.from_iterable(self.prony), strict=True)
+        own = {name: getattr(self, name) for name in self.own_quantities()}
+        return {**own, **{name: value for (name, _), value in branches}}
 
     @abstractmethod
     def moduli(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
@@ -144,8 +169,18 @@ def make_material(model: str = "corotated", **constants: Any) -> Material:
     """
     if model not in MATERIALS:
         raise InputError(f"material model is {model!r}: choose one of {', '.join(MATERIALS)}.")
-    known = MATERIALS[model].quantities()
+    known = MATERIALS[model].own_quantities()
+    branches = {name: value for name, value in constants.items() if re.fullmatch(r"prony_(ratio|time)_[1-9]\d*", name)}
+    count = len(branches) // 2
+    names = [(f"{PRONY_RATIO.name}_{k}", f"{PRONY_TIME.name}_{k}") for k in range(1, 1 + count)]
+    if {*branches} != {*chain.from_iterable(names)}:
+        raise InputError(
+            f"the Prony branches are {', '.join(sorted(branches))}: give each, numbered from 1, its prony_ratio_ and "
+            "its prony_time_."
+        )
     for name in constants:
-        if name not in known:
-            raise InputError(f"{model} has no constant {name!r}: it has {', '.join(known)}.")
-    return MATERIALS[model](**constants)
+        if name not in known and name not in branches:
+            some = ", ".join((*known, "prony_ratio_1, prony_time_1, ..."))
+            raise InputError(f"{model} has no constant {name!r}: it has {some}")
+    own = {name: value for name, value in constants.items() if name in known}
+    return MATERIALS[model](**own, prony=[(branches[ratio], branches[time]) for ratio, time in names])

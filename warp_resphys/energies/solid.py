@@ -1,4 +1,4 @@
-"""The solid: elastic energy of a material, and its Kelvin-Voigt dissipation."""
+"""The solid: elastic energy of a material, and its viscosity (Kelvin-Voigt and generalised Maxwell)."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -44,9 +44,9 @@ def spread(operator: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
 class Solid(Energy):
     """The energy of a material in a discretised body.
 
-    The step's values are ``stiffness`` (B, P, T), the moduli times the points' volumes [J]; ``viscosity`` (B,), the
-    stiffness damping over the effective time step; and ``reference_strain`` (B, P, 3, 3), the Green strain that the
-    strain rate starts from.
+    The step's values are ``stiffness`` (B, P, T), the moduli times the points' volumes [J]; and, see
+    `dynamics.viscosity`, ``viscosity`` (B, 2), c and d; ``strain_offset`` (B, P, 3, 3), W; and ``dilation_offset``
+    (B, P), w.
 
     Args:
         discretisation: of the body.
@@ -76,14 +76,14 @@ class Solid(Energy):
     @property
     def quantities(self) -> Mapping[str, Quantity]:
         """The material's constants, density and mass damping included."""
-        return self.material.quantities()
+        return self.material.quantities
 
     @override
     def prepare(self, constants: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         moduli = torch.broadcast_tensors(*self.material.moduli(constants))
         rules = self.material.rules
         spreads = [spread(self._volumes[rule], each) for rule, each in zip(rules, moduli, strict=True)]
-        return {"stiffness": torch.stack(spreads, dim=-1), "stiffness_damping": constants["stiffness_damping"][:, 0]}
+        return {"stiffness": torch.stack(spreads, dim=-1)}
 
 
 class SolidTerm(Term):
@@ -106,19 +106,22 @@ class SolidTerm(Term):
     @override
     def shapes(self) -> Mapping[str, tuple[int, ...]]:
         points = self.n_points
-        return {"stiffness": (points, self._moduli), "viscosity": (), "reference_strain": (points, 3, 3)}
+        viscous = {"viscosity": (2,), "strain_offset": (points, 3, 3), "dilation_offset": (points,)}
+        return {"stiffness": (points, self._moduli), **viscous}
 
     def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
         """What the kernels of this energy have in common."""
-        own, stiffness, strain = self.launcher, values["stiffness"], values["reference_strain"]
-        viscosity = values["viscosity"]
+        own, stiffness, strain = self.launcher, values["stiffness"], values["strain_offset"]
+        viscosity, dilation = values["viscosity"], values["dilation_offset"]
         assert stiffness is not None
         assert viscosity is not None
         assert strain is not None
+        assert dilation is not None
         views = [
             own.points_view(stiffness, s.own, self._vector),
-            warp_view(viscosity, wp.float64),
+            warp_view(viscosity, wp.vec2d),
             own.points_view(strain, s.own, wp.mat33d),
+            own.points_view(dilation, s.own, wp.float64),
         ]
         return [s.nodes, s.gradients, *views, s.points_per_cell, positions]
 
@@ -141,9 +144,10 @@ class SolidTerm(Term):
         self, values: Values, positions: torch.Tensor, direction: torch.Tensor
     ) -> Callable[[], dict[str, torch.Tensor]]:
         own, shapes = self.launcher, self.shapes
-        out = {name: own.zeros(*shapes[name]) for name in ("stiffness", "reference_strain")}
-        out["viscosity"] = own.zeros(self.n_points)
-        types = {"stiffness": self._vector, "viscosity": wp.float64, "reference_strain": wp.mat33d}
+        out = {name: own.zeros(*shape) for name, shape in shapes.items()}
+        out["viscosity"] = own.zeros(self.n_points, 2)
+        types = {"stiffness": self._vector, "viscosity": wp.vec2d, "strain_offset": wp.mat33d}
+        types["dilation_offset"] = wp.float64
         commands = []
         for s in self.sets:
             inputs = [*self._arguments(s, values, warp_view(positions, wp.vec3d)), warp_view(direction, wp.vec3d)]

@@ -28,7 +28,6 @@ from ..io.stages import StageContext
 from .build import simulation_device
 
 _KEEP_SECONDS = 10.0
-_STATE = ("q", "v", "previous_q", "previous_v")
 
 
 class March(ABC):
@@ -72,13 +71,11 @@ class March(ABC):
 
     def snapshot(self) -> dict[str, torch.Tensor]:
         """What the next frame goes on from; none of it is changed in place."""
-        values = (self.state.q, self.state.v, *(self.state.previous or ()))
-        return dict(zip(_STATE, values, strict=False))
+        return self.state.tensors()
 
     def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
         """Goes back to a `snapshot`."""
-        q, v, *previous = (tensors[name].to(self.like) for name in _STATE if name in tensors)
-        self.state = State(q, v, (previous[0], previous[1]) if previous else None)
+        self.state = State.from_tensors(tensors).map(lambda each: each.to(self.like))
 
 
 @dataclass(frozen=True)

@@ -102,6 +102,7 @@ class WindowLoss:
         self._model, self._make_simulator, self._observe = model, make_simulator, observe
         self._window, self._batch_size = window, batch_size
         self._parameters, self._frames, self._range = parameters or {}, frames, range_
+        self._overstrains: dict[int, tuple[Motion, torch.Tensor | None]] = {}  # by the motion's identity
         simulator = make_simulator()
         self._first_frame = 1 if simulator.integrator == "bdf2" else 0  # BDF2 looks back.
         rest = simulator.rest_positions
@@ -149,6 +150,25 @@ class WindowLoss:
             total += each * (float(squares.detach().sum()) + failed * self.failure)
         return total
 
+    def _carried(self, simulator: Simulator, motion: Motion) -> torch.Tensor | None:
+        """(R, W, K, P, 3, 3) what the material has not relaxed yet of a motion where its windows start; None without.
+
+        A simulator that has branches carries them on through every state, those of the windows' starts included, and
+        stands still where these are not known.
+        """
+        if id(motion) not in self._overstrains:
+            constants, *_ = Replay(simulator, self._observe, motion.trials).setting(self._parameters)
+            found, state = [], State(motion.q[:, 0], motion.v[:, 0])
+            for frame in range(motion.q.shape[1] if constants.relaxes else 0):
+                q = torch.where(torch.isfinite(motion.q[:, frame]), motion.q[:, frame], state.q)
+                with torch.no_grad():
+                    state = State(q, state.v, overstrain=simulator.relaxed(constants, state, q))
+                assert state.overstrain is not None
+                if frame >= self._first_frame and (frame - self._first_frame) % self._window == 0:
+                    found.append(state.overstrain)
+            self._overstrains[id(motion)] = (motion, torch.stack(found, 1) if found else None)
+        return self._overstrains[id(motion)][1]
+
     def _parts(self, windows: Windows) -> list[torch.Tensor]:
         """Numbers of windows that are simulated at once: of one motion each."""
         found = []
@@ -183,7 +203,9 @@ class WindowLoss:
         previous = None
         if self._first_frame:
             previous = (motion.q[run, frame - 1], motion.v[run, frame - 1])
-        state = State(motion.q[run, frame], motion.v[run, frame], previous)
+        carried = self._carried(simulator, motion)
+        overstrain = None if carried is None else carried[run, (frame - self._first_frame) // self._window]
+        state = State(motion.q[run, frame], motion.v[run, frame], previous, overstrain)
         constants, inputs, _ = Replay(simulator, self._observe, motion.trials.select(run.tolist())).setting(
             self._parameters
         )

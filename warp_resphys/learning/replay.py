@@ -47,14 +47,13 @@ class Start:
         """That of some of the trials."""
         pick = torch.as_tensor(indices, device=self.delay.device)
         shift = None if self.shift is None else self.shift[pick]
-        return replace(self, state=State(self.state.q[pick], self.state.v[pick]), delay=self.delay[pick], shift=shift)
+        return replace(self, state=self.state.map(lambda t: t[pick]), delay=self.delay[pick], shift=shift)
 
     def to(self, like: torch.Tensor) -> "Start":
         """The same on the device and in the type of a tensor."""
         shift = None if self.shift is None else self.shift.to(like)
-        return replace(
-            self, state=State(self.state.q.to(like), self.state.v.to(like)), delay=self.delay.to(like), shift=shift
-        )
+        state = self.state.map(lambda t: t.to(like))
+        return replace(self, state=state, delay=self.delay.to(like), shift=shift)
 
     def shifted(self, markers: torch.Tensor) -> torch.Tensor:
         """(..., R, T, M, 3) markers where they sit, of those where they are bound [m]."""

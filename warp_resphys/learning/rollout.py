@@ -82,11 +82,13 @@ class Rollout:
 
     def _reset(self, state: State, lost: torch.Tensor) -> State:
         """The state with its lost environments at rest."""
-        rest, where = self.simulator.rest_state(state.batch), lost[:, None, None]
-        back = state.previous
-        if back is not None:
-            back = (torch.where(where, rest.q, back[0]), torch.where(where, rest.v, back[1]))
-        return State(torch.where(where, rest.q, state.q), torch.where(where, rest.v, state.v), back)
+        rest = dict.fromkeys(("q", "previous_q"), self._rest)
+
+        def put(name: str, value: torch.Tensor) -> torch.Tensor:
+            where = lost.view(-1, *[1] * (value.ndim - 1))
+            return torch.where(where, rest.get(name, value.new_zeros(())), value)
+
+        return State.from_tensors({name: put(name, value) for name, value in state.tensors().items()})
 
     def lost(self, state: State) -> torch.Tensor:
         """(B,) bool, environments that have diverged."""

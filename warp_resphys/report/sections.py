@@ -1,6 +1,7 @@
 """Sections of the page of a run: errors by horizon and pressure, what was identified and learned, its recordings."""
 
 import math
+import re
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -44,6 +45,15 @@ _PARAMETERS: Final[Mapping[str, tuple[str, str, float]]] = {
 }
 _WHOLE: Final = 99.5  # [%] of a parameter's range.
 _TIED: Final = 0.9  # From this correlation on, two parameters are named as not told apart.
+
+
+def _parameter(name: str) -> tuple[str, str, float]:
+    """What a parameter is called, the unit that it is written in, and how many of these make an SI unit."""
+    branch = re.fullmatch(r"prony_(ratio|time)_(\d+)", name)
+    if branch is None:
+        return _PARAMETERS.get(name, (name, "", 1.0))
+    kind, number = branch.groups()
+    return (f"Relaxation time {number}", "ms", 1e3) if kind == "time" else (f"Prony ratio {number}", "", 1.0)
 
 
 def against(errors: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
@@ -210,7 +220,7 @@ def parameter_rows(found: Mapping[str, Any], start: Mapping[str, float], truth: 
     deviations = (found.get("uncertainty") or {}).get("deviation", {})
     rows = []
     for parameter, value in found["parameters"].items():
-        words, unit, factor = _PARAMETERS.get(parameter, (parameter, "", 1.0))
+        words, unit, factor = _parameter(parameter)
         deviation = deviations.get(parameter)
         beside = f"± {factor * deviation:.{_decimals(factor * deviation)}f}" if deviation else ""
         cells = [Cell(_digits(start.get(parameter), factor)), Cell(_digits(value, factor, deviation), beside=beside)]
@@ -237,8 +247,8 @@ def _decimals(deviation: float) -> int:
 
 
 def _in_a_sentence(parameter: str) -> str:
-    words = _PARAMETERS.get(parameter, (parameter, "", 1.0))[0]
-    return words if words.startswith(("Young", "Poisson")) else words[0].lower() + words[1:]
+    words = _parameter(parameter)[0]
+    return words if words.startswith(("Young", "Poisson", "Prony")) else words[0].lower() + words[1:]
 
 
 def uncertainty_text(name: str, found: Mapping[str, Any]) -> str:

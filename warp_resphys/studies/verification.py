@@ -18,7 +18,7 @@ from ..dynamics.inputs import Inputs
 from ..dynamics.integrator import State
 from ..dynamics.nonlinear_solver import SolverSettings
 from ..dynamics.simulator import Simulator
-from ..energies.materials import Corotated, Material
+from ..energies.materials import Material, make_material
 from ..experiment.build import choose_device
 from ..fem.body import Body
 from ..io.errors import ConvergenceError, DataFileError, InputError
@@ -119,7 +119,8 @@ def read_reference(path: Path) -> ReferenceTrajectory:
     if not dt > 0.0:
         raise DataFileError(f"{path}: dt is {dt:g}: it must be positive, in seconds.")
     try:
-        material = Corotated(**{key: float(values[key]) for key in ("youngs_modulus", "poissons_ratio", "density")})
+        named = {key: float(values[key]) for key in ("youngs_modulus", "poissons_ratio", "density")}
+        material = make_material("corotated", **named)
     except InputError as error:
         raise DataFileError(f"{path}: {error}") from None
     mesh = box_of_vertices(values["vertices"], str(path))

@@ -33,6 +33,7 @@ _MODULES = {
     "SolverSettings": "dynamics.nonlinear_solver",
     "State": "dynamics.integrator",
     "Trajectory": "dynamics.simulator",
+    "Tendons": "energies.tendons",
     "write_mesh": "mesh.readers",
 }
 

@@ -8,7 +8,7 @@ from typing_extensions import override
 
 from ..energies.base import PointSet
 from ..energies.potential import IncrementalPotential
-from ..linalg.linear_solver import Factor, LinearSolver
+from ..linalg.linear_solver import CorrectedFactor, Factor, LinearSolver
 from .assembly import BlockPattern, HessianAssembly
 
 
@@ -66,15 +66,22 @@ class ExactHessian(HessianApproximation):
 
     def _factorise(self) -> Factor:
         self._potential.update_tangent(self.clamped)
-        return self._linear.factor(self._assemble().to(self._linear.dtype))
+        return self._factor_of(self._assemble().to(self._linear.dtype))
+
+    def _factor_of(self, values: torch.Tensor, definite: bool = True) -> Factor:
+        """Of assembled values, and what couples vertices beside them."""
+        factor, columns = self._linear.factor(values, definite), self._potential.low_rank
+        if columns is None:
+            return factor
+        return CorrectedFactor(factor, columns[:, self._dofs].to(self._linear.dtype))
 
     def refactor_exact(self) -> None:
         """Factorises the Hessian as it is, indefinite or not: for adjoints."""
         self.clamped.zero_()
         self._potential.update_tangent()
-        self._factor = self._linear.factor(self._assemble())
+        self._factor = self._factor_of(self._assemble())
         if self._factor.failed.any():
-            self._factor = self._linear.factor(self._assemble(), definite=False)
+            self._factor = self._factor_of(self._assemble(), definite=False)
 
     @override
     def apply(self, residual: torch.Tensor) -> torch.Tensor:

@@ -1,5 +1,6 @@
 """What acts on a batch of bodies over time."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -128,7 +129,8 @@ class Inputs:
             like: a tensor on the device and of the type of the simulator.
 
         Raises:
-            InputError: an input that no energy uses, a field of another shape or type, or values that are not finite.
+            InputError: an input that no energy uses, a field of another shape or type, or values that are not finite or
+                out of their range.
         """
         known = {
             "external_force": ((batch, vertices, 3), "N", "vertex"),
@@ -136,12 +138,15 @@ class Inputs:
             "attached_mass": ((batch, vertices), "kg", "vertex"),
         }
         own = {q.name: ((batch, energy.count), q.unit, q.per) for energy in energies for q in energy.inputs}
+        bounded = {q.name: q for energy in energies for q in energy.inputs if q.lower > -math.inf or q.upper < math.inf}
         for name, values in self.fields.items():
             if name not in known and name not in own:
                 others = ", ".join(own) or "none"
                 raise InputError(f"there is an input {name}, but no energy of the body takes it: they take {others}.")
             shape, unit, place = (known | own)[name]
             check_tensor(name, values, shape, unit, place, like)
+            if name in bounded:
+                bounded[name].check(values)
 
 
 def check_tensor(name: str, values: Any, shape: tuple[int, ...], unit: str, place: str, like: torch.Tensor) -> None:

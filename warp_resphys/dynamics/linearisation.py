@@ -1,5 +1,6 @@
 """A step's residual and its exact derivative at any positions, for methods that solve it in their own way."""
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -8,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..energies.potential import StepTerms
-from ..linalg.linear_solver import Factor, SparseSolver
+from ..linalg.linear_solver import CorrectedFactor, Factor, SparseSolver
 from .assembly import HessianAssembly
 from .equilibrium import Workspace
 from .integrator import ImplicitStage, State
@@ -96,7 +97,12 @@ class Linearisation:
         self.update(x)
         solver = SparseSolver(pattern.rows, pattern.cols, len(pattern.free), 3, p.device, torch.float64)
         entries = solver.mirrored(HessianAssembly(p, solver, pattern)())[0]
-        return solver.matrix(entries), np.repeat(p.inertia[0].cpu().numpy()[pattern.free], 3)
+        matrix = solver.matrix(entries)
+        if p.low_rank is not None:
+            columns = p.low_rank[0].view(p.n_vertices, 3, -1)[self.free].flatten(0, 1)
+            columns = scipy.sparse.csc_array(columns.cpu().numpy())
+            matrix = scipy.sparse.csc_array(matrix + columns @ columns.T)
+        return matrix, np.repeat(p.inertia[0].cpu().numpy()[pattern.free], 3)
 
 
 class _ShiftedHessian:
@@ -109,7 +115,9 @@ class _ShiftedHessian:
 
     def __init__(self, workspace: Workspace, linear_solver: str) -> None:
         p, k = workspace.potential, workspace.pattern
-        self._linear = workspace.linear_solver(linear_solver)
+        self._linear, self._potential = workspace.linear_solver(linear_solver), p
+        free = torch.as_tensor(k.free, device=p.device)
+        self._dofs = (3 * free[:, None] + torch.arange(3, device=p.device)).reshape(-1)
         self._assemble = HessianAssembly(p, self._linear, k)
         diagonal = self._linear.address[k.rows == k.cols][:, [0, 4, 8]].ravel()
         self._diagonal = torch.as_tensor(diagonal.astype(np.int64), device=p.device)
@@ -118,4 +126,5 @@ class _ShiftedHessian:
         """The factor at the potential's last tangent."""
         values = scale * self._assemble()
         values[:, self._diagonal] += 1.0
-        return self._linear.factor(values)
+        factor, columns = self._linear.factor(values), self._potential.low_rank
+        return factor if columns is None else CorrectedFactor(factor, math.sqrt(scale) * columns[:, self._dofs])

@@ -143,6 +143,9 @@ class Simulator:
         for energy in own_energies:
             self.constants |= energy.constants
             self.counts |= {each.name: energy.count for each in (*energy.parameters, *energy.inputs)}
+        bound = [type(each).__name__.lower() for each in own_energies if each.implicit_only]
+        if self.coupling == "explicit" and bound:
+            raise InputError(f"coupling is explicit, but {bound[0]} act at the end of a step alone: choose implicit.")
         self._workspaces: dict[int, Workspace] = {}
         self._held: dict[tuple[int, str], HeldEnergy] = {}
         self._mass_volume = device_matrix(body.mass_volume, self.device, self.dtype)

@@ -95,6 +95,7 @@ class PointSet:
         points_per_cell: Q.
         nodes_per_cell: K.
         n_points: P = C Q.
+        n_vertices: N.
         nodes: (C, K).
         gradients: (P, K) operators.
         start: (N + 1) where a vertex's entries of ``incident`` begin.
@@ -103,6 +104,7 @@ class PointSet:
 
     def __init__(self, launcher: Launcher, points: Points, n_vertices: int, part: slice, own: slice) -> None:
         self.source, self.part, self.own, self.n_points = points, part, own, points.n_points
+        self.n_vertices = n_vertices
         self.cells, self.points_per_cell, self.nodes_per_cell, _ = points.gradients.shape
         owner = points.nodes.ravel()
         # A padded node repeats its patch's own vertex with a zero gradient and contributes nothing.
@@ -121,12 +123,14 @@ class Energy(ABC):
     Attributes:
         parameters: constants that it depends on.
         inputs: what acts through it, one value for each of `count`.
-        has_load: whether it is a load, which enters the forces that a step's residual is compared with.
+        is_load: whether it is a load, which enters the forces that a step's residual is compared with.
+        implicit_only: whether it acts on the body at the end of a step whatever the simulator's coupling of loads.
     """
 
     parameters: ClassVar[tuple[Quantity, ...]] = ()
     inputs: ClassVar[tuple[Quantity, ...]] = ()
     is_load: ClassVar[bool] = False
+    implicit_only: ClassVar[bool] = False
 
     @property
     def count(self) -> int:
@@ -171,6 +175,19 @@ class Energy(ABC):
         return values.expand(-1, self.count)
 
 
+@dataclass(frozen=True)
+class LowRank:
+    """The matrix sum_k c_k g_k g_k^T."""
+
+    gradients: torch.Tensor  # (B, 3 N, r) g
+    factors: torch.Tensor  # (B, r) c, zero or more
+
+    @property
+    def root(self) -> torch.Tensor:
+        """(B, 3 N, r) columns C with the matrix C C^T."""
+        return self.gradients * self.factors.sqrt()[:, None]
+
+
 class Term(ABC):
     """An energy's kernels on the points of a batch.
 
@@ -189,6 +206,16 @@ class Term(ABC):
     @abstractmethod
     def shapes(self) -> Mapping[str, tuple[int, ...]]:
         """Shape, without the batch, of every value that a step has for it."""
+
+    def before(self, values: Values, positions: Any) -> list[Any]:
+        """Launches that the kernels of `step` and `tangent` need to have been made at the positions."""
+        del values, positions
+        return []
+
+    def low_rank(self, values: Values, positions: Any) -> "LowRank | None":
+        """What the tangent leaves out: a part of the Hessian that couples vertices of many cells."""
+        del values, positions
+        return None
 
     @abstractmethod
     def step(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:

@@ -52,6 +52,8 @@ class IncrementalPotential(Launcher):
         energies: their terms.
         sets: the sets of points of all of them.
         free_mask: (N,) one at free vertices, zero at fixed ones.
+        low_rank: (B, 3 N, r) columns C of the last `update_tangent`: what the Hessian has beside `tangent` is C C^T.
+            None for nothing.
     """
 
     def __init__(
@@ -91,6 +93,7 @@ class IncrementalPotential(Launcher):
         self._vertex_energy = self.zeros(n_vertices)
         self._record_evaluation()
         self._tangent: torch.Tensor | None = None
+        self.low_rank: torch.Tensor | None = None
         self._direction = self.zeros(n_vertices, 3)
         self._adjoints: list[Callable[[], dict[str, torch.Tensor]]] = []
 
@@ -118,6 +121,7 @@ class IncrementalPotential(Launcher):
         self._load_commands: list[Any] = []
         for term, is_load in zip(self.energies, self._loads, strict=True):
             commands = self._load_commands if is_load else self._internal_commands
+            commands += term.before(t.values, warp_view(self.positions, wp.vec3d))
             for s in term.sets:
                 stress = self.points_view(self._stress, s.part, wp.mat33d)
                 outputs = [stress, self.points_view(self._point_energy, s.part, wp.float64)]
@@ -197,6 +201,10 @@ class IncrementalPotential(Launcher):
         if positive is not None:
             self._positive.copy_(positive)
         self.launch(*self._tangent_commands)
+        view = warp_view(self.positions, wp.vec3d)
+        found = [term.low_rank(self.terms.values, view) for term in self.energies]
+        roots = [each.root for each in found if each is not None]
+        self.low_rank = torch.cat(roots, 2) if roots else None
 
     @property
     def tangent(self) -> torch.Tensor:
@@ -217,6 +225,7 @@ class IncrementalPotential(Launcher):
         self._tangent_commands, self._product_commands = [], []
         positive, direction = warp_view(self._positive, wp.int32), warp_view(self._direction, wp.vec3d)
         for term in self.energies:
+            self._tangent_commands += term.before(self.terms.values, warp_view(self.positions, wp.vec3d))
             for s in term.sets:
                 tangent = self.points_view(blocks, s.part, wp.mat33d)
                 kernel, inputs = term.tangent(s, self.terms.values, warp_view(self.positions, wp.vec3d), positive)
@@ -235,7 +244,11 @@ class IncrementalPotential(Launcher):
         self._direction.copy_(direction)
         self._product.zero_()
         self.launch(*self._product_commands)
-        return self._product.clone()
+        product = self._product.clone()
+        if self.low_rank is not None:
+            along = torch.einsum("bnr,bn->br", self.low_rank, self._direction.flatten(1))
+            product += torch.einsum("bnr,br->bn", self.low_rank, along).view_as(product)
+        return product
 
     def value_adjoint(self, adjoint: torch.Tensor) -> dict[str, torch.Tensor]:
         """-z . d residual / d value at ``positions`` for every value of the last `set_terms`, by name, (B, *shape).

@@ -44,6 +44,27 @@ class Factor(ABC):
         """Solves for (B, n, m) right-hand sides; a factor of batch 1 serves every environment of the batch."""
 
 
+class CorrectedFactor(Factor):
+    """A factor of A + C C^T from one of A (Sherman, Morrison and Woodbury).
+
+    Args:
+        factor: of A.
+        columns: (B, n, r) C.
+    """
+
+    def __init__(self, factor: Factor, columns: torch.Tensor) -> None:
+        self._factor, self._columns = factor, columns
+        self.failed = factor.failed
+        self._solved = factor.solve(columns)
+        small = torch.eye(columns.shape[2], device=columns.device, dtype=columns.dtype) + columns.mT @ self._solved
+        self._small = torch.linalg.lu_factor_ex(small)[:2]
+
+    @override
+    def solve(self, rhs: torch.Tensor) -> torch.Tensor:
+        found = self._factor.solve(rhs)
+        return found - self._solved @ torch.linalg.lu_solve(*self._small, self._columns.mT @ found)
+
+
 class LinearSolver(ABC):
     """Factorises symmetric matrices of one sparsity pattern.
 

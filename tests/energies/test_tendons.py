@@ -1,0 +1,195 @@
+"""Tendons against closed forms, differences, and what cannot be routed."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from warp_resphys import (
+    Body,
+    Corotated,
+    Inputs,
+    Simulator,
+    SolverSettings,
+    Tendons,
+    box_hexahedra,
+    box_tetrahedra,
+    select_vertices,
+)
+from warp_resphys.dynamics.modes import vibration_modes
+from warp_resphys.io.errors import InputError
+from warp_resphys.learning.reconstruction import make_reconstructor
+from warp_resphys.studies.gradient_check import POSES, check_gradients
+
+SIZE, DIVISIONS = (0.12, 0.02, 0.02), (6, 2, 2)
+BEAM = box_hexahedra(SIZE, DIVISIONS)
+CLAMP, TIP = select_vertices(BEAM, x=0.0), select_vertices(BEAM, x=SIZE[0])
+SOFT = Corotated(264e3, 0.45, mass_damping=0.5)
+WEIGHTLESS = (0.0, 0.0, 0.0)
+TIGHT = SolverSettings("newton", relative_tolerance=1e-11)
+
+
+def route(height, count=7, depth=SIZE[1] / 2, length=SIZE[0]):
+    x = np.linspace(0.0, length, count)
+    return np.column_stack([x, np.full(count, depth), np.full(count, height)])
+
+
+def simulator(*routes, mesh=BEAM, material=SOFT, solver=TIGHT, **more):
+    body = Body(mesh, fixed=select_vertices(mesh, x=0.0), energies=(Tendons(routes, **more),))
+    return Simulator(body, material, gravity=WEIGHTLESS, solver=solver)
+
+
+def tension(*newtons):
+    return Inputs(tendon_tension=torch.tensor([newtons], dtype=torch.float64))
+
+
+def test_an_offset_tendon_bends_a_beam_to_a_constant_curvature():
+    """M = T e along the beam: for small T the curvature is T e / (E I), the compression T / (E A)."""
+    mesh = box_hexahedra((0.2, 0.01, 0.01), (20, 2, 2), nodes=27)
+    offset, pull, modulus = 0.003, 0.1, 264e3
+    material = Corotated(modulus, 0.0)
+    sim = simulator(route(0.005 + offset, 41, 0.005, 0.2), mesh=mesh, material=material)
+    q = sim.static_equilibrium(tension(pull)).q[0].numpy()
+    middle = [int(np.argmin(np.linalg.norm(mesh.vertices - [x, 0.005, 0.005], axis=1))) for x in (0.1, 0.2)]
+    bend = pull * offset / (modulus * 0.01**4 / 12)
+    angle, shortening = bend * 0.2, 1.0 - pull / (modulus * 1e-4)
+    assert angle > 0.2  # no small rotation
+    for vertex, x in zip(middle, (0.1, 0.2), strict=True):
+        wanted = [math.sin(bend * x) / bend * shortening, 0.005, 0.005 + (1.0 - math.cos(bend * x)) / bend]
+        np.testing.assert_allclose(q[vertex], wanted, atol=0.02 * abs(wanted[2] - 0.005))
+
+
+@pytest.mark.parametrize("solver", ["newton", "quasi_newton", "projective_dynamics"])
+@pytest.mark.parametrize("linear", ["banded", "dense", "sparse"])
+def test_a_winch_shortens_a_stiff_tendon_by_what_it_takes_in(solver, linear):
+    settings = SolverSettings(solver, relative_tolerance=1e-9, linear_solver=linear)
+    sim = simulator(route(0.018), stiffness=2e4, solver=settings)
+    state, contraction = sim.rest_state(), torch.tensor([[2e-3]], dtype=torch.float64)
+    state, report = sim.step(state, Inputs(tendon_contraction=contraction))
+    assert bool(report.converged.all())
+    pulled = tendon_length(sim, sim.static_equilibrium(Inputs(tendon_contraction=contraction)).q)
+    assert SIZE[0] - 2e-3 < pulled < SIZE[0] - 1.8e-3
+    # One that is let out is slack, and does nothing.
+    slack = sim.static_equilibrium(Inputs(tendon_contraction=-contraction)).q
+    torch.testing.assert_close(slack[0], sim.rest_positions, rtol=0.0, atol=1e-9)
+
+
+def tendon_length(sim, q):
+    (points,) = sim.body.energy_points[0]
+    pieces = np.einsum("pki,pk->pi", q[0].numpy()[points.nodes], points.gradients[:, 0, :, 0])
+    return float(np.linalg.norm(pieces, axis=1).sum())
+
+
+def test_a_length_that_is_commanded_needs_the_tension_that_leads_there():
+    sim = simulator(route(0.018), stiffness=3e3)
+    by_length = sim.static_equilibrium(Inputs(tendon_contraction=torch.tensor([[3e-3]], dtype=torch.float64)))
+    stretched = tendon_length(sim, by_length.q) - SIZE[0] + 3e-3
+    found = 3e3 * (stretched - 0.5e-4)  # past the toe of 0.1 mm
+    by_tension = simulator(route(0.018)).static_equilibrium(tension(found))
+    torch.testing.assert_close(by_length.q, by_tension.q, rtol=0.0, atol=1e-9)
+
+
+def test_opposite_tendons_only_compress():
+    sim = simulator(route(0.018), route(0.002))
+    q = sim.static_equilibrium(tension(1.0, 1.0)).q[0]
+    moved = (q - sim.rest_positions)[TIP].mean(0)
+    assert float(moved[0]) < -1e-3
+    assert float(moved[1:].abs().max()) < 1e-9
+
+
+@pytest.mark.parametrize("kind", [box_hexahedra(SIZE, DIVISIONS), box_tetrahedra(SIZE, (4, 1, 1), order=2)])
+def test_guides_are_where_they_were_put(kind):
+    """Also between the vertices, and where the body's surface bounds them."""
+    places = np.array([[0.001, 0.003, 0.0171], [0.0433, 0.01, 0.02], [0.118, 0.0199, 0.0001]])
+    (points,) = Tendons([places]).points(kind)
+    found = np.einsum("pki,pk->pi", kind.vertices[points.nodes], points.gradients[:, 0, :, 0])
+    np.testing.assert_allclose(found, np.diff(places, axis=0), atol=1e-12)
+
+
+@pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2", "midpoint"])
+@pytest.mark.parametrize("start", POSES)
+def test_gradients(start, integrator):
+    solver = SolverSettings(relative_tolerance=1e-11, linear_solver="banded")
+    sim = simulator(route(0.018), route(0.006, depth=0.004), stiffness=np.array([400.0, 900.0]), solver=solver)
+    material = replace(SOFT, stiffness_damping=1e-3)
+    sim = replace(sim, material=material, integrator=integrator, gravity=(0.0, 0.0, -9.8))
+    rows = {row.parameter: row for row in check_gradients(sim, start)}
+    assert {"tendon_tension", "tendon_contraction", "tendon_stiffness, each tendon"} <= rows.keys()
+    assert {name: row.relative_error for name, row in rows.items() if not row.relative_error < 1e-6} == {}
+
+
+def test_the_hessian_has_what_couples_the_pieces_of_a_tendon():
+    """Against central differences of the residual, as a product, a solution and a matrix."""
+    sim = simulator(route(0.018), stiffness=5e3)
+    acting = Inputs(tendon_contraction=torch.tensor([[2e-3]], dtype=torch.float64))
+    there = sim.static_equilibrium(acting)
+    lines = sim.linearise(there, acting)
+    direction = torch.randn(there.q.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    direction[:, sim.fixed] = 0.0
+    step = 1e-7
+    wanted = (lines.residual(there.q + step * direction) - lines.residual(there.q - step * direction)) / (2.0 * step)
+    lines.factorise(there.q)
+    product = lines.product(direction)
+    torch.testing.assert_close(product, wanted, rtol=1e-5, atol=1e-5 * float(wanted.abs().max()))
+    solved = lines.solve(product.reshape(1, -1, 1)).view_as(direction)
+    torch.testing.assert_close(solved, direction, rtol=1e-7, atol=1e-7)
+    matrix, _ = lines.matrix(there.q)
+    free = lines.free.numpy()
+    times = matrix @ direction[0, free].reshape(-1).numpy()
+    np.testing.assert_allclose(times, product[0, free].reshape(-1).numpy(), rtol=1e-9, atol=1e-9)
+    scale = 1e-4
+    right = direction + scale * product
+    shifted = lines.shifted(scale).solve(right[:, free].reshape(1, -1, 1))
+    torch.testing.assert_close(shifted.view(-1, 3), direction[0, free], rtol=1e-8, atol=1e-8)
+
+
+def test_a_taut_tendon_makes_a_beam_stiffer():
+    bare, held = (simulator(route(0.018), stiffness=k, toe=1e-9) for k in (0.0, 1e6))
+    pulled = Inputs(tendon_contraction=torch.tensor([[1e-6]], dtype=torch.float64))
+    assert vibration_modes(bare, 2).shape == vibration_modes(held, 2).shape
+    force = torch.zeros(1, len(BEAM.vertices), 3, dtype=torch.float64)
+    force[:, TIP, 2] = -1e-3 / len(TIP)
+    ends = [s.static_equilibrium(pulled.plus(force)).q[0] - s.rest_positions for s in (bare, held)]
+    sags = [float(each[TIP, 2].mean()) for each in ends]
+    assert 0.0 < sags[1] / sags[0] < 0.8
+
+
+def test_forces_are_reconstructed_beside_a_tendon():
+    sim = simulator(route(0.018), stiffness=1e3, solver=SolverSettings(relative_tolerance=1e-10))
+    acting = Inputs(tendon_contraction=torch.tensor([[1e-3]], dtype=torch.float64))
+    force = torch.zeros(1, len(BEAM.vertices), 3, dtype=torch.float64)
+    force[:, TIP, 1] = 2e-3
+    state = sim.rest_state()
+    there, _ = sim.step(state, acting.plus(force))
+    found = make_reconstructor(sim, "gauss_newton", 0.0, 1e-9, 30).step(state, there.q, acting)
+    torch.testing.assert_close(found.force, force, rtol=0.0, atol=1e-6)
+
+
+def test_a_tendon_cannot_push():
+    sim = simulator(route(0.018))
+    with pytest.raises(InputError, match=r"tendon_tension is -1: it must be zero or more, in N"):
+        sim.step(sim.rest_state(), tension(-1.0))
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: Tendons([]), "there is no tendon"),
+        (lambda: Tendons([[[0.0, 0.0, 0.0]]]), "tendon 1 has guides of shape (1, 3): it needs two or more"),
+        (lambda: Tendons([route(0.01), np.full((2, 3), np.nan)]), "tendon 2 has a guide that is not finite"),
+        (lambda: Tendons([route(0.01)[[0, 1, 1]]]), "two guides in a row at one place"),
+        (lambda: Tendons([route(0.01)], stiffness=-1.0), "tendon_stiffness is -1: it must be zero or more, in N/m"),
+        (lambda: Tendons([route(0.01)], toe=0.0), "the toe of tendons is 0"),
+        (
+            lambda: simulator(route(0.01), route(0.03)),
+            "guide 1 of tendon 2, at [0.0, 0.01, 0.03] m, lies 10 mm",
+        ),
+        (lambda: replace(simulator(route(0.01)), coupling="explicit"), "tendons act at the end of a step alone"),
+    ],
+)
+def test_what_cannot_be_routed_is_refused(make, said):
+    with pytest.raises(InputError) as caught:
+        make()
+    assert said in str(caught.value)

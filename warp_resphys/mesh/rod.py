@@ -1,0 +1,117 @@
+"""Round rods, straight or along a curve, of one radius or tapered, from hexahedra.
+
+The section is a square of cells in the middle, and rings of cells between its edge and the circle, so that no cell has
+a corner of 180 degrees. Nodes of quadratic cells lie on the circle.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..io.errors import MeshError
+from .elements import BY_NODES
+from .mesh import FloatArray, IntArray, Mesh
+
+_CORE = 0.55  # half of the middle square's diagonal over the radius
+
+
+def rod(
+    centreline: ArrayLike,
+    radii: ArrayLike,
+    layers: int,
+    core: int = 1,
+    rings: int = 1,
+    nodes: int = 27,
+) -> Mesh:
+    """A round rod of hexahedra.
+
+    Args:
+        centreline: (M, 3) points of its axis, straight or curved, joined by straight lines [m].
+        radii: one radius, or (R, 2) arc lengths and the radii there, linear in between [m].
+        layers: of cells along the axis, equally long.
+        core: cells along a side of the section's middle square.
+        rings: of cells around it.
+        nodes: of a cell, 8, 20 or 27.
+
+    Raises:
+        MeshError: fewer than two points, a radius that is not positive, a number that is no whole one, or a curve that
+            is bent more sharply than the rod is thick.
+    """
+    axis, order = np.asarray(centreline, dtype=np.float64), 1 if nodes == 8 else 2
+    if axis.ndim != 2 or axis.shape[1] != 3 or len(axis) < 2 or not np.isfinite(axis).all():
+        raise MeshError(f"the centreline of a rod has shape {axis.shape}: it needs two or more finite points (M, 3).")
+    pieces = np.linalg.norm(np.diff(axis, axis=0), axis=1)
+    if not (pieces > 0.0).all():
+        raise MeshError("the centreline of a rod has two points in a row at one place: leave one of them out.")
+    profile = np.asarray(radii, dtype=np.float64)
+    profile = np.array([[0.0, float(profile)]]) if profile.ndim == 0 else profile
+    if (
+        profile.ndim != 2
+        or profile.shape[1] != 2
+        or not (profile[:, 1] > 0.0).all()
+        or (np.diff(profile[:, 0]) <= 0).any()
+    ):
+        raise MeshError("the radii of a rod must be one positive number, or rising arc lengths with positive radii.")
+    for name, value in (("layers", layers), ("core", core), ("rings", rings)):
+        if not isinstance(value, int | np.integer) or value < 1:
+            raise MeshError(f"{name} of a rod is {value!r}: it must be a whole number, one or more.")
+    if nodes not in (8, 20, 27):
+        raise MeshError(f"a rod of cells with {nodes} nodes: choose 8, 20 or 27.")
+    section, squares = _section(core * order, rings * order, order)
+    length = np.concatenate([[0.0], np.cumsum(pieces)])
+    along = np.linspace(0.0, length[-1], layers * order + 1)
+    places, frames = _transported(axis, length, along)
+    radius = np.interp(along, profile[:, 0], profile[:, 1])
+    vertices = places[:, None] + np.einsum("s,nj,sji->sni", radius, section, frames)
+    first = np.arange(layers) * order
+    levels = first[:, None] + np.arange(order + 1)
+    cells = levels[:, None, None, None, :] * len(section) + squares[None, ..., None]  # (L, S, p + 1, p + 1, p + 1)
+    element = BY_NODES[nodes]
+    place = np.round((element.shape.nodes + 1.0) / 2.0 * order).astype(np.int64)
+    found = cells.reshape(-1, *cells.shape[2:])[:, place[:, 0], place[:, 1], place[:, 2]]
+    used, numbers = np.unique(found, return_inverse=True)
+    mesh = Mesh(vertices.reshape(-1, 3)[used], numbers.reshape(found.shape))
+    values, slopes = element.shape(element.rule[0])
+    del values
+    if not (np.linalg.det(np.einsum("cki,qkj->cqij", mesh.vertices[mesh.cells], slopes)) > 0.0).all():
+        raise MeshError("a rod is bent more sharply than it is thick: straighten its centreline, or make it thinner.")
+    return mesh
+
+
+def _section(core: int, rings: int, order: int) -> tuple[FloatArray, IntArray]:
+    """Nodes (n, 2) of a disc of radius one, and cells (S, order + 1, order + 1) of them, counter-clockwise.
+
+    Args:
+        core: pieces between the nodes along a side of the square in the middle.
+        rings: pieces between its edge and the circle.
+        order: pieces along the edge of a cell.
+    """
+    side = np.linspace(-1.0, 1.0, core + 1) * _CORE / np.sqrt(2.0)
+    square = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
+    ids = np.arange(len(square)).reshape(core + 1, core + 1)
+    edge = np.concatenate([ids[:-1, 0], ids[-1, :-1], ids[:0:-1, -1], ids[0, :0:-1]])  # counter-clockwise
+    angle = -0.75 * np.pi + np.arange(len(edge)) * 2.0 * np.pi / len(edge)
+    circle = np.column_stack([np.cos(angle), np.sin(angle)])
+    share = np.arange(1, rings + 1)[:, None, None] / rings
+    outer = (1.0 - share) * square[edge] + share * circle  # (rings, edge, 2)
+    ring = np.concatenate([edge[None], len(square) + np.arange(rings * len(edge)).reshape(rings, -1)])
+    ring = np.concatenate([ring, ring[:, :1]], axis=1)
+
+    def blocks(grid: IntArray) -> list[IntArray]:
+        rows, columns = (range(0, size - 1, order) for size in grid.shape)
+        return [grid[i : i + order + 1, j : j + order + 1] for i in rows for j in columns]
+
+    return np.concatenate([square, outer.reshape(-1, 2)]), np.array([*blocks(ids), *blocks(ring)])
+
+
+def _transported(axis: FloatArray, length: FloatArray, along: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Points (s, 3) of a polyline at arc lengths, and two unit vectors (s, 2, 3) across it there, that do not twist."""
+    places = np.stack([np.interp(along, length, axis[:, i]) for i in range(3)], axis=1)
+    tangents = np.gradient(places, along, axis=0)
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    across = np.eye(3)[np.argmin(np.abs(tangents[0]))]
+    frames = np.empty((len(along), 2, 3))
+    for i, tangent in enumerate(tangents):
+        across = across - (across @ tangent) * tangent
+        across /= np.linalg.norm(across)
+        frames[i] = across, np.cross(tangent, across)
+    return places, frames

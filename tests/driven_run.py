@@ -26,9 +26,9 @@ def data(**changes):
     """The group of that name."""
     return {
         "folder": None,
-        "pressure_limit": LIMIT,
+        "input_limit": LIMIT,
         "train_fraction": 1.0,
-        "pressure_scales": [],
+        "input_scales": [],
         **changes,
     }
 

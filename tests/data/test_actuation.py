@@ -4,14 +4,15 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys.data.actuation import PressureSequences, check_pressures, lagged, remembered
+from warp_resphys.data.actuation import InputSequences, check_inputs, lagged, remembered
+from warp_resphys.energies.pressure import PRESSURE
 from warp_resphys.io.errors import DataFileError, InputError
 
 STEP = 0.01
 
 
 def drawn(count=40, steps=150, chambers=2, **settings):
-    sequences = PressureSequences(**settings)
+    sequences = InputSequences(**settings)
     return np.stack([sequences.draw(steps, STEP, chambers, np.random.default_rng(i)) for i in range(count)])
 
 
@@ -39,7 +40,7 @@ def test_sequences_have_the_mean_deviation_and_correlations_asked_for():
 
 
 def test_a_seed_gives_its_sequence_and_another_one_another():
-    first, again, other = (PressureSequences().draw(100, STEP, 3, np.random.default_rng(i)) for i in (4, 4, 5))
+    first, again, other = (InputSequences().draw(100, STEP, 3, np.random.default_rng(i)) for i in (4, 4, 5))
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 1e3
 
@@ -54,18 +55,18 @@ def test_a_seed_gives_its_sequence_and_another_one_another():
 )
 def test_bad_sequences(settings, message):
     with pytest.raises(InputError, match=message):
-        PressureSequences(**settings).draw(300, STEP, 3, np.random.default_rng(0))
+        InputSequences(**settings).draw(300, STEP, 3, np.random.default_rng(0))
 
 
 def test_recorded_pressures_are_checked():
     good = np.full((4, 2), 1e4)
-    np.testing.assert_array_equal(check_pressures(good, 2, 2e4, "a.h5"), good)
+    np.testing.assert_array_equal(check_inputs(good, PRESSURE, 2, 2e4, "a.h5"), good)
     with pytest.raises(DataFileError, match=r"a\.h5 has pressures of 2 chambers, but the body has 6"):
-        check_pressures(good, 6, 2e4, "a.h5")
+        check_inputs(good, PRESSURE, 6, 2e4, "a.h5")
     high = good.copy()
     high[3, 1] = 2.5e4
-    with pytest.raises(DataFileError, match=r"chamber 2 is 25 kPa in frame 3, beyond data.pressure_limit of 20 kPa"):
-        check_pressures(high, 2, 2e4, "a.h5")
+    with pytest.raises(DataFileError, match=r"chamber 2 is 25 kPa in frame 3, beyond data.input_limit of 20 kPa"):
+        check_inputs(high, PRESSURE, 2, 2e4, "a.h5")
 
 
 def test_a_lag_follows_a_step_exponentially_and_has_a_derivative():

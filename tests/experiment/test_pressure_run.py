@@ -16,7 +16,7 @@ from hydra import compose, initialize_config_module
 from main_job import IN_RUN, run
 from omegaconf import OmegaConf
 
-from warp_resphys.data.actuation import PressureSequences
+from warp_resphys.data.actuation import InputSequences
 from warp_resphys.data.markers import bind_markers
 from warp_resphys.data.recordings.arrays import write_recording
 from warp_resphys.data.recordings.reading import read_recording
@@ -100,7 +100,7 @@ def finished(tmp_path_factory):
         code, err = run(*COMMAND)
         assert (code, err[-500:] if code else "") == (0, "")
         before = {path: path.stat().st_mtime_ns for path in (folder / "run").rglob("*.h5")}
-        code, err = run(*COMMAND, "data.pressure_scales=[1.5]")
+        code, err = run(*COMMAND, "data.input_scales=[1.5]")
     assert (code, err[-500:] if code else "") == (0, "")
     changed = [path.name for path, at in before.items() if path.stat().st_mtime_ns != at]
     assert changed == ["rollouts.h5"]  # Nothing but the new trials is simulated again, and nothing learned.
@@ -209,7 +209,7 @@ def test_the_same_command_does_nothing_again_and_other_windows_only_evaluate(fin
     monkeypatch.chdir(finished)
     monkeypatch.setattr(pipeline, "make_report", lambda context: (context.run_dir / "report.html").write_text("-"))
     before = {path: path.stat().st_mtime_ns for path in (finished / "run").glob("*.h5")}
-    code, _ = run(*COMMAND, "data.pressure_scales=[1.5]", "data.horizons=[0.05,0.12]")
+    code, _ = run(*COMMAND, "data.input_scales=[1.5]", "data.horizons=[0.05,0.12]")
     assert code == 0
     after = {path.name for path, at in before.items() if path.stat().st_mtime_ns != at}
     assert after == {"rollouts.h5"}
@@ -273,18 +273,18 @@ def recorded(tmp_path, finished, change):
         (["tune", "tune.model=sysid"], "tune.model is 'sysid': choose one of simfree, resphys."),
         (["data.train=-1"], "data.train is -1: it must be a number of trials, or a list of their names"),
         (
-            ["data.folds=leave_one_out", "data.pressure_scales=[1.5]"],
-            "data.pressure_scales and data.folds exclude each",
+            ["data.folds=leave_one_out", "data.input_scales=[1.5]"],
+            "data.input_scales and data.folds exclude each",
         ),
         (["+data.colour=red"], "unknown key 'data.colour'"),
         (["data.horizons=[0.06,5.0]"], "data.horizons is [0.06, 5.0]: they must rise, up to the 0.12 s"),
         (["data.train_fraction=1.5"], "data.train_fraction is 1.5"),
         (["data.cutoff=80.0"], "data.cutoff is 80 Hz: it must be below 50 Hz"),
-        (["data.pressure_scales=[1.0]"], "data.pressure_scales is [1.0]"),
-        (["data.pressure_scales=[1.5]", "data.folder=run/recordings", "data.test=[t003]"], "recordings have their own"),
+        (["data.input_scales=[1.0]"], "data.input_scales is [1.0]"),
+        (["data.input_scales=[1.5]", "data.folder=run/recordings", "data.test=[t003]"], "recordings have their own"),
         (["laboratory.time_step=0.003"], "the first must be a multiple of the second"),
         (["+identify.parameters.fibre_stiffness={lower:1.0,upper:2.0}"], "but fibres is null"),
-        (["data.chambers=[]"], "data.chambers is []: it must be a list of different chambers, from 1"),
+        (["data.parts=[]"], "data.parts is []: it must be a list of different chambers or tendons, from 1"),
         (["laboratory.sequences.mean=high"], "laboratory.sequences.mean is 'high': it must be a finite number"),
         (["laboratory.sequences.correlation=[[1.0],[0.0]]"], "it must be a finite number, or a matrix of them"),
         (["+identify.first_guess.youngs_modulus=soft"], "identify.first_guess.youngs_modulus is 'soft'"),
@@ -309,7 +309,7 @@ def test_bad_recordings_cost_one_sentence(finished, monkeypatch, tmp_path):
             with_pressures(lambda p: np.concatenate([p, p[:, :1]], axis=1)),
             "t000.h5 has pressures of 3 chambers",
         ),
-        "high": (with_pressures(lambda p: p + 3e4 * (np.arange(len(p)) > 5)[:, None]), "beyond data.pressure_limit"),
+        "high": (with_pressures(lambda p: p + 3e4 * (np.arange(len(p)) > 5)[:, None]), "beyond data.input_limit"),
         "late": (with_pressures(lambda p: p + 1e3), "t000.h5 begins under pressure"),
         "none": (lambda recording: dataclasses.replace(recording, actuation=None), "no array 'actuation'"),
         "still": (stilled, "t000.h5: 'T1', 'T2', 'T3' never move by more than"),
@@ -357,7 +357,7 @@ def test_the_number_of_processes_is_no_setting_of_the_results(finished, monkeypa
     monkeypatch.setattr(pipeline, "make_report", lambda context: (context.run_dir / "report.html").write_text("-"))
     written = []
     for processes in (1, 2):
-        code, _ = run(*COMMAND, "data.pressure_scales=[1.5]", f"parallel.processes={processes}")
+        code, _ = run(*COMMAND, "data.input_scales=[1.5]", f"parallel.processes={processes}")
         assert code == 0
         written.append({path: path.stat().st_mtime_ns for path in (finished / "run").glob("*.h5")})
     assert written[0] == written[1]
@@ -397,7 +397,7 @@ def read_published(folder):
 def driven_motions(simulator, steps=12, count=2):
     """Motions of a simulator under pressures, seen at a few vertices."""
     chambers = len(chambers_of(simulator.body))
-    sequences = PressureSequences(rest=0.01, correlation_time=0.05)
+    sequences = InputSequences(rest=0.01, correlation_time=0.05)
     drawn = [sequences.draw(steps, 0.01, chambers, np.random.default_rng(i))[1:] for i in range(count)]
     inputs = Inputs(pressure=simulator.tensor(np.stack(drawn, axis=1)))
     mesh = simulator.body.mesh

@@ -11,9 +11,10 @@ from driven_run import BASE, LIMIT, MODELS, arm_settings, bent, data, errors_of,
 from matplotlib.image import imread
 from report_page import FAILING, Page
 
+from warp_resphys.energies.pressure import PRESSURE
 from warp_resphys.experiment import report as stage
 from warp_resphys.experiment.build import shipped_arm
-from warp_resphys.experiment.report import make_report, read_film, read_pressures, read_trials
+from warp_resphys.experiment.report import make_report, read_driven, read_film, read_trials
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.files import read_json, write_json
 from warp_resphys.io.stages import StageContext
@@ -23,7 +24,7 @@ from warp_resphys.mesh.mesh import Mesh
 from warp_resphys.mesh.readers import write_mesh
 from warp_resphys.report import figures, mesh, motion_figures, page, render
 from warp_resphys.report.bodies import Motion, axes_from_below, motion_axes
-from warp_resphys.report.data import Pressures, along_body, drawn_markers, tip_markers
+from warp_resphys.report.data import Driven, along_body, drawn_markers, tip_markers
 from warp_resphys.report.figures import CHAMBER_COLOURS, TONES
 from warp_resphys.report.mesh import MeshSummary
 from warp_resphys.report.motion_sections import _sequences
@@ -46,7 +47,7 @@ DRAWN = {
     "markers",
     "plane_best",
     "plane_worst",
-    "pressures",
+    "inputs",
     "space",
     "training_resphys",
     "training_simfree",
@@ -112,7 +113,7 @@ def test_page_of_an_arm(tmp_path):
         "no OpenGL here",
     ):
         assert said in page.text
-    for absent in ("Longer than the training", "Beyond the pressures", "A line ends", "±  is"):
+    for absent in ("Longer than the training", "Beyond the inputs", "A line ends", "±  is"):
         assert absent not in page.text
     assert {path.stem for path in (tmp_path / "figures").iterdir()} == DRAWN
 
@@ -139,19 +140,19 @@ def test_page_of_longer_rollouts_of_which_one_diverged(tmp_path):
 
 @pytest.mark.usefixtures("no_figures")
 def test_page_of_higher_pressures(tmp_path):
-    settings = arm_settings("sopra_overpressure", data=data(pressure_scales=[1.25, 1.75]))
+    settings = arm_settings("sopra_overpressure", data=data(input_scales=[1.25, 1.75]))
     write_run(tmp_path, settings, test=2, scales=(1.25, 1.75))
     page = report(tmp_path, settings)
     found = errors_of(tmp_path)["scales"]
     text = page.text
-    assert f"At 1.75 times the pressures of the training the error is {found['1.75']['resphys']['mean']:.3f} mm" in text
+    assert f"At 1.75 times the inputs of the training the error is {found['1.75']['resphys']['mean']:.3f} mm" in text
     assert all(f"{found[f][m]['mean']:.3f} ± " in text for f in ("1", "1.25", "1.75") for m in MODELS)
-    assert "At higher pressures it is none of 2 (1.25 times), 2 of 2 (1.75 times), the first after 0.40 s" in text
+    assert "At higher inputs it is none of 2 (1.25 times), 2 of 2 (1.75 times), the first after 0.40 s" in text
     assert "ResPhys: none of 2 roll-outs" in text
     assert (tmp_path / "figures" / "error_over_scale.png").is_file()
     trials = read_trials(tmp_path, settings)
     assert trials.names == ("test_00", "test_01")
-    pressures = read_pressures(tmp_path, settings)
+    pressures = read_driven(tmp_path, settings)
     assert len(pressures.scaled) == 4
     assert set(pressures.scaled) < pressures.values.keys()
     rows = trials.errors_mm["resphys"]
@@ -168,12 +169,12 @@ def test_page_of_one_chamber_one_trial_and_two_models(tmp_path):
     settings["mesh"] = {"kind": "file", "path": str(tmp_path / "box.vtk"), "units": "m", "order": 1}
     settings["mesh"]["drop_unreferenced"] = True
     settings["markers"] = {"tracked": tracked, "reference": BASE}
-    settings["data"] = data(folder="recordings", pressure_limit=None)
+    settings["data"] = data(folder="recordings", input_limit=None)
     write_run(tmp_path, settings, train=0, test=1, chambers=1, models=("simulation", "resphys"), simulated=False)
     page = report(tmp_path, settings)
     assert "On trial test_00, which no training or identification saw" in page.text
     assert "mean over 1 test trial of 2 s and 1 marker, ±" in page.text
-    assert "Gauge pressures of the trial." in page.text
+    assert "Pressures of the trial." in page.text
     assert "ResPhys: the roll-out never left the states of the training." in page.text
     for absent in ("SysID", "Published", "The published", "Identification", "dashed", "median filter"):
         assert absent not in page.text
@@ -213,7 +214,7 @@ def test_what_is_read(tmp_path):
     settings = arm_settings()
     write_run(tmp_path, settings, diverged=("simfree",))
     trials, film = read_trials(tmp_path, settings), read_film(tmp_path)
-    pressures = read_pressures(tmp_path, settings)
+    pressures = read_driven(tmp_path, settings)
     assert pressures.scaled == ()
     assert trials.times[0, [0, -1]].tolist() == [0.0, pytest.approx(2.0)]
     assert np.isnan(trials.target[0, 30:36, 1]).all()
@@ -296,7 +297,7 @@ def test_words():
     assert reduction_text(lost, published) == ""
     over = {"1": errors, "1.5": {"sysid": summary(3.0), "resphys": summary(None, 2)}, "1.25": errors}
     assert scale_text(over) == (
-        "At 1.5 times the pressures of the training the error is diverged with ResPhys, 3.000 mm with SysID."
+        "At 1.5 times the inputs of the training the error is diverged with ResPhys, 3.000 mm with SysID."
     )
     assert scale_text({}) == ""
 
@@ -345,7 +346,7 @@ def test_trials_out_of_range_are_counted_where_they_belong():
     free, force = (each.replace("\u00a0", " ") for each in range_texts(found, ["a", "b", "c"]))
     assert "higher" not in free
     assert force.endswith(
-        "(a). At higher pressures it is none of 3 (1.25 times), 1 of 3 (1.5 times), the first after 0.25 s (d)."
+        "(a). At higher inputs it is none of 3 (1.25 times), 1 of 3 (1.5 times), the first after 0.25 s (d)."
     )
     assert range_texts({"range": {"resphys": {"first_s": {"a": 0.5}}}}, ["a"])[0].startswith(
         "ResPhys: the roll-out left"
@@ -406,8 +407,8 @@ def test_a_model_that_runs_away_does_not_set_the_scale_of_the_tip():
 
 def test_pressures_are_in_kilopascal_in_the_chambers_colours():
     pressure = np.array([[0.0, 1e3], [2e4, 3e3]])
-    driven = Pressures(("one", "two"), {"a": pressure, "b": 2 * pressure}, 2e4)
-    figure = motion_figures.pressure_sequences(0.5, driven, narrow=False)
+    driven = Driven(PRESSURE, ("one", "two"), {"a": pressure, "b": 2 * pressure}, 2e4)
+    figure = motion_figures.input_sequences(0.5, driven, narrow=False)
     first, second = figure.axes
     assert second.get_xlim() == (0.0, 1.0)
     assert [line.get_ydata()[0] for line in first.lines] == [20.0]
@@ -420,7 +421,7 @@ def test_pressures_are_in_kilopascal_in_the_chambers_colours():
 
 def test_pressures_of_poses_are_bars_of_the_chambers_in_use():
     poses = {"a": np.array([[9e3, 0.0, 1e3]]), "b (test)": np.array([[0.0, 0.0, 0.0], [3e3, 0.0, 5e3]])}
-    figure = motion_figures.pose_pressures(Pressures(("one", "two", "three"), poses, 2e4), narrow=False)
+    figure = motion_figures.pose_inputs(Driven(PRESSURE, ("one", "two", "three"), poses, 2e4), narrow=False)
     (axes,) = figure.axes
     assert axes.get_xlabel() == "pressure [kPa]"
     assert [tick.get_text() for tick in axes.get_yticklabels()] == ["a", "b (test)"]
@@ -431,7 +432,7 @@ def test_pressures_of_poses_are_bars_of_the_chambers_in_use():
 
 def test_poses_are_not_drawn_over_time():
     rows = np.ones((3, 1))
-    driven = Pressures(("one",), {"p": rows, "a": rows, "b": rows, "q": rows}, poses=("p", "q"))
+    driven = Driven(PRESSURE, ("one",), {"p": rows, "a": rows, "b": rows, "q": rows}, poses=("p", "q"))
     assert list(_sequences(driven, SimpleNamespace(names=("b", "q")))) == [
         "a, a trial of the training",
         "b, a test trial",
@@ -442,7 +443,7 @@ def test_poses_are_not_drawn_over_time():
 def test_markers_stand_over_the_pressures():
     times = 0.1 * np.arange(4)
     moved = np.repeat(np.array([0.0, 1e-3, 2e-3, 3e-3])[:, None, None], 3, axis=2)
-    driven = Pressures(("chamber_1",), {"Pressures": np.full((3, 1), 5e3)})
+    driven = Driven(PRESSURE, ("chamber_1",), {"Pressures": np.full((3, 1), 5e3)})
     figure = motion_figures.marker_paths(times, moved, {"resphys": moved}, ["A"], driven, narrow=False)
     *coordinates, below = figure.axes
     assert len(coordinates) == 3
@@ -462,7 +463,7 @@ def test_settings_are_shown_and_what_diverged_is_said(tmp_path):
     metrics["errors_mm"]["resphys"] = summary(None, 1)
     write_json(tmp_path / "errors.json", metrics)
     page = report(tmp_path, settings)
-    assert "data.pressure_limit20000.0" in page.text
+    assert "data.input_limit20000.0" in page.text
     assert "ResPhys diverged in 1 of 3 roll-outs" in page.text
 
 

@@ -1,4 +1,4 @@
-"""Pressures that drive a body: random smooth sequences, the lag of a valve, and a memory of what was."""
+"""Inputs that drive a body, such as pressures: random smooth sequences, the lag of a valve, a memory of what was."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..energies.base import Quantity
 from ..io.errors import DataFileError, InputError
 
 FloatArray = NDArray[np.float64]
@@ -17,27 +18,27 @@ _SLACK = 1.005  # by which a pressure gauge may exceed the limit
 
 
 @dataclass(frozen=True)
-class PressureSequences:
-    """A distribution of pressures over time: a Gaussian process, clipped to what the chambers take.
+class InputSequences:
+    """A distribution of inputs over time, such as pressures: a Gaussian process, clipped to what the body takes.
 
-    Each chamber's pressure is a normal variable at each time, correlated with those at other times by
-    ``exp(-(t - t')^2 / (2 correlation_time^2))`` and with the other chambers by `correlation`. It is conditioned on
+    Each part's input is a normal variable at each time, correlated with those at other times by
+    ``exp(-(t - t')^2 / (2 correlation_time^2))`` and with the other parts by `correlation`. It is conditioned on
     being zero, with zero slope, at the start and the end, where the body rests (Rasmussen and Williams 2006, section
     2.2); then what is below zero or above the limit is cut off.
     """
 
-    mean: float = 8e3  # [Pa]
-    deviation: float = 9e3  # [Pa]
+    mean: float = 8e3  # [Pa], or the unit of the input
+    deviation: float = 9e3  # in the same
     correlation_time: float = 0.4  # [s]; the longer, the smoother
-    correlation: float | Sequence[Sequence[float]] = 0.0  # between each two chambers, less than 1; or a (C, C) matrix
-    limit: float = 20e3  # [Pa]
-    rest: float = 0.1  # without pressure before the start and after the end [s]
+    correlation: float | Sequence[Sequence[float]] = 0.0  # between each two parts, less than 1; or a (C, C) matrix
+    limit: float = 20e3  # in the same
+    rest: float = 0.1  # without input before the start and after the end [s]
 
-    def draw(self, steps: int, time_step: float, chambers: int, random: np.random.Generator) -> FloatArray:
-        """(K + 1, C) a sequence of pressures [Pa] at the times 0, h, ..., K h of K steps h [s].
+    def draw(self, steps: int, time_step: float, parts: int, random: np.random.Generator) -> FloatArray:
+        """(K + 1, C) a sequence at the times 0, h, ..., K h of K steps h [s].
 
         Raises:
-            InputError: there is no time between the rests, or the chambers' correlations are those of no distribution.
+            InputError: there is no time between the rests, or the parts' correlations are those of no distribution.
         """
         times = time_step * np.arange(steps + 1)
         inside = (times >= self.rest - 1e-9) & (times <= times[-1] - self.rest + 1e-9)
@@ -46,11 +47,11 @@ class PressureSequences:
                 f"{times[-1]:g} s leave no time between two rests of {self.rest:g} s: simulate longer, or rest less."
             )
         bridge, root = self._conditioned(inside.sum(), time_step)
-        normal = root @ random.standard_normal((inside.sum(), chambers))
-        pressures = np.zeros((steps + 1, chambers))
-        pressures[inside] = self.mean * bridge[:, None] + self.deviation * normal @ self._between(chambers).T
-        pressures[np.flatnonzero(inside)[[0, -1]]] = 0.0  # as it is but for rounding
-        return np.clip(pressures, 0.0, self.limit)
+        normal = root @ random.standard_normal((inside.sum(), parts))
+        drawn = np.zeros((steps + 1, parts))
+        drawn[inside] = self.mean * bridge[:, None] + self.deviation * normal @ self._between(parts).T
+        drawn[np.flatnonzero(inside)[[0, -1]]] = 0.0  # as it is but for rounding
+        return np.clip(drawn, 0.0, self.limit)
 
     def _covariance(self, first: FloatArray, second: FloatArray) -> FloatArray:
         scaled = (first[:, None] - second[None]) / self.correlation_time
@@ -87,26 +88,27 @@ class PressureSequences:
             ) from None
 
 
-def check_pressures(pressures: FloatArray, chambers: int, limit: float, source: str | Path) -> FloatArray:
-    """(T, C) recorded pressures [Pa], if a body with these chambers can take them.
+def check_inputs(values: FloatArray, quantity: Quantity, parts: int, limit: float, source: str | Path) -> FloatArray:
+    """(T, C) recorded inputs, if a body with so many parts can take them.
 
     Raises:
-        DataFileError: another number of chambers, or a pressure beyond the limit [Pa].
+        DataFileError: another number of parts, or a value beyond the limit, in the unit of the quantity.
     """
-    if pressures.shape[1] != chambers:
+    words, per = quantity.words, quantity.per
+    if values.shape[1] != parts:
         raise DataFileError(
-            f"{source} has pressures of {pressures.shape[1]} chambers, but the body has {chambers}: take the mesh of "
-            "that robot, or set data.chambers to the mesh's chamber of each column of the file."
+            f"{source} has {words}s of {values.shape[1]} {per}s, but the body has {parts}: take the body of that "
+            f"robot, or set data.parts to the body's {per} of each column of the file."
         )
-    frame, chamber = np.unravel_index(np.abs(pressures).argmax(), pressures.shape)
-    highest = float(pressures[frame, chamber])
+    frame, part = np.unravel_index(np.abs(values).argmax(), values.shape)
+    highest = float(values[frame, part])
     if abs(highest) > _SLACK * limit:
         raise DataFileError(
-            f"{source}: the pressure of chamber {chamber + 1} is {1e-3 * highest:.4g} kPa in frame {frame}, beyond "
-            f"data.pressure_limit of {1e-3 * limit:.4g} kPa: raise the limit if the robot takes that, or check the "
-            "unit of the file."
+            f"{source}: the {words} of {per} {part + 1} is {quantity.shown(highest)} in frame {frame}, beyond "
+            f"data.input_limit of {quantity.shown(limit)}: raise the limit if the robot takes that, or check the unit "
+            "of the file."
         )
-    return pressures
+    return values
 
 
 def lagged(commands: torch.Tensor, rise: torch.Tensor, step: float) -> torch.Tensor:

@@ -37,6 +37,13 @@ class Quantity:
     # what there may be a value each of, such as ``element`` or ``chamber``; without it, only environments
     per: str = ""
     typical: float = 1.0  # about how large an input is
+    words: str = ""  # what an input is called in a sentence, and
+    shown_unit: str = ""  # the unit in which people read it,
+    shown_factor: float = 1.0  # of which this many make one of `unit`
+
+    def shown(self, value: float) -> str:
+        """A value as people read it."""
+        return f"{self.shown_factor * value:.4g} {self.shown_unit}"
 
     @property
     def wanted(self) -> str:
@@ -136,6 +143,11 @@ class Energy(ABC):
     def count(self) -> int:
         """Parts (chambers, tendons) with an input or a parameter of their own."""
         return 1
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of its parts."""
+        return tuple(str(number + 1) for number in range(self.count))
 
     @property
     def constants(self) -> Mapping[str, Parameter]:

@@ -23,6 +23,10 @@ from ..mesh.mesh import Mesh
 from .base import Energy, PartTerm, PointSet, Quantity, Values
 from .launcher import Launcher, warp_view
 
+PRESSURE = Quantity(
+    *("pressure", "Pa"), per="chamber", typical=1e4, words="pressure", shown_unit="kPa", shown_factor=1e-3
+)
+
 
 @dataclass(frozen=True)
 class Pressure(Energy):
@@ -32,7 +36,7 @@ class Pressure(Energy):
         InputError: no chamber.
     """
 
-    inputs: ClassVar[tuple[Quantity, ...]] = (Quantity("pressure", "Pa", per="chamber", typical=1e4),)
+    inputs: ClassVar[tuple[Quantity, ...]] = (PRESSURE,)
     is_load: ClassVar[bool] = True
 
     chambers: Sequence[Chamber]  # closed surfaces (`mesh.chambers.find_chambers`)
@@ -46,6 +50,11 @@ class Pressure(Energy):
     @override
     def count(self) -> int:
         return len(self.chambers)
+
+    @property
+    @override
+    def names(self) -> tuple[str, ...]:
+        return tuple(chamber.name for chamber in self.chambers)
 
     @override
     def points(self, mesh: Mesh) -> tuple[SurfacePoints, ...]:

@@ -40,6 +40,12 @@ class TendonPoints(Points):
     length: NDArray[np.float64]  # (P,) at rest [m]
 
 
+TENSION = Quantity("tendon_tension", "N", 0.0, closed=True, per="tendon", words="tension", shown_unit="N")
+CONTRACTION = Quantity(
+    *("tendon_contraction", "m"), per="tendon", typical=1e-3, words="contraction", shown_unit="mm", shown_factor=1e3
+)
+
+
 @dataclass(frozen=True)
 class Tendons(Energy):
     """T L, or a spring on the length, of every tendon.
@@ -52,10 +58,7 @@ class Tendons(Energy):
     """
 
     parameters: ClassVar[tuple[Quantity, ...]] = (Quantity("tendon_stiffness", "N/m", 0.0, closed=True, per="tendon"),)
-    inputs: ClassVar[tuple[Quantity, ...]] = (
-        Quantity("tendon_tension", "N", 0.0, closed=True, per="tendon"),
-        Quantity("tendon_contraction", "m", per="tendon", typical=1e-3),
-    )
+    inputs: ClassVar[tuple[Quantity, ...]] = (TENSION, CONTRACTION)
     is_load: ClassVar[bool] = True
     implicit_only: ClassVar[bool] = True
 
@@ -65,6 +68,7 @@ class Tendons(Energy):
     stiffness: Parameter = 0.0
     toe: float = 1e-4  # by which a tendon is longer than its winch leaves it when it is fully taut [m]
     reach: float = 1e-3  # how far outside of the body a guide may lie [m]
+    labels: Sequence[str] = ()  # of the tendons; numbers where left out
 
     def __post_init__(self) -> None:
         """Checks the values."""
@@ -80,6 +84,8 @@ class Tendons(Energy):
         for name, value in (("toe", self.toe), ("reach", self.reach)):
             if not (np.isfinite(value) and value > 0.0):
                 raise InputError(f"the {name} of tendons is {value:g}: it must be positive, in m.")
+        if self.labels and len(self.labels) != len(self.routes):
+            raise InputError(f"there are {len(self.labels)} names for {len(self.routes)} tendons.")
         self.parameters[0].check(self.stiffness)
 
     @property
@@ -91,6 +97,11 @@ class Tendons(Energy):
     @override
     def count(self) -> int:
         return len(self.routes)
+
+    @property
+    @override
+    def names(self) -> tuple[str, ...]:
+        return tuple(self.labels) or tuple(f"tendon_{number + 1}" for number in range(self.count))
 
     @property
     @override

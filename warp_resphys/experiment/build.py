@@ -2,19 +2,23 @@
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from importlib import resources
-from typing import Any
+from itertools import pairwise
+from typing import Any, cast
 
+import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
 from ..data.markers import Markers, bind_markers
 from ..dynamics.nonlinear_solver import SolverSettings
 from ..dynamics.simulator import Simulator
-from ..energies.base import Energy
+from ..energies.base import Energy, Quantity
 from ..energies.fibres import Fibres
 from ..energies.materials import Material, make_material
-from ..energies.pressure import Pressure
+from ..energies.pressure import PRESSURE, Pressure
+from ..energies.tendons import CONTRACTION, TENSION, Tendons
 from ..fem.body import Body
 from ..io.errors import InputError
 from ..mesh.arm import mesh_arm
@@ -22,6 +26,7 @@ from ..mesh.arm_geometry import arm_geometry
 from ..mesh.chambers import Chamber, find_chambers
 from ..mesh.mesh import Mesh, box_hexahedra, box_tetrahedra, check_mesh, quadratic, select_vertices
 from ..mesh.readers import read_mesh
+from ..mesh.rod import rod
 
 _DTYPES = {"float64": torch.float64, "float32": torch.float32}
 
@@ -69,6 +74,8 @@ def build_mesh(config: Mapping[str, Any]) -> Mesh:
     elif kind == "arm_generated":
         mesh, _ = mesh_arm(arm_geometry(config), config["size"], config["cells"], config["layers"])
         mesh = quadratic(mesh) if config["order"] == 2 else mesh
+    elif kind == "rod":
+        mesh = rod(**{str(key): value for key, value in config.items() if key != "kind"})
     else:
         raise InputError(f"mesh.kind is {kind!r}: choose one of those in conf/mesh.")
     check_mesh(mesh)
@@ -106,9 +113,57 @@ def build_chambers(config: Mapping[str, Any] | None, mesh: Mesh) -> tuple[Chambe
     return found
 
 
-def chambers_of(body: Body) -> Sequence[Chamber]:
-    """The chambers that pressure acts in; none without any."""
-    return [chamber for energy in body.energies if isinstance(energy, Pressure) for chamber in energy.chambers]
+@dataclass(frozen=True)
+class Drive:
+    """The input that recordings and simulated laboratories drive a body by."""
+
+    quantity: Quantity
+    parts: tuple[str, ...]  # that have a value each, such as chambers
+
+    @property
+    def per(self) -> str:
+        """What a part is, such as chamber."""
+        return self.quantity.per
+
+
+def driving_quantity(config: Mapping[str, Any]) -> Quantity | None:
+    """Which input of the body is driven; None for a body without actuators."""
+    if config.get("chambers") is not None:
+        return PRESSURE
+    tendons = config.get("tendons")
+    return None if tendons is None else {"tension": TENSION, "contraction": CONTRACTION}[tendons["commanded"]]
+
+
+def driven_parts(config: Mapping[str, Any]) -> int:
+    """How many values the driven input has."""
+    return int(config["chambers"]["count"]) if config.get("chambers") else len(config["tendons"]["routes"])
+
+
+def drive_of(config: Mapping[str, Any], body: Body) -> Drive | None:
+    """The input that drives a body; None for one without actuators."""
+    quantity = driving_quantity(config)
+    if quantity is None:
+        return None
+    (energy,) = (each for each in cast(Sequence[Energy], body.energies) if quantity in each.inputs)
+    return Drive(quantity, energy.names)
+
+
+def build_tendons(config: Mapping[str, Any]) -> Tendons:
+    """The tendons of a group: every straight piece of a route is divided into as many as asked for.
+
+    Raises:
+        InputError: see `Tendons`.
+    """
+    routes = []
+    for name, route in config["routes"].items():
+        guides = np.asarray(route["guides"], dtype=np.float64)
+        if guides.ndim != 2 or guides.shape[1] != 3 or len(guides) < 2:
+            raise InputError(f"tendons.routes.{name}.guides needs two or more places of three numbers, in m.")
+        share = np.linspace(0.0, 1.0, route.get("pieces", 1), endpoint=False)[:, None]
+        parts = [first + share * (last - first) for first, last in pairwise(guides)]
+        routes.append(np.concatenate([*parts, guides[-1:]]))
+    more = {key: config[key] for key in ("toe", "reach") if key in config}
+    return Tendons(routes, config["stiffness"], labels=tuple(config["routes"]), **more)
 
 
 def build_material(config: Mapping[str, Any], key: str) -> Material:
@@ -124,10 +179,10 @@ def build_material(config: Mapping[str, Any], key: str) -> Material:
 
 
 def build_body(config: Mapping[str, Any]) -> Body:
-    """A body from the groups ``mesh``, ``physics``, ``fixed``, and, where it has any, ``chambers`` and ``fibres``.
+    """A body from the groups ``mesh``, ``physics``, ``fixed``, and any of ``chambers``, ``fibres`` and ``tendons``.
 
     Raises:
-        InputError: fibres without chambers, or another number of chambers than the mesh has.
+        InputError: fibres without chambers, another number of chambers than the mesh has, or tendons that do not fit.
         MeshError: a mesh that cannot be read or simulated, or no vertex where the body is fixed.
     """
     mesh, fibres = build_mesh(config["mesh"]), config.get("fibres")
@@ -137,6 +192,10 @@ def build_body(config: Mapping[str, Any]) -> Body:
     energies: list[Energy] = [Pressure(chambers)] if chambers else []
     if fibres is not None:
         energies.append(Fibres(chambers, axis=config["chambers"]["axis"], **fibres))
+    if config.get("tendons") is not None:
+        if chambers:
+            raise InputError("a body with chambers and tendons has two inputs, but recordings drive one: take one out.")
+        energies.append(build_tendons(config["tendons"]))
     return Body(mesh, energies=tuple(energies), fixed=select_vertices(mesh, **config["fixed"]), **config["physics"])
 
 

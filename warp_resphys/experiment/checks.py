@@ -18,11 +18,11 @@ from ..learning.identification import Bounds
 from ..learning.reconstruction import make_reconstructor
 from ..learning.replay import MASS_FACTOR, known_parameters
 from ..mesh.mesh import select_vertices, surface_vertices
-from .build import build_body, build_material, build_simulator, chambers_of
+from .build import Drive, build_body, build_material, build_simulator, drive_of
 from .files import STATIC, attached_mass
 from .identify import ELASTIC
 from .schema import IN_THE_LOOP, NAME, NETWORK, TRAINER, check, configuration_group
-from .simulate import laboratory_settings, pressure_sequences, substeps_of, vertical
+from .simulate import input_sequences, laboratory_settings, substeps_of, vertical
 from .trials import (
     Trial,
     folds_of,
@@ -177,15 +177,15 @@ def _check_recorded(config: Mapping[str, Any], body: Body) -> None:
         raise InputError("data.seconds is not set: say how much of each trial counts after its release, in s.")
     if "rest" in begins and data["steps"] is None:
         raise InputError("data.steps is not set: say how many steps of the simulation are read of each recording.")
-    chambers = len(chambers_of(body))
-    if chambers:
-        _check_pressures(config, chambers)
+    drive = drive_of(config, body)
+    if drive is not None:
+        _check_inputs(config, drive)
     _check_times(config, begins)
     if config["published"] is not None:
         with _naming("published."):
             build_material(config["published"], "simulation")
     if is_laboratory(config):
-        _check_laboratory(config, begins, chambers)
+        _check_laboratory(config, begins, drive)
     _check_base_motion(config, trials)
     _check_release(config, begins)
 
@@ -283,24 +283,21 @@ def _check_release(config: Mapping[str, Any], begins: set[str]) -> None:
         raise InputError("release.sideways is across gravity, but gravity is zero: set release.sideways to 0.")
 
 
-def _check_pressures(config: Mapping[str, Any], chambers: int) -> None:
-    data = config["data"]
-    if data["pressure_limit"] is None:
-        raise InputError("data.pressure_limit is not set: say what the chambers take, in Pa.")
-    if data["chambers"] is not None and max(data["chambers"]) > chambers:
-        raise InputError(f"data.chambers names chamber {max(data['chambers'])}, but the mesh has {chambers}.")
-    scales = data["pressure_scales"]
+def _check_inputs(config: Mapping[str, Any], drive: Drive) -> None:
+    data, count = config["data"], len(drive.parts)
+    if data["input_limit"] is None:
+        raise InputError(f"data.input_limit is not set: say what the {drive.per}s take, in {drive.quantity.unit}.")
+    if data["parts"] is not None and max(data["parts"]) > count:
+        raise InputError(f"data.parts names {drive.per} {max(data['parts'])}, but the body has {count}.")
+    scales = data["input_scales"]
     if 1.0 in scales or len({*scales}) < len(scales):
-        raise InputError(
-            f"data.pressure_scales is {scales}: give different ones, none of them 1, which is always tested."
-        )
+        raise InputError(f"data.input_scales is {scales}: give different ones, none of them 1, which is always tested.")
     if scales and not is_laboratory(config):
         raise InputError(
-            "data.pressure_scales raises the pressures of simulated trials, and recordings have their own: leave it "
-            "empty."
+            "data.input_scales raises the inputs of simulated trials, and recordings have their own: leave it empty."
         )
     if scales and data["folds"]:
-        raise InputError("data.pressure_scales and data.folds exclude each other: take one of them out.")
+        raise InputError("data.input_scales and data.folds exclude each other: take one of them out.")
 
 
 def _check_times(config: Mapping[str, Any], begins: set[str]) -> None:
@@ -316,7 +313,7 @@ def _check_times(config: Mapping[str, Any], begins: set[str]) -> None:
         )
 
 
-def _check_laboratory(config: Mapping[str, Any], begins: set[str], chambers: int) -> None:
+def _check_laboratory(config: Mapping[str, Any], begins: set[str], drive: Drive | None) -> None:
     laboratory, data = config["laboratory"], config["data"]
     with _naming("laboratory."):
         material = build_material(laboratory, "material")
@@ -339,9 +336,9 @@ def _check_laboratory(config: Mapping[str, Any], begins: set[str], chambers: int
             )
     if "rest" in begins:
         substeps_of(config)
-        if chambers:
-            steps, count, random = data["steps"], config["chambers"]["count"], np.random.default_rng(0)
-            pressure_sequences(config).draw(steps, config["time_step"], count, random)
+        if drive is not None:
+            steps, random = data["steps"], np.random.default_rng(0)
+            input_sequences(config).draw(steps, config["time_step"], len(drive.parts), random)
     with _naming("laboratory: "):
         body = build_body(laboratory_settings(config))
     _check_size(body, material, config["gravity"])

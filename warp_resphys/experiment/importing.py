@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.actuation import check_pressures
+from ..data.actuation import check_inputs
 from ..data.base_motion import at_times, check_steps, followed, in_frame, prescribed, rigid
 from ..data.recordings.processing import fill_gaps, release_of, resample, smooth, trim_to_release
 from ..data.recordings.quality import check_base, check_motion, check_passive, quality
@@ -26,7 +26,7 @@ from ..dynamics.simulator import Simulator
 from ..io.errors import DataFileError, InputError, listed
 from ..io.files import write_json
 from ..io.stages import StageContext
-from .build import bound_markers, build_simulator, chambers_of
+from .build import Drive, bound_markers, build_simulator, drive_of
 from .files import DATASET, QUALITY, REGISTRATION, SCALED_DATASET, STATIC, Dataset, read_dataset
 from .simulate import vertical
 from .trials import Trial, evenly, is_laboratory, scaled_trials_of, trials_of
@@ -37,7 +37,7 @@ FloatArray = NDArray[np.float64]
 
 _LEAST_RATE = 40.0  # Hz; the first tenth of a second tells how a body was let go, and four frames are few for that
 _LARGEST_LEAN = 30.0  # degrees between the vertical of a recording and the configured gravity
-_REST_PRESSURE = 0.01  # of the limit: less is what a gauge shows of none
+_REST_INPUT = 0.01  # of the limit: less is what a gauge shows of none
 _SHOWN = 6  # driven trials whose quality and registration are kept for the report
 _POSE_SECONDS = 0.2  # at the end of a recording, that tell a pose
 _MILLI = 1e3
@@ -54,7 +54,7 @@ class Observed:
         moving: the tracked ones from time zero on, short gaps filled, long ones NaN.
         still: (M', 3) where all markers were before time zero, in the frame of the recording [m].
         registration: of the markers at rest.
-        pressure: (T, C) in the chambers of the body at the frames [Pa]; None without chambers.
+        driven: (T, C) the input that drives the body at the frames, such as pressures [Pa]; None without any.
         release: when the body was let go; None of others.
         tells_places: whether it shows where markers sit on the body, held undeformed or under nothing but gravity.
         base: (T, 6) how what the body is fixed to has moved at the frames, in the frame of the body; None where it
@@ -66,7 +66,7 @@ class Observed:
     moving: Recording
     still: FloatArray
     registration: Registration
-    pressure: FloatArray | None = None
+    driven: FloatArray | None = None
     release: Release | None = None
     tells_places: bool = True
     base: FloatArray | None = None
@@ -90,7 +90,7 @@ class Importer:
         self.simulator: Simulator = build_simulator(self.settings)
         self.tracked = list(self.markers["tracked"])
         self.nominal = _places(self.markers["tracked"])
-        self._chambers = chambers_of(self.simulator.body)
+        self.drive = drive_of(self.settings, self.simulator.body)
         self._hanging: FloatArray | None = None
 
     @property
@@ -150,7 +150,7 @@ class Importer:
             recording = read_recording(self.context.run_dir / trial.recording)
         else:
             recording = read_recording(trial.file, self.data["units"], self.data["rate"])
-        if not self._chambers:
+        if self.drive is None:
             check_passive(recording)
         recording = recording.select(self.labels)
         if not trial.is_released:
@@ -251,22 +251,22 @@ class Importer:
             )
         check_motion(moving, self.tracked)
         # Constant: how a valve moves while a body swings is not told by this.
-        pressure = self._pressure(moving, trial)[:1] if self._chambers else None
+        driven = None if self.drive is None else self._inputs(moving, trial, self.drive)[:1]
         first = int(np.ceil(release.frame))
         whole = _frames(recording, first, first + len(moving.positions))
         base = self._base(trial, whole, moving, still, registration.transform)
-        return Observed(trial, recording, moving, still, registration, pressure, release, base=base)
+        return Observed(trial, recording, moving, still, registration, driven, release, base=base)
 
     def _driven(self, trial: Trial, recording: Recording) -> Observed:
         """A body that rests until its inputs come, or one in a pose."""
         static = trial.begins == STATIC
         if not static:
             check_motion(_frames(recording, 0, self.data["steps"] + 1), self.tracked)
-        pressure = self._pressure(recording, trial) if self._chambers else None
-        loaded = pressure is not None and not self._is_at_rest(pressure[:1])[0]
+        driven = None if self.drive is None else self._inputs(recording, trial, self.drive)
+        loaded = driven is not None and not self._is_at_rest(driven[:1])[0]
         tells = trial.payload == 0.0 and not loaded
         filled = fill_gaps(recording, self.data["longest_gap"], mask_long=True)
-        still = _median(filled, self.tracked) if static and loaded else self._resting(filled, pressure)
+        still = _median(filled, self.tracked) if static and loaded else self._resting(filled, driven)
         # Where the body is without what hangs on it, the other trials tell.
         only_reference = not tells and len(self.markers["reference"]) > 2
         registration = self._register(still, recording, self.expected(True), only_reference)
@@ -275,49 +275,51 @@ class Importer:
             frames = max(round(_POSE_SECONDS * moving.rate), 1)
             last = _frames(moving, -frames, None)
             moving = replace(moving, positions=_median(last, self.tracked)[None])
-            pressure = None if pressure is None else np.median(pressure[-frames:], axis=0)[None]
+            driven = None if driven is None else np.median(driven[-frames:], axis=0)[None]
         base = None if static else self._base(trial, recording, moving, still, registration.transform)
-        return Observed(trial, recording, moving, still, registration, pressure, tells_places=tells, base=base)
+        return Observed(trial, recording, moving, still, registration, driven, tells_places=tells, base=base)
 
-    def _is_at_rest(self, pressure: FloatArray) -> NDArray[np.bool_]:
-        """(T,) whether (T, C) pressures are what a gauge shows of none."""
-        return np.asarray(np.abs(pressure).max(axis=1) <= _REST_PRESSURE * self.data["pressure_limit"])
+    def _is_at_rest(self, driven: FloatArray) -> NDArray[np.bool_]:
+        """(T,) whether (T, C) inputs are what a gauge shows of none."""
+        return np.asarray(np.abs(driven).max(axis=1) <= _REST_INPUT * self.data["input_limit"])
 
-    def _resting(self, recording: Recording, pressure: FloatArray | None) -> FloatArray:
+    def _resting(self, recording: Recording, driven: FloatArray | None) -> FloatArray:
         """(M', 3) mean positions of the markers before the inputs come [m], NaN for one that is not seen."""
-        driven = np.flatnonzero(~self._is_at_rest(pressure)) if pressure is not None else np.zeros(0, dtype=np.int64)
-        until = int(driven[0]) if len(driven) else len(recording.positions)
+        acts = np.zeros(0, dtype=np.int64) if driven is None else np.flatnonzero(~self._is_at_rest(driven))
+        until = int(acts[0]) if len(acts) else len(recording.positions)
         if until < 1:
+            assert self.drive is not None
             raise DataFileError(
-                f"{recording.source} begins under pressure: its first frame must show the body at rest."
+                f"{recording.source} begins under {self.drive.quantity.words}: its first frame must show the body at "
+                "rest."
             )
         resting = _frames(recording, 0, min(until, self._rest_frames(recording)))
         return _central(resting, self.tracked, np.mean, "rests")
 
-    def _pressure(self, recording: Recording, trial: Trial) -> FloatArray:
-        """(T, C) in the chambers of the body [Pa]; refuses those of another number of chambers, or beyond the limit."""
-        data, chambers = self.data, len(self._chambers)
+    def _inputs(self, recording: Recording, trial: Trial, drive: Drive) -> FloatArray:
+        """(T, C) of the body's parts; refuses those of another number of parts, or beyond the limit."""
+        data, count, words = self.data, len(drive.parts), drive.quantity.words
         found = recording.actuation
         if found is None:
             if trial.is_released:
-                return np.zeros((len(recording.positions), chambers))
+                return np.zeros((len(recording.positions), count))
             raise DataFileError(
-                f"{recording.source} has no array 'actuation' with the pressures of the chambers: add it "
+                f"{recording.source} has no array 'actuation' with the {words}s of the {drive.per}s: add it "
                 "(docs/recordings.md)."
             )
-        if data["chambers"] is not None:
-            columns = np.array(data["chambers"]) - 1
+        if data["parts"] is not None:
+            columns = np.array(data["parts"]) - 1
             if len(columns) != found.shape[1]:
                 raise DataFileError(
-                    f"{recording.source} has pressures of {found.shape[1]} chambers, but data.chambers names "
-                    f"{len(columns)}: name the mesh's chamber of each column of the file."
+                    f"{recording.source} has {words}s of {found.shape[1]} {drive.per}s, but data.parts names "
+                    f"{len(columns)}: name the body's {drive.per} of each column of the file."
                 )
-            given, found = found, np.zeros((len(found), chambers))
+            given, found = found, np.zeros((len(found), count))
             found[:, columns] = given
-        values = check_pressures(found, chambers, trial.scale * data["pressure_limit"], recording.source)
+        values = check_inputs(found, drive.quantity, count, trial.scale * data["input_limit"], recording.source)
         if data["valve"] == "detected" and not trial.is_released:
             opening = valve_opening(recording, self.tracked)
-            # Commanded pressures from that moment on; the step in which the valve opens has its share.
+            # Commanded inputs from that moment on; the step in which the valve opens has its share.
             frame = (opening - recording.start) * recording.rate
             values = np.asarray(values * np.clip(np.arange(len(values)) - frame, 0.0, 1.0)[:, None])
         return values
@@ -338,7 +340,8 @@ def import_recordings(context: StageContext) -> None:
     importer = Importer(context)
     settings, tracked = context.settings, importer.tracked
     observed = importer.observe(trials_of(settings))
-    _check_unit([each.pressure for each in observed if each.pressure is not None], settings["data"])
+    if importer.drive is not None:
+        _check_unit([each.driven for each in observed if each.driven is not None], settings["data"], importer.drive)
     split = settings.get("split")
     known = set(split["train"]) | set(split["validation"]) if split else {each.trial.name for each in observed}
     offsets = np.stack([_offset(importer, each) for each in observed])  # (R, M, 3) [m]
@@ -355,7 +358,7 @@ def import_recordings(context: StageContext) -> None:
 
 
 def import_scaled(context: StageContext) -> None:
-    """Writes dataset_scaled.h5, of the trials at other pressures; markers sit where they sit in dataset.h5.
+    """Writes dataset_scaled.h5, of the trials at scaled inputs; markers sit where they sit in dataset.h5.
 
     Raises:
         DataFileError: a recording that cannot be read or used.
@@ -421,16 +424,17 @@ def _rest_of(recording: Recording, tracked: Sequence[str]) -> FloatArray:
     return recording.rest
 
 
-def _check_unit(pressures: Sequence[FloatArray], data: Mapping[str, Any]) -> None:
+def _check_unit(driven: Sequence[FloatArray], data: Mapping[str, Any], drive: Drive) -> None:
     """Refuses recordings under which the body would hardly move, as those do whose unit was mistaken."""
-    if not pressures or all(len(each) == 1 for each in pressures):
+    if not driven or all(len(each) == 1 for each in driven):
         return
-    highest, limit = max(float(np.abs(each).max()) for each in pressures), data["pressure_limit"]
-    if highest < _REST_PRESSURE * limit:
+    highest, limit = max(float(np.abs(each).max()) for each in driven), data["input_limit"]
+    words, unit = drive.quantity.words, drive.quantity.unit
+    if highest < _REST_INPUT * limit:
         raise DataFileError(
-            f"the pressures of all {len(pressures)} recordings stay below {highest:.3g} Pa, and data.pressure_limit is "
-            f"{limit:.3g} Pa: name their unit in the files (actuation_units, or the header of the column), or set the "
-            "limit to what the robot takes."
+            f"the {words}s of all {len(driven)} recordings stay below {highest:.3g} {unit}, and data.input_limit is "
+            f"{limit:.3g} {unit}: name their unit in the files (actuation_units, or the header of the column), or "
+            "set the limit to what the robot takes."
         )
 
 
@@ -438,7 +442,7 @@ def _dataset(
     importer: Importer, observed: Sequence[Observed], bound: FloatArray, shifts: FloatArray, gravity: FloatArray
 ) -> Dataset:
     """The trials in the frame of the body; those that end early are padded."""
-    settings, chambers = importer.settings, chambers_of(importer.simulator.body)
+    settings, drive = importer.settings, importer.drive
     data, cutoff = settings["data"], settings["data"].get("cutoff")
     steps = data.get("steps")
     frames = max(len(each.moving.positions) if each.trial.is_released else 1 for each in observed)
@@ -447,7 +451,9 @@ def _dataset(
     shape = (len(observed), frames, len(importer.tracked), 3)
     markers, smoothed = np.full(shape, np.nan), np.full(shape, np.nan)
     times, held = np.zeros(shape[:2]), np.zeros((shape[0], *shape[2:]))
-    pressure = np.zeros((len(observed), steps if steps else 1, len(chambers))) if chambers else None
+    inputs = {}
+    if drive is not None:
+        inputs[drive.quantity.name] = np.zeros((len(observed), steps if steps else 1, len(drive.parts)))
     for row, each in enumerate(observed):
         limit = frames if each.trial.is_released or steps is None else steps + 1
         seen = each.moving.positions[:limit]
@@ -462,10 +468,10 @@ def _dataset(
             held[row] = markers[row, 0]
         else:
             held[row] = bound  # A pose is as large as it is far from the undeformed body.
-        if pressure is not None and each.pressure is not None:
-            _fill_pressure(pressure[row], each)
+        if each.driven is not None:
+            for series in inputs.values():
+                _fill_inputs(series[row], each.driven, each)
     base = _bases(observed, times, settings["time_step"], importer.simulator.body.mesh.vertices)
-    channels = {"pressure": tuple(chamber.name for chamber in chambers)} if pressure is not None else {}
     return Dataset(
         names=tuple(each.trial.name for each in observed),
         labels=tuple(importer.tracked),
@@ -478,8 +484,8 @@ def _dataset(
         time_step=settings["time_step"],
         bound=bound,
         smoothed=smoothed if cutoff is not None or all(each.trial.begins == "rest" for each in observed) else None,
-        inputs={} if pressure is None else {"pressure": pressure},
-        channels=channels,
+        inputs=inputs,
+        channels={} if drive is None else {drive.quantity.name: drive.parts},
         base=base,
     )
 
@@ -497,12 +503,11 @@ def _bases(observed: Sequence[Observed], times: FloatArray, time_step: float, po
     return found
 
 
-def _fill_pressure(row: FloatArray, each: Observed) -> None:
-    """Writes the pressures (K, C) during the steps of a trial; past its end, and in a pose, the last ones."""
-    assert each.pressure is not None
-    series = each.pressure if len(each.pressure) == 1 else each.pressure[1 : len(row) + 1]
+def _fill_inputs(row: FloatArray, driven: FloatArray, each: Observed) -> None:
+    """Writes the inputs (K, C) during the steps of a trial; past its end, and in a pose, the last ones."""
+    series = driven if len(driven) == 1 else driven[1 : len(row) + 1]
     row[: len(series)] = series
-    row[len(series) :] = each.pressure[-1]
+    row[len(series) :] = driven[-1]
     if 1 < len(series) < len(row):
         log.warning(
             "import: %s ends after %d of the %d steps of data.steps; the rest counts as not seen.",

@@ -53,15 +53,18 @@ from .trials import Split, folds_of, is_laboratory, scaled_trials_of, sees_marke
 
 _SIMULATED = (
     *("mesh", "physics", "fixed", "gravity", "time_step", "integrator", "solver", "device", "dtype"),
-    *("chambers", "fibres", "coupling"),
+    *("chambers", "fibres", "tendons", "coupling"),
 )
-_DRAWN = ("laboratory", "fixed", "chambers", "gravity", "time_step", "solver", "device", "dtype", "seed", "tip")
+_DRAWN = (
+    *("laboratory", "fixed", "chambers", "tendons", "gravity"),
+    *("time_step", "solver", "device", "dtype", "seed", "tip"),
+)
 _DRAWN_DATA = (
     *("folder", "trials", "sequences", "begins", "train", "validation", "test", "folds", "limit"),
-    *("payload_at", "up", "rest", "steps", "pressure_limit", "base_motion"),
+    *("payload_at", "up", "rest", "steps", "input_limit", "base_motion"),
 )
 _DRAWN_MARKERS = ("tracked", "reference", "bind", "bind_to", "largest_distance")
-_LATER_DATA = ("horizons", "train_fraction", "pressure_scales")
+_LATER_DATA = ("horizons", "train_fraction", "input_scales")
 _LEARNED_FROM = ("simulation", "markers", "release", "force_frame")
 _OF_NETWORKS = ("actuation", "range_guard")
 _LEARNED_DATA = ("payload_at", "train_fraction", "seconds")
@@ -107,7 +110,7 @@ def acquisition_stages(config: Mapping[str, Any]) -> list[Stage]:
         return [Stage("simulate", simulate, (DATASET,), {**base, **_pick(config, "target", "data")})]
     stages, processes = [], processes_for(config, config["parallel"]["processes"])
     imported = {**base, **_pick(config, "simulation", "markers")}
-    imported["data"] = {key: value for key, value in data.items() if key not in _LATER_DATA} | {"pressure_scales": []}
+    imported["data"] = {key: value for key, value in data.items() if key not in _LATER_DATA} | {"input_scales": []}
     trials = trials_of(config)
     if folds_of(config) is None:
         imported["split"] = {name: each for name, each in split_of(config).plain().items() if name != "test"}
@@ -120,12 +123,12 @@ def acquisition_stages(config: Mapping[str, Any]) -> list[Stage]:
         imported["recordings"] = {trial.name: _digest(trial.file, f"data.trials.{trial.name}.file") for trial in trials}
     needs = tuple(stage.name for stage in stages)
     stages.append(Stage("import", import_recordings, (DATASET, QUALITY, REGISTRATION), imported, needs))
-    scales = data["pressure_scales"]
+    scales = data["input_scales"]
     if scales:
         files = tuple(trial.recording for trial in scaled_trials_of(config))
         play = partial(run_laboratory, processes=processes, scaled=True)
         stages.append(Stage("laboratory_scaled", play, files, _laboratory_settings(config, scales), needs))
-        more = {**imported, "data": {**imported["data"], "pressure_scales": scales}}
+        more = {**imported, "data": {**imported["data"], "input_scales": scales}}
         needs = ("import", "laboratory_scaled")
         stages.append(Stage("import_scaled", import_scaled, (SCALED_DATASET,), more, needs))
     return stages
@@ -135,7 +138,7 @@ def _laboratory_settings(config: Mapping[str, Any], scales: Sequence[float]) -> 
     """What the recordings of a simulated laboratory depend on."""
     own: dict[str, Any] = {
         **_pick(config, *_DRAWN),
-        "data": {**_pick(config["data"], *_DRAWN_DATA), "pressure_scales": list(scales)},
+        "data": {**_pick(config["data"], *_DRAWN_DATA), "input_scales": list(scales)},
         "markers": _pick(config["markers"], *_DRAWN_MARKERS),
         "batch": config["parallel"]["batch"],
         "in_the_loop": config["in_the_loop"] is not None,
@@ -282,7 +285,7 @@ def _print(metrics: Mapping[str, Any], folder: Path, config: Mapping[str, Any]) 
     columns |= {f"{scale} x": found for scale, found in metrics.get("scales", {}).items()}
     columns = {name: found for name, found in columns.items() if found != whole}
     what = "markers" if sees_markers(config) else "vertices"
-    title = f"Error of the {what} in trials that no training saw" + "; x: times the pressure" * ("scales" in metrics)
+    title = f"Error of the {what} in trials that no training saw" + "; x: times the inputs" * ("scales" in metrics)
     table = Table("model", "mean [mm]", "std [mm]", *columns, "diverged", title=title)
     for model, summary in whole.items():
         each = [number_text(found[model]["mean"]) if model in found else "" for found in columns.values()]

@@ -17,10 +17,10 @@ from ..io.stages import StageContext, package_versions, resources_used
 from ..mesh.chambers import Chamber
 from ..mesh.mesh import Mesh, select_vertices
 from ..mesh.surface import closest_points
-from ..report.data import MODELS, Film, Pressures, Recordings, RunReport, Trials
+from ..report.data import MODELS, Driven, Film, Recordings, RunReport, Trials
 from ..report.page import number_text
 from ..report.run_page import write_report
-from .build import build_chambers, build_mesh, choose_device
+from .build import build_chambers, build_mesh, build_tendons, choose_device, driving_quantity
 from .files import (
     DATASET,
     ERRORS,
@@ -47,7 +47,6 @@ from .trials import is_laboratory, sees_markers
 
 FloatArray = NDArray[np.float64]
 
-PRESSURE = "pressure"  # The name of an input.
 _SELECTED_BY = {"rollout": "roll-out error", "validation_loss": "validation loss"}
 _PUBLISHED_NETWORK = {"kind": "nodal", "blocks": 5, "layers": 3, "width": 512, "activation": "normalised_elu"}
 _PUBLISHED_TRAINER = {
@@ -89,18 +88,19 @@ def make_report(context: StageContext) -> None:
     folder, config = context.run_dir, context.settings["config"]
     metrics, truth = collect_metrics(folder, config), read_if_there(common_folder(folder) / TRUTH)
     trials, identification = read_trials(folder, config), read_if_there(folder / IDENTIFICATION)
-    film, pressures = read_film(folder), read_pressures(folder, config)
+    film, driven = read_film(folder), read_driven(folder, config)
     mesh = build_mesh(config["mesh"])
-    channels = () if pressures is None else pressures.channels
+    channels = () if driven is None else driven.channels
     tip = {} if trials.labels else config.get("tip") or {}
     learned = "resphys" in metrics["errors_mm"] and not config.get("in_the_loop")
     data = RunReport(
         **_common_parts(config, metrics, mesh),
         tip=select_vertices(mesh, **tip) if tip else np.empty(0, dtype=np.int64),
         chambers=_driven_chambers(build_chambers(config.get("chambers"), mesh), channels),
+        tendons=_routes(config),
         trials=trials,
         film=film,
-        pressures=pressures,
+        driven=driven,
         recordings=read_recordings(folder, config, *_at_rest(mesh, trials, film)),
         notes=error_notes(metrics.get("sideways_mm", {}), truth),
         identification=identification,
@@ -218,7 +218,7 @@ def published_note(config: Mapping[str, Any]) -> str:
 def read_trials(folder: Path, config: Mapping[str, Any]) -> Trials:
     """What was observed in the test trials of a split and what the models made of them, as long as it counts.
 
-    Roll-outs at other pressures than those of the data set are left out.
+    Roll-outs at other inputs than those of the data set are left out.
 
     Raises:
         DataFileError: a file is missing or damaged, or the two do not belong together.
@@ -260,7 +260,7 @@ def read_trials(folder: Path, config: Mapping[str, Any]) -> Trials:
 
 
 def _read_scaled(folder: Path) -> Dataset | None:
-    """The trials at other pressures than those of the data set."""
+    """The trials at other inputs than those of the data set."""
     path = common_folder(folder) / SCALED_DATASET
     return read_dataset(path) if path.is_file() else None
 
@@ -277,25 +277,37 @@ def read_film(folder: Path) -> Film | None:
         return Film(str(file.attrs["film_trial"]), float(file.attrs["time_step"]) * steps, bodies)
 
 
-def read_pressures(folder: Path, config: Mapping[str, Any]) -> Pressures | None:
-    """The pressures of all trials of a split; None where no pressure drives them."""
+def read_driven(folder: Path, config: Mapping[str, Any]) -> Driven | None:
+    """What drives all trials of a split; None where nothing does."""
     dataset, scaled = read_dataset(common_folder(folder) / DATASET), _read_scaled(folder)
-    if PRESSURE not in dataset.inputs:
+    quantity = driving_quantity(config)
+    if quantity is None or quantity.name not in dataset.inputs:
         return None
     values: dict[str, Any] = {}
     for each in (dataset, *([] if scaled is None else [scaled])):
-        values |= dict(zip(each.names, each.inputs[PRESSURE], strict=True))
-    return Pressures(
-        dataset.channels[PRESSURE],
+        values |= dict(zip(each.names, each.inputs[quantity.name], strict=True))
+    return Driven(
+        quantity,
+        dataset.channels[quantity.name],
         values,
-        config["data"].get("pressure_limit"),
+        config["data"].get("input_limit"),
         scaled=() if scaled is None else scaled.names,
         poses=tuple(n for n, begins in zip(dataset.names, dataset.begins, strict=True) if begins == STATIC),
     )
 
 
+def _routes(config: Mapping[str, Any]) -> dict[str, FloatArray]:
+    """(G, 3) guides of the body's tendons [m], by name."""
+    if not config.get("tendons"):
+        return {}
+    tendons = build_tendons(config["tendons"])
+    return dict(zip(tendons.names, tendons.guides, strict=True))
+
+
 def _driven_chambers(chambers: tuple[Chamber, ...], names: tuple[str, ...]) -> tuple[Chamber, ...]:
     """Those of a body's chambers that are under pressure, in the order of the pressures."""
+    if not chambers:
+        return ()
     found = {chamber.name: chamber for chamber in chambers}
     unknown = [name for name in names if name not in found]
     if unknown:

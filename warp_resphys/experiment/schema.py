@@ -149,8 +149,18 @@ _STEP: Final = _number(lambda value: 0.0 < value <= 10.0, "positive and at most 
 _PLACE: Final = Kind(_is_place, "three numbers, in metres")
 _FORCE: Final = Kind(_is_place, "three numbers, in N")
 _AXIS: Final = Kind(lambda value: _is_place(value) and any(value), "three numbers, not all zero")
+_PLACES: Final = Kind(
+    lambda value: isinstance(value, list) and len(value) > 1 and all(map(_is_place, value)),
+    "a list of two or more places of three numbers, in m",
+)
+_RADII: Final = Kind(
+    lambda value: (
+        POSITIVE.fits(value) or (isinstance(value, list) and all(_list(FINITE, "", [2]).fits(each) for each in value))
+    ),
+    "a positive number, or a list of arc lengths with the radii there, in m",
+)
 _POSITIVES: Final = _list(POSITIVE, "a list of positive numbers")
-_COLUMNS: Final = _list(NATURAL, "a list of different chambers, from 1", _SOME, different=True)
+_COLUMNS: Final = _list(NATURAL, "a list of different chambers or tendons, from 1", _SOME, different=True)
 _ORDER: Final = Kind(lambda value: value in (1, 2), "1 or 2")
 _TRIALS: Final = Kind(
     lambda value: COUNT.fits(value) or (isinstance(value, list) and all(map(_is_word, value))),
@@ -167,6 +177,12 @@ _MESHES: Final[Mapping[str, Mapping[str, Spec]]] = {
     "box_hexahedra": {**_BOX, "nodes": absent(Kind(lambda value: value in (8, 20, 27), "one of 8, 20, 27"))},
     "box_tetrahedra": {**_BOX, "order": absent(_ORDER)},
     "file": {"path": WORD, "units": one_of(*METRES_PER_UNIT), "order": _ORDER, "drop_unreferenced": TRUTH_VALUE},
+    "rod": {
+        "centreline": _PLACES,
+        "radii": _RADII,
+        **dict.fromkeys(("layers", "core", "rings"), at_most(10_000)),
+        "nodes": Kind(lambda value: value in (8, 20, 27), "one of 8, 20, 27"),
+    },
     "arm": {"name": WORD},
     "arm_generated": {
         **dict.fromkeys(("cells", "profile", "outline"), WORD),
@@ -302,6 +318,16 @@ _SEQUENCES = Group(
     }
 )
 _FIBRES = Group({"angles": NUMBERS, "toe": POSITIVE, "stiffness": NOT_NEGATIVE}, optional=True)
+_ROUTE = Group({"guides": _PLACES, "pieces": absent(at_most(10_000))})
+_TENDONS = Group(
+    {
+        "routes": Group(each=_ROUTE),
+        "commanded": one_of("tension", "contraction"),
+        "stiffness": NOT_NEGATIVE,
+        **dict.fromkeys(("toe", "reach"), absent(POSITIVE)),
+    },
+    optional=True,
+)
 _LIMIT = Group(dict.fromkeys(SPLITS, NATURAL), optional=True)
 _SPLIT = dict.fromkeys(SPLITS, _TRIALS)
 _UP = Kind(lambda value: _is_word(value) or _is_place(value), "x, -x, y, -y, z, -z, three numbers, or null", True)
@@ -309,7 +335,7 @@ _RECORDED = Group(
     {
         "folder": optional(WORD),
         "units": optional(one_of(*METRES_PER_UNIT)),
-        **dict.fromkeys(("rate", "seconds", "pressure_limit", "cutoff"), optional(POSITIVE)),
+        **dict.fromkeys(("rate", "seconds", "input_limit", "cutoff"), optional(POSITIVE)),
         "trials": Group(each=replace(_TRIAL, short=True)),
         **dict.fromkeys(("sequences", "longest_gap"), COUNT),
         "begins": one_of(*BEGINNINGS),
@@ -319,10 +345,10 @@ _RECORDED = Group(
         "up": _UP,
         "rest_seconds": NOT_NEGATIVE,
         "steps": optional(NATURAL),
-        "chambers": optional(_COLUMNS),
+        "parts": optional(_COLUMNS),
         "valve": one_of("recorded", "detected"),
         "train_fraction": SHARE,
-        **dict.fromkeys(("horizons", "pressure_scales"), _POSITIVES),
+        **dict.fromkeys(("horizons", "input_scales"), _POSITIVES),
         "base_motion": _BASE_MOTION,
         "folds": optional(one_of(*FOLDS)),
         **_SPLIT,
@@ -393,6 +419,7 @@ def configuration_group(config: Mapping[str, Any]) -> Group:
             "target": absent(optional(MATERIAL)),
             "chambers": _CHAMBERS,
             "fibres": _FIBRES,
+            "tendons": _TENDONS,
             "coupling": one_of(*COUPLINGS),
             "force_frame": one_of(*FORCE_FRAMES),
             **dict.fromkeys(("range_guard", "correct_uncorrected", "timing"), TRUTH_VALUE),

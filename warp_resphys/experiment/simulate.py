@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 from typing_extensions import override
 
-from ..data.actuation import PressureSequences
+from ..data.actuation import InputSequences
 from ..data.base_motion import check_steps, in_frame, prescribed, rigid
 from ..data.recordings.arrays import write_recording
 from ..data.recordings.recording import Recording
@@ -32,7 +32,7 @@ from ..io.stages import StageContext
 from ..learning.replay import sample
 from ..mesh.mesh import select_vertices
 from ..mesh.poses import twisted
-from .build import bound_markers, build_mesh, build_simulator
+from .build import bound_markers, build_mesh, build_simulator, driven_parts, driving_quantity
 from .files import DATASET, GIVEN, STATIC, TRUTH, Dataset, attached_mass
 from .parts import March, Part, read_parts, remove_parts, split_into_parts, work_on
 from .trials import Trial, known_trials, scaled_trials_of, trials_of
@@ -193,7 +193,7 @@ def run_laboratory(context: StageContext, processes: int = 1, scaled: bool = Fal
     Args:
         context: of the stage.
         processes: that share the trials.
-        scaled: whether the trials are those at other pressures; truth.json is there then.
+        scaled: whether the trials are those at scaled inputs; truth.json is there then.
 
     Raises:
         InputError: a configured value that does not fit.
@@ -230,7 +230,7 @@ def _record(context: StageContext, setup: Setup, trial: Trial, series: FloatArra
     poses = base_of(settings, trial, since)
     positions = setup.recorded(series, poses)
     noise = laboratory["noise"] * draw.standard_normal(positions.shape)
-    actuation = None if trial.sequence is None else _pressures_of(settings, trial)
+    actuation = None if trial.sequence is None else _inputs_of(settings, trial)
     if actuation is not None and len(actuation) != len(positions):
         actuation = np.repeat(actuation[-1:], len(positions), axis=0)
     rest = None if trial.pull is None else setup.recorded(setup.tracked[None], np.zeros((1, 6)))[0]
@@ -315,16 +315,16 @@ def laboratory_simulator(settings: Mapping[str, Any], gravity: FloatArray) -> Si
     return build_simulator({**laboratory_settings(settings), "gravity": gravity.tolist()}, "material")
 
 
-def pressure_sequences(settings: Mapping[str, Any]) -> PressureSequences:
+def input_sequences(settings: Mapping[str, Any]) -> InputSequences:
     """Of the laboratory; see the class."""
-    return PressureSequences(limit=settings["data"]["pressure_limit"], **settings["laboratory"].get("sequences", {}))
+    return InputSequences(limit=settings["data"]["input_limit"], **settings["laboratory"].get("sequences", {}))
 
 
-def _pressures_of(settings: Mapping[str, Any], trial: Trial) -> FloatArray:
-    """(K + 1, C) the pressures of a trial at the frames [Pa], drawn from the seed and the number of its sequence."""
+def _inputs_of(settings: Mapping[str, Any], trial: Trial) -> FloatArray:
+    """(K + 1, C) the inputs of a trial at the frames, drawn from the seed and the number of its sequence."""
     draw = np.random.default_rng([settings["seed"], 1, trial.sequence or 0])
-    steps, chambers = settings["data"]["steps"], settings["chambers"]["count"]
-    drawn = pressure_sequences(settings).draw(steps, settings["time_step"], chambers, draw)
+    steps, parts = settings["data"]["steps"], driven_parts(settings)
+    drawn = input_sequences(settings).draw(steps, settings["time_step"], parts, draw)
     if trial.is_released:
         drawn = np.zeros_like(drawn)
     elif trial.begins == STATIC:
@@ -343,9 +343,9 @@ def _frames_of(settings: Mapping[str, Any], begins: str) -> int:
 
 
 class _Played(March):
-    """Bodies of the laboratory: released from where they are held, under pressures, or in a pose.
+    """Bodies of the laboratory: released from where they are held, driven by their inputs, or in a pose.
 
-    Released bodies are simulated step by step from time zero on; bodies under pressures are kept at the frames, with as
+    Released bodies are simulated step by step from time zero on; driven ones are kept at the frames, with as
     many smaller steps between these as fit. What is kept are the tracked markers, in the frame of the body.
     """
 
@@ -362,20 +362,22 @@ class _Played(March):
         payload = np.array([trial.payload for trial in self._trials])
         masses = attached_mass(simulator.body, settings["data"].get("payload_at"), payload)
         self._payload = Inputs(attached_mass=simulator.tensor(masses)) if payload.any() else Inputs()
-        self._pressures: torch.Tensor | None = None
-        if self._trials[0].sequence is not None:
-            self._pressures = simulator.tensor(np.stack([_pressures_of(settings, each) for each in self._trials]))
+        self._driven: torch.Tensor | None = None
+        quantity = driving_quantity(settings)
+        if self._trials[0].sequence is not None and quantity is not None:
+            self._driven = simulator.tensor(np.stack([_inputs_of(settings, each) for each in self._trials]))
+            self._name = quantity.name
         self.fields = {"markers": Field((len(self._trials), len(setup.tracked), 3), "m", batch_axes=1)}
         self.frames = part.frames
         times = simulator.time_step * np.arange(1, (part.frames - 1) * self._substeps + 1)
         self._fixed = _carried(simulator, settings, self._trials, times)
 
     def _inputs(self, frame: int, share: float = 0.0) -> Inputs:
-        """What acts between a frame and the next; pressures change linearly, those of released bodies not at all."""
-        if self._pressures is None:
+        """What acts between a frame and the next; inputs change linearly, those of released bodies not at all."""
+        if self._driven is None:
             return self._payload
-        before, after = self._pressures[:, frame], self._pressures[:, frame + (share > 0.0)]
-        return self._payload.replace(pressure=torch.lerp(before, after, share))
+        before, after = self._driven[:, frame], self._driven[:, frame + (share > 0.0)]
+        return self._payload.replace(**{self._name: torch.lerp(before, after, share)})
 
     @override
     def begin(self) -> State:

@@ -271,8 +271,8 @@ def scaled_name(name: str, scale: float) -> str:
 
 
 def scaled_trials_of(config: Mapping[str, Any]) -> tuple[Trial, ...]:
-    """The test trials at ``data.pressure_scales``, scale by scale."""
-    scales = [float(scale) for scale in config["data"].get("pressure_scales") or ()]
+    """The test trials at ``data.input_scales``, scale by scale."""
+    scales = [float(scale) for scale in config["data"].get("input_scales") or ()]
     if not scales:
         return ()
     known = known_trials(config)
@@ -282,7 +282,7 @@ def scaled_trials_of(config: Mapping[str, Any]) -> tuple[Trial, ...]:
 
 def test_groups(config: Mapping[str, Any], split: Split) -> dict[str, list[str]]:
     """By pressure scale, the trials that are tested; the first is that of the training, ``1``."""
-    scales = [float(scale) for scale in config["data"].get("pressure_scales") or ()]
+    scales = [float(scale) for scale in config["data"].get("input_scales") or ()]
     return {"1": list(split.test)} | {f"{s:g}": [scaled_name(name, s) for name in split.test] for s in scales}
 
 

@@ -1,14 +1,15 @@
 """Round rods, straight or along a curve, of one radius or tapered, from hexahedra.
 
-The section is a square of cells in the middle, and rings of cells between its edge and the circle, so that no cell has
-a corner of 180 degrees. Nodes of quadratic cells lie on the circle.
+The section is a square of cells in the middle, and rings of cells between its edge and the rim, so that no cell has a
+corner of 180 degrees. The nodes of the rim lie on a circle a little larger than the rod, so that the section's area is
+that of the rod: its stiffness and weight are those of a round one also where the rim has four sides.
 """
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..io.errors import MeshError
-from .elements import BY_NODES
+from .elements import BY_NODES, FACES, gauss_box
 from .mesh import FloatArray, IntArray, Mesh
 
 _CORE = 0.55  # half of the middle square's diagonal over the radius
@@ -100,7 +101,18 @@ def _section(core: int, rings: int, order: int) -> tuple[FloatArray, IntArray]:
         rows, columns = (range(0, size - 1, order) for size in grid.shape)
         return [grid[i : i + order + 1, j : j + order + 1] for i in rows for j in columns]
 
-    return np.concatenate([square, outer.reshape(-1, 2)]), np.array([*blocks(ids), *blocks(ring)])
+    nodes, cells = np.concatenate([square, outer.reshape(-1, 2)]), np.array([*blocks(ids), *blocks(ring)])
+    return nodes * np.sqrt(np.pi / _area(nodes, cells)), cells
+
+
+def _area(nodes: FloatArray, cells: IntArray) -> float:
+    """Of cells (S, p + 1, p + 1) of nodes (n, 2)."""
+    order = cells.shape[1] - 1
+    shape = FACES[(order + 1) ** 2].shape
+    place = np.round((shape.nodes + 1.0) / 2.0 * order).astype(np.int64)
+    points, weights = gauss_box(order + 1, 2)
+    corners = nodes[cells[:, place[:, 0], place[:, 1]]]  # (S, K, 2)
+    return float((np.linalg.det(np.einsum("ski,qkj->sqij", corners, shape(points)[1])) @ weights).sum())
 
 
 def _transported(axis: FloatArray, length: FloatArray, along: FloatArray) -> tuple[FloatArray, FloatArray]:

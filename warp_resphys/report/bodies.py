@@ -21,7 +21,6 @@ NUDGE: Final = 0.005  # The outline is drawn this far behind the body where they
 TOWARDS_VIEWER: Final = (0.40, -1.0, 0.40)  # A body along x is seen from the side, the end of high x nearer.
 SHADE: Final = 0.25  # Share of the colour that depends on the light; the rest stays readable as a value.
 _SHARP: Final = 30.0  # Between the normals of faces that share an edge of the outline [degrees].
-_RIMS: Final = {3: [0, 1, 2], 4: [0, 1, 2, 3], 6: [0, 3, 1, 4, 2, 5]}  # Nodes along the rim of a face.
 _DIVERGED: Final = 10.0  # Distance from the target, or from rest, over the body's, beyond which nothing is drawn.
 
 _FAST: Final = 2.5  # [s] that a motion lasts which is shown slowed down, and from its start only,
@@ -86,8 +85,10 @@ def distance_scene(mesh: Mesh, positions: Mapping[str, FloatArray], target: Floa
 
 def face_edges(mesh: Mesh) -> IntArray:
     """(E, 2) vertices of the lines around the faces of the boundary, each line once."""
-    sides = boundary_faces(mesh)
-    rims = sides[:, _RIMS[sides.shape[1]]]
+    sides, corners = boundary_faces(mesh), mesh.element.face.corners
+    rims = sides[:, :corners]
+    if sides.shape[1] > corners:  # Middles of the edges come after the corners.
+        rims = np.stack([rims, sides[:, corners : 2 * corners]], axis=2).reshape(len(sides), -1)
     edges = np.sort(np.stack([rims, np.roll(rims, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
     return np.asarray(np.unique(edges, axis=0))
 

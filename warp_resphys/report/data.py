@@ -8,6 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ..energies.base import Quantity
 from ..learning.metrics import PublishedError, published_errors
 from ..mesh.chambers import Chamber
 from ..mesh.mesh import Mesh
@@ -77,14 +78,15 @@ class Film:
 
 
 @dataclass(frozen=True, eq=False)
-class Pressures:
-    """The pressures of trials."""
+class Driven:
+    """The inputs that drive trials, such as pressures."""
 
-    channels: tuple[str, ...]  # C names of chambers.
-    values: Mapping[str, FloatArray]  # (K, C) gauge pressure during each step [Pa], by trial.
-    limit: float | None = None  # That none may exceed [Pa].
-    scaled: tuple[str, ...] = ()  # Names of the trials at higher pressure than that of the training.
-    poses: tuple[str, ...] = ()  # Names of the trials without time, which the last pressures hold.
+    quantity: Quantity  # What they are.
+    channels: tuple[str, ...]  # C names of parts, such as chambers.
+    values: Mapping[str, FloatArray]  # (K, C) during each step, by trial, in the quantity's unit.
+    limit: float | None = None  # That none may exceed.
+    scaled: tuple[str, ...] = ()  # Names of the trials at higher inputs than those of the training.
+    poses: tuple[str, ...] = ()  # Names of the trials without time, which the last inputs hold.
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,9 +115,10 @@ class RunReport:
     fixed: IntArray  # Its vertices that are clamped.
     tip: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))  # Where all vertices are observed.
     chambers: tuple[Chamber, ...] = ()  # The closed ones that are under pressure.
+    tendons: Mapping[str, FloatArray] = field(default_factory=dict)  # (G, 3) their guides [m], by name.
     trials: Trials | None = None  # Of the test; None over the folds.
     film: Film | None = None  # The bodies in one of them.
-    pressures: Pressures | None = None  # That drive it.
+    driven: Driven | None = None  # What drives it.
     recordings: Recordings | None = None  # Quality and registration of all trials.
     identification: Mapping[str, Any] = field(default_factory=dict)  # What `identification.json` holds.
     start: Mapping[str, float] = field(default_factory=dict)  # The values of the data sheet, by parameter.

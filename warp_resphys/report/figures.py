@@ -157,7 +157,7 @@ def mean_of_trials(rows: FloatArray) -> FloatArray:
 
 @in_style()
 def error_over_scale(errors: Mapping[str, Mapping[float, float]], *, narrow: bool) -> Figure:
-    """Draw the mean errors [mm] by model against the scale of the pressures; one that diverged is left out."""
+    """Draw the mean errors [mm] by model against the scale of the inputs; one that diverged is left out."""
     figure = new_figure(3.0, 3.6, narrow=narrow)
     axes = figure.subplots()
     scales = sorted({scale for each in errors.values() for scale in each})
@@ -166,7 +166,7 @@ def error_over_scale(errors: Mapping[str, Mapping[float, float]], *, narrow: boo
         axes.plot(scales, values, marker="o", **model_line(model))
     use_logarithm(axes)
     axes.set_xticks(scales, [f"{scale:g}" for scale in scales])
-    axes.set(xlabel="pressure over that of the training", ylabel="mean marker error [mm]")
+    axes.set(xlabel="inputs over those of the training", ylabel="mean marker error [mm]")
     legend_above(figure, axes, narrow=narrow)
     return figure
 

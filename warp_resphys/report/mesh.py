@@ -1,6 +1,7 @@
-"""A picture of a body at rest that shows its chambers."""
+"""A picture of a body at rest that shows its chambers or tendons."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from itertools import cycle
 from pathlib import Path
 from typing import Final
@@ -30,6 +31,7 @@ _NARROWEST: Final = 0.3  # width of a view over its height
 _ENTRY: Final = 1.9  # Width of an entry of the legend [inch]
 _LINE: Final = 0.24  # Height of a line of text [inch]
 _CUBIC_CENTI: Final = 1e6
+_ROPE: Final = 4.0  # Width of a tendon over that of a thin line.
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +42,7 @@ class MeshSummary:
     density: float  # Of its material [kg/m^3].
     fixed: IntArray  # (P,) vertices that are clamped.
     chambers: tuple[Chamber, ...]  # Its closed ones.
+    tendons: Mapping[str, FloatArray] = field(default_factory=dict)  # (G, 3) their guides [m], by name.
 
     @property
     def volume(self) -> float:
@@ -54,7 +57,7 @@ class MeshSummary:
 
 @in_style()
 def draw_mesh(path: Path, summary: MeshSummary, markers: FloatArray | None = None) -> None:
-    """Draws a body from outside, cut open along its length, and translucent, with its chambers in colours.
+    """Draws a body from outside, cut open along its length, and translucent, with chambers and tendons in colours.
 
     Args:
         path: The PNG file to write.
@@ -75,7 +78,8 @@ def draw_mesh(path: Path, summary: MeshSummary, markers: FloatArray | None = Non
     scene = Scene(views, size.tolist(), background="white", samples=0, towards_light=_TOWARDS_LIGHT)
     ((picture,),) = draw(scene)
     volumes = {each.name.replace("_", " "): _CUBIC_CENTI * summary.chamber_volume(each) for each in summary.chambers}
-    labels = (f"{name}: {volume:.1f} cm³" for name, volume in volumes.items())
+    labels = [*(f"{name}: {volume:.1f} cm³" for name, volume in volumes.items())]
+    labels += [name.replace("_", " ") for name in summary.tendons]
     handles = [Patch(color=tone, label=label) for label, tone in zip(labels, cycle(CHAMBER_COLOURS), strict=False)]
     width, height = 3 * size[0] / _DPI, size[1] / _DPI
     columns = max(1, int(width / _ENTRY))
@@ -85,12 +89,18 @@ def draw_mesh(path: Path, summary: MeshSummary, markers: FloatArray | None = Non
     panel = figure.add_axes((0.0, legend / total, 1.0, height / total))
     panel.imshow(picture, aspect="auto", interpolation="antialiased")
     panel.set_axis_off()
-    for at, title in enumerate(("Outside", "Cut open", "Chambers")):
+    inside = "Tendons" if summary.tendons else "Chambers"
+    for at, title in enumerate(("Outside", "Cut open", inside)):
         figure.text((at + 0.5) / 3, 1.0, title, ha="center", va="top")
     if handles:
         figure.legend(handles=handles, loc="lower center", ncols=columns, frameon=False)
     with atomic_path(path) as target:
         figure.savefig(target, format="png", dpi=_DPI)
+
+
+def _along(count: int) -> IntArray:
+    """(count - 1, 2) lines from each point to the next."""
+    return np.stack([np.arange(count - 1), np.arange(1, count)], axis=1)
 
 
 def _layers(summary: MeshSummary, markers: FloatArray, line: float) -> list[list[Layer]]:
@@ -111,6 +121,10 @@ def _layers(summary: MeshSummary, markers: FloatArray, line: float) -> list[list
     plane = np.stack([normal, vertices.mean(axis=0)])
     solid = mesh.cells[:, : ELEMENTS[mesh.element.linear].nodes]
     lift, cut_light = _LIFT * size, (0.5, 0.55)
+    routes = [
+        Layer("lines", guides, _along(len(guides)), colour, size=_ROPE * line)
+        for guides, colour in zip(summary.tendons.values(), cycle(CHAMBER_COLOURS[len(chambers) :]))
+    ]
     balls = Layer("balls", markers, None, MEASURED, size=_DOT * size, light=(0.6, 0.5))
     clamped = Layer("balls", vertices[summary.fixed], None, CLAMPED, size=0.5 * _DOT * size, light=(0.7, 0.3))
     dots = [balls] if len(markers) else []
@@ -130,6 +144,7 @@ def _layers(summary: MeshSummary, markers: FloatArray, line: float) -> list[list
         Layer("surface", vertices, outer, BODY, opacity=0.22, light=(0.8, 0.4)),
         Layer("lines", vertices, sharp_edges(vertices, outer), CLAMPED, size=line, opacity=0.5),
         *(Layer("surface", vertices, faces, colour, light=(0.55, 0.5)) for faces, colour in chambers),
+        *routes,
         *dots,
     ]
     return [outside, cut, translucent]

@@ -14,7 +14,8 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
 
-from .data import FloatArray, Pressures
+from ..energies.base import Quantity
+from .data import Driven, FloatArray
 from .figures import (
     CHAMBER_COLOURS,
     LABELS,
@@ -33,7 +34,6 @@ from .figures import (
 from .render import COLOUR_MAP, Pixels
 
 _MILLI: Final = 1e3
-_KILO: Final = 1e-3
 _MOST_DOTS: Final = 75  # Along an axis of time.
 _LEAST_SPAN: Final = 0.08  # Of a coordinate's axis, over the largest motion of the trial.
 _ABOVE: Final = 0.35  # What is seen around the measured path, over its longest side.
@@ -125,25 +125,25 @@ def marker_paths(
     target: FloatArray,
     models: Mapping[str, FloatArray],
     labels: Sequence[str],
-    pressures: Pressures | None = None,
+    driven: Driven | None = None,
     *,
     narrow: bool,
 ) -> Figure:
-    """Draw each marker's coordinates over time, measured as dots, models as lines, and the pressures below them.
+    """Draw each marker's coordinates over time, measured as dots, models as lines, and what drives the body below them.
 
     Args:
         times: (T,) [s].
         target: (T, M, 3) displacement [m] from where the markers were held, NaN where a marker was not seen.
         models: (T, M, 3) [m] by model.
         labels: Of the M markers.
-        pressures: Of this trial; all panels are then below each other.
+        driven: What drives this trial; all panels are then below each other.
         narrow: Whether the figure is for a narrow page; the panels then are below each other, too.
     """
-    count, stacked = len(labels), narrow or pressures is not None
+    count, stacked = len(labels), narrow or driven is not None
     rows, columns = (3 * count, 1) if stacked else (count, 3)
-    height = 0.9 + 1.25 * count if pressures is None else 2.9 + 2.85 * count
-    figure = new_figure(height, 1.2 + 3.15 * count if pressures is None else height + 0.5, narrow=narrow)
-    ratios = [1.0] * rows + [1.5] * (pressures is not None)
+    height = 0.9 + 1.25 * count if driven is None else 2.9 + 2.85 * count
+    figure = new_figure(height, 1.2 + 3.15 * count if driven is None else height + 0.5, narrow=narrow)
+    ratios = [1.0] * rows + [1.5] * (driven is not None)
     panels = figure.subplots(len(ratios), columns, sharex=True, squeeze=False, height_ratios=ratios)
     least = _LEAST_SPAN * float(np.ptp(np.nan_to_num(_MILLI * target), axis=0).max())
     every = -(-len(times) // _MOST_DOTS)
@@ -160,11 +160,11 @@ def marker_paths(
             axes.set_ylabel(f"{'xyz'[axis] if stacked else labels[marker]} [mm]")
         if axis == 0 if stacked else marker == 0:
             axes.set_title(f"Marker {labels[marker]}" if stacked else "xyz"[axis])
-    if pressures is not None:
-        ((title, values),) = pressures.values.items()
-        _pressures(panels[-1, 0], times, values, pressures.limit)
+    if driven is not None:
+        ((title, values),) = driven.values.items()
+        _inputs(panels[-1, 0], times, values, driven)
         panels[-1, 0].set_title(title)
-        _chamber_legend(figure, pressures, narrow=narrow)
+        _part_legend(figure, driven, narrow=narrow)
     for axes in panels[-1]:
         axes.set(xlabel="time [s]", xlim=(0.0, times[-1]))
     figure.align_ylabels(panels[:, 0])
@@ -267,66 +267,72 @@ def tip_in_space(times: FloatArray, target: FloatArray, models: Mapping[str, Flo
 
 
 @in_style()
-def pressure_sequences(time_step: float, pressures: Pressures, *, narrow: bool) -> Figure:
-    """Draw pressures over time, a panel a trial, with its name above; the time step is in [s]."""
-    height = 0.9 + 1.35 * len(pressures.values)
+def input_sequences(time_step: float, driven: Driven, *, narrow: bool) -> Figure:
+    """Draw inputs over time, a panel a trial, with its name above; the time step is in [s]."""
+    height = 0.9 + 1.35 * len(driven.values)
     figure = new_figure(height, height + 0.4, narrow=narrow)
-    panels = figure.subplots(len(pressures.values), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+    panels = figure.subplots(len(driven.values), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
     longest = 0.0
-    for (title, rows), axes in zip(pressures.values.items(), panels, strict=True):
+    for (title, rows), axes in zip(driven.values.items(), panels, strict=True):
         times = time_step * np.arange(len(rows) + 1, dtype=np.float64)
         longest = max(longest, times[-1])
-        _pressures(axes, times, rows, pressures.limit)
+        _inputs(axes, times, rows, driven)
         axes.set_title(title)
     panels[-1].set(xlabel="time [s]", xlim=(0.0, longest))
-    _chamber_legend(figure, pressures, narrow=narrow)
+    _part_legend(figure, driven, narrow=narrow)
     return figure
 
 
-def _pressures(axes: Axes, times: FloatArray, pressure: FloatArray, limit: float | None) -> None:
-    """Steps of the pressures (K, C) [Pa] between K + 1 times [s], and the limit as a dashed line."""
-    for values, colour in zip(pressure.T, cycle(CHAMBER_COLOURS), strict=False):
-        axes.stairs(_KILO * values, times, baseline=None, color=colour, linewidth=1.2)
-    if limit is not None:
-        axes.axhline(_KILO * limit, color=TONES["muted"].light, linewidth=1.0, linestyle=(0, (4, 3)))
-    axes.set_ylabel("pressure [kPa]")
+def _axis_label(quantity: Quantity) -> str:
+    return f"{quantity.words} [{quantity.shown_unit}]"
+
+
+def _inputs(axes: Axes, times: FloatArray, rows: FloatArray, driven: Driven) -> None:
+    """Steps of the inputs (K, C) between K + 1 times [s], and the limit as a dashed line."""
+    factor = driven.quantity.shown_factor
+    for values, colour in zip(rows.T, cycle(CHAMBER_COLOURS), strict=False):
+        axes.stairs(factor * values, times, baseline=None, color=colour, linewidth=1.2)
+    if driven.limit is not None:
+        axes.axhline(factor * driven.limit, color=TONES["muted"].light, linewidth=1.0, linestyle=(0, (4, 3)))
+    axes.set_ylabel(_axis_label(driven.quantity))
     axes.yaxis.set_major_locator(MaxNLocator(4, steps=ROUND_STEPS))
 
 
 @in_style()
-def pose_pressures(pressures: Pressures, *, narrow: bool) -> Figure:
-    """Draw the pressures that poses are held by, the last ones of each, as bars beside its name.
+def pose_inputs(driven: Driven, *, narrow: bool) -> Figure:
+    """Draw the inputs that poses are held by, the last ones of each, as bars beside its name.
 
-    Chambers that are never under pressure are left out.
+    Parts that never have any are left out.
     """
-    names, values = list(pressures.values), _KILO * np.stack([rows[-1] for rows in pressures.values.values()])
+    factor = driven.quantity.shown_factor
+    names, values = list(driven.values), factor * np.stack([rows[-1] for rows in driven.values.values()])
     used = np.flatnonzero(values.any(axis=0))
     count = max(1, len(used))
     height = 0.9 + len(names) * max(0.25, 0.1 * count)
     figure = new_figure(height, height + 0.3, narrow=narrow)
     axes = figure.subplots()
-    for place, chamber in enumerate(used):
+    for place, part in enumerate(used):
         middle = np.arange(len(names)) + _BARS * ((place + 0.5) / count - 0.5)
-        colour = CHAMBER_COLOURS[chamber % len(CHAMBER_COLOURS)]
-        axes.barh(middle, values[:, chamber], 0.9 * _BARS / count, color=colour)
-    if pressures.limit is not None:
-        axes.axvline(_KILO * pressures.limit, color=TONES["muted"].light, linewidth=1.0, linestyle=(0, (4, 3)))
+        colour = CHAMBER_COLOURS[part % len(CHAMBER_COLOURS)]
+        axes.barh(middle, values[:, part], 0.9 * _BARS / count, color=colour)
+    if driven.limit is not None:
+        axes.axvline(factor * driven.limit, color=TONES["muted"].light, linewidth=1.0, linestyle=(0, (4, 3)))
     axes.set_yticks(range(len(names)), names)
     axes.tick_params(axis="y", length=0, labelcolor=TONES["ink"].light)
-    axes.set(xlabel="pressure [kPa]", ylim=(len(names) - 0.5, -0.5))
+    axes.set(xlabel=_axis_label(driven.quantity), ylim=(len(names) - 0.5, -0.5))
     axes.xaxis.set_major_locator(MaxNLocator(6, steps=ROUND_STEPS))
     axes.grid(visible=False, axis="y")
-    _chamber_legend(figure, pressures, used.tolist(), narrow=narrow)
+    _part_legend(figure, driven, used.tolist(), narrow=narrow)
     return figure
 
 
-def _chamber_legend(figure: Figure, pressures: Pressures, used: Sequence[int] = (), *, narrow: bool) -> None:
-    """Names of the chambers, or of those that are used, below the figure."""
+def _part_legend(figure: Figure, driven: Driven, used: Sequence[int] = (), *, narrow: bool) -> None:
+    """Names of the parts, or of those that are used, below the figure."""
     handles: list[Any] = [
-        Line2D([], [], color=CHAMBER_COLOURS[at % len(CHAMBER_COLOURS)], label=pressures.channels[at].replace("_", " "))
-        for at in used or range(len(pressures.channels))
+        Line2D([], [], color=CHAMBER_COLOURS[at % len(CHAMBER_COLOURS)], label=driven.channels[at].replace("_", " "))
+        for at in used or range(len(driven.channels))
     ]
-    if pressures.limit is not None:
+    if driven.limit is not None:
         handles.append(Line2D([], [], color=TONES["muted"].light, linestyle=(0, (4, 3)), label="limit"))
     figure.legend(handles=handles, loc="outside lower left", ncols=2 if narrow else _LEGEND_ROW, columnspacing=1.4)
 

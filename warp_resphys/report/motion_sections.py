@@ -12,9 +12,9 @@ from markupsafe import Markup
 from .bodies import Motion, distance_scene, largest_distances, write_film
 from .data import (
     MODELS,
+    Driven,
     Film,
     FloatArray,
-    Pressures,
     RunReport,
     Trials,
     at_times,
@@ -31,7 +31,7 @@ _ONE_BY_ONE: Final = ("simulation", "sysid", "simfree", "resphys")  # Marker by 
 _MOST_MARKERS: Final = 6  # That are drawn coordinate by coordinate.
 _PLANE_SECONDS: Final = 5.0  # Of a path in the plane.
 _SPACE_SECONDS: Final = 2.5  # And in space, where a longer one cannot be told apart.
-_SEQUENCES: Final = 3  # Trials whose pressures are drawn over time.
+_SEQUENCES: Final = 3  # Trials whose inputs are drawn over time.
 _HANGING: Final = 0.7  # Cosine between gravity and a body that hangs.
 
 
@@ -192,7 +192,7 @@ def _largest(differences: FloatArray) -> str:
 
 
 def paths_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """The motion of markers: of the tip where pressures drive it, else coordinate by coordinate."""
+    """The motion of markers: of the tip where inputs drive it, else coordinate by coordinate."""
     trials = data.trials
     if trials is None or not trials.labels or not trials.moves:
         return None
@@ -201,10 +201,10 @@ def paths_section(data: RunReport, canvas: Canvas) -> Part | None:
     if len(places) > 1:
         which["worst"] = ", in which the last model of the table is farthest off"
         which["best"] = ", in which the same model is closest"
-    if data.pressures is None:
+    if data.driven is None:
         return Part("Marker by marker", [_markers(trials, row, at, which[at], canvas) for at, row in places.items()])
     blocks = [_plane(data, trials, row, at, which[at], canvas) for at, row in places.items()]
-    blocks[1:1] = _space_and_markers(data, trials, places["worst"], data.pressures, canvas)
+    blocks[1:1] = _space_and_markers(data, trials, places["worst"], data.driven, canvas)
     return Part("The tip", blocks)
 
 
@@ -258,8 +258,8 @@ def _plane(data: RunReport, trials: Trials, row: int, place: str, which: str, ca
     )
 
 
-def _space_and_markers(data: RunReport, trials: Trials, row: int, pressures: Pressures, canvas: Canvas) -> list[Drawn]:
-    """The path of the tip in space, and markers over the pressures."""
+def _space_and_markers(data: RunReport, trials: Trials, row: int, driven: Driven, canvas: Canvas) -> list[Drawn]:
+    """The path of the tip in space, and markers over what drives them."""
     from . import motion_figures
 
     name, start = trials.names[row], _start(trials, row)
@@ -276,73 +276,77 @@ def _space_and_markers(data: RunReport, trials: Trials, row: int, pressures: Pre
     compared = [m for m in _ONE_BY_ONE[1:] if m in paths] or list(paths)
     moved = {m: (trials.positions[m][row] - start)[:, kept] for m in compared}
     target, labels = (trials.target[row] - start)[:, kept], [trials.labels[marker] for marker in kept]
-    driven = replace(pressures, values={"Pressures": pressures.values[name]})
+    words, per = driven.quantity.words, driven.quantity.per
+    own = replace(driven, values={f"{words.capitalize()}s": driven.values[name]})
     markers = canvas.figure(
         "markers",
-        partial(motion_figures.marker_paths, trials.times[row], target, moved, labels, driven),
-        f"Coordinates of markers over time in the trial {name}, and below them the pressures in the chambers.",
-        f"The trial {name}: displacement of markers from rest, and the pressures that drive it.",
+        partial(motion_figures.marker_paths, trials.times[row], target, moved, labels, own),
+        f"Coordinates of markers over time in the trial {name}, and below them the {words}s of the {per}s.",
+        f"The trial {name}: displacement of markers from rest, and the {words}s that drive it.",
     )
     return [space, markers]
 
 
 def body_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """The body with its chambers, and the pressures in them."""
-    trials, pressures = data.trials, data.pressures
-    if trials is None or pressures is None:
+    """The body with its chambers or tendons, and what drives them."""
+    trials, driven = data.trials, data.driven
+    if trials is None or driven is None:
         return None
-    chambers, markers = len(data.chambers), len(trials.labels)
+    quantity, markers = driven.quantity, len(trials.labels)
+    parts = f"{len(driven.channels)} {quantity.per}{'s' if len(driven.channels) > 1 else ''}"
     dots = f", and the {f'{markers} markers' if markers > 1 else 'marker'} as dots" if markers else ""
     said = (
-        f"The body that is simulated: {len(data.mesh.vertices)} vertices, {chambers} "
-        f"chamber{'s' if chambers > 1 else ''} under pressure{dots}. Dark: clamped."
+        f"The body that is simulated: {len(data.mesh.vertices)} vertices, {parts} under {quantity.words}{dots}. Dark: "
+        "clamped."
     )
-    alt = f"The body at rest from outside, cut open and translucent, with {chambers} chambers in colours."
+    alt = f"The body at rest from outside, cut open and translucent, with {parts} in colours."
 
     def body(path: Path) -> Drawn:
         from .mesh import MeshSummary, draw_mesh
 
-        summary = MeshSummary(data.mesh, float(data.settings["simulation"]["density"]), data.fixed, data.chambers)
+        density = float(data.settings["simulation"]["density"])
+        summary = MeshSummary(data.mesh, density, data.fixed, data.chambers, data.tendons)
         draw_mesh(path, summary, trials.bound if trials.labels else None)
         return drawn_file(path, alt, said)
 
     blocks = canvas.attempt("body.png", body)
-    return Part("The body and its pressures", [*blocks, *_pressure_figures(pressures, trials, canvas)])
+    return Part(f"The body and its {quantity.words}s", [*blocks, *_input_figures(driven, trials, canvas)])
 
 
-def _pressure_figures(pressures: Pressures, trials: Trials, canvas: Canvas) -> list[Drawn]:
-    """The pressures of a few trials over time, and those of the poses."""
+def _input_figures(driven: Driven, trials: Trials, canvas: Canvas) -> list[Drawn]:
+    """The inputs of a few trials over time, and those of the poses."""
     from . import motion_figures
 
-    over_time, poses = _sequences(pressures, trials), {}
-    for name in pressures.poses:
-        poses[f"{name} (test)" if name in trials.names else name] = pressures.values[name]
-    limit = "" if not pressures.limit else f"; dashed, the limit of {1e-3 * pressures.limit:g} kPa"
-    whose = "a few trials" if len(pressures.values) > 1 else "the trial"
-    what, blocks = f"Pressures in {len(pressures.channels)} chambers", []
+    over_time, poses = _sequences(driven, trials), {}
+    for name in driven.poses:
+        poses[f"{name} (test)" if name in trials.names else name] = driven.values[name]
+    words, per = f"{driven.quantity.words}s".capitalize(), driven.quantity.per
+    limit = "" if not driven.limit else f"; dashed, the limit of {driven.quantity.shown(driven.limit)}"
+    whose = "a few trials" if len(driven.values) > 1 else "the trial"
+    what, blocks = f"{words} of {len(driven.channels)} {per}s", []
     if over_time:
-        drawn = partial(motion_figures.pressure_sequences, trials.time_step, replace(pressures, values=over_time))
-        alt, said = f"{what} over time: {', '.join(over_time)}.", f"Gauge pressures of {whose}{limit}."
-        blocks.append(canvas.figure("pressures", drawn, alt, unbroken(said)))
+        drawn = partial(motion_figures.input_sequences, trials.time_step, replace(driven, values=over_time))
+        alt, said = f"{what} over time: {', '.join(over_time)}.", f"{words} of {whose}{limit}."
+        blocks.append(canvas.figure("inputs", drawn, alt, unbroken(said)))
     if poses:
-        drawn = partial(motion_figures.pose_pressures, replace(pressures, values=poses))
+        drawn = partial(motion_figures.pose_inputs, replace(driven, values=poses))
         alt, said = (
             f"{what} by pose: {', '.join(poses)}.",
-            f"Gauge pressures that hold the poses; chambers without any are left out{limit}.",
+            f"{words} that hold the poses; {per}s without any are left out{limit}.",
         )
-        blocks.append(canvas.figure("pose_pressures", drawn, alt, unbroken(said)))
+        blocks.append(canvas.figure("pose_inputs", drawn, alt, unbroken(said)))
     return blocks
 
 
-def _sequences(pressures: Pressures, trials: Trials) -> dict[str, FloatArray]:
-    """A few trials' pressures by the panels' titles: of the test, of the training, and at the highest pressure."""
-    values = {name: each for name, each in pressures.values.items() if name not in pressures.poses}
+def _sequences(driven: Driven, trials: Trials) -> dict[str, FloatArray]:
+    """A few trials' inputs by the panels' titles: of the test, of the training, and at the highest inputs."""
+    values = {name: each for name, each in driven.values.items() if name not in driven.poses}
     test = [name for name in trials.names if name in values]
-    others = [name for name in values if name not in test and name not in pressures.scaled][:1]
-    highest = sorted(pressures.scaled, key=lambda name: float(values[name].max()))[-1:]
+    others = [name for name in values if name not in test and name not in driven.scaled][:1]
+    highest = sorted(driven.scaled, key=lambda name: float(values[name].max()))[-1:]
     many = _SEQUENCES - len(others) - len(highest)
     picked = [test[at] for at in np.unique(np.linspace(0, len(test) - 1, many).round().astype(int))] if test else []
     titles = {name: f"{name}, a trial of the training" for name in others}
     titles |= {name: f"{name}, a test trial" for name in picked}
-    titles |= {name: f"{name}, a test trial at higher pressure" for name in highest}
+    titles |= {name: f"{name}, a test trial at higher {driven.quantity.words}" for name in highest}
     return {title: values[name] for name, title in titles.items()}

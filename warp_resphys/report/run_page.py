@@ -211,7 +211,7 @@ def _numbers(rows: Mapping[str, Mapping[str, float | None]]) -> dict[str, dict[s
 def range_texts(metrics: Mapping[str, Any], trials: Sequence[str]) -> list[str]:
     """Say of each model how many of the trials' roll-outs left the states that it was trained on, and when.
 
-    Metrics may have `range`, by model `first_s`: when a trial left [s]; and `scales_range`, by scale of the pressures.
+    Metrics may have `range`, by model `first_s`: when a trial left [s]; and `scales_range`, by scale of the inputs.
     """
     said = []
     found, beyond = metrics.get("range", {}), metrics.get("scales_range", {})
@@ -225,7 +225,7 @@ def range_texts(metrics: Mapping[str, Any], trials: Sequence[str]) -> list[str]:
         if any(left.values()):
             each = [f"{len(left[scale]) or 'none'} of {len(trials)} ({float(scale):g} times)" for scale in scales]
             earliest = _when({trial: when for some in left.values() for trial, when in some.items()})
-            text += f" At higher pressures it is {', '.join(each)}{earliest}."
+            text += f" At higher inputs it is {', '.join(each)}{earliest}."
         said.append(unbroken(text))
     return said
 

@@ -104,7 +104,7 @@ def horizon_table(metrics: Mapping[str, Any], published: Mapping[str, Mapping[st
 
 
 def scales_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """The errors at multiples of the pressures."""
+    """The errors at multiples of the inputs."""
     found = data.metrics.get("scales", {})
     table = scale_table(found)
     if table is None:
@@ -120,10 +120,10 @@ def scales_section(data: RunReport, canvas: Canvas) -> Part | None:
     figure = canvas.figure(
         "error_over_scale",
         partial(figures.error_over_scale, means),
-        "Mean marker error of the models against the scale of the pressures, on a logarithmic axis.",
+        "Mean marker error of the models against the scale of the inputs, on a logarithmic axis.",
         f"Mean error over the roll-outs.{' Where a roll-out diverged, a point is missing.' if diverged else ''}",
     )
-    return Part("Beyond the pressures of the training", [table, figure])
+    return Part("Beyond the inputs of the training", [table, figure])
 
 
 def scale_table(found: Mapping[str, Mapping[str, Any]]) -> Table | None:

@@ -186,13 +186,13 @@ def published_growth(published: Mapping[str, Mapping[str, PublishedError]], firs
 
 
 def scale_text(errors: Mapping[str, Mapping[str, Any]]) -> str:
-    """Say what the errors are at the highest pressures; empty where there are none higher than in the training."""
+    """Say what the errors are at the highest inputs; empty where there are none higher than in the training."""
     if not errors:
         return ""
     largest = max(errors, key=float)
     found = {m: errors[largest][m]["mean"] for m in ("resphys", "sysid", "simfree") if m in errors[largest]}
     parts = ", ".join(f"{mm_text(mean)} with {MODELS[model][0]}" for model, mean in found.items())
-    return f"At {float(largest):g} times the pressures of the training the error is {parts}." if parts else ""
+    return f"At {float(largest):g} times the inputs of the training the error is {parts}." if parts else ""
 
 
 def judgement(metrics: Mapping[str, Any], settings: Mapping[str, Any]) -> list[str]:

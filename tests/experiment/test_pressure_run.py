@@ -23,7 +23,7 @@ from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.trials import Trials
 from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.experiment import learn, pipeline, reconstruct
-from warp_resphys.experiment.build import build_simulator, chambers_of
+from warp_resphys.experiment.build import build_simulator
 from warp_resphys.experiment.checks import check_configuration
 from warp_resphys.experiment.evaluate import summary
 from warp_resphys.experiment.files import Dataset
@@ -396,7 +396,7 @@ def read_published(folder):
 
 def driven_motions(simulator, steps=12, count=2):
     """Motions of a simulator under pressures, seen at a few vertices."""
-    chambers = len(chambers_of(simulator.body))
+    chambers = simulator.counts["pressure"]
     sequences = InputSequences(rest=0.01, correlation_time=0.05)
     drawn = [sequences.draw(steps, 0.01, chambers, np.random.default_rng(i))[1:] for i in range(count)]
     inputs = Inputs(pressure=simulator.tensor(np.stack(drawn, axis=1)))

@@ -1,0 +1,71 @@
+"""A small experiment with tendons through its command line: from its laboratory to its report, and what it refuses."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_module
+from main_job import IN_RUN, run
+from omegaconf import OmegaConf
+
+from warp_resphys.data.recordings.reading import read_recording
+from warp_resphys.experiment.checks import check_configuration
+from warp_resphys.io.errors import InputError
+from warp_resphys.io.files import read_array, read_hdf5
+
+QUIET = ["hydra/job_logging=none", "hydra/hydra_logging=none", IN_RUN]
+TINY = [
+    "experiment=tendon_rod",
+    *("mesh.layers=3", "mesh.nodes=20", "laboratory.mesh.layers=4", "laboratory.mesh.nodes=20"),
+    *("data.steps=12", "data.sequences=5", "data.train=2", "data.validation=1", "data.test=1"),
+    *("data.horizons=[0.06,0.12]", "data.rest_seconds=0.01", "data.cutoff=20.0", "parallel={processes:1,batch:2}"),
+    *("laboratory.sequences.rest=0.01", "laboratory.sequences.correlation_time=0.03"),
+    *("identify.trials=1", "identify.seconds=0.1", "identify.max_evaluations=3", "identify.grid=null"),
+    *("network={position_modes:2,velocity_modes:0,force_modes:2,width:8}", "trainer={epochs:4,rollout_every:2}"),
+    *("trainer.batch_size=16", *QUIET),
+]
+
+
+def test_a_body_that_tendons_pull_goes_through_every_stage(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, err = run(*TINY)
+    assert (code, err[-500:] if code else "") == (0, "")
+    with read_hdf5(Path("run/dataset.h5"), "dataset") as file:
+        found = read_array(file, "inputs/tendon_tension") if "inputs" in file else read_array(file, "tendon_tension")
+    recorded = read_recording(Path("run/recordings/t000.h5")).actuation
+    assert recorded.shape[1] == found.shape[2] == 3
+    np.testing.assert_allclose(found[0][: len(recorded) - 1], recorded[1:], atol=1e-6)
+    assert found.max() > 0.3  # N
+    errors = json.loads(Path("run/metrics.json").read_text())["errors_mm"]
+    assert {"simulation", "sysid", "simfree", "resphys"} <= errors.keys()
+    assert all(np.isfinite(each["mean"]) for each in errors.values())
+    page = Path("run/report.html").read_text()
+    for said in ("3 tendons under tension", "The body and its tensions", "Tensions of", "the limit of 1.5 N"):
+        assert said in page
+    assert "pressure" not in page.split("<style")[0] + page.split("</style>")[-1].split("<script")[0]
+
+
+def configuration(*overrides):
+    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
+        return OmegaConf.to_container(compose("config", ["experiment=tendon_rod", *overrides]), resolve=True)
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("tendons.routes.left.guides=[[0,0,0]]", "tendons.routes.left.guides is .*two or more places"),
+        ("tendons.routes.left.guides=[[0.02,0,0],[0,0,-0.2]]", "guide 1 of tendon 2.* lies .* mm outside of the body"),
+        ("tendons.commanded=angle", "tendons.commanded is 'angle'"),
+        ("tendons.stiffness=-1", "tendons.stiffness is -1"),
+        ("tendons.routes.left.pieces=0", "tendons.routes.left.pieces is 0"),
+        ("data.input_limit=null", "data.input_limit is not set: say what the tendons take, in N"),
+        ("data.parts=[1,2,4]", "data.parts names tendon 4, but the body has 3"),
+        ("mesh.radii=[[0.0,0.01],[0.2]]", "mesh.radii is"),
+        ("mesh.layers=0", "mesh.layers is 0"),
+        ("laboratory.material.prony_time_1=0", "prony_time_1 is 0: it must be positive, in s"),
+    ],
+)
+def test_wrong_tendons_are_refused_before_anything_runs(override, said):
+    with pytest.raises(InputError, match=said):
+        check_configuration(configuration(override))

@@ -1,7 +1,7 @@
 """Batched, differentiable simulation of one body."""
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, cast
@@ -28,6 +28,8 @@ from .viscosity import check_overstrain, relaxed, viscous_values, without_viscos
 GRAVITY = (0.0, 0.0, -9.80709)
 _MOST_LENGTHS = 100.0  # that a body at rest may be away from its rest shape
 COUPLINGS = ("implicit", "explicit")
+_MOST_ITERATIONS = 100  # of Newton's method for an equilibrium; a few are enough where it is near
+_LEAST_SHARE = 1.0 / 64.0  # of the loads, by which they grow where all of them at once lead nowhere
 _NOTHING = Inputs()
 _GRAVITY = Quantity("gravity", "m/s^2", per="axis")
 
@@ -64,6 +66,30 @@ def _device(name: str | torch.device) -> torch.device:
     if device.type == "cuda" and not torch.cuda.is_available():
         raise InputError(f"device is {name!r}, but torch finds no CUDA device: choose device=cpu.")
     return device
+
+
+def _ramped(
+    solve: Callable[[float, torch.Tensor], torch.Tensor], rest: torch.Tensor, error: ConvergenceError
+) -> torch.Tensor:
+    """Where equilibria under more and more of the loads lead to, from rest.
+
+    Args:
+        solve: the equilibrium under a share of the loads, from a start.
+        rest: (B, N, 3) without any [m].
+        error: of all loads at once, which is raised where shares do not lead there either.
+    """
+    done, step, x = 0.0, 0.5, rest
+    while done < 1.0:
+        share = min(done + step, 1.0)
+        try:
+            x = solve(share, x)
+        except ConvergenceError:
+            step *= 0.5
+            if step < _LEAST_SHARE:
+                raise error from None
+        else:
+            done = share
+    return x
 
 
 @dataclass
@@ -393,17 +419,13 @@ class Simulator:
         self._check(state, inputs, constants)
         if start is not None:
             check_tensor("start", start, tuple(state.q.shape), "m", "vertex", state.q)
-        workspace = self.workspace(batch)
-        still = without_viscosity(batch, self.rest_positions)
-        terms = StepTerms(
-            target=state.q,
-            inertia=self.rest_positions.new_zeros(batch, self.body.n_vertices),
-            force=self._loads(inputs, constants).expand(batch, -1, -1),
-            values=self._values(constants, inputs, batch, still),
-        )
-        solver = workspace.solver("statics", replace(self.settings, name="newton", on_failure="raise"))
-        at = state.q[:, self.fixed] if inputs.fixed_positions is None else inputs.fixed_positions
-        x, report = equilibrium(workspace, solver, terms, state.q if start is None else start.detach(), at)
+        solve = partial(self._balance, inputs, constants, state.q)
+        try:
+            x, report = solve(1.0, state.q if start is None else start.detach())
+        except ConvergenceError as error:
+            with torch.no_grad():
+                near = _ramped(lambda share, at: solve(share, at)[0], state.q, error)
+            x, report = solve(1.0, near)
         lengths = self.rest_positions.amax(0) - self.rest_positions.amin(0)
         furthest = (x.detach() - self.rest_positions).abs().flatten(1).amax(1)
         if bool((grown := ~(furthest < _MOST_LENGTHS * float(lengths.max()))).any()):
@@ -415,6 +437,27 @@ class Simulator:
                 report,
             )
         return State(x, torch.zeros_like(x))
+
+    def _balance(
+        self, inputs: Inputs, constants: Constants, rest: torch.Tensor, share: float, start: torch.Tensor
+    ) -> tuple[torch.Tensor, SolveReport]:
+        """(B, N, 3) the equilibrium under a share of all loads, inputs and motion of the clamp [m]."""
+        batch = len(rest)
+        still = without_viscosity(batch, self.rest_positions)
+        values = self._values(constants, inputs, batch, still)
+        driven = {quantity.name: share * values[quantity.name] for e, _ in self._energies for quantity in e.inputs}
+        terms = StepTerms(
+            target=rest,
+            inertia=self.rest_positions.new_zeros(batch, self.body.n_vertices),
+            force=share * self._loads(inputs, constants).expand(batch, -1, -1),
+            values={**values, **driven},
+        )
+        workspace, clamp = self.workspace(batch), rest[:, self.fixed]
+        most = min(self.settings.max_iterations, _MOST_ITERATIONS)
+        settings = replace(self.settings, name="newton", on_failure="raise", max_iterations=most)
+        solver = workspace.solver("statics", settings)
+        at = clamp if inputs.fixed_positions is None else torch.lerp(clamp, inputs.fixed_positions, share)
+        return equilibrium(workspace, solver, terms, start, at)
 
     def rollout(
         self,

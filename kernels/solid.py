@@ -162,8 +162,10 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         swelling = wp.trace(rise)
         strain = green_strain(f)
         dilation = wp.trace(strain)
-        by_shape = TWO * wp.ddot(c[0] * strain - strain_offset[b, p], rise)
-        by_volume = (c[1] * dilation - dilation_offset[b, p]) * swelling
+        by_shape, by_volume = ZERO, ZERO
+        if c[0] + c[1] > ZERO:  # Without viscosity nobody writes the offsets.
+            by_shape = TWO * wp.ddot(c[0] * strain - strain_offset[b, p], rise)
+            by_volume = (c[1] * dilation - dilation_offset[b, p]) * swelling
         viscosity_out[b, p] = -wp.vec2d(TWO * shape * wp.ddot(strain, rise), bulk * dilation * swelling)
         stiffness_out[b, p] = result - by_shape * mu_of - by_volume * lambda_of
         strain_out[b, p] = (TWO * shape) * rise

@@ -6,6 +6,7 @@ import torch
 
 from warp_resphys.data.actuation import InputSequences, check_inputs, lagged, remembered
 from warp_resphys.energies.pressure import PRESSURE
+from warp_resphys.energies.tendons import TENSION
 from warp_resphys.io.errors import DataFileError, InputError
 
 STEP = 0.01
@@ -49,8 +50,8 @@ def test_a_seed_gives_its_sequence_and_another_one_another():
     ("settings", "message"),
     [
         ({"rest": 2.0}, "leave no time between two rests"),
-        ({"correlation": -0.6}, "no pressures of 3 chambers have the correlation -0.6: it must lie above -0.5"),
-        ({"correlation": [[1.0, 0.0], [0.0, 1.0]]}, r"shape \(2, 2\).*3 chambers"),
+        ({"correlation": -0.6}, "no inputs of 3 parts have the correlation -0.6: it must lie above -0.5"),
+        ({"correlation": [[1.0, 0.0], [0.0, 1.0]]}, r"shape \(2, 2\).*3 parts"),
     ],
 )
 def test_bad_sequences(settings, message):
@@ -91,3 +92,10 @@ def test_memory_keeps_what_the_pressure_was():
     assert float(fast) == pytest.approx(1e4, rel=1e-3)
     assert float(slow) == pytest.approx(1e4 * (1 - np.exp(-0.8)), rel=1e-9)
     torch.testing.assert_close(remembered(pressure, [], STEP), pressure)
+
+
+def test_a_gauge_that_is_a_little_off_zero_is_believed_and_one_that_is_far_off_is_not():
+    tension = np.array([[-0.01, 1.0], [0.2, 0.5]])
+    np.testing.assert_array_equal(check_inputs(tension, TENSION, 2, 2.0, "a.h5"), [[0.0, 1.0], [0.2, 0.5]])
+    with pytest.raises(DataFileError, match=r"a\.h5: the tension of tendon 1 is -0.5 N in frame 1: it must be zero or"):
+        check_inputs(np.array([[0.0], [-0.5]]), TENSION, 1, 2.0, "a.h5")

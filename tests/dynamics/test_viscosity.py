@@ -210,3 +210,24 @@ def test_configured_branches_are_those_of_the_material():
     made = make_material(prony_ratio_2=0.1, prony_time_1=0.5, prony_ratio_1=0.2, prony_time_2=2.0)
     assert list(made.prony) == [(0.2, 0.5), (0.1, 2.0)]
     assert made.constants["prony_time_2"] == 2.0
+
+
+def test_what_a_step_left_behind_has_no_part_in_a_pose():
+    """Buffers of an earlier, viscous step are in no derivative of an equilibrium."""
+    found = []
+    for steps in (0, 3):
+        simulator = Simulator(CLAMPED, TWO_BRANCHES, solver=TIGHT)
+        simulator.rollout(pose(simulator, "bent", 1), steps) if steps else None
+        modulus = torch.full((1, 1), 2e4, dtype=torch.float64, requires_grad=True)
+        sag(simulator.static_equilibrium(pull(0.2), {"youngs_modulus": modulus}).q).sum().backward()
+        found.append(float(modulus.grad))
+    assert found[0] == pytest.approx(found[1], rel=1e-9)
+
+
+def test_single_precision_keeps_its_type():
+    simulator = Simulator(CLAMPED, TWO_BRANCHES, dtype=torch.float32, solver=SolverSettings(relative_tolerance=1e-5))
+    final = simulator.rollout(simulator.rest_state(), 3, Inputs(pull(0.2).external_force.float())).final
+    assert final.overstrain.dtype == torch.float32
+    double = Simulator(CLAMPED, TWO_BRANCHES, solver=TIGHT)
+    exact = double.rollout(double.rest_state(), 3, pull(0.2)).final
+    torch.testing.assert_close(final.overstrain.double(), exact.overstrain, rtol=0.0, atol=1e-5)

@@ -167,6 +167,11 @@ def test_forces_are_reconstructed_beside_a_tendon():
     torch.testing.assert_close(found.force, force, rtol=0.0, atol=1e-6)
 
 
+def test_a_tendon_cannot_be_held():
+    with pytest.raises(InputError, match="it cannot be held"):
+        simulator(route(0.018)).held_energy("tendon_tension", 1)
+
+
 def test_a_tendon_cannot_push():
     sim = simulator(route(0.018))
     with pytest.raises(InputError, match=r"tendon_tension is -1: it must be zero or more, in N"):

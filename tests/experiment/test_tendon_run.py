@@ -56,6 +56,7 @@ def configuration(*overrides):
     [
         ("tendons.routes.left.guides=[[0,0,0]]", "tendons.routes.left.guides is .*two or more places"),
         ("tendons.routes.left.guides=[[0.02,0,0],[0,0,-0.2]]", "guide 1 of tendon 2.* lies .* mm outside of the body"),
+        ("tendons.commanded=contraction", "tendons.stiffness is 0, but their contraction is commanded"),
         ("tendons.commanded=angle", "tendons.commanded is 'angle'"),
         ("tendons.stiffness=-1", "tendons.stiffness is -1"),
         ("tendons.routes.left.pieces=0", "tendons.routes.left.pieces is 0"),

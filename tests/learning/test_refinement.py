@@ -148,6 +148,10 @@ class TestLoss:
         loss = WindowLoss(no_force, lambda: simulator(creeping, integrator), 4, 3)
         target = motion_of(q, v, q)
         assert loss.measure(loss.side_by_side([target]), [target])[0] < 1e-12  # mm^2
+        q[0, :2] = torch.nan  # It is first known in frame 2, and counts as relaxed there.
+        late = motion_of(q, v, q)
+        value = loss.measure(loss.side_by_side([late]), [late])[0]
+        assert 0.0 < value < 1e-1
 
     def test_it_is_the_mean_squared_distance_of_separate_roll_outs(self):
         model, sim = network(), simulator()

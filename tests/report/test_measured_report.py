@@ -252,7 +252,7 @@ def test_branches_that_were_identified_have_names_and_units():
     found = {"parameters": {"prony_ratio_1": 0.25, "prony_time_2": 0.3125}, "at_bounds": []}
     ratio, time = parameter_rows(found, {"prony_time_2": 1.0}, {})
     assert (ratio.head, ratio.cells[1].text) == ("Prony ratio 1", "0.25")
-    assert (time.head, [cell.text for cell in time.cells[:2]]) == ("Relaxation time 2 [ms]", ["1000", "312.5"])
+    assert (time.head, [cell.text for cell in time.cells[:2]]) == ("Relaxation time 2 [s]", ["1", "0.3125"])
 
 
 def test_parameters_and_what_the_data_cannot_tell():

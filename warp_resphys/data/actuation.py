@@ -14,7 +14,8 @@ from ..io.errors import DataFileError, InputError
 FloatArray = NDArray[np.float64]
 
 _JITTER = 1e-9  # of the variance, on the diagonal of a smooth covariance
-_SLACK = 1.005  # by which a pressure gauge may exceed the limit
+NO_INPUT = 0.01  # of the limit: less is what a gauge shows of none
+_SLACK = 1.005  # by which a gauge may exceed the limit
 
 
 @dataclass(frozen=True)
@@ -68,31 +69,34 @@ class InputSequences:
         values, vectors = np.linalg.eigh(covariance)
         return bridge, vectors * np.sqrt(np.maximum(values, 0.0))
 
-    def _between(self, chambers: int) -> FloatArray:
-        """(C, C) factor of the chambers' correlations."""
+    def _between(self, parts: int) -> FloatArray:
+        """(C, C) factor of the parts' correlations."""
         matrix: FloatArray = np.asarray(self.correlation, dtype=np.float64)
         if matrix.ndim == 0:
-            same = np.eye(chambers)
+            same = np.eye(parts)
             matrix = same + (1.0 - same) * matrix
-        if matrix.shape != (chambers, chambers):
+        if matrix.shape != (parts, parts):
             raise InputError(
-                f"the correlations of the pressures have the shape {matrix.shape}: give one number, or a matrix for "
-                f"{chambers} chambers."
+                f"the correlations of the inputs have the shape {matrix.shape}: give one number, or a matrix for "
+                f"{parts} parts."
             )
         try:
             return np.asarray(np.linalg.cholesky(matrix))
         except np.linalg.LinAlgError:
             raise InputError(
-                f"no pressures of {chambers} chambers have the correlation {self.correlation}: it must lie above "
-                f"{-1.0 / max(chambers - 1, 1):.3g} and below 1, or be a positive definite matrix."
+                f"no inputs of {parts} parts have the correlation {self.correlation}: it must lie above "
+                f"{-1.0 / max(parts - 1, 1):.3g} and below 1, or be a positive definite matrix."
             ) from None
 
 
 def check_inputs(values: FloatArray, quantity: Quantity, parts: int, limit: float, source: str | Path) -> FloatArray:
     """(T, C) recorded inputs, if a body with so many parts can take them.
 
+    What is out of the quantity's range by no more than a gauge's error is brought into it.
+
     Raises:
-        DataFileError: another number of parts, or a value beyond the limit, in the unit of the quantity.
+        DataFileError: another number of parts, or a value beyond the limit, in the unit of the quantity, or below what
+            it can be.
     """
     words, per = quantity.words, quantity.per
     if values.shape[1] != parts:
@@ -108,7 +112,13 @@ def check_inputs(values: FloatArray, quantity: Quantity, parts: int, limit: floa
             f"data.input_limit of {quantity.shown(limit)}: raise the limit if the robot takes that, or check the unit "
             "of the file."
         )
-    return values
+    low = np.unravel_index(values.argmin(), values.shape)
+    if values[low] < quantity.lower - NO_INPUT * limit:
+        raise DataFileError(
+            f"{source}: the {words} of {per} {low[1] + 1} is {quantity.shown(float(values[low]))} in frame {low[0]}: "
+            f"it must be {quantity.wanted}, so check the zero of the gauge."
+        )
+    return np.maximum(values, quantity.lower)
 
 
 def lagged(commands: torch.Tensor, rise: torch.Tensor, step: float) -> torch.Tensor:

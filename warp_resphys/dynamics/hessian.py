@@ -99,7 +99,7 @@ class ExactHessian(HessianApproximation):
 class ProjectiveHessian(HessianApproximation):
     """Inertia plus ``(2 mu + lambda) V G G^T`` at every point of the solid, the same in each coordinate.
 
-    Fibres enter with their stiffness, pressure not at all.
+    Fibres and tendons enter with their stiffness, pressure not at all.
 
     This is the Hessian of the distances to fixed projections (Bouaziz et al. 2014, equation 10). It does not depend on
     the positions: one factor serves until inertia or stiffness change, and the whole batch where these are shared.

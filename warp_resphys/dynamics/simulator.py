@@ -1,6 +1,7 @@
 """Batched, differentiable simulation of one body."""
 
 import itertools
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -24,6 +25,8 @@ from .integrator import ImplicitStage, State, make_integrator
 from .linearisation import Linearisation
 from .nonlinear_solver import SolveReport, SolverSettings
 from .viscosity import check_overstrain, relaxed, viscous_values, without_viscosity
+
+log = logging.getLogger(__name__)
 
 GRAVITY = (0.0, 0.0, -9.80709)
 _MOST_LENGTHS = 100.0  # that a body at rest may be away from its rest shape
@@ -76,7 +79,10 @@ def _ramped(
     Args:
         solve: the equilibrium under a share of the loads, from a start.
         rest: (B, N, 3) without any [m].
-        error: of all loads at once, which is raised where shares do not lead there either.
+        error: of all loads at once.
+
+    Raises:
+        ConvergenceError: shares do not lead there either.
     """
     done, step, x = 0.0, 0.5, rest
     while done < 1.0:
@@ -86,7 +92,12 @@ def _ramped(
         except ConvergenceError:
             step *= 0.5
             if step < _LEAST_SHARE:
-                raise error from None
+                raise ConvergenceError(
+                    f"no equilibrium was found: under growing loads it is lost beyond {100.0 * done:.0f} % of them; "
+                    "lower the loads, or take a stiffer material.",
+                    x,
+                    error.report,
+                ) from None
         else:
             done = share
     return x
@@ -252,6 +263,8 @@ class Simulator:
             if not found:
                 known = ", ".join(self.inputs) or "none"
                 raise InputError(f"no energy of the body has the input {name}: they have {known}.")
+            if found[0].implicit_only:
+                raise InputError(f"{name} acts through the body as it is at the end of a step: it cannot be held.")
             device = torch.device(self.device)
             self._held[batch, name] = HeldEnergy(self.body, found[0], batch, device)
         return self._held[batch, name]
@@ -400,7 +413,8 @@ class Simulator:
         Args:
             inputs: what acts on the body.
             parameters: see `prepare`.
-            start: (B, N, 3) first guess [m]; the rest shape where left out.
+            start: (B, N, 3) first guess [m]; the rest shape where left out. Where Newton's method leads nowhere from it
+                in 100 iterations, the loads, inputs and motion of the clamp are put on bit by bit.
             batch: environments, where no other argument tells.
 
         Raises:
@@ -423,6 +437,7 @@ class Simulator:
         try:
             x, report = solve(1.0, state.q if start is None else start.detach())
         except ConvergenceError as error:
+            log.info("an equilibrium is sought under growing loads: %s", error)
             with torch.no_grad():
                 near = _ramped(lambda share, at: solve(share, at)[0], state.q, error)
             x, report = solve(1.0, near)
@@ -509,4 +524,4 @@ class Simulator:
         constants.check_batch(batch)
         if state.overstrain is not None:
             solid = self.workspace(batch).potential.solid
-            check_overstrain(state.overstrain, (batch, len(self.material.prony), solid.n_points, 3, 3))
+            check_overstrain(state.overstrain, (batch, len(self.material.prony), solid.n_points, 3, 3), like)

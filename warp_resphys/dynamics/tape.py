@@ -60,7 +60,7 @@ def record_rollout(
     Args:
         tape: entered by the caller or not.
         simulator: of the body; its device and type are those of every array.
-        q: (B, N) vec3 positions [m].
+        q: (B, N) vec3 positions [m]; a material with Prony branches begins relaxed there.
         v: (B, N) vec3 velocities [m/s].
         steps: T.
         previous: (q, v) one step earlier, where an earlier roll-out by BDF2 goes on: its ``(q[-2], v[-2])``.

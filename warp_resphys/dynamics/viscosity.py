@@ -27,6 +27,7 @@ import torch
 from ..energies.solid import GreenStrain, SolidTerm
 from ..io.errors import InputError
 from .constants import Constants
+from .inputs import check_tensor
 from .integrator import ImplicitStage, State
 
 
@@ -76,24 +77,24 @@ def relaxed(solid: SolidTerm, constants: Constants, state: State, q: torch.Tenso
         seconds: how long it took [s].
     """
     decay, gamma = (each[..., None, None, None] for each in _relaxation(constants, seconds))
-    strained = gamma * (GreenStrain.apply(solid, q) - GreenStrain.apply(solid, state.q))[:, None]
+    strained = gamma * (GreenStrain.apply(solid, q) - GreenStrain.apply(solid, state.q))[:, None].to(gamma.dtype)
     return strained if state.overstrain is None else strained + decay * state.overstrain
 
 
-def check_overstrain(overstrain: Any, shape: tuple[int, ...]) -> None:
+def check_overstrain(overstrain: Any, shape: tuple[int, ...], like: torch.Tensor) -> None:
     """Refuses strains of branches that a state cannot have.
 
     Raises:
-        InputError: another shape, or values that are not finite.
+        InputError: another shape, type or device, or values that are not finite.
     """
-    if not isinstance(overstrain, torch.Tensor) or tuple(overstrain.shape) != shape:
+    if isinstance(overstrain, torch.Tensor) and tuple(overstrain.shape) == shape:
+        check_tensor("state.overstrain", overstrain, shape, "strains", "branch", like)
+    else:
         found = tuple(overstrain.shape) if isinstance(overstrain, torch.Tensor) else type(overstrain).__name__
         raise InputError(
             f"state.overstrain is {found}, not (environments, Prony branches, points, 3, 3) = {shape}: take the state "
             "from a simulator of this body and material, or leave it out for relaxed branches."
         )
-    if not bool(torch.isfinite(overstrain).all()):
-        raise InputError("state.overstrain has values that are not finite.")
 
 
 def _relaxation(constants: Constants, seconds: float) -> tuple[torch.Tensor, torch.Tensor]:

@@ -223,7 +223,8 @@ class TendonTerm(PartTerm):
         own, (s,) = self.launcher, self.sets
         inputs, out = [s.nodes, s.gradients, positions], warp_view(self._direction, wp.vec3d)
         own.launch(own.record(kernels.directions, (own.batch, s.n_points), inputs, [out]))
-        gradient = torch.einsum("bpi,pn,pt->bnit", self._direction, self._operator, self._own)
+        by_tendon = (self._direction[:, :, :, None] * self._own[:, None]).flatten(2)  # (B, P, 3 T)
+        gradient = (self._operator.mT @ by_tendon).unflatten(2, (3, self.count))
         return LowRank(gradient.flatten(1, 2), stiffness * self._spring[..., 2])
 
     @override
@@ -231,7 +232,8 @@ class TendonTerm(PartTerm):
         tension, stiffness = values["tendon_tension"], values["tendon_stiffness"]
         assert tension is not None
         assert stiffness is not None
-        return tension[:, self.part_of] / self._piece_length + stiffness[:, self.part_of]
+        # The square of a sum of n lengths is at most n times the sum of their squares.
+        return tension[:, self.part_of] / self._piece_length + (stiffness * self._own.sum(0))[:, self.part_of]
 
     @override
     def slope(self, s: PointSet, positions: Any, direction: Any) -> tuple[Any, list[Any]]:

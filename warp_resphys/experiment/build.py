@@ -152,8 +152,12 @@ def build_tendons(config: Mapping[str, Any]) -> Tendons:
     """The tendons of a group: every straight piece of a route is divided into as many as asked for.
 
     Raises:
-        InputError: see `Tendons`.
+        InputError: see `Tendons`; or a contraction that nothing would pull.
     """
+    if config["commanded"] == "contraction" and not config["stiffness"] > 0.0:
+        raise InputError(
+            "tendons.stiffness is 0, but their contraction is commanded, which acts through it: set it, in N/m."
+        )
     routes = []
     for name, route in config["routes"].items():
         guides = np.asarray(route["guides"], dtype=np.float64)

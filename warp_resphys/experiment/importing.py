@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.actuation import check_inputs
+from ..data.actuation import NO_INPUT, check_inputs
 from ..data.base_motion import at_times, check_steps, followed, in_frame, prescribed, rigid
 from ..data.recordings.processing import fill_gaps, release_of, resample, smooth, trim_to_release
 from ..data.recordings.quality import check_base, check_motion, check_passive, quality
@@ -37,7 +37,6 @@ FloatArray = NDArray[np.float64]
 
 _LEAST_RATE = 40.0  # Hz; the first tenth of a second tells how a body was let go, and four frames are few for that
 _LARGEST_LEAN = 30.0  # degrees between the vertical of a recording and the configured gravity
-_REST_INPUT = 0.01  # of the limit: less is what a gauge shows of none
 _SHOWN = 6  # driven trials whose quality and registration are kept for the report
 _POSE_SECONDS = 0.2  # at the end of a recording, that tell a pose
 _MILLI = 1e3
@@ -281,7 +280,7 @@ class Importer:
 
     def _is_at_rest(self, driven: FloatArray) -> NDArray[np.bool_]:
         """(T,) whether (T, C) inputs are what a gauge shows of none."""
-        return np.asarray(np.abs(driven).max(axis=1) <= _REST_INPUT * self.data["input_limit"])
+        return np.asarray(np.abs(driven).max(axis=1) <= NO_INPUT * self.data["input_limit"])
 
     def _resting(self, recording: Recording, driven: FloatArray | None) -> FloatArray:
         """(M', 3) mean positions of the markers before the inputs come [m], NaN for one that is not seen."""
@@ -430,7 +429,7 @@ def _check_unit(driven: Sequence[FloatArray], data: Mapping[str, Any], drive: Dr
         return
     highest, limit = max(float(np.abs(each).max()) for each in driven), data["input_limit"]
     words, unit = drive.quantity.words, drive.quantity.unit
-    if highest < _REST_INPUT * limit:
+    if highest < NO_INPUT * limit:
         raise DataFileError(
             f"the {words}s of all {len(driven)} recordings stay below {highest:.3g} {unit}, and data.input_limit is "
             f"{limit:.3g} {unit}: name their unit in the files (actuation_units, or the header of the column), or "

@@ -68,7 +68,7 @@ class Scene:
 
     @cached_property
     def dataset(self) -> Dataset:
-        """The trials, and those at other pressures where the stage tests them."""
+        """The trials, and those at scaled inputs where the stage tests them."""
         shared = self.folder / self.config["shared"]
         found = read_dataset(shared / DATASET)
         if len(self.config.get("groups", ())) > 1:

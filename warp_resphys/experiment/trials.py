@@ -266,7 +266,7 @@ def trials_of(config: Mapping[str, Any]) -> tuple[Trial, ...]:
 
 
 def scaled_name(name: str, scale: float) -> str:
-    """The name of a test trial at other pressures."""
+    """The name of a test trial at scaled inputs."""
     return f"{name}_x{scale:g}"
 
 
@@ -281,7 +281,7 @@ def scaled_trials_of(config: Mapping[str, Any]) -> tuple[Trial, ...]:
 
 
 def test_groups(config: Mapping[str, Any], split: Split) -> dict[str, list[str]]:
-    """By pressure scale, the trials that are tested; the first is that of the training, ``1``."""
+    """By scale of the inputs, the trials that are tested; the first is that of the training, ``1``."""
     scales = [float(scale) for scale in config["data"].get("input_scales") or ()]
     return {"1": list(split.test)} | {f"{s:g}": [scaled_name(name, s) for name in split.test] for s in scales}
 

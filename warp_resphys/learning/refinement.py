@@ -7,7 +7,7 @@ gradient goes back through the implicit adjoint of every step.
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -153,19 +153,24 @@ class WindowLoss:
     def _carried(self, simulator: Simulator, motion: Motion) -> torch.Tensor | None:
         """(R, W, K, P, 3, 3) what the material has not relaxed yet of a motion where its windows start; None without.
 
-        A simulator that has branches carries them on through every state, those of the windows' starts included, and
-        stands still where these are not known.
+        The branches go through every state of the motion, from its first known one on, in which they are relaxed; while
+        none is known, it stands still.
         """
         if id(motion) not in self._overstrains:
             constants, *_ = Replay(simulator, self._observe, motion.trials).setting(self._parameters)
-            found, state = [], State(motion.q[:, 0], motion.v[:, 0])
+            found, state = [], simulator.rest_state(len(motion.q))
+            began = torch.zeros(state.batch, dtype=torch.bool, device=state.q.device)
             for frame in range(motion.q.shape[1] if constants.relaxes else 0):
-                q = torch.where(torch.isfinite(motion.q[:, frame]), motion.q[:, frame], state.q)
+                q = motion.q[:, frame]
+                known = torch.isfinite(q).flatten(1).all(1)
+                before = torch.where((known & ~began)[:, None, None], q, state.q)  # relaxed where it is first known
+                q, began = torch.where(known[:, None, None], q, before), began | known
                 with torch.no_grad():
-                    state = State(q, state.v, overstrain=simulator.relaxed(constants, state, q))
-                assert state.overstrain is not None
+                    overstrain = simulator.relaxed(constants, replace(state, q=before), q)
+                assert overstrain is not None
+                state = replace(state, q=q, overstrain=overstrain)
                 if frame >= self._first_frame and (frame - self._first_frame) % self._window == 0:
-                    found.append(state.overstrain)
+                    found.append(overstrain)
             self._overstrains[id(motion)] = (motion, torch.stack(found, 1) if found else None)
         return self._overstrains[id(motion)][1]
 

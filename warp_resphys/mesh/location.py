@@ -18,7 +18,7 @@ class Location:
 
     cells: IntArray  # (P,) the cell of each
     weights: FloatArray  # (P, K) of its nodes; their sum is one
-    outside: FloatArray  # (P,) how far from the cell [m]; zero inside
+    outside: FloatArray  # (P,) how far from the cell [m]; zero inside, infinite where its shape functions do not reach
 
 
 def locate(mesh: Mesh, points: FloatArray) -> Location:
@@ -49,7 +49,10 @@ def locate(mesh: Mesh, points: FloatArray) -> Location:
         best = int(np.argmin(away))
         cells.append(near[best])
         weights.append(element.shape(place[best : best + 1])[0][0])
-        outside.append(away[best] if away[best] > 1e-9 * np.linalg.norm(high[near[best]] - low[near[best]]) else 0.0)
+        missed = float(np.linalg.norm(weights[-1] @ nodes[near[best]] - point))
+        size = float(np.linalg.norm(high[near[best]] - low[near[best]]))
+        # What no continuation of the cell reaches is as far outside as can be.
+        outside.append(np.inf if missed > 1e-6 * size else away[best] if away[best] > 1e-9 * size else 0.0)
     return Location(np.array(cells), np.array(weights), np.array(outside))
 
 

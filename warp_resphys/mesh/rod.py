@@ -2,7 +2,8 @@
 
 The section is a square of cells in the middle, and rings of cells between its edge and the rim, so that no cell has a
 corner of 180 degrees. The nodes of the rim lie on a circle a little larger than the rod, so that the section's area is
-that of the rod: its stiffness and weight are those of a round one also where the rim has four sides.
+that of the rod: it weighs as much and stretches as easily as a round one. With four straight sides it bends 5 % less
+easily, with eight or with quadratic cells by less than 0.3 %.
 """
 
 import numpy as np
@@ -45,15 +46,11 @@ def rod(
         raise MeshError("the centreline of a rod has two points in a row at one place: leave one of them out.")
     profile = np.asarray(radii, dtype=np.float64)
     profile = np.array([[0.0, float(profile)]]) if profile.ndim == 0 else profile
-    if (
-        profile.ndim != 2
-        or profile.shape[1] != 2
-        or not (profile[:, 1] > 0.0).all()
-        or (np.diff(profile[:, 0]) <= 0).any()
-    ):
+    listed = profile.ndim == 2 and profile.shape[1] == 2 and bool(np.isfinite(profile).all())
+    if not (listed and (profile[:, 1] > 0.0).all() and (np.diff(profile[:, 0]) > 0.0).all()):
         raise MeshError("the radii of a rod must be one positive number, or rising arc lengths with positive radii.")
     for name, value in (("layers", layers), ("core", core), ("rings", rings)):
-        if not isinstance(value, int | np.integer) or value < 1:
+        if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
             raise MeshError(f"{name} of a rod is {value!r}: it must be a whole number, one or more.")
     if nodes not in (8, 20, 27):
         raise MeshError(f"a rod of cells with {nodes} nodes: choose 8, 20 or 27.")
@@ -71,8 +68,7 @@ def rod(
     found = cells.reshape(-1, *cells.shape[2:])[:, place[:, 0], place[:, 1], place[:, 2]]
     used, numbers = np.unique(found, return_inverse=True)
     mesh = Mesh(vertices.reshape(-1, 3)[used], numbers.reshape(found.shape))
-    values, slopes = element.shape(element.rule[0])
-    del values
+    slopes = element.shape(element.rule[0])[1]
     if not (np.linalg.det(np.einsum("cki,qkj->cqij", mesh.vertices[mesh.cells], slopes)) > 0.0).all():
         raise MeshError("a rod is bent more sharply than it is thick: straighten its centreline, or make it thinner.")
     return mesh

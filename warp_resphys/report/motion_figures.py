@@ -1,4 +1,4 @@
-"""Figures of motion: markers and tips against models, deformed bodies, and the pressures that drive them."""
+"""Figures of motion: markers and tips against models, deformed bodies, and the inputs that drive them."""
 
 from collections.abc import Mapping, Sequence
 from itertools import cycle

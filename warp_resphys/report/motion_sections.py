@@ -1,4 +1,4 @@
-"""Sections of the page of a run on its motion, and on the body and the pressures that drive it."""
+"""Sections of the page of a run on its motion, and on the body and the inputs that drive it."""
 
 from concurrent.futures import Executor, Future
 from dataclasses import replace

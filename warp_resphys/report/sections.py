@@ -1,4 +1,4 @@
-"""Sections of the page of a run: errors by horizon and pressure, what was identified and learned, its recordings."""
+"""Sections of the page of a run: errors by horizon and input, what was identified and learned, its recordings."""
 
 import math
 import re
@@ -53,7 +53,7 @@ def _parameter(name: str) -> tuple[str, str, float]:
     if branch is None:
         return _PARAMETERS.get(name, (name, "", 1.0))
     kind, number = branch.groups()
-    return (f"Relaxation time {number}", "ms", 1e3) if kind == "time" else (f"Prony ratio {number}", "", 1.0)
+    return (f"Relaxation time {number}", "s", 1.0) if kind == "time" else (f"Prony ratio {number}", "", 1.0)
 
 
 def against(errors: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
@@ -127,14 +127,14 @@ def scales_section(data: RunReport, canvas: Canvas) -> Part | None:
 
 
 def scale_table(found: Mapping[str, Mapping[str, Any]]) -> Table | None:
-    """Return the errors at multiples of the pressures (a summary by scale and model), with how they stand to SysID."""
+    """Return the errors at multiples of the inputs (a summary by scale and model), with how they stand to SysID."""
     rows = {}
     for scale in sorted(found, key=float):
         base, shares = against(found[scale])
         cells = {m: Cell(_whole(e), "" if m == base else shares.get(m, "")) for m, e in found[scale].items()}
         rows[f"\N{MULTIPLICATION SIGN} {float(scale):g}"] = cells
-    note = "The pressures of the test trials, multiplied; below the error, how it stands to that of SysID."
-    return model_table("Pressures; mean error [mm]", rows, note) if rows else None
+    note = "The inputs of the test trials, multiplied; below the error, how it stands to that of SysID."
+    return model_table("Inputs; mean error [mm]", rows, note) if rows else None
 
 
 def _whole(summary: Mapping[str, Any]) -> str:

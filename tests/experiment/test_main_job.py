@@ -318,7 +318,7 @@ class TestConfiguration:
             overrides.append("trainer=sequences")
         config = self.composed(*overrides)
         refused = ""
-        if group == "mesh" and option.startswith(("arm", "segment")) and option != "arm_published":
+        if group == "mesh" and option.startswith(("arm", "rod", "segment")) and option != "arm_published":
             refused = r"no vertex lies within .* of x = 0\.1"
         elif group == "mesh" and name == "marker_ablation" and option in ("file", "arm_published"):
             refused = "ablation.counts asks for 128 markers, but the mesh has 42 surface vertices"

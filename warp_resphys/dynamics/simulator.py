@@ -72,14 +72,14 @@ def _device(name: str | torch.device) -> torch.device:
 
 
 def _ramped(
-    solve: Callable[[float, torch.Tensor], torch.Tensor], rest: torch.Tensor, error: ConvergenceError
+    solve: Callable[[float, torch.Tensor], torch.Tensor], rest: torch.Tensor, limited: ConvergenceError | None
 ) -> torch.Tensor:
     """Where equilibria under more and more of the loads lead to, from rest.
 
     Args:
         solve: the equilibrium under a share of the loads, from a start.
         rest: (B, N, 3) without any [m].
-        error: of all loads at once.
+        limited: the error of all loads at once, where a configured limit of the iterations may be its cause.
 
     Raises:
         ConvergenceError: shares do not lead there either.
@@ -89,8 +89,10 @@ def _ramped(
         share = min(done + step, 1.0)
         try:
             x = solve(share, x)
-        except ConvergenceError:
+        except ConvergenceError as error:
             step *= 0.5
+            if step < _LEAST_SHARE and limited is not None:
+                raise limited from None
             if step < _LEAST_SHARE:
                 raise ConvergenceError(
                     f"no equilibrium was found: under growing loads it is lost beyond {100.0 * done:.0f} % of them; "
@@ -439,7 +441,8 @@ class Simulator:
         except ConvergenceError as error:
             log.info("an equilibrium is sought under growing loads: %s", error)
             with torch.no_grad():
-                near = _ramped(lambda share, at: solve(share, at)[0], state.q, error)
+                limited = self.settings.max_iterations < _MOST_ITERATIONS
+                near = _ramped(lambda share, at: solve(share, at)[0], state.q, error if limited else None)
             x, report = solve(1.0, near)
         lengths = self.rest_positions.amax(0) - self.rest_positions.amin(0)
         furthest = (x.detach() - self.rest_positions).abs().flatten(1).amax(1)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...io.errors import DataFileError, listed
-from .recording import SI_PER_ACTUATION_UNIT, FloatArray, RawRecording
+from .recording import METRES_PER_UNIT, SI_PER_ACTUATION_UNIT, FloatArray, RawRecording
 
 Rows = list[list[str]]
 
@@ -20,6 +20,8 @@ _AXES = ("x", "y", "z")
 _OCCLUDED = ("", "nan", "null")
 _QUALISYS_KEYS = ("FILE_VERSION", "NO_OF_FRAMES", "NO_OF_MARKERS", "FREQUENCY", "MARKER_NAMES")
 _MOTIVE_UNITS = {"meters": "m", "centimeters": "cm", "millimeters": "mm"}
+# A column in a length is a misspelt marker rather than an actuation.
+_CHANNEL_UNITS = [unit for unit in SI_PER_ACTUATION_UNIT if unit not in METRES_PER_UNIT]
 _UNEVEN = 0.25  # of a frame, that a time stamp may be off
 _LARGEST_STAMP = 1e12  # [s or 1], a time or frame number that is believed
 _LEAST_RECORDED = 0.1  # of the frames between the first and the last
@@ -68,12 +70,12 @@ def _read_table(rows: Rows, path: Path) -> RawRecording:
         if label and axis.lower() in _AXES:
             named.append((label, axis.lower(), number))
             units |= {unit} if unit else set()
-        elif unit in SI_PER_ACTUATION_UNIT:
+        elif unit in _CHANNEL_UNITS:
             channels[number] = SI_PER_ACTUATION_UNIT[unit]
         else:
             raise DataFileError(
                 f"{path}: column {number + 1} is named '{name}', which is neither '<marker>.x', '.y' or '.z' nor a "
-                f"channel with a unit in brackets ({', '.join(SI_PER_ACTUATION_UNIT)}); rename it or leave it out."
+                f"channel with a unit in brackets ({', '.join(_CHANNEL_UNITS)}); rename it or leave it out."
             )
     labels, chosen = _markers(named, path)
     if len(units) > 1:

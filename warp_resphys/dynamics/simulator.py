@@ -318,7 +318,8 @@ class Simulator:
     ) -> State:
         """The state that the stage's solution leads to."""
         new = self.method.finish(state, x, self.time_step)
-        new = replace(new, overstrain=self.relaxed(constants, state, new.q))
+        if constants.relaxes:
+            new = replace(new, overstrain=self.relaxed(constants, state, new.q))
         if stage.end == 1.0 or not len(self.fixed):
             return new
         # A prescribed motion has a velocity of its own; extrapolated from mid-step it would ring.

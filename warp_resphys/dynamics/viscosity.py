@@ -58,7 +58,8 @@ def viscous_values(
             carried = carried - torch.einsum("bk,bkpij->bpij", shares, state.overstrain)
         c, offset = c + added, carried if offset is None else offset + carried
         dilation = carried.new_zeros(carried.shape[:2]) if dilation is None else dilation
-    return {"viscosity": torch.stack([c, d], 1), "strain_offset": offset, "dilation_offset": dilation}
+    viscosity = torch.stack([c, d], 1) if constants.relaxes else d[:, None].expand(batch, 2)
+    return {"viscosity": viscosity, "strain_offset": offset, "dilation_offset": dilation}
 
 
 def without_viscosity(batch: int, like: torch.Tensor) -> dict[str, torch.Tensor | None]:

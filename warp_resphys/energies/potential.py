@@ -87,6 +87,7 @@ class IncrementalPotential(Launcher):
         values: dict[str, torch.Tensor | None] = {name: self.zeros(*shape) for name, shape in shapes.items()}
         self.terms = StepTerms(self.zeros(n_vertices, 3), self.zeros(n_vertices), self.zeros(n_vertices, 3), values)
         self.positions = self.zeros(n_vertices, 3)
+        self._position_view = warp_view(self.positions, wp.vec3d)
         self.residual = self.zeros(n_vertices, 3)
         self._stress = self.zeros(self._n_points, 3, 3)
         self._point_energy = self.zeros(self._n_points)
@@ -113,7 +114,7 @@ class IncrementalPotential(Launcher):
                 warp_view(t.inertia, wp.float64),
                 warp_view(t.target, wp.vec3d),
                 warp_view(t.force, wp.vec3d),
-                warp_view(self.positions, wp.vec3d),
+                self._position_view,
             ],
             [warp_view(self.residual, wp.vec3d), warp_view(self._vertex_energy, wp.float64)],
         )
@@ -121,11 +122,11 @@ class IncrementalPotential(Launcher):
         self._load_commands: list[Any] = []
         for term, is_load in zip(self.energies, self._loads, strict=True):
             commands = self._load_commands if is_load else self._internal_commands
-            commands += term.before(t.values, warp_view(self.positions, wp.vec3d))
+            commands += term.before(t.values, self._position_view)
             for s in term.sets:
                 stress = self.points_view(self._stress, s.part, wp.mat33d)
                 outputs = [stress, self.points_view(self._point_energy, s.part, wp.float64)]
-                kernel, inputs = term.step(s, t.values, warp_view(self.positions, wp.vec3d))
+                kernel, inputs = term.step(s, t.values, self._position_view)
                 commands += [
                     self.record(kernel, (b, s.n_points), inputs, outputs),
                     self.gather(s, stress, self.residual),
@@ -201,8 +202,7 @@ class IncrementalPotential(Launcher):
         if positive is not None:
             self._positive.copy_(positive)
         self.launch(*self._tangent_commands)
-        view = warp_view(self.positions, wp.vec3d)
-        found = [term.low_rank(self.terms.values, view) for term in self.energies]
+        found = [term.low_rank(self.terms.values, self._position_view) for term in self.energies]
         roots = [each.root for each in found if each is not None]
         self.low_rank = torch.cat(roots, 2) if roots else None
 
@@ -225,10 +225,10 @@ class IncrementalPotential(Launcher):
         self._tangent_commands, self._product_commands = [], []
         positive, direction = warp_view(self._positive, wp.int32), warp_view(self._direction, wp.vec3d)
         for term in self.energies:
-            self._tangent_commands += term.before(self.terms.values, warp_view(self.positions, wp.vec3d))
+            self._tangent_commands += term.before(self.terms.values, self._position_view)
             for s in term.sets:
                 tangent = self.points_view(blocks, s.part, wp.mat33d)
-                kernel, inputs = term.tangent(s, self.terms.values, warp_view(self.positions, wp.vec3d), positive)
+                kernel, inputs = term.tangent(s, self.terms.values, self._position_view, positive)
                 self._tangent_commands.append(self.record(kernel, (self.batch, s.n_points), inputs, [tangent]))
                 stress = self.points_view(self._product_stress, s.part, wp.mat33d)
                 self._product_commands += [

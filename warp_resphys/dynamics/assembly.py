@@ -54,6 +54,11 @@ class BlockPattern:
             self.n_cell_blocks += len(pair)
         self._collect(np.concatenate(sources), np.concatenate(pairs))
 
+    def unknowns(self, device: torch.device) -> torch.Tensor:
+        """(3 F,) the free coordinates among those of all vertices."""
+        free = torch.as_tensor(self.free, device=device)
+        return (3 * free[:, None] + torch.arange(3, device=device)).reshape(-1)
+
     def _collect(self, source: NDArray[np.int64], pair: NDArray[np.int64]) -> None:
         """Sorts the cell blocks by matrix block; a block above the diagonal enters transposed."""
         n = len(self.free)

@@ -20,6 +20,8 @@ from .nonlinear_solver import NonlinearSolver, SolveReport, SolverSettings
 
 T = TypeVar("T")
 
+_LEAST_SHARE = 1.0 / 64.0  # of the loads, by which they grow where all of them at once lead nowhere
+
 
 class Workspace:
     """Buffers, launches and factors for one batch size of a body.
@@ -100,6 +102,40 @@ def equilibrium(
         workspace, solver, reports, names, start, fixed_positions, *main, *terms.values.values()
     )
     return x, reports[0]
+
+
+def ramped(
+    solve: Callable[[float, torch.Tensor], torch.Tensor], rest: torch.Tensor, limited: ConvergenceError | None
+) -> torch.Tensor:
+    """Where equilibria under more and more of the loads lead to, from rest.
+
+    Args:
+        solve: the equilibrium under a share of the loads, from a start.
+        rest: (B, N, 3) without any [m].
+        limited: the error of all loads at once, where a configured limit of the iterations may be its cause.
+
+    Raises:
+        ConvergenceError: shares do not lead there either.
+    """
+    done, step, x = 0.0, 0.5, rest
+    while done < 1.0:
+        share = min(done + step, 1.0)
+        try:
+            x = solve(share, x)
+        except ConvergenceError as error:
+            step *= 0.5
+            if step < _LEAST_SHARE and limited is not None:
+                raise limited from None
+            if step < _LEAST_SHARE:
+                raise ConvergenceError(
+                    f"no equilibrium was found: under growing loads it is lost beyond {100.0 * done:.0f} % of them; "
+                    "lower the loads, or take a stiffer material.",
+                    x,
+                    error.report,
+                ) from None
+        else:
+            done = share
+    return x
 
 
 class _Equilibrium(torch.autograd.Function):

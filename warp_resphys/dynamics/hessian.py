@@ -8,7 +8,7 @@ from typing_extensions import override
 
 from ..energies.base import PointSet
 from ..energies.potential import IncrementalPotential
-from ..linalg.linear_solver import CorrectedFactor, Factor, LinearSolver
+from ..linalg.linear_solver import Factor, LinearSolver, corrected
 from .assembly import BlockPattern, HessianAssembly
 
 
@@ -47,8 +47,7 @@ class ExactHessian(HessianApproximation):
     def __init__(self, potential: IncrementalPotential, pattern: BlockPattern, linear: LinearSolver) -> None:
         self._potential, self._linear = potential, linear
         self._assemble = HessianAssembly(potential, linear, pattern)
-        free = torch.as_tensor(pattern.free, device=potential.device)
-        self._dofs = (3 * free[:, None] + torch.arange(3, device=potential.device)).reshape(-1)
+        self._dofs = pattern.unknowns(potential.device)
         self._factor: Factor | None = None
         self.clamped = torch.zeros(potential.batch, dtype=torch.bool, device=potential.device)
 
@@ -70,10 +69,9 @@ class ExactHessian(HessianApproximation):
 
     def _factor_of(self, values: torch.Tensor, definite: bool = True) -> Factor:
         """Of assembled values, and what couples vertices beside them."""
-        factor, columns = self._linear.factor(values, definite), self._potential.low_rank
-        if columns is None:
-            return factor
-        return CorrectedFactor(factor, columns[:, self._dofs].to(self._linear.dtype))
+        columns = self._potential.low_rank
+        columns = None if columns is None else columns[:, self._dofs].to(self._linear.dtype)
+        return corrected(self._linear.factor(values, definite), columns)
 
     def refactor_exact(self) -> None:
         """Factorises the Hessian as it is, indefinite or not: for adjoints."""

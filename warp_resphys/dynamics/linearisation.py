@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..energies.potential import StepTerms
-from ..linalg.linear_solver import CorrectedFactor, Factor, SparseSolver
+from ..linalg.linear_solver import Factor, SparseSolver, corrected
 from .assembly import HessianAssembly
 from .equilibrium import Workspace
 from .integrator import ImplicitStage, State
@@ -116,8 +116,7 @@ class _ShiftedHessian:
     def __init__(self, workspace: Workspace, linear_solver: str) -> None:
         p, k = workspace.potential, workspace.pattern
         self._linear, self._potential = workspace.linear_solver(linear_solver), p
-        free = torch.as_tensor(k.free, device=p.device)
-        self._dofs = (3 * free[:, None] + torch.arange(3, device=p.device)).reshape(-1)
+        self._dofs = k.unknowns(p.device)
         self._assemble = HessianAssembly(p, self._linear, k)
         diagonal = self._linear.address[k.rows == k.cols][:, [0, 4, 8]].ravel()
         self._diagonal = torch.as_tensor(diagonal.astype(np.int64), device=p.device)
@@ -126,5 +125,6 @@ class _ShiftedHessian:
         """The factor at the potential's last tangent."""
         values = scale * self._assemble()
         values[:, self._diagonal] += 1.0
-        factor, columns = self._linear.factor(values), self._potential.low_rank
-        return factor if columns is None else CorrectedFactor(factor, math.sqrt(scale) * columns[:, self._dofs])
+        columns = self._potential.low_rank
+        columns = None if columns is None else math.sqrt(scale) * columns[:, self._dofs]
+        return corrected(self._linear.factor(values), columns)

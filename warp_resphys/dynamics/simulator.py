@@ -2,7 +2,7 @@
 
 import itertools
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, cast
@@ -19,7 +19,7 @@ from ..fem.body import Body
 from ..io.errors import ConvergenceError, InputError
 from .assembly import BlockPattern
 from .constants import Constants
-from .equilibrium import Workspace, equilibrium
+from .equilibrium import Workspace, equilibrium, ramped
 from .inputs import Inputs, check_tensor
 from .integrator import ImplicitStage, State, make_integrator
 from .linearisation import Linearisation
@@ -32,7 +32,6 @@ GRAVITY = (0.0, 0.0, -9.80709)
 _MOST_LENGTHS = 100.0  # that a body at rest may be away from its rest shape
 COUPLINGS = ("implicit", "explicit")
 _MOST_ITERATIONS = 100  # of Newton's method for an equilibrium; a few are enough where it is near
-_LEAST_SHARE = 1.0 / 64.0  # of the loads, by which they grow where all of them at once lead nowhere
 _NOTHING = Inputs()
 _GRAVITY = Quantity("gravity", "m/s^2", per="axis")
 
@@ -69,40 +68,6 @@ def _device(name: str | torch.device) -> torch.device:
     if device.type == "cuda" and not torch.cuda.is_available():
         raise InputError(f"device is {name!r}, but torch finds no CUDA device: choose device=cpu.")
     return device
-
-
-def _ramped(
-    solve: Callable[[float, torch.Tensor], torch.Tensor], rest: torch.Tensor, limited: ConvergenceError | None
-) -> torch.Tensor:
-    """Where equilibria under more and more of the loads lead to, from rest.
-
-    Args:
-        solve: the equilibrium under a share of the loads, from a start.
-        rest: (B, N, 3) without any [m].
-        limited: the error of all loads at once, where a configured limit of the iterations may be its cause.
-
-    Raises:
-        ConvergenceError: shares do not lead there either.
-    """
-    done, step, x = 0.0, 0.5, rest
-    while done < 1.0:
-        share = min(done + step, 1.0)
-        try:
-            x = solve(share, x)
-        except ConvergenceError as error:
-            step *= 0.5
-            if step < _LEAST_SHARE and limited is not None:
-                raise limited from None
-            if step < _LEAST_SHARE:
-                raise ConvergenceError(
-                    f"no equilibrium was found: under growing loads it is lost beyond {100.0 * done:.0f} % of them; "
-                    "lower the loads, or take a stiffer material.",
-                    x,
-                    error.report,
-                ) from None
-        else:
-            done = share
-    return x
 
 
 @dataclass
@@ -327,13 +292,8 @@ class Simulator:
         moved = torch.zeros_like(now) if inputs.fixed_positions is None else inputs.fixed_positions - now
         return replace(new, v=new.v.index_copy(1, self.fixed, moved / self.time_step))
 
-    def relaxed(self, constants: Constants, state: State, q: torch.Tensor) -> torch.Tensor | None:
-        """(B, K, P, 3, 3) strains of the Prony branches where a step leads from a state to positions q (B, N, 3).
-
-        None where the material has no branch that acts.
-        """
-        if not constants.relaxes:
-            return None
+    def relaxed(self, constants: Constants, state: State, q: torch.Tensor) -> torch.Tensor:
+        """(B, K, P, 3, 3) strains of the Prony branches where a step leads from a state to positions q (B, N, 3)."""
         return relaxed(self.workspace(state.batch).potential.solid, constants, state, q, self.time_step)
 
     def linearise(
@@ -443,7 +403,7 @@ class Simulator:
             log.info("an equilibrium is sought under growing loads: %s", error)
             with torch.no_grad():
                 limited = self.settings.max_iterations < _MOST_ITERATIONS
-                near = _ramped(lambda share, at: solve(share, at)[0], state.q, error if limited else None)
+                near = ramped(lambda share, at: solve(share, at)[0], state.q, error if limited else None)
             x, report = solve(1.0, near)
         lengths = self.rest_positions.amax(0) - self.rest_positions.amin(0)
         furthest = (x.detach() - self.rest_positions).abs().flatten(1).amax(1)

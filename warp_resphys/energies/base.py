@@ -187,19 +187,6 @@ class Energy(ABC):
         return values.expand(-1, self.count)
 
 
-@dataclass(frozen=True)
-class LowRank:
-    """The matrix sum_k c_k g_k g_k^T."""
-
-    gradients: torch.Tensor  # (B, 3 N, r) g
-    factors: torch.Tensor  # (B, r) c, zero or more
-
-    @property
-    def root(self) -> torch.Tensor:
-        """(B, 3 N, r) columns C with the matrix C C^T."""
-        return self.gradients * self.factors.sqrt()[:, None]
-
-
 class Term(ABC):
     """An energy's kernels on the points of a batch.
 
@@ -224,8 +211,8 @@ class Term(ABC):
         del values, positions
         return []
 
-    def low_rank(self, values: Values, positions: Any) -> "LowRank | None":
-        """What the tangent leaves out: a part of the Hessian that couples vertices of many cells."""
+    def low_rank(self, values: Values, positions: Any) -> torch.Tensor | None:
+        """(B, 3 N, r) columns C of what the tangent leaves out: C C^T couples vertices of many cells."""
         del values, positions
         return None
 

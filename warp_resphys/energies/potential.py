@@ -203,8 +203,8 @@ class IncrementalPotential(Launcher):
             self._positive.copy_(positive)
         self.launch(*self._tangent_commands)
         found = [term.low_rank(self.terms.values, self._position_view) for term in self.energies]
-        roots = [each.root for each in found if each is not None]
-        self.low_rank = torch.cat(roots, 2) if roots else None
+        columns = [each for each in found if each is not None]
+        self.low_rank = torch.cat(columns, 2) if columns else None
 
     @property
     def tangent(self) -> torch.Tensor:

@@ -28,7 +28,7 @@ from ..io.errors import InputError
 from ..kernels import tendons as kernels
 from ..mesh.location import locate
 from ..mesh.mesh import Mesh
-from .base import Energy, LowRank, Parameter, PartTerm, PointSet, Quantity, Values
+from .base import Energy, Parameter, PartTerm, PointSet, Quantity, Values
 from .launcher import Launcher, warp_view
 
 
@@ -171,8 +171,7 @@ class TendonTerm(PartTerm):
         super().__init__(launcher, sets, "tendon_tension", numbers, np.ones(len(numbers)), tendons.count)
         self._toe = wp.float64(tendons.toe)
         self._first = launcher.upload(np.searchsorted(numbers, np.arange(tendons.count + 1)).astype(np.int32), int)
-        self._rest = np.bincount(numbers, s.source.length)
-        self._rest_length = launcher.upload(self._rest, wp.float64)
+        self._rest_length = launcher.upload(np.bincount(numbers, s.source.length), wp.float64)
         self._tension, self._spring = launcher.zeros(tendons.count), launcher.zeros(tendons.count, 3)
         self._direction = launcher.zeros(s.n_points, 3)
         self._piece_length = torch.as_tensor(s.source.length, device=launcher.device)
@@ -215,7 +214,7 @@ class TendonTerm(PartTerm):
         return kernels.tangent, [s.nodes, s.gradients, self.part, warp_view(self._tension, wp.float64), positions]
 
     @override
-    def low_rank(self, values: Values, positions: Any) -> LowRank | None:
+    def low_rank(self, values: Values, positions: Any) -> torch.Tensor | None:
         stiffness = values["tendon_stiffness"]
         assert stiffness is not None
         if not bool((stiffness > 0.0).any()):
@@ -224,8 +223,8 @@ class TendonTerm(PartTerm):
         inputs, out = [s.nodes, s.gradients, positions], warp_view(self._direction, wp.vec3d)
         own.launch(own.record(kernels.directions, (own.batch, s.n_points), inputs, [out]))
         by_tendon = (self._direction[:, :, :, None] * self._own[:, None]).flatten(2)  # (B, P, 3 T)
-        gradient = (self._operator.mT @ by_tendon).unflatten(2, (3, self.count))
-        return LowRank(gradient.flatten(1, 2), stiffness * self._spring[..., 2])
+        gradient = (self._operator.mT @ by_tendon).unflatten(2, (3, self.count)).flatten(1, 2)
+        return gradient * (stiffness * self._spring[..., 2]).sqrt()[:, None]
 
     @override
     def curvature(self, values: Values) -> torch.Tensor:

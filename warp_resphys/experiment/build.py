@@ -159,10 +159,8 @@ def build_tendons(config: Mapping[str, Any]) -> Tendons:
             "tendons.stiffness is 0, but their contraction is commanded, which acts through it: set it, in N/m."
         )
     routes = []
-    for name, route in config["routes"].items():
+    for route in config["routes"].values():
         guides = np.asarray(route["guides"], dtype=np.float64)
-        if guides.ndim != 2 or guides.shape[1] != 3 or len(guides) < 2:
-            raise InputError(f"tendons.routes.{name}.guides needs two or more places of three numbers, in m.")
         share = np.linspace(0.0, 1.0, route.get("pieces", 1), endpoint=False)[:, None]
         parts = [first + share * (last - first) for first, last in pairwise(guides)]
         routes.append(np.concatenate([*parts, guides[-1:]]))

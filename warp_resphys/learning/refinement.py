@@ -167,7 +167,6 @@ class WindowLoss:
                 q, began = torch.where(known[:, None, None], q, before), began | known
                 with torch.no_grad():
                     overstrain = simulator.relaxed(constants, replace(state, q=before), q)
-                assert overstrain is not None
                 state = replace(state, q=q, overstrain=overstrain)
                 if frame >= self._first_frame and (frame - self._first_frame) % self._window == 0:
                     found.append(overstrain)

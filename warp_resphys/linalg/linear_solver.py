@@ -65,6 +65,11 @@ class CorrectedFactor(Factor):
         return found - self._solved @ torch.linalg.lu_solve(*self._small, self._columns.mT @ found)
 
 
+def corrected(factor: Factor, columns: torch.Tensor | None) -> Factor:
+    """A factor of A + C C^T, or that of A where there is no C."""
+    return factor if columns is None else CorrectedFactor(factor, columns)
+
+
 class LinearSolver(ABC):
     """Factorises symmetric matrices of one sparsity pattern.
 

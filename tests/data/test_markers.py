@@ -31,11 +31,11 @@ POINTS = np.array(
     ]
 )
 NAMES = ["above", "edge", "corner", "sunk", "Tip - 1", "Tip - 2"]
-MIXED = ["normal", "rigid", "frame", "frame", "rigid", "normal"]
+MIXED = ["normal", "rigid", "frame", "patch", "rigid", "normal"]
 
 
 def bind(kind, mesh=MESH):
-    return bind_markers(mesh, POINTS, NAMES, kind=kind, vertices=select_vertices(mesh, x=0.1))
+    return bind_markers(mesh, POINTS, NAMES, kind=kind, vertices=select_vertices(mesh, x=0.1), patch=0.03)
 
 
 def bent(rest):
@@ -126,6 +126,16 @@ def test_rigid_ones_follow_the_best_fit_to_the_face():
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
 
 
+def test_a_patch_follows_what_is_around_its_foot_and_nothing_else():
+    markers = bind_markers(MESH, POINTS[:1], NAMES[:1], kind="patch", patch=0.025)
+    near = np.linalg.norm(MESH.vertices - [0.043, 0.012, 0.03], axis=1) <= 0.025
+    assert set(markers.vertices.tolist()) == set(np.flatnonzero(near))
+    q = poses(MESH)[1:2]
+    moved = q.clone()
+    moved[:, torch.as_tensor(~near)] += 0.1
+    np.testing.assert_array_equal(markers(moved), markers(q))
+
+
 @pytest.mark.parametrize("spread", [(3.0, 2.0, 1.0), (1.0, 1.0, 0.0), (1.0, 1.0, 1.0), (3.0, 2.0, -1.0)])
 def test_derivative_of_the_closest_rotation(spread):
     """Also where singular values coincide or vanish, as for a square face, and for a mirror image."""
@@ -172,11 +182,15 @@ def test_the_derivative_of_linear_ones_is_their_weights():
         ),
         ({"largest_distance": 0.005, "positions": POINTS[[0, 0]], "names": ["a", "b"]}, "Marker 'a' is 6.0 mm from"),
         ({"positions": np.where(np.arange(6)[:, None] == 3, np.nan, POINTS)}, "Marker 'sunk' was not seen at rest"),
-        ({"kind": "glued"}, "The kind of marker 'above' is 'glued': choose one of normal, frame, rigid."),
+        ({"kind": "glued"}, "The kind of marker 'above' is 'glued': choose one of normal, frame, rigid, patch."),
         ({"kind": ["frame"]}, "6 markers are named, with 1 kinds and positions (6, 3)"),
         ({"kind": "rigid"}, "Rigid markers follow 0 vertices: give three or more of the 54 of the mesh"),
         ({"kind": "rigid", "vertices": [0, 1, 99]}, "Rigid markers follow 3 vertices: give three or more of the 54"),
         ({"kind": "rigid", "vertices": [0, 1, 2]}, "The vertices that rigid markers follow lie on one line"),
+        (
+            {"kind": "patch", "patch": 1e-3},
+            "Marker 'above' follows 0 vertices within 1 mm of its foot: widen the patch.",
+        ),
     ],
 )
 def test_bad_markers(settings, sentence):

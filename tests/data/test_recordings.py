@@ -9,6 +9,7 @@ import pytest
 
 from warp_resphys.data.recordings.arrays import write_recording
 from warp_resphys.data.recordings.reading import read_recording
+from warp_resphys.data.recordings.text import Table
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.files import atomic_hdf5
 
@@ -54,6 +55,47 @@ def test_table(tmp_path, positions, delimiter):
     np.testing.assert_array_equal(np.argwhere(~recording.seen), [[7, 1], [8, 1]])
 
 
+def test_a_table_that_says_nothing_of_itself(tmp_path, positions):
+    """As a log has it: no header, semicolons, columns of no interest, times in milliseconds, a tendon's length."""
+    path, wound = tmp_path / "swing.csv", np.linspace(0.0, 3.9, 40)
+    rows = [[1000.0 + 10.0 * k, 7.0, *(1e3 * positions[k].ravel()), wound[k]] for k in range(40)]
+    path.write_text("a log\n" + "\n".join(";".join(f"{x:.6f}" for x in row) for row in rows) + "\n")
+    axes = [f"{label}.{axis} [mm]" for label in "abc" for axis in "xyz"]
+    recording = read_recording(path, table=Table(["time [ms]", None, *axes, "tendon [mm]"], header_lines=1))
+    assert (recording.labels, recording.rate, recording.start) == (("a", "b", "c"), 100.0, 1.0)
+    np.testing.assert_allclose(recording.positions, positions, atol=1e-8)
+    np.testing.assert_allclose(recording.actuation[:, 0], 1e-3 * wound, atol=1e-8)
+
+
+def test_a_table_of_markers_in_a_plane(tmp_path):
+    """A single camera sees no depth; and where nothing tells the time, the rate does."""
+    path, flat = tmp_path / "swing.csv", np.random.default_rng(0).uniform(0.0, 90.0, (30, 4))
+    np.savetxt(path, flat, delimiter=",")
+    recording = read_recording(path, units="mm", rate=60.0, table=Table(["a.y", "a.z", "b.y", "b.z"]))
+    np.testing.assert_allclose(recording.positions[..., 1:], 1e-3 * flat.reshape(30, 2, 2), atol=1e-12)
+    assert (recording.positions[..., 0] == 0.0).all()
+    assert recording.rate == 60.0
+
+
+@pytest.mark.parametrize(
+    ("columns", "lines", "message"),
+    [
+        (["a.x", "a.y"], 0, "line 1: 4 cells, but data.table.columns names 2: name each column"),
+        (["a.x", "a.y", "a.z", "b.x"], 0, "marker b has no column 'b.y'"),
+        (["a.x", "a.y", "a.z", "pull"], 0, "column 4 is named 'pull', which is neither"),
+        (["time", "frame", None, None], 0, "columns 1 and 2 both tell the time"),
+        (["a.x", "a.y", "a.z", None], 99, "line 100: 0 cells, but data.table.columns names 4"),
+    ],
+)
+def test_tables_that_are_described_wrongly(tmp_path, columns, lines, message):
+    path = tmp_path / "swing.csv"
+    np.savetxt(path, np.arange(40.0).reshape(10, 4), delimiter=",")
+    with pytest.raises(DataFileError, match=message):
+        read_recording(path, units="mm", rate=60.0, table=Table(columns, lines))
+    with pytest.raises(DataFileError, match=r"is no text, so that data\.table cannot tell"):
+        read_recording(tmp_path / "swing.npz", table=Table(columns, lines))
+
+
 def test_table_in_another_order_of_columns(tmp_path, positions):
     path = tmp_path / "swing.csv"
     rows = ["frame,b.y,b.x,a.z,b.z,a.x,a.y"]
@@ -82,7 +124,7 @@ def test_lines_that_were_not_recorded_are_occlusions(tmp_path, positions):
     ("line", "change", "message"),
     [
         (1, lambda line: line.replace("time [s]", "t"), "has no header that is known"),
-        (1, lambda line: line.replace("time [s]", "time [ms]"), "gives its time in 'ms'"),
+        (1, lambda line: line.replace("time [s]", "time [min]"), "gives its time in 'min'"),
         (1, lambda line: line.replace("b.y", "b.w"), r"column 6 is named 'b\.w', which is neither"),
         (1, lambda line: line.replace("c.z", "c.y"), r"has two columns named 'c\.y'"),
         (1, lambda line: line.replace("c.z [mm]", "valve [bar]"), r"marker c has no column 'c\.z'"),

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from warp_resphys.data.recordings.processing import fill_gaps
 from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.recordings.release import find_release
-from warp_resphys.data.registration import register_markers
+from warp_resphys.data.registration import axes_rotation, register_markers
 from warp_resphys.data.rigid import RigidTransform, kabsch, root_mean_square
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.mesh.mesh import boundary_triangles, box_hexahedra, box_tetrahedra
@@ -218,3 +218,38 @@ def test_closest_points_of_a_box(mesh):
 def test_beside_an_edge_the_face_below_is_the_closest():
     found = closest_points(MESHES["hexahedra"], np.array([[0.1, 0.015, 0.036], [0.1, -0.006, 0.011]]))
     np.testing.assert_allclose(found.normals, [[0, 0, 1], [0, -1, 0]], atol=1e-12)
+
+
+def shifted(axes, **moved):
+    """The nominal markers in a frame with other axes, some moved [m], and the rotation back."""
+    rotation = axes_rotation(axes)
+    points = NOMINAL.copy()
+    for place, by in moved.items():
+        points[int(place[1:])] += by
+    return (points - [0.3, -0.2, 1.5]) @ rotation, rotation
+
+
+def test_known_axes_leave_a_shift_that_one_marker_tells():
+    points, rotation = shifted(["x", "z", "-y"])
+    assert_allclose = np.testing.assert_allclose
+    for use in (NAMES[3:4], BASE, None):
+        found = register_markers(points, NOMINAL, NAMES, source=SOURCE, use=use, rotation=rotation)
+        assert_allclose(found.positions, NOMINAL, atol=1e-12)
+        assert found.rms < 1e-12
+        assert found.inliers.sum() == (len(NAMES) if use is None else len(use))
+    off, rotation = shifted(["x", "z", "-y"], m3=[0.02, 0.0, 0.0], m0=[0.0, 0.001, 0.0])
+    found = register_markers(off, NOMINAL, NAMES, source=SOURCE, rotation=rotation)
+    assert found.outliers == ("Base - 1",)
+    assert_allclose(found.residual[[3]], 0.02, atol=3e-4)
+
+
+def test_axes_that_do_not_fit():
+    points, rotation = shifted(["y", "-x", "z"])
+    with pytest.raises(DataFileError, match=r"swing.c3d: .* with the axes that are given: one is .* mm off"):
+        register_markers(points, NOMINAL, NAMES, source=SOURCE, rotation=axes_rotation(["z", "x", "y"]))
+    with pytest.raises(DataFileError, match="registration needs one marker at rest, but 0 are left to it"):
+        register_markers(points * np.nan, NOMINAL, NAMES, source=SOURCE, rotation=rotation)
+    with pytest.raises(InputError, match="would mirror the recording"):
+        axes_rotation(["x", "z", "y"])
+    with pytest.raises(InputError, match="name one axis twice"):
+        axes_rotation(["x", "-x", "y"])

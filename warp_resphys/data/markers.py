@@ -8,6 +8,7 @@ A marker stands on a stem. What a body does to the stem is decided by what it is
   the rotation of its tangent plane that is closest to the deformation (the polar factor).
 - ``rigid``: x = c + R o. It follows the rigid motion that is closest to that of a set of vertices, such as those of a
   face that it is glued to; c is their centre.
+- ``patch``: the same with the vertices around its foot, as of a marker on a clip around a rod.
 
 All reproduce the markers at rest, and carry them rigidly where the body moves rigidly.
 """
@@ -26,7 +27,8 @@ from ..io.errors import InputError
 from ..mesh.mesh import Mesh
 from ..mesh.surface import closest_points
 
-KINDS = ("normal", "frame", "rigid")
+_LEAST_PATCH = 4  # vertices that tell how a patch turns
+KINDS = ("normal", "frame", "rigid", "patch")
 
 
 class Markers(ABC):
@@ -196,6 +198,7 @@ def bind_markers(
     kind: str | Sequence[str] = "normal",
     vertices: ArrayLike | None = None,
     largest_distance: float = 0.02,
+    patch: float = 0.02,
 ) -> Markers:
     """Binds markers to a body at rest.
 
@@ -209,6 +212,7 @@ def bind_markers(
         names: m names.
         kind: One of `KINDS` for all markers, or one for each.
         vertices: (S,) the vertices that ``rigid`` markers follow.
+        patch: how far from its foot, the closest point of the surface, are those that a ``patch`` marker follows [m].
         largest_distance: How far from the surface a marker may be [m].
 
     Returns:
@@ -228,18 +232,30 @@ def bind_markers(
             f"Marker '{names[worst]}' is {1e3 * abs(found.distances[worst]):.1f} mm from the surface of the body, more "
             f"than {1e3 * largest_distance:.1f} mm: check its position, the unit of the mesh and the registration."
         )
-    on_surface = np.array([each != "rigid" for each in kinds])
+    on_surface = np.array([each in ("normal", "frame") for each in kinds])
     flat = np.array([each == "normal" for each in kinds])
     parts: list[Markers] = []
+    places: list[int] = []
     if on_surface.any():
         bound = (found.triangles, points, found.points, flat)
         parts.append(_on_triangles(mesh, *(each[on_surface] for each in bound)))
-    if not on_surface.all():
-        parts.append(_on_vertices(mesh, vertices, points[~on_surface]))
+        places += np.flatnonzero(on_surface).tolist()
+    if rigid := [number for number, each in enumerate(kinds) if each == "rigid"]:
+        parts.append(_on_vertices(mesh, vertices, points[rigid]))
+        places += rigid
+    for number in [number for number, each in enumerate(kinds) if each == "patch"]:
+        near = np.flatnonzero(np.linalg.norm(mesh.vertices - found.points[number], axis=1) <= patch)
+        if len(near) < _LEAST_PATCH:
+            raise InputError(
+                f"Marker '{names[number]}' follows {len(near)} vertices within {1e3 * patch:.3g} mm of its foot: "
+                "widen the patch."
+            )
+        parts.append(_on_vertices(mesh, near, points[number][None]))
+        places.append(number)
     if len(parts) == 1:
         return parts[0]
-    order = np.argsort(np.concatenate([np.flatnonzero(on_surface), np.flatnonzero(~on_surface)]))
-    return JoinedMarkers(torch.cat([part.vertices.flatten() for part in parts]), tuple(parts), torch.as_tensor(order))
+    order = torch.as_tensor(np.argsort(places))
+    return JoinedMarkers(torch.cat([part.vertices.flatten() for part in parts]), tuple(parts), order)
 
 
 def _check_markers(points: np.ndarray, names: Sequence[str], kinds: Sequence[str]) -> None:

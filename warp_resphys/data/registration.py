@@ -40,6 +40,7 @@ def register_markers(
     source: str | Path,
     largest_residual: float = 0.004,
     use: Sequence[str] | None = None,
+    rotation: ArrayLike | None = None,
 ) -> Registration:
     """Registers markers at rest to their nominal positions, without those that are not where they should be.
 
@@ -47,7 +48,7 @@ def register_markers(
     `largest_residual`; among sets of one size, to that with the least sum of squares. All sets are tried, up to 20 000
     of them, so that no unlucky start can miss the best. The set is more than half of the markers and at least four:
     two of six markers or seven of fifteen may be anywhere, and three markers that do not fit are an error. Markers
-    that are NaN are left out and do not count.
+    that are NaN are left out and do not count. Where the rotation is known, one marker is enough.
 
     Args:
         measured: (M, 3) [m] the markers while the body was at rest, in the frame of the recording.
@@ -56,10 +57,12 @@ def register_markers(
         source: The file that they come from, for messages.
         largest_residual: How well the nominal positions are known [m].
         use: The markers to fit, such as those on the clamp; all if None.
+        rotation: (3, 3) from the frame of the recording to that of the body, where it is known.
 
     Raises:
         InputError: Arrays that do not fit, a name in `use` that there is not, or nominal positions on one line.
-        DataFileError: Fewer than three of the markers are seen, or too many of them are too far off.
+        DataFileError: Fewer than three of the markers are seen (none, with a known rotation), or too many of them are
+            too far off.
     """
     a, b = np.asarray(measured, dtype=np.float64), np.asarray(nominal, dtype=np.float64)
     if a.shape != (len(names), 3) or b.shape != a.shape:
@@ -67,7 +70,18 @@ def register_markers(
             f"{len(names)} markers are named, with measured positions {a.shape} and nominal ones {b.shape}: both must "
             "be (markers, 3)."
         )
-    used = _used(a, names, use, source)
+    turned = None if rotation is None else np.asarray(rotation, dtype=np.float64)
+    used = _used(a, names, use, source, 3 if turned is None else 1)
+    if turned is not None:
+        near, motion = _shifted(a, b, used, turned, largest_residual)
+        if not 2 * np.count_nonzero(near) > np.count_nonzero(used):
+            off = _MILLI * float(np.linalg.norm((motion.apply(a) - b)[used], axis=1).max())
+            raise DataFileError(
+                f"{source}: the markers at rest do not fit their nominal positions to "
+                f"{_MILLI * largest_residual:.1f} mm with the axes that are given: one is {off:.1f} mm off; check the "
+                "axes, and the markers' names, nominal positions and unit."
+            )
+        return _registration(a, b, names, motion, used, near)
     if _distance_from_line(b[used]) <= largest_residual:
         raise InputError(
             f"The nominal positions of {listed(_pick(names, used))} lie on one line to within "
@@ -80,22 +94,69 @@ def register_markers(
             f"{_worst(a, b, used, names)}; check its name, its nominal position and the unit."
         )
     motion, _ = fit(a[fitted], b[fitted], np.ones(np.count_nonzero(fitted)))
+    return _registration(a, b, names, motion, used, fitted)
+
+
+def _registration(
+    a: FloatArray, b: FloatArray, names: Sequence[str], motion: RigidTransform, used: BoolArray, fitted: BoolArray
+) -> Registration:
     moved = motion.apply(a)
     outliers = tuple(_pick(names, used & ~fitted))
     rms = root_mean_square((moved - b)[fitted])
     return Registration(tuple(names), motion, moved, np.linalg.norm(moved - b, axis=1), fitted, outliers, rms)
 
 
-def _used(measured: FloatArray, names: Sequence[str], use: Sequence[str] | None, source: str | Path) -> BoolArray:
-    """(M,) which markers can be fitted: those in `use` that are seen, three or more."""
+def _shifted(
+    a: FloatArray, b: FloatArray, used: BoolArray, rotation: FloatArray, largest_residual: float
+) -> tuple[BoolArray, RigidTransform]:
+    """(M,) the largest set of used markers that one shift fits after the rotation, and the motion.
+
+    A set is that of the markers close to what one of them asks for; of two as large, that which fits better.
+    """
+    shifts = b - a @ rotation.T
+    sets = [
+        used & (np.linalg.norm(shifts - shifts[one], axis=1) <= 2.0 * largest_residual) for one in np.flatnonzero(used)
+    ]
+    misfits = [float(np.square(shifts[each] - shifts[each].mean(axis=0)).sum(axis=1).mean()) for each in sets]
+    best = max(range(len(sets)), key=lambda row: (np.count_nonzero(sets[row]), -misfits[row]))
+    shift = shifts[sets[best]].mean(axis=0)
+    near = used & (np.linalg.norm(shifts - shift, axis=1) <= largest_residual)
+    return near, RigidTransform(rotation, shifts[near].mean(axis=0) if near.any() else shift)
+
+
+def axes_rotation(axes: Sequence[str]) -> FloatArray:
+    """(3, 3) rotation to the frame of the body, of the recording's axes along which its x, y and z are.
+
+    Args:
+        axes: of `x`, `-x` and so on, as (x, z, -y) where the body's y is the recording's z, and its z points against y.
+
+    Raises:
+        InputError: an axis twice, or axes of a mirror image.
+    """
+    rows = [np.eye(3)["xyz".index(axis[-1])] * (-1.0 if axis.startswith("-") else 1.0) for axis in axes]
+    rotation = np.array(rows)
+    if np.linalg.matrix_rank(rotation) < 3:
+        raise InputError(f"the axes ({', '.join(axes)}) name one axis twice: each of x, y and z must be there once.")
+    if np.linalg.det(rotation) < 0.0:
+        raise InputError(
+            f"the axes ({', '.join(axes)}) would mirror the recording: change the sign of one, or exchange two."
+        )
+    return rotation
+
+
+def _used(
+    measured: FloatArray, names: Sequence[str], use: Sequence[str] | None, source: str | Path, least: int
+) -> BoolArray:
+    """(M,) which markers can be fitted: those in `use` that are seen, as many as it takes."""
     unknown = [name for name in use or () if name not in names]
     if unknown:
         raise InputError(f"Registration should use {listed(unknown)}, but the markers are {listed(names)}.")
     wanted = np.array([use is None or name in use for name in names], dtype=bool)
     seen = np.isfinite(measured).all(axis=1)
-    if np.count_nonzero(wanted & seen) < 3:
+    if np.count_nonzero(wanted & seen) < least:
+        needed = {1: "one marker", 3: "three markers"}[least]
         raise DataFileError(
-            f"{source}: registration needs three markers at rest, but {np.count_nonzero(wanted & seen)} are left to "
+            f"{source}: registration needs {needed} at rest, but {np.count_nonzero(wanted & seen)} are left to "
             f"it; not seen: {listed(_pick(names, wanted & ~seen))}."
         )
     return np.asarray(wanted & seen)

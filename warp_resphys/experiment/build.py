@@ -209,8 +209,8 @@ def bound_markers(settings: Mapping[str, Any], mesh: Mesh, places: ArrayLike, la
         MeshError: no vertex lies where ``markers.bind_to`` says.
     """
     vertices = None if settings["bind_to"] is None else select_vertices(mesh, **settings["bind_to"])
-    distance = settings["largest_distance"]
-    return bind_markers(mesh, places, labels, kind=settings["bind"], vertices=vertices, largest_distance=distance)
+    more = {key: settings[key] for key in ("largest_distance", "patch") if key in settings}
+    return bind_markers(mesh, places, labels, kind=settings["bind"], vertices=vertices, **more)
 
 
 def build_simulator(

@@ -10,6 +10,7 @@ import torch
 
 from ..data.base_motion import OBSERVED
 from ..data.markers import MarkerMap
+from ..data.registration import axes_rotation
 from ..energies.materials import Material
 from ..fem.body import Body
 from ..io.errors import InputError
@@ -165,12 +166,12 @@ def _naming(group: str) -> Iterator[None]:
 def _check_recorded(config: Mapping[str, Any], body: Body) -> None:
     """What an experiment has that sees its bodies through markers."""
     data = config["data"]
-    _check_markers(config, body)
-    vertical(data["up"])
     _check_trials(config)
     if folds_of(config) is None:
         split_of(config)
     trials = trials_of(config)
+    _check_markers(config, body, {trial.begins for trial in trials})
+    vertical(data["up"])
     attached_mass(body, data["payload_at"], np.array([trial.payload for trial in trials]))
     begins = {trial.begins for trial in trials}
     if begins & {"held", "released"} and data["seconds"] is None:
@@ -190,7 +191,7 @@ def _check_recorded(config: Mapping[str, Any], body: Body) -> None:
     _check_release(config, begins)
 
 
-def _check_markers(config: Mapping[str, Any], body: Body) -> None:
+def _check_markers(config: Mapping[str, Any], body: Body, begins: set[str]) -> None:
     markers = config["markers"]
     both = [label for label in markers["tracked"] if label in markers["reference"]]
     if both:
@@ -199,9 +200,18 @@ def _check_markers(config: Mapping[str, Any], body: Body) -> None:
         )
     if not markers["tracked"]:
         raise InputError("markers.tracked is empty: name the markers that errors are measured on, with their places.")
-    count = len(markers["tracked"]) + len(markers["reference"])
-    if count < 3:
+    count, axes = len(markers["tracked"]) + len(markers["reference"]), config["data"].get("axes")
+    if axes is not None:
+        with _naming("data.axes: "):
+            axes_rotation(axes)
+    if count < 3 and axes is None:
         raise InputError(f"markers names {count} in all: registration needs three or more.")
+    standing, enough = len(markers["reference"]), 3 if axes is None else 1
+    if markers.get("labels") == "assigned" and STATIC in begins and standing < enough:
+        raise InputError(
+            f"markers.labels is assigned, but markers.reference names {standing} markers that stand still beside a "
+            f"body in a pose: it takes {enough}" + (", or data.axes and one." if axes is None else ".")
+        )
     if markers["bind"] == "rigid" and markers["bind_to"] is None:
         raise InputError("markers.bind is rigid: set markers.bind_to to the vertices that they follow, as {x: 0.1}.")
     if markers["bind_to"] is not None:

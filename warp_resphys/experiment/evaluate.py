@@ -15,8 +15,8 @@ from ..io.progress import Progress
 from ..io.stages import StageContext
 from ..learning.metrics import errors_per_marker, marker_errors, median_filter, summarise, summarise_each
 from ..learning.replay import Start
-from .files import ERRORS, ROLLOUTS, TIMES, reconstruction_file
-from .models import ModelRollout, first_frame, learned_of
+from .files import ERRORS, ROLLOUTS, STATIC, TIMES, reconstruction_file
+from .models import POSE_STEPS, SIMFREE, ModelRollout, first_frame, learned_of
 from .parts import Part, padded, remove_parts, split_into_parts, work_on
 from .scene import LEARNED, Scene, models_of
 
@@ -36,7 +36,8 @@ def evaluate(context: StageContext, processes: int = 1) -> None:
     parts: dict[str, list[Part]] = {model: [] for model in models_of(settings)}
     for number, some in enumerate(scene.alike(names)):
         for model in parts:
-            frames = 1 + int(float(scene.trials(some).times.max()) / scene.model_simulator(model).time_step)
+            rests = POSE_STEPS if model == SIMFREE and scene.begins(some[0]) == STATIC else 0
+            frames = 1 + (rests or int(float(scene.trials(some).times.max()) / scene.model_simulator(model).time_step))
             parts[model] += split_into_parts(context, some, frames, f"{model}{number}", (model, filmed))
     work_on([part for some in parts.values() for part in some], _rolled_out, processes)
     order = [name for some in scene.alike(names) for name in some]

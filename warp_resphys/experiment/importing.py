@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from ..data.actuation import NO_INPUT, check_inputs
 from ..data.base_motion import at_times, check_steps, followed, in_frame, prescribed, rigid
 from ..data.recordings.processing import fill_gaps, release_of, resample, smooth, trim_to_release
-from ..data.recordings.quality import check_base, check_motion, check_passive, quality
-from ..data.recordings.reading import read_recording
+from ..data.recordings.quality import check_base, check_motion, quality
 from ..data.recordings.recording import Recording
 from ..data.recordings.release import Release, valve_opening
 from ..data.registration import Registration, register_markers
@@ -28,8 +27,9 @@ from ..io.files import write_json
 from ..io.stages import StageContext
 from .build import Drive, bound_markers, build_simulator, drive_of
 from .files import DATASET, QUALITY, REGISTRATION, SCALED_DATASET, STATIC, Dataset, read_dataset
+from .reading import POSE_SECONDS, Reader
 from .simulate import vertical
-from .trials import Trial, evenly, is_laboratory, scaled_trials_of, trials_of
+from .trials import Trial, evenly, scaled_trials_of, trials_of
 
 log = logging.getLogger(__name__)
 
@@ -38,7 +38,6 @@ FloatArray = NDArray[np.float64]
 _LEAST_RATE = 40.0  # Hz; the first tenth of a second tells how a body was let go, and four frames are few for that
 _LARGEST_LEAN = 30.0  # degrees between the vertical of a recording and the configured gravity
 _SHOWN = 6  # driven trials whose quality and registration are kept for the report
-_POSE_SECONDS = 0.2  # at the end of a recording, that tell a pose
 _MILLI = 1e3
 _START = Release(0.0, (0, 1))  # of a recording that begins with it
 
@@ -87,26 +86,9 @@ class Importer:
         self.context, self.settings = context, context.settings
         self.data, self.markers = self.settings["data"], self.settings["markers"]
         self.simulator: Simulator = build_simulator(self.settings)
-        self.tracked = list(self.markers["tracked"])
-        self.nominal = _places(self.markers["tracked"])
         self.drive = drive_of(self.settings, self.simulator.body)
-        self._hanging: FloatArray | None = None
-
-    @property
-    def labels(self) -> list[str]:
-        """All configured markers, the tracked ones first."""
-        return [*self.tracked, *self.markers["reference"]]
-
-    def expected(self, observed_at_rest: bool) -> FloatArray:
-        """(M', 3) where all markers are when they are registered: on the undeformed body, or as it hangs [m]."""
-        reference = _places(self.markers["reference"])
-        if not observed_at_rest:
-            return np.concatenate([self.nominal, reference])
-        if self._hanging is None:
-            read = bound_markers(self.markers, self.simulator.body.mesh, self.nominal, tuple(self.tracked))
-            still = read.to(self.simulator.rest_positions)(self.simulator.static_equilibrium().q)[0]
-            self._hanging = still.cpu().numpy()
-        return np.concatenate([self._hanging, reference])
+        self.reader = Reader(self.settings, context.run_dir, self.simulator, self.drive)
+        self.tracked, self.nominal = self.reader.tracked, self.reader.nominal
 
     def observe(self, trials: Sequence[Trial]) -> list[Observed]:
         """Reads every trial, finds time zero and registers it.
@@ -114,7 +96,7 @@ class Importer:
         Raises:
             DataFileError: a recording that cannot be read or used; the sentence names the file and the marker.
         """
-        ready = [self._read(trial) for trial in trials]
+        ready = [self._timed(*each) for each in zip(trials, self.reader.read(trials), strict=True)]
         self._check_reference(trials, ready)
         return self._beside_each_other(
             [
@@ -133,7 +115,7 @@ class Importer:
         known = [each.registration.positions[count:] for each in observed if each.tells_places]
         if not known or len(known) == len(observed) or len(self.markers["reference"]) < 3:
             return observed
-        expected = self.expected(True)
+        expected = self.reader.expected(True)
         seen = np.isfinite(np.stack(known)).all(-1).any(0)
         expected[count:][seen] = np.nanmean(np.stack(known)[:, seen], axis=0)
         return [
@@ -143,15 +125,8 @@ class Importer:
             for each in observed
         ]
 
-    def _read(self, trial: Trial) -> tuple[Recording, Release | None]:
+    def _timed(self, trial: Trial, recording: Recording) -> tuple[Recording, Release | None]:
         """A recording, at the steps of the simulation if the body is driven, and when the body is let go if it is."""
-        if is_laboratory(self.settings) or trial.file is None:
-            recording = read_recording(self.context.run_dir / trial.recording)
-        else:
-            recording = read_recording(trial.file, self.data["units"], self.data["rate"])
-        if self.drive is None:
-            check_passive(recording)
-        recording = recording.select(self.labels)
         if not trial.is_released:
             return resample(recording, 1.0 / self.settings["time_step"]), None
         self._check_rate(recording)
@@ -227,14 +202,14 @@ class Importer:
         self, places: FloatArray, recording: Recording, expected: FloatArray, only_reference: bool = False
     ) -> Registration:
         use = list(self.markers["reference"]) if only_reference else None
-        largest, source = self.markers["largest_residual"], recording.source
-        return register_markers(places, expected, self.labels, source=source, largest_residual=largest, use=use)
+        more = {"largest_residual": self.markers["largest_residual"], "rotation": self.reader.rotation}
+        return register_markers(places, expected, self.reader.labels, source=recording.source, use=use, **more)
 
     def _released(self, trial: Trial, recording: Recording, release: Release) -> Observed:
         """A body that was held, undeformed or as the file says, and let go."""
         still = _median(_frames(recording, *release.rest), self.tracked)
         places = _rest_of(recording, self.tracked) if self.data["rest"] == "file" else still
-        registration = self._register(places, recording, self.expected(False))
+        registration = self._register(places, recording, self.reader.expected(False))
         off = f"; left out: {listed(registration.outliers)}" if registration.outliers else ""
         log.info(
             "import: %s is let go in frame %.1f, registered to %.2f mm%s",
@@ -267,11 +242,12 @@ class Importer:
         filled = fill_gaps(recording, self.data["longest_gap"], mask_long=True)
         still = _median(filled, self.tracked) if static and loaded else self._resting(filled, driven)
         # Where the body is without what hangs on it, the other trials tell.
-        only_reference = not tells and len(self.markers["reference"]) > 2
-        registration = self._register(still, recording, self.expected(True), only_reference)
+        enough = 3 if self.reader.rotation is None else 1
+        only_reference = not tells and len(self.markers["reference"]) >= enough
+        registration = self._register(still, recording, self.reader.expected(True), only_reference)
         moving = filled.select(self.tracked)
         if static:
-            frames = max(round(_POSE_SECONDS * moving.rate), 1)
+            frames = max(round(POSE_SECONDS * moving.rate), 1)
             last = _frames(moving, -frames, None)
             moving = replace(moving, positions=_median(last, self.tracked)[None])
             driven = None if driven is None else np.median(driven[-frames:], axis=0)[None]
@@ -306,15 +282,6 @@ class Importer:
                 f"{recording.source} has no array 'actuation' with the {words}s of the {drive.per}s: add it "
                 "(docs/recordings.md)."
             )
-        if data["parts"] is not None:
-            columns = np.array(data["parts"]) - 1
-            if len(columns) != found.shape[1]:
-                raise DataFileError(
-                    f"{recording.source} has {words}s of {found.shape[1]} {drive.per}s, but data.parts names "
-                    f"{len(columns)}: name the body's {drive.per} of each column of the file."
-                )
-            given, found = found, np.zeros((len(found), count))
-            found[:, columns] = given
         values = check_inputs(found, drive.quantity, count, trial.scale * data["input_limit"], recording.source)
         if data["valve"] == "detected" and not trial.is_released:
             opening = valve_opening(recording, self.tracked)
@@ -371,14 +338,10 @@ def import_scaled(context: StageContext) -> None:
     _dataset(importer, observed, known.bound, shifts, known.gravity).write(context.run_dir / SCALED_DATASET)
 
 
-def _places(markers: Mapping[str, Any]) -> FloatArray:
-    return np.array([*markers.values()], dtype=np.float64).reshape(-1, 3)
-
-
 def _offset(importer: Importer, each: Observed) -> FloatArray:
     """(M, 3) how far the tracked markers of a trial are from where they should be, in the frame of the body [m]."""
     count = len(importer.tracked)
-    return each.registration.positions[:count] - importer.expected(not each.trial.is_released)[:count]
+    return each.registration.positions[:count] - importer.reader.expected(not each.trial.is_released)[:count]
 
 
 def _shifts(data: Mapping[str, Any], observed: Sequence[Observed], mean: FloatArray, offsets: FloatArray) -> FloatArray:

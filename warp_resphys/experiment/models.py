@@ -29,7 +29,7 @@ from .scene import LEARNED, Scene
 FloatArray = NDArray[np.float64]
 
 SIMFREE: Final = "simfree"
-_POSE_STEPS = 200  # in which a network in place of a simulator is taken to come to rest
+POSE_STEPS = 200  # in which a network in place of a simulator is taken to come to rest
 
 
 def kind_of(model: str) -> tuple[type[StateMap], str]:
@@ -138,7 +138,7 @@ class ModelRollout(March):
     def _steps(self) -> int:
         """Steps that reach past all frames; of whole time steps of the experiment."""
         if self.replay.is_static:
-            return _POSE_STEPS if self.model == SIMFREE else 0
+            return POSE_STEPS if self.model == SIMFREE else 0
         substeps = round(self.scene.config["time_step"] / self.simulator.time_step)
         return -(-self.replay.steps(self.start) // substeps) * substeps
 

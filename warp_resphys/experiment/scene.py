@@ -1,5 +1,6 @@
 """What the stages of an experiment share: the body, its trials, its simulators and its models."""
 
+import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,6 +18,7 @@ from ..dynamics.frames import BaseFrame, VertexFrames, base_movement
 from ..dynamics.integrator import State
 from ..dynamics.simulator import Simulator
 from ..fem.body import Body
+from ..io.errors import ConvergenceError
 from ..io.files import read_json
 from ..learning.release import ReleaseSettings, estimate_release
 from ..learning.replay import Replay, Start
@@ -163,7 +165,12 @@ class Scene:
             return Start(State(q, v), q.new_zeros(len(q)))
         if begins == "released":
             return estimate_release(simulator, self.observe, trials, ReleaseSettings(**self.config["release"]))
-        return Start.resting(simulator.rest_positions.expand(len(trials.names), -1, -1))
+        guess = simulator.rest_positions.expand(len(trials.names), -1, -1)
+        if begins == STATIC:  # Far from rest, where whoever changes a parameter a little need not begin again.
+            with contextlib.suppress(ConvergenceError), torch.no_grad():
+                constants, _, resting = replay.setting()
+                guess = simulator.static_equilibrium(resting, constants).q
+        return Start.resting(guess)
 
     def replay(self, simulator: Simulator, names: Sequence[str]) -> Replay:
         """A simulator of some of the trials, which begin alike."""

@@ -275,6 +275,8 @@ _MARKERS = Group(
         **dict.fromkeys(("tracked", "reference"), Group(each=_PLACE)),
         "bind": one_of(*BINDINGS),
         "bind_to": optional(PLACE),
+        "patch": absent(POSITIVE),
+        "labels": absent(one_of("recorded", "assigned")),
         **dict.fromkeys(("largest_residual", "largest_distance", "largest_distortion"), POSITIVE),
         "largest_shift": optional(POSITIVE),
     }
@@ -301,6 +303,10 @@ _BASE_MOTION = Group(
 _TRIAL = Group(
     {
         "file": absent(Kind(_is_word, "the name of a file")),
+        "inputs": absent(_list(FINITE, "a list of finite numbers, one for each chamber or tendon", _SOME)),
+        "labels": absent(
+            _list(WORD, "a list of different words, one for each marker of the file", _SOME, different=True)
+        ),
         "payload": absent(Kind(NOT_NEGATIVE.fits, "a mass, zero or more, in kg")),
         "begins": absent(one_of(*BEGINNINGS)),
         "pull": absent(_FORCE),
@@ -330,11 +336,26 @@ _TENDONS = Group(
 )
 _LIMIT = Group(dict.fromkeys(SPLITS, NATURAL), optional=True)
 _SPLIT = dict.fromkeys(SPLITS, _TRIALS)
+_TABLE = Group(
+    {
+        "columns": Kind(
+            lambda value: isinstance(value, list) and all(each is None or _is_word(each) for each in value),
+            "a list of headers such as 'time [s]' or 'tip.x [mm]', null for columns that are not read",
+        ),
+        "header_lines": absent(COUNT),
+    },
+    optional=True,
+    absent=True,
+)
+_SIGNED_AXES = [sign + axis for axis in "xyz" for sign in ("", "-")]
+_AXES = absent(optional(_list(one_of(*_SIGNED_AXES), f"three of {', '.join(_SIGNED_AXES)}", [3], different=True)))
 _UP = Kind(lambda value: _is_word(value) or _is_place(value), "x, -x, y, -y, z, -z, three numbers, or null", True)
 _RECORDED = Group(
     {
         "folder": optional(WORD),
         "units": optional(one_of(*METRES_PER_UNIT)),
+        "table": _TABLE,
+        "axes": _AXES,
         **dict.fromkeys(("rate", "seconds", "input_limit", "cutoff"), optional(POSITIVE)),
         "trials": Group(each=replace(_TRIAL, short=True)),
         **dict.fromkeys(("sequences", "longest_gap"), COUNT),

@@ -33,6 +33,8 @@ class Trial:
         sequence: number of its pressures, where they are drawn; None without any.
         scale: by which these are multiplied.
         amount: what sets simulated trajectories apart: a weight [kg], an angle [rad], or a factor of `base_motion`.
+        inputs: what drives it all the time, one number for each part of the body; None where the recording tells.
+        labels: of the markers of its recording, in their order; None where that tells.
         base_motion: how what it is fixed to moves, if otherwise than ``data.base_motion`` says; see
             `data.base_motion.prescribed`.
     """
@@ -45,6 +47,8 @@ class Trial:
     sequence: int | None = None
     scale: float = 1.0
     amount: float = 0.0
+    inputs: Sequence[float] | None = None
+    labels: Sequence[str] | None = None
     base_motion: Mapping[str, Any] | None = None
 
     @property

@@ -8,7 +8,7 @@ from ...io.errors import DataFileError
 from .arrays import read_raw_hdf5, read_raw_npz
 from .c3d import read_raw_c3d
 from .recording import RawRecording, Recording, to_recording
-from .text import read_raw_text
+from .text import Table, read_raw_text
 
 READERS: Final[Mapping[str, Callable[[Path], RawRecording]]] = {
     ".c3d": read_raw_c3d,
@@ -26,6 +26,7 @@ def read_recording(
     units: str | None = None,
     rate: float | None = None,
     labels: Sequence[str] | None = None,
+    table: Table | None = None,
 ) -> Recording:
     """Reads a recording; the end of its name tells the format. docs/recordings.md describes the layouts.
 
@@ -34,6 +35,7 @@ def read_recording(
         units: m, cm or mm, where the file does not say it, or says it wrongly.
         rate: Frames a second [Hz], where the file does not say it, or says it wrongly.
         labels: A name for each marker in the file's order, in place of those in the file.
+        table: What the columns of a CSV, TSV or text file are, where it has no header, or another.
 
     Raises:
         DataFileError: The file is missing, of another format, damaged, or lacks something that was not given.
@@ -46,4 +48,7 @@ def read_recording(
             f"{path} is no recording that can be read: give a file that ends in {', '.join(READERS)}, or convert it "
             "with warp-resphys convert."
         )
-    return to_recording(reader(path), path, units, rate, labels)
+    if table is not None and reader is not read_raw_text:
+        raise DataFileError(f"{path} is no text, so that data.table cannot tell what its columns are: leave that out.")
+    raw = reader(path) if table is None else read_raw_text(path, table)
+    return to_recording(raw, path, units, rate, labels)

@@ -6,6 +6,7 @@ docs/recordings.md describes the layouts. A cell that is empty or NaN is an occl
 import csv
 import io
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -22,13 +23,32 @@ _QUALISYS_KEYS = ("FILE_VERSION", "NO_OF_FRAMES", "NO_OF_MARKERS", "FREQUENCY", 
 _MOTIVE_UNITS = {"meters": "m", "centimeters": "cm", "millimeters": "mm"}
 # A column in a length is a misspelt marker rather than an actuation.
 _CHANNEL_UNITS = [unit for unit in SI_PER_ACTUATION_UNIT if unit not in METRES_PER_UNIT]
+_CLOCKS = ("time", "frame")
+_SECONDS = {"s": 1.0, "ms": 1e-3}
 _UNEVEN = 0.25  # of a frame, that a time stamp may be off
 _LARGEST_STAMP = 1e12  # [s or 1], a time or frame number that is believed
 _LEAST_RECORDED = 0.1  # of the frames between the first and the last
 
 
-def read_raw_text(path: Path) -> RawRecording:
+@dataclass(frozen=True)
+class Table:
+    """What a table holds that does not say so itself, as logs of other programs do not.
+
+    Attributes:
+        columns: the header that it should have had: a cell for each column, None for one that is not read.
+        header_lines: lines of the file that come before the numbers.
+    """
+
+    columns: Sequence[str | None]
+    header_lines: int = 0
+
+
+def read_raw_text(path: Path, table: Table | None = None) -> RawRecording:
     """Reads a table, a Qualisys TSV or a Motive CSV; which one it is, its first line tells.
+
+    Args:
+        path: of the file.
+        table: how it is to be read, whatever its first line says.
 
     Raises:
         DataFileError: The file is missing, empty or no text, has none of the layouts, or a cell or row is wrong.
@@ -39,12 +59,16 @@ def read_raw_text(path: Path) -> RawRecording:
         raise DataFileError(f"Cannot read {path}: {error.strerror}; check the path of the recording.") from error
     except UnicodeDecodeError as error:
         raise DataFileError(f"{path} is not a text file: export it as CSV or TSV again.") from error
-    first = text.partition("\n")[0]
+    lines, before = text.splitlines(), 0 if table is None else table.header_lines
+    first = "".join(lines[:1])
     try:
-        rows = list(csv.reader(io.StringIO(text), delimiter=max("\t,;", key=first.count)))
+        delimiter = max("\t,;", key="".join(lines[before : before + 1]).count)
+        rows = list(csv.reader(io.StringIO(text), delimiter=delimiter))
     except csv.Error as error:
         raise DataFileError(f"{path} is no table ({error}): export it as CSV or TSV again.") from error
     rows = [[cell.strip() for cell in row] for row in rows]
+    if table is not None:
+        return _read_described(rows, table, path)
     if first.split("\t")[0].strip() in _QUALISYS_KEYS:
         return _read_qualisys(rows, path)
     if first.startswith("Format Version"):
@@ -55,33 +79,71 @@ def read_raw_text(path: Path) -> RawRecording:
 def _read_table(rows: Rows, path: Path) -> RawRecording:
     """A header of `time [s]` or `frame`, then `<marker>.x`, `.y`, `.z` of each marker, and channels `name [unit]`."""
     columns = [_name_and_unit(cell) for cell in rows[0]] if rows else []
-    clock, clock_unit = columns[0] if columns else ("", None)
-    timed = clock.lower() == "time"
-    if not (timed or clock.lower() == "frame") or len(columns) < 4:
+    if not columns or columns[0][0].lower() not in _CLOCKS or len(columns) < 4:
         raise DataFileError(
             f"{path} has no header that is known: its first line must be 'time [s]' or 'frame', then "
-            "'<marker>.x', '<marker>.y' and '<marker>.z' for each marker."
+            "'<marker>.x', '<marker>.y' and '<marker>.z' for each marker; or say in data.table what its columns are."
         )
-    if timed and clock_unit not in (None, "s"):
-        raise DataFileError(f"{path} gives its time in '{clock_unit}': it must be in seconds, 'time [s]'.")
+    return _read_columns(rows, 1, dict(enumerate(columns)), _CHANNEL_UNITS, path)
+
+
+def _read_described(rows: Rows, table: Table, path: Path) -> RawRecording:
+    """The same, with the columns that the table is said to have; a length that is no marker's is a channel here."""
+    width = len(rows[table.header_lines]) if len(rows) > table.header_lines else 0
+    if width != len(table.columns):
+        raise DataFileError(
+            f"{path}, line {table.header_lines + 1}: {width} cells, but data.table.columns names {len(table.columns)}: "
+            "name each column of the file, null for one that is not read."
+        )
+    columns = {number: _name_and_unit(cell) for number, cell in enumerate(table.columns) if cell}
+    return _read_columns(rows, table.header_lines, columns, list(SI_PER_ACTUATION_UNIT), path, planar=True)
+
+
+def _read_columns(
+    rows: Rows,
+    first: int,
+    columns: dict[int, tuple[str, str | None]],
+    channel_units: Sequence[str],
+    path: Path,
+    planar: bool = False,
+) -> RawRecording:
+    """The lines from ``first`` on, of columns whose names and units are known by their number.
+
+    Where markers may be ``planar``, a coordinate that none of their columns has is zero.
+    """
+    clocks = [number for number, (name, _) in columns.items() if name.lower() in _CLOCKS]
+    if len(clocks) > 1:
+        raise DataFileError(f"{path}: columns {clocks[0] + 1} and {clocks[1] + 1} both tell the time: read one only.")
+    clock, told = columns[clocks[0]] if clocks else ("frame", None)
+    timed, clock_unit = clock.lower() == "time", told or "s"
+    if timed and clock_unit not in _SECONDS:
+        raise DataFileError(f"{path} gives its time in '{clock_unit}': it must be in s or ms, as in 'time [s]'.")
     named, units, channels = [], set(), {}
-    for number, (name, unit) in enumerate(columns[1:], start=1):
+    for number, (name, unit) in columns.items():
         label, _, axis = name.rpartition(".")
+        if number in clocks:
+            continue
         if label and axis.lower() in _AXES:
             named.append((label, axis.lower(), number))
             units |= {unit} if unit else set()
-        elif unit in _CHANNEL_UNITS:
+        elif unit is not None and unit in channel_units:
             channels[number] = SI_PER_ACTUATION_UNIT[unit]
         else:
             raise DataFileError(
                 f"{path}: column {number + 1} is named '{name}', which is neither '<marker>.x', '.y' or '.z' nor a "
-                f"channel with a unit in brackets ({', '.join(_CHANNEL_UNITS)}); rename it or leave it out."
+                f"channel with a unit in brackets ({', '.join(channel_units)}); rename it or leave it out."
             )
-    labels, chosen = _markers(named, path)
+    labels, chosen = _markers(named, path, planar)
     if len(units) > 1:
         raise DataFileError(f"{path} gives positions in {listed(sorted(units))}: give all of them in one unit.")
-    values, lines = _numbers(rows, 1, range(len(columns)), len(columns), path)
-    frames, rate = _frames(values[:, 0], timed, lines, path)
+    width = len(rows[first]) if len(rows) > first else 0
+    read, lines = _numbers(rows, first, list(columns), width if planar else len(columns), path)
+    values = np.zeros((len(read), max(columns, default=0) + 2))  # The last column is what planar markers lack.
+    values[:, list(columns)] = read
+    stamps = values[:, clocks[0]] if clocks else np.arange(len(values), dtype=np.float64)
+    if timed:
+        stamps = stamps * _SECONDS[clock_unit]
+    frames, rate = _frames(stamps, timed, lines, path)
     actuation = None
     if channels:
         with np.errstate(over="ignore"):
@@ -94,7 +156,7 @@ def _read_table(rows: Rows, path: Path) -> RawRecording:
             )
         grid = np.arange(frames[-1] + 1)
         actuation = np.stack([np.interp(grid, frames, channel) for channel in driven.T], axis=1)
-    start = float(values[0, 0]) if timed else 0.0
+    start = float(stamps[0]) if timed else 0.0
     return RawRecording(
         _positions(frames, values[:, chosen]), labels, next(iter(units), None), rate, actuation, start=start
     )
@@ -170,19 +232,24 @@ def _read_motive(rows: Rows, path: Path) -> RawRecording:
     return RawRecording(_positions(frames, values[:, 1:]), labels, _MOTIVE_UNITS.get((unit or "").lower(), unit), rate)
 
 
-def _markers(named: Iterable[tuple[str, str, int]], path: Path) -> tuple[list[str], list[int]]:
-    """Labels, and the columns of their x, y and z in turn, of columns by label and axis."""
+def _markers(named: Iterable[tuple[str, str, int]], path: Path, planar: bool = False) -> tuple[list[str], list[int]]:
+    """Labels, and the columns of their x, y and z in turn, of columns by label and axis.
+
+    The column of the one axis that planar markers lack is -1.
+    """
     found: dict[tuple[str, str], int] = {}
     for label, axis, column in named:
         if (label, axis) in found:
             raise DataFileError(f"{path} has two columns named '{label}.{axis}': rename one of these markers.")
         found[label, axis] = column
     labels = list(dict.fromkeys(label for label, _ in found))
+    axes = {axis for _, axis in found}
+    flat = planar and len(axes) == 2
     for label in labels:
         for axis in _AXES:
-            if (label, axis) not in found:
+            if (label, axis) not in found and not (flat and axis not in axes):
                 raise DataFileError(f"{path}: marker {label} has no column '{label}.{axis}'; export it again with all.")
-    return labels, [found[label, axis] for label in labels for axis in _AXES]
+    return labels, [found.get((label, axis), -1) for label in labels for axis in _AXES]
 
 
 def _is_data(row: Sequence[str]) -> bool:

@@ -1,0 +1,104 @@
+"""Poses under tendons, recorded without header, names or order of their markers, from a table to the report."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+from main_job import IN_RUN, run
+from omegaconf import OmegaConf
+
+from warp_resphys.dynamics.inputs import Inputs
+from warp_resphys.experiment.build import bound_markers, build_simulator
+from warp_resphys.experiment.checks import check_configuration
+from warp_resphys.experiment.files import read_dataset
+from warp_resphys.io.errors import InputError
+
+MODULUS = 420e3  # Pa, of the body that is recorded; the experiment expects 505 kPa
+POSES = {"weak": (0.5, 0.0), "strong": (1.5, 0.0), "other": (0.0, 1.0), "both": (1.0, 1.0)}
+TINY = [
+    "experiment=tentacle",
+    *("mesh.layers=4", "mesh.nodes=20", "tendons.routes.first.pieces=6", "tendons.routes.second.pieces=6"),
+    *("data.folder=recordings", "data.folds=null", "data.validation=[other]"),
+    *("data.train=[weak,strong]", "data.test=[both]", "identify.max_evaluations=6"),
+    *("trainer={epochs:4,rollout_every:2,batch_size:16}", "network={force_modes:2,width:8}", "in_the_loop=null"),
+    *("~identify.parameters.density", "parallel.processes=1", "markers.patch=0.05"),
+    *("hydra/job_logging=none", "hydra/hydra_logging=none", IN_RUN),
+]
+TRIALS = [
+    "data.trials=null",
+    f"+data.trials={{{','.join(f'{n}: {{file: {n}.csv, inputs: {list(t)}}}' for n, t in POSES.items())}}}",
+]
+
+
+def configuration(*overrides):
+    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
+        cfg = compose("config", [each for each in TINY if not each.startswith("hydra")] + list(overrides))
+        return OmegaConf.to_container(cfg, resolve=True)
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    """The configuration of the poses, and (R, 5, 3) where their markers are in the frame of the body [m]."""
+    config = configuration(*TRIALS)
+    simulator = build_simulator({**config, "simulation": {**config["simulation"], "youngs_modulus": MODULUS}})
+    markers = config["markers"]
+    places = np.array([*markers["tracked"].values()])
+    read = bound_markers(markers, simulator.body.mesh, places, tuple(markers["tracked"]))
+    tensions = torch.tensor([*POSES.values()], dtype=torch.float64)
+    at = read(simulator.static_equilibrium(Inputs(tendon_tension=tensions)).q).numpy()
+    base = np.broadcast_to([*markers["reference"].values()], (len(at), 1, 3))
+    return config, np.concatenate([at, base], 1)
+
+
+def write(folder, found):
+    """Files as a tracker writes them: no header, another order in each, y against the rod, 0.1 mm of noise."""
+    folder.mkdir()
+    draw = np.random.default_rng(0)
+    for name, places in zip(POSES, found, strict=True):
+        turned = np.stack([places[:, 0], -places[:, 2], places[:, 1]], -1)  # so that (x, z, -y) turns it back
+        row = turned[draw.permutation(5)] + [0.3, 0.4, -0.1]
+        frames = row.ravel() + 1e-4 * draw.normal(size=(40, 15))
+        table = np.column_stack([np.arange(40), np.arange(40) / 200.0, frames])
+        np.savetxt(folder / f"{name}.csv", table, delimiter=",", fmt="%.6f")
+
+
+def test_poses_of_unnamed_markers_identify_the_body(recorded, tmp_path, monkeypatch):
+    _, found = recorded
+    monkeypatch.chdir(tmp_path)
+    write(Path("recordings"), found)
+    code, err = run(*TINY, *TRIALS)
+    assert (code, err[-500:] if code else "") == (0, "")
+    dataset = read_dataset(Path("run/dataset.h5"))
+    rows = [dataset.names.index(name) for name in POSES]
+    assert set(dataset.begins) == {"static"}
+    np.testing.assert_allclose(dataset.observed[rows, 0], found[:, :4], atol=3e-4)  # named and turned back
+    np.testing.assert_allclose(dataset.inputs["tendon_tension"][rows, 0], [*POSES.values()], atol=1e-12)
+    identified = json.loads(Path("run/identification.json").read_text())["sysid"]["parameters"]["youngs_modulus"]
+    assert identified == pytest.approx(MODULUS, rel=0.01)
+    errors = {
+        name: each["mean"] for name, each in json.loads(Path("run/metrics.json").read_text())["errors_mm"].items()
+    }
+    assert 5.0 * errors["sysid"] < errors["simulation"]
+    assert {"simfree", "resphys"} <= errors.keys()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (["data.axes=[x,z,y]"], r"data.axes: the axes \(x, z, y\) would mirror the recording"),
+        (["data.axes=[x,x,y]"], "data.axes is .*three of x, -x"),
+        (["data.axes=null"], "markers.reference names 1 .* it takes 3, or data.axes and one"),
+        (["data.table.columns=[1,2]"], "data.table.columns is .* a list of headers"),
+        (["data.trials.weak.inputs=[a]"], "data.trials.weak.inputs is .* one for each chamber or tendon"),
+        (["markers.labels=guessed"], "markers.labels is 'guessed': .* recorded, assigned"),
+        (["markers.reference={}", "~markers.reference.Base"], "markers.reference names 0 .* it takes 1"),
+    ],
+)
+def test_what_cannot_be_told_from_the_table_is_refused(overrides, said, tmp_path, recorded, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write(Path("recordings"), recorded[1])
+    with pytest.raises(InputError, match=said):
+        check_configuration(configuration(*TRIALS, *overrides))

@@ -1,0 +1,192 @@
+"""From files to recordings in which the configured markers have their names, with what drove the body."""
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..data.assignment import assign
+from ..data.recordings.quality import check_passive
+from ..data.recordings.reading import read_recording
+from ..data.recordings.recording import Recording
+from ..data.recordings.text import Table
+from ..data.registration import axes_rotation
+from ..dynamics.inputs import Inputs
+from ..dynamics.simulator import Simulator
+from ..io.errors import DataFileError, InputError
+from .build import Drive, bound_markers
+from .files import STATIC, attached_mass
+from .trials import Trial, is_laboratory
+
+log = logging.getLogger(__name__)
+
+FloatArray = NDArray[np.float64]
+
+POSE_SECONDS = 0.2  # at the end of a recording, that tell a pose
+_HELD_SECONDS = 0.1  # at the beginning of one, in which a body is held
+_MILLI = 1e3
+
+
+class Reader:
+    """Reads recordings, and knows where their markers should be.
+
+    Args:
+        settings: the groups data, markers, laboratory and what a simulator needs.
+        run_dir: where the recordings of a laboratory are.
+        simulator: of the body.
+        drive: what drives it; None if nothing does.
+
+    Attributes:
+        tracked: names of the markers that errors are measured on.
+        nominal: (M, 3) where they are on the undeformed body [m].
+        rotation: (3, 3) from the frame of the recordings to that of the body; None where markers tell.
+    """
+
+    def __init__(self, settings: Mapping[str, Any], run_dir: Path, simulator: Simulator, drive: Drive | None) -> None:
+        self.data, self.markers = settings["data"], settings["markers"]
+        self.tracked = list(self.markers["tracked"])
+        self.nominal, self._reference = (_places(self.markers[key]) for key in ("tracked", "reference"))
+        axes = self.data.get("axes")
+        self.rotation = None if axes is None else axes_rotation(axes)
+        self._simulator, self._drive = simulator, drive
+        self._folder = run_dir if is_laboratory(settings) else None
+        table = self.data.get("table")
+        self._table = None if table is None else Table(table["columns"], table.get("header_lines", 0))
+        self._hanging: FloatArray | None = None
+
+    @property
+    def labels(self) -> list[str]:
+        """All configured markers, the tracked ones first."""
+        return [*self.tracked, *self.markers["reference"]]
+
+    def expected(self, observed_at_rest: bool) -> FloatArray:
+        """(M', 3) where all markers are when they are registered: on the undeformed body, or as it hangs [m]."""
+        if not observed_at_rest:
+            return np.concatenate([self.nominal, self._reference])
+        if self._hanging is None:
+            self._hanging = self._posed(Inputs())[0]
+        return np.concatenate([self._hanging, self._reference])
+
+    def read(self, trials: Sequence[Trial]) -> list[Recording]:
+        """The recordings of trials, with all configured markers in their order.
+
+        Raises:
+            DataFileError: a recording that cannot be read or used; the sentence names the file and the marker.
+        """
+        found = [self._read(trial) for trial in trials]
+        if self.markers.get("labels") == "assigned":
+            found = self._assigned(trials, found)
+        return [recording.select(self.labels) for recording in found]
+
+    def _read(self, trial: Trial) -> Recording:
+        if self._folder is not None or trial.file is None:
+            assert self._folder is not None
+            recording = read_recording(self._folder / trial.recording)
+        else:
+            recording = read_recording(trial.file, self.data["units"], self.data["rate"], trial.labels, self._table)
+        if self._drive is None:
+            if trial.inputs is not None:
+                raise InputError(
+                    f"data.trials.{trial.name}.inputs drives nothing: the body has no chambers and no tendons."
+                )
+            check_passive(recording)
+        elif trial.inputs is not None:
+            everywhere = np.tile(np.asarray(trial.inputs, dtype=np.float64), (len(recording.positions), 1))
+            recording = replace(recording, actuation=everywhere)
+        if self._drive is None or recording.actuation is None:
+            return recording
+        return replace(recording, actuation=self._of_parts(recording.actuation, recording.source, self._drive))
+
+    def _of_parts(self, columns: FloatArray, source: Path, drive: Drive) -> FloatArray:
+        """(T, C) inputs of the parts of the body, of the columns (T, A) that a recording has of them."""
+        parts, count = self.data["parts"], len(drive.parts)
+        if columns.shape[1] != (count if parts is None else len(parts)):
+            names = "the body has" if parts is None else "data.parts names"
+            raise DataFileError(
+                f"{source} has {drive.quantity.words}s of {columns.shape[1]} {drive.per}s, but {names} "
+                f"{count if parts is None else len(parts)}: name the body's {drive.per} of each column in data.parts."
+            )
+        if parts is None:
+            return columns
+        found = np.zeros((len(columns), count))
+        found[:, np.array(parts) - 1] = columns
+        return found
+
+    def _assigned(self, trials: Sequence[Trial], recordings: Sequence[Recording]) -> list[Recording]:
+        """The same, with the markers of each named by where they are while the body rests or is held."""
+        expected = [self.expected(not trial.is_released) for trial in trials]
+        poses = [row for row, trial in enumerate(trials) if trial.begins == STATIC and trial.labels is None]
+        if poses:
+            posed = self._posed(self._held([trials[row] for row in poses], [recordings[row] for row in poses]))
+            for row, places in zip(poses, posed, strict=True):
+                expected[row] = np.concatenate([places, self._reference])
+        found = []
+        for row, (trial, recording) in enumerate(zip(trials, recordings, strict=True)):
+            if trial.labels is not None:
+                found.append(recording)
+                continue
+            standing = list(range(len(self.tracked), len(self.labels)))
+            bent = trial.begins == STATIC or len(standing) >= (3 if self.rotation is None else 1)
+            frames = _still_frames(trial, recording)
+            with np.errstate(all="ignore"):
+                places = np.nanmedian(np.where(np.isfinite(frames), frames, np.nan), axis=0)
+            pairs = assign(
+                places,
+                expected[row],
+                self.labels,
+                source=recording.source,
+                anchors=standing if bent else None,
+                rotation=self.rotation,
+            )
+            log.info(
+                "import: the markers of %s are told by where they are, to %.1f mm (with others, %.1f mm at best)",
+                *(trial.name, _MILLI * pairs.rms, _MILLI * pairs.next_rms),
+            )
+            columns = pairs.columns.tolist()
+            rest = None if recording.rest is None else recording.rest[columns]
+            named = replace(recording, labels=tuple(self.labels), positions=recording.positions[:, columns], rest=rest)
+            found.append(named)
+        return found
+
+    def _held(self, trials: Sequence[Trial], recordings: Sequence[Recording]) -> Inputs:
+        """What acts on the body in poses."""
+        like, fields = self._simulator.rest_positions, {}
+        if self._drive is not None:
+            last = []
+            for recording in recordings:
+                driven = recording.actuation
+                if driven is None:
+                    raise DataFileError(
+                        f"{recording.source} does not say what drove the body: add it to the file, or as "
+                        "data.trials.NAME.inputs."
+                    )
+                last.append(np.median(driven[-_count(POSE_SECONDS, recording) :], axis=0))
+            fields[self._drive.quantity.name] = like.new_tensor(np.stack(last))
+        mass = attached_mass(self._simulator.body, self.data["payload_at"], np.array([t.payload for t in trials]))
+        return Inputs(**fields, attached_mass=None if mass is None else like.new_tensor(mass))
+
+    def _posed(self, inputs: Inputs) -> FloatArray:
+        """(R, M, 3) the tracked markers of the uncorrected simulator in equilibrium [m]."""
+        simulator = self._simulator
+        read = bound_markers(self.markers, simulator.body.mesh, self.nominal, tuple(self.tracked))
+        found: FloatArray = read.to(simulator.rest_positions)(simulator.static_equilibrium(inputs).q).cpu().numpy()
+        return found
+
+
+def _still_frames(trial: Trial, recording: Recording) -> FloatArray:
+    """(T', M, 3) while the body is in a pose, rests or is held [m]."""
+    if trial.begins == STATIC:
+        return recording.positions[-_count(POSE_SECONDS, recording) :]
+    return recording.positions[: _count(_HELD_SECONDS, recording)]
+
+
+def _count(seconds: float, recording: Recording) -> int:
+    return max(round(seconds * recording.rate), 1)
+
+
+def _places(markers: Mapping[str, Any]) -> FloatArray:
+    return np.array([*markers.values()], dtype=np.float64).reshape(-1, 3)

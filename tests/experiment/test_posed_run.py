@@ -23,7 +23,12 @@ TINY = [
     *("mesh.layers=4", "mesh.nodes=20", "tendons.routes.first.pieces=6", "tendons.routes.second.pieces=6"),
     *("data.folder=recordings", "data.folds=null", "data.validation=[other]"),
     *("data.train=[weak,strong]", "data.test=[both]", "identify.max_evaluations=6"),
-    *("trainer={epochs:4,rollout_every:2,batch_size:16}", "network={force_modes:2,width:8}", "in_the_loop=null"),
+    *(
+        "trainer={epochs:4,rollout_every:2,batch_size:16}",
+        "network={position_modes:1,force_modes:2,width:8}",
+        "in_the_loop.epochs=2",
+        "simfree.network.position_modes=1",
+    ),
     *("~identify.parameters.density", "parallel.processes=1", "markers.patch=0.05"),
     *("hydra/job_logging=none", "hydra/hydra_logging=none", IN_RUN),
 ]

@@ -49,6 +49,17 @@ class Markers(ABC):
             (rows,) = torch.autograd.grad(at, q, seeds.expand(-1, *at.shape), is_grads_batched=True)
         return rows.flatten(2).permute(1, 2, 0).contiguous()
 
+    def moved(self, by: torch.Tensor) -> "Markers":
+        """The same markers elsewhere on the body.
+
+        Args:
+            by: (m, 3) how far they sit from here, in the frame of the body at rest [m].
+
+        Raises:
+            InputError: of vertices themselves.
+        """
+        raise InputError("observed vertices are where they are: only markers on stems can be placed elsewhere.")
+
     def to(self, like: torch.Tensor) -> Self:
         """The same markers on the device and in the precision of a tensor."""
         changed: dict[str, Any] = {}
@@ -107,6 +118,11 @@ class SurfaceMarkers(Markers):
     # (m, 2, 2) from the triangle's edges to its tangents at rest: the inverse of their coordinates [1/m]
     unstretch: torch.Tensor
     offsets: torch.Tensor  # (m, 3) stems [m] along the first and second tangent and the normal
+    axes: torch.Tensor  # (m, 3, 3) these at rest, as columns
+
+    @override
+    def moved(self, by: torch.Tensor) -> "SurfaceMarkers":
+        return replace(self, offsets=self.offsets + torch.einsum("mij,mi->mj", self.axes, by.to(self.offsets)))
 
     @override
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
@@ -124,6 +140,10 @@ class RigidMarkers(Markers):
     offsets: torch.Tensor  # (m, 3) [m] the markers at rest, from the centre of the vertices
 
     @override
+    def moved(self, by: torch.Tensor) -> "RigidMarkers":
+        return replace(self, offsets=self.offsets + by.to(self.offsets))
+
+    @override
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
         now = positions[:, self.vertices]  # (B, S, 3)
         centre = now.mean(1, keepdim=True)
@@ -136,12 +156,19 @@ class JoinedMarkers(Markers):
     """Markers of several kinds."""
 
     vertices: torch.Tensor  # (K,) those of all parts
-    parts: tuple[Markers, ...]  # the markers of each kind
+    parts: tuple[SurfaceMarkers | RigidMarkers, ...]  # the markers of each kind
     order: torch.Tensor  # (m,) place of each marker in the parts laid end to end
 
     @override
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
         return torch.cat([part(positions) for part in self.parts], 1)[:, self.order]
+
+    @override
+    def moved(self, by: torch.Tensor) -> "JoinedMarkers":
+        counts = [len(part.offsets) for part in self.parts]
+        in_parts = by[torch.argsort(self.order).to(by.device)].split(counts)
+        parts = tuple(part.moved(some) for part, some in zip(self.parts, in_parts, strict=True))
+        return replace(self, parts=parts)
 
     @override
     def to(self, like: torch.Tensor) -> Self:
@@ -234,7 +261,7 @@ def bind_markers(
         )
     on_surface = np.array([each in ("normal", "frame") for each in kinds])
     flat = np.array([each == "normal" for each in kinds])
-    parts: list[Markers] = []
+    parts: list[SurfaceMarkers | RigidMarkers] = []
     places: list[int] = []
     if on_surface.any():
         bound = (found.triangles, points, found.points, flat)
@@ -289,7 +316,7 @@ def _on_triangles(
     stems = points - np.einsum("mki,mk->mi", corners, weights)
     offsets = (np.swapaxes(frame, 1, 2) @ stems[:, :, None])[:, :, 0]
     offsets[flat, :2] = 0.0
-    return SurfaceMarkers(*map(torch.as_tensor, (triangles, weights, unstretch, offsets)))
+    return SurfaceMarkers(*map(torch.as_tensor, (triangles, weights, unstretch, offsets, frame)))
 
 
 def _on_vertices(mesh: Mesh, vertices: ArrayLike | None, points: np.ndarray) -> RigidMarkers:

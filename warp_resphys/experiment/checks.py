@@ -15,13 +15,12 @@ from ..energies.materials import Material
 from ..fem.body import Body
 from ..io.errors import InputError
 from ..io.memory import available_memory_gib
-from ..learning.identification import Bounds
 from ..learning.reconstruction import make_reconstructor
 from ..learning.replay import MASS_FACTOR, known_parameters
 from ..mesh.mesh import select_vertices, surface_vertices
 from .build import Drive, build_body, build_material, build_simulator, drive_of
 from .files import STATIC, attached_mass
-from .identify import ELASTIC
+from .identify import ELASTIC, bounds_of
 from .schema import IN_THE_LOOP, NAME, NETWORK, TRAINER, check, configuration_group
 from .simulate import input_sequences, laboratory_settings, substeps_of, vertical
 from .trials import (
@@ -388,7 +387,7 @@ def _check_identification(identify: Mapping[str, Any], known: Sequence[str]) -> 
                 instead = f"choose from {', '.join(choice)}" if choice else f"set identify.{group} to null"
                 raise InputError(f"identify.{group} names '{name}': {instead}.")
             with _naming(f"identify.{group}.{name}: "):
-                Bounds(**{key: value for key, value in settings.items() if key != "points"})
+                bounds_of(settings)
     for name, value in identify["first_guess"].items():
         within = parameters.get(name)
         if name not in known:

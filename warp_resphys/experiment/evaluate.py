@@ -208,7 +208,7 @@ def _sideways(scene: Scene, names: Sequence[str]) -> dict[str, float]:
     for some in scene.alike(names):
         if scene.begins(some[0]) != "released":
             continue
-        shift = scene.start(scene.replay(simulator, some)).shift
+        shift = scene.start(scene.replay(simulator, some, "resphys")).shift
         if shift is not None:
             found |= dict(zip(some, (1e3 * shift.norm(dim=2).mean(1)).tolist(), strict=True))
     return found
@@ -225,7 +225,7 @@ def time_models(context: StageContext) -> None:
     names = scene.moving(context.settings["groups"]["1"])
     simulator = scene.model_simulator("resphys")
     learned = learned_of(scene, "resphys")
-    starts = {name: scene.start(scene.replay(simulator, [name])) for name in names}
+    starts = {name: scene.start(scene.replay(simulator, [name], "resphys")) for name in names}
     rows: dict[str, tuple[str, Any, Any]] = {"simulation": ("simulation", None, scene.simulator("simulation"))}
     if scene.config.get("target") is not None:
         rows["target"] = ("simulation", None, scene.simulator("target"))

@@ -5,11 +5,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
+import numpy as np
+
 from ..io.files import write_json
 from ..io.progress import Progress
 from ..io.resumable import forget_checkpoint, keep_checkpoint, resume_checkpoint
 from ..io.stages import StageContext
-from ..learning.identification import Bounds, Identifier
+from ..learning.identification import Bounds, Identifier, Prior
+from ..learning.placement import Accuracy
 from ..learning.replay import MASS_FACTOR, Replay, Start
 from .files import IDENTIFICATION
 from .scene import MODELS, Scene
@@ -36,7 +39,7 @@ def identify(context: StageContext) -> None:
     names = settings["split"]["train"]
     names = evenly(names, config["trials"]) if config["trials"] is not None else names
     searches = {"sysid": config["parameters"], "sysid_elastic": config.get("elastic") or {}}
-    ranges = {model: {k: Bounds(**b) for k, b in each.items() if b} for model, each in searches.items() if each}
+    ranges = {model: {k: bounds_of(b) for k, b in each.items() if b} for model, each in searches.items() if each}
     kinds = {model: MODELS[model][0] for model in ranges}
     evaluations = len(ranges) * config["starts"] * config["max_evaluations"]
     kept = {part: _Kept(context, part) for part in (*ranges, _LANDSCAPE)}
@@ -45,18 +48,42 @@ def identify(context: StageContext) -> None:
     with Progress(context.name, evaluations, "evaluations at most", done) as progress:
         for model, bounds in ranges.items():
             replays[model] = scene.replays(scene.simulator(kinds[model]), names)
-            identifier = Identifier(replays[model], bounds, _seconds(settings, replays[model]))
+            placed = _placement(scene) if model == "sysid" else {}
+            identifier = Identifier(replays[model], bounds, _seconds(settings, replays[model]), **placed)
             found[model] = _search(settings, identifier, kept[model], progress)
     if config["grid"]:
         seconds = _seconds(settings, replays["sysid"]) if config["seconds"] is not None else None
         axes = {name: Bounds(*(grid[key] for key in _RANGE)) for name, grid in config["grid"].items()}
         others = {name: bounds for name, bounds in ranges["sysid"].items() if name not in axes}
-        identifier = Identifier(replays["sysid"], {**axes, **others}, seconds)
+        identifier = Identifier(replays["sysid"], {**axes, **others}, seconds, **_placement(scene))
         counts = {name: int(grid["points"]) for name, grid in config["grid"].items()}
         found[_LANDSCAPE] = _landscape(identifier, counts, found["sysid"]["parameters"], kept[_LANDSCAPE])
     write_json(context.run_dir / IDENTIFICATION, found)
     for each in kept.values():
         forget_checkpoint(each.path)
+
+
+def bounds_of(settings: Mapping[str, Any]) -> Bounds:
+    """A range as it is configured.
+
+    Raises:
+        InputError: an empty range, or a prior outside of it.
+    """
+    prior = settings.get("prior")
+    own = {key: settings[key] for key in _RANGE if key in settings}
+    return Bounds(**own, prior=None if prior is None else Prior(**prior))
+
+
+def _placement(scene: Scene) -> dict[str, Any]:
+    """What an `Identifier` is told of how well it is known where markers sit; nothing where that is not asked."""
+    wanted = scene.config["identify"].get("placement")
+    if wanted is None:
+        return {}
+    turn = wanted.get("turn")
+    accuracy = Accuracy(wanted.get("markers"), wanted.get("shift"), None if turn is None else math.radians(turn))
+    markers = scene.config["markers"]
+    standing = [*markers["reference"].values()] or [*markers["tracked"].values()]
+    return {"accuracy": accuracy, "labels": scene.dataset.labels, "centre": np.mean(standing, axis=0).tolist()}
 
 
 class _Kept:

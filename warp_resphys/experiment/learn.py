@@ -201,7 +201,7 @@ def _in_the_loop(scene: Scene, model: str, samples: Samples, groups: Mapping[str
     """
     config, split = groups["in_the_loop"], scene.config["split"]
     parameters, simulator = scene.parameters(model), scene.model_simulator(model)
-    everyone, frames = scene.replays(simulator, [*split["train"], *split["validation"]]), scene.frames(simulator)
+    everyone, frames = scene.replays(simulator, [*split["train"], *split["validation"]], model), scene.frames(simulator)
 
     def loss(names: Sequence[str]) -> MotionLoss:
         watched = []
@@ -256,7 +256,7 @@ def refine(context: StageContext) -> None:
         partial(dataclasses.replace, simulator),  # One whose solver has seen nothing yet.
         config["window"],
         config["batch_size"],
-        observe=scene.observe,
+        observe=scene.observe_by(model),
         parameters=scene.parameters(model),
         frames=scene.frames(simulator, learned.force_frame),
         range_=learned.range_,
@@ -272,7 +272,7 @@ def _motions(scene: Scene, model: str, names: Sequence[str]) -> list[Motion]:
     """What windows of some trials start from, and where they should go: a motion for those that begin alike."""
     found = []
     simulator = reconstructing_simulator(scene, model)
-    for replay, start in scene.replays(simulator, scene.moving(names)):
+    for replay, start in scene.replays(simulator, scene.moving(names), model):
         some, target = replay.trials.names, scene.explained(replay, start)
         known, device = scene.dataset.velocity is not None, simulator.rest_positions.device
         q, v, *_ = _known(scene, some, device) if known else _reconstructed(scene, model, some, device)

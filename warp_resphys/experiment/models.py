@@ -102,7 +102,7 @@ class ModelRollout(March):
         self.scene, self.model = scene, model
         self.simulator = scene.model_simulator(model) if simulator is None else simulator
         self.like = self.simulator.rest_positions
-        self.replay = scene.replay(self.simulator, names)
+        self.replay = scene.replay(self.simulator, names, model)
         self.start = scene.start(self.replay) if start is None else start
         parameters = scene.parameters(model)
         self._constants, self._inputs, self._resting = self.replay.setting(parameters)
@@ -177,7 +177,7 @@ class ModelRollout(March):
 
     def points(self) -> torch.Tensor:
         """(R, M, 3) what is observed of the last state [m]; NaN where the roll-out has diverged."""
-        return torch.where(self._lost[:, None, None], torch.nan, self.scene.observe(self.state.q))
+        return torch.where(self._lost[:, None, None], torch.nan, self.replay.observe(self.state.q))
 
     @override
     def kept(self, number: int) -> dict[str, ArrayLike]:

@@ -130,7 +130,7 @@ class _OfTrials(Reconstructing):
         settings = part.context.settings
         scene = Scene(settings, part.context.run_dir)
         simulator = reconstructing_simulator(scene, settings["model"])
-        replay = self._replay = scene.replay(simulator, part.names)
+        replay = self._replay = scene.replay(simulator, part.names, settings["model"])
         self._start, self.like = scene.start(replay), simulator.rest_positions
         self._constants, self._inputs, self._resting = replay.setting(scene.parameters(settings["model"]))
         self._observed = scene.explained(replay, self._start)
@@ -138,7 +138,7 @@ class _OfTrials(Reconstructing):
             simulator = dataclasses.replace(simulator, time_step=_FOR_EVER, integrator="implicit_euler")
             self._observed = torch.cat([torch.full_like(self._observed, torch.nan), self._observed], 1)
             self._inputs = self._resting
-        markers: Any = None if scene.dataset.bound is None else scene.observe  # Full states have a faster way.
+        markers: Any = None if scene.dataset.bound is None else replay.observe  # Full states have a faster way.
         method = make_reconstructor(simulator, **settings["reconstruction"], markers=markers)
         self.method = method.with_constants(self._constants)
         self.force = torch.zeros_like(self._start.state.q)
@@ -179,7 +179,7 @@ def replayed_errors(
     """
     scene = Scene(settings, run_dir, "count")
     simulator = reconstructing_simulator(scene, settings["model"])
-    replay = scene.replay(simulator, names)
+    replay = scene.replay(simulator, names, settings["model"])
     start = scene.start(replay)
     constants, inputs, resting = replay.setting(scene.parameters(settings["model"]))
     observed = scene.explained(replay, start)
@@ -198,7 +198,7 @@ def replayed_errors(
         state = replay.begin(start, constants, resting)
         for k in range(min(errors.shape[1], observed.shape[1])):
             state = rollout.step(state) if k > 0 else state
-            reached, seen = scene.observe(state.q).cpu().numpy(), observed[:, k].cpu().numpy()
+            reached, seen = replay.observe(state.q).cpu().numpy(), observed[:, k].cpu().numpy()
             for row in np.flatnonzero(~rollout.lost(state).cpu().numpy()):
                 errors[row, k] = frame_error(reached[row], seen[row])
     return errors

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from ..data.actuation import remembered
+from ..data.markers import Markers
 from ..data.trials import Trials
 from ..dynamics.frames import BaseFrame, VertexFrames, base_movement
 from ..dynamics.integrator import State
@@ -20,6 +21,7 @@ from ..dynamics.simulator import Simulator
 from ..fem.body import Body
 from ..io.errors import ConvergenceError
 from ..io.files import read_json
+from ..learning.placement import PlacedMarkers, Placement
 from ..learning.release import ReleaseSettings, estimate_release
 from ..learning.replay import Replay, Start
 from .build import bound_markers, build_body, build_simulator
@@ -118,6 +120,17 @@ class Scene:
         found = bound_markers(self.config["markers"], self.body.mesh, self.dataset.bound, self.dataset.labels)
         return found.to(self.like)
 
+    def observe_by(self, model: str) -> Observe:
+        """The same, with the markers where the identification of a model found that they sit."""
+        key = MODELS[model][1]
+        if key is None or self.config.get("identify") is None:
+            return self.observe
+        found = read_json(self.folder / IDENTIFICATION)[key].get("placement")
+        if found is None:
+            return self.observe
+        assert isinstance(self.observe, Markers)
+        return PlacedMarkers.of(self.observe, Placement.from_plain(found, self.dataset.labels)).to(self.like)
+
     def trials(self, names: Sequence[str], simulator: Simulator | None = None) -> Trials:
         """Some of the trials, which begin alike, on the simulators' device, with inputs for a simulator's steps."""
         payload_at = self.config["data"].get("payload_at")
@@ -164,7 +177,7 @@ class Scene:
             v = torch.zeros_like(q) if velocity is None else q.new_tensor(velocity[self.dataset.rows(trials.names), 0])
             return Start(State(q, v), q.new_zeros(len(q)))
         if begins == "released":
-            return estimate_release(simulator, self.observe, trials, ReleaseSettings(**self.config["release"]))
+            return estimate_release(simulator, replay.observe, trials, ReleaseSettings(**self.config["release"]))
         guess = simulator.rest_positions.expand(len(trials.names), -1, -1)
         if begins == STATIC:  # Far from rest, where whoever changes a parameter a little need not begin again.
             with contextlib.suppress(ConvergenceError), torch.no_grad():
@@ -172,13 +185,15 @@ class Scene:
                 guess = simulator.static_equilibrium(resting, constants).q
         return Start.resting(guess)
 
-    def replay(self, simulator: Simulator, names: Sequence[str]) -> Replay:
-        """A simulator of some of the trials, which begin alike."""
-        return Replay(simulator, self.observe, self.trials(names, simulator))
+    def replay(self, simulator: Simulator, names: Sequence[str], model: str = "simulation") -> Replay:
+        """A simulator of some of the trials, which begin alike, seen as a model sees them."""
+        return Replay(simulator, self.observe_by(model), self.trials(names, simulator))
 
-    def replays(self, simulator: Simulator, names: Sequence[str]) -> list[tuple[Replay, Start]]:
+    def replays(
+        self, simulator: Simulator, names: Sequence[str], model: str = "simulation"
+    ) -> list[tuple[Replay, Start]]:
         """A simulator of any of the trials, a replay for those that begin alike, and how they begin."""
-        found = [self.replay(simulator, some) for some in self.alike(names)]
+        found = [self.replay(simulator, some, model) for some in self.alike(names)]
         return [(each, self.start(each)) for each in found]
 
     def parameters(self, model: str) -> dict[str, torch.Tensor]:

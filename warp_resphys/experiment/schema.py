@@ -246,7 +246,9 @@ IN_THE_LOOP: Final = Group(
         "hold_out": TRUTH_VALUE,
     }
 )
-_RANGE = {"lower": FINITE, "upper": FINITE, "logarithmic": absent(TRUTH_VALUE)}
+_PRIOR = Group({"mean": FINITE, "deviation": POSITIVE}, optional=True, absent=True)
+_RANGE = {"lower": FINITE, "upper": FINITE, "logarithmic": absent(TRUTH_VALUE), "prior": _PRIOR}
+_PLACEMENT = Group(dict.fromkeys(("markers", "shift", "turn"), absent(optional(POSITIVE))), optional=True, absent=True)
 _GRID = Group({"lower": FINITE, "upper": FINITE, "logarithmic": TRUTH_VALUE, "points": NATURAL})
 _IDENTIFY = Group(
     {
@@ -254,6 +256,7 @@ _IDENTIFY = Group(
         **dict.fromkeys(("substeps", "starts", "max_evaluations"), NATURAL),
         "parameters": Group(each=Group(_RANGE, optional=True)),
         "elastic": optional(Group(each=Group(_RANGE, optional=True))),
+        "placement": _PLACEMENT,
         "first_guess": Group(each=FINITE),
         "trials": optional(NATURAL),
         "seconds": optional(POSITIVE),

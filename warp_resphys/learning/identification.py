@@ -3,6 +3,10 @@
 The loss is the mean square distance of simulated and observed markers, each motion in units of its own amplitude, over
 all motions at once. `linalg.least_squares` minimises it within bounds, from the best of a coarse set of starts, with
 gradients through the simulator.
+
+What is known beforehand, normal distributions of parameters (`Prior`) and of where markers sit (`placement`), adds its
+squares, weighed as much as one residual that tells something new: by the mean square residual of the data, times the
+number of frames that tell the same. That number is found at the start and again at the minimum.
 """
 
 import math
@@ -16,8 +20,11 @@ import scipy.stats
 import torch
 from numpy.typing import NDArray
 
+from ..data.markers import Markers
+from ..data.trials import Trials
 from ..io.errors import ConvergenceError, InputError
 from ..linalg.least_squares import UnitBox, minimise
+from .placement import Accuracy, Placement, Stems, estimate
 from .replay import Replay, Start
 
 Report = Callable[[int, float, Mapping[str, float]], None]
@@ -25,6 +32,15 @@ Attempt = dict[str, Any]
 
 _MOST_ITERATIONS = 200  # of a solve; steps take a handful, and parameters that need more have failed
 _DIFFERENCE = 1e-3  # of a range, for derivatives by differences
+_ALIKE = 0.7  # weights of the priors that differ by less are not worth another descent
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known of a parameter beforehand: a normal distribution, of its logarithm where that is searched."""
+
+    mean: float  # in the parameter's unit
+    deviation: float  # standard deviation, the same
 
 
 @dataclass(frozen=True)
@@ -34,6 +50,7 @@ class Bounds:
     lower: float  # in the parameter's unit
     upper: float  # the same
     logarithmic: bool = False  # whether it is searched on a logarithmic scale
+    prior: Prior | None = None  # known beforehand
 
     def __post_init__(self) -> None:
         """Checks the range.
@@ -45,6 +62,18 @@ class Bounds:
             raise InputError(f"the bounds {self.lower:g} and {self.upper:g} leave no range: the first must be smaller.")
         if self.logarithmic and not self.lower > 0.0:
             raise InputError(f"a logarithmic range from {self.lower:g}: its lower bound must be positive.")
+        if self.prior is not None and not self.lower <= self.prior.mean <= self.upper:
+            raise InputError(
+                f"{self.prior.mean:g} is expected beforehand, outside of the range from {self.lower:g} to "
+                f"{self.upper:g}: widen the range, or correct the prior."
+            )
+
+    def expected(self) -> tuple[float, float] | None:
+        """Mean and standard deviation of the prior, as fractions of the range."""
+        if self.prior is None:
+            return None
+        mean = self.to_unit(self.prior.mean)
+        return mean, self.prior.deviation / self.slope(mean)
 
     def to_unit(self, value: float) -> float:
         """A value as a fraction of the range, 0 to 1."""
@@ -84,6 +113,7 @@ class Identification:
     # for every start the records ``loss`` and the parameters, one an evaluation that did not fail
     history: list[list[dict[str, float]]] = field(default_factory=list)
     at_bounds: tuple[str, ...] = ()  # parameters that ended on a bound
+    placement: dict[str, Any] | None = None  # of the markers, as `Placement.plain` has it
     uncertainty: Uncertainty | None = None  # see the class; None if the simulation fails beside the minimum
 
 
@@ -95,13 +125,22 @@ class Identifier:
             begin; all by one simulator.
         bounds: range of each parameter to identify.
         seconds: how much of each motion counts; all of it if None.
+        accuracy: to which it is known where markers sit and how the recordings lie; None: exactly.
+        labels: of the markers, if that is given.
+        centre: (3,) about which recordings may be turned [m].
 
     Raises:
         InputError: an unknown parameter, or none; or a motion in which nothing moves.
     """
 
     def __init__(
-        self, replays: Sequence[tuple[Replay, Start]], bounds: Mapping[str, Bounds], seconds: float | None = None
+        self,
+        replays: Sequence[tuple[Replay, Start]],
+        bounds: Mapping[str, Bounds],
+        seconds: float | None = None,
+        accuracy: Accuracy | None = None,
+        labels: Sequence[str] = (),
+        centre: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> None:
         if not bounds:
             raise InputError("there is nothing to identify: name a parameter under identify.parameters.")
@@ -113,25 +152,97 @@ class Identifier:
         most = min(simulator.settings.max_iterations, _MOST_ITERATIONS)
         settings = replace(simulator.settings, max_iterations=most, on_failure="raise")
         self.simulator = replace(simulator, solver=settings)
-        self._replays, self._weights = [], []
+        self._replays: list[tuple[Replay, Start]] = []
+        self._weights: list[torch.Tensor] = []
+        self._accuracy, self._labels, self._centre = accuracy, tuple(labels), self.simulator.tensor(list(centre))
+        self._expected = [each.expected() for each in self.bounds.values()]
+        self._prior_weight = 0.0
         count = sum(len(replay.trials.names) for replay, _ in replays)
         for replay, start in replays:
             trials = replay.trials if seconds is None else replay.trials.first(seconds)
             for name, moved in zip(trials.names, trials.amplitude.tolist(), strict=True):
                 if not moved > 0.0:
                     raise InputError(f"the markers of the trial {name!r} stay where they were held: leave it out.")
-            self._replays.append((Replay(self.simulator, replay.observe, trials), start))
+            self._replays.append(self._watched(replay, start, trials))
             self._weights.append(trials.loss_weight * (len(trials.names) / count))
+
+    def _watched(self, replay: Replay, start: Start, trials: Trials) -> tuple[Replay, Start]:
+        """A replay that also tells how stems turn, where markers may sit elsewhere."""
+        if self._accuracy is None:
+            return Replay(self.simulator, replay.observe, trials), start
+        if not isinstance(replay.observe, Markers):
+            raise InputError("where the markers sit can be identified of markers alone: leave identify.placement out.")
+        stems = Stems(replay.observe, trials.observed.shape[2])
+        shift = None if start.shift is None else start.shift.repeat(1, stems.copies, 1)
+        return Replay(self.simulator, stems, trials), replace(start, shift=shift)
 
     def losses(self, unit: torch.Tensor) -> torch.Tensor:
         """(E,) losses of (E, P) parameters, each a fraction of its range."""
-        pairs = zip(self._residuals(unit), self._weights, strict=True)
-        return torch.stack([(each.square().sum((2, 3, 4)) * weight).sum(1) for each, weight in pairs]).sum(0)
+        residuals, prior = self._residuals(unit)
+        pairs = zip(residuals, self._weights, strict=True)
+        data = torch.stack([(each.square().sum((2, 3, 4)) * weight).sum(1) for each, weight in pairs]).sum(0)
+        return data + prior.square().sum(1)
 
-    def _residuals(self, unit: torch.Tensor) -> list[torch.Tensor]:
-        """(E, R, T, M, 3) simulated less observed points of each replay [m]."""
+    def _residuals(self, unit: torch.Tensor) -> tuple[list[torch.Tensor], torch.Tensor]:
+        """(E, R, T, M, 3) simulated less observed points of each replay [m], and (E, K) what the priors add."""
         values = {name: b.from_unit(unit[:, i]) for i, (name, b) in enumerate(self.bounds.items())}
-        return [replay.errors(replay(start, values)) for replay, start in self._replays]
+        series = [replay(start, values) for replay, start in self._replays]
+        weight = math.sqrt(self._prior_weight)
+        known = [(i, *expected) for i, expected in enumerate(self._expected) if expected is not None]
+        prior = [weight * (unit[:, i] - mean) / deviation for i, mean, deviation in known]
+        rows = torch.stack(prior, 1) if prior else unit.new_zeros(len(unit), 0)
+        if self._accuracy is None:
+            return [r.errors(each) for (r, _), each in zip(self._replays, series, strict=True)], rows
+        placed, inside = [], []
+        for row in range(len(unit)):
+            shown = [each[row] for each in series]
+            if not self._prior_weight:  # Nothing is known yet of how much the data tell.
+                placed.append([Stems.parts(each)[0] for each in shown])
+                inside.append(unit.new_zeros(1))
+                continue
+            placement, deviations, points = self._place(shown)
+            inside.append(weight * deviations)
+            placed.append([placement.apply(at) for at in points])
+        errors = [
+            r.errors(torch.stack(each)) for (r, _), each in zip(self._replays, zip(*placed, strict=True), strict=True)
+        ]
+        return errors, torch.cat([rows, torch.stack(inside)], 1)
+
+    def _place(self, series: Sequence[torch.Tensor]) -> tuple[Placement, torch.Tensor, list[torch.Tensor]]:
+        """The best placement for what one set of parameters shows, it in standard deviations, and the moved markers."""
+        assert self._accuracy is not None
+        parts = [Stems.parts(each) for each in series]
+        with torch.no_grad():  # Where it is the best, the loss does not change with it.
+            errors = [r.errors(at[None])[0] for (r, _), (at, _) in zip(self._replays, parts, strict=True)]
+            seen = [r.trials.seen for r, _ in self._replays]
+            points, turns = [at for at, _ in parts], [turn for _, turn in parts]
+            weight = max(self._prior_weight, 1e-12)
+            found, inside = estimate(self._accuracy, self._centre, errors, seen, points, turns, self._weights, weight)
+        moved = [at + (turn @ found.offsets[..., None])[..., 0] for at, turn in parts]
+        return found, inside, moved
+
+    def _weigh_priors(self, unit: NDArray[np.float64]) -> float:
+        """Sets what a residual that tells something new weighs, from those at parameters; the ratio to before."""
+        before = self._prior_weight
+        if self._accuracy is None and not any(self._expected):
+            return 1.0
+        found = self._linearise(unit, derivatives=False)
+        if found is None:
+            return 1.0
+        trials = found[0]
+        seen = sum(count for *_, count in trials)
+        squares = [np.square(rows).sum() * _redundancy(rows) for rows, _, _ in trials]
+        self._prior_weight = float(sum(squares)) / max(seen, 1)
+        return self._prior_weight / before if before else math.inf
+
+    def placement(self, unit: NDArray[np.float64]) -> Placement | None:
+        """Where the markers sit with parameters, each a fraction of its range; None where that is known."""
+        if self._accuracy is None:
+            return None
+        with torch.no_grad():
+            x = self.simulator.tensor(unit)[None]
+            values = {name: b.from_unit(x[:, i]) for i, (name, b) in enumerate(self.bounds.items())}
+            return self._place([replay(start, values)[0] for replay, start in self._replays])[0]
 
     def grid(
         self,
@@ -145,7 +256,7 @@ class Identifier:
 
         Args:
             axes: number of points of each parameter of the grid, over its whole range.
-            others: values of the remaining parameters.
+            others: values of the remaining parameters; those of all of them tell how much the priors weigh.
             chunk: sets of parameters that are simulated at once.
             finished: what an interrupted call with the same arguments told last; those losses are not computed again.
             report: is told the losses so far, in the order of the grid's points, after every chunk.
@@ -153,6 +264,8 @@ class Identifier:
         Returns:
             Losses with an axis for each of `axes`, in their order; infinite where a simulation failed.
         """
+        if not self._prior_weight and others.keys() >= self.bounds.keys():
+            self._weigh_priors(self._units(others))
         held = self._units({**others, **{name: self.bounds[name].lower for name in axes}})
         ticks = [
             np.linspace(0.0, 1.0, axes[name]) if name in axes else [unit]
@@ -246,9 +359,18 @@ class Identifier:
             raise ConvergenceError("the simulation failed at every start of the identification.", None, None)
         best = min(good, key=lambda attempt: attempt["loss"])
         unit = self._units(best["parameters"])
+        self._prior_weight = best.get("prior_weight", 0.0)
+        placement = self.placement(unit)
         at_bounds = tuple(n for n, u in zip(self.bounds, unit, strict=True) if min(u, 1.0 - u) < 1e-4)
         histories = [attempt["history"] for attempt in attempts]
-        return Identification(best["parameters"], best["loss"], histories, at_bounds, self.uncertainty(unit))
+        return Identification(
+            best["parameters"],
+            best["loss"],
+            histories,
+            at_bounds,
+            None if placement is None else placement.plain(self._labels),
+            self.uncertainty(unit),
+        )
 
     def _descend(
         self, number: int, start: Mapping[str, float], max_evaluations: int, tolerance: float, report: Report | None
@@ -266,15 +388,29 @@ class Identifier:
 
         def matrix(unit: NDArray[np.float64]) -> NDArray[np.float64] | None:
             found = self._linearise(unit)
-            return None if found is None else 2.0 * np.stack([j.T @ j for _, j, _ in found]).sum(0)
+            if found is None:
+                return None
+            trials, prior = found
+            return 2.0 * (np.stack([j.T @ j for _, j, _ in trials]).sum(0) + prior.T @ prior)
 
+        first = self._units(start)
+        self._prior_weight = 0.0
+        self._weigh_priors(first)
         problem = UnitBox(objective, matrix)
-        point = problem.evaluate(torch.as_tensor(self._units(start))[None])
+        point = problem.evaluate(torch.as_tensor(first)[None])
         simulated = math.isfinite(float(point.value))
         if simulated:
             point = minimise(problem, point, tolerance, max_evaluations - 1).point
+            left = max_evaluations - len(history)
+            if left > 1 and not _ALIKE < self._weigh_priors(point.x[0].numpy()) < 1.0 / _ALIKE:
+                point = minimise(problem, problem.evaluate(point.x), tolerance, left - 1).point
         loss = float(point.value) if simulated else None
-        return {"parameters": self._values(point.x[0].tolist()), "loss": loss, "history": history}
+        return {
+            "parameters": self._values(point.x[0].tolist()),
+            "loss": loss,
+            "history": history,
+            "prior_weight": self._prior_weight,
+        }
 
     def _loss_and_gradient(self, unit: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         """Infinite, and zero, where the simulation fails."""
@@ -288,48 +424,61 @@ class Identifier:
         return float(loss.detach()), gradient[0].double().cpu().numpy()
 
     def _linearise(
-        self, unit: NDArray[np.float64], central: bool = False
-    ) -> list[tuple[NDArray[np.float64], NDArray[np.float64], int]] | None:
+        self, unit: NDArray[np.float64], central: bool = False, derivatives: bool = True
+    ) -> tuple[list[tuple[NDArray[np.float64], NDArray[np.float64], int]], NDArray[np.float64]] | None:
         """Weighted residuals of every trial, their derivatives by the fractions from differences, and how many count.
 
         One-sided differences lead into the range; central ones are taken a step inside of it. None where a simulation
         fails.
 
         Returns:
-            A trial each (T, 3 M), (3 T M, P) and the number of coordinates that were seen.
+            A trial each (T, 3 M), (3 T M, P) and the number of coordinates that were seen; and (K, P) the derivatives
+            of what the priors add.
         """
         count, steps = len(unit), np.where(unit < 0.5, _DIFFERENCE, -_DIFFERENCE)
         if central:
             unit = np.clip(unit, _DIFFERENCE, 1.0 - _DIFFERENCE)
         sides = [unit[None], unit + np.diag(steps), unit - np.diag(steps)]
+        wanted = sides[: 3 if central else 2] if derivatives else sides[:1]
         try:
             with torch.no_grad():
-                residuals = self._residuals(self.simulator.tensor(np.concatenate(sides[: 3 if central else 2])))
+                residuals, prior = self._residuals(self.simulator.tensor(np.concatenate(wanted)))
         except ConvergenceError:
             return None
+
+        def slopes(values: NDArray[np.float64]) -> NDArray[np.float64]:
+            """(..., P) of values (E, ...) at the points."""
+            if not derivatives:
+                return np.zeros((*values.shape[1:], count))
+            behind, width = (values[count + 1 :], 2.0 * steps) if central else (values[:1], steps)
+            change = values[1 : count + 1] - behind
+            return np.moveaxis(change / width.reshape(-1, *[1] * (change.ndim - 1)), 0, -1)
+
         found = []
         for (replay, _), each, weight in zip(self._replays, residuals, self._weights, strict=True):
             weighted = (each * weight.sqrt()[:, None, None, None]).double().cpu().numpy()  # (E, R, T, M, 3)
-            flat = weighted.reshape(*weighted.shape[:2], -1)
-            behind, width = (flat[count + 1 :], 2.0 * steps) if central else (flat[:1], steps)
-            jacobian = np.moveaxis((flat[1 : count + 1] - behind) / width[:, None, None], 0, -1)
+            jacobian = slopes(weighted.reshape(*weighted.shape[:2], -1))
             seen = 3 * replay.trials.seen.sum((1, 2)).cpu().numpy()
             rows = weighted[0].reshape(*weighted.shape[1:3], -1)
             found += list(zip(rows, jacobian, seen.tolist(), strict=True))
-        return found
+        return found, slopes(prior.double().cpu().numpy())
 
     def uncertainty(self, unit: NDArray[np.float64]) -> Uncertainty | None:
         """Covariance (J^T J)^-1 (sum_r s_r^2 J_r^T J_r) (J^T J)^-1 at fractions of the ranges, J_r that of a trial.
 
         s_r^2 is the mean square residual of the trial times the number of frames that tell nothing new: the sum of
-        the residuals' autocorrelation up to its first zero. None if the simulation fails close by.
+        the residuals' autocorrelation up to its first zero. What the priors add counts as one more trial, whose s_r^2
+        is its weight. None if the simulation fails close by.
         """
-        found = self._linearise(unit, central=True)
-        if found is None:
+        linear = self._linearise(unit, central=True)
+        if linear is None:
             return None
+        found, prior = linear
         free = 1.0 - min(len(unit) / sum(seen for _, _, seen in found), 0.5)
         variances = [np.square(rows).sum() / (seen * free) * _redundancy(rows) for rows, _, seen in found]
         blocks = np.stack([jacobian.T @ jacobian for _, jacobian, _ in found])
+        blocks = np.concatenate([blocks, (prior.T @ prior)[None]])
+        variances.append(self._prior_weight)
         values, vectors = np.linalg.eigh(blocks.sum(0))
         inverse = (vectors / np.maximum(values, 1e-12 * max(values[-1], 1e-300))) @ vectors.T
         covariance = inverse @ np.einsum("r,rpq->pq", variances, blocks) @ inverse

@@ -162,6 +162,7 @@ def identification_section(data: RunReport, canvas: Canvas) -> Part | None:
         notes.append(f"The true values are those of the simulated laboratory, whose material is {model}.")
     blocks += [Text(" ".join(notes), note=True)] if notes else []
     blocks += [Text(said) for said in uncertain]
+    blocks += [Text(placement_text(name, each["placement"])) for name, each in found.items() if each.get("placement")]
     return Part("Identification", blocks + _loss_figures(data, found, canvas))
 
 
@@ -249,6 +250,17 @@ def _decimals(deviation: float) -> int:
 def _in_a_sentence(parameter: str) -> str:
     words = _parameter(parameter)[0]
     return words if words.startswith(("Young", "Poisson", "Prony")) else words[0].lower() + words[1:]
+
+
+def placement_text(name: str, placed: Mapping[str, Any]) -> str:
+    """Say how far from where they should be an identification found the markers and the recordings."""
+    away = {label: 1e3 * math.dist(offset, (0.0, 0.0, 0.0)) for label, offset in placed["offsets"].items()}
+    furthest = max(away, key=lambda label: away[label])
+    said = f"{MODELS[name][0]}, with the parameters: "
+    said += f"markers sit beside their nominal places, {furthest} the furthest, by {away[furthest]:.1f} mm; "
+    shift, turn = (math.hypot(*placed[key]) for key in ("shift", "turn"))
+    said += f"the recordings lie {1e3 * shift:.1f} mm and {math.degrees(turn):.1f}° off."
+    return said.replace(" mm", f"{NO_BREAK_SPACE}mm")
 
 
 def uncertainty_text(name: str, found: Mapping[str, Any]) -> str:

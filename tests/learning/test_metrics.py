@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from warp_resphys.io.errors import InputError
-from warp_resphys.learning.metrics import PUBLISHED_MM, marker_errors, summarise, summarise_each, summarise_folds
+from warp_resphys.learning.metrics import (
+    PUBLISHED_MM,
+    marker_errors,
+    paired_gain,
+    summarise,
+    summarise_each,
+    summarise_folds,
+)
 
 
 def two_vertices(*distances: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
@@ -72,3 +79,22 @@ def test_folds_weigh_the_same_whatever_their_length() -> None:
     assert found["resphys"] == {"mean": 2.5, "std": 1.5, "trajectories": 3, "diverged": 0}
     assert found["simfree"] == {"mean": None, "std": None, "trajectories": 2, "diverged": 1}
     assert summarise_folds(folds[:1])["resphys"] == {"mean": 1.0, "std": None, "trajectories": 1, "diverged": 0}
+
+
+def test_a_paired_gain_is_that_of_the_means_with_the_spread_of_the_trials():
+    found = paired_gain([2.0, 1.0, 3.0], [1.0, 0.5, 1.5])
+    assert found.share == found.lower == found.upper == pytest.approx(0.5)  # the same on each trial, however large
+    assert paired_gain([1.0], [1.2]) == (pytest.approx(-0.2), pytest.approx(-0.2), pytest.approx(-0.2), 1)
+    two = paired_gain([1.0, 1.0], [0.5, 0.9])
+    assert (two.share, two.lower, two.upper) == (pytest.approx(0.3), pytest.approx(0.1), pytest.approx(0.5))
+
+
+@pytest.mark.parametrize("count", [5, 20])
+def test_intervals_of_gains_cover_as_often_as_they_say(count):
+    """Trials whose gains scatter by as much again as their mean: 85 to 95 % where 90 % are meant."""
+    draw, inside = np.random.default_rng(3), 0
+    for _ in range(300):
+        before = draw.uniform(0.5, 2.0, count)
+        found = paired_gain(before, before * (0.8 + 0.2 * draw.normal(size=count)))
+        inside += found.lower <= 0.2 <= found.upper
+    assert 0.85 < inside / 300 < 0.95

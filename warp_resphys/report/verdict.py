@@ -5,12 +5,12 @@ import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from statistics import fmean, stdev
+from statistics import fmean
 from typing import Any, Final
 
-from ..learning.metrics import PUBLISHED_WINDOWS_MM, PublishedError
+from ..learning.metrics import PUBLISHED_WINDOWS_MM, Gain, PublishedError, paired_gain
 from .data import MODELS, RunReport
-from .page import NO_BREAK_SPACE, mm_text, published_parts
+from .page import MINUS, NO_BREAK_SPACE, mm_text, published_parts
 
 # By model: what it is called, and what it adds to the first of these models that there is.
 _STEPS: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = {
@@ -47,7 +47,7 @@ def verdict(data: RunReport) -> str:
     else:
         trials = tuple(data.pages) if data.trials is None else data.trials.names
         said = [marker_verdict(errors, trials, data.seconds, folds=data.trials is None)]
-        said.append(reduction_text(errors, data.published))
+        said.append(reduction_text(errors, data.published, _paired(metrics)))
     if data.settings["data"].get("train_fraction", 1.0) < 1.0:
         published = PUBLISHED_WINDOWS_MM.get(data.experiment, {})
         said.append(growth_text(metrics.get("growth", {}), list(metrics.get("horizons", {})), published))
@@ -150,17 +150,47 @@ def reduction(means: Mapping[str, float | None]) -> float | None:
     return None if before is None or after is None or before <= 0.0 else 1.0 - after / before
 
 
-def reduction_text(errors: Mapping[str, Any], published: Mapping[str, PublishedError]) -> str:
-    """Say how the error of ResPhys stands to that of SysID, here and as published; empty where it is not known."""
+def reduction_text(
+    errors: Mapping[str, Any], published: Mapping[str, PublishedError], paired: Gain | None = None
+) -> str:
+    """Say how the error of ResPhys stands to that of SysID, here and as published; empty where it is not known.
+
+    Args:
+        errors: A summary [mm] a model.
+        published: Published errors [mm].
+        paired: The gain on the same trials, whose interval is told; None where it is not known.
+    """
     found = reduction({model: each["mean"] for model, each in errors.items()})
     if found is None:
         return ""
     theirs = reduction({model: each.mean for model, each in published.items()})
-    beside = "" if theirs is None else f" (published: {100.0 * theirs:.1f} % smaller)"
+    beside = [] if theirs is None else [f"published: {100.0 * theirs:.1f} % smaller"]
+    if paired is not None and paired.trials > 1:
+        sign = 1.0 if found >= 0.0 else -1.0
+        ends = sorted(100.0 * sign * x for x in (paired.lower, paired.upper))
+        low, high = (f"{x:.0f}".replace("-", MINUS) for x in ends)
+        beside.insert(0, f"{low} to {high} % in nine of ten draws of {paired.trials} trials")
+    more = f" ({'; '.join(beside)})" if beside else ""
     if found < -1.0:
-        return f"The error of ResPhys is {1.0 - found:.1f} times that of SysID{beside}."
+        return f"The error of ResPhys is {1.0 - found:.1f} times that of SysID{more}."
     which = "smaller" if found >= 0.0 else "larger"
-    return f"The error of ResPhys is {100.0 * abs(found):.1f} % {which} than that of SysID{beside}."
+    return f"The error of ResPhys is {100.0 * abs(found):.1f} % {which} than that of SysID{more}."
+
+
+def _paired(metrics: Mapping[str, Any]) -> Gain | None:
+    """The gain of ResPhys over SysID on the held-out trials of a split or of folds."""
+    rows = _held_out(metrics)
+    pairs = [(row.get("sysid"), row.get("resphys")) for row in rows]
+    known = [(before, after) for before, after in pairs if before and after is not None]
+    if not known or len(known) < len(rows):
+        return None
+    return paired_gain([before for before, _ in known], [after for _, after in known])
+
+
+def _held_out(metrics: Mapping[str, Any]) -> list[Mapping[str, float | None]]:
+    """The errors of all models on each held-out trial [mm]."""
+    folds = list(metrics.get("folds", {}).values()) or [metrics]
+    return [row["errors_mm"] for fold in folds for row in fold.get("per_trajectory", ())]
 
 
 def growth_text(
@@ -198,7 +228,7 @@ def scale_text(errors: Mapping[str, Mapping[str, Any]]) -> str:
 def judgement(metrics: Mapping[str, Any], settings: Mapping[str, Any]) -> list[str]:
     """Sentences on a run, by what metrics.json holds of a split or of folds, and its configuration."""
     folds = list(metrics.get("folds", {}).values()) or [metrics]
-    rows = [row["errors_mm"] for fold in folds for row in fold.get("per_trajectory", ())]
+    rows = _held_out(metrics)
     errors = {model: [row.get(model) for row in rows] for model in (rows[0] if rows else ())}
     return gains(errors, epochs_kept(metrics)) + advice([_identified(fold, settings) for fold in folds])
 
@@ -228,10 +258,9 @@ def best(errors: Mapping[str, Any], without: Collection[str] = ()) -> str:
 
 
 def gains(errors: Mapping[str, Sequence[float | None]], epochs: Mapping[str, Sequence[int]]) -> list[str]:
-    """Say of every step whether it helped on held-out trials, by how much, and whether by more than its spread.
+    """Say of every step whether it helped on held-out trials, by how much, and whether other trials would show it.
 
-    The gain is the share of the error that a step takes away, trial by trial; its spread is the standard deviation of
-    that over the trials.
+    The gain is the share of the mean error that a step takes away, see `learning.metrics.paired_gain`.
 
     Args:
         errors: of each model on the same held-out trials [mm], None where its roll-out diverged.
@@ -264,18 +293,27 @@ def _gain(
     pairs = [(a, b) for a, b in zip(after, before, strict=True) if a is not None and b]
     if len(pairs) < len(before):
         return f"{name} cannot be compared with {base}, which diverged on held-out trials or has no error there.{idle}"
-    shares = [1.0 - a / b for a, b in pairs]
-    share, spread = fmean(shares), stdev(shares) if len(shares) > 1 else None
+    gain = paired_gain([b for _, b in pairs], [a for a, _ in pairs])
     means = f"mean {fmean(b for _, b in pairs):.3g} to {fmean(a for a, _ in pairs):.3g} mm"
-    digits = 2 if 0.99 < share < 1.0 else 0  # Where nearly everything is gone.
-    amount = f"{100.0 * abs(share):.{digits}f}{'' if spread is None else f' ± {100.0 * spread:.2g}'} %"
-    said = f"{name} leaves {amount} {'less' if share >= 0.0 else 'more'} error than {base}"
-    if spread is None:
+    which = "less" if gain.share >= 0.0 else "more"
+    said = f"{name} leaves {_percent(gain)} {which} error than {base}"
+    if gain.trials == 1:
         return f"{said} ({means}).{idle}"
-    said += f" on {len(pairs)} trials ({means}): "
-    if abs(share) <= spread:
-        return f"{said}that is within its spread over the trials, so another may show the opposite.{idle}"
-    return f"{said}it {'helps' if share > 0.0 else 'does harm'}, by more than its spread over the trials.{idle}"
+    said += f" on {gain.trials} trials ({means}): "
+    if gain.lower <= 0.0 <= gain.upper:
+        return f"{said}other trials may show the opposite.{idle}"
+    return f"{said}it {'helps' if gain.share > 0.0 else 'does harm'}.{idle}"
+
+
+def _percent(gain: Gain) -> str:
+    """The size of a gain or loss, with the interval in which nine of ten other draws of the trials have it."""
+    sign = 1.0 if gain.share >= 0.0 else -1.0
+    digits = 2 if 0.99 < gain.share < 1.0 else 0  # Where nearly everything is gone.
+    share, *ends = (f"{100.0 * sign * x:.{digits}f}" for x in (gain.share, gain.lower, gain.upper))
+    if gain.trials == 1:
+        return f"{share} %"
+    lower, upper = (each.replace("-", MINUS) for each in (ends if sign > 0.0 else ends[::-1]))
+    return f"{share} % (90 %: {lower} to {upper})"
 
 
 def advice(folds: Sequence[Sequence[Identified]]) -> list[str]:

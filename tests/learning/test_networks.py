@@ -108,6 +108,10 @@ class TestPOD:
         with pytest.raises(InputError, match=f"{modes} modes were asked for, but {samples} samples give 1 to"):
             pod_coder(field(samples), modes)
 
+    def test_nothing_has_no_modes(self):
+        with pytest.raises(InputError, match="2 modes were asked for of what is zero in all 5 samples, such as the vel"):
+            pod_coder(torch.zeros(5, 4, 3), 2)
+
 
 class TestNodalCoder:
     def test_round_trip_and_standardisation(self):

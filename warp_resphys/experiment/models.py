@@ -103,7 +103,7 @@ class ModelRollout(March):
         self.simulator = scene.model_simulator(model) if simulator is None else simulator
         self.like = self.simulator.rest_positions
         self.replay = scene.replay(self.simulator, names, model)
-        self.start = scene.start(self.replay) if start is None else start
+        self.start = scene.start(self.replay, model) if start is None else start
         parameters = scene.parameters(model)
         self._constants, self._inputs, self._resting = self.replay.setting(parameters)
         self._told = None if learned is None else scene.conditions(self.replay, parameters, model == SIMFREE)

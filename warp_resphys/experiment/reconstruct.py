@@ -131,7 +131,7 @@ class _OfTrials(Reconstructing):
         scene = Scene(settings, part.context.run_dir)
         simulator = reconstructing_simulator(scene, settings["model"])
         replay = self._replay = scene.replay(simulator, part.names, settings["model"])
-        self._start, self.like = scene.start(replay), simulator.rest_positions
+        self._start, self.like = scene.start(replay, settings["model"]), simulator.rest_positions
         self._constants, self._inputs, self._resting = replay.setting(scene.parameters(settings["model"]))
         self._observed = scene.explained(replay, self._start)
         if replay.is_static:  # A pose is where one step leads that lasts so long that inertia has no say.
@@ -180,7 +180,7 @@ def replayed_errors(
     scene = Scene(settings, run_dir, "count")
     simulator = reconstructing_simulator(scene, settings["model"])
     replay = scene.replay(simulator, names, settings["model"])
-    start = scene.start(replay)
+    start = scene.start(replay, settings["model"])
     constants, inputs, resting = replay.setting(scene.parameters(settings["model"]))
     observed = scene.explained(replay, start)
     frames = scene.frames(simulator)

@@ -167,8 +167,8 @@ class Scene:
         """How a trial begins."""
         return self.dataset.begins[self.dataset.names.index(name)]
 
-    def start(self, replay: Replay) -> Start:
-        """How trials begin, as a simulator would have it."""
+    def start(self, replay: Replay, model: str = "simulation") -> Start:
+        """How trials begin, as the simulator of a model would have it."""
         simulator, trials = replay.simulator, replay.trials
         begins = self.begins(trials.names[0])
         if begins == GIVEN:
@@ -181,7 +181,7 @@ class Scene:
         guess = simulator.rest_positions.expand(len(trials.names), -1, -1)
         if begins == STATIC:  # Far from rest, where whoever changes a parameter a little need not begin again.
             with contextlib.suppress(ConvergenceError), torch.no_grad():
-                constants, _, resting = replay.setting()
+                constants, _, resting = replay.setting(self.parameters(model))
                 guess = simulator.static_equilibrium(resting, constants).q
         return Start.resting(guess)
 
@@ -194,7 +194,7 @@ class Scene:
     ) -> list[tuple[Replay, Start]]:
         """A simulator of any of the trials, a replay for those that begin alike, and how they begin."""
         found = [self.replay(simulator, some, model) for some in self.alike(names)]
-        return [(each, self.start(each)) for each in found]
+        return [(each, self.start(each, model)) for each in found]
 
     def parameters(self, model: str) -> dict[str, torch.Tensor]:
         """(1,) identified parameters of a model's simulator; none for one that is not identified."""

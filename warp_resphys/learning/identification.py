@@ -155,6 +155,8 @@ class Identifier:
         self._replays: list[tuple[Replay, Start]] = []
         self._weights: list[torch.Tensor] = []
         self._accuracy, self._labels, self._centre = accuracy, tuple(labels), self.simulator.tensor(list(centre))
+        # By replay, equilibria for the parameters that were tried last in a descent, near which the next ones are.
+        self._near: list[torch.Tensor | None] = []
         self._expected = [each.expected() for each in self.bounds.values()]
         self._prior_weight = 0.0
         count = sum(len(replay.trials.names) for replay, _ in replays)
@@ -186,7 +188,7 @@ class Identifier:
     def _residuals(self, unit: torch.Tensor) -> tuple[list[torch.Tensor], torch.Tensor]:
         """(E, R, T, M, 3) simulated less observed points of each replay [m], and (E, K) what the priors add."""
         values = {name: b.from_unit(unit[:, i]) for i, (name, b) in enumerate(self.bounds.items())}
-        series = [replay(start, values) for replay, start in self._replays]
+        series = self._simulated(values)
         weight = math.sqrt(self._prior_weight)
         known = [(i, *expected) for i, expected in enumerate(self._expected) if expected is not None]
         prior = [weight * (unit[:, i] - mean) / deviation for i, mean, deviation in known]
@@ -208,6 +210,14 @@ class Identifier:
         ]
         return errors, torch.cat([rows, torch.stack(inside)], 1)
 
+    def _simulated(self, values: Mapping[str, torch.Tensor]) -> list[torch.Tensor]:
+        """(E, R, T, M, 3) what each replay shows with (E,) parameters [m]."""
+        near = self._near or [None] * len(self._replays)
+        found = []
+        for (replay, start), q in zip(self._replays, near, strict=True):
+            found.append(replay(start if q is None else start.near(q), values))
+        return found
+
     def _place(self, series: Sequence[torch.Tensor]) -> tuple[Placement, torch.Tensor, list[torch.Tensor]]:
         """The best placement for what one set of parameters shows, it in standard deviations, and the moved markers."""
         assert self._accuracy is not None
@@ -216,8 +226,8 @@ class Identifier:
             errors = [r.errors(at[None])[0] for (r, _), (at, _) in zip(self._replays, parts, strict=True)]
             seen = [r.trials.seen for r, _ in self._replays]
             points, turns = [at for at, _ in parts], [turn for _, turn in parts]
-            weight = max(self._prior_weight, 1e-12)
-            found, inside = estimate(self._accuracy, self._centre, errors, seen, points, turns, self._weights, weight)
+            known = self._accuracy, self._centre, errors, seen
+            found, inside = estimate(*known, points, turns, self._weights, self._prior_weight)
         moved = [at + (turn @ found.offsets[..., None])[..., 0] for at, turn in parts]
         return found, inside, moved
 
@@ -242,7 +252,7 @@ class Identifier:
         with torch.no_grad():
             x = self.simulator.tensor(unit)[None]
             values = {name: b.from_unit(x[:, i]) for i, (name, b) in enumerate(self.bounds.items())}
-            return self._place([replay(start, values)[0] for replay, start in self._replays])[0]
+            return self._place([each[0] for each in self._simulated(values)])[0]
 
     def grid(
         self,
@@ -359,7 +369,7 @@ class Identifier:
             raise ConvergenceError("the simulation failed at every start of the identification.", None, None)
         best = min(good, key=lambda attempt: attempt["loss"])
         unit = self._units(best["parameters"])
-        self._prior_weight = best.get("prior_weight", 0.0)
+        self._prior_weight, self._near = best.get("prior_weight", 0.0), []  # As a run that finished the starts has them.
         placement = self.placement(unit)
         at_bounds = tuple(n for n, u in zip(self.bounds, unit, strict=True) if min(u, 1.0 - u) < 1e-4)
         histories = [attempt["history"] for attempt in attempts]
@@ -394,7 +404,7 @@ class Identifier:
             return 2.0 * (np.stack([j.T @ j for _, j, _ in trials]).sum(0) + prior.T @ prior)
 
         first = self._units(start)
-        self._prior_weight = 0.0
+        self._prior_weight, self._near = 0.0, []
         self._weigh_priors(first)
         problem = UnitBox(objective, matrix)
         point = problem.evaluate(torch.as_tensor(first)[None])
@@ -421,6 +431,7 @@ class Identifier:
                 (gradient,) = torch.autograd.grad(loss, x)
         except ConvergenceError:
             return np.inf, np.zeros_like(unit)
+        self._near = [replay.settled if start.at_rest else None for replay, start in self._replays]
         return float(loss.detach()), gradient[0].double().cpu().numpy()
 
     def _linearise(

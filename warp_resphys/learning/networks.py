@@ -143,9 +143,14 @@ def pod_coder(samples: torch.Tensor, modes: int) -> Coder:
     """Proper orthogonal decomposition about zero: the M modes that hold most of the energy of samples (S, N, 3).
 
     Raises:
-        InputError: more modes than samples or coordinates.
+        InputError: more modes than samples or coordinates, or samples that are all zero.
     """
     x = _some(samples).flatten(1).double()
+    if not bool(x.any()):
+        raise InputError(
+            f"{modes} modes were asked for of what is zero in all {len(x)} samples, such as the velocities of poses: "
+            "set that number of modes to 0."
+        )
     if not 1 <= modes <= min(x.shape):
         raise InputError(f"{modes} modes were asked for, but {len(x)} samples give 1 to {min(x.shape)}.")
     _, _, directions = torch.linalg.svd(x, full_matrices=False)

@@ -43,6 +43,10 @@ class Start:
         """In equilibrium, found from a first guess (R, N, 3) [m]."""
         return cls(State(guess, torch.zeros_like(guess)), guess.new_zeros(len(guess)), at_rest=True)
 
+    def near(self, q: torch.Tensor) -> "Start":
+        """The same with another first guess (R, N, 3) of where bodies rest [m]."""
+        return replace(self, state=State(q, torch.zeros_like(q)))
+
     def select(self, indices: list[int]) -> "Start":
         """That of some of the trials."""
         pick = torch.as_tensor(indices, device=self.delay.device)
@@ -73,6 +77,7 @@ class Replay:
         trials: what was observed.
 
     Attributes:
+        settled: (E R, N, 3) the equilibria [m] in which the trials began when they were simulated last, if they did.
         known: the parameters that it takes: the simulator's that are one number, a factor on the weights that hang on
             the body, components of gravity's tilt, and for every input the rise time with which it follows its command,
             such as ``pressure_rise`` [s].
@@ -80,6 +85,7 @@ class Replay:
 
     def __init__(self, simulator: Simulator, observe: Observe, trials: Trials) -> None:
         self.simulator, self.observe, self.trials = simulator, observe, trials
+        self.settled: torch.Tensor | None = None
         self.known = known_parameters(simulator)
 
     def setting(self, parameters: Parameters | None = None) -> tuple[Constants, Inputs, Inputs]:
@@ -131,6 +137,7 @@ class Replay:
         if not start.at_rest:
             return State(q, v)
         state = self.simulator.static_equilibrium(resting, constants, start=q)
+        self.settled = state.q.detach()
         if force is None or not self.is_static:
             return state
         share, before = 1.0, math.inf  # of the way that is gone: less where it leads past the goal

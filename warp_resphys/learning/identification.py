@@ -369,7 +369,8 @@ class Identifier:
             raise ConvergenceError("the simulation failed at every start of the identification.", None, None)
         best = min(good, key=lambda attempt: attempt["loss"])
         unit = self._units(best["parameters"])
-        self._prior_weight, self._near = best.get("prior_weight", 0.0), []  # As a run that finished the starts has them.
+        self._prior_weight = best.get("prior_weight", 0.0)
+        self._near = []  # As in a run that only reads what the starts led to.
         placement = self.placement(unit)
         at_bounds = tuple(n for n, u in zip(self.bounds, unit, strict=True) if min(u, 1.0 - u) < 1e-4)
         histories = [attempt["history"] for attempt in attempts]

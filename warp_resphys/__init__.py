@@ -31,6 +31,8 @@ _MODULES = {
     "rod": "mesh.rod",
     "select_vertices": "mesh.mesh",
     "Simulator": "dynamics.simulator",
+    "Muscle": "energies.muscles",
+    "Muscles": "energies.muscles",
     "SolverSettings": "dynamics.nonlinear_solver",
     "State": "dynamics.integrator",
     "Trajectory": "dynamics.simulator",

@@ -97,7 +97,7 @@ def test_poses_of_unnamed_markers_identify_the_body(recorded, tmp_path, monkeypa
         (["data.axes=[x,x,y]"], "data.axes is .*three of x, -x"),
         (["data.axes=null"], "markers.reference names 1 .* it takes 3, or data.axes and one"),
         (["data.table.columns=[1,2]"], "data.table.columns is .* a list of headers"),
-        (["data.trials.weak.inputs=[a]"], "data.trials.weak.inputs is .* one for each chamber or tendon"),
+        (["data.trials.weak.inputs=[a]"], "data.trials.weak.inputs is .* one for each chamber, tendon or muscle"),
         (["markers.labels=guessed"], "markers.labels is 'guessed': .* recorded, assigned"),
         (["markers.reference={}", "~markers.reference.Base"], "markers.reference names 0 .* it takes 1"),
     ],

@@ -46,6 +46,25 @@ def test_a_body_that_tendons_pull_goes_through_every_stage(tmp_path, monkeypatch
     assert "pressure" not in page.split("<style")[0] + page.split("</style>")[-1].split("<script")[0]
 
 
+MUSCLES = (
+    "muscles={commanded:stress,stiffness:0,bundles:{front:{within:{x:[0,0.02]},direction:[0,0,1]},"
+    "back:{within:{x:[-0.02,0]},direction:[0,0,1]}}}"
+)
+
+
+def test_a_body_whose_muscles_contract_goes_through_every_stage(tmp_path, monkeypatch):
+    """The same rod and laboratory with muscles in place of the tendons, by options alone."""
+    monkeypatch.chdir(tmp_path)
+    push = ["laboratory.sequences.mean=1e4", "laboratory.sequences.deviation=8e3", "data.input_limit=3e4"]
+    code, err = run(*TINY, "tendons=null", MUSCLES, *push)
+    assert (code, err[-500:] if code else "") == (0, "")
+    errors = json.loads(Path("run/metrics.json").read_text())["errors_mm"]
+    assert all(np.isfinite(errors[each]["mean"]) for each in ("simulation", "sysid", "simfree", "resphys"))
+    page = Path("run/report.html").read_text()
+    for said in ("2 muscles under stress", "The body and its stresses", "the limit of 30"):
+        assert said in page
+
+
 def configuration(*overrides):
     with initialize_config_module("warp_resphys.conf", version_base="1.3"):
         return OmegaConf.to_container(compose("config", ["experiment=tendon_rod", *overrides]), resolve=True)
@@ -62,6 +81,17 @@ def configuration(*overrides):
         ("tendons.routes.left.pieces=0", "tendons.routes.left.pieces is 0"),
         ("data.input_limit=null", "data.input_limit is not set: say what the tendons take, in N"),
         ("data.parts=[1,2,4]", "data.parts names tendon 4, but the body has 3"),
+        (MUSCLES, "a body with tendons and muscles has two inputs, but recordings drive one: take one out"),
+        ("chambers={count:1,axis:[0,0,1]}", "a body with chambers and tendons has two inputs"),
+        (
+            "muscles={commanded:null,stiffness:0,bundles:{a:{direction:[0,0,1]}}}",
+            "muscles.stiffness is 0, but nothing is commanded: set it, in Pa",
+        ),
+        (
+            "muscles={commanded:null,stiffness:1e4,bundles:{a:{direction:[0,0,1],within:{x:[1,2]}}}}",
+            "no cell has its centre within x from 1 to 2",
+        ),
+        ("muscles={commanded:null,stiffness:1e4,bundles:{a:{direction:[0,0,0]}}}", "three numbers, not all zero"),
         ("mesh.radii=[[0.0,0.01],[0.2]]", "mesh.radii is"),
         ("mesh.layers=0", "mesh.layers is 0"),
         ("laboratory.material.prony_time_1=0", "prony_time_1 is 0: it must be positive, in s"),

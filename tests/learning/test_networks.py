@@ -109,7 +109,9 @@ class TestPOD:
             pod_coder(field(samples), modes)
 
     def test_nothing_has_no_modes(self):
-        with pytest.raises(InputError, match="2 modes were asked for of what is zero in all 5 samples, such as the vel"):
+        with pytest.raises(
+            InputError, match="2 modes were asked for of what is zero in all 5 samples, such as the vel"
+        ):
             pod_coder(torch.zeros(5, 4, 3), 2)
 
 

@@ -172,7 +172,7 @@ class TestGaussNewton:
     def test_markers_on_stems_against_the_published_method(self, kind, integrator):
         """Stems that turn make the map nonlinear: both ways to the minimum need its derivative where the body is."""
         stems = [[0.06, 0.012, 0.045], [0.03, -0.015, 0.013], [0.075, 0.02, 0.01]]
-        markers = bind_markers(MESH, stems, "abc", kind=kind, vertices=TIP)
+        markers = bind_markers(MESH, stems, "abc", kind=kind, vertices=TIP, patch=0.06)
         observed, start = observation(1, (0.5,), integrator=integrator)
         targets, sim = markers(observed[1]), simulator(integrator=integrator)
         ours = make_sparse_reconstructor(sim, markers, "gauss_newton", 1e-6, **TIGHT).step(start, targets)

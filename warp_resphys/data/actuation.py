@@ -101,8 +101,8 @@ def check_inputs(values: FloatArray, quantity: Quantity, parts: int, limit: floa
     words, per = quantity.words, quantity.per
     if values.shape[1] != parts:
         raise DataFileError(
-            f"{source} has {words}s of {values.shape[1]} {per}s, but the body has {parts}: take the body of that "
-            f"robot, or set data.parts to the body's {per} of each column of the file."
+            f"{source} has {quantity.plural} of {values.shape[1]} {per}s, but the body has {parts}: take the body of "
+            f"that robot, or set data.parts to the body's {per} of each column of the file."
         )
     frame, part = np.unravel_index(np.abs(values).argmax(), values.shape)
     highest = float(values[frame, part])

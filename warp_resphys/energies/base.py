@@ -46,6 +46,11 @@ class Quantity:
         return f"{self.shown_factor * value:.4g} {self.shown_unit}"
 
     @property
+    def plural(self) -> str:
+        """What several of it are called."""
+        return f"{self.words}{'es' if self.words.endswith('s') else 's'}"
+
+    @property
     def wanted(self) -> str:
         """Its range in words."""
         unit = f", in {self.unit}" if self.unit else ""
@@ -276,13 +281,17 @@ class PartTerm(Term):
         """One value a part."""
         return {self.value: (self.count,)}
 
-    @abstractmethod
-    def slope(self, s: PointSet, positions: Any, direction: Any) -> tuple[Any, list[Any]]:
-        """Kernel of each point's part of the loss's derivative by its part's value, and its inputs."""
-
     def sum_parts(self, values: torch.Tensor) -> torch.Tensor:
         """(B, count) sums of (B, P) values over the points of each part, in a fixed order."""
         return values @ self._own
+
+
+class ValueTerm(PartTerm):
+    """One whose derivatives all come from those by one value a part."""
+
+    @abstractmethod
+    def slope(self, s: PointSet, positions: Any, direction: Any) -> tuple[Any, list[Any]]:
+        """Kernel of each point's part of the loss's derivative by its part's value, and its inputs."""
 
     def adjoint(
         self, values: Values, positions: torch.Tensor, direction: torch.Tensor

@@ -19,7 +19,7 @@ from ..io.errors import InputError, MeshError
 from ..kernels import fibres as kernels
 from ..mesh.chambers import Chamber
 from ..mesh.mesh import Mesh
-from .base import Energy, Parameter, PartTerm, PointSet, Quantity, Values
+from .base import Energy, Parameter, PointSet, Quantity, Values, ValueTerm
 from .launcher import Launcher, warp_view
 
 _CAP = 0.7  # cosine between a face's normal and the chamber's axis from which on the face is an end, without fibres
@@ -126,7 +126,7 @@ class Fibres(Energy):
         return term
 
 
-class FibreTerm(PartTerm):
+class FibreTerm(ValueTerm):
     """Kernels of the thread around every chamber.
 
     Attributes:

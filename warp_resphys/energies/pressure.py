@@ -20,7 +20,7 @@ from ..io.errors import InputError
 from ..kernels import pressure as kernels
 from ..mesh.chambers import Chamber, check_chambers
 from ..mesh.mesh import Mesh
-from .base import Energy, PartTerm, PointSet, Quantity, Values
+from .base import Energy, PointSet, Quantity, Values, ValueTerm
 from .launcher import Launcher, warp_view
 
 PRESSURE = Quantity(
@@ -85,7 +85,7 @@ class Pressure(Energy):
         return PressureTerm(launcher, sets, "pressure", s.source.chamber, s.source.weights, self.count)
 
 
-class PressureTerm(PartTerm):
+class PressureTerm(ValueTerm):
     """Kernels of pressure."""
 
     @override

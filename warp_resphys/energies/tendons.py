@@ -28,7 +28,7 @@ from ..io.errors import InputError
 from ..kernels import tendons as kernels
 from ..mesh.location import locate
 from ..mesh.mesh import Mesh
-from .base import Energy, Parameter, PartTerm, PointSet, Quantity, Values
+from .base import Energy, Parameter, PointSet, Quantity, Values, ValueTerm
 from .launcher import Launcher, warp_view
 
 
@@ -155,7 +155,7 @@ def _difference(
     return vertices[used], sums[used]
 
 
-class TendonTerm(PartTerm):
+class TendonTerm(ValueTerm):
     """Kernels of tendons.
 
     Args:

@@ -2,31 +2,24 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from importlib import resources
-from itertools import pairwise
-from typing import Any, cast
+from typing import Any
 
-import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
 from ..data.markers import Markers, bind_markers
 from ..dynamics.nonlinear_solver import SolverSettings
 from ..dynamics.simulator import Simulator
-from ..energies.base import Energy, Quantity
-from ..energies.fibres import Fibres
 from ..energies.materials import Material, make_material
-from ..energies.pressure import PRESSURE, Pressure
-from ..energies.tendons import CONTRACTION, TENSION, Tendons
 from ..fem.body import Body
 from ..io.errors import InputError
 from ..mesh.arm import mesh_arm
 from ..mesh.arm_geometry import arm_geometry
-from ..mesh.chambers import Chamber, find_chambers
 from ..mesh.mesh import Mesh, box_hexahedra, box_tetrahedra, check_mesh, quadratic, select_vertices
 from ..mesh.readers import read_mesh
 from ..mesh.rod import rod
+from .actuators import build_actuators
 
 _DTYPES = {"float64": torch.float64, "float32": torch.float32}
 
@@ -96,78 +89,6 @@ def shipped_arm(name: str) -> Mesh:
         return read_mesh(path)
 
 
-def build_chambers(config: Mapping[str, Any] | None, mesh: Mesh) -> tuple[Chamber, ...]:
-    """The closed chambers of a mesh, from the group ``chambers``; none without the group.
-
-    Raises:
-        InputError: the mesh has another number of them.
-    """
-    if config is None:
-        return ()
-    found = find_chambers(mesh, config["axis"])
-    if len(found) != config["count"]:
-        raise InputError(
-            f"the mesh has {len(found)} closed chambers, but chambers.count is {config['count']}: a chamber that is "
-            "open to the outside is none, so close it in the mesh, or set chambers.count."
-        )
-    return found
-
-
-@dataclass(frozen=True)
-class Drive:
-    """The input that recordings and simulated laboratories drive a body by."""
-
-    quantity: Quantity
-    parts: tuple[str, ...]  # that have a value each, such as chambers
-
-    @property
-    def per(self) -> str:
-        """What a part is, such as chamber."""
-        return self.quantity.per
-
-
-def driving_quantity(config: Mapping[str, Any]) -> Quantity | None:
-    """Which input of the body is driven; None for a body without actuators."""
-    if config.get("chambers") is not None:
-        return PRESSURE
-    tendons = config.get("tendons")
-    return None if tendons is None else {"tension": TENSION, "contraction": CONTRACTION}[tendons["commanded"]]
-
-
-def driven_parts(config: Mapping[str, Any]) -> int:
-    """How many values the driven input has."""
-    return int(config["chambers"]["count"]) if config.get("chambers") else len(config["tendons"]["routes"])
-
-
-def drive_of(config: Mapping[str, Any], body: Body) -> Drive | None:
-    """The input that drives a body; None for one without actuators."""
-    quantity = driving_quantity(config)
-    if quantity is None:
-        return None
-    (energy,) = (each for each in cast(Sequence[Energy], body.energies) if quantity in each.inputs)
-    return Drive(quantity, energy.names)
-
-
-def build_tendons(config: Mapping[str, Any]) -> Tendons:
-    """The tendons of a group: every straight piece of a route is divided into as many as asked for.
-
-    Raises:
-        InputError: see `Tendons`; or a contraction that nothing would pull.
-    """
-    if config["commanded"] == "contraction" and not config["stiffness"] > 0.0:
-        raise InputError(
-            "tendons.stiffness is 0, but their contraction is commanded, which acts through it: set it, in N/m."
-        )
-    routes = []
-    for route in config["routes"].values():
-        guides = np.asarray(route["guides"], dtype=np.float64)
-        share = np.linspace(0.0, 1.0, route.get("pieces", 1), endpoint=False)[:, None]
-        parts = [first + share * (last - first) for first, last in pairwise(guides)]
-        routes.append(np.concatenate([*parts, guides[-1:]]))
-    more = {key: config[key] for key in ("toe", "reach") if key in config}
-    return Tendons(routes, config["stiffness"], labels=tuple(config["routes"]), **more)
-
-
 def build_material(config: Mapping[str, Any], key: str) -> Material:
     """The material of a group.
 
@@ -181,23 +102,15 @@ def build_material(config: Mapping[str, Any], key: str) -> Material:
 
 
 def build_body(config: Mapping[str, Any]) -> Body:
-    """A body from the groups ``mesh``, ``physics``, ``fixed``, and any of ``chambers``, ``fibres`` and ``tendons``.
+    """A body from the groups ``mesh``, ``physics``, ``fixed``, and any of its actuators' groups and ``fibres``.
 
     Raises:
-        InputError: fibres without chambers, another number of chambers than the mesh has, or tendons that do not fit.
+        InputError: fibres without chambers, another number of chambers than the mesh has, tendons or muscles that do
+            not fit, or two inputs.
         MeshError: a mesh that cannot be read or simulated, or no vertex where the body is fixed.
     """
-    mesh, fibres = build_mesh(config["mesh"]), config.get("fibres")
-    chambers = build_chambers(config.get("chambers"), mesh)
-    if fibres is not None and not chambers:
-        raise InputError("fibres are wound around chambers, but there is no group chambers: leave the fibres out.")
-    energies: list[Energy] = [Pressure(chambers)] if chambers else []
-    if fibres is not None:
-        energies.append(Fibres(chambers, axis=config["chambers"]["axis"], **fibres))
-    if config.get("tendons") is not None:
-        if chambers:
-            raise InputError("a body with chambers and tendons has two inputs, but recordings drive one: take one out.")
-        energies.append(build_tendons(config["tendons"]))
+    mesh = build_mesh(config["mesh"])
+    energies = build_actuators(config, mesh)
     return Body(mesh, energies=tuple(energies), fixed=select_vertices(mesh, **config["fixed"]), **config["physics"])
 
 

@@ -18,7 +18,8 @@ from ..io.memory import available_memory_gib
 from ..learning.reconstruction import make_reconstructor
 from ..learning.replay import MASS_FACTOR, known_parameters
 from ..mesh.mesh import select_vertices, surface_vertices
-from .build import Drive, build_body, build_material, build_simulator, drive_of
+from .actuators import Drive, drive_of
+from .build import build_body, build_material, build_simulator
 from .files import STATIC, attached_mass
 from .identify import ELASTIC, bounds_of
 from .schema import IN_THE_LOOP, NAME, NETWORK, TRAINER, check, configuration_group

@@ -25,7 +25,8 @@ from ..dynamics.simulator import Simulator
 from ..io.errors import DataFileError, InputError, listed
 from ..io.files import write_json
 from ..io.stages import StageContext
-from .build import Drive, bound_markers, build_simulator, drive_of
+from .actuators import Drive, drive_of
+from .build import bound_markers, build_simulator
 from .files import DATASET, QUALITY, REGISTRATION, SCALED_DATASET, STATIC, Dataset, read_dataset
 from .reading import POSE_SECONDS, Reader
 from .simulate import vertical
@@ -273,14 +274,14 @@ class Importer:
 
     def _inputs(self, recording: Recording, trial: Trial, drive: Drive) -> FloatArray:
         """(T, C) of the body's parts; refuses those of another number of parts, or beyond the limit."""
-        data, count, words = self.data, len(drive.parts), drive.quantity.words
+        data, count = self.data, len(drive.parts)
         found = recording.actuation
         if found is None:
             if trial.is_released:
                 return np.zeros((len(recording.positions), count))
             raise DataFileError(
-                f"{recording.source} has no array 'actuation' with the {words}s of the {drive.per}s: add it "
-                "(docs/recordings.md)."
+                f"{recording.source} has no array 'actuation' with the {drive.quantity.plural} of the {drive.per}s: "
+                "add it (docs/recordings.md)."
             )
         values = check_inputs(found, drive.quantity, count, trial.scale * data["input_limit"], recording.source)
         if data["valve"] == "detected" and not trial.is_released:
@@ -391,10 +392,10 @@ def _check_unit(driven: Sequence[FloatArray], data: Mapping[str, Any], drive: Dr
     if not driven or all(len(each) == 1 for each in driven):
         return
     highest, limit = max(float(np.abs(each).max()) for each in driven), data["input_limit"]
-    words, unit = drive.quantity.words, drive.quantity.unit
+    words, unit = drive.quantity.plural, drive.quantity.unit
     if highest < NO_INPUT * limit:
         raise DataFileError(
-            f"the {words}s of all {len(driven)} recordings stay below {highest:.3g} {unit}, and data.input_limit is "
+            f"the {words} of all {len(driven)} recordings stay below {highest:.3g} {unit}, and data.input_limit is "
             f"{limit:.3g} {unit}: name their unit in the files (actuation_units, or the header of the column), or "
             "set the limit to what the robot takes."
         )

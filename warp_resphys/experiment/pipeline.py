@@ -53,10 +53,10 @@ from .trials import Split, folds_of, is_laboratory, scaled_trials_of, sees_marke
 
 _SIMULATED = (
     *("mesh", "physics", "fixed", "gravity", "time_step", "integrator", "solver", "device", "dtype"),
-    *("chambers", "fibres", "tendons", "coupling"),
+    *("chambers", "fibres", "tendons", "muscles", "coupling"),
 )
 _DRAWN = (
-    *("laboratory", "fixed", "chambers", "tendons", "gravity"),
+    *("laboratory", "fixed", "chambers", "tendons", "muscles", "gravity"),
     *("time_step", "solver", "device", "dtype", "seed", "tip"),
 )
 _DRAWN_DATA = (

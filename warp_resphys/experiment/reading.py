@@ -18,7 +18,8 @@ from ..data.registration import axes_rotation
 from ..dynamics.inputs import Inputs
 from ..dynamics.simulator import Simulator
 from ..io.errors import DataFileError, InputError
-from .build import Drive, bound_markers
+from .actuators import Drive
+from .build import bound_markers
 from .files import STATIC, attached_mass
 from .trials import Trial, is_laboratory
 
@@ -91,7 +92,7 @@ class Reader:
         if self._drive is None:
             if trial.inputs is not None:
                 raise InputError(
-                    f"data.trials.{trial.name}.inputs drives nothing: the body has no chambers and no tendons."
+                    f"data.trials.{trial.name}.inputs drives nothing: the body has no chambers, tendons or muscles."
                 )
             check_passive(recording)
         elif trial.inputs is not None:
@@ -107,7 +108,7 @@ class Reader:
         if columns.shape[1] != (count if parts is None else len(parts)):
             names = "the body has" if parts is None else "data.parts names"
             raise DataFileError(
-                f"{source} has {drive.quantity.words}s of {columns.shape[1]} {drive.per}s, but {names} "
+                f"{source} has {drive.quantity.plural} of {columns.shape[1]} {drive.per}s, but {names} "
                 f"{count if parts is None else len(parts)}: name the body's {drive.per} of each column in data.parts."
             )
         if parts is None:

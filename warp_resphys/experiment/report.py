@@ -20,7 +20,8 @@ from ..mesh.surface import closest_points
 from ..report.data import MODELS, Driven, Film, Recordings, RunReport, Trials
 from ..report.page import number_text
 from ..report.run_page import write_report
-from .build import build_chambers, build_mesh, build_tendons, choose_device, driving_quantity
+from .actuators import build_chambers, build_muscles, build_tendons, driving_quantity
+from .build import build_mesh, choose_device
 from .files import (
     DATASET,
     ERRORS,
@@ -97,7 +98,7 @@ def make_report(context: StageContext) -> None:
         **_common_parts(config, metrics, mesh),
         tip=select_vertices(mesh, **tip) if tip else np.empty(0, dtype=np.int64),
         chambers=_driven_chambers(build_chambers(config.get("chambers"), mesh), channels),
-        tendons=_routes(config),
+        tendons=_routes(config, mesh),
         trials=trials,
         film=film,
         driven=driven,
@@ -296,12 +297,12 @@ def read_driven(folder: Path, config: Mapping[str, Any]) -> Driven | None:
     )
 
 
-def _routes(config: Mapping[str, Any]) -> dict[str, FloatArray]:
-    """(G, 3) guides of the body's tendons [m], by name."""
-    if not config.get("tendons"):
-        return {}
-    tendons = build_tendons(config["tendons"])
-    return dict(zip(tendons.names, tendons.guides, strict=True))
+def _routes(config: Mapping[str, Any], mesh: Mesh) -> dict[str, FloatArray]:
+    """(G, 3) guides of the body's tendons, or a line through each of its muscles [m], by name."""
+    if config.get("tendons"):
+        tendons = build_tendons(config["tendons"])
+        return dict(zip(tendons.names, tendons.guides, strict=True))
+    return build_muscles(config["muscles"], mesh).lines(mesh) if config.get("muscles") else {}
 
 
 def _driven_chambers(chambers: tuple[Chamber, ...], names: tuple[str, ...]) -> tuple[Chamber, ...]:

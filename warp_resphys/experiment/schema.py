@@ -160,7 +160,7 @@ _RADII: Final = Kind(
     "a positive number, or a list of arc lengths with the radii there, in m",
 )
 _POSITIVES: Final = _list(POSITIVE, "a list of positive numbers")
-_COLUMNS: Final = _list(NATURAL, "a list of different chambers or tendons, from 1", _SOME, different=True)
+_COLUMNS: Final = _list(NATURAL, "a list of different chambers, tendons or muscles, from 1", _SOME, different=True)
 _ORDER: Final = Kind(lambda value: value in (1, 2), "1 or 2")
 _TRIALS: Final = Kind(
     lambda value: COUNT.fits(value) or (isinstance(value, list) and all(map(_is_word, value))),
@@ -306,7 +306,7 @@ _BASE_MOTION = Group(
 _TRIAL = Group(
     {
         "file": absent(Kind(_is_word, "the name of a file")),
-        "inputs": absent(_list(FINITE, "a list of finite numbers, one for each chamber or tendon", _SOME)),
+        "inputs": absent(_list(FINITE, "a list of finite numbers, one for each chamber, tendon or muscle", _SOME)),
         "labels": absent(
             _list(WORD, "a list of different words, one for each marker of the file", _SOME, different=True)
         ),
@@ -334,6 +334,16 @@ _TENDONS = Group(
         "commanded": one_of("tension", "contraction"),
         "stiffness": NOT_NEGATIVE,
         **dict.fromkeys(("toe", "reach"), absent(POSITIVE)),
+    },
+    optional=True,
+)
+_SPAN = absent(_list(FINITE, "two numbers, from and to, in m", [2]))
+_MUSCLES = Group(
+    {
+        "bundles": Group(each=Group({"direction": _AXIS, "within": absent(Group(dict.fromkeys("xyz", _SPAN)))})),
+        "commanded": optional(one_of("stress", "contraction")),
+        "stiffness": NOT_NEGATIVE,
+        "toe": absent(POSITIVE),
     },
     optional=True,
 )
@@ -444,6 +454,7 @@ def configuration_group(config: Mapping[str, Any]) -> Group:
             "chambers": _CHAMBERS,
             "fibres": _FIBRES,
             "tendons": _TENDONS,
+            "muscles": _MUSCLES,
             "coupling": one_of(*COUPLINGS),
             "force_frame": one_of(*FORCE_FRAMES),
             **dict.fromkeys(("range_guard", "correct_uncorrected", "timing"), TRUTH_VALUE),

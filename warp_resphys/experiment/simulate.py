@@ -32,7 +32,8 @@ from ..io.stages import StageContext
 from ..learning.replay import sample
 from ..mesh.mesh import select_vertices
 from ..mesh.poses import twisted
-from .build import bound_markers, build_mesh, build_simulator, driven_parts, driving_quantity
+from .actuators import driven_parts, driving_quantity
+from .build import bound_markers, build_mesh, build_simulator
 from .files import DATASET, GIVEN, STATIC, TRUTH, Dataset, attached_mass
 from .parts import March, Part, read_parts, remove_parts, split_into_parts, work_on
 from .trials import Trial, known_trials, scaled_trials_of, trials_of

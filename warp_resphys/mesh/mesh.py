@@ -222,6 +222,28 @@ def select_vertices(
     return np.flatnonzero(chosen)
 
 
+def select_cells(
+    mesh: Mesh,
+    x: Sequence[float] = (-np.inf, np.inf),
+    y: Sequence[float] = (-np.inf, np.inf),
+    z: Sequence[float] = (-np.inf, np.inf),
+) -> IntArray:
+    """(S,) cells whose centres lie within a box, from two coordinates along each axis [m].
+
+    Raises:
+        MeshError: no cell lies there.
+    """
+    corners = mesh.cells[:, : ELEMENTS[mesh.element.linear].nodes]
+    centres, box = mesh.vertices[corners].mean(axis=1), np.array([x, y, z], dtype=np.float64)
+    chosen = ((centres >= box[:, 0]) & (centres <= box[:, 1])).all(axis=1)
+    if not chosen.any():
+        asked = ", ".join(f"{axis} from {low:g} to {high:g}" for axis, (low, high) in zip("xyz", box, strict=True))
+        ranges = zip("xyz", centres.min(axis=0), centres.max(axis=0), strict=True)
+        there = ", ".join(f"{axis} from {low:g} to {high:g}" for axis, low, high in ranges)
+        raise MeshError(f"no cell has its centre within {asked} m: those of the mesh reach {there} m")
+    return np.flatnonzero(chosen)
+
+
 def _normalised_volumes(mesh: Mesh) -> tuple[FloatArray, FloatArray]:
     """Volumes and smallest Jacobian determinants of the cells, both (M,) and over the longest edge cubed.
 

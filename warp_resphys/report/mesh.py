@@ -43,6 +43,7 @@ class MeshSummary:
     fixed: IntArray  # (P,) vertices that are clamped.
     chambers: tuple[Chamber, ...]  # Its closed ones.
     tendons: Mapping[str, FloatArray] = field(default_factory=dict)  # (G, 3) their guides [m], by name.
+    inside: str = "Chambers"  # What is in colours, as a title.
 
     @property
     def volume(self) -> float:
@@ -89,8 +90,7 @@ def draw_mesh(path: Path, summary: MeshSummary, markers: FloatArray | None = Non
     panel = figure.add_axes((0.0, legend / total, 1.0, height / total))
     panel.imshow(picture, aspect="auto", interpolation="antialiased")
     panel.set_axis_off()
-    inside = "Tendons" if summary.tendons else "Chambers"
-    for at, title in enumerate(("Outside", "Cut open", inside)):
+    for at, title in enumerate(("Outside", "Cut open", summary.inside)):
         figure.text((at + 0.5) / 3, 1.0, title, ha="center", va="top")
     if handles:
         figure.legend(handles=handles, loc="lower center", ncols=columns, frameon=False)

@@ -276,13 +276,13 @@ def _space_and_markers(data: RunReport, trials: Trials, row: int, driven: Driven
     compared = [m for m in _ONE_BY_ONE[1:] if m in paths] or list(paths)
     moved = {m: (trials.positions[m][row] - start)[:, kept] for m in compared}
     target, labels = (trials.target[row] - start)[:, kept], [trials.labels[marker] for marker in kept]
-    words, per = driven.quantity.words, driven.quantity.per
-    own = replace(driven, values={f"{words.capitalize()}s": driven.values[name]})
+    words, per = driven.quantity.plural, driven.quantity.per
+    own = replace(driven, values={words.capitalize(): driven.values[name]})
     markers = canvas.figure(
         "markers",
         partial(motion_figures.marker_paths, trials.times[row], target, moved, labels, own),
-        f"Coordinates of markers over time in the trial {name}, and below them the {words}s of the {per}s.",
-        f"The trial {name}: displacement of markers from rest, and the {words}s that drive it.",
+        f"Coordinates of markers over time in the trial {name}, and below them the {words} of the {per}s.",
+        f"The trial {name}: displacement of markers from rest, and the {words} that drive it.",
     )
     return [space, markers]
 
@@ -305,12 +305,13 @@ def body_section(data: RunReport, canvas: Canvas) -> Part | None:
         from .mesh import MeshSummary, draw_mesh
 
         density = float(data.settings["simulation"]["density"])
-        summary = MeshSummary(data.mesh, density, data.fixed, data.chambers, data.tendons)
+        coloured = f"{quantity.per}s".capitalize()
+        summary = MeshSummary(data.mesh, density, data.fixed, data.chambers, data.tendons, coloured)
         draw_mesh(path, summary, trials.bound if trials.labels else None)
         return drawn_file(path, alt, said)
 
     blocks = canvas.attempt("body.png", body)
-    return Part(f"The body and its {quantity.words}s", [*blocks, *_input_figures(driven, trials, canvas)])
+    return Part(f"The body and its {quantity.plural}", [*blocks, *_input_figures(driven, trials, canvas)])
 
 
 def _input_figures(driven: Driven, trials: Trials, canvas: Canvas) -> list[Drawn]:
@@ -320,7 +321,7 @@ def _input_figures(driven: Driven, trials: Trials, canvas: Canvas) -> list[Drawn
     over_time, poses = _sequences(driven, trials), {}
     for name in driven.poses:
         poses[f"{name} (test)" if name in trials.names else name] = driven.values[name]
-    words, per = f"{driven.quantity.words}s".capitalize(), driven.quantity.per
+    words, per = driven.quantity.plural.capitalize(), driven.quantity.per
     limit = "" if not driven.limit else f"; dashed, the limit of {driven.quantity.shown(driven.limit)}"
     whose = "a few trials" if len(driven.values) > 1 else "the trial"
     what, blocks = f"{words} of {len(driven.channels)} {per}s", []

@@ -1,0 +1,167 @@
+"""Contractile fibres against closed forms, differences, and what cannot contract."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from warp_resphys import (
+    Body,
+    Corotated,
+    Inputs,
+    Muscle,
+    Muscles,
+    Simulator,
+    SolverSettings,
+    box_hexahedra,
+    box_tetrahedra,
+    select_vertices,
+)
+from warp_resphys.io.errors import InputError
+from warp_resphys.studies.gradient_check import POSES, check_gradients
+
+SIZE, MODULUS = (0.12, 0.02, 0.02), 264e3
+BEAM = box_hexahedra(SIZE, (6, 2, 2))
+MESHES = {
+    "hexahedra": BEAM,
+    "hexahedra27": box_hexahedra(SIZE, (4, 2, 2), nodes=27),
+    "tetrahedra": box_tetrahedra(SIZE, (4, 2, 2)),
+    "tetrahedra10": box_tetrahedra(SIZE, (4, 2, 2), order=2),
+}
+ALONG = (2.0, 0.0, 0.0)  # of any length
+TIGHT = SolverSettings("newton", relative_tolerance=1e-11)
+
+
+def centres(mesh):
+    return mesh.vertices[mesh.cells].mean(axis=1)
+
+
+def whole(mesh):
+    return Muscle(np.arange(len(mesh.cells)), ALONG)
+
+
+def upper(mesh):
+    return Muscle(np.flatnonzero(centres(mesh)[:, 2] > SIZE[2] / 2), ALONG, "upper")
+
+
+def simulator(*muscles, mesh=BEAM, ratio=0.0, solver=TIGHT, **more):
+    body = Body(mesh, fixed=select_vertices(mesh, x=0.0), energies=(Muscles(muscles, **more),))
+    return Simulator(body, Corotated(MODULUS, ratio, mass_damping=0.5), gravity=(0.0, 0.0, 0.0), solver=solver)
+
+
+def one(value):
+    return torch.tensor([[value]], dtype=torch.float64)
+
+
+def stretch(sim, inputs):
+    """Of the whole bar along x, and how far its vertices are from a uniform one [m]."""
+    q = sim.static_equilibrium(inputs).q[0].numpy()
+    found = q[:, 0].max() / SIZE[0]
+    return found, np.abs(q[:, 0] - found * sim.body.mesh.vertices[:, 0]).max()
+
+
+@pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES.keys())
+def test_a_bar_shortens_by_stress_over_modulus(mesh):
+    """Corotated, nu = 0: P = E (lambda - 1) + sigma = 0 along the bar, at any strain."""
+    found, off = stretch(simulator(whole(mesh), mesh=mesh), Inputs(muscle_stress=one(0.2 * MODULUS)))
+    assert found == pytest.approx(0.8, abs=1e-9)
+    assert off < 1e-9
+
+
+def test_a_contraction_shares_the_strain_with_the_solid():
+    """E (lambda - 1) + k (lambda - 1 + c - toe / 2) = 0 past the toe."""
+    k, c, toe = 3.0 * MODULUS, 0.1, 1e-3
+    sim = simulator(whole(BEAM), stiffness=k, toe=toe)
+    found, off = stretch(sim, Inputs(muscle_contraction=one(c)))
+    assert found == pytest.approx(1.0 - k * (c - 0.5 * toe) / (MODULUS + k), abs=1e-9)
+    assert off < 1e-9
+    slack, _ = stretch(sim, Inputs(muscle_contraction=one(-0.1)))
+    assert slack == pytest.approx(1.0, abs=1e-12)
+
+
+@pytest.mark.parametrize(("pull", "modulus"), [(1.0, 3.0 * MODULUS), (-1.0, MODULUS)])
+def test_fibres_of_a_stiffness_reinforce_what_is_stretched_alone(pull, modulus):
+    sim = simulator(whole(BEAM), stiffness=2.0 * MODULUS, toe=1e-9)
+    tip, force = select_vertices(BEAM, x=SIZE[0]), torch.zeros(1, len(BEAM.vertices), 3, dtype=torch.float64)
+    share = np.where(np.isin(BEAM.vertices[tip][:, 1:], (0.0, SIZE[1])).all(1), 1.0, 2.0)
+    share[(BEAM.vertices[tip][:, 1:] == SIZE[1] / 2).all(1)] = 4.0
+    force[0, tip, 0] = pull * torch.as_tensor(share / share.sum())
+    found, off = stretch(sim, Inputs(external_force=force))
+    assert found == pytest.approx(1.0 + pull / (modulus * SIZE[1] * SIZE[2]), abs=1e-6)
+    assert off < 1e-8
+
+
+def test_muscles_of_one_side_bend_a_beam():
+    """M = sigma A/2 h/4 with E I of the whole section, for small sigma."""
+    mesh, sigma = box_hexahedra((0.2, 0.01, 0.01), (20, 2, 2), nodes=27), 0.01 * MODULUS
+    body = Body(
+        mesh,
+        fixed=select_vertices(mesh, x=0.0),
+        energies=(Muscles([Muscle(np.flatnonzero(centres(mesh)[:, 2] > 0.005), ALONG)]),),
+    )
+    sim = Simulator(body, Corotated(MODULUS, 0.0), gravity=(0.0, 0.0, 0.0), solver=TIGHT)
+    q = sim.static_equilibrium(Inputs(muscle_stress=one(sigma))).q[0].numpy()
+    tip = q[select_vertices(mesh, x=0.2)]
+    curvature = sigma * 0.5e-4 * 0.0025 / (MODULUS * 0.01**4 / 12)
+    middle = tip.mean(axis=0)
+    assert middle[2] - 0.005 == pytest.approx((1.0 - np.cos(curvature * 0.2)) / curvature, rel=0.03)
+    assert abs(middle[1] - 0.005) < 1e-9
+
+
+def test_two_muscles_in_the_same_cells_add():
+    both = simulator(whole(BEAM), whole(BEAM))
+    found, _ = stretch(both, Inputs(muscle_stress=torch.tensor([[2e4, 3e4]], dtype=torch.float64)))
+    assert found == pytest.approx(1.0 - 5e4 / MODULUS, abs=1e-9)
+
+
+@pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2", "midpoint"])
+@pytest.mark.parametrize("start", POSES)
+def test_gradients(start, integrator):
+    solver = SolverSettings(relative_tolerance=1e-11, linear_solver="banded")
+    slanted = Muscle(np.arange(8), np.random.default_rng(0).normal(size=(8, 3)))
+    sim = simulator(upper(BEAM), slanted, ratio=0.45, stiffness=np.array([4e5, 9e5]), toe=1.0, solver=solver)
+    material = replace(sim.material, stiffness_damping=1e-3)
+    sim = replace(sim, material=material, integrator=integrator, gravity=(0.0, 0.0, -9.8))
+    rows = {row.parameter: row for row in check_gradients(sim, start)}
+    assert {"muscle_stress", "muscle_contraction", "muscle_stiffness, each muscle"} <= rows.keys()
+    assert {name: row.relative_error for name, row in rows.items() if not row.relative_error < 1e-6} == {}
+
+
+def test_the_tangent_is_the_derivative_of_the_force():
+    sim = simulator(upper(BEAM), stiffness=3e5, ratio=0.45)
+    acting = Inputs(muscle_stress=one(2e4), muscle_contraction=one(0.1))
+    there = sim.static_equilibrium(acting)
+    lines = sim.linearise(there, acting)
+    direction = torch.randn(there.q.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    direction[:, sim.fixed] = 0.0
+    step = 1e-7
+    wanted = (lines.residual(there.q + step * direction) - lines.residual(there.q - step * direction)) / (2.0 * step)
+    lines.factorise(there.q)
+    torch.testing.assert_close(lines.product(direction), wanted, rtol=1e-5, atol=1e-5 * float(wanted.abs().max()))
+
+
+def test_a_muscle_cannot_push():
+    sim = simulator(whole(BEAM))
+    with pytest.raises(InputError, match=r"muscle_stress is -1: it must be zero or more, in Pa"):
+        sim.step(sim.rest_state(), Inputs(muscle_stress=one(-1.0)))
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: Muscles([]), "there is no muscle"),
+        (lambda: Muscles([Muscle([], ALONG)]), "the muscle 'muscle_1' has cells of shape (0,)"),
+        (lambda: Muscles([Muscle([0.5], ALONG)]), "give the numbers of one or more"),
+        (lambda: Muscles([Muscle([0, 1], np.ones((3, 3)), "left")]), "'left' has directions of shape (3, 3)"),
+        (lambda: Muscles([Muscle([0], (0.0, 0.0, 0.0))]), "has a direction that is zero or not finite"),
+        (lambda: Muscles([whole(BEAM)], stiffness=-1.0), "muscle_stiffness is -1: it must be zero or more, in Pa"),
+        (lambda: Muscles([whole(BEAM)], toe=0.0), "the strain over which muscle fibres tighten is 0"),
+        (lambda: simulator(Muscle([99], ALONG)), "runs through cell 99, but there are 24"),
+        (lambda: replace(simulator(whole(BEAM)), coupling="explicit"), "muscles act at the end of a step alone"),
+    ],
+)
+def test_what_cannot_contract_is_refused(make, said):
+    with pytest.raises(InputError) as caught:
+        make()
+    assert said in str(caught.value)

@@ -284,7 +284,7 @@ def recorded(tmp_path, finished, change):
         (["data.input_scales=[1.5]", "data.folder=run/recordings", "data.test=[t003]"], "recordings have their own"),
         (["laboratory.time_step=0.003"], "the first must be a multiple of the second"),
         (["+identify.parameters.fibre_stiffness={lower:1.0,upper:2.0}"], "but fibres is null"),
-        (["data.parts=[]"], "data.parts is []: it must be a list of different chambers or tendons, from 1"),
+        (["data.parts=[]"], "data.parts is []: it must be a list of different chambers, tendons or muscles, from 1"),
         (["laboratory.sequences.mean=high"], "laboratory.sequences.mean is 'high': it must be a finite number"),
         (["laboratory.sequences.correlation=[[1.0],[0.0]]"], "it must be a finite number, or a matrix of them"),
         (["+identify.first_guess.youngs_modulus=soft"], "identify.first_guess.youngs_modulus is 'soft'"),

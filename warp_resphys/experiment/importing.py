@@ -534,19 +534,28 @@ def _write_quality(
                 log.warning("%s: %s", found.source.name, warning)
         elif found.warnings:
             log.info("import: %s: %d remarks on its quality in the report", found.source.name, len(found.warnings))
-        registrations[name] = _summary(each.registration, tracked, -shifts[row])
+        # Where a loaded body has its own markers says nothing of the registration.
+        standing = None if each.tells_places else reference
+        registrations[name] = _summary(each.registration, tracked, -shifts[row], standing)
         if verticals is not None:
             registrations[name]["vertical_deg"] = _angle(verticals[row], -gravity)
     write_json(context.run_dir / QUALITY, qualities)
     write_json(context.run_dir / REGISTRATION, registrations)
 
 
-def _summary(registration: Registration, tracked: Sequence[str], shift: FloatArray) -> dict[str, Any]:
-    """For registration.json: lengths in millimetres, but for the positions in the frame of the body, in metres."""
+def _summary(
+    registration: Registration, tracked: Sequence[str], shift: FloatArray, only: Sequence[str] | None
+) -> dict[str, Any]:
+    """For registration.json: lengths in millimetres, but for the positions in the frame of the body, in metres.
+
+    Positions and residuals are those of all markers, or of some ``only``.
+    """
+    rows = [row for row, name in enumerate(registration.names) if only is None or name in only]
+    names = [registration.names[row] for row in rows]
     return {
-        "positions": dict(zip(registration.names, registration.positions.tolist(), strict=True)),
+        "positions": dict(zip(names, registration.positions[rows].tolist(), strict=True)),
         "rms_mm": _MILLI * registration.rms,
-        "residual_mm": dict(zip(registration.names, _MILLI * registration.residual, strict=True)),
+        "residual_mm": dict(zip(names, _MILLI * registration.residual[rows], strict=True)),
         "outliers": list(registration.outliers),
         "shift_mm": dict(zip(tracked, (_MILLI * shift).tolist(), strict=True)),
     }

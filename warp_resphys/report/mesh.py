@@ -69,12 +69,14 @@ def draw_mesh(path: Path, summary: MeshSummary, markers: FloatArray | None = Non
         DrawingError: There is no pyvista, or no OpenGL driver that works off screen.
     """
     axes = view_axes(_TOWARDS_VIEWER)
-    turned = summary.mesh.vertices @ axes.T
+    dots = np.empty((0, 3)) if markers is None else markers
+    shown = dots[np.isfinite(dots).all(axis=1)]
+    radius = _DOT * float(np.ptp(summary.mesh.vertices, axis=0).max())
+    turned = np.concatenate([summary.mesh.vertices, shown - radius, shown + radius]) @ axes.T
     sides = _MARGIN * np.ptp(turned, axis=0)[:2]
     size = np.ceil(_LONGER_SIDE * np.maximum(sides, _NARROWEST * sides.max()) / sides.max()).astype(int)
     focus = 0.5 * (turned.min(axis=0) + turned.max(axis=0)) @ axes
     half = 0.5 * max(sides[1], sides[0] * size[1] / size[0])
-    dots = np.empty((0, 3)) if markers is None else markers
     views = [View(layers, axes, focus, half) for layers in _layers(summary, dots, max(1.0, size[1] / 900.0))]
     scene = Scene(views, size.tolist(), background="white", samples=0, towards_light=_TOWARDS_LIGHT)
     ((picture,),) = draw(scene)

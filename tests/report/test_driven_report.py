@@ -505,11 +505,16 @@ def test_second_view_is_from_below():
 def test_picture_of_the_arm_has_markers_where_it_is_whole(tmp_path):
     arm = shipped_arm("arm_hexahedra_500")
     body = MeshSummary(arm, 1070.0, np.flatnonzero(arm.vertices[:, 2] == 0.0), find_chambers(arm))
-    places = np.array(list(arm_settings()["markers"]["tracked"].values()))
+    near = [np.flatnonzero(np.abs(arm.vertices[:, 2] - z) < 0.01) for z in (-0.05, -0.1, -0.15, -0.2)]
+    places = np.array([arm.vertices[some[(arm.vertices[some] @ mesh._TOWARDS_VIEWER).argmax()]] for some in near])
+    below = np.append(places, [[0.0, 0.0, arm.vertices[:, 2].min() - 0.05]], axis=0)  # on a stem below the tip
     mesh.draw_mesh(tmp_path / "plain.png", body)
     mesh.draw_mesh(tmp_path / "dots.png", body, places)
-    plain, dots = (imread(tmp_path / f"{name}.png")[..., :3] for name in ("plain", "dots"))
+    mesh.draw_mesh(tmp_path / "below.png", body, below)
+    plain, dots, longer = (imread(tmp_path / f"{name}.png")[..., :3] for name in ("plain", "dots", "below"))
     changed = np.abs(plain - dots).max(axis=2) > 0.2
     left, middle, right = (part.sum() for part in np.array_split(changed, 3, axis=1))
     assert middle == 0
     assert min(left, right) > 500
+    inked = [int((each[: int(0.9 * len(each))].min(axis=2) < 0.95).sum()) for each in (longer, plain)]
+    assert inked[0] < 0.9 * inked[1]  # the picture reaches as far, so that the body is smaller in it

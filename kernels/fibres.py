@@ -3,7 +3,7 @@
 import warp as wp
 
 from .modules import decorators
-from .points import deformation_gradient
+from .points import line_at, write_axial
 
 ZERO, HALF, ONE = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0)
 SIXTH, TWENTY_FOURTH = wp.float64(1.0 / 6.0), wp.float64(1.0 / 24.0)
@@ -43,8 +43,7 @@ def local_step(
 ):
     """The pull along the fibre, and its energy."""
     b, p = wp.tid()
-    f = deformation_gradient(positions, nodes, gradients, b, p, p / points_per_cell)
-    fibre = wp.vec3d(f[0, 0], f[1, 0], f[2, 0])
+    fibre = line_at(positions, nodes, gradients, b, p, p / points_per_cell)
     stretch = wp.length(fibre)
     energy, force, _slope = tension(stretch - ONE, toe)
     scale = weights[p] * stiffness[b, chamber[p]]
@@ -69,23 +68,14 @@ def tangent(
 ):
     """Block (0, 0) is k w (s / lambda (1 - u u^T) + s' u u^T), which is never indefinite: a thread only pulls."""
     b, p = wp.tid()
-    f = deformation_gradient(positions, nodes, gradients, b, p, p / points_per_cell)
-    fibre = wp.vec3d(f[0, 0], f[1, 0], f[2, 0])
+    fibre = line_at(positions, nodes, gradients, b, p, p / points_per_cell)
     stretch = wp.length(fibre)
-    out = tangent_out[b, p]
-    nothing = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
-    for k in range(6):
-        out[k] = nothing
+    across, along = ZERO, ZERO
     if stretch > ONE:
         _energy, force, slope = tension(stretch - ONE, toe)
         scale = weights[p] * stiffness[b, chamber[p]]
-        u = fibre / stretch
-        across = scale * force / stretch
-        block = (scale * slope - across) * wp.outer(u, u)
-        block[0, 0] += across
-        block[1, 1] += across
-        block[2, 2] += across
-        out[0] = block
+        across, along = scale * force / stretch, scale * slope
+    write_axial(fibre, across, along, tangent_out[b, p])
 
 
 @kernel
@@ -102,10 +92,8 @@ def adjoint(
     """dL/dk = -z . dg/dk = -w s (u . dz)."""
     b, p = wp.tid()
     cell = p / points_per_cell
-    f = deformation_gradient(positions, nodes, gradients, b, p, cell)
-    dz = deformation_gradient(direction, nodes, gradients, b, p, cell)
-    fibre = wp.vec3d(f[0, 0], f[1, 0], f[2, 0])
-    along = wp.vec3d(dz[0, 0], dz[1, 0], dz[2, 0])
+    fibre = line_at(positions, nodes, gradients, b, p, cell)
+    along = line_at(direction, nodes, gradients, b, p, cell)
     stretch = wp.length(fibre)
     _energy, force, _slope = tension(stretch - ONE, toe)
     result = ZERO

@@ -8,7 +8,7 @@ contraction c leaves it.
 import warp as wp
 
 from .modules import decorators
-from .points import deformation_gradient
+from .points import line_at, write_axial
 
 ZERO, HALF, ONE, TWO, THREE = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0), wp.float64(2.0), wp.float64(3.0)
 QUARTER, TENTH, FORTIETH = wp.float64(0.25), wp.float64(0.1), wp.float64(0.025)
@@ -38,20 +38,6 @@ def tension(strain: wp.float64, toe: wp.float64):
     return energy, force, slope
 
 
-@function
-def fibre_at(
-    positions: wp.array2d[wp.vec3d],
-    nodes: wp.array2d[int],
-    gradients: wp.array2d[wp.vec3d],
-    b: int,
-    p: int,
-    points_per_cell: int,
-) -> wp.vec3d:
-    """The deformed fibre."""
-    f = deformation_gradient(positions, nodes, gradients, b, p, p / points_per_cell)
-    return wp.vec3d(f[0, 0], f[1, 0], f[2, 0])
-
-
 @kernel
 def local_step(
     nodes: wp.array2d[int],
@@ -70,7 +56,7 @@ def local_step(
     """The pull along the fibre, and its energy sigma lambda + k s."""
     b, p = wp.tid()
     m = muscle[p]
-    fibre = fibre_at(positions, nodes, gradients, b, p, points_per_cell)
+    fibre = line_at(positions, nodes, gradients, b, p, p / points_per_cell)
     stretch = wp.length(fibre)
     energy, force, _slope = tension(stretch - ONE + contraction[b, m], toe)
     pull = wp.vec3d(ZERO, ZERO, ZERO)
@@ -97,21 +83,14 @@ def tangent(
     """Block (0, 0) is V (t / lambda (1 - u u^T) + k s'' u u^T), which is never indefinite: a fibre only pulls."""
     b, p = wp.tid()
     m = muscle[p]
-    fibre = fibre_at(positions, nodes, gradients, b, p, points_per_cell)
+    fibre = line_at(positions, nodes, gradients, b, p, p / points_per_cell)
     stretch = wp.length(fibre)
-    out = tangent_out[b, p]
-    nothing = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
-    for k in range(6):
-        out[k] = nothing
+    across, along = ZERO, ZERO
     if stretch > ZERO:
         _energy, force, slope = tension(stretch - ONE + contraction[b, m], toe)
-        u = fibre / stretch
         across = volumes[p] * (stress[b, m] + stiffness[b, m] * force) / stretch
-        block = (volumes[p] * stiffness[b, m] * slope - across) * wp.outer(u, u)
-        block[0, 0] += across
-        block[1, 1] += across
-        block[2, 2] += across
-        out[0] = block
+        along = volumes[p] * stiffness[b, m] * slope
+    write_axial(fibre, across, along, tangent_out[b, p])
 
 
 @kernel
@@ -131,8 +110,8 @@ def adjoint(
     """dL/dt = -V u . dz, as the gradient is V t u; and t = sigma + k s'(lambda - 1 + c)."""
     b, p = wp.tid()
     m = muscle[p]
-    fibre = fibre_at(positions, nodes, gradients, b, p, points_per_cell)
-    along = fibre_at(direction, nodes, gradients, b, p, points_per_cell)
+    fibre = line_at(positions, nodes, gradients, b, p, p / points_per_cell)
+    along = line_at(direction, nodes, gradients, b, p, p / points_per_cell)
     stretch = wp.length(fibre)
     result = wp.vec3d(ZERO, ZERO, ZERO)
     if stretch > ZERO:

@@ -21,6 +21,31 @@ def deformation_gradient(
 
 
 @function
+def line_at(
+    positions: wp.array2d[wp.vec3d], nodes: wp.array2d[int], gradients: wp.array2d[wp.vec3d], b: int, p: int, cell: int
+) -> wp.vec3d:
+    """The first column of F: what becomes of the line that the first components of the operators tell."""
+    f = deformation_gradient(positions, nodes, gradients, b, p, cell)
+    return wp.vec3d(f[0, 0], f[1, 0], f[2, 0])
+
+
+@function
+def write_axial(line: wp.vec3d, across: wp.float64, along: wp.float64, out: wp.array[wp.mat33d]):
+    """The six blocks of a tangent along a line alone: (0, 0) is across (1 - u u^T) + along u u^T, all else zero."""
+    nothing = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
+    for k in range(6):
+        out[k] = nothing
+    length = wp.length(line)
+    if length > ZERO:
+        u = line / length
+        block = (along - across) * wp.outer(u, u)
+        block[0, 0] += across
+        block[1, 1] += across
+        block[2, 2] += across
+        out[0] = block
+
+
+@function
 def green_strain(f: wp.mat33d) -> wp.mat33d:
     """E = (F^T F - I) / 2."""
     e = HALF * (wp.transpose(f) * f)

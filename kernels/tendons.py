@@ -9,20 +9,11 @@ import warp as wp
 
 from .fibres import tension
 from .modules import decorators
-from .points import deformation_gradient
+from .points import line_at, write_axial
 
 ZERO, ONE = wp.float64(0.0), wp.float64(1.0)
 
 kernel, function = decorators("tendons")
-
-
-@function
-def piece(
-    positions: wp.array2d[wp.vec3d], nodes: wp.array2d[int], gradients: wp.array2d[wp.vec3d], b: int, p: int
-) -> wp.vec3d:
-    """From a guide to the next one."""
-    f = deformation_gradient(positions, nodes, gradients, b, p, p)
-    return wp.vec3d(f[0, 0], f[1, 0], f[2, 0])
 
 
 @kernel
@@ -43,7 +34,7 @@ def pull(
     b, t = wp.tid()
     length = ZERO
     for p in range(first[t], first[t + 1]):
-        length += wp.length(piece(positions, nodes, gradients, b, p))
+        length += wp.length(line_at(positions, nodes, gradients, b, p, p))
     energy, force, slope = tension(length - rest_length[t] + contraction[b, t], toe)
     spring_out[b, t] = wp.vec3d(energy, force, slope)
     tension_out[b, t] = commanded[b, t] + stiffness[b, t] * force
@@ -66,7 +57,7 @@ def local_step(
     """T L of the commanded tension, and the spring's energy with the first piece."""
     b, p = wp.tid()
     t = tendon[p]
-    along = piece(positions, nodes, gradients, b, p)
+    along = line_at(positions, nodes, gradients, b, p, p)
     length = wp.length(along)
     energy = commanded[b, t] * length
     if p == first[t]:
@@ -89,19 +80,12 @@ def tangent(
 ):
     """Block (0, 0) is T / l (1 - u u^T), at a given tension; that of its change couples all pieces of a tendon."""
     b, p = wp.tid()
-    along = piece(positions, nodes, gradients, b, p)
+    along = line_at(positions, nodes, gradients, b, p, p)
     length = wp.length(along)
-    out = tangent_out[b, p]
-    nothing = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
-    for k in range(6):
-        out[k] = nothing
+    across = ZERO
     if length > ZERO:
-        u = along / length
-        block = -wp.outer(u, u)
-        block[0, 0] += ONE
-        block[1, 1] += ONE
-        block[2, 2] += ONE
-        out[0] = (total[b, tendon[p]] / length) * block
+        across = total[b, tendon[p]] / length
+    write_axial(along, across, ZERO, tangent_out[b, p])
 
 
 @kernel
@@ -113,7 +97,7 @@ def directions(
 ):
     """Unit vectors along the pieces."""
     b, p = wp.tid()
-    along = piece(positions, nodes, gradients, b, p)
+    along = line_at(positions, nodes, gradients, b, p, p)
     length = wp.length(along)
     result = wp.vec3d(ZERO, ZERO, ZERO)
     if length > ZERO:
@@ -131,8 +115,8 @@ def shortening(
 ):
     """How much shorter a displacement makes each piece."""
     b, p = wp.tid()
-    along = piece(positions, nodes, gradients, b, p)
-    dz = piece(direction, nodes, gradients, b, p)
+    along = line_at(positions, nodes, gradients, b, p, p)
+    dz = line_at(direction, nodes, gradients, b, p, p)
     length = wp.length(along)
     result = ZERO
     if length > ZERO:

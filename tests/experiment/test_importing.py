@@ -107,6 +107,14 @@ def test_simulated_markers_come_back_within_noise(laboratory):
     assert max(abs(x) for shift in registration["shift_mm"].values() for x in shift) < 0.1
 
 
+def test_a_laboratory_binds_its_markers_as_they_are_configured():
+    """Whatever changes where markers go makes its recordings anew."""
+    changes = ("markers.bind=patch", "markers.patch=0.05", "markers.largest_distance=0.03")
+    made = [acquisition_stages(configuration(*SMALL, *changes[:count]))[0] for count in range(4)]
+    assert len({fingerprint(each, {}) for each in made}) == 4
+    assert made[2].settings["markers"]["patch"] == 0.05
+
+
 def test_frames_end_with_what_counts(laboratory):
     folder, config = laboratory
     with read_hdf5(folder / DATASET, "dataset") as file:

@@ -153,6 +153,12 @@ def test_a_modulus_comes_back_from_markers_that_sit_elsewhere():
     assert deviation > 0.2 * abs(found.parameters["youngs_modulus"] - 215e3)
 
 
+def test_recordings_without_any_error_are_no_trouble():
+    found = identifier(posed(bind())).run([TRUTH], 3)
+    assert found.parameters["youngs_modulus"] == pytest.approx(215e3, rel=1e-6)
+    assert max(abs(x) for offset in found.placement["offsets"].values() for x in offset) < 1e-6
+
+
 def test_the_gradient_takes_the_placement_with_it():
     search = identifier(posed(PlacedMarkers.of(bind(), ASKEW)))
     unit = np.array([0.5])

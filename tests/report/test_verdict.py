@@ -2,8 +2,18 @@
 
 import pytest
 
+from warp_resphys.learning.metrics import paired_gain
 from warp_resphys.report.page import MINUS
-from warp_resphys.report.verdict import Identified, advice, best, epochs_kept, gains, judgement, untrained
+from warp_resphys.report.verdict import (
+    Identified,
+    advice,
+    best,
+    epochs_kept,
+    gains,
+    judgement,
+    reduction_text,
+    untrained,
+)
 
 
 def summary(mean):
@@ -84,6 +94,20 @@ def test_no_epoch_is_no_learned_force():
     assert best({**means, "resphys": summary(0.6)}) == "resphys"
     assert best({"simulation": summary(1.0), "resphys": summary(2.0), "published": summary(0.1)}) == "simulation"
     assert best({"resphys": summary(None)}) == ""
+
+
+def test_how_much_hangs_on_the_trials_is_told_in_the_words_of_the_gain():
+    means = {"sysid": summary(1.0), "resphys": summary(0.7)}
+    said = reduction_text(means, {}, paired_gain([1.0, 1.0, 1.0], [0.6, 0.7, 0.8]))
+    assert (
+        said
+        == "The error of ResPhys is 30.0 % smaller than that of SysID (20 to 40 % in nine of ten draws of 3 trials)."
+    )
+    worse = {"sysid": summary(1.0), "resphys": summary(3.0)}
+    said = reduction_text(worse, {}, paired_gain([1.0, 1.0, 1.0], [2.5, 3.0, 3.5]))
+    assert (
+        said == "The error of ResPhys is 3.0 times that of SysID (2.5 to 3.5 times in nine of ten draws of 3 trials)."
+    )
 
 
 def modulus(value, lower=5e4, upper=2e6, start=264e3):

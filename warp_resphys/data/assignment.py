@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linear_sum_assignment
 
 from ..io.errors import DataFileError, InputError, listed
-from .rigid import FloatArray, RigidTransform, fit
+from .rigid import FloatArray, RigidTransform, fit, root_mean_square
 
 IntArray = NDArray[np.int64]
 
@@ -83,7 +83,7 @@ def assign(
             if (pairs == before).all():
                 break
         for some in _and_next_best(motion.apply(points), places, pairs):
-            off = _rms(motion.apply(points[some]) - places)
+            off = root_mean_square(motion.apply(points[some]) - places)
             if tuple(some) not in found or off < found[tuple(some)][0]:
                 found[tuple(some)] = off, motion
     if not found:
@@ -120,7 +120,7 @@ def _motions(
     for three in permutations(range(len(points)), 3):
         motion, on_a_line = fit(points[list(three)], wanted, np.ones(3))
         off = motion.apply(points[list(three)]) - wanted
-        if not on_a_line and _rms(off) < 0.1 * np.sqrt(_area(wanted)):
+        if not on_a_line and root_mean_square(off) < 0.1 * np.sqrt(_area(wanted)):
             yield motion
 
 
@@ -149,14 +149,8 @@ def _and_next_best(points: FloatArray, places: FloatArray, pairs: IntArray) -> I
     yield pairs
     squares = _squares(points, places)
     for place, point in enumerate(pairs):
-        if len(points) == 1:
-            return
         forbidden = squares.copy()
         forbidden[place, point] = 1e6 * (1.0 + squares.max())
         other = linear_sum_assignment(forbidden)[1]
         if other[place] != point:
             yield np.asarray(other)
-
-
-def _rms(off: FloatArray) -> float:
-    return float(np.sqrt(np.square(off).sum(axis=-1).mean()))

@@ -281,6 +281,11 @@ class PartTerm(Term):
         """One value a part."""
         return {self.value: (self.count,)}
 
+    def views(self, values: Values) -> list[Any]:
+        """The step's values, as kernels take them, in the order of `shapes`."""
+        found = [values[name] for name in self.shapes]
+        return [warp_view(each, wp.float64) for each in found if each is not None]
+
     def sum_parts(self, values: torch.Tensor) -> torch.Tensor:
         """(B, count) sums of (B, P) values over the points of each part, in a fixed order."""
         return values @ self._own

@@ -133,10 +133,9 @@ class Muscles(Energy):
         nodes, operators, volumes, numbers = [], [], [], []
         for number, (name, muscle) in enumerate(zip(self.names, self.muscles, strict=True)):
             cells = np.asarray(muscle.cells, dtype=np.int64)
-            if cells.min() < 0 or cells.max() >= len(mesh.cells):
-                raise InputError(
-                    f"the muscle '{name}' runs through cell {cells.max()}, but there are {len(mesh.cells)}."
-                )
+            wrong = cells[(cells < 0) | (cells >= len(mesh.cells))]
+            if len(wrong):
+                raise InputError(f"the muscle '{name}' runs through cell {wrong[0]}, but there are {len(mesh.cells)}.")
             direction = np.broadcast_to(np.asarray(muscle.direction, dtype=np.float64), (len(cells), 3))
             unit = direction / np.linalg.norm(direction, axis=1, keepdims=True)
             gradients, determinants = physical_gradients(
@@ -188,13 +187,9 @@ class MuscleTerm(PartTerm):
     def shapes(self) -> Mapping[str, tuple[int, ...]]:
         return dict.fromkeys(("muscle_stress", "muscle_contraction", "muscle_stiffness"), (self.count,))
 
-    def _values(self, values: Values) -> list[Any]:
-        found = [values[name] for name in self.shapes]
-        return [warp_view(each, wp.float64) for each in found if each is not None]
-
     def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
         volume = [s.nodes, s.gradients, self.weights, self.part]
-        return [*volume, *self._values(values), self._toe, s.points_per_cell, positions]
+        return [*volume, *self.views(values), self._toe, s.points_per_cell, positions]
 
     @override
     def step(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
@@ -219,7 +214,7 @@ class MuscleTerm(PartTerm):
         """See `Term.adjoint`."""
         own, (s,) = self.launcher, self.sets
         out = own.zeros(self.n_points, 3)
-        _, contraction, stiffness = self._values(values)
+        _, contraction, stiffness = self.views(values)
         views = [warp_view(each, wp.vec3d) for each in (positions, direction)]
         volume = [s.nodes, s.gradients, self.weights, self.part]
         inputs = [*volume, contraction, stiffness, self._toe, s.points_per_cell, *views]

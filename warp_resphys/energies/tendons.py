@@ -185,14 +185,10 @@ class TendonTerm(ValueTerm):
     def shapes(self) -> Mapping[str, tuple[int, ...]]:
         return dict.fromkeys(("tendon_tension", "tendon_contraction", "tendon_stiffness"), (self.count,))
 
-    def _values(self, values: Values) -> list[Any]:
-        found = [values[name] for name in self.shapes]
-        return [warp_view(each, wp.float64) for each in found if each is not None]
-
     @override
     def before(self, values: Values, positions: Any) -> list[Any]:
         (s,) = self.sets
-        tension, contraction, stiffness = self._values(values)
+        tension, contraction, stiffness = self.views(values)
         inputs = [s.nodes, s.gradients, self._first, self._rest_length, tension, contraction, stiffness, self._toe]
         outputs = [warp_view(self._tension, wp.float64), warp_view(self._spring, wp.vec3d)]
         return [
@@ -201,7 +197,7 @@ class TendonTerm(ValueTerm):
 
     @override
     def step(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
-        tension, _, stiffness = self._values(values)
+        tension, _, stiffness = self.views(values)
         found = [warp_view(self._tension, wp.float64), warp_view(self._spring, wp.vec3d)]
         return kernels.local_step, [
             *(s.nodes, s.gradients, self._first, self.part, tension, stiffness),

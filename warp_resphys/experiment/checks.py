@@ -22,6 +22,7 @@ from .actuators import Drive, drive_of
 from .build import build_body, build_material, build_simulator
 from .files import STATIC, attached_mass
 from .identify import ELASTIC, bounds_of
+from .reading import standing_enough
 from .schema import IN_THE_LOOP, NAME, NETWORK, TRAINER, check, configuration_group
 from .simulate import input_sequences, laboratory_settings, substeps_of, vertical
 from .trials import (
@@ -206,7 +207,7 @@ def _check_markers(config: Mapping[str, Any], body: Body, begins: set[str]) -> N
             axes_rotation(axes)
     if count < 3 and axes is None:
         raise InputError(f"markers names {count} in all: registration needs three or more.")
-    standing, enough = len(markers["reference"]), 3 if axes is None else 1
+    standing, enough = len(markers["reference"]), standing_enough(config["data"])
     if markers.get("labels") == "assigned" and STATIC in begins and standing < enough:
         raise InputError(
             f"markers.labels is assigned, but markers.reference names {standing} markers that stand still beside a "

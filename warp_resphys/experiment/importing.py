@@ -28,7 +28,7 @@ from ..io.stages import StageContext
 from .actuators import Drive, drive_of
 from .build import bound_markers, build_simulator
 from .files import DATASET, QUALITY, REGISTRATION, SCALED_DATASET, STATIC, Dataset, read_dataset
-from .reading import POSE_SECONDS, Reader
+from .reading import POSE_SECONDS, Reader, central_places
 from .simulate import vertical
 from .trials import Trial, evenly, scaled_trials_of, trials_of
 
@@ -114,7 +114,7 @@ class Importer:
         """
         count = len(self.tracked)
         known = [each.registration.positions[count:] for each in observed if each.tells_places]
-        if not known or len(known) == len(observed) or len(self.markers["reference"]) < 3:
+        if not known or len(known) == len(observed) or len(self.markers["reference"]) < self.reader.enough:
             return observed
         expected = self.reader.expected(True)
         seen = np.isfinite(np.stack(known)).all(-1).any(0)
@@ -243,8 +243,7 @@ class Importer:
         filled = fill_gaps(recording, self.data["longest_gap"], mask_long=True)
         still = _median(filled, self.tracked) if static and loaded else self._resting(filled, driven)
         # Where the body is without what hangs on it, the other trials tell.
-        enough = 3 if self.reader.rotation is None else 1
-        only_reference = not tells and len(self.markers["reference"]) >= enough
+        only_reference = not tells and len(self.markers["reference"]) >= self.reader.enough
         registration = self._register(still, recording, self.reader.expected(True), only_reference)
         moving = filled.select(self.tracked)
         if static:
@@ -367,11 +366,7 @@ def _central(recording: Recording, tracked: Sequence[str], centre: Any, while_it
             f"{recording.source}: {listed(lost)} cannot be seen while the body {while_it}, so where it sits is not "
             "known; leave it out of markers.tracked."
         )
-    places = np.full(recording.positions.shape[1:], np.nan)
-    for column, frames in enumerate(seen.T):
-        if frames.any():
-            places[column] = centre(recording.positions[frames, column], axis=0)
-    return places
+    return central_places(recording, centre)
 
 
 def _rest_of(recording: Recording, tracked: Sequence[str]) -> FloatArray:

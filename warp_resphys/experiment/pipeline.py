@@ -63,7 +63,7 @@ _DRAWN_DATA = (
     *("folder", "trials", "sequences", "begins", "train", "validation", "test", "folds", "limit"),
     *("payload_at", "up", "rest", "steps", "input_limit", "base_motion"),
 )
-_DRAWN_MARKERS = ("tracked", "reference", "bind", "bind_to", "largest_distance")
+_DRAWN_MARKERS = ("tracked", "reference", "bind", "bind_to", "patch", "largest_distance")
 _LATER_DATA = ("horizons", "train_fraction", "input_scales")
 _LEARNED_FROM = ("simulation", "markers", "release", "force_frame")
 _OF_NETWORKS = ("actuation", "range_guard")

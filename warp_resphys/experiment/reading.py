@@ -1,7 +1,7 @@
 """From files to recordings in which the configured markers have their names, with what drove the body."""
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -45,6 +45,7 @@ class Reader:
         tracked: names of the markers that errors are measured on.
         nominal: (M, 3) where they are on the undeformed body [m].
         rotation: (3, 3) from the frame of the recordings to that of the body; None where markers tell.
+        enough: how many markers that stand still register a recording.
     """
 
     def __init__(self, settings: Mapping[str, Any], run_dir: Path, simulator: Simulator, drive: Drive | None) -> None:
@@ -53,6 +54,7 @@ class Reader:
         self.nominal, self._reference = (_places(self.markers[key]) for key in ("tracked", "reference"))
         axes = self.data.get("axes")
         self.rotation = None if axes is None else axes_rotation(axes)
+        self.enough = standing_enough(self.data)
         self._simulator, self._drive = simulator, drive
         self._folder = run_dir if is_laboratory(settings) else None
         table = self.data.get("table")
@@ -84,10 +86,10 @@ class Reader:
         return [recording.select(self.labels) for recording in found]
 
     def _read(self, trial: Trial) -> Recording:
-        if self._folder is not None or trial.file is None:
-            assert self._folder is not None
+        if self._folder is not None:
             recording = read_recording(self._folder / trial.recording)
         else:
+            assert trial.file is not None
             recording = read_recording(trial.file, self.data["units"], self.data["rate"], trial.labels, self._table)
         if self._drive is None:
             if trial.inputs is not None:
@@ -131,12 +133,9 @@ class Reader:
                 found.append(recording)
                 continue
             standing = list(range(len(self.tracked), len(self.labels)))
-            bent = trial.begins == STATIC or len(standing) >= (3 if self.rotation is None else 1)
-            frames = _still_frames(trial, recording)
-            with np.errstate(all="ignore"):
-                places = np.nanmedian(np.where(np.isfinite(frames), frames, np.nan), axis=0)
+            bent = trial.begins == STATIC or len(standing) >= self.enough
             pairs = assign(
-                places,
+                central_places(replace(recording, positions=_still_frames(trial, recording)), np.median),
                 expected[row],
                 self.labels,
                 source=recording.source,
@@ -176,6 +175,20 @@ class Reader:
         read = bound_markers(self.markers, simulator.body.mesh, self.nominal, tuple(self.tracked))
         found: FloatArray = read.to(simulator.rest_positions)(simulator.static_equilibrium(inputs).q).cpu().numpy()
         return found
+
+
+def standing_enough(data: Mapping[str, Any]) -> int:
+    """How many markers that stand still register a recording: one, where it is known how it is turned."""
+    return 3 if data.get("axes") is None else 1
+
+
+def central_places(recording: Recording, centre: Callable[..., Any]) -> FloatArray:
+    """(M, 3) means or medians of the positions of each marker [m], NaN for one that is never seen."""
+    places = np.full(recording.positions.shape[1:], np.nan)
+    for column, frames in enumerate(recording.seen.T):
+        if frames.any():
+            places[column] = centre(recording.positions[frames, column], axis=0)
+    return places
 
 
 def _still_frames(trial: Trial, recording: Recording) -> FloatArray:

@@ -32,6 +32,7 @@ Attempt = dict[str, Any]
 
 _MOST_ITERATIONS = 200  # of a solve; steps take a handful, and parameters that need more have failed
 _DIFFERENCE = 1e-3  # of a range, for derivatives by differences
+_LEAST_WEIGHT = 1e-18  # of the priors, where the residuals are rounding
 _ALIKE = 0.7  # weights of the priors that differ by less are not worth another descent
 
 
@@ -242,7 +243,7 @@ class Identifier:
         trials = found[0]
         seen = sum(count for *_, count in trials)
         squares = [np.square(rows).sum() * _redundancy(rows) for rows, _, _ in trials]
-        self._prior_weight = float(sum(squares)) / max(seen, 1)
+        self._prior_weight = max(float(sum(squares)) / max(seen, 1), _LEAST_WEIGHT)
         return self._prior_weight / before if before else math.inf
 
     def placement(self, unit: NDArray[np.float64]) -> Placement | None:

@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..io.errors import InputError
 
+_DRAWS, _TAIL = 10_000, 0.05  # of a bootstrap, and what its interval leaves out at either end
+
 
 class PublishedError(NamedTuple):
     """A published roll-out error [mm]: mean and standard deviation over the authors' test trajectories."""
@@ -60,8 +62,6 @@ def paired_gain(before: Sequence[float], after: Sequence[float]) -> Gain:
     lower, upper = np.quantile(1.0 - drawn[1] / drawn[0], [tail, 1.0 - tail])
     return Gain(float(1.0 - means[1] / means[0]), float(lower), float(upper), count)
 
-
-_DRAWS, _TAIL = 10_000, 0.05
 
 # J. Gao, M. Y. Michelis, A. Spielberg, R. K. Katzschmann, "Sim-to-Real of Soft Robots with Learned Residual
 # Physics", IEEE Robotics and Automation Letters, 2024: the tables of sim-to-sim results (beam_oscillation,

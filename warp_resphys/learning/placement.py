@@ -117,7 +117,8 @@ class Stems:
     """Markers and what moving them by a metre would do, as points of one observation.
 
     Args:
-        markers: M nominal ones.
+        markers: nominal ones.
+        count: M, how many they are.
     """
 
     copies = 1 + _DIRECTIONS

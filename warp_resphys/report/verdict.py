@@ -166,10 +166,9 @@ def reduction_text(
     theirs = reduction({model: each.mean for model, each in published.items()})
     beside = [] if theirs is None else [f"published: {100.0 * theirs:.1f} % smaller"]
     if paired is not None and paired.trials > 1:
-        sign = 1.0 if found >= 0.0 else -1.0
-        ends = sorted(100.0 * sign * x for x in (paired.lower, paired.upper))
-        low, high = (f"{x:.0f}".replace("-", MINUS) for x in ends)
-        beside.insert(0, f"{low} to {high} % in nine of ten draws of {paired.trials} trials")
+        times = f"{1.0 - paired.upper:.1f} to {1.0 - paired.lower:.1f} times"
+        between = times if found < -1.0 else f"{_interval(paired)} %"
+        beside.insert(0, f"{between} in nine of ten draws of {paired.trials} trials")
     more = f" ({'; '.join(beside)})" if beside else ""
     if found < -1.0:
         return f"The error of ResPhys is {1.0 - found:.1f} times that of SysID{more}."
@@ -307,13 +306,15 @@ def _gain(
 
 def _percent(gain: Gain) -> str:
     """The size of a gain or loss, with the interval in which nine of ten other draws of the trials have it."""
-    sign = 1.0 if gain.share >= 0.0 else -1.0
     digits = 2 if 0.99 < gain.share < 1.0 else 0  # Where nearly everything is gone.
-    share, *ends = (f"{100.0 * sign * x:.{digits}f}" for x in (gain.share, gain.lower, gain.upper))
-    if gain.trials == 1:
-        return f"{share} %"
-    lower, upper = (each.replace("-", MINUS) for each in (ends if sign > 0.0 else ends[::-1]))
-    return f"{share} % (90 %: {lower} to {upper})"
+    share = f"{100.0 * abs(gain.share):.{digits}f} %"
+    return share if gain.trials == 1 else f"{share} (90 %: {_interval(gain, digits)})"
+
+
+def _interval(gain: Gain, digits: int = 0) -> str:
+    """The ends of a gain's interval, of a loss where it is one, in percent."""
+    ends = (gain.lower, gain.upper) if gain.share >= 0.0 else (-gain.upper, -gain.lower)
+    return " to ".join(f"{100.0 * end:.{digits}f}".replace("-", MINUS) for end in ends)
 
 
 def advice(folds: Sequence[Sequence[Identified]]) -> list[str]:

@@ -11,6 +11,7 @@ kernel, _ = decorators()
 
 @kernel
 def cell_blocks(
+    idle: wp.array[int],  # (B) not zero where nothing is to be done
     gradients: wp.array2d[wp.vec3d],
     points_per_cell: int,
     tangent_point: wp.array3d[wp.mat33d],  # (B, P, 6)
@@ -19,6 +20,8 @@ def cell_blocks(
 ):
     """Block (a, c) of a cell: d force_a / d x_c."""
     b, cell, a = wp.tid()
+    if idle[b] != 0:
+        return
     k = gradients.shape[1]
     first = block_offset + cell * (k * (k + 1)) / 2 + (a * (a + 1)) / 2
     for q in range(points_per_cell):
@@ -38,6 +41,7 @@ def cell_blocks(
 
 @kernel
 def scatter_blocks(
+    idle: wp.array[int],  # (B) not zero where nothing is to be done
     block_start: wp.array[int],  # (blocks + 1) where a matrix block's contributions begin
     contribution: wp.array[int],  # cell block, or -1 - cell block where it enters transposed
     diagonal_vertex: wp.array[int],  # (blocks) the vertex of a diagonal block, else -1
@@ -48,6 +52,8 @@ def scatter_blocks(
 ):
     """The entries of a layout: the sums of the blocks of the cells, and inertia on the diagonal."""
     b, block = wp.tid()
+    if idle[b] != 0:
+        return
     total = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
     for entry in range(block_start[block], block_start[block + 1]):
         source = contribution[entry]

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -254,10 +255,8 @@ def test_groups_of_trials_weigh_what_their_trials_do():
     np.testing.assert_allclose(other.correlation, one.correlation, atol=1e-3)
 
 
-def test_poses_tell_the_stiffness_beside_motions():
-    """A pose under a weight depends on the stiffness alone: the damping is still found, from the motion."""
-    motion, release = replay_of(simulator(), TRUTH, masses=(0.0,), frames=25)
-    sim = motion.simulator
+def resting_pose(sim):
+    """A pose under a weight with the true parameters, and its beginning."""
     held = torch.as_tensor(POINTS)[None]
     still = Trials(
         ("pose",), torch.zeros(1, 1, dtype=torch.float64), held[:, None], held, Inputs(attached_mass=hanging((0.1,)))
@@ -266,9 +265,36 @@ def test_poses_tell_the_stiffness_beside_motions():
     assert Replay(sim, MARKERS, still).is_static
     with torch.no_grad():
         seen = Replay(sim, MARKERS, still)(start, {name: one(value) for name, value in TRUTH.items()})[0]
-    pose = Replay(sim, MARKERS, replace(still, observed=seen))
+    return Replay(sim, MARKERS, replace(still, observed=seen)), start
+
+
+def test_poses_tell_the_stiffness_beside_motions():
+    """A pose under a weight depends on the stiffness alone: the damping is still found, from the motion."""
+    motion, release = replay_of(simulator(), TRUTH, masses=(0.0,), frames=25)
+    pose, start = resting_pose(motion.simulator)
     found = Identifier([(motion, release), (pose, start)], RANGES).run([FIRST], 40)
     assert found.parameters["youngs_modulus"] == pytest.approx(215e3, rel=1e-3)
     assert found.parameters["stiffness_damping"] == pytest.approx(0.002, rel=0.02)
     alone = Identifier([(pose, start)], {"youngs_modulus": RANGES["youngs_modulus"]}).run([FIRST], 40)
     assert alone.parameters["youngs_modulus"] == pytest.approx(215e3, rel=1e-3)
+
+
+def test_equilibria_are_looked_for_where_the_parameters_lead_the_last_ones(monkeypatch):
+    """Closer to where they are than the last ones were, but for the first step, which is taken without slopes."""
+    pose, start = resting_pose(simulator())
+    solve, guesses, found = Simulator.static_equilibrium, [], []
+
+    def watched(self, inputs, constants, start):
+        state = solve(self, inputs, constants, start=start)
+        if len(start) == 1:  # Not those that differ to tell slopes.
+            guesses.append(start.detach())
+            found.append(state.q.detach())
+        return state
+
+    monkeypatch.setattr(Simulator, "static_equilibrium", watched)
+    Identifier([(pose, start)], {"youngs_modulus": RANGES["youngs_modulus"]}).run([FIRST], 40)
+    moves = [float((after - before).norm()) for before, after in pairwise(found)]
+    misses = [float((guess - after).norm()) for guess, after in zip(guesses[1:], found[1:], strict=True)]
+    steps = [(miss, move) for miss, move in zip(misses, moves, strict=True) if move > 1e-6]
+    assert len(steps) > 2
+    assert all(miss < 0.5 * move for miss, move in steps[1:-1])

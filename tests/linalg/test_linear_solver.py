@@ -91,6 +91,30 @@ def test_matrices_that_are_not_positive_definite_are_reported_one_by_one(device,
         np.testing.assert_array_equal(solver.factor(values_of(solver, dense)).failed, [False, True, False])
 
 
+@pytest.mark.parametrize("definite", [True, False])
+def test_idle_matrices_leave_the_others_as_they_are(definite, device, cholespy):
+    """Even where they are no matrix at all."""
+    dense = matrices(3, 20.0)
+    dense[1] = np.nan
+    idle = torch.tensor([False, True, False], device=device)
+    right = torch.ones(BATCH, NODES * 3, 2, dtype=torch.float64, device=device)
+    for kind in layouts(device):
+        solver = make(kind, 3, device)
+        factor = solver.factor(values_of(solver, dense), definite, idle)
+        assert not factor.failed[[0, 2]].any()
+        found = factor.solve(right).cpu()[[0, 2]]
+        np.testing.assert_allclose(found, np.linalg.solve(dense[[0, 2]], right.cpu()[[0, 2]]), rtol=1e-9, atol=1e-9)
+
+
+def test_only_a_solver_that_says_so_writes_over_the_values(device):
+    for kind in layouts(device):
+        solver = make(kind, 3, device)
+        values = values_of(solver, matrices(3, 20.0))
+        before = values.clone()
+        solver.factor(values)
+        assert bool((values == before).all()) != solver.overwrites
+
+
 def test_nan_counts_as_failed_or_stays_nan():
     """A NaN in a matrix never turns into a finite solution."""
     dense = matrices(3, 20.0)

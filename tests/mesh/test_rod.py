@@ -40,6 +40,15 @@ def test_along_a_curve_it_keeps_its_radius_and_does_not_twist():
     np.testing.assert_allclose(first, last, atol=1e-4)  # a section that does not turn about the axis
 
 
+def test_layers_are_as_long_as_the_grading_says():
+    for grading in (0.0, 0.5, 1.0):
+        ends = np.unique(np.round(rod(AXIS, TAPER, 10, nodes=8, grading=grading).vertices[:, 2], 9))[::-1]
+        lengths, middles = -np.diff(ends), 0.5 * (ends[1:] + ends[:-1])
+        shares = lengths / np.interp(-middles, *np.transpose(TAPER)) ** grading
+        assert (ends[0], ends[-1], len(ends)) == (0.0, -0.3, 11)
+        np.testing.assert_allclose(shares, shares.mean(), rtol=1e-3)
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -49,6 +58,7 @@ def test_along_a_curve_it_keeps_its_radius_and_does_not_twist():
         ((AXIS, [[0.3, 0.1], [0.0, 0.1]], 4), "rising arc lengths"),
         ((AXIS, 0.1, 0), "layers of a rod is 0"),
         ((AXIS, 0.1, 4, 1, 1, 10), "a rod of cells with 10 nodes"),
+        ((AXIS, 0.1, 4, 1, 1, 27, 2.0), "grading of a rod is 2: it must be from 0"),
         (([[0, 0, 0], [0, 0, 1], [0, 0.5, 0.1]], 0.4, 12), "bent more sharply than it is thick"),
     ],
 )

@@ -79,11 +79,13 @@ class HessianAssembly:
     def __init__(self, potential: IncrementalPotential, solver: LinearSolver, pattern: BlockPattern) -> None:
         p = potential
         self._potential = p
+        self._idle = torch.zeros(p.batch, dtype=torch.int32, device=p.device)
+        idle = warp_view(self._idle, wp.int32)
         blocks = p.zeros(pattern.n_cell_blocks, 3, 3)
-        self._values = p.zeros(solver.n_values)
+        self._values, self._overwritten = p.zeros(solver.n_values), solver.overwrites
         self._commands = []
         for s, offset in zip(p.sets, pattern.offsets, strict=True):
-            inputs = [s.gradients, s.points_per_cell]
+            inputs = [idle, s.gradients, s.points_per_cell]
             inputs += [p.points_view(p.tangent, s.part, wp.mat33d), offset]
             self._commands.append(
                 p.record(
@@ -91,6 +93,7 @@ class HessianAssembly:
                 )
             )
         inputs = [
+            idle,
             p.upload(pattern.start.astype(np.int32), int),
             p.upload(pattern.contribution.astype(np.int32), int),
             p.upload(pattern.diagonal_vertex.astype(np.int32), int),
@@ -101,7 +104,14 @@ class HessianAssembly:
         dim = (p.batch, len(pattern.rows))
         self._commands.append(p.record(kernels.scatter_blocks, dim, inputs, [warp_view(self._values, wp.float64)]))
 
-    def __call__(self) -> torch.Tensor:
-        """(B, n_values) from the potential's last `update_tangent`; overwritten by the next call."""
+    def __call__(self, idle: torch.Tensor | None = None) -> torch.Tensor:
+        """(B, n_values) from the potential's last `update_tangent`; overwritten by the next call.
+
+        Args:
+            idle: (B,) environments whose values nobody needs; they may be anything.
+        """
+        self._idle.zero_() if idle is None else self._idle.copy_(idle)
+        if self._overwritten:
+            self._values.zero_()
         self._potential.launch(*self._commands)
         return self._values

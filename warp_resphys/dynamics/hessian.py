@@ -27,8 +27,8 @@ class HessianApproximation(ABC):
         """Whether there is a factor that may serve the current terms."""
 
     @abstractmethod
-    def refactor(self, clamp: bool = False) -> None:
-        """Factorises at the potential's positions."""
+    def refactor(self, clamp: bool = False, idle: torch.Tensor | None = None) -> None:
+        """Factorises at the potential's positions, if need be not for the (B,) environments that nobody asks for."""
 
     @abstractmethod
     def apply(self, residual: torch.Tensor) -> torch.Tensor:
@@ -56,22 +56,24 @@ class ExactHessian(HessianApproximation):
         return self._factor is not None
 
     @override
-    def refactor(self, clamp: bool = False) -> None:
+    def refactor(self, clamp: bool = False, idle: torch.Tensor | None = None) -> None:
         self.clamped.fill_(clamp)
-        self._factor = self._factorise()
-        if self._factor.failed.any() and not clamp:
-            self.clamped = torch.as_tensor(self._factor.failed, device=self.clamped.device)
-            self._factor = self._factorise()
+        self._factor = self._factorise(idle)
+        failed = torch.as_tensor(self._factor.failed, device=self.clamped.device)
+        failed = failed if idle is None else failed & ~idle
+        if bool(failed.any()) and not clamp:
+            self.clamped = failed
+            self._factor = self._factorise(idle)
 
-    def _factorise(self) -> Factor:
+    def _factorise(self, idle: torch.Tensor | None) -> Factor:
         self._potential.update_tangent(self.clamped)
-        return self._factor_of(self._assemble().to(self._linear.dtype))
+        return self._factor_of(self._assemble(idle).to(self._linear.dtype), idle=idle)
 
-    def _factor_of(self, values: torch.Tensor, definite: bool = True) -> Factor:
+    def _factor_of(self, values: torch.Tensor, definite: bool = True, idle: torch.Tensor | None = None) -> Factor:
         """Of assembled values, and what couples vertices beside them."""
         columns = self._potential.low_rank
         columns = None if columns is None else columns[:, self._dofs].to(self._linear.dtype)
-        return corrected(self._linear.factor(values, definite), columns)
+        return corrected(self._linear.factor(values, definite, idle), columns)
 
     def refactor_exact(self) -> None:
         """Factorises the Hessian as it is, indefinite or not: for adjoints."""
@@ -130,8 +132,8 @@ class ProjectiveHessian(HessianApproximation):
         return self._key is not None and all(map(torch.equal, self._key, terms))
 
     @override
-    def refactor(self, clamp: bool = False) -> None:
-        del clamp  # The matrix is positive definite as it is.
+    def refactor(self, clamp: bool = False, idle: torch.Tensor | None = None) -> None:
+        del clamp, idle  # The matrix is positive definite as it is, and serves later steps.
         self._key = tuple(t.clone() for t in self._terms())
         inertia, *weights = (t[:1] if bool((t == t[:1]).all()) else t for t in self._key)
         batch = max(len(t) for t in (inertia, *weights))

@@ -179,7 +179,7 @@ class _Run:
         if bool(resting.all()) or self.iteration >= self.solver.settings.max_iterations:
             return False
         if self.clamp is not None or self.solver.stale(self.iteration):
-            self._refactor()
+            self._refactor(resting if self.solver.settings.name == "newton" else None)
         direction, slope = self._direction(resting)
         active = ~resting
         self.iterations += active
@@ -220,8 +220,8 @@ class _Run:
             direction, slope = direction.masked_fill_(lost[:, None], 0.0), slope.masked_fill_(lost, 0.0)
         return direction, slope
 
-    def _refactor(self) -> None:
-        self.solver.hessian.refactor(bool(self.clamp))
+    def _refactor(self, idle: torch.Tensor | None = None) -> None:
+        self.solver.hessian.refactor(bool(self.clamp), idle)
         self.solver._update.reset()
         self.factorisations += 1
         self.clamp = None

@@ -182,6 +182,7 @@ _MESHES: Final[Mapping[str, Mapping[str, Spec]]] = {
         "radii": _RADII,
         **dict.fromkeys(("layers", "core", "rings"), at_most(10_000)),
         "nodes": Kind(lambda value: value in (8, 20, 27), "one of 8, 20, 27"),
+        "grading": absent(_number(lambda value: 0.0 <= value <= 1.0, "a number from 0 to 1")),
     },
     "arm": {"name": WORD},
     "arm_generated": {

@@ -156,8 +156,8 @@ class Identifier:
         self._replays: list[tuple[Replay, Start]] = []
         self._weights: list[torch.Tensor] = []
         self._accuracy, self._labels, self._centre = accuracy, tuple(labels), self.simulator.tensor(list(centre))
-        # By replay, equilibria for the parameters that were tried last in a descent, near which the next ones are.
-        self._near: list[torch.Tensor | None] = []
+        # By replay, equilibria for the parameters that were tried last, near which the next ones are.
+        self._near: list[_Equilibria | None] = []
         self._expected = [each.expected() for each in self.bounds.values()]
         self._prior_weight = 0.0
         count = sum(len(replay.trials.names) for replay, _ in replays)
@@ -188,8 +188,7 @@ class Identifier:
 
     def _residuals(self, unit: torch.Tensor) -> tuple[list[torch.Tensor], torch.Tensor]:
         """(E, R, T, M, 3) simulated less observed points of each replay [m], and (E, K) what the priors add."""
-        values = {name: b.from_unit(unit[:, i]) for i, (name, b) in enumerate(self.bounds.items())}
-        series = self._simulated(values)
+        series = self._simulated(unit)
         weight = math.sqrt(self._prior_weight)
         known = [(i, *expected) for i, expected in enumerate(self._expected) if expected is not None]
         prior = [weight * (unit[:, i] - mean) / deviation for i, mean, deviation in known]
@@ -211,13 +210,33 @@ class Identifier:
         ]
         return errors, torch.cat([rows, torch.stack(inside)], 1)
 
-    def _simulated(self, values: Mapping[str, torch.Tensor]) -> list[torch.Tensor]:
-        """(E, R, T, M, 3) what each replay shows with (E,) parameters [m]."""
+    def _simulated(self, unit: torch.Tensor) -> list[torch.Tensor]:
+        """(E, R, T, M, 3) what each replay shows with (E, P) parameters [m]."""
+        values = {name: b.from_unit(unit[:, i]) for i, (name, b) in enumerate(self.bounds.items())}
         near = self._near or [None] * len(self._replays)
         found = []
-        for (replay, start), q in zip(self._replays, near, strict=True):
-            found.append(replay(start if q is None else start.near(q), values))
+        for (replay, start), known in zip(self._replays, near, strict=True):
+            found.append(replay(start if known is None else start.near(known.at(unit.detach())), values))
         return found
+
+    def _remember(self, unit: torch.Tensor) -> None:
+        """Keeps the equilibria of the last simulation.
+
+        Args:
+            unit: (1, P) parameters, or (1 + P, P), in which each is changed once; what was simulated besides is left.
+        """
+        unit, near = unit.detach(), self._near or [None] * len(self._replays)
+        self._near = []
+        for (replay, start), known in zip(self._replays, near, strict=True):
+            if not start.at_rest or replay.settled is None:
+                self._near.append(None)
+                continue
+            first, *others = replay.settled.split(len(replay.trials.names))[: len(unit)]
+            slopes = None if known is None else known.slopes
+            if others:
+                steps = (unit[1:] - unit[:1]).diagonal()
+                slopes = (torch.stack(others) - first) / steps[:, None, None, None]
+            self._near.append(_Equilibria(unit[0], first, slopes))
 
     def _place(self, series: Sequence[torch.Tensor]) -> tuple[Placement, torch.Tensor, list[torch.Tensor]]:
         """The best placement for what one set of parameters shows, it in standard deviations, and the moved markers."""
@@ -252,8 +271,9 @@ class Identifier:
             return None
         with torch.no_grad():
             x = self.simulator.tensor(unit)[None]
-            values = {name: b.from_unit(x[:, i]) for i, (name, b) in enumerate(self.bounds.items())}
-            return self._place([each[0] for each in self._simulated(values)])[0]
+            series = self._simulated(x)
+            self._remember(x)
+            return self._place([each[0] for each in series])[0]
 
     def grid(
         self,
@@ -433,7 +453,7 @@ class Identifier:
                 (gradient,) = torch.autograd.grad(loss, x)
         except ConvergenceError:
             return np.inf, np.zeros_like(unit)
-        self._near = [replay.settled if start.at_rest else None for replay, start in self._replays]
+        self._remember(x)
         return float(loss.detach()), gradient[0].double().cpu().numpy()
 
     def _linearise(
@@ -453,11 +473,16 @@ class Identifier:
             unit = np.clip(unit, _DIFFERENCE, 1.0 - _DIFFERENCE)
         sides = [unit[None], unit + np.diag(steps), unit - np.diag(steps)]
         wanted = sides[: 3 if central else 2] if derivatives else sides[:1]
+        points = self.simulator.tensor(np.concatenate(wanted))
         try:
             with torch.no_grad():
-                residuals, prior = self._residuals(self.simulator.tensor(np.concatenate(wanted)))
+                if not self._near and any(start.at_rest for _, start in self._replays):
+                    self._simulated(points[:1])
+                    self._remember(points[:1])
+                residuals, prior = self._residuals(points)
         except ConvergenceError:
             return None
+        self._remember(points[: count + 1])
 
         def slopes(values: NDArray[np.float64]) -> NDArray[np.float64]:
             """(..., P) of values (E, ...) at the points."""
@@ -504,6 +529,22 @@ class Identifier:
             poorest=dict(zip(self.bounds, poorest.tolist(), strict=True)),
             poorest_deviation=float(np.sqrt(max(vectors[:, 0] @ covariance @ vectors[:, 0], 0.0))),
         )
+
+
+@dataclass(frozen=True)
+class _Equilibria:
+    """Equilibria of trials, and how they change with the parameters."""
+
+    unit: torch.Tensor  # (P,) the parameters, each a fraction of its range
+    q: torch.Tensor  # (R, N, 3) [m]
+    slopes: torch.Tensor | None  # (P, R, N, 3) by the parameters [m]; None where not known
+
+    def at(self, unit: torch.Tensor) -> torch.Tensor:
+        """(E R, N, 3) where they may be with (E, P) other parameters [m]."""
+        away = unit - self.unit
+        if self.slopes is None:
+            return self.q.repeat(len(unit), 1, 1)
+        return (self.q + torch.einsum("ep,prni->erni", away, self.slopes)).flatten(0, 1)
 
 
 def _redundancy(series: NDArray[np.float64]) -> float:

@@ -44,7 +44,7 @@ class Start:
         return cls(State(guess, torch.zeros_like(guess)), guess.new_zeros(len(guess)), at_rest=True)
 
     def near(self, q: torch.Tensor) -> "Start":
-        """The same with another first guess (R, N, 3) of where bodies rest [m]."""
+        """The same with another first guess of where bodies rest [m], (R or E R, N, 3) for E sets of parameters."""
         return replace(self, state=State(q, torch.zeros_like(q)))
 
     def select(self, indices: list[int]) -> "Start":
@@ -133,7 +133,8 @@ class Replay:
         Raises:
             ConvergenceError: there is no equilibrium, or a pose and its force do not settle.
         """
-        q, v = start.state.q.repeat(each, 1, 1), start.state.v.repeat(each, 1, 1)
+        times = each * len(self.trials.names)
+        q, v = (t.repeat(times // len(t), 1, 1) for t in (start.state.q, start.state.v))
         if not start.at_rest:
             return State(q, v)
         state = self.simulator.static_equilibrium(resting, constants, start=q)

@@ -87,10 +87,12 @@ class LinearSolver(ABC):
     Attributes:
         address: (E, block^2) place of each block's entries in the value array, -1 where not stored.
         n_values: length of the value array.
+        overwrites: whether `factor` writes over the values.
     """
 
     address: NDArray[np.int32]
     n_values: int
+    overwrites = False
 
     def __init__(
         self, rows: Indices, cols: Indices, n_nodes: int, block: int, device: torch.device, dtype: torch.dtype
@@ -111,13 +113,14 @@ class LinearSolver(ABC):
         """Chooses an order and sets ``address`` and ``n_values``."""
 
     @abstractmethod
-    def factor(self, values: torch.Tensor, definite: bool = True) -> Factor:
+    def factor(self, values: torch.Tensor, definite: bool = True, idle: torch.Tensor | None = None) -> Factor:
         """Factorises (B, n_values).
 
         Args:
-            values: entries at the solver's addresses.
+            values: entries at the solver's addresses, zero elsewhere; see `overwrites`.
             definite: Cholesky, which reports matrices that are not positive definite in ``failed``; otherwise a pivoted
                 factorisation that takes any regular matrix.
+            idle: (B,) matrices that may be left out: nobody asks for their solutions, which may be anything.
         """
 
     def _entries(self, rows: Indices, cols: Indices) -> tuple[Indices, Indices]:
@@ -128,6 +131,8 @@ class LinearSolver(ABC):
 
 class BandedSolver(LinearSolver):
     """LAPACK's banded Cholesky in reverse Cuthill-McKee order, on the CPU, one environment after another."""
+
+    overwrites = True
 
     @override
     def _lay_out(self, rows: Indices, cols: Indices, n_nodes: int) -> None:
@@ -147,10 +152,12 @@ class BandedSolver(LinearSolver):
         self._threads = ThreadpoolController()
 
     @override
-    def factor(self, values: torch.Tensor, definite: bool = True) -> Factor:
-        bands = values.reshape(-1, self.n, self.bandwidth + 1)
+    def factor(self, values: torch.Tensor, definite: bool = True, idle: torch.Tensor | None = None) -> Factor:
+        bands = values.reshape(-1, self.n, self.bandwidth + 1).numpy()
         with _one_thread(self._threads):
-            return _BandedFactor(bands.numpy(), self, definite)
+            return _BandedFactor(
+                bands, self, definite, np.zeros(len(bands), dtype=bool) if idle is None else idle.numpy()
+            )
 
 
 def _one_thread(threads: ThreadpoolController) -> AbstractContextManager[Any]:
@@ -159,7 +166,7 @@ def _one_thread(threads: ThreadpoolController) -> AbstractContextManager[Any]:
 
 
 class _BandedFactor(Factor):
-    def __init__(self, bands: NDArray[Any], solver: BandedSolver, definite: bool) -> None:
+    def __init__(self, bands: NDArray[Any], solver: BandedSolver, definite: bool, idle: NDArray[np.bool_]) -> None:
         self._order, self._place = solver._order, solver._place
         self._definite = definite
         self.failed = np.zeros(len(bands), dtype=bool)
@@ -168,8 +175,11 @@ class _BandedFactor(Factor):
         self._width = bands.shape[2] - 1
         (self._solve,) = scipy.linalg.get_lapack_funcs(("pbtrs" if definite else "gbtrs",), (bands,))
         for i, band in enumerate(bands):
+            if idle[i]:
+                self._factors.append(None)
+                continue
             if definite:
-                factor, info = factorise(np.array(band).T, lower=1, overwrite_ab=1)
+                factor, info = factorise(band.T, lower=1, overwrite_ab=1)
                 self._factors.append(factor)
             else:
                 lu, pivots, info = factorise(_general_band(band), self._width, self._width, overwrite_ab=1)
@@ -187,7 +197,8 @@ class _BandedFactor(Factor):
         columns = ordered.transpose(1, 2).reshape((1, b * m, n) if shared else (b, m, n)).contiguous().numpy()
         # Triangular solves with a band run on one thread in any case.
         for factor, block in zip(self._factors, columns, strict=True):
-            self._solve_in_place(factor, block.T)
+            if factor is not None:
+                self._solve_in_place(factor, block.T)
         solved = torch.from_numpy(columns).reshape(b, m, n).transpose(1, 2)
         return solved[:, self._place]
 
@@ -223,7 +234,7 @@ class DenseSolver(LinearSolver):
         self.n_values = self.n * self.n
 
     @override
-    def factor(self, values: torch.Tensor, definite: bool = True) -> Factor:
+    def factor(self, values: torch.Tensor, definite: bool = True, idle: torch.Tensor | None = None) -> Factor:
         return _DenseFactor(values.reshape(-1, self.n, self.n), definite)
 
 
@@ -276,7 +287,7 @@ class SparseSolver(LinearSolver):
         return scipy.sparse.csc_array((data, (self._rows, self._cols)), shape=(self.n, self.n))
 
     @override
-    def factor(self, values: torch.Tensor, definite: bool = True) -> Factor:
+    def factor(self, values: torch.Tensor, definite: bool = True, idle: torch.Tensor | None = None) -> Factor:
         return _SparseFactor(self, values, definite)
 
 

@@ -7,6 +7,7 @@ easily, with eight or with quadratic cells by less than 0.3 %.
 """
 
 import numpy as np
+import scipy.integrate
 from numpy.typing import ArrayLike
 
 from ..io.errors import MeshError
@@ -23,20 +24,23 @@ def rod(
     core: int = 1,
     rings: int = 1,
     nodes: int = 27,
+    grading: float = 0.0,
 ) -> Mesh:
     """A round rod of hexahedra.
 
     Args:
         centreline: (M, 3) points of its axis, straight or curved, joined by straight lines [m].
         radii: one radius, or (R, 2) arc lengths and the radii there, linear in between [m].
-        layers: of cells along the axis, equally long.
+        layers: of cells along the axis.
         core: cells along a side of the section's middle square.
         rings: of cells around it.
         nodes: of a cell, 8, 20 or 27.
+        grading: layers are as long as this power of the rod's radius there: 0 for one length, up to 1 for layers that
+            are as slender as one another.
 
     Raises:
-        MeshError: fewer than two points, a radius that is not positive, a number that is no whole one, or a curve that
-            is bent more sharply than the rod is thick.
+        MeshError: fewer than two points, a radius that is not positive, a number that is no whole one, a grading out of
+            its range, or a curve that is bent more sharply than the rod is thick.
     """
     axis, order = np.asarray(centreline, dtype=np.float64), 1 if nodes == 8 else 2
     if axis.ndim != 2 or axis.shape[1] != 3 or len(axis) < 2 or not np.isfinite(axis).all():
@@ -56,7 +60,9 @@ def rod(
         raise MeshError(f"a rod of cells with {nodes} nodes: choose 8, 20 or 27.")
     section, squares = _section(core * order, rings * order, order)
     length = np.concatenate([[0.0], np.cumsum(pieces)])
-    along = np.linspace(0.0, length[-1], layers * order + 1)
+    if not 0.0 <= grading <= 1.0:
+        raise MeshError(f"the grading of a rod is {grading:g}: it must be from 0, for layers of one length, to 1.")
+    along = _levels(float(length[-1]), profile, layers, order, grading)
     places, frames = _transported(axis, length, along)
     radius = np.interp(along, profile[:, 0], profile[:, 1])
     vertices = places[:, None] + np.einsum("s,nj,sji->sni", radius, section, frames)
@@ -72,6 +78,16 @@ def rod(
     if not (np.linalg.det(np.einsum("cki,qkj->cqij", mesh.vertices[mesh.cells], slopes)) > 0.0).all():
         raise MeshError("a rod is bent more sharply than it is thick: straighten its centreline, or make it thinner.")
     return mesh
+
+
+def _levels(length: float, radii: FloatArray, layers: int, order: int, grading: float) -> FloatArray:
+    """(layers order + 1,) arc lengths [m] of the nodes of layers as long as a power of the radius says."""
+    ends = np.linspace(0.0, length, layers + 1)
+    if grading != 0.0:
+        fine = np.linspace(0.0, length, 1000 * layers + 1)
+        share = scipy.integrate.cumulative_trapezoid(np.interp(fine, *radii.T) ** -grading, fine, initial=0.0)
+        ends = np.interp(np.linspace(0.0, share[-1], layers + 1), share, fine)
+    return np.interp(np.arange(layers * order + 1) / order, np.arange(layers + 1), ends)
 
 
 def _section(core: int, rings: int, order: int) -> tuple[FloatArray, IntArray]:

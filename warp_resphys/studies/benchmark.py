@@ -276,13 +276,13 @@ def _time_parts(case: Case, repeats: int) -> dict[str, Any]:
     assemble = HessianAssembly(potential, linear, pattern)
     potential.update_tangent()
     values = assemble().to(sim.dtype, copy=True)
-    factor = linear.factor(values)
+    factor = linear.factor(values.clone())
     right = torch.ones(case.batch, linear.n, 1, device=device, dtype=sim.dtype)
     tasks: dict[str, Callable[[], object]] = {
         "local_step": potential.evaluate,
         "tangent": potential.update_tangent,
         "assembly": assemble,
-        "factor": lambda: linear.factor(values),
+        "factor": lambda: linear.factor(values.clone()),
         "solve": lambda: factor.solve(right),
     }
     times = {f"{name}_ms": 1e3 * _median_seconds(tasks[name], repeats, device) for name in PARTS}

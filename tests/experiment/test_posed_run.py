@@ -11,7 +11,7 @@ from main_job import IN_RUN, run
 from omegaconf import OmegaConf
 
 from warp_resphys.dynamics.inputs import Inputs
-from warp_resphys.experiment.build import bound_markers, build_simulator
+from warp_resphys.experiment.build import bound_markers, build_simulator, finer
 from warp_resphys.experiment.checks import check_configuration
 from warp_resphys.experiment.files import read_dataset
 from warp_resphys.io.errors import InputError
@@ -88,6 +88,37 @@ def test_poses_of_unnamed_markers_identify_the_body(recorded, tmp_path, monkeypa
     }
     assert 5.0 * errors["sysid"] < errors["simulation"]
     assert {"simfree", "resphys"} <= errors.keys()
+    check_of_the_mesh()
+
+
+def check_of_the_mesh():
+    """What the run tells of its mesh is what two simulators differ by."""
+    found = json.loads(Path("run/metrics.json").read_text())["mesh_check"]
+    parameters = json.loads(Path("run/identification.json").read_text())["sysid"]["parameters"]
+    shown = []
+    for layers in (4, 6):
+        config = configuration(*TRIALS, f"mesh.layers={layers}")
+        sim = build_simulator({**config, "simulation": {**config["simulation"], **parameters}})
+        markers = config["markers"]
+        read = bound_markers(markers, sim.body.mesh, np.array([*markers["tracked"].values()]), (*markers["tracked"],))
+        tension = torch.tensor([POSES["both"]], dtype=torch.float64)
+        shown.append(read(sim.static_equilibrium(Inputs(tendon_tension=tension)).q)[0])
+        assert found["cells"][len(shown) - 1] == len(sim.body.mesh.cells)
+    moved = 1e3 * float((shown[1] - shown[0]).norm(dim=1).mean())
+    assert moved > 0.1
+    assert found["moved_mm"] == pytest.approx(moved, rel=0.05)
+    assert "How much of the errors is mesh" in Path("run/report.html").read_text()
+
+
+def test_a_finer_mesh_has_so_many_times_as_many_cells():
+    box = {"kind": "box_hexahedra", "size": [0.1, 0.03, 0.03], "divisions": [5, 2, 1]}
+    assert finer(box, 1.5) == {**box, "divisions": [8, 3, 2]}
+    assert finer({"kind": "rod", "layers": 4, "core": 1}, 2.0) == {"kind": "rod", "layers": 8, "core": 1}
+    arm = {"kind": "arm_generated", "size": 0.006, "layers": None}
+    assert finer(arm, 2.0) == {**arm, "size": 0.003}
+    assert finer({**arm, "layers": 0.01}, 2.0) == {**arm, "size": 0.003, "layers": 0.005}
+    with pytest.raises(InputError, match="cells of a mesh of the kind 'file' are given"):
+        finer({"kind": "file"}, 2.0)
 
 
 @pytest.mark.parametrize(
@@ -95,6 +126,7 @@ def test_poses_of_unnamed_markers_identify_the_body(recorded, tmp_path, monkeypa
     [
         (["data.axes=[x,z,y]"], r"data.axes: the axes \(x, z, y\) would mirror the recording"),
         (["data.axes=[x,x,y]"], "data.axes is .*three of x, -x"),
+        (["mesh_check=1"], "mesh_check is 1: .* above 1"),
         (["data.axes=null"], "markers.reference names 1 .* it takes 3, or data.axes and one"),
         (["data.table.columns=[1,2]"], "data.table.columns is .* a list of headers"),
         (["data.trials.weak.inputs=[a]"], "data.trials.weak.inputs is .* one for each chamber, tendon or muscle"),

@@ -1,5 +1,6 @@
 """Builds meshes, bodies, materials and simulators from configurations."""
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from importlib import resources
@@ -73,6 +74,25 @@ def build_mesh(config: Mapping[str, Any]) -> Mesh:
         raise InputError(f"mesh.kind is {kind!r}: choose one of those in conf/mesh.")
     check_mesh(mesh)
     return mesh
+
+
+def finer(config: Mapping[str, Any], times: float) -> dict[str, Any]:
+    """The group ``mesh`` with so many times as many cells along the edges of a box, a rod's axis, or all of an arm.
+
+    Raises:
+        InputError: a mesh whose cells are given.
+    """
+    kind = config["kind"]
+    if kind in ("box_hexahedra", "box_tetrahedra"):
+        return {**config, "divisions": [math.ceil(times * each) for each in config["divisions"]]}
+    if kind == "rod":
+        return {**config, "layers": math.ceil(times * config["layers"])}
+    if kind == "arm_generated":
+        layers = None if config["layers"] is None else config["layers"] / times
+        return {**config, "size": config["size"] / times, "layers": layers}
+    raise InputError(
+        f"mesh_check: the cells of a mesh of the kind {kind!r} are given and cannot be made finer: take null."
+    )
 
 
 def shipped_arm(name: str) -> Mesh:

@@ -19,7 +19,7 @@ from ..learning.reconstruction import make_reconstructor
 from ..learning.replay import MASS_FACTOR, known_parameters
 from ..mesh.mesh import select_vertices, surface_vertices
 from .actuators import Drive, drive_of
-from .build import build_body, build_material, build_simulator
+from .build import build_body, build_material, build_simulator, finer
 from .files import STATIC, attached_mass
 from .identify import ELASTIC, bounds_of
 from .reading import standing_enough
@@ -83,6 +83,10 @@ def check_configuration(config: Mapping[str, Any]) -> None:
         if "modes" in config["reconstruction"]:
             raise InputError("reconstruction.modes is for bodies that are seen through markers: leave it out.")
         make_reconstructor(simulator, **config["reconstruction"])
+    if config["mesh_check"] is not None:
+        if not recorded:
+            raise InputError("mesh_check compares markers, but markers is null: leave it null, too.")
+        _check_memory({**config, "mesh": finer(config["mesh"], config["mesh_check"])})
     if config["refinement"]["kind"] != "none":
         _check_refinement(config)
     if config["identify"] is not None:

@@ -9,13 +9,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..data.trials import Trials
 from ..dynamics.integrator import State
+from ..io.errors import ConvergenceError
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5, write_json
 from ..io.progress import Progress
 from ..io.stages import StageContext
 from ..learning.metrics import errors_per_marker, marker_errors, median_filter, summarise, summarise_each
 from ..learning.replay import Start
-from .files import ERRORS, ROLLOUTS, STATIC, TIMES, reconstruction_file
+from .build import finer
+from .files import ERRORS, MESH_CHECK, ROLLOUTS, STATIC, TIMES, reconstruction_file
 from .models import POSE_STEPS, SIMFREE, ModelRollout, first_frame, learned_of
 from .parts import Part, padded, remove_parts, split_into_parts, work_on
 from .scene import LEARNED, Scene, models_of
@@ -248,3 +251,48 @@ def time_models(context: StageContext) -> None:
             progress.advance(len(names))
             times[row] = {"mean": mean(seconds[1:]), "std": pstdev(seconds[1:])}
     write_json(context.run_dir / TIMES, {"steps": steps, "seconds": times})
+
+
+def check_mesh(context: StageContext) -> None:
+    """Writes mesh_check.json: what a finer mesh changes in what the simulator to correct makes of the test trials.
+
+    Its constants stay those that were identified on the mesh as it is.
+    """
+    settings = context.settings
+    other = {**settings, "mesh": finer(settings["mesh"], settings["mesh_check"])}
+    scenes = [Scene(each, context.run_dir) for each in (settings, other)]
+    model = "simulation" if settings["identify"] is None else "sysid"
+    groups = scenes[0].alike(settings["groups"]["1"])
+    found: dict[str, Any] = {"cells": [len(each.body.mesh.cells) for each in scenes], "model": model}
+    errors: list[list[FloatArray]] = [[], []]
+    moved: list[FloatArray] = []
+    with Progress(context.name, 2 * sum(map(len, groups)), "trials") as progress:
+        try:
+            for names in groups:
+                shown = []
+                for scene, each in zip(scenes, errors, strict=True):
+                    markers, trials = _simulated(scene, model, names)
+                    seen = trials.seen.cpu().numpy()
+                    each += _distances(markers, trials.observed.cpu().numpy(), seen)
+                    shown.append(markers)
+                    progress.advance(len(names))
+                moved += _distances(shown[0], shown[1], seen)
+        except ConvergenceError as error:
+            found["failed"] = str(error)
+        else:
+            found["moved_mm"] = float(np.mean([each.mean() for each in moved]))
+            found["errors_mm"] = [float(np.mean([each.mean() for each in some])) for some in errors]
+    write_json(context.run_dir / MESH_CHECK, found)
+
+
+def _simulated(scene: Scene, model: str, names: Sequence[str]) -> tuple[FloatArray, Trials]:
+    """(R, T, M, 3) markers of trials that begin alike, by a model without a force [m], and what was observed."""
+    replay = scene.replay(scene.model_simulator(model), names, model)
+    with torch.no_grad():
+        markers = replay(scene.start(replay, model), scene.parameters(model))[0]
+    return np.asarray(markers.cpu().numpy()), replay.trials
+
+
+def _distances(left: FloatArray, right: FloatArray, seen: NDArray[np.bool_]) -> list[FloatArray]:
+    """By trial, the distances of (R, T, M, 3) markers that were seen [mm]."""
+    return [1e3 * np.linalg.norm(a - b, axis=-1)[s] for a, b, s in zip(left, right, seen, strict=True)]

@@ -30,6 +30,7 @@ RECONSTRUCTION: Final = "reconstruction.json"
 ROLLOUTS: Final = "rollouts.h5"
 ERRORS: Final = "errors.json"
 TIMES: Final = "times.json"
+MESH_CHECK: Final = "mesh_check.json"
 METRICS: Final = "metrics.json"
 REPORT: Final = "report.html"
 

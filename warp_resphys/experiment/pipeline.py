@@ -22,11 +22,12 @@ from ..report.verdict import judgement
 from .ablation import ablation_stages, print_ablation
 from .build import choose_device
 from .checks import check_configuration, training_settings
-from .evaluate import evaluate, time_models
+from .evaluate import check_mesh, evaluate, time_models
 from .files import (
     DATASET,
     ERRORS,
     IDENTIFICATION,
+    MESH_CHECK,
     METRICS,
     QUALITY,
     REGISTRATION,
@@ -209,7 +210,9 @@ def learning_stages(config: Mapping[str, Any], split: Split, shared: str, acquir
     add("evaluate", work, (ROLLOUTS, ERRORS), settings, *learned, "reconstruct_resphys")
     if config["timing"]:
         add("time", time_models, (TIMES,), {**tested, **_pick(config, "target")}, *learned)
-    last = tuple(stage.name for stage in stages if stage.name in ("evaluate", "time"))
+    if config["mesh_check"] is not None:
+        add("mesh_check", check_mesh, (MESH_CHECK,), {**tested, **_pick(config, "mesh_check")})
+    last = tuple(stage.name for stage in stages if stage.name in ("evaluate", "time", "mesh_check"))
     stages.append(Stage("report", make_report, (REPORT,), {"config": shown(config), "acquired": acquired}, last))
     return stages
 

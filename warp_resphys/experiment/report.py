@@ -26,6 +26,7 @@ from .files import (
     DATASET,
     ERRORS,
     IDENTIFICATION,
+    MESH_CHECK,
     METRICS,
     QUALITY,
     RECONSTRUCTION,
@@ -103,7 +104,7 @@ def make_report(context: StageContext) -> None:
         film=film,
         driven=driven,
         recordings=read_recordings(folder, config, *_at_rest(mesh, trials, film)),
-        notes=error_notes(metrics.get("sideways_mm", {}), truth),
+        notes=error_notes(metrics.get("sideways_mm", {}), truth, metrics.get("mesh_check", {})),
         identification=identification,
         start=data_sheet(config, identification),
         truth=truth.get("material", {}),
@@ -131,7 +132,7 @@ def make_folds_report(context: StageContext) -> None:
         **_common_parts(config, metrics, mesh),
         pages={trial: f"{fold_folder(trial)}/{REPORT}" for trial in metrics["folds"]},
         recordings=read_recordings(folder, config, mesh, {}),
-        notes=error_notes(sideways, {}),
+        notes=error_notes(sideways, {}, {}),
     )
     write_report(folder / REPORT, data)
 
@@ -175,6 +176,7 @@ def collect_metrics(folder: Path, config: Mapping[str, Any], stages: Sequence[st
     identified, truth = (read_if_there(each) for each in (folder / IDENTIFICATION, common_folder(folder) / TRUTH))
     more = {
         "reconstruction": read_if_there(folder / RECONSTRUCTION),
+        "mesh_check": read_if_there(folder / MESH_CHECK),
         "seconds_per_test_trajectory": read_if_there(folder / TIMES).get("seconds", {}),
         **({"noise_mm": truth["noise_mm"]} if "noise_mm" in truth else {}),
     }
@@ -195,8 +197,8 @@ def data_sheet(config: Mapping[str, Any], identification: Mapping[str, Any]) -> 
     return first_guess(config, (*names, "youngs_modulus", "poissons_ratio"))
 
 
-def error_notes(sideways: Mapping[str, float], truth: Mapping[str, Any]) -> list[str]:
-    """How the bodies of the test trials were held, and what of the errors is noise, as far as these are known."""
+def error_notes(sideways: Mapping[str, float], truth: Mapping[str, Any], mesh: Mapping[str, Any]) -> list[str]:
+    """How the bodies of the test trials were held, and what of the errors is noise or mesh, where that is known."""
     notes = []
     if sideways:
         each = ", ".join(f"{distance:.1f} mm ({trial})" for trial, distance in sideways.items())
@@ -206,7 +208,21 @@ def error_notes(sideways: Mapping[str, float], truth: Mapping[str, Any]) -> list
         )
     if "noise_mm" in truth:
         notes.append(f"The noise of the markers alone is {truth['noise_mm']:.2f} mm.")
-    return notes
+    return [*notes, mesh_note(mesh)] if mesh else notes
+
+
+def mesh_note(found: Mapping[str, Any]) -> str:
+    """What a finer mesh changes, in words."""
+    cells, finer = found["cells"]
+    model = "the identified simulator" if found["model"] == "sysid" else "the simulator"
+    finer_mesh = f"a mesh of {finer:,} in place of {cells:,} cells"
+    if "failed" in found:
+        return f"What of the errors is mesh is not known: on {finer_mesh}, {found['failed']}"
+    before, after = map(number_text, found["errors_mm"])
+    return (
+        f"How much of the errors is mesh: on {finer_mesh}, with the same constants, the markers of {model} are "
+        f"{number_text(found['moved_mm'])} mm elsewhere, and its error is {after} mm in place of {before} mm."
+    )
 
 
 def published_note(config: Mapping[str, Any]) -> str:

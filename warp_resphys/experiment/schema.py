@@ -457,6 +457,7 @@ def configuration_group(config: Mapping[str, Any]) -> Group:
             "tendons": _TENDONS,
             "muscles": _MUSCLES,
             "coupling": one_of(*COUPLINGS),
+            "mesh_check": optional(_number(lambda value: 1.0 < value <= 4.0, "a number above 1, 4 at most")),
             "force_frame": one_of(*FORCE_FRAMES),
             **dict.fromkeys(("range_guard", "correct_uncorrected", "timing"), TRUTH_VALUE),
             "data": _SIMULATED if config.get("markers") is None else _RECORDED,

@@ -275,11 +275,31 @@ def test_parameters_and_what_the_data_cannot_tell():
     found["parameters"]["youngs_modulus"] = -3.0
     assert parameter_rows(found, {}, {})[0].cells[1].text == "0.0"
     assert parameter_rows({**found, "uncertainty": None}, {}, {})[0].cells[1].text == "\N{MINUS SIGN}0.003"
-    said = uncertainty_text("sysid", found).replace("\u00a0", " ")
+    said = uncertainty_text("sysid", found, {}).replace("\u00a0", " ")
     assert said == "SysID: the data tell least about damping by stiffness, to 3.4 % of the range."
-    assert uncertainty_text("sysid", {**found, "uncertainty": None}) == ""
+    assert uncertainty_text("sysid", {**found, "uncertainty": None}, {}) == ""
     found["uncertainty"]["poorest_deviation"] = 1.9
-    assert uncertainty_text("sysid", found).endswith("damping by stiffness, and leave that open over the whole range.")
+    assert uncertainty_text("sysid", found, {}).endswith(
+        "damping by stiffness, and leave that open over the whole range: a prior would settle it."
+    )
+
+
+@pytest.mark.parametrize(("deviation", "told"), [(2.5e3, True), (9.9e3, False)])
+def test_what_the_data_add_nothing_to_is_said_to_be_its_prior(deviation, told):
+    found = {
+        "parameters": {"youngs_modulus": 251.3e3},
+        "at_bounds": [],
+        "uncertainty": {
+            "deviation": {"youngs_modulus": deviation},
+            "correlation": [[1.0]],
+            "poorest": {"youngs_modulus": 1.0},
+            "poorest_deviation": 0.01,
+        },
+    }
+    ranges = {"youngs_modulus": {"prior": {"mean": 250e3, "deviation": 10e3}}}
+    said = uncertainty_text("sysid", found, ranges).replace("\u00a0", " ")
+    added = " They tell next to nothing of Young's modulus: it stays where its prior has it, at 250 ± 10 kPa."
+    assert said.endswith(added) is not told
 
 
 def test_rows_of_markers_that_were_never_seen():

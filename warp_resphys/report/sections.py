@@ -44,7 +44,11 @@ _PARAMETERS: Final[Mapping[str, tuple[str, str, float]]] = {
     "gravity_tilt_2": ("Second tilt of gravity", "°", 180.0 / np.pi),
 }
 _WHOLE: Final = 99.5  # [%] of a parameter's range.
+_OPEN: Final = "and leave that open over the whole range: a prior would settle it"
 _TIED: Final = 0.9  # From this correlation on, two parameters are named as not told apart.
+_NOTHING_NEW: Final = (
+    0.8  # From this share of the deviation of its prior on, the data tell next to nothing about a parameter.
+)
 
 
 def _parameter(name: str) -> tuple[str, str, float]:
@@ -151,7 +155,8 @@ def identification_section(data: RunReport, canvas: Canvas) -> Part | None:
     blocks: list[Any] = [
         Table(MODELS[name][0], columns, parameter_rows(each, data.start, data.truth)) for name, each in found.items()
     ]
-    uncertain = [said for name, each in found.items() if (said := uncertainty_text(name, each))]
+    ranges = (data.settings.get("identify") or {}).get("parameters", {})
+    uncertain = [said for name, each in found.items() if (said := uncertainty_text(name, each, ranges))]
     notes = []
     if uncertain:
         notes.append(
@@ -263,8 +268,14 @@ def placement_text(name: str, placed: Mapping[str, Any]) -> str:
     return said.replace(" mm", f"{NO_BREAK_SPACE}mm")
 
 
-def uncertainty_text(name: str, found: Mapping[str, Any]) -> str:
-    """Say which parameters the data of a model's identification cannot tell apart; empty where that is not known."""
+def uncertainty_text(name: str, found: Mapping[str, Any], ranges: Mapping[str, Any]) -> str:
+    """Say which parameters the data of a model's identification cannot tell, or tell apart; empty if that is not known.
+
+    Args:
+        name: of the model.
+        found: its identification.
+        ranges: of the parameters, with what was known of them before.
+    """
     known = found.get("uncertainty")
     if not known:
         return ""
@@ -274,7 +285,7 @@ def uncertainty_text(name: str, found: Mapping[str, Any]) -> str:
     along = [words[p] for p, weight in known["poorest"].items() if abs(weight) > 0.4 * largest]
     said = f"{MODELS[name][0]}: the data tell least about {' together with '.join(along)}, "
     share = 100.0 * known["poorest_deviation"]
-    said += f"to {share:.2g} % of the range" if share < _WHOLE else "and leave that open over the whole range"
+    said += f"to {share:.2g} % of the range" if share < _WHOLE else _OPEN
     correlation = np.array(known["correlation"], dtype=np.float64)
     tied = [
         f"{words[names[i]]} and {words[names[j]]} ({correlation[i, j]:+.2f})".replace("-", MINUS)
@@ -283,6 +294,13 @@ def uncertainty_text(name: str, found: Mapping[str, Any]) -> str:
         if abs(correlation[i, j]) > _TIED
     ]
     said += f"; they cannot tell apart {', '.join(tied)}, by their correlation." if tied else "."
+    for parameter, deviation in known["deviation"].items():
+        prior = (ranges.get(parameter) or {}).get("prior")
+        if prior is not None and deviation > _NOTHING_NEW * prior["deviation"]:
+            unit, factor = _parameter(parameter)[1:]
+            expected, spread = _digits(prior["mean"], factor), _digits(prior["deviation"], factor)
+            where = f"{expected} ± {spread} {unit}".rstrip()
+            said += f" They tell next to nothing of {words[parameter]}: it stays where its prior has it, at {where}."
     return said.replace(" %", f"{NO_BREAK_SPACE}%")
 
 

@@ -19,7 +19,8 @@ from omegaconf import OmegaConf
 from warp_resphys import cli
 from warp_resphys.io.errors import InputError
 from warp_resphys.report.page import error_parts, number_text
-from warp_resphys.studies.reproduction import Run, _Pace, execute, plan
+from warp_resphys.studies.reproduction import plan
+from warp_resphys.studies.runs import Run, _Pace, execute
 
 TINY = [
     'overrides=["mesh.divisions=[4,2,2]","data.steps=8","trainer.epochs=4","trainer.rollout_every=2"]',

@@ -178,7 +178,7 @@ def reduction_text(
 
 def _paired(metrics: Mapping[str, Any]) -> Gain | None:
     """The gain of ResPhys over SysID on the held-out trials of a split or of folds."""
-    rows = _held_out(metrics)
+    rows = held_out(metrics)
     pairs = [(row.get("sysid"), row.get("resphys")) for row in rows]
     known = [(before, after) for before, after in pairs if before and after is not None]
     if not known or len(known) < len(rows):
@@ -186,7 +186,7 @@ def _paired(metrics: Mapping[str, Any]) -> Gain | None:
     return paired_gain([before for before, _ in known], [after for _, after in known])
 
 
-def _held_out(metrics: Mapping[str, Any]) -> list[Mapping[str, float | None]]:
+def held_out(metrics: Mapping[str, Any]) -> list[Mapping[str, float | None]]:
     """The errors of all models on each held-out trial [mm]."""
     folds = list(metrics.get("folds", {}).values()) or [metrics]
     return [row["errors_mm"] for fold in folds for row in fold.get("per_trajectory", ())]
@@ -227,7 +227,7 @@ def scale_text(errors: Mapping[str, Mapping[str, Any]]) -> str:
 def judgement(metrics: Mapping[str, Any], settings: Mapping[str, Any]) -> list[str]:
     """Sentences on a run, by what metrics.json holds of a split or of folds, and its configuration."""
     folds = list(metrics.get("folds", {}).values()) or [metrics]
-    rows = _held_out(metrics)
+    rows = held_out(metrics)
     errors = {model: [row.get(model) for row in rows] for model in (rows[0] if rows else ())}
     return gains(errors, epochs_kept(metrics)) + advice([_identified(fold, settings) for fold in folds])
 

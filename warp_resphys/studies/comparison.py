@@ -2,16 +2,12 @@
 
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from ..experiment.build import build_mesh
-from ..experiment.files import METRICS
 from ..experiment.report import read_trials
 from ..experiment.trials import variation_of
-from ..io.files import read_json
 from ..learning import metrics as paper
 from ..mesh.mesh import select_vertices, surface_vertices
 from ..report import ablation_page, figures, motion_figures
@@ -32,6 +28,7 @@ from ..report.page import (
     number_text,
     published_parts,
 )
+from .runs import Run
 
 _NONE = Cell(NONE)
 _SPLITS = {"train": "training", "validation": "validation", "test": "testing"}
@@ -46,33 +43,6 @@ _TIMED = {
     "resphys": "Residual physics simulation",
     "inference": "of it, the network alone",
 }
-
-
-@dataclass(frozen=True)
-class Run:
-    """One run of the ordinary command."""
-
-    experiment: str
-    variant: str
-    arguments: tuple[str, ...]  # of the command
-    folder: Path  # that it writes, the one that the ordinary command takes for the same arguments
-    minutes: float  # that it may take
-    failure: str | None = None  # the sentence that it failed with
-
-    @property
-    def name(self) -> str:
-        """As in the key ``only``."""
-        return f"{self.experiment}/{self.variant}"
-
-    @property
-    def metrics(self) -> dict[str, Any]:
-        """What `metrics.json` holds."""
-        return dict(read_json(self.folder / METRICS))
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """The whole configuration of the run."""
-        return dict(read_json(self.folder / "stages" / "report.json")["settings"]["config"])
 
 
 Runs = Mapping[str, Run]  # by variant

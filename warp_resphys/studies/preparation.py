@@ -11,7 +11,7 @@ from ..io.errors import InputError
 from . import mesh_inspection as meshes
 from .recording_quality import inspect_recording
 
-_CONVERTERS = {"arm": convert_arm, "beam": convert_beam, "segment": convert_segment}
+CONVERTERS = {"arm": convert_arm, "beam": convert_beam, "segment": convert_segment}
 
 
 def inspect(config: Mapping[str, Any], folder: Path) -> None:
@@ -45,9 +45,9 @@ def convert(config: Mapping[str, Any], folder: Path) -> None:
         InputError: an unknown layout.
         DataFileError: a file cannot be read or written.
     """
-    check("layout", config["layout"], one_of(*_CONVERTERS))
+    check("layout", config["layout"], one_of(*CONVERTERS))
     folder = Path(config["output"])
-    index = _CONVERTERS[config["layout"]](config["source"], folder)
+    index = CONVERTERS[config["layout"]](config["source"], folder)
     residuals = [entry["registration_residual_mm"] for entry in index if entry["registration_residual_mm"] is not None]
     worst = f"; rest shapes at most {max(residuals):.1f} mm off the nominal markers" if residuals else ""
     print(f"Written: {len(index)} recordings and index.json to {folder}{worst}")

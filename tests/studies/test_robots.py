@@ -1,0 +1,115 @@
+"""The page of robots: whose recordings are there, that they are the right ones, and what it says of each."""
+
+import contextlib
+import json
+
+import pytest
+from hydra import compose, initialize_config_module
+from main_job import end_of
+from omegaconf import OmegaConf
+
+from warp_resphys import cli
+from warp_resphys.report.page import error_parts
+
+SMALL = [
+    *("mesh.layers=3", "mesh.nodes=20", "laboratory.mesh.layers=4", "laboratory.mesh.nodes=20"),
+    *("data.steps=12", "data.sequences=5", "data.train=2", "data.validation=1", "data.test=2"),
+    *("data.horizons=[0.06,0.12]", "data.rest_seconds=0.01", "data.cutoff=20.0", "laboratory.sequences.rest=0.01"),
+    *("laboratory.sequences.correlation_time=0.03", "identify.trials=1", "identify.seconds=0.1"),
+    *("identify.max_evaluations=2", "identify.grid=null", "mesh_check=1.4", "parallel.processes=1"),
+    *("network.position_modes=2", "network.velocity_modes=0", "network.force_modes=2", "network.width=8"),
+    *("trainer.epochs=4", "trainer.rollout_every=2", "trainer.batch_size=16"),
+]
+# In place of the arm, whose recordings are simulated too, a rod that takes seconds.
+ARGUMENTS = [
+    "robots.sopra.experiment=tendon_rod",
+    f"robots.sopra.overrides={json.dumps(SMALL, separators=(',', ':'))}",
+    "hydra/job_logging=none",
+    "hydra/hydra_logging=none",
+]
+
+
+def run(*arguments):
+    """Exit code of the command in this process, and what it wrote to stderr."""
+    return end_of(cli.main, "warp-resphys", "robots", *arguments)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    root = tmp_path_factory.mktemp("robots")
+    with contextlib.chdir(root):
+        (root / "shelf").mkdir()
+        code, err = run(*ARGUMENTS, "only=[sopra,tentacle]", "data=shelf", "results=docs")
+    assert (code, err[-500:] if code else "") == (0, "")
+    return root
+
+
+def test_a_robot_has_a_row_a_picture_and_what_was_tested(finished):
+    (folder,) = (finished / "runs/tendon_rod").iterdir()
+    metrics = json.loads((folder / "metrics.json").read_text())
+    for text in ((finished / "docs/robots.md").read_text(), (finished / "outputs/robots/results.md").read_text()):
+        (row,) = (line for line in text.splitlines() if line.startswith("| SoPrA |"))
+        cells = [cell.strip() for cell in row.split("|")[1:-1]]
+        means = [error_parts(metrics["errors_mm"][m])[0] for m in ("simulation", "sysid", "simfree", "resphys")]
+        assert [cell.split()[0] for cell in cells[1:5]] == means
+        share = 1.0 - metrics["errors_mm"]["sysid"]["mean"] / metrics["errors_mm"]["simulation"]["mean"]
+        assert cells[5].replace("\N{MINUS SIGN}", "-").startswith(f"{100.0 * share:.0f} % (")
+        assert "Tested on 2 trials, kept back: " in text
+        assert "mm elsewhere" in text
+        assert "Tentacle: no folder tentacle" in text
+    assert (finished / "docs/robots/sopra.png").is_file()
+    page = (finished / "outputs/robots/robots.html").read_text()
+    assert "pressures of six chambers" in page
+    assert str(finished) not in page
+    assert "data=FOLDER" in page
+
+
+def configured():
+    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
+        return OmegaConf.to_container(compose("robots"), resolve=True)["robots"]
+
+
+def test_every_robot_is_an_experiment_whose_files_are_known():
+    for robot in configured().values():
+        with initialize_config_module("warp_resphys.conf", version_base="1.3"):
+            found = compose("config", [f"experiment={robot['experiment']}", *robot["overrides"]])
+        assert found.name == robot["experiment"]
+        assert (robot["recordings"] is None) == ("files" not in robot)
+        assert all(len(digest) == 64 for digest in robot.get("files", {}).values())
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (None, "is missing: fetch it again, or leave tentacle out"),
+        (b"0,1", "is another file than the one that tentacle was measured with"),
+    ],
+)
+def test_recordings_that_are_not_those_of_the_page_are_refused(content, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "shelf/tentacle"
+    folder.mkdir(parents=True)
+    if content is not None:
+        (folder / "m1_u01.csv").write_bytes(content)
+    for each in configured()["tentacle"]["files"] if content is not None else ():
+        (folder / each).write_bytes(content)
+    code, err = run("data=shelf", "only=[tentacle]", *ARGUMENTS[2:])
+    assert code == 2
+    assert said in err
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["only=[starfish]"], "only names 'starfish', which is no robot: there are sopra"),
+        (["only=[]"], "name at least one robot"),
+        (["only=[tentacle]"], "data is None, where there is none of tentacle"),
+        (["only=[tentacle]", "data=nowhere"], "data is nowhere, where there is none of tentacle"),
+    ],
+)
+def test_what_cannot_be_run_is_refused(arguments, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, err = run(*arguments, *ARGUMENTS[2:])
+    assert code == 2
+    assert said in err

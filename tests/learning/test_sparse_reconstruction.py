@@ -192,8 +192,9 @@ class TestGaussNewton:
 
 
 class TestLevenbergMarquardt:
+    @pytest.mark.parametrize("modes", [None, 4])
     @pytest.mark.parametrize("integrator", INTEGRATORS)
-    def test_gauss_newton_finds_the_same_minimum(self, integrator):
+    def test_gauss_newton_finds_the_same_minimum(self, integrator, modes):
         """With stems that turn, and with a marker that one of the environments did not see."""
         observed, start = observation(3, (0.1, 0.5), integrator=integrator)
         stems = [[0.06, 0.012, 0.045], [0.075, 0.02, 0.01]]
@@ -203,7 +204,7 @@ class TestLevenbergMarquardt:
             seen = markers(target)
             seen[1, 0] = torch.nan
             damped, plain = (
-                solver(sim, markers, 1e-6, **TIGHT).step(state, seen, first_guess=first)
+                solver(sim, markers, 1e-6, **TIGHT, modes=modes).step(state, seen, first_guess=first)
                 for solver, state in zip((levenberg_marquardt, gauss_newton), states, strict=True)
             )
             scale = float(plain.force.abs().max())
@@ -225,6 +226,16 @@ class TestLevenbergMarquardt:
         np.testing.assert_allclose(new.q.detach(), found.state.q, rtol=0, atol=1e-9)
         free = [i for i in range(12) if i not in BODY.fixed_vertices]
         assert float(gradient[:, free].abs().max()) < 1e-4 * 2e-5 * float(found.force.abs().max())
+
+    def test_full_steps_that_do_not_settle_are_followed_by_damped_ones(self, caplog):
+        _, start = observation(1, (0.1, 0.1))
+        sim, markers = simulator(), markers_at([6, 11], [6, 11])
+        target = markers(start.q) + torch.tensor([[[-0.03, 0.0, 0.05]], [[0.0, 0.0, 1e-3]]], dtype=torch.float64)
+        damped = levenberg_marquardt(sim, markers, 1e-5, 1e-10, 200).step(start, target)
+        with caplog.at_level("INFO"):
+            found = gauss_newton(sim, markers, 1e-5, 1e-10, 200).step(start, target)
+        assert "damped ones follow" in caplog.text
+        np.testing.assert_array_equal(found.force, damped.force)
 
     def test_a_first_guess_that_fails_is_left(self, monkeypatch):
         observed, start = observation()

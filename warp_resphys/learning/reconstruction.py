@@ -11,6 +11,7 @@ sees stays at zero.
 """
 
 import copy
+import logging
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, Self
@@ -29,6 +30,8 @@ from ..io.errors import ConvergenceError, InputError
 from ..linalg.least_squares import minimise
 from ..linalg.threads import threads_for
 from .reconstruction_problems import FullStateProblem, MarkerForceProblem, MarkerPositionProblem, Step, StepProblem
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -104,6 +107,8 @@ class Reconstructor(ABC):
 class LeastSquares(Reconstructor):
     """A method of `linalg.least_squares`; its ``tolerance`` is the last change of any position [m].
 
+    Where full steps do not settle, as in a pose far from where it would be without the force, damped ones are taken.
+
     Args:
         problem: what it minimises.
         modes: columns of B; every force on the free vertices where left out.
@@ -128,6 +133,10 @@ class LeastSquares(Reconstructor):
         with threads_for(state.q.numel()), torch.no_grad():
             problem = self._problem(step)
             found = minimise(problem, problem.start(first_guess), self.tolerance, self.max_iterations)
+            if not found.settled and self._problem is MarkerPositionProblem:
+                log.info("full steps moved by %.1e m after %d: damped ones follow", found.moved, found.iterations)
+                problem = MarkerForceProblem(step)
+                found = minimise(problem, problem.start(None), self.tolerance, self.max_iterations)
             x, force = (each.to(self.simulator.dtype) for each in problem.reached(found.point))
             if not found.settled:
                 raise ConvergenceError(
@@ -222,9 +231,7 @@ def make_reconstructor(
         raise InputError(f"reconstruction.method is {method!r}: choose one of {', '.join(problems)}, lbfgsb.")
     if modes is not None and markers is None:
         raise InputError("reconstruction.modes is for bodies that are seen through markers: leave it out.")
-    if modes is not None and method != "gauss_newton":
-        raise InputError(
-            f"{modes} modes are asked for, but reconstruction.method={method} has none: take gauss_newton."
-        )
+    if modes is not None and method == "lbfgsb":
+        raise InputError(f"{modes} modes are asked for, but reconstruction.method=lbfgsb has none: take gauss_newton.")
     settings = (simulator, markers, regularisation, tolerance, max_iterations)
     return LBFGSB(*settings) if method == "lbfgsb" else LeastSquares(problems[method], modes, *settings)

@@ -186,7 +186,7 @@ class MarkerForceProblem(StepProblem):
 
     Each trial force is followed by a whole step of the simulator, with its line search, so that an iterate is always a
     state that it reaches. With J = C' H^-1 there, the next force minimises
-    |r - J (f - f0)|^2 + lambda |f|^2 + d lambda |f - f0|^2.
+    |r - J (f - f0)|^2 + lambda |f|^2 + d lambda |f - f0|^2, over forces B a where there are such columns.
     """
 
     method = "sparse Levenberg-Marquardt"
@@ -198,6 +198,9 @@ class MarkerForceProblem(StepProblem):
     @override
     def start(self, first_guess: torch.Tensor | None) -> Point:
         """A first guess that the simulator does not follow is left."""
+        if first_guess is not None and self._task.basis is not None:
+            basis = self._task.basis
+            first_guess = (basis @ (basis.mT @ first_guess.flatten(1)[..., None])).view_as(first_guess)
         if first_guess is not None and bool(torch.isfinite((found := self.evaluate(first_guess)).value).all()):
             return found
         return self.evaluate(torch.zeros_like(self._task.state.q))
@@ -218,17 +221,20 @@ class MarkerForceProblem(StepProblem):
 
     @override
     def linearise(self, point: Point) -> Move:
-        force, (end,) = point.x.flatten(1)[..., None], point.kept
+        force, (end,), basis = point.x.flatten(1)[..., None], point.kept, self._task.basis
         step = self._task.linearise()
         step.factorise(self.reached(point)[0])
         # q+ moves 1 / end times as far as the solution.
         jacobian = step.solve(self._task.transposed_jacobian(end)).mT / step.stage.end
         missing = self._task.missing(end)
+        if basis is not None:
+            force, jacobian = basis.mT @ force, jacobian @ basis
 
         def damped_step(damping: torch.Tensor) -> torch.Tensor:
             own = (1.0 + damping)[:, None, None]
             centre = force - force / own
             change = ridge(jacobian, missing + jacobian @ (force / own), self._task.weight * own)
-            return (centre + change).view_as(point.x)
+            found = centre + change
+            return (found if basis is None else basis @ found).view_as(point.x)
 
         return damped_step

@@ -196,8 +196,8 @@ def _robot(robot: Mapping[str, Any], run: Run, canvas: Canvas) -> Part:
         return Part(robot["title"], [*source, Text(f"It failed: {run.failure}"), command])
     metrics = run.metrics
     names = list(metrics.get("folds", {})) or [row["name"] for row in metrics["per_trajectory"]]
-    how = "each of them kept back once" if "folds" in metrics else "kept back"
-    said = [f"Tested on {len(names)} trials, {how}: {', '.join(names)}."]
+    how = "each of them kept back once" if "folds" in metrics and len(names) > 1 else "kept back"
+    said = [f"Tested on {len(names)} trial{'s' if len(names) > 1 else ''}, {how}: {', '.join(names)}."]
     if "mesh_check" in metrics and "moved_mm" in metrics["mesh_check"]:
         moved = number_text(metrics["mesh_check"]["moved_mm"])
         said.append(f"On a finer mesh the markers of the identified simulator are {moved} mm elsewhere.")

@@ -201,7 +201,7 @@ def test_workers_end_with_their_parent_and_what_they_finished_is_kept(finished, 
 def test_an_error_in_a_worker_is_one_sentence(folder):
     code, err = run(*TINY, "ablation.processes=2", "reconstruction.max_iterations=1")
     assert code == 2
-    assert err.splitlines()[-1].startswith("error: sparse Gauss-Newton reconstruction moved by ")
+    assert err.splitlines()[-1].startswith("error: sparse Levenberg-Marquardt reconstruction moved by ")
     assert "Traceback" not in err
 
 

@@ -11,7 +11,7 @@ from .fibres import tension
 from .modules import decorators
 from .points import line_at, write_axial
 
-ZERO, ONE = wp.float64(0.0), wp.float64(1.0)
+ZERO = wp.float64(0.0)
 
 kernel, function = decorators("tendons")
 

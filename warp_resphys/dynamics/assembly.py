@@ -110,7 +110,10 @@ class HessianAssembly:
         Args:
             idle: (B,) environments whose values nobody needs; they may be anything.
         """
-        self._idle.zero_() if idle is None else self._idle.copy_(idle)
+        if idle is None:
+            self._idle.zero_()
+        else:
+            self._idle.copy_(idle)
         if self._overwritten:
             self._values.zero_()
         self._potential.launch(*self._commands)

@@ -176,7 +176,7 @@ def collect_metrics(folder: Path, config: Mapping[str, Any], stages: Sequence[st
     identified, truth = (read_if_there(each) for each in (folder / IDENTIFICATION, common_folder(folder) / TRUTH))
     more = {
         "reconstruction": read_if_there(folder / RECONSTRUCTION),
-        "mesh_check": read_if_there(folder / MESH_CHECK),
+        "mesh_check": {} if config["mesh_check"] is None else read_if_there(folder / MESH_CHECK),
         "seconds_per_test_trajectory": read_if_there(folder / TIMES).get("seconds", {}),
         **({"noise_mm": truth["noise_mm"]} if "noise_mm" in truth else {}),
     }

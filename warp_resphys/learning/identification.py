@@ -219,6 +219,15 @@ class Identifier:
             found.append(replay(start if known is None else start.near(known.at(unit.detach())), values))
         return found
 
+    def _settle(self, unit: torch.Tensor) -> None:
+        """Finds the equilibria for (1, P) parameters alone, near which are those of others."""
+        values = {name: b.from_unit(unit[:, i]) for i, (name, b) in enumerate(self.bounds.items())}
+        for replay, start in self._replays:
+            if start.at_rest:
+                constants, _, resting = replay.setting(values)
+                replay.begin(start, constants, resting)
+        self._remember(unit)
+
     def _remember(self, unit: torch.Tensor) -> None:
         """Keeps the equilibria of the last simulation.
 
@@ -476,9 +485,8 @@ class Identifier:
         points = self.simulator.tensor(np.concatenate(wanted))
         try:
             with torch.no_grad():
-                if not self._near and any(start.at_rest for _, start in self._replays):
-                    self._simulated(points[:1])
-                    self._remember(points[:1])
+                if derivatives and not self._near:
+                    self._settle(points[:1])
                 residuals, prior = self._residuals(points)
         except ConvergenceError:
             return None

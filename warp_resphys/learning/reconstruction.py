@@ -13,6 +13,7 @@ sees stays at zero.
 import copy
 import logging
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -107,17 +108,17 @@ class Reconstructor(ABC):
 class LeastSquares(Reconstructor):
     """A method of `linalg.least_squares`; its ``tolerance`` is the last change of any position [m].
 
-    Where full steps do not settle, as in a pose far from where it would be without the force, damped ones are taken.
+    Where one way does not settle, as full steps in a pose far from where it would be without the force, the next does.
 
     Args:
-        problem: what it minimises.
+        problems: ways to the same minimum, the quickest first.
         modes: columns of B; every force on the free vertices where left out.
         settings: see `Reconstructor`.
     """
 
-    def __init__(self, problem: type[StepProblem], modes: int | None, *settings: Any) -> None:
+    def __init__(self, problems: Sequence[type[StepProblem]], modes: int | None, *settings: Any) -> None:
         super().__init__(*settings)
-        self._problem = problem
+        self._problems = tuple(problems)
         self._basis = None if modes is None else vibration_modes(self.simulator, modes)
 
     @override
@@ -131,12 +132,12 @@ class LeastSquares(Reconstructor):
         acting, constants = inputs or Inputs(), self._constants
         step = Step(self.simulator, constants, state, acting, observed, self.regularisation, self.markers, self._basis)
         with threads_for(state.q.numel()), torch.no_grad():
-            problem = self._problem(step)
-            found = minimise(problem, problem.start(first_guess), self.tolerance, self.max_iterations)
-            if not found.settled and self._problem is MarkerPositionProblem:
+            for number, kind in enumerate(self._problems, 1):
+                problem = kind(step)
+                found = minimise(problem, problem.start(first_guess), self.tolerance, self.max_iterations)
+                if found.settled or number == len(self._problems):
+                    break
                 log.info("full steps moved by %.1e m after %d: damped ones follow", found.moved, found.iterations)
-                problem = MarkerForceProblem(step)
-                found = minimise(problem, problem.start(None), self.tolerance, self.max_iterations)
             x, force = (each.to(self.simulator.dtype) for each in problem.reached(found.point))
             if not found.settled:
                 raise ConvergenceError(
@@ -224,9 +225,10 @@ def make_reconstructor(
         InputError: an unknown method, modes for a method without them, a number out of range, or a marker on a vertex
             that the body does not have.
     """
-    problems: dict[str, type[StepProblem]] = {"gauss_newton": FullStateProblem}
+    problems: dict[str, tuple[type[StepProblem], ...]] = {"gauss_newton": (FullStateProblem,)}
     if markers is not None:
-        problems = {"gauss_newton": MarkerPositionProblem, "levenberg_marquardt": MarkerForceProblem}
+        damped = (MarkerForceProblem,)
+        problems = {"gauss_newton": (MarkerPositionProblem, *damped), "levenberg_marquardt": damped}
     if method not in (*problems, "lbfgsb"):
         raise InputError(f"reconstruction.method is {method!r}: choose one of {', '.join(problems)}, lbfgsb.")
     if modes is not None and markers is None:

@@ -5,14 +5,12 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from ..experiment.schema import check, optional
 from ..io.errors import InputError
 from ..io.labels import run_label
 from ..io.stages import run_lock
 from ..report.page import Canvas, figures_beside
-from .command import WORDS
 from .comparison import compare
-from .runs import Results, Run, fail_for, made, run_all
+from .runs import Results, Run, asked_for, fail_for, made, run_all
 
 PAGE = "reproduction.html"
 
@@ -43,24 +41,14 @@ def plan(config: Mapping[str, Any]) -> list[Run]:
     Raises:
         InputError: a value of the wrong kind, or a name that does not exist.
     """
-    check("overrides", config["overrides"], WORDS)
-    check("only", config["only"], optional(WORDS))
     runs = [
         _run(config, experiment, variant)
         for experiment, group in config["experiments"].items()
         for variant in group["variants"]
     ]
-    wanted = config["only"]
-    if wanted is None:
-        return runs
-    known = {run.experiment for run in runs} | {run.name for run in runs}
-    if foreign := [name for name in wanted if name not in known]:
-        raise InputError(
-            f"only names {foreign[0]!r}, which is no experiment or run: there are {', '.join(sorted(known))}."
-        )
-    if not wanted:
-        raise InputError("only is []: name at least one experiment or run, or leave it null for all.")
-    return [run for run in runs if {run.experiment, run.name} & {*wanted}]
+    known = sorted({run.experiment for run in runs} | {run.name for run in runs})
+    wanted = asked_for(config, known, "experiment or run")
+    return [run for run in runs if {run.experiment, run.name} & wanted]
 
 
 def _run(config: Mapping[str, Any], experiment: str, name: str) -> Run:

@@ -7,7 +7,6 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from ..experiment.schema import check, optional
 from ..io.errors import InputError
 from ..io.files import digest
 from ..io.labels import run_label
@@ -17,7 +16,6 @@ from ..report.page import (
     MINUS,
     NONE,
     Block,
-    Canvas,
     Cell,
     Drawn,
     Items,
@@ -32,9 +30,8 @@ from ..report.page import (
     number_text,
 )
 from ..report.verdict import held_out
-from .command import WORDS
 from .preparation import CONVERTERS
-from .runs import Results, Run, fail_for, made, run_all
+from .runs import Results, Run, asked_for, fail_for, made, run_all
 
 PAGE = "robots.html"
 _MODELS = ("simulation", "sysid", "simfree", "resphys")
@@ -50,7 +47,8 @@ def robots(config: Mapping[str, Any], folder: Path) -> None:
         ResphysError: a run failed; the others were run, and the page is written.
         RunsInterrupted: Ctrl-C.
     """
-    chosen = _chosen(config)
+    wanted = asked_for(config, list(config["robots"]), "robot")
+    chosen = [name for name in config["robots"] if name in wanted]
     absent = [name for name in chosen if _absent(config, name)]
     if len(absent) == len(chosen):
         where = ", ".join(str(config["robots"][name]["recordings"]) for name in absent)
@@ -63,7 +61,7 @@ def robots(config: Mapping[str, Any], folder: Path) -> None:
         page = folder / PAGE
         with figures_beside(page) as pictures:
             parts = [_summary(config, results)]
-            parts += [_robot(config["robots"][run.experiment], run, Canvas(pictures)) for run in results]
+            parts += [_robot(config["robots"][run.experiment], run, pictures) for run in results]
         if absent:
             parts.append(_not_run(config, absent))
         page_of = Results(
@@ -74,24 +72,6 @@ def robots(config: Mapping[str, Any], folder: Path) -> None:
         )
         page_of.write(page, config["results"], "robots")
     fail_for(results)
-
-
-def _chosen(config: Mapping[str, Any]) -> list[str]:
-    """The names of the robots that are asked for.
-
-    Raises:
-        InputError: a value of the wrong kind, or a name that does not exist.
-    """
-    check("overrides", config["overrides"], WORDS)
-    check("only", config["only"], optional(WORDS))
-    known, wanted = list(config["robots"]), config["only"]
-    if wanted is None:
-        return known
-    if foreign := [name for name in wanted if name not in known]:
-        raise InputError(f"only names {foreign[0]!r}, which is no robot: there are {', '.join(known)}.")
-    if not wanted:
-        raise InputError("only is []: name at least one robot, or leave it null for all.")
-    return [name for name in known if name in wanted]
 
 
 def _absent(config: Mapping[str, Any], name: str) -> bool:
@@ -187,7 +167,7 @@ def _seconds(metrics: Mapping[str, Any]) -> float:
     return float(sum(sum(each["seconds"].values()) for each in every))
 
 
-def _robot(robot: Mapping[str, Any], run: Run, canvas: Canvas) -> Part:
+def _robot(robot: Mapping[str, Any], run: Run, pictures: Path) -> Part:
     """A robot: its picture, where its recordings come from, what was tested, and what was published."""
     source: list[Block] = [Text(f"{robot['actuation'][:1].upper()}{robot['actuation'][1:]}. {robot['source']}")]
     shown = ["data.folder=FOLDER" if each.startswith("data.folder=") else each for each in run.arguments]
@@ -201,18 +181,18 @@ def _robot(robot: Mapping[str, Any], run: Run, canvas: Canvas) -> Part:
     if "mesh_check" in metrics and "moved_mm" in metrics["mesh_check"]:
         moved = number_text(metrics["mesh_check"]["moved_mm"])
         said.append(f"On a finer mesh the markers of the identified simulator are {moved} mm elsewhere.")
-    blocks = [*_picture(robot, run, canvas), *source, Text(" ".join(said))]
+    blocks = [*_picture(robot, run, pictures), *source, Text(" ".join(said))]
     if robot["published"]:
         blocks += [Text("Published", heading=True), Items(robot["published"])]
     return Part(robot["title"], [*blocks, command])
 
 
-def _picture(robot: Mapping[str, Any], run: Run, canvas: Canvas) -> list[Drawn]:
+def _picture(robot: Mapping[str, Any], run: Run, pictures: Path) -> list[Drawn]:
     """The body as the report of the run has it; none where that lacks it."""
     found = next((path for pattern in _PICTURES for path in sorted(run.folder.glob(pattern))), None)
     if found is None:
         return []
-    path = Path(shutil.copy(found, canvas.folder / f"{run.experiment}.png"))
+    path = Path(shutil.copy(found, pictures / f"{run.experiment}.png"))
     return [drawn_file(path, f"The body of {robot['title']} and its markers.", "The body as it is simulated.")]
 
 

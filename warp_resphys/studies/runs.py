@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,12 +17,14 @@ from rich.console import Console
 from rich.markup import escape
 
 from ..experiment.files import METRICS
-from ..io.errors import DataFileError, ResphysError
+from ..experiment.schema import check, optional
+from ..io.errors import DataFileError, InputError, ResphysError
 from ..io.files import disk_full_error, is_disk_full, read_json, write_text
 from ..io.machine import commit, hardware
 from ..io.progress import clock
 from ..io.stages import package_versions
 from ..report.page import Cell, Drawn, Items, Part, Row, Table
+from .command import WORDS
 from .page import markdown, write_page
 
 _UP_TO_DATE_SECONDS = 8.0  # for a run that finds nothing to do
@@ -60,6 +62,22 @@ class Run:
     def settings(self) -> dict[str, Any]:
         """The whole configuration of the run."""
         return dict(read_json(self.folder / "stages" / "report.json")["settings"]["config"])
+
+
+def asked_for(config: Mapping[str, Any], known: Sequence[str], kind: str) -> set[str]:
+    """What the key ``only`` names; all that is known where it is null.
+
+    Raises:
+        InputError: a value of the wrong kind, nothing, or a name that does not exist.
+    """
+    check("overrides", config["overrides"], WORDS)
+    check("only", config["only"], optional(WORDS))
+    wanted = known if config["only"] is None else config["only"]
+    if foreign := [name for name in wanted if name not in known]:
+        raise InputError(f"only names {foreign[0]!r}, which is no {kind}: there are {', '.join(known)}.")
+    if not wanted:
+        raise InputError(f"only is []: name at least one {kind}, or leave it null for all.")
+    return set(wanted)
 
 
 @dataclass(frozen=True)

@@ -41,14 +41,11 @@ def plan(config: Mapping[str, Any]) -> list[Run]:
     Raises:
         InputError: a value of the wrong kind, or a name that does not exist.
     """
-    runs = [
-        _run(config, experiment, variant)
-        for experiment, group in config["experiments"].items()
-        for variant in group["variants"]
-    ]
-    known = sorted({run.experiment for run in runs} | {run.name for run in runs})
+    groups = config["experiments"]
+    pairs = [(experiment, variant) for experiment, group in groups.items() for variant in group["variants"]]
+    known = sorted({*groups, *("/".join(pair) for pair in pairs)})
     wanted = asked_for(config, known, "experiment or run")
-    return [run for run in runs if {run.experiment, run.name} & wanted]
+    return [_run(config, *pair) for pair in pairs if {pair[0], "/".join(pair)} & wanted]
 
 
 def _run(config: Mapping[str, Any], experiment: str, name: str) -> Run:

@@ -1,4 +1,4 @@
-"""Fibres through a solid that only pull: stress, tangent and derivatives by what contracts them.
+"""Fibres through a solid: stress, tangent and derivatives by what contracts them.
 
 The first column of F = sum_a x_a g_a^T is the deformed fibre, of the length lambda of one that was one long. It pulls
 with t = sigma + k s'(lambda - 1 + c): a commanded stress, and a spring that tightens where the fibre is longer than the
@@ -78,9 +78,10 @@ def tangent(
     toe: wp.float64,
     points_per_cell: int,
     positions: wp.array2d[wp.vec3d],
+    positive: wp.array[int],  # (B) 1: clamp the eigenvalues at zero
     tangent_out: wp.array3d[wp.mat33d],
 ):
-    """Block (0, 0) is V (t / lambda (1 - u u^T) + k s'' u u^T), which is never indefinite: a fibre only pulls."""
+    """Block (0, 0) is V (t / lambda (1 - u u^T) + k s'' u u^T), which is indefinite only where a fibre pushes."""
     b, p = wp.tid()
     m = muscle[p]
     fibre = line_at(positions, nodes, gradients, b, p, p / points_per_cell)
@@ -90,6 +91,8 @@ def tangent(
         _energy, force, slope = tension(stretch - ONE + contraction[b, m], toe)
         across = volumes[p] * (stress[b, m] + stiffness[b, m] * force) / stretch
         along = volumes[p] * stiffness[b, m] * slope
+        if positive[b] == 1:
+            across = wp.max(across, ZERO)
     write_axial(fibre, across, along, tangent_out[b, p])
 
 

@@ -35,6 +35,7 @@ _MODULES = {
     "Muscles": "energies.muscles",
     "SolverSettings": "dynamics.nonlinear_solver",
     "State": "dynamics.integrator",
+    "Strings": "energies.strings",
     "Trajectory": "dynamics.simulator",
     "Tendons": "energies.tendons",
     "write_mesh": "mesh.readers",

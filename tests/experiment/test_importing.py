@@ -21,7 +21,7 @@ from warp_resphys.data.trials import Trials
 from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.experiment.build import bound_markers, build_body
 from warp_resphys.experiment.checks import check_configuration
-from warp_resphys.experiment.files import DATASET, QUALITY, REGISTRATION, TRUTH, Dataset, attached_mass, read_dataset
+from warp_resphys.experiment.files import DATASET, QUALITY, REGISTRATION, TRUTH, Dataset, payload_inputs, read_dataset
 from warp_resphys.experiment.importing import import_recordings
 from warp_resphys.experiment.pipeline import acquisition_stages
 from warp_resphys.experiment.simulate import laboratory_simulator, make_setup
@@ -63,10 +63,10 @@ def true_markers(config, setup, trials, times):
     """(R, T, M, 3) tracked markers in the frame of the body at times (R, T) since the release, as simulated [m]."""
     simulator = laboratory_simulator(config, setup.gravity)
     read = bound_markers(config["markers"], simulator.body.mesh, setup.tracked, TIPS).to(simulator.rest_positions)
-    masses = attached_mass(simulator.body, config["data"]["payload_at"], np.array([each.payload for each in trials]))
+    masses = payload_inputs(simulator.body, config["data"]["payload_at"], np.array([each.payload for each in trials]))
     held = torch.as_tensor(setup.tracked).expand(len(trials), -1, -1)
     blank = held[:, None].expand(-1, times.shape[1], -1, -1)
-    inputs = Inputs(attached_mass=torch.as_tensor(masses))
+    inputs = Inputs(attached_mass=torch.as_tensor(masses["attached_mass"]))
     motions = Trials(tuple(each.name for each in trials), torch.as_tensor(times).clamp_min(0.0), blank, held, inputs)
     start = Start(simulator.rest_state(len(trials)), torch.zeros(len(trials), dtype=torch.float64))
     with torch.no_grad():

@@ -8,6 +8,7 @@ import json
 import re
 import shutil
 import signal
+from functools import partial
 
 import numpy as np
 import pytest
@@ -16,9 +17,10 @@ from main_job import run
 from omegaconf import OmegaConf
 
 from warp_resphys.experiment import identify, report
+from warp_resphys.experiment.folds import Fold, run_folds
 from warp_resphys.experiment.pipeline import learning_stages
 from warp_resphys.experiment.scene import LEARNED, MODELS
-from warp_resphys.experiment.trials import split_of
+from warp_resphys.experiment.trials import folds_of, split_of
 from warp_resphys.io.files import read_checkpoint, read_hdf5
 from warp_resphys.io.stages import StageInterrupted, run_stages
 from warp_resphys.learning.identification import Identifier
@@ -59,6 +61,7 @@ FOLDS = [
     "~data.trials.load101",
     "identify.max_evaluations=3",
     "in_the_loop.epochs=1",
+    "parallel.processes=1",  # in this process, where no report is drawn
 ]
 STAGES = [
     "identify",
@@ -253,6 +256,20 @@ def test_folds(finished, tmp_path, monkeypatch, pages):
     assert settings["folds"] == {trial: fold["errors_mm"] for trial, fold in found["folds"].items()}
     assert {f"fold_{trial}" for trial in found["folds"]} <= set(pages)
     assert all((tmp_path / "run" / f"fold_{trial}" / "report.html").is_file() for trial in found["folds"])
+    at_once = tmp_path / "at_once"
+    at_once.mkdir()
+    shutil.copy(tmp_path / "run" / "dataset.h5", at_once)
+    splits = folds_of(configuration(*(each for each in FOLDS if not each.startswith("hydra"))))
+    folds = {name: Fold(name, at_once / name, partial(_unreported, split)) for name, split in splits.items()}
+    run_folds(folds, 2)
+    for trial, fold in found["folds"].items():
+        assert read(at_once / trial / "errors.json")["errors_mm"] == fold["errors_mm"]
+
+
+def _unreported(split, processes):
+    """The stages of a fold but its report."""
+    config = configuration(*(each for each in FOLDS if not each.startswith("hydra")))
+    return learning_stages(config, split, "..", "imported", processes)[:-1]
 
 
 def test_an_interrupted_identification_goes_on_with_the_next_start(finished, tmp_path, monkeypatch):

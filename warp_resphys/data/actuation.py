@@ -141,6 +141,32 @@ def lagged(commands: torch.Tensor, rise: torch.Tensor, step: float) -> torch.Ten
     return torch.stack(series)
 
 
+def delayed(commands: torch.Tensor, delay: torch.Tensor, step: float) -> torch.Tensor:
+    """(K, B, C) inputs that come later than the commanded ones; none before these.
+
+    A step during which one command follows another has the mean of both over its time, differentiable in the delay but
+    where that is a whole number of steps.
+
+    Args:
+        commands: (K, B, C) during each step, or (B, C) throughout, which is taken as it is.
+        delay: (B,) [s], zero or more, differentiable.
+        step: h [s].
+    """
+    if commands.ndim == 2:
+        return commands
+    late = delay / step
+    whole = late.detach().floor().clamp_min(0.0)
+    share, number = (late - whole)[:, None], whole.long()
+    steps, environments = torch.arange(len(commands), device=commands.device), torch.arange(len(delay))
+
+    def before(count: torch.Tensor) -> torch.Tensor:
+        at = steps[:, None] - count
+        found = commands[at.clamp_min(0), environments.to(commands.device)]
+        return torch.where((at >= 0)[..., None], found, 0.0)
+
+    return (1.0 - share) * before(number) + share * before(number + 1)
+
+
 def remembered(inputs: torch.Tensor, time_constants: Sequence[float], step: float) -> torch.Tensor:
     """(K, B, C (1 + n)) inputs, and the exponential means of each time constant of what they were.
 

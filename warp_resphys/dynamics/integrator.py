@@ -15,6 +15,7 @@ from typing_extensions import override
 from ..io.errors import InputError
 
 INTEGRATORS = ("implicit_euler", "bdf2", "midpoint")
+_PAYLOAD = "payload_"
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,8 @@ class State:
     # (B, K, P, 3, 3) strain that each Prony branch of the material still carries at each of the solid's points; None
     # where all have relaxed, as in a body that has been at rest for long
     overstrain: torch.Tensor | None = None
+    # (B, S, 3) of the weights that hang on the body's strings; None where these hang still below where they are tied
+    payload: "State | None" = None
 
     @property
     def batch(self) -> int:
@@ -46,13 +49,19 @@ class State:
         found = {"q": self.q, "v": self.v}
         if self.previous is not None:
             found |= {"previous_q": self.previous[0], "previous_v": self.previous[1]}
-        return found if self.overstrain is None else {**found, "overstrain": self.overstrain}
+        if self.overstrain is not None:
+            found["overstrain"] = self.overstrain
+        if self.payload is not None:
+            found |= {f"{_PAYLOAD}{name}": each for name, each in self.payload.tensors().items()}
+        return found
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, torch.Tensor]) -> "State":
         """The state of `tensors`; others than its own are left out."""
         previous = (tensors["previous_q"], tensors["previous_v"]) if "previous_q" in tensors else None
-        return cls(tensors["q"], tensors["v"], previous, tensors.get("overstrain"))
+        hung = {name.removeprefix(_PAYLOAD): each for name, each in tensors.items() if name.startswith(_PAYLOAD)}
+        payload = cls.from_tensors(hung) if hung else None
+        return cls(tensors["q"], tensors["v"], previous, tensors.get("overstrain"), payload)
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,13 @@ from ..energies.explicit import HeldEnergy
 from ..energies.materials import PRONY_RATIO, PRONY_TIME, Corotated, Material
 from ..energies.potential import StepTerms
 from ..energies.solid import Solid, device_matrix, spread
+from ..energies.strings import Strings
 from ..fem.body import Body
 from ..io.errors import ConvergenceError, InputError
 from .assembly import BlockPattern
 from .constants import Constants
 from .equilibrium import Workspace, equilibrium, ramped
+from .hanging import HangingWeights
 from .inputs import Inputs, check_tensor
 from .integrator import ImplicitStage, State, make_integrator
 from .linearisation import Linearisation
@@ -150,6 +152,11 @@ class Simulator:
         bound = [type(each).__name__.lower() for each in own_energies if each.implicit_only]
         if self.coupling == "explicit" and bound:
             raise InputError(f"coupling is explicit, but {bound[0]} act at the end of a step alone: choose implicit.")
+        strings = [each for each in own_energies if isinstance(each, Strings)]
+        self._hanging: HangingWeights | None = None
+        if strings:
+            shares = self.tensor(strings[0].shares(body.n_vertices))
+            self._hanging = HangingWeights(strings[0], shares, self.method, self.time_step)
         self._workspaces: dict[int, Workspace] = {}
         self._held: dict[tuple[int, str], HeldEnergy] = {}
         self._mass_volume = device_matrix(body.mass_volume, self.device, self.dtype)
@@ -283,6 +290,8 @@ class Simulator:
     ) -> State:
         """The state that the stage's solution leads to."""
         new = self.method.finish(state, x, self.time_step)
+        if self._hanging is not None:
+            new = replace(new, payload=self._hanging.after(state, stage, inputs, constants, x))
         if constants.relaxes:
             new = replace(new, overstrain=self.relaxed(constants, state, new.q))
         if stage.end == 1.0 or not len(self.fixed):
@@ -333,6 +342,8 @@ class Simulator:
             mass = mass + inputs.attached_mass
         viscous = viscous_values(solid, constants, state, stage, self.time_step)
         values = self._values(constants, inputs, batch, viscous)
+        if self._hanging is not None:
+            values |= self._hanging.values(state, stage, inputs, constants)
         if self.coupling == "explicit":
             for energy, _ in self._energies:
                 for quantity in energy.inputs if energy.is_load else ():
@@ -423,12 +434,14 @@ class Simulator:
         """(B, N, 3) the equilibrium under a share of all loads, inputs and motion of the clamp [m]."""
         batch = len(rest)
         still = without_viscosity(batch, self.rest_positions)
-        values = self._values(constants, inputs, batch, still)
+        values, loads = self._values(constants, inputs, batch, still), self._loads(inputs, constants)
+        if self._hanging is not None:
+            values, loads = values | self._hanging.slack(batch), loads + self._hanging.weight(inputs, constants, batch)
         driven = {quantity.name: share * values[quantity.name] for e, _ in self._energies for quantity in e.inputs}
         terms = StepTerms(
             target=rest,
             inertia=self.rest_positions.new_zeros(batch, self.body.n_vertices),
-            force=share * self._loads(inputs, constants).expand(batch, -1, -1),
+            force=share * loads.expand(batch, -1, -1),
             values={**values, **driven},
         )
         workspace, clamp = self.workspace(batch), rest[:, self.fixed]
@@ -482,6 +495,12 @@ class Simulator:
             fields |= {f"state.previous[{i}]": each for i, each in enumerate(state.previous)}
         for unit, (name, values) in zip(itertools.cycle(("m", "m/s")), fields.items(), strict=False):
             check_tensor(name, values, (batch, n, 3), unit, "vertex", like)
+        if state.payload is not None:
+            if self._hanging is None:
+                raise InputError("the state has a payload, but the body has no strings: leave it out.")
+            shape = (batch, self._hanging.strings.count, 3)
+            for name, unit in (("q", "m"), ("v", "m/s")):
+                check_tensor(f"state.payload.{name}", getattr(state.payload, name), shape, unit, "string", like)
         if not isinstance(inputs, Inputs):
             raise InputError(f"the inputs are a {type(inputs).__name__}: give Inputs(external_force=...), say.")
         inputs.check([energy for energy, _ in self._energies], batch, n, len(self.fixed), like)

@@ -5,7 +5,8 @@ At a point with the unit direction a the fibre has the stretch lambda = |F a|, a
     sigma lambda + k s(lambda - 1 + c),     tension  t = sigma + k s'(lambda - 1 + c)   [Pa of the rest shape],
 
 an active stress sigma, and a fibre of stiffness k that an active contraction c shortens, s being half the square of
-what is positive, rounded over a short strain (`kernels.muscles.tension`). Without an input, fibres of a stiffness are a
+what is positive, rounded over a short strain (`kernels.muscles.tension`). A negative stress pushes, as an inflated
+chamber does whose walls are not modelled. Without an input, fibres of a stiffness are a
 reinforcement: the solid is stiffer along them where it is stretched (Spencer, Continuum Theory of the Mechanics of
 Fibre-Reinforced Composites, 1984), and as it was where it is compressed.
 """
@@ -28,8 +29,7 @@ from .base import Energy, Parameter, PartTerm, PointSet, Quantity, Values
 from .launcher import Launcher, warp_view
 
 STRESS = Quantity(
-    *("muscle_stress", "Pa", 0.0),
-    closed=True,
+    *("muscle_stress", "Pa"),
     per="muscle",
     typical=1e4,
     words="stress",
@@ -197,15 +197,14 @@ class MuscleTerm(PartTerm):
 
     @override
     def tangent(self, s: PointSet, values: Values, positions: Any, positive: Any) -> tuple[Any, list[Any]]:
-        del positive  # A fibre only pulls: its tangent has no negative eigenvalues.
-        return kernels.tangent, self._arguments(s, values, positions)
+        return kernels.tangent, [*self._arguments(s, values, positions), positive]
 
     @override
     def curvature(self, values: Values) -> torch.Tensor:
         stress, stiffness = values["muscle_stress"], values["muscle_stiffness"]
         assert stress is not None
         assert stiffness is not None
-        return self.weight * (stress + stiffness)[:, self.part_of]
+        return self.weight * (stress.clamp_min(0.0) + stiffness)[:, self.part_of]
 
     @override
     def adjoint(

@@ -12,11 +12,12 @@ from ..energies.fibres import Fibres
 from ..energies.muscles import CONTRACTION as MUSCLE_CONTRACTION
 from ..energies.muscles import STRESS, Muscle, Muscles
 from ..energies.pressure import PRESSURE, Pressure
+from ..energies.strings import Strings
 from ..energies.tendons import CONTRACTION, TENSION, Tendons
 from ..fem.body import Body
 from ..io.errors import InputError
 from ..mesh.chambers import Chamber, find_chambers
-from ..mesh.mesh import Mesh, select_cells
+from ..mesh.mesh import Mesh, select_cells, select_vertices
 
 # By group, and the word of its key ``commanded``: the input.
 _COMMANDED: Final[Mapping[str, Mapping[str, Quantity]]] = {
@@ -26,11 +27,11 @@ _COMMANDED: Final[Mapping[str, Mapping[str, Quantity]]] = {
 
 
 def build_actuators(config: Mapping[str, Any], mesh: Mesh) -> list[Energy]:
-    """The energies of the groups ``chambers``, ``fibres``, ``tendons`` and ``muscles``, of those that there are.
+    """The energies of ``chambers``, ``fibres``, ``tendons``, ``muscles`` and ``payload_string``, where there are any.
 
     Raises:
         InputError: fibres without chambers, another number of chambers than the mesh has, tendons or muscles that do
-            not fit, or two inputs.
+            not fit, two inputs, or a string that is tied to nothing.
     """
     driving_quantity(config)
     chambers, fibres = build_chambers(config.get("chambers"), mesh), config.get("fibres")
@@ -43,6 +44,12 @@ def build_actuators(config: Mapping[str, Any], mesh: Mesh) -> list[Energy]:
         energies.append(build_tendons(config["tendons"]))
     if config.get("muscles") is not None:
         energies.append(build_muscles(config["muscles"], mesh))
+    if config.get("payload_string") is not None:
+        place = config["data"].get("payload_at")
+        if place is None:
+            raise InputError("payload_string is set, but data.payload_at is not: name the vertices that carry it.")
+        string = {str(key): value for key, value in config["payload_string"].items()}
+        energies.append(Strings([select_vertices(mesh, **place)], **string))
     return energies
 
 

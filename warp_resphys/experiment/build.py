@@ -17,6 +17,7 @@ from ..fem.body import Body
 from ..io.errors import InputError
 from ..mesh.arm import mesh_arm
 from ..mesh.arm_geometry import arm_geometry
+from ..mesh.boxes import boxes_hexahedra
 from ..mesh.mesh import Mesh, box_hexahedra, box_tetrahedra, check_mesh, quadratic, select_vertices
 from ..mesh.readers import read_mesh
 from ..mesh.rod import rod
@@ -61,6 +62,9 @@ def build_mesh(config: Mapping[str, Any]) -> Mesh:
         mesh = box_hexahedra(config["size"], config["divisions"], config.get("nodes", 8))
     elif kind == "box_tetrahedra":
         mesh = box_tetrahedra(config["size"], config["divisions"], config.get("order", 1))
+    elif kind == "boxes":
+        corners = [(each["from"], each["to"]) for each in config["boxes"].values()]
+        mesh = boxes_hexahedra(corners, config["size"], config["nodes"])
     elif kind == "file":
         mesh = read_mesh(config["path"], config["units"], config["order"], config["drop_unreferenced"])
     elif kind == "arm":
@@ -85,6 +89,8 @@ def finer(config: Mapping[str, Any], times: float) -> dict[str, Any]:
     kind = config["kind"]
     if kind in ("box_hexahedra", "box_tetrahedra"):
         return {**config, "divisions": [math.ceil(times * each) for each in config["divisions"]]}
+    if kind == "boxes":
+        return {**config, "size": config["size"] / times}
     if kind == "rod":
         return {**config, "layers": math.ceil(times * config["layers"])}
     if kind == "arm_generated":

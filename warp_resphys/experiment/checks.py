@@ -20,7 +20,7 @@ from ..learning.replay import MASS_FACTOR, known_parameters
 from ..mesh.mesh import select_vertices, surface_vertices
 from .actuators import Drive, drive_of
 from .build import build_body, build_material, build_simulator, finer
-from .files import STATIC, attached_mass
+from .files import STATIC, payload_inputs
 from .identify import ELASTIC, bounds_of
 from .reading import standing_enough
 from .schema import IN_THE_LOOP, NAME, NETWORK, TRAINER, check, configuration_group
@@ -88,6 +88,11 @@ def check_configuration(config: Mapping[str, Any]) -> None:
             raise InputError("mesh_check compares markers, but markers is null: leave it null, too.")
         _check_memory({**config, "mesh": finer(config["mesh"], config["mesh_check"])})
     if config["refinement"]["kind"] != "none":
+        if config["payload_string"] is not None:
+            raise InputError(
+                "refinement begins anew in every window, where nothing tells how a weight on a string swings: set "
+                "refinement to none, or payload_string to null."
+            )
         _check_refinement(config)
     if config["identify"] is not None:
         if "fibre_stiffness" in config["identify"]["parameters"] and config["fibres"] is None:
@@ -177,7 +182,7 @@ def _check_recorded(config: Mapping[str, Any], body: Body) -> None:
     trials = trials_of(config)
     _check_markers(config, body, {trial.begins for trial in trials})
     vertical(data["up"])
-    attached_mass(body, data["payload_at"], np.array([trial.payload for trial in trials]))
+    payload_inputs(body, data["payload_at"], np.array([trial.payload for trial in trials]))
     begins = {trial.begins for trial in trials}
     if begins & {"held", "released"} and data["seconds"] is None:
         raise InputError("data.seconds is not set: say how much of each trial counts after its release, in s.")

@@ -116,6 +116,9 @@ def summary(
     count, step = len(names), settings["time_step"]
     observed = dataset.observed[dataset.rows(every)]
     first = [first_frame(scene, [name]) for name in every]
+    for row, name in enumerate(every):
+        if name in settings["split"]["train"]:  # What was learned from is no test.
+            observed[row, : scene.learned_steps(observed.shape[1] - 1) + 1] = np.nan
     models = dict(simulated)
     if dataset.bound is None:
         models["reconstruction"] = _reconstructed(context, names)

@@ -13,6 +13,7 @@ from ..data.base_motion import at_times
 from ..data.trials import Trials
 from ..dynamics.frames import rotations
 from ..dynamics.inputs import Inputs
+from ..energies.strings import PAYLOAD, Strings
 from ..fem.body import Body
 from ..io.errors import InputError
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5, read_json
@@ -166,11 +167,11 @@ class Dataset:
         Args:
             names: of the trials.
             body: that payloads hang on.
-            payload_at: see `attached_mass`.
+            payload_at: see `payload_inputs`.
             time_step: of the simulation, if another than that of the inputs [s].
 
         Raises:
-            InputError: see `attached_mass`.
+            InputError: see `payload_inputs`.
         """
         rows = self.rows(names)
         static = self.begins[rows[0]] == STATIC
@@ -178,7 +179,8 @@ class Dataset:
         step = self.time_step if time_step is None else time_step
         given = {key: torch.from_numpy(self._during(values[rows], step)) for key, values in self.inputs.items()}
         if any(self.payload):
-            given["attached_mass"] = torch.from_numpy(attached_mass(body, payload_at, self.payload[rows]))
+            hung = payload_inputs(body, payload_at, self.payload[rows])
+            given |= {key: torch.from_numpy(each) for key, each in hung.items()}
         poses = self.base_at(names, step)
         if poses is not None and not static:
             fixed = torch.from_numpy(np.asarray(body.mesh.vertices[body.fixed_vertices], dtype=np.float64))
@@ -221,8 +223,11 @@ def read_dataset(path: Path) -> Dataset:
         )
 
 
-def attached_mass(body: Body, payload_at: Mapping[str, float] | None, loads: FloatArray) -> FloatArray:
-    """(R, N) payloads in equal shares on the vertices that carry them [kg].
+def payload_inputs(body: Body, payload_at: Mapping[str, float] | None, loads: FloatArray) -> dict[str, FloatArray]:
+    """What payloads are for a simulation, as arguments of `Inputs` [kg].
+
+    On a body with strings they are (R, 1) `energies.strings.PAYLOAD`; on others an (R, N) ``attached_mass`` in equal
+    shares on the vertices that carry them.
 
     Args:
         body: that they hang on.
@@ -233,13 +238,15 @@ def attached_mass(body: Body, payload_at: Mapping[str, float] | None, loads: Flo
         InputError: a payload without a place, or a place where nothing can move.
         MeshError: no vertex lies there.
     """
+    if any(isinstance(energy, Strings) for energy in body.energies):
+        return {PAYLOAD.name: loads[:, None].copy()}
     masses = np.zeros((len(loads), body.n_vertices))
     if not np.any(loads):
-        return masses
+        return {"attached_mass": masses}
     if payload_at is None:
         raise InputError("a trial has a payload, but data.payload_at is not set: name the vertices that carry it.")
     carrying = select_vertices(body.mesh, **payload_at)
     if np.isin(carrying, body.fixed_vertices).all():
         raise InputError("data.payload_at names fixed vertices alone: hang the payload on vertices that can move.")
     masses[:, carrying] = loads[:, None] / len(carrying)
-    return masses
+    return {"attached_mass": masses}

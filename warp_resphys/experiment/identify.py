@@ -13,7 +13,7 @@ from ..io.resumable import forget_checkpoint, keep_checkpoint, resume_checkpoint
 from ..io.stages import StageContext
 from ..learning.identification import Bounds, Identifier, Prior
 from ..learning.placement import Accuracy
-from ..learning.replay import MASS_FACTOR, Replay, Start
+from ..learning.replay import Replay, Start
 from .files import IDENTIFICATION
 from .scene import MODELS, Scene
 from .trials import evenly
@@ -116,9 +116,9 @@ def _seconds(settings: Mapping[str, Any], replays: Replays) -> float | None:
 
 def first_guess(settings: Mapping[str, Any], names: Any) -> dict[str, float]:
     """What the parameters are before anything is known: those of the uncorrected simulation."""
-    values = {MASS_FACTOR: 1.0, "fibre_stiffness": (settings.get("fibres") or {}).get("stiffness", 0.0)}
+    values = {"fibre_stiffness": (settings.get("fibres") or {}).get("stiffness", 0.0)}
     values |= {key: value for key, value in settings["simulation"].items() if key != "model"}
-    return {name: values.get(name, 0.0) for name in names}
+    return {name: values.get(name, 1.0 if name.endswith("_factor") else 0.0) for name in names}
 
 
 def _search(settings: Mapping[str, Any], identifier: Identifier, kept: _Kept, progress: Progress) -> dict[str, Any]:

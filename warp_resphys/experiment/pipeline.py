@@ -41,6 +41,7 @@ from .files import (
     training_file,
     weights_file,
 )
+from .folds import Fold, run_folds
 from .identify import identify
 from .importing import import_recordings, import_scaled
 from .learn import refine, train
@@ -71,12 +72,14 @@ _OF_NETWORKS = ("actuation", "range_guard")
 _LEARNED_DATA = ("payload_at", "train_fraction", "seconds")
 
 
+_MOST_COLUMNS = 5  # folds that stand beside each other in a terminal
+
 Work = Callable[[StageContext], None]
 
 
 def simulated(config: Mapping[str, Any]) -> dict[str, Any]:
     """The settings that every simulation of an experiment depends on."""
-    base = _pick(config, *_SIMULATED)
+    base = _pick(config, *_SIMULATED, *_strung(config))
     if config["mesh"]["kind"] == "file":
         base["mesh_digest"] = digest(config["mesh"]["path"])
     trials = config["data"].get("trials") or {}
@@ -86,6 +89,11 @@ def simulated(config: Mapping[str, Any]) -> dict[str, Any]:
         folder = Path(config["data"].get("folder") or ".").expanduser()
         base["base_motions"] = {name: _digest(folder / name, "the file of base_motion") for name in files}
     return base
+
+
+def _strung(config: Mapping[str, Any]) -> tuple[str, ...]:
+    """The key of the string that payloads hang on, where they do."""
+    return () if config.get("payload_string") is None else ("payload_string",)
 
 
 def shown(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -138,7 +146,7 @@ def acquisition_stages(config: Mapping[str, Any]) -> list[Stage]:
 def _laboratory_settings(config: Mapping[str, Any], scales: Sequence[float]) -> dict[str, Any]:
     """What the recordings of a simulated laboratory depend on."""
     own: dict[str, Any] = {
-        **_pick(config, *_DRAWN),
+        **_pick(config, *_DRAWN, *_strung(config)),
         "data": {**_pick(config["data"], *_DRAWN_DATA), "input_scales": list(scales)},
         "markers": _pick(config["markers"], *_DRAWN_MARKERS),
         "batch": config["parallel"]["batch"],
@@ -156,7 +164,9 @@ def _digest(path: Path | None, key: str) -> str:
         raise DataFileError(f"cannot read {path} ({error.strerror}): check data.folder and {key}.") from error
 
 
-def learning_stages(config: Mapping[str, Any], split: Split, shared: str, acquired: str) -> list[Stage]:
+def learning_stages(
+    config: Mapping[str, Any], split: Split, shared: str, acquired: str, processes: int | None = None
+) -> list[Stage]:
     """The stages of one split, from the identification to the report.
 
     Args:
@@ -164,8 +174,10 @@ def learning_stages(config: Mapping[str, Any], split: Split, shared: str, acquir
         split: names of trials.
         shared: the folder of dataset.h5, relative to that of the split.
         acquired: fingerprint of the stage that wrote it.
+        processes: that work at once; as the configuration says, if left out.
     """
-    processes, markers = processes_for(config, config["parallel"]["processes"]), sees_markers(config)
+    processes = processes_for(config, config["parallel"]["processes"]) if processes is None else processes
+    markers = sees_markers(config)
     needs = ("identify",) if config["identify"] is not None else ()
     base: dict[str, Any] = {
         **simulated(config),
@@ -261,16 +273,18 @@ def run_experiment(plain: dict[str, Any], folder: Path) -> None:
 
 
 def _run_folds(
-    config: dict[str, Any], folder: Path, folds: Mapping[str, Split], first: Sequence[Stage], acquired: str
+    config: dict[str, Any], folder: Path, splits: Mapping[str, Split], first: Sequence[Stage], acquired: str
 ) -> dict[str, Any]:
     """What metrics.json says of a cross-validation, each fold of which has a folder of its own."""
+    folds = {
+        name: Fold(name, folder / fold_folder(name), partial(learning_stages, config, split, "..", acquired))
+        for name, split in splits.items()
+    }
+    run_folds(folds, processes_for(config, config["parallel"]["processes"]))
     found = {}
-    for trial, split in folds.items():
-        inner = folder / fold_folder(trial)
-        stages = learning_stages(config, split, "..", acquired)
-        run_stages(stages, inner)
-        found[trial] = collect_metrics(inner, config, [stage.name for stage in stages])
-        write_json(inner / METRICS, found[trial])
+    for name, fold in folds.items():
+        found[name] = collect_metrics(fold.folder, config, [stage.name for stage in fold.stages(1)])
+        write_json(fold.folder / METRICS, found[name])
     return {
         "errors_mm": summarise_folds([each["errors_mm"] for each in found.values()]),
         "folds": found,
@@ -283,7 +297,8 @@ def _run_folds(
 def _print(metrics: Mapping[str, Any], folder: Path, config: Mapping[str, Any]) -> None:
     """Errors as a table, a column for every fold, horizon and pressure scale that tells more, and what they say."""
     whole = metrics["errors_mm"]
-    columns = {trial: fold["errors_mm"] for trial, fold in metrics.get("folds", {}).items()}
+    folds = {trial: fold["errors_mm"] for trial, fold in metrics.get("folds", {}).items()}
+    columns = folds if len(folds) <= _MOST_COLUMNS else {}
     columns |= {f"first {seconds} s": found for seconds, found in metrics.get("horizons", {}).items()}
     columns |= {f"{scale} x": found for scale, found in metrics.get("scales", {}).items()}
     columns = {name: found for name, found in columns.items() if found != whole}
@@ -296,6 +311,11 @@ def _print(metrics: Mapping[str, Any], folder: Path, config: Mapping[str, Any]) 
         table.add_row(model, number_text(summary["mean"]), std, *each, str(summary["diverged"]))
     console = Console()
     console.print(table)
+    if folds and not columns:
+        by_trial = Table("left out", *whole, title="Error of each trial [mm]")
+        for trial, errors in folds.items():
+            by_trial.add_row(trial, *(number_text(errors[model]["mean"]) for model in whole))
+        console.print(by_trial)
     for model, found in metrics.get("range", {}).items():
         if found["left"]:
             first = min(found["first_s"].values())

@@ -20,7 +20,7 @@ from ..dynamics.simulator import Simulator
 from ..io.errors import DataFileError, InputError
 from .actuators import Drive
 from .build import bound_markers
-from .files import STATIC, attached_mass
+from .files import STATIC, payload_inputs
 from .trials import Trial, is_laboratory
 
 log = logging.getLogger(__name__)
@@ -98,8 +98,10 @@ class Reader:
                 )
             check_passive(recording)
         elif trial.inputs is not None:
-            everywhere = np.tile(np.asarray(trial.inputs, dtype=np.float64), (len(recording.positions), 1))
-            recording = replace(recording, actuation=everywhere)
+            frames = np.arange(len(recording.positions)) + recording.start * recording.rate
+            share = 1.0 if trial.onset is None else np.clip(frames - trial.onset * recording.rate, 0.0, 1.0)
+            inputs = np.asarray(trial.inputs, dtype=np.float64)
+            recording = replace(recording, actuation=(np.ones_like(frames) * share)[:, None] * inputs)
         if self._drive is None or recording.actuation is None:
             return recording
         return replace(recording, actuation=self._of_parts(recording.actuation, recording.source, self._drive))
@@ -166,8 +168,9 @@ class Reader:
                     )
                 last.append(np.median(driven[-_count(POSE_SECONDS, recording) :], axis=0))
             fields[self._drive.quantity.name] = like.new_tensor(np.stack(last))
-        mass = attached_mass(self._simulator.body, self.data["payload_at"], np.array([t.payload for t in trials]))
-        return Inputs(**fields, attached_mass=None if mass is None else like.new_tensor(mass))
+        loads = np.array([trial.payload for trial in trials])
+        hung = payload_inputs(self._simulator.body, self.data["payload_at"], loads)
+        return Inputs(**fields, **{key: like.new_tensor(each) for key, each in hung.items()})
 
     def _posed(self, inputs: Inputs) -> FloatArray:
         """(R, M, 3) the tracked markers of the uncorrected simulator in equilibrium [m]."""

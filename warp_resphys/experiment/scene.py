@@ -18,6 +18,7 @@ from ..data.trials import Trials
 from ..dynamics.frames import BaseFrame, VertexFrames, base_movement
 from ..dynamics.integrator import State
 from ..dynamics.simulator import Simulator
+from ..energies.strings import PAYLOAD
 from ..fem.body import Body
 from ..io.errors import ConvergenceError
 from ..io.files import read_json
@@ -100,7 +101,7 @@ class Scene:
         config = {**self.config, "gravity": self.dataset.gravity.tolist()}
         identify = config.get("identify") or {}
         if kind == "published":
-            config |= config["published"]
+            config |= {**config["published"], "payload_string": None}
         elif kind == "identified" and identify.get("integrator") is not None:
             config |= {"integrator": identify["integrator"], "time_step": config["time_step"] / identify["substeps"]}
         material, body = ("target" if kind == "target" else "simulation"), (None if kind == "published" else self.body)
@@ -134,7 +135,8 @@ class Scene:
     def trials(self, names: Sequence[str], simulator: Simulator | None = None) -> Trials:
         """Some of the trials, which begin alike, on the simulators' device, with inputs for a simulator's steps."""
         payload_at = self.config["data"].get("payload_at")
-        found = self.dataset.trials(names, self.body, payload_at, None if simulator is None else simulator.time_step)
+        body, step = (self.body, None) if simulator is None else (simulator.body, simulator.time_step)
+        found = self.dataset.trials(names, body, payload_at, step)
         return found.to(self.like)
 
     def base(self, names: Sequence[str], simulator: Simulator) -> BaseFrame | None:
@@ -229,7 +231,8 @@ class Scene:
             rows = self.dataset.rows(replay.trials.names)
             told.append(replay.trials.times.new_tensor(self.dataset.payload[rows])[:, None])
         constants = actuation["filter_time_constants"]
-        series = [remembered(each, constants, replay.simulator.time_step) for each in inputs.actuation.values()]
+        driven = [each for name, each in inputs.actuation.items() if name != PAYLOAD.name]
+        series = [remembered(each, constants, replay.simulator.time_step) for each in driven]
         moving = self._base_movement(replay.trials.names, replay.simulator)
         series += [] if moving is None else [moving]
         if not series:

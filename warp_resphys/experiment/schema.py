@@ -173,15 +173,21 @@ _BOX: Final[Mapping[str, Spec]] = {
     "size": _list(POSITIVE, "three positive numbers, in m", [3]),
     "divisions": _list(at_most(10_000), "three whole numbers from 1 to 10,000", [3]),
 }
+_NODES = Kind(lambda value: value in (8, 20, 27), "one of 8, 20, 27")
 _MESHES: Final[Mapping[str, Mapping[str, Spec]]] = {
-    "box_hexahedra": {**_BOX, "nodes": absent(Kind(lambda value: value in (8, 20, 27), "one of 8, 20, 27"))},
+    "box_hexahedra": {**_BOX, "nodes": absent(_NODES)},
     "box_tetrahedra": {**_BOX, "order": absent(_ORDER)},
+    "boxes": {
+        "boxes": Group(each=Group(dict.fromkeys(("from", "to"), _list(FINITE, "three numbers, in m", [3])))),
+        "size": POSITIVE,
+        "nodes": _NODES,
+    },
     "file": {"path": WORD, "units": one_of(*METRES_PER_UNIT), "order": _ORDER, "drop_unreferenced": TRUTH_VALUE},
     "rod": {
         "centreline": _PLACES,
         "radii": _RADII,
         **dict.fromkeys(("layers", "core", "rings"), at_most(10_000)),
-        "nodes": Kind(lambda value: value in (8, 20, 27), "one of 8, 20, 27"),
+        "nodes": _NODES,
         "grading": absent(_number(lambda value: 0.0 <= value <= 1.0, "a number from 0 to 1")),
     },
     "arm": {"name": WORD},
@@ -308,6 +314,7 @@ _TRIAL = Group(
     {
         "file": absent(Kind(_is_word, "the name of a file")),
         "inputs": absent(_list(FINITE, "a list of finite numbers, one for each chamber, tendon or muscle", _SOME)),
+        "onset": absent(NOT_NEGATIVE),
         "labels": absent(
             _list(WORD, "a list of different words, one for each marker of the file", _SOME, different=True)
         ),
@@ -456,6 +463,9 @@ def configuration_group(config: Mapping[str, Any]) -> Group:
             "fibres": _FIBRES,
             "tendons": _TENDONS,
             "muscles": _MUSCLES,
+            "payload_string": Group(
+                {"length": POSITIVE, "compliance": absent(NOT_NEGATIVE), "toe": absent(POSITIVE)}, optional=True
+            ),
             "coupling": one_of(*COUPLINGS),
             "mesh_check": optional(_number(lambda value: 1.0 < value <= 4.0, "a number above 1, 4 at most")),
             "force_frame": one_of(*FORCE_FRAMES),

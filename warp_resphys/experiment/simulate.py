@@ -34,7 +34,7 @@ from ..mesh.mesh import select_vertices
 from ..mesh.poses import twisted
 from .actuators import driven_parts, driving_quantity
 from .build import bound_markers, build_mesh, build_simulator
-from .files import DATASET, GIVEN, STATIC, TRUTH, Dataset, attached_mass
+from .files import DATASET, GIVEN, STATIC, TRUTH, Dataset, payload_inputs
 from .parts import March, Part, read_parts, remove_parts, split_into_parts, work_on
 from .trials import Trial, known_trials, scaled_trials_of, trials_of
 
@@ -361,8 +361,8 @@ class _Played(March):
         found = bound_markers(markers, simulator.body.mesh, setup.tracked, tuple(markers["tracked"]))
         self._read = found.to(self.like)
         payload = np.array([trial.payload for trial in self._trials])
-        masses = attached_mass(simulator.body, settings["data"].get("payload_at"), payload)
-        self._payload = Inputs(attached_mass=simulator.tensor(masses)) if payload.any() else Inputs()
+        hung = payload_inputs(simulator.body, settings["data"].get("payload_at"), payload)
+        self._payload = Inputs(**{key: simulator.tensor(each) for key, each in hung.items()} if payload.any() else {})
         self._driven: torch.Tensor | None = None
         quantity = driving_quantity(settings)
         if self._trials[0].sequence is not None and quantity is not None:

@@ -34,6 +34,7 @@ class Trial:
         scale: by which these are multiplied.
         amount: what sets simulated trajectories apart: a weight [kg], an angle [rad], or a factor of `base_motion`.
         inputs: what drives it all the time, one number for each part of the body; None where the recording tells.
+        onset: when these come, on the clock of the recording [s]; with its first frame, if left out.
         labels: of the markers of its recording, in their order; None where that tells.
         base_motion: how what it is fixed to moves, if otherwise than ``data.base_motion`` says; see
             `data.base_motion.prescribed`.
@@ -48,6 +49,7 @@ class Trial:
     scale: float = 1.0
     amount: float = 0.0
     inputs: Sequence[float] | None = None
+    onset: float | None = None
     labels: Sequence[str] | None = None
     base_motion: Mapping[str, Any] | None = None
 
@@ -64,7 +66,10 @@ class Trial:
 
 @dataclass(frozen=True)
 class Split:
-    """Names of the trials of each split; their order is that of the files."""
+    """Names of the trials of each split; their order is that of the files.
+
+    A trial of which a part is learned from (``data.train_fraction``) may be tested on the rest of it.
+    """
 
     train: tuple[str, ...]
     validation: tuple[str, ...]
@@ -73,7 +78,7 @@ class Split:
     @property
     def names(self) -> tuple[str, ...]:
         """All of them."""
-        return self.train + self.validation + self.test
+        return tuple(dict.fromkeys(self.train + self.validation + self.test))
 
     def plain(self) -> dict[str, list[str]]:
         """As settings of a stage."""
@@ -234,8 +239,11 @@ def _named(config: Mapping[str, Any], group: str) -> dict[str, list[str]]:
             more = ", or set data.folds to leave_one_out" if group == "data" else ""
             raise InputError(f"{group}.{name} is empty: name one of {group}.trials there{more}.")
     seen: dict[str, str] = {}
+    parted = config["data"].get("train_fraction", 0.0) < 1.0  # A stage that is not told it is told checked splits.
     for name, trial in ((name, trial) for name, members in lists.items() for trial in members):
         if trial in seen:
+            if parted and (seen[trial], name) == ("train", "test"):
+                continue
             other = seen[trial]
             where = f"twice in {group}.{name}" if other == name else f"in {group}.{other} and {group}.{name}"
             raise InputError(f"the trial '{trial}' is {where}: every trial is in one split, once.")

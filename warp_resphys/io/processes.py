@@ -21,6 +21,7 @@ from threadpoolctl import threadpool_limits
 
 from .errors import ResphysError
 from .memory import WorkersMemory, peak_memory_gib
+from .progress import be_quiet
 
 Advance = Callable[..., None]
 
@@ -123,8 +124,9 @@ def _work(function: Callable[[Any, Advance], Any], connection: Connection) -> No
     def advance(count: int = 1, **fields: object) -> None:
         connection.send(("advance", (count, fields)))
 
+    be_quiet()
     torch.set_num_threads(1)
-    wp.config.log_level = wp.LOG_WARNING  # As in the parent: every worker would greet otherwise.
+    wp.config.log_level = wp.LOG_ERROR  # What Warp says when it starts, the parent has said.
     with threadpool_limits(1):
         try:
             while True:

@@ -12,6 +12,13 @@ from rich.progress import Progress as Bars
 
 _BAR_SECONDS = 0.1
 _LINE_SECONDS = 10.0
+_shown = True
+
+
+def be_quiet() -> None:
+    """Shows nothing in this process from now on, as in a worker whose parent tells how far all of them are."""
+    global _shown
+    _shown = False
 
 
 class Progress:
@@ -34,7 +41,7 @@ class Progress:
     ) -> None:
         self.description, self.total, self.unit, self.done = description, total, unit, start_at
         self._start_at, self._shown = start_at, -1
-        self._console = Console(stderr=True) if console is None else console
+        self._console = Console(stderr=True, quiet=not _shown) if console is None else console
         self._fields: dict[str, object] = {}
         self._start = self._next = 0.0
         self._bars: Bars | None = None

@@ -70,13 +70,19 @@ def fingerprint(stage: Stage, upstream_fingerprints: Mapping[str, str]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def run_stages(stages: Sequence[Stage], run_dir: str | Path, wait: bool = False) -> dict[str, float]:
+def run_stages(
+    stages: Sequence[Stage],
+    run_dir: str | Path,
+    wait: bool = False,
+    begins: Callable[[str], None] = lambda name: None,
+) -> dict[str, float]:
     """Runs those of the stages whose outputs are missing, damaged or made from other settings.
 
     Args:
         stages: In the order in which they run; a stage comes after those it reads from.
         run_dir: The run folder, made where it is missing; one process at a time may use it.
         wait: Whether to wait for another process that uses it, in place of raising.
+        begins: Told the name of each stage before it is looked at.
 
     Returns:
         The seconds that each stage took, summed over interrupted runs.
@@ -91,13 +97,25 @@ def run_stages(stages: Sequence[Stage], run_dir: str | Path, wait: bool = False)
     seconds: dict[str, float] = {}
     with run_lock(run_dir, wait):
         for stage in stages:
-            if stage.name in known or not known.keys() >= set(stage.upstream):
-                raise ValueError(f"stage '{stage.name}' is there twice or stands before a stage it reads from")
-            known[stage.name] = fingerprint(stage, known)
-            context = StageContext(stage.name, run_dir, known[stage.name], stage.settings)
+            begins(stage.name)
+            context = _context(stage, run_dir, known)
             took = _valid_seconds(stage, context)
             seconds[stage.name] = _run_stage(stage, context, [*seconds]) if took is None else took
     return seconds
+
+
+def up_to_date(stages: Sequence[Stage], run_dir: str | Path) -> bool:
+    """Whether `run_stages` would find nothing to do."""
+    known: dict[str, str] = {}
+    return all(_valid_seconds(stage, _context(stage, Path(run_dir), known)) is not None for stage in stages)
+
+
+def _context(stage: Stage, run_dir: Path, known: dict[str, str]) -> StageContext:
+    """What a stage is told; adds its fingerprint to those of the stages before it."""
+    if stage.name in known or not known.keys() >= set(stage.upstream):
+        raise ValueError(f"stage '{stage.name}' is there twice or stands before a stage it reads from")
+    known[stage.name] = fingerprint(stage, known)
+    return StageContext(stage.name, run_dir, known[stage.name], stage.settings)
 
 
 def _record(run_dir: Path, name: str) -> Path:

@@ -10,15 +10,18 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from ..data.actuation import lagged
+from ..data.actuation import delayed, lagged
 from ..data.trials import Trials
 from ..dynamics.inputs import Inputs
 from ..dynamics.integrator import State
 from ..dynamics.simulator import Constants, Simulator
+from ..energies.strings import PAYLOAD
 from ..io.errors import ConvergenceError, InputError
 
 MASS_FACTOR = "attached_mass_factor"
 TILTS = ("gravity_tilt_1", "gravity_tilt_2")
+_COMMANDS = ("factor", "delay", "rise")  # that may be unknown of an input, in the order in which they act
+_HUNG = ("attached_mass", PAYLOAD.name)
 _POSE_ITERATIONS = 50
 _POSE_TOLERANCE = 1e-8  # m
 Observe = Callable[[torch.Tensor], torch.Tensor]
@@ -79,8 +82,9 @@ class Replay:
     Attributes:
         settled: (E R, N, 3) the equilibria [m] in which the trials began when they were simulated last, if they did.
         known: the parameters that it takes: the simulator's that are one number, a factor on the weights that hang on
-            the body, components of gravity's tilt, and for every input the rise time with which it follows its command,
-            such as ``pressure_rise`` [s].
+            the body, components of gravity's tilt, and for every input what is unknown of its commands: a factor on
+            them, a delay [s] with which they come, and the rise time [s] with which it follows them, such as
+            ``pressure_factor``, ``pressure_delay`` and ``pressure_rise``.
     """
 
     def __init__(self, simulator: Simulator, observe: Observe, trials: Trials) -> None:
@@ -111,16 +115,29 @@ class Replay:
         if any(name in spread for name in TILTS):
             constants["gravity"] = tilted_gravity(sim, *(spread.get(name) for name in TILTS))
         inputs = self.trials.inputs.repeat(each)
-        changed = {
-            name: lagged(command, spread[f"{name}_rise"], sim.time_step)
-            for name, command in inputs.actuation.items()
-            if f"{name}_rise" in spread
-        }
-        if MASS_FACTOR in spread and inputs.attached_mass is not None:
-            changed["attached_mass"] = inputs.attached_mass * spread[MASS_FACTOR][:, None]
-        inputs = inputs.replace(**changed)
-        resting = self.trials.resting.repeat(each).replace(attached_mass=inputs.attached_mass)
+        changed = self._acting(inputs, spread)
+        hung = {name: each for name, each in inputs.fields.items() if name in _HUNG}
+        if MASS_FACTOR in spread:
+            hung = {name: weight * spread[MASS_FACTOR][:, None] for name, weight in hung.items()}
+        inputs = inputs.replace(**changed, **hung)
+        resting = self.trials.resting.repeat(each)
+        resting = resting.replace(**self._acting(resting, spread), **hung)
         return sim.prepare(constants), inputs, resting
+
+    def _acting(self, inputs: Inputs, spread: Parameters) -> dict[str, torch.Tensor]:
+        """What commanded inputs come to, of values (E R,) of their parameters."""
+        found, step = {}, self.simulator.time_step
+        for name, command in inputs.actuation.items():
+            if name in _HUNG:
+                continue
+            if (factor := spread.get(f"{name}_factor")) is not None:
+                command = command * factor[:, None]
+            if (delay := spread.get(f"{name}_delay")) is not None:
+                command = delayed(command, delay, step)
+            if (rise := spread.get(f"{name}_rise")) is not None:
+                command = lagged(command, rise, step)
+            found[name] = command
+        return found
 
     def begin(
         self, start: Start, constants: Constants, resting: Inputs, each: int = 1, force: StepForce | None = None
@@ -137,18 +154,22 @@ class Replay:
         q, v = (t.repeat(times // len(t), 1, 1) for t in (start.state.q, start.state.v))
         if not start.at_rest:
             return State(q, v)
-        state = self.simulator.static_equilibrium(resting, constants, start=q)
-        self.settled = state.q.detach()
         if force is None or not self.is_static:
+            state = self.simulator.static_equilibrium(resting, constants, start=q)
+            self.settled = state.q.detach()
             return state
+        state, pull = State(q, v), None
         share, before = 1.0, math.inf  # of the way that is gone: less where it leads past the goal
         for _ in range(_POSE_ITERATIONS):
-            found = self.simulator.static_equilibrium(resting.plus(force(state, 0)), constants, start=state.q.detach())
+            last, pull = pull, force(state, 0)
+            if share == 1.0 and last is not None and torch.equal(pull, last):  # It is of the inputs alone.
+                return state
+            found = self.simulator.static_equilibrium(resting.plus(pull), constants, start=state.q.detach())
             change = float((found.q - state.q).detach().abs().max())
             if change < _POSE_TOLERANCE:
                 return found
             share, before = (0.5 * share if change > before else share), change
-            state = State(torch.lerp(state.q, found.q, share), state.v)
+            state = found if share == 1.0 else State(torch.lerp(state.q, found.q, share), state.v)
         raise ConvergenceError(
             f"a pose and the force that depends on it did not settle in {_POSE_ITERATIONS} iterations: the force "
             "is too large to be a correction.",
@@ -206,7 +227,8 @@ class Replay:
 def known_parameters(simulator: Simulator) -> tuple[str, ...]:
     """What can be identified of a simulator; see `Replay`."""
     constants = tuple(name for name in simulator.parameters if name != "gravity")
-    return (*constants, MASS_FACTOR, *TILTS, *(f"{name}_rise" for name in simulator.inputs))
+    driven = [f"{name}_{what}" for name in simulator.inputs if name not in _HUNG for what in _COMMANDS]
+    return (*constants, MASS_FACTOR, *TILTS, *driven)
 
 
 def tilted_gravity(simulator: Simulator, first: torch.Tensor | None, second: torch.Tensor | None) -> torch.Tensor:

@@ -30,6 +30,7 @@ BODIES: Final = ("#6b7580", "#8db4e8")  # Of the bodies behind, and of the last 
 RINGS: Final = ("#6b7580", "#1a5fb4")  # Of their markers.
 _FRAME: Final = 0.06  # Around what is seen of a motion, over its longer side.
 _HEADROOM: Final = 0.12  # For the text above a film's first view, over half its height.
+_LEAST_NEAR: Final = 0.03  # Of the body's size, half the height of the view from nearby, as of one marker alone.
 _MOST_NEAR: Final = 1.6  # How far the other models' markers may widen the view from nearby.
 _TILT: Final = (0.30, 0.30)  # From the right and from above.
 _FILM_VIEW: Final = (560, 480)  # [px] of each of two.
@@ -206,7 +207,7 @@ def _views(motion: Motion, size: tuple[int, int], headroom: float = 0.0) -> list
         near, near_half = _frame(everything, second, size)
     else:
         second = axes
-        near, near_half = _follow(motion.measured, simulated, axes, size)
+        near, near_half = _follow(motion.measured, simulated, axes, size, _LEAST_NEAR * body)
         near = np.where(np.isfinite(near), near, middle)
     room = headroom * half
     layers = [*_bodies(motion.mesh, positions, half), _stems(motion, positions[-1], simulated[-1])]
@@ -309,9 +310,9 @@ def _frame(points: FloatArray, axes: FloatArray, size: tuple[int, int]) -> tuple
 
 
 def _follow(
-    measured: FloatArray, simulated: FloatArray, axes: FloatArray, size: tuple[int, int]
+    measured: FloatArray, simulated: FloatArray, axes: FloatArray, size: tuple[int, int], least: float
 ) -> tuple[FloatArray, float]:
-    """(T, 3) middle of the markers in each frame, and half the height of a view that holds them [m].
+    """(T, 3) middle of the markers in each frame, and half the height of a view that holds them, or the least one [m].
 
     Where not all markers were seen, those of the last model say where the middle is. The other models' markers are in
     the view unless they are far off.
@@ -321,7 +322,7 @@ def _follow(
 
     def half(points: FloatArray) -> float:
         reach = np.nanmax(np.abs((points - middle[:, None]) @ axes[:2].T), axis=(0, 1))
-        return float(max(reach[1], reach[0] * size[1] / size[0], 1e-4))
+        return float(max(reach[1], reach[0] * size[1] / size[0], least))
 
-    least = half(measured)
-    return middle, 1.25 * min(half(np.concatenate([measured, *simulated], axis=1)), _MOST_NEAR * least)
+    everything = half(np.concatenate([measured, *simulated], axis=1))
+    return middle, 1.25 * min(everything, _MOST_NEAR * half(measured))

@@ -39,9 +39,13 @@ _PARAMETERS: Final[Mapping[str, tuple[str, str, float]]] = {
     "mass_damping": ("Damping by mass", "1/s", 1.0),
     "stiffness_damping": ("Damping by stiffness", "ms", 1e3),
     "attached_mass_factor": ("Factor of the attached masses", "", 1.0),
-    "pressure_rise": ("Time constant of the pressures", "ms", 1e3),
     "gravity_tilt_1": ("First tilt of gravity", "°", 180.0 / np.pi),
     "gravity_tilt_2": ("Second tilt of gravity", "°", 180.0 / np.pi),
+}
+_COMMANDS: Final[Mapping[str, tuple[str, str, float]]] = {
+    "factor": ("Factor", "", 1.0),
+    "delay": ("Delay", "ms", 1e3),
+    "rise": ("Time constant", "ms", 1e3),
 }
 _WHOLE: Final = 99.5  # [%] of a parameter's range.
 _OPEN: Final = "and leave that open over the whole range: a prior would settle it"
@@ -53,6 +57,10 @@ _NOTHING_NEW: Final = (
 
 def _parameter(name: str) -> tuple[str, str, float]:
     """What a parameter is called, the unit that it is written in, and how many of these make an SI unit."""
+    command = re.fullmatch(r"([a-z]+_)?([a-z]+)_(factor|delay|rise)", name)
+    if command is not None and name not in _PARAMETERS:
+        kind, unit, per = _COMMANDS[command[3]]
+        return f"{kind} of the {command[2]}s", unit, per
     branch = re.fullmatch(r"prony_(ratio|time)_(\d+)", name)
     if branch is None:
         return _PARAMETERS.get(name, (name, "", 1.0))

@@ -349,7 +349,7 @@ def _identified(metrics: Mapping[str, Any], settings: Mapping[str, Any]) -> list
         ranges = config.get(place) or {}
         for name, value in metrics.get("parameters", {}).get(model, {}).items():
             if ranges.get(name):
-                start = guess.get(name, 1.0 if name == "attached_mass_factor" else 0.0)
+                start = guess.get(name, 1.0 if name.endswith("_factor") else 0.0)
                 lower, upper = ranges[name]["lower"], ranges[name]["upper"]
                 found.append(Identified(f"identify.{place}.{name}", value, lower, upper, start))
     return found

@@ -1,0 +1,101 @@
+"""Folds of a cross-validation in several processes: each once, whatever fails or is interrupted."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from warp_resphys.experiment.folds import Fold, run_folds
+from warp_resphys.io.errors import ConvergenceError
+from warp_resphys.io.processes import WorkerError
+from warp_resphys.io.stages import Stage, StageInterrupted
+
+
+def write(context):
+    """Notes the process and the number of the run; fails or waits where it is told to."""
+    if context.settings["fails"]:
+        raise ConvergenceError("the simulation fails.", None, None)
+    time.sleep(context.settings["seconds"])
+    path = context.run_dir / f"{context.name}.json"
+    path.write_text(json.dumps({"process": os.getpid(), "name": context.settings["name"]}))
+
+
+def stages(name, fails, seconds, processes):
+    del processes
+    settings = {"name": name, "fails": False, "seconds": seconds}
+    first = Stage("first", write, ("first.json",), settings)
+    return [first, Stage("second", write, ("second.json",), {**settings, "fails": fails}, ("first",))]
+
+
+def folds(folder, names="abcd", fails="", seconds=0.0):
+    found = {n: Fold(n, Path(folder) / f"fold_{n}", partial(stages, n, n in fails, seconds)) for n in names}
+    return found
+
+
+def written(folder, name="second"):
+    return {path.parent.name[-1]: json.loads(path.read_text()) for path in Path(folder).glob(f"fold_*/{name}.json")}
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_every_fold_is_run_once(tmp_path, processes):
+    run_folds(folds(tmp_path), processes)
+    found = written(tmp_path)
+    assert {name: each["name"] for name, each in found.items()} == dict(zip("abcd", "abcd", strict=True))
+    others = {each["process"] for each in found.values()} - {os.getpid()}
+    assert len(others) == (2 if processes > 1 else 0)
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.json")}
+    run_folds(folds(tmp_path), processes)
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.json")} == before
+
+
+def test_a_fold_that_fails_is_named_and_the_others_are_kept(tmp_path):
+    with pytest.raises(WorkerError, match=r"^fold d: the simulation fails"):
+        run_folds(folds(tmp_path, fails="d"), 2)
+    assert "d" not in written(tmp_path)
+    assert "d" in written(tmp_path, "first")
+    run_folds(folds(tmp_path), 2)
+    assert written(tmp_path).keys() == set("abcd")
+
+
+def test_the_last_fold_that_is_left_has_all_processes(tmp_path, monkeypatch):
+    run_folds(folds(tmp_path, "abc"), 1)
+    asked = []
+
+    def told(processes):
+        asked.append(processes)
+        return stages("d", False, 0.0, processes)
+
+    run_folds({**folds(tmp_path, "abc"), "d": Fold("d", tmp_path / "fold_d", told)}, 4)
+    assert asked[-1] == 4
+
+
+def test_ctrl_c_says_what_was_on_and_the_rest_is_kept(tmp_path):
+    program = f"""if __name__ == "__main__":
+    import sys
+    sys.path.insert(0, {str(Path(__file__).parent)!r})
+    from test_folds import folds, run_folds
+    run_folds(folds({str(tmp_path)!r}, "abcd", seconds=1.0), 2)
+"""
+    script = tmp_path / "program.py"
+    script.write_text(program)
+    process = subprocess.Popen([sys.executable, str(script)], stderr=subprocess.PIPE, text=True)
+    start = time.monotonic()
+    while not written(tmp_path, "first") and time.monotonic() - start < 60.0:
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=60.0)
+    assert process.returncode != 0
+    assert f"{StageInterrupted.__name__}: interrupted in the folds " in said
+    assert "the same command goes on from there" in said
+    kept = {name: each["process"] for name, each in written(tmp_path, "first").items()}
+    assert kept
+    run_folds(folds(tmp_path, "abcd", seconds=1.0), 2)
+    after = written(tmp_path, "first")
+    assert {name: after[name]["process"] for name in kept} == kept
+    assert written(tmp_path).keys() == set("abcd")

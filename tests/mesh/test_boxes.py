@@ -1,0 +1,64 @@
+"""Bodies of boxes: what they fill, that their cells fit, and boxes that make no body."""
+
+import re
+
+import numpy as np
+import pytest
+
+from warp_resphys.experiment.build import build_mesh, finer
+from warp_resphys.io.errors import MeshError
+from warp_resphys.mesh.boxes import boxes_hexahedra
+from warp_resphys.mesh.mesh import boundary_triangles, box_hexahedra, check_mesh
+from warp_resphys.mesh.quality import cell_volumes
+
+PLATE, SIDES, FIN = (
+    ((-0.005, -0.025, 0.0), (0.005, 0.025, 0.06)),
+    ((-0.015, -0.015, 0.0), (0.015, 0.015, 0.06)),
+    ((-0.005, -0.015, 0.06), (0.005, 0.015, 0.08)),
+)
+
+
+def area(mesh):
+    a, b, c = np.moveaxis(mesh.vertices[boundary_triangles(mesh)], 1, 0)
+    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+
+
+@pytest.mark.parametrize("nodes", [8, 20, 27])
+@pytest.mark.parametrize("size", [0.015, 0.007])
+def test_a_cross_with_a_fin_is_filled_without_cracks(size, nodes):
+    mesh = boxes_hexahedra([PLATE, SIDES, FIN], size, nodes)
+    check_mesh(mesh)
+    assert mesh.element.nodes == nodes
+    section = 0.01 * 0.05 + 2 * 0.01 * 0.03
+    assert cell_volumes(mesh).sum() == pytest.approx(section * 0.06 + 0.01 * 0.03 * 0.02, rel=1e-12)
+    around = 2 * (0.03 + 0.05)
+    assert area(mesh) == pytest.approx(2 * section + around * 0.06 + 2 * (0.01 + 0.03) * 0.02, rel=1e-9)
+    corners = mesh.vertices[mesh.cells[:, :8]]
+    assert (corners.max(1) - corners.min(1)).max() <= size + 1e-12
+
+
+def test_one_box_is_a_box():
+    mesh, box = boxes_hexahedra([((0, 0, 0), (0.1, 0.03, 0.03))], 0.01), box_hexahedra((0.1, 0.03, 0.03), (10, 3, 3))
+    np.testing.assert_allclose(mesh.vertices, box.vertices, atol=1e-15)
+    np.testing.assert_array_equal(mesh.cells, box.cells)
+
+
+def test_of_a_configuration():
+    config = {"kind": "boxes", "boxes": {"a": {"from": [0, 0, 0], "to": [0.1, 0.03, 0.03]}}, "size": 0.01, "nodes": 8}
+    assert len(build_mesh(config).cells) == 90
+    assert len(build_mesh(finer(config, 2.0)).cells) == 720
+
+
+@pytest.mark.parametrize(
+    ("boxes", "size", "sentence"),
+    [
+        ([], 0.01, "a body of boxes needs one box or more"),
+        ([PLATE, (PLATE[1], PLATE[0])], 0.01, "box 2 reaches from [0.005, 0.025, 0.06] to [-0.005"),
+        ([((0, 0, 0), (0.1, 0.0, 0.1))], 0.01, "box 1 reaches from [0.0, 0.0, 0.0] to [0.1, 0.0, 0.1] m: it has no"),
+        ([PLATE], 0.0, "the size of cells must be a positive length in metres, not 0.0"),
+        ([PLATE, ((0.1, 0, 0), (0.2, 0.1, 0.1))], 0.01, "the boxes do not form one body"),
+    ],
+)
+def test_boxes_that_make_no_body(boxes, size, sentence):
+    with pytest.raises(MeshError, match=re.escape(sentence)):
+        boxes_hexahedra(boxes, size)

@@ -1,0 +1,193 @@
+r"""Weights on strings: masses that swing below a body, and pull on it only where their strings are taut.
+
+A string of length L and compliance c (inextensible for c = 0) is tied to a, the mean of some vertices, and carries a
+mass m. In an implicit stage of effective length h, in which inertia and gravity alone would take the mass to y, its
+place p minimises m/(2 h^2) |p - y|^2 and the string's energy together. It lies on the line from a to y, so that it can
+be eliminated: what is left for the body is a spring from a to y that only pulls,
+
+    E(a) = k s(|a - y| - L),     k = M / (1 + c M),     M = m / h^2,
+
+s being half the square of what is positive, rounded over a short distance (see `tendons`); and the mass goes to
+
+    p = y + (k / M) s'(|a - y| - L) (a - y) / |a - y| .
+
+So the body's solve has no further unknown, whatever hangs on it. A string that tightens takes the difference of the
+speeds along it away, as in a perfectly inelastic impact.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+import warp as wp
+from numpy.typing import NDArray
+from typing_extensions import override
+
+from ..fem.elements import Points
+from ..io.errors import InputError
+from ..kernels import strings as kernels
+from ..mesh.mesh import Mesh
+from .base import Energy, Parameter, PointSet, Quantity, Term, Values
+from .launcher import Launcher, warp_view
+
+PAYLOAD = Quantity(
+    "payload", "kg", 0.0, closed=True, per="string", typical=0.05, words="weight", shown_unit="g", shown_factor=1e3
+)
+
+
+@dataclass(frozen=True)
+class Strings(Energy):
+    """Weights on strings.
+
+    Its input is ``payload`` [kg], constant during a motion, its parameters are ``string_length`` [m] and
+    ``string_compliance`` [m/N]; each has a value for every string.
+
+    Raises:
+        InputError: no string, one that is tied to nothing, or a length or compliance out of range.
+    """
+
+    parameters: ClassVar[tuple[Quantity, ...]] = (
+        Quantity("string_length", "m", 0.0, per="string"),
+        Quantity("string_compliance", "m/N", 0.0, closed=True, per="string"),
+    )
+    inputs: ClassVar[tuple[Quantity, ...]] = (PAYLOAD,)
+
+    tied_to: Sequence[NDArray[np.int64]]  # the vertices of each string, whose mean it is tied to
+    length: Parameter  # L [m]: a number, (S,) values with one for each string, (B, 1), or (B, S)
+    compliance: Parameter = 0.0  # c [m/N], the same
+    toe: float = 1e-5  # by which a string is longer than its length when it is fully taut [m]
+
+    def __post_init__(self) -> None:
+        """Checks the values."""
+        if not len(self.tied_to):
+            raise InputError("there is no string: say what each is tied to, or leave the strings out.")
+        for number, vertices in enumerate(self.tied_to, 1):
+            if not len(vertices):
+                raise InputError(f"string {number} is tied to no vertex: give it one or more.")
+        if not (np.isfinite(self.toe) and self.toe > 0.0):
+            raise InputError(f"the toe of strings is {self.toe:g}: it must be positive, in m.")
+        for quantity, value in zip(self.parameters, (self.length, self.compliance), strict=True):
+            quantity.check(value)
+
+    @property
+    @override
+    def count(self) -> int:
+        return len(self.tied_to)
+
+    @property
+    @override
+    def constants(self) -> Mapping[str, Parameter]:
+        return {"string_length": self.length, "string_compliance": self.compliance}
+
+    def shares(self, n_vertices: int) -> NDArray[np.float64]:
+        """(S, N) of the vertices in the place that each string is tied to."""
+        found = np.zeros((self.count, n_vertices))
+        for row, vertices in zip(found, self.tied_to, strict=True):
+            row[vertices] = 1.0 / len(vertices)
+        return found
+
+    @override
+    def points(self, mesh: Mesh) -> tuple[Points, ...]:
+        """One a string, whose operators are the shares of its vertices.
+
+        Raises:
+            InputError: a vertex that the mesh does not have.
+        """
+        most, count = max(map(len, self.tied_to)), len(mesh.vertices)
+        for number, vertices in enumerate(self.tied_to, 1):
+            if not (np.min(vertices) >= 0 and np.max(vertices) < count):
+                raise InputError(f"string {number} is tied to a vertex that is not among the {count} of the mesh.")
+        # What pads a list repeats its first vertex with a zero share, which contributes nothing.
+        nodes = np.array([np.pad(each, (0, most - len(each)), constant_values=each[0]) for each in self.tied_to])
+        operator = np.zeros((self.count, 1, most, 3))
+        for row, each in zip(operator, self.tied_to, strict=True):
+            row[0, : len(each), 0] = 1.0 / len(each)
+        return (Points(nodes, operator),)
+
+    @override
+    def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "StringTerm":
+        return StringTerm(launcher, sets, self)
+
+    def stiffness(self, mass: torch.Tensor, compliance: torch.Tensor) -> torch.Tensor:
+        """K [N/m], of the inertia M = m / h^2 [N/m] and the compliance."""
+        return mass / (1.0 + compliance * mass)
+
+    def taken(
+        self, tied: torch.Tensor, free: torch.Tensor, mass: torch.Tensor, values: Mapping[str, torch.Tensor]
+    ) -> torch.Tensor:
+        """(B, S, 3) where the masses go in a stage [m].
+
+        Args:
+            tied: (B, S, 3) a, what the strings are tied to at its end [m].
+            free: (B, S, 3) y, where the masses would go without strings [m].
+            mass: (B, S) M [N/m].
+            values: the parameters.
+        """
+        line = tied - free
+        distance = line.norm(dim=-1)
+        excess = distance - values["string_length"]
+        pull = torch.where(excess > self.toe, excess - 0.5 * self.toe, 0.5 * excess.clamp_min(0.0) ** 2 / self.toe)
+        share = pull / (1.0 + values["string_compliance"] * mass) / distance.clamp_min(torch.finfo(line.dtype).tiny)
+        return free + share[..., None] * line
+
+
+class StringTerm(Term):
+    """Kernels of the springs that strings with weights are for a body in a stage.
+
+    Args:
+        launcher: of the potential.
+        sets: one point a string.
+        strings: whose they are.
+    """
+
+    def __init__(self, launcher: Launcher, sets: Sequence[PointSet], strings: Strings) -> None:
+        super().__init__(launcher, sets)
+        self.count, self._toe = strings.count, wp.float64(strings.toe)
+
+    @property
+    @override
+    def shapes(self) -> Mapping[str, tuple[int, ...]]:
+        return {"string_target": (self.count, 3), "string_stiffness": (self.count,), "string_length": (self.count,)}
+
+    def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
+        target, stiffness, length = (values[name] for name in self.shapes)
+        assert target is not None
+        assert stiffness is not None
+        assert length is not None
+        springs = [warp_view(target, wp.vec3d), warp_view(stiffness, wp.float64), warp_view(length, wp.float64)]
+        return [s.nodes, s.gradients, *springs, self._toe, positions]
+
+    @override
+    def step(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
+        return kernels.local_step, self._arguments(s, values, positions)
+
+    @override
+    def tangent(self, s: PointSet, values: Values, positions: Any, positive: Any) -> tuple[Any, list[Any]]:
+        del positive  # A string only pulls: its tangent has no negative eigenvalues.
+        return kernels.tangent, self._arguments(s, values, positions)
+
+    @override
+    def curvature(self, values: Values) -> torch.Tensor:
+        stiffness = values["string_stiffness"]
+        assert stiffness is not None
+        return stiffness
+
+    @override
+    def adjoint(
+        self, values: Values, positions: torch.Tensor, direction: torch.Tensor
+    ) -> Callable[[], dict[str, torch.Tensor]]:
+        """See `Term.adjoint`."""
+        own, (s,) = self.launcher, self.sets
+        by_target, by_others = own.zeros(self.count, 3), own.zeros(self.count, 3)
+        inputs = [*self._arguments(s, values, warp_view(positions, wp.vec3d)), warp_view(direction, wp.vec3d)]
+        outputs = [warp_view(by_target, wp.vec3d), warp_view(by_others, wp.vec3d)]
+        command = own.record(kernels.slopes, (own.batch, self.count), inputs, outputs)
+
+        def differentiate() -> dict[str, torch.Tensor]:
+            own.launch(command)
+            found = (by_target.clone(), by_others[..., 0].clone(), by_others[..., 1].clone())
+            return dict(zip(self.shapes, found, strict=True))
+
+        return differentiate

@@ -1,0 +1,80 @@
+"""A cross-validation: the folds of an experiment, each in a folder of its own, several at once."""
+
+import logging
+from collections.abc import Callable, Mapping
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+from threadpoolctl import threadpool_limits
+
+from ..io.errors import ResphysError
+from ..io.processes import Advance, WorkerError, in_processes
+from ..io.progress import Progress
+from ..io.stages import Stage, StageInterrupted, run_stages, up_to_date
+
+Stages = Callable[[int], list[Stage]]
+
+
+@dataclass(frozen=True)
+class Fold:
+    """One of them.
+
+    Attributes:
+        name: of the trial that is left out.
+        folder: of its files.
+        stages: for so many processes; can be sent to another process.
+    """
+
+    name: str
+    folder: Path
+    stages: Stages
+
+
+def run_folds(folds: Mapping[str, Fold], processes: int) -> None:
+    """Runs those that are not up to date: as many at once as there may be processes, or one with all of these.
+
+    The numbers do not depend on the processes.
+
+    Raises:
+        WorkerError: a fold failed; the others keep what they have.
+        StageInterrupted: Ctrl-C; so does every one.
+    """
+    left = [fold for fold in folds.values() if not up_to_date(fold.stages(1), fold.folder)]
+    if min(processes, len(left)) <= 1:
+        with threadpool_limits(1):
+            for fold in left:
+                run_stages(fold.stages(processes), fold.folder)
+        return
+    total = sum(len(fold.stages(1)) for fold in left)
+    running: dict[str, str] = {}
+
+    def advance(count: int, name: str, stage: str) -> None:
+        running[name] = f"{name}: {stage}"
+        if not stage:
+            del running[name]
+        progress.advance(count, now=", ".join(running.values()))
+
+    crew = in_processes(_run, left, min(processes, len(left)), advance)
+    try:
+        with Progress(f"{len(left)} folds", total, "stages") as progress, closing(crew) as results:
+            for _ in results:
+                pass
+    except KeyboardInterrupt as error:
+        raise StageInterrupted(
+            f"interrupted in the folds {', '.join(running)}; they keep what they have saved, as do those before them, "
+            "and the same command goes on from there"
+        ) from error
+
+
+def _run(fold: Fold, advance: Advance) -> None:
+    """Runs a fold in a worker process, which tells each stage that it begins."""
+    logging.basicConfig(level=logging.WARNING, format=f"fold {fold.name}: %(message)s", force=True)
+    counts = iter([0])
+    try:
+        run_stages(
+            fold.stages(1), fold.folder, begins=lambda each: advance(next(counts, 1), name=fold.name, stage=each)
+        )
+    except ResphysError as error:
+        raise WorkerError(f"fold {fold.name}: {error}") from error
+    advance(1, name=fold.name, stage="")

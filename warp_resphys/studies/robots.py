@@ -126,20 +126,31 @@ def _summary(config: Mapping[str, Any], results: Sequence[Run]) -> Part:
     for run in results:
         robot = config["robots"][run.experiment]
         if run.failure is not None:
-            rows.append(Row(robot["title"], [Cell(NONE)] * (len(_MODELS) + len(_GAINS)) + [Cell("failed")]))
+            rows.append(Row(robot["title"], [Cell(NONE)] * (len(_MODELS) + len(_GAINS) + 1) + [Cell("failed")]))
             continue
         metrics = run.metrics
         errors = metrics["errors_mm"]
         cells = [Cell(*error_parts(errors[model])) if model in errors else Cell(NONE) for model in _MODELS]
         cells += [Cell(_gain(metrics, after, before)) for after, before in _GAINS]
+        cells.append(Cell(_coverage(metrics)))
         rows.append(Row(robot["title"], [*cells, Cell(duration_text(_seconds(metrics)))], small=robot["actuation"]))
     note = (
         "Mean distance of the markers in trials that no training and no identification saw [mm], ± the standard "
         "deviation over trials. Less error: the share that SysID takes away of the uncorrected error, and ResPhys of "
-        "SysID's, with the interval that holds it in nine of ten draws of the trials (paired bootstrap). Time: all "
-        "stages, beside whatever else the machine did."
+        "SysID's, with the interval that holds it in nine of ten draws of the trials (paired bootstrap). Coverage: of "
+        "the measured coordinates, those within the 90 % prediction intervals of ResPhys, and how wide these are on "
+        "average. Time: all stages, beside whatever else the machine did."
     )
-    columns = ["Uncorrected", "SysID", "SimFree", "ResPhys", "Less error by SysID", "Less error by ResPhys", "Time"]
+    columns = [
+        "Uncorrected",
+        "SysID",
+        "SimFree",
+        "ResPhys",
+        "Less error by SysID",
+        "Less error by ResPhys",
+        "Coverage",
+        "Time",
+    ]
     return Part("All robots", [Table("Robot", columns, rows, note)])
 
 
@@ -150,6 +161,12 @@ def _gain(metrics: Mapping[str, Any], after: str, before: str) -> str:
         return NONE
     share, *ends = (f"{100.0 * each:.0f}".replace("-", MINUS) for each in (found.share, found.lower, found.upper))
     return f"{share} %" if found.trials == 1 else f"{share} % ({' to '.join(ends)})"
+
+
+def _coverage(metrics: Mapping[str, Any]) -> str:
+    """How often the prediction intervals of the learned force hold, and their mean half-width."""
+    found = metrics.get("intervals", {}).get("models", {}).get("resphys")
+    return NONE if found is None else f"{100.0 * found['coverage']:.0f} % (± {found['half_width_mm']:.2g} mm)"
 
 
 def _paired(metrics: Mapping[str, Any], after: str, before: str) -> Gain | None:

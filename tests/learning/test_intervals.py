@@ -1,0 +1,75 @@
+"""Prediction intervals: how often they hold where the errors are known, and what they are scaled by."""
+
+import numpy as np
+import pytest
+
+from warp_resphys.learning.intervals import Intervals
+
+REST = np.array([[0.0, 0.0, 0.1], [0.0, 0.0, 0.2]])
+
+
+def trials(count, seed, noise, frames=60):
+    """Swinging markers, and what was observed: off by ``noise`` of how far each has moved [m], slowly varying."""
+    draw = np.random.default_rng(seed)
+    simulated, observed = [], []
+    for _ in range(count):
+        time = np.linspace(0.0, 3.0, frames)[:, None, None]
+        x = REST + draw.uniform(0.5, 1.5) * np.array([0.01, 0.03])[:, None] * np.sin(
+            2.0 * time + draw.uniform(0.0, 6.0)
+        )
+        shocks = draw.normal(size=x.shape)
+        for k in range(1, frames):
+            shocks[k] = 0.8 * shocks[k - 1] + 0.6 * shocks[k]
+        moved = np.linalg.norm(x - REST, axis=-1, keepdims=True)
+        simulated.append(x)
+        observed.append(x + noise(moved) * shocks)
+    return simulated, observed
+
+
+@pytest.mark.parametrize(
+    ("noise", "scale"),
+    [(lambda moved: 1e-3 + 0.0 * moved, "constant"), (lambda moved: 1e-4 + 0.2 * moved, "displacement")],
+)
+def test_ninety_per_cent_hold_on_other_trials(noise, scale):
+    """On average over many sets of calibrating trials, whatever the errors, few trials or many."""
+    for count in (3, 10):
+        found, scales = [], []
+        for seed in range(40):
+            intervals = Intervals.calibrated(*trials(count, seed, noise), REST)
+            found.append(intervals.holds(*trials(20, 1000 + seed, noise), REST)["coverage"])
+            scales.append(intervals.scale)
+        assert 0.85 < np.mean(found) < 0.95, count
+        assert scales.count(scale) > 30
+
+
+def test_wider_for_a_marker_that_is_further_off():
+    simulated, observed = trials(8, 0, lambda moved: 1e-3 + 0.0 * moved)
+    for each in observed:
+        each[:, 1] += 0.004
+    intervals = Intervals.calibrated(simulated, observed, REST)
+    assert intervals.factor[1] > 1.5 * intervals.factor[0]
+    again = Intervals.from_plain(intervals.plain())
+    assert again == intervals
+    held = again.holds(simulated, observed, REST)
+    assert held["coverage"] > 0.9
+    assert 1.5 < held["half_width_mm"] < 6.0
+
+
+def test_what_was_not_seen_counts_nowhere():
+    simulated, observed = trials(6, 1, lambda moved: 1e-3 + 0.0 * moved)
+    whole = Intervals.calibrated(simulated, observed, REST)
+    for each in observed[:3]:
+        each[10:, 0] = np.nan
+    some = Intervals.calibrated(simulated, observed, REST)
+    assert some.factor == pytest.approx(whole.factor, rel=0.3)
+    observed[0][:] = np.nan
+    assert np.isfinite(some.holds(simulated, observed, REST)["coverage"])
+
+
+def test_a_model_that_diverges_has_no_intervals():
+    simulated, observed = trials(4, 2, lambda moved: 1e-3 + 0.0 * moved)
+    simulated[2][30:] = np.nan
+    assert Intervals.calibrated(simulated, observed, REST) is None
+    for each in observed:
+        each[:, 1] = np.nan
+    assert Intervals.calibrated(*trials(4, 2, lambda moved: 1e-3 + 0.0 * moved)[:1], observed, REST) is None

@@ -451,6 +451,21 @@ def test_the_three_beams(shared_data, tmp_path):
     assert any("Base - 1 jumps" in warning for warning in quality["load101"]["warnings"])
 
 
+def test_the_fish_tail(shared_data, tmp_path):
+    """A table without a header, with semicolons, in millimetres; a step that nobody has recorded."""
+    config = configuration("experiment=fish_tail", f"data.folder={shared_data / 'fish_tail'}")
+    check_configuration(config)
+    run_stages(acquisition_stages(config), tmp_path)
+    dataset = read_dataset(tmp_path / DATASET)
+    (tip,) = dataset.observed.transpose(2, 0, 1, 3)
+    travel = np.linalg.norm(tip[0] - tip[0, 0], axis=1)
+    assert travel.max() == pytest.approx(0.0192, abs=2e-4)
+    assert (tip[0, -1] - tip[0, 0])[0] > 0.99 * 0.0184  # towards +x
+    np.testing.assert_allclose(tip[0, 0], [0.0, -0.0142, 0.0522], atol=2e-3)
+    assert dataset.inputs["muscle_stress"][0, :2].tolist() == [[0.0, 0.0], [-2e4, 2e4]]  # from 0.01 s on
+    assert dataset.inputs["muscle_stress"][0, -1].tolist() == [-2e4, 2e4]
+
+
 class TestCommand:
     @pytest.fixture
     def command(self, shelf, monkeypatch, capsys):

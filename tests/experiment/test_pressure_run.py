@@ -441,7 +441,8 @@ def test_the_replays_gradient_is_that_of_differences():
     motions, read = driven_motions(simulator, steps=4)
     replay = Replay(simulator, read, motions)
     release = at_rest(simulator, motions)
-    for name, value in (("youngs_modulus", 2e5), ("stiffness_damping", 3e-3), ("pressure_rise", 0.02)):
+    of_commands = (("pressure_rise", 0.02), ("pressure_delay", 0.013), ("pressure_factor", 1.3))
+    for name, value in (("youngs_modulus", 2e5), ("stiffness_damping", 3e-3), *of_commands):
         x = torch.tensor([value], dtype=torch.float64, requires_grad=True)
         loss = lambda x, name=name: 1e6 * replay.errors(replay(release, {name: x})).square().sum()  # noqa: E731
         (gradient,) = torch.autograd.grad(loss(x), x)
@@ -462,7 +463,7 @@ def test_a_diverged_roll_out_and_one_that_left_the_range_are_reported(tmp_path):
     observed = np.zeros((2, 5, 1, 3))
     good, lost = observed + np.array([3e-3, 0.0, 4e-3]), observed.copy()
     lost[1, 3:] = np.nan
-    settings = {"data": {"horizons": [0.02, 0.04]}, "time_step": 0.01}
+    settings = {"data": {"horizons": [0.02, 0.04]}, "time_step": 0.01, "split": {"train": []}}
     left = {"resphys": np.array([-1, 3])}
     markers = {"sysid": good, "resphys": lost}
     scene = Scene(settings, tmp_path)

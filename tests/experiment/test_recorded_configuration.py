@@ -9,7 +9,7 @@ from measured_run import configuration
 from warp_resphys.experiment.checks import check_configuration, training_settings
 from warp_resphys.experiment.schema import dotted
 from warp_resphys.experiment.simulate import vertical
-from warp_resphys.experiment.trials import folds_of, split_of, trials_of
+from warp_resphys.experiment.trials import Split, folds_of, split_of, trials_of
 from warp_resphys.io.errors import InputError, ResphysError
 
 ROOT = Path(__file__).parents[2]
@@ -229,6 +229,15 @@ def test_folds_and_splits(tmp_path):
     config["data"]["train"] = []
     with pytest.raises(InputError, match=r"data\.train is empty: .* or set data\.folds to leave_one_out"):
         check_configuration(config)
+
+
+def test_the_rest_of_a_trial_that_is_learned_from_in_part_may_be_the_test():
+    config = configuration("experiment=fish_tail", "data.folder=recordings")
+    assert split_of(config) == Split(("step",), (), ("step",))
+    assert [trial.name for trial in trials_of(config)] == ["step"]
+    config["data"]["train_fraction"] = 1.0
+    with pytest.raises(InputError, match=r"the trial 'step' is in data\.train and data\.test: every trial is in one"):
+        split_of(config)
 
 
 def test_a_budget_takes_fewer_simulated_trials():

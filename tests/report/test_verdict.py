@@ -127,6 +127,7 @@ def test_bounds_and_first_guesses_get_advice():
         "youngs_modulus stayed at its first guess, 264000: raise identify.max_evaluations or identify.starts, or take "
         "it out (~identify.parameters.youngs_modulus) if the trials do not tell about it."
     ]
+    assert advice([[Identified("identify.parameters.density", 1300.0, 1000.0, 2000.0, 1300.0, known=True)]]) == []
     (said,) = advice([[Identified("identify.parameters.mass_damping", 0.0, 0.0, 10.0, 1.0)]])
     assert "mass_damping was identified at its lower bound, 0: take it out (~identify.parameters.mass_damping)" in said
     (said,) = advice([[modulus(2e6)], [modulus(3e5)], [modulus(2e6)]])

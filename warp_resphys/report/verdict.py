@@ -35,12 +35,13 @@ class Identified:
     lower: float  # End of its range.
     upper: float
     start: float  # The first guess.
+    known: bool = False  # Whether it has a prior, where it may stay.
 
 
 # Where prediction intervals come from.
 _CALIBRATED: Final[Mapping[str, str]] = {
     "validation": "its errors in the validation trials",
-    "training": "its errors in what it was trained on, which are too small",
+    "training": "its errors in what it was trained on, which tend to be too small",
     "folds": "the errors of the other folds",
 }
 
@@ -355,7 +356,7 @@ def _advice(found: Identified) -> str:
                 f"{name} was identified at its {end} bound, {bound:g}: {widen}, or look for what it makes up for, "
                 "such as a wrong weight, mesh or registration."
             )
-    if abs(found.value - found.start) > close:
+    if found.known or abs(found.value - found.start) > close:
         return ""
     return (
         f"{name} stayed at its first guess, {found.start:g}: raise identify.max_evaluations or identify.starts, or "
@@ -374,5 +375,6 @@ def _identified(metrics: Mapping[str, Any], settings: Mapping[str, Any]) -> list
             if ranges.get(name):
                 start = guess.get(name, 1.0 if name.endswith("_factor") else 0.0)
                 lower, upper = ranges[name]["lower"], ranges[name]["upper"]
-                found.append(Identified(f"identify.{place}.{name}", value, lower, upper, start))
+                known = ranges[name].get("prior") is not None
+                found.append(Identified(f"identify.{place}.{name}", value, lower, upper, start, known))
     return found

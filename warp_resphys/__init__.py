@@ -31,6 +31,7 @@ _MODULES = {
     "rod": "mesh.rod",
     "select_vertices": "mesh.mesh",
     "Simulator": "dynamics.simulator",
+    "Medium": "energies.medium",
     "Muscle": "energies.muscles",
     "Muscles": "energies.muscles",
     "SolverSettings": "dynamics.nonlinear_solver",

@@ -1,6 +1,7 @@
 """Weights on strings over a step: where they are, what they are for the body's solve, and where they go."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 
@@ -24,8 +25,10 @@ class HangingWeights:
         given = inputs.actuation.get(PAYLOAD.name)
         return self.shares.new_zeros(batch, self.strings.count) if given is None else given
 
-    def weight(self, inputs: Inputs, constants: Constants, batch: int) -> torch.Tensor:
-        """(B, N, 3) what the weights pull at rest [N]."""
+    def load(self, inputs: Inputs, constants: Constants, batch: int, static: bool) -> torch.Tensor | None:
+        """See `StepPart`: what the weights pull at rest."""
+        if not static:
+            return None
         return torch.einsum(
             "bs,sn,bc->bnc", self.masses(inputs, batch), self.shares, constants.gravity.expand(batch, 3)
         )
@@ -49,25 +52,27 @@ class HangingWeights:
     def values(
         self, state: State, stage: ImplicitStage, inputs: Inputs, constants: Constants
     ) -> dict[str, torch.Tensor]:
-        """What the strings' term needs of a step."""
+        """See `StepPart`."""
         mass = self.masses(inputs, state.batch) / stage.step**2
         return {
             "string_target": self._free(self._stage(state, inputs, constants), constants),
             "string_stiffness": self.strings.stiffness(mass, constants.values["string_compliance"]),
         }
 
-    def slack(self, batch: int) -> dict[str, torch.Tensor]:
-        """What it needs where nothing moves, and `weight` is a load."""
+    def still(self, batch: int) -> dict[str, torch.Tensor]:
+        """Strings that do nothing, as `load` has what they pull."""
         zeros = self.shares.new_zeros(batch, self.strings.count)
         return {"string_target": zeros[..., None].expand(-1, -1, 3), "string_stiffness": zeros}
 
-    def after(self, state: State, stage: ImplicitStage, inputs: Inputs, constants: Constants, x: torch.Tensor) -> State:
-        """Where a step ends whose solve has the solution x (B, N, 3) [m]."""
+    def after(
+        self, state: State, stage: ImplicitStage, inputs: Inputs, constants: Constants, x: torch.Tensor
+    ) -> dict[str, Any]:
+        """Where the weights go."""
         free = self._free(self._stage(state, inputs, constants), constants)
         mass = self.masses(inputs, state.batch) / stage.step**2
         tied = torch.einsum("sn,bnc->bsc", self.shares, x)
         at = self.strings.taken(tied, free, mass, constants.values)
-        return self.method.finish(self.of(state, inputs, constants), at, self.time_step)
+        return {"payload": self.method.finish(self.of(state, inputs, constants), at, self.time_step)}
 
     def _stage(self, state: State, inputs: Inputs, constants: Constants) -> ImplicitStage:
         return self.method.stage(self.of(state, inputs, constants), self.time_step)

@@ -13,10 +13,12 @@ import torch
 from ..energies.base import Energy, Quantity
 from ..energies.explicit import HeldEnergy
 from ..energies.materials import PRONY_RATIO, PRONY_TIME, Corotated, Material
+from ..energies.medium import FacePoints, Medium
 from ..energies.potential import StepTerms
 from ..energies.solid import Solid, device_matrix, spread
 from ..energies.strings import Strings
 from ..fem.body import Body
+from ..fem.elements import Points
 from ..io.errors import ConvergenceError, InputError
 from .assembly import BlockPattern
 from .constants import Constants
@@ -26,6 +28,8 @@ from .inputs import Inputs, check_tensor
 from .integrator import ImplicitStage, State, make_integrator
 from .linearisation import Linearisation
 from .nonlinear_solver import SolveReport, SolverSettings
+from .step_parts import StepPart
+from .surrounding import Surrounding
 from .viscosity import check_overstrain, relaxed, viscous_values, without_viscosity
 
 log = logging.getLogger(__name__)
@@ -152,17 +156,27 @@ class Simulator:
         bound = [type(each).__name__.lower() for each in own_energies if each.implicit_only]
         if self.coupling == "explicit" and bound:
             raise InputError(f"coupling is explicit, but {bound[0]} act at the end of a step alone: choose implicit.")
-        strings = [each for each in own_energies if isinstance(each, Strings)]
-        self._hanging: HangingWeights | None = None
-        if strings:
-            shares = self.tensor(strings[0].shares(body.n_vertices))
-            self._hanging = HangingWeights(strings[0], shares, self.method, self.time_step)
+        self._strings = next((each for each in own_energies if isinstance(each, Strings)), None)
         self._workspaces: dict[int, Workspace] = {}
         self._held: dict[tuple[int, str], HeldEnergy] = {}
         self._mass_volume = device_matrix(body.mass_volume, self.device, self.dtype)
         self._load_volume = device_matrix(body.load_volume, self.device, self.dtype)
         self._attached_mass = self.tensor(body.attached_mass)
+        parts = (self._step_part(*pair) for pair in zip(own_energies, body.energy_points, strict=True))
+        self._step_parts = [part for part in parts if part is not None]
         self._built = True
+
+    def _step_part(self, energy: Energy, points: Sequence[Points]) -> StepPart | None:
+        """What an energy does over steps, if it depends on where these start."""
+        if isinstance(energy, Strings):
+            shares = self.tensor(energy.shares(self.body.n_vertices))
+            return HangingWeights(energy, shares, self.method, self.time_step)
+        if isinstance(energy, Medium):
+            (faces,) = points
+            assert isinstance(faces, FacePoints)
+            volume = self._load_volume.sum(1).to_dense() if energy.buoyancy else None
+            return Surrounding.of(faces, volume, self.rest_positions)
+        return None
 
     def __setattr__(self, name: str, value: object) -> None:
         """Refuses changes: what was uploaded would not follow them.
@@ -290,8 +304,8 @@ class Simulator:
     ) -> State:
         """The state that the stage's solution leads to."""
         new = self.method.finish(state, x, self.time_step)
-        if self._hanging is not None:
-            new = replace(new, payload=self._hanging.after(state, stage, inputs, constants, x))
+        for part in self._step_parts:
+            new = replace(new, **part.after(state, stage, inputs, constants, x))
         if constants.relaxes:
             new = replace(new, overstrain=self.relaxed(constants, state, new.q))
         if stage.end == 1.0 or not len(self.fixed):
@@ -337,13 +351,13 @@ class Simulator:
         solid = self.workspace(batch).potential.solid
         # Mass damping is linear in x: it joins inertia and moves the target.
         damping = constants.mass_damping[..., None] * h  # (1 or B, 1, 1)
-        mass, force = constants.mass, self._loads(inputs, constants)
+        mass, force = constants.mass, self._loads(inputs, constants, batch)
         if inputs.attached_mass is not None:
             mass = mass + inputs.attached_mass
         viscous = viscous_values(solid, constants, state, stage, self.time_step)
         values = self._values(constants, inputs, batch, viscous)
-        if self._hanging is not None:
-            values |= self._hanging.values(state, stage, inputs, constants)
+        for part in self._step_parts:
+            values |= part.values(state, stage, inputs, constants)
         if self.coupling == "explicit":
             for energy, _ in self._energies:
                 for quantity in energy.inputs if energy.is_load else ():
@@ -367,13 +381,15 @@ class Simulator:
                 values[quantity.name] = self.rest_positions.new_zeros(batch, energy.count) if given is None else given
         return values
 
-    def _loads(self, inputs: Inputs, constants: Constants) -> torch.Tensor:
-        """(1 or B, N, 3) gravity and external force [N]."""
+    def _loads(self, inputs: Inputs, constants: Constants, batch: int, static: bool = False) -> torch.Tensor:
+        """(1 or B, N, 3) gravity, external force and what parts add in equilibria or in steps [N]."""
         mass = constants.load_mass
         if inputs.attached_mass is not None:
             mass = mass + inputs.attached_mass
         weight = mass[..., None] * constants.gravity[:, None]
-        return weight if inputs.external_force is None else weight + inputs.external_force
+        for load in (inputs.external_force, *(p.load(inputs, constants, batch, static) for p in self._step_parts)):
+            weight = weight if load is None else weight + load
+        return weight
 
     def static_equilibrium(
         self,
@@ -434,14 +450,14 @@ class Simulator:
         """(B, N, 3) the equilibrium under a share of all loads, inputs and motion of the clamp [m]."""
         batch = len(rest)
         still = without_viscosity(batch, self.rest_positions)
-        values, loads = self._values(constants, inputs, batch, still), self._loads(inputs, constants)
-        if self._hanging is not None:
-            values, loads = values | self._hanging.slack(batch), loads + self._hanging.weight(inputs, constants, batch)
+        values = self._values(constants, inputs, batch, still)
+        for part in self._step_parts:
+            values |= part.still(batch)
         driven = {quantity.name: share * values[quantity.name] for e, _ in self._energies for quantity in e.inputs}
         terms = StepTerms(
             target=rest,
             inertia=self.rest_positions.new_zeros(batch, self.body.n_vertices),
-            force=share * loads.expand(batch, -1, -1),
+            force=share * self._loads(inputs, constants, batch, static=True).expand(batch, -1, -1),
             values={**values, **driven},
         )
         workspace, clamp = self.workspace(batch), rest[:, self.fixed]
@@ -496,9 +512,9 @@ class Simulator:
         for unit, (name, values) in zip(itertools.cycle(("m", "m/s")), fields.items(), strict=False):
             check_tensor(name, values, (batch, n, 3), unit, "vertex", like)
         if state.payload is not None:
-            if self._hanging is None:
+            if self._strings is None:
                 raise InputError("the state has a payload, but the body has no strings: leave it out.")
-            shape = (batch, self._hanging.strings.count, 3)
+            shape = (batch, self._strings.count, 3)
             for name, unit in (("q", "m"), ("v", "m/s")):
                 check_tensor(f"state.payload.{name}", getattr(state.payload, name), shape, unit, "string", like)
         if not isinstance(inputs, Inputs):

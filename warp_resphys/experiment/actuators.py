@@ -9,6 +9,7 @@ import numpy as np
 
 from ..energies.base import Energy, Quantity
 from ..energies.fibres import Fibres
+from ..energies.medium import Medium
 from ..energies.muscles import CONTRACTION as MUSCLE_CONTRACTION
 from ..energies.muscles import STRESS, Muscle, Muscles
 from ..energies.pressure import PRESSURE, Pressure
@@ -27,7 +28,7 @@ _COMMANDED: Final[Mapping[str, Mapping[str, Quantity]]] = {
 
 
 def build_actuators(config: Mapping[str, Any], mesh: Mesh) -> list[Energy]:
-    """The energies of ``chambers``, ``fibres``, ``tendons``, ``muscles`` and ``payload_string``, where there are any.
+    """The energies of ``chambers``, ``fibres``, ``tendons``, ``muscles``, ``medium`` and ``payload_string``.
 
     Raises:
         InputError: fibres without chambers, another number of chambers than the mesh has, tendons or muscles that do
@@ -44,6 +45,8 @@ def build_actuators(config: Mapping[str, Any], mesh: Mesh) -> list[Energy]:
         energies.append(build_tendons(config["tendons"]))
     if config.get("muscles") is not None:
         energies.append(build_muscles(config["muscles"], mesh))
+    if config.get("medium") is not None:
+        energies.append(Medium(**{str(key): value for key, value in config["medium"].items()}))
     if config.get("payload_string") is not None:
         place = config["data"].get("payload_at")
         if place is None:

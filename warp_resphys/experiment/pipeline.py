@@ -79,7 +79,7 @@ Work = Callable[[StageContext], None]
 
 def simulated(config: Mapping[str, Any]) -> dict[str, Any]:
     """The settings that every simulation of an experiment depends on."""
-    base = _pick(config, *_SIMULATED, *_strung(config))
+    base = _pick(config, *_SIMULATED, *_around(config))
     if config["mesh"]["kind"] == "file":
         base["mesh_digest"] = digest(config["mesh"]["path"])
     trials = config["data"].get("trials") or {}
@@ -91,9 +91,9 @@ def simulated(config: Mapping[str, Any]) -> dict[str, Any]:
     return base
 
 
-def _strung(config: Mapping[str, Any]) -> tuple[str, ...]:
-    """The key of the string that payloads hang on, where they do."""
-    return () if config.get("payload_string") is None else ("payload_string",)
+def _around(config: Mapping[str, Any]) -> tuple[str, ...]:
+    """The keys of what is around a body and hangs on it, where there is any."""
+    return tuple(key for key in ("medium", "payload_string") if config.get(key) is not None)
 
 
 def shown(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -146,7 +146,7 @@ def acquisition_stages(config: Mapping[str, Any]) -> list[Stage]:
 def _laboratory_settings(config: Mapping[str, Any], scales: Sequence[float]) -> dict[str, Any]:
     """What the recordings of a simulated laboratory depend on."""
     own: dict[str, Any] = {
-        **_pick(config, *_DRAWN, *_strung(config)),
+        **_pick(config, *_DRAWN, *_around(config)),
         "data": {**_pick(config["data"], *_DRAWN_DATA), "input_scales": list(scales)},
         "markers": _pick(config["markers"], *_DRAWN_MARKERS),
         "batch": config["parallel"]["batch"],

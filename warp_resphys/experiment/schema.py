@@ -463,6 +463,14 @@ def configuration_group(config: Mapping[str, Any]) -> Group:
             "fibres": _FIBRES,
             "tendons": _TENDONS,
             "muscles": _MUSCLES,
+            "medium": Group(
+                {
+                    "density": NOT_NEGATIVE,
+                    **dict.fromkeys(("linear", "normal", "tangential", "layer"), absent(NOT_NEGATIVE)),
+                    "buoyancy": absent(TRUTH_VALUE),
+                },
+                optional=True,
+            ),
             "payload_string": Group(
                 {"length": POSITIVE, "compliance": absent(NOT_NEGATIVE), "toe": absent(POSITIVE)}, optional=True
             ),

@@ -1,0 +1,83 @@
+"""Drag and added mass of a medium on a surface over an implicit stage: stress and tangent.
+
+The first column of F = sum_a x_a g_a^T is the place of a point of the surface. With its area a and normal n at the
+start of the step, d its way since then, e its distance from where inertia alone would take it, and the coefficients
+c = (linear, normal, tangential, inertial) of the step, its energy is
+
+    a (c_l / 2 |d|^2 + c_n / 3 |d . n|^3 + c_t / 3 |d_t|^3 + c_i / 2 (e . n)^2),     d_t = d - (d . n) n .
+"""
+
+import warp as wp
+
+from .modules import decorators
+from .points import line_at
+
+ZERO, HALF, THIRD = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0 / 3.0)
+
+kernel, function = decorators("medium")
+
+
+@kernel
+def local_step(
+    nodes: wp.array2d[int],
+    gradients: wp.array2d[wp.vec3d],
+    reference: wp.array2d[wp.vec3d],  # (B, P) where the point was [m]
+    target: wp.array2d[wp.vec3d],  # (B, P) where inertia alone would take it [m]
+    area: wp.array2d[wp.vec3d],  # (B, P) a n [m^2]
+    coefficients: wp.array2d[wp.vec4d],  # (B, 1)
+    points_per_cell: int,
+    positions: wp.array2d[wp.vec3d],
+    stress_out: wp.array2d[wp.mat33d],
+    energy_out: wp.array2d[wp.float64],
+):
+    """Force and energy of each point."""
+    b, p = wp.tid()
+    x = line_at(positions, nodes, gradients, b, p, p / points_per_cell)
+    d = x - reference[b, p]
+    e = x - target[b, p]
+    c = coefficients[b, 0]
+    a = wp.length(area[b, p])
+    n = wp.normalize(area[b, p])
+    across = wp.dot(d, n)
+    along = d - across * n
+    slip = wp.length(along)
+    inertial = wp.dot(e, n)
+    force = a * (c[0] * d + (c[1] * wp.abs(across) * across + c[3] * inertial) * n + c[2] * slip * along)
+    stress_out[b, p] = wp.mat33d(force[0], ZERO, ZERO, force[1], ZERO, ZERO, force[2], ZERO, ZERO)
+    cubes = c[1] * wp.abs(across) * across * across + c[2] * slip * slip * slip
+    energy_out[b, p] = a * (HALF * (c[0] * wp.dot(d, d) + c[3] * inertial * inertial) + THIRD * cubes)
+
+
+@kernel
+def tangent(
+    nodes: wp.array2d[int],
+    gradients: wp.array2d[wp.vec3d],
+    reference: wp.array2d[wp.vec3d],
+    target: wp.array2d[wp.vec3d],
+    area: wp.array2d[wp.vec3d],
+    coefficients: wp.array2d[wp.vec4d],
+    points_per_cell: int,
+    positions: wp.array2d[wp.vec3d],
+    tangent_out: wp.array3d[wp.mat33d],
+):
+    """Block (0, 0); the energy is convex, so that it has no negative eigenvalues."""
+    b, p = wp.tid()
+    d = line_at(positions, nodes, gradients, b, p, p / points_per_cell) - reference[b, p]
+    c = coefficients[b, 0]
+    a = wp.length(area[b, p])
+    n = wp.normalize(area[b, p])
+    across = wp.dot(d, n)
+    along = d - across * n
+    slip = wp.length(along)
+    # The tangential part is c_t (|d_t| (1 - n n^T) + d_t d_t^T / |d_t|).
+    even = a * (c[0] + c[2] * slip)
+    block = a * (wp.float64(2.0) * c[1] * wp.abs(across) + c[3] - c[2] * slip) * wp.outer(n, n)
+    if slip > ZERO:
+        block += (a * c[2] / slip) * wp.outer(along, along)
+    block[0, 0] += even
+    block[1, 1] += even
+    block[2, 2] += even
+    nothing = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
+    for k in range(6):
+        tangent_out[b, p, k] = nothing
+    tangent_out[b, p, 0] = block

@@ -1,0 +1,165 @@
+r"""A medium around a body: drag on its surface, the mass that moves with it, and buoyancy.
+
+The force on an area with the normal n that moves with the velocity v is, for the density rho of the medium,
+
+    -c v - rho / 2 (C_n |v . n| (v . n) n + C_t |v_t| v_t) - rho l (n . dv/dt) n,     v_t = v - (v . n) n
+
+(the resistive part of Taylor, Proc. R. Soc. A 214, 1952, for what swims, and a reactive one; Lighthill 1971). c is the
+linear drag of creeping flow [N s/m^3], C_n and C_t are drag coefficients across and along the surface, and l is the
+thickness of the layer of the medium that is pushed along [m]. Each acts at the end of an implicit stage, with areas and
+normals of its start, so that it is the derivative of a convex potential, and never sheds energy that is not there.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+import warp as wp
+from numpy.typing import NDArray
+from typing_extensions import override
+
+from ..fem.elements import Points
+from ..io.errors import InputError
+from ..kernels import medium as kernels
+from ..mesh.elements import FACES
+from ..mesh.mesh import Mesh, boundary_faces
+from .base import Energy, Parameter, PointSet, Quantity, Term, Values
+from .launcher import Launcher, warp_view
+
+
+@dataclass(frozen=True)
+class FacePoints(Points):
+    """Points on faces of a surface."""
+
+    slopes: NDArray[np.float64]  # (Q, K, 2) derivatives of a face's shape functions
+    weights: NDArray[np.float64]  # (Q,)
+
+
+@dataclass(frozen=True)
+class Medium(Energy):
+    """Drag, added mass and buoyancy on the surface of a body; see the module.
+
+    Its parameters are ``medium_density`` [kg/m^3], ``drag_linear`` [N s/m^3], ``drag_normal``, ``drag_tangential`` and
+    ``added_layer`` [m].
+
+    Raises:
+        InputError: a value out of range, or faces that are none of the surface.
+    """
+
+    parameters: ClassVar[tuple[Quantity, ...]] = (
+        Quantity("medium_density", "kg/m^3", 0.0, closed=True),
+        Quantity("drag_linear", "N s/m^3", 0.0, closed=True),
+        Quantity("drag_normal", "", 0.0, closed=True),
+        Quantity("drag_tangential", "", 0.0, closed=True),
+        Quantity("added_layer", "m", 0.0, closed=True),
+    )
+
+    density: Parameter  # rho [kg/m^3]: a number, or (B, 1) values
+    linear: Parameter = 0.0  # c [N s/m^3], the same
+    normal: Parameter = 0.0  # C_n, the same
+    tangential: Parameter = 0.0  # C_t, the same
+    layer: Parameter = 0.0  # l [m], the same
+    buoyancy: bool = True  # whether the medium carries the weight of what the body displaces
+    faces: NDArray[np.int64] | None = None  # (F, n) of `boundary_faces` that it acts on; all where left out
+
+    def __post_init__(self) -> None:
+        """Checks the values."""
+        for quantity, value in zip(self.parameters, self.constants.values(), strict=True):
+            quantity.check(value)
+
+    @property
+    @override
+    def constants(self) -> Mapping[str, Parameter]:
+        values = (self.density, self.linear, self.normal, self.tangential, self.layer)
+        return dict(zip((quantity.name for quantity in self.parameters), values, strict=True))
+
+    @override
+    def points(self, mesh: Mesh) -> tuple[FacePoints, ...]:
+        """Points of a rule that integrates quadratic fields over the faces."""
+        surface = boundary_faces(mesh)
+        faces = surface if self.faces is None else np.asarray(self.faces)
+        if not len(faces) or faces.shape[1:] != surface.shape[1:] or not np.isin(faces, surface).all():
+            raise InputError("the faces that a medium acts on are none of the body's surface: take some of it.")
+        face = FACES[faces.shape[1]]
+        places, weights = face.rule(2)
+        values, slopes = face.shape(places)
+        operator = np.zeros((len(faces), *values.shape, 3))
+        operator[..., 0] = values
+        return (FacePoints(faces, operator, np.asarray(slopes), np.asarray(weights)),)
+
+    @override
+    def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "MediumTerm":
+        return MediumTerm(launcher, sets)
+
+
+class MediumTerm(Term):
+    """Kernels of what a medium does over a stage."""
+
+    @property
+    @override
+    def shapes(self) -> Mapping[str, tuple[int, ...]]:
+        places = dict.fromkeys(("medium_reference", "medium_target", "medium_area"), (self.n_points, 3))
+        return {**places, "medium_coefficients": (1, 4)}
+
+    def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
+        *places, coefficients = (values[name] for name in self.shapes)
+        views = [warp_view(each, wp.vec3d) for each in places if each is not None]
+        assert coefficients is not None
+        return [s.nodes, s.gradients, *views, warp_view(coefficients, wp.vec4d), s.points_per_cell, positions]
+
+    @override
+    def step(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
+        return kernels.local_step, self._arguments(s, values, positions)
+
+    @override
+    def tangent(self, s: PointSet, values: Values, positions: Any, positive: Any) -> tuple[Any, list[Any]]:
+        del positive  # The energy is convex.
+        return kernels.tangent, self._arguments(s, values, positions)
+
+    @override
+    def curvature(self, values: Values) -> torch.Tensor:
+        area, coefficients = values["medium_area"], values["medium_coefficients"]
+        assert area is not None
+        assert coefficients is not None
+        return area.norm(dim=-1) * (coefficients[..., 0] + coefficients[..., 3])
+
+    @override
+    def adjoint(
+        self, values: Values, positions: torch.Tensor, direction: torch.Tensor
+    ) -> Callable[[], dict[str, torch.Tensor]]:
+        """See `Term.adjoint`; through the energy's own derivatives, which torch takes twice."""
+        (s,) = self.sets
+        nodes = torch.as_tensor(s.source.nodes, device=self.launcher.device)
+        shares = torch.as_tensor(s.source.gradients[0, :, :, 0], device=self.launcher.device)  # (Q, K)
+
+        def at_points(field: torch.Tensor) -> torch.Tensor:
+            return torch.einsum("qk,bfki->bfqi", shares, field[:, nodes]).flatten(1, 2)
+
+        def differentiate() -> dict[str, torch.Tensor]:
+            with torch.enable_grad():
+                given = {name: values[name] for name in self.shapes}
+                leaves = {name: each.detach().requires_grad_() for name, each in given.items() if each is not None}
+                x = at_points(positions).requires_grad_()
+                (slope,) = torch.autograd.grad(_energy(x, *leaves.values()), x, create_graph=True)
+                loss = -(slope * at_points(direction)).sum()
+                found = torch.autograd.grad(loss, list(leaves.values()))
+            return dict(zip(leaves, found, strict=True))
+
+        return differentiate
+
+
+def _energy(
+    x: torch.Tensor, reference: torch.Tensor, target: torch.Tensor, area: torch.Tensor, coefficients: torch.Tensor
+) -> torch.Tensor:
+    """The sum of what `kernels.medium` has for each point."""
+    size = area.norm(dim=-1)
+    n = area / size[..., None].clamp_min(1e-30)
+    d, inertial = x - reference, ((x - target) * n).sum(-1)
+    across = (d * n).sum(-1)
+    along = (d - across[..., None] * n).square().sum(-1)
+    linear, normal, tangential, mass = coefficients.unbind(-1)
+    squares = 0.5 * (linear * d.square().sum(-1) + mass * inertial.square())
+    slip = torch.where(along > 0.0, along.clamp_min(1e-300).sqrt(), 0.0)
+    return (size * (squares + (normal * across.abs() ** 3 + tangential * along * slip) / 3.0)).sum()

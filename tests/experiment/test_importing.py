@@ -513,8 +513,8 @@ TUTORIAL = ROOT / "docs" / "bring_your_robot.md"
 def test_the_tutorial(shared_data, tmp_path, monkeypatch):
     """Its mesh, its configuration and its output, on the recordings that it was written with."""
     blocks = re.findall(r"```(\w*)\n(.*?)```", TUTORIAL.read_text(encoding="utf-8"), flags=re.DOTALL)
-    (mesh,), (written,) = ([text for kind, text in blocks if kind == wanted] for wanted in ("python", "yaml"))
-    (log,) = [text.splitlines() for _, text in blocks if text.startswith("import: ")]
+    (mesh,), (written, _) = ([text for kind, text in blocks if kind == wanted] for wanted in ("python", "yaml"))
+    log, _ = [text.splitlines() for _, text in blocks if text.startswith("import: ")]
     monkeypatch.chdir(tmp_path)
     exec(compile(mesh, TUTORIAL.name, "exec"), {})
     (tmp_path / "recordings").symlink_to(shared_data / "beam_mocap")
@@ -529,6 +529,22 @@ def test_the_tutorial(shared_data, tmp_path, monkeypatch):
     for line, (name, each) in zip(log, quality.items(), strict=True):
         rms = registration[name]["rms_mm"]
         assert line == f"import: {name} is let go in frame {each['release_frame']:.1f}, registered to {rms:.2f} mm"
+
+
+def test_the_second_robot_of_the_tutorial(shared_data, tmp_path, monkeypatch, caplog):
+    blocks = re.findall(r"```(\w*)\n(.*?)```", TUTORIAL.read_text(encoding="utf-8"), flags=re.DOTALL)
+    _, written = [text for kind, text in blocks if kind == "yaml"]
+    _, log = [text.splitlines() for _, text in blocks if text.startswith("import: ")]
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "poses").symlink_to(shared_data / "tentacle")
+    place = tmp_path / "configs" / "experiment" / "my_tentacle.yaml"
+    place.parent.mkdir(parents=True)
+    place.write_text(written)
+    config = configuration(f"hydra.searchpath=[file://{tmp_path / 'configs'}]", experiment="my_tentacle")
+    check_configuration(config)
+    with caplog.at_level("INFO"):
+        run_stages(acquisition_stages(config), tmp_path)
+    assert [each for each in caplog.messages if "are told by where they are" in each] == log
 
 
 def test_an_experiment_may_set_gravity(tmp_path):

@@ -162,12 +162,24 @@ class Prepared:
 def _new_network(scene: Scene, model: str, train: Samples, groups: Mapping[str, Any]) -> StateMap:
     """An untrained network, with coders from the training steps; the same for the same seed."""
     rest, config = scene.like.to(train.q.device), groups["network"]
+    if not scene.moving(scene.config["split"]["train"]):
+        config = _told_by(config, len(train.q), model)
     torch.manual_seed(groups["seed"])
     if model == SIMFREE:
         return build_next_state(config, rest, train.q, train.v, train.actuation)
     by_displacement = config["kind"] == "reduced" and config["force_basis"] == "displacement"
     stiffness = RestStiffness(scene.model_simulator(model)) if by_displacement else None
     return build_model(config, rest, train.q, train.v, train.outputs[0], train.actuation, stiffness)
+
+
+def _told_by(config: Mapping[str, Any], poses: int, model: str) -> Mapping[str, Any]:
+    """The group ``network`` with no more modes than there are poses, each of which tells one at most."""
+    known = ("position_modes",) if model == SIMFREE else ("position_modes", "force_modes")
+    many = {key: poses for key in known if config.get(key, 0) > poses}
+    if many:
+        said = " and ".join(f"network.{key} of {config[key]}" for key in many)
+        log.info("%s: %d poses tell %d modes, which %s comes down to", model, poses, poses, said)
+    return {**config, **many}
 
 
 def _supervised(

@@ -126,7 +126,7 @@ def _work(function: Callable[[Any, Advance], Any], connection: Connection) -> No
 
     be_quiet()
     torch.set_num_threads(1)
-    wp.config.log_level = wp.LOG_ERROR  # What Warp says when it starts, the parent has said.
+    wp.config.log_level = wp.LOG_WARNING  # As in the parent: every worker would greet otherwise.
     with threadpool_limits(1):
         try:
             while True:

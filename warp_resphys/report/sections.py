@@ -60,7 +60,7 @@ def _parameter(name: str) -> tuple[str, str, float]:
     command = re.fullmatch(r"([a-z]+_)?([a-z]+)_(factor|delay|rise)", name)
     if command is not None and name not in _PARAMETERS:
         kind, unit, per = _COMMANDS[command[3]]
-        return f"{kind} of the {command[2]}s", unit, per
+        return f"{kind} of the {command[2]}{'es' if command[2].endswith('s') else 's'}", unit, per
     branch = re.fullmatch(r"prony_(ratio|time)_(\d+)", name)
     if branch is None:
         return _PARAMETERS.get(name, (name, "", 1.0))

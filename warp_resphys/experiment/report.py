@@ -177,7 +177,7 @@ def collect_metrics(folder: Path, config: Mapping[str, Any], stages: Sequence[st
     more = {
         "reconstruction": read_if_there(folder / RECONSTRUCTION),
         "mesh_check": {} if config["mesh_check"] is None else read_if_there(folder / MESH_CHECK),
-        "seconds_per_test_trajectory": read_if_there(folder / TIMES).get("seconds", {}),
+        "seconds_per_test_trajectory": read_if_there(folder / TIMES).get("seconds", {}) if config["timing"] else {},
         **({"noise_mm": truth["noise_mm"]} if "noise_mm" in truth else {}),
     }
     return {

@@ -44,7 +44,7 @@ def test_one_box_is_a_box():
 
 
 def test_of_a_configuration():
-    config = {"kind": "boxes", "boxes": {"a": {"from": [0, 0, 0], "to": [0.1, 0.03, 0.03]}}, "size": 0.01, "nodes": 8}
+    config = {"kind": "boxes", "boxes": [[[0, 0, 0], [0.1, 0.03, 0.03]]], "size": 0.01, "nodes": 8}
     assert len(build_mesh(config).cells) == 90
     assert len(build_mesh(finer(config, 2.0)).cells) == 720
 

@@ -63,8 +63,7 @@ def build_mesh(config: Mapping[str, Any]) -> Mesh:
     elif kind == "box_tetrahedra":
         mesh = box_tetrahedra(config["size"], config["divisions"], config.get("order", 1))
     elif kind == "boxes":
-        corners = [(each["from"], each["to"]) for each in config["boxes"].values()]
-        mesh = boxes_hexahedra(corners, config["size"], config["nodes"])
+        mesh = boxes_hexahedra([(low, high) for low, high in config["boxes"]], config["size"], config["nodes"])
     elif kind == "file":
         mesh = read_mesh(config["path"], config["units"], config["order"], config["drop_unreferenced"])
     elif kind == "arm":

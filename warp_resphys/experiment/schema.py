@@ -178,7 +178,10 @@ _MESHES: Final[Mapping[str, Mapping[str, Spec]]] = {
     "box_hexahedra": {**_BOX, "nodes": absent(_NODES)},
     "box_tetrahedra": {**_BOX, "order": absent(_ORDER)},
     "boxes": {
-        "boxes": Group(each=Group(dict.fromkeys(("from", "to"), _list(FINITE, "three numbers, in m", [3])))),
+        "boxes": Kind(
+            lambda value: isinstance(value, list) and all(_PLACES.fits(each) and len(each) == 2 for each in value),
+            "a list of boxes, each by its lowest and its highest corner of three numbers, in m",
+        ),
         "size": POSITIVE,
         "nodes": _NODES,
     },

@@ -510,24 +510,23 @@ class Identifier:
         return found, slopes(prior.double().cpu().numpy())
 
     def uncertainty(self, unit: NDArray[np.float64]) -> Uncertainty | None:
-        """Covariance (J^T J)^-1 (sum_r s_r^2 J_r^T J_r) (J^T J)^-1 at fractions of the ranges, J_r that of a trial.
+        """Covariance (J^T J)^-1 (sum_r S_r) (J^T J)^-1 at fractions of the ranges; None if a simulation close by fails.
 
-        s_r^2 is the mean square residual of the trial times the number of frames that tell nothing new: the sum of
-        the residuals' autocorrelation up to its first zero. What the priors add counts as one more trial, whose s_r^2
-        is its weight. None if the simulation fails close by.
+        S_r is that of the gradient J_r^T e of a trial whose errors e are as large as its residuals, and as correlated
+        in time, up to the first zero of their autocorrelation (Newey and West 1987, with the same correlation for all
+        coordinates). What the priors add counts as one more trial, whose errors are independent and of their weight.
         """
         linear = self._linearise(unit, central=True)
         if linear is None:
             return None
         found, prior = linear
         free = 1.0 - min(len(unit) / sum(seen for _, _, seen in found), 0.5)
-        variances = [np.square(rows).sum() / (seen * free) * _redundancy(rows) for rows, _, seen in found]
-        blocks = np.stack([jacobian.T @ jacobian for _, jacobian, _ in found])
-        blocks = np.concatenate([blocks, (prior.T @ prior)[None]])
-        variances.append(self._prior_weight)
-        values, vectors = np.linalg.eigh(blocks.sum(0))
+        told = [np.square(rows).sum() / (seen * free) * _scatter(rows, jacobian) for rows, jacobian, seen in found]
+        told.append(self._prior_weight * prior.T @ prior)
+        curvature = np.sum([jacobian.T @ jacobian for _, jacobian, _ in found], axis=0) + prior.T @ prior
+        values, vectors = np.linalg.eigh(curvature)
         inverse = (vectors / np.maximum(values, 1e-12 * max(values[-1], 1e-300))) @ vectors.T
-        covariance = inverse @ np.einsum("r,rpq->pq", variances, blocks) @ inverse
+        covariance = inverse @ np.sum(told, axis=0) @ inverse
         deviation = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
         slopes = [bounds.slope(u) for bounds, u in zip(self.bounds.values(), unit, strict=True)]
         poorest = vectors[:, 0] * np.sign(vectors[np.abs(vectors[:, 0]).argmax(), 0])
@@ -555,11 +554,30 @@ class _Equilibria:
         return (self.q + torch.einsum("ep,prni->erni", away, self.slopes)).flatten(0, 1)
 
 
-def _redundancy(series: NDArray[np.float64]) -> float:
-    """How many frames (T, C) weigh as much as one: 1 + 2 sum of the autocorrelation up to its first zero."""
-    if len(series) < 2:
-        return 1.0
+def _autocorrelation(series: NDArray[np.float64]) -> list[float]:
+    """That of (T, C) values at the lags of 1, 2, ... frames, up to its first zero."""
     products = [float((series[lag:] * series[: len(series) - lag]).sum()) for lag in range(len(series) // 2)]
-    if products[0] <= 0.0:
-        return 1.0
-    return 1.0 + 2.0 * sum(takewhile(lambda value: value > 0.0, products[1:])) / products[0]
+    if not products or products[0] <= 0.0:
+        return []
+    return [value / products[0] for value in takewhile(lambda value: value > 0.0, products[1:])]
+
+
+def _redundancy(series: NDArray[np.float64]) -> float:
+    """How many frames (T, C) weigh as much as one."""
+    return 1.0 + 2.0 * sum(_autocorrelation(series))
+
+
+def _scatter(rows: NDArray[np.float64], jacobian: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(P, P) the covariance of J^T e for errors e of unit size that are as correlated in time as the residuals.
+
+    Args:
+        rows: (T, C) the residuals.
+        jacobian: (T C, P) J.
+    """
+    slopes = jacobian.reshape(*rows.shape, -1)
+    found = np.einsum("tcp,tcq->pq", slopes, slopes)
+    for lag, share in enumerate(_autocorrelation(rows), 1):
+        across = share * np.einsum("tcp,tcq->pq", slopes[lag:], slopes[:-lag])
+        found += across + across.T
+    values, vectors = np.linalg.eigh(found)  # Cut off at a zero, a correlation may leave something negative.
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)

@@ -17,6 +17,14 @@ ZERO, HALF, THIRD = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0 / 3.0)
 kernel, function = decorators("medium")
 
 
+@function
+def split(way: wp.vec3d, area: wp.vec3d):
+    """Size and normal of an area, and the parts of a way across it (a length) and along it (a vector)."""
+    n = wp.normalize(area)
+    across = wp.dot(way, n)
+    return wp.length(area), n, across, way - across * n
+
+
 @kernel
 def local_step(
     nodes: wp.array2d[int],
@@ -36,10 +44,7 @@ def local_step(
     d = x - reference[b, p]
     e = x - target[b, p]
     c = coefficients[b, 0]
-    a = wp.length(area[b, p])
-    n = wp.normalize(area[b, p])
-    across = wp.dot(d, n)
-    along = d - across * n
+    a, n, across, along = split(d, area[b, p])
     slip = wp.length(along)
     inertial = wp.dot(e, n)
     force = a * (c[0] * d + (c[1] * wp.abs(across) * across + c[3] * inertial) * n + c[2] * slip * along)
@@ -64,10 +69,7 @@ def tangent(
     b, p = wp.tid()
     d = line_at(positions, nodes, gradients, b, p, p / points_per_cell) - reference[b, p]
     c = coefficients[b, 0]
-    a = wp.length(area[b, p])
-    n = wp.normalize(area[b, p])
-    across = wp.dot(d, n)
-    along = d - across * n
+    a, n, across, along = split(d, area[b, p])
     slip = wp.length(along)
     # The tangential part is c_t (|d_t| (1 - n n^T) + d_t d_t^T / |d_t|).
     even = a * (c[0] + c[2] * slip)

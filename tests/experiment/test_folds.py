@@ -77,15 +77,15 @@ def test_the_last_fold_that_is_left_has_all_processes(tmp_path, monkeypatch):
 
 def test_ctrl_c_says_what_was_on_and_the_rest_is_kept(tmp_path):
     program = f"""if __name__ == "__main__":
-    import signal, sys
+    import signal
     signal.signal(signal.SIGINT, signal.default_int_handler)  # Who runs the tests may ignore it.
-    sys.path.insert(0, {str(Path(__file__).parent)!r})
     from test_folds import folds, run_folds
     run_folds(folds({str(tmp_path)!r}, "abcd", seconds=1.0), 2)
 """
     script = tmp_path / "program.py"
     script.write_text(program)
-    process = subprocess.Popen([sys.executable, str(script)], stderr=subprocess.PIPE, text=True)
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+    process = subprocess.Popen([sys.executable, str(script)], stderr=subprocess.PIPE, text=True, env=environment)
     start = time.monotonic()
     while not [*tmp_path.glob("fold_*/stages/first.json")] and time.monotonic() - start < 60.0:
         time.sleep(0.1)

@@ -287,6 +287,10 @@ def recorded(tmp_path, finished, change):
         (["data.parts=[]"], "data.parts is []: it must be a list of different chambers, tendons or muscles, from 1"),
         (["laboratory.sequences.mean=high"], "laboratory.sequences.mean is 'high': it must be a finite number"),
         (["laboratory.sequences.correlation=[[1.0],[0.0]]"], "it must be a finite number, or a matrix of them"),
+        (
+            ["+identify.parameters.pressure_delay={lower:-0.01,upper:0.1}"],
+            "identify.parameters.pressure_delay.lower is -0.01: nothing comes before its command",
+        ),
         (["+identify.first_guess.youngs_modulus=soft"], "identify.first_guess.youngs_modulus is 'soft'"),
         (["+identify.first_guess.pressure=0.04"], "identify.first_guess names 'pressure': choose from youngs_modulus"),
         (["reconstruction=lbfgsb", "+reconstruction.modes=4"], "reconstruction.method=lbfgsb has none"),

@@ -11,6 +11,8 @@ from warp_resphys.report.verdict import (
     epochs_kept,
     gains,
     judgement,
+    learned_in_part,
+    marker_verdict,
     reduction_text,
     untrained,
 )
@@ -169,3 +171,14 @@ def test_metrics_of_folds_and_of_one_split():
     assert "leaves 50 % less error than the uncorrected simulation (mean 2 to 1 mm)." in said_of("sysid", alone)
     assert "adds nothing to SysID" in said_of("resphys", alone)
     assert judgement({"errors_mm": {}}, {}) == []
+
+
+def test_a_trial_whose_rest_is_the_test_is_not_called_unseen():
+    half = {"data": {"train": ["step"], "train_fraction": 0.5}}
+    assert learned_in_part(half, ["step"])
+    assert not learned_in_part(half, ["step", "other"])
+    assert not learned_in_part({"data": {"train": ["step"], "train_fraction": 1.0}}, ["step"])
+    assert not learned_in_part({"data": {"train": 35, "train_fraction": 0.5}}, ["step"])
+    errors = {"sysid": {"mean": 1.0}}
+    said = marker_verdict(errors, ["step"], None, parted=True)
+    assert said.startswith("On trial step, in the part that no training or identification saw, the simulated markers")

@@ -399,6 +399,11 @@ def _check_identification(identify: Mapping[str, Any], known: Sequence[str]) -> 
                 raise InputError(f"identify.{group} names '{name}': {instead}.")
             with _naming(f"identify.{group}.{name}: "):
                 bounds_of(settings)
+            if name.endswith(("_delay", "_rise")) and settings["lower"] < 0.0:
+                raise InputError(
+                    f"identify.{group}.{name}.lower is {settings['lower']:g}: nothing comes before its command, so it "
+                    "must be zero or more, in s; data.trials.NAME.onset says when a command comes."
+                )
     for name, value in identify["first_guess"].items():
         within = parameters.get(name)
         if name not in known:

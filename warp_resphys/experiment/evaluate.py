@@ -91,11 +91,9 @@ def _intervals(
     settings, rest = scene.config, scene.dataset.bound
     assert rest is not None
     names = [name for some in scene.alike(settings["calibration"]) for name in some]
-    known, target = (_counted(scene, some) for some in (names, settings["groups"]["1"]))
-    if learned := [row for row, name in enumerate(names) if name in settings["split"]["train"]]:
-        steps = scene.learned_steps(known.shape[1] - 1) + 1
-        known[learned, :steps] = scene.dataset.observed[scene.dataset.rows([names[row] for row in learned])][:, :steps]
-        known[learned, steps:] = np.nan
+    known, target = scene.dataset.observed[scene.dataset.rows(names)], _counted(scene, settings["groups"]["1"])
+    learned = [row for row, name in enumerate(names) if name in settings["split"]["train"]]
+    known[learned, scene.learned_steps(known.shape[1] - 1) + 1 :] = np.nan  # The rest may be the test.
     found: dict[str, Any] = {}
     for model, parts in calibrating.items():
         intervals = Intervals.calibrated(list(_all_observed(scene, model, parts)), list(known), rest)

@@ -305,7 +305,7 @@ def _print(metrics: Mapping[str, Any], folder: Path, config: Mapping[str, Any]) 
     columns |= {f"{scale} x": found for scale, found in metrics.get("scales", {}).items()}
     columns = {name: found for name, found in columns.items() if found != whole}
     what = "markers" if sees_markers(config) else "vertices"
-    title = f"Error of the {what} in trials that no training saw" + "; x: times the inputs" * ("scales" in metrics)
+    title = f"Error of the {what} in what no training saw" + "; x: times the inputs" * ("scales" in metrics)
     table = Table("model", "mean [mm]", "std [mm]", *columns, "diverged", title=title)
     for model, summary in whole.items():
         each = [number_text(found[model]["mean"]) if model in found else "" for found in columns.values()]

@@ -55,13 +55,20 @@ def verdict(data: RunReport) -> str:
         said = [vertex_verdict(metrics["errors_mm"], data.published, data.simulator, data.target)]
     else:
         trials = tuple(data.pages) if data.trials is None else data.trials.names
-        said = [marker_verdict(errors, trials, data.seconds, folds=data.trials is None)]
+        parted = learned_in_part(data.settings, trials)
+        said = [marker_verdict(errors, trials, data.seconds, folds=data.trials is None, parted=parted)]
         said.append(reduction_text(errors, data.published, _paired(metrics)))
     if data.settings["data"].get("train_fraction", 1.0) < 1.0:
         published = PUBLISHED_WINDOWS_MM.get(data.experiment, {})
         said.append(growth_text(metrics.get("growth", {}), list(metrics.get("horizons", {})), published))
     said.append(scale_text(metrics.get("scales", {})))
     return unbroken(" ".join(each for each in said if each))
+
+
+def learned_in_part(settings: Mapping[str, Any], tested: Collection[str]) -> bool:
+    """Whether the trials that are tested were learned from, but for the rest of each that is the test."""
+    named = settings["data"].get("train")
+    return settings["data"].get("train_fraction", 1.0) < 1.0 and isinstance(named, list) and {*tested} <= {*named}
 
 
 def unbroken(said: str) -> str:
@@ -120,7 +127,12 @@ def _closer(before: float, after: float) -> str:
 
 
 def marker_verdict(
-    errors: Mapping[str, Any], trials: Sequence[str], seconds: float | None, *, folds: bool = False
+    errors: Mapping[str, Any],
+    trials: Sequence[str],
+    seconds: float | None,
+    *,
+    folds: bool = False,
+    parted: bool = False,
 ) -> str:
     """Say how far the models are from what was measured.
 
@@ -129,9 +141,11 @@ def marker_verdict(
         trials: Names of the test trials.
         seconds: How much of them counts.
         folds: Whether each trial was the test of a fold of its own.
+        parted: Whether each was learned from, but for the part that is the test.
     """
     who = f"trial {trials[0]}" if len(trials) == 1 else f"{len(trials)} trials"
     held = "each of them kept back once" if folds and len(trials) > 1 else "which no training or identification saw"
+    held = "in the part that no training or identification saw" if parted else held
     span = "" if seconds is None else f" over the first {seconds:g} s"
     ranked = ("resphys", "resphys_uncorrected", "sysid", "sysid_elastic", "simulation")
     main = next((m for m in ranked if m in errors), "")

@@ -29,7 +29,7 @@ from ..report.page import (
     figures_beside,
     number_text,
 )
-from ..report.verdict import held_out
+from ..report.verdict import held_out, learned_in_part
 from .preparation import CONVERTERS
 from .runs import Results, Run, asked_for, fail_for, made, run_all
 
@@ -194,6 +194,7 @@ def _robot(robot: Mapping[str, Any], run: Run, pictures: Path) -> Part:
     metrics = run.metrics
     names = list(metrics.get("folds", {})) or [row["name"] for row in metrics["per_trajectory"]]
     how = "each of them kept back once" if "folds" in metrics and len(names) > 1 else "kept back"
+    how = "in the part that was not learned from" if learned_in_part(run.settings, names) else how
     said = [f"Tested on {len(names)} trial{'s' if len(names) > 1 else ''}, {how}: {', '.join(names)}."]
     if "mesh_check" in metrics and "moved_mm" in metrics["mesh_check"]:
         moved = number_text(metrics["mesh_check"]["moved_mm"])

@@ -135,7 +135,7 @@ def _summary(config: Mapping[str, Any], results: Sequence[Run]) -> Part:
         cells.append(Cell(_coverage(metrics)))
         rows.append(Row(robot["title"], [*cells, Cell(duration_text(_seconds(metrics)))], small=robot["actuation"]))
     note = (
-        "Mean distance of the markers in trials that no training and no identification saw [mm], ± the standard "
+        "Mean distance of the markers in what no training and no identification saw [mm], ± the standard "
         "deviation over trials. Less error: the share that SysID takes away of the uncorrected error, and ResPhys of "
         "SysID's, with the interval that holds it in nine of ten draws of the trials (paired bootstrap). Coverage: of "
         "the measured coordinates, those within the 90 % prediction intervals of ResPhys, and how wide these are on "

@@ -28,6 +28,7 @@ _MODULES = {
     "read_surfaces": "mesh.readers",
     "read_recording": "data.recordings.reading",
     "record_rollout": "dynamics.tape",
+    "fill_surface": "mesh.tetrahedra",
     "rod": "mesh.rod",
     "select_vertices": "mesh.mesh",
     "Simulator": "dynamics.simulator",

@@ -67,6 +67,25 @@ def test_a_table_that_says_nothing_of_itself(tmp_path, positions):
     np.testing.assert_allclose(recording.actuation[:, 0], 1e-3 * wound, atol=1e-8)
 
 
+def test_a_log_that_began_before_its_winch_and_ended_after_it(tmp_path, positions):
+    """It is as it was first told, and ends with what is told last; a note at the side of the header is none of it."""
+    path, pulled = tmp_path / "swing.csv", [np.nan] * 5 + np.linspace(2.0, 3.5, 30).tolist() + [np.nan] * 5
+    columns = ["frame", *(f"{label}.{axis}" for label in "abc" for axis in "xyz"), "winch [mm]"]
+    rows = [f"{k},{','.join(f'{x:.6f}' for x in positions[k].ravel())},{pulled[k]:.6f},," for k in range(40)]
+    path.write_text("\n".join([",".join(columns) + ",,from left to right", *rows]))
+    table = Table(columns, header_lines=1)
+    recording = read_recording(path, units="m", rate=100.0, table=table)
+    assert recording.positions.shape == (35, 3, 3)
+    np.testing.assert_allclose(recording.actuation[:, 0], 1e-3 * np.array([2.0] * 5 + pulled[5:35]), atol=1e-9)
+    rows[20] = rows[20].replace(f"{pulled[20]:.6f}", "")
+    path.write_text("\n".join([",".join(columns), *rows]))
+    with pytest.raises(DataFileError, match="line 22: an actuation is missing or infinite; every frame between"):
+        read_recording(path, units="m", rate=100.0, table=table)
+    path.write_text("\n".join([",".join(columns), *rows[:20], rows[21] + "9"]))
+    with pytest.raises(DataFileError, match=r"line 2: 13 cells, but data\.table\.columns names 11"):
+        read_recording(path, units="m", rate=100.0, table=table)
+
+
 def test_a_table_of_markers_in_a_plane(tmp_path):
     """A single camera sees no depth; and where nothing tells the time, the rate does."""
     path, flat = tmp_path / "swing.csv", np.random.default_rng(0).uniform(0.0, 90.0, (30, 4))

@@ -203,12 +203,16 @@ def test_selection_of_a_plane_and_of_an_edge() -> None:
     assert select_vertices(mesh, x=0.0).tolist() == list(range(16))
     assert select_vertices(mesh, x=0.1, z=0.03).tolist() == [163, 167, 171, 175]
     assert len(select_vertices(mesh, y=0.0149, tolerance=0.006)) == 2 * 11 * 4
+    assert select_vertices(mesh, x=[0.0, 0.01]).tolist() == list(range(32))
+    assert select_vertices(mesh, x=[0.1, 0.2], y=(-1.0, 0.0)).tolist() == [160, 161, 162, 163]
 
 
 def test_empty_selections_are_refused() -> None:
     mesh = box_hexahedra()
     with pytest.raises(MeshError, match=r"x = 0\.2 m: the mesh reaches x from 0 to 0.1 m"):
         select_vertices(mesh, x=0.2)
+    with pytest.raises(MeshError, match=r"x = 0\.011 to 0\.019 m: the mesh reaches x from 0 to 0.1 m"):
+        select_vertices(mesh, x=[0.011, 0.019])
     with pytest.raises(MeshError, match="at least one of the coordinates"):
         select_vertices(mesh)
 

@@ -40,6 +40,18 @@ def test_along_a_curve_it_keeps_its_radius_and_does_not_twist():
     np.testing.assert_allclose(first, last, atol=1e-4)  # a section that does not turn about the axis
 
 
+def test_a_section_may_be_an_ellipse():
+    """Of which the first semi-axis is along the coordinate axis that the rod crosses most squarely, y here."""
+    tapered = np.array([[0.0, 0.02, 0.005], [0.2, 0.01, 0.0025]])
+    mesh = rod([[0.0, 0.0, 0.0], [0.02, 0.0, -0.2]], tapered, 8, nodes=27)
+    length = np.hypot(0.02, 0.2)
+    taper = 1.0 - 0.5 * min(length / 0.2, 1.0)
+    middle = np.pi * 0.02 * 0.005 * (1.0 + taper + taper**2) / 3.0
+    assert cell_volumes(mesh).sum() == pytest.approx(middle * length, rel=3e-3)
+    wide, thick = np.ptp(mesh.vertices[:, 1]), np.ptp(mesh.vertices[mesh.vertices[:, 2] > -1e-3, 0])
+    assert (wide, thick) == (pytest.approx(0.04, rel=0.01), pytest.approx(0.01, rel=0.02))
+
+
 def test_layers_are_as_long_as_the_grading_says():
     for grading in (0.0, 0.5, 1.0):
         ends = np.unique(np.round(rod(AXIS, TAPER, 10, nodes=8, grading=grading).vertices[:, 2], 9))[::-1]

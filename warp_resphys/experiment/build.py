@@ -10,6 +10,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from ..data.markers import Markers, bind_markers
+from ..data.sight import SeenMarkers, Sight
 from ..dynamics.nonlinear_solver import SolverSettings
 from ..dynamics.simulator import Simulator
 from ..energies.materials import Material, make_material
@@ -21,6 +22,7 @@ from ..mesh.boxes import boxes_hexahedra
 from ..mesh.mesh import Mesh, box_hexahedra, box_tetrahedra, check_mesh, quadratic, select_vertices
 from ..mesh.readers import read_mesh
 from ..mesh.rod import rod
+from ..mesh.tetrahedra import fill_surface
 from .actuators import build_actuators
 
 _DTYPES = {"float64": torch.float64, "float32": torch.float32}
@@ -66,6 +68,8 @@ def build_mesh(config: Mapping[str, Any]) -> Mesh:
         mesh = boxes_hexahedra([(low, high) for low, high in config["boxes"]], config["size"], config["nodes"])
     elif kind == "file":
         mesh = read_mesh(config["path"], config["units"], config["order"], config["drop_unreferenced"])
+    elif kind == "surface":
+        mesh = fill_surface(config["path"], config["size"], config["units"], config["order"])
     elif kind == "arm":
         mesh = shipped_arm(config["name"])
     elif kind == "arm_generated":
@@ -80,7 +84,7 @@ def build_mesh(config: Mapping[str, Any]) -> Mesh:
 
 
 def finer(config: Mapping[str, Any], times: float) -> dict[str, Any]:
-    """The group ``mesh`` with so many times as many cells along the edges of a box, a rod's axis, or all of an arm.
+    """The group ``mesh`` with so many times as many cells along the edges of a box, a rod's axis, or all of others.
 
     Raises:
         InputError: a mesh whose cells are given.
@@ -88,7 +92,7 @@ def finer(config: Mapping[str, Any], times: float) -> dict[str, Any]:
     kind = config["kind"]
     if kind in ("box_hexahedra", "box_tetrahedra"):
         return {**config, "divisions": [math.ceil(times * each) for each in config["divisions"]]}
-    if kind == "boxes":
+    if kind in ("boxes", "surface"):
         return {**config, "size": config["size"] / times}
     if kind == "rod":
         return {**config, "layers": math.ceil(times * config["layers"])}
@@ -149,6 +153,21 @@ def bound_markers(settings: Mapping[str, Any], mesh: Mesh, places: ArrayLike, la
     vertices = None if settings["bind_to"] is None else select_vertices(mesh, **settings["bind_to"])
     more = {key: settings[key] for key in ("largest_distance", "patch") if key in settings}
     return bind_markers(mesh, places, labels, kind=settings["bind"], vertices=vertices, **more)
+
+
+def sight_of(settings: Mapping[str, Any], labels: Sequence[str]) -> Sight:
+    """How much recordings tell of where these tracked markers are, from the group ``markers``.
+
+    Raises:
+        InputError: see `Sight`.
+    """
+    nominal = [settings["tracked"][label] for label in labels]
+    return Sight.of(nominal, settings.get("plane"), settings.get("frame", "body"))
+
+
+def seen_markers(settings: Mapping[str, Any], mesh: Mesh, places: ArrayLike, labels: Sequence[str]) -> Markers:
+    """`bound_markers`, as far as recordings tell where they are."""
+    return SeenMarkers.of(bound_markers(settings, mesh, places, labels), sight_of(settings, labels))
 
 
 def build_simulator(

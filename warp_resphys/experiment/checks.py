@@ -19,7 +19,7 @@ from ..learning.reconstruction import make_reconstructor
 from ..learning.replay import MASS_FACTOR, known_parameters
 from ..mesh.mesh import select_vertices, surface_vertices
 from .actuators import Drive, drive_of
-from .build import build_body, build_material, build_simulator, finer
+from .build import build_body, build_material, build_simulator, finer, sight_of
 from .files import STATIC, payload_inputs
 from .identify import ELASTIC, bounds_of
 from .reading import standing_enough
@@ -222,10 +222,29 @@ def _check_markers(config: Mapping[str, Any], body: Body, begins: set[str]) -> N
             f"markers.labels is assigned, but markers.reference names {standing} markers that stand still beside a "
             f"body in a pose: it takes {enough}" + (", or data.axes and one." if axes is None else ".")
         )
+    _check_sight(config)
     if markers["bind"] == "rigid" and markers["bind_to"] is None:
         raise InputError("markers.bind is rigid: set markers.bind_to to the vertices that they follow, as {x: 0.1}.")
     if markers["bind_to"] is not None:
         select_vertices(body.mesh, **markers["bind_to"])
+
+
+def _check_sight(config: Mapping[str, Any]) -> None:
+    """Refuses what cannot be had of markers whose places are not told."""
+    markers, data = config["markers"], config["data"]
+    sight = sight_of(markers, [*markers["tracked"]])
+    if sight.plane is not None and data.get("axes") is None:
+        raise InputError(
+            "markers.plane is set, but data.axes is not: name the axes of the recordings along which the body's x, y "
+            "and z are, so that it is known which one is not seen."
+        )
+    if sight.own and data.get("base_motion") is not None:
+        raise InputError("markers.frame is own, but data.base_motion tells where the body is: take one of them out.")
+    if sight.own and (config.get("identify") or {}).get("placement") is not None:
+        raise InputError(
+            "identify.placement is set, but with markers.frame own the markers themselves are the frame, so that where "
+            "each of them sits stays open: set it to null."
+        )
 
 
 def _check_trials(config: Mapping[str, Any]) -> None:

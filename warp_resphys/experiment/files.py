@@ -160,7 +160,7 @@ class Dataset:
         return torch.from_numpy(np.stack(rows, axis=1))
 
     def trials(
-        self, names: Sequence[str], body: Body, payload_at: Mapping[str, float] | None, time_step: float | None = None
+        self, names: Sequence[str], body: Body, payload_at: Mapping[str, Any] | None, time_step: float | None = None
     ) -> Trials:
         """Some of the trials, which begin alike, in float64 on the CPU.
 
@@ -223,7 +223,7 @@ def read_dataset(path: Path) -> Dataset:
         )
 
 
-def payload_inputs(body: Body, payload_at: Mapping[str, float] | None, loads: FloatArray) -> dict[str, FloatArray]:
+def payload_inputs(body: Body, payload_at: Mapping[str, Any] | None, loads: FloatArray) -> dict[str, FloatArray]:
     """What payloads are for a simulation, as arguments of `Inputs` [kg].
 
     On a body with strings they are (R, 1) `energies.strings.PAYLOAD`; on others an (R, N) ``attached_mass`` in equal

@@ -21,6 +21,7 @@ from ..data.recordings.recording import Recording
 from ..data.recordings.release import Release, valve_opening
 from ..data.registration import Registration, register_markers
 from ..data.rigid import RigidTransform
+from ..data.sight import Sight
 from ..dynamics.simulator import Simulator
 from ..io.errors import DataFileError, InputError, listed
 from ..io.files import write_json
@@ -70,10 +71,10 @@ class Observed:
     tells_places: bool = True
     base: FloatArray | None = None
 
-    def to_body(self, points: FloatArray, shift: FloatArray) -> FloatArray:
-        """(..., M, 3) points of the recording in the frame of the body, moved by (M, 3) [m]."""
-        moved: FloatArray = self.registration.transform.apply(points.reshape(-1, 3)).reshape(points.shape) + shift
-        return moved
+    def to_body(self, points: FloatArray, shift: FloatArray, sight: Sight) -> FloatArray:
+        """What (..., M, 3) points of the recording tell in the frame of the body, moved by (M, 3) [m]."""
+        moved = self.registration.transform.apply(points.reshape(-1, 3)).reshape(points.shape)
+        return sight.of_arrays(sight.of_arrays(moved) + shift)
 
 
 class Importer:
@@ -341,7 +342,8 @@ def import_scaled(context: StageContext) -> None:
 def _offset(importer: Importer, each: Observed) -> FloatArray:
     """(M, 3) how far the tracked markers of a trial are from where they should be, in the frame of the body [m]."""
     count = len(importer.tracked)
-    return each.registration.positions[:count] - importer.reader.expected(not each.trial.is_released)[:count]
+    told = importer.reader.sight.of_arrays(each.registration.positions[:count])
+    return told - importer.reader.expected(not each.trial.is_released)[:count]
 
 
 def _shifts(data: Mapping[str, Any], observed: Sequence[Observed], mean: FloatArray, offsets: FloatArray) -> FloatArray:
@@ -400,7 +402,7 @@ def _dataset(
     importer: Importer, observed: Sequence[Observed], bound: FloatArray, shifts: FloatArray, gravity: FloatArray
 ) -> Dataset:
     """The trials in the frame of the body; those that end early are padded."""
-    settings, drive = importer.settings, importer.drive
+    settings, drive, sight = importer.settings, importer.drive, importer.reader.sight
     data, cutoff = settings["data"], settings["data"].get("cutoff")
     steps = data.get("steps")
     frames = max(len(each.moving.positions) if each.trial.is_released else 1 for each in observed)
@@ -416,9 +418,9 @@ def _dataset(
         limit = frames if each.trial.is_released or steps is None else steps + 1
         seen = each.moving.positions[:limit]
         slow = each.moving if cutoff is None or len(seen) == 1 else smooth(each.moving, cutoff)
-        markers[row, : len(seen)] = each.to_body(seen, shifts[row])
-        smoothed[row, : len(seen)] = each.to_body(slow.positions[:limit], shifts[row])
-        held[row] = each.to_body(each.still[: shape[2]], shifts[row])
+        markers[row, : len(seen)] = each.to_body(seen, shifts[row], sight)
+        smoothed[row, : len(seen)] = each.to_body(slow.positions[:limit], shifts[row], sight)
+        held[row] = each.to_body(each.still[: shape[2]], shifts[row], sight)
         if each.trial.is_released:
             times[row] = np.pad(each.moving.time, (0, frames - len(seen)), mode="edge")
         elif each.trial.begins == "rest":

@@ -80,7 +80,7 @@ Work = Callable[[StageContext], None]
 def simulated(config: Mapping[str, Any]) -> dict[str, Any]:
     """The settings that every simulation of an experiment depends on."""
     base = _pick(config, *_SIMULATED, *_around(config))
-    if config["mesh"]["kind"] == "file":
+    if "path" in config["mesh"]:
         base["mesh_digest"] = digest(config["mesh"]["path"])
     trials = config["data"].get("trials") or {}
     motions = [each.get("base_motion") for each in (config["data"], *trials.values()) if isinstance(each, Mapping)]
@@ -152,7 +152,7 @@ def _laboratory_settings(config: Mapping[str, Any], scales: Sequence[float]) -> 
         "batch": config["parallel"]["batch"],
         "in_the_loop": config["in_the_loop"] is not None,
     }
-    if config["laboratory"]["mesh"]["kind"] == "file":
+    if "path" in config["laboratory"]["mesh"]:
         own["mesh_digest"] = digest(config["laboratory"]["mesh"]["path"])
     return own
 

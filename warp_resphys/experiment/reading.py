@@ -19,7 +19,7 @@ from ..dynamics.inputs import Inputs
 from ..dynamics.simulator import Simulator
 from ..io.errors import DataFileError, InputError
 from .actuators import Drive
-from .build import bound_markers
+from .build import seen_markers, sight_of
 from .files import STATIC, payload_inputs
 from .trials import Trial, is_laboratory
 
@@ -46,6 +46,7 @@ class Reader:
         nominal: (M, 3) where they are on the undeformed body [m].
         rotation: (3, 3) from the frame of the recordings to that of the body; None where markers tell.
         enough: how many markers that stand still register a recording.
+        sight: how much recordings tell of where the tracked markers are.
     """
 
     def __init__(self, settings: Mapping[str, Any], run_dir: Path, simulator: Simulator, drive: Drive | None) -> None:
@@ -55,6 +56,7 @@ class Reader:
         axes = self.data.get("axes")
         self.rotation = None if axes is None else axes_rotation(axes)
         self.enough = standing_enough(self.data)
+        self.sight = sight_of(self.markers, self.tracked)
         self._simulator, self._drive = simulator, drive
         self._folder = run_dir if is_laboratory(settings) else None
         table = self.data.get("table")
@@ -83,7 +85,16 @@ class Reader:
         found = [self._read(trial) for trial in trials]
         if self.markers.get("labels") == "assigned":
             found = self._assigned(trials, found)
-        return [recording.select(self.labels) for recording in found]
+        return [self._with_depth(recording.select(self.labels)) for recording in found]
+
+    def _with_depth(self, recording: Recording) -> Recording:
+        """The same, with what is not seen of each marker as it is nominally."""
+        if self.sight.unseen is None:
+            return recording
+        rotation = np.eye(3) if self.rotation is None else self.rotation
+        deep = np.concatenate([self.nominal, self._reference])[:, self.sight.unseen]
+        away = deep - recording.positions @ rotation[self.sight.unseen]
+        return replace(recording, positions=recording.positions + away[..., None] * rotation[self.sight.unseen])
 
     def _read(self, trial: Trial) -> Recording:
         if self._folder is not None:
@@ -175,7 +186,7 @@ class Reader:
     def _posed(self, inputs: Inputs) -> FloatArray:
         """(R, M, 3) the tracked markers of the uncorrected simulator in equilibrium [m]."""
         simulator = self._simulator
-        read = bound_markers(self.markers, simulator.body.mesh, self.nominal, tuple(self.tracked))
+        read = seen_markers(self.markers, simulator.body.mesh, self.nominal, tuple(self.tracked))
         found: FloatArray = read.to(simulator.rest_positions)(simulator.static_equilibrium(inputs).q).cpu().numpy()
         return found
 

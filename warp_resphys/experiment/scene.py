@@ -25,7 +25,7 @@ from ..io.files import read_json
 from ..learning.placement import PlacedMarkers, Placement
 from ..learning.release import ReleaseSettings, estimate_release
 from ..learning.replay import Replay, Start
-from .build import bound_markers, build_body, build_simulator
+from .build import build_body, build_simulator, seen_markers
 from .files import DATASET, GIVEN, IDENTIFICATION, SCALED_DATASET, STATIC, Dataset, read_dataset
 
 COROTATED: Final = "corotated"
@@ -118,7 +118,7 @@ class Scene:
         """(B, N, 3) positions to what is observed of them: (B, M, 3) markers, or all of them."""
         if self.dataset.bound is None:
             return lambda positions: positions
-        found = bound_markers(self.config["markers"], self.body.mesh, self.dataset.bound, self.dataset.labels)
+        found = seen_markers(self.config["markers"], self.body.mesh, self.dataset.bound, self.dataset.labels)
         return found.to(self.like)
 
     def observe_by(self, model: str) -> Observe:

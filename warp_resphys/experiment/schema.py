@@ -10,6 +10,7 @@ from typing import Any, Final
 
 from ..data.markers import KINDS as BINDINGS
 from ..data.recordings.recording import METRES_PER_UNIT
+from ..data.sight import FRAMES
 from ..dynamics.integrator import INTEGRATORS
 from ..dynamics.simulator import COUPLINGS
 from ..fem.body import MASS_MODES
@@ -155,9 +156,10 @@ _PLACES: Final = Kind(
 )
 _RADII: Final = Kind(
     lambda value: (
-        POSITIVE.fits(value) or (isinstance(value, list) and all(_list(FINITE, "", [2]).fits(each) for each in value))
+        POSITIVE.fits(value)
+        or (isinstance(value, list) and all(_list(FINITE, "", [2, 3]).fits(each) for each in value))
     ),
-    "a positive number, or a list of arc lengths with the radii there, in m",
+    "a positive number, or a list of arc lengths with one or two radii there, in m",
 )
 _POSITIVES: Final = _list(POSITIVE, "a list of positive numbers")
 _COLUMNS: Final = _list(NATURAL, "a list of different chambers, tendons or muscles, from 1", _SOME, different=True)
@@ -167,7 +169,11 @@ _TRIALS: Final = Kind(
     "a number of trials, or a list of their names",
 )
 
-PLACE: Final = Group({key: absent(optional(FINITE)) for key in ("x", "y", "z")} | {"tolerance": absent(POSITIVE)})
+_SPAN: Final = Kind(
+    lambda value: _list(FINITE, "", [2]).fits(value) and value[0] <= value[1], "two rising numbers, in m"
+)
+_AT: Final = Kind(lambda value: FINITE.fits(value) or _SPAN.fits(value), "a finite number or two rising ones, in m")
+PLACE: Final = Group({key: absent(optional(_AT)) for key in ("x", "y", "z")} | {"tolerance": absent(POSITIVE)})
 MATERIAL: Final = Group({"model": absent(WORD)}, each=NUMBER)
 _BOX: Final[Mapping[str, Spec]] = {
     "size": _list(POSITIVE, "three positive numbers, in m", [3]),
@@ -186,6 +192,7 @@ _MESHES: Final[Mapping[str, Mapping[str, Spec]]] = {
         "nodes": _NODES,
     },
     "file": {"path": WORD, "units": one_of(*METRES_PER_UNIT), "order": _ORDER, "drop_unreferenced": TRUTH_VALUE},
+    "surface": {"path": WORD, "units": one_of(*METRES_PER_UNIT), "size": POSITIVE, "order": _ORDER},
     "rod": {
         "centreline": _PLACES,
         "radii": _RADII,
@@ -290,6 +297,10 @@ _MARKERS = Group(
         "bind_to": optional(PLACE),
         "patch": absent(POSITIVE),
         "labels": absent(one_of("recorded", "assigned")),
+        "plane": absent(
+            optional(_list(one_of("x", "y", "z"), "two different ones of x, y and z", [2], different=True))
+        ),
+        "frame": absent(one_of(*FRAMES)),
         **dict.fromkeys(("largest_residual", "largest_distance", "largest_distortion"), POSITIVE),
         "largest_shift": optional(POSITIVE),
     }
@@ -348,10 +359,10 @@ _TENDONS = Group(
     },
     optional=True,
 )
-_SPAN = absent(_list(FINITE, "two numbers, from and to, in m", [2]))
+_WITHIN = absent(Group(dict.fromkeys("xyz", absent(_SPAN))))
 _MUSCLES = Group(
     {
-        "bundles": Group(each=Group({"direction": _AXIS, "within": absent(Group(dict.fromkeys("xyz", _SPAN)))})),
+        "bundles": Group(each=Group({"direction": _AXIS, "within": _WITHIN})),
         "commanded": optional(one_of("stress", "contraction")),
         "stiffness": NOT_NEGATIVE,
         "toe": absent(POSITIVE),

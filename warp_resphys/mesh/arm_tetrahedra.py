@@ -6,14 +6,10 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
-import numpy as np
-
-from ..io.errors import MeshError
 from .arm_geometry import ArmGeometry
 from .arm_section import ComplexArray
 from .mesh import Mesh
-
-_TETRAHEDRON = 4  # gmsh's number of the 4-node tetrahedron
+from .tetrahedra import tetrahedra_by_gmsh
 
 
 def tetrahedra(geometry: ArmGeometry, size: float) -> Mesh:
@@ -24,36 +20,11 @@ def tetrahedra(geometry: ArmGeometry, size: float) -> Mesh:
     Raises:
         MeshError: there is no gmsh, or it fails.
     """
-    try:
-        import gmsh
-    except (ImportError, OSError) as error:  # OSError: a system library that gmsh needs is missing
-        raise MeshError(
-            f"arms of tetrahedra need gmsh, which cannot be imported ({error}): install it with pip install gmsh, or "
-            "mesh the arm with hexahedra."
-        ) from error
-    if gmsh.isInitialized():
-        raise MeshError("gmsh is in use in this process: call gmsh.finalize() before an arm is meshed.")
-    gmsh.initialize(interruptible=False)  # so that Ctrl-C stays Python's
-    try:
-        options = {"General.Terminal": 0.0, "General.NumThreads": 1.0}
-        options |= {"Mesh.MeshSizeMax": size, "Mesh.MeshSizeMin": 0.5 * size}
-        options |= {"Mesh.Algorithm3D": 1.0}  # Delaunay, the same mesh every time
-        options |= {"Mesh.OptimizeThreshold": 0.6}  # of the quality below which tetrahedra are improved
-        for option, value in options.items():
-            gmsh.option.setNumber(option, value)
+
+    def describe(gmsh: Any) -> None:
         _build(gmsh.model.occ, geometry, size)
-        gmsh.model.mesh.generate(3)
-        tags, coordinates, _ = gmsh.model.mesh.getNodes()
-        _, nodes = gmsh.model.mesh.getElementsByType(_TETRAHEDRON)
-    except Exception as error:  # gmsh raises nothing more special
-        raise MeshError(f"gmsh cannot mesh this arm ({error}): try another size, or thicker walls.") from error
-    finally:
-        gmsh.finalize()
-    if not len(nodes):
-        raise MeshError("gmsh made no tetrahedra of this arm: try another size, or thicker walls.")
-    places = np.zeros(int(tags.max()) + 1, dtype=np.int64)
-    places[tags.astype(np.int64)] = np.arange(len(tags))
-    return _ordered(coordinates.reshape(-1, 3), places[nodes.astype(np.int64)].reshape(-1, 4))
+
+    return tetrahedra_by_gmsh(describe, size, "an arm")
 
 
 def _build(occ: Any, geometry: ArmGeometry, size: float) -> None:
@@ -83,13 +54,3 @@ def _loft(occ: Any, ends: Sequence[tuple[ComplexArray, float, float]]) -> tuple[
         wires.append(occ.addWire([occ.addLine(a, b) for a, b in zip(tags, tags[1:] + tags[:1], strict=True)]))
     ((dimension, tag),) = (each for each in occ.addThruSections(wires, makeSolid=True, makeRuled=True) if each[0] == 3)
     return dimension, tag
-
-
-def _ordered(points: Any, cells: Any) -> Mesh:
-    """The mesh of the vertices that cells use, numbered from the highest down, with cells in that order as well."""
-    used = np.unique(cells)
-    used = used[np.lexsort((points[used, 1], points[used, 0], -points[used, 2]))]
-    number = np.empty(len(points), dtype=np.int64)
-    number[used] = np.arange(len(used))
-    renumbered = number[cells]
-    return Mesh(points[used], renumbered[np.lexsort(np.sort(renumbered, axis=1).T[::-1])])

@@ -18,6 +18,7 @@ from .elements import BY_NODES, ELEMENTS, FACES, Element
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+Extent = float | Sequence[float]  # along an axis: one place, or from one to another
 
 LARGEST_COORDINATE = 1e50  # in any unit; the product of three must be a number
 DEGENERATE_VOLUME = 1e-12  # smallest volume of a cell, over the cube of its longest edge
@@ -201,24 +202,35 @@ def surface_vertices(mesh: Mesh) -> IntArray:
 
 
 def select_vertices(
-    mesh: Mesh, x: float | None = None, y: float | None = None, z: float | None = None, tolerance: float = 1e-9
+    mesh: Mesh, x: Extent | None = None, y: Extent | None = None, z: Extent | None = None, tolerance: float = 1e-9
 ) -> IntArray:
-    """(S,) sorted vertices within a tolerance [m] of planes across the axes at x, y and z [m], of one plane at least.
+    """(S,) sorted vertices at x, y and z, of one coordinate at least: a plane across that axis, or from one to another.
+
+    Args:
+        mesh: what they are chosen of.
+        x: where the plane is, or from where to where [m].
+        y: the same along y [m].
+        z: the same along z [m].
+        tolerance: how far off they may be [m].
 
     Raises:
         MeshError: No coordinate is given, or no vertex lies there.
     """
-    planes = {axis: at for axis, at in enumerate((x, y, z)) if at is not None}
-    if not planes:
+    spans = {axis: np.broadcast_to(at, 2) for axis, at in enumerate((x, y, z)) if at is not None}
+    if not spans:
         raise MeshError("a selection of vertices needs at least one of the coordinates x, y and z")
     chosen = np.ones(len(mesh.vertices), dtype=bool)
-    for axis, at in planes.items():
-        chosen &= np.abs(mesh.vertices[:, axis] - at) <= tolerance
+    for axis, (first, last) in spans.items():
+        along = mesh.vertices[:, axis]
+        chosen &= (along >= first - tolerance) & (along <= last + tolerance)
     if not chosen.any():
         low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-        wanted = ", ".join(f"{'xyz'[axis]} = {at:g}" for axis, at in planes.items())
-        spans = ", ".join(f"{'xyz'[axis]} from {low[axis]:g} to {high[axis]:g}" for axis in planes)
-        raise MeshError(f"no vertex lies within {tolerance:g} m of {wanted} m: the mesh reaches {spans} m")
+        wanted = ", ".join(
+            f"{'xyz'[axis]} = {first:g}" + (f" to {last:g}" if last > first else "")
+            for axis, (first, last) in spans.items()
+        )
+        there = ", ".join(f"{'xyz'[axis]} from {low[axis]:g} to {high[axis]:g}" for axis in spans)
+        raise MeshError(f"no vertex lies within {tolerance:g} m of {wanted} m: the mesh reaches {there} m")
     return np.flatnonzero(chosen)
 
 

@@ -1,4 +1,4 @@
-"""Round rods, straight or along a curve, of one radius or tapered, from hexahedra.
+"""Round and elliptic rods, straight or along a curve, of one radius or tapered, from hexahedra.
 
 The section is a square of cells in the middle, and rings of cells between its edge and the rim, so that no cell has a
 corner of 180 degrees. The nodes of the rim lie on a circle a little larger than the rod, so that the section's area is
@@ -26,11 +26,13 @@ def rod(
     nodes: int = 27,
     grading: float = 0.0,
 ) -> Mesh:
-    """A round rod of hexahedra.
+    """A round rod of hexahedra, or an elliptic one.
 
     Args:
         centreline: (M, 3) points of its axis, straight or curved, joined by straight lines [m].
-        radii: one radius, or (R, 2) arc lengths and the radii there, linear in between [m].
+        radii: one radius; (R, 2) arc lengths and the radii there, linear in between; or (R, 3) arc lengths and the two
+            semi-axes there, the first one along that coordinate axis which the rod crosses most squarely where it
+            begins [m].
         layers: of cells along the axis.
         core: cells along a side of the section's middle square.
         rings: of cells around it.
@@ -50,9 +52,12 @@ def rod(
         raise MeshError("the centreline of a rod has two points in a row at one place: leave one of them out.")
     profile = np.asarray(radii, dtype=np.float64)
     profile = np.array([[0.0, float(profile)]]) if profile.ndim == 0 else profile
-    listed = profile.ndim == 2 and profile.shape[1] == 2 and bool(np.isfinite(profile).all())
-    if not (listed and (profile[:, 1] > 0.0).all() and (np.diff(profile[:, 0]) > 0.0).all()):
-        raise MeshError("the radii of a rod must be one positive number, or rising arc lengths with positive radii.")
+    listed = profile.ndim == 2 and profile.shape[1] in (2, 3) and bool(np.isfinite(profile).all())
+    if not (listed and (profile[:, 1:] > 0.0).all() and (np.diff(profile[:, 0]) > 0.0).all()):
+        raise MeshError(
+            "the radii of a rod must be one positive number, or rising arc lengths with one or two positive radii each."
+        )
+    profile = profile[:, [0, 1, -1]]
     for name, value in (("layers", layers), ("core", core), ("rings", rings)):
         if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
             raise MeshError(f"{name} of a rod is {value!r}: it must be a whole number, one or more.")
@@ -64,8 +69,8 @@ def rod(
         raise MeshError(f"the grading of a rod is {grading:g}: it must be from 0, for layers of one length, to 1.")
     along = _levels(float(length[-1]), profile, layers, order, grading)
     places, frames = _transported(axis, length, along)
-    radius = np.interp(along, profile[:, 0], profile[:, 1])
-    vertices = places[:, None] + np.einsum("s,nj,sji->sni", radius, section, frames)
+    radius = np.stack([np.interp(along, profile[:, 0], each) for each in profile[:, 1:].T], axis=1)
+    vertices = places[:, None] + np.einsum("sj,nj,sji->sni", radius, section, frames)
     first = np.arange(layers) * order
     levels = first[:, None] + np.arange(order + 1)
     cells = levels[:, None, None, None, :] * len(section) + squares[None, ..., None]  # (L, S, p + 1, p + 1, p + 1)
@@ -85,7 +90,8 @@ def _levels(length: float, radii: FloatArray, layers: int, order: int, grading: 
     ends = np.linspace(0.0, length, layers + 1)
     if grading != 0.0:
         fine = np.linspace(0.0, length, 1000 * layers + 1)
-        share = scipy.integrate.cumulative_trapezoid(np.interp(fine, *radii.T) ** -grading, fine, initial=0.0)
+        mean = np.sqrt(np.interp(fine, *radii[:, :2].T) * np.interp(fine, *radii[:, ::2].T))
+        share = scipy.integrate.cumulative_trapezoid(mean**-grading, fine, initial=0.0)
         ends = np.interp(np.linspace(0.0, share[-1], layers + 1), share, fine)
     return np.interp(np.arange(layers * order + 1) / order, np.arange(layers + 1), ends)
 

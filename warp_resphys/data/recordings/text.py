@@ -89,6 +89,7 @@ def _read_table(rows: Rows, path: Path) -> RawRecording:
 
 def _read_described(rows: Rows, table: Table, path: Path) -> RawRecording:
     """The same, with the columns that the table is said to have; a length that is no marker's is a channel here."""
+    rows = [*rows[: table.header_lines], *_without_empty_ends(rows[table.header_lines :], len(table.columns))]
     width = len(rows[table.header_lines]) if len(rows) > table.header_lines else 0
     if width != len(table.columns):
         raise DataFileError(
@@ -97,6 +98,11 @@ def _read_described(rows: Rows, table: Table, path: Path) -> RawRecording:
         )
     columns = {number: _name_and_unit(cell) for number, cell in enumerate(table.columns) if cell}
     return _read_columns(rows, table.header_lines, columns, list(SI_PER_ACTUATION_UNIT), path, planar=True)
+
+
+def _without_empty_ends(rows: Rows, width: int) -> Rows:
+    """The same rows without the cells beyond a width, if none of them holds anything."""
+    return rows if any(cell for row in rows for cell in row[width:]) else [row[:width] for row in rows]
 
 
 def _read_columns(
@@ -148,12 +154,18 @@ def _read_columns(
     if channels:
         with np.errstate(over="ignore"):
             driven = values[:, list(channels)] * list(channels.values())
-        wrong = ~np.isfinite(driven).all(axis=1)
-        if wrong.any():
+        wrong = np.asarray(~np.isfinite(driven).all(axis=1))
+        # A log may begin before what drives the body is switched on, and end after it is switched off.
+        first_told, end = (
+            (0, len(wrong)) if wrong.all() else (int(wrong.argmin()), len(wrong) - int(wrong[::-1].argmin()))
+        )
+        if wrong[first_told:end].any():
             raise DataFileError(
-                f"{path}, line {lines[int(np.argmax(wrong))]}: an actuation is missing or infinite; every frame needs "
-                "one."
+                f"{path}, line {lines[first_told + int(wrong[first_told:].argmax())]}: an actuation is missing or "
+                "infinite; every frame between the first and the last one that has it needs one."
             )
+        driven, values, frames = driven[:end], values[:end], frames[:end]
+        driven[:first_told] = driven[first_told]
         grid = np.arange(frames[-1] + 1)
         actuation = np.stack([np.interp(grid, frames, channel) for channel in driven.T], axis=1)
     start = float(stamps[0]) if timed else 0.0

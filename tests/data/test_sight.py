@@ -1,0 +1,123 @@
+"""What recordings tell of markers: a plane, or a shape alone."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from warp_resphys.data.markers import bind_markers
+from warp_resphys.data.sight import SeenMarkers, Sight
+from warp_resphys.io.errors import InputError
+from warp_resphys.mesh.mesh import box_hexahedra
+
+NOMINAL = np.array([[0.0, 0.01, -0.07], [0.002, -0.02, -0.04], [0.0, 0.015, 0.036], [0.004, 0.0, 0.063]])
+SIGHTS = {
+    "plane": Sight.of(NOMINAL, plane=["x", "z"]),
+    "own": Sight.of(NOMINAL, frame="own"),
+    "own plane": Sight.of(NOMINAL, ["x", "z"], "own"),
+    "own plane, turned": Sight.of(NOMINAL, ["z", "y"], "own"),
+}
+
+
+def moved(points, angle, axis, shift):
+    return points @ Rotation.from_rotvec(angle * np.asarray(axis)).as_matrix().T + shift
+
+
+def shaken(scale=0.01, count=5):
+    return NOMINAL + scale * np.random.default_rng(0).normal(size=(count, 4, 3))
+
+
+@pytest.mark.parametrize("name", SIGHTS)
+def test_what_is_told_of_nominal_places_is_these(name):
+    np.testing.assert_allclose(SIGHTS[name].of_arrays(NOMINAL), NOMINAL, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", SIGHTS)
+def test_what_is_told_twice_is_told_once(name):
+    once = SIGHTS[name].of_arrays(shaken())
+    np.testing.assert_allclose(SIGHTS[name].of_arrays(once), once, atol=1e-12)
+
+
+def test_depth_is_not_told():
+    points = shaken()
+    told = SIGHTS["plane"].of_arrays(points)
+    np.testing.assert_array_equal(told[..., [0, 2]], points[..., [0, 2]])
+    np.testing.assert_array_equal(told[..., 1], np.broadcast_to(NOMINAL[:, 1], (5, 4)))
+
+
+@pytest.mark.parametrize(
+    ("name", "axis"), [("own", [0.6, -0.64, 0.48]), ("own plane", [0, 1, 0]), ("own plane, turned", [1, 0, 0])]
+)
+@pytest.mark.parametrize("angle", [0.3, -2.0, 3.1])
+def test_a_shape_is_told_wherever_it_is(name, axis, angle):
+    """In three dimensions or in the plane, moved by any angle: the same shape, and no other."""
+    points, sight = shaken(), SIGHTS[name]
+    shift = np.array([0.3, -0.2, 0.1])
+    np.testing.assert_allclose(sight.of_arrays(moved(points, angle, axis, shift)), sight.of_arrays(points), atol=1e-12)
+    spread = sight.of_arrays(points)
+    assert np.abs(spread - spread[:1]).max() > 5e-3
+
+
+@pytest.mark.parametrize("name", ["own", "own plane"])
+def test_no_rigid_motion_is_closer_to_the_nominal_places(name):
+    told = SIGHTS[name].of_arrays(shaken())
+    error = np.square(told - NOMINAL).sum()
+    axes = np.eye(3) if name == "own" else [[0.0, 1.0, 0.0]]
+    for angle in (-1e-2, 1e-2):
+        for axis in axes:
+            middle = told.mean(axis=1, keepdims=True)
+            turned = moved(told - middle, angle, axis, 0.0) + middle
+            assert np.square(turned - NOMINAL).sum() > error
+    assert np.abs(told.mean(axis=1) - NOMINAL.mean(axis=0))[:, [0, 2]].max() < 1e-12
+
+
+@pytest.mark.parametrize("name", SIGHTS)
+def test_gradients_at_rest_and_after_a_large_turn(name):
+    """Against central differences, at the nominal places too, where the singular values of a plane's are no three."""
+    turned = moved(shaken(count=2), 2.5, [0.0, 1.0, 0.0], 0.1)
+    points = torch.as_tensor(np.concatenate([NOMINAL[None], turned])).requires_grad_()
+    assert torch.autograd.gradcheck(SIGHTS[name], (points,), eps=1e-6, atol=1e-7)
+
+
+def test_a_hidden_marker_hides_the_shape_of_its_frame_alone():
+    points = shaken()
+    points[2, 1] = np.nan
+    assert np.isnan(SIGHTS["own plane"].of_arrays(points)).all(axis=(1, 2)).tolist() == [
+        False,
+        False,
+        True,
+        False,
+        False,
+    ]
+    told = SIGHTS["plane"].of_arrays(points)
+    assert np.argwhere(np.isnan(told).all(axis=2)).tolist() == [[2, 1]]
+    assert np.isnan(told).sum() == 3  # its depth neither
+
+
+def test_seen_markers_of_a_body_that_is_carried_away_are_where_they_were():
+    mesh = box_hexahedra(divisions=(5, 2, 2))
+    places = np.array([[0.01, 0.0, 0.033], [0.05, 0.002, 0.033], [0.09, 0.03, 0.033]])
+    markers = bind_markers(mesh, places, ["a", "b", "c"], kind="frame")
+    seen = SeenMarkers.of(markers, Sight.of(places, frame="own"))
+    at = torch.as_tensor(moved(mesh.vertices, 1.0, [0.0, 0.6, 0.8], 0.5))[None]
+    np.testing.assert_allclose(seen(at)[0], places, atol=1e-12)
+    bent = at.clone()
+    bent[0, mesh.vertices[:, 0] > 0.07] += 0.01
+    assert float((seen(bent)[0] - torch.as_tensor(places)).norm(dim=1).max()) > 2e-3
+    slope = seen.transposed_jacobian(bent).view(1, -1, 3, 9)
+    assert float(slope.sum(1).abs().max()) < 1e-10 < float(slope.abs().max())  # all vertices alike change no shape
+    assert SeenMarkers.of(markers, Sight.of(places)) is markers
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ((NOMINAL, ["x", "x"]), r"markers\.plane is \['x', 'x'\]: name two"),
+        ((NOMINAL, ["x", "y", "z"]), "name two of the body's axes"),
+        ((NOMINAL * [0, 0, 1], None, "own"), "the 4 tracked markers lie on one line, so that they tell no frame"),
+        ((NOMINAL[:1], ["x", "z"], "own"), "the 1 tracked markers are at one place"),
+    ],
+)
+def test_what_tells_nothing_is_refused(arguments, said):
+    with pytest.raises(InputError, match=said):
+        Sight.of(*arguments)

@@ -1,0 +1,118 @@
+"""Closed surfaces filled with tetrahedra."""
+
+import contextlib
+import sys
+
+import numpy as np
+import pytest
+import trimesh
+
+from warp_resphys.io.errors import MeshError
+from warp_resphys.mesh.chambers import find_chambers
+from warp_resphys.mesh.mesh import check_mesh
+from warp_resphys.mesh.quality import cell_volumes, scaled_jacobian
+from warp_resphys.mesh.tetrahedra import fill_surface
+
+
+@pytest.fixture
+def _gmsh():
+    pytest.importorskip("gmsh", reason="gmsh is not installed", exc_type=ImportError)
+
+
+def written(tmp_path, *shells, name="robot.stl"):
+    path = tmp_path / name
+    trimesh.util.concatenate(shells).export(path)
+    return path
+
+
+@pytest.mark.usefixtures("_gmsh")
+@pytest.mark.parametrize(("name", "order"), [("robot.stl", 1), ("robot.obj", 2), ("robot.ply", 2)])
+def test_a_box_is_filled_to_its_edges(tmp_path, name, order):
+    path = written(tmp_path, trimesh.creation.box((100.0, 30.0, 20.0)), name=name)
+    mesh = fill_surface(path, 0.01, "mm", order)
+    check_mesh(mesh)
+    assert mesh.cells.shape[1] == {1: 4, 2: 10}[order]
+    np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), [0.1, 0.03, 0.02], rtol=1e-6)
+    assert cell_volumes(mesh).sum() == pytest.approx(6e-5, rel=1e-6)
+    assert scaled_jacobian(mesh).min() > 0.1
+    corners = mesh.vertices[mesh.cells[:, :4]]
+    edges = np.linalg.norm(corners[:, :, None] - corners[:, None], axis=-1).max(axis=(1, 2))
+    assert 0.004 < np.median(edges) < 0.02
+    again = fill_surface(path, 0.01, "mm", order)
+    np.testing.assert_array_equal(mesh.cells, again.cells)
+
+
+@pytest.mark.usefixtures("_gmsh")
+def test_surfaces_within_are_chambers(tmp_path):
+    """Whichever way their triangles turn, as programs differ in that."""
+    outer = trimesh.creation.cylinder(20.0, 100.0, sections=24)
+    for turned in (False, True):
+        holes = [trimesh.creation.box((10.0, 14.0, 60.0)) for _ in range(2)]
+        for hole, x in zip(holes, (-9.0, 9.0), strict=True):
+            hole.apply_translation([x, 0.0, 0.0])
+            if turned:
+                hole.invert()
+        mesh = fill_surface(written(tmp_path, outer, *holes), 0.008, "mm", order=1)
+        assert cell_volumes(mesh).sum() == pytest.approx(1e-9 * (outer.volume - 2 * 8400.0), rel=0.02)
+        chambers = find_chambers(mesh)
+        assert len(chambers) == 2
+        centres = sorted(mesh.vertices[np.unique(each.faces)].mean(axis=0)[0] for each in chambers)
+        np.testing.assert_allclose(centres, [-0.009, 0.009], atol=5e-4)
+
+
+@pytest.mark.usefixtures("_gmsh")
+def test_a_curved_surface_is_followed(tmp_path):
+    ball = trimesh.creation.icosphere(3, 25.0)
+    mesh = fill_surface(written(tmp_path, ball), 0.01, "mm", order=1)
+    assert cell_volumes(mesh).sum() == pytest.approx(1e-9 * ball.volume, rel=0.08)
+    assert np.linalg.norm(mesh.vertices, axis=1).max() == pytest.approx(0.025, rel=0.01)
+
+
+@pytest.mark.usefixtures("_gmsh")
+def test_what_is_thinner_than_the_tetrahedra_is_not_lost_silently(tmp_path):
+    """A point that tetrahedra of a size cannot follow is there all the same, or that size is refused."""
+    path, reach = written(tmp_path, trimesh.creation.cone(4.0, 120.0, sections=6)), 0.12
+    with contextlib.suppress(MeshError):
+        reach = np.ptp(fill_surface(path, 0.03, "mm", order=1).vertices[:, 2])
+    assert reach > 0.1
+    assert np.ptp(fill_surface(path, 0.004, "mm", order=1).vertices[:, 2]) == pytest.approx(0.12, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"units": "inch"}, "a surface in inch filled to order 2: units are m, cm or mm"),
+        ({"order": 3}, "orders 1 or 2"),
+        ({"size": 0.0}, "the size of tetrahedra is 0.0: it must be positive"),
+        ({"units": "m"}, "the surface is 106 m across in m: check the unit"),
+    ],
+)
+def test_arguments_that_do_not_fit(tmp_path, changes, said):
+    path = written(tmp_path, trimesh.creation.box((100.0, 30.0, 20.0)))
+    with pytest.raises(MeshError, match=said):
+        fill_surface(path, **{"size": 0.01, "units": "mm", **changes})
+
+
+def test_files_that_are_no_closed_surface(tmp_path):
+    box = trimesh.creation.box((100.0, 30.0, 20.0))
+    box.update_faces(np.arange(12) != 5)
+    with pytest.raises(
+        MeshError, match=r"3 edges of its triangles do not have two of them, the first at \(.*\): close"
+    ):
+        fill_surface(written(tmp_path, box), 0.01, "mm")
+    with pytest.raises(MeshError, match="there is no such file"):
+        fill_surface(tmp_path / "other.stl", 0.01)
+    for name, content in (
+        ("torn.stl", b"solid robot\nfacet nor"),
+        ("robot.obj", b"\x00\x01"),
+        ("robot.xyz", b"1 2 3\n"),
+    ):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(MeshError, match="export"):
+            fill_surface(tmp_path / name, 0.01)
+
+
+def test_without_gmsh_one_sentence(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "gmsh", None)
+    with pytest.raises(MeshError, match=r"tetrahedra of .*robot.stl need gmsh, which cannot be imported .*pip install"):
+        fill_surface(written(tmp_path, trimesh.creation.box((100.0, 30.0, 20.0))), 0.01, "mm")

@@ -1,0 +1,138 @@
+r"""What recordings tell of where markers are, where that is less than their places in the frame of the body.
+
+A single camera sees a plane. And a body that nothing holds, as one that swims, is anywhere: its markers tell its shape
+alone. Then both recorded and simulated markers are moved rigidly, frame by frame, to where they are closest to their
+nominal places (Kabsch 1976), and differ by what is left. Moved so, markers x become R^T (x - mean x) + mean o, with the
+nominal places o and the rotation R that maximises sum (x_i - mean x) . R (o_i - mean o); in a plane that has the angle
+atan2(sum (o_i - mean o) x (x_i - mean x), sum (o_i - mean o) . (x_i - mean x)).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from typing_extensions import override
+
+from ..io.errors import InputError
+from .markers import Markers, closest_rotation
+
+FRAMES = ("body", "own")
+_AXES = "xyz"
+_LINE = 1e-3  # m: markers that are closer to a line do not tell how a body is turned about it
+
+
+@dataclass(frozen=True)
+class Sight:
+    """How much of the places of m markers recordings tell.
+
+    Attributes:
+        nominal: (m, 3) where they are on the undeformed body [m].
+        plane: the two axes of the body that span what is seen, such as ("x", "z"); None where all is.
+        own: whether markers are seen in a frame of their own, rather than in that of the body.
+
+    Raises:
+        InputError: other axes than two, or markers that tell no frame.
+    """
+
+    nominal: torch.Tensor
+    plane: tuple[str, str] | None = None
+    own: bool = False
+
+    @classmethod
+    def of(cls, nominal: ArrayLike, plane: Sequence[str] | None = None, frame: str = "body") -> "Sight":
+        """From the values of a configuration; a ``frame`` is one of `FRAMES`."""
+        if plane is not None and (len(set(plane)) != 2 or not set(plane) <= set(_AXES)):
+            raise InputError(f"markers.plane is {list(plane)}: name two of the body's axes x, y and z.")
+        chosen = None if plane is None else (str(plane[0]), str(plane[1]))
+        found = cls(torch.as_tensor(np.asarray(nominal, dtype=np.float64)), chosen, frame == "own")
+        if found.own:
+            found._check_frame()
+        return found
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether recordings tell where markers are."""
+        return self.plane is None and not self.own
+
+    @property
+    def unseen(self) -> int | None:
+        """The number of the axis that is not seen."""
+        return None if self.plane is None else next(i for i, axis in enumerate(_AXES) if axis not in self.plane)
+
+    def to(self, like: torch.Tensor) -> "Sight":
+        """The same on the device and in the precision of a tensor."""
+        return replace(self, nominal=self.nominal.to(like))
+
+    def __call__(self, points: torch.Tensor) -> torch.Tensor:
+        """(..., m, 3) places in the frame of the body to what is told of them [m]; what is not seen is nominal."""
+        if self.unseen is not None:
+            hidden = torch.arange(3, device=points.device) == self.unseen
+            points = torch.where(hidden, self.nominal, points)
+        return self._in_own_frame(points) if self.own else points
+
+    def of_arrays(self, points: ArrayLike) -> NDArray[np.float64]:
+        """The same of an array (..., m, 3); in its own frame, a marker that is NaN leaves none of that frame."""
+        if self.is_whole:
+            return np.asarray(points, dtype=np.float64)
+        given = torch.as_tensor(np.asarray(points, dtype=np.float64))
+        hidden = given.isnan().any(-1, keepdim=True)
+        told = self(given)
+        lost = hidden.any(-2, keepdim=True) if self.own else hidden
+        return torch.where(lost, torch.nan, told).numpy()
+
+    def _in_own_frame(self, points: torch.Tensor) -> torch.Tensor:
+        middle = self.nominal.mean(-2)
+        nominal, now = self.nominal - middle, points - points.mean(-2, keepdim=True)
+        if self.plane is None:
+            flat = now.reshape(-1, *now.shape[-2:])
+            return (flat @ closest_rotation(flat.mT @ nominal)).reshape(now.shape) + middle
+        first, second = (_AXES.index(axis) for axis in self.plane)
+        across = (now[..., first] * nominal[:, second] - now[..., second] * nominal[:, first]).sum(-1)
+        along = (now[..., first] * nominal[:, first] + now[..., second] * nominal[:, second]).sum(-1)
+        size = torch.hypot(across, along)
+        sine, cosine = (across / size)[..., None], (along / size)[..., None]
+        turned = list(now.unbind(-1))
+        turned[first] = cosine * now[..., first] - sine * now[..., second]
+        turned[second] = sine * now[..., first] + cosine * now[..., second]
+        return torch.stack(turned, -1) + middle
+
+    def _check_frame(self) -> None:
+        seen = self.nominal if self.unseen is None else self.nominal * (torch.arange(3) != self.unseen)
+        spread = torch.linalg.svdvals(seen - seen.mean(0)) if len(seen) > 1 else torch.zeros(2)
+        least = spread[1] if self.plane is None and len(spread) > 1 else spread[0]
+        if float(least) <= _LINE:
+            what = "lie on one line" if self.plane is None else "are at one place"
+            raise InputError(
+                f"markers.frame is own, but the {len(seen)} tracked markers {what}, so that they tell no frame: track "
+                "others as well, or set markers.frame to body."
+            )
+
+
+@dataclass(frozen=True)
+class SeenMarkers(Markers):
+    """Markers as far as recordings tell where they are."""
+
+    vertices: torch.Tensor
+    markers: Markers  # where they are
+    sight: Sight
+
+    @classmethod
+    def of(cls, markers: Markers, sight: Sight) -> Markers:
+        """Markers seen so; themselves where all is told."""
+        return markers if sight.is_whole else cls(markers.vertices, markers, sight)
+
+    @override
+    def __call__(self, positions: torch.Tensor) -> torch.Tensor:
+        return self.sight(self.markers(positions))
+
+    @override
+    def moved(self, by: torch.Tensor) -> "SeenMarkers":
+        return replace(self, markers=self.markers.moved(by))
+
+    @override
+    def to(self, like: torch.Tensor) -> "SeenMarkers":
+        return replace(
+            self, vertices=self.vertices.to(like.device), markers=self.markers.to(like), sight=self.sight.to(like)
+        )

@@ -108,8 +108,8 @@ def fill_surface(path: str | os.PathLike[str], size: float, units: str = "m", or
             reason = str(error)
             continue
         made = float(cell_volumes(found).sum())
-        ends = [(each.min(axis=0), each.max(axis=0)) for each in (found.vertices, vertices)]
-        if abs(made - enclosed) <= _VOLUME * enclosed and np.abs(np.subtract(*ends)).max() <= _REACH * size:
+        reached, meant = (np.array([each.min(axis=0), each.max(axis=0)]) for each in (found.vertices, vertices))
+        if abs(made - enclosed) <= _VOLUME * enclosed and np.abs(reached - meant).max() <= _REACH * size:
             return quadratic(found) if order == 2 else found
         reason = (
             f"{path}: tetrahedra of {size:g} m fill {1e6 * made:.3g} of the {1e6 * enclosed:.3g} cm^3 that the surface "

@@ -6,10 +6,12 @@ import pickle
 import h5py
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from warp_resphys.data.recordings.arrays import write_recording
 from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.recordings.text import Table
+from warp_resphys.data.registration import register_markers
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.files import atomic_hdf5
 
@@ -479,3 +481,59 @@ def test_recorded_beam_in_the_wrong_unit_is_noticed(shared_data):
     assert read_recording(path).labels[0] == "Tip - 1"
     with pytest.raises(DataFileError, match=r"all markers lie within 0\.098 mm"):
         read_recording(path, units="mm")
+
+
+def plate(count=20):
+    """(T, 3) and (T, 4) a rigid body that moves and turns, and the points on its axes (T, 3, 3), in m."""
+    turn = Rotation.from_rotvec(np.linspace(0.0, 2.5, count)[:, None] * [0.6, 0.0, 0.8])
+    place = np.linspace([0.0, 0.0, 0.0], [0.1, -0.05, 0.02], count)
+    arms = place[:, None] + 0.05 * np.stack([turn.apply(axis) for axis in np.eye(3)], axis=1)
+    return place, turn.as_quat()[:, [3, 0, 1, 2]], arms
+
+
+@pytest.mark.parametrize("suffix", ["csv", "npz"])
+def test_a_rigid_body_is_four_markers(tmp_path, positions, suffix):
+    place, quaternion, arms = plate()
+    path = tmp_path / f"swing.{suffix}"
+    if suffix == "npz":
+        both = np.stack([positions[:20, 0], place], axis=1)
+        turns = np.stack([np.full((20, 4), np.nan), -2.0 * quaternion], axis=1)  # of any length, and of either sign
+        np.savez(path, positions=both, quaternions=turns, labels=["a", "plate"], rate_hz=100.0)
+    else:
+        names = "frame,plate.qx,plate.qy,plate.qz,plate.qw," + ",".join(
+            f"{m}.{x} [mm]" for m in ("a", "plate") for x in "xyz"
+        )
+        values = np.column_stack([np.arange(20), quaternion[:, [1, 2, 3, 0]], 1e3 * positions[:20, 0], 1e3 * place])
+        rows = [",".join(f"{x:.9f}" for x in row) for row in values]
+        rows[3] = ",".join(["3.0", "", "", "", "", *rows[3].split(",")[5:]])
+        path.write_text("\n".join([names, *rows]))
+    recording = read_recording(path, rate=100.0)
+    assert recording.labels == ("a", "plate", "plate +x", "plate +y", "plate +z")
+    np.testing.assert_allclose(recording.positions[:, 1], place, atol=1e-8)
+    seen = np.arange(20) != (3 if suffix == "csv" else -1)
+    np.testing.assert_allclose(recording.positions[seen, 2:], arms[seen], atol=1e-8)
+    assert not recording.seen[~seen, 2:].any()
+    nominal = np.concatenate([[[0.0, 0.0, 0.0]], 0.05 * np.eye(3)])
+    names = recording.labels[1:]
+    fitted = register_markers(recording.positions[10, 1:], nominal, names, source=path)
+    assert fitted.rms < 1e-7  # one rigid body registers
+
+
+def test_rigid_bodies_that_are_not_whole(tmp_path):
+    path = tmp_path / "swing.csv"
+    path.write_text("frame,a.x [mm],a.y,a.z,a.qw,a.qx,a.qy\n" + "\n".join(f"{k},1,2,{k},1,0,0" for k in range(9)))
+    with pytest.raises(DataFileError, match=r"the rigid body a has no column 'a\.qz': it needs"):
+        read_recording(path, rate=100.0)
+    path.write_text(
+        "frame,a.x [mm],a.y,a.z,b.qw,b.qx,b.qy,b.qz\n" + "\n".join(f"{k},1,2,{k},1,0,0,0" for k in range(9))
+    )
+    with pytest.raises(DataFileError, match="the rigid body b has no place"):
+        read_recording(path, rate=100.0)
+    path.write_text(
+        "frame,a.x [mm],a.y,a.z,a.qw,a.qx,a.qy,a.qz\n" + "\n".join(f"{k},1,2,{k},0,0,0,0" for k in range(9))
+    )
+    with pytest.raises(DataFileError, match="the quaternion of a is zero in frame 0: leave it empty"):
+        read_recording(path, rate=100.0)
+    np.savez(tmp_path / "swing.npz", positions=np.ones((9, 2, 3)), quaternions=np.ones((9, 4)), rate_hz=100.0)
+    with pytest.raises(DataFileError, match=r"quaternions have the shape \(9, 4\)"):
+        read_recording(tmp_path / "swing.npz")

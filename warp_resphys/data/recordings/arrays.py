@@ -14,7 +14,18 @@ from ...io.files import FORMAT, atomic_hdf5, create, hdf5_error, read_arrays
 from .recording import SI_PER_ACTUATION_UNIT, FloatArray, RawRecording, Recording
 
 KIND = "recording"
-_NAMES = ("positions", "labels", "rate_hz", "units", "actuation", "actuation_units", "rest", "base", "start")
+_NAMES = (
+    "positions",
+    "labels",
+    "rate_hz",
+    "units",
+    "actuation",
+    "actuation_units",
+    "rest",
+    "base",
+    "start",
+    "quaternions",
+)
 
 
 def read_raw_npz(path: Path) -> RawRecording:
@@ -114,6 +125,7 @@ def _assemble(found: Arrays, path: Path) -> RawRecording:
         rest=numbers(found, "rest", path) if "rest" in found else None,
         base=numbers(found, "base", path) if "base" in found else None,
         start=_number(found, "start", path) or 0.0,
+        turns=numbers(found, "quaternions", path) if "quaternions" in found else None,
     )
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
 
 from ...io.errors import DataFileError, InputError, listed
 from ..base_motion import since_first
@@ -20,6 +21,7 @@ METRES_PER_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 SI_PER_ACTUATION_UNIT = {"Pa": 1.0, "kPa": 1e3, "mbar": 1e2, "bar": 1e5, "N": 1.0, "m": 1.0, "mm": 1e-3, "1": 1.0}
 LARGEST_SPAN = 100.0  # [m]
 LEAST_SPAN = 1e-3  # [m]
+ARM = 0.05  # [m] from a rigid body to the points that tell how it is turned
 RATES = (1e-3, 1e6)  # [Hz]
 
 
@@ -84,6 +86,8 @@ class RawRecording:
     # (T, 7) a point of what the body is fixed to [m], and a quaternion of its rotation, w first
     base: FloatArray | None = None
     start: float = 0.0  # Time of the first frame [s]
+    # (T, M, 4) quaternions, w first, of those markers that are rigid bodies; NaN for others
+    turns: FloatArray | None = None
 
 
 def to_recording(
@@ -96,7 +100,8 @@ def to_recording(
     """Brings what was read of a file to metres and seconds, and checks it.
 
     What is given, as `reading.read_recording` describes it, goes before what the file says. A marker without a name
-    becomes `marker 3`, those that share one `name #1`, `name #2` and so on.
+    becomes `marker 3`, those that share one `name #1`, `name #2` and so on. A rigid body becomes four markers: its
+    place, and the points `name +x`, `name +y` and `name +z` at 50 mm along its axes.
 
     Raises:
         DataFileError: The unit or the rate is missing or not known, an array has the wrong shape, or the positions are
@@ -135,6 +140,8 @@ def to_recording(
         raise DataFileError(f"{path}: an actuation is NaN or infinite; every frame needs one.")
     if not np.isfinite(raw.start):
         raise DataFileError(f"{path}: its first frame is at {raw.start} s: give the time of each frame, or no start.")
+    if raw.turns is not None:
+        names, positions, rest = _with_arms(names, positions, rest, raw.turns, path)
     _check_span(positions, path)
     base = None
     if raw.base is not None:
@@ -145,6 +152,32 @@ def to_recording(
             )
         base = since_first(raw.base[:, :3], raw.base[:, 3:], path)
     return Recording(names, positions, float(rate), path, driven, rest, base, raw.start)
+
+
+def _with_arms(
+    names: tuple[str, ...], positions: FloatArray, rest: FloatArray | None, turns: FloatArray, path: Path
+) -> tuple[tuple[str, ...], FloatArray, FloatArray | None]:
+    """The same with the points on the axes of rigid bodies; where these are at rest is not known."""
+    if turns.shape != (*positions.shape[:2], 4):
+        raise DataFileError(
+            f"{path}: its quaternions have the shape {turns.shape}; each marker in each frame needs (w, x, y, z), NaN "
+            "for one that is no rigid body."
+        )
+    size = np.linalg.norm(turns, axis=2)
+    if (size == 0.0).any():
+        frame, column = np.argwhere(size == 0.0)[0]
+        raise DataFileError(
+            f"{path}: the quaternion of {names[column]} is zero in frame {frame}: leave it empty there."
+        )
+    for column in np.flatnonzero(np.isfinite(size).any(axis=0)):
+        seen = np.isfinite(size[:, column])
+        arms = np.full((len(positions), 3, 3), np.nan)
+        axes = Rotation.from_quat(turns[seen, column][:, [1, 2, 3, 0]]).as_matrix()
+        arms[seen] = positions[seen, column, None] + ARM * np.swapaxes(axes, 1, 2)
+        positions = np.concatenate([positions, arms], axis=1)
+        names = (*names, *(f"{names[column]} +{axis}" for axis in "xyz"))
+        rest = None if rest is None else np.concatenate([rest, np.full((3, 3), np.nan)])
+    return names, positions, rest
 
 
 def _check_span(positions: FloatArray, path: Path) -> None:

@@ -18,6 +18,7 @@ from .recording import METRES_PER_UNIT, SI_PER_ACTUATION_UNIT, FloatArray, RawRe
 Rows = list[list[str]]
 
 _AXES = ("x", "y", "z")
+_QUATERNION = ("qw", "qx", "qy", "qz")
 _OCCLUDED = ("", "nan", "null")
 _QUALISYS_KEYS = ("FILE_VERSION", "NO_OF_FRAMES", "NO_OF_MARKERS", "FREQUENCY", "MARKER_NAMES")
 _MOTIVE_UNITS = {"meters": "m", "centimeters": "cm", "millimeters": "mm"}
@@ -77,7 +78,10 @@ def read_raw_text(path: Path, table: Table | None = None) -> RawRecording:
 
 
 def _read_table(rows: Rows, path: Path) -> RawRecording:
-    """A header of `time [s]` or `frame`, then `<marker>.x`, `.y`, `.z` of each marker, and channels `name [unit]`."""
+    """A header of `time [s]` or `frame`, then `<marker>.x`, `.y`, `.z` of each marker, and channels `name [unit]`.
+
+    A rigid body has its quaternion as well, in `.qw`, `.qx`, `.qy` and `.qz`.
+    """
     columns = [_name_and_unit(cell) for cell in rows[0]] if rows else []
     if not columns or columns[0][0].lower() not in _CLOCKS or len(columns) < 4:
         raise DataFileError(
@@ -124,7 +128,7 @@ def _read_columns(
     timed, clock_unit = clock.lower() == "time", told or "s"
     if timed and clock_unit not in _SECONDS:
         raise DataFileError(f"{path} gives its time in '{clock_unit}': it must be in s or ms, as in 'time [s]'.")
-    named, units, channels = [], set(), {}
+    named, turned, units, channels = [], {}, set(), {}
     for number, (name, unit) in columns.items():
         label, _, axis = name.rpartition(".")
         if number in clocks:
@@ -132,6 +136,8 @@ def _read_columns(
         if label and axis.lower() in _AXES:
             named.append((label, axis.lower(), number))
             units |= {unit} if unit else set()
+        elif label and axis.lower() in _QUATERNION:
+            turned[label, axis.lower()] = number
         elif unit is not None and unit in channel_units:
             channels[number] = SI_PER_ACTUATION_UNIT[unit]
         else:
@@ -140,6 +146,7 @@ def _read_columns(
                 f"channel with a unit in brackets ({', '.join(channel_units)}); rename it or leave it out."
             )
     labels, chosen = _markers(named, path, planar)
+    turns = _quaternions(turned, labels, path)
     if len(units) > 1:
         raise DataFileError(f"{path} gives positions in {listed(sorted(units))}: give all of them in one unit.")
     width = len(rows[first]) if len(rows) > first else 0
@@ -169,9 +176,26 @@ def _read_columns(
         grid = np.arange(frames[-1] + 1)
         actuation = np.stack([np.interp(grid, frames, channel) for channel in driven.T], axis=1)
     start = float(stamps[0]) if timed else 0.0
+    found = np.full((len(values), len(labels), len(_QUATERNION)), np.nan)
+    for row, numbers in turns.items():
+        found[:, row] = values[:, numbers]
     return RawRecording(
-        _positions(frames, values[:, chosen]), labels, next(iter(units), None), rate, actuation, start=start
+        *(_positions(frames, values[:, chosen]), labels, next(iter(units), None), rate, actuation),
+        start=start,
+        turns=_spread(frames, found) if turns else None,
     )
+
+
+def _quaternions(turned: dict[tuple[str, str], int], labels: Sequence[str], path: Path) -> dict[int, list[int]]:
+    """By the number of a marker that is a rigid body, the columns of its quaternion, w first."""
+    found = {}
+    for label in dict.fromkeys(label for label, _ in turned):
+        missing = [axis for axis in _QUATERNION if (label, axis) not in turned]
+        if label not in labels or missing:
+            lacks = f"column '{label}.{missing[0]}'" if missing else "place"
+            raise DataFileError(f"{path}: the rigid body {label} has no {lacks}: it needs x, y, z, qw, qx, qy and qz.")
+        found[labels.index(label)] = [turned[label, axis] for axis in _QUATERNION]
+    return found
 
 
 def _name_and_unit(cell: str) -> tuple[str, str | None]:
@@ -339,6 +363,11 @@ def _frames(
 
 def _positions(frames: NDArray[np.int64], values: FloatArray) -> FloatArray:
     """(T, M, 3) positions from (R, 3 M) rows at their frames; a frame that was not recorded is NaN."""
-    spread = np.full((int(frames[-1]) + 1, values.shape[1]), np.nan)
+    return _spread(frames, values.reshape(len(values), -1, 3))
+
+
+def _spread(frames: NDArray[np.int64], values: FloatArray) -> FloatArray:
+    """(T, ...) values from (R, ...) at their frames, NaN at others."""
+    spread = np.full((int(frames[-1]) + 1, *values.shape[1:]), np.nan)
     spread[frames] = values
-    return spread.reshape(len(spread), -1, 3)
+    return spread

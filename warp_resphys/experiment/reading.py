@@ -115,7 +115,12 @@ class Reader:
             recording = replace(recording, actuation=(np.ones_like(frames) * share)[:, None] * inputs)
         if self._drive is None or recording.actuation is None:
             return recording
-        return replace(recording, actuation=self._of_parts(recording.actuation, recording.source, self._drive))
+        driven = self._of_parts(recording.actuation, recording.source, self._drive)
+        if trial.input_delay:
+            frames = np.arange(len(driven))
+            logged = frames - trial.input_delay * recording.rate
+            driven = np.stack([np.interp(logged, frames, column) for column in driven.T], axis=1)
+        return replace(recording, actuation=driven)
 
     def _of_parts(self, columns: FloatArray, source: Path, drive: Drive) -> FloatArray:
         """(T, C) inputs of the parts of the body, of the columns (T, A) that a recording has of them."""

@@ -329,6 +329,7 @@ _TRIAL = Group(
         "file": absent(Kind(_is_word, "the name of a file")),
         "inputs": absent(_list(FINITE, "a list of finite numbers, one for each chamber, tendon or muscle", _SOME)),
         "onset": absent(NOT_NEGATIVE),
+        "input_delay": absent(FINITE),
         "labels": absent(
             _list(WORD, "a list of different words, one for each marker of the file", _SOME, different=True)
         ),

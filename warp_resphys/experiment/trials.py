@@ -35,6 +35,7 @@ class Trial:
         amount: what sets simulated trajectories apart: a weight [kg], an angle [rad], or a factor of `base_motion`.
         inputs: what drives it all the time, one number for each part of the body; None where the recording tells.
         onset: when these come, on the clock of the recording [s]; with its first frame, if left out.
+        input_delay: how much later than its log says what drives it came, as clocks differ; negative for earlier [s].
         labels: of the markers of its recording, in their order; None where that tells.
         base_motion: how what it is fixed to moves, if otherwise than ``data.base_motion`` says; see
             `data.base_motion.prescribed`.
@@ -50,6 +51,7 @@ class Trial:
     amount: float = 0.0
     inputs: Sequence[float] | None = None
     onset: float | None = None
+    input_delay: float = 0.0
     labels: Sequence[str] | None = None
     base_motion: Mapping[str, Any] | None = None
 

@@ -1,0 +1,120 @@
+"""Limbs that swim, seen by one camera: whatever carries them off, what pulls them is identified, and corrected."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+from main_job import IN_RUN, run
+from omegaconf import OmegaConf
+
+from warp_resphys.data.sight import Sight
+from warp_resphys.dynamics.inputs import Inputs
+from warp_resphys.experiment.build import bound_markers, build_simulator
+from warp_resphys.experiment.checks import check_configuration
+from warp_resphys.experiment.files import read_dataset
+from warp_resphys.io.errors import InputError
+
+FACTOR = 1.3  # of the contraction that the winch is told
+STEPS = 24
+TINY = [
+    "experiment=starfish_limb",
+    *("mesh.layers=6", "mesh.nodes=20", "fixed.z=[-0.03,0.03]", "tendons.routes.limbs.pieces=3"),
+    *("data.folder=recordings", f"data.steps={STEPS}", "data.train_fraction=1.0", "data.rest_seconds=0.05"),
+    *("identify.max_evaluations=6", "~identify.parameters"),
+    "+identify.parameters={tendon_contraction_factor: {lower: 0.3, upper: 3.0, logarithmic: true}}",
+    "identify.first_guess={}",
+    *("trainer={epochs:4,rollout_every:2,batch_size:16}", "network={width:8}", "in_the_loop.epochs=2"),
+    *("reconstruction.max_iterations=2", "parallel.processes=1"),
+    *("hydra/job_logging=none", "hydra/hydra_logging=none", IN_RUN),
+]
+LATE = {"slow": 0, "fast": 2}  # frames that the winch's log is behind the camera
+TRIALS = [
+    "data.trials=null",
+    "+data.trials={slow: {file: slow.csv}, fast: {file: fast.csv, input_delay: -0.0333333333}}",
+]
+SPLIT = ["data.train=[slow]", "data.test=[fast]"]
+PERIODS = {"slow": 16.0, "fast": 9.0}  # steps
+
+
+def configuration(*overrides):
+    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
+        shown = [each for each in (*TINY, *TRIALS, *SPLIT) if not each.startswith("hydra")]
+        return OmegaConf.to_container(compose("config", [*shown, *overrides]), resolve=True)
+
+
+@pytest.fixture(scope="module")
+def swum():
+    """By trial, what the winch is told (T,) and where the markers are in the frame of the body (T, 4, 3), both [m]."""
+    config = configuration()
+    simulator = build_simulator(config)
+    markers = config["markers"]
+    places = np.array([*markers["tracked"].values()])
+    read = bound_markers(markers, simulator.body.mesh, places, tuple(markers["tracked"]))
+    found = {}
+    for name, period in PERIODS.items():
+        steps = np.arange(STEPS + 4)
+        told = 0.008 * np.sin(np.pi * np.clip(steps - 3, 0, None) / period) ** 2
+        pulled = torch.as_tensor(FACTOR * told[1:, None, None])
+        with torch.no_grad():
+            motion = simulator.rollout(simulator.rest_state(), len(steps) - 1, Inputs(tendon_contraction=pulled))
+        found[name] = told, read(motion.q[:, 0]).numpy()
+    return found
+
+
+def write(folder, found):
+    """Tables of a camera: two coordinates in mm of a body that drifts and turns, and a winch that is late to begin."""
+    folder.mkdir()
+    draw = np.random.default_rng(0)
+    for name, (told, markers) in found.items():
+        frames = np.arange(len(told))
+        angle, drift = 0.02 * frames, np.stack([0.3 - 0.002 * frames, 0.2 + 0.001 * frames], 1)
+        x, y = markers[..., 0], -markers[..., 2]  # of the camera
+        turned = np.exp(1j * angle)[:, None] * (x + 1j * y)
+        turned = np.stack([turned.real, turned.imag], -1)
+        seen = 1e3 * (turned + drift[:, None]) + 0.02 * draw.normal(size=turned.shape)
+        winch = np.where(frames < 2, np.nan, 1e3 * told[np.clip(frames - LATE[name], 0, None)])
+        table = np.column_stack([1e3 * frames / 60.0, winch, seen.reshape(len(frames), -1)])
+        np.savetxt(folder / f"{name}.csv", table, delimiter=",", header="as the camera has it", fmt="%.9f")
+
+
+def test_limbs_are_identified_by_their_shape(swum, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write(Path("recordings"), swum)
+    code, err = run(*TINY, *TRIALS, *SPLIT)
+    assert (code, err[-500:] if code else "") == (0, "")
+    config, dataset = configuration(), read_dataset(Path("run/dataset.h5"))
+    sight = Sight.of([*config["markers"]["tracked"].values()], ["x", "z"], "own")
+    for name, (told, markers) in swum.items():
+        pulled = dataset.inputs["tendon_contraction"][dataset.names.index(name), :, 0]
+        np.testing.assert_allclose(pulled, told[1 : STEPS + 1], atol=1e-6)
+        shapes = sight.of_arrays(markers[: STEPS + 1])
+        np.testing.assert_allclose(dataset.observed[dataset.names.index(name)], shapes, atol=3e-4)
+        assert np.abs(shapes - shapes[:1]).max() > 3e-3
+    factor = json.loads(Path("run/identification.json").read_text())["sysid"]["parameters"]["tendon_contraction_factor"]
+    assert factor == pytest.approx(FACTOR, rel=0.03)
+    found = json.loads(Path("run/metrics.json").read_text())["errors_mm"]
+    errors = {name: each["mean"] for name, each in found.items()}
+    assert 3.0 * errors["sysid"] < errors["simulation"]
+    assert errors["resphys"] < 1.5 * errors["sysid"]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (["markers.plane=[x,x]"], "markers.plane is .*two different ones"),
+        (["data.axes=null"], "markers.plane is set, but data.axes is not"),
+        (["markers.frame=free"], "markers.frame is 'free': .* body, own"),
+        (["data.base_motion=recorded"], "markers.frame is own, but data.base_motion tells"),
+        (["identify.placement={markers: 0.001}"], "identify.placement is set, but with markers.frame own"),
+        (["fixed.z=[0.02,-0.02]"], "fixed.z is .*two rising ones"),
+        (["fixed.z=[0.2,0.3]"], r"no vertex lies within 1e-09 m of z = 0\.2 to 0\.3 m"),
+    ],
+)
+def test_what_a_camera_cannot_tell_is_refused(overrides, said, tmp_path, swum, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write(Path("recordings"), swum)
+    with pytest.raises(InputError, match=said):
+        check_configuration(configuration(*overrides))

@@ -253,3 +253,46 @@ def test_axes_that_do_not_fit():
         axes_rotation(["x", "z", "y"])
     with pytest.raises(InputError, match="name one axis twice"):
         axes_rotation(["x", "-x", "y"])
+
+
+class TestWithAKnownVertical:
+    """Two markers of a base, or a row of them, and where up is."""
+
+    UP = np.array([0.0, 0.0, 1.0])
+
+    def found(self, nominal, angle=2.0, lean=(0.7, -0.4, 0.0), **more):
+        turn = Rotation.from_rotvec(np.asarray(lean)) * Rotation.from_rotvec(angle * self.UP)
+        measured = turn.apply(nominal) + [0.3, 0.2, -0.1]
+        below = Rotation.from_rotvec(np.asarray(lean)).apply(self.UP)
+        names = [f"B{number}" for number in range(len(nominal))]
+        result = register_markers(measured, nominal, names, source=SOURCE, vertical=(9.8 * below, self.UP), **more)
+        return result, turn
+
+    @pytest.mark.parametrize("angle", [0.0, 2.0, -3.1])
+    @pytest.mark.parametrize(
+        "nominal", [[[0.1, 0.0, 0.02], [-0.1, 0.03, 0.0]], [[0.0, 0.0, 0.0], [0.05, 0.0, 0.1], [0.1, 0.0, 0.2]]]
+    )
+    def test_two_markers_or_a_row_tell_how_a_body_stands(self, nominal, angle):
+        result, turn = self.found(np.array(nominal), angle)
+        np.testing.assert_allclose(result.transform.rotation, turn.inv().as_matrix(), atol=1e-12)
+        np.testing.assert_allclose(result.positions, nominal, atol=1e-12)
+
+    def test_a_recording_upside_down(self):
+        result, turn = self.found(np.array([[0.1, 0.0, 0.02], [-0.1, 0.03, 0.0]]), lean=(np.pi, 0.0, 0.0))
+        np.testing.assert_allclose(result.transform.rotation, turn.inv().as_matrix(), atol=1e-9)
+
+    def test_three_markers_off_a_line_tell_the_vertical_themselves(self):
+        nominal = np.array([[0.1, 0.0, 0.0], [-0.1, 0.05, 0.0], [0.0, 0.1, 0.05]])
+        names = ["a", "b", "c"]
+        leaning = register_markers(nominal, nominal, names, source=SOURCE, vertical=([0.1, 0.0, 1.0], self.UP))
+        np.testing.assert_allclose(leaning.transform.rotation, np.eye(3), atol=1e-12)
+
+    def test_what_does_not_tell_is_refused(self):
+        with pytest.raises(InputError, match=r"'B0', 'B1' lie above one another to within 4\.0 mm"):
+            self.found(np.array([[0.0, 0.0, 0.0], [0.001, 0.0, 0.3]]))
+        pair = np.array([[0.1, 0.0, 0.0], [-0.1, 0.0, 0.0]])
+        with pytest.raises(DataFileError, match="mm off where the vertical and 'B0', 'B1' tell how the body stands"):
+            register_markers(pair * 1.2, pair, ["B0", "B1"], source=SOURCE, vertical=(self.UP, self.UP))
+        hidden = np.array([[0.1, 0.0, 0.0], [np.nan] * 3])
+        with pytest.raises(DataFileError, match="registration needs two markers at rest, but 1 are left"):
+            register_markers(hidden, pair, ["B0", "B1"], source=SOURCE, vertical=(self.UP, self.UP))

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from ..io.errors import DataFileError, InputError, listed
 from .rigid import BoolArray, FloatArray, RigidTransform, fit, root_mean_square
@@ -41,6 +42,7 @@ def register_markers(
     largest_residual: float = 0.004,
     use: Sequence[str] | None = None,
     rotation: ArrayLike | None = None,
+    vertical: tuple[ArrayLike, ArrayLike] | None = None,
 ) -> Registration:
     """Registers markers at rest to their nominal positions, without those that are not where they should be.
 
@@ -48,7 +50,8 @@ def register_markers(
     `largest_residual`; among sets of one size, to that with the least sum of squares. All sets are tried, up to 20 000
     of them, so that no unlucky start can miss the best. The set is more than half of the markers and at least four:
     two of six markers or seven of fifteen may be anywhere, and three markers that do not fit are an error. Markers
-    that are NaN are left out and do not count. Where the rotation is known, one marker is enough.
+    that are NaN are left out and do not count. Where the rotation is known, one marker is enough. Where the vertical
+    is, two are, or several on a line, if they do not lie above one another: what is open is the angle about it.
 
     Args:
         measured: (M, 3) [m] the markers while the body was at rest, in the frame of the recording.
@@ -58,11 +61,13 @@ def register_markers(
         largest_residual: How well the nominal positions are known [m].
         use: The markers to fit, such as those on the clamp; all if None.
         rotation: (3, 3) from the frame of the recording to that of the body, where it is known.
+        vertical: (3,) upwards in the frame of the recording and in that of the body, where these are known.
 
     Raises:
-        InputError: Arrays that do not fit, a name in `use` that there is not, or nominal positions on one line.
-        DataFileError: Fewer than three of the markers are seen (none, with a known rotation), or too many of them are
-            too far off.
+        InputError: Arrays that do not fit, a name in `use` that there is not, or nominal positions on one line (with a
+            known vertical: above one another).
+        DataFileError: Fewer than three of the markers are seen (two with a known vertical, one with a known rotation),
+            or too many of them are too far off.
     """
     a, b = np.asarray(measured, dtype=np.float64), np.asarray(nominal, dtype=np.float64)
     if a.shape != (len(names), 3) or b.shape != a.shape:
@@ -71,7 +76,8 @@ def register_markers(
             "be (markers, 3)."
         )
     turned = None if rotation is None else np.asarray(rotation, dtype=np.float64)
-    used = _used(a, names, use, source, 3 if turned is None else 1)
+    least = 1 if turned is not None else 3 if vertical is None else 2
+    used = _used(a, names, use, source, least)
     if turned is not None:
         near, motion = _shifted(a, b, used, turned, largest_residual)
         if not 2 * np.count_nonzero(near) > np.count_nonzero(used):
@@ -82,6 +88,16 @@ def register_markers(
                 "axes, and the markers' names, nominal positions and unit."
             )
         return _registration(a, b, names, motion, used, near)
+    if vertical is not None and _distance_from_line(b[used]) <= largest_residual:
+        motion = _upright(a[used], b[used], vertical, largest_residual, listed(_pick(names, used)))
+        off = np.linalg.norm(motion.apply(a[used]) - b[used], axis=1)
+        if off.max() > largest_residual:
+            raise DataFileError(
+                f"{source}: {_pick(names, used)[int(off.argmax())]!r} is {_MILLI * off.max():.1f} mm off where the "
+                f"vertical and {listed(_pick(names, used))} tell how the body stands: check their nominal positions, "
+                "the unit and data.up."
+            )
+        return _registration(a, b, names, motion, used, used)
     if _distance_from_line(b[used]) <= largest_residual:
         raise InputError(
             f"The nominal positions of {listed(_pick(names, used))} lie on one line to within "
@@ -124,6 +140,24 @@ def _shifted(
     return near, RigidTransform(rotation, shifts[near].mean(axis=0) if near.any() else shift)
 
 
+def _upright(
+    a: FloatArray, b: FloatArray, vertical: tuple[ArrayLike, ArrayLike], least: float, names: str
+) -> RigidTransform:
+    """The motion of points a onto points b (M, 3) of those that carry one vertical onto the other."""
+    below, up = (np.asarray(each, dtype=np.float64) / np.linalg.norm(each) for each in vertical)
+    tilt, _ = Rotation.align_vectors(up[None], below[None])
+    now, meant = tilt.apply(a - a.mean(axis=0)), b - b.mean(axis=0)
+    level = meant - np.outer(meant @ up, up)
+    if np.linalg.norm(level, axis=1).max() <= least:
+        raise InputError(
+            f"{names} lie above one another to within {_MILLI * least:.1f} mm, so that the vertical does not tell how "
+            "the body is turned: register with another marker."
+        )
+    angle = np.arctan2(np.sum(np.cross(now, level) @ up), np.sum(now * level))
+    rotation = (Rotation.from_rotvec(angle * up) * tilt).as_matrix()
+    return RigidTransform(rotation, b.mean(axis=0) - rotation @ a.mean(axis=0))
+
+
 def axes_rotation(axes: Sequence[str]) -> FloatArray:
     """(3, 3) rotation to the frame of the body, of the recording's axes along which its x, y and z are.
 
@@ -154,7 +188,7 @@ def _used(
     wanted = np.array([use is None or name in use for name in names], dtype=bool)
     seen = np.isfinite(measured).all(axis=1)
     if np.count_nonzero(wanted & seen) < least:
-        needed = {1: "one marker", 3: "three markers"}[least]
+        needed = {1: "one marker", 2: "two markers", 3: "three markers"}[least]
         raise DataFileError(
             f"{source}: registration needs {needed} at rest, but {np.count_nonzero(wanted & seen)} are left to "
             f"it; not seen: {listed(_pick(names, wanted & ~seen))}."

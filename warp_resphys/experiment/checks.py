@@ -214,9 +214,11 @@ def _check_markers(config: Mapping[str, Any], body: Body, begins: set[str]) -> N
     if axes is not None:
         with _naming("data.axes: "):
             axes_rotation(axes)
-    if count < 3 and axes is None:
-        raise InputError(f"markers names {count} in all: registration needs three or more.")
-    standing, enough = len(markers["reference"]), standing_enough(config["data"])
+    standing, enough = len(markers["reference"]), standing_enough(config)
+    if count < enough:
+        raise InputError(
+            f"markers names {count} in all: registration needs three or more, two with data.up, or one with data.axes."
+        )
     if markers.get("labels") == "assigned" and STATIC in begins and standing < enough:
         raise InputError(
             f"markers.labels is assigned, but markers.reference names {standing} markers that stand still beside a "

@@ -205,6 +205,7 @@ class Importer:
     ) -> Registration:
         use = list(self.markers["reference"]) if only_reference else None
         more = {"largest_residual": self.markers["largest_residual"], "rotation": self.reader.rotation}
+        more["vertical"] = self.reader.vertical
         return register_markers(places, expected, self.reader.labels, source=recording.source, use=use, **more)
 
     def _released(self, trial: Trial, recording: Recording, release: Release) -> Observed:

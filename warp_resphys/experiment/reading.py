@@ -21,6 +21,7 @@ from ..io.errors import DataFileError, InputError
 from .actuators import Drive
 from .build import seen_markers, sight_of
 from .files import STATIC, payload_inputs
+from .simulate import vertical
 from .trials import Trial, is_laboratory
 
 log = logging.getLogger(__name__)
@@ -45,6 +46,7 @@ class Reader:
         tracked: names of the markers that errors are measured on.
         nominal: (M, 3) where they are on the undeformed body [m].
         rotation: (3, 3) from the frame of the recordings to that of the body; None where markers tell.
+        vertical: upwards in the frame of the recordings and in that of the body; None where either is not known.
         enough: how many markers that stand still register a recording.
         sight: how much recordings tell of where the tracked markers are.
     """
@@ -55,7 +57,8 @@ class Reader:
         self.nominal, self._reference = (_places(self.markers[key]) for key in ("tracked", "reference"))
         axes = self.data.get("axes")
         self.rotation = None if axes is None else axes_rotation(axes)
-        self.enough = standing_enough(self.data)
+        self.vertical = vertical_of(settings)
+        self.enough = standing_enough(settings)
         self.sight = sight_of(self.markers, self.tracked)
         self._simulator, self._drive = simulator, drive
         self._folder = run_dir if is_laboratory(settings) else None
@@ -117,9 +120,9 @@ class Reader:
             return recording
         driven = self._of_parts(recording.actuation, recording.source, self._drive)
         if trial.input_delay:
-            frames = np.arange(len(driven))
-            logged = frames - trial.input_delay * recording.rate
-            driven = np.stack([np.interp(logged, frames, column) for column in driven.T], axis=1)
+            own = np.arange(len(driven), dtype=np.float64)
+            logged = own - trial.input_delay * recording.rate
+            driven = np.stack([np.interp(logged, own, column) for column in driven.T], axis=1)
         return replace(recording, actuation=driven)
 
     def _of_parts(self, columns: FloatArray, source: Path, drive: Drive) -> FloatArray:
@@ -196,9 +199,17 @@ class Reader:
         return found
 
 
-def standing_enough(data: Mapping[str, Any]) -> int:
-    """How many markers that stand still register a recording: one, where it is known how it is turned."""
-    return 3 if data.get("axes") is None else 1
+def standing_enough(settings: Mapping[str, Any]) -> int:
+    """How many markers that stand still register a recording: one where its rotation is known, two where its up is."""
+    if settings["data"].get("axes") is not None:
+        return 1
+    return 3 if vertical_of(settings) is None else 2
+
+
+def vertical_of(settings: Mapping[str, Any]) -> tuple[FloatArray, FloatArray] | None:
+    """(3,) upwards in the frame of the recordings, and in that of the body by its gravity; None if one is not known."""
+    up, gravity = vertical(settings["data"].get("up")), np.asarray(settings["gravity"], dtype=np.float64)
+    return None if up is None or not gravity.any() else (up, -gravity)
 
 
 def central_places(recording: Recording, centre: Callable[..., Any]) -> FloatArray:

@@ -69,23 +69,53 @@ def test_a_table_that_says_nothing_of_itself(tmp_path, positions):
     np.testing.assert_allclose(recording.actuation[:, 0], 1e-3 * wound, atol=1e-8)
 
 
-def test_a_log_that_began_before_its_winch_and_ended_after_it(tmp_path, positions):
+class TestALogThatBeganBeforeItsWinch:
     """It is as it was first told, and ends with what is told last; a note at the side of the header is none of it."""
-    path, pulled = tmp_path / "swing.csv", [np.nan] * 5 + np.linspace(2.0, 3.5, 30).tolist() + [np.nan] * 5
-    columns = ["frame", *(f"{label}.{axis}" for label in "abc" for axis in "xyz"), "winch [mm]"]
-    rows = [f"{k},{','.join(f'{x:.6f}' for x in positions[k].ravel())},{pulled[k]:.6f},," for k in range(40)]
-    path.write_text("\n".join([",".join(columns) + ",,from left to right", *rows]))
-    table = Table(columns, header_lines=1)
-    recording = read_recording(path, units="m", rate=100.0, table=table)
-    assert recording.positions.shape == (35, 3, 3)
-    np.testing.assert_allclose(recording.actuation[:, 0], 1e-3 * np.array([2.0] * 5 + pulled[5:35]), atol=1e-9)
-    rows[20] = rows[20].replace(f"{pulled[20]:.6f}", "")
-    path.write_text("\n".join([",".join(columns), *rows]))
-    with pytest.raises(DataFileError, match="line 22: an actuation is missing or infinite; every frame between"):
-        read_recording(path, units="m", rate=100.0, table=table)
-    path.write_text("\n".join([",".join(columns), *rows[:20], rows[21] + "9"]))
-    with pytest.raises(DataFileError, match=r"line 2: 13 cells, but data\.table\.columns names 11"):
-        read_recording(path, units="m", rate=100.0, table=table)
+
+    COLUMNS = ("frame", *(f"{label}.{axis}" for label in "abc" for axis in "xyz"), "winch [mm]", "valve [Pa]")
+    TABLE = Table(COLUMNS, header_lines=1)
+    GONE = float("nan")
+
+    def write(self, path, positions, winch, valve, ends=",,"):
+        rows = [
+            f"{k},{','.join(f'{x:.6f}' for x in positions[k].ravel())},{winch[k]:.6f},{valve[k]:.6f}{ends}"
+            for k in range(40)
+        ]
+        path.write_text("\n".join([",".join(self.COLUMNS) + ",,from left to right", *rows]).replace("nan", ""))
+        return path
+
+    def read(self, path):
+        return read_recording(path, units="m", rate=100.0, table=self.TABLE)
+
+    def test_each_channel_is_filled_by_itself(self, tmp_path, positions, caplog):
+        pulled, valve = np.linspace(2.0, 3.5, 40), np.arange(40.0)
+        winch = np.where((np.arange(40) < 5) | (np.arange(40) >= 35), np.nan, pulled)
+        recording = self.read(self.write(tmp_path / "swing.csv", positions, winch, valve))
+        assert recording.positions.shape == (35, 3, 3)
+        np.testing.assert_allclose(recording.actuation[:, 0], 1e-3 * pulled[np.clip(np.arange(35), 5, None)], atol=1e-9)
+        np.testing.assert_array_equal(recording.actuation[:, 1], valve[:35])  # as it was logged
+        assert "in its first 5 frames" in caplog.text
+        assert "its last 5, which are left out" in caplog.text
+
+    def test_a_gap_an_infinity_and_a_channel_that_ends_at_once_are_refused(self, tmp_path, positions):
+        whole, numbers = np.linspace(2.0, 3.5, 40), np.arange(40)
+        path = tmp_path / "swing.csv"
+        for value in (np.nan, np.inf):
+            with pytest.raises(DataFileError, match="line 22: an actuation is missing"):
+                self.read(self.write(path, positions, np.where(numbers == 20, value, whole), whole))
+        with pytest.raises(DataFileError, match="line 32: an actuation is missing or infinite"):
+            self.read(self.write(path, positions, np.where(numbers >= 30, np.inf, whole), whole))
+        with pytest.raises(DataFileError, match="line 2: an actuation is missing"):
+            self.read(self.write(path, positions, np.full(40, np.nan), whole))
+        with pytest.raises(DataFileError, match="tells what drove the body in 1 frames: a recording needs two"):
+            self.read(self.write(path, positions, np.where(numbers > 0, np.nan, whole), whole))
+
+    def test_a_line_that_holds_more_than_its_columns_is_named(self, tmp_path, positions):
+        path = self.write(tmp_path / "swing.csv", positions, np.ones(40), np.ones(40))
+        rows = path.read_text().split("\n")
+        path.write_text("\n".join([*rows[:21], rows[21] + "9", *rows[22:]]))
+        with pytest.raises(DataFileError, match="line 22: 14 cells where the other lines have 12"):
+            self.read(path)
 
 
 def test_a_table_of_markers_in_a_plane(tmp_path):
@@ -497,7 +527,7 @@ def test_a_rigid_body_is_four_markers(tmp_path, positions, suffix):
     path = tmp_path / f"swing.{suffix}"
     if suffix == "npz":
         both = np.stack([positions[:20, 0], place], axis=1)
-        turns = np.stack([np.full((20, 4), np.nan), -2.0 * quaternion], axis=1)  # of any length, and of either sign
+        turns = np.stack([np.full((20, 4), np.nan), -quaternion], axis=1)  # of either sign
         np.savez(path, positions=both, quaternions=turns, labels=["a", "plate"], rate_hz=100.0)
     else:
         names = "frame,plate.qx,plate.qy,plate.qz,plate.qw," + ",".join(
@@ -532,8 +562,21 @@ def test_rigid_bodies_that_are_not_whole(tmp_path):
     path.write_text(
         "frame,a.x [mm],a.y,a.z,a.qw,a.qx,a.qy,a.qz\n" + "\n".join(f"{k},1,2,{k},0,0,0,0" for k in range(9))
     )
-    with pytest.raises(DataFileError, match="the quaternion of a is zero in frame 0: leave it empty"):
+    with pytest.raises(DataFileError, match="the quaternion of a has the length 0 in frame 1 from the start"):
         read_recording(path, rate=100.0)
     np.savez(tmp_path / "swing.npz", positions=np.ones((9, 2, 3)), quaternions=np.ones((9, 4)), rate_hz=100.0)
     with pytest.raises(DataFileError, match=r"quaternions have the shape \(9, 4\)"):
         read_recording(tmp_path / "swing.npz")
+    path.write_text(
+        "frame,a.x [mm],a.y,a.z,a.qw,a.qx,a.qy,a.qw\n" + "\n".join(f"{k},1,2,{k},1,0,0,1" for k in range(9))
+    )
+    with pytest.raises(DataFileError, match=r"has two columns named 'a\.qw'"):
+        read_recording(path, rate=100.0)
+    twice = {"positions": np.random.default_rng(0).normal(size=(9, 2, 3)), "labels": ["a", "a +x"], "rate_hz": 100.0}
+    turns = np.stack([np.tile([1.0, 0.0, 0.0, 0.0], (9, 1)), np.full((9, 4), np.nan)], axis=1)
+    np.savez(tmp_path / "swing.npz", quaternions=turns, **twice)
+    with pytest.raises(DataFileError, match=r"a marker is named 'a \+x', as a point of a rigid body is"):
+        read_recording(tmp_path / "swing.npz")
+    turns[3, 0], twice["positions"][3, 0] = 0.0, np.nan  # not seen
+    np.savez(tmp_path / "swing.npz", quaternions=turns, **{**twice, "labels": ["a", "b"]})
+    assert np.flatnonzero(~read_recording(tmp_path / "swing.npz").seen[:, 2]).tolist() == [3]

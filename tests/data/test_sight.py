@@ -94,6 +94,21 @@ def test_a_hidden_marker_hides_the_shape_of_its_frame_alone():
     assert np.isnan(told).sum() == 3  # its depth neither
 
 
+@pytest.mark.parametrize("name", ["own", "own plane"])
+def test_markers_that_tell_no_frame_hide_it(name):
+    points = shaken()
+    points[0] = 0.0  # as trackers write what they lost
+    points[3] = [0.0, 0.01, 0.0] if name == "own plane" else np.linspace([0.0, 0.0, 0.0], [0.1, 0.0, 0.0], 4)
+    points[4, 2] = np.inf
+    seen = np.isfinite(SIGHTS[name].of_arrays(points)).all(axis=(1, 2))
+    assert seen.tolist() == [False, True, True, False, False]
+
+
+def test_a_mirror_image_is_another_shape():
+    mirrored = SIGHTS["own"].of_arrays(NOMINAL * [1.0, -1.0, 1.0])
+    assert np.abs(mirrored - NOMINAL).max() > 1e-3
+
+
 def test_seen_markers_of_a_body_that_is_carried_away_are_where_they_were():
     mesh = box_hexahedra(divisions=(5, 2, 2))
     places = np.array([[0.01, 0.0, 0.033], [0.05, 0.002, 0.033], [0.09, 0.03, 0.033]])
@@ -106,6 +121,13 @@ def test_seen_markers_of_a_body_that_is_carried_away_are_where_they_were():
     assert float((seen(bent)[0] - torch.as_tensor(places)).norm(dim=1).max()) > 2e-3
     slope = seen.transposed_jacobian(bent).view(1, -1, 3, 9)
     assert float(slope.sum(1).abs().max()) < 1e-10 < float(slope.abs().max())  # all vertices alike change no shape
+    spin = torch.linalg.cross(torch.tensor([0.3, -0.5, 0.8], dtype=torch.float64).expand_as(bent[0]), bent[0])
+    assert float(torch.einsum("ni,nim->m", spin, slope[0]).abs().max()) < 1e-10  # nor does a turn
+    by = torch.tensor([[0.002, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]], dtype=torch.float64)
+    assert not torch.allclose(seen.moved(by)(at), seen(at), atol=1e-4)
+    single = seen.to(torch.zeros(1, dtype=torch.float32))(bent.float())
+    assert single.dtype == torch.float32
+    np.testing.assert_allclose(single.numpy(), seen(bent).numpy(), atol=1e-6)
     assert SeenMarkers.of(markers, Sight.of(places)) is markers
 
 
@@ -114,8 +136,9 @@ def test_seen_markers_of_a_body_that_is_carried_away_are_where_they_were():
     [
         ((NOMINAL, ["x", "x"]), r"markers\.plane is \['x', 'x'\]: name two"),
         ((NOMINAL, ["x", "y", "z"]), "name two of the body's axes"),
-        ((NOMINAL * [0, 0, 1], None, "own"), "the 4 tracked markers lie on one line, so that they tell no frame"),
-        ((NOMINAL[:1], ["x", "z"], "own"), "the 1 tracked markers are at one place"),
+        ((NOMINAL, None, "free"), "markers.frame is 'free': choose body or own"),
+        ((NOMINAL * [0, 0, 1], None, "own"), r"all tracked markers \(4\) lie on one line, so that they tell no frame"),
+        ((NOMINAL[:1], ["x", "z"], "own"), r"all tracked markers \(1\) are at one place"),
     ],
 )
 def test_what_tells_nothing_is_refused(arguments, said):

@@ -215,6 +215,9 @@ def test_empty_selections_are_refused() -> None:
         select_vertices(mesh, x=[0.011, 0.019])
     with pytest.raises(MeshError, match="at least one of the coordinates"):
         select_vertices(mesh)
+    for wrong in ([0.02, 0.01], [0.0, 0.01, 0.02], [], float("nan"), [0.0, float("inf")]):
+        with pytest.raises(MeshError, match=r"a selection of vertices at x = .*: give one number, or two that rise"):
+            select_vertices(mesh, x=wrong)
 
 
 @pytest.mark.parametrize(

@@ -42,18 +42,29 @@ def test_along_a_curve_it_keeps_its_radius_and_does_not_twist():
 
 def test_a_section_may_be_an_ellipse():
     """Of which the first semi-axis is along the coordinate axis that the rod crosses most squarely, y here."""
-    tapered = np.array([[0.0, 0.02, 0.005], [0.2, 0.01, 0.0025]])
-    mesh = rod([[0.0, 0.0, 0.0], [0.02, 0.0, -0.2]], tapered, 8, nodes=27)
-    length = np.hypot(0.02, 0.2)
-    taper = 1.0 - 0.5 * min(length / 0.2, 1.0)
-    middle = np.pi * 0.02 * 0.005 * (1.0 + taper + taper**2) / 3.0
-    assert cell_volumes(mesh).sum() == pytest.approx(middle * length, rel=3e-3)
-    wide, thick = np.ptp(mesh.vertices[:, 1]), np.ptp(mesh.vertices[mesh.vertices[:, 2] > -1e-3, 0])
-    assert (wide, thick) == (pytest.approx(0.04, rel=0.01), pytest.approx(0.01, rel=0.02))
+    profile = np.array([[0.0, 0.02, 0.005], [0.201, 0.01, 0.005]])
+    mesh = rod([[0.0, 0.0, 0.0], [0.02, 0.0, -0.2]], profile, 8, nodes=27)
+    assert cell_volumes(mesh).sum() == pytest.approx(np.pi * 0.015 * 0.005 * 0.201, rel=3e-3)
+    first, last = mesh.vertices[mesh.vertices[:, 2] > -1e-3], mesh.vertices[mesh.vertices[:, 2] < -0.199]
+    assert (np.ptp(first[:, 1]), np.ptp(last[:, 1])) == (pytest.approx(0.04, rel=0.01), pytest.approx(0.02, rel=0.01))
+    assert (np.ptp(first[:, 0]), np.ptp(last[:, 0])) == (pytest.approx(0.01, rel=0.02), pytest.approx(0.01, rel=0.02))
+
+
+@pytest.mark.parametrize("noise", [0.0, 6e-17, -6e-17])
+def test_an_ellipse_does_not_turn_on_a_rounding_error(noise):
+    mesh = rod([[0.0, 0.0, 0.0], [noise, 2.0 * noise, -0.2]], [[0.0, 0.02, 0.005]], 4)
+    assert np.ptp(mesh.vertices[:, 0]) == pytest.approx(0.04, rel=0.01)  # x comes first where x and y are alike
+    assert np.ptp(mesh.vertices[:, 1]) == pytest.approx(0.01, rel=0.02)
 
 
 def test_layers_are_as_long_as_the_grading_says():
     for grading in (0.0, 0.5, 1.0):
+        flat = [[length, 4.0 * radius, 0.25 * radius] for length, radius in TAPER]
+        np.testing.assert_allclose(
+            np.unique(np.round(rod(AXIS, flat, 10, nodes=8, grading=grading).vertices[:, 2], 9)),
+            np.unique(np.round(rod(AXIS, TAPER, 10, nodes=8, grading=grading).vertices[:, 2], 9)),
+            atol=1e-6,  # layers by the geometric mean
+        )
         ends = np.unique(np.round(rod(AXIS, TAPER, 10, nodes=8, grading=grading).vertices[:, 2], 9))[::-1]
         lengths, middles = -np.diff(ends), 0.5 * (ends[1:] + ends[:-1])
         shares = lengths / np.interp(-middles, *np.transpose(TAPER)) ** grading

@@ -116,3 +116,29 @@ def test_without_gmsh_one_sentence(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "gmsh", None)
     with pytest.raises(MeshError, match=r"tetrahedra of .*robot.stl need gmsh, which cannot be imported .*pip install"):
         fill_surface(written(tmp_path, trimesh.creation.box((100.0, 30.0, 20.0))), 0.01, "mm")
+
+
+@pytest.mark.usefixtures("_gmsh")
+def test_files_as_other_programs_write_them(tmp_path):
+    """With texture coordinates of its own at each corner, and with triangles that turn either way."""
+    box = trimesh.creation.box((100.0, 30.0, 20.0))
+    path, corners = tmp_path / "robot.obj", "".join(f"v {x} {y} {z}\n" for x, y, z in box.vertices)
+    textures = "".join(f"vt {u:.4f} {1.0 - u:.4f}\n" for u in np.linspace(0.0, 1.0, 36))
+    faces = "".join(
+        "f " + " ".join(f"{v + 1}/{3 * row + k + 1}" for k, v in enumerate(face)) + "\n"
+        for row, face in enumerate(box.faces)
+    )
+    path.write_text(corners + textures + faces)
+    assert cell_volumes(fill_surface(path, 0.01, "mm", 1)).sum() == pytest.approx(6e-5, rel=1e-6)
+    turned = box.copy()
+    turned.faces[:5] = turned.faces[:5, ::-1]
+    turned.export(tmp_path / "turned.ply")
+    assert cell_volumes(fill_surface(tmp_path / "turned.ply", 0.01, "mm", 1)).sum() == pytest.approx(6e-5, rel=1e-6)
+
+
+def test_bodies_beside_one_another(tmp_path):
+    other = trimesh.creation.box((10.0, 10.0, 10.0))
+    other.apply_translation([80.0, 0.0, 0.0])
+    path = written(tmp_path, trimesh.creation.box((100.0, 30.0, 20.0)), other)
+    with pytest.raises(MeshError, match=r"closed surfaces beside one another \(2 in all\): export one body"):
+        fill_surface(path, 0.01, "mm")

@@ -183,6 +183,11 @@ def test_any_mesh_that_an_experiment_may_have(folder, monkeypatch, capsys):
     assert not {"vertices in the file", "surfaces with a name", "Written:"} & rows.keys()
 
 
+def test_a_body_that_is_fixed_from_one_place_to_another(tmp_path):
+    config = configured("inspect", "mesh=rod", "+fixed.tolerance=1e-6", "fixed.z=[-0.1,-0.06]", "picture=false")
+    assert rows_of(inspect_mesh(config, tmp_path))["fixed"].endswith(" at z = -0.1 to -0.06 m, 125 of them used")
+
+
 def test_a_body_in_two_pieces_with_an_open_chamber(tmp_path, arm):
     mesh = without(arm[0], arm[0].vertices[arm[0].cells].mean(axis=1)[:, 2] < -0.271)
     apart = Mesh(

@@ -33,23 +33,35 @@ class Sight:
         own: whether markers are seen in a frame of their own, rather than in that of the body.
 
     Raises:
-        InputError: other axes than two, or markers that tell no frame.
+        InputError: axes that are not two of x, y and z, or markers that tell no frame.
     """
 
     nominal: torch.Tensor
-    plane: tuple[str, str] | None = None
+    plane: tuple[str, ...] | None = None
     own: bool = False
 
     @classmethod
     def of(cls, nominal: ArrayLike, plane: Sequence[str] | None = None, frame: str = "body") -> "Sight":
-        """From the values of a configuration; a ``frame`` is one of `FRAMES`."""
-        if plane is not None and (len(set(plane)) != 2 or not set(plane) <= set(_AXES)):
-            raise InputError(f"markers.plane is {list(plane)}: name two of the body's axes x, y and z.")
-        chosen = None if plane is None else (str(plane[0]), str(plane[1]))
-        found = cls(torch.as_tensor(np.asarray(nominal, dtype=np.float64)), chosen, frame == "own")
-        if found.own:
-            found._check_frame()
-        return found
+        """From the values of a configuration.
+
+        Raises:
+            InputError: see the class; or a ``frame`` that is none of `FRAMES`.
+        """
+        if frame not in FRAMES:
+            raise InputError(f"markers.frame is {frame!r}: choose {' or '.join(FRAMES)}.")
+        chosen = None if plane is None else tuple(map(str, plane))
+        return cls(torch.as_tensor(np.asarray(nominal, dtype=np.float64)), chosen, frame == "own")
+
+    def __post_init__(self) -> None:
+        """Checks the plane and the frame."""
+        if self.plane is not None and (len(self.plane) != 2 or len({*self.plane} & {*_AXES}) != 2):
+            raise InputError(f"markers.plane is {list(self.plane)}: name two of the body's axes x, y and z.")
+        if self.own and bool(self._is_degenerate(self.nominal)):
+            what = "lie on one line" if self.plane is None else "are at one place"
+            raise InputError(
+                f"markers.frame is own, but all tracked markers ({len(self.nominal)}) {what}, so that they tell no "
+                "frame: track others as well, or set markers.frame to body."
+            )
 
     @property
     def is_whole(self) -> bool:
@@ -73,14 +85,18 @@ class Sight:
         return self._in_own_frame(points) if self.own else points
 
     def of_arrays(self, points: ArrayLike) -> NDArray[np.float64]:
-        """The same of an array (..., m, 3); in its own frame, a marker that is NaN leaves none of that frame."""
+        """The same of an array (..., m, 3), NaN where a marker is not seen.
+
+        In a frame of their own, one marker that is not seen hides all, and so do markers that tell no frame.
+        """
         if self.is_whole:
             return np.asarray(points, dtype=np.float64)
         given = torch.as_tensor(np.asarray(points, dtype=np.float64))
-        hidden = given.isnan().any(-1, keepdim=True)
-        told = self(given)
-        lost = hidden.any(-2, keepdim=True) if self.own else hidden
-        return torch.where(lost, torch.nan, told).numpy()
+        lost = ~given.isfinite().all(-1, keepdim=True)
+        if self.own:
+            lost = lost.any(-2, keepdim=True)
+            lost = lost | self._is_degenerate(torch.where(lost, self.nominal, given))[..., None, None]
+        return torch.where(lost, torch.nan, self(torch.where(lost, self.nominal, given))).numpy()
 
     def _in_own_frame(self, points: torch.Tensor) -> torch.Tensor:
         middle = self.nominal.mean(-2)
@@ -98,16 +114,15 @@ class Sight:
         turned[second] = sine * now[..., first] + cosine * now[..., second]
         return torch.stack(turned, -1) + middle
 
-    def _check_frame(self) -> None:
-        seen = self.nominal if self.unseen is None else self.nominal * (torch.arange(3) != self.unseen)
-        spread = torch.linalg.svdvals(seen - seen.mean(0)) if len(seen) > 1 else torch.zeros(2)
-        least = spread[1] if self.plane is None and len(spread) > 1 else spread[0]
-        if float(least) <= _LINE:
-            what = "lie on one line" if self.plane is None else "are at one place"
-            raise InputError(
-                f"markers.frame is own, but the {len(seen)} tracked markers {what}, so that they tell no frame: track "
-                "others as well, or set markers.frame to body."
-            )
+    def _is_degenerate(self, points: torch.Tensor) -> torch.Tensor:
+        """(...,) whether places (..., m, 3) do not tell how they are turned."""
+        if self.unseen is not None:
+            points = points * (torch.arange(3, device=points.device) != self.unseen)
+        spread = torch.linalg.svdvals(points - points.mean(-2, keepdim=True))
+        needed = 1 if self.plane is None else 0  # they span a plane in space, a line in a plane
+        if spread.shape[-1] <= needed:
+            return torch.ones(spread.shape[:-1], dtype=torch.bool)
+        return spread[..., needed] <= _LINE
 
 
 @dataclass(frozen=True)

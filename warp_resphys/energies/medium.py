@@ -154,7 +154,7 @@ class MediumTerm(Term):
 def _energy(
     x: torch.Tensor, reference: torch.Tensor, target: torch.Tensor, area: torch.Tensor, coefficients: torch.Tensor
 ) -> torch.Tensor:
-    """The sum of what `kernels.medium` has for each point; a cube would make torch load its compiler, for seconds."""
+    """The sum of what `kernels.medium` has for each point."""
     size = area.norm(dim=-1)
     n = area / size[..., None].clamp_min(1e-30)
     d, inertial = x - reference, ((x - target) * n).sum(-1)
@@ -163,4 +163,5 @@ def _energy(
     linear, normal, tangential, mass = coefficients.unbind(-1)
     squares = 0.5 * (linear * d.square().sum(-1) + mass * inertial.square())
     slip = torch.where(along > 0.0, along.clamp_min(1e-300).sqrt(), 0.0)
+    # Not a third power, for whose second derivative torch loads its compiler, for seconds.
     return (size * (squares + (normal * across.square() * across.abs() + tangential * along * slip) / 3.0)).sum()

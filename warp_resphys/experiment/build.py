@@ -84,7 +84,7 @@ def build_mesh(config: Mapping[str, Any]) -> Mesh:
 
 
 def finer(config: Mapping[str, Any], times: float) -> dict[str, Any]:
-    """The group ``mesh`` with so many times as many cells along the edges of a box, a rod's axis, or all of others.
+    """The group ``mesh`` with so many times as many cells along the edges of a box, along a rod's axis, or everywhere.
 
     Raises:
         InputError: a mesh whose cells are given.

@@ -240,12 +240,13 @@ def _check_sight(config: Mapping[str, Any]) -> None:
             "markers.plane is set, but data.axes is not: name the axes of the recordings along which the body's x, y "
             "and z are, so that it is known which one is not seen."
         )
-    if sight.own and data.get("base_motion") is not None:
-        raise InputError("markers.frame is own, but data.base_motion tells where the body is: take one of them out.")
-    if sight.own and (config.get("identify") or {}).get("placement") is not None:
+    moves = [data.get("base_motion"), *(each.base_motion for each in trials_of(config))]
+    if sight.own and any(each is not None for each in moves):
+        raise InputError("markers.frame is own, but a base_motion tells where the body is: take one of them out.")
+    if not sight.is_whole and (config.get("identify") or {}).get("placement") is not None:
         raise InputError(
-            "identify.placement is set, but with markers.frame own the markers themselves are the frame, so that where "
-            "each of them sits stays open: set it to null."
+            "identify.placement is set, but with markers.plane, or markers.frame own, recordings do not tell where "
+            "markers sit and how the body lies: set it to null."
         )
 
 

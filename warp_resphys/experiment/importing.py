@@ -200,10 +200,21 @@ class Importer:
             )
         return poses
 
+    def _turned_back(self, places: FloatArray) -> FloatArray:
+        """(M', 3) places in the frame of the recording, those of the tracked markers turned as the sight of them is.
+
+        What is told in a frame of their own is the same wherever they are: any motion that registers it will do.
+        """
+        sight, rotation, count = self.reader.sight, self.reader.rotation, len(self.tracked)
+        if not sight.own or rotation is None:
+            return places
+        return np.concatenate([sight.of_arrays(places[:count] @ rotation.T) @ rotation, places[count:]])
+
     def _register(
         self, places: FloatArray, recording: Recording, expected: FloatArray, only_reference: bool = False
     ) -> Registration:
         use = list(self.markers["reference"]) if only_reference else None
+        places = self._turned_back(places)
         more = {"largest_residual": self.markers["largest_residual"], "rotation": self.reader.rotation}
         more["vertical"] = self.reader.vertical
         return register_markers(places, expected, self.reader.labels, source=recording.source, use=use, **more)

@@ -95,9 +95,14 @@ class Reader:
         if self.sight.unseen is None:
             return recording
         rotation = np.eye(3) if self.rotation is None else self.rotation
+        axis = rotation[self.sight.unseen]
         deep = np.concatenate([self.nominal, self._reference])[:, self.sight.unseen]
-        away = deep - recording.positions @ rotation[self.sight.unseen]
-        return replace(recording, positions=recording.positions + away[..., None] * rotation[self.sight.unseen])
+
+        def moved(points: FloatArray) -> FloatArray:
+            return np.asarray(points + (deep - points @ axis)[..., None] * axis)
+
+        rest = None if recording.rest is None else moved(recording.rest)
+        return replace(recording, positions=moved(recording.positions), rest=rest)
 
     def _read(self, trial: Trial) -> Recording:
         if self._folder is not None:
@@ -116,6 +121,11 @@ class Reader:
             share = 1.0 if trial.onset is None else np.clip(frames - trial.onset * recording.rate, 0.0, 1.0)
             inputs = np.asarray(trial.inputs, dtype=np.float64)
             recording = replace(recording, actuation=(np.ones_like(frames) * share)[:, None] * inputs)
+        if abs(trial.input_delay) * recording.rate >= len(recording.positions):
+            raise InputError(
+                f"data.trials.{trial.name}.input_delay is {trial.input_delay:g} s, longer than the recording: its "
+                "unit is s."
+            )
         if self._drive is None or recording.actuation is None:
             return recording
         driven = self._of_parts(recording.actuation, recording.source, self._drive)
@@ -148,6 +158,9 @@ class Reader:
             posed = self._posed(self._held([trials[row] for row in poses], [recordings[row] for row in poses]))
             for row, places in zip(poses, posed, strict=True):
                 expected[row] = np.concatenate([places, self._reference])
+        if self.sight.unseen is not None:  # no depth, as the recordings have it
+            flat = np.arange(3) == self.sight.unseen
+            expected = [np.where(flat, 0.0, places) for places in expected]
         found = []
         for row, (trial, recording) in enumerate(zip(trials, recordings, strict=True)):
             if trial.labels is not None:

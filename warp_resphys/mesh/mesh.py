@@ -201,37 +201,74 @@ def surface_vertices(mesh: Mesh) -> IntArray:
     return np.unique(boundary_faces(mesh))
 
 
+@dataclass(frozen=True)
+class Place:
+    """Where points lie, by coordinates: each a plane across its axis, or from one to another.
+
+    Raises:
+        MeshError: no coordinate is given, or one is no finite number nor two that do not fall.
+    """
+
+    x: Extent | None = None  # [m]
+    y: Extent | None = None
+    z: Extent | None = None
+    tolerance: float = 1e-9  # how far off they may be [m]
+
+    def __post_init__(self) -> None:
+        """Checks the coordinates."""
+        if not self._given:
+            raise MeshError("a selection of vertices needs at least one of the coordinates x, y and z")
+        for axis, at in self._given.items():
+            ends = np.atleast_1d(np.asarray(at, dtype=np.float64))
+            if ends.shape not in ((1,), (2,)) or not np.isfinite(ends).all() or ends[-1] < ends[0]:
+                raise MeshError(f"a selection of vertices at {axis} = {at}: give one number, or two that rise, in m")
+
+    @property
+    def _given(self) -> dict[str, Extent]:
+        named = {"x": self.x, "y": self.y, "z": self.z}
+        return {axis: at for axis, at in named.items() if at is not None}
+
+    def _spans(self) -> dict[str, tuple[float, float]]:
+        return {axis: (float(np.min(at)), float(np.max(at))) for axis, at in self._given.items()}
+
+    def holds(self, points: FloatArray) -> NDArray[np.bool_]:
+        """(N,) whether points (N, 3) [m] lie there."""
+        inside = np.ones(len(points), dtype=bool)
+        for axis, (first, last) in self._spans().items():
+            along = points[:, "xyz".index(axis)]
+            inside &= (along >= first - self.tolerance) & (along <= last + self.tolerance)
+        return inside
+
+    def __str__(self) -> str:
+        return ", ".join(
+            f"{axis} = {first:g}" + (f" to {last:g}" if last > first else "")
+            for axis, (first, last) in self._spans().items()
+        )
+
+
 def select_vertices(
     mesh: Mesh, x: Extent | None = None, y: Extent | None = None, z: Extent | None = None, tolerance: float = 1e-9
 ) -> IntArray:
-    """(S,) sorted vertices at x, y and z, of one coordinate at least: a plane across that axis, or from one to another.
+    """(S,) sorted vertices that lie at a `Place`, of one coordinate at least.
 
     Args:
         mesh: what they are chosen of.
-        x: where the plane is, or from where to where [m].
+        x: the plane that they lie on, or from where to where they lie [m].
         y: the same along y [m].
         z: the same along z [m].
         tolerance: how far off they may be [m].
 
     Raises:
-        MeshError: No coordinate is given, or no vertex lies there.
+        MeshError: No coordinate is given, one that cannot be, or no vertex lies there.
     """
-    spans = {axis: np.broadcast_to(at, 2) for axis, at in enumerate((x, y, z)) if at is not None}
-    if not spans:
-        raise MeshError("a selection of vertices needs at least one of the coordinates x, y and z")
-    chosen = np.ones(len(mesh.vertices), dtype=bool)
-    for axis, (first, last) in spans.items():
-        along = mesh.vertices[:, axis]
-        chosen &= (along >= first - tolerance) & (along <= last + tolerance)
-    if not chosen.any():
+    place = Place(x, y, z, tolerance)
+    chosen = np.flatnonzero(place.holds(mesh.vertices))
+    if not len(chosen):
         low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-        wanted = ", ".join(
-            f"{'xyz'[axis]} = {first:g}" + (f" to {last:g}" if last > first else "")
-            for axis, (first, last) in spans.items()
-        )
-        there = ", ".join(f"{'xyz'[axis]} from {low[axis]:g} to {high[axis]:g}" for axis in spans)
-        raise MeshError(f"no vertex lies within {tolerance:g} m of {wanted} m: the mesh reaches {there} m")
-    return np.flatnonzero(chosen)
+        axes = [axis for axis, at in zip("xyz", (x, y, z), strict=True) if at is not None]
+        there = ", ".join(f"{axis} from {low['xyz'.index(axis)]:g} to {high['xyz'.index(axis)]:g}" for axis in axes)
+        raise MeshError(f"no vertex lies within {tolerance:g} m of {place} m: the mesh reaches {there} m")
+    return chosen
 
 
 def select_cells(

@@ -2,8 +2,8 @@
 
 The section is a square of cells in the middle, and rings of cells between its edge and the rim, so that no cell has a
 corner of 180 degrees. The nodes of the rim lie on a circle a little larger than the rod, so that the section's area is
-that of the rod: it weighs as much and stretches as easily as a round one. With four straight sides it bends 5 % less
-easily, with eight or with quadratic cells by less than 0.3 %.
+that of the rod: it weighs as much and stretches as easily as one without corners. With
+four straight sides a round one bends 5 % less easily, with eight or with quadratic cells by less than 0.3 %.
 """
 
 import numpy as np
@@ -14,6 +14,7 @@ from ..io.errors import MeshError
 from .elements import BY_NODES, FACES, gauss_box
 from .mesh import FloatArray, IntArray, Mesh
 
+_TIE = 1e-6  # by which a tangent may be closer to an axis than to another that comes first
 _CORE = 0.55  # half of the middle square's diagonal over the radius
 
 
@@ -32,13 +33,13 @@ def rod(
         centreline: (M, 3) points of its axis, straight or curved, joined by straight lines [m].
         radii: one radius; (R, 2) arc lengths and the radii there, linear in between; or (R, 3) arc lengths and the two
             semi-axes there, the first one along that coordinate axis which the rod crosses most squarely where it
-            begins [m].
+            begins, or the first of x, y and z that it crosses so [m].
         layers: of cells along the axis.
         core: cells along a side of the section's middle square.
         rings: of cells around it.
         nodes: of a cell, 8, 20 or 27.
-        grading: layers are as long as this power of the rod's radius there: 0 for one length, up to 1 for layers that
-            are as slender as one another.
+        grading: layers are as long as this power of the rod's radius there, of an ellipse the geometric mean of both: 0
+            for one length, up to 1 for layers that are as slender as one another.
 
     Raises:
         MeshError: fewer than two points, a radius that is not positive, a number that is no whole one, a grading out of
@@ -138,7 +139,8 @@ def _transported(axis: FloatArray, length: FloatArray, along: FloatArray) -> tup
     places = np.stack([np.interp(along, length, axis[:, i]) for i in range(3)], axis=1)
     tangents = np.gradient(places, along, axis=0)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
-    across = np.eye(3)[np.argmin(np.abs(tangents[0]))]
+    crossed = np.abs(tangents[0])
+    across = np.eye(3)[np.argmax(crossed <= crossed.min() + _TIE)]
     frames = np.empty((len(along), 2, 3))
     for i, tangent in enumerate(tangents):
         across = across - (across @ tangent) * tangent

@@ -20,6 +20,10 @@ _VOLUME = 0.08  # by how much of itself that of the tetrahedra may differ from w
 _REACH = 0.5  # of the size, by which the tetrahedra may reach less far than the surface
 
 
+class _NoGmshError(MeshError):
+    """Nothing can be meshed at all."""
+
+
 def tetrahedra_by_gmsh(describe: Callable[[Any], None], size: float, what: str) -> Mesh:
     """The 4-node tetrahedra of a body, the same every time, numbered from the highest down.
 
@@ -34,11 +38,11 @@ def tetrahedra_by_gmsh(describe: Callable[[Any], None], size: float, what: str) 
     try:
         import gmsh
     except (ImportError, OSError) as error:  # OSError: a system library that gmsh needs is missing
-        raise MeshError(
+        raise _NoGmshError(
             f"tetrahedra of {what} need gmsh, which cannot be imported ({error}): install it with pip install gmsh."
         ) from error
     if gmsh.isInitialized():
-        raise MeshError(f"gmsh is in use in this process: call gmsh.finalize() before {what} is meshed.")
+        raise _NoGmshError(f"gmsh is in use in this process: call gmsh.finalize() before {what} is meshed.")
     gmsh.initialize(interruptible=False)  # so that Ctrl-C stays Python's
     try:
         options = {"General.Terminal": 0.0, "General.NumThreads": 1.0}
@@ -98,12 +102,19 @@ def fill_surface(path: str | os.PathLike[str], size: float, units: str = "m", or
     if not SHORTEST_DIAGONAL <= across <= LONGEST_DIAGONAL:
         raise MeshError(f"{path}: the surface is {across:.3g} m across in {units}: check the unit of its coordinates.")
     volumes = [_volume(vertices, shell) for shell in shells]
+    outer = vertices[shells[int(np.argmax(volumes))]].reshape(-1, 3)
+    for shell in shells:
+        if (vertices[shell] < outer.min(axis=0)).any() or (vertices[shell] > outer.max(axis=0)).any():
+            raise MeshError(
+                f"{path} holds closed surfaces beside one another ({len(shells)} in all): export one body, whose other "
+                "surfaces lie within it."
+            )
     enclosed, reason = 2.0 * max(volumes) - sum(volumes), ""
     for angle in _ANGLES:
         try:
             found = tetrahedra_by_gmsh(_Remeshed(vertices, shells, angle), size, str(path))
         except MeshError as error:
-            if "cannot be imported" in str(error) or "is in use" in str(error):
+            if isinstance(error, _NoGmshError):
                 raise
             reason = str(error)
             continue
@@ -130,7 +141,8 @@ def _read_shells(path: Path) -> tuple[FloatArray, list[IntArray]]:
         raise MeshError(f"{path} cannot be read as a surface ({error}): export it as STL, OBJ or PLY again.") from error
     if not isinstance(read, trimesh.Trimesh) or not len(read.faces):
         raise MeshError(f"{path} holds no triangles: export the robot's surface as STL, OBJ or PLY.")
-    read.merge_vertices()
+    read.merge_vertices(merge_tex=True, merge_norm=True)
+    read.fix_normals(multibody=True)
     if not read.is_watertight:
         edges, counts = np.unique(np.sort(read.edges, axis=1), axis=0, return_counts=True)
         place = read.vertices[edges[counts != 2][0]].mean(axis=0)
@@ -144,7 +156,7 @@ def _read_shells(path: Path) -> tuple[FloatArray, list[IntArray]]:
 
 
 def _volume(vertices: FloatArray, faces: IntArray) -> float:
-    """What a closed surface encloses, whichever way its triangles turn."""
+    """What a closed surface encloses, whether its triangles turn outwards or inwards."""
     a, b, c = np.moveaxis(vertices[faces] - vertices[faces].mean(axis=(0, 1)), 1, 0)
     return abs(float(np.einsum("fi,fi->", a, np.cross(b, c)))) / 6.0
 

@@ -13,13 +13,12 @@ from ..mesh.arm import mesh_arm, name_surfaces
 from ..mesh.arm_geometry import arm_geometry
 from ..mesh.cavities import MOST_TRIANGLES, open_cavities
 from ..mesh.chambers import find_chambers
-from ..mesh.mesh import FloatArray, Mesh, boundary_triangles, connected_parts, quadratic, select_vertices
+from ..mesh.mesh import FloatArray, Mesh, Place, boundary_triangles, connected_parts, quadratic, select_vertices
 from ..mesh.quality import scaled_jacobian
 from ..mesh.readers import read_mesh, read_surfaces, read_vertices, write_mesh
 from ..report.mesh import MeshSummary, draw_mesh
 from .command import aligned
 
-_ON_PLANE: Final = 1e-9  # [m], as in `mesh.select_vertices`
 _MILLI: Final = 1e3
 _CUBIC_CENTI: Final = 1e6
 
@@ -65,16 +64,15 @@ def inspect_mesh(config: Mapping[str, Any], folder: Path) -> str:
         surfaces = read_surfaces(path, units, order, True)
         names = ", ".join(f"{name} ({len(faces)})" for name, faces in surfaces.items())
     else:
-        mesh = build_mesh(config["mesh"])
+        mesh = build_mesh({key: each for key, each in config["mesh"].items() if (key, each) != ("path", None)})
         points = mesh.vertices
-    chosen = {axis: at for axis, at in config["fixed"].items() if at is not None}
-    fixed = select_vertices(mesh, **chosen) if chosen else np.empty(0, dtype=np.int64)
+    chosen = {axis: at for axis, at in config["fixed"].items() if at is not None and axis != "tolerance"}
+    place = Place(**config["fixed"]) if chosen else None
+    fixed = np.empty(0, dtype=np.int64) if place is None else select_vertices(mesh, **config["fixed"])
     summary = MeshSummary(mesh, config["density"], fixed, find_chambers(mesh))
     rows += summary_rows(summary)
-    if chosen:
-        where = ", ".join(f"{axis} = {at:g} m" for axis, at in chosen.items())
-        there = [np.abs(points[:, "xyz".index(axis)] - at) <= _ON_PLANE for axis, at in chosen.items()]
-        rows.append(("fixed", f"{np.all(there, axis=0).sum()} vertices at {where}, {len(fixed)} of them used"))
+    if place is not None:
+        rows.append(("fixed", f"{place.holds(points).sum()} vertices at {place} m, {len(fixed)} of them used"))
     if read:
         rows.append(("surfaces with a name", names or "none"))
     rows.append(("open cavities", _cavities(mesh)))

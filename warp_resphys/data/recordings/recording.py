@@ -21,6 +21,7 @@ METRES_PER_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 SI_PER_ACTUATION_UNIT = {"Pa": 1.0, "kPa": 1e3, "mbar": 1e2, "bar": 1e5, "N": 1.0, "m": 1.0, "mm": 1e-3, "1": 1.0}
 LARGEST_SPAN = 100.0  # [m]
 LEAST_SPAN = 1e-3  # [m]
+_QUATERNION_ERROR = 0.01  # of the length of a quaternion, which is one
 ARM = 0.05  # [m] from a rigid body to the points that tell how it is turned
 RATES = (1e-3, 1e6)  # [Hz]
 
@@ -163,11 +164,14 @@ def _with_arms(
             f"{path}: its quaternions have the shape {turns.shape}; each marker in each frame needs (w, x, y, z), NaN "
             "for one that is no rigid body."
         )
-    size = np.linalg.norm(turns, axis=2)
-    if (size == 0.0).any():
-        frame, column = np.argwhere(size == 0.0)[0]
+    size = np.where(np.isfinite(positions).all(axis=2), np.linalg.norm(turns, axis=2), np.nan)
+    wrong = np.abs(size - 1.0) > _QUATERNION_ERROR
+    if wrong.any():
+        frame, column = np.argwhere(wrong)[0]
         raise DataFileError(
-            f"{path}: the quaternion of {names[column]} is zero in frame {frame}: leave it empty there."
+            f"{path}: the quaternion of {names[column]} has the length {size[frame, column]:.3g} in frame "
+            f"{frame + 1} from the start, where a rotation has 1: check its four numbers, or mask them (empty, or NaN) "
+            "where it was not seen."
         )
     for column in np.flatnonzero(np.isfinite(size).any(axis=0)):
         seen = np.isfinite(size[:, column])
@@ -175,7 +179,10 @@ def _with_arms(
         axes = Rotation.from_quat(turns[seen, column][:, [1, 2, 3, 0]]).as_matrix()
         arms[seen] = positions[seen, column, None] + ARM * np.swapaxes(axes, 1, 2)
         positions = np.concatenate([positions, arms], axis=1)
-        names = (*names, *(f"{names[column]} +{axis}" for axis in "xyz"))
+        new = [f"{names[column]} +{axis}" for axis in "xyz"]
+        if taken := [name for name in new if name in names]:
+            raise DataFileError(f"{path}: a marker is named {taken[0]!r}, as a point of a rigid body is: rename it.")
+        names = (*names, *new)
         rest = None if rest is None else np.concatenate([rest, np.full((3, 3), np.nan)])
     return names, positions, rest
 

@@ -5,6 +5,7 @@ docs/recordings.md describes the layouts. A cell that is empty or NaN is an occl
 
 import csv
 import io
+import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,8 @@ from numpy.typing import NDArray
 
 from ...io.errors import DataFileError, listed
 from .recording import METRES_PER_UNIT, SI_PER_ACTUATION_UNIT, FloatArray, RawRecording
+
+log = logging.getLogger(__name__)
 
 Rows = list[list[str]]
 
@@ -28,6 +31,7 @@ _CLOCKS = ("time", "frame")
 _SECONDS = {"s": 1.0, "ms": 1e-3}
 _UNEVEN = 0.25  # of a frame, that a time stamp may be off
 _LARGEST_STAMP = 1e12  # [s or 1], a time or frame number that is believed
+_LEAST_FRAMES = 2
 _LEAST_RECORDED = 0.1  # of the frames between the first and the last
 
 
@@ -105,8 +109,37 @@ def _read_described(rows: Rows, table: Table, path: Path) -> RawRecording:
 
 
 def _without_empty_ends(rows: Rows, width: int) -> Rows:
-    """The same rows without the cells beyond a width, if none of them holds anything."""
-    return rows if any(cell for row in rows for cell in row[width:]) else [row[:width] for row in rows]
+    """The same rows without the cells beyond a width, where none of them holds anything."""
+    return [row if any(row[width:]) else row[:width] for row in rows]
+
+
+def _switched_on(driven: FloatArray, lines: Sequence[int], path: Path) -> FloatArray:
+    """(T', C) channels (T, C) until the first of them ends, each from the start on as it is first told.
+
+    A log may begin before what drives the body is switched on, and end after it is switched off.
+    """
+    told = np.isfinite(driven)
+    if np.isinf(driven).any() or not told.any(axis=0).all():
+        row = int(np.argmax((np.isinf(driven) | ~told.any(axis=0)).any(axis=1)))
+        raise DataFileError(f"{path}, line {lines[row]}: an actuation is missing or infinite; every frame needs one.")
+    first = told.argmax(axis=0)
+    end = len(driven) - int(told[::-1].argmax(axis=0).max())
+    frames = np.arange(end)[:, None]
+    found = np.where(frames < first, driven[first, np.arange(driven.shape[1])], driven[:end])
+    if (missing := np.isnan(found).any(axis=1)).any():
+        raise DataFileError(
+            f"{path}, line {lines[int(missing.argmax())]}: an actuation is missing; every frame between the first and "
+            "the last one that has it needs one."
+        )
+    if first.any() or end < len(driven):
+        log.warning(
+            "%s does not tell what drove the body in its first %d frames, where it counts as it is told first, nor in "
+            "its last %d, which are left out.",
+            *(path.name, int(first.max()), len(driven) - end),
+        )
+    if end < _LEAST_FRAMES:
+        raise DataFileError(f"{path} tells what drove the body in {end} frames: a recording needs two or more.")
+    return np.asarray(found)
 
 
 def _read_columns(
@@ -137,6 +170,8 @@ def _read_columns(
             named.append((label, axis.lower(), number))
             units |= {unit} if unit else set()
         elif label and axis.lower() in _QUATERNION:
+            if (label, axis.lower()) in turned:
+                raise DataFileError(f"{path} has two columns named '{label}.{axis}': rename one of these bodies.")
             turned[label, axis.lower()] = number
         elif unit is not None and unit in channel_units:
             channels[number] = SI_PER_ACTUATION_UNIT[unit]
@@ -161,18 +196,8 @@ def _read_columns(
     if channels:
         with np.errstate(over="ignore"):
             driven = values[:, list(channels)] * list(channels.values())
-        wrong = np.asarray(~np.isfinite(driven).all(axis=1))
-        # A log may begin before what drives the body is switched on, and end after it is switched off.
-        first_told, end = (
-            (0, len(wrong)) if wrong.all() else (int(wrong.argmin()), len(wrong) - int(wrong[::-1].argmin()))
-        )
-        if wrong[first_told:end].any():
-            raise DataFileError(
-                f"{path}, line {lines[first_told + int(wrong[first_told:].argmax())]}: an actuation is missing or "
-                "infinite; every frame between the first and the last one that has it needs one."
-            )
-        driven, values, frames = driven[:end], values[:end], frames[:end]
-        driven[:first_told] = driven[first_told]
+        driven = _switched_on(driven, lines, path)
+        values, frames = values[: len(driven)], frames[: len(driven)]
         grid = np.arange(frames[-1] + 1)
         actuation = np.stack([np.interp(grid, frames, channel) for channel in driven.T], axis=1)
     start = float(stamps[0]) if timed else 0.0

@@ -79,6 +79,23 @@ def test_gradients_at_rest_and_after_a_large_turn(name):
     assert torch.autograd.gradcheck(SIGHTS[name], (points,), eps=1e-6, atol=1e-7)
 
 
+@pytest.mark.parametrize("name", SIGHTS)
+def test_a_body_is_carried_with_its_markers(name):
+    """Where one of its points is a marker, that is where the marker is told to be; but for depth, which it keeps."""
+    points, sight = torch.as_tensor(moved(shaken(), 1.2, [0.0, 1.0, 0.0], 0.2)), SIGHTS[name]
+    body = torch.cat([points, points.flip(-2) + 0.01], -2)
+    carried, told = sight.carried(body, points), sight(points)
+    if not sight.own:
+        assert carried is body
+        return
+    seen = [axis for axis in range(3) if axis != sight.unseen]
+    np.testing.assert_allclose(carried[:, :4, seen], told[..., seen], atol=1e-12)
+    if sight.plane is None:  # rigidly
+        np.testing.assert_allclose(torch.cdist(carried, carried), torch.cdist(body, body), atol=1e-12)
+    else:
+        np.testing.assert_allclose(carried[..., sight.unseen], body[..., sight.unseen], atol=1e-12)
+
+
 def test_a_hidden_marker_hides_the_shape_of_its_frame_alone():
     points = shaken()
     points[2, 1] = np.nan

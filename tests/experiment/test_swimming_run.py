@@ -97,6 +97,9 @@ def test_limbs_are_identified_by_their_shape(swum, tmp_path, monkeypatch):
     assert factor == pytest.approx(FACTOR, rel=0.03)
     found = json.loads(Path("run/metrics.json").read_text())["errors_mm"]
     errors = {name: each["mean"] for name, each in found.items()}
+    drawn = {path.stem for path in Path("run/figures").glob("*.png")}
+    assert "markers" in drawn
+    assert not drawn & {"space", "plane_worst"}  # which a camera does not tell
     assert 3.0 * errors["sysid"] < errors["simulation"]
     assert errors["resphys"] < 1.05 * errors["sysid"]
 

@@ -13,7 +13,7 @@ from report_page import FAILING, Page
 
 from warp_resphys.energies.pressure import PRESSURE
 from warp_resphys.experiment import report as stage
-from warp_resphys.experiment.build import shipped_arm
+from warp_resphys.experiment.build import build_mesh, shipped_arm
 from warp_resphys.experiment.report import make_report, read_driven, read_film, read_trials
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.files import read_json, write_json
@@ -215,7 +215,7 @@ def test_files_that_do_not_belong_together_are_refused(tmp_path):
 def test_what_is_read(tmp_path):
     settings = arm_settings()
     write_run(tmp_path, settings, diverged=("simfree",))
-    trials, film = read_trials(tmp_path, settings), read_film(tmp_path)
+    trials, film = read_trials(tmp_path, settings), read_film(tmp_path, settings, build_mesh(settings["mesh"]))
     pressures = read_driven(tmp_path, settings)
     assert pressures.scaled == ()
     assert trials.times[0, [0, -1]].tolist() == [0.0, pytest.approx(2.0)]

@@ -82,7 +82,7 @@ class Sight:
         if self.unseen is not None:
             hidden = torch.arange(3, device=points.device) == self.unseen
             points = torch.where(hidden, self.nominal, points)
-        return self._in_own_frame(points) if self.own else points
+        return self._in_own_frame(points, points) if self.own else points
 
     def of_arrays(self, points: ArrayLike) -> NDArray[np.float64]:
         """The same of an array (..., m, 3), NaN where a marker is not seen.
@@ -98,20 +98,25 @@ class Sight:
             lost = lost | self._is_degenerate(torch.where(lost, self.nominal, given))[..., None, None]
         return torch.where(lost, torch.nan, self(torch.where(lost, self.nominal, given))).numpy()
 
-    def _in_own_frame(self, points: torch.Tensor) -> torch.Tensor:
-        middle = self.nominal.mean(-2)
-        nominal, now = self.nominal - middle, points - points.mean(-2, keepdim=True)
+    def carried(self, others: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+        """(..., N, 3) places of a body, moved as what is told of its markers (..., m, 3) is [m]."""
+        return self._in_own_frame(replace(self, own=False)(points), others) if self.own else others
+
+    def _in_own_frame(self, markers: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+        """(..., N, 3) points by the rigid motion that brings markers (..., m, 3) closest to their nominal places."""
+        middle, here = self.nominal.mean(-2), markers.mean(-2, keepdim=True)
+        nominal, now, moved = self.nominal - middle, markers - here, points - here
         if self.plane is None:
-            flat = now.reshape(-1, *now.shape[-2:])
-            return (flat @ closest_rotation(flat.mT @ nominal)).reshape(now.shape) + middle
+            rotation = closest_rotation((now.mT @ nominal).reshape(-1, 3, 3)).reshape(*now.shape[:-2], 3, 3)
+            return moved @ rotation + middle
         first, second = (_AXES.index(axis) for axis in self.plane)
         across = (now[..., first] * nominal[:, second] - now[..., second] * nominal[:, first]).sum(-1)
         along = (now[..., first] * nominal[:, first] + now[..., second] * nominal[:, second]).sum(-1)
         size = torch.hypot(across, along)
         sine, cosine = (across / size)[..., None], (along / size)[..., None]
-        turned = list(now.unbind(-1))
-        turned[first] = cosine * now[..., first] - sine * now[..., second]
-        turned[second] = sine * now[..., first] + cosine * now[..., second]
+        turned = list(moved.unbind(-1))
+        turned[first] = cosine * moved[..., first] - sine * moved[..., second]
+        turned[second] = sine * moved[..., first] + cosine * moved[..., second]
         return torch.stack(turned, -1) + middle
 
     def _is_degenerate(self, points: torch.Tensor) -> torch.Tensor:

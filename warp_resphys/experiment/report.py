@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from ..energies.materials import make_material
@@ -21,7 +22,7 @@ from ..report.data import MODELS, Driven, Film, Recordings, RunReport, Trials
 from ..report.page import number_text
 from ..report.run_page import write_report
 from .actuators import build_chambers, build_muscles, build_tendons, driving_quantity
-from .build import build_mesh, choose_device
+from .build import bound_markers, build_mesh, choose_device, sight_of
 from .files import (
     DATASET,
     ERRORS,
@@ -90,8 +91,8 @@ def make_report(context: StageContext) -> None:
     folder, config = context.run_dir, context.settings["config"]
     metrics, truth = collect_metrics(folder, config), read_if_there(common_folder(folder) / TRUTH)
     trials, identification = read_trials(folder, config), read_if_there(folder / IDENTIFICATION)
-    film, driven = read_film(folder), read_driven(folder, config)
     mesh = build_mesh(config["mesh"])
+    film, driven = read_film(folder, config, mesh), read_driven(folder, config)
     channels = () if driven is None else driven.channels
     tip = {} if trials.labels else config.get("tip") or {}
     learned = "resphys" in metrics["errors_mm"] and not config.get("in_the_loop")
@@ -273,7 +274,16 @@ def read_trials(folder: Path, config: Mapping[str, Any]) -> Trials:
         bound=bound,
         gravity=dataset.gravity,
         time_step=dataset.time_step,
+        **_seen(config, dataset.labels),
     )
+
+
+def _seen(config: Mapping[str, Any], labels: Sequence[str]) -> dict[str, Any]:
+    """How markers are seen, for the pictures."""
+    if not labels:
+        return {}
+    sight = sight_of(config["markers"], labels)
+    return {"axes": tuple(axis for axis in range(3) if axis != sight.unseen), "own_frame": sight.own}
 
 
 def _read_scaled(folder: Path) -> Dataset | None:
@@ -282,8 +292,8 @@ def _read_scaled(folder: Path) -> Dataset | None:
     return read_dataset(path) if path.is_file() else None
 
 
-def read_film(folder: Path) -> Film | None:
-    """The bodies of the film; None where there is none."""
+def read_film(folder: Path, config: Mapping[str, Any], mesh: Mesh) -> Film | None:
+    """The bodies of the film, where their markers are seen; None where there is none."""
     with read_hdf5(folder / ROLLOUTS, "rollouts") as file:
         if "film_steps" not in file:
             return None
@@ -291,7 +301,18 @@ def read_film(folder: Path) -> Film | None:
         models = [model for model in MODELS if f"{model}_film" in file]
         shape = (len(steps), None, 3)
         bodies = {model: read_array(file, f"{model}_film", shape).astype(np.float64) for model in models}
+        bodies = {model: _as_seen(each, folder, config, mesh) for model, each in bodies.items()}
         return Film(str(file.attrs["film_trial"]), float(file.attrs["time_step"]) * steps, bodies)
+
+
+def _as_seen(bodies: NDArray[np.float64], folder: Path, config: Mapping[str, Any], mesh: Mesh) -> NDArray[np.float64]:
+    """(T, N, 3) bodies [m], carried to where their markers are seen."""
+    dataset = read_dataset(common_folder(folder) / DATASET)
+    if dataset.bound is None or not (sight := sight_of(config["markers"], dataset.labels)).own:
+        return bodies
+    at = torch.from_numpy(bodies)
+    markers = bound_markers(config["markers"], mesh, dataset.bound, dataset.labels)
+    return np.asarray(sight.carried(at, markers(at)).numpy())
 
 
 def read_driven(folder: Path, config: Mapping[str, Any]) -> Driven | None:

@@ -45,6 +45,8 @@ class Trials:
     bound: FloatArray  # (M, 3) [m] the markers on the undeformed body, or its vertices.
     gravity: FloatArray  # (3,) [m/s^2]
     time_step: float  # Of the simulation [s].
+    axes: tuple[int, ...] = (0, 1, 2)  # Of the body, along which markers are seen.
+    own_frame: bool = False  # Whether markers are seen in a frame of their own.
 
     @cached_property
     def errors_mm(self) -> dict[str, FloatArray]:

@@ -128,6 +128,7 @@ def marker_paths(
     labels: Sequence[str],
     driven: Driven | None = None,
     *,
+    coordinates: Sequence[int] = (0, 1, 2),
     bands: Mapping[str, FloatArray] | None = None,
     narrow: bool,
 ) -> Figure:
@@ -139,20 +140,23 @@ def marker_paths(
         models: (T, M, 3) [m] by model.
         labels: Of the M markers.
         driven: What drives this trial; all panels are then below each other.
+        coordinates: Which of x, y and z are seen.
         bands: (T, M) half-widths of prediction intervals [m], by model.
         narrow: Whether the figure is for a narrow page; the panels then are below each other, too.
     """
+    many = len(coordinates)
     count, stacked = len(labels), narrow or driven is not None
-    rows, columns = (3 * count, 1) if stacked else (count, 3)
-    height = 0.9 + 1.25 * count if driven is None else 2.9 + 2.85 * count
-    figure = new_figure(height, 1.2 + 3.15 * count if driven is None else height + 0.5, narrow=narrow)
+    rows, columns = (many * count, 1) if stacked else (count, many)
+    height = 0.9 + 1.25 * count if driven is None else 2.9 + 0.95 * many * count
+    figure = new_figure(height, 1.2 + 1.05 * many * count if driven is None else height + 0.5, narrow=narrow)
     ratios = [1.0] * rows + [1.5] * (driven is not None)
     panels = figure.subplots(len(ratios), columns, sharex=True, squeeze=False, height_ratios=ratios)
     least = _LEAST_SPAN * float(np.ptp(np.nan_to_num(_MILLI * target), axis=0).max())
     every = -(-len(times) // _MOST_DOTS)
     dots: dict[str, Any] = {"color": TONES["ink"].light, "markersize": 3.2, "zorder": 1.5, "label": "Measured"}
     for place, axes in enumerate(panels[:rows].flat):
-        marker, axis = divmod(place, 3)
+        marker, column = divmod(place, many)
+        axis = coordinates[column]
         seen = _MILLI * target[:, marker, axis]
         axes.plot(times[::every], seen[::every], ".", **dots)
         for model, path in models.items():
@@ -162,9 +166,9 @@ def marker_paths(
             axes.fill_between(times, *ends, color=TONES[model].light, alpha=_BAND, linewidth=0.0, zorder=0.5)
         _keep_in_view(axes, seen, 0.6, least)
         axes.yaxis.set_major_locator(MaxNLocator(4, steps=ROUND_STEPS))
-        if axis == 0 or stacked:
+        if column == 0 or stacked:
             axes.set_ylabel(f"{'xyz'[axis] if stacked else labels[marker]} [mm]")
-        if axis == 0 if stacked else marker == 0:
+        if column == 0 if stacked else marker == 0:
             axes.set_title(f"Marker {labels[marker]}" if stacked else "xyz"[axis])
     if driven is not None:
         ((title, values),) = driven.values.items()

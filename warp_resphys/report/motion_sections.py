@@ -206,9 +206,11 @@ def paths_section(data: RunReport, canvas: Canvas) -> Part | None:
     if data.driven is None:
         found = [_markers(data, trials, row, at, which[at], canvas) for at, row in places.items()]
         return Part("Marker by marker", found)
+    driven = _driven_markers(data, trials, places["worst"], data.driven, canvas)
+    if trials.own_frame or len(trials.axes) < 3:  # Where the tip is in space is not told.
+        return Part("Marker by marker", [driven])
     blocks = [_plane(data, trials, row, at, which[at], canvas) for at, row in places.items()]
-    blocks[1:1] = _space_and_markers(data, trials, places["worst"], data.driven, canvas)
-    return Part("The tip", blocks)
+    return Part("The tip", [*blocks[:1], _space(data, trials, places["worst"], canvas), driven, *blocks[1:]])
 
 
 def _bands(data: RunReport, trials: Trials, row: int, kept: Sequence[int]) -> dict[str, FloatArray]:
@@ -234,10 +236,10 @@ def _markers(data: RunReport, trials: Trials, row: int, place: str, which: str, 
     moved = {m: (trials.positions[m][row] - trials.bound)[:, kept] for m in _ONE_BY_ONE if m in trials.positions}
     target, labels = (trials.target[row] - trials.bound)[:, kept], [trials.labels[marker] for marker in kept]
     name, hidden = trials.names[row], len(trials.labels) - len(kept)
-    bands = _bands(data, trials, row, kept.tolist())
+    bands, series = _bands(data, trials, row, kept.tolist()), (trials.times[row], target, moved)
     return canvas.figure(
         f"paths_{place}",
-        partial(motion_figures.marker_paths, trials.times[row], target, moved, labels, bands=bands),
+        partial(motion_figures.marker_paths, *series, labels, coordinates=trials.axes, bands=bands),
         f"Coordinates of the markers over time in the trial {name}: measured as dots, the models as lines.",
         f"Trial {name}{which}: coordinates of the markers from where they were held.{_band_note(bands)}"
         + (f" The {hidden} markers that move least are not drawn." if hidden else ""),
@@ -276,34 +278,40 @@ def _plane(data: RunReport, trials: Trials, row: int, place: str, which: str, ca
     )
 
 
-def _space_and_markers(data: RunReport, trials: Trials, row: int, driven: Driven, canvas: Canvas) -> list[Drawn]:
-    """The path of the tip in space, and markers over what drives them."""
+def _space(data: RunReport, trials: Trials, row: int, canvas: Canvas) -> Drawn:
+    """The path of the tip in space."""
     from . import motion_figures
 
-    name, start = trials.names[row], _start(trials, row)
+    name = trials.names[row]
     times, seen, paths = _tip_paths(data, trials, row, _SPACE_SECONDS)
     last = [m for m in ("sysid", "resphys") if m in paths] or list(paths)[-1:]
-    space = canvas.figure(
+    return canvas.figure(
         "space",
         partial(motion_figures.tip_in_space, times, seen, {m: paths[m] for m in last}),
         f"Path of the tip in space in the trial {name}: measured in grey, the models as lines beside it.",
         f"The first {min(_SPACE_SECONDS, trials.times[row, -1]):g} s of the trial {name} in space, with points every "
         "0.5 s that are joined to the measured ones.",
     )
+
+
+def _driven_markers(data: RunReport, trials: Trials, row: int, driven: Driven, canvas: Canvas) -> Drawn:
+    """Markers over what drives them."""
+    from . import motion_figures
+
+    name, start = trials.names[row], _start(trials, row)
     kept = drawn_markers(trials.target[row], trials.bound, data.mesh.vertices[data.fixed])
-    compared = [m for m in _ONE_BY_ONE[1:] if m in paths] or list(paths)
+    compared = [m for m in _ONE_BY_ONE[1:] if m in trials.positions] or [m for m in MODELS if m in trials.positions]
     moved = {m: (trials.positions[m][row] - start)[:, kept] for m in compared}
     target, labels = (trials.target[row] - start)[:, kept], [trials.labels[marker] for marker in kept]
     words, per = driven.quantity.plural, driven.quantity.per
     own = replace(driven, values={words.capitalize(): driven.values[name]})
-    bands = _bands(data, trials, row, kept)
-    markers = canvas.figure(
+    bands, series = _bands(data, trials, row, kept), (trials.times[row], target, moved)
+    return canvas.figure(
         "markers",
-        partial(motion_figures.marker_paths, trials.times[row], target, moved, labels, own, bands=bands),
+        partial(motion_figures.marker_paths, *series, labels, own, coordinates=trials.axes, bands=bands),
         f"Coordinates of markers over time in the trial {name}, and below them the {words} of the {per}s.",
         f"The trial {name}: displacement of markers from rest, and the {words} that drive it.{_band_note(bands)}",
     )
-    return [space, markers]
 
 
 def body_section(data: RunReport, canvas: Canvas) -> Part | None:

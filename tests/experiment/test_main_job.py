@@ -8,6 +8,7 @@ import meshio
 import numpy as np
 import pytest
 import torch
+import trimesh
 from hydra import compose, initialize_config_module
 from main_job import (
     CORRECTED,
@@ -314,6 +315,10 @@ class TestConfiguration:
             box = box_hexahedra((0.1, 0.03, 0.03), (4, 2, 2))
             meshio.write("box.vtu", meshio.Mesh(box.vertices, [("hexahedron", box.cells)]))
             overrides.append("mesh.path=box.vtu")
+        if option == "surface":
+            pytest.importorskip("gmsh", reason="gmsh is not installed", exc_type=ImportError)
+            trimesh.creation.box(bounds=[[0.0, 0.0, 0.0], [0.1, 0.03, 0.03]]).export("box.obj")
+            overrides += ["mesh.path=box.obj", "mesh.units=m"]
         if option == "recurrent":
             overrides.append("trainer=sequences")
         config = self.composed(*overrides)

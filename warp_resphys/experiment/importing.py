@@ -215,9 +215,14 @@ class Importer:
     ) -> Registration:
         use = list(self.markers["reference"]) if only_reference else None
         places = self._turned_back(places)
-        more = {"largest_residual": self.markers["largest_residual"], "rotation": self.reader.rotation}
-        more["vertical"] = self.reader.vertical
-        return register_markers(places, expected, self.reader.labels, source=recording.source, use=use, **more)
+        return register_markers(
+            *(places, expected, self.reader.labels),
+            source=recording.source,
+            largest_residual=self.markers["largest_residual"],
+            use=use,
+            rotation=self.reader.rotation,
+            vertical=self.reader.vertical,
+        )
 
     def _released(self, trial: Trial, recording: Recording, release: Release) -> Observed:
         """A body that was held, undeformed or as the file says, and let go."""

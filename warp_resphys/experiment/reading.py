@@ -94,8 +94,8 @@ class Reader:
         """The same, with what is not seen of each marker as it is nominally."""
         if self.sight.unseen is None:
             return recording
-        rotation = np.eye(3) if self.rotation is None else self.rotation
-        axis = rotation[self.sight.unseen]
+        assert self.rotation is not None  # A plane needs data.axes.
+        axis = self.rotation[self.sight.unseen]
         deep = np.concatenate([self.nominal, self._reference])[:, self.sight.unseen]
 
         def moved(points: FloatArray) -> FloatArray:

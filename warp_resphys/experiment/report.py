@@ -4,6 +4,7 @@ What reads a file raises a DataFileError where that is missing or damaged.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -301,18 +302,17 @@ def read_film(folder: Path, config: Mapping[str, Any], mesh: Mesh) -> Film | Non
         models = [model for model in MODELS if f"{model}_film" in file]
         shape = (len(steps), None, 3)
         bodies = {model: read_array(file, f"{model}_film", shape).astype(np.float64) for model in models}
-        bodies = {model: _as_seen(each, folder, config, mesh) for model, each in bodies.items()}
-        return Film(str(file.attrs["film_trial"]), float(file.attrs["time_step"]) * steps, bodies)
+        film = Film(str(file.attrs["film_trial"]), float(file.attrs["time_step"]) * steps, bodies)
+    return _as_seen(film, read_dataset(common_folder(folder) / DATASET), config, mesh)
 
 
-def _as_seen(bodies: NDArray[np.float64], folder: Path, config: Mapping[str, Any], mesh: Mesh) -> NDArray[np.float64]:
-    """(T, N, 3) bodies [m], carried to where their markers are seen."""
-    dataset = read_dataset(common_folder(folder) / DATASET)
+def _as_seen(film: Film, dataset: Dataset, config: Mapping[str, Any], mesh: Mesh) -> Film:
+    """The same, with the bodies carried to where their markers are seen."""
     if dataset.bound is None or not (sight := sight_of(config["markers"], dataset.labels)).own:
-        return bodies
-    at = torch.from_numpy(bodies)
+        return film
     markers = bound_markers(config["markers"], mesh, dataset.bound, dataset.labels)
-    return np.asarray(sight.carried(at, markers(at)).numpy())
+    at = {model: torch.from_numpy(each) for model, each in film.positions.items()}
+    return replace(film, positions={model: sight.carried(q, markers(q)).numpy() for model, q in at.items()})
 
 
 def read_driven(folder: Path, config: Mapping[str, Any]) -> Driven | None:

@@ -31,7 +31,7 @@ _CLOCKS = ("time", "frame")
 _SECONDS = {"s": 1.0, "ms": 1e-3}
 _UNEVEN = 0.25  # of a frame, that a time stamp may be off
 _LARGEST_STAMP = 1e12  # [s or 1], a time or frame number that is believed
-_LEAST_FRAMES = 2
+_LEAST_FRAMES = 2  # of a recording
 _LEAST_RECORDED = 0.1  # of the frames between the first and the last
 
 
@@ -346,7 +346,7 @@ def _numbers(rows: Rows, first: int, columns: Sequence[int], width: int, path: P
             )
         values.append(numbers)
         lines.append(line)
-    if len(values) < 2:
+    if len(values) < _LEAST_FRAMES:
         raise DataFileError(f"{path} holds {len(values)} frames: a recording needs two or more.")
     return np.array(values, dtype=np.float64), lines
 

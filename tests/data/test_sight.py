@@ -161,3 +161,23 @@ def test_seen_markers_of_a_body_that_is_carried_away_are_where_they_were():
 def test_what_tells_nothing_is_refused(arguments, said):
     with pytest.raises(InputError, match=said):
         Sight.of(*arguments)
+
+
+def test_each_set_has_a_frame_of_its_own():
+    """Markers of trials that share none, and one that no trial has: each is where it would be without the others."""
+    places = np.concatenate([NOMINAL, NOMINAL[:3] + [0.01, 0.0, 0.02], NOMINAL[:1]])
+    sets = ((0, 2, 3), (1, 4, 5, 6))
+    points = torch.from_numpy(places + 0.01 * np.random.default_rng(3).normal(size=(5, 8, 3)))
+    for plane in (None, ["x", "z"]):
+        found = Sight.of(places, plane, "own", sets)(points)
+        for some in sets:
+            alone = Sight.of(places[list(some)], plane, "own")(points[:, some])
+            torch.testing.assert_close(found[:, some], alone, rtol=0.0, atol=1e-15)
+    torch.testing.assert_close(Sight.of(places, None, "own", sets)(points)[:, 7], points[:, 7])
+
+
+def test_sets_that_share_markers_are_refused():
+    with pytest.raises(InputError, match="some trials have a few of the markers of others"):
+        Sight.of(NOMINAL, frame="own", sets=((0, 1, 2), (1, 2, 3)))
+    with pytest.raises(InputError, match=r"all tracked markers \(2\) lie on one line"):
+        Sight.of(NOMINAL, frame="own", sets=((0, 1), (2, 3)))

@@ -275,6 +275,40 @@ def test_each_trial_stands_where_the_mean_of_all_does(shelf):
     assert np.linalg.norm(shift) == pytest.approx(0.6 * 0.7, abs=0.2)  # half of 1.2 mm, less what the fit takes up
 
 
+def test_a_trial_with_markers_of_its_own(shelf):
+    """In one trial a marker sits elsewhere, and has another name: it is bound by that trial, and nowhere else there."""
+    whole = shelf.bring_in()
+    away = np.array([0.0, 0.003, 0.0])
+    shelf.move("load101", "Tip - 2", away)
+    shelf.config["markers"]["tracked"]["Tip - 4"] = (
+        np.array(shelf.config["markers"]["tracked"]["Tip - 2"]) + away
+    ).tolist()
+    for name, own in {"bare": "Tip - 2", "load52": "Tip - 2", "load101": "Tip - 4"}.items():
+        shelf.config["data"]["trials"][name]["labels"] = ["Tip - 1", own, "Tip - 3", *BASES]
+    check_configuration(shelf.config)
+    shelf.config["split"] = {"train": ["bare", "load52"], "validation": []}
+    found = shelf.bring_in()
+    assert list(found["labels"]) == [*TIPS, "Tip - 4"]
+    np.testing.assert_array_equal(np.isfinite(found["held"]).all(2), [[1, 1, 1, 0], [1, 1, 1, 0], [1, 0, 1, 1]])
+    hidden = np.isnan(found["observed"]).all((1, 3))
+    np.testing.assert_array_equal(hidden, ~np.isfinite(found["held"]).all(2))
+    np.testing.assert_allclose(found["bound"][:3], whole["bound"], rtol=0.0, atol=2e-4)
+    apart = np.linalg.norm(found["bound"][3] - found["bound"][1])  # ``away`` is in the frame of the recording
+    assert apart == pytest.approx(np.linalg.norm(away), abs=2e-4)
+    swing, same = (each["observed"][2] - each["held"][2] for each in (found, whole))
+    np.testing.assert_allclose(swing[:, [0, 3, 2]], same, rtol=0.0, atol=5e-5)
+    assert set(read_json(shelf.folder / REGISTRATION)["load101"]["shift_mm"]) == {"Tip - 1", "Tip - 3", "Tip - 4"}
+    assert read_dataset(shelf.folder / DATASET).sets == ((0, 2, 3), (0, 1, 2))
+
+
+def test_a_trial_whose_labels_are_all_wrong_is_named(shelf):
+    shelf.config["data"]["trials"]["load52"]["labels"] = ["a", "b", "c", *BASES]
+    with pytest.raises(
+        InputError, match=r"data\.trials\.load52\.labels names 'a', .* none of which is in markers\.trac"
+    ):
+        check_configuration(shelf.config)
+
+
 def published_layout(shelf, name, first):
     """The recording from a frame on, with the places of its markers on the undeformed body."""
     positions = shelf.recordings[name].positions

@@ -30,10 +30,14 @@ TINY = [
     *("reconstruction.max_iterations=2", "parallel.processes=1"),
     *("hydra/job_logging=none", "hydra/hydra_logging=none", IN_RUN),
 ]
+# where the markers of the second trial sit, with names of their own
+ELSEWHERE = ([0.0, -0.0070, -0.060], [0.0, -0.0120, -0.036], [0.0, -0.0125, 0.040], [0.0, -0.0065, 0.057])
 LATE = {"slow": 0, "fast": 2}  # frames that the winch's log is behind the camera
 TRIALS = [
     "data.trials=null",
-    "+data.trials={slow: {file: slow.csv}, fast: {file: fast.csv, input_delay: -0.0333333333}}",
+    "+data.trials={slow: {file: slow.csv, labels: [M1, M2, M3, M4]}, "
+    "fast: {file: fast.csv, input_delay: -0.0333333333, labels: [N1, N2, N3, N4]}}",
+    *(f"+markers.tracked.N{number}={place}" for number, place in enumerate(ELSEWHERE, 1)),
 ]
 SPLIT = ["data.train=[slow]", "data.test=[fast]"]
 PERIODS = {"slow": 16.0, "fast": 9.0}  # steps
@@ -45,16 +49,23 @@ def configuration(*overrides):
         return OmegaConf.to_container(compose("config", [*shown, *overrides]), resolve=True)
 
 
+def tracked(config, trial):
+    """The places of the markers that a trial has, by name."""
+    places = config["markers"]["tracked"]
+    return {label: places[label] for label in config["data"]["trials"][trial]["labels"]}
+
+
 @pytest.fixture(scope="module")
 def swum():
     """By trial, what the winch is told (T,) and where the markers are in the frame of the body (T, 4, 3), both [m]."""
     config = configuration()
     simulator = build_simulator(config)
     markers = config["markers"]
-    places = np.array([*markers["tracked"].values()])
-    read = bound_markers(markers, simulator.body.mesh, places, tuple(markers["tracked"]))
     found = {}
     for name, period in PERIODS.items():
+        read = bound_markers(
+            markers, simulator.body.mesh, [*tracked(config, name).values()], tuple(tracked(config, name))
+        )
         steps = np.arange(STEPS + 4)
         told = 0.008 * np.sin(np.pi * np.clip(steps - 3, 0, None) / period) ** 2
         pulled = torch.as_tensor(FACTOR * told[1:, None, None])
@@ -86,19 +97,21 @@ def test_limbs_are_identified_by_their_shape(swum, tmp_path, monkeypatch):
     code, err = run(*TINY, *TRIALS, *SPLIT)
     assert (code, err[-500:] if code else "") == (0, "")
     config, dataset = configuration(), read_dataset(Path("run/dataset.h5"))
-    sight = Sight.of([*config["markers"]["tracked"].values()], ["x", "z"], "own")
+    assert dataset.sets == ((4, 5, 6, 7), (0, 1, 2, 3))
     for name, (told, markers) in swum.items():
         pulled = dataset.inputs["tendon_contraction"][dataset.names.index(name), :, 0]
         np.testing.assert_allclose(pulled, told[1 : STEPS + 1], atol=1e-6)
+        sight = Sight.of([*tracked(config, name).values()], ["x", "z"], "own")
         shapes = sight.of_arrays(markers[: STEPS + 1])
-        np.testing.assert_allclose(dataset.observed[dataset.names.index(name)], shapes, atol=3e-4)
+        columns = [dataset.labels.index(label) for label in tracked(config, name)]
+        np.testing.assert_allclose(dataset.observed[dataset.names.index(name)][:, columns], shapes, atol=3e-4)
         assert np.abs(shapes - shapes[:1]).max() > 3e-3
     factor = json.loads(Path("run/identification.json").read_text())["sysid"]["parameters"]["tendon_contraction_factor"]
     assert factor == pytest.approx(FACTOR, rel=0.03)
     found = json.loads(Path("run/metrics.json").read_text())["errors_mm"]
     errors = {name: each["mean"] for name, each in found.items()}
     drawn = {path.stem for path in Path("run/figures").glob("*.png")}
-    assert "markers" in drawn
+    assert {"markers", "motion"} <= drawn
     assert not drawn & {"space", "plane_worst"}  # which a camera does not tell
     assert 3.0 * errors["sysid"] < errors["simulation"]
     assert errors["resphys"] < 1.05 * errors["sysid"]
@@ -108,6 +121,7 @@ def test_limbs_are_identified_by_their_shape(swum, tmp_path, monkeypatch):
     ("overrides", "said"),
     [
         (["markers.plane=[x,x]"], "markers.plane is .*two different ones"),
+        (["data.trials.fast.labels=[N1,N2,M3,N4]"], "markers.frame is own, but some trials have a few of the markers"),
         (["data.axes=null"], "markers.plane is set, but data.axes is not"),
         (["markers.frame=free"], "markers.frame is 'free': .* body, own"),
         (["data.base_motion=recorded"], "markers.frame is own, but a base_motion tells"),

@@ -70,6 +70,16 @@ def test_a_model_that_diverges_has_no_intervals():
     simulated, observed = trials(4, 2, lambda moved: 1e-3 + 0.0 * moved)
     simulated[2][30:] = np.nan
     assert Intervals.calibrated(simulated, observed, REST) is None
+
+
+def test_a_marker_that_calibrates_nothing_is_taken_for_the_worst_of_the_others():
+    simulated, observed = trials(4, 2, lambda moved: 1e-3 + 0.0 * moved)
+    known = Intervals.calibrated(simulated, observed, REST)
     for each in observed:
         each[:, 1] = np.nan
-    assert Intervals.calibrated(*trials(4, 2, lambda moved: 1e-3 + 0.0 * moved)[:1], observed, REST) is None
+    found = Intervals.calibrated(simulated, observed, REST)
+    assert found.factor[0] == found.factor[1] == pytest.approx(known.factor[0], rel=1e-9)
+    assert found.standing == pytest.approx(known.standing)
+    for each in observed:
+        each[:] = np.nan
+    assert Intervals.calibrated(simulated, observed, REST) is None

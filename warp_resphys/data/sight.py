@@ -9,6 +9,7 @@ atan2(sum (o_i - mean o) x (x_i - mean x), sum (o_i - mean o) . (x_i - mean x)).
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -31,17 +32,26 @@ class Sight:
         nominal: (m, 3) where they are on the undeformed body [m].
         plane: the two axes of the body that span what is seen, such as ("x", "z"); None where all is.
         own: whether markers are seen in a frame of their own, rather than in that of the body.
+        sets: the numbers of those that are seen together, and have one frame; all are, if left out. Those in none are
+            nowhere seen.
 
     Raises:
-        InputError: axes that are not two of x, y and z, or markers that tell no frame.
+        InputError: axes that are not two of x, y and z, or markers that tell no frame or are in two sets.
     """
 
     nominal: torch.Tensor
     plane: tuple[str, ...] | None = None
     own: bool = False
+    sets: tuple[tuple[int, ...], ...] = ()
 
     @classmethod
-    def of(cls, nominal: ArrayLike, plane: Sequence[str] | None = None, frame: str = "body") -> "Sight":
+    def of(
+        cls,
+        nominal: ArrayLike,
+        plane: Sequence[str] | None = None,
+        frame: str = "body",
+        sets: tuple[tuple[int, ...], ...] = (),
+    ) -> "Sight":
         """From the values of a configuration.
 
         Raises:
@@ -50,13 +60,23 @@ class Sight:
         if frame not in FRAMES:
             raise InputError(f"markers.frame is {frame!r}: choose {' or '.join(FRAMES)}.")
         chosen = None if plane is None else tuple(map(str, plane))
-        return cls(torch.as_tensor(np.asarray(nominal, dtype=np.float64)), chosen, frame == "own")
+        return cls(torch.as_tensor(np.asarray(nominal, dtype=np.float64)), chosen, frame == "own", sets)
 
     def __post_init__(self) -> None:
         """Checks the plane and the frame."""
         if self.plane is not None and (len(self.plane) != 2 or len({*self.plane} & {*_AXES}) != 2):
             raise InputError(f"markers.plane is {list(self.plane)}: name two of the body's axes x, y and z.")
-        if self.own and bool(self._is_degenerate(self.nominal)):
+        if not self.own:
+            return
+        if self.sets:
+            if len({each for some in self.sets for each in some}) < sum(map(len, self.sets)):
+                raise InputError(
+                    "markers.frame is own, but some trials have a few of the markers of others: the shapes of those "
+                    "that are seen together are compared, so name markers that sit elsewhere otherwise, and leave out "
+                    "those that only some of such trials have."
+                )
+            _ = self._parts
+        elif bool(self._is_degenerate(self.nominal)):
             what = "lie on one line" if self.plane is None else "are at one place"
             raise InputError(
                 f"markers.frame is own, but all tracked markers ({len(self.nominal)}) {what}, so that they tell no "
@@ -67,6 +87,15 @@ class Sight:
     def is_whole(self) -> bool:
         """Whether recordings tell where markers are."""
         return self.plane is None and not self.own
+
+    @cached_property
+    def _parts(self) -> tuple["Sight", ...]:
+        """Of each set."""
+        return tuple(self.select(some) for some in self.sets)
+
+    def select(self, chosen: Sequence[int]) -> "Sight":
+        """Of some of the markers, which are seen together."""
+        return replace(self, nominal=self.nominal[list(chosen)], sets=())
 
     @property
     def unseen(self) -> int | None:
@@ -82,7 +111,13 @@ class Sight:
         if self.unseen is not None:
             hidden = torch.arange(3, device=points.device) == self.unseen
             points = torch.where(hidden, self.nominal, points)
-        return self._in_own_frame(points, points) if self.own else points
+        if not self.own or not self.sets:
+            return self._in_own_frame(points, points) if self.own else points
+        found = points
+        for part, some in zip(self._parts, self.sets, strict=True):
+            at = torch.tensor(some, device=points.device)
+            found = found.index_copy(-2, at, part(points.index_select(-2, at)))
+        return found
 
     def of_arrays(self, points: ArrayLike) -> NDArray[np.float64]:
         """The same of an array (..., m, 3), NaN where a marker is not seen.
@@ -91,6 +126,7 @@ class Sight:
         """
         if self.is_whole:
             return np.asarray(points, dtype=np.float64)
+        assert not self.sets, "A trial has the markers of one set."
         given = torch.as_tensor(np.asarray(points, dtype=np.float64))
         lost = ~given.isfinite().all(-1, keepdim=True)
         if self.own:

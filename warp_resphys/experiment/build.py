@@ -10,7 +10,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from ..data.markers import Markers, bind_markers
-from ..data.sight import SeenMarkers, Sight
+from ..data.sight import Sight
 from ..dynamics.nonlinear_solver import SolverSettings
 from ..dynamics.simulator import Simulator
 from ..energies.materials import Material, make_material
@@ -155,19 +155,19 @@ def bound_markers(settings: Mapping[str, Any], mesh: Mesh, places: ArrayLike, la
     return bind_markers(mesh, places, labels, kind=settings["bind"], vertices=vertices, **more)
 
 
-def sight_of(settings: Mapping[str, Any], labels: Sequence[str]) -> Sight:
+def sight_of(settings: Mapping[str, Any], labels: Sequence[str], sets: tuple[tuple[int, ...], ...] = ()) -> Sight:
     """How much recordings tell of where these tracked markers are, from the group ``markers``.
+
+    Args:
+        settings: the group.
+        labels: of the markers.
+        sets: the numbers of those that are seen together, if not all are.
 
     Raises:
         InputError: see `Sight`.
     """
     nominal = [settings["tracked"][label] for label in labels]
-    return Sight.of(nominal, settings.get("plane"), settings.get("frame", "body"))
-
-
-def seen_markers(settings: Mapping[str, Any], mesh: Mesh, places: ArrayLike, labels: Sequence[str]) -> Markers:
-    """`bound_markers`, as far as recordings tell where they are."""
-    return SeenMarkers.of(bound_markers(settings, mesh, places, labels), sight_of(settings, labels))
+    return Sight.of(nominal, settings.get("plane"), settings.get("frame", "body"), sets)
 
 
 def build_simulator(

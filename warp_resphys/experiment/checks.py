@@ -13,7 +13,7 @@ from ..data.markers import MarkerMap
 from ..data.registration import axes_rotation
 from ..energies.materials import Material
 from ..fem.body import Body
-from ..io.errors import InputError
+from ..io.errors import InputError, listed
 from ..io.memory import available_memory_gib
 from ..learning.reconstruction import make_reconstructor
 from ..learning.replay import MASS_FACTOR, known_parameters
@@ -233,14 +233,21 @@ def _check_markers(config: Mapping[str, Any], body: Body, begins: set[str]) -> N
 
 def _check_sight(config: Mapping[str, Any]) -> None:
     """Refuses what cannot be had of markers whose places are not told."""
-    markers, data = config["markers"], config["data"]
-    sight = sight_of(markers, [*markers["tracked"]])
+    markers, data, trials = config["markers"], config["data"], trials_of(config)
+    tracked = [*markers["tracked"]]
+    for trial in trials:
+        if not trial.tracked(tracked):
+            raise InputError(
+                f"data.trials.{trial.name}.labels names {listed(trial.labels or ())}, none of which is in "
+                f"markers.tracked: {listed(tracked)}."
+            )
+    sight = sight_of(markers, tracked, tuple({tuple(trial.tracked(tracked)) for trial in trials}))
     if sight.plane is not None and data.get("axes") is None:
         raise InputError(
             "markers.plane is set, but data.axes is not: name the axes of the recordings along which the body's x, y "
             "and z are, so that it is known which one is not seen."
         )
-    moves = [data.get("base_motion"), *(each.base_motion for each in trials_of(config))]
+    moves = [data.get("base_motion"), *(each.base_motion for each in trials)]
     if sight.own and any(each is not None for each in moves):
         raise InputError("markers.frame is own, but a base_motion tells where the body is: take one of them out.")
     if not sight.is_whole and (config.get("identify") or {}).get("placement") is not None:

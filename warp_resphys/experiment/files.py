@@ -80,7 +80,7 @@ class Dataset:
         begins: how each trial begins, see `trials.BEGINNINGS`; held bodies are ``released`` here.
         times: (R, T) of the frames [s]; trials that end early repeat their last time.
         observed: (R, T, M, 3) [m], NaN where nothing was seen.
-        held: (R, M, 3) the same before time zero [m].
+        held: (R, M, 3) the same before time zero [m], NaN for markers that a trial does not have.
         payload: (R,) mass that hangs on the body [kg].
         gravity: (3,) [m/s^2].
         time_step: of the inputs [s].
@@ -108,6 +108,12 @@ class Dataset:
     inputs: Mapping[str, FloatArray] = field(default_factory=dict)
     channels: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     base: FloatArray | None = None
+
+    @property
+    def sets(self) -> tuple[tuple[int, ...], ...]:
+        """The numbers of the markers that trials have; none where all have all."""
+        kept = np.unique(np.isfinite(self.held).all(-1), axis=0)
+        return () if kept.all() else tuple(tuple(np.flatnonzero(row).tolist()) for row in kept)
 
     def write(self, path: Path) -> None:
         """Writes its file, for `read_dataset`.

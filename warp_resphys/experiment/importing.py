@@ -6,7 +6,7 @@ that the frame rate need not fit the time step. Driven ones are brought to the s
 """
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -50,9 +50,11 @@ class Observed:
 
     Attributes:
         trial: what is configured of it.
-        raw: the configured markers, the tracked ones first, as measured.
+        raw: the configured markers that it has, the tracked ones first, as measured.
+        columns: which of all tracked markers these are.
+        sight: how much it tells of where they are.
         moving: the tracked ones from time zero on, short gaps filled, long ones NaN.
-        still: (M', 3) where all markers were before time zero, in the frame of the recording [m].
+        still: (M', 3) where its markers were before time zero, in the frame of the recording [m].
         registration: of the markers at rest.
         driven: (T, C) the input that drives the body at the frames, such as pressures [Pa]; None without any.
         release: when the body was let go; None of others.
@@ -63,6 +65,8 @@ class Observed:
 
     trial: Trial
     raw: Recording
+    columns: list[int]
+    sight: Sight
     moving: Recording
     still: FloatArray
     registration: Registration
@@ -71,10 +75,15 @@ class Observed:
     tells_places: bool = True
     base: FloatArray | None = None
 
-    def to_body(self, points: FloatArray, shift: FloatArray, sight: Sight) -> FloatArray:
-        """What (..., M, 3) points of the recording tell in the frame of the body, moved by (M, 3) [m]."""
+    def to_body(self, points: FloatArray, shift: FloatArray) -> FloatArray:
+        """What (..., M, 3) points of its markers tell in the frame of the body, moved by (M, 3) [m]."""
         moved = self.registration.transform.apply(points.reshape(-1, 3)).reshape(points.shape)
-        return sight.of_arrays(sight.of_arrays(moved) + shift)
+        return self.sight.of_arrays(self.sight.of_arrays(moved) + shift)
+
+    @property
+    def places(self) -> FloatArray:
+        """(M, 3) what is told of where its tracked markers are while it is registered, in the frame of the body [m]."""
+        return self.sight.of_arrays(self.registration.positions[: len(self.columns)])
 
 
 class Importer:
@@ -113,19 +122,23 @@ class Importer:
         These alone can be where they should be, and a third of a millimetre between nominal and true places would turn
         a body by a millimetre at its tip, otherwise than in the trials that are registered by all markers.
         """
-        count = len(self.tracked)
-        known = [each.registration.positions[count:] for each in observed if each.tells_places]
+        known = [each.registration.positions[len(each.columns) :] for each in observed if each.tells_places]
         if not known or len(known) == len(observed) or len(self.markers["reference"]) < self.reader.enough:
             return observed
-        expected = self.reader.expected(True)
         seen = np.isfinite(np.stack(known)).all(-1).any(0)
-        expected[count:][seen] = np.nanmean(np.stack(known)[:, seen], axis=0)
-        return [
-            each
-            if each.tells_places
-            else replace(each, registration=self._register(each.still, each.raw, expected, only_reference=True))
-            for each in observed
-        ]
+        mean = np.nanmean(np.stack(known)[:, seen], axis=0)
+
+        def beside_others(each: Observed) -> Observed:
+            expected = self.reader.expected(each.trial)
+            expected[len(each.columns) :][seen] = mean
+            registration = self._register(each.trial, each.still, each.raw, expected, only_reference=True)
+            return replace(each, registration=registration)
+
+        return [each if each.tells_places else beside_others(each) for each in observed]
+
+    def _tracked(self, trial: Trial) -> list[str]:
+        """Those of the tracked markers that a trial has."""
+        return [self.tracked[number] for number in trial.tracked(self.tracked)]
 
     def _timed(self, trial: Trial, recording: Recording) -> tuple[Recording, Release | None]:
         """A recording, at the steps of the simulation if the body is driven, and when the body is let go if it is."""
@@ -134,7 +147,7 @@ class Importer:
         self._check_rate(recording)
         if trial.begins == "released":
             return recording, _START
-        return recording, release_of(recording, self.tracked, self.data["longest_gap"])
+        return recording, release_of(recording, self._tracked(trial), self.data["longest_gap"])
 
     def _check_rate(self, recording: Recording) -> None:
         """Refuses a recording that is too slow, and says whether frames fall between the steps of the simulation."""
@@ -182,7 +195,7 @@ class Importer:
         if isinstance(motion, Mapping):
             poses = prescribed(motion, moving.time, self.data["folder"] or ".")
         elif motion == "reference":
-            count = len(self.tracked)
+            count = len(self._tracked(trial))
             poses = in_frame(followed(whole.positions[:, count:], still[count:], whole.source), transform)
         elif moving.base is not None:
             poses = in_frame(moving.base, transform)
@@ -200,23 +213,27 @@ class Importer:
             )
         return poses
 
-    def _turned_back(self, places: FloatArray) -> FloatArray:
+    def _turned_back(self, places: FloatArray, sight: Sight) -> FloatArray:
         """(M', 3) places in the frame of the recording, those of the tracked markers turned as the sight of them is.
 
         What is told in a frame of their own is the same wherever they are: any motion that registers it will do.
         """
-        sight, rotation, count = self.reader.sight, self.reader.rotation, len(self.tracked)
+        rotation, count = self.reader.rotation, len(sight.nominal)
         if not sight.own or rotation is None:
             return places
         return np.concatenate([sight.of_arrays(places[:count] @ rotation.T) @ rotation, places[count:]])
 
     def _register(
-        self, places: FloatArray, recording: Recording, expected: FloatArray, only_reference: bool = False
+        self,
+        trial: Trial,
+        places: FloatArray,
+        recording: Recording,
+        expected: FloatArray,
+        only_reference: bool = False,
     ) -> Registration:
         use = list(self.markers["reference"]) if only_reference else None
-        places = self._turned_back(places)
         return register_markers(
-            *(places, expected, self.reader.labels),
+            *(self._turned_back(places, self.reader.sight(trial)), expected, recording.labels),
             source=recording.source,
             largest_residual=self.markers["largest_residual"],
             use=use,
@@ -226,15 +243,16 @@ class Importer:
 
     def _released(self, trial: Trial, recording: Recording, release: Release) -> Observed:
         """A body that was held, undeformed or as the file says, and let go."""
-        still = _median(_frames(recording, *release.rest), self.tracked)
-        places = _rest_of(recording, self.tracked) if self.data["rest"] == "file" else still
-        registration = self._register(places, recording, self.reader.expected(False))
+        tracked = self._tracked(trial)
+        still = _median(_frames(recording, *release.rest), tracked)
+        places = _rest_of(recording, tracked) if self.data["rest"] == "file" else still
+        registration = self._register(trial, places, recording, self.reader.expected(trial))
         off = f"; left out: {listed(registration.outliers)}" if registration.outliers else ""
         log.info(
             "import: %s is let go in frame %.1f, registered to %.2f mm%s",
             *(trial.name, release.frame, _MILLI * registration.rms, off),
         )
-        filled = fill_gaps(recording.select(self.tracked), self.data["longest_gap"], mask_long=True)
+        filled = fill_gaps(recording.select(tracked), self.data["longest_gap"], mask_long=True)
         moving = trim_to_release(filled, release, seconds=self.data["seconds"])
         lost = [label for label, seen in zip(moving.labels, moving.seen.T, strict=True) if not seen.any()]
         if lost:
@@ -242,41 +260,43 @@ class Importer:
                 f"{moving.source}: {listed(lost)} cannot be seen in the {self.data['seconds']:g} s after the release; "
                 "leave it out of markers.tracked."
             )
-        check_motion(moving, self.tracked)
+        check_motion(moving, tracked)
         # Constant: how a valve moves while a body swings is not told by this.
         driven = None if self.drive is None else self._inputs(moving, trial, self.drive)[:1]
         first = int(np.ceil(release.frame))
         whole = _frames(recording, first, first + len(moving.positions))
         base = self._base(trial, whole, moving, still, registration.transform)
-        return Observed(trial, recording, moving, still, registration, driven, release, base=base)
+        seen = (trial.tracked(self.tracked), self.reader.sight(trial))
+        return Observed(trial, recording, *seen, moving, still, registration, driven, release, base=base)
 
     def _driven(self, trial: Trial, recording: Recording) -> Observed:
         """A body that rests until its inputs come, or one in a pose."""
-        static = trial.begins == STATIC
+        static, tracked = trial.begins == STATIC, self._tracked(trial)
         if not static:
-            check_motion(_frames(recording, 0, self.data["steps"] + 1), self.tracked)
+            check_motion(_frames(recording, 0, self.data["steps"] + 1), tracked)
         driven = None if self.drive is None else self._inputs(recording, trial, self.drive)
         loaded = driven is not None and not self._is_at_rest(driven[:1])[0]
         tells = trial.payload == 0.0 and not loaded
         filled = fill_gaps(recording, self.data["longest_gap"], mask_long=True)
-        still = _median(filled, self.tracked) if static and loaded else self._resting(filled, driven)
+        still = _median(filled, tracked) if static and loaded else self._resting(trial, filled, driven)
         # Where the body is without what hangs on it, the other trials tell.
         only_reference = not tells and len(self.markers["reference"]) >= self.reader.enough
-        registration = self._register(still, recording, self.reader.expected(True), only_reference)
-        moving = filled.select(self.tracked)
+        registration = self._register(trial, still, recording, self.reader.expected(trial), only_reference)
+        moving = filled.select(tracked)
         if static:
             frames = max(round(POSE_SECONDS * moving.rate), 1)
             last = _frames(moving, -frames, None)
-            moving = replace(moving, positions=_median(last, self.tracked)[None])
+            moving = replace(moving, positions=_median(last, tracked)[None])
             driven = None if driven is None else np.median(driven[-frames:], axis=0)[None]
         base = None if static else self._base(trial, recording, moving, still, registration.transform)
-        return Observed(trial, recording, moving, still, registration, driven, tells_places=tells, base=base)
+        seen = (trial.tracked(self.tracked), self.reader.sight(trial))
+        return Observed(trial, recording, *seen, moving, still, registration, driven, tells_places=tells, base=base)
 
     def _is_at_rest(self, driven: FloatArray) -> NDArray[np.bool_]:
         """(T,) whether (T, C) inputs are what a gauge shows of none."""
         return np.asarray(np.abs(driven).max(axis=1) <= NO_INPUT * self.data["input_limit"])
 
-    def _resting(self, recording: Recording, driven: FloatArray | None) -> FloatArray:
+    def _resting(self, trial: Trial, recording: Recording, driven: FloatArray | None) -> FloatArray:
         """(M', 3) mean positions of the markers before the inputs come [m], NaN for one that is not seen."""
         acts = np.zeros(0, dtype=np.int64) if driven is None else np.flatnonzero(~self._is_at_rest(driven))
         until = int(acts[0]) if len(acts) else len(recording.positions)
@@ -287,7 +307,7 @@ class Importer:
                 "rest."
             )
         resting = _frames(recording, 0, min(until, self._rest_frames(recording)))
-        return _central(resting, self.tracked, np.mean, "rests")
+        return _central(resting, self._tracked(trial), np.mean, "rests")
 
     def _inputs(self, recording: Recording, trial: Trial, drive: Drive) -> FloatArray:
         """(T, C) of the body's parts; refuses those of another number of parts, or beyond the limit."""
@@ -302,7 +322,7 @@ class Importer:
             )
         values = check_inputs(found, drive.quantity, count, trial.scale * data["input_limit"], recording.source)
         if data["valve"] == "detected" and not trial.is_released:
-            opening = valve_opening(recording, self.tracked)
+            opening = valve_opening(recording, self._tracked(trial))
             # Commanded inputs from that moment on; the step in which the valve opens has its share.
             frame = (opening - recording.start) * recording.rate
             values = np.asarray(values * np.clip(np.arange(len(values)) - frame, 0.0, 1.0)[:, None])
@@ -329,9 +349,7 @@ def import_recordings(context: StageContext) -> None:
     split = settings.get("split")
     known = set(split["train"]) | set(split["validation"]) if split else {each.trial.name for each in observed}
     offsets = np.stack([_offset(importer, each) for each in observed])  # (R, M, 3) [m]
-    told = [row for row, each in enumerate(observed) if each.tells_places and each.trial.name in known]
-    told = told or [row for row, each in enumerate(observed) if each.tells_places]
-    mean = np.nanmean(offsets[told], axis=0) if told else np.zeros_like(importer.nominal)
+    mean = _mean_offset(offsets, observed, known)
     mesh, bound = importer.simulator.body.mesh, importer.nominal + mean
     bound_markers(settings["markers"], mesh, bound, tracked)  # Refuses a marker that is far off.
     shifts = _shifts(settings["data"], observed, mean, offsets)
@@ -357,10 +375,24 @@ def import_scaled(context: StageContext) -> None:
 
 
 def _offset(importer: Importer, each: Observed) -> FloatArray:
-    """(M, 3) how far the tracked markers of a trial are from where they should be, in the frame of the body [m]."""
-    count = len(importer.tracked)
-    told = importer.reader.sight.of_arrays(each.registration.positions[:count])
-    return told - importer.reader.expected(not each.trial.is_released)[:count]
+    """(M, 3) how far tracked markers are from where they should be in the frame of the body [m], NaN where not seen."""
+    found = np.full_like(importer.nominal, np.nan)
+    found[each.columns] = each.places - importer.reader.expected(each.trial)[: len(each.columns)]
+    return found
+
+
+def _mean_offset(offsets: FloatArray, observed: Sequence[Observed], known: Container[str]) -> FloatArray:
+    """(M, 3) by which markers sit elsewhere than nominally [m], of (R, M, 3) offsets; none of those nobody tells.
+
+    Trials that are not ``known``, as they test, tell it of markers that others do not have.
+    """
+    mean = np.zeros(offsets.shape[1:])
+    tells = np.array([each.tells_places for each in observed])
+    learned = np.array([each.trial.name in known for each in observed])
+    for marker, seen in enumerate(np.isfinite(offsets).all(axis=2).T & tells):
+        if seen.any():
+            mean[marker] = offsets[seen & learned if (seen & learned).any() else seen, marker].mean(axis=0)
+    return mean
 
 
 def _shifts(data: Mapping[str, Any], observed: Sequence[Observed], mean: FloatArray, offsets: FloatArray) -> FloatArray:
@@ -419,7 +451,7 @@ def _dataset(
     importer: Importer, observed: Sequence[Observed], bound: FloatArray, shifts: FloatArray, gravity: FloatArray
 ) -> Dataset:
     """The trials in the frame of the body; those that end early are padded."""
-    settings, drive, sight = importer.settings, importer.drive, importer.reader.sight
+    settings, drive = importer.settings, importer.drive
     data, cutoff = settings["data"], settings["data"].get("cutoff")
     steps = data.get("steps")
     frames = max(len(each.moving.positions) if each.trial.is_released else 1 for each in observed)
@@ -427,7 +459,7 @@ def _dataset(
         frames = max(frames, steps + 1)
     shape = (len(observed), frames, len(importer.tracked), 3)
     markers, smoothed = np.full(shape, np.nan), np.full(shape, np.nan)
-    times, held = np.zeros(shape[:2]), np.zeros((shape[0], *shape[2:]))
+    times, held = np.zeros(shape[:2]), np.full((shape[0], *shape[2:]), np.nan)
     inputs = {}
     if drive is not None:
         inputs[drive.quantity.name] = np.zeros((len(observed), steps if steps else 1, len(drive.parts)))
@@ -435,16 +467,17 @@ def _dataset(
         limit = frames if each.trial.is_released or steps is None else steps + 1
         seen = each.moving.positions[:limit]
         slow = each.moving if cutoff is None or len(seen) == 1 else smooth(each.moving, cutoff)
-        markers[row, : len(seen)] = each.to_body(seen, shifts[row], sight)
-        smoothed[row, : len(seen)] = each.to_body(slow.positions[:limit], shifts[row], sight)
-        held[row] = each.to_body(each.still[: shape[2]], shifts[row], sight)
+        has, shift = each.columns, shifts[row, each.columns]
+        markers[row, : len(seen), has] = each.to_body(seen, shift).swapaxes(0, 1)
+        smoothed[row, : len(seen), has] = each.to_body(slow.positions[:limit], shift).swapaxes(0, 1)
+        held[row, has] = each.to_body(each.still[: len(has)], shift)
         if each.trial.is_released:
             times[row] = np.pad(each.moving.time, (0, frames - len(seen)), mode="edge")
         elif each.trial.begins == "rest":
             times[row] = np.minimum(np.arange(frames), steps) * settings["time_step"]
             held[row] = markers[row, 0]
         else:
-            held[row] = bound  # A pose is as large as it is far from the undeformed body.
+            held[row, has] = bound[has]  # A pose is as large as it is far from the undeformed body.
         if each.driven is not None:
             for series in inputs.values():
                 _fill_inputs(series[row], each.driven, each)
@@ -550,7 +583,8 @@ def _write_quality(
             log.info("import: %s: %d remarks on its quality in the report", found.source.name, len(found.warnings))
         # Where a loaded body has its own markers says nothing of the registration.
         standing = None if each.tells_places else reference
-        registrations[name] = _summary(each.registration, tracked, -shifts[row], standing)
+        labels = [tracked[number] for number in each.columns]
+        registrations[name] = _summary(each.registration, labels, -shifts[row, each.columns], standing)
         if verticals is not None:
             registrations[name]["vertical_deg"] = _angle(verticals[row], -gravity)
     write_json(context.run_dir / QUALITY, qualities)

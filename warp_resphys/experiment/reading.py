@@ -15,11 +15,12 @@ from ..data.recordings.reading import read_recording
 from ..data.recordings.recording import Recording
 from ..data.recordings.text import Table
 from ..data.registration import axes_rotation
+from ..data.sight import Sight
 from ..dynamics.inputs import Inputs
 from ..dynamics.simulator import Simulator
-from ..io.errors import DataFileError, InputError
+from ..io.errors import DataFileError, InputError, listed
 from .actuators import Drive
-from .build import seen_markers, sight_of
+from .build import bound_markers, sight_of
 from .files import STATIC, payload_inputs
 from .simulate import vertical
 from .trials import Trial, is_laboratory
@@ -48,7 +49,6 @@ class Reader:
         rotation: (3, 3) from the frame of the recordings to that of the body; None where markers tell.
         vertical: upwards in the frame of the recordings and in that of the body; None where either is not known.
         enough: how many markers that stand still register a recording.
-        sight: how much recordings tell of where the tracked markers are.
     """
 
     def __init__(self, settings: Mapping[str, Any], run_dir: Path, simulator: Simulator, drive: Drive | None) -> None:
@@ -59,25 +59,35 @@ class Reader:
         self.rotation = None if axes is None else axes_rotation(axes)
         self.vertical = vertical_of(settings)
         self.enough = standing_enough(settings)
-        self.sight = sight_of(self.markers, self.tracked)
         self._simulator, self._drive = simulator, drive
         self._folder = run_dir if is_laboratory(settings) else None
         table = self.data.get("table")
         self._table = None if table is None else Table(table["columns"], table.get("header_lines", 0))
         self._hanging: FloatArray | None = None
 
-    @property
-    def labels(self) -> list[str]:
-        """All configured markers, the tracked ones first."""
-        return [*self.tracked, *self.markers["reference"]]
+    def labels(self, trial: Trial) -> list[str]:
+        """Of the configured markers that a trial has, the tracked ones first."""
+        return [*(self.tracked[number] for number in trial.tracked(self.tracked)), *self.markers["reference"]]
 
-    def expected(self, observed_at_rest: bool) -> FloatArray:
-        """(M', 3) where all markers are when they are registered: on the undeformed body, or as it hangs [m]."""
-        if not observed_at_rest:
-            return np.concatenate([self.nominal, self._reference])
+    def sight(self, trial: Trial) -> Sight:
+        """How much the recording of a trial tells of where its tracked markers are."""
+        return sight_of(self.markers, [self.tracked[number] for number in trial.tracked(self.tracked)])
+
+    def expected(self, trial: Trial) -> FloatArray:
+        """(M', 3) where the markers of a trial are when they are registered, on the undeformed body or as it hangs [m].
+
+        What is not told of them is as it is nominally.
+        """
+        if trial.is_released:
+            return np.concatenate([self.nominal[trial.tracked(self.tracked)], self._reference])
         if self._hanging is None:
             self._hanging = self._posed(Inputs())[0]
-        return np.concatenate([self._hanging, self._reference])
+        return self._seen(trial, self._hanging)
+
+    def _seen(self, trial: Trial, places: FloatArray) -> FloatArray:
+        """(M', 3) what is told of the markers of a trial, of where all tracked ones are."""
+        told = self.sight(trial).of_arrays(places[trial.tracked(self.tracked)])
+        return np.concatenate([told, self._reference])
 
     def read(self, trials: Sequence[Trial]) -> list[Recording]:
         """The recordings of trials, with all configured markers in their order.
@@ -88,15 +98,20 @@ class Reader:
         found = [self._read(trial) for trial in trials]
         if self.markers.get("labels") == "assigned":
             found = self._assigned(trials, found)
-        return [self._with_depth(recording.select(self.labels)) for recording in found]
+        for trial in trials:
+            if absent := [label for label in self.tracked if label not in self.labels(trial)]:
+                log.info("import: %s has no %s, by data.trials.%s.labels", trial.name, listed(absent), trial.name)
+        pairs = zip(trials, found, strict=True)
+        return [self._with_depth(trial, recording.select(self.labels(trial))) for trial, recording in pairs]
 
-    def _with_depth(self, recording: Recording) -> Recording:
+    def _with_depth(self, trial: Trial, recording: Recording) -> Recording:
         """The same, with what is not seen of each marker as it is nominally."""
-        if self.sight.unseen is None:
+        unseen = self.sight(trial).unseen
+        if unseen is None:
             return recording
         assert self.rotation is not None  # A plane needs data.axes.
-        axis = self.rotation[self.sight.unseen]
-        deep = np.concatenate([self.nominal, self._reference])[:, self.sight.unseen]
+        axis = self.rotation[unseen]
+        deep = np.concatenate([self.nominal[trial.tracked(self.tracked)], self._reference])[:, unseen]
 
         def moved(points: FloatArray) -> FloatArray:
             return np.asarray(points + (deep - points @ axis)[..., None] * axis)
@@ -152,26 +167,26 @@ class Reader:
 
     def _assigned(self, trials: Sequence[Trial], recordings: Sequence[Recording]) -> list[Recording]:
         """The same, with the markers of each named by where they are while the body rests or is held."""
-        expected = [self.expected(not trial.is_released) for trial in trials]
+        expected = [self.expected(trial) for trial in trials]
         poses = [row for row, trial in enumerate(trials) if trial.begins == STATIC and trial.labels is None]
         if poses:
             posed = self._posed(self._held([trials[row] for row in poses], [recordings[row] for row in poses]))
             for row, places in zip(poses, posed, strict=True):
-                expected[row] = np.concatenate([places, self._reference])
-        if self.sight.unseen is not None:  # no depth, as the recordings have it
-            flat = np.arange(3) == self.sight.unseen
-            expected = [np.where(flat, 0.0, places) for places in expected]
+                expected[row] = self._seen(trials[row], places)
         found = []
         for row, (trial, recording) in enumerate(zip(trials, recordings, strict=True)):
             if trial.labels is not None:
                 found.append(recording)
                 continue
-            standing = list(range(len(self.tracked), len(self.labels)))
+            unseen, labels = self.sight(trial).unseen, self.labels(trial)
+            if unseen is not None:  # no depth, as the recordings have it
+                expected[row][:, unseen] = 0.0
+            standing = list(range(len(self.tracked), len(labels)))
             bent = trial.begins == STATIC or len(standing) >= self.enough
             pairs = assign(
                 central_places(replace(recording, positions=_still_frames(trial, recording)), np.median),
                 expected[row],
-                self.labels,
+                labels,
                 source=recording.source,
                 anchors=standing if bent else None,
                 rotation=self.rotation,
@@ -182,7 +197,7 @@ class Reader:
             )
             columns = pairs.columns.tolist()
             rest = None if recording.rest is None else recording.rest[columns]
-            named = replace(recording, labels=tuple(self.labels), positions=recording.positions[:, columns], rest=rest)
+            named = replace(recording, labels=tuple(labels), positions=recording.positions[:, columns], rest=rest)
             found.append(named)
         return found
 
@@ -207,7 +222,7 @@ class Reader:
     def _posed(self, inputs: Inputs) -> FloatArray:
         """(R, M, 3) the tracked markers of the uncorrected simulator in equilibrium [m]."""
         simulator = self._simulator
-        read = seen_markers(self.markers, simulator.body.mesh, self.nominal, tuple(self.tracked))
+        read = bound_markers(self.markers, simulator.body.mesh, self.nominal, tuple(self.tracked))
         found: FloatArray = read.to(simulator.rest_positions)(simulator.static_equilibrium(inputs).q).cpu().numpy()
         return found
 

@@ -275,15 +275,16 @@ def read_trials(folder: Path, config: Mapping[str, Any]) -> Trials:
         bound=bound,
         gravity=dataset.gravity,
         time_step=dataset.time_step,
-        **_seen(config, dataset.labels),
+        **_seen(config, dataset),
     )
 
 
-def _seen(config: Mapping[str, Any], labels: Sequence[str]) -> dict[str, Any]:
+def _seen(config: Mapping[str, Any], dataset: Dataset) -> dict[str, Any]:
     """How markers are seen, for the pictures."""
+    labels = dataset.labels
     if not labels:
         return {}
-    sight = sight_of(config["markers"], labels)
+    sight = sight_of(config["markers"], labels, dataset.sets)
     return {"axes": tuple(axis for axis in range(3) if axis != sight.unseen), "own_frame": sight.own}
 
 
@@ -308,11 +309,13 @@ def read_film(folder: Path, config: Mapping[str, Any], mesh: Mesh) -> Film | Non
 
 def _as_seen(film: Film, dataset: Dataset, config: Mapping[str, Any], mesh: Mesh) -> Film:
     """The same, with the bodies carried to where their markers are seen."""
-    if dataset.bound is None or not (sight := sight_of(config["markers"], dataset.labels)).own:
+    if dataset.bound is None or not (sight := sight_of(config["markers"], dataset.labels, dataset.sets)).own:
         return film
+    has = np.flatnonzero(np.isfinite(dataset.held[dataset.names.index(film.trial)]).all(-1)).tolist()
     markers = bound_markers(config["markers"], mesh, dataset.bound, dataset.labels)
+    sight = sight.select(has)
     at = {model: torch.from_numpy(each) for model, each in film.positions.items()}
-    return replace(film, positions={model: sight.carried(q, markers(q)).numpy() for model, q in at.items()})
+    return replace(film, positions={model: sight.carried(q, markers(q)[:, has]).numpy() for model, q in at.items()})
 
 
 def read_driven(folder: Path, config: Mapping[str, Any]) -> Driven | None:

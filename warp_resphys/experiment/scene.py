@@ -14,6 +14,7 @@ from scipy.interpolate import CubicSpline
 
 from ..data.actuation import remembered
 from ..data.markers import Markers
+from ..data.sight import SeenMarkers
 from ..data.trials import Trials
 from ..dynamics.frames import BaseFrame, VertexFrames, base_movement
 from ..dynamics.integrator import State
@@ -25,7 +26,7 @@ from ..io.files import read_json
 from ..learning.placement import PlacedMarkers, Placement
 from ..learning.release import ReleaseSettings, estimate_release
 from ..learning.replay import Replay, Start
-from .build import build_body, build_simulator, seen_markers
+from .build import bound_markers, build_body, build_simulator, sight_of
 from .files import DATASET, GIVEN, IDENTIFICATION, SCALED_DATASET, STATIC, Dataset, read_dataset
 
 COROTATED: Final = "corotated"
@@ -118,8 +119,9 @@ class Scene:
         """(B, N, 3) positions to what is observed of them: (B, M, 3) markers, or all of them."""
         if self.dataset.bound is None:
             return lambda positions: positions
-        found = seen_markers(self.config["markers"], self.body.mesh, self.dataset.bound, self.dataset.labels)
-        return found.to(self.like)
+        markers, labels = self.config["markers"], self.dataset.labels
+        found = bound_markers(markers, self.body.mesh, self.dataset.bound, labels)
+        return SeenMarkers.of(found, sight_of(markers, labels, self.dataset.sets)).to(self.like)
 
     def observe_by(self, model: str) -> Observe:
         """The same, with the markers where the identification of a model found that they sit."""

@@ -36,7 +36,7 @@ class Trial:
         inputs: what drives it all the time, one number for each part of the body; None where the recording tells.
         onset: when these come, on the clock of the recording [s]; with its first frame, if left out.
         input_delay: how much later than its log says what drives it came, as clocks differ; negative for earlier [s].
-        labels: of the markers of its recording, in their order; None where that tells.
+        labels: of the markers of its recording, in their order; None where that tells. It has no others.
         base_motion: how what it is fixed to moves, if otherwise than ``data.base_motion`` says; see
             `data.base_motion.prescribed`.
     """
@@ -59,6 +59,10 @@ class Trial:
     def is_released(self) -> bool:
         """Whether it is let go at time zero."""
         return self.begins in ("held", "released")
+
+    def tracked(self, known: Sequence[str]) -> list[int]:
+        """Which of the tracked markers it has, by their numbers."""
+        return [number for number, label in enumerate(known) if self.labels is None or label in self.labels]
 
     @property
     def recording(self) -> str:

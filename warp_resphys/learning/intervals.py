@@ -36,10 +36,11 @@ class Intervals:
     def calibrated(
         cls, simulated: Sequence[FloatArray], observed: Sequence[FloatArray], rest: FloatArray, level: float = LEVEL
     ) -> "Intervals | None":
-        """From trials that did not train the model; None where one has diverged, or a marker was never seen.
+        """From trials that did not train the model; None where one has diverged.
 
         The quantile is the lowest with which intervals from all calibrating trials but one hold often enough in that
         one, on average; the largest deviation of all, if none does or there is one trial. All trials weigh the same.
+        Markers that none of them shows get the largest quantile of those that are shown.
 
         Args:
             simulated: (T, M, 3) of each trial [m], by the model.
@@ -50,15 +51,19 @@ class Intervals:
         seen = [_seen(each) for each in observed]  # (T, M)
         if not all(np.isfinite(each[at]).all() for each, at in zip(simulated, seen, strict=True)):
             return None
-        if not np.any([at.any(0) for at in seen], axis=0).all():
+        known = np.any([at.any(0) for at in seen], axis=0)
+        if not known.any():
             return None
-        moved = [np.where(at, np.linalg.norm(x - rest, axis=-1), np.nan) for x, at in zip(simulated, seen, strict=True)]
+        counted = [at | ~known for at in seen]
+        pairs = zip(simulated, counted, strict=True)
+        moved = [np.where(at, np.linalg.norm(x - rest, axis=-1), np.nan) for x, at in pairs]
         standing = tuple((_STANDING * np.nanmean(np.concatenate(moved), axis=0)).tolist())
         found = []
         for scale in _SCALES:
             widths = [cls(scale, tuple(np.ones(len(rest))), standing).half_widths(each, rest) for each in simulated]
             scores = [np.abs(x - y) / w[..., None] for x, y, w in zip(simulated, observed, widths, strict=True)]
             factor = _factor(scores, level)
+            factor[~known] = factor[known].max()
             mean = float(np.mean([(w * factor)[at].mean() for w, at in zip(widths, seen, strict=True) if at.any()]))
             found.append((mean, cls(scale, tuple(factor.tolist()), standing)))
         return min(found, key=lambda pair: pair[0])[1]

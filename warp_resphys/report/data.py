@@ -244,5 +244,7 @@ def drawn_markers(target: FloatArray, bound: FloatArray, clamped: FloatArray) ->
     moved = np.nanmax(np.linalg.norm(target - bound, axis=2), axis=0, initial=0.0)  # (M,) [m]
     away = along_body(bound, clamped)
     others = np.flatnonzero(away < (1.0 - _OTHER) * away.max())
-    groups = [group for group in (tip_markers(bound, clamped), others) if len(group)]
+    seen = np.flatnonzero(np.isfinite(target).all(2).any(0))
+    groups = [np.intersect1d(group, seen) for group in (tip_markers(bound, clamped), others)]
+    groups = [group for group in groups if len(group)] or [seen]
     return [int(group[np.argmax(moved[group])]) for group in groups]

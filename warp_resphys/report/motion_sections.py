@@ -61,6 +61,8 @@ def motion_of(data: RunReport) -> Motion | None:
         return None
     hangs, away = _hangs(data, trials)
     some = np.arange(len(trials.bound))
+    if trials.labels and film is not None and film.trial in trials.names:
+        some = np.flatnonzero(np.isfinite(trials.target[trials.names.index(film.trial)]).all(-1).any(0))
     if not trials.labels:
         row = trials.worst
         film = Film(trials.names[row], trials.times[row], {m: q[row] for m, q in trials.positions.items()})

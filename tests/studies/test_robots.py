@@ -2,6 +2,8 @@
 
 import contextlib
 import json
+import shutil
+from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_module
@@ -48,7 +50,7 @@ def test_a_robot_has_a_row_a_picture_and_what_was_tested(finished):
     (folder,) = (finished / "runs/tendon_rod").iterdir()
     metrics = json.loads((folder / "metrics.json").read_text())
     for text in ((finished / "docs/robots.md").read_text(), (finished / "outputs/robots/results.md").read_text()):
-        (row,) = (line for line in text.splitlines() if line.startswith("| SoPrA |"))
+        row = next(line for line in text.splitlines() if line.startswith("| SoPrA |"))
         cells = [cell.strip() for cell in row.split("|")[1:-1]]
         means = [error_parts(metrics["errors_mm"][m])[0] for m in ("simulation", "sysid", "simfree", "resphys")]
         assert [cell.split()[0] for cell in cells[1:5]] == means
@@ -62,6 +64,42 @@ def test_a_robot_has_a_row_a_picture_and_what_was_tested(finished):
     assert "pressures of six chambers" in page
     assert str(finished) not in page
     assert "data=FOLDER" in page
+
+
+def test_robots_of_earlier_runs_keep_their_rows(finished, tmp_path, monkeypatch):
+    """The page is of all that was measured, each with its day; what is run again has a new row."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(finished / "docs", "docs")
+    shutil.copytree(finished / "runs", "runs")
+    known = json.loads(Path("docs/robots.json").read_text())
+    assert list(known) == ["sopra"]
+    other = {
+        **known["sopra"],
+        "day": "2020-02-02",
+        "errors_mm": {"sysid": {**known["sopra"]["errors_mm"]["sysid"], "mean": 77.7}},
+    }
+    old = {**known["sopra"], "day": "2019-01-01", "seconds": 1.0}
+    Path("docs/robots.json").write_text(json.dumps({"sopra": old, "fish_tail": other}))
+    shutil.copy("docs/robots/sopra.png", "docs/robots/fish_tail.png")
+    code, err = run(*ARGUMENTS, "only=[sopra]", "results=docs")
+    assert (code, err[-500:] if code else "") == (0, "")
+    assert json.loads(Path("docs/robots.json").read_text()) == {"sopra": known["sopra"], "fish_tail": other}
+    page = Path("docs/robots.md").read_text()
+    assert "2020-02-02" in page
+    assert "2019-01-01" not in page
+    row = next(line for line in page.splitlines() if line.startswith("| Fish tail |"))
+    assert "77.7" in row.split("|")[3]
+    assert Path("docs/robots/fish_tail.png").is_file()
+
+
+def test_what_another_version_kept_is_refused(finished, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("docs").mkdir()
+    Path("docs/robots.json").write_text('{"sopra": {"mean": 1.0}}')
+    code, err = run(*ARGUMENTS, "only=[sopra]", "results=docs")
+    assert code == 2
+    assert "robots.json is not what this version keeps of earlier runs: move it away" in err
+    assert not Path("runs").exists()
 
 
 def configured():

@@ -61,7 +61,17 @@ class Run:
     @property
     def settings(self) -> dict[str, Any]:
         """The whole configuration of the run."""
-        return dict(read_json(self.folder / "stages" / "report.json")["settings"]["config"])
+        return dict(self._report["settings"]["config"])
+
+    @property
+    def day(self) -> str:
+        """On which it ended, such as 2024-05-13 (UTC)."""
+        return str(self._report["finished"]).partition("T")[0]
+
+    @property
+    def _report(self) -> dict[str, Any]:
+        """How its last stage went."""
+        return dict(read_json(self.folder / "stages" / "report.json"))
 
 
 def asked_for(config: Mapping[str, Any], known: Sequence[str], kind: str) -> set[str]:
@@ -114,11 +124,16 @@ def made(command: str, hidden: Sequence[str] = ()) -> Part:
         command: its name.
         hidden: keys whose values are folders of that machine.
     """
-    given = [(each, each.partition("=")[0]) for each in HydraConfig.get().overrides.task]
-    line = shlex.join(["warp-resphys", command, *(f"{key}=FOLDER" if key in hidden else each for each, key in given)])
     known = {**hardware(), "commit": commit() or "not known", **package_versions()}
     table = Table("Machine and versions", ["Here"], [Row(name, [Cell(value)]) for name, value in known.items()])
-    return Part("Command, machine and versions", [Items([line], code=True), table])
+    return Part("Command, machine and versions", [*command_part(command, hidden).blocks, table])
+
+
+def command_part(command: str, hidden: Sequence[str] = ()) -> Part:
+    """By which command a page was made; see `made`."""
+    given = [(each, each.partition("=")[0]) for each in HydraConfig.get().overrides.task]
+    line = shlex.join(["warp-resphys", command, *(f"{key}=FOLDER" if key in hidden else each for each, key in given)])
+    return Part("Command", [Items([line], code=True)])
 
 
 def fail_for(results: Sequence[Run]) -> None:

@@ -1,0 +1,211 @@
+"""What the runs of robots have shown, and the parts of the page on them."""
+
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from ..io.errors import InputError
+from ..io.machine import commit, hardware
+from ..learning.metrics import Gain, paired_gain
+from ..report.page import (
+    MINUS,
+    NONE,
+    Block,
+    Cell,
+    Drawn,
+    Items,
+    Part,
+    Row,
+    Table,
+    Text,
+    drawn_file,
+    duration_text,
+    error_parts,
+    number_text,
+)
+from ..report.verdict import held_out, learned_in_part
+from .runs import Run
+
+_MODELS = ("simulation", "sysid", "simfree", "resphys")
+_GAINS = {"sysid": "simulation", "resphys": "sysid"}  # over what
+_MACHINE = {"processor": "Processor", "cores used": "Cores used", "GPU": "GPU", "commit": "Commit"}
+_PACKAGES = ("python", "warp-lang", "torch")
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What a run of a robot has shown.
+
+    Attributes:
+        day: on which it ended.
+        machine: and the commit that read it, and the packages that it ran with.
+        arguments: of the command, without folders of that machine.
+        tested: the trials.
+        how: they were kept from the training.
+        errors_mm: by model, as `metrics.summarise` has them.
+        gains: of a model over the one that it corrects, as `metrics.Gain`; None where a roll-out diverged.
+        intervals: of ResPhys, with ``coverage`` and ``half_width_mm``.
+        seconds: of all stages.
+        moved_mm: how far the markers of the identified simulator are elsewhere on a finer mesh.
+    """
+
+    day: str
+    machine: Mapping[str, str]
+    arguments: tuple[str, ...]
+    tested: tuple[str, ...]
+    how: str
+    errors_mm: Mapping[str, Mapping[str, Any]]
+    gains: Mapping[str, Gain | None]
+    intervals: Mapping[str, Any] | None
+    seconds: float
+    moved_mm: float | None
+
+    @classmethod
+    def of(cls, run: Run) -> "Measured":
+        """Reads the folder of a run that has succeeded."""
+        metrics = run.metrics
+        tested = list(metrics.get("folds", {})) or [row["name"] for row in metrics["per_trajectory"]]
+        how = "each of them kept back once" if "folds" in metrics and len(tested) > 1 else "kept back"
+        how = "in the part that was not learned from" if learned_in_part(run.settings, tested) else how
+        return cls(
+            day=run.day,
+            machine={**hardware(), "commit": commit() or "not known", **metrics["versions"]},
+            arguments=tuple(
+                "data.folder=FOLDER" if each.startswith("data.folder=") else each for each in run.arguments
+            ),
+            tested=tuple(tested),
+            how=how,
+            errors_mm={model: metrics["errors_mm"][model] for model in _MODELS if model in metrics["errors_mm"]},
+            gains={model: _gain(metrics, model, other) for model, other in _GAINS.items()},
+            intervals=metrics.get("intervals", {}).get("models", {}).get("resphys"),
+            seconds=_seconds(metrics),
+            moved_mm=metrics.get("mesh_check", {}).get("moved_mm"),
+        )
+
+    def plain(self) -> dict[str, Any]:
+        """As plain data."""
+        gains = {model: None if each is None else each._asdict() for model, each in self.gains.items()}
+        return {**asdict(self), "gains": gains}
+
+    @classmethod
+    def from_plain(cls, found: Mapping[str, Any]) -> "Measured":
+        """From `plain`.
+
+        Raises:
+            InputError: it is of another version.
+        """
+        if set(found) != {field.name for field in fields(cls)}:
+            raise InputError("what is kept of earlier runs is of another version of this program.")
+        gains = {model: None if each is None else Gain(**each) for model, each in found["gains"].items()}
+        words = {key: tuple(found[key]) for key in ("arguments", "tested")}
+        return cls(**{**found, **words, "gains": gains})
+
+    @property
+    def is_helped(self) -> bool:
+        """Whether the learned force is better than identification in nine of ten draws of several trials."""
+        gain = self.gains["resphys"]
+        return gain is not None and gain.trials > 1 and gain.lower > 0.0
+
+
+def _gain(metrics: Mapping[str, Any], after: str, before: str) -> Gain | None:
+    """By how much a model is better than another on held-out trials; None where a roll-out diverged."""
+    pairs = [(row.get(before), row.get(after)) for row in held_out(metrics)]
+    known = [(b, a) for b, a in pairs if a is not None and b]
+    if not known or len(known) < len(pairs):
+        return None
+    return paired_gain([b for b, _ in known], [a for _, a in known])
+
+
+def _seconds(metrics: Mapping[str, Any]) -> float:
+    """Of all stages, those of the folds included."""
+    every = [metrics, *metrics.get("folds", {}).values()]
+    return float(sum(sum(each["seconds"].values()) for each in every))
+
+
+def summary(robots: Mapping[str, Any], found: Mapping[str, Measured]) -> Part:
+    """A row for each robot."""
+    rows = []
+    for name, each in found.items():
+        errors = each.errors_mm
+        cells = [Cell(*error_parts(errors[model])) if model in errors else Cell(NONE) for model in _MODELS]
+        cells += [Cell(_gain_text(gain)) for gain in each.gains.values()]
+        cells += [Cell(_coverage(each.intervals)), Cell(duration_text(each.seconds))]
+        rows.append(Row(robots[name]["title"], cells, small=robots[name]["actuation"]))
+    note = (
+        "Mean distance of the markers in what no training and no identification saw [mm], ± the standard "
+        "deviation over trials. Less error: the share that SysID takes away of the uncorrected error, and ResPhys of "
+        "SysID's, with the interval that holds it in nine of ten draws of the trials (paired bootstrap). Coverage: of "
+        "the measured coordinates, those within the 90 % prediction intervals of ResPhys, and how wide these are on "
+        "average. Time: all stages, beside whatever else the machine did."
+    )
+    columns = [
+        "Uncorrected",
+        "SysID",
+        "SimFree",
+        "ResPhys",
+        "Less error by SysID",
+        "Less error by ResPhys",
+        "Coverage",
+        "Time",
+    ]
+    return Part("All robots", [Table("Robot", columns, rows, note)] if rows else [])
+
+
+def _gain_text(gain: Gain | None) -> str:
+    if gain is None:
+        return NONE
+    share, *ends = (f"{100.0 * each:.0f}".replace("-", MINUS) for each in (gain.share, gain.lower, gain.upper))
+    return f"{share} %" if gain.trials == 1 else f"{share} % ({' to '.join(ends)})"
+
+
+def _coverage(intervals: Mapping[str, Any] | None) -> str:
+    """How often the prediction intervals of the learned force hold, and their mean half-width."""
+    if intervals is None:
+        return NONE
+    return f"{100.0 * intervals['coverage']:.0f} % (± {intervals['half_width_mm']:.2g} mm)"
+
+
+def details(name: str, robot: Mapping[str, Any], found: Measured, pictures: Path) -> Part:
+    """A robot: its picture, where its recordings come from, what was tested, and what was published."""
+    source = Text(f"{robot['actuation'][:1].upper()}{robot['actuation'][1:]}. {robot['source']}")
+    count = len(found.tested)
+    said = [f"Tested on {count} trial{'s' if count > 1 else ''}, {found.how}: {', '.join(found.tested)}."]
+    if found.moved_mm is not None:
+        moved = number_text(found.moved_mm)
+        said.append(f"On a finer mesh the markers of the identified simulator are {moved} mm elsewhere.")
+    blocks: list[Block] = [*_drawn(name, robot, pictures), source, Text(" ".join(said))]
+    if robot["published"]:
+        blocks += [Text("Published", heading=True), Items(robot["published"])]
+    return Part(robot["title"], [*blocks, Items([shlex.join(["warp-resphys", *found.arguments])], code=True)])
+
+
+def _drawn(name: str, robot: Mapping[str, Any], pictures: Path) -> list[Drawn]:
+    """The body; none where no picture was drawn."""
+    path = pictures / f"{name}.png"
+    if not path.is_file():
+        return []
+    return [drawn_file(path, f"The body of {robot['title']} and its markers.", "The body as it is simulated.")]
+
+
+def machines(robots: Mapping[str, Any], found: Mapping[str, Measured]) -> Part:
+    """When each robot was measured, on which machine and with which versions."""
+    columns = ["Measured", *_MACHINE.values(), *_PACKAGES]
+    rows = [
+        Row(
+            robots[name]["title"],
+            [Cell(each.day), *(Cell(each.machine.get(key, NONE)) for key in (*_MACHINE, *_PACKAGES))],
+        )
+        for name, each in found.items()
+    ]
+    return Part("Machines and versions", [Table("Robot", columns, rows)] if rows else [])
+
+
+def verdict(robots: Mapping[str, Any], found: Mapping[str, Measured]) -> str:
+    """The robots on which the learned force helps, in a sentence."""
+    if not found:
+        return "No run has succeeded."
+    helped: Sequence[str] = [robots[name]["title"] for name, each in found.items() if each.is_helped]
+    which = f"{len(helped)} of {len(found)} robots" + (f" ({', '.join(helped)})" if helped else "")
+    return f"The learned force takes away error that identification leaves, and other trials would show it, on {which}."

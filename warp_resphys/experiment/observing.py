@@ -1,0 +1,355 @@
+"""Trials as they were recorded: when each begins, where its markers are in the frame of the body, and what drove it."""
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..data.actuation import NO_INPUT, check_inputs
+from ..data.base_motion import followed, in_frame, prescribed, rigid
+from ..data.recordings.processing import fill_gaps, release_of, resample, trim_to_release
+from ..data.recordings.quality import check_base, check_motion
+from ..data.recordings.recording import Recording
+from ..data.recordings.release import Release, valve_opening
+from ..data.registration import Registration, register_markers
+from ..data.rigid import RigidTransform
+from ..data.sight import Sight
+from ..dynamics.simulator import Simulator
+from ..io.errors import DataFileError, listed
+from ..io.stages import StageContext
+from .actuators import Drive, drive_of
+from .build import build_simulator
+from .files import STATIC
+from .reading import POSE_SECONDS, Reader, central_places
+from .trials import Trial
+
+log = logging.getLogger(__name__)
+
+FloatArray = NDArray[np.float64]
+
+_LEAST_RATE = 40.0  # Hz; the first tenth of a second tells how a body was let go, and four frames are few for that
+_MILLI = 1e3
+_START = Release(0.0, (0, 1))  # of a recording that begins with it
+
+
+@dataclass(frozen=True)
+class Observed:
+    """A trial as it was recorded.
+
+    Attributes:
+        trial: what is configured of it.
+        raw: the configured markers that it has, the tracked ones first, as measured.
+        columns: which of all tracked markers these are.
+        sight: how much it tells of where they are.
+        moving: the tracked ones from time zero on, short gaps filled, long ones NaN.
+        still: (M', 3) where its markers were before time zero, in the frame of the recording [m].
+        registration: of the markers at rest.
+        driven: (T, C) the input that drives the body at the frames, such as pressures [Pa]; None without any.
+        release: when the body was let go; None of others.
+        tells_places: whether it shows where markers sit on the body, held undeformed or under nothing but gravity.
+        base: (T, 6) how what the body is fixed to has moved at the frames, in the frame of the body; None where it
+            stands still.
+    """
+
+    trial: Trial
+    raw: Recording
+    columns: list[int]
+    sight: Sight
+    moving: Recording
+    still: FloatArray
+    registration: Registration
+    driven: FloatArray | None = None
+    release: Release | None = None
+    tells_places: bool = True
+    base: FloatArray | None = None
+
+    def to_body(self, points: FloatArray, shift: FloatArray) -> FloatArray:
+        """What (..., M, 3) points of its markers tell in the frame of the body, moved by (M, 3) [m]."""
+        moved = self.registration.transform.apply(points.reshape(-1, 3)).reshape(points.shape)
+        return self.sight.of_arrays(self.sight.of_arrays(moved) + shift)
+
+    @property
+    def places(self) -> FloatArray:
+        """(M, 3) what is told of where its tracked markers are while it is registered, in the frame of the body [m]."""
+        return self.sight.of_arrays(self.registration.positions[: len(self.columns)])
+
+
+class Observer:
+    """Reads and registers trials.
+
+    Args:
+        context: of the stage, with the groups data, markers, laboratory, mesh and what a simulator needs.
+    """
+
+    def __init__(self, context: StageContext) -> None:
+        self.context, self.settings = context, context.settings
+        self.data, self.markers = self.settings["data"], self.settings["markers"]
+        self.simulator: Simulator = build_simulator(self.settings)
+        self.drive = drive_of(self.settings, self.simulator.body)
+        self.reader = Reader(self.settings, context.run_dir, self.simulator, self.drive)
+        self.tracked, self.nominal = self.reader.tracked, self.reader.nominal
+
+    def observe(self, trials: Sequence[Trial]) -> list[Observed]:
+        """Reads every trial, finds time zero and registers it.
+
+        Raises:
+            DataFileError: a recording that cannot be read or used; the sentence names the file and the marker.
+        """
+        ready = [self._timed(*each) for each in zip(trials, self.reader.read(trials), strict=True)]
+        self._check_reference(trials, ready)
+        return self._beside_each_other(
+            [
+                self._driven(trial, recording) if release is None else self._released(trial, recording, release)
+                for trial, (recording, release) in zip(trials, ready, strict=True)
+            ]
+        )
+
+    def _beside_each_other(self, observed: list[Observed]) -> list[Observed]:
+        """Trials that are loaded from their first frame on, registered to where the others have the reference markers.
+
+        These alone can be where they should be, and a third of a millimetre between nominal and true places would turn
+        a body by a millimetre at its tip, otherwise than in the trials that are registered by all markers.
+        """
+        known = [each.registration.positions[len(each.columns) :] for each in observed if each.tells_places]
+        if not known or len(known) == len(observed) or len(self.markers["reference"]) < self.reader.enough:
+            return observed
+        seen = np.isfinite(np.stack(known)).all(-1).any(0)
+        mean = np.nanmean(np.stack(known)[:, seen], axis=0)
+
+        def beside_others(each: Observed) -> Observed:
+            expected = self.reader.expected(each.trial)
+            expected[len(each.columns) :][seen] = mean
+            registration = self._register(each.trial, each.still, each.raw, expected, only_reference=True)
+            return replace(each, registration=registration)
+
+        return [each if each.tells_places else beside_others(each) for each in observed]
+
+    def _tracked(self, trial: Trial) -> list[str]:
+        """Those of the tracked markers that a trial has."""
+        return [self.tracked[number] for number in trial.tracked(self.tracked)]
+
+    def _timed(self, trial: Trial, recording: Recording) -> tuple[Recording, Release | None]:
+        """A recording, at the steps of the simulation if the body is driven, and when the body is let go if it is."""
+        if not trial.is_released:
+            return resample(recording, 1.0 / self.settings["time_step"]), None
+        self._check_rate(recording)
+        if trial.begins == "released":
+            return recording, _START
+        return recording, release_of(recording, self._tracked(trial), self.data["longest_gap"])
+
+    def _check_rate(self, recording: Recording) -> None:
+        """Refuses a recording that is too slow, and says whether frames fall between the steps of the simulation."""
+        if recording.rate < _LEAST_RATE:
+            raise DataFileError(
+                f"{recording.source} has {recording.rate:g} frames a second, too few to tell how the body was let "
+                f"go: record {_LEAST_RATE:g} or more, or set data.rate if the file is wrong."
+            )
+        ratio = recording.rate * self.settings["time_step"]
+        if abs(max(ratio, 1.0 / ratio) - round(max(ratio, 1.0 / ratio))) > 1e-6:
+            log.info(
+                "import: %s has %g frames a second and the simulation %g steps: it is read off at the times of the "
+                "frames, between its steps",
+                *(recording.source.name, recording.rate, 1.0 / self.settings["time_step"]),
+            )
+
+    def _check_reference(self, trials: Sequence[Trial], ready: Sequence[tuple[Recording, Release | None]]) -> None:
+        """Refuses recordings whose reference markers moved against each other between trials."""
+        reference, still = list(self.markers["reference"]), []
+        for trial, (recording, release) in zip(trials, ready, strict=True):
+            if release is not None:
+                still.append(_frames(recording, *release.rest))
+            else:
+                stands = self._base_motion(trial) is None
+                still.append(recording if stands else _frames(recording, 0, self._rest_frames(recording)))
+        if len(reference) > 1:
+            limits = {key: self.markers[key] for key in ("largest_distortion", "largest_shift")}
+            check_base(still, reference, **limits)
+
+    def _rest_frames(self, recording: Recording) -> int:
+        return max(round(self.data["rest_seconds"] * recording.rate), 1)
+
+    def _base_motion(self, trial: Trial) -> Mapping[str, Any] | str | None:
+        """How the base of a trial moves; that of a laboratory's trial may have to be found out."""
+        common: Mapping[str, Any] | str | None = self.data.get("base_motion")
+        return common if trial.base_motion is None or isinstance(common, str) else trial.base_motion
+
+    def _base(
+        self, trial: Trial, whole: Recording, moving: Recording, still: FloatArray, transform: RigidTransform
+    ) -> FloatArray | None:
+        """(T, 6) how the base has moved at the frames, in the frame of the body; ``whole`` has all of their markers."""
+        motion = self._base_motion(trial)
+        if motion is None:
+            return None
+        if isinstance(motion, Mapping):
+            poses = prescribed(motion, moving.time, self.data["folder"] or ".")
+        elif motion == "reference":
+            count = len(self._tracked(trial))
+            poses = in_frame(followed(whole.positions[:, count:], still[count:], whole.source), transform)
+        elif moving.base is not None:
+            poses = in_frame(moving.base, transform)
+        else:
+            raise DataFileError(
+                f"{whole.source} has no array 'base' that tells how what the body is fixed to moves: add it "
+                "(docs/recordings.md), or set data.base_motion to reference if markers.reference move with it."
+            )
+        early = poses[: 1 if trial.is_released else self._rest_frames(whole)]
+        moved = rigid(early).apply(np.broadcast_to(self.nominal, (len(early), *self.nominal.shape))) - self.nominal
+        if (furthest := float(np.linalg.norm(moved, axis=-1).max())) > self.markers["largest_residual"]:
+            raise DataFileError(
+                f"{whole.source}: the base has moved the body by {_MILLI * furthest:.1f} mm while that is registered: "
+                "let it stand still until the release, or in the first data.rest_seconds."
+            )
+        return poses
+
+    def _turned_back(self, places: FloatArray, sight: Sight) -> FloatArray:
+        """(M', 3) places in the frame of the recording, those of the tracked markers turned as the sight of them is.
+
+        What is told in a frame of their own is the same wherever they are: any motion that registers it will do.
+        """
+        rotation, count = self.reader.rotation, len(sight.nominal)
+        if not sight.own or rotation is None:
+            return places
+        return np.concatenate([sight.of_arrays(places[:count] @ rotation.T) @ rotation, places[count:]])
+
+    def _register(
+        self,
+        trial: Trial,
+        places: FloatArray,
+        recording: Recording,
+        expected: FloatArray,
+        only_reference: bool = False,
+    ) -> Registration:
+        use = list(self.markers["reference"]) if only_reference else None
+        return register_markers(
+            *(self._turned_back(places, self.reader.sight(trial)), expected, recording.labels),
+            source=recording.source,
+            largest_residual=self.markers["largest_residual"],
+            use=use,
+            rotation=self.reader.rotation,
+            vertical=self.reader.vertical,
+        )
+
+    def _released(self, trial: Trial, recording: Recording, release: Release) -> Observed:
+        """A body that was held, undeformed or as the file says, and let go."""
+        tracked = self._tracked(trial)
+        still = _median(_frames(recording, *release.rest), tracked)
+        places = _rest_of(recording, tracked) if self.data["rest"] == "file" else still
+        registration = self._register(trial, places, recording, self.reader.expected(trial))
+        off = f"; left out: {listed(registration.outliers)}" if registration.outliers else ""
+        log.info(
+            "import: %s is let go in frame %.1f, registered to %.2f mm%s",
+            *(trial.name, release.frame, _MILLI * registration.rms, off),
+        )
+        filled = fill_gaps(recording.select(tracked), self.data["longest_gap"], mask_long=True)
+        moving = trim_to_release(filled, release, seconds=self.data["seconds"])
+        lost = [label for label, seen in zip(moving.labels, moving.seen.T, strict=True) if not seen.any()]
+        if lost:
+            raise DataFileError(
+                f"{moving.source}: {listed(lost)} cannot be seen in the {self.data['seconds']:g} s after the release; "
+                "leave it out of markers.tracked."
+            )
+        check_motion(moving, tracked)
+        # Constant: how a valve moves while a body swings is not told by this.
+        driven = None if self.drive is None else self._inputs(moving, trial, self.drive)[:1]
+        first = int(np.ceil(release.frame))
+        whole = _frames(recording, first, first + len(moving.positions))
+        base = self._base(trial, whole, moving, still, registration.transform)
+        seen = (trial.tracked(self.tracked), self.reader.sight(trial))
+        return Observed(trial, recording, *seen, moving, still, registration, driven, release, base=base)
+
+    def _driven(self, trial: Trial, recording: Recording) -> Observed:
+        """A body that rests until its inputs come, or one in a pose."""
+        static, tracked = trial.begins == STATIC, self._tracked(trial)
+        if not static:
+            check_motion(_frames(recording, 0, self.data["steps"] + 1), tracked)
+        driven = None if self.drive is None else self._inputs(recording, trial, self.drive)
+        loaded = driven is not None and not self._is_at_rest(driven[:1])[0]
+        tells = trial.payload == 0.0 and not loaded
+        filled = fill_gaps(recording, self.data["longest_gap"], mask_long=True)
+        still = _median(filled, tracked) if static and loaded else self._resting(trial, filled, driven)
+        # Where the body is without what hangs on it, the other trials tell.
+        only_reference = not tells and len(self.markers["reference"]) >= self.reader.enough
+        registration = self._register(trial, still, recording, self.reader.expected(trial), only_reference)
+        moving = filled.select(tracked)
+        if static:
+            frames = max(round(POSE_SECONDS * moving.rate), 1)
+            last = _frames(moving, -frames, None)
+            moving = replace(moving, positions=_median(last, tracked)[None])
+            driven = None if driven is None else np.median(driven[-frames:], axis=0)[None]
+        base = None if static else self._base(trial, recording, moving, still, registration.transform)
+        seen = (trial.tracked(self.tracked), self.reader.sight(trial))
+        return Observed(trial, recording, *seen, moving, still, registration, driven, tells_places=tells, base=base)
+
+    def _is_at_rest(self, driven: FloatArray) -> NDArray[np.bool_]:
+        """(T,) whether (T, C) inputs are what a gauge shows of none."""
+        return np.asarray(np.abs(driven).max(axis=1) <= NO_INPUT * self.data["input_limit"])
+
+    def _resting(self, trial: Trial, recording: Recording, driven: FloatArray | None) -> FloatArray:
+        """(M', 3) mean positions of the markers before the inputs come [m], NaN for one that is not seen."""
+        acts = np.zeros(0, dtype=np.int64) if driven is None else np.flatnonzero(~self._is_at_rest(driven))
+        until = int(acts[0]) if len(acts) else len(recording.positions)
+        if until < 1:
+            assert self.drive is not None
+            raise DataFileError(
+                f"{recording.source} begins under {self.drive.quantity.words}: its first frame must show the body at "
+                "rest."
+            )
+        resting = _frames(recording, 0, min(until, self._rest_frames(recording)))
+        return _central(resting, self._tracked(trial), np.mean, "rests")
+
+    def _inputs(self, recording: Recording, trial: Trial, drive: Drive) -> FloatArray:
+        """(T, C) of the body's parts; refuses those of another number of parts, or beyond the limit."""
+        data, count = self.data, len(drive.parts)
+        found = recording.actuation
+        if found is None:
+            if trial.is_released:
+                return np.zeros((len(recording.positions), count))
+            raise DataFileError(
+                f"{recording.source} has no array 'actuation' with the {drive.quantity.plural} of the {drive.per}s: "
+                "add it (docs/recordings.md)."
+            )
+        values = check_inputs(found, drive.quantity, count, trial.scale * data["input_limit"], recording.source)
+        if data["valve"] == "detected" and not trial.is_released:
+            opening = valve_opening(recording, self._tracked(trial))
+            # Commanded inputs from that moment on; the step in which the valve opens has its share.
+            frame = (opening - recording.start) * recording.rate
+            values = np.asarray(values * np.clip(np.arange(len(values)) - frame, 0.0, 1.0)[:, None])
+        return values
+
+
+def _frames(recording: Recording, first: int, last: int | None) -> Recording:
+    """The markers of some of the frames."""
+    return replace(recording, positions=recording.positions[first:last])
+
+
+def _median(recording: Recording, tracked: Sequence[str]) -> FloatArray:
+    """(M', 3) median positions of the markers of a body that is held [m], NaN for one that is not seen."""
+    return _central(recording, tracked, np.median, "is held")
+
+
+def _central(recording: Recording, tracked: Sequence[str], centre: Any, while_it: str) -> FloatArray:
+    seen: NDArray[np.bool_] = recording.seen
+    hidden = np.flatnonzero(~seen.any(axis=0))
+    lost = [recording.labels[column] for column in hidden if recording.labels[column] in tracked]
+    if lost:
+        raise DataFileError(
+            f"{recording.source}: {listed(lost)} cannot be seen while the body {while_it}, so where it sits is not "
+            "known; leave it out of markers.tracked."
+        )
+    return central_places(recording, centre)
+
+
+def _rest_of(recording: Recording, tracked: Sequence[str]) -> FloatArray:
+    """(M', 3) the markers on the undeformed body, as the file has them [m]."""
+    if recording.rest is None:
+        raise DataFileError(
+            f"{recording.source} has no array 'rest' that tells where its markers are on the undeformed body: add it "
+            "(docs/recordings.md), or set data.rest to held if the body is held undeformed."
+        )
+    lost = [label for label in tracked if not np.isfinite(recording.rest[recording.labels.index(label)]).all()]
+    if lost:
+        raise DataFileError(f"{recording.source}: 'rest' has no place of {listed(lost)}; leave it out of the markers.")
+    return recording.rest

@@ -293,6 +293,12 @@ def test_a_trial_with_markers_of_its_own(shelf):
     hidden = np.isnan(found["observed"]).all((1, 3))
     np.testing.assert_array_equal(hidden, ~np.isfinite(found["held"]).all(2))
     np.testing.assert_allclose(found["bound"][:3], whole["bound"], rtol=0.0, atol=2e-4)
+    shelf.config["split"] = {"train": ["bare", "load52", "load101"], "validation": []}
+    mean = shelf.bring_in()["bound"]
+    assert (
+        np.abs(mean[[0, 2]] - found["bound"][[0, 2]]).max() > 1e-5
+    )  # that trial has a say where it is learned from, and
+    np.testing.assert_array_equal(mean[[1, 3]], found["bound"][[1, 3]])  # none on markers that it does not have
     apart = np.linalg.norm(found["bound"][3] - found["bound"][1])  # ``away`` is in the frame of the recording
     assert apart == pytest.approx(np.linalg.norm(away), abs=2e-4)
     swing, same = (each["observed"][2] - each["held"][2] for each in (found, whole))

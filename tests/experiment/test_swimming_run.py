@@ -121,7 +121,8 @@ def test_limbs_are_identified_by_their_shape(swum, tmp_path, monkeypatch):
     ("overrides", "said"),
     [
         (["markers.plane=[x,x]"], "markers.plane is .*two different ones"),
-        (["data.trials.fast.labels=[N1,N2,M3,N4]"], "markers.frame is own, but some trials have a few of the markers"),
+        (["data.trials.fast.labels=[N1,N2,N3,N4,M3]"], "'slow' and 'fast' both have 'M3', but only one has 'M1'"),
+        (["data.trials.fast.labels=[N1,N2,N4]"], "markers.tracked names 'N3', which no trial has"),
         (["data.axes=null"], "markers.plane is set, but data.axes is not"),
         (["markers.frame=free"], "markers.frame is 'free': .* body, own"),
         (["data.base_motion=recorded"], "markers.frame is own, but a base_motion tells"),

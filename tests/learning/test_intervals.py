@@ -74,12 +74,20 @@ def test_a_model_that_diverges_has_no_intervals():
 
 def test_a_marker_that_calibrates_nothing_is_taken_for_the_worst_of_the_others():
     simulated, observed = trials(4, 2, lambda moved: 1e-3 + 0.0 * moved)
-    known = Intervals.calibrated(simulated, observed, REST)
+    simulated, observed = ([x[:, [0, 1, 1]].copy() for x in some] for some in (simulated, observed))
+    rest = REST[[0, 1, 1]]
     for each in observed:
-        each[:, 1] = np.nan
-    found = Intervals.calibrated(simulated, observed, REST)
-    assert found.factor[0] == found.factor[1] == pytest.approx(known.factor[0], rel=1e-9)
+        each[:, 1] += 0.004
+    known = Intervals.calibrated(simulated, observed, rest)
+    for each in observed:
+        each[:, 2] = np.nan
+    found = Intervals.calibrated(simulated, observed, rest)
+    assert found.factor[2] == found.factor[1] > 1.5 * found.factor[0]
+    assert found.factor[:2] == pytest.approx(known.factor[:2], rel=1e-9)
     assert found.standing == pytest.approx(known.standing)
+    rest = REST
+    observed = [x[:, :2] for x in observed]
+    simulated = [x[:, :2] for x in simulated]
     for each in observed:
         each[:] = np.nan
-    assert Intervals.calibrated(simulated, observed, REST) is None
+    assert Intervals.calibrated(simulated, observed, rest) is None

@@ -102,6 +102,29 @@ def test_what_another_version_kept_is_refused(finished, tmp_path, monkeypatch):
     assert not Path("runs").exists()
 
 
+def test_rows_of_other_settings_are_not_replaced(finished, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(finished / "docs", "docs")
+    code, err = run(*ARGUMENTS, "only=[sopra]", "results=docs", "budget=quick")
+    assert code == 2
+    assert "has sopra with no more than its own settings, and this would replace it by one with budget=quick" in err
+    assert not Path("runs").exists()
+
+
+def test_a_robot_that_fails_keeps_its_row_and_says_so(finished, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(finished / "docs", "docs")
+    broken = ARGUMENTS[1].replace("data.steps=12", "data.steps=-1")
+    code, err = run(ARGUMENTS[0], broken, *ARGUMENTS[2:], "only=[sopra]", "results=docs")
+    assert code != 0
+    assert "1 of 1 runs failed" in err
+    page = Path("docs/robots.md").read_text()
+    row = next(line for line in page.splitlines() if line.startswith("| SoPrA |"))
+    assert "±" in row
+    assert "SoPrA failed: data.steps is -1" in page
+    assert json.loads(Path("docs/robots.json").read_text()) == json.loads((finished / "docs/robots.json").read_text())
+
+
 def configured():
     with initialize_config_module("warp_resphys.conf", version_base="1.3"):
         return OmegaConf.to_container(compose("robots"), resolve=True)["robots"]

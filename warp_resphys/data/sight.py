@@ -71,16 +71,15 @@ class Sight:
         if self.sets:
             if len({each for some in self.sets for each in some}) < sum(map(len, self.sets)):
                 raise InputError(
-                    "markers.frame is own, but some trials have a few of the markers of others: the shapes of those "
-                    "that are seen together are compared, so name markers that sit elsewhere otherwise, and leave out "
-                    "those that only some of such trials have."
+                    "markers.frame is own, but two trials have some markers in common, and not all: they must have the "
+                    "same ones, or none in common."
                 )
             _ = self._parts
         elif bool(self._is_degenerate(self.nominal)):
             what = "lie on one line" if self.plane is None else "are at one place"
             raise InputError(
-                f"markers.frame is own, but all tracked markers ({len(self.nominal)}) {what}, so that they tell no "
-                "frame: track others as well, or set markers.frame to body."
+                f"markers.frame is own, but the {len(self.nominal)} markers that are seen together {what}, so that "
+                "they tell no frame: track others as well, or set markers.frame to body."
             )
 
     @property
@@ -89,9 +88,10 @@ class Sight:
         return self.plane is None and not self.own
 
     @cached_property
-    def _parts(self) -> tuple["Sight", ...]:
-        """Of each set."""
-        return tuple(self.select(some) for some in self.sets)
+    def _parts(self) -> "list[tuple[torch.Tensor, Sight]]":
+        """The numbers of each set, and the sight of its markers."""
+        device = self.nominal.device
+        return [(torch.tensor(some, device=device), self.select(some)) for some in self.sets]
 
     def select(self, chosen: Sequence[int]) -> "Sight":
         """Of some of the markers, which are seen together."""
@@ -114,8 +114,7 @@ class Sight:
         if not self.own or not self.sets:
             return self._in_own_frame(points, points) if self.own else points
         found = points
-        for part, some in zip(self._parts, self.sets, strict=True):
-            at = torch.tensor(some, device=points.device)
+        for at, part in self._parts:
             found = found.index_copy(-2, at, part(points.index_select(-2, at)))
         return found
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ from .trials import (
     Trial,
     folds_of,
     is_laboratory,
+    known_trials,
     sees_markers,
     split_of,
     trials_of,
@@ -241,6 +243,14 @@ def _check_sight(config: Mapping[str, Any]) -> None:
                 f"data.trials.{trial.name}.labels names {listed(trial.labels or ())}, none of which is in "
                 f"markers.tracked: {listed(tracked)}."
             )
+    everywhere = {number for trial in known_trials(config).values() for number in trial.tracked(tracked)}
+    if nowhere := [label for number, label in enumerate(tracked) if number not in everywhere]:
+        raise InputError(
+            f"markers.tracked names {listed(nowhere)}, which no trial has by data.trials.NAME.labels: name it there, "
+            "or leave it out."
+        )
+    if markers.get("frame") == "own":
+        _check_sets(trials, tracked)
     sight = sight_of(markers, tracked, tuple({tuple(trial.tracked(tracked)) for trial in trials}))
     if sight.plane is not None and data.get("axes") is None:
         raise InputError(
@@ -255,6 +265,18 @@ def _check_sight(config: Mapping[str, Any]) -> None:
             "identify.placement is set, but with markers.plane, or markers.frame own, recordings do not tell where "
             "markers sit and how the body lies: set it to null."
         )
+
+
+def _check_sets(trials: Sequence[Trial], tracked: Sequence[str]) -> None:
+    """Refuses trials that have some markers in common, and not all, where shapes of them are compared."""
+    has = {trial.name: {tracked[number] for number in trial.tracked(tracked)} for trial in trials}
+    for one, other in combinations(has, 2):
+        common, own = has[one] & has[other], has[one] ^ has[other]
+        if common and own:
+            raise InputError(
+                f"the trials '{one}' and '{other}' both have {listed(sorted(common))}, but only one has "
+                f"{listed(sorted(own))}: with markers.frame own they must have the same markers, or none in common."
+            )
 
 
 def _check_trials(config: Mapping[str, Any]) -> None:

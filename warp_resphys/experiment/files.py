@@ -110,9 +110,15 @@ class Dataset:
     base: FloatArray | None = None
 
     @property
+    def present(self) -> NDArray[np.bool_]:
+        """(R, M) whether a trial has a marker: whether that is seen in any of its frames."""
+        seen: NDArray[np.bool_] = np.isfinite(self.observed).all(axis=-1)
+        return np.asarray(seen.any(axis=1))
+
+    @property
     def sets(self) -> tuple[tuple[int, ...], ...]:
         """The numbers of the markers that trials have; none where all have all."""
-        kept = np.unique(np.isfinite(self.held).all(-1), axis=0)
+        kept = np.unique(self.present, axis=0)
         return () if kept.all() else tuple(tuple(np.flatnonzero(row).tolist()) for row in kept)
 
     def write(self, path: Path) -> None:

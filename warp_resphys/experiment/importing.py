@@ -147,7 +147,7 @@ def _dataset(
             times[row] = np.pad(each.moving.time, (0, frames - len(seen)), mode="edge")
         elif each.trial.begins == "rest":
             times[row] = np.minimum(np.arange(frames), steps) * settings["time_step"]
-            held[row] = markers[row, 0]
+            held[row] = np.where(np.isfinite(markers[row, 0]), markers[row, 0], held[row])
         else:
             held[row, has] = bound[has]  # A pose is as large as it is far from the undeformed body.
         if each.driven is not None:

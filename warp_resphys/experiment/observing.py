@@ -127,10 +127,6 @@ class Observer:
 
         return [each if each.tells_places else beside_others(each) for each in observed]
 
-    def _tracked(self, trial: Trial) -> list[str]:
-        """Those of the tracked markers that a trial has."""
-        return [self.tracked[number] for number in trial.tracked(self.tracked)]
-
     def _timed(self, trial: Trial, recording: Recording) -> tuple[Recording, Release | None]:
         """A recording, at the steps of the simulation if the body is driven, and when the body is let go if it is."""
         if not trial.is_released:
@@ -138,7 +134,7 @@ class Observer:
         self._check_rate(recording)
         if trial.begins == "released":
             return recording, _START
-        return recording, release_of(recording, self._tracked(trial), self.data["longest_gap"])
+        return recording, release_of(recording, self.reader.tracked_in(trial), self.data["longest_gap"])
 
     def _check_rate(self, recording: Recording) -> None:
         """Refuses a recording that is too slow, and says whether frames fall between the steps of the simulation."""
@@ -186,7 +182,7 @@ class Observer:
         if isinstance(motion, Mapping):
             poses = prescribed(motion, moving.time, self.data["folder"] or ".")
         elif motion == "reference":
-            count = len(self._tracked(trial))
+            count = len(self.reader.tracked_in(trial))
             poses = in_frame(followed(whole.positions[:, count:], still[count:], whole.source), transform)
         elif moving.base is not None:
             poses = in_frame(moving.base, transform)
@@ -234,7 +230,7 @@ class Observer:
 
     def _released(self, trial: Trial, recording: Recording, release: Release) -> Observed:
         """A body that was held, undeformed or as the file says, and let go."""
-        tracked = self._tracked(trial)
+        tracked = self.reader.tracked_in(trial)
         still = _median(_frames(recording, *release.rest), tracked)
         places = _rest_of(recording, tracked) if self.data["rest"] == "file" else still
         registration = self._register(trial, places, recording, self.reader.expected(trial))
@@ -257,12 +253,11 @@ class Observer:
         first = int(np.ceil(release.frame))
         whole = _frames(recording, first, first + len(moving.positions))
         base = self._base(trial, whole, moving, still, registration.transform)
-        seen = (trial.tracked(self.tracked), self.reader.sight(trial))
-        return Observed(trial, recording, *seen, moving, still, registration, driven, release, base=base)
+        return self._observed(trial, recording, moving, still, registration, driven, release=release, base=base)
 
     def _driven(self, trial: Trial, recording: Recording) -> Observed:
         """A body that rests until its inputs come, or one in a pose."""
-        static, tracked = trial.begins == STATIC, self._tracked(trial)
+        static, tracked = trial.begins == STATIC, self.reader.tracked_in(trial)
         if not static:
             check_motion(_frames(recording, 0, self.data["steps"] + 1), tracked)
         driven = None if self.drive is None else self._inputs(recording, trial, self.drive)
@@ -280,8 +275,11 @@ class Observer:
             moving = replace(moving, positions=_median(last, tracked)[None])
             driven = None if driven is None else np.median(driven[-frames:], axis=0)[None]
         base = None if static else self._base(trial, recording, moving, still, registration.transform)
-        seen = (trial.tracked(self.tracked), self.reader.sight(trial))
-        return Observed(trial, recording, *seen, moving, still, registration, driven, tells_places=tells, base=base)
+        return self._observed(trial, recording, moving, still, registration, driven, tells_places=tells, base=base)
+
+    def _observed(self, trial: Trial, recording: Recording, *found: Any, **more: Any) -> Observed:
+        """A trial, with which markers it has."""
+        return Observed(trial, recording, trial.tracked(self.tracked), self.reader.sight(trial), *found, **more)
 
     def _is_at_rest(self, driven: FloatArray) -> NDArray[np.bool_]:
         """(T,) whether (T, C) inputs are what a gauge shows of none."""
@@ -298,7 +296,7 @@ class Observer:
                 "rest."
             )
         resting = _frames(recording, 0, min(until, self._rest_frames(recording)))
-        return _central(resting, self._tracked(trial), np.mean, "rests")
+        return _central(resting, self.reader.tracked_in(trial), np.mean, "rests")
 
     def _inputs(self, recording: Recording, trial: Trial, drive: Drive) -> FloatArray:
         """(T, C) of the body's parts; refuses those of another number of parts, or beyond the limit."""
@@ -313,7 +311,7 @@ class Observer:
             )
         values = check_inputs(found, drive.quantity, count, trial.scale * data["input_limit"], recording.source)
         if data["valve"] == "detected" and not trial.is_released:
-            opening = valve_opening(recording, self._tracked(trial))
+            opening = valve_opening(recording, self.reader.tracked_in(trial))
             # Commanded inputs from that moment on; the step in which the valve opens has its share.
             frame = (opening - recording.start) * recording.rate
             values = np.asarray(values * np.clip(np.arange(len(values)) - frame, 0.0, 1.0)[:, None])

@@ -65,13 +65,17 @@ class Reader:
         self._table = None if table is None else Table(table["columns"], table.get("header_lines", 0))
         self._hanging: FloatArray | None = None
 
+    def tracked_in(self, trial: Trial) -> list[str]:
+        """Those of the tracked markers that a trial has."""
+        return [self.tracked[number] for number in trial.tracked(self.tracked)]
+
     def labels(self, trial: Trial) -> list[str]:
         """Of the configured markers that a trial has, the tracked ones first."""
-        return [*(self.tracked[number] for number in trial.tracked(self.tracked)), *self.markers["reference"]]
+        return [*self.tracked_in(trial), *self.markers["reference"]]
 
     def sight(self, trial: Trial) -> Sight:
         """How much the recording of a trial tells of where its tracked markers are."""
-        return sight_of(self.markers, [self.tracked[number] for number in trial.tracked(self.tracked)])
+        return sight_of(self.markers, self.tracked_in(trial))
 
     def expected(self, trial: Trial) -> FloatArray:
         """(M', 3) where the markers of a trial are when they are registered, on the undeformed body or as it hangs [m].
@@ -100,7 +104,13 @@ class Reader:
             found = self._assigned(trials, found)
         for trial in trials:
             if absent := [label for label in self.tracked if label not in self.labels(trial)]:
-                log.info("import: %s has no %s, by data.trials.%s.labels", trial.name, listed(absent), trial.name)
+                others = [label for label in trial.labels or () if label not in self.labels(trial)]
+                log.log(
+                    logging.WARNING if others else logging.INFO,
+                    "import: %s has no %s, by data.trials.%s.labels%s",
+                    *(trial.name, listed(absent), trial.name),
+                    f", and of its {listed(others)} nothing is configured" if others else "",
+                )
         pairs = zip(trials, found, strict=True)
         return [self._with_depth(trial, recording.select(self.labels(trial))) for trial, recording in pairs]
 

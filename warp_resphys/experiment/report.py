@@ -311,7 +311,7 @@ def _as_seen(film: Film, dataset: Dataset, config: Mapping[str, Any], mesh: Mesh
     """The same, with the bodies carried to where their markers are seen."""
     if dataset.bound is None or not (sight := sight_of(config["markers"], dataset.labels, dataset.sets)).own:
         return film
-    has = np.flatnonzero(np.isfinite(dataset.held[dataset.names.index(film.trial)]).all(-1)).tolist()
+    has = np.flatnonzero(dataset.present[dataset.names.index(film.trial)]).tolist()
     markers = bound_markers(config["markers"], mesh, dataset.bound, dataset.labels)
     sight = sight.select(has)
     at = {model: torch.from_numpy(each) for model, each in film.positions.items()}

@@ -4,6 +4,7 @@ import os
 import platform
 import shutil
 import subprocess
+from functools import lru_cache
 from pathlib import Path
 
 import torch
@@ -31,6 +32,12 @@ def _processor() -> str:
             if key.strip() == "model name":
                 return value.strip()
     return platform.processor() or platform.machine()
+
+
+@lru_cache
+def made_on() -> dict[str, str]:
+    """`hardware` and `commit`, as this process began with them."""
+    return {**hardware(), "commit": commit() or "not known"}
 
 
 def commit() -> str | None:

@@ -152,6 +152,8 @@ def _run_stage(stage: Stage, context: StageContext, finished: list[str]) -> floa
 
 
 def _write_record(stage: Stage, context: StageContext, seconds: float) -> None:
+    from .machine import made_on  # imports torch, which not all who name stages need
+
     write_json(
         _record(context.run_dir, stage.name),
         {
@@ -162,6 +164,7 @@ def _write_record(stage: Stage, context: StageContext, seconds: float) -> None:
             "outputs": {name: _identity(context.run_dir / name) for name in stage.outputs},
             "settings": to_plain(stage.settings),
             "versions": package_versions(),
+            "machine": made_on(),
         },
     )
 

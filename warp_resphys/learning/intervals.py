@@ -40,7 +40,7 @@ class Intervals:
 
         The quantile is the lowest with which intervals from all calibrating trials but one hold often enough in that
         one, on average; the largest deviation of all, if none does or there is one trial. All trials weigh the same.
-        Markers that none of them shows get the largest quantile of those that are shown.
+        Markers that none of them shows get the largest quantile of those that are shown: nothing says that these hold.
 
         Args:
             simulated: (T, M, 3) of each trial [m], by the model.

@@ -166,7 +166,7 @@ def marker_errors(simulated: NDArray[np.float64], observed: NDArray[np.float64])
 def errors_per_marker(
     simulated: NDArray[np.float64], observed: NDArray[np.float64], labels: Sequence[str]
 ) -> dict[str, float | None]:
-    """Return the mean error of each marker [mm]; None where a roll-out diverged or the marker was never seen.
+    """Return the mean error of each marker that was seen [mm]; None where a roll-out diverged.
 
     Args:
         simulated: (R, T, M, 3) [m], NaN where a roll-out diverged.
@@ -176,7 +176,8 @@ def errors_per_marker(
     found: dict[str, float | None] = {}
     for m, label in enumerate(labels):
         errors = [marker_errors(x[:, m : m + 1], y[:, m : m + 1]) for x, y in zip(simulated, observed, strict=True)]
-        found[label] = _finite_mean(np.concatenate(errors)) if any(map(len, errors)) else None
+        if any(map(len, errors)):
+            found[label] = _finite_mean(np.concatenate(errors))
     return found
 
 

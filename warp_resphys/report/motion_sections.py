@@ -234,10 +234,11 @@ def _markers(data: RunReport, trials: Trials, row: int, place: str, which: str, 
     from . import motion_figures
 
     reach = np.nanmax(np.linalg.norm(trials.target[row] - trials.bound, axis=2), axis=0, initial=0.0)
-    kept = np.sort(np.argsort(-reach)[:_MOST_MARKERS])
+    seen = np.flatnonzero(np.isfinite(trials.target[row]).all(-1).any(0))
+    kept = np.sort(seen[np.argsort(-reach[seen])[:_MOST_MARKERS]])
     moved = {m: (trials.positions[m][row] - trials.bound)[:, kept] for m in _ONE_BY_ONE if m in trials.positions}
     target, labels = (trials.target[row] - trials.bound)[:, kept], [trials.labels[marker] for marker in kept]
-    name, hidden = trials.names[row], len(trials.labels) - len(kept)
+    name, hidden = trials.names[row], len(seen) - len(kept)
     bands, series = _bands(data, trials, row, kept.tolist()), (trials.times[row], target, moved)
     return canvas.figure(
         f"paths_{place}",
@@ -256,7 +257,9 @@ def _start(trials: Trials, row: int) -> FloatArray:
 
 def _tip_paths(data: RunReport, trials: Trials, row: int, seconds: float) -> tuple[Any, ...]:
     """(T,) first times [s], and (T, 3) how the mean of the markers at the tip moves [m]: measured, and by model."""
-    tip = tip_markers(trials.bound, data.mesh.vertices[data.fixed])
+    shown = np.flatnonzero(np.isfinite(trials.target[row]).all(-1).any(0))
+    tip = np.intersect1d(tip_markers(trials.bound, data.mesh.vertices[data.fixed]), shown)
+    tip = tip if len(tip) else shown
     rest = _start(trials, row)[tip].mean(axis=0)
     near = trials.times[row] <= seconds + 1e-9
     models = {m: trials.positions[m] for m in MODELS if m in trials.positions}

@@ -257,7 +257,8 @@ def error_section(data: RunReport, canvas: Canvas) -> Part | None:
     if len(rows) > 1:
         blocks.append(model_table("Each trial [mm]", _numbers(rows)))
     if found := metrics.get("per_marker"):
-        each = {label: {m: markers.get(label) for m, markers in found.items()} for label in trials.labels}
+        shown = [label for label in trials.labels if any(label in markers for markers in found.values())]
+        each = {label: {m: markers.get(label) for m, markers in found.items()} for label in shown}
         blocks.append(model_table("Each marker [mm]", _numbers(each)))
     return Part("Error over time" if trials.moves else "Each trial", blocks) if blocks else None
 

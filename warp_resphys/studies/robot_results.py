@@ -1,13 +1,12 @@
 """What the runs of robots have shown, and the parts of the page on them."""
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from ..io.errors import InputError
-from ..io.machine import commit, hardware
 from ..learning.metrics import Gain, paired_gain
 from ..report.page import (
     MINUS,
@@ -39,9 +38,10 @@ class Measured:
     """What a run of a robot has shown.
 
     Attributes:
-        day: on which it ended.
-        machine: and the commit that read it, and the packages that it ran with.
+        day: on which its errors were measured (UTC).
+        machine: on which, with the commit and the packages.
         arguments: of the command, without folders of that machine.
+        beyond: those that are not the robot's own, such as ``budget=quick``.
         tested: the trials.
         how: they were kept from the training.
         errors_mm: by model, as `metrics.summarise` has them.
@@ -54,6 +54,7 @@ class Measured:
     day: str
     machine: Mapping[str, str]
     arguments: tuple[str, ...]
+    beyond: tuple[str, ...]
     tested: tuple[str, ...]
     how: str
     errors_mm: Mapping[str, Mapping[str, Any]]
@@ -63,18 +64,19 @@ class Measured:
     moved_mm: float | None
 
     @classmethod
-    def of(cls, run: Run) -> "Measured":
+    def of(cls, run: Run, beyond: Sequence[str]) -> "Measured":
         """Reads the folder of a run that has succeeded."""
-        metrics = run.metrics
+        metrics, made = run.metrics, run.evaluation
         tested = list(metrics.get("folds", {})) or [row["name"] for row in metrics["per_trajectory"]]
         how = "each of them kept back once" if "folds" in metrics and len(tested) > 1 else "kept back"
         how = "in the part that was not learned from" if learned_in_part(run.settings, tested) else how
         return cls(
-            day=run.day,
-            machine={**hardware(), "commit": commit() or "not known", **metrics["versions"]},
+            day=str(made["finished"]).partition("T")[0],
+            machine={**made.get("machine", {}), **made["versions"]},
             arguments=tuple(
                 "data.folder=FOLDER" if each.startswith("data.folder=") else each for each in run.arguments
             ),
+            beyond=tuple(beyond),
             tested=tuple(tested),
             how=how,
             errors_mm={model: metrics["errors_mm"][model] for model in _MODELS if model in metrics["errors_mm"]},
@@ -87,7 +89,7 @@ class Measured:
     def plain(self) -> dict[str, Any]:
         """As plain data."""
         gains = {model: None if each is None else each._asdict() for model, each in self.gains.items()}
-        return {**asdict(self), "gains": gains}
+        return {**{key: list(x) if isinstance(x, tuple) else x for key, x in asdict(self).items()}, "gains": gains}
 
     @classmethod
     def from_plain(cls, found: Mapping[str, Any]) -> "Measured":
@@ -99,7 +101,7 @@ class Measured:
         if set(found) != {field.name for field in fields(cls)}:
             raise InputError("what is kept of earlier runs is of another version of this program.")
         gains = {model: None if each is None else Gain(**each) for model, each in found["gains"].items()}
-        words = {key: tuple(found[key]) for key in ("arguments", "tested")}
+        words = {key: tuple(found[key]) for key in ("arguments", "beyond", "tested")}
         return cls(**{**found, **words, "gains": gains})
 
     @property
@@ -124,15 +126,16 @@ def _seconds(metrics: Mapping[str, Any]) -> float:
     return float(sum(sum(each["seconds"].values()) for each in every))
 
 
-def summary(robots: Mapping[str, Any], found: Mapping[str, Measured]) -> Part:
-    """A row for each robot."""
+def summary(robots: Mapping[str, Any], found: Mapping[str, Measured], failed: Container[str]) -> Part:
+    """A row for each robot; what is known of one that failed now is of an earlier run."""
     rows = []
     for name, each in found.items():
         errors = each.errors_mm
         cells = [Cell(*error_parts(errors[model])) if model in errors else Cell(NONE) for model in _MODELS]
         cells += [Cell(_gain_text(gain)) for gain in each.gains.values()]
         cells += [Cell(_coverage(each.intervals)), Cell(duration_text(each.seconds))]
-        rows.append(Row(robots[name]["title"], cells, small=robots[name]["actuation"]))
+        small = [robots[name]["actuation"], *each.beyond, *([f"failed since {each.day}"] if name in failed else [])]
+        rows.append(Row(robots[name]["title"], cells, small="; ".join(small)))
     note = (
         "Mean distance of the markers in what no training and no identification saw [mm], ± the standard "
         "deviation over trials. Less error: the share that SysID takes away of the uncorrected error, and ResPhys of "

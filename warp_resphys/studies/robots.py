@@ -41,11 +41,13 @@ def robots(config: Mapping[str, Any], folder: Path) -> None:
             f"data is {config['data']}, where there is none of {where}: give the folder with the recordings."
         )
     kept = None if config["results"] is None else Path(config["results"]) / f"{NAME}.json"
+    beyond = _beyond(config)
     with run_lock(folder):
-        known = {} if kept is None else _kept(kept)
+        _check_kept(kept, [name for name in chosen if name not in absent], beyond)
         runs = [_run(config, name, folder) for name in chosen if name not in absent]
         results = run_all(runs, folder / "logs")
-        new = {run.experiment: Measured.of(run) for run in results if run.failure is None}
+        new = {run.experiment: Measured.of(run, beyond) for run in results if run.failure is None}
+        known = _kept(kept)  # once more: another process may have finished in the meantime
         found = {name: each for name in config["robots"] if (each := new.get(name, known.get(name))) is not None}
         page = folder / f"{NAME}.html"
         with figures_beside(page) as pictures:
@@ -55,10 +57,11 @@ def robots(config: Mapping[str, Any], folder: Path) -> None:
                 for name in found.keys() - new.keys():
                     with suppress(FileNotFoundError):
                         shutil.copy(kept.parent / NAME / f"{name}.png", pictures)
-            parts = [summary(config["robots"], found)]
+            failed = {run.experiment for run in results if run.failure is not None}
+            parts = [summary(config["robots"], found, failed)]
             parts += [details(name, config["robots"][name], each, pictures) for name, each in found.items()]
         parts += [_not_run(config, results, [name for name in absent if name not in found])]
-        parts += [machines(config["robots"], found), command_part(NAME, hidden=("data", "runs"))]
+        parts += [machines(config["robots"], found), command_part(NAME, hidden=("data", "runs", "results"))]
         page_of = Results(
             "Robots",
             f"{datetime.now():%Y-%m-%d}",
@@ -67,18 +70,39 @@ def robots(config: Mapping[str, Any], folder: Path) -> None:
         )
         page_of.write(page, config["results"], NAME)
         if kept is not None:
-            write_json(kept, {name: each.plain() for name, each in found.items()})
+            write_json(kept, {name: each.plain() for name, each in {**found, **known, **new}.items()})
     fail_for(results)
 
 
-def _kept(path: Path) -> dict[str, Measured]:
-    """What earlier runs have shown, by robot.
+def _beyond(config: Mapping[str, Any]) -> tuple[str, ...]:
+    """What all robots are run with that is not their own."""
+    return (*config["overrides"], *([] if config["budget"] == "full" else [f"budget={config['budget']}"]))
+
+
+def _check_kept(path: Path | None, names: Sequence[str], beyond: Sequence[str]) -> None:
+    """Refuses to put rows in place of those that were measured with other settings.
+
+    Raises:
+        InputError: see there, and `_kept`.
+    """
+    known = _kept(path)
+    for name in names:
+        if name in known and known[name].beyond != tuple(beyond):
+            said = [" ".join(each) or "no more than its own settings" for each in (known[name].beyond, beyond)]
+            raise InputError(
+                f"{path} has {name} with {said[0]}, and this would replace it by one with {said[1]}: give another "
+                "folder as results."
+            )
+
+
+def _kept(path: Path | None) -> dict[str, Measured]:
+    """What earlier runs have shown, by robot; nothing where nothing is kept.
 
     Raises:
         InputError: the file is not one of this version.
         DataFileError: it is damaged.
     """
-    if not path.is_file():
+    if path is None or not path.is_file():
         return {}
     try:
         return {name: Measured.from_plain(each) for name, each in read_json(path).items()}
@@ -101,9 +125,7 @@ def _place(config: Mapping[str, Any], name: str) -> Path:
 def _run(config: Mapping[str, Any], name: str, folder: Path) -> Run:
     """The run of a robot, whose recordings have been checked and, where they have to be, converted."""
     robot = config["robots"][name]
-    overrides = [*robot["overrides"], *config["overrides"]]
-    if config["budget"] != "full":
-        overrides.append(f"budget={config['budget']}")
+    overrides = [*robot["overrides"], *_beyond(config)]
     run_folder = Path(config["runs"]) / robot["experiment"] / run_label(overrides, ("experiment", "device"))
     if robot["recordings"] is not None:
         place = _place(config, name)

@@ -61,17 +61,13 @@ class Run:
     @property
     def settings(self) -> dict[str, Any]:
         """The whole configuration of the run."""
-        return dict(self._report["settings"]["config"])
+        return dict(read_json(self.folder / "stages" / "report.json")["settings"]["config"])
 
     @property
-    def day(self) -> str:
-        """On which it ended, such as 2024-05-13 (UTC)."""
-        return str(self._report["finished"]).partition("T")[0]
-
-    @property
-    def _report(self) -> dict[str, Any]:
-        """How its last stage went."""
-        return dict(read_json(self.folder / "stages" / "report.json"))
+    def evaluation(self) -> dict[str, Any]:
+        """What is kept of the stage that measured its errors, the last of those of its folds."""
+        paths = [path for each in (".", "fold_*") for path in self.folder.glob(f"{each}/stages/evaluate.json")]
+        return max((dict(read_json(path)) for path in paths), key=lambda found: str(found["finished"]))
 
 
 def asked_for(config: Mapping[str, Any], known: Sequence[str], kind: str) -> set[str]:

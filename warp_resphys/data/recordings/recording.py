@@ -62,7 +62,8 @@ class Recording:
         if missing:
             raise DataFileError(
                 f"{self.source} has no marker named {listed(missing)}; it has {listed(self.labels)}: "
-                "set the marker names in the configuration to those of the recording."
+                "set the marker names in the configuration to those of the recording, or name the markers that it has "
+                "in data.trials.NAME.labels."
             )
         columns = [self.labels.index(label) for label in labels]
         rest = None if self.rest is None else self.rest[columns]

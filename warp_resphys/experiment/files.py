@@ -112,7 +112,7 @@ class Dataset:
     @property
     def present(self) -> NDArray[np.bool_]:
         """(R, M) whether a trial has a marker: whether that is seen in any of its frames."""
-        seen: NDArray[np.bool_] = np.isfinite(self.observed).all(axis=-1)
+        seen = np.asarray(np.isfinite(self.observed).all(axis=-1))
         return np.asarray(seen.any(axis=1))
 
     @property

@@ -40,6 +40,8 @@ TRIALS = [
     *(f"+markers.tracked.N{number}={place}" for number, place in enumerate(ELSEWHERE, 1)),
 ]
 SPLIT = ["data.train=[slow]", "data.test=[fast]"]
+NOISE = 0.02  # mm
+HIDDEN = {"slow": [0], "fast": []}  # frames in which the second marker is, and with it the shape
 PERIODS = {"slow": 16.0, "fast": 9.0}  # steps
 
 
@@ -85,8 +87,9 @@ def write(folder, found):
         x, y = markers[..., 0], -markers[..., 2]  # of the camera
         turned = np.exp(1j * angle)[:, None] * (x + 1j * y)
         turned = np.stack([turned.real, turned.imag], -1)
-        seen = 1e3 * (turned + drift[:, None]) + 0.02 * draw.normal(size=turned.shape)
+        seen = 1e3 * (turned + drift[:, None]) + NOISE * draw.normal(size=turned.shape)
         winch = np.where(frames < 2, np.nan, 1e3 * told[np.clip(frames - LATE[name], 0, None)])
+        seen[HIDDEN[name], 1] = np.nan
         table = np.column_stack([1e3 * frames / 60.0, winch, seen.reshape(len(frames), -1)])
         np.savetxt(folder / f"{name}.csv", table, delimiter=",", header="as the camera has it", fmt="%.9f")
 
@@ -104,17 +107,21 @@ def test_limbs_are_identified_by_their_shape(swum, tmp_path, monkeypatch):
         sight = Sight.of([*tracked(config, name).values()], ["x", "z"], "own")
         shapes = sight.of_arrays(markers[: STEPS + 1])
         columns = [dataset.labels.index(label) for label in tracked(config, name)]
+        shapes[HIDDEN[name]] = np.nan
         np.testing.assert_allclose(dataset.observed[dataset.names.index(name)][:, columns], shapes, atol=3e-4)
-        assert np.abs(shapes - shapes[:1]).max() > 3e-3
+        assert np.nanmax(np.abs(shapes - shapes[1])) > 3e-3
     factor = json.loads(Path("run/identification.json").read_text())["sysid"]["parameters"]["tendon_contraction_factor"]
     assert factor == pytest.approx(FACTOR, rel=0.03)
-    found = json.loads(Path("run/metrics.json").read_text())["errors_mm"]
-    errors = {name: each["mean"] for name, each in found.items()}
+    metrics = json.loads(Path("run/metrics.json").read_text())
+    errors = {name: each["mean"] for name, each in metrics["errors_mm"].items()}
+    assert {label: value is None for label, value in metrics["per_marker"]["sysid"].items()} == dict.fromkeys(
+        tracked(config, "fast"), False
+    )
     drawn = {path.stem for path in Path("run/figures").glob("*.png")}
     assert {"markers", "motion"} <= drawn
     assert not drawn & {"space", "plane_worst"}  # which a camera does not tell
     assert 3.0 * errors["sysid"] < errors["simulation"]
-    assert errors["resphys"] < 1.05 * errors["sysid"]
+    assert errors["resphys"] < errors["sysid"] + 0.25 * NOISE  # nothing is left to learn
 
 
 @pytest.mark.parametrize(

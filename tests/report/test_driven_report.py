@@ -367,6 +367,12 @@ def test_markers_that_are_drawn():
     measured[4, 3] = np.nan
     assert drawn_markers(measured, bound, clamped) == [2, 0]
     assert drawn_markers(measured[:, 1:2], bound[1:2], clamped) == [0]
+    measured[:, 2] = np.nan  # which that trial does not have
+    assert drawn_markers(measured, bound, clamped) == [1, 0]
+    measured[:, 1] = np.nan
+    assert drawn_markers(measured, bound, clamped) == [0]
+    measured[:, 0] = np.nan
+    assert drawn_markers(measured, bound, clamped) == [3]
 
 
 def test_error_lines_are_filtered_and_thin_behind():

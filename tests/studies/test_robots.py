@@ -92,22 +92,26 @@ def test_robots_of_earlier_runs_keep_their_rows(finished, tmp_path, monkeypatch)
     assert Path("docs/robots/fish_tail.png").is_file()
 
 
-def test_what_another_version_kept_is_refused(finished, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    Path("docs").mkdir()
-    Path("docs/robots.json").write_text('{"sopra": {"mean": 1.0}}')
-    code, err = run(*ARGUMENTS, "only=[sopra]", "results=docs")
-    assert code == 2
-    assert "robots.json is not what this version keeps of earlier runs: move it away" in err
-    assert not Path("runs").exists()
-
-
-def test_rows_of_other_settings_are_not_replaced(finished, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("kept", "arguments", "said"),
+    [
+        ('{"sopra": {"mean": 1.0}}', [], "robots.json is not what this version keeps of earlier runs: move it away"),
+        (
+            None,
+            ["budget=quick"],
+            "has sopra with no more than its own settings, and this would replace it by one with budget=quick",
+        ),
+    ],
+)
+def test_rows_that_cannot_be_kept_or_replaced_are_refused(kept, arguments, said, finished, tmp_path, monkeypatch):
+    """One of another version, and one that was measured with other settings."""
     monkeypatch.chdir(tmp_path)
     shutil.copytree(finished / "docs", "docs")
-    code, err = run(*ARGUMENTS, "only=[sopra]", "results=docs", "budget=quick")
+    if kept is not None:
+        Path("docs/robots.json").write_text(kept)
+    code, err = run(*ARGUMENTS, "only=[sopra]", "results=docs", *arguments)
     assert code == 2
-    assert "has sopra with no more than its own settings, and this would replace it by one with budget=quick" in err
+    assert said in err
     assert not Path("runs").exists()
 
 

@@ -253,7 +253,8 @@ class Observer:
         first = int(np.ceil(release.frame))
         whole = _frames(recording, first, first + len(moving.positions))
         base = self._base(trial, whole, moving, still, registration.transform)
-        return self._observed(trial, recording, moving, still, registration, driven, release=release, base=base)
+        sight, columns = self.reader.sight(trial), trial.tracked(self.tracked)
+        return Observed(trial, recording, columns, sight, moving, still, registration, driven, release, base=base)
 
     def _driven(self, trial: Trial, recording: Recording) -> Observed:
         """A body that rests until its inputs come, or one in a pose."""
@@ -275,11 +276,9 @@ class Observer:
             moving = replace(moving, positions=_median(last, tracked)[None])
             driven = None if driven is None else np.median(driven[-frames:], axis=0)[None]
         base = None if static else self._base(trial, recording, moving, still, registration.transform)
-        return self._observed(trial, recording, moving, still, registration, driven, tells_places=tells, base=base)
-
-    def _observed(self, trial: Trial, recording: Recording, *found: Any, **more: Any) -> Observed:
-        """A trial, with which markers it has."""
-        return Observed(trial, recording, trial.tracked(self.tracked), self.reader.sight(trial), *found, **more)
+        sight, columns = self.reader.sight(trial), trial.tracked(self.tracked)
+        fields = (trial, recording, columns, sight, moving, still, registration, driven)
+        return Observed(*fields, tells_places=tells, base=base)
 
     def _is_at_rest(self, driven: FloatArray) -> NDArray[np.bool_]:
         """(T,) whether (T, C) inputs are what a gauge shows of none."""

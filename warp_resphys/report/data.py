@@ -233,6 +233,11 @@ def tip_markers(bound: FloatArray, clamped: FloatArray) -> IntArray:
     return np.flatnonzero(away >= (1.0 - _TIP) * away.max())
 
 
+def shown_markers(target: FloatArray) -> IntArray:
+    """Return which of the markers (T, M, 3) of a trial were seen in any of its frames; NaN where one was not."""
+    return np.flatnonzero(np.isfinite(target).all(axis=2).any(axis=0))
+
+
 def drawn_markers(target: FloatArray, bound: FloatArray, clamped: FloatArray) -> list[int]:
     """Return the marker at the tip that moves most and, where there is one well above the tip, that of those.
 
@@ -244,7 +249,7 @@ def drawn_markers(target: FloatArray, bound: FloatArray, clamped: FloatArray) ->
     moved = np.nanmax(np.linalg.norm(target - bound, axis=2), axis=0, initial=0.0)  # (M,) [m]
     away = along_body(bound, clamped)
     others = np.flatnonzero(away < (1.0 - _OTHER) * away.max())
-    seen = np.flatnonzero(np.isfinite(target).all(2).any(0))
-    groups = [np.intersect1d(group, seen) for group in (tip_markers(bound, clamped), others)]
-    groups = [group for group in groups if len(group)] or [seen]
+    shown = shown_markers(target)
+    groups = [np.intersect1d(group, shown) for group in (tip_markers(bound, clamped), others)]
+    groups = [group for group in groups if len(group)] or [shown]
     return [int(group[np.argmax(moved[group])]) for group in groups]

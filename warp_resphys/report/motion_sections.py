@@ -22,6 +22,7 @@ from .data import (
     at_times,
     best_and_worst,
     drawn_markers,
+    shown_markers,
     shown_models,
     tip_markers,
 )
@@ -60,9 +61,7 @@ def motion_of(data: RunReport) -> Motion | None:
     if trials is None:
         return None
     hangs, away = _hangs(data, trials)
-    some = np.arange(len(trials.bound))
-    if trials.labels and film is not None and film.trial in trials.names:
-        some = np.flatnonzero(np.isfinite(trials.target[trials.names.index(film.trial)]).all(-1).any(0))
+    some = None
     if not trials.labels:
         row = trials.worst
         film = Film(trials.names[row], trials.times[row], {m: q[row] for m, q in trials.positions.items()})
@@ -71,6 +70,7 @@ def motion_of(data: RunReport) -> Motion | None:
     if film is None or film.trial not in trials.names or not shown_models(film.positions):
         return None
     row, models = trials.names.index(film.trial), shown_models(film.positions)
+    some = shown_markers(trials.target[row]) if some is None else some
     times = trials.times[row]
     frames = np.flatnonzero(np.append(True, np.diff(times) > 0.0))
     if len(frames) > len(film.times):  # The closest ones.
@@ -234,11 +234,11 @@ def _markers(data: RunReport, trials: Trials, row: int, place: str, which: str, 
     from . import motion_figures
 
     reach = np.nanmax(np.linalg.norm(trials.target[row] - trials.bound, axis=2), axis=0, initial=0.0)
-    seen = np.flatnonzero(np.isfinite(trials.target[row]).all(-1).any(0))
-    kept = np.sort(seen[np.argsort(-reach[seen])[:_MOST_MARKERS]])
+    shown = shown_markers(trials.target[row])
+    kept = np.sort(shown[np.argsort(-reach[shown])[:_MOST_MARKERS]])
     moved = {m: (trials.positions[m][row] - trials.bound)[:, kept] for m in _ONE_BY_ONE if m in trials.positions}
     target, labels = (trials.target[row] - trials.bound)[:, kept], [trials.labels[marker] for marker in kept]
-    name, hidden = trials.names[row], len(seen) - len(kept)
+    name, hidden = trials.names[row], len(shown) - len(kept)
     bands, series = _bands(data, trials, row, kept.tolist()), (trials.times[row], target, moved)
     return canvas.figure(
         f"paths_{place}",
@@ -257,7 +257,7 @@ def _start(trials: Trials, row: int) -> FloatArray:
 
 def _tip_paths(data: RunReport, trials: Trials, row: int, seconds: float) -> tuple[Any, ...]:
     """(T,) first times [s], and (T, 3) how the mean of the markers at the tip moves [m]: measured, and by model."""
-    shown = np.flatnonzero(np.isfinite(trials.target[row]).all(-1).any(0))
+    shown = shown_markers(trials.target[row])
     tip = np.intersect1d(tip_markers(trials.bound, data.mesh.vertices[data.fixed]), shown)
     tip = tip if len(tip) else shown
     rest = _start(trials, row)[tip].mean(axis=0)

@@ -1,41 +1,60 @@
-"""Tendons that slide without friction through guides: stress, tangent and derivatives by what pulls.
+"""Tendons that slide without friction through guides: stress, tangent and derivatives by what pulls and where it runs.
 
 A point is the piece of a tendon between two guides. The first column of F = sum_a x_a g_a^T is the vector from one to
-the other. A tendon's tension is that commanded, and that of a spring that only pulls, stretched by what the tendon is
-longer than its winch leaves it.
+the other, the two others how it changes as the guides move in the body along the tendon's two directions, by a
+millimetre each. So a piece is F c, with c = (1, offsets in millimetres). A tendon's tension is that commanded, and that
+of a spring that only pulls, stretched by what the tendon is longer than its winch leaves it.
 """
 
 import warp as wp
 
 from .fibres import tension
 from .modules import decorators
-from .points import line_at, write_axial
+from .points import deformation_gradient
 
-ZERO = wp.float64(0.0)
+ZERO, ONE = wp.float64(0.0), wp.float64(1.0)
+OFFSET_UNIT = 1e-3  # of the offsets [m], by which the columns of F are of one size
+PER_METRE = wp.float64(1.0 / OFFSET_UNIT)
 
 kernel, function = decorators("tendons")
+
+
+@function
+def direction_of(line: wp.vec3d) -> wp.vec3d:
+    """The unit vector along a piece; zero for one without a length."""
+    length = wp.length(line)
+    result = wp.vec3d(ZERO, ZERO, ZERO)
+    if length > ZERO:
+        result = line / length
+    return result
 
 
 @kernel
 def pull(
     nodes: wp.array2d[int],
     gradients: wp.array2d[wp.vec3d],
-    first: wp.array[int],  # (T + 1) pieces of each tendon, those at rest
-    rest_length: wp.array[wp.float64],  # (T) of a tendon that nothing contracts [m]
+    first: wp.array[int],  # (T + 1) pieces of each tendon
+    rest: wp.array[wp.mat33d],  # (P) F of the undeformed body
+    first_offset: wp.array2d[wp.float64],  # (B, T) [m]
+    second_offset: wp.array2d[wp.float64],
     commanded: wp.array2d[wp.float64],  # (B, T) tension [N]
     contraction: wp.array2d[wp.float64],  # (B, T) [m]
     stiffness: wp.array2d[wp.float64],  # (B, T) of the spring [N/m]
     toe: wp.float64,  # over which the spring tightens [m]
     positions: wp.array2d[wp.vec3d],
+    along_out: wp.array2d[wp.vec3d],  # (B, T) c
     tension_out: wp.array2d[wp.float64],  # (B, T) [N]
     spring_out: wp.array2d[wp.vec3d],  # (B, T) energy, force and slope of a spring of stiffness one [m^2, m, -]
 ):
-    """The tension of each tendon."""
+    """The tension of each tendon, and where it runs."""
     b, t = wp.tid()
-    length = ZERO
+    c = wp.vec3d(ONE, PER_METRE * first_offset[b, t], PER_METRE * second_offset[b, t])
+    along_out[b, t] = c
+    longer = ZERO
     for p in range(first[t], first[t + 1]):
-        length += wp.length(line_at(positions, nodes, gradients, b, p, p))
-    energy, force, slope = tension(length - rest_length[t] + contraction[b, t], toe)
+        f = deformation_gradient(positions, nodes, gradients, b, p, p)
+        longer += wp.length(f * c) - wp.length(rest[p] * c)
+    energy, force, slope = tension(longer + contraction[b, t], toe)
     spring_out[b, t] = wp.vec3d(energy, force, slope)
     tension_out[b, t] = commanded[b, t] + stiffness[b, t] * force
 
@@ -48,7 +67,8 @@ def local_step(
     tendon: wp.array[int],  # (P)
     commanded: wp.array2d[wp.float64],
     stiffness: wp.array2d[wp.float64],
-    total: wp.array2d[wp.float64],  # (B, T) what `pull` wrote
+    along: wp.array2d[wp.vec3d],  # (B, T) what `pull` wrote
+    total: wp.array2d[wp.float64],
     spring: wp.array2d[wp.vec3d],
     positions: wp.array2d[wp.vec3d],
     stress_out: wp.array2d[wp.mat33d],
@@ -57,15 +77,12 @@ def local_step(
     """T L of the commanded tension, and the spring's energy with the first piece."""
     b, p = wp.tid()
     t = tendon[p]
-    along = line_at(positions, nodes, gradients, b, p, p)
-    length = wp.length(along)
-    energy = commanded[b, t] * length
+    c = along[b, t]
+    line = deformation_gradient(positions, nodes, gradients, b, p, p) * c
+    energy = commanded[b, t] * wp.length(line)
     if p == first[t]:
         energy += stiffness[b, t] * spring[b, t][0]
-    force = wp.vec3d(ZERO, ZERO, ZERO)
-    if length > ZERO:
-        force = (total[b, t] / length) * along
-    stress_out[b, p] = wp.mat33d(force[0], ZERO, ZERO, force[1], ZERO, ZERO, force[2], ZERO, ZERO)
+    stress_out[b, p] = total[b, t] * wp.outer(direction_of(line), c)
     energy_out[b, p] = energy
 
 
@@ -74,51 +91,73 @@ def tangent(
     nodes: wp.array2d[int],
     gradients: wp.array2d[wp.vec3d],
     tendon: wp.array[int],
+    along: wp.array2d[wp.vec3d],
     total: wp.array2d[wp.float64],
     positions: wp.array2d[wp.vec3d],
     tangent_out: wp.array3d[wp.mat33d],
 ):
-    """Block (0, 0) is T / l (1 - u u^T), at a given tension; that of its change couples all pieces of a tendon."""
+    """Block (i, j) is c_i c_j T / l (1 - u u^T), at a given tension; its change couples all pieces of a tendon."""
     b, p = wp.tid()
-    along = line_at(positions, nodes, gradients, b, p, p)
-    length = wp.length(along)
-    across = ZERO
+    c = along[b, tendon[p]]
+    line = deformation_gradient(positions, nodes, gradients, b, p, p) * c
+    length = wp.length(line)
+    stiffness = ZERO
     if length > ZERO:
-        across = total[b, tendon[p]] / length
-    write_axial(along, across, ZERO, tangent_out[b, p])
+        stiffness = total[b, tendon[p]] / length
+    u = direction_of(line)
+    block = stiffness * (wp.identity(n=3, dtype=wp.float64) - wp.outer(u, u))
+    tangent_out[b, p, 0] = (c[0] * c[0]) * block
+    tangent_out[b, p, 1] = (c[1] * c[0]) * block
+    tangent_out[b, p, 2] = (c[1] * c[1]) * block
+    tangent_out[b, p, 3] = (c[2] * c[0]) * block
+    tangent_out[b, p, 4] = (c[2] * c[1]) * block
+    tangent_out[b, p, 5] = (c[2] * c[2]) * block
 
 
 @kernel
 def directions(
     nodes: wp.array2d[int],
     gradients: wp.array2d[wp.vec3d],
+    tendon: wp.array[int],
+    along: wp.array2d[wp.vec3d],
     positions: wp.array2d[wp.vec3d],
-    direction_out: wp.array2d[wp.vec3d],  # (B, P)
+    direction_out: wp.array2d[wp.mat33d],  # (B, P)
 ):
-    """Unit vectors along the pieces."""
+    """What lengthens a tendon: u c^T of its pieces, with the unit vectors u along them."""
     b, p = wp.tid()
-    along = line_at(positions, nodes, gradients, b, p, p)
-    length = wp.length(along)
-    result = wp.vec3d(ZERO, ZERO, ZERO)
-    if length > ZERO:
-        result = along / length
-    direction_out[b, p] = result
+    c = along[b, tendon[p]]
+    line = deformation_gradient(positions, nodes, gradients, b, p, p) * c
+    direction_out[b, p] = wp.outer(direction_of(line), c)
 
 
 @kernel
-def shortening(
+def adjoint(
     nodes: wp.array2d[int],
     gradients: wp.array2d[wp.vec3d],
+    tendon: wp.array[int],
+    rest: wp.array[wp.mat33d],
+    along: wp.array2d[wp.vec3d],
+    total: wp.array2d[wp.float64],
     positions: wp.array2d[wp.vec3d],
     direction: wp.array2d[wp.vec3d],  # (B, N) z = H^-1 dL/dx [m]
-    shortening_out: wp.array2d[wp.float64],  # (B, P) -u . dz, dL/dT of this piece
+    by_tension_out: wp.array2d[wp.float64],  # (B, P) -u . dZ c, dL/dT of this piece [m]
+    by_offset_out: wp.array2d[wp.vec2d],  # (B, P) dL/d offset at a given tension [N]
+    longer_out: wp.array2d[wp.vec2d],  # (B, P) how much longer than at rest an offset makes this piece
 ):
-    """How much shorter a displacement makes each piece."""
+    """What a displacement does to each piece, with F and dZ of the positions and of the displacement."""
     b, p = wp.tid()
-    along = line_at(positions, nodes, gradients, b, p, p)
-    dz = line_at(direction, nodes, gradients, b, p, p)
-    length = wp.length(along)
-    result = ZERO
-    if length > ZERO:
-        result = -wp.dot(along, dz) / length
-    shortening_out[b, p] = result
+    t = tendon[p]
+    c = along[b, t]
+    f = deformation_gradient(positions, nodes, gradients, b, p, p)
+    dz = deformation_gradient(direction, nodes, gradients, b, p, p)
+    line, moved = f * c, dz * c
+    u, u_rest = direction_of(line), direction_of(rest[p] * c)
+    shorter = -wp.dot(u, moved)
+    turned = wp.vec3d(ZERO, ZERO, ZERO)
+    if wp.length(line) > ZERO:
+        turned = (moved + shorter * u) / wp.length(line)
+    by_offset = -total[b, t] * (wp.transpose(dz) * u + wp.transpose(f) * turned)
+    longer = wp.transpose(f) * u - wp.transpose(rest[p]) * u_rest
+    by_tension_out[b, p] = shorter
+    by_offset_out[b, p] = PER_METRE * wp.vec2d(by_offset[1], by_offset[2])
+    longer_out[b, p] = PER_METRE * wp.vec2d(longer[1], longer[2])

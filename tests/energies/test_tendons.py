@@ -108,6 +108,43 @@ def test_guides_are_where_they_were_put(kind):
     np.testing.assert_allclose(found, np.diff(places, axis=0), atol=1e-12)
 
 
+ACROSS = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]  # a beam's tendons
+
+
+@pytest.mark.parametrize("start", POSES)
+def test_gradients_by_where_tendons_run(start):
+    """With a winch and a commanded tension at once, at rest, bent and turned."""
+    solver = SolverSettings(relative_tolerance=1e-11, linear_solver="banded")
+    turning = np.linspace([0.0, 1.0, 0.2], [0.0, -0.5, 1.0], 7)
+    directions = [ACROSS, [turning, [0.3, 0.0, 1.0]]]
+    stiffness = np.array([400.0, 900.0])
+    sim = simulator(
+        *(route(0.014), route(0.006, depth=0.006)), stiffness=stiffness, directions=directions, solver=solver
+    )
+    sim = replace(sim, material=replace(SOFT, poissons_ratio=0.499, stiffness_damping=1e-3), integrator="bdf2")
+    rows = [row for row in check_gradients(sim, start) if row.parameter.startswith("tendon")]
+    names = {row.parameter for row in rows}
+    assert {"tendon_offset_1, each tendon", "tendon_offset_2, each tendon", "tendon_offset_1"} <= names
+    assert {row.parameter: row.relative_error for row in rows if not row.relative_error < 1e-6} == {}
+
+
+@pytest.mark.parametrize("solver", ["newton", "quasi_newton", "projective_dynamics"])
+def test_a_tendon_that_is_off_is_one_that_was_routed_there(solver):
+    """Within the cells of a beam the shape functions are linear along each axis: an offset along one is exact."""
+    settings = SolverSettings(solver, relative_tolerance=1e-10)
+    offset = {"tendon_offset_1": torch.tensor([[3e-3, -2e-3]], dtype=torch.float64)}
+    drive = Inputs(tendon_tension=torch.tensor([[0.5, 0.0]], dtype=torch.float64))
+    drive = drive.replace(tendon_contraction=torch.tensor([[0.0, 2e-3]], dtype=torch.float64))
+    more = {"stiffness": 500.0, "solver": settings}
+    given = simulator(route(0.013), route(0.009), directions=[[[0.0, 0.0, 1.0]], [[0.0, 0.0, 1.0]]], **more)
+    there = simulator(route(0.016), route(0.007), **more)
+    ends = [given.step(given.rest_state(), drive, offset)[0].q, there.step(there.rest_state(), drive)[0].q]
+    torch.testing.assert_close(*ends, rtol=0.0, atol=1e-9)
+    assert float((ends[1] - there.rest_positions).abs().max()) > 1e-3
+    zero = given.step(given.rest_state(), drive)[0].q
+    assert float((zero - ends[1]).abs().max()) > 1e-4
+
+
 @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2", "midpoint"])
 @pytest.mark.parametrize("start", POSES)
 def test_gradients(start, integrator):
@@ -120,12 +157,14 @@ def test_gradients(start, integrator):
     assert {name: row.relative_error for name, row in rows.items() if not row.relative_error < 1e-6} == {}
 
 
-def test_the_hessian_has_what_couples_the_pieces_of_a_tendon():
+@pytest.mark.parametrize("offset", [None, 2e-3])
+def test_the_hessian_has_what_couples_the_pieces_of_a_tendon(offset):
     """Against central differences of the residual, as a product, a solution and a matrix."""
-    sim = simulator(route(0.018), stiffness=5e3)
+    sim = simulator(route(0.018), stiffness=5e3, directions=[] if offset is None else [ACROSS])
     acting = Inputs(tendon_contraction=torch.tensor([[2e-3]], dtype=torch.float64))
-    there = sim.static_equilibrium(acting)
-    lines = sim.linearise(there, acting)
+    given = {} if offset is None else {"tendon_offset_1": offset, "tendon_offset_2": -offset}
+    there = sim.static_equilibrium(acting, given)
+    lines = sim.linearise(there, acting, given)
     direction = torch.randn(there.q.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     direction[:, sim.fixed] = 0.0
     step = 1e-7
@@ -187,6 +226,16 @@ def test_a_tendon_cannot_push():
         (lambda: Tendons([route(0.01)[[0, 1, 1]]]), "two guides in a row at one place"),
         (lambda: Tendons([route(0.01)], stiffness=-1.0), "tendon_stiffness is -1: it must be zero or more, in N/m"),
         (lambda: Tendons([route(0.01)], toe=0.0), "the toe of tendons is 0"),
+        (
+            lambda: Tendons([route(0.01)], directions=[ACROSS, ACROSS]),
+            "directions of offsets for 2 tendons, [2, 2] in number, but 1 tendons: give the same number for each",
+        ),
+        (lambda: Tendons([route(0.01)], directions=[[*ACROSS, ACROSS[0]]]), "3 directions of offsets: give one or two"),
+        (
+            lambda: Tendons([route(0.01)], directions=[[[1.0, 0.0]]]),
+            "of shape (2,): give three numbers, or three for each",
+        ),
+        (lambda: Tendons([route(0.01)], directions=[[np.zeros(3)]]), "a direction of offsets that is zero"),
         (
             lambda: simulator(route(0.01), route(0.03)),
             "guide 1 of tendon 2, at [0.0, 0.01, 0.03] m, lies 10 mm",

@@ -17,6 +17,7 @@ from warp_resphys.experiment.files import read_dataset
 from warp_resphys.io.errors import InputError
 
 MODULUS = 420e3  # Pa, of the body that is recorded; the experiment expects 505 kPa
+OFFSETS = (1e-3, 0.0)  # m, around the axis, of its tendons; only the first pulls in the training
 POSES = {"weak": (0.5, 0.0), "strong": (1.5, 0.0), "other": (0.0, 1.0), "both": (1.0, 1.0)}
 TINY = [
     "experiment=tentacle",
@@ -53,7 +54,8 @@ def recorded():
     places = np.array([*markers["tracked"].values()])
     read = bound_markers(markers, simulator.body.mesh, places, tuple(markers["tracked"]))
     tensions = torch.tensor([*POSES.values()], dtype=torch.float64)
-    at = read(simulator.static_equilibrium(Inputs(tendon_tension=tensions)).q).numpy()
+    offsets = {"tendon_offset_1": torch.tensor(OFFSETS, dtype=torch.float64)}
+    at = read(simulator.static_equilibrium(Inputs(tendon_tension=tensions), offsets).q).numpy()
     base = np.broadcast_to([*markers["reference"].values()], (len(at), 1, 3))
     return config, np.concatenate([at, base], 1)
 
@@ -81,8 +83,11 @@ def test_poses_of_unnamed_markers_identify_the_body(recorded, tmp_path, monkeypa
     assert set(dataset.begins) == {"static"}
     np.testing.assert_allclose(dataset.observed[rows, 0], found[:, :4], atol=3e-4)  # named and turned back
     np.testing.assert_allclose(dataset.inputs["tendon_tension"][rows, 0], [*POSES.values()], atol=1e-12)
-    identified = json.loads(Path("run/identification.json").read_text())["sysid"]["parameters"]["youngs_modulus"]
-    assert identified == pytest.approx(MODULUS, rel=0.01)
+    identified = json.loads(Path("run/identification.json").read_text())["sysid"]["parameters"]
+    assert identified["youngs_modulus"] == pytest.approx(MODULUS, rel=0.01)
+    found_offsets = [identified[f"tendon_offset_1_{name}"] for name in ("first", "second")]
+    np.testing.assert_allclose(found_offsets, OFFSETS, atol=2e-4)
+    assert "First offset of the tendon &#39;first&#39;" in Path("run/report.html").read_text()
     errors = {
         name: each["mean"] for name, each in json.loads(Path("run/metrics.json").read_text())["errors_mm"].items()
     }
@@ -98,11 +103,14 @@ def check_of_the_mesh():
     shown = []
     for layers in (4, 6):
         config = configuration(*TRIALS, f"mesh.layers={layers}")
-        sim = build_simulator({**config, "simulation": {**config["simulation"], **parameters}})
+        modulus = {"youngs_modulus": parameters["youngs_modulus"]}
+        sim = build_simulator({**config, "simulation": {**config["simulation"], **modulus}})
+        offsets = [parameters[f"tendon_offset_1_{name}"] for name in ("first", "second")]
         markers = config["markers"]
         read = bound_markers(markers, sim.body.mesh, np.array([*markers["tracked"].values()]), (*markers["tracked"],))
         tension = torch.tensor([POSES["both"]], dtype=torch.float64)
-        shown.append(read(sim.static_equilibrium(Inputs(tendon_tension=tension)).q)[0])
+        given = {"tendon_offset_1": torch.tensor(offsets, dtype=torch.float64)}
+        shown.append(read(sim.static_equilibrium(Inputs(tendon_tension=tension), given).q)[0])
         assert found["cells"][len(shown) - 1] == len(sim.body.mesh.cells)
     moved = 1e3 * float((shown[1] - shown[0]).norm(dim=1).mean())
     assert moved > 0.1

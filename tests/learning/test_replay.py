@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import Body, Corotated, PointMass, Simulator
+from warp_resphys import Body, Corotated, PointMass, Simulator, Tendons
 from warp_resphys.data.markers import bind_markers
 from warp_resphys.data.trials import Trials
 from warp_resphys.dynamics.inputs import Inputs
@@ -118,6 +118,24 @@ def test_sets_of_parameters_at_once_are_those_one_by_one():
     torch.testing.assert_close(replay(release), replay(release, defaults), rtol=0.0, atol=1e-9)
     with pytest.raises(InputError, match="no parameter 'stiffness'"):
         replay(release, {"stiffness": double([1.0])})
+
+
+def test_parts_have_parameters_of_their_own():
+    """One that is named alone leaves the others at what they are, or at what is given for all."""
+    routes = [[[0.0, 0.01, z], [0.1, 0.01, z]] for z in (0.005, 0.015)]
+    tendons = Tendons(routes, stiffness=[300.0, 400.0], labels=("low", "high"))
+    sim = Simulator(Body(MESH, select_vertices(MESH, x=0.0), energies=(tendons,)))
+    replay = Replay(sim, lambda q: q, blank(masses=(0.0, 0.0)))
+    assert {"tendon_stiffness", "tendon_stiffness_low", "tendon_stiffness_high"} <= {*replay.known}
+    value = double([1.0, 2.0])
+    for given, wanted in (
+        ({"tendon_stiffness_high": value}, [[300.0, 1.0], [300.0, 2.0]]),
+        ({"tendon_stiffness_low": value, "tendon_stiffness_high": 3.0 * value}, [[1.0, 3.0], [2.0, 6.0]]),
+        ({"tendon_stiffness": 5.0 * value, "tendon_stiffness_low": value}, [[1.0, 5.0], [2.0, 10.0]]),
+    ):
+        constants, _, _ = replay.setting(given)
+        found = constants.values["tendon_stiffness"]  # two trials for each set of parameters
+        torch.testing.assert_close(found, double(wanted).repeat_interleave(2, 0))
 
 
 def test_before_its_release_a_body_holds_still_and_frames_lie_between_steps():

@@ -104,6 +104,7 @@ class Simulator:
             body's energies, and ``gravity`` (B, 3).
         inputs: what acts through the body's energies, by name.
         counts: how many values an input has, and a parameter may have beside the environments, by name.
+        parts: what the parts are called that a parameter may have values for, such as tendons, by its name.
         constants: the values of the parameters.
     """
 
@@ -150,9 +151,11 @@ class Simulator:
         self.inputs: dict[str, Quantity] = {each.name: each for energy in body.energies for each in energy.inputs}
         self.constants: dict[str, Any] = {**self.material.constants, "gravity": [list(self.gravity)]}
         self.counts = dict.fromkeys(self.material.quantities, len(body.mesh.cells)) | {"gravity": 3}
+        self.parts: dict[str, tuple[str, ...]] = {}
         for energy in own_energies:
             self.constants |= energy.constants
             self.counts |= {each.name: energy.count for each in (*energy.parameters, *energy.inputs)}
+            self.parts |= dict.fromkeys([each.name for each in energy.parameters], energy.names)
         bound = [type(each).__name__.lower() for each in own_energies if each.implicit_only]
         if self.coupling == "explicit" and bound:
             raise InputError(f"coupling is explicit, but {bound[0]} act at the end of a step alone: choose implicit.")

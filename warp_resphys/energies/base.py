@@ -36,7 +36,7 @@ class Quantity:
     closed: bool = False  # whether `lower` itself is allowed
     # what there may be a value each of, such as ``element`` or ``chamber``; without it, only environments
     per: str = ""
-    typical: float = 1.0  # about how large an input is
+    typical: float = 1.0  # about how large it is: an input, or a parameter that may be anything
     words: str = ""  # what an input is called in a sentence, and
     shown_unit: str = ""  # the unit in which people read it,
     shown_factor: float = 1.0  # of which this many make one of `unit`
@@ -67,7 +67,7 @@ class Quantity:
             return self.lower + width * torch.sigmoid(torch.logit((value - self.lower) / width) + x)
         if np.isfinite(self.lower):
             return self.lower + (value - self.lower) * torch.exp(x)
-        return value + value.abs().amax() * x
+        return value + value.abs().amax().clamp_min(self.typical) * x
 
     def check(self, value: Any) -> None:
         """Refuses a value out of range.
@@ -133,16 +133,19 @@ class Energy(ABC):
     """One energy of a body.
 
     Attributes:
-        parameters: constants that it depends on.
         inputs: what acts through it, one value for each of `count`.
         is_load: whether it is a load, which enters the forces that a step's residual is compared with.
         implicit_only: whether it acts on the body at the end of a step whatever the simulator's coupling of loads.
     """
 
-    parameters: ClassVar[tuple[Quantity, ...]] = ()
     inputs: ClassVar[tuple[Quantity, ...]] = ()
     is_load: ClassVar[bool] = False
     implicit_only: ClassVar[bool] = False
+
+    @property
+    def parameters(self) -> tuple[Quantity, ...]:
+        """Constants that it depends on."""
+        return ()
 
     @property
     def count(self) -> int:

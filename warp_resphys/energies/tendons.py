@@ -11,6 +11,11 @@ a tendon commanded by tension has k = 0, one commanded by length has T = 0, and 
 
 The tension is one number for all pieces of a tendon: its change, k s'' g g^T with the gradient g of the length, couples
 every vertex near it with every other. That is a correction of low rank to a Hessian that stays as sparse as the mesh.
+
+Where a tendon runs may be a parameter, too: its guides move in the undeformed body along up to two given directions,
+each by an offset, from X to X + o_1 d_1 + o_2 d_2. A guide is at sum_a N_a(X) x_a; the shape functions N_a are
+continued linearly from where the guide was put, so that offsets are to be small beside the cells. L_0 is that of the
+tendon where it runs.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -28,36 +33,39 @@ from ..io.errors import InputError
 from ..kernels import tendons as kernels
 from ..mesh.location import locate
 from ..mesh.mesh import Mesh
-from .base import Energy, Parameter, PointSet, Quantity, Values, ValueTerm
+from .base import Energy, Parameter, PartTerm, PointSet, Quantity, Values
 from .launcher import Launcher, warp_view
 
 
 @dataclass(frozen=True)
 class TendonPoints(Points):
-    """The pieces of tendons between their guides, tendon after tendon."""
+    """The pieces of tendons between their guides, tendon after tendon; the operators are those of the kernels' F."""
 
     tendon: NDArray[np.int64]  # (P,) number of its tendon
-    length: NDArray[np.float64]  # (P,) at rest [m]
+    rest: NDArray[np.float64]  # (P, 3, 3) F of the undeformed body [m]
 
 
 TENSION = Quantity("tendon_tension", "N", 0.0, closed=True, per="tendon", words="tension", shown_unit="N")
 CONTRACTION = Quantity(
     *("tendon_contraction", "m"), per="tendon", typical=1e-3, words="contraction", shown_unit="mm", shown_factor=1e3
 )
+_STIFFNESS = Quantity("tendon_stiffness", "N/m", 0.0, closed=True, per="tendon")
+OFFSETS = tuple(Quantity(f"tendon_offset_{k}", "m", per="tendon", typical=1e-3) for k in (1, 2))
 
 
 @dataclass(frozen=True)
 class Tendons(Energy):
     """T L, or a spring on the length, of every tendon.
 
-    Its inputs are ``tendon_tension`` [N] and ``tendon_contraction`` [m], its parameter ``tendon_stiffness`` [N/m]; each
-    has a value for every tendon.
+    Its inputs are ``tendon_tension`` [N] and ``tendon_contraction`` [m], its parameters ``tendon_stiffness`` [N/m] and,
+    with directions, ``tendon_offset_1`` and ``tendon_offset_2`` [m], zero unless others are given; each has a value for
+    every tendon.
 
     Raises:
-        InputError: no tendon, one with fewer than two guides, guides that are not finite, or a negative stiffness.
+        InputError: no tendon, one with fewer than two guides, guides that are not finite, a negative stiffness, or
+            directions of offsets that do not fit the guides.
     """
 
-    parameters: ClassVar[tuple[Quantity, ...]] = (Quantity("tendon_stiffness", "N/m", 0.0, closed=True, per="tendon"),)
     inputs: ClassVar[tuple[Quantity, ...]] = (TENSION, CONTRACTION)
     is_load: ClassVar[bool] = True
     implicit_only: ClassVar[bool] = True
@@ -69,6 +77,9 @@ class Tendons(Energy):
     toe: float = 1e-4  # by which a tendon is longer than its winch leaves it when it is fully taut [m]
     reach: float = 1e-3  # how far outside of the body a guide may lie [m]
     labels: Sequence[str] = ()  # of the tendons; numbers where left out
+    # one or two directions for each tendon, the same number for all, along which its guides may be off: (3,) for all of
+    # its guides, or (G, 3) for each; per metre of offset, so that a direction of length one is an offset of the guide
+    directions: Sequence[Sequence[ArrayLike]] = ()
 
     def __post_init__(self) -> None:
         """Checks the values."""
@@ -86,7 +97,36 @@ class Tendons(Energy):
                 raise InputError(f"the {name} of tendons is {value:g}: it must be positive, in m.")
         if self.labels and len(self.labels) != len(self.routes):
             raise InputError(f"there are {len(self.labels)} names for {len(self.routes)} tendons.")
-        self.parameters[0].check(self.stiffness)
+        _STIFFNESS.check(self.stiffness)
+        if not self.directions:
+            return
+        if len(self.directions) != len(self.routes) or len({len(each) for each in self.directions}) != 1:
+            counts = [len(each) for each in self.directions]
+            raise InputError(
+                f"there are directions of offsets for {len(counts)} tendons, {counts} in number, but {self.count} "
+                "tendons: give the same number for each."
+            )
+        if len(self.directions[0]) not in (1, 2):
+            raise InputError(f"each tendon has {len(self.directions[0])} directions of offsets: give one or two.")
+        for number, (route, each) in enumerate(zip(self.guides, self.directions, strict=True), 1):
+            for direction in (np.asarray(one, dtype=np.float64) for one in each):
+                if direction.shape not in ((3,), route.shape):
+                    raise InputError(
+                        f"tendon {number} has a direction of offsets of shape {direction.shape}: give three numbers, "
+                        f"or three for each of its {len(route)} guides."
+                    )
+                if not np.isfinite(direction).all() or not direction.any():
+                    raise InputError(f"tendon {number} has a direction of offsets that is zero or not finite.")
+
+    @property
+    def offset_count(self) -> int:
+        """Directions that each tendon has."""
+        return len(self.directions[0]) if self.directions else 0
+
+    @property
+    @override
+    def parameters(self) -> tuple[Quantity, ...]:
+        return (_STIFFNESS, *OFFSETS[: self.offset_count])
 
     @property
     def guides(self) -> list[NDArray[np.float64]]:
@@ -106,7 +146,14 @@ class Tendons(Energy):
     @property
     @override
     def constants(self) -> Mapping[str, Parameter]:
-        return {"tendon_stiffness": self.stiffness}
+        return {"tendon_stiffness": self.stiffness} | {each.name: 0.0 for each in OFFSETS[: self.offset_count]}
+
+    @override
+    def prepare(self, constants: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """See `Energy.prepare`; offsets without a direction are zero."""
+        found = super().prepare(constants)
+        zero = torch.zeros_like(found["tendon_stiffness"])
+        return found | {each.name: zero for each in OFFSETS[self.offset_count :]}
 
     @override
     def points(self, mesh: Mesh) -> tuple[TendonPoints, ...]:
@@ -115,7 +162,7 @@ class Tendons(Energy):
         Raises:
             InputError: a guide outside of the body.
         """
-        nodes, weights, tendon, length = [], [], [], []
+        nodes, operators, tendon, rest = [], [], [], []
         for number, route in enumerate(self.guides):
             found = locate(mesh, route)
             worst = int(np.argmax(found.outside))
@@ -125,19 +172,26 @@ class Tendons(Energy):
                     f"{1e3 * found.outside[worst]:.3g} mm outside of the body: move it, or raise the reach of "
                     f"{1e3 * self.reach:g} mm."
                 )
+            weights = np.zeros((*found.weights.shape, 3))  # (G, K, 3): place, and its derivatives by the offsets
+            shape = np.zeros((len(route), 3, 3))
+            weights[..., 0], shape[..., 0] = found.weights, route
+            for k in range(self.offset_count):
+                step = kernels.OFFSET_UNIT * np.broadcast_to(self.directions[number][k], route.shape)
+                weights[..., 1 + k] = np.einsum("gki,gi->gk", found.gradients, step)
+                shape[..., 1 + k] = step
             for first in range(len(route) - 1):
-                piece = _difference(mesh, found.cells[first : first + 2], found.weights[first : first + 2])
+                piece = _difference(mesh, found.cells[first : first + 2], weights[first : first + 2])
                 nodes.append(piece[0])
-                weights.append(piece[1])
+                operators.append(piece[1])
             tendon += [number] * (len(route) - 1)
-            length += np.linalg.norm(np.diff(route, axis=0), axis=1).tolist()
+            rest.append(np.diff(shape, axis=0))
         most = max(map(len, nodes))
         # What pads a list repeats its first vertex with a zero weight, which contributes nothing.
         padded = np.array([np.pad(each, (0, most - len(each)), constant_values=each[0]) for each in nodes])
         operator = np.zeros((len(nodes), 1, most, 3))
-        for row, each in enumerate(weights):
-            operator[row, 0, : len(each), 0] = each
-        return (TendonPoints(padded, operator, np.array(tendon), np.array(length)),)
+        for row, each in enumerate(operators):
+            operator[row, 0, : len(each)] = each
+        return (TendonPoints(padded, operator, np.array(tendon), np.concatenate(rest)),)
 
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "TendonTerm":
@@ -147,15 +201,15 @@ class Tendons(Energy):
 def _difference(
     mesh: Mesh, cells: NDArray[np.int64], weights: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Vertices and weights whose sum is the vector from one place to another, each vertex once."""
+    """Vertices and weights (K', 3) whose sums lead from one place to another, each vertex once."""
     vertices, inverse = np.unique(mesh.cells[cells].ravel(), return_inverse=True)
-    sums = np.zeros(len(vertices))
+    sums = np.zeros((len(vertices), 3))
     np.add.at(sums, inverse, np.concatenate([-weights[0], weights[1]]))
-    used = np.abs(sums) > 1e-14
+    used = np.abs(sums).max(axis=1) > 1e-14
     return vertices[used], sums[used]
 
 
-class TendonTerm(ValueTerm):
+class TendonTerm(PartTerm):
     """Kernels of tendons.
 
     Args:
@@ -171,43 +225,47 @@ class TendonTerm(ValueTerm):
         super().__init__(launcher, sets, "tendon_tension", numbers, np.ones(len(numbers)), tendons.count)
         self._toe = wp.float64(tendons.toe)
         self._first = launcher.upload(np.searchsorted(numbers, np.arange(tendons.count + 1)).astype(np.int32), int)
-        self._rest_length = launcher.upload(np.bincount(numbers, s.source.length), wp.float64)
-        self._tension, self._spring = launcher.zeros(tendons.count), launcher.zeros(tendons.count, 3)
-        self._direction = launcher.zeros(s.n_points, 3)
-        self._piece_length = torch.as_tensor(s.source.length, device=launcher.device)
-        # (P, N) how a vertex moves a piece
-        operator = np.zeros((s.n_points, s.n_vertices))
-        np.add.at(operator, (np.arange(s.n_points)[:, None], s.source.nodes), s.source.gradients[:, 0, :, 0])
-        self._operator = torch.as_tensor(operator, device=launcher.device)
+        self._rest = launcher.upload(s.source.rest, wp.mat33d)
+        self._along, self._tension = launcher.zeros(tendons.count, 3), launcher.zeros(tendons.count)
+        self._spring = launcher.zeros(tendons.count, 3)
+        self._direction = launcher.zeros(s.n_points, 3, 3)
+        self._piece_length = torch.as_tensor(np.linalg.norm(s.source.rest[..., 0], axis=1), device=launcher.device)
+        operator = np.zeros((s.n_points, s.n_vertices, 3))  # how a vertex moves a piece
+        np.add.at(operator, (np.arange(s.n_points)[:, None], s.source.nodes), s.source.gradients[:, 0])
+        self._operator = torch.as_tensor(np.moveaxis(operator, -1, 0).copy(), device=launcher.device)  # (3, P, N)
 
     @property
     @override
     def shapes(self) -> Mapping[str, tuple[int, ...]]:
-        return dict.fromkeys(("tendon_tension", "tendon_contraction", "tendon_stiffness"), (self.count,))
+        names = ("tendon_tension", "tendon_contraction", "tendon_stiffness", *(each.name for each in OFFSETS))
+        return dict.fromkeys(names, (self.count,))
+
+    @property
+    def _found(self) -> tuple[Any, Any]:
+        """What `before` writes: c and the tension of each tendon."""
+        return warp_view(self._along, wp.vec3d), warp_view(self._tension, wp.float64)
 
     @override
     def before(self, values: Values, positions: Any) -> list[Any]:
         (s,) = self.sets
-        tension, contraction, stiffness = self.views(values)
-        inputs = [s.nodes, s.gradients, self._first, self._rest_length, tension, contraction, stiffness, self._toe]
-        outputs = [warp_view(self._tension, wp.float64), warp_view(self._spring, wp.vec3d)]
-        return [
-            self.launcher.record(kernels.pull, (self.launcher.batch, self.count), [*inputs, positions], outputs),
-        ]
+        tension, contraction, stiffness, *offsets = self.views(values)
+        runs = [s.nodes, s.gradients, self._first, self._rest, *offsets]
+        inputs = [*runs, tension, contraction, stiffness, self._toe, positions]
+        outputs = [*self._found, warp_view(self._spring, wp.vec3d)]
+        return [self.launcher.record(kernels.pull, (self.launcher.batch, self.count), inputs, outputs)]
 
     @override
     def step(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
-        tension, _, stiffness = self.views(values)
-        found = [warp_view(self._tension, wp.float64), warp_view(self._spring, wp.vec3d)]
+        tension, _, stiffness, *_ = self.views(values)
         return kernels.local_step, [
             *(s.nodes, s.gradients, self._first, self.part, tension, stiffness),
-            *(*found, positions),
+            *(*self._found, warp_view(self._spring, wp.vec3d), positions),
         ]
 
     @override
     def tangent(self, s: PointSet, values: Values, positions: Any, positive: Any) -> tuple[Any, list[Any]]:
         del positive  # A tendon only pulls: its tangent has no negative eigenvalues.
-        return kernels.tangent, [s.nodes, s.gradients, self.part, warp_view(self._tension, wp.float64), positions]
+        return kernels.tangent, [s.nodes, s.gradients, self.part, *self._found, positions]
 
     @override
     def low_rank(self, values: Values, positions: Any) -> torch.Tensor | None:
@@ -216,10 +274,12 @@ class TendonTerm(ValueTerm):
         if not bool((stiffness > 0.0).any()):
             return None
         own, (s,) = self.launcher, self.sets
-        inputs, out = [s.nodes, s.gradients, positions], warp_view(self._direction, wp.vec3d)
-        own.launch(own.record(kernels.directions, (own.batch, s.n_points), inputs, [out]))
-        by_tendon = (self._direction[:, :, :, None] * self._own[:, None]).flatten(2)  # (B, P, 3 T)
-        gradient = (self._operator.mT @ by_tendon).unflatten(2, (3, self.count)).flatten(1, 2)
+        inputs = [s.nodes, s.gradients, self.part, self._found[0], positions]
+        out = [warp_view(self._direction, wp.mat33d)]
+        own.launch(own.record(kernels.directions, (own.batch, s.n_points), inputs, out))
+        by_column = self._direction.movedim(-1, 1)[..., None] * self._own[:, None]  # (B, 3, P, 3, T), columns first
+        gradient = (self._operator.mT @ by_column.flatten(3)).sum(1)  # (B, N, 3 T)
+        gradient = gradient.unflatten(2, (3, self.count)).flatten(1, 2)
         return gradient * (stiffness * self._spring[..., 2]).sqrt()[:, None]
 
     @override
@@ -227,27 +287,37 @@ class TendonTerm(ValueTerm):
         tension, stiffness = values["tendon_tension"], values["tendon_stiffness"]
         assert tension is not None
         assert stiffness is not None
-        # The square of a sum of n lengths is at most n times the sum of their squares.
-        return tension[:, self.part_of] / self._piece_length + (stiffness * self._own.sum(0))[:, self.part_of]
-
-    @override
-    def slope(self, s: PointSet, positions: Any, direction: Any) -> tuple[Any, list[Any]]:
-        return kernels.shortening, [s.nodes, s.gradients, positions, direction]
+        # |F c|^2 is at most |c|^2 |F|^2, and the square of a sum of n lengths at most n times the sum of their squares.
+        columns = 1.0 + sum((values[each.name] / kernels.OFFSET_UNIT).square() for each in OFFSETS)
+        stretching = (tension * columns)[:, self.part_of] / self._piece_length
+        return stretching + (stiffness * columns * self._own.sum(0))[:, self.part_of]
 
     @override
     def adjoint(
         self, values: Values, positions: torch.Tensor, direction: torch.Tensor
     ) -> Callable[[], dict[str, torch.Tensor]]:
-        """See `Term.adjoint`; all three act through the tension alone."""
-        shortening = super().adjoint(values, positions, direction)
-        before = self.before(values, warp_view(positions, wp.vec3d))
+        """See `Term.adjoint`."""
+        own, (s,) = self.launcher, self.sets
+        views = [warp_view(each, wp.vec3d) for each in (positions, direction)]
+        shorter, by_offset, longer = own.zeros(s.n_points), own.zeros(s.n_points, 2), own.zeros(s.n_points, 2)
+        inputs = [s.nodes, s.gradients, self.part, self._rest, *self._found, *views]
+        outputs = [warp_view(shorter, wp.float64), warp_view(by_offset, wp.vec2d), warp_view(longer, wp.vec2d)]
+        launches = [
+            *self.before(values, views[0]),
+            own.record(kernels.adjoint, (own.batch, s.n_points), inputs, outputs),
+        ]
 
         def differentiate() -> dict[str, torch.Tensor]:
-            self.launcher.launch(*before)
-            by_tension, stiffness = shortening()[self.value], values["tendon_stiffness"]
+            own.launch(*launches)
+            stiffness = values["tendon_stiffness"]
             assert stiffness is not None
+            by_tension = self.sum_parts(shorter)
             by_contraction = stiffness * self._spring[..., 2] * by_tension
             by_stiffness = self._spring[..., 1] * by_tension
-            return dict(zip(self.shapes, (by_tension, by_contraction, by_stiffness), strict=True))
+            by_offsets = [
+                self.sum_parts(held) + by_contraction * self.sum_parts(taut)
+                for held, taut in zip(by_offset.unbind(-1), longer.unbind(-1), strict=True)
+            ]
+            return dict(zip(self.shapes, (by_tension, by_contraction, by_stiffness, *by_offsets), strict=True))
 
         return differentiate

@@ -6,6 +6,7 @@ from itertools import pairwise
 from typing import Any, Final, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..energies.base import Energy, Quantity
 from ..energies.fibres import Fibres
@@ -121,7 +122,7 @@ def drive_of(config: Mapping[str, Any], body: Body) -> Drive | None:
 
 
 def build_tendons(config: Mapping[str, Any]) -> Tendons:
-    """The tendons of a group: every straight piece of a route is divided into as many as asked for.
+    """The tendons of a group: every straight piece of a route is divided into as many as asked for, and its offsets.
 
     Raises:
         InputError: see `Tendons`; or a contraction that nothing would pull.
@@ -130,14 +131,28 @@ def build_tendons(config: Mapping[str, Any]) -> Tendons:
         raise InputError(
             "tendons.stiffness is 0, but their contraction is commanded, which acts through it: set it, in N/m."
         )
-    routes = []
-    for route in config["routes"].values():
-        guides = np.asarray(route["guides"], dtype=np.float64)
-        share = np.linspace(0.0, 1.0, route.get("pieces", 1), endpoint=False)[:, None]
-        parts = [first + share * (last - first) for first, last in pairwise(guides)]
-        routes.append(np.concatenate([*parts, guides[-1:]]))
-    more = {key: config[key] for key in ("toe", "reach") if key in config}
+    more: dict[str, Any] = {key: config[key] for key in ("toe", "reach") if key in config}
+    routes, directions = [], []
+    for name, route in config["routes"].items():
+        guides, pieces = np.asarray(route["guides"], dtype=np.float64), route.get("pieces", 1)
+        routes.append(_divided(guides, pieces))
+        own = [np.asarray(each, dtype=np.float64) for each in route.get("offsets", ())]
+        for each in own:
+            if each.shape not in ((3,), guides.shape):
+                raise InputError(
+                    f"tendons.routes.{name}.offsets has a direction of shape {each.shape}: give three numbers, or "
+                    f"three for each of its {len(guides)} guides."
+                )
+        directions.append([_divided(np.broadcast_to(each, guides.shape), pieces) for each in own])
+    if any(directions):
+        more["directions"] = directions
     return Tendons(routes, config["stiffness"], labels=tuple(config["routes"]), **more)
+
+
+def _divided(values: NDArray[np.float64], pieces: int) -> NDArray[np.float64]:
+    """(G, 3) values at guides, and so many times as many between them."""
+    share = np.linspace(0.0, 1.0, pieces, endpoint=False)[:, None]
+    return np.concatenate([*(first + share * (last - first) for first, last in pairwise(values)), values[-1:]])
 
 
 def build_muscles(config: Mapping[str, Any], mesh: Mesh) -> Muscles:

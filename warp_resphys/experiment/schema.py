@@ -350,7 +350,15 @@ _SEQUENCES = Group(
     }
 )
 _FIBRES = Group({"angles": NUMBERS, "toe": POSITIVE, "stiffness": NOT_NEGATIVE}, optional=True)
-_ROUTE = Group({"guides": _PLACES, "pieces": absent(at_most(10_000))})
+_OFFSETS = Kind(
+    lambda value: (
+        isinstance(value, list)
+        and len(value) in (1, 2)
+        and all(_AXIS.fits(each) or _PLACES.fits(each) for each in value)
+    ),
+    "a list of one or two directions, each of three numbers, not all zero, or of three for each guide",
+)
+_ROUTE = Group({"guides": _PLACES, "pieces": absent(at_most(10_000)), "offsets": absent(_OFFSETS)})
 _TENDONS = Group(
     {
         "routes": Group(each=_ROUTE),

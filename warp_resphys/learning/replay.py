@@ -81,9 +81,10 @@ class Replay:
 
     Attributes:
         settled: (E R, N, 3) the equilibria [m] in which the trials began when they were simulated last, if they did.
-        known: the parameters that it takes: the simulator's that are one number, a factor on the weights that hang on
-            the body, components of gravity's tilt, and for every input what is unknown of its commands: a factor on
-            them, a delay [s] with which they come, and the rise time [s] with which it follows them, such as
+        known: the parameters that it takes: the simulator's that are one number, those of each part of an energy by
+            itself, such as ``tendon_stiffness_left`` of a tendon ``left``, a factor on the weights that hang on the
+            body, components of gravity's tilt, and for every input what is unknown of its commands: a factor on them,
+            a delay [s] with which they come, and the rise time [s] with which it follows them, such as
             ``pressure_factor``, ``pressure_delay`` and ``pressure_rise``.
     """
 
@@ -91,6 +92,7 @@ class Replay:
         self.simulator, self.observe, self.trials = simulator, observe, trials
         self.settled: torch.Tensor | None = None
         self.known = known_parameters(simulator)
+        self._of_parts = _parameters_of_parts(simulator)
 
     def setting(self, parameters: Parameters | None = None) -> tuple[Constants, Inputs, Inputs]:
         """What E sets of parameters make of R trials, as (E R) environments, the trials running fastest.
@@ -112,6 +114,7 @@ class Replay:
         each = len(next(iter(parameters.values()))) if parameters else 1
         spread = {name: value.repeat_interleave(count) for name, value in parameters.items()}
         constants = {name: value[:, None] for name, value in spread.items() if name in sim.parameters}
+        constants |= self._by_part(spread)
         if any(name in spread for name in TILTS):
             constants["gravity"] = tilted_gravity(sim, *(spread.get(name) for name in TILTS))
         inputs = self.trials.inputs.repeat(each)
@@ -123,6 +126,20 @@ class Replay:
         resting = self.trials.resting.repeat(each)
         resting = resting.replace(**self._acting(resting, spread), **hung)
         return sim.prepare(constants), inputs, resting
+
+    def _by_part(self, spread: Parameters) -> dict[str, torch.Tensor]:
+        """(E R, count) constants of energies of which parts have values (E R,) of their own, the others theirs all."""
+        sim, found = self.simulator, dict[str, list[torch.Tensor]]()
+        for name, value in spread.items():
+            if name not in self._of_parts:
+                continue
+            constant, part = self._of_parts[name]
+            if constant not in found:
+                own = spread[constant] if constant in spread else sim.tensor(sim.constants[constant])
+                own = own[:, None] if constant in spread else sim.parameters[constant].shaped(own)
+                found[constant] = list(own.expand(len(value), sim.counts[constant]).unbind(1))
+            found[constant][part] = value
+        return {name: torch.stack(columns, 1) for name, columns in found.items()}
 
     def _acting(self, inputs: Inputs, spread: Parameters) -> dict[str, torch.Tensor]:
         """What commanded inputs come to, of values (E R,) of their parameters."""
@@ -226,9 +243,19 @@ class Replay:
 
 def known_parameters(simulator: Simulator) -> tuple[str, ...]:
     """What can be identified of a simulator; see `Replay`."""
-    constants = tuple(name for name in simulator.parameters if name != "gravity")
+    constants = (*(name for name in simulator.parameters if name != "gravity"), *_parameters_of_parts(simulator))
     driven = [f"{name}_{what}" for name in simulator.inputs if name not in _HUNG for what in _COMMANDS]
     return (*constants, MASS_FACTOR, *TILTS, *driven)
+
+
+def _parameters_of_parts(simulator: Simulator) -> dict[str, tuple[str, int]]:
+    """The parameter and the number of the part, for every part of energies that have several, by name."""
+    return {
+        f"{name}_{part}": (name, number)
+        for name, parts in simulator.parts.items()
+        if len(parts) > 1
+        for number, part in enumerate(parts)
+    }
 
 
 def tilted_gravity(simulator: Simulator, first: torch.Tensor | None, second: torch.Tensor | None) -> torch.Tensor:

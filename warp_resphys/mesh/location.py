@@ -18,6 +18,7 @@ class Location:
 
     cells: IntArray  # (P,) the cell of each
     weights: FloatArray  # (P, K) of its nodes; their sum is one
+    gradients: FloatArray  # (P, K, 3) by where the point is [1/m]
     outside: FloatArray  # (P,) how far from the cell [m]; zero inside, infinite where its shape functions do not reach
 
 
@@ -38,7 +39,7 @@ def locate(mesh: Mesh, points: FloatArray) -> Location:
         raise InputError("a point that is to be found in a mesh is not finite.")
     element, nodes = mesh.element, mesh.vertices[mesh.cells]  # (M, K, 3)
     low, high = nodes.min(axis=1), nodes.max(axis=1)
-    cells, weights, outside = [], [], []
+    cells, weights, gradients, outside = [], [], [], []
     for point in points:
         distance = np.linalg.norm(np.maximum(np.maximum(low - point, point - high), 0.0), axis=1)
         limit = np.partition(distance, min(_CANDIDATES, len(distance)) - 1)[min(_CANDIDATES, len(distance)) - 1]
@@ -48,12 +49,14 @@ def locate(mesh: Mesh, points: FloatArray) -> Location:
         away = np.linalg.norm(np.einsum("ck,cki->ci", element.shape(held)[0], nodes[near]) - point, axis=1)
         best = int(np.argmin(away))
         cells.append(near[best])
-        weights.append(element.shape(place[best : best + 1])[0][0])
+        (values,), (slopes,) = element.shape(place[best : best + 1])
+        weights.append(values)
+        gradients.append(slopes @ np.linalg.pinv(nodes[near[best]].T @ slopes))
         missed = float(np.linalg.norm(weights[-1] @ nodes[near[best]] - point))
         size = float(np.linalg.norm(high[near[best]] - low[near[best]]))
         # What no continuation of the cell reaches is as far outside as can be.
         outside.append(np.inf if missed > 1e-6 * size else away[best] if away[best] > 1e-9 * size else 0.0)
-    return Location(np.array(cells), np.array(weights), np.array(outside))
+    return Location(np.array(cells), np.array(weights), np.array(gradients), np.array(outside))
 
 
 def _is_simplex(element: Element) -> bool:

@@ -41,6 +41,8 @@ _PARAMETERS: Final[Mapping[str, tuple[str, str, float]]] = {
     "attached_mass_factor": ("Factor of the attached masses", "", 1.0),
     "gravity_tilt_1": ("First tilt of gravity", "°", 180.0 / np.pi),
     "gravity_tilt_2": ("Second tilt of gravity", "°", 180.0 / np.pi),
+    "tendon_offset_1": ("First offset of the tendons", "mm", 1e3),
+    "tendon_offset_2": ("Second offset of the tendons", "mm", 1e3),
 }
 _COMMANDS: Final[Mapping[str, tuple[str, str, float]]] = {
     "factor": ("Factor", "", 1.0),
@@ -61,6 +63,10 @@ def _parameter(name: str) -> tuple[str, str, float]:
     if command is not None and name not in _PARAMETERS:
         kind, unit, per = _COMMANDS[command[3]]
         return f"{kind} of the {command[2]}{'es' if command[2].endswith('s') else 's'}", unit, per
+    offset = re.fullmatch(r"(tendon_offset_[12])_(.+)", name)
+    if offset is not None:
+        kind, unit, per = _PARAMETERS[offset[1]]
+        return f"{kind.removesuffix(' of the tendons')} of the tendon '{offset[2]}'", unit, per
     branch = re.fullmatch(r"prony_(ratio|time)_(\d+)", name)
     if branch is None:
         return _PARAMETERS.get(name, (name, "", 1.0))

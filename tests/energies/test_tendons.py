@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.integrate import cumulative_trapezoid
 
 from warp_resphys import (
     Body,
@@ -16,6 +17,7 @@ from warp_resphys import (
     Tendons,
     box_hexahedra,
     box_tetrahedra,
+    rod,
     select_vertices,
 )
 from warp_resphys.dynamics.modes import vibration_modes
@@ -59,6 +61,48 @@ def test_an_offset_tendon_bends_a_beam_to_a_constant_curvature():
     for vertex, x in zip(middle, (0.1, 0.2), strict=True):
         wanted = [math.sin(bend * x) / bend * shortening, 0.005, 0.005 + (1.0 - math.cos(bend * x)) / bend]
         np.testing.assert_allclose(q[vertex], wanted, atol=0.02 * abs(wanted[2] - 0.005))
+
+
+def hanging_cosserat_rod(pull, offsets, end, length, radius, modulus, density, count=1001):
+    """(2,) tip, and the angle there, of an extensible rod in a plane that a tendon and its weight bend.
+
+    Forces and moments on what lies beyond a section: the weight, and the tension of the tendon that is cut there
+    (Rucker and Webster, IEEE Transactions on Robotics 27(6), 2011, without shear), iterated to their equilibrium.
+    """
+    s, h = np.linspace(0.0, length, count, retstep=True)
+    area, second = np.pi * radius**2, np.pi * radius**4 / 4
+    offset = (offsets[0] + (offsets[1] - offsets[0]) * s / end)[:, None]
+    angle, stretch = np.zeros(count), np.ones(count)
+    below = -9.81 * density * area * (length - s)  # N
+    for _ in range(200):
+        tangent, normal = (
+            np.stack(each, 1) for each in ([np.sin(angle), -np.cos(angle)], [np.cos(angle), np.sin(angle)])
+        )
+        place = cumulative_trapezoid(stretch[:, None] * tangent, dx=h, axis=0, initial=0.0)
+        path = np.gradient(place + offset * normal, h, axis=0)
+        tension = -pull * (s <= end)[:, None] * path / np.linalg.norm(path, axis=1, keepdims=True)
+        beyond = cumulative_trapezoid(place[::-1, 0], dx=h, initial=0.0)[::-1]
+        arm = offset * normal
+        moment = arm[:, 0] * tension[:, 1] - arm[:, 1] * tension[:, 0]
+        moment += -9.81 * density * area * (beyond - place[:, 0] * (length - s))
+        along = (tension * tangent).sum(1) + below * tangent[:, 1]
+        angle += 0.3 * (cumulative_trapezoid(moment / (modulus * second), dx=h, initial=0.0) - angle)
+        stretch += 0.3 * (1.0 + along / (modulus * area) - stretch)
+    return place[-1], angle[-1]
+
+
+def test_a_tapering_tendon_curls_a_hanging_rod_as_the_theory_of_rods_has_it():
+    shape = {"length": 0.2, "radius": 0.008, "modulus": 264e3, "density": 1070.0}
+    offsets, end = (0.006, 0.003), 0.16  # m; the tendon ends before the rod does
+    wanted, angle = hanging_cosserat_rod(3.0, offsets, end, **shape)
+    assert angle > 0.9
+    mesh = rod([[0, 0, 0], [0, 0, -0.2]], [[0.0, 0.008], [0.2, 0.008]], layers=10)
+    tendons = Tendons([np.linspace([offsets[0], 0.0, 0.0], [offsets[1], 0.0, -end], 41)])
+    body = Body(mesh, fixed=select_vertices(mesh, z=0.0), energies=(tendons,))
+    sim = Simulator(body, Corotated(264e3, 0.0, density=1070.0), gravity=(0.0, 0.0, -9.81), solver=TIGHT)
+    tip = sim.static_equilibrium(tension(3.0)).q[0].numpy()[select_vertices(mesh, z=-0.2)].mean(axis=0)
+    np.testing.assert_allclose(tip[[0, 2]], wanted, atol=0.005 * 0.2)
+    assert abs(tip[1]) < 1e-9
 
 
 @pytest.mark.parametrize("solver", ["newton", "quasi_newton", "projective_dynamics"])

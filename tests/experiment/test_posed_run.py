@@ -31,6 +31,7 @@ TINY = [
         "simfree.network.position_modes=1",
     ),
     *("~identify.parameters.density", "parallel.processes=1", "markers.patch=0.05"),
+    *("~identify.parameters.tendon_offset_2_first", "~identify.parameters.tendon_offset_2_second"),  # as E, for two poses
     *("hydra/job_logging=none", "hydra/hydra_logging=none", IN_RUN),
 ]
 TRIALS = [

@@ -1,9 +1,9 @@
 """Tendons that slide without friction through guides: stress, tangent and derivatives by what pulls and where it runs.
 
 A point is the piece of a tendon between two guides. The first column of F = sum_a x_a g_a^T is the vector from one to
-the other, the two others how it changes as the guides move in the body along the tendon's two directions, by a
-millimetre each. So a piece is F c, with c = (1, offsets in millimetres). A tendon's tension is that commanded, and that
-of a spring that only pulls, stretched by what the tendon is longer than its winch leaves it.
+the other, the two others how it changes as the guides move in the body along the tendon's two directions, by
+`OFFSET_UNIT` each. So a piece is F c, with c = (1, offsets in that unit). A tendon's tension is that commanded, and
+that of a spring that only pulls, stretched by what the tendon is longer than its winch leaves it.
 """
 
 import warp as wp
@@ -13,8 +13,8 @@ from .modules import decorators
 from .points import deformation_gradient
 
 ZERO, ONE = wp.float64(0.0), wp.float64(1.0)
-OFFSET_UNIT = 1e-3  # of the offsets [m], by which the columns of F are of one size
-PER_METRE = wp.float64(1.0 / OFFSET_UNIT)
+OFFSET_UNIT = 5e-3  # of the offsets [m], about the size of cells, so that the columns of F are of one size
+PER_UNIT_OFFSET = wp.float64(1.0 / OFFSET_UNIT)
 
 kernel, function = decorators("tendons")
 
@@ -48,7 +48,7 @@ def pull(
 ):
     """The tension of each tendon, and where it runs."""
     b, t = wp.tid()
-    c = wp.vec3d(ONE, PER_METRE * first_offset[b, t], PER_METRE * second_offset[b, t])
+    c = wp.vec3d(ONE, PER_UNIT_OFFSET * first_offset[b, t], PER_UNIT_OFFSET * second_offset[b, t])
     along_out[b, t] = c
     longer = ZERO
     for p in range(first[t], first[t + 1]):
@@ -159,5 +159,5 @@ def adjoint(
     by_offset = -total[b, t] * (wp.transpose(dz) * u + wp.transpose(f) * turned)
     longer = wp.transpose(f) * u - wp.transpose(rest[p]) * u_rest
     by_tension_out[b, p] = shorter
-    by_offset_out[b, p] = PER_METRE * wp.vec2d(by_offset[1], by_offset[2])
-    longer_out[b, p] = PER_METRE * wp.vec2d(longer[1], longer[2])
+    by_offset_out[b, p] = PER_UNIT_OFFSET * wp.vec2d(by_offset[1], by_offset[2])
+    longer_out[b, p] = PER_UNIT_OFFSET * wp.vec2d(longer[1], longer[2])

@@ -163,6 +163,7 @@ def test_a_negative_stress_lengthens_a_bar_as_an_inflated_chamber_does(solver):
         (lambda: Muscles([Muscle([0.5], ALONG)]), "give the numbers of one or more"),
         (lambda: Muscles([Muscle([0, 1], np.ones((3, 3)), "left")]), "'left' has directions of shape (3, 3)"),
         (lambda: Muscles([Muscle([0], (0.0, 0.0, 0.0))]), "has a direction that is zero or not finite"),
+        (lambda: Muscles([replace(whole(BEAM), name="a")] * 2), "muscles are called a, a: give each a name of its own"),
         (lambda: Muscles([whole(BEAM)], stiffness=-1.0), "muscle_stiffness is -1: it must be zero or more, in Pa"),
         (lambda: Muscles([whole(BEAM)], toe=0.0), "the strain over which muscle fibres tighten is 0"),
         (lambda: simulator(Muscle([99], ALONG)), "runs through cell 99, but there are 24"),

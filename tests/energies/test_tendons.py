@@ -173,20 +173,23 @@ def test_gradients_by_where_tendons_run(start):
 
 
 @pytest.mark.parametrize("solver", ["newton", "quasi_newton", "projective_dynamics"])
-def test_a_tendon_that_is_off_is_one_that_was_routed_there(solver):
-    """Within the cells of a beam the shape functions are linear along each axis: an offset along one is exact."""
+@pytest.mark.parametrize("offset", [(5e-3, 0.0), (0.0, 5e-3)])
+def test_a_tendon_that_is_off_is_one_that_was_routed_there(solver, offset):
+    """In a beam's cells shape functions are linear along each axis: an offset along one is exact."""
     settings = SolverSettings(solver, relative_tolerance=1e-10)
-    offset = {"tendon_offset_1": torch.tensor([[3e-3, -2e-3]], dtype=torch.float64)}
-    drive = Inputs(tendon_tension=torch.tensor([[0.5, 0.0]], dtype=torch.float64))
-    drive = drive.replace(tendon_contraction=torch.tensor([[0.0, 2e-3]], dtype=torch.float64))
-    more = {"stiffness": 500.0, "solver": settings}
-    given = simulator(route(0.013), route(0.009), directions=[[[0.0, 0.0, 1.0]], [[0.0, 0.0, 1.0]]], **more)
-    there = simulator(route(0.016), route(0.007), **more)
-    ends = [given.step(given.rest_state(), drive, offset)[0].q, there.step(there.rest_state(), drive)[0].q]
-    torch.testing.assert_close(*ends, rtol=0.0, atol=1e-9)
-    assert float((ends[1] - there.rest_positions).abs().max()) > 1e-3
-    zero = given.step(given.rest_state(), drive)[0].q
-    assert float((zero - ends[1]).abs().max()) > 1e-4
+    tapering = np.linspace([0.0, 1.0, 0.0], [0.0, 0.2, 0.0], 7), np.linspace([0.0, 0.0, 0.1], [0.0, 0.0, 1.0], 7)
+    drive = Inputs(tendon_tension=torch.tensor([[0.5]], dtype=torch.float64))
+    drive = drive.replace(tendon_contraction=torch.tensor([[4e-3]], dtype=torch.float64))
+    tendons = Tendons([route(0.013, depth=0.013)], stiffness=2000.0, directions=[tapering])
+    sims = [
+        Simulator(Body(BEAM, CLAMP, energies=(each,)), SOFT, gravity=WEIGHTLESS, solver=settings)
+        for each in (tendons, tendons.rerouted([offset]))
+    ]
+    given = {f"tendon_offset_{number}": value for number, value in enumerate(offset, 1)}
+    found, wanted = (sim.step(sim.rest_state(), drive, its)[0].q for sim, its in zip(sims, (given, None), strict=True))
+    torch.testing.assert_close(found, wanted, rtol=0.0, atol=1e-9)
+    assert float((wanted - sims[0].rest_positions).abs().max()) > 1e-3
+    assert float((sims[0].step(sims[0].rest_state(), drive)[0].q - wanted).abs().max()) > 1e-4
 
 
 @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2", "midpoint"])
@@ -272,9 +275,14 @@ def test_a_tendon_cannot_push():
         (lambda: Tendons([route(0.01)], toe=0.0), "the toe of tendons is 0"),
         (
             lambda: Tendons([route(0.01)], directions=[ACROSS, ACROSS]),
-            "directions of offsets for 2 tendons, [2, 2] in number, but 1 tendons: give the same number for each",
+            "2 tendons have directions of offsets, but there are 1",
         ),
-        (lambda: Tendons([route(0.01)], directions=[[*ACROSS, ACROSS[0]]]), "3 directions of offsets: give one or two"),
+        (
+            lambda: Tendons([route(0.01)], directions=[[*ACROSS, ACROSS[0]]]),
+            "the tendons have [3] directions of offsets",
+        ),
+        (lambda: Tendons([route(0.01)], directions=[["up"]]), "a direction that is no array: 'up'"),
+        (lambda: Tendons([route(0.01), route(0.02)], labels=("a", "a")), "tendons are called a, a: give each a name"),
         (
             lambda: Tendons([route(0.01)], directions=[[[1.0, 0.0]]]),
             "of shape (2,): give three numbers, or three for each",

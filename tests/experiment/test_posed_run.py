@@ -17,13 +17,13 @@ from warp_resphys.experiment.files import read_dataset
 from warp_resphys.io.errors import InputError
 
 MODULUS = 420e3  # Pa, of the body that is recorded; the experiment expects 505 kPa
-OFFSETS = (1e-3, 0.0)  # m, around the axis, of its tendons; only the first pulls in the training
-POSES = {"weak": (0.5, 0.0), "strong": (1.5, 0.0), "other": (0.0, 1.0), "both": (1.0, 1.0)}
+OFFSETS = {"first": 1e-3, "second": -8e-4}  # m, around the axis, by which its tendons run elsewhere
+POSES = {"weak": (0.5, 0.0), "strong": (1.5, 0.0), "second": (0.0, 1.5), "other": (0.0, 1.0), "both": (1.0, 1.0)}
 TINY = [
     "experiment=tentacle",
     *("mesh.layers=4", "mesh.nodes=20", "tendons.routes.first.pieces=6", "tendons.routes.second.pieces=6"),
     *("data.folder=recordings", "data.folds=null", "data.validation=[other]"),
-    *("data.train=[weak,strong]", "data.test=[both]", "identify.max_evaluations=6"),
+    *("data.train=[weak,strong,second]", "data.test=[both]", "identify.max_evaluations=6"),
     *(
         "trainer={epochs:4,rollout_every:2,batch_size:16}",
         "network={position_modes:1,force_modes:2,width:8}",
@@ -31,7 +31,10 @@ TINY = [
         "simfree.network.position_modes=1",
     ),
     *("~identify.parameters.density", "parallel.processes=1", "markers.patch=0.05"),
-    *("~identify.parameters.tendon_offset_2_first", "~identify.parameters.tendon_offset_2_second"),  # as E, for two poses
+    *(
+        "~identify.parameters.tendon_offset_2_first",
+        "~identify.parameters.tendon_offset_2_second",
+    ),  # hardly told from E
     *("hydra/job_logging=none", "hydra/hydra_logging=none", IN_RUN),
 ]
 TRIALS = [
@@ -46,17 +49,26 @@ def configuration(*overrides):
         return OmegaConf.to_container(cfg, resolve=True)
 
 
+def moved(config):
+    """The tendons of a configuration, their guides where the recorded body has them."""
+    routes = {}
+    for name, each in config["tendons"]["routes"].items():
+        guides = np.array(each["guides"]) + OFFSETS[name] * np.array(each["offsets"][0])
+        routes[name] = {"guides": guides.tolist(), "pieces": each["pieces"]}
+    return {**config["tendons"], "routes": routes}
+
+
 @pytest.fixture(scope="module")
-def recorded():
+def poses():
     """The configuration of the poses, and (R, 5, 3) where their markers are in the frame of the body [m]."""
     config = configuration(*TRIALS)
-    simulator = build_simulator({**config, "simulation": {**config["simulation"], "youngs_modulus": MODULUS}})
+    recorded = {**config, "simulation": {**config["simulation"], "youngs_modulus": MODULUS}, "tendons": moved(config)}
+    simulator = build_simulator(recorded)
     markers = config["markers"]
     places = np.array([*markers["tracked"].values()])
     read = bound_markers(markers, simulator.body.mesh, places, tuple(markers["tracked"]))
     tensions = torch.tensor([*POSES.values()], dtype=torch.float64)
-    offsets = {"tendon_offset_1": torch.tensor(OFFSETS, dtype=torch.float64)}
-    at = read(simulator.static_equilibrium(Inputs(tendon_tension=tensions), offsets).q).numpy()
+    at = read(simulator.static_equilibrium(Inputs(tendon_tension=tensions)).q).numpy()
     base = np.broadcast_to([*markers["reference"].values()], (len(at), 1, 3))
     return config, np.concatenate([at, base], 1)
 
@@ -73,8 +85,8 @@ def write(folder, found):
         np.savetxt(folder / f"{name}.csv", table, delimiter=",", fmt="%.6f")
 
 
-def test_poses_of_unnamed_markers_identify_the_body(recorded, tmp_path, monkeypatch):
-    _, found = recorded
+def test_poses_of_unnamed_markers_identify_the_body(poses, tmp_path, monkeypatch):
+    _, found = poses
     monkeypatch.chdir(tmp_path)
     write(Path("recordings"), found)
     code, err = run(*TINY, *TRIALS)
@@ -86,8 +98,7 @@ def test_poses_of_unnamed_markers_identify_the_body(recorded, tmp_path, monkeypa
     np.testing.assert_allclose(dataset.inputs["tendon_tension"][rows, 0], [*POSES.values()], atol=1e-12)
     identified = json.loads(Path("run/identification.json").read_text())["sysid"]["parameters"]
     assert identified["youngs_modulus"] == pytest.approx(MODULUS, rel=0.01)
-    found_offsets = [identified[f"tendon_offset_1_{name}"] for name in ("first", "second")]
-    np.testing.assert_allclose(found_offsets, OFFSETS, atol=2e-4)
+    assert {name: identified[f"tendon_offset_1_{name}"] for name in OFFSETS} == pytest.approx(OFFSETS, abs=2e-4)
     assert "First offset of the tendon &#39;first&#39;" in Path("run/report.html").read_text()
     errors = {
         name: each["mean"] for name, each in json.loads(Path("run/metrics.json").read_text())["errors_mm"].items()
@@ -139,12 +150,20 @@ def test_a_finer_mesh_has_so_many_times_as_many_cells():
         (["data.axes=null"], "markers.reference names 1 .* it takes 3, or data.axes and one"),
         (["data.table.columns=[1,2]"], "data.table.columns is .* a list of headers"),
         (["data.trials.weak.inputs=[a]"], "data.trials.weak.inputs is .* one for each chamber, tendon or muscle"),
+        (
+            ["identify.parameters.tendon_offset_1_first.upper=0.03"],
+            "tendon_offset_1_first.upper: guide 1 .* outside of",
+        ),
+        (
+            ["+identify.parameters.tendon_offset_1={lower: -1e-3, upper: 1e-3}"],
+            "names tendon_offset_1 and it of every part, tendon_offset_1_first, tendon_offset_1_second: choose one",
+        ),
         (["markers.labels=guessed"], "markers.labels is 'guessed': .* recorded, assigned"),
         (["markers.reference={}", "~markers.reference.Base"], "markers.reference names 0 .* it takes 1"),
     ],
 )
-def test_what_cannot_be_told_from_the_table_is_refused(overrides, said, tmp_path, recorded, monkeypatch):
+def test_what_cannot_be_told_from_the_table_is_refused(overrides, said, tmp_path, poses, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    write(Path("recordings"), recorded[1])
+    write(Path("recordings"), poses[1])
     with pytest.raises(InputError, match=said):
         check_configuration(configuration(*TRIALS, *overrides))

@@ -81,7 +81,7 @@ def configuration(*overrides):
         ("tendons.routes.left.pieces=0", "tendons.routes.left.pieces is 0"),
         ("+tendons.routes.left.offsets=[]", "tendons.routes.left.offsets is .*one or two directions"),
         ("+tendons.routes.left.offsets=[[[1,0,0],[0,1,0],[0,0,1]]]", "left.offsets has a direction of shape"),
-        ("+tendons.routes.left.offsets=[[1,0,0]]", "give the same number for each"),
+        ("+tendons.routes.left.offsets=[[1,0,0]]", "3 tendons|the tendons have"),
         ("+identify.parameters.tendon_offset_1_left={lower:-1,upper:1}", "'tendon_offset_1_left': choose from"),
         ("data.input_limit=null", "data.input_limit is not set: say what the tendons take, in N"),
         ("data.parts=[1,2,4]", "data.parts names tendon 4, but the body has 3"),

@@ -61,7 +61,10 @@ class Quantity:
         return (" and ".join(ends) or "finite") + unit
 
     def varied(self, value: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
-        """A value within the range for every x, and the given one for zero: changed by a factor exp(x), at first."""
+        """A value within the range for every x, and the given one for zero.
+
+        At first it changes by a factor exp(x), or by x times its size or `typical` where it may be anything.
+        """
         if np.isfinite(self.lower) and np.isfinite(self.upper):
             width = self.upper - self.lower
             return self.lower + width * torch.sigmoid(torch.logit((value - self.lower) / width) + x)

@@ -90,6 +90,8 @@ class Muscles(Energy):
         """Checks the values."""
         if not self.muscles:
             raise InputError("there is no muscle: name the cells and the direction of each, or leave the muscles out.")
+        if len(set(self.names)) != self.count:
+            raise InputError(f"muscles are called {', '.join(self.names)}: give each a name of its own.")
         for name, muscle in zip(self.names, self.muscles, strict=True):
             cells, direction = np.asarray(muscle.cells), np.asarray(muscle.direction, dtype=np.float64)
             if cells.ndim != 1 or not cells.size or not np.issubdtype(cells.dtype, np.integer):

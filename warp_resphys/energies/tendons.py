@@ -19,7 +19,7 @@ tendon where it runs.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -98,18 +98,21 @@ class Tendons(Energy):
         if self.labels and len(self.labels) != len(self.routes):
             raise InputError(f"there are {len(self.labels)} names for {len(self.routes)} tendons.")
         _STIFFNESS.check(self.stiffness)
-        if not self.directions:
+        if len(set(self.names)) != self.count:
+            raise InputError(f"tendons are called {', '.join(self.names)}: give each a name of its own.")
+        if not len(self.directions):
             return
-        if len(self.directions) != len(self.routes) or len({len(each) for each in self.directions}) != 1:
-            counts = [len(each) for each in self.directions]
-            raise InputError(
-                f"there are directions of offsets for {len(counts)} tendons, {counts} in number, but {self.count} "
-                "tendons: give the same number for each."
-            )
-        if len(self.directions[0]) not in (1, 2):
-            raise InputError(f"each tendon has {len(self.directions[0])} directions of offsets: give one or two.")
+        if len(self.directions) != self.count:
+            raise InputError(f"{len(self.directions)} tendons have directions of offsets, but there are {self.count}.")
+        counts = [len(each) for each in self.directions]
+        if set(counts) not in ({1}, {2}):
+            raise InputError(f"the tendons have {counts} directions of offsets: give each one, or each two.")
         for number, (route, each) in enumerate(zip(self.guides, self.directions, strict=True), 1):
-            for direction in (np.asarray(one, dtype=np.float64) for one in each):
+            for given in each:
+                try:
+                    direction = np.asarray(given, dtype=np.float64)
+                except (TypeError, ValueError):
+                    raise InputError(f"tendon {number} has a direction that is no array: {given!r}.") from None
                 if direction.shape not in ((3,), route.shape):
                     raise InputError(
                         f"tendon {number} has a direction of offsets of shape {direction.shape}: give three numbers, "
@@ -118,10 +121,23 @@ class Tendons(Energy):
                 if not np.isfinite(direction).all() or not direction.any():
                     raise InputError(f"tendon {number} has a direction of offsets that is zero or not finite.")
 
+    def rerouted(self, offsets: ArrayLike) -> "Tendons":
+        """The same tendons where offsets take their guides, without offsets of their own.
+
+        Args:
+            offsets: (T, D) along the D directions of each of the T tendons [m].
+        """
+        along = np.asarray(offsets, dtype=np.float64)
+        routes = [
+            route + sum(o * np.asarray(d, dtype=np.float64) for o, d in zip(own, each, strict=True))
+            for route, own, each in zip(self.guides, along, self.directions, strict=True)
+        ]
+        return replace(self, routes=routes, directions=())
+
     @property
     def offset_count(self) -> int:
         """Directions that each tendon has."""
-        return len(self.directions[0]) if self.directions else 0
+        return len(self.directions[0]) if len(self.directions) else 0
 
     @property
     @override
@@ -230,9 +246,11 @@ class TendonTerm(PartTerm):
         self._spring = launcher.zeros(tendons.count, 3)
         self._direction = launcher.zeros(s.n_points, 3, 3)
         self._piece_length = torch.as_tensor(np.linalg.norm(s.source.rest[..., 0], axis=1), device=launcher.device)
-        operator = np.zeros((s.n_points, s.n_vertices, 3))  # how a vertex moves a piece
-        np.add.at(operator, (np.arange(s.n_points)[:, None], s.source.nodes), s.source.gradients[:, 0])
-        self._operator = torch.as_tensor(np.moveaxis(operator, -1, 0).copy(), device=launcher.device)  # (3, P, N)
+        columns = 1 + tendons.offset_count
+        operator = np.zeros((s.n_points, s.n_vertices, columns))  # how a vertex moves a piece
+        rows = np.arange(s.n_points)[:, None]
+        np.add.at(operator, (rows, s.source.nodes), s.source.gradients[:, 0, :, :columns])
+        self._operator = torch.as_tensor(np.moveaxis(operator, -1, 0).copy(), device=launcher.device)  # (.., P, N)
 
     @property
     @override
@@ -277,7 +295,8 @@ class TendonTerm(PartTerm):
         inputs = [s.nodes, s.gradients, self.part, self._found[0], positions]
         out = [warp_view(self._direction, wp.mat33d)]
         own.launch(own.record(kernels.directions, (own.batch, s.n_points), inputs, out))
-        by_column = self._direction.movedim(-1, 1)[..., None] * self._own[:, None]  # (B, 3, P, 3, T), columns first
+        columns = self._direction.movedim(-1, 1)[:, : len(self._operator)]  # (B, .., P, 3)
+        by_column = columns[..., None] * self._own[:, None]  # (B, .., P, 3, T)
         gradient = (self._operator.mT @ by_column.flatten(3)).sum(1)  # (B, N, 3 T)
         gradient = gradient.unflatten(2, (3, self.count)).flatten(1, 2)
         return gradient * (stiffness * self._spring[..., 2]).sqrt()[:, None]

@@ -3,8 +3,8 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from itertools import combinations
-from typing import Any
+from itertools import combinations, product
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -12,12 +12,15 @@ import torch
 from ..data.base_motion import OBSERVED
 from ..data.markers import MarkerMap
 from ..data.registration import axes_rotation
+from ..dynamics.simulator import Simulator
+from ..energies.base import Energy
 from ..energies.materials import Material
+from ..energies.tendons import OFFSETS, Tendons
 from ..fem.body import Body
 from ..io.errors import InputError, listed
 from ..io.memory import available_memory_gib
+from ..learning.parameters import MASS_FACTOR, command_of, known_parameters, parameters_of_parts
 from ..learning.reconstruction import make_reconstructor
-from ..learning.replay import MASS_FACTOR, known_parameters
 from ..mesh.mesh import select_vertices, surface_vertices
 from .actuators import Drive, drive_of
 from .build import build_body, build_material, build_simulator, finer, sight_of
@@ -102,6 +105,7 @@ def check_configuration(config: Mapping[str, Any]) -> None:
         hangs = config["data"].get("payload_at") is not None
         known = [name for name in known_parameters(simulator) if hangs or name != MASS_FACTOR]
         _check_identification(config["identify"], known)
+        _check_parts(config["identify"], simulator)
 
 
 def _check_refinement(config: Mapping[str, Any]) -> None:
@@ -450,7 +454,7 @@ def _check_identification(identify: Mapping[str, Any], known: Sequence[str]) -> 
                 raise InputError(f"identify.{group} names '{name}': {instead}.")
             with _naming(f"identify.{group}.{name}: "):
                 bounds_of(settings)
-            if name.endswith(("_delay", "_rise")) and settings["lower"] < 0.0:
+            if command_of(name)[1] in ("delay", "rise") and settings["lower"] < 0.0:
                 raise InputError(
                     f"identify.{group}.{name}.lower is {settings['lower']:g}: nothing comes before its command, so it "
                     "must be zero or more, in s; data.trials.NAME.onset says when a command comes."
@@ -464,6 +468,25 @@ def _check_identification(identify: Mapping[str, Any], known: Sequence[str]) -> 
                 f"identify.first_guess.{name} is {value!r}: it must be a number from {within['lower']:g} to "
                 f"{within['upper']:g}, its range."
             )
+
+
+def _check_parts(identify: Mapping[str, Any], simulator: Simulator) -> None:
+    """Checks parameters of parts, and where the ends of their ranges take tendons."""
+    names = [name for name, each in identify["parameters"].items() if each is not None]
+    of_parts = parameters_of_parts(simulator)
+    for whole in names:
+        parts = [name for name, (each, _) in of_parts.items() if each == whole]
+        if parts and set(parts) <= set(names):
+            raise InputError(f"identify.parameters names {whole} and it of every part, {', '.join(parts)}: choose one.")
+    found = [each for each in cast(Sequence[Energy], simulator.body.energies) if isinstance(each, Tendons)]
+    for tendons, name in product(found, names):
+        whole, part = of_parts.get(name, (name, None))
+        for number, quantity in enumerate(OFFSETS[: tendons.offset_count]):
+            for end in ("lower", "upper") if quantity.name == whole else ():
+                offsets = np.zeros((tendons.count, tendons.offset_count))
+                offsets[slice(None) if part is None else part, number] = identify["parameters"][name][end]
+                with _naming(f"identify.parameters.{name}.{end}: "):
+                    tendons.rerouted(offsets).points(simulator.body.mesh)
 
 
 def _check_ablation(config: Mapping[str, Any], body: Body) -> None:

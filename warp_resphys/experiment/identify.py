@@ -12,6 +12,7 @@ from ..io.progress import Progress
 from ..io.resumable import forget_checkpoint, keep_checkpoint, resume_checkpoint
 from ..io.stages import StageContext
 from ..learning.identification import Bounds, Identifier, Prior
+from ..learning.parameters import first_guesses
 from ..learning.placement import Accuracy
 from ..learning.replay import Replay, Start
 from .files import IDENTIFICATION
@@ -114,21 +115,13 @@ def _seconds(settings: Mapping[str, Any], replays: Replays) -> float | None:
     return min((each for each in limits if each is not None), default=None)
 
 
-def first_guess(settings: Mapping[str, Any], names: Any) -> dict[str, float]:
-    """What the parameters are before anything is known: those of the uncorrected simulation."""
-    values = {"fibre_stiffness": (settings.get("fibres") or {}).get("stiffness", 0.0)}
-    values |= {key: value for key, value in settings["simulation"].items() if key != "model"}
-    return {name: values.get(name, 1.0 if name.endswith("_factor") else 0.0) for name in names}
-
-
 def _search(settings: Mapping[str, Any], identifier: Identifier, kept: _Kept, progress: Progress) -> dict[str, Any]:
     """The `Identification` of a model, as plain data; goes on from where an interrupted one ended."""
     if "found" in kept.content:
         return dict(kept.content["found"])
     config, bounds = settings["identify"], identifier.bounds
     if "starts" not in kept.content:
-        guess = first_guess(settings, bounds)
-        guess |= {name: value for name, value in config["first_guess"].items() if name in bounds}
+        guess = first_guesses(settings, bounds)
         starts = identifier.starts(guess, config["starts"], config["candidates"], settings["seed"])
         kept.keep(starts=starts, attempts=[])
 

@@ -16,6 +16,7 @@ from ..energies.materials import make_material
 from ..io.errors import DataFileError
 from ..io.files import read_array, read_hdf5, read_json
 from ..io.stages import StageContext, package_versions, resources_used
+from ..learning.parameters import configured_parameters
 from ..mesh.chambers import Chamber
 from ..mesh.mesh import Mesh, select_vertices
 from ..mesh.surface import closest_points
@@ -45,7 +46,6 @@ from .files import (
     read_if_there,
     training_file,
 )
-from .identify import first_guess
 from .scene import LEARNED
 from .trials import is_laboratory, sees_markers
 
@@ -196,7 +196,7 @@ def collect_metrics(folder: Path, config: Mapping[str, Any], stages: Sequence[st
 def data_sheet(config: Mapping[str, Any], identification: Mapping[str, Any]) -> dict[str, float]:
     """What the simulator has of all that was identified, and of what the landscape is drawn over."""
     names = {name for found in identification.values() for name in found.get("parameters", {})}
-    return first_guess(config, (*names, "youngs_modulus", "poissons_ratio"))
+    return configured_parameters(config, (*names, "youngs_modulus", "poissons_ratio"))
 
 
 def error_notes(sideways: Mapping[str, float], truth: Mapping[str, Any], mesh: Mapping[str, Any]) -> list[str]:

@@ -15,13 +15,9 @@ from ..data.trials import Trials
 from ..dynamics.inputs import Inputs
 from ..dynamics.integrator import State
 from ..dynamics.simulator import Constants, Simulator
-from ..energies.strings import PAYLOAD
 from ..io.errors import ConvergenceError, InputError
+from .parameters import HUNG, MASS_FACTOR, TILTS, known_parameters, parameters_of_parts
 
-MASS_FACTOR = "attached_mass_factor"
-TILTS = ("gravity_tilt_1", "gravity_tilt_2")
-_COMMANDS = ("factor", "delay", "rise")  # that may be unknown of an input, in the order in which they act
-_HUNG = ("attached_mass", PAYLOAD.name)
 _POSE_ITERATIONS = 50
 _POSE_TOLERANCE = 1e-8  # m
 Observe = Callable[[torch.Tensor], torch.Tensor]
@@ -92,7 +88,7 @@ class Replay:
         self.simulator, self.observe, self.trials = simulator, observe, trials
         self.settled: torch.Tensor | None = None
         self.known = known_parameters(simulator)
-        self._of_parts = _parameters_of_parts(simulator)
+        self._of_parts = parameters_of_parts(simulator)
 
     def setting(self, parameters: Parameters | None = None) -> tuple[Constants, Inputs, Inputs]:
         """What E sets of parameters make of R trials, as (E R) environments, the trials running fastest.
@@ -119,7 +115,7 @@ class Replay:
             constants["gravity"] = tilted_gravity(sim, *(spread.get(name) for name in TILTS))
         inputs = self.trials.inputs.repeat(each)
         changed = self._acting(inputs, spread)
-        hung = {name: each for name, each in inputs.fields.items() if name in _HUNG}
+        hung = {name: each for name, each in inputs.fields.items() if name in HUNG}
         if MASS_FACTOR in spread:
             hung = {name: weight * spread[MASS_FACTOR][:, None] for name, weight in hung.items()}
         inputs = inputs.replace(**changed, **hung)
@@ -145,7 +141,7 @@ class Replay:
         """What commanded inputs come to, of values (E R,) of their parameters."""
         found, step = {}, self.simulator.time_step
         for name, command in inputs.actuation.items():
-            if name in _HUNG:
+            if name in HUNG:
                 continue
             if (factor := spread.get(f"{name}_factor")) is not None:
                 command = command * factor[:, None]
@@ -239,23 +235,6 @@ class Replay:
         """(E, R, T, M, 3) simulated less observed points [m], zero where nothing was seen."""
         difference = simulated - self.trials.observed
         return torch.where(self.trials.seen[..., None], difference, 0.0)
-
-
-def known_parameters(simulator: Simulator) -> tuple[str, ...]:
-    """What can be identified of a simulator; see `Replay`."""
-    constants = (*(name for name in simulator.parameters if name != "gravity"), *_parameters_of_parts(simulator))
-    driven = [f"{name}_{what}" for name in simulator.inputs if name not in _HUNG for what in _COMMANDS]
-    return (*constants, MASS_FACTOR, *TILTS, *driven)
-
-
-def _parameters_of_parts(simulator: Simulator) -> dict[str, tuple[str, int]]:
-    """The parameter and the number of the part, for every part of energies that have several, by name."""
-    return {
-        f"{name}_{part}": (name, number)
-        for name, parts in simulator.parts.items()
-        if len(parts) > 1
-        for number, part in enumerate(parts)
-    }
 
 
 def tilted_gravity(simulator: Simulator, first: torch.Tensor | None, second: torch.Tensor | None) -> torch.Tensor:

@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from ..learning.metrics import PUBLISHED_WINDOWS_MM
+from ..learning.parameters import command_of
 from .data import MODELS, FloatArray, RunReport
 from .page import (
     MINUS,
@@ -59,10 +60,10 @@ _NOTHING_NEW: Final = (
 
 def _parameter(name: str) -> tuple[str, str, float]:
     """What a parameter is called, the unit that it is written in, and how many of these make an SI unit."""
-    command = re.fullmatch(r"([a-z]+_)?([a-z]+)_(factor|delay|rise)", name)
-    if command is not None and name not in _PARAMETERS:
-        kind, unit, per = _COMMANDS[command[3]]
-        return f"{kind} of the {command[2]}{'es' if command[2].endswith('s') else 's'}", unit, per
+    driven, command = command_of(name)
+    if driven:
+        (kind, unit, per), words = _COMMANDS[command], driven.rpartition("_")[2]
+        return f"{kind} of the {words}{'es' if words.endswith('s') else 's'}", unit, per
     offset = re.fullmatch(r"(tendon_offset_[12])_(.+)", name)
     if offset is not None:
         kind, unit, per = _PARAMETERS[offset[1]]

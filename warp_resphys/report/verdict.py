@@ -9,6 +9,7 @@ from statistics import fmean
 from typing import Any, Final
 
 from ..learning.metrics import PUBLISHED_WINDOWS_MM, Gain, PublishedError, paired_gain
+from ..learning.parameters import first_guesses
 from .data import MODELS, RunReport
 from .page import MINUS, NO_BREAK_SPACE, mm_text, published_parts
 
@@ -381,13 +382,12 @@ def _advice(found: Identified) -> str:
 def _identified(metrics: Mapping[str, Any], settings: Mapping[str, Any]) -> list[Identified]:
     """What a fold has identified, beside how that is configured."""
     config = settings.get("identify") or {}
-    guess = {**settings.get("simulation", {}), **(config.get("first_guess") or {})}
     found = []
     for model, place in _PLACES.items():
         ranges = config.get(place) or {}
         for name, value in metrics.get("parameters", {}).get(model, {}).items():
             if ranges.get(name):
-                start = guess.get(name, 1.0 if name.endswith("_factor") else 0.0)
+                start = first_guesses(settings, [name])[name]
                 lower, upper = ranges[name]["lower"], ranges[name]["upper"]
                 known = ranges[name].get("prior") is not None
                 found.append(Identified(f"identify.{place}.{name}", value, lower, upper, start, known))

@@ -141,7 +141,7 @@ def summary(robots: Mapping[str, Any], found: Mapping[str, Measured], failed: Co
         "deviation over trials. Less error: the share that SysID takes away of the uncorrected error, and ResPhys of "
         "SysID's, with the interval that holds it in nine of ten draws of the trials (paired bootstrap). Coverage: of "
         "the measured coordinates, those within the 90 % prediction intervals of ResPhys, and how wide these are on "
-        "average. Time: all stages, beside whatever else the machine did."
+        "average. Time: all stages, also of folds that ran at once, beside whatever else the machine did."
     )
     columns = [
         "Uncorrected",

@@ -196,7 +196,7 @@ def _adjoint(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...
     hessian = ctx.workspace.hessian(ctx.linear_solver)
     hessian.refactor_exact()
     gradient = gradient.double()
-    z = hessian.apply(gradient.reshape(len(x), -1)).view_as(x)
+    z = hessian.solve(gradient.reshape(len(x), -1, 1)).view_as(x)
     product = potential.stiffness_product(z)
     _check_adjoint(potential, z, product, gradient)
     _, _, _, _, _, fixed, target, inertia, force, *values = ctx.needs_input_grad

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from ..io.kernel_cache import ensure_kernel_cache
 from ..kernels import points
 
+BLOCK = 128  # threads of a GPU that work on one environment
+
 ensure_kernel_cache()  # Before Warp is first used, by this package or by who imports it.
 
 
@@ -45,6 +47,13 @@ class Launcher:
     def record(self, kernel: Any, dim: tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> Any:
         """A launch to be made by `launch`, as often as needed."""
         return wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=str(self.device), record_cmd=True)
+
+    def record_blocks(self, kernel: Any, blocks: int, inputs: list[Any], outputs: list[Any]) -> Any:
+        """A launch by blocks of threads that work together, on a CPU of one thread each."""
+        device = str(self.device)
+        return wp.launch_tiled(
+            kernel, dim=[blocks], inputs=inputs, outputs=outputs, block_dim=BLOCK, device=device, record_cmd=True
+        )
 
     def gather(self, s: Any, stress: Any, out: torch.Tensor) -> Any:
         """A launch that adds the transposed operator of a set's stress, a view (B, P) mat33, to (B, N, 3)."""

@@ -19,6 +19,7 @@ import warp as wp
 
 from ..fem.elements import Points
 from ..kernels import points as kernels
+from ..kernels import reductions
 from .base import Energy, PointSet, Term
 from .launcher import Launcher, warp_view
 from .solid import SolidTerm
@@ -52,6 +53,10 @@ class IncrementalPotential(Launcher):
         energies: their terms.
         sets: the sets of points of all of them.
         free_mask: (N,) one at free vertices, zero at fixed ones.
+        energy: (B,) of the last evaluation [J].
+        energy_size: (B,) sum of the absolute values of what it is the sum of [J].
+        balance: (B,) norm of inertia less all loads there [N].
+        residual_norm: (B,) norm of the residual there [N].
         low_rank: (B, 3 N, r) columns C of the last `update_tangent`: what the Hessian has beside `tangent` is C C^T.
             None for nothing.
     """
@@ -92,6 +97,7 @@ class IncrementalPotential(Launcher):
         self._stress = self.zeros(self._n_points, 3, 3)
         self._point_energy = self.zeros(self._n_points)
         self._vertex_energy = self.zeros(n_vertices)
+        self.energy, self.energy_size, self.balance, self.residual_norm = (self.zeros() for _ in range(4))
         self._record_evaluation()
         self._tangent: torch.Tensor | None = None
         self.low_rank: torch.Tensor | None = None
@@ -131,6 +137,15 @@ class IncrementalPotential(Launcher):
                     self.record(kernel, (b, s.n_points), inputs, outputs),
                     self.gather(s, stress, self.residual),
                 ]
+        free, residual = warp_view(self.free_mask, wp.float64), warp_view(self.residual, wp.vec3d)
+        self._load_commands.append(
+            self.record_blocks(reductions.masked_norm, b, [free, residual], [warp_view(self.balance, wp.float64)])
+        )
+        energies = [warp_view(each, wp.float64) for each in (self._vertex_energy, self._point_energy)]
+        sums = [warp_view(each, wp.float64) for each in (self.energy, self.energy_size, self.residual_norm)]
+        self._internal_commands.append(
+            self.record_blocks(reductions.totals, b, [free, *energies, residual], sums)
+        )
 
     def set_terms(self, terms: StepTerms) -> None:
         """Copies a step's terms into the buffers; fixed vertices get neither inertia nor load."""
@@ -153,28 +168,17 @@ class IncrementalPotential(Launcher):
         """(B, N) inertia of the current terms [N/m], zero at fixed vertices."""
         return self.terms.inertia
 
+    def launch_evaluation(self) -> None:
+        """Sets ``residual`` and the sums of it and of the energy at ``positions``; see the attributes."""
+        self.launch(self._inertia_command, *self._load_commands, *self._internal_commands)
+
     def evaluate(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Energy (B,) [J] and norm of inertia less all loads (B,) [N] at ``positions``; sets ``residual`` [N].
 
         The residual is the potential's gradient, zero at fixed vertices.
         """
-        self.launch(self._inertia_command, *self._load_commands)
-        if self._load_commands:
-            self.residual.mul_(self.free_mask[:, None])
-        balance = torch.linalg.vector_norm(self.residual.view(self.batch, -1), dim=1)
-        self.launch(*self._internal_commands)
-        self.residual.mul_(self.free_mask[:, None])
-        return self._point_energy.sum(1).add_(self._vertex_energy.sum(1)), balance
-
-    def energy_rounding(self) -> torch.Tensor:
-        """(B,) how far rounding may have moved the energy last evaluated [J].
-
-        Terms of the size of the stiffness cancel in the energy of a small strain.
-        """
-        stiffness = self.terms.values["stiffness"]
-        assert stiffness is not None
-        energy = self._point_energy.abs().sum(1) + self._vertex_energy.abs().sum(1)
-        return 8.0 * torch.finfo(torch.float64).eps * (stiffness.sum((1, 2)) + 100.0 * energy)
+        self.launch_evaluation()
+        return self.energy.clone(), self.balance.clone()
 
     def residual_rounding(self) -> torch.Tensor:
         """(B,) norm by which the residual last evaluated changes when every coordinate moves by one rounding unit [N].

@@ -43,6 +43,10 @@ class Factor(ABC):
     def solve(self, rhs: torch.Tensor) -> torch.Tensor:
         """Solves for (B, n, m) right-hand sides; a factor of batch 1 serves every environment of the batch."""
 
+    def solve_in_place(self, columns: torch.Tensor) -> None:
+        """Overwrites (B, n) right-hand sides, in the order of the linear solver, by their solutions."""
+        columns.copy_(self.solve(columns[:, :, None])[:, :, 0])
+
 
 class CorrectedFactor(Factor):
     """A factor of A + C C^T from one of A (Sherman, Morrison and Woodbury).
@@ -50,10 +54,11 @@ class CorrectedFactor(Factor):
     Args:
         factor: of A.
         columns: (B, n, r) C.
+        order: (n,) unknown at each place of the linear solver.
     """
 
-    def __init__(self, factor: Factor, columns: torch.Tensor) -> None:
-        self._factor, self._columns = factor, columns
+    def __init__(self, factor: Factor, columns: torch.Tensor, order: torch.Tensor) -> None:
+        self._factor, self._columns, self._order = factor, columns, order
         self.failed = factor.failed
         self._solved = factor.solve(columns)
         small = torch.eye(columns.shape[2], device=columns.device, dtype=columns.dtype) + columns.mT @ self._solved
@@ -64,10 +69,11 @@ class CorrectedFactor(Factor):
         found = self._factor.solve(rhs)
         return found - self._solved @ torch.linalg.lu_solve(*self._small, self._columns.mT @ found)
 
-
-def corrected(factor: Factor, columns: torch.Tensor | None) -> Factor:
-    """A factor of A + C C^T, or that of A where there is no C."""
-    return factor if columns is None else CorrectedFactor(factor, columns)
+    @override
+    def solve_in_place(self, columns: torch.Tensor) -> None:
+        self._factor.solve_in_place(columns)
+        along = self._columns[:, self._order].mT @ columns[:, :, None]
+        columns -= (self._solved[:, self._order] @ torch.linalg.lu_solve(*self._small, along))[:, :, 0]
 
 
 class LinearSolver(ABC):
@@ -88,10 +94,12 @@ class LinearSolver(ABC):
         address: (E, block^2) place of each block's entries in the value array, -1 where not stored.
         n_values: length of the value array.
         overwrites: whether `factor` writes over the values.
+        order: (n_nodes,) node at each place of its right-hand sides `in place <Factor.solve_in_place>`.
     """
 
     address: NDArray[np.int32]
     n_values: int
+    order: Indices
     overwrites = False
 
     def __init__(
@@ -101,6 +109,7 @@ class LinearSolver(ABC):
         self.block = block
         self.device = device
         self.dtype = dtype
+        self.order = np.arange(n_nodes)
         self._lay_out(rows, cols, n_nodes)
         if self.n_values > _MOST_VALUES:
             raise InputError(
@@ -122,6 +131,16 @@ class LinearSolver(ABC):
                 factorisation that takes any regular matrix.
             idle: (B,) matrices that may be left out: nobody asks for their solutions, which may be anything.
         """
+
+    def corrected(self, factor: Factor, columns: torch.Tensor | None) -> Factor:
+        """A factor of A + C C^T with C (B, n, r), or that of A where there is no C."""
+        return factor if columns is None else CorrectedFactor(factor, columns, self.unknowns)
+
+    @property
+    def unknowns(self) -> torch.Tensor:
+        """(n,) unknown at each place of the right-hand sides in place."""
+        dofs = (self.order[:, None] * self.block + np.arange(self.block)).ravel()
+        return torch.as_tensor(dofs, device=self.device)
 
     def _entries(self, rows: Indices, cols: Indices) -> tuple[Indices, Indices]:
         """Scalar row and column (E, block^2) of every entry of every block, in the order of the nodes given."""
@@ -146,8 +165,8 @@ class BandedSolver(LinearSolver):
         self.bandwidth = int((i - j).max())
         self.n_values = self.n * (self.bandwidth + 1)
         self.address = np.where(diagonal_upper, -1, j * (self.bandwidth + 1) + (i - j)).astype(np.int32)
-        dofs = (order[:, None] * self.block + np.arange(self.block)).ravel()
-        self._order = torch.as_tensor(dofs)
+        self.order = order
+        self._order = self.unknowns
         self._place = torch.argsort(self._order)
         self._threads = ThreadpoolController()
 
@@ -198,11 +217,18 @@ class _BandedFactor(Factor):
         # Triangular solves with a band run on one thread in any case.
         for factor, block in zip(self._factors, columns, strict=True):
             if factor is not None:
-                self._solve_in_place(factor, block.T)
+                self._overwrite(factor, block.T)
         solved = torch.from_numpy(columns).reshape(b, m, n).transpose(1, 2)
         return solved[:, self._place]
 
-    def _solve_in_place(self, factor: Any, columns: NDArray[Any]) -> None:
+    @override
+    def solve_in_place(self, columns: torch.Tensor) -> None:
+        each = columns.numpy()[:, None] if len(self._factors) > 1 else columns.numpy()[None]
+        for factor, block in zip(self._factors, each, strict=True):
+            if factor is not None:
+                self._overwrite(factor, block.T)
+
+    def _overwrite(self, factor: Any, columns: NDArray[Any]) -> None:
         """Overwrites (n, columns) in Fortran order."""
         w = self._width
         if self._definite:

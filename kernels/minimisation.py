@@ -345,7 +345,7 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
         curvature, lengths, changes = block_sum(curvature), block_sum(lengths), block_sum(changes)
         if not curvature > LEAST_CURVATURE * wp.sqrt(lengths * changes):
             return
-        first = int(0)
+        first = 0
         if k == m:
             first = 1
         for i in range(first, k):

@@ -77,8 +77,8 @@ class Minimiser:
         found.energy, found.size = warp_view(p.energy, wp.float64), warp_view(p.energy_size, wp.float64)
         found.balance, found.norm = warp_view(p.balance, wp.float64), warp_view(p.residual_norm, wp.float64)
         found.residual = warp_view(p.residual, wp.vec3d)
-        tolerances.relative, tolerances.absolute = relative_tolerance, absolute_tolerance
-        tolerances.epsilon, tolerances.max_iterations = torch.finfo(dtype).eps, max_iterations
+        tolerances.relative, tolerances.absolute = wp.float64(relative_tolerance), wp.float64(absolute_tolerance)
+        tolerances.epsilon, tolerances.max_iterations = wp.float64(torch.finfo(dtype).eps), max_iterations
 
         positions, gradient = warp_view(p.positions, wp.vec3d), warp_view(self._gradient, wp.vec3d)
         direction, origin_view = warp_view(self._direction, wp.vec3d), warp_view(origin, wp.vec3d)

@@ -142,8 +142,8 @@ class NonlinearSolver:
         """Whether the global step's matrix is to be factorised before the next directions."""
         name, limit = self.settings.name, self.settings.refactor_after
         if first:
-            return not self.hessian.ready() or self._newton or (
-                name == "quasi_newton" and self._mean_iterations > limit
+            return (
+                not self.hessian.ready() or self._newton or (name == "quasi_newton" and self._mean_iterations > limit)
             )
         return self._newton or (name == "quasi_newton" and since >= 3 * limit)
 

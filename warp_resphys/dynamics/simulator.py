@@ -290,6 +290,10 @@ class Simulator:
         inputs = _NOTHING if inputs is None else inputs
         constants = self.prepare(parameters)
         self._check(state, inputs, constants)
+        return self._advance(state, inputs, constants)
+
+    def _advance(self, state: State, inputs: Inputs, constants: Constants) -> tuple[State, SolveReport]:
+        """`step` with arguments that have been checked."""
         stage = self.method.stage(state, self.time_step)
         workspace = self.workspace(state.batch)
         terms = self._terms(state, stage, inputs, constants)
@@ -498,7 +502,12 @@ class Simulator:
         constants = self.prepare(parameters)
         states, reports = [state], []
         for t in range(steps):
-            state, report = self.step(state, inputs.at(t), constants)
+            acting = inputs.at(t)
+            if t == 0:
+                self._check(state, acting, constants)
+            elif acting is not inputs:
+                self._check_inputs(acting, state.batch)
+            state, report = self._advance(state, acting, constants)
             states.append(state)
             reports.append(report)
         q, v = (torch.stack([getattr(s, name) for s in states]) for name in ("q", "v"))
@@ -520,10 +529,15 @@ class Simulator:
             shape = (batch, self._strings.count, 3)
             for name, unit in (("q", "m"), ("v", "m/s")):
                 check_tensor(f"state.payload.{name}", getattr(state.payload, name), shape, unit, "string", like)
-        if not isinstance(inputs, Inputs):
-            raise InputError(f"the inputs are a {type(inputs).__name__}: give Inputs(external_force=...), say.")
-        inputs.check([energy for energy, _ in self._energies], batch, n, len(self.fixed), like)
+        self._check_inputs(inputs, batch)
         constants.check_batch(batch)
         if state.overstrain is not None:
             solid = self.workspace(batch).potential.solid
             check_overstrain(state.overstrain, (batch, len(self.material.prony), solid.n_points, 3, 3), like)
+
+    def _check_inputs(self, inputs: Inputs, batch: int) -> None:
+        """One sentence on the first input that cannot be simulated."""
+        if not isinstance(inputs, Inputs):
+            raise InputError(f"the inputs are a {type(inputs).__name__}: give Inputs(external_force=...), say.")
+        energies, counts = [energy for energy, _ in self._energies], (self.body.n_vertices, len(self.fixed))
+        inputs.check(energies, batch, *counts, self.rest_positions)

@@ -143,9 +143,7 @@ class IncrementalPotential(Launcher):
         )
         energies = [warp_view(each, wp.float64) for each in (self._vertex_energy, self._point_energy)]
         sums = [warp_view(each, wp.float64) for each in (self.energy, self.energy_size, self.residual_norm)]
-        self._internal_commands.append(
-            self.record_blocks(reductions.totals, b, [free, *energies, residual], sums)
-        )
+        self._internal_commands.append(self.record_blocks(reductions.totals, b, [free, *energies, residual], sums))
 
     def set_terms(self, terms: StepTerms) -> None:
         """Copies a step's terms into the buffers; fixed vertices get neither inertia nor load."""

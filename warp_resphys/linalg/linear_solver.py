@@ -25,7 +25,7 @@ from typing_extensions import override
 
 from ..io.errors import InputError
 
-LINEAR_SOLVERS = ("auto", "banded", "dense", "sparse")
+LINEAR_SOLVERS = ("auto", "banded", "tiled", "dense", "sparse")
 Indices = NDArray[np.int64]
 _MOST_VALUES = 2**31 // 8 - 1  # Warp's strides are 32-bit numbers of bytes.
 
@@ -261,10 +261,12 @@ class DenseSolver(LinearSolver):
 
     @override
     def factor(self, values: torch.Tensor, definite: bool = True, idle: torch.Tensor | None = None) -> Factor:
-        return _DenseFactor(values.reshape(-1, self.n, self.n), definite)
+        return DenseFactor(values.reshape(-1, self.n, self.n), definite)
 
 
-class _DenseFactor(Factor):
+class DenseFactor(Factor):
+    """Of lower triangles (B, n, n), which it may overwrite."""
+
     def __init__(self, lower: torch.Tensor, definite: bool) -> None:
         self._definite = definite
         if definite:
@@ -414,8 +416,11 @@ def make_linear_solver(
         raise InputError("linear_solver=banded runs on the CPU alone: choose dense, sparse or auto on a GPU.")
     if name == "auto":
         name = _cheapest(rows, cols, n_nodes, block, device)
+    from .tiled_solver import TiledSolver
+
     solvers: dict[str, Callable[..., LinearSolver]] = {
         "banded": BandedSolver,
+        "tiled": TiledSolver,
         "dense": DenseSolver,
         "sparse": SparseSolver,
     }

@@ -1,8 +1,8 @@
 """Cholesky factorisation of banded matrices in square tiles, and both sweeps of a solve: one block a matrix.
 
 A matrix of n unknowns is stored by rows: row i holds the W + 1 tiles of T columns that end with its diagonal tile, so
-that entry (i, j) of the lower triangle is at column (j // T - i // T + W) T + j % T. Tiles left of the first column, and
-what lies above the diagonal, are never read. Rows and columns of the last tiles beyond n are those of a unit matrix.
+that entry (i, j) of the lower triangle is at column (j // T - i // T + W) T + j % T. Tiles left of the first column,
+and what lies above the diagonal, are never read. In the last tiles, what is beyond n is a unit matrix.
 
 The factorisation is the left-looking one by rows of tiles (Golub and Van Loan 2013, section 4.2.9).
 """

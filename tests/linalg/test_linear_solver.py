@@ -6,8 +6,10 @@ import scipy.linalg
 import torch
 
 from warp_resphys.io.errors import InputError
-from warp_resphys.linalg import linear_solver
-from warp_resphys.linalg.linear_solver import bandwidth_reducing_order, make_linear_solver
+from warp_resphys.linalg import sparse
+from warp_resphys.linalg.banded import BandedSolver
+from warp_resphys.linalg.choice import make_linear_solver
+from warp_resphys.linalg.linear_solver import bandwidth_reducing_order
 
 NODES, BATCH = 12, 3
 
@@ -57,7 +59,7 @@ def cholespy(request, monkeypatch):
     if request.param:
         pytest.importorskip("cholespy")
     else:
-        monkeypatch.setattr(linear_solver, "_cholespy", lambda: None)
+        monkeypatch.setattr(sparse, "_cholespy", lambda: None)
 
 
 @pytest.mark.parametrize("block", [1, 3])
@@ -162,4 +164,4 @@ def test_bad_choices_are_refused():
         make("lu", 3)
     with pytest.raises(InputError, match="linear_solver=banded runs on the CPU alone"):
         make("banded", 3, "cuda")
-    assert isinstance(make("auto", 3), linear_solver.BandedSolver)
+    assert isinstance(make("auto", 3), BandedSolver)

@@ -12,7 +12,8 @@ from ..energies.base import Energy
 from ..energies.potential import IncrementalPotential, StepTerms
 from ..fem.elements import Points
 from ..io.errors import ConvergenceError
-from ..linalg.linear_solver import LinearSolver, make_linear_solver
+from ..linalg.choice import make_linear_solver
+from ..linalg.linear_solver import LinearSolver
 from ..linalg.threads import threads_for
 from .assembly import BlockPattern
 from .hessian import ExactHessian

@@ -9,7 +9,8 @@ import torch
 from numpy.typing import NDArray
 
 from ..energies.potential import StepTerms
-from ..linalg.linear_solver import Factor, SparseSolver
+from ..linalg.linear_solver import Factor
+from ..linalg.sparse import SparseSolver
 from .assembly import HessianAssembly
 from .equilibrium import Workspace
 from .integrator import ImplicitStage, State

@@ -24,7 +24,7 @@ import torch
 
 from ..energies.potential import IncrementalPotential
 from ..io.errors import ConvergenceError, InputError
-from ..linalg.linear_solver import LINEAR_SOLVERS, make_linear_solver
+from ..linalg.choice import LINEAR_SOLVERS, make_linear_solver
 from .assembly import BlockPattern
 from .hessian import ExactHessian, HessianApproximation, ProjectiveHessian
 from .minimiser import Minimiser
@@ -44,7 +44,7 @@ class SolverSettings:
     max_iterations: int = 2000  # after which it has failed
     memory: int = 12  # pairs that L-BFGS keeps
     refactor_after: int = 4  # mean iterations a step above which ``quasi_newton`` factorises anew
-    linear_solver: str = "auto"  # ``auto``, ``banded``, ``dense`` or ``sparse``
+    linear_solver: str = "auto"  # ``auto``, ``banded``, ``tiled``, ``dense`` or ``sparse``
     on_failure: str = "raise"  # ``raise`` a `ConvergenceError`, or ``count`` the failure in the report and go on
 
     def __post_init__(self) -> None:

@@ -45,7 +45,7 @@ from ..io.files import write_json
 from ..io.machine import hardware
 from ..io.progress import Progress
 from ..io.stages import package_versions
-from ..linalg.linear_solver import make_linear_solver
+from ..linalg.choice import make_linear_solver
 from .command import show, table_of
 
 PARTS: Final = ("local_step", "tangent", "assembly", "factor", "solve")

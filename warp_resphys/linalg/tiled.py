@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from ..kernels.tiled_cholesky import tiled_kernels
-from .linear_solver import DenseFactor, Factor, Indices, LinearSolver, bandwidth_reducing_order
+from .dense import DenseFactor
+from .linear_solver import Factor, Indices, LinearSolver, bandwidth_reducing_order
 
 TILE = 16  # rows and columns of a tile
 BLOCK = 64  # threads that share a matrix

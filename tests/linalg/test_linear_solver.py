@@ -153,7 +153,7 @@ def test_band_storage_is_lapacks():
     solver = make("banded", 3)
     bands = values_of(solver, dense).numpy().reshape(BATCH, solver.n, -1)
     right = np.ones(solver.n)
-    order = solver._order.numpy()
+    order = solver.dofs.numpy()
     for matrix, band in zip(dense, bands, strict=True):
         reference = np.linalg.solve(matrix[np.ix_(order, order)], right)
         np.testing.assert_allclose(scipy.linalg.solveh_banded(band.T, right, lower=True), reference, rtol=1e-9)

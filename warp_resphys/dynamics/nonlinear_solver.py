@@ -18,6 +18,7 @@ Residuals and positions are float64. Factors and pairs may be float32: they deci
 What is decided for an environment is decided by kernels (`minimiser`); the host makes their launches, and factorises.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -71,7 +72,38 @@ class SolveReport:
     iterations: torch.Tensor  # (B,) global steps of each environment
     relative_residual: torch.Tensor  # (B,) last residual over balancing forces
     converged: torch.Tensor  # (B,) bool
-    factorisations: int  # of the whole batch
+    factorisations: int  # of the whole batch, or of the shard that needed most
+
+    @staticmethod
+    def of(shards: "Sequence[SolveReport]") -> "SolveReport":
+        """The report of a batch from those of its shards."""
+        if len(shards) == 1:
+            return shards[0]
+        columns = ([r.iterations for r in shards], [r.relative_residual for r in shards], [r.converged for r in shards])
+        return SolveReport(*map(torch.cat, columns), max(r.factorisations for r in shards))
+
+
+def check_converged(settings: SolverSettings, report: SolveReport, positions: torch.Tensor) -> None:
+    """Refuses a solve that failed, if failures are not merely counted.
+
+    Args:
+        settings: of the solver.
+        report: of the solve.
+        positions: (B, N, 3) where it ended [m].
+
+    Raises:
+        ConvergenceError: an environment did not converge.
+    """
+    if settings.on_failure != "raise" or bool(report.converged.all()):
+        return
+    worst = int((~report.converged).nonzero()[0])
+    raise ConvergenceError(
+        f"the {settings.name} solver stopped after {int(report.iterations[worst])} iterations with a relative residual "
+        f"of {float(report.relative_residual[worst]):.2e} in environment {worst} of {len(report.converged)}: take a "
+        "smaller time step or loads, raise solver.max_iterations, or choose solver.name=newton.",
+        positions.detach(),
+        report,
+    )
 
 
 class NonlinearSolver:
@@ -110,11 +142,7 @@ class NonlinearSolver:
         self._mean_iterations = float("inf")
 
     def solve(self, start: torch.Tensor) -> SolveReport:
-        """Minimises from (B, N, 3); the minimiser is left in ``potential.positions``.
-
-        Raises:
-            ConvergenceError: an environment did not converge and failures are not merely counted.
-        """
+        """Minimises from (B, N, 3); what it ends at is left in ``potential.positions``."""
         m, factorisations = self._minimiser, 0
         state = m.begin(start)
         first = True
@@ -126,16 +154,6 @@ class NonlinearSolver:
             state = m.advance(state)
         report = SolveReport(*m.outcome(), factorisations)
         self._mean_iterations = float(report.iterations.double().mean())
-        if self.settings.on_failure == "raise" and not bool(report.converged.all()):
-            worst = int((~report.converged).nonzero()[0])
-            raise ConvergenceError(
-                f"the {self.settings.name} solver stopped after {int(report.iterations[worst])} iterations with a "
-                f"relative residual of {float(report.relative_residual[worst]):.2e} in environment {worst} of "
-                f"{len(report.converged)}: take a smaller time step or loads, raise solver.max_iterations, or choose "
-                "solver.name=newton.",
-                self.potential.positions.to(self.dtype, copy=True),
-                report,
-            )
         return report
 
     def _stale(self, first: bool, since: int) -> bool:

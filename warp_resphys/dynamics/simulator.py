@@ -20,6 +20,7 @@ from ..energies.strings import Strings
 from ..fem.body import Body
 from ..fem.elements import Points
 from ..io.errors import ConvergenceError, InputError
+from ..linalg.threads import shards_of
 from .assembly import BlockPattern
 from .constants import Constants
 from .equilibrium import Workspace, equilibrium, ramped
@@ -238,10 +239,15 @@ class Simulator:
     def workspace(self, batch: int) -> Workspace:
         """Buffers for a batch size, made at their first use."""
         if batch not in self._workspaces:
-            n, fixed = self.body.n_vertices, self.body.fixed_vertices
-            device = torch.device(self.device)
-            self._workspaces[batch] = Workspace(self._energies, n, fixed, self._pattern, batch, device, self.dtype)
+            workspace = self._make_workspace(batch)
+            rows = shards_of(batch, workspace.potential.device)
+            workspace.shards += [(each, self._make_workspace(each.stop - each.start)) for each in rows]
+            self._workspaces[batch] = workspace
         return self._workspaces[batch]
+
+    def _make_workspace(self, batch: int) -> Workspace:
+        n, fixed = self.body.n_vertices, self.body.fixed_vertices
+        return Workspace(self._energies, n, fixed, self._pattern, batch, torch.device(self.device), self.dtype)
 
     def held_energy(self, name: str, batch: int) -> HeldEnergy:
         """The energy with an input of that name, by itself in a given state.
@@ -297,8 +303,8 @@ class Simulator:
         stage = self.method.stage(state, self.time_step)
         workspace = self.workspace(state.batch)
         terms = self._terms(state, stage, inputs, constants)
-        solver = workspace.solver("dynamics", self.settings)
-        x, report = equilibrium(workspace, solver, terms, stage.target, self._fixed_at(state, stage, inputs))
+        clamped = self._fixed_at(state, stage, inputs)
+        x, report = equilibrium(workspace, "dynamics", self.settings, terms, stage.target, clamped)
         return self._finish(state, stage, inputs, constants, x), report
 
     def _fixed_at(self, state: State, stage: ImplicitStage, inputs: Inputs) -> torch.Tensor:
@@ -470,9 +476,8 @@ class Simulator:
         workspace, clamp = self.workspace(batch), rest[:, self.fixed]
         most = min(self.settings.max_iterations, _MOST_ITERATIONS)
         settings = replace(self.settings, name="newton", on_failure="raise", max_iterations=most)
-        solver = workspace.solver("statics", settings)
         at = clamp if inputs.fixed_positions is None else torch.lerp(clamp, inputs.fixed_positions, share)
-        return equilibrium(workspace, solver, terms, start, at)
+        return equilibrium(workspace, "statics", settings, terms, start, at)
 
     def rollout(
         self,

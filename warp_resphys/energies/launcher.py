@@ -1,5 +1,7 @@
 """Warp launches on torch's memory, recorded once and made as often as needed."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,21 @@ ensure_kernel_cache()  # Before Warp is first used, by this package or by who im
 def warp_view(tensor: torch.Tensor, dtype: Any) -> Any:
     """A Warp array on a tensor's own memory, without a gradient."""
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
+
+
+@contextmanager
+def shareable() -> Iterator[None]:
+    """Warp modules that are loaded meanwhile may be launched by several threads at once, on a CPU.
+
+    Otherwise every launch would register the place of its tiles, which these kernels do not use, in a variable that
+    all threads share.
+    """
+    before = wp.config.enable_tiles_in_stack_memory
+    wp.config.enable_tiles_in_stack_memory = False
+    try:
+        yield
+    finally:
+        wp.config.enable_tiles_in_stack_memory = before
 
 
 class Launcher:
@@ -46,14 +63,14 @@ class Launcher:
 
     def record(self, kernel: Any, dim: tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> Any:
         """A launch to be made by `launch`, as often as needed."""
-        return wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=str(self.device), record_cmd=True)
+        with shareable():
+            return wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=str(self.device), record_cmd=True)
 
     def record_blocks(self, kernel: Any, blocks: int, inputs: list[Any], outputs: list[Any]) -> Any:
         """A launch by blocks of threads that work together, on a CPU of one thread each."""
-        device = str(self.device)
-        return wp.launch_tiled(
-            kernel, dim=[blocks], inputs=inputs, outputs=outputs, block_dim=BLOCK, device=device, record_cmd=True
-        )
+        options = {"block_dim": BLOCK, "device": str(self.device), "record_cmd": True}
+        with shareable():
+            return wp.launch_tiled(kernel, dim=[blocks], inputs=inputs, outputs=outputs, **options)
 
     def gather(self, s: Any, stress: Any, out: torch.Tensor) -> Any:
         """A launch that adds the transposed operator of a set's stress, a view (B, P) mat33, to (B, N, 3)."""

@@ -23,6 +23,7 @@ from .reductions import block_max, block_sum
 
 BEGINS, AIMS, TRIES, DONE, STUCK = (wp.constant(k) for k in range(5))
 FACTOR, CLAMPED_FACTOR = wp.constant(1), wp.constant(2)  # requests
+ALWAYS, NEVER = wp.constant(0), wp.constant(2**28)  # iterations after which a factor is made anew
 
 ZERO, HALF, ONE = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0)
 INFINITE = wp.constant(wp.float64(float("inf")))
@@ -42,8 +43,9 @@ class Progress:
 
     phase: wp.array[int]
     wanted: wp.array[int]  # 0, FACTOR or CLAMPED_FACTOR, before it goes on
+    factored: wp.array[int]  # 1: it has a factor, of this solve or one before
     asks: wp.array[int]  # 1: whether its residual is rounding is to be measured
-    iterations: wp.array[int]  # directions so far
+    iterations: wp.array[int]  # directions so far; at first, those of the solve before
     since: wp.array[int]  # directions since the solve began, or since a factorisation in it
     made: wp.array[int]  # factorisations in this solve
     halvings: wp.array[int]
@@ -78,6 +80,7 @@ class Tolerances:
     absolute: wp.float64  # [N]
     epsilon: wp.float64  # of the states' type
     max_iterations: int
+    refactor_after: int  # iterations of a solve, more of which are to be fewer by a new factor
 
 
 @kernel
@@ -85,6 +88,7 @@ def begin(
     force: wp.array2d[wp.vec3d],  # (B, N) [N]
     stiffness: wp.array3d[wp.float64],  # (B, P, T) [J]
     positions: wp.array2d[wp.vec3d],  # (B, N) the start [m]
+    tolerances: Tolerances,
     origin_out: wp.array2d[wp.vec3d],
     progress: Progress,
     pairs: wp.array[int],  # (B) how many there are
@@ -102,6 +106,8 @@ def begin(
     if lane == 0:
         progress.phase[b] = BEGINS
         progress.wanted[b] = 0
+        if progress.factored[b] == 0 or progress.iterations[b] > tolerances.refactor_after:
+            progress.wanted[b] = FACTOR
         progress.asks[b] = 0
         progress.iterations[b] = 0
         progress.since[b] = 0
@@ -116,24 +122,16 @@ def begin(
 
 
 @kernel
-def restart(
-    searches_go_on: int,  # 1: an environment in a line search keeps what it has
-    origin: wp.array2d[wp.vec3d],
-    positions: wp.array2d[wp.vec3d],
-    progress: Progress,
-    pairs: wp.array[int],
-):
-    """Before a factorisation: forgets the pairs, and takes trials back."""
-    b, lane = wp.tid()
-    phase = progress.phase[b]
-    if phase == TRIES and searches_go_on == 0:
-        for i in range(lane, positions.shape[1], wp.block_dim()):
-            positions[b, i] = origin[b, i]
-        phase = AIMS
-    block_max(ZERO)  # Every thread has read the phase.
-    if phase == AIMS and lane == 0:
-        progress.phase[b] = AIMS
+def choose(progress: Progress, idle_out: wp.array[wp.bool], clamp_out: wp.array[wp.bool], pairs: wp.array[int]):
+    """Which environments are factorised next, and which of these are clamped; forgets the pairs of the old factors."""
+    b = wp.tid()
+    wanted = progress.wanted[b]
+    chosen = progress.phase[b] == AIMS and wanted > 0
+    idle_out[b] = not chosen
+    clamp_out[b] = chosen and wanted == CLAMPED_FACTOR
+    if chosen:
         progress.wanted[b] = 0
+        progress.factored[b] = 1
         progress.since[b] = 0
         progress.made[b] += 1
         pairs[b] = 0
@@ -143,24 +141,22 @@ def restart(
 def summarise(progress: Progress, summary_out: wp.array[int]):
     """What the host has to know, by the one block of the launch: `dynamics.minimiser`."""
     _, lane = wp.tid()
-    active, aiming, asking = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
-    wanted, since = wp.float64(0.0), wp.float64(0.0)
+    active, aiming = wp.float64(0.0), wp.float64(0.0)
+    wanting, asking = wp.float64(0.0), wp.float64(0.0)
     for b in range(lane, progress.phase.shape[0], wp.block_dim()):
         asking += wp.float64(progress.asks[b])
         if progress.phase[b] < DONE:
             active += ONE
-            wanted = wp.max(wanted, wp.float64(progress.wanted[b]))
         if progress.phase[b] == AIMS:
             aiming += ONE
-            since = wp.max(since, wp.float64(progress.since[b]))
-    active, aiming, asking = block_sum(active), block_sum(aiming), block_sum(asking)
-    wanted, since = block_max(wanted), block_max(since)
+            if progress.wanted[b] > 0:
+                wanting += ONE
+    active, aiming, wanting, asking = block_sum(active), block_sum(aiming), block_sum(wanting), block_sum(asking)
     if lane == 0:
         summary_out[0] = int(active)
         summary_out[1] = int(aiming)
-        summary_out[2] = int(asking)
-        summary_out[3] = int(wanted)
-        summary_out[4] = int(since)
+        summary_out[2] = int(wanting)
+        summary_out[3] = int(asking)
 
 
 @function
@@ -440,6 +436,8 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
             progress.stalls[b] = stalls
             progress.asks[b] = int(asks)
             progress.phase[b] = AIMS
+            if progress.since[b] >= 3 * tolerances.refactor_after:
+                progress.wanted[b] = FACTOR
             if done:
                 progress.phase[b] = DONE
             elif not wp.isfinite(relative) or iterations >= tolerances.max_iterations:

@@ -111,10 +111,12 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         dilation_offset: wp.array2d[wp.float64],
         points_per_cell: int,
         positions: wp.array2d[wp.vec3d],
-        positive: wp.array[int],  # (B) 1: clamp the eigenvalues at zero
+        positive: wp.array[int],  # (B) 1: clamp the eigenvalues at zero; -1: nobody asks for this tangent
         tangent_out: wp.array3d[wp.mat33d],
     ):
         b, p = wp.tid()
+        if positive[b] < 0:
+            return
         f = deformation_gradient(positions, nodes, gradients, b, p, p / points_per_cell)
         m = stiffness[b, p]
         out = tangent_out[b, p]

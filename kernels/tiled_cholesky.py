@@ -23,8 +23,13 @@ def tiled_kernels(tile: int, width: int, scalar: Any) -> SimpleNamespace:
     T, W = wp.constant(tile), wp.constant(width)  # noqa: N806
 
     @kernel
-    def factor(matrices: wp.array3d[scalar]):  # (B, n rounded up to tiles, (W + 1) T) overwritten by the factors
+    def factor(
+        idle: wp.array[wp.bool],  # (B) those that stay as they are
+        matrices: wp.array3d[scalar],  # (B, n rounded up to tiles, (W + 1) T) overwritten by the factors
+    ):
         b, _ = wp.tid()
+        if idle[b]:
+            return
         a = matrices[b]
         for i in range(a.shape[0] / T):
             for j in range(wp.max(0, i - W), i + 1):

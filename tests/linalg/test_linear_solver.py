@@ -102,7 +102,7 @@ def test_idle_matrices_leave_the_others_as_they_are(definite, device, cholespy):
     right = torch.ones(BATCH, NODES * 3, 2, dtype=torch.float64, device=device)
     for kind in layouts(device):
         solver = make(kind, 3, device)
-        factor = solver.factor(values_of(solver, dense), definite, idle)
+        factor = solver.factor(values_of(solver, dense), definite, idle=idle)
         assert not factor.failed[[0, 2]].any()
         found = factor.solve(right).cpu()[[0, 2]]
         np.testing.assert_allclose(found, np.linalg.solve(dense[[0, 2]], right.cpu()[[0, 2]]), rtol=1e-9, atol=1e-9)

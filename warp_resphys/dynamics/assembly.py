@@ -82,7 +82,8 @@ class HessianAssembly:
         self._idle = torch.zeros(p.batch, dtype=torch.int32, device=p.device)
         idle = warp_view(self._idle, wp.int32)
         blocks = p.zeros(pattern.n_cell_blocks, 3, 3)
-        self._values, self._overwritten = p.zeros(solver.n_values), solver.overwrites
+        self._values = torch.zeros(p.batch, solver.n_values, device=p.device, dtype=solver.dtype)
+        self._overwritten = solver.overwrites
         self._commands = []
         for s, offset in zip(p.sets, pattern.offsets, strict=True):
             inputs = [idle, s.gradients, s.points_per_cell]
@@ -102,19 +103,23 @@ class HessianAssembly:
             warp_view(p.terms.inertia, wp.float64),
         ]
         dim = (p.batch, len(pattern.rows))
-        self._commands.append(p.record(kernels.scatter_blocks, dim, inputs, [warp_view(self._values, wp.float64)]))
+        scalar = wp.float64 if solver.dtype == torch.float64 else wp.float32
+        values = warp_view(self._values, scalar)
+        self._commands.append(p.record(kernels.scatter_kernel(scalar), dim, inputs, [values]))
 
     def __call__(self, idle: torch.Tensor | None = None) -> torch.Tensor:
         """(B, n_values) from the potential's last `update_tangent`; overwritten by the next call.
 
         Args:
-            idle: (B,) environments whose values nobody needs; they may be anything.
+            idle: (B,) environments whose values stay as they are.
         """
         if idle is None:
             self._idle.zero_()
         else:
             self._idle.copy_(idle)
-        if self._overwritten:
+        if self._overwritten and idle is None:
             self._values.zero_()
+        elif self._overwritten:
+            self._values.masked_fill_(~idle[:, None], 0.0)
         self._potential.launch(*self._commands)
         return self._values

@@ -35,7 +35,7 @@ class HessianApproximation(ABC):
 
         Args:
             clamp: (B,) environments whose matrix is to be positive definite by force.
-            idle: (B,) environments that nobody asks for: they need no factor.
+            idle: (B,) environments that keep the factor they have, if they have one.
         """
 
     @abstractmethod
@@ -66,28 +66,27 @@ class ExactHessian(HessianApproximation):
 
     @override
     def refactor(self, clamp: torch.Tensor | None = None, idle: torch.Tensor | None = None) -> None:
-        if clamp is None:
-            self.clamped.zero_()
-        else:
-            self.clamped.copy_(clamp)
-        self._factor = self._factorise(idle)
+        clamp = torch.zeros_like(self.clamped) if clamp is None else clamp
+        self.clamped.copy_(clamp if idle is None else torch.where(idle, self.clamped, clamp))
+        self._factorise(idle)
+        assert self._factor is not None
         if not self._factor.failed.any():
             return
         failed = torch.as_tensor(self._factor.failed, device=self.clamped.device) & ~self.clamped
         failed = failed if idle is None else failed & ~idle
         if bool(failed.any()):
             self.clamped |= failed
-            self._factor = self._factorise(idle)
+            self._factorise(~failed)
 
-    def _factorise(self, idle: torch.Tensor | None) -> Factor:
-        self._potential.update_tangent(self.clamped)
-        return self._factor_of(self._assemble(idle).to(self._linear.dtype), idle=idle)
+    def _factorise(self, idle: torch.Tensor | None) -> None:
+        self._potential.update_tangent(self.clamped, idle)
+        self._factor = self._factor_of(self._assemble(idle), idle=idle)
 
     def _factor_of(self, values: torch.Tensor, definite: bool = True, idle: torch.Tensor | None = None) -> Factor:
         """Of assembled values, and what couples vertices beside them."""
         columns = self._potential.low_rank
         columns = None if columns is None else columns[:, self._dofs].to(self._linear.dtype)
-        return self._linear.corrected(self._linear.factor(values, definite, idle), columns)
+        return self._linear.factor(values, definite, columns, idle, self._factor)
 
     def refactor_exact(self) -> None:
         """Factorises the Hessian as it is, indefinite or not: for adjoints."""

@@ -128,4 +128,4 @@ class _ShiftedHessian:
         values[:, self._diagonal] += 1.0
         columns = self._potential.low_rank
         columns = None if columns is None else math.sqrt(scale) * columns[:, self._dofs]
-        return self._linear.corrected(self._linear.factor(values), columns)
+        return self._linear.factor(values, columns=columns)

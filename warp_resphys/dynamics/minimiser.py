@@ -11,7 +11,7 @@ from ..energies.potential import IncrementalPotential
 from ..kernels import minimisation as kernels
 from .hessian import HessianApproximation
 
-_COUNTS = ("phase", "wanted", "asks", "iterations", "since", "made", "halvings", "stalls")
+_COUNTS = ("phase", "wanted", "factored", "asks", "iterations", "since", "made", "halvings", "stalls")
 _SUMS = ("step", "slope", "energy", "scale", "relative", "smallest", "rounding", "force", "stiffness")
 
 
@@ -20,9 +20,8 @@ class Summary(NamedTuple):
 
     active: int  # environments that go on
     aiming: int  # those that need a direction
+    wanting: int  # those that need a factor first
     asking: int  # those whose residual may be rounding
-    wanted: int  # 1: one of them asks for a factor; 2: for a clamped one
-    since: int  # directions since the last factorisation, or since the solve began: the most
 
 
 class Minimiser:
@@ -36,6 +35,8 @@ class Minimiser:
         relative_tolerance: residual over balancing forces at which an environment has converged.
         absolute_tolerance: residual at which it has in any case [N].
         max_iterations: directions after which it is stuck.
+        refactor_after: directions of a solve, more of which ask for a new factor before the next one, and three times
+            as many at once; 0 asks always, None never.
     """
 
     def __init__(
@@ -47,6 +48,7 @@ class Minimiser:
         relative_tolerance: float,
         absolute_tolerance: float,
         max_iterations: int,
+        refactor_after: int | None,
     ) -> None:
         p, b, n = potential, potential.batch, potential.n_vertices
         self._potential, self._hessian = p, hessian
@@ -79,6 +81,7 @@ class Minimiser:
         found.residual = warp_view(p.residual, wp.vec3d)
         tolerances.relative, tolerances.absolute = wp.float64(relative_tolerance), wp.float64(absolute_tolerance)
         tolerances.epsilon, tolerances.max_iterations = wp.float64(torch.finfo(dtype).eps), max_iterations
+        tolerances.refactor_after = kernels.NEVER if refactor_after is None else refactor_after
 
         positions, gradient = warp_view(p.positions, wp.vec3d), warp_view(self._gradient, wp.vec3d)
         direction, origin_view = warp_view(self._direction, wp.vec3d), warp_view(origin, wp.vec3d)
@@ -86,11 +89,12 @@ class Minimiser:
         stiffness = p.terms.values["stiffness"]
         assert stiffness is not None
         loads = [warp_view(p.terms.force, wp.vec3d), warp_view(stiffness, wp.float64)]
-        self._begin = p.record_blocks(kernels.begin, b, [*loads, positions, origin_view, progress, pairs.count], [])
-        self._restart = {
-            go_on: p.record_blocks(kernels.restart, b, [int(go_on), origin_view, positions, progress, pairs.count], [])
-            for go_on in (False, True)
-        }
+        self._begin = p.record_blocks(
+            kernels.begin, b, [*loads, positions, tolerances, origin_view, progress, pairs.count], []
+        )
+        self._idle, self._clamp = (torch.zeros(b, device=p.device, dtype=torch.bool) for _ in range(2))
+        chosen = [warp_view(each, wp.bool) for each in (self._idle, self._clamp)]
+        self._choose = p.record(kernels.choose, (b,), [progress, *chosen, pairs.count], [])
         aiming = [progress, pairs, vertex_at, gradient]
         self._project = p.record_blocks(own.project, b, aiming, [right])
         self._aim = p.record_blocks(own.aim, b, [*aiming, right, positions], [origin_view, direction])
@@ -107,6 +111,10 @@ class Minimiser:
         p.launch(self._begin)
         return self._evaluate()
 
+    def forget(self) -> None:
+        """The factors serve no more."""
+        self._counts["factored"].zero_()
+
     def advance(self, state: Summary) -> Summary:
         """One evaluation: of the first trial of those that need a direction, and of the next of the others."""
         p = self._potential
@@ -116,22 +124,21 @@ class Minimiser:
             p.launch(self._aim)
         return self._evaluate()
 
-    def restart(self, searches_go_on: bool) -> None:
-        """To be called before a factorisation; `searches_go_on` if it leaves out those whose line search goes on."""
-        self._potential.launch(self._restart[searches_go_on])
-
-    def clamp(self) -> torch.Tensor:
-        """(B,) environments that ask for a clamped factor."""
-        return self._counts["wanted"] == kernels.CLAMPED_FACTOR
+    def refactor(self, state: Summary) -> None:
+        """Factorises for the environments that need it, at their iterates."""
+        self._potential.launch(self._choose)
+        everyone = state.wanting == self._potential.batch
+        self._hessian.refactor(self._clamp, None if everyone else self._idle)
 
     def elsewhere(self) -> torch.Tensor:
         """(B,) environments that need no direction next."""
         return self._counts["phase"] != kernels.AIMS
 
-    def outcome(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """(B,) directions, last residual over balancing forces, and whether it has converged."""
-        converged = self._counts["phase"] == kernels.DONE
-        return self._counts["iterations"].long(), self._sums["relative"].clone(), converged
+    def outcome(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+        """(B,) directions, last residual over balancing forces, whether it has converged, and factorisations."""
+        counts = self._counts
+        converged = counts["phase"] == kernels.DONE
+        return counts["iterations"].long(), self._sums["relative"].clone(), converged, counts["made"].long()
 
     def _evaluate(self) -> Summary:
         p = self._potential

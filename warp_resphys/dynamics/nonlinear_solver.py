@@ -19,7 +19,7 @@ What is decided for an environment is decided by kernels (`minimiser`); the host
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 
@@ -44,7 +44,7 @@ class SolverSettings:
     absolute_tolerance: float = 1e-12  # residual below which it has converged in any case [N]
     max_iterations: int = 2000  # after which it has failed
     memory: int = 12  # pairs that L-BFGS keeps
-    refactor_after: int = 4  # mean iterations a step above which ``quasi_newton`` factorises anew
+    refactor_after: int = 4  # iterations of a step above which ``quasi_newton`` factorises anew
     linear_solver: str = "auto"  # ``auto``, ``banded``, ``tiled``, ``dense`` or ``sparse``
     on_failure: str = "raise"  # ``raise`` a `ConvergenceError`, or ``count`` the failure in the report and go on
 
@@ -72,15 +72,15 @@ class SolveReport:
     iterations: torch.Tensor  # (B,) global steps of each environment
     relative_residual: torch.Tensor  # (B,) last residual over balancing forces
     converged: torch.Tensor  # (B,) bool
-    factorisations: int  # of the whole batch, or of the shard that needed most
+    factorisations: torch.Tensor  # (B,) of the matrix of each environment
 
     @staticmethod
     def of(shards: "Sequence[SolveReport]") -> "SolveReport":
         """The report of a batch from those of its shards."""
         if len(shards) == 1:
             return shards[0]
-        columns = ([r.iterations for r in shards], [r.relative_residual for r in shards], [r.converged for r in shards])
-        return SolveReport(*map(torch.cat, columns), max(r.factorisations for r in shards))
+        names = [each.name for each in fields(SolveReport)]
+        return SolveReport(*(torch.cat([getattr(report, name) for report in shards]) for name in names))
 
 
 def check_converged(settings: SolverSettings, report: SolveReport, positions: torch.Tensor) -> None:
@@ -129,45 +129,26 @@ class NonlinearSolver:
         else:
             linear = make_linear_solver(kind, pattern.rows, pattern.cols, len(pattern.free), 3, *where)
             self.hessian = ExactHessian(potential, pattern, linear)
-        self._newton = settings.name == "newton"
+        after = {"newton": 0, "quasi_newton": settings.refactor_after, "projective_dynamics": None}
         self._minimiser = Minimiser(
             potential,
             self.hessian,
             dtype,
-            memory=0 if self._newton else settings.memory,
+            memory=0 if settings.name == "newton" else settings.memory,
             relative_tolerance=settings.relative_tolerance,
             absolute_tolerance=settings.absolute_tolerance,
             max_iterations=settings.max_iterations,
+            refactor_after=after[settings.name],
         )
-        self._mean_iterations = float("inf")
 
     def solve(self, start: torch.Tensor) -> SolveReport:
         """Minimises from (B, N, 3); what it ends at is left in ``potential.positions``."""
-        m, factorisations = self._minimiser, 0
-        state = m.begin(start)
-        first = True
-        while state.active:
-            if state.aiming and (state.wanted or self._stale(first, state.since)):
-                self._refactor(state.wanted)
-                factorisations += 1
-            first = False
-            state = m.advance(state)
-        report = SolveReport(*m.outcome(), factorisations)
-        self._mean_iterations = float(report.iterations.double().mean())
-        return report
-
-    def _stale(self, first: bool, since: int) -> bool:
-        """Whether the global step's matrix is to be factorised before the next directions."""
-        name, limit = self.settings.name, self.settings.refactor_after
-        if first:
-            return (
-                not self.hessian.ready() or self._newton or (name == "quasi_newton" and self._mean_iterations > limit)
-            )
-        return self._newton or (name == "quasi_newton" and since >= 3 * limit)
-
-    def _refactor(self, wanted: int) -> None:
-        """Factorises at the iterates; with Newton's method for those alone that need a direction."""
         m = self._minimiser
-        clamp, idle = m.clamp() if wanted else None, m.elsewhere() if self._newton else None
-        m.restart(searches_go_on=self._newton)
-        self.hessian.refactor(clamp, idle)
+        if not self.hessian.ready():
+            m.forget()
+        state = m.begin(start)
+        while state.active:
+            if state.wanting:
+                m.refactor(state)
+            state = m.advance(state)
+        return SolveReport(*m.outcome())

@@ -193,16 +193,19 @@ class IncrementalPotential(Launcher):
         self.residual.copy_(residual)
         return change
 
-    def update_tangent(self, positive: torch.Tensor | None = None) -> None:
+    def update_tangent(self, positive: torch.Tensor | None = None, idle: torch.Tensor | None = None) -> None:
         """Computes dP/dF at ``positions``.
 
         Args:
             positive: (B,) environments whose eigenvalues are clamped at zero; none where left out.
+            idle: (B,) environments whose tangent nobody asks for; none where left out.
         """
         self._prepare_tangent()
         self._positive.zero_()
         if positive is not None:
             self._positive.copy_(positive)
+        if idle is not None:
+            self._positive.masked_fill_(idle, -1)
         self.launch(*self._tangent_commands)
         found = [term.low_rank(self.terms.values, self._position_view) for term in self.energies]
         columns = [each for each in found if each is not None]

@@ -31,12 +31,16 @@ class BandedSolver(LinearSolver):
         self.order = order
         self.dofs = self.unknowns
         self.places = torch.argsort(self.dofs)
+        self.lapack = BandedCholesky(self.n, self.bandwidth, self.dtype)
 
     @override
-    def factor(self, values: torch.Tensor, definite: bool = True, idle: torch.Tensor | None = None) -> Factor:
+    def _factorise(
+        self, values: torch.Tensor, definite: bool, idle: torch.Tensor | None, before: Factor | None
+    ) -> Factor:
         bands = values.reshape(-1, self.n, self.bandwidth + 1)
         left_out = [False] * len(bands) if idle is None else idle.tolist()
-        return _BandedCholesky(self, bands, left_out) if definite else _BandedLU(self, bands, left_out)
+        kind = _BandedCholesky if definite else _BandedLU
+        return kind(self, bands, left_out, before if isinstance(before, kind) else None)
 
 
 class _BandedFactor(Factor):
@@ -45,12 +49,25 @@ class _BandedFactor(Factor):
     Args:
         solver: with the order.
         bands: (B or 1, n, w + 1) matrices.
+        idle: those that keep a factor, or have none.
+        before: the factor they keep.
     """
 
-    def __init__(self, solver: BandedSolver, bands: torch.Tensor) -> None:
+    def __init__(
+        self, solver: BandedSolver, bands: torch.Tensor, idle: list[bool], before: "_BandedFactor | None"
+    ) -> None:
         self._solver, self._shared = solver, len(bands) == 1
         self.failed = np.zeros(len(bands), dtype=bool)
-        self._factors: list[Any] = []
+        self._factors: list[Any] = [None] * len(bands)
+        for i, band in enumerate(bands):
+            if not idle[i]:
+                self._factors[i], self.failed[i] = self._factorise(band)
+            elif before is not None:
+                self._factors[i], self.failed[i] = before._factors[i], before.failed[i]
+
+    def _factorise(self, band: torch.Tensor) -> tuple[Any, bool]:
+        """The factor of a matrix, which it may overwrite, and whether there is none: it is not a number then."""
+        raise NotImplementedError
 
     def _overwrite(self, factor: Any, columns: torch.Tensor) -> None:
         """Solves for contiguous (m, n) right-hand sides."""
@@ -76,37 +93,31 @@ class _BandedFactor(Factor):
 
 
 class _BandedCholesky(_BandedFactor):
-    def __init__(self, solver: BandedSolver, bands: torch.Tensor, left_out: list[bool]) -> None:
-        super().__init__(solver, bands)
-        self._lapack = BandedCholesky(solver.n, solver.bandwidth, solver.dtype)
-        for i, (band, idle) in enumerate(zip(bands, left_out, strict=True)):
-            self._factors.append(None if idle else band)
-            if not idle and not self._lapack.factor(band):
-                self.failed[i] = True
-                band.fill_(torch.nan)
+    @override
+    def _factorise(self, band: torch.Tensor) -> tuple[Any, bool]:
+        definite = self._solver.lapack.factor(band)
+        if not definite:
+            band.fill_(torch.nan)
+        return band, not definite
 
     @override
     def _overwrite(self, factor: torch.Tensor, columns: torch.Tensor) -> None:
-        self._lapack.solve(factor, columns)
+        self._solver.lapack.solve(factor, columns)
 
 
 class _BandedLU(_BandedFactor):
-    def __init__(self, solver: BandedSolver, bands: torch.Tensor, left_out: list[bool]) -> None:
-        super().__init__(solver, bands)
-        self._width = solver.bandwidth
-        factorise, self._solve = scipy.linalg.get_lapack_funcs(("gbtrf", "gbtrs"), (bands.numpy(),))
-        for i, (band, idle) in enumerate(zip(bands.numpy(), left_out, strict=True)):
-            if idle:
-                self._factors.append(None)
-                continue
-            lu, pivots, info = factorise(general_band(band), self._width, self._width, overwrite_ab=1)
-            self._factors.append((lu, pivots))
-            if info != 0:
-                self.failed[i] = True
-                lu.fill(np.nan)
+    @override
+    def _factorise(self, band: torch.Tensor) -> tuple[Any, bool]:
+        matrix, w = general_band(band.numpy()), self._solver.bandwidth
+        (factorise,) = scipy.linalg.get_lapack_funcs(("gbtrf",), (matrix,))
+        lu, pivots, info = factorise(matrix, w, w, overwrite_ab=1)
+        if info != 0:
+            lu.fill(np.nan)
+        return (lu, pivots), info != 0
 
     @override
     def _overwrite(self, factor: tuple[Any, Any], columns: torch.Tensor) -> None:
-        lu, pivots = factor
-        solved, _ = self._solve(lu, self._width, self._width, columns.numpy().T, pivots)
+        (lu, pivots), w = factor, self._solver.bandwidth
+        (solve,) = scipy.linalg.get_lapack_funcs(("gbtrs",), (lu,))
+        solved, _ = solve(lu, w, w, columns.numpy().T, pivots)
         columns.copy_(torch.from_numpy(solved.T))

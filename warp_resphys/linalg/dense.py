@@ -18,8 +18,13 @@ class DenseSolver(LinearSolver):
         self.n_values = self.n * self.n
 
     @override
-    def factor(self, values: torch.Tensor, definite: bool = True, idle: torch.Tensor | None = None) -> Factor:
-        return DenseFactor(values.reshape(-1, self.n, self.n), definite)
+    def _factorise(
+        self, values: torch.Tensor, definite: bool, idle: torch.Tensor | None, before: Factor | None
+    ) -> Factor:
+        factor = DenseFactor(values.reshape(-1, self.n, self.n), definite)
+        if idle is not None and isinstance(before, DenseFactor) and definite:
+            factor.keep(before, idle)
+        return factor
 
 
 class DenseFactor(Factor):
@@ -35,6 +40,11 @@ class DenseFactor(Factor):
         self.failed = info.cpu().numpy() != 0
         if self.failed.any():
             (self._cholesky if definite else self._lu)[info != 0] = torch.nan
+
+    def keep(self, before: "DenseFactor", idle: torch.Tensor) -> None:
+        """Takes the Cholesky factors of some matrices (B,) from another one."""
+        self._cholesky = torch.where(idle[:, None, None], before._cholesky, self._cholesky)
+        self.failed = np.where(idle.cpu().numpy(), before.failed, self.failed)
 
     @override
     def solve(self, rhs: torch.Tensor) -> torch.Tensor:

@@ -47,7 +47,7 @@ class CorrectedFactor(Factor):
     """
 
     def __init__(self, factor: Factor, columns: torch.Tensor, order: torch.Tensor) -> None:
-        self._factor, self._columns, self._order = factor, columns, order
+        self.factor, self.columns, self._order = factor, columns, order
         self.failed = factor.failed
         self._solved = factor.solve(columns)
         small = torch.eye(columns.shape[2], device=columns.device, dtype=columns.dtype) + columns.mT @ self._solved
@@ -55,13 +55,13 @@ class CorrectedFactor(Factor):
 
     @override
     def solve(self, rhs: torch.Tensor) -> torch.Tensor:
-        found = self._factor.solve(rhs)
-        return found - self._solved @ torch.linalg.lu_solve(*self._small, self._columns.mT @ found)
+        found = self.factor.solve(rhs)
+        return found - self._solved @ torch.linalg.lu_solve(*self._small, self.columns.mT @ found)
 
     @override
     def solve_in_place(self, columns: torch.Tensor) -> None:
-        self._factor.solve_in_place(columns)
-        along = self._columns[:, self._order].mT @ columns[:, :, None]
+        self.factor.solve_in_place(columns)
+        along = self.columns[:, self._order].mT @ columns[:, :, None]
         columns -= (self._solved[:, self._order] @ torch.linalg.lu_solve(*self._small, along))[:, :, 0]
 
 
@@ -110,20 +110,37 @@ class LinearSolver(ABC):
     def _lay_out(self, rows: Indices, cols: Indices, n_nodes: int) -> None:
         """Chooses an order and sets ``address`` and ``n_values``."""
 
-    @abstractmethod
-    def factor(self, values: torch.Tensor, definite: bool = True, idle: torch.Tensor | None = None) -> Factor:
-        """Factorises (B, n_values).
+    def factor(
+        self,
+        values: torch.Tensor,
+        definite: bool = True,
+        columns: torch.Tensor | None = None,
+        idle: torch.Tensor | None = None,
+        before: Factor | None = None,
+    ) -> Factor:
+        """Factorises matrices A, or A + C C^T.
 
         Args:
-            values: entries at the solver's addresses, zero elsewhere; see `overwrites`.
+            values: (B, n_values) entries at the solver's addresses, zero elsewhere; see `overwrites`.
             definite: Cholesky, which reports matrices that are not positive definite in ``failed``; otherwise a pivoted
                 factorisation that takes any regular matrix.
-            idle: (B,) matrices that may be left out: nobody asks for their solutions, which may be anything.
+            columns: (B, n, r) C.
+            idle: (B,) matrices that keep the factor they have; without one, their solutions may be anything.
+            before: the factor they have. It serves no more itself.
         """
-
-    def corrected(self, factor: Factor, columns: torch.Tensor | None) -> Factor:
-        """A factor of A + C C^T with C (B, n, r), or that of A where there is no C."""
+        kept = before if idle is not None else None
+        if isinstance(kept, CorrectedFactor):
+            if columns is not None and idle is not None:
+                columns = torch.where(idle[:, None, None], kept.columns, columns)
+            kept = kept.factor
+        factor = self._factorise(values, definite, idle, kept)
         return factor if columns is None else CorrectedFactor(factor, columns, self.unknowns)
+
+    @abstractmethod
+    def _factorise(
+        self, values: torch.Tensor, definite: bool, idle: torch.Tensor | None, before: Factor | None
+    ) -> Factor:
+        """See `factor`; there is no factor before unless a matrix is idle."""
 
     @property
     def unknowns(self) -> torch.Tensor:

@@ -34,18 +34,32 @@ class SparseSolver(LinearSolver):
         return scipy.sparse.csc_array((data, (self._rows, self._cols)), shape=(self.n, self.n))
 
     @override
-    def factor(self, values: torch.Tensor, definite: bool = True, idle: torch.Tensor | None = None) -> Factor:
-        return _SparseFactor(self, values, definite)
+    def _factorise(
+        self, values: torch.Tensor, definite: bool, idle: torch.Tensor | None, before: Factor | None
+    ) -> Factor:
+        left_out = [False] * len(values) if idle is None else idle.tolist()
+        return _SparseFactor(self, values, definite, left_out, before if isinstance(before, _SparseFactor) else None)
 
 
 class _SparseFactor(Factor):
-    def __init__(self, solver: SparseSolver, values: torch.Tensor, definite: bool) -> None:
+    def __init__(
+        self,
+        solver: SparseSolver,
+        values: torch.Tensor,
+        definite: bool,
+        idle: list[bool],
+        before: "_SparseFactor | None",
+    ) -> None:
         self._device, self._dtype = solver.device, solver.dtype
         self.failed = np.zeros(len(values), dtype=bool)
         cholmod = _cholespy() if definite else None
         self._factors: list[Any] = []
         self._cholmod = cholmod is not None
         for i, entries in enumerate(solver.mirrored(values)):
+            if idle[i]:
+                self._factors.append(None if before is None else before._factors[i])
+                self.failed[i] = before is not None and before.failed[i]
+                continue
             try:
                 if cholmod is not None:
                     self._factors.append(_cholmod_factor(cholmod, solver, entries))

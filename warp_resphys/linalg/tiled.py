@@ -49,11 +49,14 @@ class TiledSolver(LinearSolver):
         self.kernels = tiled_kernels(TILE, self.width, self.scalar)
 
     @override
-    def factor(self, values: torch.Tensor, definite: bool = True, idle: torch.Tensor | None = None) -> Factor:
+    def _factorise(
+        self, values: torch.Tensor, definite: bool, idle: torch.Tensor | None, before: Factor | None
+    ) -> Factor:
         values[:, self._padding] = 1.0
         if not definite:
             return _Reordered(DenseFactor(self._dense(values), definite=False), self)
-        self.launch(self.kernels.factor, (len(values),), values.view(-1, *self.shape))
+        idle = torch.zeros(len(values), device=values.device, dtype=torch.bool) if idle is None else idle
+        self.launch(self.kernels.factor, (len(values),), idle, values.view(-1, *self.shape))
         return _TiledFactor(values, self)
 
     def failed(self, values: torch.Tensor) -> NDArray[np.bool_]:
@@ -63,7 +66,7 @@ class TiledSolver(LinearSolver):
 
     def launch(self, kernel: Any, blocks: tuple[int, ...], *arrays: torch.Tensor) -> None:
         """Launches on torch's stream."""
-        views = [wp.from_torch(each, dtype=self.scalar, requires_grad=False) for each in arrays]
+        views = [wp.from_torch(each, requires_grad=False) for each in arrays]
         stream = None
         if self.device.type == "cuda":
             stream = wp.stream_from_torch(torch.cuda.current_stream(self.device))

@@ -108,7 +108,7 @@ class Case:
         self.backward.append(_now(q.device) - turned)
         self.forward.append(done - began)
         self.iterations = float(np.mean([r.iterations.double().mean().item() for r in trajectory.reports]))
-        self.factorisations = float(np.mean([r.factorisations for r in trajectory.reports]))
+        self.factorisations = float(np.mean([r.factorisations.double().mean().item() for r in trajectory.reports]))
 
     def row(self) -> dict[str, Any]:
         """The case for the file; times are of one step of the whole batch."""

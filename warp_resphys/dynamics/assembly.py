@@ -84,11 +84,11 @@ class HessianAssembly:
         blocks = p.zeros(pattern.n_cell_blocks, 3, 3)
         self._values = torch.zeros(p.batch, solver.n_values, device=p.device, dtype=solver.dtype)
         self._overwritten = solver.overwrites
-        self._commands = []
+        commands = []
         for s, offset in zip(p.sets, pattern.offsets, strict=True):
             inputs = [idle, s.gradients, s.points_per_cell]
             inputs += [p.points_view(p.tangent, s.part, wp.mat33d), offset]
-            self._commands.append(
+            commands.append(
                 p.record(
                     kernels.cell_blocks, (p.batch, s.cells, s.nodes_per_cell), inputs, [warp_view(blocks, wp.mat33d)]
                 )
@@ -105,7 +105,8 @@ class HessianAssembly:
         dim = (p.batch, len(pattern.rows))
         scalar = wp.float64 if solver.dtype == torch.float64 else wp.float32
         values = warp_view(self._values, scalar)
-        self._commands.append(p.record(kernels.scatter_kernel(scalar), dim, inputs, [values]))
+        commands.append(p.record(kernels.scatter_kernel(scalar), dim, inputs, [values]))
+        self._launches = p.capture(*commands)
 
     def __call__(self, idle: torch.Tensor | None = None) -> torch.Tensor:
         """(B, n_values) from the potential's last `update_tangent`; overwritten by the next call.
@@ -121,5 +122,5 @@ class HessianAssembly:
             self._values.zero_()
         elif self._overwritten:
             self._values.masked_fill_(~idle[:, None], 0.0)
-        self._potential.launch(*self._commands)
+        self._potential.launch(self._launches)
         return self._values

@@ -179,12 +179,15 @@ class _Equilibrium(torch.autograd.Function):
     ) -> torch.Tensor:
         tensors = [None if each is None else each.detach() for each in (start, fixed_positions, *terms)]
 
-        def solve(shard: Shard) -> tuple[torch.Tensor, SolveReport]:
-            rows, own = shard
-            return _solve(own, own.solver(purpose, settings), names, *(_rows(each, rows) for each in tensors))
+        # Made here, not in the threads: Warp captures graphs for the whole process.
+        parts = [(rows, own, own.solver(purpose, settings)) for rows, own in workspace.parts]
+
+        def solve(part: tuple[slice, Workspace, NonlinearSolver]) -> tuple[torch.Tensor, SolveReport]:
+            rows, own, solver = part
+            return _solve(own, solver, names, *(_rows(each, rows) for each in tensors))
 
         with threads_for(start.numel()):
-            found = in_threads(solve, workspace.parts)
+            found = in_threads(solve, parts)
         reports.append(SolveReport.of([report for _, report in found]))
         x = found[0][0] if len(found) == 1 else torch.cat([each for each, _ in found])
         ctx.workspace, ctx.names, ctx.linear_solver = workspace, names, settings.linear_solver
@@ -198,13 +201,16 @@ class _Equilibrium(torch.autograd.Function):
         x, *saved = ctx.saved_tensors
         needed = ctx.needs_input_grad[6:]
 
-        def differentiate(shard: Shard) -> tuple[torch.Tensor | None, ...]:
-            rows, own = shard
-            hessian = own.hessian(ctx.linear_solver)
+        parts = [(rows, own, own.hessian(ctx.linear_solver)) for rows, own in ctx.workspace.parts]
+        for _, own, _ in parts:
+            own.potential.prepare_adjoint()
+
+        def differentiate(part: tuple[slice, Workspace, ExactHessian]) -> tuple[torch.Tensor | None, ...]:
+            rows, own, hessian = part
             return _adjoint(own, hessian, ctx.names, needed, *(_rows(each, rows) for each in (gradient, x, *saved)))
 
         with threads_for(gradient.numel()):
-            found = in_threads(differentiate, ctx.workspace.parts)
+            found = in_threads(differentiate, parts)
         return (*([None] * 6), *map(_joined, (None, *saved), zip(*found, strict=True)))
 
 

@@ -89,27 +89,28 @@ class Minimiser:
         stiffness = p.terms.values["stiffness"]
         assert stiffness is not None
         loads = [warp_view(p.terms.force, wp.vec3d), warp_view(stiffness, wp.float64)]
-        self._begin = p.record_blocks(
-            kernels.begin, b, [*loads, positions, tolerances, origin_view, progress, pairs.count], []
-        )
+        beginning = [*loads, positions, tolerances, origin_view, progress, pairs.count]
+        begin = p.record_blocks(kernels.begin, b, beginning, [])
         self._idle, self._clamp = (torch.zeros(b, device=p.device, dtype=torch.bool) for _ in range(2))
         chosen = [warp_view(each, wp.bool) for each in (self._idle, self._clamp)]
         self._choose = p.record(kernels.choose, (b,), [progress, *chosen, pairs.count], [])
         aiming = [progress, pairs, vertex_at, gradient]
         self._project = p.record_blocks(own.project, b, aiming, [right])
-        self._aim = p.record_blocks(own.aim, b, [*aiming, right, positions], [origin_view, direction])
+        aim = p.record_blocks(own.aim, b, [*aiming, right, positions], [origin_view, direction])
         clamped = warp_view(hessian.clamped, wp.bool)
         judging = [int(memory > 0), tolerances, warp_view(p.inertia, wp.float64), found, origin_view, direction]
         judging += [clamped, positions, gradient, progress, pairs]
-        self._accept = p.record_blocks(own.accept, b, judging, [])
+        accept = p.record_blocks(own.accept, b, judging, [])
         self._summarise = p.record_blocks(kernels.summarise, 1, [progress], [warp_view(summary, wp.int32)])
+        judge = [*p.evaluation, accept, self._summarise]
+        self._begin, self._aim, self._go_on = p.capture(begin, *judge), p.capture(aim, *judge), p.capture(*judge)
 
     def begin(self, start: torch.Tensor) -> Summary:
         """Evaluates the potential at a start (B, N, 3) [m]."""
         p = self._potential
         p.positions.copy_(start)
         p.launch(self._begin)
-        return self._evaluate()
+        return self._look()
 
     def forget(self) -> None:
         """The factors serve no more."""
@@ -122,7 +123,9 @@ class Minimiser:
             p.launch(self._project)
             self._hessian.solve_in_place(self._right)
             p.launch(self._aim)
-        return self._evaluate()
+        else:
+            p.launch(self._go_on)
+        return self._look()
 
     def refactor(self, state: Summary) -> None:
         """Factorises for the environments that need it, at their iterates."""
@@ -140,18 +143,15 @@ class Minimiser:
         converged = counts["phase"] == kernels.DONE
         return counts["iterations"].long(), self._sums["relative"].clone(), converged, counts["made"].long()
 
-    def _evaluate(self) -> Summary:
-        p = self._potential
-        p.launch_evaluation()
-        p.launch(self._accept, self._summarise)
-        state = self._look()
+    def _look(self) -> Summary:
+        state = self._read()
         if state.asking:
             self._compare_with_rounding()
-            p.launch(self._summarise)
-            state = self._look()
+            self._potential.launch(self._summarise)
+            state = self._read()
         return state
 
-    def _look(self) -> Summary:
+    def _read(self) -> Summary:
         if self._seen is not self._summary:
             self._seen.copy_(self._summary)
         return Summary._make(self._shown.tolist())

@@ -53,6 +53,7 @@ class IncrementalPotential(Launcher):
         energies: their terms.
         sets: the sets of points of all of them.
         free_mask: (N,) one at free vertices, zero at fixed ones.
+        evaluation: launches that set ``residual``, and the sums of it and of the energy, at ``positions``:
         energy: (B,) of the last evaluation [J].
         energy_size: (B,) sum of the absolute values of what it is the sum of [J].
         balance: (B,) norm of inertia less all loads there [N].
@@ -144,6 +145,8 @@ class IncrementalPotential(Launcher):
         energies = [warp_view(each, wp.float64) for each in (self._vertex_energy, self._point_energy)]
         sums = [warp_view(each, wp.float64) for each in (self.energy, self.energy_size, self.residual_norm)]
         self._internal_commands.append(self.record_blocks(reductions.totals, b, [free, *energies, residual], sums))
+        self.evaluation = [self._inertia_command, *self._load_commands, *self._internal_commands]
+        self._evaluation = self.capture(*self.evaluation)
 
     def set_terms(self, terms: StepTerms) -> None:
         """Copies a step's terms into the buffers; fixed vertices get neither inertia nor load."""
@@ -166,16 +169,12 @@ class IncrementalPotential(Launcher):
         """(B, N) inertia of the current terms [N/m], zero at fixed vertices."""
         return self.terms.inertia
 
-    def launch_evaluation(self) -> None:
-        """Sets ``residual`` and the sums of it and of the energy at ``positions``; see the attributes."""
-        self.launch(self._inertia_command, *self._load_commands, *self._internal_commands)
-
     def evaluate(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Energy (B,) [J] and norm of inertia less all loads (B,) [N] at ``positions``; sets ``residual`` [N].
 
         The residual is the potential's gradient, zero at fixed vertices.
         """
-        self.launch_evaluation()
+        self.launch(self._evaluation)
         return self.energy.clone(), self.balance.clone()
 
     def residual_rounding(self) -> torch.Tensor:
@@ -206,7 +205,7 @@ class IncrementalPotential(Launcher):
             self._positive.copy_(positive)
         if idle is not None:
             self._positive.masked_fill_(idle, -1)
-        self.launch(*self._tangent_commands)
+        self.launch(self._tangent_commands)
         found = [term.low_rank(self.terms.values, self._position_view) for term in self.energies]
         columns = [each for each in found if each is not None]
         self.low_rank = torch.cat(columns, 2) if columns else None
@@ -227,19 +226,20 @@ class IncrementalPotential(Launcher):
         self._positive = torch.zeros(self.batch, device=self.device, dtype=torch.int32)
         self._product_stress = self.zeros(self._n_points, 3, 3)
         self._product = self.zeros(self.n_vertices, 3)
-        self._tangent_commands, self._product_commands = [], []
+        tangents, products = [], []
         positive, direction = warp_view(self._positive, wp.int32), warp_view(self._direction, wp.vec3d)
         for term in self.energies:
-            self._tangent_commands += term.before(self.terms.values, self._position_view)
+            tangents += term.before(self.terms.values, self._position_view)
             for s in term.sets:
                 tangent = self.points_view(blocks, s.part, wp.mat33d)
                 kernel, inputs = term.tangent(s, self.terms.values, self._position_view, positive)
-                self._tangent_commands.append(self.record(kernel, (self.batch, s.n_points), inputs, [tangent]))
+                tangents.append(self.record(kernel, (self.batch, s.n_points), inputs, [tangent]))
                 stress = self.points_view(self._product_stress, s.part, wp.mat33d)
-                self._product_commands += [
+                products += [
                     self.product(s, tangent, direction, stress),
                     self.gather(s, stress, self._product),
                 ]
+        self._tangent_commands, self._product_commands = self.capture(*tangents), self.capture(*products)
 
     def stiffness_product(self, direction: torch.Tensor) -> torch.Tensor:
         """(B, N, 3) product of the internal forces' stiffness with a displacement, all vertices included [N].
@@ -248,7 +248,7 @@ class IncrementalPotential(Launcher):
         """
         self._direction.copy_(direction)
         self._product.zero_()
-        self.launch(*self._product_commands)
+        self.launch(self._product_commands)
         product = self._product.clone()
         if self.low_rank is not None:
             along = torch.einsum("bnr,bn->br", self.low_rank, self._direction.flatten(1))
@@ -261,7 +261,11 @@ class IncrementalPotential(Launcher):
         Args:
             adjoint: (B, N, 3) z = H^-1 dL/dx, zero at fixed vertices [m].
         """
-        if not self._adjoints:
-            self._adjoints = [t.adjoint(self.terms.values, self.positions, self._direction) for t in self.energies]
+        self.prepare_adjoint()
         self._direction.copy_(adjoint)
         return {name: value for differentiate in self._adjoints for name, value in differentiate().items()}
+
+    def prepare_adjoint(self) -> None:
+        """Buffers and launches of `value_adjoint`, made at their first use."""
+        if not self._adjoints:
+            self._adjoints = [t.adjoint(self.terms.values, self.positions, self._direction) for t in self.energies]

@@ -118,9 +118,10 @@ class HessianAssembly:
             self._idle.zero_()
         else:
             self._idle.copy_(idle)
-        if self._overwritten and idle is None:
-            self._values.zero_()
-        elif self._overwritten:
-            self._values.masked_fill_(~idle[:, None], 0.0)
+        if self._overwritten:
+            if idle is None:
+                self._values.zero_()
+            else:
+                self._values.masked_fill_(~idle[:, None], 0.0)
         self._potential.launch(self._launches)
         return self._values

@@ -38,7 +38,7 @@ class BandedCholesky:
         letter = _LETTERS[dtype]
         self._factor, self._solve = _routine(f"{letter}pbtrf", 6), _routine(f"{letter}pbtrs", 9)
         self._lower, self._numbers = ctypes.c_char(b"L"), [ctypes.c_int(k) for k in (n, width, width + 1)]
-        self._where = [ctypes.addressof(each) for each in (self._lower, *self._numbers)]
+        self._where = [ctypes.addressof(self._lower), *map(ctypes.addressof, self._numbers)]
 
     def factor(self, matrix: torch.Tensor) -> bool:
         """Overwrites a contiguous matrix by its factor; False where it is not positive definite."""

@@ -1,5 +1,8 @@
 """Hessian blocks of the cells, and their gather into the value array of a matrix layout."""
 
+import functools
+from typing import Any
+
 import warp as wp
 
 from .modules import decorators
@@ -39,36 +42,43 @@ def cell_blocks(
             blocks_out[b, first + c] = block
 
 
-@kernel
-def scatter_blocks(
-    idle: wp.array[int],  # (B) not zero where nothing is to be done
-    block_start: wp.array[int],  # (blocks + 1) where a matrix block's contributions begin
-    contribution: wp.array[int],  # cell block, or -1 - cell block where it enters transposed
-    diagonal_vertex: wp.array[int],  # (blocks) the vertex of a diagonal block, else -1
-    address: wp.array2d[int],  # (blocks, 9) place in the layout's value array, or -1
-    cell_block: wp.array2d[wp.mat33d],
-    inertia: wp.array2d[wp.float64],  # (B, N) [N/m]
-    values_out: wp.array2d[wp.float64],  # (B, layout size) [N/m]
-):
-    """The entries of a layout: the sums of the blocks of the cells, and inertia on the diagonal."""
-    b, block = wp.tid()
-    if idle[b] != 0:
-        return
-    total = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
-    for entry in range(block_start[block], block_start[block + 1]):
-        source = contribution[entry]
-        if source >= 0:
-            total += cell_block[b, source]
-        else:
-            total += wp.transpose(cell_block[b, -1 - source])
-    i = diagonal_vertex[block]
-    if i >= 0:
-        k = inertia[b, i]
-        total[0, 0] += k
-        total[1, 1] += k
-        total[2, 2] += k
-    for r in range(3):
-        for c in range(3):
-            at = address[block, 3 * r + c]
-            if at >= 0:
-                values_out[b, at] = total[r, c]
+@functools.cache
+def scatter_kernel(scalar: Any) -> Any:
+    """`scatter_blocks` into values of a type, ``wp.float64`` or ``wp.float32``."""
+    kernel, _ = decorators("" if scalar is wp.float64 else scalar.__name__)
+
+    @kernel
+    def scatter_blocks(
+        idle: wp.array[int],  # (B) not zero where nothing is to be done
+        block_start: wp.array[int],  # (blocks + 1) where a matrix block's contributions begin
+        contribution: wp.array[int],  # cell block, or -1 - cell block where it enters transposed
+        diagonal_vertex: wp.array[int],  # (blocks) the vertex of a diagonal block, else -1
+        address: wp.array2d[int],  # (blocks, 9) place in the layout's value array, or -1
+        cell_block: wp.array2d[wp.mat33d],
+        inertia: wp.array2d[wp.float64],  # (B, N) [N/m]
+        values_out: wp.array2d[scalar],  # (B, layout size) [N/m]
+    ):
+        """The entries of a layout: the sums of the blocks of the cells, and inertia on the diagonal."""
+        b, block = wp.tid()
+        if idle[b] != 0:
+            return
+        total = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
+        for entry in range(block_start[block], block_start[block + 1]):
+            source = contribution[entry]
+            if source >= 0:
+                total += cell_block[b, source]
+            else:
+                total += wp.transpose(cell_block[b, -1 - source])
+        i = diagonal_vertex[block]
+        if i >= 0:
+            k = inertia[b, i]
+            total[0, 0] += k
+            total[1, 1] += k
+            total[2, 2] += k
+        for r in range(3):
+            for c in range(3):
+                at = address[block, 3 * r + c]
+                if at >= 0:
+                    values_out[b, at] = scalar(total[r, c])
+
+    return scatter_blocks

@@ -111,10 +111,12 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         dilation_offset: wp.array2d[wp.float64],
         points_per_cell: int,
         positions: wp.array2d[wp.vec3d],
-        positive: wp.array[int],  # (B) 1: clamp the eigenvalues at zero
+        positive: wp.array[int],  # (B) 1: clamp the eigenvalues at zero; -1: nobody asks for this tangent
         tangent_out: wp.array3d[wp.mat33d],
     ):
         b, p = wp.tid()
+        if positive[b] < 0:
+            return
         f = deformation_gradient(positions, nodes, gradients, b, p, p / points_per_cell)
         m = stiffness[b, p]
         out = tangent_out[b, p]
@@ -140,6 +142,7 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         dilation_offset: wp.array2d[wp.float64],
         points_per_cell: int,
         positions: wp.array2d[wp.vec3d],
+        carried: wp.array[moduli],  # (P) volumes that the points carry for each modulus [m^3]
         direction: wp.array2d[wp.vec3d],  # (B, N) z = H^-1 dL/dx [m]
         stiffness_out: wp.array2d[moduli],  # (B, P) dL/d stiffness
         viscosity_out: wp.array2d[wp.vec2d],  # (B, P) this point's part of dL/d viscosity
@@ -155,8 +158,8 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         shape = wp.dot(mu_of, m)
         bulk = wp.dot(lambda_of, m)
         c = viscosity[b]
-        # A stiffness of zero has a derivative too (nu = 0), so nothing is skipped here.
-        result = -slopes(f, dz)
+        # A stiffness of zero has a derivative too (nu = 0): what is skipped depends on the volumes alone.
+        result = -slopes(f, dz, carried[p])
         rise = wp.transpose(f) * dz
         rise = HALF * (rise + wp.transpose(rise))
         swelling = wp.trace(rise)

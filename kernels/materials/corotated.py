@@ -34,9 +34,14 @@ def response(f: wp.mat33d, m: moduli):
 
 
 @function
-def slopes(f: wp.mat33d, df: wp.mat33d) -> moduli:
+def slopes(f: wp.mat33d, df: wp.mat33d, carried: moduli) -> moduli:
     """See ``kernels.materials``."""
-    return moduli(TWO * wp.ddot(f - polar_rotation(f), df), wp.ddot(f - nearest_unimodular(f), df))
+    found = moduli(ZERO, ZERO)
+    if carried[0] != ZERO:
+        found[0] = TWO * wp.ddot(f - polar_rotation(f), df)
+    if carried[1] != ZERO:
+        found[1] = wp.ddot(f - nearest_unimodular(f), df)
+    return found
 
 
 @function

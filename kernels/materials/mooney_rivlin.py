@@ -40,7 +40,7 @@ def response(f: wp.mat33d, m: moduli):
 
 
 @function
-def slopes(f: wp.mat33d, df: wp.mat33d) -> moduli:
+def slopes(f: wp.mat33d, df: wp.mat33d, carried: moduli) -> moduli:
     """See ``kernels.materials``."""
     jac = wp.determinant(f)
     along = wp.ddot(cofactor(f), df)

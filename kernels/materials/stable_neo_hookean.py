@@ -34,7 +34,7 @@ def response(f: wp.mat33d, m: moduli):
 
 
 @function
-def slopes(f: wp.mat33d, df: wp.mat33d) -> moduli:
+def slopes(f: wp.mat33d, df: wp.mat33d, carried: moduli) -> moduli:
     """See ``kernels.materials``."""
     change = wp.determinant(f) - ONE
     along = wp.ddot(cofactor(f), df)

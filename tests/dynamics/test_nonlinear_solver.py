@@ -1,14 +1,15 @@
 """The three nonlinear solvers: agreement, failures, batches."""
 
+import numpy as np
 import pytest
 import torch
 
 from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, box_hexahedra, select_vertices
 from warp_resphys.dynamics.inputs import Inputs
+from warp_resphys.dynamics.minimiser import Minimiser
 from warp_resphys.dynamics.nonlinear_solver import SOLVERS
 from warp_resphys.energies.materials import MATERIALS
 from warp_resphys.io.errors import ConvergenceError, InputError
-from warp_resphys.linalg.lbfgs import InverseHessianUpdate
 from warp_resphys.studies.gradient_check import pose
 
 MESH = box_hexahedra((0.06, 0.02, 0.02), (4, 2, 2))
@@ -38,11 +39,11 @@ def test_all_solvers_find_the_same_trajectory(model, start, device):
 
 def test_linear_solvers_find_the_same_step():
     results = []
-    for kind in ("banded", "dense", "sparse"):
+    for kind in ("banded", "tiled", "dense", "sparse"):
         s = simulator(linear_solver=kind)
         results.append(s.step(pose(s, "bent", 2))[0].q)
-    torch.testing.assert_close(results[1], results[0], rtol=0.0, atol=1e-10)
-    torch.testing.assert_close(results[2], results[0], rtol=0.0, atol=1e-10)
+    for found in results[1:]:
+        torch.testing.assert_close(found, results[0], rtol=0.0, atol=1e-10)
 
 
 def test_solver_finds_the_minimum_and_reports_it():
@@ -198,7 +199,7 @@ def test_a_slow_solver_is_not_taken_for_one_at_rounding(pulled_beam):
     torch.testing.assert_close(found.q, exact.q, rtol=0.0, atol=2e-10)
 
 
-@pytest.mark.parametrize("linear_solver", ["banded", "dense", "sparse"])
+@pytest.mark.parametrize("linear_solver", ["banded", "tiled", "dense", "sparse"])
 @pytest.mark.parametrize("name", SOLVERS)
 @pytest.mark.parametrize("speed", [1e80, 1e160])
 def test_an_overflow_touches_neither_neighbours_nor_later_steps(name, linear_solver, speed, device):
@@ -288,29 +289,62 @@ def test_bad_settings_are_refused(settings, message):
 
 
 class DiagonalMetric:
-    def __init__(self, inverse):
-        self.inverse = inverse
+    """A matrix of the global step that the test can invert: another one for each environment."""
 
-    def apply(self, residual):
-        return self.inverse * residual
+    def __init__(self, inverse, vertex_at):
+        self.inverse, self.vertex_at = inverse, vertex_at
+        self.clamped = torch.ones(len(inverse), dtype=torch.bool)
+
+    def refactor(self, clamp=None, idle=None):
+        """It is always the same."""
+
+    def solve_in_place(self, right):
+        right.mul_(self.inverse)
 
 
-def test_compact_updates_equal_the_bfgs_formula():
-    """More pairs than memory, one of them of negative curvature in one environment."""
-    generator = torch.Generator().manual_seed(0)
-    like = torch.zeros(2, 3, 3, dtype=torch.float64)
-    update, inverse = InverseHessianUpdate(3, like), 1.0 + torch.rand(2, 9, generator=generator, dtype=like.dtype)
-    pairs = torch.randn(5, 2, 2, 9, generator=generator, dtype=like.dtype)
-    pairs[:, 1] = 2.0 * pairs[:, 0] + 0.3 * pairs[:, 1]
-    pairs[3, 1, 1] *= -1.0
+def bfgs_inverse(inverse, pairs):
+    """Nocedal and Wright (2006), equation 6.17, one pair after another, where the curvature is positive."""
+    h, unit = torch.diag(inverse), torch.eye(len(inverse), dtype=torch.float64)
     for s, y in pairs:
-        update.add(s, y)
-    residual = torch.randn(2, 9, generator=generator, dtype=like.dtype)
-    found = update.apply(residual, DiagonalMetric(inverse))
-    for b in range(2):
-        h = torch.diag(inverse[b])
-        for s, y in pairs[-3:, :, b]:
-            if s @ y > 0:
-                left = torch.eye(9, dtype=like.dtype) - torch.outer(s, y) / (s @ y)
-                h = left @ h @ left.T + torch.outer(s, s) / (s @ y)
-        torch.testing.assert_close(found[b], h @ residual[b], rtol=1e-10, atol=1e-12)
+        left = unit - torch.outer(s, y) / (s @ y)
+        h = left @ h @ left.T + torch.outer(s, s) / (s @ y)
+    return h
+
+
+def test_directions_equal_the_bfgs_formula():
+    """More pairs than memory, two environments with line searches of their own, vertices in another order."""
+    s, memory = simulator(), 3
+    potential, free = s.workspace(2).potential, BODY.n_vertices - len(BODY.fixed_vertices)
+    s.step(pose(s, "bent", 2))  # sets the terms of a step
+    generator = torch.Generator().manual_seed(0)
+    vertex_at = np.setdiff1d(np.arange(BODY.n_vertices), BODY.fixed_vertices)[::-1].copy()
+    inverse = 2e-3 * (1.0 + torch.rand(2, free, 3, generator=generator, dtype=torch.float64))
+    metric = DiagonalMetric(inverse, vertex_at)
+    minimiser = Minimiser(potential, metric, torch.float64, memory, 1e-12, 1e-12, 1000, None)
+    start = s.rest_positions + 1e-3 * torch.randn(2, BODY.n_vertices, 3, generator=generator, dtype=torch.float64)
+    start[:, s.fixed] = s.rest_positions[s.fixed]
+    state = minimiser.begin(start)
+
+    def now(b):
+        return (each[b, vertex_at].flatten().clone() for each in (potential.positions, potential.residual))
+
+    pairs = ([], [])
+    here = [tuple(now(b)) for b in range(2)]
+    searches = 0
+    minimiser.refactor(state)
+    while min(map(len, pairs)) < 3 * memory:
+        state = minimiser.advance(state)
+        waits = minimiser.elsewhere()
+        searches += int(waits.sum())
+        for b in range(2):
+            if waits[b]:
+                continue
+            x, g = now(b)
+            wanted = -bfgs_inverse(inverse[b].flatten(), pairs[b][-memory:]) @ here[b][1]
+            moved = x - here[b][0]
+            share = float(moved @ wanted / (wanted @ wanted))
+            torch.testing.assert_close(moved, share * wanted, rtol=0.0, atol=1e-9 * float(moved.abs().max()))
+            assert share > 0.0
+            pairs[b].append((moved, g - here[b][1]))
+            here[b] = (x, g)
+    assert searches > 0

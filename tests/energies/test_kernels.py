@@ -10,7 +10,7 @@ from warp_resphys.dynamics.assembly import BlockPattern, HessianAssembly
 from warp_resphys.energies.materials import MATERIALS
 from warp_resphys.energies.potential import IncrementalPotential, StepTerms
 from warp_resphys.energies.solid import Solid
-from warp_resphys.linalg.linear_solver import make_linear_solver
+from warp_resphys.linalg.choice import make_linear_solver
 
 UNIT = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 TETRAHEDRON = Body(Mesh(UNIT, np.array([[0, 1, 2, 3]])), volume_integration="full")

@@ -6,8 +6,10 @@ import scipy.linalg
 import torch
 
 from warp_resphys.io.errors import InputError
-from warp_resphys.linalg import linear_solver
-from warp_resphys.linalg.linear_solver import bandwidth_reducing_order, make_linear_solver
+from warp_resphys.linalg import sparse
+from warp_resphys.linalg.banded import BandedSolver
+from warp_resphys.linalg.choice import make_linear_solver
+from warp_resphys.linalg.linear_solver import bandwidth_reducing_order
 
 NODES, BATCH = 12, 3
 
@@ -49,7 +51,7 @@ def make(kind, block, device="cpu", dtype=torch.float64):
 
 
 def layouts(device):
-    return ["dense", "sparse"] + (["banded"] if device == "cpu" else [])
+    return ["dense", "sparse", "tiled"] + (["banded"] if device == "cpu" else [])
 
 
 @pytest.fixture(params=[True, False], ids=["cholespy", "scipy"])
@@ -57,7 +59,7 @@ def cholespy(request, monkeypatch):
     if request.param:
         pytest.importorskip("cholespy")
     else:
-        monkeypatch.setattr(linear_solver, "_cholespy", lambda: None)
+        monkeypatch.setattr(sparse, "_cholespy", lambda: None)
 
 
 @pytest.mark.parametrize("block", [1, 3])
@@ -100,7 +102,7 @@ def test_idle_matrices_leave_the_others_as_they_are(definite, device, cholespy):
     right = torch.ones(BATCH, NODES * 3, 2, dtype=torch.float64, device=device)
     for kind in layouts(device):
         solver = make(kind, 3, device)
-        factor = solver.factor(values_of(solver, dense), definite, idle)
+        factor = solver.factor(values_of(solver, dense), definite, idle=idle)
         assert not factor.failed[[0, 2]].any()
         found = factor.solve(right).cpu()[[0, 2]]
         np.testing.assert_allclose(found, np.linalg.solve(dense[[0, 2]], right.cpu()[[0, 2]]), rtol=1e-9, atol=1e-9)
@@ -151,15 +153,15 @@ def test_band_storage_is_lapacks():
     solver = make("banded", 3)
     bands = values_of(solver, dense).numpy().reshape(BATCH, solver.n, -1)
     right = np.ones(solver.n)
-    order = solver._order.numpy()
+    order = solver.dofs.numpy()
     for matrix, band in zip(dense, bands, strict=True):
         reference = np.linalg.solve(matrix[np.ix_(order, order)], right)
         np.testing.assert_allclose(scipy.linalg.solveh_banded(band.T, right, lower=True), reference, rtol=1e-9)
 
 
 def test_bad_choices_are_refused():
-    with pytest.raises(InputError, match="linear_solver is 'lu': choose one of auto, banded, dense, sparse"):
+    with pytest.raises(InputError, match="linear_solver is 'lu': choose one of auto, banded, tiled, dense, sparse"):
         make("lu", 3)
     with pytest.raises(InputError, match="linear_solver=banded runs on the CPU alone"):
         make("banded", 3, "cuda")
-    assert isinstance(make("auto", 3), linear_solver.BandedSolver)
+    assert isinstance(make("auto", 3), BandedSolver)

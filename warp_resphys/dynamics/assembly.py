@@ -82,12 +82,13 @@ class HessianAssembly:
         self._idle = torch.zeros(p.batch, dtype=torch.int32, device=p.device)
         idle = warp_view(self._idle, wp.int32)
         blocks = p.zeros(pattern.n_cell_blocks, 3, 3)
-        self._values, self._overwritten = p.zeros(solver.n_values), solver.overwrites
-        self._commands = []
+        self._values = torch.zeros(p.batch, solver.n_values, device=p.device, dtype=solver.dtype)
+        self._overwritten = solver.overwrites
+        commands = []
         for s, offset in zip(p.sets, pattern.offsets, strict=True):
             inputs = [idle, s.gradients, s.points_per_cell]
             inputs += [p.points_view(p.tangent, s.part, wp.mat33d), offset]
-            self._commands.append(
+            commands.append(
                 p.record(
                     kernels.cell_blocks, (p.batch, s.cells, s.nodes_per_cell), inputs, [warp_view(blocks, wp.mat33d)]
                 )
@@ -102,19 +103,25 @@ class HessianAssembly:
             warp_view(p.terms.inertia, wp.float64),
         ]
         dim = (p.batch, len(pattern.rows))
-        self._commands.append(p.record(kernels.scatter_blocks, dim, inputs, [warp_view(self._values, wp.float64)]))
+        scalar = wp.float64 if solver.dtype == torch.float64 else wp.float32
+        values = warp_view(self._values, scalar)
+        commands.append(p.record(kernels.scatter_kernel(scalar), dim, inputs, [values]))
+        self._launches = p.capture(*commands)
 
     def __call__(self, idle: torch.Tensor | None = None) -> torch.Tensor:
         """(B, n_values) from the potential's last `update_tangent`; overwritten by the next call.
 
         Args:
-            idle: (B,) environments whose values nobody needs; they may be anything.
+            idle: (B,) environments whose values stay as they are.
         """
         if idle is None:
             self._idle.zero_()
         else:
             self._idle.copy_(idle)
         if self._overwritten:
-            self._values.zero_()
-        self._potential.launch(*self._commands)
+            if idle is None:
+                self._values.zero_()
+            else:
+                self._values.masked_fill_(~idle[:, None], 0.0)
+        self._potential.launch(self._launches)
         return self._values

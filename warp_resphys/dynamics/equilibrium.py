@@ -12,13 +12,15 @@ from ..energies.base import Energy
 from ..energies.potential import IncrementalPotential, StepTerms
 from ..fem.elements import Points
 from ..io.errors import ConvergenceError
-from ..linalg.linear_solver import LinearSolver, make_linear_solver
-from ..linalg.threads import threads_for
+from ..linalg.choice import make_linear_solver
+from ..linalg.linear_solver import LinearSolver
+from ..linalg.threads import in_threads, threads_for
 from .assembly import BlockPattern
 from .hessian import ExactHessian
-from .nonlinear_solver import NonlinearSolver, SolveReport, SolverSettings
+from .nonlinear_solver import NonlinearSolver, SolveReport, SolverSettings, check_converged
 
 T = TypeVar("T")
+Shard = tuple[slice, "Workspace"]
 
 _LEAST_SHARE = 1.0 / 64.0  # of the loads, by which they grow where all of them at once lead nowhere
 
@@ -34,6 +36,9 @@ class Workspace:
         batch: environments.
         device: of every buffer.
         dtype: of states and factors; the potential is evaluated in float64.
+
+    Attributes:
+        shards: rows of the batch and a workspace for each, if several threads share it; empty if not.
     """
 
     def __init__(
@@ -50,6 +55,12 @@ class Workspace:
         self.potential = IncrementalPotential(energies, n_vertices, self.fixed, batch, device)
         self.pattern, self.dtype = pattern, dtype
         self._made: dict[Any, Any] = {}
+        self.shards: list[Shard] = []
+
+    @property
+    def parts(self) -> "list[Shard]":
+        """The shards, or the whole batch."""
+        return self.shards or [(slice(None), self)]
 
     def once(self, key: Hashable, make: Callable[[], T]) -> T:
         """What belongs to this batch, made at its first use."""
@@ -78,7 +89,8 @@ class Workspace:
 
 def equilibrium(
     workspace: Workspace,
-    solver: NonlinearSolver,
+    purpose: str,
+    settings: SolverSettings,
     terms: StepTerms,
     start: torch.Tensor,
     fixed_positions: torch.Tensor,
@@ -87,7 +99,8 @@ def equilibrium(
 
     Args:
         workspace: of the batch.
-        solver: of the workspace.
+        purpose: which of the workspace's solvers; see `Workspace.solver`.
+        settings: of the solver.
         terms: of the step.
         start: (B, N, 3) where the solver begins [m]; without influence on the result, and without a gradient.
         fixed_positions: (B, D, 3) of the fixed vertices [m].
@@ -99,8 +112,9 @@ def equilibrium(
     names = tuple(terms.values)
     main = (terms.target, terms.inertia, terms.force)
     x: torch.Tensor = _Equilibrium.apply(
-        workspace, solver, reports, names, start, fixed_positions, *main, *terms.values.values()
+        workspace, purpose, settings, reports, names, start, fixed_positions, *main, *terms.values.values()
     )
+    check_converged(settings, reports[0], x)
     return x, reports[0]
 
 
@@ -155,21 +169,28 @@ class _Equilibrium(torch.autograd.Function):
     def forward(
         ctx: Any,
         workspace: Workspace,
-        solver: NonlinearSolver,
+        purpose: str,
+        settings: SolverSettings,
         reports: list[SolveReport],
         names: tuple[str, ...],
         start: torch.Tensor,
         fixed_positions: torch.Tensor,
         *terms: torch.Tensor | None,
     ) -> torch.Tensor:
-        workspace.potential.set_terms(_terms(names, terms))
-        if len(workspace.fixed):
-            start = start.detach().clone()
-            start[:, workspace.fixed] = fixed_positions.detach()
+        tensors = [None if each is None else each.detach() for each in (start, fixed_positions, *terms)]
+
+        # Made here, not in the threads: Warp captures graphs for the whole process.
+        parts = [(rows, own, own.solver(purpose, settings)) for rows, own in workspace.parts]
+
+        def solve(part: tuple[slice, Workspace, NonlinearSolver]) -> tuple[torch.Tensor, SolveReport]:
+            rows, own, solver = part
+            return _solve(own, solver, names, *(_rows(each, rows) for each in tensors))
+
         with threads_for(start.numel()):
-            reports.append(solver.solve(start.detach()))
-        x = workspace.potential.positions.to(start.dtype, copy=True)
-        ctx.workspace, ctx.names, ctx.linear_solver = workspace, names, solver.settings.linear_solver
+            found = in_threads(solve, parts)
+        reports.append(SolveReport.of([report for _, report in found]))
+        x = found[0][0] if len(found) == 1 else torch.cat([each for each, _ in found])
+        ctx.workspace, ctx.names, ctx.linear_solver = workspace, names, settings.linear_solver
         ctx.save_for_backward(x, *terms)
         return x
 
@@ -177,8 +198,33 @@ class _Equilibrium(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        x, *saved = ctx.saved_tensors
+        needed = ctx.needs_input_grad[6:]
+
+        parts = [(rows, own, own.hessian(ctx.linear_solver)) for rows, own in ctx.workspace.parts]
+        for _, own, _ in parts:
+            own.potential.prepare_adjoint()
+
+        def differentiate(part: tuple[slice, Workspace, ExactHessian]) -> tuple[torch.Tensor | None, ...]:
+            rows, own, hessian = part
+            return _adjoint(own, hessian, ctx.names, needed, *(_rows(each, rows) for each in (gradient, x, *saved)))
+
         with threads_for(gradient.numel()):
-            return _adjoint(ctx, gradient)
+            found = in_threads(differentiate, parts)
+        return (*([None] * 6), *map(_joined, (None, *saved), zip(*found, strict=True)))
+
+
+def _rows(values: torch.Tensor | None, rows: slice) -> torch.Tensor | None:
+    """Those of some environments; what they share stays."""
+    return values if values is None or len(values) == 1 else values[rows]
+
+
+def _joined(value: torch.Tensor | None, slopes: tuple[torch.Tensor | None, ...]) -> torch.Tensor | None:
+    """The slopes by a value from those of its shards: their sum, if these share it."""
+    found = [slope for slope in slopes if slope is not None]
+    if len(found) < 2:
+        return found[0] if found else None
+    return torch.stack(found).sum(0) if value is not None and len(value) == 1 else torch.cat(found)
 
 
 def _terms(names: tuple[str, ...], tensors: Sequence[Any]) -> StepTerms:
@@ -186,31 +232,48 @@ def _terms(names: tuple[str, ...], tensors: Sequence[Any]) -> StepTerms:
     return StepTerms(target, inertia, force, dict(zip(names, values, strict=True)))
 
 
-def _adjoint(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-    """Gradients of the inputs of `_Equilibrium.forward`; the equations are in its docstring."""
-    x, *saved = ctx.saved_tensors
-    terms = _terms(ctx.names, saved)
-    potential = ctx.workspace.potential
+def _solve(
+    workspace: Workspace, solver: NonlinearSolver, names: tuple[str, ...], start: Any, fixed_positions: Any, *terms: Any
+) -> tuple[torch.Tensor, SolveReport]:
+    """See `_Equilibrium.forward`."""
+    workspace.potential.set_terms(_terms(names, terms))
+    if len(workspace.fixed):
+        start = start.clone()
+        start[:, workspace.fixed] = fixed_positions
+    report = solver.solve(start)
+    return workspace.potential.positions.to(start.dtype, copy=True), report
+
+
+def _adjoint(
+    workspace: Workspace,
+    hessian: ExactHessian,
+    names: tuple[str, ...],
+    needed: Sequence[bool],
+    gradient: Any,
+    x: Any,
+    *saved: Any,
+) -> tuple[torch.Tensor | None, ...]:
+    """Gradients of the fixed positions and terms; the equations are in the docstring of `_Equilibrium`."""
+    terms = _terms(names, saved)
+    potential = workspace.potential
     potential.set_terms(terms)
     potential.positions.copy_(x)
-    hessian = ctx.workspace.hessian(ctx.linear_solver)
     hessian.refactor_exact()
     gradient = gradient.double()
-    z = hessian.apply(gradient.reshape(len(x), -1)).view_as(x)
+    z = hessian.solve(gradient.reshape(len(x), -1, 1)).view_as(x)
     product = potential.stiffness_product(z)
     _check_adjoint(potential, z, product, gradient)
-    _, _, _, _, _, fixed, target, inertia, force, *values = ctx.needs_input_grad
+    fixed, target, inertia, force, *values = needed
     slopes = potential.value_adjoint(z) if any(values) else {}
     of_values: list[torch.Tensor | None] = []
-    for name, needed in zip(ctx.names, values, strict=True):
+    for name, wanted in zip(names, values, strict=True):
         value, slope = terms.values[name], slopes.get(name)
-        if value is None or slope is None or not needed:
+        if value is None or slope is None or not wanted:
             of_values.append(None)
         else:
             of_values.append(slope.sum(0, keepdim=True) if len(value) < len(slope) else slope)
     return (
-        *([None] * 5),
-        (gradient - product)[:, ctx.workspace.fixed] if fixed else None,
+        (gradient - product)[:, workspace.fixed] if fixed else None,
         terms.inertia[..., None] * z * potential.free_mask[:, None] if target else None,
         -(z * (x - terms.target)).sum(-1) * potential.free_mask if inertia else None,
         z if force else None,

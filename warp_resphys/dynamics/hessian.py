@@ -4,11 +4,12 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from typing_extensions import override
 
 from ..energies.base import PointSet
 from ..energies.potential import IncrementalPotential
-from ..linalg.linear_solver import Factor, LinearSolver, corrected
+from ..linalg.linear_solver import Factor, LinearSolver
 from .assembly import BlockPattern, HessianAssembly
 
 
@@ -18,21 +19,28 @@ class HessianApproximation(ABC):
     Attributes:
         clamped: (B,) environments whose matrix is positive definite by force or by construction: a line search that
             fails with it gets no further try.
+        vertex_at: (F,) the free vertex at each place of right-hand sides `in place <solve_in_place>`.
     """
 
     clamped: torch.Tensor
+    vertex_at: NDArray[np.int64]
 
     @abstractmethod
     def ready(self) -> bool:
         """Whether there is a factor that may serve the current terms."""
 
     @abstractmethod
-    def refactor(self, clamp: bool = False, idle: torch.Tensor | None = None) -> None:
-        """Factorises at the potential's positions, if need be not for the (B,) environments that nobody asks for."""
+    def refactor(self, clamp: torch.Tensor | None = None, idle: torch.Tensor | None = None) -> None:
+        """Factorises at the potential's positions.
+
+        Args:
+            clamp: (B,) environments whose matrix is to be positive definite by force.
+            idle: (B,) environments that keep the factor they have, if they have one.
+        """
 
     @abstractmethod
-    def apply(self, residual: torch.Tensor) -> torch.Tensor:
-        """(B, 3 N) displacement [m] for a (B, 3 N) residual [N]; zero at fixed vertices."""
+    def solve_in_place(self, right: torch.Tensor) -> None:
+        """Overwrites residuals (B, F, 3) [N] at the free vertices, see `vertex_at`, by displacements [m]."""
 
 
 class ExactHessian(HessianApproximation):
@@ -50,30 +58,35 @@ class ExactHessian(HessianApproximation):
         self._dofs = pattern.unknowns(potential.device)
         self._factor: Factor | None = None
         self.clamped = torch.zeros(potential.batch, dtype=torch.bool, device=potential.device)
+        self.vertex_at = pattern.free[linear.order]
 
     @override
     def ready(self) -> bool:
         return self._factor is not None
 
     @override
-    def refactor(self, clamp: bool = False, idle: torch.Tensor | None = None) -> None:
-        self.clamped.fill_(clamp)
-        self._factor = self._factorise(idle)
-        failed = torch.as_tensor(self._factor.failed, device=self.clamped.device)
+    def refactor(self, clamp: torch.Tensor | None = None, idle: torch.Tensor | None = None) -> None:
+        clamp = torch.zeros_like(self.clamped) if clamp is None else clamp
+        self.clamped.copy_(clamp if idle is None else torch.where(idle, self.clamped, clamp))
+        self._factorise(idle)
+        assert self._factor is not None
+        if not self._factor.failed.any():
+            return
+        failed = torch.as_tensor(self._factor.failed, device=self.clamped.device) & ~self.clamped
         failed = failed if idle is None else failed & ~idle
-        if bool(failed.any()) and not clamp:
-            self.clamped = failed
-            self._factor = self._factorise(idle)
+        if bool(failed.any()):
+            self.clamped |= failed
+            self._factorise(~failed)
 
-    def _factorise(self, idle: torch.Tensor | None) -> Factor:
-        self._potential.update_tangent(self.clamped)
-        return self._factor_of(self._assemble(idle).to(self._linear.dtype), idle=idle)
+    def _factorise(self, idle: torch.Tensor | None) -> None:
+        self._potential.update_tangent(self.clamped, idle)
+        self._factor = self._factor_of(self._assemble(idle), idle=idle)
 
     def _factor_of(self, values: torch.Tensor, definite: bool = True, idle: torch.Tensor | None = None) -> Factor:
         """Of assembled values, and what couples vertices beside them."""
         columns = self._potential.low_rank
         columns = None if columns is None else columns[:, self._dofs].to(self._linear.dtype)
-        return corrected(self._linear.factor(values, definite, idle), columns)
+        return self._linear.factor(values, definite, columns, idle, self._factor)
 
     def refactor_exact(self) -> None:
         """Factorises the Hessian as it is, indefinite or not: for adjoints."""
@@ -84,8 +97,10 @@ class ExactHessian(HessianApproximation):
             self._factor = self._factor_of(self._assemble(), definite=False)
 
     @override
-    def apply(self, residual: torch.Tensor) -> torch.Tensor:
-        return self.solve(residual[:, :, None])[:, :, 0]
+    def solve_in_place(self, right: torch.Tensor) -> None:
+        if self._factor is None:
+            raise RuntimeError("refactor before solve")
+        self._factor.solve_in_place(right.flatten(1))
 
     def solve(self, right: torch.Tensor) -> torch.Tensor:
         """(B, 3 N, m) solutions for (B, 3 N, m) right-hand sides; zero at fixed vertices."""
@@ -107,7 +122,7 @@ class ProjectiveHessian(HessianApproximation):
 
     def __init__(self, potential: IncrementalPotential, pattern: BlockPattern, linear: LinearSolver) -> None:
         self._potential, self._pattern, self._linear = potential, pattern, linear
-        self._free = torch.as_tensor(pattern.free, device=potential.device)
+        self.vertex_at = pattern.free
         self._address = torch.as_tensor(linear.address[:, 0], device=potential.device, dtype=torch.int64)
         self._products = [self._gradient_products(s) for s in potential.sets]
         self._key: tuple[torch.Tensor, ...] | None = None
@@ -132,7 +147,7 @@ class ProjectiveHessian(HessianApproximation):
         return self._key is not None and all(map(torch.equal, self._key, terms))
 
     @override
-    def refactor(self, clamp: bool = False, idle: torch.Tensor | None = None) -> None:
+    def refactor(self, clamp: torch.Tensor | None = None, idle: torch.Tensor | None = None) -> None:
         del clamp, idle  # The matrix is positive definite as it is, and serves later steps.
         self._key = tuple(t.clone() for t in self._terms())
         inertia, *weights = (t[:1] if bool((t == t[:1]).all()) else t for t in self._key)
@@ -155,10 +170,7 @@ class ProjectiveHessian(HessianApproximation):
         self._factor = self._linear.factor(values.to(self._linear.dtype))
 
     @override
-    def apply(self, residual: torch.Tensor) -> torch.Tensor:
+    def solve_in_place(self, right: torch.Tensor) -> None:
         if self._factor is None:
-            raise RuntimeError("refactor before apply")
-        right = residual.view(self._potential.batch, -1, 3)
-        out = torch.zeros_like(right)
-        out[:, self._free] = self._factor.solve(right[:, self._free])
-        return out.view_as(residual)
+            raise RuntimeError("refactor before solve")
+        right.copy_(self._factor.solve(right))

@@ -9,7 +9,8 @@ import torch
 from numpy.typing import NDArray
 
 from ..energies.potential import StepTerms
-from ..linalg.linear_solver import Factor, SparseSolver, corrected
+from ..linalg.linear_solver import Factor
+from ..linalg.sparse import SparseSolver
 from .assembly import HessianAssembly
 from .equilibrium import Workspace
 from .integrator import ImplicitStage, State
@@ -127,4 +128,4 @@ class _ShiftedHessian:
         values[:, self._diagonal] += 1.0
         columns = self._potential.low_rank
         columns = None if columns is None else math.sqrt(scale) * columns[:, self._dofs]
-        return corrected(self._linear.factor(values), columns)
+        return self._linear.factor(values, columns=columns)

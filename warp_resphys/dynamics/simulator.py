@@ -20,6 +20,7 @@ from ..energies.strings import Strings
 from ..fem.body import Body
 from ..fem.elements import Points
 from ..io.errors import ConvergenceError, InputError
+from ..linalg.threads import shards_of
 from .assembly import BlockPattern
 from .constants import Constants
 from .equilibrium import Workspace, equilibrium, ramped
@@ -238,10 +239,15 @@ class Simulator:
     def workspace(self, batch: int) -> Workspace:
         """Buffers for a batch size, made at their first use."""
         if batch not in self._workspaces:
-            n, fixed = self.body.n_vertices, self.body.fixed_vertices
-            device = torch.device(self.device)
-            self._workspaces[batch] = Workspace(self._energies, n, fixed, self._pattern, batch, device, self.dtype)
+            workspace = self._make_workspace(batch)
+            rows = shards_of(batch, workspace.potential.device)
+            workspace.shards += [(each, self._make_workspace(each.stop - each.start)) for each in rows]
+            self._workspaces[batch] = workspace
         return self._workspaces[batch]
+
+    def _make_workspace(self, batch: int) -> Workspace:
+        n, fixed = self.body.n_vertices, self.body.fixed_vertices
+        return Workspace(self._energies, n, fixed, self._pattern, batch, torch.device(self.device), self.dtype)
 
     def held_energy(self, name: str, batch: int) -> HeldEnergy:
         """The energy with an input of that name, by itself in a given state.
@@ -290,11 +296,15 @@ class Simulator:
         inputs = _NOTHING if inputs is None else inputs
         constants = self.prepare(parameters)
         self._check(state, inputs, constants)
+        return self._advance(state, inputs, constants)
+
+    def _advance(self, state: State, inputs: Inputs, constants: Constants) -> tuple[State, SolveReport]:
+        """`step` with arguments that have been checked."""
         stage = self.method.stage(state, self.time_step)
         workspace = self.workspace(state.batch)
         terms = self._terms(state, stage, inputs, constants)
-        solver = workspace.solver("dynamics", self.settings)
-        x, report = equilibrium(workspace, solver, terms, stage.target, self._fixed_at(state, stage, inputs))
+        clamped = self._fixed_at(state, stage, inputs)
+        x, report = equilibrium(workspace, "dynamics", self.settings, terms, stage.target, clamped)
         return self._finish(state, stage, inputs, constants, x), report
 
     def _fixed_at(self, state: State, stage: ImplicitStage, inputs: Inputs) -> torch.Tensor:
@@ -466,9 +476,8 @@ class Simulator:
         workspace, clamp = self.workspace(batch), rest[:, self.fixed]
         most = min(self.settings.max_iterations, _MOST_ITERATIONS)
         settings = replace(self.settings, name="newton", on_failure="raise", max_iterations=most)
-        solver = workspace.solver("statics", settings)
         at = clamp if inputs.fixed_positions is None else torch.lerp(clamp, inputs.fixed_positions, share)
-        return equilibrium(workspace, solver, terms, start, at)
+        return equilibrium(workspace, "statics", settings, terms, start, at)
 
     def rollout(
         self,
@@ -498,7 +507,12 @@ class Simulator:
         constants = self.prepare(parameters)
         states, reports = [state], []
         for t in range(steps):
-            state, report = self.step(state, inputs.at(t), constants)
+            acting = inputs.at(t)
+            if t == 0:
+                self._check(state, acting, constants)
+            elif acting is not inputs:
+                self._check_inputs(acting, state.batch)
+            state, report = self._advance(state, acting, constants)
             states.append(state)
             reports.append(report)
         q, v = (torch.stack([getattr(s, name) for s in states]) for name in ("q", "v"))
@@ -520,10 +534,15 @@ class Simulator:
             shape = (batch, self._strings.count, 3)
             for name, unit in (("q", "m"), ("v", "m/s")):
                 check_tensor(f"state.payload.{name}", getattr(state.payload, name), shape, unit, "string", like)
-        if not isinstance(inputs, Inputs):
-            raise InputError(f"the inputs are a {type(inputs).__name__}: give Inputs(external_force=...), say.")
-        inputs.check([energy for energy, _ in self._energies], batch, n, len(self.fixed), like)
+        self._check_inputs(inputs, batch)
         constants.check_batch(batch)
         if state.overstrain is not None:
             solid = self.workspace(batch).potential.solid
             check_overstrain(state.overstrain, (batch, len(self.material.prony), solid.n_points, 3, 3), like)
+
+    def _check_inputs(self, inputs: Inputs, batch: int) -> None:
+        """One sentence on the first input that cannot be simulated."""
+        if not isinstance(inputs, Inputs):
+            raise InputError(f"the inputs are a {type(inputs).__name__}: give Inputs(external_force=...), say.")
+        energies, counts = [energy for energy, _ in self._energies], (self.body.n_vertices, len(self.fixed))
+        inputs.check(energies, batch, *counts, self.rest_positions)

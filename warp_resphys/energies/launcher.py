@@ -1,5 +1,8 @@
 """Warp launches on torch's memory, recorded once and made as often as needed."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -10,12 +13,30 @@ from numpy.typing import NDArray
 from ..io.kernel_cache import ensure_kernel_cache
 from ..kernels import points
 
+_CAPTURES = Lock()  # Warp captures what any thread launches meanwhile.
+BLOCK = 128  # threads of a GPU that work on one environment
+
 ensure_kernel_cache()  # Before Warp is first used, by this package or by who imports it.
 
 
 def warp_view(tensor: torch.Tensor, dtype: Any) -> Any:
     """A Warp array on a tensor's own memory, without a gradient."""
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
+
+
+@contextmanager
+def shareable() -> Iterator[None]:
+    """Warp modules that are loaded meanwhile may be launched by several threads at once, on a CPU.
+
+    Otherwise every launch would register the place of its tiles, which these kernels do not use, in a variable that
+    all threads share.
+    """
+    before = wp.config.enable_tiles_in_stack_memory
+    wp.config.enable_tiles_in_stack_memory = False
+    try:
+        yield
+    finally:
+        wp.config.enable_tiles_in_stack_memory = before
 
 
 class Launcher:
@@ -44,7 +65,14 @@ class Launcher:
 
     def record(self, kernel: Any, dim: tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> Any:
         """A launch to be made by `launch`, as often as needed."""
-        return wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=str(self.device), record_cmd=True)
+        with shareable():
+            return wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=str(self.device), record_cmd=True)
+
+    def record_blocks(self, kernel: Any, blocks: int, inputs: list[Any], outputs: list[Any]) -> Any:
+        """A launch by blocks of threads that work together, on a CPU of one thread each."""
+        options = {"block_dim": BLOCK, "device": str(self.device), "record_cmd": True}
+        with shareable():
+            return wp.launch_tiled(kernel, dim=[blocks], inputs=inputs, outputs=outputs, **options)
 
     def gather(self, s: Any, stress: Any, out: torch.Tensor) -> Any:
         """A launch that adds the transposed operator of a set's stress, a view (B, P) mat33, to (B, N, 3)."""
@@ -55,6 +83,13 @@ class Launcher:
         """A launch of a set's stress (B, P) from its tangent (B, P, 6) mat33 and a direction (B, N) vec3, all views."""
         inputs = [s.nodes, s.gradients, s.points_per_cell, tangent, direction]
         return self.record(points.tangent_product, (self.batch, s.n_points), inputs, [stress])
+
+    def capture(self, *commands: Any) -> "Sequence":
+        """Recorded launches as one: a graph, on a CPU too, whose launches cost a sixth of as many single ones."""
+        with _CAPTURES, wp.ScopedCapture(device=str(self.device)) as capture:
+            for command in commands:
+                command.launch()
+        return Sequence(capture.graph, commands)
 
     def launch(self, *commands: Any) -> None:
         """Makes recorded launches, on torch's stream."""
@@ -68,3 +103,14 @@ class Launcher:
         stream = self._stream[1]
         for command in commands:
             command.launch(stream)
+
+
+class Sequence:
+    """Launches that were captured: to be made like a recorded launch."""
+
+    def __init__(self, graph: Any, commands: tuple[Any, ...]) -> None:
+        self._graph, self._alive = graph, commands  # What they were recorded with is to stay.
+
+    def launch(self, stream: Any = None) -> None:
+        """All of them, in their order."""
+        wp.capture_launch(self._graph, stream)

@@ -19,6 +19,7 @@ import warp as wp
 
 from ..fem.elements import Points
 from ..kernels import points as kernels
+from ..kernels import reductions
 from .base import Energy, PointSet, Term
 from .launcher import Launcher, warp_view
 from .solid import SolidTerm
@@ -52,6 +53,11 @@ class IncrementalPotential(Launcher):
         energies: their terms.
         sets: the sets of points of all of them.
         free_mask: (N,) one at free vertices, zero at fixed ones.
+        evaluation: launches that set ``residual``, and the sums of it and of the energy, at ``positions``:
+        energy: (B,) of the last evaluation [J].
+        energy_size: (B,) sum of the absolute values of what it is the sum of [J].
+        balance: (B,) norm of inertia less all loads there [N].
+        residual_norm: (B,) norm of the residual there [N].
         low_rank: (B, 3 N, r) columns C of the last `update_tangent`: what the Hessian has beside `tangent` is C C^T.
             None for nothing.
     """
@@ -92,6 +98,7 @@ class IncrementalPotential(Launcher):
         self._stress = self.zeros(self._n_points, 3, 3)
         self._point_energy = self.zeros(self._n_points)
         self._vertex_energy = self.zeros(n_vertices)
+        self.energy, self.energy_size, self.balance, self.residual_norm = (self.zeros() for _ in range(4))
         self._record_evaluation()
         self._tangent: torch.Tensor | None = None
         self.low_rank: torch.Tensor | None = None
@@ -131,6 +138,15 @@ class IncrementalPotential(Launcher):
                     self.record(kernel, (b, s.n_points), inputs, outputs),
                     self.gather(s, stress, self.residual),
                 ]
+        free, residual = warp_view(self.free_mask, wp.float64), warp_view(self.residual, wp.vec3d)
+        self._load_commands.append(
+            self.record_blocks(reductions.masked_norm, b, [free, residual], [warp_view(self.balance, wp.float64)])
+        )
+        energies = [warp_view(each, wp.float64) for each in (self._vertex_energy, self._point_energy)]
+        sums = [warp_view(each, wp.float64) for each in (self.energy, self.energy_size, self.residual_norm)]
+        self._internal_commands.append(self.record_blocks(reductions.totals, b, [free, *energies, residual], sums))
+        self.evaluation = [self._inertia_command, *self._load_commands, *self._internal_commands]
+        self._evaluation = self.capture(*self.evaluation)
 
     def set_terms(self, terms: StepTerms) -> None:
         """Copies a step's terms into the buffers; fixed vertices get neither inertia nor load."""
@@ -158,23 +174,8 @@ class IncrementalPotential(Launcher):
 
         The residual is the potential's gradient, zero at fixed vertices.
         """
-        self.launch(self._inertia_command, *self._load_commands)
-        if self._load_commands:
-            self.residual.mul_(self.free_mask[:, None])
-        balance = torch.linalg.vector_norm(self.residual.view(self.batch, -1), dim=1)
-        self.launch(*self._internal_commands)
-        self.residual.mul_(self.free_mask[:, None])
-        return self._point_energy.sum(1).add_(self._vertex_energy.sum(1)), balance
-
-    def energy_rounding(self) -> torch.Tensor:
-        """(B,) how far rounding may have moved the energy last evaluated [J].
-
-        Terms of the size of the stiffness cancel in the energy of a small strain.
-        """
-        stiffness = self.terms.values["stiffness"]
-        assert stiffness is not None
-        energy = self._point_energy.abs().sum(1) + self._vertex_energy.abs().sum(1)
-        return 8.0 * torch.finfo(torch.float64).eps * (stiffness.sum((1, 2)) + 100.0 * energy)
+        self.launch(self._evaluation)
+        return self.energy.clone(), self.balance.clone()
 
     def residual_rounding(self) -> torch.Tensor:
         """(B,) norm by which the residual last evaluated changes when every coordinate moves by one rounding unit [N].
@@ -191,17 +192,20 @@ class IncrementalPotential(Launcher):
         self.residual.copy_(residual)
         return change
 
-    def update_tangent(self, positive: torch.Tensor | None = None) -> None:
+    def update_tangent(self, positive: torch.Tensor | None = None, idle: torch.Tensor | None = None) -> None:
         """Computes dP/dF at ``positions``.
 
         Args:
             positive: (B,) environments whose eigenvalues are clamped at zero; none where left out.
+            idle: (B,) environments whose tangent nobody asks for; none where left out.
         """
         self._prepare_tangent()
         self._positive.zero_()
         if positive is not None:
             self._positive.copy_(positive)
-        self.launch(*self._tangent_commands)
+        if idle is not None:
+            self._positive.masked_fill_(idle, -1)
+        self.launch(self._tangent_commands)
         found = [term.low_rank(self.terms.values, self._position_view) for term in self.energies]
         columns = [each for each in found if each is not None]
         self.low_rank = torch.cat(columns, 2) if columns else None
@@ -222,19 +226,20 @@ class IncrementalPotential(Launcher):
         self._positive = torch.zeros(self.batch, device=self.device, dtype=torch.int32)
         self._product_stress = self.zeros(self._n_points, 3, 3)
         self._product = self.zeros(self.n_vertices, 3)
-        self._tangent_commands, self._product_commands = [], []
+        tangents, products = [], []
         positive, direction = warp_view(self._positive, wp.int32), warp_view(self._direction, wp.vec3d)
         for term in self.energies:
-            self._tangent_commands += term.before(self.terms.values, self._position_view)
+            tangents += term.before(self.terms.values, self._position_view)
             for s in term.sets:
                 tangent = self.points_view(blocks, s.part, wp.mat33d)
                 kernel, inputs = term.tangent(s, self.terms.values, self._position_view, positive)
-                self._tangent_commands.append(self.record(kernel, (self.batch, s.n_points), inputs, [tangent]))
+                tangents.append(self.record(kernel, (self.batch, s.n_points), inputs, [tangent]))
                 stress = self.points_view(self._product_stress, s.part, wp.mat33d)
-                self._product_commands += [
+                products += [
                     self.product(s, tangent, direction, stress),
                     self.gather(s, stress, self._product),
                 ]
+        self._tangent_commands, self._product_commands = self.capture(*tangents), self.capture(*products)
 
     def stiffness_product(self, direction: torch.Tensor) -> torch.Tensor:
         """(B, N, 3) product of the internal forces' stiffness with a displacement, all vertices included [N].
@@ -243,7 +248,7 @@ class IncrementalPotential(Launcher):
         """
         self._direction.copy_(direction)
         self._product.zero_()
-        self.launch(*self._product_commands)
+        self.launch(self._product_commands)
         product = self._product.clone()
         if self.low_rank is not None:
             along = torch.einsum("bnr,bn->br", self.low_rank, self._direction.flatten(1))
@@ -256,7 +261,11 @@ class IncrementalPotential(Launcher):
         Args:
             adjoint: (B, N, 3) z = H^-1 dL/dx, zero at fixed vertices [m].
         """
-        if not self._adjoints:
-            self._adjoints = [t.adjoint(self.terms.values, self.positions, self._direction) for t in self.energies]
+        self.prepare_adjoint()
         self._direction.copy_(adjoint)
         return {name: value for differentiate in self._adjoints for name, value in differentiate().items()}
+
+    def prepare_adjoint(self) -> None:
+        """Buffers and launches of `value_adjoint`, made at their first use."""
+        if not self._adjoints:
+            self._adjoints = [t.adjoint(self.terms.values, self.positions, self._direction) for t in self.energies]

@@ -71,7 +71,9 @@ class Solid(Energy):
 
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "SolidTerm":
-        return SolidTerm(launcher, sets, self.material)
+        carried = torch.stack([volumes.sum(1).to_dense() for volumes in self._volumes.values()])
+        rules = list(self._volumes)
+        return SolidTerm(launcher, sets, self.material, carried[[rules.index(each) for each in self.material.rules]].T)
 
     @property
     def quantities(self) -> Mapping[str, Quantity]:
@@ -93,13 +95,15 @@ class SolidTerm(Term):
         launcher: of the potential.
         sets: the solid's points.
         material: whose law it is.
+        carried: (P, T) volumes that the points carry for each modulus [m^3].
     """
 
-    def __init__(self, launcher: Launcher, sets: Sequence[PointSet], material: Material) -> None:
+    def __init__(self, launcher: Launcher, sets: Sequence[PointSet], material: Material, carried: torch.Tensor) -> None:
         super().__init__(launcher, sets)
         law = type(material).law
         self._kernels, self._vector = kernels.solid_kernels(law), law.moduli
         self._moduli = len(material.rules)
+        self._carried = carried.double().cpu().numpy()
         self._curvature = torch.as_tensor(material.curvature, device=launcher.device, dtype=torch.float64)
 
     @property
@@ -150,7 +154,9 @@ class SolidTerm(Term):
         types["dilation_offset"] = wp.float64
         commands = []
         for s in self.sets:
-            inputs = [*self._arguments(s, values, warp_view(positions, wp.vec3d)), warp_view(direction, wp.vec3d)]
+            carried = own.upload(self._carried[s.own], self._vector)
+            inputs = [*self._arguments(s, values, warp_view(positions, wp.vec3d)), carried]
+            inputs.append(warp_view(direction, wp.vec3d))
             outputs = [own.points_view(out[name], s.own, kind) for name, kind in types.items()]
             commands.append(own.record(self._kernels.adjoint, (own.batch, s.n_points), inputs, outputs))
 

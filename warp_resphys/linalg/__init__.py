@@ -1,4 +1,4 @@
-"""Linear solvers of the Hessian's structure, L-BFGS, conjugate gradients and least squares.
+"""Linear solvers of the Hessian's structure, conjugate gradients and least squares.
 
-From outside: `linear_solver.make_linear_solver`, `lbfgs.InverseHessianUpdate`, `least_squares.minimise`.
+From outside: `choice.make_linear_solver`, `least_squares.minimise`.
 """

@@ -1,25 +1,69 @@
-"""Keeps small linear algebra on one thread."""
+"""Threads: one for small linear algebra, several for the shards of a batch."""
 
-from collections.abc import Iterator
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import cache
+from itertools import pairwise
+from typing import TypeVar
 
 import torch
+from threadpoolctl import ThreadpoolController
+
+S = TypeVar("S")
+T = TypeVar("T")
 
 _WORTH_SHARING = 200_000  # unknowns of a batch
+_LEAST_ENVIRONMENTS = 2  # of a shard
 
 
 @contextmanager
 def threads_for(unknowns: int) -> Iterator[None]:
-    """Torch on one thread while vectors of this size are worked on, if that is too small to share.
+    """Torch and BLAS on one thread while vectors of this size are worked on, if that is too small to share.
 
-    Threads that spin for one another's share of a microsecond's work take milliseconds when the cores are busy.
+    Threads that spin for one another's share of a microsecond's work take milliseconds when the cores are busy, and the
+    band of a slender body is always too narrow.
     """
     before = torch.get_num_threads()
-    if before == 1 or unknowns >= _WORTH_SHARING:
-        yield
-        return
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
+    with _blas().limit(limits=1, user_api="blas"):
+        if before == 1 or unknowns >= _WORTH_SHARING:
+            yield
+            return
+        torch.set_num_threads(1)
+        try:
+            yield
+        finally:
+            torch.set_num_threads(before)
+
+
+@cache
+def _blas() -> ThreadpoolController:
+    return ThreadpoolController()
+
+
+def shards_of(batch: int, device: torch.device) -> list[slice]:
+    """Rows of a batch that a thread each works on, or nothing if one thread has them all.
+
+    On a CPU a kernel runs on the thread that launches it, and releases Python's lock meanwhile. As many threads are
+    used as torch may use; ``WARP_RESPHYS_THREADS`` is another number.
+    """
+    count = min(int(os.environ.get("WARP_RESPHYS_THREADS", torch.get_num_threads())), batch // _LEAST_ENVIRONMENTS)
+    if device.type != "cpu" or count < 2:
+        return []
+    ends = [round(batch * k / count) for k in range(count + 1)]
+    return [slice(*pair) for pair in pairwise(ends)]
+
+
+@cache
+def _crew(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, "warp-resphys", lambda: torch.set_num_threads(1))
+
+
+def in_threads(work: Callable[[S], T], shards: Sequence[S]) -> list[T]:
+    """The results of a function for each shard, the last of which the calling thread works on."""
+    if len(shards) == 1:
+        return [work(shards[0])]
+    others = [_crew(len(shards) - 1).submit(work, shard) for shard in shards[:-1]]
+    own = work(shards[-1])
+    return [*(other.result() for other in others), own]

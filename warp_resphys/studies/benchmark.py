@@ -45,7 +45,7 @@ from ..io.files import write_json
 from ..io.machine import hardware
 from ..io.progress import Progress
 from ..io.stages import package_versions
-from ..linalg.linear_solver import make_linear_solver
+from ..linalg.choice import make_linear_solver
 from .command import show, table_of
 
 PARTS: Final = ("local_step", "tangent", "assembly", "factor", "solve")
@@ -108,7 +108,7 @@ class Case:
         self.backward.append(_now(q.device) - turned)
         self.forward.append(done - began)
         self.iterations = float(np.mean([r.iterations.double().mean().item() for r in trajectory.reports]))
-        self.factorisations = float(np.mean([r.factorisations for r in trajectory.reports]))
+        self.factorisations = float(np.mean([r.factorisations.double().mean().item() for r in trajectory.reports]))
 
     def row(self) -> dict[str, Any]:
         """The case for the file; times are of one step of the whole batch."""

@@ -1,0 +1,446 @@
+"""L-BFGS directions, backtracking line search and convergence of a batch, decided where the data are.
+
+One block of threads works on one environment. Every environment is in a phase of its own, so that none waits while
+another one's line search goes on:
+
+=========  ============================================================================================
+BEGINS     its start is evaluated next
+AIMS       it needs a direction: `project`, a solve with the global step's matrix, `aim`
+TRIES      its positions are a trial, which is evaluated next and judged by `accept`
+DONE       it has converged
+STUCK      it has not, and no more is to be tried
+=========  ============================================================================================
+"""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from .modules import decorators
+from .reductions import block_max, block_sum
+
+BEGINS, AIMS, TRIES, DONE, STUCK = (wp.constant(k) for k in range(5))
+FACTOR, CLAMPED_FACTOR = wp.constant(1), wp.constant(2)  # requests
+ALWAYS, NEVER = wp.constant(0), wp.constant(2**28)  # iterations after which a factor is made anew
+
+ZERO, HALF, ONE = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0)
+INFINITE = wp.constant(wp.float64(float("inf")))
+ARMIJO = wp.constant(wp.float64(1e-4))
+LEAST_CURVATURE = wp.constant(wp.float64(1e-10))
+MOST_HALVINGS = wp.constant(25)
+STALLS = wp.constant(3)
+# Of a sum of energies: what rounding leaves of the terms that cancel, per unit of stiffness and of energy.
+ENERGY_ROUNDING = wp.constant(wp.float64(8.0 * 2.0**-52))
+
+kernel, function = decorators("minimisation")
+
+
+@wp.struct
+class Progress:
+    """Where the environments of a batch are, (B) each."""
+
+    phase: wp.array[int]
+    wanted: wp.array[int]  # 0, FACTOR or CLAMPED_FACTOR, before it goes on
+    factored: wp.array[int]  # 1: it has a factor, of this solve or one before
+    asks: wp.array[int]  # 1: whether its residual is rounding is to be measured
+    iterations: wp.array[int]  # directions so far; at first, those of the solve before
+    since: wp.array[int]  # directions since the solve began, or since a factorisation in it
+    made: wp.array[int]  # factorisations in this solve
+    halvings: wp.array[int]
+    stalls: wp.array[int]  # evaluations that have not halved the residual
+    step: wp.array[wp.float64]  # length, as a share of the direction
+    slope: wp.array[wp.float64]  # of the energy along the direction [J]
+    energy: wp.array[wp.float64]  # at the iterate [J]
+    scale: wp.array[wp.float64]  # norm of the balancing forces there [N]
+    relative: wp.array[wp.float64]  # residual over scale
+    smallest: wp.array[wp.float64]  # norm of a residual so far [N]
+    rounding: wp.array[wp.float64]  # norm that rounding leaves of it, once it was measured [N]
+    force: wp.array[wp.float64]  # norm of the loads [N]
+    stiffness: wp.array[wp.float64]  # sum over all points [J]
+
+
+@wp.struct
+class Evaluation:
+    """What was found of the potential, (B) each but for the residual."""
+
+    energy: wp.array[wp.float64]  # [J]
+    size: wp.array[wp.float64]  # sum of the energies' absolute values [J]
+    balance: wp.array[wp.float64]  # norm of inertia less all loads [N]
+    norm: wp.array[wp.float64]  # of the residual [N]
+    residual: wp.array2d[wp.vec3d]  # (B, N) [N]
+
+
+@wp.struct
+class Tolerances:
+    """When a solve has converged, and how long it may take."""
+
+    relative: wp.float64
+    absolute: wp.float64  # [N]
+    epsilon: wp.float64  # of the states' type
+    max_iterations: int
+    refactor_after: int  # iterations of a solve, more of which are to be fewer by a new factor
+
+
+@kernel
+def begin(
+    force: wp.array2d[wp.vec3d],  # (B, N) [N]
+    stiffness: wp.array3d[wp.float64],  # (B, P, T) [J]
+    positions: wp.array2d[wp.vec3d],  # (B, N) the start [m]
+    tolerances: Tolerances,
+    origin_out: wp.array2d[wp.vec3d],
+    progress: Progress,
+    pairs: wp.array[int],  # (B) how many there are
+):
+    """Forgets the solve before, and sums what does not change during this one."""
+    b, lane = wp.tid()
+    square, total = wp.float64(0.0), wp.float64(0.0)
+    for i in range(lane, force.shape[1], wp.block_dim()):
+        square += wp.dot(force[b, i], force[b, i])
+        origin_out[b, i] = positions[b, i]
+    for p in range(lane, stiffness.shape[1], wp.block_dim()):
+        for t in range(stiffness.shape[2]):
+            total += stiffness[b, p, t]
+    square, total = block_sum(square), block_sum(total)
+    if lane == 0:
+        progress.phase[b] = BEGINS
+        progress.wanted[b] = 0
+        if progress.factored[b] == 0 or progress.iterations[b] > tolerances.refactor_after:
+            progress.wanted[b] = FACTOR
+        progress.asks[b] = 0
+        progress.iterations[b] = 0
+        progress.since[b] = 0
+        progress.made[b] = 0
+        progress.stalls[b] = 0
+        progress.energy[b] = INFINITE
+        progress.smallest[b] = INFINITE
+        progress.rounding[b] = INFINITE
+        progress.force[b] = wp.sqrt(square)
+        progress.stiffness[b] = total
+        pairs[b] = 0
+
+
+@kernel
+def choose(progress: Progress, idle_out: wp.array[wp.bool], clamp_out: wp.array[wp.bool], pairs: wp.array[int]):
+    """Which environments are factorised next, and which of these are clamped; forgets the pairs of the old factors."""
+    b = wp.tid()
+    wanted = progress.wanted[b]
+    chosen = progress.phase[b] == AIMS and wanted > 0
+    idle_out[b] = not chosen
+    clamp_out[b] = chosen and wanted == CLAMPED_FACTOR
+    if chosen:
+        progress.wanted[b] = 0
+        progress.factored[b] = 1
+        progress.since[b] = 0
+        progress.made[b] += 1
+        pairs[b] = 0
+
+
+@kernel
+def summarise(progress: Progress, summary_out: wp.array[int]):
+    """What the host has to know, by the one block of the launch: `dynamics.minimiser`."""
+    _, lane = wp.tid()
+    active, aiming = wp.float64(0.0), wp.float64(0.0)
+    wanting, asking = wp.float64(0.0), wp.float64(0.0)
+    for b in range(lane, progress.phase.shape[0], wp.block_dim()):
+        asking += wp.float64(progress.asks[b])
+        if progress.phase[b] < DONE:
+            active += ONE
+        if progress.phase[b] == AIMS:
+            aiming += ONE
+            if progress.wanted[b] > 0:
+                wanting += ONE
+    active, aiming, wanting, asking = block_sum(active), block_sum(aiming), block_sum(wanting), block_sum(asking)
+    if lane == 0:
+        summary_out[0] = int(active)
+        summary_out[1] = int(aiming)
+        summary_out[2] = int(wanting)
+        summary_out[3] = int(asking)
+
+
+@function
+def give_up(progress: Progress, clamped: wp.array[wp.bool], b: int):
+    """Stays where it was: a new factor, and a clamped one, get a try before the environment counts as stuck."""
+    progress.phase[b] = AIMS
+    if progress.made[b] == 0:
+        progress.wanted[b] = FACTOR
+    elif clamped[b]:
+        progress.phase[b] = STUCK
+    else:
+        progress.wanted[b] = CLAMPED_FACTOR
+
+
+@function
+def within_rounding(
+    tolerances: Tolerances,
+    inertia: wp.array2d[wp.float64],
+    positions: wp.array2d[wp.vec3d],
+    direction: wp.array2d[wp.vec3d],
+    scale: wp.float64,
+    b: int,
+    lane: int,
+) -> bool:
+    """Whether a step, and the forces that balance after it, are those of rounding the state."""
+    moved, size, square = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
+    for i in range(lane, positions.shape[1], wp.block_dim()):
+        for c in range(3):
+            moved = wp.max(moved, wp.abs(direction[b, i][c]))
+            size = wp.max(size, wp.abs(positions[b, i][c]))
+        square += inertia[b, i] * inertia[b, i]
+    moved, size, square = block_max(moved), block_max(size), block_sum(square)
+    rounding = tolerances.epsilon * size
+    return moved <= rounding and scale <= wp.float64(2.0) * rounding * wp.sqrt(square)
+
+
+@functools.cache
+def minimisation_kernels(scalar: Any) -> SimpleNamespace:
+    """Kernels whose pairs, right-hand sides and solutions are of a type, ``wp.float64`` or ``wp.float32``."""
+    kernel, function = decorators(f"minimisation.{scalar.__name__}")
+    vector = wp.vec3d if scalar is wp.float64 else wp.vec3f
+
+    @wp.struct
+    class Pairs:
+        """The last pairs of displacement and change of the residual, and R = triu(S Y^T); a ring of M places."""
+
+        count: wp.array[int]  # (B)
+        last: wp.array[int]  # (B) place of the newest
+        s: wp.array3d[vector]  # (B, M, N) [m]
+        y: wp.array3d[vector]  # (B, M, N) [N]
+        r: wp.array3d[wp.float64]  # (B, M, M) by place [J]
+        a: wp.array2d[wp.float64]  # (B, M) by age, oldest first: coefficients of `project`
+        b: wp.array2d[wp.float64]  # (B, M) those of `aim`, and S g for a while
+
+    @function
+    def place(pairs: Pairs, b: int, age: int) -> int:
+        """Of the pair of an age, 0 for the oldest."""
+        m = pairs.s.shape[1]
+        return (pairs.last[b] - pairs.count[b] + 1 + age + m) % m
+
+    @kernel
+    def project(
+        progress: Progress,
+        pairs: Pairs,
+        vertex_at: wp.array[int],  # (F) the vertex at each place of the linear solver's order
+        gradient: wp.array2d[wp.vec3d],  # (B, N) [N]
+        right_out: wp.array2d[vector],  # (B, F) g - Y^T a, with a = R^-1 S g
+    ):
+        """What comes before the solve in the compact form of L-BFGS; zero where no direction is needed."""
+        b, lane = wp.tid()
+        if progress.phase[b] != AIMS:
+            for p in range(lane, vertex_at.shape[0], wp.block_dim()):
+                right_out[b, p] = vector()
+            return
+        k = pairs.count[b]
+        for i in range(k):
+            total = wp.float64(0.0)
+            row = pairs.s[b, place(pairs, b, i)]
+            for v in range(lane, gradient.shape[1], wp.block_dim()):
+                total += wp.dot(wp.vec3d(row[v]), gradient[b, v])
+            pairs.b[b, i] = block_sum(total)
+        # Every thread solves the small system by itself: all write the same.
+        for j in range(k):
+            i = k - 1 - j
+            here = place(pairs, b, i)
+            rest = pairs.b[b, i]
+            for newer in range(i + 1, k):
+                rest -= pairs.r[b, here, place(pairs, b, newer)] * pairs.a[b, newer]
+            pairs.a[b, i] = rest / pairs.r[b, here, here]
+        for p in range(lane, vertex_at.shape[0], wp.block_dim()):
+            v = vertex_at[p]
+            value = gradient[b, v]
+            for i in range(k):
+                value -= pairs.a[b, i] * wp.vec3d(pairs.y[b, place(pairs, b, i), v])
+            right_out[b, p] = vector(value)
+
+    @kernel
+    def aim(
+        progress: Progress,
+        pairs: Pairs,
+        vertex_at: wp.array[int],
+        gradient: wp.array2d[wp.vec3d],
+        solution: wp.array2d[vector],  # (B, F) z, of the matrix with the right-hand side of `project` [m]
+        positions: wp.array2d[wp.vec3d],  # (B, N) becomes the first trial
+        origin_out: wp.array2d[wp.vec3d],
+        direction_out: wp.array2d[wp.vec3d],  # (B, N) -(z + S^T b), with b = R^-T (D a - Y z); zero at fixed vertices
+    ):
+        """The direction and its slope, and the first trial.
+
+        Where the slope is positive or not finite the pairs are forgotten; without pairs a factor is asked for, once.
+        """
+        b, lane = wp.tid()
+        if progress.phase[b] != AIMS:
+            return
+        k = pairs.count[b]
+        for i in range(k):
+            total = wp.float64(0.0)
+            row = pairs.y[b, place(pairs, b, i)]
+            for p in range(lane, vertex_at.shape[0], wp.block_dim()):
+                total += wp.dot(wp.vec3d(row[vertex_at[p]]), wp.vec3d(solution[b, p]))
+            total = block_sum(total)
+            here = place(pairs, b, i)
+            diagonal = pairs.r[b, here, here]
+            rest = diagonal * pairs.a[b, i] - total
+            for older in range(i):
+                rest -= pairs.r[b, place(pairs, b, older), here] * pairs.b[b, older]
+            pairs.b[b, i] = rest / diagonal
+        slope = wp.float64(0.0)
+        for p in range(lane, vertex_at.shape[0], wp.block_dim()):
+            v = vertex_at[p]
+            value = wp.vec3d(solution[b, p])
+            for i in range(k):
+                value += pairs.b[b, i] * wp.vec3d(pairs.s[b, place(pairs, b, i), v])
+            direction_out[b, v] = -value
+            slope -= wp.dot(gradient[b, v], value)
+        slope = block_sum(slope)
+        if wp.isfinite(slope) and (slope <= ZERO or k == 0):
+            for p in range(lane, vertex_at.shape[0], wp.block_dim()):
+                v = vertex_at[p]
+                origin_out[b, v] = positions[b, v]
+                positions[b, v] = positions[b, v] + direction_out[b, v]
+            if lane == 0:
+                progress.phase[b] = TRIES
+                progress.iterations[b] += 1
+                progress.since[b] += 1
+                progress.halvings[b] = 0
+                progress.step[b] = ONE
+                progress.slope[b] = slope
+        elif lane == 0:
+            if k > 0:
+                pairs.count[b] = 0
+            elif progress.made[b] == 0:
+                progress.wanted[b] = FACTOR
+            else:
+                progress.phase[b] = STUCK
+
+    @function
+    def add_pair(
+        pairs: Pairs,
+        b: int,
+        lane: int,
+        step: wp.float64,
+        direction: wp.array2d[wp.vec3d],
+        before: wp.array2d[wp.vec3d],
+        after: wp.array2d[wp.vec3d],
+    ):
+        """Remembers a pair of positive curvature."""
+        m, lanes = pairs.s.shape[1], wp.block_dim()
+        k = pairs.count[b]
+        new = (pairs.last[b] + 1) % m
+        s = pairs.s[b, new]
+        y = pairs.y[b, new]
+        curvature, lengths, changes = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
+        for v in range(lane, direction.shape[1], lanes):
+            moved = step * direction[b, v]
+            changed = after[b, v] - before[b, v]
+            s[v] = vector(moved)
+            y[v] = vector(changed)
+            curvature += wp.dot(moved, changed)
+            lengths += wp.dot(moved, moved)
+            changes += wp.dot(changed, changed)
+        curvature, lengths, changes = block_sum(curvature), block_sum(lengths), block_sum(changes)
+        if not curvature > LEAST_CURVATURE * wp.sqrt(lengths * changes):
+            return
+        first = 0
+        if k == m:
+            first = 1
+        for i in range(first, k):
+            total, other = wp.float64(0.0), place(pairs, b, i)
+            row = pairs.s[b, other]
+            for v in range(lane, direction.shape[1], lanes):
+                total += wp.dot(wp.vec3d(row[v]), wp.vec3d(y[v]))
+            total = block_sum(total)
+            pairs.r[b, other, new] = total
+        if lane == 0:
+            pairs.r[b, new, new] = curvature
+            pairs.last[b] = new
+            pairs.count[b] = wp.min(k + 1, m)
+
+    @kernel
+    def accept(
+        remembers: int,  # 1: pairs are kept
+        tolerances: Tolerances,
+        inertia: wp.array2d[wp.float64],  # (B, N) [N/m]
+        found: Evaluation,  # at the positions
+        origin: wp.array2d[wp.vec3d],
+        direction: wp.array2d[wp.vec3d],
+        clamped: wp.array[wp.bool],  # (B) whether the global step's matrix is positive definite by force
+        positions: wp.array2d[wp.vec3d],
+        gradient: wp.array2d[wp.vec3d],  # (B, N) becomes the residual, where the trial is taken
+        progress: Progress,
+        pairs: Pairs,
+    ):
+        """Takes a trial that decreases the energy, or its slope where the energy is down to rounding; or halves it.
+
+        The second test is the approximate Wolfe condition of Hager and Zhang (2005).
+        """
+        b, lane = wp.tid()
+        phase = progress.phase[b]
+        lanes = wp.block_dim()
+        n = positions.shape[1]
+        if phase != BEGINS and phase != TRIES:
+            return
+        energy = found.energy[b]
+        norm = found.norm[b]
+        before = progress.energy[b]
+        flat = ENERGY_ROUNDING * (progress.stiffness[b] + wp.float64(100.0) * found.size[b])
+        iterations = progress.iterations[b]
+        stalls = progress.stalls[b]
+        if phase == TRIES:
+            step = progress.step[b]
+            slope = progress.slope[b]
+            halvings = progress.halvings[b]
+            after = wp.float64(0.0)
+            for i in range(lane, n, lanes):
+                after += wp.dot(found.residual[b, i], direction[b, i])
+            after = block_sum(after)
+            taken = energy <= before + ARMIJO * step * slope
+            if not taken:
+                taken = energy <= before + flat and after <= (wp.float64(2.0) * ARMIJO - ONE) * slope
+            if not taken:
+                step = HALF * step
+                if halvings + 1 >= MOST_HALVINGS:
+                    step = wp.float64(0.0)
+                for i in range(lane, n, lanes):
+                    positions[b, i] = origin[b, i] + step * direction[b, i]
+                if lane == 0:
+                    progress.step[b] = step
+                    progress.halvings[b] = halvings + 1
+                    if halvings + 1 >= MOST_HALVINGS:
+                        give_up(progress, clamped, b)
+                return
+            if remembers == 1:
+                add_pair(pairs, b, lane, step, direction, gradient, found.residual)
+        for i in range(lane, n, lanes):
+            gradient[b, i] = found.residual[b, i]
+        scale = found.balance[b] + progress.force[b]
+        smallest = progress.smallest[b]
+        rounding = progress.rounding[b]
+        stalls += 1
+        if norm < HALF * smallest:
+            stalls = 0
+        done = norm <= tolerances.relative * scale or norm <= tolerances.absolute
+        done = done and norm + scale < INFINITE
+        if phase == TRIES and iterations == 1 and progress.force[b] == ZERO:
+            done = done or within_rounding(tolerances, inertia, positions, direction, scale, b, lane)
+        # Before the values of this environment are written, every thread has read them.
+        asks = block_max(ZERO)
+        if iterations >= STALLS and stalls >= STALLS and before - energy <= flat and norm <= rounding and not done:
+            asks = ONE
+        if lane == 0:
+            relative = norm / wp.max(scale, tolerances.absolute)
+            progress.energy[b] = energy
+            progress.scale[b] = scale
+            progress.relative[b] = relative
+            progress.smallest[b] = wp.min(norm, smallest)
+            progress.stalls[b] = stalls
+            progress.asks[b] = int(asks)
+            progress.phase[b] = AIMS
+            if progress.since[b] >= 3 * tolerances.refactor_after:
+                progress.wanted[b] = FACTOR
+            if done:
+                progress.phase[b] = DONE
+            elif not wp.isfinite(relative) or iterations >= tolerances.max_iterations:
+                progress.phase[b] = STUCK
+
+    return SimpleNamespace(project=project, aim=aim, accept=accept, Pairs=Pairs)

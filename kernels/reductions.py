@@ -1,0 +1,72 @@
+"""Sums over an environment by one block of threads: one thread on a CPU, the launch's ``block_dim`` of them on a GPU.
+
+Threads stride over the vertices or points. The order of a sum depends on the device alone, never on timing. Every
+thread of the block has to come to a reduction, which is a barrier too.
+"""
+
+import warp as wp
+
+from .modules import decorators
+
+ZERO = wp.float64(0.0)
+
+kernel, function = decorators("reductions")
+
+
+@function
+def block_sum(value: wp.float64) -> wp.float64:
+    """The sum over a block, known to every thread of it."""
+    return wp.tile_sum(wp.tile(value))[0]
+
+
+@function
+def block_max(value: wp.float64) -> wp.float64:
+    """The maximum over a block, known to every thread of it."""
+    return wp.tile_max(wp.tile(value))[0]
+
+
+@kernel
+def masked_norm(
+    free: wp.array[wp.float64],  # (N) one at free vertices, zero at fixed ones
+    vectors: wp.array2d[wp.vec3d],  # (B, N) set to zero at fixed vertices
+    norm_out: wp.array[wp.float64],  # (B)
+):
+    """The norm over all free vertices."""
+    b, lane = wp.tid()
+    total = wp.float64(0.0)
+    for i in range(lane, free.shape[0], wp.block_dim()):
+        value = free[i] * vectors[b, i]
+        vectors[b, i] = value
+        total += wp.dot(value, value)
+    total = block_sum(total)
+    if lane == 0:
+        norm_out[b] = wp.sqrt(total)
+
+
+@kernel
+def totals(
+    free: wp.array[wp.float64],
+    vertex_energy: wp.array2d[wp.float64],  # (B, N) [J]
+    point_energy: wp.array2d[wp.float64],  # (B, P) [J]
+    residual: wp.array2d[wp.vec3d],  # (B, N) set to zero at fixed vertices [N]
+    energy_out: wp.array[wp.float64],  # (B) [J]
+    size_out: wp.array[wp.float64],  # (B) sum of the energies' absolute values [J]
+    norm_out: wp.array[wp.float64],  # (B) of the residual [N]
+):
+    """What a line search and a test of convergence need of an evaluated potential."""
+    b, lane = wp.tid()
+    energy, size, square = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
+    for i in range(lane, free.shape[0], wp.block_dim()):
+        value = free[i] * residual[b, i]
+        residual[b, i] = value
+        square += wp.dot(value, value)
+        energy += vertex_energy[b, i]
+        size += wp.abs(vertex_energy[b, i])
+    for p in range(lane, point_energy.shape[1], wp.block_dim()):
+        energy += point_energy[b, p]
+        size += wp.abs(point_energy[b, p])
+    energy, size, square = block_sum(energy), block_sum(size), block_sum(square)
+    if lane == 0:
+        energy_out[b] = energy
+        size_out[b] = size
+        norm_out[b] = wp.sqrt(square)

@@ -1,0 +1,104 @@
+"""A batch is what its environments are one by one: whoever else is in it, and however many threads share it."""
+
+import pytest
+import torch
+
+from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, box_hexahedra, select_vertices
+from warp_resphys.dynamics.inputs import Inputs
+from warp_resphys.io.errors import ConvergenceError
+from warp_resphys.linalg.threads import shards_of
+from warp_resphys.studies.gradient_check import pose
+
+MESH = box_hexahedra((0.06, 0.02, 0.02), (4, 2, 2))
+BODY = Body(MESH, fixed=select_vertices(MESH, x=0.0))
+SIZE, STEPS = 7, 6
+
+
+def threads(monkeypatch, count):
+    monkeypatch.setenv("WARP_RESPHYS_THREADS", str(count))
+
+
+def simulator(**settings):
+    material = Corotated(1e5, 0.45, density=1000.0, stiffness_damping=1e-3)
+    return Simulator(BODY, material, solver=SolverSettings(**({"relative_tolerance": 1e-5} | settings)))
+
+
+@pytest.fixture
+def motion():
+    """A start, forces and a modulus that differ from one environment to the next, none as hard as the other."""
+    sim = simulator()
+    generator = torch.Generator().manual_seed(0)
+    start = pose(sim, "bent", SIZE)
+    start = State(
+        sim.rest_positions + torch.linspace(0.0, 1.2, SIZE)[:, None, None] * (start.q - sim.rest_positions), start.v
+    )
+    forces = (
+        1e-3
+        * torch.linspace(0.0, 3.0, SIZE)[:, None, None]
+        * torch.randn(STEPS, *start.q.shape, generator=generator, dtype=torch.float64)
+    )
+    modulus = 1e5 * (1.0 + torch.rand(SIZE, 1, generator=generator, dtype=torch.float64))
+    return start, forces, modulus
+
+
+def rolled(motion, rows, **settings):
+    start, forces, modulus = motion
+    state = State(start.q[rows], start.v[rows])
+    return simulator(**settings).rollout(state, STEPS, Inputs(forces[:, rows]), {"youngs_modulus": modulus[rows]})
+
+
+@pytest.mark.parametrize("name", ["quasi_newton", "newton"])
+def test_an_environment_does_what_it_does_alone(motion, name):
+    """Its directions, line searches and factors are its own: nothing depends on its neighbours."""
+    together = rolled(motion, slice(None), name=name)
+    counts = torch.stack([r.iterations for r in together.reports])
+    made = torch.stack([r.factorisations for r in together.reports])
+    assert len(set(counts.sum(0).tolist())) > 2
+    assert len(set(made.sum(0).tolist())) > 2
+    for i in range(SIZE):
+        alone = rolled(motion, slice(i, i + 1), name=name)
+        torch.testing.assert_close(alone.q[:, 0], together.q[:, i], rtol=0.0, atol=1e-14)
+        assert counts[:, i].tolist() == [int(r.iterations) for r in alone.reports]
+        assert made[:, i].tolist() == [int(r.factorisations) for r in alone.reports]
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_threads_change_nothing(motion, monkeypatch, count):
+    results = []
+    for each in (1, count):
+        threads(monkeypatch, each)
+        sim = simulator()
+        assert len(sim.workspace(SIZE).shards) == (0 if each == 1 else count)
+        start, forces, modulus = motion
+        leaves = [
+            t.clone().requires_grad_() for t in (start.q, start.v, forces, modulus, torch.tensor([1000.0]).double())
+        ]
+        q, v, f, e, density = leaves
+        trajectory = sim.rollout(State(q, v), STEPS, Inputs(f), {"youngs_modulus": e, "density": density})
+        gradients = torch.autograd.grad(trajectory.q[-1].square().sum() + trajectory.v[-1].sum(), leaves)
+        report = trajectory.reports[-1]
+        results.append((trajectory.q, report.iterations, report.relative_residual, *gradients))
+    for one, several in zip(*results, strict=True):
+        torch.testing.assert_close(several, one, rtol=1e-12, atol=1e-14)
+
+
+def test_a_failure_in_a_thread_names_the_environment_of_the_batch(motion, monkeypatch):
+    threads(monkeypatch, 3)
+    start = motion[0]
+    v = start.v.clone()
+    v[5] += 1e3
+    with pytest.raises(ConvergenceError, match=f"in environment 5 of {SIZE}") as caught:
+        simulator(max_iterations=25).step(State(start.q, v))
+    assert caught.value.positions.shape == start.q.shape
+    assert caught.value.report.converged.tolist() == [i != 5 for i in range(SIZE)]
+
+
+def test_shards_cover_the_batch(monkeypatch):
+    cpu = torch.device("cpu")
+    threads(monkeypatch, 4)
+    assert shards_of(3, cpu) == []
+    assert shards_of(64, torch.device("cuda")) == []
+    for batch in (4, 9, 64):
+        rows = shards_of(batch, cpu)
+        assert [i for each in rows for i in range(batch)[each]] == list(range(batch))
+        assert len(rows) == min(4, batch // 2)

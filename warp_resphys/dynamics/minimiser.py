@@ -1,0 +1,165 @@
+"""The state of a minimisation on its device, and the launches that advance it; see ``kernels.minimisation``."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import warp as wp
+
+from ..energies.launcher import warp_view
+from ..energies.potential import IncrementalPotential
+from ..kernels import minimisation as kernels
+from .hessian import HessianApproximation
+
+_COUNTS = ("phase", "wanted", "factored", "asks", "iterations", "since", "made", "halvings", "stalls")
+_SUMS = ("step", "slope", "energy", "scale", "relative", "smallest", "rounding", "force", "stiffness")
+
+
+class Summary(NamedTuple):
+    """What the host has to know of a batch."""
+
+    active: int  # environments that go on
+    aiming: int  # those that need a direction
+    wanting: int  # those that need a factor first
+    asking: int  # those whose residual may be rounding
+
+
+class Minimiser:
+    """Buffers and launches of one batch.
+
+    Args:
+        potential: what is minimised, with the positions.
+        hessian: whose factor the directions come from.
+        dtype: of pairs and right-hand sides.
+        memory: pairs that L-BFGS keeps; 0 for Newton's method.
+        relative_tolerance: residual over balancing forces at which an environment has converged.
+        absolute_tolerance: residual at which it has in any case [N].
+        max_iterations: directions after which it is stuck.
+        refactor_after: directions of a solve, more of which ask for a new factor before the next one, and three times
+            as many at once; 0 asks always, None never.
+    """
+
+    def __init__(
+        self,
+        potential: IncrementalPotential,
+        hessian: HessianApproximation,
+        dtype: torch.dtype,
+        memory: int,
+        relative_tolerance: float,
+        absolute_tolerance: float,
+        max_iterations: int,
+        refactor_after: int | None,
+    ) -> None:
+        p, b, n = potential, potential.batch, potential.n_vertices
+        self._potential, self._hessian = p, hessian
+        self._counts = {name: torch.zeros(b, device=p.device, dtype=torch.int32) for name in _COUNTS}
+        self._sums = {name: p.zeros() for name in _SUMS}
+        self._gradient, self._direction, origin = (p.zeros(n, 3) for _ in range(3))
+        self._right = torch.zeros(b, len(hessian.vertex_at), 3, device=p.device, dtype=dtype)
+        summary = torch.zeros(len(Summary._fields), device=p.device, dtype=torch.int32)
+        # Where the host reads it: the same memory on a CPU.
+        self._summary, self._seen = summary, summary if p.device.type == "cpu" else summary.cpu().pin_memory()
+        self._shown = self._seen.numpy()
+
+        double = dtype == torch.float64
+        own = kernels.minimisation_kernels(wp.float64 if double else wp.float32)
+        vector = wp.vec3d if double else wp.vec3f
+        progress, pairs, found, tolerances = kernels.Progress(), own.Pairs(), kernels.Evaluation(), kernels.Tolerances()
+        for name, values in self._counts.items():
+            setattr(progress, name, warp_view(values, wp.int32))
+        for name, values in self._sums.items():
+            setattr(progress, name, warp_view(values, wp.float64))
+        places = max(memory, 1)
+        pairs.count, pairs.last = (wp.zeros(b, dtype=int, device=str(p.device)) for _ in range(2))
+        pairs.s, pairs.y = (
+            warp_view(torch.zeros(b, places, n, 3, device=p.device, dtype=dtype), vector) for _ in range(2)
+        )
+        pairs.r = warp_view(p.zeros(places, places), wp.float64)
+        pairs.a, pairs.b = (warp_view(p.zeros(places), wp.float64) for _ in range(2))
+        found.energy, found.size = warp_view(p.energy, wp.float64), warp_view(p.energy_size, wp.float64)
+        found.balance, found.norm = warp_view(p.balance, wp.float64), warp_view(p.residual_norm, wp.float64)
+        found.residual = warp_view(p.residual, wp.vec3d)
+        tolerances.relative, tolerances.absolute = wp.float64(relative_tolerance), wp.float64(absolute_tolerance)
+        tolerances.epsilon, tolerances.max_iterations = wp.float64(torch.finfo(dtype).eps), max_iterations
+        tolerances.refactor_after = kernels.NEVER if refactor_after is None else refactor_after
+
+        positions, gradient = warp_view(p.positions, wp.vec3d), warp_view(self._gradient, wp.vec3d)
+        direction, origin_view = warp_view(self._direction, wp.vec3d), warp_view(origin, wp.vec3d)
+        right, vertex_at = warp_view(self._right, vector), p.upload(hessian.vertex_at.astype(np.int32), int)
+        stiffness = p.terms.values["stiffness"]
+        assert stiffness is not None
+        loads = [warp_view(p.terms.force, wp.vec3d), warp_view(stiffness, wp.float64)]
+        beginning = [*loads, positions, tolerances, origin_view, progress, pairs.count]
+        begin = p.record_blocks(kernels.begin, b, beginning, [])
+        self._idle, self._clamp = (torch.zeros(b, device=p.device, dtype=torch.bool) for _ in range(2))
+        chosen = [warp_view(each, wp.bool) for each in (self._idle, self._clamp)]
+        self._choose = p.record(kernels.choose, (b,), [progress, *chosen, pairs.count], [])
+        aiming = [progress, pairs, vertex_at, gradient]
+        self._project = p.record_blocks(own.project, b, aiming, [right])
+        aim = p.record_blocks(own.aim, b, [*aiming, right, positions], [origin_view, direction])
+        clamped = warp_view(hessian.clamped, wp.bool)
+        judging = [int(memory > 0), tolerances, warp_view(p.inertia, wp.float64), found, origin_view, direction]
+        judging += [clamped, positions, gradient, progress, pairs]
+        accept = p.record_blocks(own.accept, b, judging, [])
+        self._summarise = p.record_blocks(kernels.summarise, 1, [progress], [warp_view(summary, wp.int32)])
+        judge = [*p.evaluation, accept, self._summarise]
+        self._begin, self._aim, self._go_on = p.capture(begin, *judge), p.capture(aim, *judge), p.capture(*judge)
+
+    def begin(self, start: torch.Tensor) -> Summary:
+        """Evaluates the potential at a start (B, N, 3) [m]."""
+        p = self._potential
+        p.positions.copy_(start)
+        p.launch(self._begin)
+        return self._look()
+
+    def forget(self) -> None:
+        """The factors serve no more."""
+        self._counts["factored"].zero_()
+
+    def advance(self, state: Summary) -> Summary:
+        """One evaluation: of the first trial of those that need a direction, and of the next of the others."""
+        p = self._potential
+        if state.aiming:
+            p.launch(self._project)
+            self._hessian.solve_in_place(self._right)
+            p.launch(self._aim)
+        else:
+            p.launch(self._go_on)
+        return self._look()
+
+    def refactor(self, state: Summary) -> None:
+        """Factorises for the environments that need it, at their iterates."""
+        self._potential.launch(self._choose)
+        everyone = state.wanting == self._potential.batch
+        self._hessian.refactor(self._clamp, None if everyone else self._idle)
+
+    def elsewhere(self) -> torch.Tensor:
+        """(B,) environments that need no direction next."""
+        return self._counts["phase"] != kernels.AIMS
+
+    def outcome(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+        """(B,) directions, last residual over balancing forces, whether it has converged, and factorisations."""
+        counts = self._counts
+        converged = counts["phase"] == kernels.DONE
+        return counts["iterations"].long(), self._sums["relative"].clone(), converged, counts["made"].long()
+
+    def _look(self) -> Summary:
+        state = self._read()
+        if state.asking:
+            self._compare_with_rounding()
+            self._potential.launch(self._summarise)
+            state = self._read()
+        return state
+
+    def _read(self) -> Summary:
+        if self._seen is not self._summary:
+            self._seen.copy_(self._summary)
+        return Summary._make(self._shown.tolist())
+
+    def _compare_with_rounding(self) -> None:
+        """Where a residual that does not fall any more is no more than rounding makes of it, it has converged."""
+        asks, rounding = self._counts["asks"] == 1, self._sums["rounding"]
+        rounding.copy_(torch.where(asks, self._potential.residual_rounding(), rounding))
+        norm = torch.linalg.vector_norm(self._gradient.flatten(1), dim=1)
+        self._counts["phase"].masked_fill_(asks & (norm <= rounding), kernels.DONE)
+        self._counts["asks"].zero_()

@@ -1,0 +1,68 @@
+"""Which linear solver: by name, or the cheapest for a pattern and a device.
+
+The bodies of this field are slender: with a bandwidth-reducing order, LAPACK's banded Cholesky is the cheapest choice
+on a CPU up to tens of thousands of unknowns, and one in tiles on a GPU. Wide meshes go to CHOLMOD (cholespy), the
+smallest on a GPU to batched dense Cholesky.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from ..io.errors import InputError
+from .banded import BandedSolver
+from .dense import DenseSolver
+from .linear_solver import Indices, LinearSolver, bandwidth_reducing_order
+from .sparse import SparseSolver
+from .tiled import TILE, TiledSolver
+
+LINEAR_SOLVERS = ("auto", "banded", "tiled", "dense", "sparse")
+WIDEST_BAND = 600  # beyond which CHOLMOD's factor is the cheaper one
+MOST_DENSE = 4000  # unknowns
+
+
+def make_linear_solver(
+    name: str,
+    rows: Indices,
+    cols: Indices,
+    n_nodes: int,
+    block: int,
+    device: torch.device,
+    dtype: torch.dtype,
+) -> LinearSolver:
+    """Builds the named solver; ``auto`` takes the cheapest for the pattern and device.
+
+    Raises:
+        InputError: an unknown name, or a banded solver on a GPU.
+    """
+    if name not in LINEAR_SOLVERS:
+        raise InputError(f"linear_solver is {name!r}: choose one of {', '.join(LINEAR_SOLVERS)}.")
+    if name == "banded" and device.type != "cpu":
+        raise InputError("linear_solver=banded runs on the CPU alone: choose tiled, dense, sparse or auto on a GPU.")
+    if name == "auto":
+        name = _cheapest(rows, cols, n_nodes, block, device)
+    solvers: dict[str, Callable[..., LinearSolver]] = {
+        "banded": BandedSolver,
+        "tiled": TiledSolver,
+        "dense": DenseSolver,
+        "sparse": SparseSolver,
+    }
+    return solvers[name](rows, cols, n_nodes, block, device, dtype)
+
+
+def _cheapest(rows: Indices, cols: Indices, n_nodes: int, block: int, device: torch.device) -> str:
+    """By what a factor takes of memory, and by the operations that a wide band costs.
+
+    A band of width w takes n w numbers and n w^2 operations, dense n^2 and n^3 / 3; where the band is wide, a sparse
+    factor fills in less. The limits on a CPU were measured; those on a GPU are arithmetic.
+    """
+    order = bandwidth_reducing_order(rows, cols, n_nodes)
+    place = np.argsort(order)
+    bandwidth = block * int(np.abs(place[rows] - place[cols]).max(initial=0) + 1)
+    unknowns = n_nodes * block
+    if device.type == "cpu":
+        return "banded" if bandwidth <= WIDEST_BAND else "sparse"
+    if bandwidth + 2 * TILE <= min(unknowns // 2, WIDEST_BAND):
+        return "tiled"
+    return "dense" if unknowns <= MOST_DENSE else "sparse"

@@ -160,10 +160,16 @@ def summarise(progress: Progress, summary_out: wp.array[int]):
 
 
 @function
-def give_up(progress: Progress, clamped: wp.array[wp.bool], b: int):
+def give_up(progress: Progress, tolerances: Tolerances, clamped: wp.array[wp.bool], b: int):
     """Stays where it was: a new factor, and a clamped one, get a try before the environment counts as stuck."""
     progress.phase[b] = AIMS
-    if progress.made[b] == 0:
+    progress.stalls[b] += 1
+    norm = progress.relative[b] * wp.max(progress.scale[b], tolerances.absolute)
+    if progress.iterations[b] >= STALLS and progress.stalls[b] >= STALLS and norm <= progress.rounding[b]:
+        progress.asks[b] = 1
+    if progress.iterations[b] >= tolerances.max_iterations:
+        progress.phase[b] = STUCK
+    elif progress.made[b] == 0:
         progress.wanted[b] = FACTOR
     elif clamped[b]:
         progress.phase[b] = STUCK
@@ -333,14 +339,15 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
         for v in range(lane, direction.shape[1], lanes):
             moved = step * direction[b, v]
             changed = after[b, v] - before[b, v]
-            s[v] = vector(moved)
-            y[v] = vector(changed)
             curvature += wp.dot(moved, changed)
             lengths += wp.dot(moved, moved)
             changes += wp.dot(changed, changed)
         curvature, lengths, changes = block_sum(curvature), block_sum(lengths), block_sum(changes)
         if not curvature > LEAST_CURVATURE * wp.sqrt(lengths * changes):
             return
+        for v in range(lane, direction.shape[1], lanes):
+            s[v] = vector(step * direction[b, v])
+            y[v] = vector(after[b, v] - before[b, v])
         first = 0
         if k == m:
             first = 1
@@ -399,15 +406,22 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
                 taken = energy <= before + flat and after <= (wp.float64(2.0) * ARMIJO - ONE) * slope
             if not taken:
                 step = HALF * step
-                if halvings + 1 >= MOST_HALVINGS:
+                given_up = halvings + 1 >= MOST_HALVINGS
+                if given_up:
                     step = wp.float64(0.0)
                 for i in range(lane, n, lanes):
                     positions[b, i] = origin[b, i] + step * direction[b, i]
+                rests = False
+                if given_up and iterations == 1 and progress.force[b] == ZERO:
+                    scale = progress.scale[b]
+                    rests = within_rounding(tolerances, inertia, positions, direction, scale, b, lane)
                 if lane == 0:
                     progress.step[b] = step
                     progress.halvings[b] = halvings + 1
-                    if halvings + 1 >= MOST_HALVINGS:
-                        give_up(progress, clamped, b)
+                    if rests:
+                        progress.phase[b] = DONE
+                    elif given_up:
+                        give_up(progress, tolerances, clamped, b)
                 return
             if remembers == 1:
                 add_pair(pairs, b, lane, step, direction, gradient, found.residual)

@@ -3,11 +3,15 @@
 import numpy as np
 import pytest
 import torch
+import warp as wp
+from warp_resphys.kernels import minimisation as kernels
+from warp_resphys.kernels.minimisation import minimisation_kernels
 
 from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, box_hexahedra, select_vertices
 from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.dynamics.minimiser import Minimiser
 from warp_resphys.dynamics.nonlinear_solver import SOLVERS
+from warp_resphys.energies.launcher import warp_view
 from warp_resphys.energies.materials import MATERIALS
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.studies.gradient_check import pose
@@ -348,3 +352,46 @@ def test_directions_equal_the_bfgs_formula():
             pairs[b].append((moved, g - here[b][1]))
             here[b] = (x, g)
     assert searches > 0
+
+
+@pytest.mark.parametrize("memory", [1, 3])
+def test_a_pair_of_negative_curvature_leaves_the_others_as_they_are(memory):
+    """Also where all places are taken. One environment of one vertex: a trial is taken at each launch."""
+    own, vectors = minimisation_kernels(wp.float64), {}
+    progress, pairs, found, tolerances = kernels.Progress(), own.Pairs(), kernels.Evaluation(), kernels.Tolerances()
+
+    def vector(name):
+        vectors[name] = torch.zeros(1, 1, 3, dtype=torch.float64)
+        return warp_view(vectors[name], wp.vec3d)
+
+    for name, variable in kernels.Progress.vars.items():
+        setattr(progress, name, wp.full(1, 1, dtype=variable.type.dtype, device="cpu"))
+    progress.phase.fill_(kernels.TRIES)
+    pairs.count, pairs.last = (wp.zeros(1, dtype=int, device="cpu") for _ in range(2))
+    pairs.s, pairs.y = (wp.zeros((1, memory, 1), dtype=wp.vec3d, device="cpu") for _ in range(2))
+    pairs.r = wp.zeros((1, memory, memory), dtype=wp.float64, device="cpu")
+    for name in ("energy", "size", "balance", "norm"):
+        setattr(found, name, wp.full(1, -1e9, dtype=wp.float64, device="cpu"))
+    found.residual, tolerances.max_iterations = vector("residual"), 1000
+    inertia, clamped = wp.zeros((1, 1), dtype=wp.float64, device="cpu"), wp.zeros(1, dtype=wp.bool, device="cpu")
+    inputs = [1, tolerances, inertia, found, vector("origin"), vector("direction"), clamped, vector("positions")]
+    inputs += [vector("gradient"), progress, pairs]
+    kept = []
+    generator = torch.Generator().manual_seed(0)
+    for step in range(9):
+        moved, changed = torch.randn(2, 3, generator=generator, dtype=torch.float64)
+        changed = (moved + 0.2 * changed) * (-1.0 if step in (1, 5, 8) else 1.0)
+        vectors["direction"][0, 0], vectors["gradient"][0, 0] = moved, 1.0
+        vectors["residual"][0, 0] = 1.0 + changed
+        progress.phase.fill_(kernels.TRIES)
+        wp.launch_tiled(own.accept, dim=[1], inputs=inputs, block_dim=64, device="cpu")
+        if float(moved @ changed) > 0.0:
+            kept = [*kept, (moved, changed)][-memory:]
+        count, last = int(pairs.count.numpy()[0]), int(pairs.last.numpy()[0])
+        places = [(last - age) % memory for age in reversed(range(count))]
+        assert count == len(kept)
+        for k, (i, (s, y)) in enumerate(zip(places, kept, strict=True)):
+            np.testing.assert_allclose(pairs.s.numpy()[0, i, 0], s, rtol=1e-14)
+            np.testing.assert_allclose(pairs.y.numpy()[0, i, 0], y, rtol=1e-12)
+            for j, (_, newer) in zip(places[k:], kept[k:], strict=True):
+                np.testing.assert_allclose(pairs.r.numpy()[0, i, j], float(s @ newer), rtol=1e-10, atol=1e-12)

@@ -1,12 +1,14 @@
 """A batch is what its environments are one by one: whoever else is in it, and however many threads share it."""
 
+import time
+
 import pytest
 import torch
 
 from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, box_hexahedra, select_vertices
 from warp_resphys.dynamics.inputs import Inputs
-from warp_resphys.io.errors import ConvergenceError
-from warp_resphys.linalg.threads import shards_of
+from warp_resphys.io.errors import ConvergenceError, InputError
+from warp_resphys.linalg.threads import in_threads, shards_of
 from warp_resphys.studies.gradient_check import pose
 
 MESH = box_hexahedra((0.06, 0.02, 0.02), (4, 2, 2))
@@ -47,27 +49,31 @@ def rolled(motion, rows, **settings):
     return simulator(**settings).rollout(state, STEPS, Inputs(forces[:, rows]), {"youngs_modulus": modulus[rows]})
 
 
-@pytest.mark.parametrize("name", ["quasi_newton", "newton"])
-def test_an_environment_does_what_it_does_alone(motion, name):
+@pytest.mark.parametrize(
+    ("name", "linear_solver"),
+    [("newton", "banded"), *(("quasi_newton", each) for each in ("banded", "tiled", "dense", "sparse"))],
+)
+def test_an_environment_does_what_it_does_alone(motion, name, linear_solver):
     """Its directions, line searches and factors are its own: nothing depends on its neighbours."""
-    together = rolled(motion, slice(None), name=name)
+    settings = {"name": name, "linear_solver": linear_solver}
+    together = rolled(motion, slice(None), **settings)
     counts = torch.stack([r.iterations for r in together.reports])
     made = torch.stack([r.factorisations for r in together.reports])
     assert len(set(counts.sum(0).tolist())) > 2
     assert len(set(made.sum(0).tolist())) > 2
     for i in range(SIZE):
-        alone = rolled(motion, slice(i, i + 1), name=name)
-        torch.testing.assert_close(alone.q[:, 0], together.q[:, i], rtol=0.0, atol=1e-14)
+        alone = rolled(motion, slice(i, i + 1), **settings)
+        torch.testing.assert_close(alone.q[:, 0], together.q[:, i], rtol=0.0, atol=1e-13)
         assert counts[:, i].tolist() == [int(r.iterations) for r in alone.reports]
         assert made[:, i].tolist() == [int(r.factorisations) for r in alone.reports]
 
 
-@pytest.mark.parametrize("count", [2, 3])
-def test_threads_change_nothing(motion, monkeypatch, count):
+@pytest.mark.parametrize(("count", "linear_solver"), [(2, "banded"), (3, "banded"), (3, "tiled"), (3, "sparse")])
+def test_threads_change_nothing(motion, monkeypatch, count, linear_solver):
     results = []
     for each in (1, count):
         threads(monkeypatch, each)
-        sim = simulator()
+        sim = simulator(linear_solver=linear_solver)
         assert len(sim.workspace(SIZE).shards) == (0 if each == 1 else count)
         start, forces, modulus = motion
         leaves = [
@@ -78,6 +84,9 @@ def test_threads_change_nothing(motion, monkeypatch, count):
         gradients = torch.autograd.grad(trajectory.q[-1].square().sum() + trajectory.v[-1].sum(), leaves)
         report = trajectory.reports[-1]
         results.append((trajectory.q, report.iterations, report.relative_residual, *gradients))
+    shards = [own.potential for _, own in sim.workspace(SIZE).shards]
+    assert not any(potential.positions.requires_grad for potential in shards)
+    torch.testing.assert_close(sim.workspace(SIZE).gather().positions, results[0][0][1].detach())
     for one, several in zip(*results, strict=True):
         torch.testing.assert_close(several, one, rtol=1e-12, atol=1e-14)
 
@@ -91,6 +100,52 @@ def test_a_failure_in_a_thread_names_the_environment_of_the_batch(motion, monkey
         simulator(max_iterations=25).step(State(start.q, v))
     assert caught.value.positions.shape == start.q.shape
     assert caught.value.report.converged.tolist() == [i != 5 for i in range(SIZE)]
+
+
+def test_a_failed_adjoint_has_the_positions_of_the_batch(monkeypatch):
+    """A body held by one vertex may turn about it."""
+    threads(monkeypatch, 2)
+    body = Body(MESH, fixed=select_vertices(MESH, x=0.0)[:1])
+    sim = Simulator(body, Corotated(1e5, 0.45, density=1000.0), gravity=(0.0, 0.0, 0.0))
+    force = torch.zeros(4, body.n_vertices, 3, dtype=torch.float64, requires_grad=True)
+    x = sim.static_equilibrium(Inputs(force)).q
+    with pytest.raises(ConvergenceError, match="the adjoint system is singular") as caught:
+        torch.autograd.grad((x * torch.randn(x.shape, dtype=x.dtype)).sum(), force)
+    assert caught.value.positions.shape == x.shape
+
+
+@pytest.mark.parametrize("failing", [0, 2])
+def test_what_a_thread_raises_comes_when_all_have_ended(failing):
+    ended = []
+
+    def work(number):
+        if number == failing:
+            raise ValueError(f"from {number}")
+        time.sleep(0.2)
+        ended.append(number)
+
+    with pytest.raises(ValueError, match=f"from {failing}"):
+        in_threads(work, range(3))
+    assert sorted(ended) == sorted({0, 1, 2} - {failing})
+
+
+@pytest.mark.parametrize("name", ["quasi_newton", "newton", "projective_dynamics"])
+@pytest.mark.parametrize("limit", [1, 2, 3])
+def test_no_environment_has_more_iterations_than_the_limit(name, limit):
+    """Not those either whose line search gives up: here the layers at the tip are turned inside out."""
+    sim = simulator(name=name, max_iterations=limit, on_failure="count")
+    rest = sim.rest_state(3)
+    q, tip = rest.q.clone(), torch.as_tensor(select_vertices(MESH, x=0.06))
+    q[1, tip, 0] -= 0.04
+    q[2, tip] *= 1e6
+    report = sim.step(State(q, rest.v))[1]
+    assert int(report.iterations.max()) <= limit
+
+
+def test_threads_that_are_no_number(monkeypatch):
+    monkeypatch.setenv("WARP_RESPHYS_THREADS", "many")
+    with pytest.raises(InputError, match="WARP_RESPHYS_THREADS is 'many': it must be a whole number"):
+        simulator().step(simulator().rest_state(4))
 
 
 def test_shards_cover_the_batch(monkeypatch):

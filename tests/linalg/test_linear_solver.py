@@ -108,6 +108,44 @@ def test_idle_matrices_leave_the_others_as_they_are(definite, device, cholespy):
         np.testing.assert_allclose(found, np.linalg.solve(dense[[0, 2]], right.cpu()[[0, 2]]), rtol=1e-9, atol=1e-9)
 
 
+def test_idle_matrices_keep_the_factor_they_have(device, cholespy):
+    dense, others = matrices(3, 20.0), matrices(3, 20.0, seed=7)
+    idle = torch.tensor([False, True, True], device=device)
+    right = torch.ones(BATCH, NODES * 3, 2, dtype=torch.float64, device=device)
+    columns = 0.3 * torch.randn(BATCH, NODES * 3, 2, dtype=torch.float64).to(device)
+    for kind in layouts(device):
+        for extra in (None, columns):
+            solver = make(kind, 3, device)
+            values = values_of(solver, dense)
+            before = solver.factor(values, columns=extra)
+            # As the assembly does: what is idle stays, as a matrix or as the factor that overwrote it.
+            values[0] = values_of(solver, others)[0]
+            after = solver.factor(values, columns=None if extra is None else 2.0 * extra, idle=idle, before=before)
+            assert not after.failed.any()
+            expected = dense.copy()
+            expected[0] = others[0]
+            if extra is not None:
+                scale = np.array([2.0, 1.0, 1.0])[:, None, None] * extra.cpu().numpy()
+                expected = expected + scale @ scale.transpose(0, 2, 1)
+            found = after.solve(right).cpu()
+            np.testing.assert_allclose(found, np.linalg.solve(expected, right.cpu()), rtol=1e-9, atol=1e-9)
+            in_place = right[:, solver.unknowns, 0].contiguous()
+            after.solve_in_place(in_place)
+            np.testing.assert_allclose(in_place.cpu(), found[:, solver.unknowns.cpu(), 0], rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("unknown", [0, 15, 16, 35])
+def test_a_pivot_that_is_not_positive_is_found_wherever_it_is(unknown, device):
+    """The first, the last of a tile, the first of the next one, the last of all."""
+    dense = matrices(3, 20.0)
+    for kind in layouts(device):
+        solver = make(kind, 3, device)
+        bad = dense.copy()
+        at = int(solver.unknowns[unknown])
+        bad[1, at, at] = -1.0
+        assert solver.factor(values_of(solver, bad)).failed.tolist() == [False, True, False]
+
+
 def test_only_a_solver_that_says_so_writes_over_the_values(device):
     for kind in layouts(device):
         solver = make(kind, 3, device)

@@ -62,6 +62,18 @@ class Workspace:
         """The shards, or the whole batch."""
         return self.shards or [(slice(None), self)]
 
+    def gather(self) -> IncrementalPotential:
+        """The potential of the whole batch, with the terms and positions that the shards have last had."""
+        for rows, own in self.shards:
+            mine, theirs = self.potential, own.potential
+            pairs: list[tuple[Any, Any]] = [(mine.positions, theirs.positions)]
+            pairs += [(getattr(mine.terms, n), getattr(theirs.terms, n)) for n in ("target", "inertia", "force")]
+            pairs += [(mine.terms.values[name], value) for name, value in theirs.terms.values.items()]
+            for whole, part in pairs:
+                if whole is not None and part is not None:
+                    whole[rows] = part
+        return self.potential
+
     def once(self, key: Hashable, make: Callable[[], T]) -> T:
         """What belongs to this batch, made at its first use."""
         if key not in self._made:
@@ -199,6 +211,7 @@ class _Equilibrium(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         x, *saved = ctx.saved_tensors
+        x, saved = x.detach(), [None if each is None else each.detach() for each in saved]
         needed = ctx.needs_input_grad[6:]
 
         parts = [(rows, own, own.hessian(ctx.linear_solver)) for rows, own in ctx.workspace.parts]
@@ -209,8 +222,11 @@ class _Equilibrium(torch.autograd.Function):
             rows, own, hessian = part
             return _adjoint(own, hessian, ctx.names, needed, *(_rows(each, rows) for each in (gradient, x, *saved)))
 
-        with threads_for(gradient.numel()):
-            found = in_threads(differentiate, parts)
+        try:
+            with threads_for(gradient.numel()):
+                found = in_threads(differentiate, parts)
+        except ConvergenceError as error:
+            raise ConvergenceError(str(error), x.detach().clone(), None) from None
         return (*([None] * 6), *map(_joined, (None, *saved), zip(*found, strict=True)))
 
 

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from ..io.kernel_cache import ensure_kernel_cache
 from ..kernels import points
 
-_CAPTURES = Lock()  # Warp captures what any thread launches meanwhile.
+_SETTINGS = Lock()  # Warp has them for the whole process.
+_CAPTURES = Lock()  # Warp captures what any thread launches: simulators are to be used by one thread while one is new.
 BLOCK = 128  # threads of a GPU that work on one environment
 
 ensure_kernel_cache()  # Before Warp is first used, by this package or by who imports it.
@@ -31,12 +32,13 @@ def shareable() -> Iterator[None]:
     Otherwise every launch would register the place of its tiles, which these kernels do not use, in a variable that
     all threads share.
     """
-    before = wp.config.enable_tiles_in_stack_memory
-    wp.config.enable_tiles_in_stack_memory = False
-    try:
-        yield
-    finally:
-        wp.config.enable_tiles_in_stack_memory = before
+    with _SETTINGS:
+        before = wp.config.enable_tiles_in_stack_memory
+        wp.config.enable_tiles_in_stack_memory = False
+        try:
+            yield
+        finally:
+            wp.config.enable_tiles_in_stack_memory = before
 
 
 class Launcher:

@@ -245,6 +245,7 @@ class TendonTerm(PartTerm):
         self._along, self._tension = launcher.zeros(tendons.count, 3), launcher.zeros(tendons.count)
         self._spring = launcher.zeros(tendons.count, 3)
         self._direction = launcher.zeros(s.n_points, 3, 3)
+        self._directions: Any = None  # the launch that fills it
         self._piece_length = torch.as_tensor(np.linalg.norm(s.source.rest[..., 0], axis=1), device=launcher.device)
         columns = 1 + tendons.offset_count
         operator = np.zeros((s.n_points, s.n_vertices, columns))  # how a vertex moves a piece
@@ -292,9 +293,11 @@ class TendonTerm(PartTerm):
         if not bool((stiffness > 0.0).any()):
             return None
         own, (s,) = self.launcher, self.sets
-        inputs = [s.nodes, s.gradients, self.part, self._found[0], positions]
-        out = [warp_view(self._direction, wp.mat33d)]
-        own.launch(own.record(kernels.directions, (own.batch, s.n_points), inputs, out))
+        if self._directions is None:
+            inputs = [s.nodes, s.gradients, self.part, self._found[0], positions]
+            out = [warp_view(self._direction, wp.mat33d)]
+            self._directions = own.record(kernels.directions, (own.batch, s.n_points), inputs, out)
+        own.launch(self._directions)
         columns = self._direction.movedim(-1, 1)[:, : len(self._operator)]  # (B, .., P, 3)
         by_column = columns[..., None] * self._own[:, None]  # (B, .., P, 3, T)
         gradient = (self._operator.mT @ by_column.flatten(3)).sum(1)  # (B, N, 3 T)

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import cache
 from itertools import pairwise
@@ -10,6 +10,8 @@ from typing import TypeVar
 
 import torch
 from threadpoolctl import ThreadpoolController
+
+from ..io.errors import InputError
 
 S = TypeVar("S")
 T = TypeVar("T")
@@ -47,8 +49,14 @@ def shards_of(batch: int, device: torch.device) -> list[slice]:
 
     On a CPU a kernel runs on the thread that launches it, and releases Python's lock meanwhile. As many threads are
     used as torch may use; ``WARP_RESPHYS_THREADS`` is another number.
+
+    Raises:
+        InputError: that is none.
     """
-    count = min(int(os.environ.get("WARP_RESPHYS_THREADS", torch.get_num_threads())), batch // _LEAST_ENVIRONMENTS)
+    wanted = os.environ.get("WARP_RESPHYS_THREADS", str(torch.get_num_threads()))
+    if not wanted.isdecimal():
+        raise InputError(f"WARP_RESPHYS_THREADS is {wanted!r}: it must be a whole number of threads.")
+    count = min(int(wanted), batch // _LEAST_ENVIRONMENTS)
     if device.type != "cpu" or count < 2:
         return []
     ends = [round(batch * k / count) for k in range(count + 1)]
@@ -61,9 +69,21 @@ def _crew(threads: int) -> ThreadPoolExecutor:
 
 
 def in_threads(work: Callable[[S], T], shards: Sequence[S]) -> list[T]:
-    """The results of a function for each shard, the last of which the calling thread works on."""
+    """The results of a function for each shard, the last of which the calling thread works on.
+
+    What one of them raises is raised when all have ended.
+    """
     if len(shards) == 1:
         return [work(shards[0])]
-    others = [_crew(len(shards) - 1).submit(work, shard) for shard in shards[:-1]]
-    own = work(shards[-1])
+    graded = torch.is_grad_enabled()  # Each thread has that setting for itself.
+
+    def work_on(shard: S) -> T:
+        with torch.set_grad_enabled(graded):
+            return work(shard)
+
+    others = [_crew(len(shards) - 1).submit(work_on, shard) for shard in shards[:-1]]
+    try:
+        own = work(shards[-1])
+    finally:
+        wait(others)
     return [*(other.result() for other in others), own]

@@ -1,5 +1,7 @@
 """Banded Cholesky by blocks of threads: for batches of slender bodies on a GPU, each with a factor of its own."""
 
+from contextlib import nullcontext
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -14,12 +16,13 @@ from .linear_solver import Factor, Indices, LinearSolver, bandwidth_reducing_ord
 
 TILE = 16  # rows and columns of a tile
 BLOCK = 64  # threads that share a matrix
+_ONE_AT_A_TIME = Lock()
 
 
 class TiledSolver(LinearSolver):
     """Cholesky in tiles over a band, in reverse Cuthill-McKee order, on any device; see ``kernels.tiled_cholesky``.
 
-    What is not positive definite, and has to be solved all the same, is solved as a dense matrix.
+    A matrix that is not positive definite, and has to be solved all the same, is solved as a dense one.
     """
 
     overwrites = True
@@ -53,11 +56,14 @@ class TiledSolver(LinearSolver):
         self, values: torch.Tensor, definite: bool, idle: torch.Tensor | None, before: Factor | None
     ) -> Factor:
         values[:, self._padding] = 1.0
-        if not definite:
-            return _Reordered(DenseFactor(self._dense(values), definite=False), self)
+        whole = None if definite else values.clone()
         idle = torch.zeros(len(values), device=values.device, dtype=torch.bool) if idle is None else idle
         self.launch(self.kernels.factor, (len(values),), idle, values.view(-1, *self.shape))
-        return _TiledFactor(values, self)
+        factor = _TiledFactor(values, self)
+        if whole is None or not factor.failed.any():
+            return factor
+        rows = torch.as_tensor(factor.failed, device=values.device)
+        return _PartlyDense(factor, DenseFactor(self._dense(whole[rows]), definite=False), rows)
 
     def failed(self, values: torch.Tensor) -> NDArray[np.bool_]:
         """(B,) matrices whose factor has a pivot that is not positive."""
@@ -65,12 +71,15 @@ class TiledSolver(LinearSolver):
         return failed
 
     def launch(self, kernel: Any, blocks: tuple[int, ...], *arrays: torch.Tensor) -> None:
-        """Launches on torch's stream."""
+        """Launches on torch's stream; on a CPU one at a time, as all threads share the place of tiles there."""
         views = [wp.from_torch(each, requires_grad=False) for each in arrays]
         stream = None
         if self.device.type == "cuda":
             stream = wp.stream_from_torch(torch.cuda.current_stream(self.device))
-        wp.launch_tiled(kernel, dim=list(blocks), inputs=views, block_dim=BLOCK, device=str(self.device), stream=stream)
+        with _ONE_AT_A_TIME if self.device.type == "cpu" else nullcontext():
+            wp.launch_tiled(
+                kernel, dim=list(blocks), inputs=views, block_dim=BLOCK, device=str(self.device), stream=stream
+            )
 
     def _dense(self, values: torch.Tensor) -> torch.Tensor:
         """(B, n, n) lower triangles."""
@@ -86,35 +95,42 @@ class TiledSolver(LinearSolver):
 
 class _TiledFactor(Factor):
     def __init__(self, values: torch.Tensor, solver: TiledSolver) -> None:
-        self._bands, self._solver = values.view(-1, *solver.shape), solver
+        self._bands, self.solver = values.view(-1, *solver.shape), solver
         self.failed = solver.failed(values)
         if self.failed.any():
             values[torch.as_tensor(self.failed, device=values.device)] = torch.nan
 
     @override
     def solve(self, rhs: torch.Tensor) -> torch.Tensor:
-        columns = rhs[:, self._solver.dofs].mT.contiguous()
+        columns = rhs[:, self.solver.dofs].mT.contiguous()
         self._sweep(columns)
-        return columns.mT[:, self._solver.places]
+        return columns.mT[:, self.solver.places]
 
     @override
     def solve_in_place(self, columns: torch.Tensor) -> None:
         self._sweep(columns[:, None])
 
     def _sweep(self, columns: torch.Tensor) -> None:
-        self._solver.launch(self._solver.kernels.solve, columns.shape[:2], self._bands, columns)
+        self.solver.launch(self.solver.kernels.solve, columns.shape[:2], self._bands, columns)
 
 
-class _Reordered(Factor):
-    """A factor in the solver's order."""
+class _PartlyDense(Factor):
+    """A factor, and dense ones of the matrices (B,) that it has none of."""
 
-    def __init__(self, factor: Factor, solver: TiledSolver) -> None:
-        self._factor, self._solver, self.failed = factor, solver, factor.failed
+    def __init__(self, factor: _TiledFactor, dense: DenseFactor, rows: torch.Tensor) -> None:
+        self._factor, self._dense, self._rows = factor, dense, rows
+        self._dofs, self._places = factor.solver.dofs, factor.solver.places
+        self.failed = np.zeros(len(rows), dtype=bool)
+        self.failed[rows.cpu().numpy()] = dense.failed
 
     @override
     def solve(self, rhs: torch.Tensor) -> torch.Tensor:
-        return self._factor.solve(rhs[:, self._solver.dofs])[:, self._solver.places]
+        found = self._factor.solve(rhs)
+        found[self._rows] = self._dense.solve(rhs[self._rows][:, self._dofs])[:, self._places]
+        return found
 
     @override
     def solve_in_place(self, columns: torch.Tensor) -> None:
+        found = self._dense.solve(columns[self._rows][:, :, None])[:, :, 0]
         self._factor.solve_in_place(columns)
+        columns[self._rows] = found

@@ -268,7 +268,7 @@ def _time_parts(case: Case, repeats: int) -> dict[str, Any]:
     """Milliseconds of each part of an iteration, for the whole batch, at the end of the case's last roll-out."""
     sim = case.simulator
     workspace = sim.workspace(case.batch)
-    potential, pattern = workspace.potential, workspace.pattern
+    potential, pattern = workspace.gather(), workspace.pattern
     device = potential.device
     linear = make_linear_solver(
         sim.settings.linear_solver, pattern.rows, pattern.cols, len(pattern.free), 3, device, sim.dtype

@@ -23,7 +23,7 @@ from .reductions import block_max, block_sum
 
 BEGINS, AIMS, TRIES, DONE, STUCK = (wp.constant(k) for k in range(5))
 FACTOR, CLAMPED_FACTOR = wp.constant(1), wp.constant(2)  # requests
-ALWAYS, NEVER = wp.constant(0), wp.constant(2**28)  # iterations after which a factor is made anew
+NEVER = wp.constant(2**28)  # iterations after which a factor is made anew
 
 ZERO, HALF, ONE = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0)
 INFINITE = wp.constant(wp.float64(float("inf")))

@@ -338,7 +338,7 @@ def test_directions_equal_the_bfgs_formula():
     minimiser.refactor(state)
     while min(map(len, pairs)) < 3 * memory:
         state = minimiser.advance(state)
-        waits = minimiser.elsewhere()
+        waits = minimiser._counts["phase"] != kernels.AIMS
         searches += int(waits.sum())
         for b in range(2):
             if waits[b]:
@@ -354,40 +354,61 @@ def test_directions_equal_the_bfgs_formula():
     assert searches > 0
 
 
+class OneVertex:
+    """Arrays of the kernels for one environment of one vertex, in the phase after a trial was evaluated.
+
+    Its energy is far below that before, so that the trial is taken.
+    """
+
+    def __init__(self, memory):
+        self.own, self.vectors = minimisation_kernels(wp.float64), {}
+        self.progress, self.pairs, self.found = kernels.Progress(), self.own.Pairs(), kernels.Evaluation()
+        self.tolerances, pairs = kernels.Tolerances(), self.pairs
+        for name, variable in kernels.Progress.vars.items():
+            setattr(self.progress, name, wp.full(1, 1, dtype=variable.type.dtype, device="cpu"))
+        pairs.count, pairs.last = (wp.zeros(1, dtype=int, device="cpu") for _ in range(2))
+        pairs.s, pairs.y = (wp.zeros((1, memory, 1), dtype=wp.vec3d, device="cpu") for _ in range(2))
+        pairs.r = wp.zeros((1, memory, memory), dtype=wp.float64, device="cpu")
+        for name in ("energy", "size", "balance", "norm"):
+            setattr(self.found, name, wp.full(1, -1e9, dtype=wp.float64, device="cpu"))
+        self.found.residual, self.tolerances.max_iterations = self._vector("residual"), 1000
+        self.clamped = wp.zeros(1, dtype=wp.bool, device="cpu")
+
+    def _vector(self, name):
+        self.vectors[name] = torch.zeros(1, 1, 3, dtype=torch.float64)
+        return warp_view(self.vectors[name], wp.vec3d)
+
+    def accept(self):
+        self.progress.phase.fill_(kernels.TRIES)
+        inertia = wp.zeros((1, 1), dtype=wp.float64, device="cpu")
+        kept = {name: self.vectors.get(name) for name in ("origin", "direction", "positions", "gradient")}
+        views = {n: self._vector(n) if v is None else warp_view(v, wp.vec3d) for n, v in kept.items()}
+        inputs = [1, self.tolerances, inertia, self.found, views["origin"], views["direction"], self.clamped]
+        inputs += [views["positions"], views["gradient"], self.progress, self.pairs]
+        wp.launch_tiled(self.own.accept, dim=[1], inputs=inputs, block_dim=64, device="cpu")
+
+    def __getitem__(self, name):
+        return float(getattr(self.progress, name).numpy()[0])
+
+
 @pytest.mark.parametrize("memory", [1, 3])
 def test_a_pair_of_negative_curvature_leaves_the_others_as_they_are(memory):
-    """Also where all places are taken. One environment of one vertex: a trial is taken at each launch."""
-    own, vectors = minimisation_kernels(wp.float64), {}
-    progress, pairs, found, tolerances = kernels.Progress(), own.Pairs(), kernels.Evaluation(), kernels.Tolerances()
-
-    def vector(name):
-        vectors[name] = torch.zeros(1, 1, 3, dtype=torch.float64)
-        return warp_view(vectors[name], wp.vec3d)
-
-    for name, variable in kernels.Progress.vars.items():
-        setattr(progress, name, wp.full(1, 1, dtype=variable.type.dtype, device="cpu"))
-    progress.phase.fill_(kernels.TRIES)
-    pairs.count, pairs.last = (wp.zeros(1, dtype=int, device="cpu") for _ in range(2))
-    pairs.s, pairs.y = (wp.zeros((1, memory, 1), dtype=wp.vec3d, device="cpu") for _ in range(2))
-    pairs.r = wp.zeros((1, memory, memory), dtype=wp.float64, device="cpu")
-    for name in ("energy", "size", "balance", "norm"):
-        setattr(found, name, wp.full(1, -1e9, dtype=wp.float64, device="cpu"))
-    found.residual, tolerances.max_iterations = vector("residual"), 1000
-    inertia, clamped = wp.zeros((1, 1), dtype=wp.float64, device="cpu"), wp.zeros(1, dtype=wp.bool, device="cpu")
-    inputs = [1, tolerances, inertia, found, vector("origin"), vector("direction"), clamped, vector("positions")]
-    inputs += [vector("gradient"), progress, pairs]
+    """Also where all places are taken."""
+    one = OneVertex(memory)
+    one.accept()  # makes the vectors
+    one.pairs.count.zero_()
+    one.pairs.last.zero_()
     kept = []
     generator = torch.Generator().manual_seed(0)
     for step in range(9):
         moved, changed = torch.randn(2, 3, generator=generator, dtype=torch.float64)
         changed = (moved + 0.2 * changed) * (-1.0 if step in (1, 5, 8) else 1.0)
-        vectors["direction"][0, 0], vectors["gradient"][0, 0] = moved, 1.0
-        vectors["residual"][0, 0] = 1.0 + changed
-        progress.phase.fill_(kernels.TRIES)
-        wp.launch_tiled(own.accept, dim=[1], inputs=inputs, block_dim=64, device="cpu")
+        one.vectors["direction"][0, 0], one.vectors["gradient"][0, 0] = moved, 1.0
+        one.vectors["residual"][0, 0] = 1.0 + changed
+        one.accept()
         if float(moved @ changed) > 0.0:
             kept = [*kept, (moved, changed)][-memory:]
-        count, last = int(pairs.count.numpy()[0]), int(pairs.last.numpy()[0])
+        pairs, count, last = one.pairs, int(one.pairs.count.numpy()[0]), int(one.pairs.last.numpy()[0])
         places = [(last - age) % memory for age in reversed(range(count))]
         assert count == len(kept)
         for k, (i, (s, y)) in enumerate(zip(places, kept, strict=True)):
@@ -395,3 +416,30 @@ def test_a_pair_of_negative_curvature_leaves_the_others_as_they_are(memory):
             np.testing.assert_allclose(pairs.y.numpy()[0, i, 0], y, rtol=1e-12)
             for j, (_, newer) in zip(places[k:], kept[k:], strict=True):
                 np.testing.assert_allclose(pairs.r.numpy()[0, i, j], float(s @ newer), rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("iterations", "made", "clamped", "phase", "wanted"),
+    [
+        (5, 0, False, kernels.AIMS, kernels.FACTOR),
+        (5, 1, False, kernels.AIMS, kernels.CLAMPED_FACTOR),
+        (5, 1, True, kernels.STUCK, 0),
+        (10, 0, False, kernels.STUCK, 0),
+        (10, 1, False, kernels.STUCK, 0),
+    ],
+)
+@pytest.mark.parametrize("stalls", [0, 2])
+def test_a_line_search_that_gives_up(iterations, made, clamped, phase, wanted, stalls):
+    """It asks for a factor, and a clamped one, within the limit of iterations; and whether its residual is rounding."""
+    one = OneVertex(3)
+    one.tolerances.max_iterations = 10
+    for name, value in {"iterations": iterations, "made": made, "stalls": stalls, "wanted": 0, "asks": 0}.items():
+        getattr(one.progress, name).fill_(value)
+    one.progress.halvings.fill_(kernels.MOST_HALVINGS - 1)
+    one.progress.rounding.fill_(np.inf)
+    one.found.energy.fill_(np.nan)
+    one.clamped.fill_(clamped)
+    one.accept()
+    assert (one["phase"], one["wanted"], one["stalls"]) == (phase, wanted, stalls + 1)
+    assert one["asks"] == (stalls + 1 >= kernels.STALLS)
+    assert one["step"] == 0.0

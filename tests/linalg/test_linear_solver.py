@@ -112,7 +112,7 @@ def test_idle_matrices_keep_the_factor_they_have(device, cholespy):
     dense, others = matrices(3, 20.0), matrices(3, 20.0, seed=7)
     idle = torch.tensor([False, True, True], device=device)
     right = torch.ones(BATCH, NODES * 3, 2, dtype=torch.float64, device=device)
-    columns = 0.3 * torch.randn(BATCH, NODES * 3, 2, dtype=torch.float64).to(device)
+    columns = torch.as_tensor(0.3 * np.random.default_rng(0).normal(size=(BATCH, NODES * 3, 2)), device=device)
     for kind in layouts(device):
         for extra in (None, columns):
             solver = make(kind, 3, device)

@@ -133,10 +133,6 @@ class Minimiser:
         everyone = state.wanting == self._potential.batch
         self._hessian.refactor(self._clamp, None if everyone else self._idle)
 
-    def elsewhere(self) -> torch.Tensor:
-        """(B,) environments that need no direction next."""
-        return self._counts["phase"] != kernels.AIMS
-
     def outcome(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
         """(B,) directions, last residual over balancing forces, whether it has converged, and factorisations."""
         counts = self._counts

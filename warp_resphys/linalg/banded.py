@@ -1,5 +1,6 @@
 """LAPACK's banded Cholesky: the cheapest for slender bodies on a CPU, up to tens of thousands of unknowns."""
 
+from abc import abstractmethod
 from typing import Any
 
 import numpy as np
@@ -19,8 +20,7 @@ class BandedSolver(LinearSolver):
     @override
     def _lay_out(self, rows: Indices, cols: Indices, n_nodes: int) -> None:
         order = bandwidth_reducing_order(rows, cols, n_nodes)
-        place = np.empty(n_nodes, dtype=np.int64)
-        place[order] = np.arange(n_nodes)
+        place = np.argsort(order)
         i, j = self._entries(place[rows], place[cols])
         swap = i < j
         diagonal_upper = (rows == cols)[:, None] & swap
@@ -65,13 +65,13 @@ class _BandedFactor(Factor):
             elif before is not None:
                 self._factors[i], self.failed[i] = before._factors[i], before.failed[i]
 
+    @abstractmethod
     def _factorise(self, band: torch.Tensor) -> tuple[Any, bool]:
         """The factor of a matrix, which it may overwrite, and whether there is none: it is not a number then."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _overwrite(self, factor: Any, columns: torch.Tensor) -> None:
         """Solves for contiguous (m, n) right-hand sides."""
-        raise NotImplementedError
 
     @override
     def solve(self, rhs: torch.Tensor) -> torch.Tensor:

@@ -30,8 +30,7 @@ class TiledSolver(LinearSolver):
     @override
     def _lay_out(self, rows: Indices, cols: Indices, n_nodes: int) -> None:
         self.order = bandwidth_reducing_order(rows, cols, n_nodes)
-        place = np.empty(n_nodes, dtype=np.int64)
-        place[self.order] = np.arange(n_nodes)
+        place = np.argsort(self.order)
         i, j = self._entries(place[rows], place[cols])
         upper = (rows == cols)[:, None] & (i < j)
         i, j = np.maximum(i, j), np.minimum(i, j)

@@ -52,8 +52,13 @@ COMMANDS: Final[Mapping[str, tuple[str, str]]] = MappingProxyType(
         "compare": ("studies.recording_comparison:compare", "set a beam that is let go beside its simulation"),
         "verify": ("studies.verification:verify", "simulate reference trajectories, and compare every vertex"),
         "gradcheck": ("studies.gradient_check:gradcheck", "compare adjoint gradients with central differences"),
+        "check": (
+            "studies.device_check:check_device",
+            "check a device against the CPU, and time it: for a page of results",
+        ),
         "benchmark": ("studies.benchmark:benchmark", "time steps, forward and backward, and what they consist of"),
         "element-study": ("studies.elements:element_study", "static sag of a beam, by element and refinement"),
+        "size-study": ("studies.sizes:size_study", "time and memory of a step, by linear solver and size of the body"),
         "locking-study": ("studies.locking:locking_study", "deflection of an arm, by element and refinement"),
     }
 )

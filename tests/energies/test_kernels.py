@@ -257,7 +257,7 @@ def loaded_potential(mesh):
     values = {"viscosity": noise(b, 2), "strain_offset": strain + strain.mT, "dilation_offset": strain[..., 0, 0]}
     potential.set_terms(StepTerms(*main, {"stiffness": torch.stack(stiffness, dim=-1), **values}))
     potential.positions.copy_(torch.as_tensor(mesh.vertices) + 1e-3 * noise(b, n, 3))
-    pattern = BlockPattern(n, body.fixed_vertices, sets)
+    pattern = BlockPattern(body.mesh.vertices, body.fixed_vertices, sets)
     dofs = (3 * pattern.free[:, None] + np.arange(3)).ravel()
     return potential, pattern, dofs
 

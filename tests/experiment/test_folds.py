@@ -13,7 +13,7 @@ import pytest
 
 from warp_resphys.experiment.folds import Fold, run_folds
 from warp_resphys.io.errors import ConvergenceError
-from warp_resphys.io.processes import WorkerError
+from warp_resphys.io.fan_out import WorkerError, Workers
 from warp_resphys.io.stages import Stage, StageInterrupted
 
 
@@ -26,8 +26,8 @@ def write(context):
     path.write_text(json.dumps({"process": os.getpid(), "name": context.settings["name"]}))
 
 
-def stages(name, fails, seconds, processes):
-    del processes
+def stages(name, fails, seconds, workers):
+    del workers
     settings = {"name": name, "fails": False, "seconds": seconds}
     first = Stage("first", write, ("first.json",), settings)
     return [first, Stage("second", write, ("second.json",), {**settings, "fails": fails}, ("first",))]
@@ -44,43 +44,63 @@ def written(folder, name="second"):
 
 @pytest.mark.parametrize("processes", [1, 2])
 def test_every_fold_is_run_once(tmp_path, processes):
-    run_folds(folds(tmp_path), processes)
+    run_folds(folds(tmp_path), Workers(processes))
     found = written(tmp_path)
     assert {name: each["name"] for name, each in found.items()} == dict(zip("abcd", "abcd", strict=True))
     others = {each["process"] for each in found.values()} - {os.getpid()}
     assert len(others) == (2 if processes > 1 else 0)
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.json")}
-    run_folds(folds(tmp_path), processes)
+    run_folds(folds(tmp_path), Workers(processes))
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.json")} == before
 
 
 def test_a_fold_that_fails_is_named_and_the_others_are_kept(tmp_path):
     with pytest.raises(WorkerError, match=r"^fold d: the simulation fails"):
-        run_folds(folds(tmp_path, fails="d"), 2)
+        run_folds(folds(tmp_path, fails="d"), Workers(2))
     assert "d" not in written(tmp_path)
     assert "d" in written(tmp_path, "first")
-    run_folds(folds(tmp_path), 2)
+    run_folds(folds(tmp_path), Workers(2))
     assert written(tmp_path).keys() == set("abcd")
 
 
+def killed_once(context):
+    mark = context.run_dir / "killed"
+    if not mark.exists():
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    write(context)
+
+
+def deadly(name, workers):
+    first, second = stages(name, False, 0.0, workers)
+    return [first, Stage("second", killed_once, second.outputs, second.settings, second.upstream)]
+
+
+def test_a_fold_whose_worker_is_killed_goes_on_in_another(tmp_path, caplog):
+    run_folds({**folds(tmp_path, "abc"), "d": Fold("d", tmp_path / "fold_d", partial(deadly, "d"))}, Workers(2))
+    assert written(tmp_path).keys() == set("abcd")
+    assert written(tmp_path, "first")["d"]["process"] != written(tmp_path)["d"]["process"]
+    assert "a worker process was lost" in caplog.text
+
+
 def test_the_last_fold_that_is_left_has_all_processes(tmp_path, monkeypatch):
-    run_folds(folds(tmp_path, "abc"), 1)
+    run_folds(folds(tmp_path, "abc"), Workers(1))
     asked = []
 
-    def told(processes):
-        asked.append(processes)
-        return stages("d", False, 0.0, processes)
+    def told(workers):
+        asked.append(workers)
+        return stages("d", False, 0.0, workers)
 
-    run_folds({**folds(tmp_path, "abc"), "d": Fold("d", tmp_path / "fold_d", told)}, 4)
-    assert asked[-1] == 4
+    run_folds({**folds(tmp_path, "abc"), "d": Fold("d", tmp_path / "fold_d", told)}, Workers(4))
+    assert asked[-1] == Workers(4)
 
 
 def test_ctrl_c_says_what_was_on_and_the_rest_is_kept(tmp_path):
     program = f"""if __name__ == "__main__":
     import signal
     signal.signal(signal.SIGINT, signal.default_int_handler)  # Who runs the tests may ignore it.
-    from test_folds import folds, run_folds
-    run_folds(folds({str(tmp_path)!r}, "abcd", seconds=1.0), 2)
+    from test_folds import Workers, folds, run_folds
+    run_folds(folds({str(tmp_path)!r}, "abcd", seconds=1.0), Workers(2))
 """
     script = tmp_path / "program.py"
     script.write_text(program)
@@ -97,7 +117,7 @@ def test_ctrl_c_says_what_was_on_and_the_rest_is_kept(tmp_path):
     done = {path.parents[1].name[-1] for path in tmp_path.glob("fold_*/stages/first.json")}
     kept = {name: each["process"] for name, each in written(tmp_path, "first").items() if name in done}
     assert kept
-    run_folds(folds(tmp_path, "abcd", seconds=1.0), 2)
+    run_folds(folds(tmp_path, "abcd", seconds=1.0), Workers(2))
     after = written(tmp_path, "first")
     assert {name: after[name]["process"] for name in kept} == kept
     assert written(tmp_path).keys() == set("abcd")

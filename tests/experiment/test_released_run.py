@@ -21,6 +21,7 @@ from warp_resphys.experiment.folds import Fold, run_folds
 from warp_resphys.experiment.pipeline import learning_stages
 from warp_resphys.experiment.scene import LEARNED, MODELS
 from warp_resphys.experiment.trials import folds_of, split_of
+from warp_resphys.io.fan_out import Workers
 from warp_resphys.io.files import read_checkpoint, read_hdf5
 from warp_resphys.io.stages import StageInterrupted, run_stages
 from warp_resphys.learning.identification import Identifier
@@ -261,7 +262,7 @@ def test_folds(finished, tmp_path, monkeypatch, pages):
     shutil.copy(tmp_path / "run" / "dataset.h5", at_once)
     splits = folds_of(configuration(*(each for each in FOLDS if not each.startswith("hydra"))))
     folds = {name: Fold(name, at_once / name, partial(_unreported, split)) for name, split in splits.items()}
-    run_folds(folds, 2)
+    run_folds(folds, Workers(2))
     for trial, fold in found["folds"].items():
         assert read(at_once / trial / "errors.json")["errors_mm"] == fold["errors_mm"]
 

@@ -26,7 +26,7 @@ def test_dense_solve(preconditioned):
     matrices, right = problem()
     diagonal = torch.diag_embed(matrices.diagonal(dim1=1, dim2=2)).inverse()
     preconditioner = product(diagonal) if preconditioned else torch.clone
-    x = conjugate_gradients(product(matrices), preconditioner, right, tolerance=1e-12)
+    x = conjugate_gradients(product(matrices), preconditioner, right, tolerance=1e-12).x
     expected = torch.linalg.solve(matrices, right.flatten(1)).view_as(right)
     np.testing.assert_allclose(x, expected, rtol=0, atol=1e-9 * float(expected.abs().max()))
     assert not x[1].any()

@@ -51,7 +51,7 @@ def make(kind, block, device="cpu", dtype=torch.float64):
 
 
 def layouts(device):
-    return ["dense", "sparse", "tiled"] + (["banded"] if device == "cpu" else [])
+    return ["dense", "sparse", "tiled", "multigrid"] + (["banded"] if device == "cpu" else [])
 
 
 @pytest.fixture(params=[True, False], ids=["cholespy", "scipy"])
@@ -198,7 +198,9 @@ def test_band_storage_is_lapacks():
 
 
 def test_bad_choices_are_refused():
-    with pytest.raises(InputError, match="linear_solver is 'lu': choose one of auto, banded, tiled, dense, sparse"):
+    with pytest.raises(
+        InputError, match="linear_solver is 'lu': choose one of auto, banded, tiled, dense, sparse, multigrid"
+    ):
         make("lu", 3)
     with pytest.raises(InputError, match="linear_solver=banded runs on the CPU alone"):
         make("banded", 3, "cuda")

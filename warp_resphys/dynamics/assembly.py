@@ -18,12 +18,13 @@ class BlockPattern:
     """Which pairs of vertices the Hessian couples, and which cell blocks make up each pair.
 
     Args:
-        n_vertices: N.
+        vertices: (N, 3) at rest [m].
         fixed: (D,) fixed vertices.
         sets: every set of points that carries energy.
 
     Attributes:
         free: (F,) vertices that are not fixed.
+        positions: (F, 3) of these at rest [m].
         rows: (E,) row of each block, an index into ``free``.
         cols: (E,) its column; ``rows >= cols``.
         start: (E + 1,) where a block's entries of ``contribution`` begin.
@@ -33,10 +34,11 @@ class BlockPattern:
         n_cell_blocks: of all point sets.
     """
 
-    def __init__(self, n_vertices: int, fixed: NDArray[np.int64], sets: Sequence[Points]) -> None:
-        is_free = np.ones(n_vertices, dtype=bool)
+    def __init__(self, vertices: NDArray[np.float64], fixed: NDArray[np.int64], sets: Sequence[Points]) -> None:
+        is_free = np.ones(len(vertices), dtype=bool)
         is_free[fixed] = False
         self.free = np.flatnonzero(is_free)
+        self.positions = vertices[self.free]
         reduced = np.where(is_free, np.cumsum(is_free) - 1, -1)
         sources: list[NDArray[np.int64]] = []
         pairs: list[NDArray[np.int64]] = []

@@ -96,7 +96,7 @@ class Workspace:
     def linear_solver(self, name: str) -> LinearSolver:
         """A new solver of the named kind for the Hessian's structure."""
         p, k = self.potential, self.pattern
-        return make_linear_solver(name, k.rows, k.cols, len(k.free), 3, p.device, torch.float64)
+        return make_linear_solver(name, k.rows, k.cols, len(k.free), 3, p.device, torch.float64, k.positions)
 
 
 def equilibrium(
@@ -198,7 +198,7 @@ class _Equilibrium(torch.autograd.Function):
             rows, own, solver = part
             return _solve(own, solver, names, *(_rows(each, rows) for each in tensors))
 
-        with threads_for(start.numel()):
+        with threads_for(start[0].numel()):
             found = in_threads(solve, parts)
         reports.append(SolveReport.of([report for _, report in found]))
         x = found[0][0] if len(found) == 1 else torch.cat([each for each, _ in found])
@@ -223,7 +223,7 @@ class _Equilibrium(torch.autograd.Function):
             return _adjoint(own, hessian, ctx.names, needed, *(_rows(each, rows) for each in (gradient, x, *saved)))
 
         try:
-            with threads_for(gradient.numel()):
+            with threads_for(gradient[0].numel()):
                 found = in_threads(differentiate, parts)
         except ConvergenceError as error:
             raise ConvergenceError(str(error), x.detach().clone(), None) from None

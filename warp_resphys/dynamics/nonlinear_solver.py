@@ -4,7 +4,8 @@ Three solvers differ in the matrix of the global step and share everything else:
 
 =======================  ====================================================================================
 ``projective_dynamics``  constant projective-dynamics matrix, accelerated by L-BFGS (Liu et al. 2017)
-``quasi_newton``         Hessian of a recent state, accelerated by L-BFGS; factorised anew when steps get slow
+``quasi_newton``         Hessian of a recent state, accelerated by L-BFGS; factorised anew when steps get slow, or
+                         for every iterate where that costs little (multigrid)
 ``newton``               Hessian of every iterate, clamped to positive eigenvalues where it is not positive definite
 =======================  ====================================================================================
 
@@ -45,7 +46,7 @@ class SolverSettings:
     max_iterations: int = 2000  # after which it has failed
     memory: int = 12  # pairs that L-BFGS keeps
     refactor_after: int = 4  # iterations of a step above which ``quasi_newton`` factorises anew
-    linear_solver: str = "auto"  # ``auto``, ``banded``, ``tiled``, ``dense`` or ``sparse``
+    linear_solver: str = "auto"  # ``auto``, ``banded``, ``tiled``, ``dense``, ``sparse`` or ``multigrid``
     on_failure: str = "raise"  # ``raise`` a `ConvergenceError`, or ``count`` the failure in the report and go on
 
     def __post_init__(self) -> None:
@@ -122,19 +123,21 @@ class NonlinearSolver:
         self.potential, self.settings, self.dtype = potential, settings, dtype
         self.hessian: HessianApproximation
         kind = settings.linear_solver
-        where = (potential.device, dtype)
+        where = (potential.device, dtype, pattern.positions)
         if settings.name == "projective_dynamics":
             linear = make_linear_solver(kind, pattern.rows, pattern.cols, len(pattern.free), 1, *where)
             self.hessian = ProjectiveHessian(potential, pattern, linear)
         else:
             linear = make_linear_solver(kind, pattern.rows, pattern.cols, len(pattern.free), 3, *where)
             self.hessian = ExactHessian(potential, pattern, linear)
-        after = {"newton": 0, "quasi_newton": settings.refactor_after, "projective_dynamics": None}
+        # Directions by iterations cost most of a solve, and no more with the Hessian where they begin.
+        quasi = 0 if linear.iterates else settings.refactor_after
+        after = {"newton": 0, "quasi_newton": quasi, "projective_dynamics": None}
         self._minimiser = Minimiser(
             potential,
             self.hessian,
             dtype,
-            memory=0 if settings.name == "newton" else settings.memory,
+            memory=0 if after[settings.name] == 0 else settings.memory,
             relative_tolerance=settings.relative_tolerance,
             absolute_tolerance=settings.absolute_tolerance,
             max_iterations=settings.max_iterations,

@@ -144,7 +144,7 @@ class Simulator:
         own_energies = cast(Sequence[Energy], body.energies)
         self._energies += list(zip(own_energies, body.energy_points, strict=True))
         self._pattern = BlockPattern(
-            body.n_vertices, body.fixed_vertices, [points for _, sets in self._energies for points in sets]
+            body.mesh.vertices, body.fixed_vertices, [points for _, sets in self._energies for points in sets]
         )
         own = [quantity for energy in body.energies for quantity in energy.parameters]
         self.parameters: dict[str, Quantity] = {**self.material.quantities, **{each.name: each for each in own}}

@@ -18,6 +18,7 @@ from typing_extensions import override
 from ..data.markers import MarkerMap
 from ..dynamics.integrator import State
 from ..dynamics.simulator import Simulator
+from ..io.fan_out import ALONE, Workers
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5, read_json, write_json, write_text
 from ..io.resumable import Field
 from ..io.stages import Stage, StageContext, package_versions, resources_used
@@ -27,7 +28,7 @@ from ..report.ablation_page import AblationReport, write_ablation_report
 from ..report.page import number_text
 from .build import build_mesh, build_simulator, simulation_device
 from .files import METRICS, REPORT
-from .parts import Part, processes_for, remove_parts, split_into_parts, work_on
+from .parts import Part, remove_parts, split_into_parts, work_on, workers_for
 from .reconstruct import Reconstructing
 from .simulate import held_state
 
@@ -42,10 +43,10 @@ _MM = 1e3
 def ablation_stages(config: Mapping[str, Any], base: Mapping[str, Any], shown: Mapping[str, Any]) -> list[Stage]:
     """The stages of the study; ``base`` has what every simulation depends on, ``shown`` goes into the report."""
     own = dict(config["ablation"])
-    processes = min(processes_for(config, own.pop("processes")), len(own["counts"]))
+    workers = workers_for(config, own.pop("processes")).at_most(len(own["counts"]))
     moved = {**base, **{key: config[key] for key in ("target", "simulation", "data")}}
     reconstructed = {**base, **{key: config[key] for key in ("simulation", "reconstruction", "seed")}, "ablation": own}
-    work = partial(ablate, processes=processes)
+    work = partial(ablate, workers=workers)
     return [
         Stage("generate", generate_motion, (MOTION,), moved),
         Stage("ablation", work, (DRAWS, SUMMARY, TABLE), reconstructed, ("generate",)),
@@ -81,7 +82,7 @@ def generate_motion(context: StageContext) -> None:
             create(file, name, q.cpu().numpy(), "m")
 
 
-def ablate(context: StageContext, processes: int = 1) -> None:
+def ablate(context: StageContext, workers: Workers = ALONE) -> None:
     """Writes ablation.h5, with the sets of markers and the error of each at every step, and tables of the errors.
 
     Raises:
@@ -92,7 +93,7 @@ def ablate(context: StageContext, processes: int = 1) -> None:
     parts = {}
     for count in sorted(counts, reverse=True):  # The longest first, so that no process is left with it.
         (parts[count],) = split_into_parts(context, (str(count),), len(motion), f"markers_{count}", count)
-    work_on([*parts.values()], _FromMarkers, processes)
+    work_on([*parts.values()], _FromMarkers, workers)
     found = {name: np.stack([parts[count].read(name) for count in counts]) for name in ("markers", "error", "misfit")}
     found |= {name: found[name][..., 1:] for name in ("error", "misfit")}  # The first frame is given.
     with atomic_hdf5(context.run_dir / DRAWS, "marker ablation", {"fingerprint": context.fingerprint}) as file:

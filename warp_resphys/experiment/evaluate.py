@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..data.trials import Trials
 from ..dynamics.integrator import State
 from ..io.errors import ConvergenceError
+from ..io.fan_out import ALONE, Workers
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5, write_json
 from ..io.progress import Progress
 from ..io.stages import StageContext
@@ -33,7 +34,7 @@ _FILM_FRAMES = 256  # at most
 _FILTERED_SECONDS = 4.0  # that trials must last for the median filter over a second
 
 
-def evaluate(context: StageContext, processes: int = 1) -> None:
+def evaluate(context: StageContext, workers: Workers = ALONE) -> None:
     """Writes rollouts.h5, what is observed of every model's roll-outs of the test trials, and errors.json."""
     settings = context.settings
     scene = Scene(settings, context.run_dir, "count")
@@ -41,7 +42,7 @@ def evaluate(context: StageContext, processes: int = 1) -> None:
     filmed = _film_trial(scene, settings["groups"]["1"])
     parts = _parts(context, scene, names, models_of(settings), filmed)
     calibrating = _parts(context, scene, settings["calibration"], INTERVAL_MODELS, filmed, "calibration_")
-    work_on([part for each in (parts, calibrating) for some in each.values() for part in some], _rolled_out, processes)
+    work_on([part for each in (parts, calibrating) for some in each.values() for part in some], _rolled_out, workers)
     order = [name for some in scene.alike(names) for name in some]
     rows = [order.index(name) for name in names]
     observed = {model: _all_observed(scene, model, some)[rows] for model, some in parts.items()}

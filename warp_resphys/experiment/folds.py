@@ -9,11 +9,11 @@ from pathlib import Path
 from threadpoolctl import threadpool_limits
 
 from ..io.errors import ResphysError
-from ..io.processes import Advance, WorkerError, in_processes
+from ..io.fan_out import ALONE, Advance, WorkerError, Workers, fan_out
 from ..io.progress import Progress
 from ..io.stages import Stage, StageInterrupted, run_stages, up_to_date
 
-Stages = Callable[[int], list[Stage]]
+Stages = Callable[[Workers], list[Stage]]
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Fold:
     Attributes:
         name: of the trial that is left out.
         folder: of its files.
-        stages: for so many processes; can be sent to another process.
+        stages: by the workers that share their work; can be sent to another process.
     """
 
     name: str
@@ -31,31 +31,32 @@ class Fold:
     stages: Stages
 
 
-def run_folds(folds: Mapping[str, Fold], processes: int) -> None:
-    """Runs those that are not up to date: as many at once as there may be processes, or one with all of these.
+def run_folds(folds: Mapping[str, Fold], workers: Workers) -> None:
+    """Runs those that are not up to date: as many at once as there are workers, or one with all of these.
 
-    The numbers do not depend on the processes.
+    The numbers do not depend on the workers.
 
     Raises:
         WorkerError: a fold failed; the others keep what they have.
         StageInterrupted: Ctrl-C; so does every one.
     """
-    left = [fold for fold in folds.values() if not up_to_date(fold.stages(1), fold.folder)]
-    if min(processes, len(left)) <= 1:
+    left = [fold for fold in folds.values() if not up_to_date(fold.stages(ALONE), fold.folder)]
+    if workers.alone or len(left) <= 1:
         with threadpool_limits(1):
             for fold in left:
-                run_stages(fold.stages(processes), fold.folder)
+                run_stages(fold.stages(workers), fold.folder)
         return
-    total = sum(len(fold.stages(1)) for fold in left)
+    total = sum(len(fold.stages(ALONE)) for fold in left)
     running: dict[str, str] = {}
 
-    def advance(count: int, name: str, stage: str) -> None:
-        running[name] = f"{name}: {stage}"
-        if not stage:
-            del running[name]
+    def advance(count: int, name: str = "", stage: str = "") -> None:
+        if stage:
+            running[name] = f"{name}: {stage}"
+        else:
+            running.pop(name, None)
         progress.advance(count, now=", ".join(running.values()))
 
-    crew = in_processes(_run, left, min(processes, len(left)), advance)
+    crew = fan_out(_run, left, workers.at_most(len(left)), advance, left[0].folder.parent)
     try:
         with Progress(f"{len(left)} folds", total, "stages") as progress, closing(crew) as results:
             for _ in results:
@@ -73,7 +74,7 @@ def _run(fold: Fold, advance: Advance) -> None:
     counts = iter([0])
     try:
         run_stages(
-            fold.stages(1), fold.folder, begins=lambda each: advance(next(counts, 1), name=fold.name, stage=each)
+            fold.stages(ALONE), fold.folder, begins=lambda each: advance(next(counts, 1), name=fold.name, stage=each)
         )
     except ResphysError as error:
         raise WorkerError(f"fold {fold.name}: {error}") from error

@@ -20,8 +20,9 @@ from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import threadpool_limits
 
 from ..dynamics.integrator import State
+from ..io.fan_out import Advance, Workers, fan_out
 from ..io.files import read_array, read_hdf5
-from ..io.processes import Advance, available_cores, in_processes
+from ..io.machine import available_cores
 from ..io.progress import Progress
 from ..io.resumable import Field, ResumableHDF5, forget_checkpoint, keep_checkpoint, resume_checkpoint
 from ..io.stages import StageContext
@@ -169,20 +170,20 @@ def _folder(context: StageContext) -> Path:
     return context.run_dir / f"{context.name}_parts"
 
 
-def processes_for(config: Mapping[str, Any], wanted: int | None) -> int:
-    """Worker processes: as many as wanted; if that is not said, one a core, but one for all where a GPU simulates."""
-    if wanted is not None:
-        return wanted
-    return available_cores() if simulation_device(config).type == "cpu" else 1
+def workers_for(config: Mapping[str, Any], wanted: int | None) -> Workers:
+    """As many as wanted; if that is not said, one a core, but one for all where a GPU simulates."""
+    if wanted is None:
+        wanted = available_cores() if simulation_device(config).type == "cpu" else 1
+    return Workers(wanted, config["parallel"]["backend"], config["parallel"]["address"])
 
 
-def work_on(parts: Sequence[Part], function: Callable[[Part], March], processes: int) -> None:
+def work_on(parts: Sequence[Part], function: Callable[[Part], March], workers: Workers) -> None:
     """Marches through those parts that are not done yet.
 
     Args:
         parts: each with its own file.
         function: makes the march of a part; defined at the top of a module.
-        processes: at most so many at once.
+        workers: that share them.
 
     Raises:
         ConvergenceError, WorkerError: a part could not be done.
@@ -191,14 +192,13 @@ def work_on(parts: Sequence[Part], function: Callable[[Part], March], processes:
     left = [part for part in parts if not part.done]
     total, missing = (sum(part.frames * len(part.names) for part in some) for some in (parts, left))
     with Progress(parts[0].context.name, total, "frames", total - missing) as progress:
-        if processes == 1 or len(parts) == 1:
+        if workers.alone or (workers.backend == "local" and len(parts) == 1):
             with threadpool_limits(1):  # As in a worker process: the same numbers, however many there are.
                 for part in left:
                     part.write(function(part), progress.advance)
             return
-        crew, memory = max(min(processes, len(left)), 1), parts[0].context.memory
-        work = partial(_quietly, function)
-        with closing(in_processes(work, left, crew, progress.advance, memory)) as results:
+        work, crew, first = partial(_quietly, function), workers.at_most(len(left)), parts[0]
+        with closing(fan_out(work, left, crew, progress.advance, first.path.parent, first.context.memory)) as results:
             for _ in results:
                 pass
 

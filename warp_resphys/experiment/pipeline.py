@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ..io.errors import DataFileError
+from ..io.fan_out import ALONE, Workers
 from ..io.files import digest, read_json, write_json
 from ..io.stages import Stage, StageContext, package_versions, resources_used, run_stages
 from ..learning.metrics import summarise_folds
@@ -46,7 +47,7 @@ from .identify import identify
 from .importing import import_recordings, import_scaled
 from .learn import refine, train
 from .models import SIMFREE
-from .parts import processes_for
+from .parts import workers_for
 from .reconstruct import reconstruct
 from .report import collect_metrics, make_folds_report, make_report
 from .scene import LEARNED, models_of
@@ -117,7 +118,7 @@ def acquisition_stages(config: Mapping[str, Any]) -> list[Stage]:
     base, data = simulated(config), config["data"]
     if not sees_markers(config):
         return [Stage("simulate", simulate, (DATASET,), {**base, **_pick(config, "target", "data")})]
-    stages, processes = [], processes_for(config, config["parallel"]["processes"])
+    stages, workers = [], workers_for(config, config["parallel"]["processes"])
     imported = {**base, **_pick(config, "simulation", "markers")}
     imported["data"] = {key: value for key, value in data.items() if key not in _LATER_DATA} | {"input_scales": []}
     trials = trials_of(config)
@@ -126,7 +127,7 @@ def acquisition_stages(config: Mapping[str, Any]) -> list[Stage]:
     imported |= {"laboratory": config["laboratory"], "in_the_loop": config["in_the_loop"] is not None}
     if is_laboratory(config):
         files = (*(trial.recording for trial in trials), TRUTH)
-        play = partial(run_laboratory, processes=processes)
+        play = partial(run_laboratory, workers=workers)
         stages.append(Stage("laboratory", play, files, _laboratory_settings(config, ())))
     else:
         imported["recordings"] = {trial.name: _digest(trial.file, f"data.trials.{trial.name}.file") for trial in trials}
@@ -135,7 +136,7 @@ def acquisition_stages(config: Mapping[str, Any]) -> list[Stage]:
     scales = data["input_scales"]
     if scales:
         files = tuple(trial.recording for trial in scaled_trials_of(config))
-        play = partial(run_laboratory, processes=processes, scaled=True)
+        play = partial(run_laboratory, workers=workers, scaled=True)
         stages.append(Stage("laboratory_scaled", play, files, _laboratory_settings(config, scales), needs))
         more = {**imported, "data": {**imported["data"], "input_scales": scales}}
         needs = ("import", "laboratory_scaled")
@@ -165,7 +166,7 @@ def _digest(path: Path | None, key: str) -> str:
 
 
 def learning_stages(
-    config: Mapping[str, Any], split: Split, shared: str, acquired: str, processes: int | None = None
+    config: Mapping[str, Any], split: Split, shared: str, acquired: str, workers: Workers | None = None
 ) -> list[Stage]:
     """The stages of one split, from the identification to the report.
 
@@ -174,9 +175,9 @@ def learning_stages(
         split: names of trials.
         shared: the folder of dataset.h5, relative to that of the split.
         acquired: fingerprint of the stage that wrote it.
-        processes: that work at once; as the configuration says, if left out.
+        workers: that share the work; as the configuration says, if left out.
     """
-    processes = processes_for(config, config["parallel"]["processes"]) if processes is None else processes
+    workers = workers_for(config, config["parallel"]["processes"]) if workers is None else workers
     markers = sees_markers(config)
     needs = ("identify",) if config["identify"] is not None else ()
     base: dict[str, Any] = {
@@ -201,7 +202,7 @@ def learning_stages(
     for model in (each for each in models_of(config) if each in LEARNED and each != SIMFREE):
         own, first, second = {"model": model}, f"reconstruct_{model}", f"train_{model}"
         settings = {**own, **_pick(config, "reconstruction"), "reconstructed": reconstructed}
-        add(first, partial(reconstruct, processes=processes), (reconstruction_file(model),), settings)
+        add(first, partial(reconstruct, workers=workers), (reconstruction_file(model),), settings)
         settings = {**own, **networks, **training_settings(config, model)}
         add(second, train, (weights_file(model), training_file(model)), settings, first)
         if config["refinement"]["kind"] != "none":
@@ -219,7 +220,7 @@ def learning_stages(
     calibration = [*(split.validation or split.train)] if markers and folds_of(config) is None else []
     settings = {**tested, "calibration": calibration, **_pick(config, "published", "correct_uncorrected")}
     settings["data"] = {**base["data"], **_pick(config["data"], "horizons")}
-    work = partial(evaluate, processes=processes)
+    work = partial(evaluate, workers=workers)
     add("evaluate", work, (ROLLOUTS, ERRORS), settings, *learned, "reconstruct_resphys")
     if config["timing"]:
         add("time", time_models, (TIMES,), {**tested, **_pick(config, "target")}, *learned)
@@ -281,10 +282,10 @@ def _run_folds(
         name: Fold(name, folder / fold_folder(name), partial(learning_stages, config, split, "..", acquired))
         for name, split in splits.items()
     }
-    run_folds(folds, processes_for(config, config["parallel"]["processes"]))
+    run_folds(folds, workers_for(config, config["parallel"]["processes"]))
     found = {}
     for name, fold in folds.items():
-        found[name] = collect_metrics(fold.folder, config, [stage.name for stage in fold.stages(1)])
+        found[name] = collect_metrics(fold.folder, config, [stage.name for stage in fold.stages(ALONE)])
         write_json(fold.folder / METRICS, found[name])
     return {
         "errors_mm": summarise_folds([each["errors_mm"] for each in found.values()]),

@@ -14,6 +14,7 @@ from typing_extensions import override
 from ..dynamics.inputs import Inputs
 from ..dynamics.integrator import State
 from ..dynamics.simulator import Simulator
+from ..io.fan_out import ALONE, Workers
 from ..io.files import atomic_hdf5, create, write_json
 from ..io.resumable import Field
 from ..io.stages import StageContext
@@ -33,7 +34,7 @@ _FOR_EVER = 1e6  # s
 _UNHELD = 0.1  # mm, by which replayed markers may be further off than reconstructed ones
 
 
-def reconstruct(context: StageContext, processes: int = 1) -> None:
+def reconstruct(context: StageContext, workers: Workers = ALONE) -> None:
     """Writes reconstruction_<model>.h5: q, v and force (R, K + 1, N, 3), and adds to reconstruction.json.
 
     The force of a frame is the one that led to it; that of the first frame is zero. Forces from markers are kept in
@@ -49,7 +50,7 @@ def reconstruct(context: StageContext, processes: int = 1) -> None:
         last = float(scene.trials(names).times.max()) / scene.model_simulator(model).time_step
         frames = max(scene.learned_steps(int(last + 1e-6)), 1) + 1
         parts += split_into_parts(context, names, frames, f"part{number}")
-    work_on(parts, _OfTrials, processes)
+    work_on(parts, _OfTrials, workers)
     order = [name for part in parts for name in part.names]
     held = scene.moving(settings["split"]["validation"])
     rows = [row for row, name in enumerate(order) if name in held]

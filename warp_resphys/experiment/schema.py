@@ -16,6 +16,7 @@ from ..dynamics.simulator import COUPLINGS
 from ..fem.body import MASS_MODES
 from ..fem.elements import VOLUME_INTEGRATIONS
 from ..io.errors import InputError
+from ..io.fan_out import BACKENDS
 from ..learning.networks import ACTIVATIONS, FORCE_BASES, NETWORK_KINDS
 from ..learning.refinement import REFINEMENTS
 from ..learning.training import SCHEDULES, SELECTIONS
@@ -520,7 +521,13 @@ def configuration_group(config: Mapping[str, Any]) -> Group:
             "release": _RELEASE,
             "markers": optional(_MARKERS),
             "actuation": Group({"filter_time_constants": _POSITIVES, "sees_payload": TRUTH_VALUE}),
-            "parallel": Group(dict.fromkeys(("processes", "batch"), optional(NATURAL))),
+            "parallel": Group(
+                {
+                    **dict.fromkeys(("processes", "batch"), optional(NATURAL)),
+                    "backend": one_of(*BACKENDS),
+                    "address": optional(WORD),
+                }
+            ),
             "published": Group(
                 {"simulation": MATERIAL, "physics": _PHYSICS, "integrator": one_of(*INTEGRATORS)}, optional=True
             ),

@@ -26,6 +26,7 @@ from ..dynamics.inputs import Inputs
 from ..dynamics.integrator import State
 from ..dynamics.simulator import Simulator
 from ..io.errors import InputError
+from ..io.fan_out import ALONE, Workers
 from ..io.files import write_json
 from ..io.resumable import Field
 from ..io.stages import StageContext
@@ -58,7 +59,7 @@ def simulate(context: StageContext) -> None:
         for each in poses:
             check_steps(each, points, "data.base_motion")
     parts = split_into_parts(context, names, frames)
-    work_on(parts, _Free, 1)
+    work_on(parts, _Free, ALONE)
     observed = read_parts(parts, "observed")
     Dataset(
         names,
@@ -188,12 +189,12 @@ class Setup:
         return self.frame.apply(np.concatenate([positions, standing], axis=1))
 
 
-def run_laboratory(context: StageContext, processes: int = 1, scaled: bool = False) -> None:
+def run_laboratory(context: StageContext, workers: Workers = ALONE, scaled: bool = False) -> None:
     """Writes the recording of every trial, and truth.json.
 
     Args:
         context: of the stage.
-        processes: that share the trials.
+        workers: that share the trials.
         scaled: whether the trials are those at scaled inputs; truth.json is there then.
 
     Raises:
@@ -206,7 +207,7 @@ def run_laboratory(context: StageContext, processes: int = 1, scaled: bool = Fal
     for begins in dict.fromkeys(trial.begins for trial in trials):
         names = [trial.name for trial in trials if trial.begins == begins]
         parts += split_into_parts(context, names, _frames_of(settings, begins), begins)
-    work_on(parts, _Played, processes)
+    work_on(parts, _Played, workers)
     setup = make_setup(settings)
     written = {name: row for part in parts for name, row in zip(part.names, part.read("markers"), strict=True)}
     noise = [_record(context, setup, trial, written[trial.name]) for trial in trials]

@@ -9,9 +9,12 @@ from pathlib import Path
 
 import torch
 
-from .processes import available_cores
-
 _CPU_INFO = Path("/proc/cpuinfo")
+
+
+def available_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def hardware() -> dict[str, str]:

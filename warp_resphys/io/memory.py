@@ -4,6 +4,7 @@ import re
 import resource
 import sys
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,6 +27,12 @@ def peak_memory_gib() -> float:
     if known:
         return int(known[1]) / 2**20
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**30 if sys.platform == "darwin" else 2**20)
+
+
+def forget_peak_memory() -> None:
+    """From now on `peak_memory_gib` tells what comes, where the system can do that."""
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
 
 
 def available_memory_gib() -> float:

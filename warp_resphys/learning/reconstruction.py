@@ -131,7 +131,7 @@ class LeastSquares(Reconstructor):
     ) -> Reconstruction:
         acting, constants = inputs or Inputs(), self._constants
         step = Step(self.simulator, constants, state, acting, observed, self.regularisation, self.markers, self._basis)
-        with threads_for(state.q.numel()), torch.no_grad():
+        with threads_for(state.q[0].numel()), torch.no_grad():
             for number, kind in enumerate(self._problems, 1):
                 problem = kind(step)
                 found = minimise(problem, problem.start(first_guess), self.tolerance, self.max_iterations)

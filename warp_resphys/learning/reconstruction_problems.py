@@ -121,7 +121,7 @@ class FullStateProblem(StepProblem):
             preconditioner,
             self._target - x - weight * step.product(force),
             tolerance=1e-6,
-        )
+        ).x
         return lambda damping: x + change / (1.0 + damping)[:, None, None]
 
 

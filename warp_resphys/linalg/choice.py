@@ -1,24 +1,27 @@
 """Which linear solver: by name, or the cheapest for a pattern and a device.
 
 The bodies of this field are slender: with a bandwidth-reducing order, LAPACK's banded Cholesky is the cheapest choice
-on a CPU up to tens of thousands of unknowns, and one in tiles on a GPU. Wide meshes go to CHOLMOD (cholespy), the
-smallest on a GPU to batched dense Cholesky.
+on a CPU up to tens of thousands of unknowns, and one in tiles on a GPU. Larger bodies go to multigrid on a CPU and to
+CHOLMOD (cholespy) on a GPU, the smallest on a GPU to batched dense Cholesky.
 """
 
 from collections.abc import Callable
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from ..io.errors import InputError
 from .banded import BandedSolver
 from .dense import DenseSolver
 from .linear_solver import Indices, LinearSolver, bandwidth_reducing_order
+from .multigrid import MultigridSolver
 from .sparse import SparseSolver
 from .tiled import TILE, TiledSolver
 
-LINEAR_SOLVERS = ("auto", "banded", "tiled", "dense", "sparse")
-WIDEST_BAND = 600  # beyond which CHOLMOD's factor is the cheaper one
+LINEAR_SOLVERS = ("auto", "banded", "tiled", "dense", "sparse", "multigrid")
+DEAREST_BAND = 4e10  # multiplications of a banded factor on a CPU, beyond which multigrid is the cheaper one
+WIDEST_BAND = 600  # unknowns, beyond which tiles of a band hold mostly fill on a GPU
 MOST_DENSE = 4000  # unknowns
 
 
@@ -30,6 +33,7 @@ def make_linear_solver(
     block: int,
     device: torch.device,
     dtype: torch.dtype,
+    positions: NDArray[np.float64] | None = None,
 ) -> LinearSolver:
     """Builds the named solver; ``auto`` takes the cheapest for the pattern and device.
 
@@ -47,22 +51,23 @@ def make_linear_solver(
         "tiled": TiledSolver,
         "dense": DenseSolver,
         "sparse": SparseSolver,
+        "multigrid": MultigridSolver,
     }
-    return solvers[name](rows, cols, n_nodes, block, device, dtype)
+    return solvers[name](rows, cols, n_nodes, block, device, dtype, positions)
 
 
 def _cheapest(rows: Indices, cols: Indices, n_nodes: int, block: int, device: torch.device) -> str:
     """By what a factor takes of memory, and by the operations that a wide band costs.
 
     A band of width w takes n w numbers and n w^2 operations, dense n^2 and n^3 / 3; where the band is wide, a sparse
-    factor fills in less. The limits on a CPU were measured; those on a GPU are arithmetic.
+    factor fills in less. The limit on a CPU was measured (``warp-resphys size-study``); those on a GPU are arithmetic.
     """
     order = bandwidth_reducing_order(rows, cols, n_nodes)
     place = np.argsort(order)
     bandwidth = block * int(np.abs(place[rows] - place[cols]).max(initial=0) + 1)
     unknowns = n_nodes * block
     if device.type == "cpu":
-        return "banded" if bandwidth <= WIDEST_BAND else "sparse"
+        return "banded" if unknowns * bandwidth**2 <= DEAREST_BAND else "multigrid"
     if bandwidth + 2 * TILE <= min(unknowns // 2, WIDEST_BAND):
         return "tiled"
     return "dense" if unknowns <= MOST_DENSE else "sparse"

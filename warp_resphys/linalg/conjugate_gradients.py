@@ -1,10 +1,19 @@
 """Conjugate gradients for a batch of systems that are known by their products alone."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 
 LinearMap = Callable[[torch.Tensor], torch.Tensor]
+
+
+class Iterate(NamedTuple):
+    """Where the iterations of a batch ended."""
+
+    x: torch.Tensor  # (B, ...)
+    converged: torch.Tensor  # (B,) bool
+    iterations: int  # until the last of them stopped
 
 
 def conjugate_gradients(
@@ -13,32 +22,49 @@ def conjugate_gradients(
     right: torch.Tensor,
     tolerance: float,
     max_iterations: int = 500,
-) -> torch.Tensor:
+) -> Iterate:
     """Preconditioned conjugate gradients for a batch of symmetric positive definite systems.
 
+    A system whose operator turns out not to be positive definite keeps the iterate before: it has come closer to the
+    solution along directions of positive curvature (Steihaug 1983), or is a step of the preconditioner if the first
+    direction is none.
+
     Args:
-        operator: (B, N, 3) to (B, N, 3).
-        preconditioner: approximate inverse of it.
-        right: (B, N, 3) right-hand sides.
+        operator: (B, ...) to (B, ...).
+        preconditioner: approximate inverse of it, positive definite.
+        right: (B, ...) right-hand sides.
         tolerance: relative, in the preconditioner's norm.
         max_iterations: the last iterate is returned after that many.
     """
+
+    def dot(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+        return (a * b).flatten(1).sum(1)
+
+    spread = (-1, *(1,) * (right.ndim - 1))
+    tiny = torch.finfo(right.dtype).tiny
     x = torch.zeros_like(right)
     r = right.clone()
     z = preconditioner(r)
     d = z.clone()
-    rz = (r * z).sum((1, 2))
+    rz = dot(r, z)
     goal = tolerance**2 * rz
-    for _ in range(max_iterations):
-        if bool((rz <= goal).all()):
+    curved = torch.zeros_like(rz, dtype=torch.bool)
+    count = 0
+    for count in range(max_iterations + 1):
+        going = (rz > goal) & ~curved
+        if count == max_iterations or not bool(going.any()):
             break
         hd = operator(d)
-        curvature = (d * hd).sum((1, 2))
-        step = torch.where(rz > goal, rz / curvature.clamp_min(torch.finfo(r.dtype).tiny), 0.0)
-        x += step[:, None, None] * d
-        r -= step[:, None, None] * hd
+        curvature = dot(d, hd)
+        bent = going & ~(curvature > 0.0)
+        if count == 0 and bool(bent.any()):
+            x += torch.where(bent.view(spread), z, 0.0)
+        curved |= bent
+        step = torch.where(going & ~bent, rz / curvature.clamp_min(tiny), 0.0).view(spread)
+        x += step * d
+        r -= step * hd
         z = preconditioner(r)
-        following = (r * z).sum((1, 2))
-        d = z + (following / rz.clamp_min(torch.finfo(r.dtype).tiny))[:, None, None] * d
+        following = dot(r, z)
+        d = z + (following / rz.clamp_min(tiny)).view(spread) * d
         rz = following
-    return x
+    return Iterate(x, (rz <= goal) & ~curved, count)

@@ -75,6 +75,7 @@ class LinearSolver(ABC):
         block: unknowns a node (3 for a Hessian, 1 for a projective-dynamics matrix).
         device: where values and right-hand sides live.
         dtype: their type.
+        positions: (n_nodes, 3) of the nodes [m], for solvers that make use of them.
 
     Raises:
         InputError: a matrix too large for the layout.
@@ -83,6 +84,7 @@ class LinearSolver(ABC):
         address: (E, block^2) place of each block's entries in the value array, -1 where not stored.
         n_values: length of the value array.
         overwrites: whether `factor` writes over the values.
+        iterates: whether a factor costs little beside its solutions, which are found by iterations.
         order: (n_nodes,) node at each place of its right-hand sides `in place <Factor.solve_in_place>`.
     """
 
@@ -90,10 +92,19 @@ class LinearSolver(ABC):
     n_values: int
     order: Indices
     overwrites = False
+    iterates = False
 
     def __init__(
-        self, rows: Indices, cols: Indices, n_nodes: int, block: int, device: torch.device, dtype: torch.dtype
+        self,
+        rows: Indices,
+        cols: Indices,
+        n_nodes: int,
+        block: int,
+        device: torch.device,
+        dtype: torch.dtype,
+        positions: NDArray[np.float64] | None = None,
     ) -> None:
+        self.positions = positions
         self.n = n_nodes * block
         self.block = block
         self.device = device

@@ -64,16 +64,7 @@ class _SparseFactor(Factor):
                 if cholmod is not None:
                     self._factors.append(_cholmod_factor(cholmod, solver, entries))
                     continue
-                lu = scipy.sparse.linalg.splu(
-                    solver.matrix(entries),
-                    permc_spec="MMD_AT_PLUS_A",
-                    diag_pivot_thresh=0.0 if definite else 1.0,
-                    options={"SymmetricMode": definite},
-                )
-                # Without pivoting a symmetric matrix is positive definite where every pivot is positive.
-                if definite and not (lu.U.diagonal() > 0).all():
-                    raise ValueError("a pivot is not positive")
-                self._factors.append(lu)
+                self._factors.append(sparse_lu(solver.matrix(entries), definite))
             except (ValueError, RuntimeError):
                 self.failed[i] = True
                 self._factors.append(None)
@@ -101,6 +92,25 @@ class _SparseFactor(Factor):
             solutions.append(solution.to(self._device, self._dtype))
         stacked = torch.stack(solutions)
         return stacked.reshape(n, b, m).permute(1, 0, 2) if shared else stacked
+
+
+def sparse_lu(matrix: scipy.sparse.csc_array, definite: bool) -> Any:
+    """SuperLU's factor of a symmetric matrix.
+
+    Raises:
+        ValueError: it is to be positive definite, and is not.
+        RuntimeError: it is singular.
+    """
+    lu = scipy.sparse.linalg.splu(
+        matrix,
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0 if definite else 1.0,
+        options={"SymmetricMode": definite},
+    )
+    # Without pivoting a symmetric matrix is positive definite where every pivot is positive.
+    if definite and not (lu.U.diagonal() > 0).all():
+        raise ValueError("a pivot is not positive")
+    return lu
 
 
 def _cholespy() -> Any:

@@ -16,16 +16,16 @@ from ..io.errors import InputError
 S = TypeVar("S")
 T = TypeVar("T")
 
-_WORTH_SHARING = 200_000  # unknowns of a batch
+_WORTH_SHARING = 9_000  # unknowns of a body
 _LEAST_ENVIRONMENTS = 2  # of a shard
 
 
 @contextmanager
 def threads_for(unknowns: int) -> Iterator[None]:
-    """Torch and BLAS on one thread while vectors of this size are worked on, if that is too small to share.
+    """BLAS on one thread, and torch too while bodies of so few unknowns are worked on that they are not worth sharing.
 
-    Threads that spin for one another's share of a microsecond's work take milliseconds when the cores are busy, and the
-    band of a slender body is always too narrow.
+    Threads that spin for one another's share of a microsecond's work take milliseconds when the cores are busy, and a
+    banded factor gains nothing from a second one.
     """
     before = torch.get_num_threads()
     with _blas().limit(limits=1, user_api="blas"):

@@ -46,6 +46,7 @@ from ..io.machine import hardware
 from ..io.progress import Progress
 from ..io.stages import package_versions
 from ..linalg.choice import make_linear_solver
+from ..linalg.threads import threads_for
 from .command import show, table_of
 
 PARTS: Final = ("local_step", "tangent", "assembly", "factor", "solve")
@@ -271,7 +272,14 @@ def _time_parts(case: Case, repeats: int) -> dict[str, Any]:
     potential, pattern = workspace.gather(), workspace.pattern
     device = potential.device
     linear = make_linear_solver(
-        sim.settings.linear_solver, pattern.rows, pattern.cols, len(pattern.free), 3, device, sim.dtype
+        sim.settings.linear_solver,
+        pattern.rows,
+        pattern.cols,
+        len(pattern.free),
+        3,
+        device,
+        sim.dtype,
+        pattern.positions,
     )
     assemble = HessianAssembly(potential, linear, pattern)
     potential.update_tangent()
@@ -285,7 +293,8 @@ def _time_parts(case: Case, repeats: int) -> dict[str, Any]:
         "factor": lambda: linear.factor(values.clone()),
         "solve": lambda: factor.solve(right),
     }
-    times = {f"{name}_ms": 1e3 * _median_seconds(tasks[name], repeats, device) for name in PARTS}
+    with threads_for(linear.n):  # as in a step
+        times = {f"{name}_ms": 1e3 * _median_seconds(tasks[name], repeats, device) for name in PARTS}
     return {"refinement": case.refinement, "batch": case.batch, "linear_solver": type(linear).__name__, **times}
 
 

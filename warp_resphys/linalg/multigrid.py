@@ -1,0 +1,286 @@
+"""Conjugate gradients preconditioned by algebraic multigrid: for large bodies, at a cost that grows with their size."""
+
+import warnings
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.sparse
+import torch
+from numpy.typing import NDArray
+from typing_extensions import override
+
+from .conjugate_gradients import Iterate, conjugate_gradients
+from .linear_solver import Factor, Indices
+from .sparse import SparseSolver, sparse_lu
+
+FloatArray = NDArray[np.float64]
+
+_COARSEST = 400  # unknowns, up to which a level is solved by a dense factor
+_DEGREE = 3  # of the smoother's polynomial
+_SMOOTHED = 20.0  # ratio of the largest eigenvalue to the smallest one that the smoother reduces
+_POWER_STEPS = 15  # to estimate the largest eigenvalue, which is then taken to be so much larger:
+_MARGIN = 1.1
+_MOST_ITERATIONS = 1000
+_WEAR, _FEW = 1.5, 6  # a cycle is worn once it takes so many times the iterations that it first took, or this number
+DIRECTION = 1e-2  # relative accuracy of a direction of descent
+EXACT = 1e-12  # that of a solution
+
+
+class MultigridSolver(SparseSolver):
+    """Conjugate gradients with a V-cycle of smoothed aggregation (Vanek, Mandel and Brezina 1996) by PyAMG.
+
+    The coarse spaces hold the motions of a rigid body, the near-null space of elasticity; the smoother is a Chebyshev
+    polynomial of the block-Jacobi iteration (Adams, Brezina, Hu and Tuminaro 2003). The cycle is made of sparse
+    products, which any device has, and of a dense factor of a few hundred unknowns.
+
+    Solutions are accurate to 1e-12; directions `in place <Factor.solve_in_place>`, of which a line search takes a share
+    anyway, to 1e-2. A matrix whose coarsest level or diagonal is not positive definite counts as failed. A matrix that
+    is not positive definite and has to be solved all the same gets a sparse factor.
+    """
+
+    iterates = True
+
+    @override
+    def _lay_out(self, rows: Indices, cols: Indices, n_nodes: int) -> None:
+        super()._lay_out(rows, cols, n_nodes)
+        numbers = self.matrix(torch.arange(1.0, len(self._rows) + 1.0, dtype=torch.float64))
+        blocks = scipy.sparse.bsr_array(numbers, blocksize=(self.block, self.block))
+        blocks.sort_indices()
+        self._blocks = _Layout(blocks, self.device)
+        self._scalars = _Layout(blocks.tocsr(), self.device)
+        self._near_null = _rigid_motions(self.positions, self.block, n_nodes)
+        self._cycles: dict[tuple[int, int], _Cycle] = {}
+
+    @override
+    def _factorise(
+        self, values: torch.Tensor, definite: bool, idle: torch.Tensor | None, before: Factor | None
+    ) -> Factor:
+        if not definite:
+            return super()._factorise(values, definite, idle, before)
+        kept = before if isinstance(before, _Preconditioned) else None
+        left_out = [False] * len(values) if idle is None else idle.tolist()
+        systems: list[_System | None] = []
+        for i, entries in enumerate(self.mirrored(values)):
+            if left_out[i]:
+                systems.append(None if kept is None else kept.systems[i])
+            else:
+                systems.append(self._system((len(values), i), entries.to(torch.float64)))
+        failed = [not left_out[i] and each is None for i, each in enumerate(systems)]
+        if kept is not None:
+            failed = [kept.failed[i] if left_out[i] else each for i, each in enumerate(failed)]
+        return _Preconditioned(systems, np.array(failed))
+
+    def _system(self, environment: tuple[int, int], entries: torch.Tensor) -> "_System | None":
+        """Of an environment's `mirrored` entries; None where the matrix is found not to be positive definite."""
+        if not bool(torch.isfinite(entries).all()):
+            return None
+        cycle = self._cycles.get(environment)
+        if cycle is None or cycle.worn:
+            at, columns, starts = self._blocks.source, self._blocks.columns, self._blocks.starts
+            parts = (entries[at].cpu().numpy(), columns, starts)
+            hierarchy = _hierarchy(scipy.sparse.bsr_array(parts, shape=(self.n, self.n)), self._near_null)
+            try:
+                cycle = self._cycles[environment] = _Cycle(hierarchy, self.device)
+            except torch.linalg.LinAlgError:
+                self._cycles.pop(environment, None)
+                return None
+        return _System(_of_rows(self._scalars.indices, entries[self._scalars.source], (self.n, self.n)), cycle)
+
+
+class _Layout:
+    """Where the entries of a sparse matrix come from: one whose entries are the places of these, counted from one."""
+
+    def __init__(self, places: Any, device: torch.device) -> None:
+        self.starts, self.columns = places.indptr, places.indices
+        self.source = torch.as_tensor(places.data.astype(np.int64) - 1, device=device)
+        self.indices = [torch.as_tensor(each.astype(np.int32), device=device) for each in (self.starts, self.columns)]
+
+
+class _Preconditioned(Factor):
+    """Matrices with a V-cycle each; None for those that failed or were never made."""
+
+    def __init__(self, systems: "list[_System | None]", failed: NDArray[np.bool_]) -> None:
+        self.systems, self.failed = systems, failed
+
+    @override
+    def solve(self, rhs: torch.Tensor) -> torch.Tensor:
+        b, n, m = rhs.shape
+        shared = len(self.systems) == 1
+        columns = rhs.permute(1, 0, 2).reshape(1, n, b * m) if shared else rhs
+        found = torch.stack([_solved(each, right.mT).mT for each, right in zip(self.systems, columns, strict=True)])
+        return found.reshape(n, b, m).permute(1, 0, 2) if shared else found
+
+    @override
+    def solve_in_place(self, columns: torch.Tensor) -> None:
+        rows = columns[None] if len(self.systems) == 1 else columns[:, None]
+        for system, right in zip(self.systems, rows, strict=True):
+            right.copy_(torch.full_like(right, torch.nan) if system is None else system.direction(right.double()))
+
+
+def _solved(system: "_System | None", right: torch.Tensor) -> torch.Tensor:
+    """(m, n) for right-hand sides (m, n)."""
+    return torch.full_like(right, torch.nan) if system is None else system.solve(right.double()).to(right.dtype)
+
+
+class _System:
+    """A matrix, and a V-cycle of it or of one before."""
+
+    def __init__(self, matrix: torch.Tensor, cycle: "_Cycle") -> None:
+        self._matrix, self._cycle = matrix, cycle
+        self._lu: Any = None
+
+    def direction(self, right: torch.Tensor) -> torch.Tensor:
+        """(m, n) roughly the solutions for (m, n) right-hand sides, and never uphill of them."""
+        return self._iterate(right, DIRECTION).x
+
+    def solve(self, right: torch.Tensor) -> torch.Tensor:
+        """(m, n) the solutions for (m, n) right-hand sides; by a sparse factor where the iterations do not converge.
+
+        Those of a matrix that has no factor either are not finite.
+        """
+        if self._lu is None:
+            found = self._iterate(right, EXACT)
+            if bool(found.converged.all()):
+                return found.x
+            matrix = self._matrix.cpu()
+            parts = (matrix.values().numpy(), matrix.col_indices().numpy(), matrix.crow_indices().numpy())
+            try:
+                self._lu = sparse_lu(scipy.sparse.csr_array(parts, shape=matrix.shape).tocsc(), definite=False)
+            except RuntimeError:
+                return torch.full_like(right, torch.nan)
+        found = self._lu.solve(np.ascontiguousarray(right.cpu().numpy().T))
+        return torch.as_tensor(found.T, device=right.device)
+
+    def _iterate(self, right: torch.Tensor, tolerance: float) -> Iterate:
+        matrix, cycle = self._matrix, self._cycle
+        found = conjugate_gradients(
+            lambda x: _times(matrix, x), cycle.apply, right, tolerance, max_iterations=_MOST_ITERATIONS
+        )
+        cycle.note(found.iterations, tolerance)
+        return found
+
+
+class _Level(NamedTuple):
+    """One of the matrices of a hierarchy, with what its smoother needs and the way to the next one."""
+
+    matrix: torch.Tensor  # (n, n) sparse
+    inverse: torch.Tensor  # (n / k, k, k) of its diagonal blocks
+    largest: float  # eigenvalue of the block-Jacobi iteration
+    prolongation: torch.Tensor  # (n, n') sparse
+    restriction: torch.Tensor  # (n', n) its transpose
+
+
+class _Cycle:
+    """A V-cycle of a matrix; it serves later ones too, until it is worn.
+
+    Raises:
+        torch.linalg.LinAlgError: the matrix is not positive definite, as far as its diagonals and coarsest level tell.
+
+    Attributes:
+        worn: whether iterations have become so many that a new one is worth its making.
+    """
+
+    def __init__(self, hierarchy: Any, device: torch.device) -> None:
+        *finer, coarsest = hierarchy.levels
+        self._levels = [_level(each, device) for each in finer]
+        self._coarsest = torch.linalg.cholesky(torch.as_tensor(coarsest.A.toarray(), device=device))
+        self._fresh: dict[float, int] = {}
+        self.worn = not finer  # The factor of a small matrix costs nothing, and serves no other.
+
+    def note(self, iterations: int, tolerance: float) -> None:
+        """Notes how many iterations it took."""
+        self.worn |= iterations > _WEAR * self._fresh.setdefault(tolerance, max(iterations, _FEW))
+
+    def apply(self, right: torch.Tensor, k: int = 0) -> torch.Tensor:
+        """(m, n) from (m, n): the cycle from zero on level k."""
+        if k == len(self._levels):
+            return torch.cholesky_solve(right.mT, self._coarsest).mT
+        level = self._levels[k]
+        x = _smooth(level, right)
+        coarse = self.apply(_times(level.restriction, right - _times(level.matrix, x)), k + 1)
+        x = x + _times(level.prolongation, coarse)
+        return x + _smooth(level, right - _times(level.matrix, x))
+
+
+def _times(matrix: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
+    """(m, n') products of a matrix (n', n) with each of (m, n)."""
+    return (matrix @ x[0])[None] if len(x) == 1 else (matrix @ x.mT).mT
+
+
+def _smooth(level: _Level, right: torch.Tensor) -> torch.Tensor:
+    """(m, n) a Chebyshev polynomial of the block-Jacobi iteration, from zero (Saad 2003, algorithm 12.1)."""
+    least = level.largest / _SMOOTHED
+    middle, half = 0.5 * (level.largest + least), 0.5 * (level.largest - least)
+    ratio = middle / half
+    rho = 1.0 / ratio
+    residual = right
+    step = _block_diagonal(level.inverse, residual) / middle
+    x = step
+    for _ in range(_DEGREE - 1):
+        residual = residual - _times(level.matrix, step)
+        following = 1.0 / (2.0 * ratio - rho)
+        step = following * rho * step + (2.0 * following / half) * _block_diagonal(level.inverse, residual)
+        x, rho = x + step, following
+    return x
+
+
+def _block_diagonal(blocks: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
+    """(m, n) products of the blocks (n / k, k, k) with each of (m, n)."""
+    return (blocks @ x.view(len(x), -1, blocks.shape[1], 1)).view_as(x)
+
+
+def _level(level: Any, device: torch.device) -> _Level:
+    """Of one of PyAMG's."""
+    a = level.A
+    row = np.repeat(np.arange(len(a.indptr) - 1), np.diff(a.indptr))
+    blocks = torch.as_tensor(a.data[row == a.indices], device=device)
+    inverse = torch.cholesky_inverse(torch.linalg.cholesky(blocks))
+    matrix = _sparse(a, device)
+    x = 1.0 + torch.sin(torch.arange(a.shape[0], device=device, dtype=torch.float64))[None]
+    for _ in range(_POWER_STEPS):
+        x = _block_diagonal(inverse, _times(matrix, x / torch.linalg.vector_norm(x)))
+    largest = _MARGIN * float(torch.linalg.vector_norm(x))
+    return _Level(matrix, inverse, largest, _sparse(level.P, device), _sparse(level.P.T, device))
+
+
+def _sparse(matrix: Any, device: torch.device) -> torch.Tensor:
+    """On the device, with indices of 32 bits, which its libraries take as they are."""
+    rows = scipy.sparse.csr_array(matrix)
+    indices = [torch.as_tensor(each.astype(np.int32), device=device) for each in (rows.indptr, rows.indices)]
+    return _of_rows(indices, torch.as_tensor(rows.data, device=device), rows.shape)
+
+
+def _of_rows(indices: Sequence[torch.Tensor], values: torch.Tensor, shape: tuple[int, int]) -> torch.Tensor:
+    """A sparse matrix from where its rows start, its columns, and its entries."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")
+        starts, columns = indices
+        return torch.sparse_csr_tensor(starts, columns, values, size=shape, check_invariants=False)
+
+
+def _hierarchy(matrix: scipy.sparse.bsr_array, near_null: FloatArray) -> Any:
+    """PyAMG's levels, the same on every run: weights by row in place of an eigenvalue from random numbers."""
+    from pyamg.aggregation import smoothed_aggregation_solver
+
+    return smoothed_aggregation_solver(
+        matrix,
+        B=near_null,
+        strength=("symmetric", {"theta": 0.0}),
+        smooth=("jacobi", {"omega": 4.0 / 3.0, "weighting": "local"}),
+        presmoother=None,
+        postsmoother=None,
+        improve_candidates=None,
+        max_coarse=_COARSEST // near_null.shape[1],  # in nodes of as many unknowns
+        max_levels=20,
+    )
+
+
+def _rigid_motions(positions: FloatArray | None, block: int, n_nodes: int) -> FloatArray:
+    """(n, k) translations; (n, 6) with rotations, where there are three unknowns a node at known positions."""
+    translations = np.tile(np.eye(block), (n_nodes, 1))
+    if positions is None or block != 3:
+        return translations
+    arm = positions - positions.mean(axis=0)
+    arm = arm / np.abs(arm).max()
+    return np.hstack([translations, np.cross(np.eye(3)[None], arm[:, None]).transpose(0, 2, 1).reshape(-1, 3)])

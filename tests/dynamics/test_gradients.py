@@ -24,6 +24,7 @@ from warp_resphys import (
     cli,
     select_vertices,
 )
+from warp_resphys.dynamics import equilibrium
 from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.dynamics.integrator import INTEGRATORS
 from warp_resphys.studies.gradient_check import (
@@ -56,6 +57,32 @@ KINDS = [
 def simulator(kind="hexahedron", material=DAMPED, **options):
     mesh = MESHES[kind]
     return Simulator(Body(mesh, fixed=select_vertices(mesh, x=0.0)), material, **({"solver": TIGHT} | options))
+
+
+@pytest.mark.numerics
+@pytest.mark.parametrize("poissons_ratio", [0.45, 0.499])
+@pytest.mark.parametrize("pose_name", ["rest", "twisted"])
+def test_factors_in_single_precision_give_gradients_in_double(pose_name, poissons_ratio):
+    material = replace(DAMPED, poissons_ratio=poissons_ratio)
+    both = []
+    for factors in ("single", "double"):
+        sim = simulator(material=material, solver=replace(TIGHT, factors=factors))
+        state = pose(sim, pose_name, 2)
+        q = state.q.clone().requires_grad_(True)
+        end = sim.rollout(State(q, state.v), 3)
+        both.append(torch.autograd.grad((end.q[-1] ** 2).sum() + end.v[-1].sum(), q)[0])
+    torch.testing.assert_close(both[0], both[1], rtol=0.0, atol=1e-9 * float(both[1].abs().max()))
+
+
+def test_an_adjoint_that_single_precision_cannot_solve_is_solved_in_double(monkeypatch):
+    monkeypatch.setattr(equilibrium, "_REFINEMENTS", 0)
+    gradients = []
+    for factors in ("single", "double"):
+        sim = simulator(solver=replace(TIGHT, factors=factors))
+        state = pose(sim, "bent", 1)
+        q = state.q.clone().requires_grad_(True)
+        gradients.append(torch.autograd.grad((sim.rollout(State(q, state.v), 2).q[-1] ** 2).sum(), q)[0])
+    torch.testing.assert_close(*gradients, rtol=0.0, atol=1e-11)
 
 
 def assert_equal(rows):

@@ -62,7 +62,7 @@ def test_overflow_is_not_convergence():
     assert not report.converged.any()
 
 
-@pytest.mark.parametrize("linear_solver", ["banded", "dense", "sparse"])
+@pytest.mark.parametrize("linear_solver", ["banded", "tiled", "dense", "sparse", "multigrid"])
 def test_a_singular_system_is_a_convergence_error_with_every_linear_solver(linear_solver):
     hinged = Body(MESH, fixed=[0])
     sim = Simulator(hinged, RUBBER, solver=SolverSettings(linear_solver=linear_solver, max_iterations=20))

@@ -23,6 +23,8 @@ T = TypeVar("T")
 Shard = tuple[slice, "Workspace"]
 
 _LEAST_SHARE = 1.0 / 64.0  # of the loads, by which they grow where all of them at once lead nowhere
+_REFINEMENTS = 8  # of an adjoint by a factor in float32, after which one in float64 takes its place
+_REFINED = 1e-12  # relative residual
 
 
 class Workspace:
@@ -87,16 +89,17 @@ class Workspace:
             (purpose, settings), lambda: NonlinearSolver(self.potential, self.pattern, settings, self.dtype)
         )
 
-    def hessian(self, linear_solver: str) -> ExactHessian:
+    def hessian(self, linear_solver: str, dtype: torch.dtype = torch.float64) -> ExactHessian:
         """The exact Hessian, for adjoint solves."""
         return self.once(
-            linear_solver, lambda: ExactHessian(self.potential, self.pattern, self.linear_solver(linear_solver))
+            (linear_solver, dtype),
+            lambda: ExactHessian(self.potential, self.pattern, self.linear_solver(linear_solver, dtype)),
         )
 
-    def linear_solver(self, name: str) -> LinearSolver:
+    def linear_solver(self, name: str, dtype: torch.dtype = torch.float64) -> LinearSolver:
         """A new solver of the named kind for the Hessian's structure."""
         p, k = self.potential, self.pattern
-        return make_linear_solver(name, k.rows, k.cols, len(k.free), 3, p.device, torch.float64, k.positions)
+        return make_linear_solver(name, k.rows, k.cols, len(k.free), 3, p.device, dtype, k.positions)
 
 
 def equilibrium(
@@ -202,7 +205,7 @@ class _Equilibrium(torch.autograd.Function):
             found = in_threads(solve, parts)
         reports.append(SolveReport.of([report for _, report in found]))
         x = found[0][0] if len(found) == 1 else torch.cat([each for each, _ in found])
-        ctx.workspace, ctx.names, ctx.linear_solver = workspace, names, settings.linear_solver
+        ctx.workspace, ctx.names, ctx.settings = workspace, names, settings
         ctx.save_for_backward(x, *terms)
         return x
 
@@ -214,13 +217,17 @@ class _Equilibrium(torch.autograd.Function):
         x, saved = x.detach(), [None if each is None else each.detach() for each in saved]
         needed = ctx.needs_input_grad[6:]
 
-        parts = [(rows, own, own.hessian(ctx.linear_solver)) for rows, own in ctx.workspace.parts]
+        types = (torch.float32, torch.float64) if ctx.settings.factors == "single" else (torch.float64,)
+        parts = [
+            (rows, own, [own.hessian(ctx.settings.linear_solver, each) for each in types])
+            for rows, own in ctx.workspace.parts
+        ]
         for _, own, _ in parts:
             own.potential.prepare_adjoint()
 
-        def differentiate(part: tuple[slice, Workspace, ExactHessian]) -> tuple[torch.Tensor | None, ...]:
-            rows, own, hessian = part
-            return _adjoint(own, hessian, ctx.names, needed, *(_rows(each, rows) for each in (gradient, x, *saved)))
+        def differentiate(part: tuple[slice, Workspace, list[ExactHessian]]) -> tuple[torch.Tensor | None, ...]:
+            rows, own, hessians = part
+            return _adjoint(own, hessians, ctx.names, needed, *(_rows(each, rows) for each in (gradient, x, *saved)))
 
         try:
             with threads_for(gradient[0].numel()):
@@ -262,7 +269,7 @@ def _solve(
 
 def _adjoint(
     workspace: Workspace,
-    hessian: ExactHessian,
+    hessians: Sequence[ExactHessian],
     names: tuple[str, ...],
     needed: Sequence[bool],
     gradient: Any,
@@ -274,11 +281,8 @@ def _adjoint(
     potential = workspace.potential
     potential.set_terms(terms)
     potential.positions.copy_(x)
-    hessian.refactor_exact()
     gradient = gradient.double()
-    z = hessian.solve(gradient.reshape(len(x), -1, 1)).view_as(x)
-    product = potential.stiffness_product(z)
-    _check_adjoint(potential, z, product, gradient)
+    z, product = _adjoint_solution(potential, hessians, gradient)
     fixed, target, inertia, force, *values = needed
     slopes = potential.value_adjoint(z) if any(values) else {}
     of_values: list[torch.Tensor | None] = []
@@ -297,21 +301,41 @@ def _adjoint(
     )
 
 
-def _check_adjoint(
-    potential: IncrementalPotential, z: torch.Tensor, product: torch.Tensor, gradient: torch.Tensor
-) -> None:
-    """Refuses an adjoint that does not solve its system.
+def _adjoint_solution(
+    potential: IncrementalPotential, hessians: Sequence[ExactHessian], gradient: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """(B, N, 3) the adjoint z at the potential's positions [m], and its product with the stiffness [N].
+
+    Args:
+        potential: with the terms and positions of the solution.
+        hessians: to be tried in turn; what is solved with a factor in float32 is refined until it is accurate.
+        gradient: (B, N, 3) of the loss by the positions.
 
     Raises:
         ConvergenceError: the Hessian is singular, as where a body can turn about its only fixed vertex.
     """
-    right = gradient * potential.free_mask[:, None]
-    left = (product + potential.inertia[..., None] * z) * potential.free_mask[:, None]
-    error = (left - right).flatten(1).norm(dim=1)
-    if not bool((error <= 1e-6 * right.flatten(1).norm(dim=1)).all()):
-        raise ConvergenceError(
-            "the adjoint system is singular at a state of the roll-out, so that there is no gradient: fix the body so "
-            "that it cannot move freely, or keep away from the point where it buckles.",
-            potential.positions.clone(),
-            None,
-        )
+    mask = potential.free_mask[:, None]
+    right = gradient * mask
+    size = right.flatten(1).norm(dim=1)
+
+    def solved(hessian: ExactHessian, rest: torch.Tensor) -> torch.Tensor:
+        return hessian.solve(rest.reshape(len(rest), -1, 1)).view_as(rest)
+
+    for hessian in hessians:
+        hessian.refactor_exact()
+        z = solved(hessian, right)
+        for _ in range(1 + _REFINEMENTS):
+            product = potential.stiffness_product(z)
+            rest = right - (product + potential.inertia[..., None] * z) * mask
+            error = rest.flatten(1).norm(dim=1)
+            if hessian.exact or bool((error <= _REFINED * size).all()):
+                break
+            z = z + solved(hessian, rest)
+        if bool((error <= (1e-6 if hessian.exact else _REFINED) * size).all()):
+            return z, product
+    raise ConvergenceError(
+        "the adjoint system is singular at a state of the roll-out, so that there is no gradient: fix the body so "
+        "that it cannot move freely, or keep away from the point where it buckles.",
+        potential.positions.clone(),
+        None,
+    )

@@ -50,10 +50,14 @@ class ExactHessian(HessianApproximation):
         potential: whose Hessian it is.
         pattern: its block structure.
         linear: solver built for that pattern with blocks of 3.
+
+    Attributes:
+        exact: whether solutions are as accurate as float64 makes them.
     """
 
     def __init__(self, potential: IncrementalPotential, pattern: BlockPattern, linear: LinearSolver) -> None:
         self._potential, self._linear = potential, linear
+        self.exact = linear.dtype == torch.float64
         self._assemble = HessianAssembly(potential, linear, pattern)
         self._dofs = pattern.unknowns(potential.device)
         self._factor: Factor | None = None

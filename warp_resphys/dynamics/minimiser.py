@@ -34,6 +34,7 @@ class Minimiser:
         memory: pairs that L-BFGS keeps; 0 for Newton's method.
         relative_tolerance: residual over balancing forces at which an environment has converged.
         absolute_tolerance: residual at which it has in any case [N].
+        epsilon: of the states' type.
         max_iterations: directions after which it is stuck.
         refactor_after: directions of a solve, more of which ask for a new factor before the next one, and three times
             as many at once; 0 asks always, None never.
@@ -47,6 +48,7 @@ class Minimiser:
         memory: int,
         relative_tolerance: float,
         absolute_tolerance: float,
+        epsilon: float,
         max_iterations: int,
         refactor_after: int | None,
     ) -> None:
@@ -80,7 +82,7 @@ class Minimiser:
         found.balance, found.norm = warp_view(p.balance, wp.float64), warp_view(p.residual_norm, wp.float64)
         found.residual = warp_view(p.residual, wp.vec3d)
         tolerances.relative, tolerances.absolute = wp.float64(relative_tolerance), wp.float64(absolute_tolerance)
-        tolerances.epsilon, tolerances.max_iterations = wp.float64(torch.finfo(dtype).eps), max_iterations
+        tolerances.epsilon, tolerances.max_iterations = wp.float64(epsilon), max_iterations
         tolerances.refactor_after = kernels.NEVER if refactor_after is None else refactor_after
 
         positions, gradient = warp_view(p.positions, wp.vec3d), warp_view(self._gradient, wp.vec3d)

@@ -32,6 +32,7 @@ from .hessian import ExactHessian, HessianApproximation, ProjectiveHessian
 from .minimiser import Minimiser
 
 SOLVERS = ("projective_dynamics", "quasi_newton", "newton")
+FACTORS = ("double", "single")
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,7 @@ class SolverSettings:
     memory: int = 12  # pairs that L-BFGS keeps
     refactor_after: int = 4  # iterations of a step above which ``quasi_newton`` factorises anew
     linear_solver: str = "auto"  # ``auto``, ``banded``, ``tiled``, ``dense``, ``sparse`` or ``multigrid``
+    factors: str = "double"  # or ``single``: factors and pairs in float32, residuals and states as they are
     on_failure: str = "raise"  # ``raise`` a `ConvergenceError`, or ``count`` the failure in the report and go on
 
     def __post_init__(self) -> None:
@@ -55,6 +57,8 @@ class SolverSettings:
             raise InputError(f"solver is {self.name!r}: choose one of {', '.join(SOLVERS)}.")
         if self.on_failure not in ("raise", "count"):
             raise InputError(f"solver.on_failure is {self.on_failure!r}: choose raise or count.")
+        if self.factors not in FACTORS:
+            raise InputError(f"solver.factors is {self.factors!r}: choose {' or '.join(FACTORS)}.")
         if self.linear_solver not in LINEAR_SOLVERS:
             raise InputError(
                 f"solver.linear_solver is {self.linear_solver!r}: choose one of {', '.join(LINEAR_SOLVERS)}."
@@ -114,16 +118,17 @@ class NonlinearSolver:
         potential: evaluated at its current terms.
         pattern: block structure of its Hessian.
         settings: see `SolverSettings`.
-        dtype: of factors and pairs.
+        dtype: of states.
     """
 
     def __init__(
         self, potential: IncrementalPotential, pattern: BlockPattern, settings: SolverSettings, dtype: torch.dtype
     ) -> None:
-        self.potential, self.settings, self.dtype = potential, settings, dtype
+        self.potential, self.settings = potential, settings
+        factors = torch.float32 if settings.factors == "single" else dtype
         self.hessian: HessianApproximation
         kind = settings.linear_solver
-        where = (potential.device, dtype, pattern.positions)
+        where = (potential.device, factors, pattern.positions)
         if settings.name == "projective_dynamics":
             linear = make_linear_solver(kind, pattern.rows, pattern.cols, len(pattern.free), 1, *where)
             self.hessian = ProjectiveHessian(potential, pattern, linear)
@@ -136,10 +141,11 @@ class NonlinearSolver:
         self._minimiser = Minimiser(
             potential,
             self.hessian,
-            dtype,
+            factors,
             memory=0 if after[settings.name] == 0 else settings.memory,
             relative_tolerance=settings.relative_tolerance,
             absolute_tolerance=settings.absolute_tolerance,
+            epsilon=torch.finfo(dtype).eps,
             max_iterations=settings.max_iterations,
             refactor_after=after[settings.name],
         )

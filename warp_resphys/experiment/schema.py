@@ -225,7 +225,7 @@ def _mesh_group(settings: Any) -> Group:
 
 _SOLVER = Group(
     {
-        **dict.fromkeys(("name", "linear_solver", "on_failure"), WORD),
+        **dict.fromkeys(("name", "linear_solver", "factors", "on_failure"), WORD),
         **dict.fromkeys(("max_iterations", "memory", "refactor_after"), NATURAL),
         "relative_tolerance": _TOLERANCE,
         "absolute_tolerance": NOT_NEGATIVE,

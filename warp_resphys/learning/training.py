@@ -179,7 +179,7 @@ class Trainer(EpochTrainer[Model]):
             if not len(samples.q):
                 raise InputError(f"the {name} split is empty: give it at least one trajectory.")
         rate, decay = config["learning_rate"], config["weight_decay"]
-        optimiser = torch.optim.Adam(model.network.parameters(), lr=rate, weight_decay=decay)
+        optimiser = torch.optim.Adam(model.network.parameters(), lr=rate, weight_decay=decay, fused=True)
         super().__init__(model, optimiser, rollout_error, config)
         self.selection = config["selection"]
         self._random = torch.Generator().manual_seed(seed)

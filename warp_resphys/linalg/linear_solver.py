@@ -114,7 +114,7 @@ class LinearSolver(ABC):
         if self.n_values > _MOST_VALUES:
             raise InputError(
                 f"a {type(self).__name__} for {self.n} unknowns needs {self.n_values:.1e} numbers, beyond the "
-                f"{_MOST_VALUES:.1e} that a kernel addresses: choose solver.linear_solver=sparse."
+                f"{_MOST_VALUES:.1e} that a kernel addresses: choose solver.linear_solver=sparse or multigrid."
             )
 
     @abstractmethod

@@ -1,4 +1,4 @@
-"""Files, stages and processes: safe files, resumable work, progress, several processes.
+"""Files, stages and workers: safe files, resumable work, progress, work for several processes or a cluster.
 
 From outside: `errors`, `files`, `resumable.ResumableHDF5`, `stages.run_stages`, `progress.Progress`.
 """

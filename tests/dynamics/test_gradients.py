@@ -25,6 +25,7 @@ from warp_resphys import (
     select_vertices,
 )
 from warp_resphys.dynamics import equilibrium
+from warp_resphys.dynamics.hessian import ExactHessian
 from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.dynamics.integrator import INTEGRATORS
 from warp_resphys.studies.gradient_check import (
@@ -72,6 +73,22 @@ def test_factors_in_single_precision_give_gradients_in_double(pose_name, poisson
         end = sim.rollout(State(q, state.v), 3)
         both.append(torch.autograd.grad((end.q[-1] ** 2).sum() + end.v[-1].sum(), q)[0])
     torch.testing.assert_close(both[0], both[1], rtol=0.0, atol=1e-9 * float(both[1].abs().max()))
+
+
+@pytest.mark.numerics
+@pytest.mark.parametrize("time_step", [0.01, 1.0])
+def test_single_precision_needs_no_factor_in_double(time_step, monkeypatch):
+    """Not even where inertia is so small that rounding leaves more than is aimed at."""
+    tried = []
+    refactor = ExactHessian.refactor_exact
+    monkeypatch.setattr(ExactHessian, "refactor_exact", lambda self: (tried.append(self.exact), refactor(self)))
+    sim = simulator(
+        material=replace(DAMPED, poissons_ratio=0.499), time_step=time_step, solver=replace(TIGHT, factors="single")
+    )
+    state = pose(sim, "bent", 2)
+    q = state.q.clone().requires_grad_(True)
+    torch.autograd.grad(sim.rollout(State(q, state.v), 2).q[-1].square().sum(), q)
+    assert tried == [False, False]
 
 
 def test_an_adjoint_that_single_precision_cannot_solve_is_solved_in_double(monkeypatch):

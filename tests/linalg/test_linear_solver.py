@@ -176,6 +176,28 @@ def test_float32_values_give_float32_solutions(device):
         np.testing.assert_allclose(found.cpu(), np.linalg.solve(dense, right.cpu()), rtol=1e-3, atol=1e-5)
 
 
+def test_indefinite_matrices_in_float32(device, cholespy):
+    dense, right = matrices(3, 0.3), torch.ones(BATCH, NODES * 3, 1, device=device)
+    for kind in layouts(device):
+        solver = make(kind, 3, device, torch.float32)
+        found = solver.factor(values_of(solver, dense), definite=False).solve(right)
+        expected = np.linalg.solve(dense, right.cpu().numpy())
+        np.testing.assert_allclose(found.cpu().numpy(), expected, rtol=0, atol=1e-3 * np.abs(expected).max())
+
+
+def test_a_correction_of_low_rank_is_as_accurate_in_place(device):
+    """Even for the right-hand sides that it changes most."""
+    dense = matrices(3, 20.0)
+    columns = torch.as_tensor(1e3 * np.random.default_rng(0).normal(size=(BATCH, NODES * 3, 1)), device=device)
+    expected = np.linalg.solve(dense + (columns @ columns.mT).cpu().numpy(), columns.cpu().numpy())
+    for kind in layouts(device):
+        solver = make(kind, 3, device)
+        in_place = columns[:, solver.unknowns, 0].contiguous()
+        solver.factor(values_of(solver, dense), columns=columns).solve_in_place(in_place)
+        wanted = expected[:, solver.unknowns.cpu().numpy(), 0]
+        np.testing.assert_allclose(in_place.cpu(), wanted, rtol=0, atol=1e-6 * np.abs(wanted).max())
+
+
 def test_band_is_as_narrow_as_the_order_allows():
     rows, cols = pattern()
     order = bandwidth_reducing_order(rows, cols, NODES)

@@ -24,7 +24,7 @@ Shard = tuple[slice, "Workspace"]
 
 _LEAST_SHARE = 1.0 / 64.0  # of the loads, by which they grow where all of them at once lead nowhere
 _REFINEMENTS = 8  # of an adjoint by a factor in float32, after which one in float64 takes its place
-_REFINED = 1e-12  # relative residual
+_REFINED, _ACCEPTED = 1e-12, 1e-9  # relative residuals: aimed at, and good enough where rounding leaves more
 
 
 class Workspace:
@@ -201,7 +201,7 @@ class _Equilibrium(torch.autograd.Function):
             rows, own, solver = part
             return _solve(own, solver, names, *(_rows(each, rows) for each in tensors))
 
-        with threads_for(start[0].numel()):
+        with threads_for(start[0].numel(), len(parts)):
             found = in_threads(solve, parts)
         reports.append(SolveReport.of([report for _, report in found]))
         x = found[0][0] if len(found) == 1 else torch.cat([each for each, _ in found])
@@ -230,7 +230,7 @@ class _Equilibrium(torch.autograd.Function):
             return _adjoint(own, hessians, ctx.names, needed, *(_rows(each, rows) for each in (gradient, x, *saved)))
 
         try:
-            with threads_for(gradient[0].numel()):
+            with threads_for(gradient[0].numel(), len(parts)):
                 found = in_threads(differentiate, parts)
         except ConvergenceError as error:
             raise ConvergenceError(str(error), x.detach().clone(), None) from None
@@ -323,15 +323,17 @@ def _adjoint_solution(
 
     for hessian in hessians:
         hessian.refactor_exact()
-        z = solved(hessian, right)
-        for _ in range(1 + _REFINEMENTS):
+        z, rest, before = torch.zeros_like(right), right, size
+        for _ in range(1 if hessian.exact else 1 + _REFINEMENTS):
+            z = z + solved(hessian, rest)
             product = potential.stiffness_product(z)
             rest = right - (product + potential.inertia[..., None] * z) * mask
             error = rest.flatten(1).norm(dim=1)
-            if hessian.exact or bool((error <= _REFINED * size).all()):
+            # Rounding of the product, too, ends the refinement.
+            if bool(((error <= _REFINED * size) | ~(error <= 0.5 * before)).all()):
                 break
-            z = z + solved(hessian, rest)
-        if bool((error <= (1e-6 if hessian.exact else _REFINED) * size).all()):
+            before = error
+        if bool((error <= (1e-6 if hessian.exact else _ACCEPTED) * size).all()):
             return z, product
     raise ConvergenceError(
         "the adjoint system is singular at a state of the roll-out, so that there is no gradient: fix the body so "

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import threadpool_limits
 
 from ..dynamics.integrator import State
+from ..io.errors import InputError
 from ..io.fan_out import Advance, Workers, fan_out
 from ..io.files import read_array, read_hdf5
 from ..io.machine import available_cores
@@ -102,7 +103,9 @@ class Part:
         fingerprint, each = self.context.fingerprint, len(self.names)
         checkpoint = self.path.with_name(f"{self.path.stem}.state.safetensors")
         with ResumableHDF5(self.path, self.context.name, fingerprint, motion.frames, motion.fields) as file:
-            if file.done < file.steps:
+            if file.done == file.steps:
+                advance(each * file.done)
+            else:
                 found = resume_checkpoint(checkpoint, "state", fingerprint)
                 done = 0 if found is None else int(found[1]["done"])
                 file.rewind(done if done <= file.done else 0)
@@ -171,10 +174,21 @@ def _folder(context: StageContext) -> Path:
 
 
 def workers_for(config: Mapping[str, Any], wanted: int | None) -> Workers:
-    """As many as wanted; if that is not said, one a core, but one for all where a GPU simulates."""
+    """As many as wanted; if that is not said, one a core, but one for all where a GPU simulates.
+
+    Raises:
+        InputError: a cluster without a number of workers, or that cannot simulate on the device.
+    """
+    backend = config["parallel"]["backend"]
+    if backend != "local" and wanted is None:
+        raise InputError(f"parallel.processes is null: say how many workers of the {backend} cluster are to be used.")
+    if backend == "ray" and simulation_device(config).type != "cpu":
+        raise InputError(
+            "parallel.backend is ray, which hands out CPUs here: choose device=cpu, or parallel.backend=dask."
+        )
     if wanted is None:
         wanted = available_cores() if simulation_device(config).type == "cpu" else 1
-    return Workers(wanted, config["parallel"]["backend"], config["parallel"]["address"])
+    return Workers(wanted, backend, config["parallel"]["address"])
 
 
 def work_on(parts: Sequence[Part], function: Callable[[Part], March], workers: Workers) -> None:

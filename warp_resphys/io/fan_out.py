@@ -41,6 +41,10 @@ _LOSSES = 3  # one after the other without a result in between, after which work
 _IDLE_SECONDS = 60.0  # after which a worker of this machine ends
 _LOOK_SECONDS = 0.1  # between looks at the progress
 _ANSWER_SECONDS = 10.0  # that a cluster has to answer in
+_LOST = {  # errors, by name, that say that a worker is gone
+    *("BrokenProcessPool", "TerminatedWorkerError", "KilledWorker", "CommClosedError"),
+    *("WorkerCrashedError", "NodeDiedError", "OwnerDiedError", "ObjectLostError"),
+}
 _BEGINS = "begins"  # line of a journal
 
 
@@ -115,7 +119,7 @@ def fan_out(
     if not left:
         return
     peaks: dict[tuple[str, int], float] = {}
-    count, losses = workers.count, 0
+    count, losses, attempt = workers.count, 0, 0
     parent = os.getpid() if workers.backend == "local" else None
     folder.mkdir(parents=True, exist_ok=True)
     with (
@@ -125,7 +129,10 @@ def fan_out(
     ):
         try:
             while left:
-                calls = [(function, number, task, Path(place, str(number)), parent) for number, task in left.items()]
+                over = Path(place, f"over_{attempt}")
+                calls = [
+                    (function, number, task, Path(place, str(number)), over, parent) for number, task in left.items()
+                ]
                 try:
                     with closing(run(calls, count)) as outcomes:
                         for outcome in outcomes:
@@ -137,13 +144,19 @@ def fan_out(
                 except (ResphysError, WorkerFaultError):
                     raise
                 except Exception as error:
-                    losses += 1
+                    if not _LOST & {each.__name__ for each in type(error).__mro__}:
+                        raise
+                    over.touch()
+                    losses, attempt = losses + 1, attempt + 1
                     if losses == _LOSSES:
                         raise WorkerError(
                             f"worker processes were ended from outside {losses} times in a row, perhaps for want of "
                             f"memory ({_first_line(error)}): run the same command again, with fewer processes."
                         ) from error
-                    count = max(count // 2, 1)
+                    if memory is not None:
+                        memory.count(peaks.values())
+                    peaks.clear()
+                    count = max(count // 2, 1) if workers.backend == "local" else count
                     log.warning("a worker process was lost: its work is done again, %d at once", count)
         finally:
             if memory is not None:
@@ -162,9 +175,9 @@ def _raise_for(outcome: _Outcome) -> None:
 
 
 def _work(
-    function: Callable[[Any, Advance], Any], number: int, task: Any, journal: Path, parent: int | None
+    function: Callable[[Any, Advance], Any], number: int, task: Any, journal: Path, over: Path, parent: int | None
 ) -> _Outcome:
-    """Does a task in a worker process, which ends if the process is gone that handed it out."""
+    """Does a task in a worker process, until nobody wants it: what handed it out has ended, or says that it is over."""
     be_quiet()
     wp.config.log_level = wp.LOG_WARNING  # Every worker would greet otherwise.
     if threading.current_thread() is threading.main_thread():
@@ -172,11 +185,17 @@ def _work(
     torch.set_num_threads(1)
     forget_peak_memory()
     worker = (socket.gethostname(), os.getpid())
+    if not journal.parent.is_dir():
+        place = journal.parent.parent
+        said = f"the worker on {worker[0]} does not see {place}: choose a run folder that all workers share."
+        return _Outcome(number, "error", said, worker, peak_memory_gib())
     with threadpool_limits(1), journal.open("a", encoding="utf-8", buffering=1) as written:
 
         def advance(count: int = 1, **fields: object) -> None:
             if parent is not None and os.getppid() != parent:
                 os._exit(1)
+            if over.exists() or not over.parent.exists():
+                raise WorkerError("the work was given up, or handed out again.")
             written.write(json.dumps([count, fields], default=str) + "\n")
 
         written.write(f"\n{_BEGINS}\n")  # after what a worker may have begun to write when it was lost
@@ -265,6 +284,9 @@ def _dask(workers: Workers) -> Iterator[Run]:
         client = Client(**own) if workers.address is None else Client(workers.address, timeout=_ANSWER_SECONDS)
     except (OSError, ValueError) as error:
         raise InputError(_unreachable(workers)) from error
+    if any(threads != 1 for threads in client.nthreads().values()):
+        client.close()
+        raise InputError("a worker of the dask cluster has several threads: start each with --nthreads 1.")
     with client, parallel_config("dask"):
         yield _by_joblib
 

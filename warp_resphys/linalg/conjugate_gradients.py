@@ -67,4 +67,4 @@ def conjugate_gradients(
         following = dot(r, z)
         d = z + (following / rz.clamp_min(tiny)).view(spread) * d
         rz = following
-    return Iterate(x, (rz <= goal) & ~curved, count)
+    return Iterate(x, (rz >= 0.0) & (rz <= goal) & ~curved, count)

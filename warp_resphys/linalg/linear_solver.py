@@ -23,10 +23,12 @@ class Factor(ABC):
     """A factorised batch of matrices.
 
     Attributes:
+        approximate: whether solutions in place are rough.
         failed: (B,) bool; matrices that are not positive definite and have no factor: their solutions are not finite.
     """
 
     failed: NDArray[np.bool_]
+    approximate = False
 
     @abstractmethod
     def solve(self, rhs: torch.Tensor) -> torch.Tensor:
@@ -60,6 +62,9 @@ class CorrectedFactor(Factor):
 
     @override
     def solve_in_place(self, columns: torch.Tensor) -> None:
+        if self.factor.approximate:  # What is rough along C would be amplified.
+            super().solve_in_place(columns)
+            return
         self.factor.solve_in_place(columns)
         along = self.columns[:, self._order].mT @ columns[:, :, None]
         columns -= (self._solved[:, self._order] @ torch.linalg.lu_solve(*self._small, along))[:, :, 0]

@@ -35,8 +35,8 @@ class MultigridSolver(SparseSolver):
     products, which any device has, and of a dense factor of a few hundred unknowns.
 
     Solutions are accurate to 1e-12; directions `in place <Factor.solve_in_place>`, of which a line search takes a share
-    anyway, to 1e-2. A matrix whose coarsest level or diagonal is not positive definite counts as failed. A matrix that
-    is not positive definite and has to be solved all the same gets a sparse factor.
+    anyway, to 1e-2, where nothing of low rank is added. A matrix whose coarsest level or diagonal is not positive
+    definite counts as failed. One that is not positive definite and has to be solved all the same gets a sparse factor.
     """
 
     iterates = True
@@ -99,6 +99,8 @@ class _Layout:
 
 class _Preconditioned(Factor):
     """Matrices with a V-cycle each; None for those that failed or were never made."""
+
+    approximate = True
 
     def __init__(self, systems: "list[_System | None]", failed: NDArray[np.bool_]) -> None:
         self.systems, self.failed = systems, failed

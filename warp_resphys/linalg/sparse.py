@@ -30,7 +30,7 @@ class SparseSolver(LinearSolver):
 
     def matrix(self, entries: torch.Tensor) -> scipy.sparse.csc_array:
         """(n, n) the matrix of one environment's `mirrored` entries (E',)."""
-        data = entries.detach().cpu().numpy()
+        data = entries.detach().double().cpu().numpy()
         return scipy.sparse.csc_array((data, (self._rows, self._cols)), shape=(self.n, self.n))
 
     @override

@@ -21,15 +21,15 @@ _LEAST_ENVIRONMENTS = 2  # of a shard
 
 
 @contextmanager
-def threads_for(unknowns: int) -> Iterator[None]:
-    """BLAS on one thread, and torch too while bodies of so few unknowns are worked on that they are not worth sharing.
+def threads_for(unknowns: int, shards: int = 1) -> Iterator[None]:
+    """BLAS on one thread; torch too, where bodies of so many unknowns are not worth sharing, or shards have one each.
 
     Threads that spin for one another's share of a microsecond's work take milliseconds when the cores are busy, and a
     banded factor gains nothing from a second one.
     """
     before = torch.get_num_threads()
     with _blas().limit(limits=1, user_api="blas"):
-        if before == 1 or unknowns >= _WORTH_SHARING:
+        if before == 1 or (unknowns >= _WORTH_SHARING and shards == 1):
             yield
             return
         torch.set_num_threads(1)

@@ -61,7 +61,7 @@ class Section:
         try:
             self.bound(name, *measure())
         except (ResphysError, RuntimeError) as error:
-            self.rows.append((name, str(error).strip().splitlines()[0], "no error", False))
+            self.rows.append((name, (str(error).strip() or repr(error)).splitlines()[0], "no error", False))
 
     @property
     def passed(self) -> bool:
@@ -80,6 +80,7 @@ def check_device(config: Mapping[str, Any], folder: Path) -> None:
     check("check", settings, _KEYS)
     wp.config.log_level = wp.LOG_WARNING
     device = choose_device(config["device"])
+    config = {**config, "device": str(device)}
     sections: list[Section] = []
     with run_lock(folder):
         for title, work in _SECTIONS.items():
@@ -180,8 +181,13 @@ def _shared_memory(section: Section, device: torch.device, steps: int) -> None:
     """Torch and Warp at the same addresses, and nothing that leaves the device."""
     simulator = _beam(_meshes()["8-node hexahedra"], 0.45, device=device)
     state = simulator.rest_state(2)
+    potential = simulator.workspace(2).gather()
+    own = simulator.workspace(2).parts[0][1].potential
+    before = {name: getattr(own, name).data_ptr() for name in ("positions", "residual", "tangent", "energy")}
     end = simulator.rollout(state, steps, Inputs())
-    potential = simulator.workspace(2).potential
+    for name, address in before.items():
+        same = getattr(own, name).data_ptr() == address and bool(getattr(own, name).abs().max() > 0.0)
+        section.rows.append((f"{name} after a roll-out", "in place" if same else "elsewhere", "in place", same))
     tensors = {
         "positions": (potential.positions, wp.vec3d),
         "residual": (potential.residual, wp.vec3d),

@@ -141,8 +141,6 @@ def fan_out(
                             del left[outcome.number]
                             losses = 0
                             yield outcome.number, outcome.content
-                except (ResphysError, WorkerFaultError):
-                    raise
                 except Exception as error:
                     if not _LOST & {each.__name__ for each in type(error).__mro__}:
                         raise

@@ -61,15 +61,15 @@ class MultigridSolver(SparseSolver):
         kept = before if isinstance(before, _Preconditioned) else None
         left_out = [False] * len(values) if idle is None else idle.tolist()
         systems: list[_System | None] = []
+        failed = np.zeros(len(values), dtype=bool)
         for i, entries in enumerate(self.mirrored(values)):
             if left_out[i]:
                 systems.append(None if kept is None else kept.systems[i])
+                failed[i] = kept is not None and kept.failed[i]
             else:
                 systems.append(self._system((len(values), i), entries.to(torch.float64)))
-        failed = [not left_out[i] and each is None for i, each in enumerate(systems)]
-        if kept is not None:
-            failed = [kept.failed[i] if left_out[i] else each for i, each in enumerate(failed)]
-        return _Preconditioned(systems, np.array(failed))
+                failed[i] = systems[i] is None
+        return _Preconditioned(systems, failed)
 
     def _system(self, environment: tuple[int, int], entries: torch.Tensor) -> "_System | None":
         """Of an environment's `mirrored` entries; None where the matrix is found not to be positive definite."""

@@ -45,7 +45,6 @@ from ..io.files import write_json
 from ..io.machine import hardware
 from ..io.progress import Progress
 from ..io.stages import package_versions
-from ..linalg.choice import make_linear_solver
 from ..linalg.threads import threads_for
 from .command import show, table_of
 
@@ -99,14 +98,14 @@ class Case:
         q, v = (t.clone().requires_grad_(True) for t in (self.start.q, self.start.v))
         forces = torch.zeros(self.steps, b, n, 3, device=q.device, dtype=q.dtype, requires_grad=True)
         modulus = sim.tensor(self.material["youngs_modulus"]).reshape(1).requires_grad_(True)
-        began = _now(q.device)
+        began = now(q.device)
         inputs = self.inputs.replace(external_force=forces)
         trajectory = sim.rollout(State(q, v), self.steps, inputs, {"youngs_modulus": modulus})
-        done = _now(q.device)
+        done = now(q.device)
         loss = trajectory.q[-1].square().sum() + trajectory.v[-1].square().sum()
-        turned = _now(q.device)
+        turned = now(q.device)
         torch.autograd.grad(loss, (q, v, forces, modulus))
-        self.backward.append(_now(q.device) - turned)
+        self.backward.append(now(q.device) - turned)
         self.forward.append(done - began)
         self.iterations = float(np.mean([r.iterations.double().mean().item() for r in trajectory.reports]))
         self.factorisations = float(np.mean([r.factorisations.double().mean().item() for r in trajectory.reports]))
@@ -271,16 +270,7 @@ def _time_parts(case: Case, repeats: int) -> dict[str, Any]:
     workspace = sim.workspace(case.batch)
     potential, pattern = workspace.gather(), workspace.pattern
     device = potential.device
-    linear = make_linear_solver(
-        sim.settings.linear_solver,
-        pattern.rows,
-        pattern.cols,
-        len(pattern.free),
-        3,
-        device,
-        sim.dtype,
-        pattern.positions,
-    )
+    linear = workspace.linear_solver(sim.settings.linear_solver, sim.dtype)
     assemble = HessianAssembly(potential, linear, pattern)
     potential.update_tangent()
     values = assemble().to(sim.dtype, copy=True)
@@ -301,13 +291,13 @@ def _time_parts(case: Case, repeats: int) -> dict[str, Any]:
 def _median_seconds(task: Callable[[], object], repeats: int, device: torch.device) -> float:
     seconds = []
     for _ in range(repeats):
-        began = _now(device)
+        began = now(device)
         task()
-        seconds.append(_now(device) - began)
+        seconds.append(now(device) - began)
     return median(seconds)
 
 
-def _now(device: torch.device) -> float:
+def now(device: torch.device) -> float:
     """Seconds, once the device has finished what it was given."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
@@ -353,9 +343,9 @@ def first_step(began: float, config: str) -> None:
     built = time.perf_counter()
     potential = simulator.workspace(1).potential
     potential.update_tangent()
-    kernels = _now(potential.device)
+    kernels = now(potential.device)
     simulator.step(state)
-    stepped = _now(potential.device)
+    stepped = now(potential.device)
     names = ("import_s", "build_s", "kernels_s", "first_step_s")
     moments = (began, imported, built, kernels, stepped)
     print(json.dumps(dict(zip(names, np.diff(moments).tolist(), strict=True))))

@@ -3,7 +3,6 @@
 import json
 import subprocess
 import sys
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -26,6 +25,7 @@ from ..io.memory import peak_memory_gib
 from ..io.progress import Progress, be_quiet
 from ..linalg.choice import LINEAR_SOLVERS
 from ..mesh.mesh import Mesh, box_hexahedra, box_tetrahedra, select_vertices
+from .benchmark import now
 from .command import WORDS, show, table_of
 
 FIGURES: Final = ("forward_s", "adjoint_s", "memory_gib")
@@ -151,12 +151,12 @@ def measure(case: Mapping[str, Any]) -> dict[str, Any]:
     for repeat in range(1 + case["repeats"]):
         q = rest.q.clone().requires_grad_(True)
         steps = case["steps"] if repeat else 1
-        began = _now(device)
+        began = now(device)
         trajectory = simulator.rollout(State(q, rest.v), steps, Inputs())
-        ended = _now(device)
+        ended = now(device)
         torch.autograd.grad(trajectory.q[-1].square().sum(), q)
         forward.append((ended - began) / steps)
-        adjoint.append((_now(device) - ended) / steps)
+        adjoint.append((now(device) - ended) / steps)
         reports = trajectory.reports
     return {
         "unknowns": 3 * (body.n_vertices - len(simulator.fixed)),
@@ -166,12 +166,6 @@ def measure(case: Mapping[str, Any]) -> dict[str, Any]:
         "iterations": float(np.mean([float(each.iterations) for each in reports])),
         "factorisations": float(np.mean([float(each.factorisations) for each in reports])),
     }
-
-
-def _now(device: torch.device) -> float:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-    return time.perf_counter()
 
 
 def _mesh(case: Mapping[str, Any]) -> Mesh:

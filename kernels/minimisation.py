@@ -31,6 +31,7 @@ ARMIJO = wp.constant(wp.float64(1e-4))
 LEAST_CURVATURE = wp.constant(wp.float64(1e-10))
 MOST_HALVINGS = wp.constant(25)
 STALLS = wp.constant(3)
+UNIT = wp.constant(wp.float64(2.0**-52))  # of rounding
 # Of a sum of energies: what rounding leaves of the terms that cancel, per unit of stiffness and of energy.
 ENERGY_ROUNDING = wp.constant(wp.float64(8.0 * 2.0**-52))
 
@@ -135,6 +136,91 @@ def choose(progress: Progress, idle_out: wp.array[wp.bool], clamp_out: wp.array[
         progress.since[b] = 0
         progress.made[b] += 1
         pairs[b] = 0
+
+
+@kernel
+def mark(
+    idle: wp.array[wp.bool],  # (B) see `choose`
+    clamp: wp.array[wp.bool],
+    clamped: wp.array[wp.bool],  # (B) of the factors that there are
+    positive_out: wp.array[int],  # (B) what the tangent is to be: 1 positive, 0 as it is, -1 left alone
+    idle_out: wp.array[int],
+):
+    """What is asked of tangent and assembly."""
+    b = wp.tid()
+    idle_out[b] = int(idle[b])
+    positive_out[b] = -1
+    if not idle[b]:
+        clamped[b] = clamp[b]
+        positive_out[b] = int(clamp[b])
+
+
+@kernel
+def repeat(idle: wp.array[wp.bool], clamp: wp.array[wp.bool], wanting_out: wp.array[int]):
+    """Which are to be factorised again, clamped: how many there are, by the one block of the launch."""
+    _, lane = wp.tid()
+    wanting = wp.float64(0.0)
+    for b in range(lane, idle.shape[0], wp.block_dim()):
+        if not idle[b]:
+            clamp[b] = True
+            wanting += ONE
+    wanting = block_sum(wanting)
+    if lane == 0:
+        wanting_out[0] = int(wanting)
+
+
+@kernel
+def nudge(
+    progress: Progress,
+    signs: wp.array[wp.vec3d],  # (N) up or down, at random
+    positions: wp.array2d[wp.vec3d],  # (B, N) [m]
+    residual: wp.array2d[wp.vec3d],  # (B, N) [N]
+    positions_out: wp.array2d[wp.vec3d],  # what they were
+    residual_out: wp.array2d[wp.vec3d],
+):
+    """Moves every coordinate of those that ask by one rounding unit of the largest.
+
+    Not by one of its own: deformation gradients sum over coordinates of all sizes.
+    """
+    b, lane = wp.tid()
+    if progress.asks[b] == 0:
+        return
+    size = wp.float64(0.0)
+    for i in range(lane, positions.shape[1], wp.block_dim()):
+        positions_out[b, i] = positions[b, i]
+        residual_out[b, i] = residual[b, i]
+        size = wp.max(size, wp.max(wp.abs(positions[b, i])))
+    unit = UNIT * block_max(size)
+    for i in range(lane, positions.shape[1], wp.block_dim()):
+        positions[b, i] = positions[b, i] + unit * signs[i]
+
+
+@kernel
+def compare(
+    progress: Progress,
+    kept_positions: wp.array2d[wp.vec3d],  # (B, N) before `nudge` [m]
+    kept_residual: wp.array2d[wp.vec3d],  # (B, N) [N]
+    gradient: wp.array2d[wp.vec3d],  # (B, N) at the iterate [N]
+    positions: wp.array2d[wp.vec3d],  # (B, N) are again what they were
+    residual: wp.array2d[wp.vec3d],
+):
+    """Where a residual that does not fall any more is no more than rounding makes of it, it has converged."""
+    b, lane = wp.tid()
+    if progress.asks[b] == 0:
+        return
+    change, size = wp.float64(0.0), wp.float64(0.0)
+    for i in range(lane, positions.shape[1], wp.block_dim()):
+        moved = residual[b, i] - kept_residual[b, i]
+        change += wp.dot(moved, moved)
+        size += wp.dot(gradient[b, i], gradient[b, i])
+        positions[b, i] = kept_positions[b, i]
+        residual[b, i] = kept_residual[b, i]
+    change, size = block_sum(change), block_sum(size)
+    if lane == 0:
+        progress.asks[b] = 0
+        progress.rounding[b] = wp.sqrt(change)
+        if size <= change:
+            progress.phase[b] = DONE
 
 
 @kernel

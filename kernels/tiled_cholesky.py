@@ -14,6 +14,7 @@ from typing import Any
 import warp as wp
 
 from .modules import decorators
+from .reductions import block_max
 
 
 @functools.cache
@@ -21,6 +22,38 @@ def tiled_kernels(tile: int, width: int, scalar: Any) -> SimpleNamespace:
     """Kernels for tiles of T x T numbers of a type, W of them left of the diagonal one."""
     kernel, _ = decorators(f"tiles.{tile}.{width}.{scalar.__name__}")
     T, W = wp.constant(tile), wp.constant(width)  # noqa: N806
+
+    @kernel
+    def clear(
+        idle: wp.array[wp.bool],  # (B) those that stay as they are
+        unit: wp.array[scalar],  # (n rounded up to tiles times (W + 1) T) zero, but for one beyond n on the diagonal
+        matrices: wp.array2d[scalar],  # (B, as many)
+    ):
+        b, k = wp.tid()
+        if not idle[b]:
+            matrices[b, k] = unit[k]
+
+    @kernel
+    def check(
+        clamped: wp.array[wp.bool],  # (B) matrices that are positive definite by force
+        idle: wp.array[wp.bool],  # (B) becomes False for those alone that failed, and may be clamped yet
+        factors: wp.array3d[scalar],  # (B, n rounded up to tiles, (W + 1) T) NaN where clamped ones have failed
+    ):
+        """Which matrices were not positive definite, one block a matrix."""
+        b, lane = wp.tid()
+        if idle[b]:
+            return
+        bad = wp.float64(0.0)
+        for i in range(lane, factors.shape[1], wp.block_dim()):
+            if not factors[b, i, W * T + i % T] > scalar(0.0):
+                bad = wp.float64(1.0)
+        failed = block_max(bad) > wp.float64(0.0)
+        again = failed and not clamped[b]
+        if failed and not again:
+            for i in range(lane, factors.shape[1], wp.block_dim()):
+                factors[b, i, W * T + i % T] = scalar(wp.nan)
+        if lane == 0:
+            idle[b] = not again
 
     @kernel
     def factor(
@@ -80,4 +113,4 @@ def tiled_kernels(tile: int, width: int, scalar: Any) -> SimpleNamespace:
             diagonal = wp.tile_load(a, shape=(T, T), offset=(i * T, W * T), storage="shared")
             wp.tile_store(x, wp.tile_upper_solve(wp.tile_transpose(diagonal), rest), offset=i * T)
 
-    return SimpleNamespace(factor=factor, solve=solve)
+    return SimpleNamespace(clear=clear, factor=factor, check=check, solve=solve)

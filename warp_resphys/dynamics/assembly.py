@@ -76,15 +76,21 @@ class BlockPattern:
 
 
 class HessianAssembly:
-    """Recorded launches from the tangent of a potential to the value array of a linear solver."""
+    """Recorded launches from the tangent of a potential to the value array of a linear solver.
+
+    Attributes:
+        launches: they set the entries in ``values`` of environments whose ``idle`` is zero.
+        values: (B, n_values).
+        idle: (B,).
+    """
 
     def __init__(self, potential: IncrementalPotential, solver: LinearSolver, pattern: BlockPattern) -> None:
         p = potential
         self._potential = p
-        self._idle = torch.zeros(p.batch, dtype=torch.int32, device=p.device)
-        idle = warp_view(self._idle, wp.int32)
+        self.idle = torch.zeros(p.batch, dtype=torch.int32, device=p.device)
+        idle = warp_view(self.idle, wp.int32)
         blocks = p.zeros(pattern.n_cell_blocks, 3, 3)
-        self._values = torch.zeros(p.batch, solver.n_values, device=p.device, dtype=solver.dtype)
+        self.values = torch.zeros(p.batch, solver.n_values, device=p.device, dtype=solver.dtype)
         self._overwritten = solver.overwrites
         commands = []
         for s, offset in zip(p.sets, pattern.offsets, strict=True):
@@ -106,9 +112,9 @@ class HessianAssembly:
         ]
         dim = (p.batch, len(pattern.rows))
         scalar = wp.float64 if solver.dtype == torch.float64 else wp.float32
-        values = warp_view(self._values, scalar)
+        values = warp_view(self.values, scalar)
         commands.append(p.record(kernels.scatter_kernel(scalar), dim, inputs, [values]))
-        self._launches = p.capture(*commands)
+        self.launches = p.capture(*commands)
 
     def __call__(self, idle: torch.Tensor | None = None) -> torch.Tensor:
         """(B, n_values) from the potential's last `update_tangent`; overwritten by the next call.
@@ -117,13 +123,13 @@ class HessianAssembly:
             idle: (B,) environments whose values stay as they are.
         """
         if idle is None:
-            self._idle.zero_()
+            self.idle.zero_()
         else:
-            self._idle.copy_(idle)
+            self.idle.copy_(idle)
         if self._overwritten:
             if idle is None:
-                self._values.zero_()
+                self.values.zero_()
             else:
-                self._values.masked_fill_(~idle[:, None], 0.0)
-        self._potential.launch(self._launches)
-        return self._values
+                self.values.masked_fill_(~idle[:, None], 0.0)
+        self._potential.launch(self.launches)
+        return self.values

@@ -52,13 +52,15 @@ class ExactHessian(HessianApproximation):
         linear: solver built for that pattern with blocks of 3.
 
     Attributes:
+        linear: the solver.
+        assembly: in its layout.
         exact: whether solutions are as accurate as float64 makes them.
     """
 
     def __init__(self, potential: IncrementalPotential, pattern: BlockPattern, linear: LinearSolver) -> None:
-        self._potential, self._linear = potential, linear
+        self._potential, self.linear = potential, linear
         self.exact = linear.dtype == torch.float64
-        self._assemble = HessianAssembly(potential, linear, pattern)
+        self.assembly = HessianAssembly(potential, linear, pattern)
         self._dofs = pattern.unknowns(potential.device)
         self._factor: Factor | None = None
         self.clamped = torch.zeros(potential.batch, dtype=torch.bool, device=potential.device)
@@ -84,21 +86,21 @@ class ExactHessian(HessianApproximation):
 
     def _factorise(self, idle: torch.Tensor | None) -> None:
         self._potential.update_tangent(self.clamped, idle)
-        self._factor = self._factor_of(self._assemble(idle), idle=idle)
+        self._factor = self._factor_of(self.assembly(idle), idle=idle)
 
     def _factor_of(self, values: torch.Tensor, definite: bool = True, idle: torch.Tensor | None = None) -> Factor:
         """Of assembled values, and what couples vertices beside them."""
         columns = self._potential.low_rank
-        columns = None if columns is None else columns[:, self._dofs].to(self._linear.dtype)
-        return self._linear.factor(values, definite, columns, idle, self._factor)
+        columns = None if columns is None else columns[:, self._dofs].to(self.linear.dtype)
+        return self.linear.factor(values, definite, columns, idle, self._factor)
 
     def refactor_exact(self) -> None:
         """Factorises the Hessian as it is, indefinite or not: for adjoints."""
         self.clamped.zero_()
         self._potential.update_tangent()
-        self._factor = self._factor_of(self._assemble())
+        self._factor = self._factor_of(self.assembly())
         if self._factor.failed.any():
-            self._factor = self._factor_of(self._assemble(), definite=False)
+            self._factor = self._factor_of(self.assembly(), definite=False)
 
     @override
     def solve_in_place(self, right: torch.Tensor) -> None:
@@ -111,7 +113,7 @@ class ExactHessian(HessianApproximation):
         if self._factor is None:
             raise RuntimeError("refactor before solve")
         out = torch.zeros_like(right)
-        out[:, self._dofs] = self._factor.solve(right[:, self._dofs].to(self._linear.dtype)).to(right.dtype)
+        out[:, self._dofs] = self._factor.solve(right[:, self._dofs].to(self.linear.dtype)).to(right.dtype)
         return out
 
 

@@ -1,15 +1,18 @@
 """The state of a minimisation on its device, and the launches that advance it; see ``kernels.minimisation``."""
 
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
 import torch
 import warp as wp
 
-from ..energies.launcher import warp_view
+from ..energies.launcher import Launches, issue, warp_view
 from ..energies.potential import IncrementalPotential
 from ..kernels import minimisation as kernels
-from .hessian import HessianApproximation
+from ..linalg.tiled import TiledSolver, alone
+from .hessian import ExactHessian, HessianApproximation
+from .recorded_factors import RecordedFactors
 
 _COUNTS = ("phase", "wanted", "factored", "asks", "iterations", "since", "made", "halvings", "stalls")
 _SUMS = ("step", "slope", "energy", "scale", "relative", "smallest", "rounding", "force", "stiffness")
@@ -103,9 +106,71 @@ class Minimiser:
         judging = [int(memory > 0), tolerances, warp_view(p.inertia, wp.float64), found, origin_view, direction]
         judging += [clamped, positions, gradient, progress, pairs]
         accept = p.record_blocks(own.accept, b, judging, [])
-        self._summarise = p.record_blocks(kernels.summarise, 1, [progress], [warp_view(summary, wp.int32)])
-        judge = [*p.evaluation, accept, self._summarise]
+        summarise = p.record_blocks(kernels.summarise, 1, [progress], [warp_view(summary, wp.int32)])
+        judge = [*p.evaluation, accept, summarise]
         self._begin, self._aim, self._go_on = p.capture(begin, *judge), p.capture(aim, *judge), p.capture(*judge)
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], (n, 3))
+        residual, kept = warp_view(p.residual, wp.vec3d), [warp_view(p.zeros(n, 3), wp.vec3d) for _ in range(2)]
+        nudge = p.record_blocks(kernels.nudge, b, [progress, p.upload(signs, wp.vec3d), positions, residual], kept)
+        compare = p.record_blocks(kernels.compare, b, [progress, *kept, gradient], [positions, residual])
+        self._compare = p.capture(nudge, *p.evaluation, compare, summarise)
+        self._parts = SimpleNamespace(begin=begin, aim=aim, judge=judge)
+        self._loop: Launches | None = None
+        if self._decides_by_itself:
+            self._record_loop()
+
+    @property
+    def _decides_by_itself(self) -> bool:
+        """Whether launches alone make the factors, and a graph may have a loop in it (CUDA 12.4 and later)."""
+        h, p = self._hessian, self._potential
+        able = p.device.type == "cpu" or bool(wp.is_conditional_graph_supported())
+        return isinstance(h, ExactHessian) and isinstance(h.linear, TiledSolver) and not p.couples_cells and able
+
+    def _record_loop(self) -> None:
+        p, h, parts = self._potential, self._hessian, self._parts
+        assert isinstance(h, ExactHessian)
+        assert isinstance(h.linear, TiledSolver)
+        factors = RecordedFactors(p, h.assembly, h.linear, self._idle, self._clamp, h.clamped, self._right)
+        conditions = (warp_view(self._summary[k : k + 1], wp.int32) for k in range(len(Summary._fields)))
+        active, aiming, wanting, asking = conditions
+
+        def factorise() -> None:
+            issue(self._choose)
+            factors.factorise()
+
+        def aim() -> None:
+            issue(self._project)
+            factors.solve()
+            issue(parts.aim)
+
+        def advance() -> None:
+            wp.capture_if(wanting, factorise)
+            wp.capture_if(aiming, aim)
+            issue(*parts.judge)
+            wp.capture_if(asking, lambda: issue(self._compare))
+
+        def solve() -> None:
+            issue(parts.begin, *parts.judge)
+            wp.capture_while(active, advance)
+
+        commands = [parts.begin, *parts.judge, self._choose, self._project, parts.aim, self._compare]
+        self._loop = p.capture_calls(solve, [*commands, *factors.commands])
+
+    def minimise(self, start: torch.Tensor) -> None:
+        """Minimises from (B, N, 3) [m]; on a GPU, with tiled factors, without waiting for it."""
+        p = self._potential
+        if self._loop is not None:
+            p.positions.copy_(start)
+            with alone(p.device):
+                p.launch(self._loop)
+            return
+        if not self._hessian.ready():
+            self._counts["factored"].zero_()
+        state = self.begin(start)
+        while state.active:
+            if state.wanting:
+                self.refactor(state)
+            state = self.advance(state)
 
     def begin(self, start: torch.Tensor) -> Summary:
         """Evaluates the potential at a start (B, N, 3) [m]."""
@@ -113,10 +178,6 @@ class Minimiser:
         p.positions.copy_(start)
         p.launch(self._begin)
         return self._look()
-
-    def forget(self) -> None:
-        """The factors serve no more."""
-        self._counts["factored"].zero_()
 
     def advance(self, state: Summary) -> Summary:
         """One evaluation: of the first trial of those that need a direction, and of the next of the others."""
@@ -144,8 +205,7 @@ class Minimiser:
     def _look(self) -> Summary:
         state = self._read()
         if state.asking:
-            self._compare_with_rounding()
-            self._potential.launch(self._summarise)
+            self._potential.launch(self._compare)
             state = self._read()
         return state
 
@@ -153,11 +213,3 @@ class Minimiser:
         if self._seen is not self._summary:
             self._seen.copy_(self._summary)
         return Summary._make(self._shown.tolist())
-
-    def _compare_with_rounding(self) -> None:
-        """Where a residual that does not fall any more is no more than rounding makes of it, it has converged."""
-        asks, rounding = self._counts["asks"] == 1, self._sums["rounding"]
-        rounding.copy_(torch.where(asks, self._potential.residual_rounding(), rounding))
-        norm = torch.linalg.vector_norm(self._gradient.flatten(1), dim=1)
-        self._counts["phase"].masked_fill_(asks & (norm <= rounding), kernels.DONE)
-        self._counts["asks"].zero_()

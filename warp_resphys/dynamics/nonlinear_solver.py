@@ -152,12 +152,5 @@ class NonlinearSolver:
 
     def solve(self, start: torch.Tensor) -> SolveReport:
         """Minimises from (B, N, 3); what it ends at is left in ``potential.positions``."""
-        m = self._minimiser
-        if not self.hessian.ready():
-            m.forget()
-        state = m.begin(start)
-        while state.active:
-            if state.wanting:
-                m.refactor(state)
-            state = m.advance(state)
-        return SolveReport(*m.outcome())
+        self._minimiser.minimise(start)
+        return SolveReport(*self._minimiser.outcome())

@@ -206,7 +206,12 @@ class Term(ABC):
     Args:
         launcher: of the potential.
         sets: its points.
+
+    Attributes:
+        couples_cells: whether it may have `low_rank` columns.
     """
+
+    couples_cells = False
 
     def __init__(self, launcher: Launcher, sets: Sequence[PointSet]) -> None:
         self.launcher, self.sets = launcher, tuple(sets)

@@ -1,6 +1,6 @@
 """Warp launches on torch's memory, recorded once and made as often as needed."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from threading import Lock
 from typing import Any
@@ -86,12 +86,20 @@ class Launcher:
         inputs = [s.nodes, s.gradients, s.points_per_cell, tangent, direction]
         return self.record(points.tangent_product, (self.batch, s.n_points), inputs, [stress])
 
-    def capture(self, *commands: Any) -> "Sequence":
+    def capture(self, *commands: Any) -> "Launches":
         """Recorded launches as one: a graph, on a CPU too, whose launches cost a sixth of as many single ones."""
+        return self.capture_calls(lambda: issue(*commands), commands)
+
+    def capture_calls(self, calls: Callable[[], None], commands: Iterable[Any]) -> "Launches":
+        """Recorded launches as one graph, in the order and under the conditions of a function that makes them.
+
+        Args:
+            calls: makes the launches, by `issue`, ``wp.capture_while`` and ``wp.capture_if``.
+            commands: all that it may launch.
+        """
         with _CAPTURES, wp.ScopedCapture(device=str(self.device)) as capture:
-            for command in commands:
-                command.launch()
-        return Sequence(capture.graph, commands)
+            calls()
+        return Launches(capture.graph, tuple(commands))
 
     def launch(self, *commands: Any) -> None:
         """Makes recorded launches, on torch's stream."""
@@ -107,11 +115,20 @@ class Launcher:
             command.launch(stream)
 
 
-class Sequence:
+def issue(*commands: Any) -> None:
+    """Makes recorded launches one by one, captured ones too: into the graph that is being captured."""
+    for command in commands:
+        if isinstance(command, Launches):
+            issue(*command.commands)
+        else:
+            command.launch()
+
+
+class Launches:
     """Launches that were captured: to be made like a recorded launch."""
 
     def __init__(self, graph: Any, commands: tuple[Any, ...]) -> None:
-        self._graph, self._alive = graph, commands  # What they were recorded with is to stay.
+        self._graph, self.commands = graph, commands  # What they were recorded with is to stay.
 
     def launch(self, stream: Any = None) -> None:
         """All of them, in their order."""

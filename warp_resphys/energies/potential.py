@@ -13,7 +13,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
 import torch
 import warp as wp
 
@@ -21,7 +20,7 @@ from ..fem.elements import Points
 from ..kernels import points as kernels
 from ..kernels import reductions
 from .base import Energy, PointSet, Term
-from .launcher import Launcher, warp_view
+from .launcher import Launcher, Launches, warp_view
 from .solid import SolidTerm
 
 
@@ -60,7 +59,12 @@ class IncrementalPotential(Launcher):
         residual_norm: (B,) norm of the residual there [N].
         low_rank: (B, 3 N, r) columns C of the last `update_tangent`: what the Hessian has beside `tangent` is C C^T.
             None for nothing.
+        tangent_launches: what sets `tangent`, in environments whose ``positive`` (B,) is not -1; clamped where it is 1.
+            Both are made with `tangent`.
     """
+
+    positive: torch.Tensor
+    tangent_launches: Launches
 
     def __init__(
         self,
@@ -177,21 +181,6 @@ class IncrementalPotential(Launcher):
         self.launch(self._evaluation)
         return self.energy.clone(), self.balance.clone()
 
-    def residual_rounding(self) -> torch.Tensor:
-        """(B,) norm by which the residual last evaluated changes when every coordinate moves by one rounding unit [N].
-
-        That of the largest coordinate, up or down at random: deformation gradients sum over coordinates of all sizes.
-        """
-        positions, residual = self.positions.clone(), self.residual.clone()
-        signs = np.random.default_rng(0).choice([-1.0, 1.0], positions.shape[1:])
-        unit = torch.finfo(torch.float64).eps * positions.abs().amax(dim=(1, 2), keepdim=True)
-        self.positions.addcmul_(unit, positions.new_tensor(signs))
-        self.evaluate()
-        change = torch.linalg.vector_norm((self.residual - residual).view(self.batch, -1), dim=1)
-        self.positions.copy_(positions)
-        self.residual.copy_(residual)
-        return change
-
     def update_tangent(self, positive: torch.Tensor | None = None, idle: torch.Tensor | None = None) -> None:
         """Computes dP/dF at ``positions``.
 
@@ -200,15 +189,20 @@ class IncrementalPotential(Launcher):
             idle: (B,) environments whose tangent nobody asks for; none where left out.
         """
         self._prepare_tangent()
-        self._positive.zero_()
+        self.positive.zero_()
         if positive is not None:
-            self._positive.copy_(positive)
+            self.positive.copy_(positive)
         if idle is not None:
-            self._positive.masked_fill_(idle, -1)
-        self.launch(self._tangent_commands)
+            self.positive.masked_fill_(idle, -1)
+        self.launch(self.tangent_launches)
         found = [term.low_rank(self.terms.values, self._position_view) for term in self.energies]
         columns = [each for each in found if each is not None]
         self.low_rank = torch.cat(columns, 2) if columns else None
+
+    @property
+    def couples_cells(self) -> bool:
+        """Whether there may be `low_rank` columns."""
+        return any(term.couples_cells for term in self.energies)
 
     @property
     def tangent(self) -> torch.Tensor:
@@ -223,11 +217,11 @@ class IncrementalPotential(Launcher):
         return self._tangent
 
     def _record_tangent(self, blocks: torch.Tensor) -> None:
-        self._positive = torch.zeros(self.batch, device=self.device, dtype=torch.int32)
+        self.positive = torch.zeros(self.batch, device=self.device, dtype=torch.int32)
         self._product_stress = self.zeros(self._n_points, 3, 3)
         self._product = self.zeros(self.n_vertices, 3)
         tangents, products = [], []
-        positive, direction = warp_view(self._positive, wp.int32), warp_view(self._direction, wp.vec3d)
+        positive, direction = warp_view(self.positive, wp.int32), warp_view(self._direction, wp.vec3d)
         for term in self.energies:
             tangents += term.before(self.terms.values, self._position_view)
             for s in term.sets:
@@ -239,7 +233,7 @@ class IncrementalPotential(Launcher):
                     self.product(s, tangent, direction, stress),
                     self.gather(s, stress, self._product),
                 ]
-        self._tangent_commands, self._product_commands = self.capture(*tangents), self.capture(*products)
+        self.tangent_launches, self._product_commands = self.capture(*tangents), self.capture(*products)
 
     def stiffness_product(self, direction: torch.Tensor) -> torch.Tensor:
         """(B, N, 3) product of the internal forces' stiffness with a displacement, all vertices included [N].

@@ -234,6 +234,8 @@ class TendonTerm(PartTerm):
         tendons: whose they are.
     """
 
+    couples_cells = True
+
     def __init__(self, launcher: Launcher, sets: Sequence[PointSet], tendons: Tendons) -> None:
         (s,) = sets
         assert isinstance(s.source, TendonPoints)

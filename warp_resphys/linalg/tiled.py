@@ -1,7 +1,8 @@
 """Banded Cholesky by blocks of threads: for batches of slender bodies on a GPU, each with a factor of its own."""
 
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from threading import Lock
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,11 @@ from .linear_solver import Factor, Indices, LinearSolver, bandwidth_reducing_ord
 TILE = 16  # rows and columns of a tile
 BLOCK = 64  # threads that share a matrix
 _ONE_AT_A_TIME = Lock()
+
+
+def alone(device: torch.device) -> AbstractContextManager[object]:
+    """To be held while kernels with tiles run: on a CPU all threads share the place of these."""
+    return _ONE_AT_A_TIME if device.type == "cpu" else nullcontext()
 
 
 class TiledSolver(LinearSolver):
@@ -71,14 +77,39 @@ class TiledSolver(LinearSolver):
 
     def launch(self, kernel: Any, blocks: tuple[int, ...], *arrays: torch.Tensor) -> None:
         """Launches on torch's stream; on a CPU one at a time, as all threads share the place of tiles there."""
-        views = [wp.from_torch(each, requires_grad=False) for each in arrays]
         stream = None
         if self.device.type == "cuda":
             stream = wp.stream_from_torch(torch.cuda.current_stream(self.device))
-        with _ONE_AT_A_TIME if self.device.type == "cpu" else nullcontext():
-            wp.launch_tiled(
-                kernel, dim=list(blocks), inputs=views, block_dim=BLOCK, device=str(self.device), stream=stream
-            )
+        with alone(self.device):
+            self._record(kernel, blocks, *arrays).launch(stream)
+
+    def _record(self, kernel: Any, blocks: tuple[int, ...], *arrays: torch.Tensor) -> Any:
+        views = [wp.from_torch(each, requires_grad=False) for each in arrays]
+        options = {"block_dim": BLOCK, "device": str(self.device), "record_cmd": True}
+        return wp.launch_tiled(kernel, dim=list(blocks), inputs=views, **options)
+
+    def record_factor(self, values: torch.Tensor, idle: torch.Tensor, clamped: torch.Tensor) -> SimpleNamespace:
+        """Launches ``clear``, ``factor`` and ``check`` on a value array (B, n_values); see ``kernels.tiled_cholesky``.
+
+        Args:
+            values: filled between the first two, and overwritten by the factors.
+            idle: (B,) matrices that stay as they are. `check` leaves those alone that failed and were not clamped.
+            clamped: (B,) matrices that are positive definite by force: their factors are not finite if they fail.
+        """
+        batch, unit = len(values), torch.zeros(self.n_values, device=self.device, dtype=self.dtype)
+        unit[self._padding] = 1.0
+        tiles = values.view(-1, *self.shape)
+        views = [wp.from_torch(each, requires_grad=False) for each in (idle, unit, values)]
+        clear = wp.launch(self.kernels.clear, dim=values.shape, inputs=views, device=str(self.device), record_cmd=True)
+        return SimpleNamespace(
+            clear=clear,
+            factor=self._record(self.kernels.factor, (batch,), idle, tiles),
+            check=self._record(self.kernels.check, (batch,), clamped, idle, tiles),
+        )
+
+    def record_solve(self, factors: torch.Tensor, columns: torch.Tensor) -> Any:
+        """The launch that overwrites (B, n) right-hand sides, in the solver's order, by the solutions."""
+        return self._record(self.kernels.solve, (len(columns), 1), factors.view(-1, *self.shape), columns[:, None])
 
     def _dense(self, values: torch.Tensor) -> torch.Tensor:
         """(B, n, n) lower triangles."""

@@ -1,0 +1,111 @@
+"""A solve whose every decision is taken on the device does what the host would have done."""
+
+import pytest
+import torch
+
+from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, Tendons, box_hexahedra, select_vertices
+from warp_resphys.dynamics.minimiser import Minimiser
+from warp_resphys.energies.potential import IncrementalPotential
+from warp_resphys.io.errors import ConvergenceError
+from warp_resphys.studies.gradient_check import pose
+
+MESH = box_hexahedra((0.06, 0.02, 0.02), (4, 2, 2))
+FIXED = select_vertices(MESH, x=0.0)
+BODY = Body(MESH, fixed=FIXED)
+TIP = torch.as_tensor(select_vertices(MESH, x=0.06))
+MATERIAL = Corotated(1e5, 0.45, density=1000.0, stiffness_damping=1e-3)
+
+
+def simulator(name, device, body=BODY, material=MATERIAL, **settings):
+    chosen = SolverSettings(name, linear_solver="tiled", **({"relative_tolerance": 1e-9} | settings))
+    return Simulator(body, material, solver=chosen, device=device)
+
+
+def bent(s):
+    return pose(s, "bent", 3)
+
+
+def inverted(s):
+    """In the second environment: the last layer is 0.015 m thick."""
+    state = s.rest_state(3)
+    state.q[1, TIP, 0] -= 0.02
+    return state
+
+
+def far(s):
+    """Ten metres from the origin rounding leaves more than 1e-13 of the residual."""
+    state = pose(s, "bent", 3)
+    return State(state.q + 10.0, state.v)
+
+
+def clamped(s, batch=3):
+    return s.workspace(batch).solver("dynamics", s.settings).hessian.clamped
+
+
+@pytest.fixture
+def host(monkeypatch):
+    """Runs a function with the host in the loop."""
+
+    def run(function):
+        with monkeypatch.context() as patch:
+            patch.setattr(Minimiser, "_decides_by_itself", False)
+            return function()
+
+    return run
+
+
+@pytest.mark.parametrize("factors", ["double", "single"])
+@pytest.mark.parametrize("name", ["quasi_newton", "newton"])
+@pytest.mark.parametrize(("start", "tolerance"), [(bent, 1e-9), (inverted, 1e-9), (far, 1e-13)])
+def test_the_loop_on_the_device_is_that_of_the_host(name, start, tolerance, factors, host, device):
+    def rolled():
+        s = simulator(name, device, relative_tolerance=tolerance, factors=factors, max_iterations=500)
+        seen, state, reports = torch.zeros(3, dtype=torch.bool, device=device), start(s), []
+        for _ in range(8):
+            state, report = s.step(state)
+            reports.append(report)
+            seen |= clamped(s)
+        return state, reports, seen
+
+    found, reports, seen = rolled()
+    expected, wanted, seen_by_host = host(rolled)
+    assert seen.tolist() == seen_by_host.tolist()
+    if start is bent and name == "quasi_newton":
+        assert bool(seen.any())  # A Hessian on the way was indefinite.
+    torch.testing.assert_close(found.q, expected.q, rtol=0.0, atol=0.0)
+    for one, other in zip(reports, wanted, strict=True):
+        assert one.iterations.tolist() == other.iterations.tolist()
+        assert one.factorisations.tolist() == other.factorisations.tolist()
+        assert bool(one.converged.all())
+
+
+def test_a_solve_is_one_launch(monkeypatch, device):
+    s = simulator("quasi_newton", device, material=Corotated(1e5, 0.45, density=1000.0))
+    start = bent(s)
+    s.step(start)
+    launches = []
+    launch = IncrementalPotential.launch
+    monkeypatch.setattr(
+        IncrementalPotential, "launch", lambda self, *commands: launches.append(commands) or launch(self, *commands)
+    )
+    s.step(start)
+    assert len(launches) == 1
+
+
+def test_a_failure_is_said_and_mends_itself(device):
+    s = simulator("quasi_newton", device, max_iterations=25)
+    calm = bent(s)
+    wanted = s.step(calm)[0]
+    wild = calm.v.clone()
+    wild[1] += 1e3
+    with pytest.raises(ConvergenceError, match="environment 1 of 3"):
+        s.step(State(calm.q, wild))
+    torch.testing.assert_close(s.step(calm)[0].q, wanted.q, rtol=0.0, atol=1e-9)
+
+
+def test_tendons_have_the_host_in_the_loop(device):
+    """The columns by which they couple cells are made by torch."""
+    path = [[[0.0, 0.01, 0.015], [0.03, 0.01, 0.015], [0.06, 0.01, 0.015]]]
+    s = simulator("quasi_newton", device, Body(MESH, fixed=FIXED, energies=(Tendons(path, stiffness=100.0),)))
+    assert s.workspace(1).potential.couples_cells
+    assert bool(s.step(s.rest_state())[1].converged.all())

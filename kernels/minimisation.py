@@ -31,6 +31,9 @@ ARMIJO = wp.constant(wp.float64(1e-4))
 LEAST_CURVATURE = wp.constant(wp.float64(1e-10))
 MOST_HALVINGS = wp.constant(25)
 STALLS = wp.constant(3)
+BETTER = wp.constant(
+    wp.float64(0.1)
+)  # squared error that makes a higher order worth it: fast modes grow with the order
 UNIT = wp.constant(wp.float64(2.0**-52))  # of rounding
 # Of a sum of energies: what rounding leaves of the terms that cancel, per unit of stiffness and of energy.
 ENERGY_ROUNDING = wp.constant(wp.float64(8.0 * 2.0**-52))
@@ -74,6 +77,17 @@ class Evaluation:
 
 
 @wp.struct
+class History:
+    """By how much the solutions of the last steps were off where they were sought first."""
+
+    known: wp.array[int]  # (B) how many there are, 0 to 3
+    newest: wp.array[int]  # (B) place of the last one
+    order: wp.array[int]  # (B) how many of them foretell the next one
+    start: wp.array2d[wp.vec3d]  # (B, N) [m]
+    correction: wp.array3d[wp.vec3d]  # (B, 3, N) solution less start, a ring [m]
+
+
+@wp.struct
 class Tolerances:
     """When a solve has converged, and how long it may take."""
 
@@ -84,27 +98,84 @@ class Tolerances:
     refactor_after: int  # iterations of a solve, more of which are to be fewer by a new factor
 
 
+@function
+def correction(history: History, b: int, i: int, age: int) -> wp.vec3d:
+    """Of a vertex, 0 for the newest."""
+    return history.correction[b, (history.newest[b] + 3 - age) % 3, i]
+
+
+@function
+def foretold(history: History, b: int, i: int, order: int) -> wp.vec3d:
+    """The polynomial through the last corrections, one step on: none, the last one, a line, a parabola."""
+    guess = wp.vec3d()
+    if order == 1:
+        guess = correction(history, b, i, 0)
+    elif order == 2:
+        guess = wp.float64(2.0) * correction(history, b, i, 0) - correction(history, b, i, 1)
+    elif order == 3:
+        guess = wp.float64(3.0) * (correction(history, b, i, 0) - correction(history, b, i, 1))
+        guess += correction(history, b, i, 2)
+    return guess
+
+
+@function
+def remember(history: History, positions: wp.array2d[wp.vec3d], b: int, lane: int):
+    """Adds a solution, and chooses the order that would have foretold it best."""
+    lanes = wp.block_dim()
+    n = positions.shape[1]
+    known = history.known[b]
+    place = (history.newest[b] + 1) % 3
+    best = wp.int32(0)
+    least = wp.float64(INFINITE)
+    for order in range(known + 1):
+        total = wp.float64(0.0)
+        for i in range(lane, n, lanes):
+            error = positions[b, i] - history.start[b, i] - foretold(history, b, i, order)
+            total += wp.dot(error, error)
+        total = block_sum(total)
+        if total < BETTER * least:
+            best = order
+            least = total
+    if known == 0:
+        best = 1
+    for i in range(lane, n, lanes):
+        history.correction[b, place, i] = positions[b, i] - history.start[b, i]
+    if lane == 0:
+        history.newest[b] = place
+        history.known[b] = wp.min(known + 1, 3)
+        history.order[b] = best
+
+
 @kernel
 def begin(
     force: wp.array2d[wp.vec3d],  # (B, N) [N]
     stiffness: wp.array3d[wp.float64],  # (B, P, T) [J]
-    positions: wp.array2d[wp.vec3d],  # (B, N) the start [m]
+    positions: wp.array2d[wp.vec3d],  # (B, N) where inertia alone would lead; becomes the start [m]
     tolerances: Tolerances,
     origin_out: wp.array2d[wp.vec3d],
     progress: Progress,
-    pairs: wp.array[int],  # (B) how many there are
+    history: History,
 ):
-    """Forgets the solve before, and sums what does not change during this one."""
+    """Starts where the last steps foretell, and sums what does not change during this solve."""
     b, lane = wp.tid()
     square, total = wp.float64(0.0), wp.float64(0.0)
+    known = history.known[b]
+    if progress.phase[b] != DONE:  # The solve before has failed.
+        known = 0
+    order = wp.min(history.order[b], known)
     for i in range(lane, force.shape[1], wp.block_dim()):
         square += wp.dot(force[b, i], force[b, i])
-        origin_out[b, i] = positions[b, i]
+        start = positions[b, i]
+        history.start[b, i] = start
+        start = start + foretold(history, b, i, order)
+        positions[b, i] = start
+        origin_out[b, i] = start
     for p in range(lane, stiffness.shape[1], wp.block_dim()):
         for t in range(stiffness.shape[2]):
             total += stiffness[b, p, t]
     square, total = block_sum(square), block_sum(total)
     if lane == 0:
+        history.known[b] = known
         progress.phase[b] = BEGINS
         progress.wanted[b] = 0
         if progress.factored[b] == 0 or progress.iterations[b] > tolerances.refactor_after:
@@ -119,7 +190,6 @@ def begin(
         progress.rounding[b] = INFINITE
         progress.force[b] = wp.sqrt(square)
         progress.stiffness[b] = total
-        pairs[b] = 0
 
 
 @kernel
@@ -462,6 +532,7 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
         gradient: wp.array2d[wp.vec3d],  # (B, N) becomes the residual, where the trial is taken
         progress: Progress,
         pairs: Pairs,
+        history: History,
     ):
         """Takes a trial that decreases the energy, or its slope where the energy is down to rounding; or halves it.
 
@@ -527,6 +598,8 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
         asks = block_max(ZERO)
         if iterations >= STALLS and stalls >= STALLS and before - energy <= flat and norm <= rounding and not done:
             asks = ONE
+        if done:
+            remember(history, positions, b, lane)
         if lane == 0:
             relative = norm / wp.max(scale, tolerances.absolute)
             progress.energy[b] = energy

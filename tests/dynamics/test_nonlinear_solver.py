@@ -390,7 +390,11 @@ class OneVertex:
         for name in ("energy", "size", "balance", "norm"):
             setattr(self.found, name, wp.full(1, -1e9, dtype=wp.float64, device="cpu"))
         self.found.residual, self.tolerances.max_iterations = self._vector("residual"), 1000
-        self.clamped = wp.zeros(1, dtype=wp.bool, device="cpu")
+        self.clamped, self.history = wp.zeros(1, dtype=wp.bool, device="cpu"), kernels.History()
+        for name in ("known", "newest", "order"):
+            setattr(self.history, name, wp.zeros(1, dtype=int, device="cpu"))
+        self.history.start = wp.zeros((1, 1), dtype=wp.vec3d, device="cpu")
+        self.history.correction = wp.zeros((1, 3, 1), dtype=wp.vec3d, device="cpu")
 
     def _vector(self, name):
         self.vectors[name] = torch.zeros(1, 1, 3, dtype=torch.float64)
@@ -402,7 +406,7 @@ class OneVertex:
         kept = {name: self.vectors.get(name) for name in ("origin", "direction", "positions", "gradient")}
         views = {n: self._vector(n) if v is None else warp_view(v, wp.vec3d) for n, v in kept.items()}
         inputs = [1, self.tolerances, inertia, self.found, views["origin"], views["direction"], self.clamped]
-        inputs += [views["positions"], views["gradient"], self.progress, self.pairs]
+        inputs += [views["positions"], views["gradient"], self.progress, self.pairs, self.history]
         wp.launch_tiled(self.own.accept, dim=[1], inputs=inputs, block_dim=64, device="cpu")
 
     def __getitem__(self, name):

@@ -1,5 +1,6 @@
 """The differentiable solve: minimiser of an incremental potential, with its implicit adjoint."""
 
+import weakref
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any, TypeVar
 
@@ -58,11 +59,20 @@ class Workspace:
         self.pattern, self.dtype = pattern, dtype
         self._made: dict[Any, Any] = {}
         self.shards: list[Shard] = []
+        self._last: weakref.ref[torch.Tensor] | None = None
 
     @property
     def parts(self) -> "list[Shard]":
         """The shards, or the whole batch."""
         return self.shards or [(slice(None), self)]
+
+    def reached(self, q: torch.Tensor) -> None:
+        """Remembers the positions (B, N, 3) that the last step of the dynamics has led to."""
+        self._last = weakref.ref(q)
+
+    def follows(self, q: torch.Tensor) -> bool:
+        """Whether a step from these positions, the tensor itself, goes on where the last one has led."""
+        return self._last is not None and self._last() is q
 
     def gather(self) -> IncrementalPotential:
         """The potential of the whole batch, with the terms and positions that the shards have last had."""
@@ -109,6 +119,7 @@ def equilibrium(
     terms: StepTerms,
     start: torch.Tensor,
     fixed_positions: torch.Tensor,
+    follows: bool = False,
 ) -> tuple[torch.Tensor, SolveReport]:
     """x* (B, N, 3), the minimiser of a step's potential, differentiable in its terms and the fixed positions.
 
@@ -119,6 +130,7 @@ def equilibrium(
         terms: of the step.
         start: (B, N, 3) where the solver begins [m]; without influence on the result, and without a gradient.
         fixed_positions: (B, D, 3) of the fixed vertices [m].
+        follows: see `NonlinearSolver.solve`.
 
     Raises:
         ConvergenceError: see `nonlinear_solver.SolverSettings.on_failure`.
@@ -127,7 +139,7 @@ def equilibrium(
     names = tuple(terms.values)
     main = (terms.target, terms.inertia, terms.force)
     x: torch.Tensor = _Equilibrium.apply(
-        workspace, purpose, settings, reports, names, start, fixed_positions, *main, *terms.values.values()
+        workspace, purpose, settings, follows, reports, names, start, fixed_positions, *main, *terms.values.values()
     )
     check_converged(settings, reports[0], x)
     return x, reports[0]
@@ -186,6 +198,7 @@ class _Equilibrium(torch.autograd.Function):
         workspace: Workspace,
         purpose: str,
         settings: SolverSettings,
+        follows: bool,
         reports: list[SolveReport],
         names: tuple[str, ...],
         start: torch.Tensor,
@@ -199,7 +212,7 @@ class _Equilibrium(torch.autograd.Function):
 
         def solve(part: tuple[slice, Workspace, NonlinearSolver]) -> tuple[torch.Tensor, SolveReport]:
             rows, own, solver = part
-            return _solve(own, solver, names, *(_rows(each, rows) for each in tensors))
+            return _solve(own, solver, follows, names, *(_rows(each, rows) for each in tensors))
 
         with threads_for(start[0].numel(), len(parts)):
             found = in_threads(solve, parts)
@@ -215,7 +228,7 @@ class _Equilibrium(torch.autograd.Function):
     def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         x, *saved = ctx.saved_tensors
         x, saved = x.detach(), [None if each is None else each.detach() for each in saved]
-        needed = ctx.needs_input_grad[6:]
+        needed = ctx.needs_input_grad[7:]
 
         types = (torch.float32, torch.float64) if ctx.settings.factors == "single" else (torch.float64,)
         parts = [
@@ -234,7 +247,7 @@ class _Equilibrium(torch.autograd.Function):
                 found = in_threads(differentiate, parts)
         except ConvergenceError as error:
             raise ConvergenceError(str(error), x.detach().clone(), None) from None
-        return (*([None] * 6), *map(_joined, (None, *saved), zip(*found, strict=True)))
+        return (*([None] * 7), *map(_joined, (None, *saved), zip(*found, strict=True)))
 
 
 def _rows(values: torch.Tensor | None, rows: slice) -> torch.Tensor | None:
@@ -256,14 +269,20 @@ def _terms(names: tuple[str, ...], tensors: Sequence[Any]) -> StepTerms:
 
 
 def _solve(
-    workspace: Workspace, solver: NonlinearSolver, names: tuple[str, ...], start: Any, fixed_positions: Any, *terms: Any
+    workspace: Workspace,
+    solver: NonlinearSolver,
+    follows: bool,
+    names: tuple[str, ...],
+    start: Any,
+    fixed_positions: Any,
+    *terms: Any,
 ) -> tuple[torch.Tensor, SolveReport]:
     """See `_Equilibrium.forward`."""
     workspace.potential.set_terms(_terms(names, terms))
     if len(workspace.fixed):
         start = start.clone()
         start[:, workspace.fixed] = fixed_positions
-    report = solver.solve(start)
+    report = solver.solve(start, follows)
     return workspace.potential.positions.to(start.dtype, copy=True), report
 
 

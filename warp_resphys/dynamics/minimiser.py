@@ -75,7 +75,10 @@ class Minimiser:
         for name, values in self._sums.items():
             setattr(progress, name, warp_view(values, wp.float64))
         places = max(memory, 1)
-        pairs.count, pairs.last = (wp.zeros(b, dtype=int, device=str(p.device)) for _ in range(2))
+        self._recent = [torch.zeros(b, device=p.device, dtype=torch.int32) for _ in range(3)]
+        self._pair_counts = torch.zeros(b, device=p.device, dtype=torch.int32)
+        pairs.count = warp_view(self._pair_counts, wp.int32)
+        pairs.last = wp.zeros(b, dtype=int, device=str(p.device))
         pairs.s, pairs.y = (
             warp_view(torch.zeros(b, places, n, 3, device=p.device, dtype=dtype), vector) for _ in range(2)
         )
@@ -88,13 +91,17 @@ class Minimiser:
         tolerances.epsilon, tolerances.max_iterations = wp.float64(epsilon), max_iterations
         tolerances.refactor_after = kernels.NEVER if refactor_after is None else refactor_after
 
+        history = kernels.History()
+        history.known, history.newest, history.order = (warp_view(each, wp.int32) for each in self._recent)
+        history.start, history.correction = warp_view(p.zeros(n, 3), wp.vec3d), warp_view(p.zeros(3, n, 3), wp.vec3d)
+
         positions, gradient = warp_view(p.positions, wp.vec3d), warp_view(self._gradient, wp.vec3d)
         direction, origin_view = warp_view(self._direction, wp.vec3d), warp_view(origin, wp.vec3d)
         right, vertex_at = warp_view(self._right, vector), p.upload(hessian.vertex_at.astype(np.int32), int)
         stiffness = p.terms.values["stiffness"]
         assert stiffness is not None
         loads = [warp_view(p.terms.force, wp.vec3d), warp_view(stiffness, wp.float64)]
-        beginning = [*loads, positions, tolerances, origin_view, progress, pairs.count]
+        beginning = [*loads, positions, tolerances, origin_view, progress, history]
         begin = p.record_blocks(kernels.begin, b, beginning, [])
         self._idle, self._clamp = (torch.zeros(b, device=p.device, dtype=torch.bool) for _ in range(2))
         chosen = [warp_view(each, wp.bool) for each in (self._idle, self._clamp)]
@@ -104,7 +111,7 @@ class Minimiser:
         aim = p.record_blocks(own.aim, b, [*aiming, right, positions], [origin_view, direction])
         clamped = warp_view(hessian.clamped, wp.bool)
         judging = [int(memory > 0), tolerances, warp_view(p.inertia, wp.float64), found, origin_view, direction]
-        judging += [clamped, positions, gradient, progress, pairs]
+        judging += [clamped, positions, gradient, progress, pairs, history]
         accept = p.record_blocks(own.accept, b, judging, [])
         summarise = p.record_blocks(kernels.summarise, 1, [progress], [warp_view(summary, wp.int32)])
         judge = [*p.evaluation, accept, summarise]
@@ -156,9 +163,18 @@ class Minimiser:
         commands = [parts.begin, *parts.judge, self._choose, self._project, parts.aim, self._compare]
         self._loop = p.capture_calls(solve, [*commands, *factors.commands])
 
-    def minimise(self, start: torch.Tensor) -> None:
-        """Minimises from (B, N, 3) [m]; on a GPU, with tiled factors, without waiting for it."""
+    def minimise(self, start: torch.Tensor, follows: bool = False) -> None:
+        """Minimises; on a GPU, with tiled factors, without waiting for it.
+
+        Args:
+            start: (B, N, 3) where inertia alone would lead [m].
+            follows: whether this step goes on where the last one ended: its solution and those before then foretell
+                where to begin, and pairs are kept as long as the factor.
+        """
         p = self._potential
+        if not follows:
+            for each in (self._recent[0], self._pair_counts):
+                each.zero_()
         if self._loop is not None:
             p.positions.copy_(start)
             with alone(p.device):

@@ -150,7 +150,12 @@ class NonlinearSolver:
             refactor_after=after[settings.name],
         )
 
-    def solve(self, start: torch.Tensor) -> SolveReport:
-        """Minimises from (B, N, 3); what it ends at is left in ``potential.positions``."""
-        self._minimiser.minimise(start)
+    def solve(self, start: torch.Tensor, follows: bool = False) -> SolveReport:
+        """Minimises; what it ends at is left in ``potential.positions``.
+
+        Args:
+            start: (B, N, 3) where inertia alone would lead, or any guess [m].
+            follows: whether this is the step after the one that was solved last, and may begin where that foretells.
+        """
+        self._minimiser.minimise(start, follows)
         return SolveReport(*self._minimiser.outcome())

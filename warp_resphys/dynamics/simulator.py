@@ -304,8 +304,11 @@ class Simulator:
         workspace = self.workspace(state.batch)
         terms = self._terms(state, stage, inputs, constants)
         clamped = self._fixed_at(state, stage, inputs)
-        x, report = equilibrium(workspace, "dynamics", self.settings, terms, stage.target, clamped)
-        return self._finish(state, stage, inputs, constants, x), report
+        follows = workspace.follows(state.q)
+        x, report = equilibrium(workspace, "dynamics", self.settings, terms, stage.target, clamped, follows)
+        new = self._finish(state, stage, inputs, constants, x)
+        workspace.reached(new.q)
+        return new, report
 
     def _fixed_at(self, state: State, stage: ImplicitStage, inputs: Inputs) -> torch.Tensor:
         """(B, D, 3) where the fixed vertices are at the stage [m]."""

@@ -1,0 +1,71 @@
+"""Where a step begins: at what the steps before it foretell, if it follows them."""
+
+import pytest
+import torch
+
+from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, box_hexahedra, select_vertices
+from warp_resphys.dynamics.inputs import Inputs
+from warp_resphys.dynamics.nonlinear_solver import SOLVERS
+from warp_resphys.studies.gradient_check import pose
+
+MESH = box_hexahedra((0.06, 0.02, 0.02), (4, 2, 2))
+BODY = Body(MESH, fixed=select_vertices(MESH, x=0.0))
+MATERIAL = Corotated(1e5, 0.45, density=1000.0)
+
+
+def simulator(body=BODY, **options):
+    settings = {"relative_tolerance": 1e-8} | options.pop("solver", {})
+    return Simulator(body, MATERIAL, solver=SolverSettings(**settings), **options)
+
+
+def iterations(reports):
+    return [report.iterations.tolist() for report in reports]
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("degree", [0, 1, 2])
+def test_forces_that_a_polynomial_describes_are_foretold(name, degree, device):
+    """A free body under its weight and a multiple of it: how far a step is off inertia goes with the force."""
+    s = simulator(Body(MESH), device=device, solver={"name": name})
+    weight = s.prepare().mass[0, :, None] * torch.tensor([0.0, 0.0, 9.8], dtype=torch.float64, device=device)
+    growth = torch.arange(7, dtype=torch.float64, device=device) ** degree
+    forces = (growth[:, None, None, None] * torch.tensor([[[1.0]], [[-2.0]]], device=device).double()) * weight
+    counts = iterations(s.rollout(s.rest_state(2), 7, Inputs(forces)).reports)
+    assert min(counts[0]) > 0
+    assert counts[degree + 2 :] == [[0, 0]] * (5 - degree)
+
+
+@pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2", "midpoint"])
+@pytest.mark.parametrize("time_step", [0.01, 0.0002])
+def test_it_saves_iterations_and_changes_no_state(integrator, time_step, device):
+    s = simulator(integrator=integrator, time_step=time_step, device=device)
+    start, steps = s.rest_state(2), 40
+    followed = s.rollout(start, steps)
+    state, alone = start, []
+    for _ in range(steps):
+        state, report = s.step(state.map(torch.clone))
+        alone.append(report)
+    sums = [sum(sum(counts) for counts in iterations(reports)) for reports in (followed.reports, alone)]
+    assert sums[0] < (1.02 if time_step == 0.01 else 0.9) * sums[1]
+    torch.testing.assert_close(followed.q[-1], state.q, rtol=0.0, atol=2e-9)
+
+
+def test_another_motion_begins_anew(device):
+    """What was foretold of one motion is not taken for another one, nor for the same from its start."""
+    s, fresh = (simulator(device=device, solver={"name": "newton"}) for _ in range(2))
+    s.rollout(pose(s, "bent", 2), 5)
+    other = s.rest_state(2)
+    torch.testing.assert_close(s.step(other)[0].q, fresh.step(other)[0].q, rtol=0.0, atol=0.0)
+
+
+def test_a_failure_is_not_extrapolated(device):
+    s = simulator(device=device, solver={"on_failure": "count", "max_iterations": 30})
+    state = s.rollout(pose(s, "bent", 2), 4).final
+    state.v[0] += 1e4  # in place: the next step still follows
+    failed, report = s.step(state)
+    assert report.converged.tolist() == [False, True]
+    calm = State(pose(s, "bent", 2).q, torch.zeros_like(failed.v))
+    failed.q.copy_(calm.q)
+    failed.v.copy_(calm.v)
+    report = s.step(failed)[1]
+    assert bool(report.converged.all())

@@ -33,7 +33,7 @@ MOST_HALVINGS = wp.constant(25)
 STALLS = wp.constant(3)
 BETTER = wp.constant(
     wp.float64(0.1)
-)  # squared error that makes a higher order worth it: fast modes grow with the order
+)  # of the squared error: what makes a higher order, that amplifies fast modes, worth it
 UNIT = wp.constant(wp.float64(2.0**-52))  # of rounding
 # Of a sum of energies: what rounding leaves of the terms that cancel, per unit of stiffness and of energy.
 ENERGY_ROUNDING = wp.constant(wp.float64(8.0 * 2.0**-52))

@@ -40,6 +40,7 @@ SEARCH = [
     "tune.settings.trainer.rollout_every=3",
     "tune",
     f"tune.trials={TRIALS}",
+    "parallel.processes=1",
     *SPACE,
 ]
 FOLDER = Path("run/tune/resphys")
@@ -122,6 +123,21 @@ class TestSearch:
         assert {name: now[name] for name in before if not name.endswith(".log")} == {
             name: content for name, content in before.items() if not name.endswith(".log")
         }
+
+    def test_workers_find_what_one_process_finds(self, searched, folder):
+        """Two processes, one of which is killed in its trial."""
+        environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+        command = [sys.executable, "-m", "warp_resphys.cli", *SEARCH, "parallel.processes=2", IN_RUN]
+        search = subprocess.Popen(command, env=environment, text=True, stderr=subprocess.PIPE)
+        while not (workers := at_work()):
+            assert search.poll() is None, search.communicate()[1]
+            time.sleep(0.01)
+        os.kill(workers[0], signal.SIGKILL)
+        err = search.communicate(timeout=120)[1]
+        assert search.returncode == 0, err
+        assert "a worker process was lost" in err
+        assert f"{TRIALS}/{TRIALS} trials" in err
+        assert results() == results(searched / FOLDER)
 
     def test_simfree_is_tuned_by_itself(self, folder, no_pictures):
         assert run(*SEARCH, IN_RUN, "tune.model=simfree", "tune.trials=2")[0] == 0
@@ -271,6 +287,14 @@ class TestCrashes:
         rows = table()
         assert [row["rollout_error_mm"] == "123.0" for row in rows] == [True] + (TRIALS - 1) * [False]
         assert not list((FOLDER / "trials").iterdir())
+
+
+def at_work():
+    """The processes that run a trial."""
+    journal = FOLDER / "study.journal"
+    lines = journal.read_text().splitlines() if journal.exists() else []
+    claims = [json.loads(line).get("user_attr", {}).get("claims") for line in lines if line.endswith("}")]
+    return [each[-1]["pid"] for each in claims if each]
 
 
 def table_has(count):

@@ -149,14 +149,18 @@ class SharedStudy:
             for trial in running:
                 claims = trial.user_attrs.get("claims", [])
                 if not claims or not self._is_alive(claims[-1]):
+                    self._seed_sampler(trial.number)
                     number = self._storage.get_trial_id_from_study_id_trial_number(self._id, trial.number)
                     return self._take(Trial(self._study, number))
             if len(running) + len(self._trials(TrialState.COMPLETE, TrialState.PRUNED)) >= self.trials:
                 return None
-            # Each trial draws numbers of its own, so that workers with the same seed do not try the same.
-            seed = int(np.random.SeedSequence([self._seed, len(self._trials())]).generate_state(1)[0])
-            self._study.sampler = optuna.samplers.TPESampler(seed=seed)
+            self._seed_sampler(len(self._trials()))
             return self._take(self._study.ask())
+
+    def _seed_sampler(self, number: int) -> None:
+        """Each trial draws numbers of its own, whichever worker it falls to, so that no two try the same."""
+        seed = int(np.random.SeedSequence([self._seed, number]).generate_state(1)[0])
+        self._study.sampler = optuna.samplers.TPESampler(seed=seed)
 
     def _take(self, trial: Trial) -> Claim:
         claims = [*trial.user_attrs.get("claims", []), self._identity]

@@ -5,7 +5,9 @@ import json
 import logging
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,13 +15,15 @@ from typing import Any
 from ...experiment.checks import check_training, training_settings
 from ...experiment.files import training_file
 from ...experiment.learn import Learning, Snapshot, run_epochs
+from ...experiment.parts import workers_for
 from ...experiment.pipeline import acquire, acquisition_stages, learning_stages, prepare
 from ...experiment.scene import LEARNED, Scene, models_of
 from ...experiment.schema import ANYTHING, COUNT, NAME, NATURAL, POSITIVE, WORD, Group, check, optional
 from ...experiment.trials import folds_of, split_of
 from ...io.errors import DataFileError, InputError
+from ...io.fan_out import Advance, Workers, fan_out
 from ...io.files import read_json
-from ...io.progress import clock
+from ...io.progress import Progress, clock
 from ...io.resumable import forget_checkpoint, keep_checkpoint, resume_checkpoint
 from ...io.stages import Stage, StageInterrupted, run_stages
 from .results import Tuning, print_best, ranked, short_text, write_pictures, write_results
@@ -31,6 +35,7 @@ log = logging.getLogger(__name__)
 
 _POLL_SECONDS = 0.5
 _PICTURE_SECONDS = 60.0
+_COUNTED = ("complete", "pruned")  # states of trials
 _KEYS = Group(
     {"model": WORD, "trials": NATURAL, "trial_seconds": optional(POSITIVE), "seed": COUNT, "study": NAME}
     | {"save_as": NAME, "space": ANYTHING, "settings": Group(each=ANYTHING)}
@@ -52,26 +57,124 @@ def run_tuning(config: Mapping[str, Any], run_dir: Path) -> None:
         StageInterrupted: the user pressed Ctrl-C; what is done so far is kept.
     """
     prepare(config)
-    space = check_tuning(config)
+    check_tuning(config)
     tune = config["tune"]
-    model = tune["model"]
+    with _joined(config, run_dir):  # Refuses a study of something else before anything is computed.
+        pass
+    _, acquired = acquire(config, run_dir, wait=True)
+    run_stages(_stages_before(config, tune["model"], acquired), run_dir, wait=True)
+    workers = workers_for(config, config["parallel"]["processes"]).at_most(tune["trials"])
+    with _joined(config, run_dir) as searcher:
+        tuning = searcher.tuning(run_dir)
+        if not workers.alone:
+            _share(_Task(config, run_dir.absolute(), acquired), tuning, workers)
+        results = _Results(tuning)
+        searcher.work(tuning, _learning(config, run_dir, acquired), results)
+        results.write(pictures=True)
+    print_best(tuning)
+
+
+@dataclass(frozen=True)
+class _Searcher:
+    """One process that works on the study."""
+
+    config: Mapping[str, Any]
+    space: Mapping[str, Dimension]
+    groups: Mapping[str, Any]
+    conditions: Mapping[str, Any]
+    study: SharedStudy
+
+    def tuning(self, run_dir: Path) -> Tuning:
+        """What it works on, in a run whose training as configured is done."""
+        kept = read_json(run_dir / training_file(self.config["tune"]["model"]))["kept"]
+        return Tuning(self.config, self.groups, self.space, self.study, kept["validation_rollout_error_mm"])
+
+    def work(self, tuning: Tuning, learning: Learning, tell: Advance) -> None:
+        """See `_work`."""
+        _work(tuning, learning, _digest(self.conditions), tell)
+
+
+@contextmanager
+def _joined(config: Mapping[str, Any], run_dir: Path) -> Iterator[_Searcher]:
+    """Makes this process one of those that work on the study."""
+    tune = config["tune"]
+    space, model = parse_space(tune["space"]), tune["model"]
     groups = with_settings(training_settings(config, model), fixed_settings(tune))
     folder = run_dir / "tune" / tune["study"]
-    workers = folder / "workers"
-    with at_work(workers) as identity:
+    everyone = folder / "workers"
+    with at_work(everyone) as identity:
         before = [*acquisition_stages(config), *_stages_before(config, model, "")]
         conditions = {"model": model, **_settings_of(before), **groups}
         for group in _searched(groups):
             conditions[group] = {k: v for k, v in groups[group].items() if f"{group}.{k}" not in space}
-        seed, alive = tune["seed"], partial(is_alive, workers)
+        seed, alive = tune["seed"], partial(is_alive, everyone)
         study = SharedStudy(folder, space, conditions, tune["trials"], seed, identity, alive)
-        _, acquired = acquire(config, run_dir, wait=True)
-        needed = _stages_before(config, model, acquired)
-        run_stages(needed, run_dir, wait=True)
-        configured = read_json(run_dir / training_file(model))["kept"]["validation_rollout_error_mm"]
-        tuning = Tuning(config, groups, space, study, configured)
-        _work(tuning, Learning(Scene(needed[-1].settings, run_dir), model), _digest(conditions))
-    print_best(tuning)
+        yield _Searcher(config, space, groups, conditions, study)
+
+
+def _learning(config: Mapping[str, Any], run_dir: Path, acquired: str) -> Learning:
+    model = config["tune"]["model"]
+    return Learning(Scene(_stages_before(config, model, acquired)[-1].settings, run_dir), model)
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What a worker process has to know."""
+
+    config: Mapping[str, Any]
+    run_dir: Path
+    acquired: str  # fingerprint of the dataset
+
+
+class _Results:
+    """Writes what is known, and draws it now and then, as trials end."""
+
+    def __init__(self, tuning: Tuning) -> None:
+        self._tuning, self._drawn = tuning, time.monotonic()
+
+    def __call__(self, count: int = 1, **shown: object) -> None:
+        """After some trials."""
+        if count:
+            self.write(time.monotonic() - self._drawn > _PICTURE_SECONDS)
+
+    def write(self, pictures: bool) -> None:
+        """Now."""
+        with held(self._tuning.folder / "results.lock"):
+            write_results(self._tuning)
+            if pictures:
+                write_pictures(self._tuning)
+                self._drawn = time.monotonic()
+
+
+def _share(task: _Task, tuning: Tuning, workers: Workers) -> None:
+    """Runs trials in worker processes until there are enough."""
+    study, results = tuning.study, _Results(tuning)
+    done = sum(each.state in _COUNTED for each in study.outcomes())
+    if done >= study.trials:
+        return
+    crew = workers.at_most(study.trials - done)
+
+    def advance(count: int, **shown: object) -> None:
+        progress.advance(count, **shown)
+        results(count)
+
+    try:
+        with (
+            Progress(f"{crew.count} workers", study.trials, "trials", done) as progress,
+            closing(fan_out(_join, [task] * crew.count, crew, advance, study.folder)) as ended,
+        ):
+            for _ in ended:
+                pass
+    except KeyboardInterrupt as error:
+        raise StageInterrupted(
+            "interrupted; whole epochs of the trials that ran are kept, and the same command goes on from there"
+        ) from error
+
+
+def _join(task: _Task, advance: Advance) -> None:
+    with _joined(task.config, task.run_dir) as searcher:
+        learning = _learning(task.config, task.run_dir, task.acquired)
+        searcher.work(searcher.tuning(task.run_dir), learning, advance)
 
 
 def _stages_before(config: Mapping[str, Any], model: str, acquired: str) -> list[Stage]:
@@ -103,30 +206,29 @@ def _digest(data: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
 
 
-def _work(tuning: Tuning, learning: Learning, fingerprint: str) -> None:
-    """Runs trials until there are enough; then waits for those of others, which may have to be taken over."""
-    study, drawn, told = tuning.study, time.monotonic(), False
-    results = tuning.folder / "results.lock"
+def _work(tuning: Tuning, learning: Learning, fingerprint: str, tell: Advance) -> None:
+    """Runs trials until there are enough; then waits for those of others, which may have to be taken over.
+
+    Args:
+        tuning: the study.
+        learning: what is trained.
+        fingerprint: of all that trials have in common.
+        tell: is told after each epoch and trial how many trials that makes, and what came of them; may raise.
+    """
+    study, told = tuning.study, False
     while (claim := study.claim()) is not None or (holders := study.holders()):
         if claim is None:
             if not told:
                 log.info("waiting for the last trials, of %s; Ctrl-C leaves them alone", ", ".join(holders))
             told = True
             time.sleep(_POLL_SECONDS)
+            tell(0)
             continue
         told = False
-        _run_trial(tuning, learning, claim, f"{fingerprint} {_digest(claim.settings)}")
-        with held(results):
-            write_results(tuning)
-            if time.monotonic() - drawn > _PICTURE_SECONDS:
-                write_pictures(tuning)
-                drawn = time.monotonic()
-    with held(results):
-        write_results(tuning)
-        write_pictures(tuning)
+        _run_trial(tuning, learning, claim, f"{fingerprint} {_digest(claim.settings)}", tell)
 
 
-def _run_trial(tuning: Tuning, learning: Learning, claim: Claim, fingerprint: str) -> None:
+def _run_trial(tuning: Tuning, learning: Learning, claim: Claim, fingerprint: str, tell: Advance) -> None:
     """Trains with the settings of a trial, from where another worker left it, and tells what came of it."""
     start, spent, study = time.perf_counter(), 0.0, tuning.study
     limit = tuning.config["tune"]["trial_seconds"]
@@ -141,6 +243,7 @@ def _run_trial(tuning: Tuning, learning: Learning, claim: Claim, fingerprint: st
         keep_checkpoint(path, "training", kept[0], {**kept[1], "seconds": seconds(), "fingerprint": fingerprint})
 
     def watch(record: Mapping[str, float]) -> None:
+        tell(0)
         if limit is not None and seconds() > limit:
             raise SlowError
         if "rollout_error_mm" in record:
@@ -174,12 +277,18 @@ def _run_trial(tuning: Tuning, learning: Learning, claim: Claim, fingerprint: st
     else:
         log.warning("trial %d was taken over by another process: this one was taken for dead", claim.number)
     forget_checkpoint(path)
+    tell(1, **_shown(study))
+
+
+def _shown(study: SharedStudy) -> dict[str, str]:
+    best = ranked(study.outcomes())
+    return {"best": f"{best[0].error:.3g} mm of trial {best[0].number}"} if best else {}
 
 
 def _log_progress(study: SharedStudy, claim: Claim, value: float | None, seconds: float) -> None:
     """One line a trial: what came of it, how far the study is, and how long the rest takes."""
     outcomes = study.outcomes()
-    told = [each for each in outcomes if each.state in ("complete", "pruned")]
+    told = [each for each in outcomes if each.state in _COUNTED]
     came = "given up" if value is None else "diverged" if math.isinf(value) else f"{value:.3g} mm"
     said = f"trial {claim.number}: {came} in {clock(seconds)}; {len(told)} of {study.trials} done"
     if best := ranked(outcomes):

@@ -59,6 +59,7 @@ COMMANDS: Final[Mapping[str, tuple[str, str]]] = MappingProxyType(
         "benchmark": ("studies.benchmark:benchmark", "time steps, forward and backward, and what they consist of"),
         "element-study": ("studies.elements:element_study", "static sag of a beam, by element and refinement"),
         "size-study": ("studies.sizes:size_study", "time and memory of a step, by linear solver and size of the body"),
+        "peer-study": ("studies.peers:peer_study", "time of a step beside another simulator's, at equal error"),
         "locking-study": ("studies.locking:locking_study", "deflection of an arm, by element and refinement"),
     }
 )

@@ -135,14 +135,16 @@ def equilibrium(
     Raises:
         ConvergenceError: see `nonlinear_solver.SolverSettings.on_failure`.
     """
-    reports: list[SolveReport] = []
-    names = tuple(terms.values)
-    main = (terms.target, terms.inertia, terms.force)
-    x: torch.Tensor = _Equilibrium.apply(
-        workspace, purpose, settings, follows, reports, names, start, fixed_positions, *main, *terms.values.values()
-    )
-    check_converged(settings, reports[0], x)
-    return x, reports[0]
+    names, main = tuple(terms.values), (terms.target, terms.inertia, terms.force)
+    tensors = (start, fixed_positions, *main, *terms.values.values())
+    if torch.is_grad_enabled() and any(each is not None and each.requires_grad for each in tensors[1:]):
+        reports: list[SolveReport] = []
+        x: torch.Tensor = _Equilibrium.apply(workspace, purpose, settings, follows, reports, names, *tensors)
+        report = reports[0]
+    else:
+        x, report = _solve_shards(workspace, purpose, settings, follows, names, tensors)
+    check_converged(settings, report, x)
+    return x, report
 
 
 def ramped(
@@ -205,19 +207,9 @@ class _Equilibrium(torch.autograd.Function):
         fixed_positions: torch.Tensor,
         *terms: torch.Tensor | None,
     ) -> torch.Tensor:
-        tensors = [None if each is None else each.detach() for each in (start, fixed_positions, *terms)]
-
-        # Made here, not in the threads: Warp captures graphs for the whole process.
-        parts = [(rows, own, own.solver(purpose, settings)) for rows, own in workspace.parts]
-
-        def solve(part: tuple[slice, Workspace, NonlinearSolver]) -> tuple[torch.Tensor, SolveReport]:
-            rows, own, solver = part
-            return _solve(own, solver, follows, names, *(_rows(each, rows) for each in tensors))
-
-        with threads_for(start[0].numel(), len(parts)):
-            found = in_threads(solve, parts)
-        reports.append(SolveReport.of([report for _, report in found]))
-        x = found[0][0] if len(found) == 1 else torch.cat([each for each, _ in found])
+        tensors = (start, fixed_positions, *terms)
+        x, report = _solve_shards(workspace, purpose, settings, follows, names, tensors)
+        reports.append(report)
         ctx.workspace, ctx.names, ctx.settings = workspace, names, settings
         ctx.save_for_backward(x, *terms)
         return x
@@ -248,6 +240,30 @@ class _Equilibrium(torch.autograd.Function):
         except ConvergenceError as error:
             raise ConvergenceError(str(error), x.detach().clone(), None) from None
         return (*([None] * 7), *map(_joined, (None, *saved), zip(*found, strict=True)))
+
+
+def _solve_shards(
+    workspace: Workspace,
+    purpose: str,
+    settings: SolverSettings,
+    follows: bool,
+    names: tuple[str, ...],
+    given: Sequence[torch.Tensor | None],
+) -> tuple[torch.Tensor, SolveReport]:
+    """The minimiser and the report of a batch, whose shards go to as many threads."""
+    tensors = [None if each is None else each.detach() for each in given]
+    # Made here, not in the threads: Warp captures graphs for the whole process.
+    parts = [(rows, own, own.solver(purpose, settings)) for rows, own in workspace.parts]
+
+    def solve(part: tuple[slice, Workspace, NonlinearSolver]) -> tuple[torch.Tensor, SolveReport]:
+        rows, own, solver = part
+        return _solve(own, solver, follows, names, *(_rows(each, rows) for each in tensors))
+
+    assert tensors[0] is not None
+    with threads_for(tensors[0][0].numel(), len(parts)):
+        found = in_threads(solve, parts)
+    x = found[0][0] if len(found) == 1 else torch.cat([each for each, _ in found])
+    return x, SolveReport.of([report for _, report in found])
 
 
 def _rows(values: torch.Tensor | None, rows: slice) -> torch.Tensor | None:

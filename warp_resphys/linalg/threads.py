@@ -9,7 +9,7 @@ from itertools import pairwise
 from typing import TypeVar
 
 import torch
-from threadpoolctl import ThreadpoolController
+from threadpoolctl import LibController, ThreadpoolController
 
 from ..io.errors import InputError
 
@@ -28,20 +28,26 @@ def threads_for(unknowns: int, shards: int = 1) -> Iterator[None]:
     banded factor gains nothing from a second one.
     """
     before = torch.get_num_threads()
-    with _blas().limit(limits=1, user_api="blas"):
-        if before == 1 or (unknowns >= _WORTH_SHARING and shards == 1):
-            yield
-            return
+    one = before > 1 and not (unknowns >= _WORTH_SHARING and shards == 1)
+    # By the libraries themselves: a step is too short to ask all that threadpoolctl asks.
+    several = [(library, count) for library in _blas() if (count := library.get_num_threads()) != 1]
+    for library, _ in several:
+        library.set_num_threads(1)
+    if one:
         torch.set_num_threads(1)
-        try:
-            yield
-        finally:
+    try:
+        yield
+    finally:
+        if one:
             torch.set_num_threads(before)
+        for library, count in several:
+            library.set_num_threads(count)
 
 
 @cache
-def _blas() -> ThreadpoolController:
-    return ThreadpoolController()
+def _blas() -> list[LibController]:
+    found: list[LibController] = ThreadpoolController().select(user_api="blas").lib_controllers
+    return found
 
 
 def shards_of(batch: int, device: torch.device) -> list[slice]:

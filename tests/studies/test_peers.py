@@ -46,7 +46,7 @@ def test_both_converge_to_their_own_solution(folder, monkeypatch, capsys):
     for solver in ("quasi_newton", "VBD"):
         errors = [row["error_mm"] for row in rows if row["solver"] == solver]
         assert errors == sorted(errors, reverse=True)
-        assert errors[-1] < 0.01 * errors[0]
+        assert errors[-1] < 0.05 * errors[0]
         assert all(row["ms"] > 0.0 for row in rows)
 
 

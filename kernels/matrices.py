@@ -53,9 +53,10 @@ def polar_rotation(f: wp.mat33d) -> wp.mat33d:
     if wp.determinant(f) > SINGULAR:
         for _ in range(20):
             c = cofactor(r)
-            following = HALF * r + (wp.float64(1.5) / wp.ddot(c, r)) * c
-            update = wp.ddot(following - r, following - r)
-            r = following
+            determinant = r[0, 0] * c[0, 0] + r[0, 1] * c[0, 1] + r[0, 2] * c[0, 2]
+            step = (HALF / determinant) * c - HALF * r
+            r += step
+            update = wp.ddot(step, step)
             if update < NEWTON_TOLERANCE:
                 break
     if not (update < NEWTON_TOLERANCE):
@@ -80,9 +81,9 @@ def nearest_unimodular(f: wp.mat33d) -> wp.mat33d:
     for _ in range(60):
         c = cofactor(d)
         offset = wp.ddot(c, d - f) - (wp.ddot(c, d) / wp.float64(3.0) - ONE)
-        following = f + (offset / (wp.ddot(c, c) + SINGULAR)) * c
-        update = wp.ddot(following - d, following - d)
-        d = following
+        step = (f - d) + (offset / (wp.ddot(c, c) + SINGULAR)) * c
+        d += step
+        update = wp.ddot(step, step)
         if update < UPDATE_TOLERANCE:
             break
     return d

@@ -31,6 +31,7 @@ from yaml import MarkedYAMLError
 from .io.errors import InputError, ResphysError
 from .io.files import OWN_OPTIONS, is_disk_full
 from .io.labels import run_label
+from .io.team import is_first, place
 
 CONFIG_PACKAGE = "pkg://warp_resphys.conf"
 USER_ERROR = 2
@@ -99,6 +100,8 @@ _VALUED: Final = (
     *("--cfg", "-c", "--package", "-p", "--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd"),
     *("--info", "-i", "--experimental-rerun"),
 )
+# Of a process that helps another one with a run.
+_SILENT: Final = ("hydra.output_subdir=null", "hydra/job_logging=disabled")
 
 
 def main(command: str | None = None) -> None:
@@ -175,7 +178,9 @@ def _run(command: str | None) -> None:
         if any(argument.startswith("--experimental-rerun") for argument in sys.argv[1:]):
             raise HydraException("--experimental-rerun reads a pickle, which can run code: use overrides")
         chosen, rest = _read(arguments[1:], command)
-        sys.argv = [arguments[0], *_own_options(), *rest]
+        sys.argv = [arguments[0], *_own_options(), *rest, *([] if is_first() else _SILENT)]
+        if place()[1] > 1 and chosen != "run":
+            raise InputError(f"torchrun is for runs: start warp-resphys {chosen} without it.")
         configuration = _CONFIGURATIONS.get(chosen, chosen.replace("-", "_"))
         hydra.main(version_base="1.3", config_path=CONFIG_PACKAGE, config_name=configuration)(job)()
     except KeyboardInterrupt as error:

@@ -139,7 +139,7 @@ def test_states_travel():
     final = sim.rollout(sim.rest_state(), 3, weight(0.05)).final
     again = State.from_tensors(final.tensors())
     assert torch.equal(again.payload.q, final.payload.q)
-    first, second = (sim.step(each, weight(0.05))[0] for each in (final, again))
+    first, second = (simulator().step(each, weight(0.05))[0] for each in (final, again))
     assert torch.equal(first.q, second.q)
     assert torch.equal(first.payload.v, second.payload.v)
 

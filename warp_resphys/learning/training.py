@@ -11,6 +11,7 @@ import torch
 from typing_extensions import override
 
 from ..io.errors import InputError
+from ..io.team import add_up, place
 from .networks import Model, StateMap
 
 SCHEDULES = ("cosine", "step")
@@ -211,9 +212,11 @@ class Trainer(EpochTrainer[Model]):
         for loss, weight in self._batches():
             self._optimiser.zero_grad()
             loss.backward()
+            add_up(p.grad for p in self.model.network.parameters() if p.grad is not None)
             self._optimiser.step()
             total += loss.detach() * weight
             count += weight
+        add_up([total])
         self.model.eval()
         unit = float(self.model.remainder) ** 2
         with torch.no_grad():
@@ -221,12 +224,14 @@ class Trainer(EpochTrainer[Model]):
         return {"train_loss": float(total) / count * unit, "validation_loss": validation, "learning_rate": rate}
 
     def _batches(self) -> Iterator[tuple[torch.Tensor, float]]:
-        """The mean loss of each batch of one pass over the training samples, and how many are in it."""
+        """This process's part of the mean loss of each batch of one pass, and how many samples are in the batch."""
         inputs, outputs = self._train
+        first, step = place()
         order = torch.randperm(len(inputs), generator=self._random).to(inputs.device)
         for batch in order.split(self.config["batch_size"]):
-            found, _ = self.model.standardised(self._noisy(inputs[batch]))
-            yield self._squares(found, outputs[batch]).mean(), len(batch)
+            found, _ = self.model.standardised(self._noisy(inputs[batch])[first::step])
+            mine = self._squares(found, outputs[batch[first::step]])
+            yield mine.sum() / (len(batch) * outputs.shape[1]), len(batch)
 
     def _validate(self) -> torch.Tensor:
         """The mean validation loss."""
@@ -268,27 +273,34 @@ class SequenceTrainer(Trainer[Model]):
     @override
     def _batches(self) -> Iterator[tuple[torch.Tensor, float]]:
         inputs, outputs, inside = self._train_series
+        first, step = place()
         hidden = None
         for span in torch.arange(len(inputs)).split(self.config["sequence"]):
-            x = self._noisy(inputs[span])
-            loss, hidden = self._through(x, outputs[span], inside[span], hidden)
-            yield loss, float(inside[span].sum())
+            mine, count = (slice(None), slice(first, None, step)), float(inside[span].sum())
+            x = self._noisy(inputs[span])[mine]
+            loss, hidden = self._through(x, outputs[span][mine], inside[span][mine], hidden, count)
+            yield loss, count
             hidden = hidden.detach()
 
     def _through(
-        self, inputs: torch.Tensor, outputs: torch.Tensor, inside: torch.Tensor, hidden: torch.Tensor | None
+        self,
+        inputs: torch.Tensor,
+        outputs: torch.Tensor,
+        inside: torch.Tensor,
+        hidden: torch.Tensor | None,
+        count: float,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Mean loss of (L, R, .) steps that are inside (L, R) of their trial, and the hidden state after them."""
+        """Loss of (L, R, .) steps that are inside (L, R) of their trial, over a count; the hidden state at last."""
         total = inputs.new_zeros(())
         for x, y, known in zip(inputs, outputs, inside, strict=True):
             found, hidden = self.model.standardised(x, hidden)
             total = total + torch.where(known, self._squares(found, y).mean(1), 0.0).sum()
         assert hidden is not None
-        return total / inside.sum().clamp_min(1), hidden
+        return total / max(count, 1.0), hidden
 
     @override
     def _validate(self) -> torch.Tensor:
-        return self._through(*self._validation_series, None)[0]
+        return self._through(*self._validation_series, None, float(self._validation_series[2].sum()))[0]
 
 
 def _side_by_side(

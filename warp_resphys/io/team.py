@@ -1,0 +1,84 @@
+"""Processes that torchrun has started: the first one works, and all of them train networks together.
+
+Each knows its place from the environment. Without torchrun there is one process, and nothing here does anything.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from datetime import timedelta
+from typing import TYPE_CHECKING
+
+from .errors import InputError
+from .progress import be_quiet
+
+if TYPE_CHECKING:  # Not all who name stages need it.
+    import torch
+
+_PATIENCE = timedelta(days=7)  # that the others have while the first one works
+
+
+def place() -> tuple[int, int]:
+    """This process's number, and how many there are."""
+    return int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
+
+
+def is_first() -> bool:
+    """Whether this is the process that works and writes."""
+    return place()[0] == 0
+
+
+@contextmanager
+def joined(device: torch.device) -> Iterator[None]:
+    """Brings the processes together; all but the first fall silent. On GPUs, each takes one of its own machine.
+
+    Raises:
+        InputError: a machine with fewer GPUs than processes.
+    """
+    if place()[1] == 1:
+        yield
+        return
+    import torch
+    import torch.distributed as dist
+
+    if device.type == "cuda":
+        local, present = int(os.environ.get("LOCAL_RANK", "0")), torch.cuda.device_count()
+        if local >= present:
+            raise InputError(f"torchrun has started more processes than there are GPUs, {present}: start one for each.")
+        torch.cuda.set_device(local)
+    if not is_first():
+        be_quiet()
+        logging.disable(logging.WARNING)
+    dist.init_process_group("nccl" if device.type == "cuda" else "gloo", timeout=_PATIENCE)
+    try:
+        yield
+    finally:
+        dist.destroy_process_group()
+
+
+def agreed(value: bool) -> bool:
+    """What the first process says; the others wait for it."""
+    if place()[1] == 1:
+        return value
+    import torch.distributed as dist
+
+    said = [value]
+    dist.broadcast_object_list(said)
+    return said[0]
+
+
+def add_up(tensors: Iterable[torch.Tensor]) -> None:
+    """Replaces each process's tensors by their sums over all: the same numbers everywhere."""
+    if place()[1] == 1:
+        return
+    import torch
+    import torch.distributed as dist
+
+    parts = list(tensors)
+    whole = torch.cat([each.reshape(-1) for each in parts])
+    dist.all_reduce(whole)
+    for each, values in zip(parts, whole.split([each.numel() for each in parts]), strict=True):
+        each.copy_(values.view_as(each))

@@ -31,6 +31,7 @@ ARMIJO = wp.constant(wp.float64(1e-4))
 LEAST_CURVATURE = wp.constant(wp.float64(1e-10))
 MOST_HALVINGS = wp.constant(25)
 STALLS = wp.constant(3)
+ASKS_AGAIN = wp.constant(16)  # stalls: one nudge may happen to change little
 BETTER = wp.constant(
     wp.float64(0.1)
 )  # of the squared error: what makes a higher order, that amplifies fast modes, worth it
@@ -136,8 +137,6 @@ def remember(history: History, positions: wp.array2d[wp.vec3d], b: int, lane: in
         if total < BETTER * least:
             best = order
             least = total
-    if known == 0:
-        best = 1
     for i in range(lane, n, lanes):
         history.correction[b, place, i] = positions[b, i] - history.start[b, i]
     if lane == 0:
@@ -242,7 +241,7 @@ def repeat(idle: wp.array[wp.bool], clamp: wp.array[wp.bool], wanting_out: wp.ar
 @kernel
 def nudge(
     progress: Progress,
-    signs: wp.array[wp.vec3d],  # (N) up or down, at random
+    signs: wp.array2d[wp.vec3d],  # (., N) up or down, at random: several draws
     positions: wp.array2d[wp.vec3d],  # (B, N) [m]
     residual: wp.array2d[wp.vec3d],  # (B, N) [N]
     positions_out: wp.array2d[wp.vec3d],  # what they were
@@ -261,8 +260,9 @@ def nudge(
         residual_out[b, i] = residual[b, i]
         size = wp.max(size, wp.max(wp.abs(positions[b, i])))
     unit = UNIT * block_max(size)
+    draw = progress.iterations[b] % signs.shape[0]
     for i in range(lane, positions.shape[1], wp.block_dim()):
-        positions[b, i] = positions[b, i] + unit * signs[i]
+        positions[b, i] = positions[b, i] + unit * signs[draw, i]
 
 
 @kernel
@@ -278,6 +278,7 @@ def compare(
     b, lane = wp.tid()
     if progress.asks[b] == 0:
         return
+    rounding = progress.rounding[b]
     change, size = wp.float64(0.0), wp.float64(0.0)
     for i in range(lane, positions.shape[1], wp.block_dim()):
         moved = residual[b, i] - kept_residual[b, i]
@@ -285,10 +286,12 @@ def compare(
         size += wp.dot(gradient[b, i], gradient[b, i])
         positions[b, i] = kept_positions[b, i]
         residual[b, i] = kept_residual[b, i]
-    change, size = block_sum(change), block_sum(size)
+    change, size = wp.sqrt(block_sum(change)), wp.sqrt(block_sum(size))
+    if rounding < INFINITE:
+        change = wp.max(change, rounding)
     if lane == 0:
         progress.asks[b] = 0
-        progress.rounding[b] = wp.sqrt(change)
+        progress.rounding[b] = change
         if size <= change:
             progress.phase[b] = DONE
 
@@ -316,12 +319,19 @@ def summarise(progress: Progress, summary_out: wp.array[int]):
 
 
 @function
+def may_be_rounding(progress: Progress, b: int, norm: wp.float64, iterations: int, stalls: int) -> bool:
+    """Whether to measure what rounding makes of a residual that does not fall: once, and again when that went on."""
+    stuck = iterations >= STALLS and stalls >= STALLS
+    return stuck and (norm <= progress.rounding[b] or stalls % ASKS_AGAIN == 0)
+
+
+@function
 def give_up(progress: Progress, tolerances: Tolerances, clamped: wp.array[wp.bool], b: int):
     """Stays where it was: a new factor, and a clamped one, get a try before the environment counts as stuck."""
     progress.phase[b] = AIMS
     progress.stalls[b] += 1
     norm = progress.relative[b] * wp.max(progress.scale[b], tolerances.absolute)
-    if progress.iterations[b] >= STALLS and progress.stalls[b] >= STALLS and norm <= progress.rounding[b]:
+    if may_be_rounding(progress, b, norm, progress.iterations[b], progress.stalls[b]):
         progress.asks[b] = 1
     if progress.iterations[b] >= tolerances.max_iterations:
         progress.phase[b] = STUCK
@@ -586,7 +596,6 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
             gradient[b, i] = found.residual[b, i]
         scale = found.balance[b] + progress.force[b]
         smallest = progress.smallest[b]
-        rounding = progress.rounding[b]
         stalls += 1
         if norm < HALF * smallest:
             stalls = 0
@@ -596,7 +605,7 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
             done = done or within_rounding(tolerances, inertia, positions, direction, scale, b, lane)
         # Before the values of this environment are written, every thread has read them.
         asks = block_max(ZERO)
-        if iterations >= STALLS and stalls >= STALLS and before - energy <= flat and norm <= rounding and not done:
+        if may_be_rounding(progress, b, norm, iterations, stalls) and before - energy <= flat and not done:
             asks = ONE
         if done:
             remember(history, positions, b, lane)

@@ -16,6 +16,7 @@ from .recorded_factors import RecordedFactors
 
 _COUNTS = ("phase", "wanted", "factored", "asks", "iterations", "since", "made", "halvings", "stalls")
 _SUMS = ("step", "slope", "energy", "scale", "relative", "smallest", "rounding", "force", "stiffness")
+_NUDGES = 7  # by rounding units that are drawn
 
 
 class Summary(NamedTuple):
@@ -75,6 +76,7 @@ class Minimiser:
         for name, values in self._sums.items():
             setattr(progress, name, warp_view(values, wp.float64))
         places = max(memory, 1)
+        self._keeps_pairs = refactor_after is not None  # The tail of a long solve tells the next one little.
         self._recent = [torch.zeros(b, device=p.device, dtype=torch.int32) for _ in range(3)]
         self._pair_counts = torch.zeros(b, device=p.device, dtype=torch.int32)
         pairs.count = warp_view(self._pair_counts, wp.int32)
@@ -116,7 +118,7 @@ class Minimiser:
         summarise = p.record_blocks(kernels.summarise, 1, [progress], [warp_view(summary, wp.int32)])
         judge = [*p.evaluation, accept, summarise]
         self._begin, self._aim, self._go_on = p.capture(begin, *judge), p.capture(aim, *judge), p.capture(*judge)
-        signs = np.random.default_rng(0).choice([-1.0, 1.0], (n, 3))
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], (_NUDGES, n, 3))
         residual, kept = warp_view(p.residual, wp.vec3d), [warp_view(p.zeros(n, 3), wp.vec3d) for _ in range(2)]
         nudge = p.record_blocks(kernels.nudge, b, [progress, p.upload(signs, wp.vec3d), positions, residual], kept)
         compare = p.record_blocks(kernels.compare, b, [progress, *kept, gradient], [positions, residual])
@@ -169,12 +171,13 @@ class Minimiser:
         Args:
             start: (B, N, 3) where inertia alone would lead [m].
             follows: whether this step goes on where the last one ended: its solution and those before then foretell
-                where to begin, and pairs are kept as long as the factor.
+                where to begin, and pairs are kept as long as the factor, if there will be another one.
         """
         p = self._potential
         if not follows:
-            for each in (self._recent[0], self._pair_counts):
-                each.zero_()
+            self._recent[0].zero_()
+        if not (follows and self._keeps_pairs):
+            self._pair_counts.zero_()
         if self._loop is not None:
             p.positions.copy_(start)
             with alone(p.device):

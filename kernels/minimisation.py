@@ -243,9 +243,7 @@ def nudge(
     progress: Progress,
     signs: wp.array2d[wp.vec3d],  # (., N) up or down, at random: several draws
     positions: wp.array2d[wp.vec3d],  # (B, N) [m]
-    residual: wp.array2d[wp.vec3d],  # (B, N) [N]
-    positions_out: wp.array2d[wp.vec3d],  # what they were
-    residual_out: wp.array2d[wp.vec3d],
+    positions_out: wp.array2d[wp.vec3d],  # (B, N) what they were
 ):
     """Moves every coordinate of those that ask by one rounding unit of the largest.
 
@@ -257,7 +255,6 @@ def nudge(
     size = wp.float64(0.0)
     for i in range(lane, positions.shape[1], wp.block_dim()):
         positions_out[b, i] = positions[b, i]
-        residual_out[b, i] = residual[b, i]
         size = wp.max(size, wp.max(wp.abs(positions[b, i])))
     unit = UNIT * block_max(size)
     draw = progress.iterations[b] % signs.shape[0]
@@ -268,11 +265,11 @@ def nudge(
 @kernel
 def compare(
     progress: Progress,
-    kept_positions: wp.array2d[wp.vec3d],  # (B, N) before `nudge` [m]
-    kept_residual: wp.array2d[wp.vec3d],  # (B, N) [N]
-    gradient: wp.array2d[wp.vec3d],  # (B, N) at the iterate [N]
+    kept: wp.array2d[wp.vec3d],  # (B, N) positions before `nudge` [m]
+    gradient: wp.array2d[wp.vec3d],  # (B, N) there [N]
+    residual: wp.array2d[wp.vec3d],  # (B, N) after it [N]
     positions: wp.array2d[wp.vec3d],  # (B, N) are again what they were
-    residual: wp.array2d[wp.vec3d],
+    history: History,
 ):
     """Where a residual that does not fall any more is no more than rounding makes of it, it has converged."""
     b, lane = wp.tid()
@@ -281,14 +278,15 @@ def compare(
     rounding = progress.rounding[b]
     change, size = wp.float64(0.0), wp.float64(0.0)
     for i in range(lane, positions.shape[1], wp.block_dim()):
-        moved = residual[b, i] - kept_residual[b, i]
+        moved = residual[b, i] - gradient[b, i]
         change += wp.dot(moved, moved)
         size += wp.dot(gradient[b, i], gradient[b, i])
-        positions[b, i] = kept_positions[b, i]
-        residual[b, i] = kept_residual[b, i]
+        positions[b, i] = kept[b, i]
     change, size = wp.sqrt(block_sum(change)), wp.sqrt(block_sum(size))
     if rounding < INFINITE:
         change = wp.max(change, rounding)
+    if size <= change:
+        remember(history, positions, b, lane)
     if lane == 0:
         progress.asks[b] = 0
         progress.rounding[b] = change
@@ -587,6 +585,7 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
                     progress.halvings[b] = halvings + 1
                     if rests:
                         progress.phase[b] = DONE
+                        history.known[b] = 0
                     elif given_up:
                         give_up(progress, tolerances, clamped, b)
                 return

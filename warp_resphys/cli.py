@@ -161,7 +161,8 @@ def _run(command: str | None) -> None:
             sentence = _explain(error, started)
             if sentence is None or full_error:
                 raise
-            print(f"error: {sentence}", file=sys.stderr, flush=True)
+            if is_first():
+                print(f"error: {sentence}", file=sys.stderr, flush=True)
             reported.append(error)
             if HydraConfig.get().mode == RunMode.RUN:
                 raise SystemExit(USER_ERROR) from error
@@ -190,7 +191,7 @@ def _run(command: str | None) -> None:
         sentence = _explain(error, started)
         if sentence is None or full_error:
             raise
-        if not any(error is known for known in reported):
+        if is_first() and not any(error is known for known in reported):
             print(f"error: {sentence}", file=sys.stderr, flush=True)
         raise SystemExit(USER_ERROR) from None
     finally:

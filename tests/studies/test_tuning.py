@@ -125,7 +125,7 @@ class TestSearch:
         }
 
     def test_workers_find_what_one_process_finds(self, searched, folder):
-        """Two processes, one of which is killed in its trial."""
+        """Two processes, one of which is killed in its trial; so few trials are drawn without looking at others."""
         environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
         command = [sys.executable, "-m", "warp_resphys.cli", *SEARCH, "parallel.processes=2", IN_RUN]
         search = subprocess.Popen(command, env=environment, text=True, stderr=subprocess.PIPE)

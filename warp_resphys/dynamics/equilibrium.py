@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch.autograd import forward_ad
 from typing_extensions import override
 
 from ..energies.base import Energy
@@ -128,7 +129,7 @@ def equilibrium(
         purpose: which of the workspace's solvers; see `Workspace.solver`.
         settings: of the solver.
         terms: of the step.
-        start: (B, N, 3) where the solver begins [m]; without influence on the result, and without a gradient.
+        start: (B, N, 3) where the solver begins [m]; of influence within its tolerance alone, and without a gradient.
         fixed_positions: (B, D, 3) of the fixed vertices [m].
         follows: see `NonlinearSolver.solve`.
 
@@ -137,7 +138,9 @@ def equilibrium(
     """
     names, main = tuple(terms.values), (terms.target, terms.inertia, terms.force)
     tensors = (start, fixed_positions, *main, *terms.values.values())
-    if torch.is_grad_enabled() and any(each is not None and each.requires_grad for each in tensors[1:]):
+    # What differentiates forward is to be told that it cannot.
+    graded = torch.is_grad_enabled() and any(each is not None and each.requires_grad for each in tensors[1:])
+    if graded or forward_ad._current_level >= 0:
         reports: list[SolveReport] = []
         x: torch.Tensor = _Equilibrium.apply(workspace, purpose, settings, follows, reports, names, *tensors)
         report = reports[0]
@@ -293,7 +296,7 @@ def _solve(
     fixed_positions: Any,
     *terms: Any,
 ) -> tuple[torch.Tensor, SolveReport]:
-    """See `_Equilibrium.forward`."""
+    """See `_solve_shards`."""
     workspace.potential.set_terms(_terms(names, terms))
     if len(workspace.fixed):
         start = start.clone()

@@ -119,9 +119,9 @@ class Minimiser:
         judge = [*p.evaluation, accept, summarise]
         self._begin, self._aim, self._go_on = p.capture(begin, *judge), p.capture(aim, *judge), p.capture(*judge)
         signs = np.random.default_rng(0).choice([-1.0, 1.0], (_NUDGES, n, 3))
-        residual, kept = warp_view(p.residual, wp.vec3d), [warp_view(p.zeros(n, 3), wp.vec3d) for _ in range(2)]
-        nudge = p.record_blocks(kernels.nudge, b, [progress, p.upload(signs, wp.vec3d), positions, residual], kept)
-        compare = p.record_blocks(kernels.compare, b, [progress, *kept, gradient], [positions, residual])
+        kept = warp_view(p.zeros(n, 3), wp.vec3d)
+        nudge = p.record_blocks(kernels.nudge, b, [progress, p.upload(signs, wp.vec3d), positions], [kept])
+        compare = p.record_blocks(kernels.compare, b, [progress, kept, gradient, found.residual], [positions, history])
         self._compare = p.capture(nudge, *p.evaluation, compare, summarise)
         self._parts = SimpleNamespace(begin=begin, aim=aim, judge=judge)
         self._loop: Launches | None = None

@@ -16,7 +16,8 @@ it, which is measured; and one on which nothing acts, if its first step is withi
 
 Residuals and positions are float64. Factors and pairs may be float32: they decide how many iterations it takes.
 
-What is decided for an environment is decided by kernels (`minimiser`); the host makes their launches, and factorises.
+What is decided for an environment is decided by kernels (`minimiser`); the host makes their launches and factorises, or
+launches one graph that does both.
 """
 
 from collections.abc import Sequence

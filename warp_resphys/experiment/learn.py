@@ -17,7 +17,7 @@ from ..io.files import read_array, read_hdf5, write_checkpoint, write_json
 from ..io.progress import Progress
 from ..io.resumable import forget_checkpoint, keep_checkpoint, resume_checkpoint
 from ..io.stages import StageContext
-from ..io.team import is_first
+from ..io.team import agreed, is_first
 from ..learning.markers_in_the_loop import MarkersInTheLoop, MotionLoss, Watched, cross_validated_epochs
 from ..learning.networks import ResidualForce, StateMap, build_model, build_next_state
 from ..learning.predictors import Range
@@ -305,7 +305,7 @@ def fit(context: StageContext, prepared: Prepared, refined: bool = False) -> Non
     """
     model, trainer = context.settings["model"], prepared.trainer
     checkpoint = context.run_dir / f"{context.name}.safetensors"
-    found = resume_checkpoint(checkpoint, "training", context.fingerprint)
+    found = agreed(resume_checkpoint(checkpoint, "training", context.fingerprint) if is_first() else None)
     if found is not None:
         trainer.resume(*found)
 

@@ -10,13 +10,15 @@ import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from datetime import timedelta
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from .errors import InputError
 from .progress import be_quiet
 
 if TYPE_CHECKING:  # Not all who name stages need it.
     import torch
+
+T = TypeVar("T")
 
 _PATIENCE = timedelta(days=7)  # that the others have while the first one works
 
@@ -36,7 +38,7 @@ def joined(device: torch.device) -> Iterator[None]:
     """Brings the processes together; all but the first fall silent. On GPUs, each takes one of its own machine.
 
     Raises:
-        InputError: a machine with fewer GPUs than processes.
+        InputError: a GPU that is named, or a machine with fewer GPUs than processes.
     """
     if place()[1] == 1:
         yield
@@ -44,22 +46,24 @@ def joined(device: torch.device) -> Iterator[None]:
     import torch
     import torch.distributed as dist
 
+    if device.index is not None:
+        raise InputError(f"device is {device}, but torchrun gives each process a GPU of its own: choose device=cuda.")
     if device.type == "cuda":
-        local, present = int(os.environ.get("LOCAL_RANK", "0")), torch.cuda.device_count()
-        if local >= present:
-            raise InputError(f"torchrun has started more processes than there are GPUs, {present}: start one for each.")
+        local, count = (int(os.environ.get(name, "0")) for name in ("LOCAL_RANK", "LOCAL_WORLD_SIZE"))
+        if count > torch.cuda.device_count():
+            raise InputError(
+                f"torchrun has started {count} processes here for {torch.cuda.device_count()} GPUs: start one for each."
+            )
         torch.cuda.set_device(local)
     if not is_first():
         be_quiet()
         logging.disable(logging.WARNING)
     dist.init_process_group("nccl" if device.type == "cuda" else "gloo", timeout=_PATIENCE)
-    try:
-        yield
-    finally:
-        dist.destroy_process_group()
+    yield
+    dist.destroy_process_group()  # After an error the process is to end, not to wait for the others.
 
 
-def agreed(value: bool) -> bool:
+def agreed(value: T) -> T:
     """What the first process says; the others wait for it."""
     if place()[1] == 1:
         return value

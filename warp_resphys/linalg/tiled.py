@@ -100,7 +100,14 @@ class TiledSolver(LinearSolver):
         unit[self._padding] = 1.0
         tiles = values.view(-1, *self.shape)
         views = [wp.from_torch(each, requires_grad=False) for each in (idle, unit, values)]
-        clear = wp.launch(self.kernels.clear, dim=values.shape, inputs=views, device=str(self.device), record_cmd=True)
+        clear = wp.launch(
+            self.kernels.clear,
+            dim=tuple(values.shape),
+            inputs=views,
+            block_dim=BLOCK,  # of the module's other kernels, which would be compiled for another one again
+            device=str(self.device),
+            record_cmd=True,
+        )
         return SimpleNamespace(
             clear=clear,
             factor=self._record(self.kernels.factor, (batch,), idle, tiles),

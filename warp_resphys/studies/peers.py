@@ -2,7 +2,7 @@
 
 Both step the same tetrahedra. Their energies and masses are not quite the same, so each is judged by its own converged
 solution: an error is the mean distance of the vertices from there, over all steps. Both make their launches as graphs;
-a step of ours is one of a roll-out without gradients.
+a step of ours is one of a roll-out without gradients, in float64, the peer's are in float32.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -32,6 +32,7 @@ from .command import show, table_of
 Positions = NDArray[np.float64]  # (T, N, 3) [m]
 _CONVERGED: Final = 1e-11  # relative residual of our reference
 _TIME_STEP: Final = Group({"size": POSITIVE, "count": NATURAL, "iterations": NATURALS})
+_BOX: Final = Kind(lambda value: NUMBERS.fits(value) and len(value) == 3, "three lengths")
 _LIST: Final = Kind(lambda value: isinstance(value, list) and bool(value), "a list of time steps")
 
 
@@ -78,6 +79,8 @@ def peer_study(config: Mapping[str, Any], folder: Path) -> None:
 
 
 def _check(config: Mapping[str, Any]) -> None:
+    check("size", config["size"], _BOX)
+    check("divisions", config["divisions"], NATURALS)
     for key in ("poissons_ratios", "tolerances"):
         check(key, config[key], NUMBERS)
     for key in ("youngs_modulus", "density"):

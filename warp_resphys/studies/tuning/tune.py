@@ -21,7 +21,7 @@ from ...experiment.scene import LEARNED, Scene, models_of
 from ...experiment.schema import ANYTHING, COUNT, NAME, NATURAL, POSITIVE, WORD, Group, check, optional
 from ...experiment.trials import folds_of, split_of
 from ...io.errors import DataFileError, InputError
-from ...io.fan_out import Advance, Workers, fan_out
+from ...io.fan_out import Advance, WorkerError, Workers, fan_out
 from ...io.files import read_json
 from ...io.progress import Progress, clock
 from ...io.resumable import forget_checkpoint, keep_checkpoint, resume_checkpoint
@@ -149,14 +149,21 @@ class _Results:
 def _share(task: _Task, tuning: Tuning, workers: Workers) -> None:
     """Runs trials in worker processes until there are enough."""
     study, results = tuning.study, _Results(tuning)
-    done = sum(each.state in _COUNTED for each in study.outcomes())
+
+    def counted() -> int:
+        return sum(each.state in _COUNTED for each in study.outcomes())
+
+    done = counted()
     if done >= study.trials:
         return
     crew = workers.at_most(study.trials - done)
 
     def advance(count: int, **shown: object) -> None:
-        progress.advance(count, **shown)
-        results(count)
+        nonlocal done
+        if shown:  # A trial has ended. What lost workers had counted stays done: the study knows.
+            before, done = done, counted()
+            progress.advance(done - before, **shown)
+            results(count)
 
     try:
         with (
@@ -264,7 +271,7 @@ def _run_trial(tuning: Tuning, learning: Learning, claim: Claim, fingerprint: st
         raise StageInterrupted(
             f"interrupted in trial {claim.number} (its whole epochs are kept); the same command goes on from there"
         ) from error
-    except (DataFileError, OSError):
+    except (DataFileError, OSError, WorkerError):
         raise  # Not the trial's fault: the next process goes on with it.
     except Exception as error:
         if study.fail(claim, seconds()):

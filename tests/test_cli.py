@@ -415,7 +415,7 @@ class TestProcess:
         names = out.splitlines()[-1].removeprefix("imported: ").split()
         ours = {
             f"warp_resphys.{name}"
-            for name in ("cli", "conf", "io", "io.decoding", "io.errors", "io.files", "io.labels")
+            for name in ("cli", "conf", "io", "io.decoding", "io.errors", "io.files", "io.labels", "io.team")
         }
         assert {"warp_resphys", "warp_resphys.cli"} <= set(names) <= {"warp_resphys", *ours}
         assert err == ""

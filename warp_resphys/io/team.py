@@ -13,7 +13,6 @@ from datetime import timedelta
 from typing import TYPE_CHECKING, TypeVar
 
 from .errors import InputError
-from .progress import be_quiet
 
 if TYPE_CHECKING:  # Not all who name stages need it.
     import torch
@@ -45,6 +44,8 @@ def joined(device: torch.device) -> Iterator[None]:
         return
     import torch
     import torch.distributed as dist
+
+    from .progress import be_quiet
 
     if device.index is not None:
         raise InputError(f"device is {device}, but torchrun gives each process a GPU of its own: choose device=cuda.")

@@ -281,6 +281,9 @@ class Simulator:
     ) -> tuple[State, SolveReport]:
         """Advances a batch by one time step.
 
+        From the very state that the last step has returned, the solver begins at what the steps before it
+        foretell. From a copy, it begins as from any state: the results agree to the solver's tolerance.
+
         Args:
             state: where it is.
             inputs: what acts on it during the step.

@@ -149,23 +149,22 @@ class SharedStudy:
             for trial in running:
                 claims = trial.user_attrs.get("claims", [])
                 if not claims or not self._is_alive(claims[-1]):
-                    self._seed_sampler(trial.number)
                     number = self._storage.get_trial_id_from_study_id_trial_number(self._id, trial.number)
                     return self._take(Trial(self._study, number))
             if len(running) + len(self._trials(TrialState.COMPLETE, TrialState.PRUNED)) >= self.trials:
                 return None
-            self._seed_sampler(len(self._trials()))
             return self._take(self._study.ask())
-
-    def _seed_sampler(self, number: int) -> None:
-        """Each trial draws numbers of its own, whichever worker it falls to, so that no two try the same."""
-        seed = int(np.random.SeedSequence([self._seed, number]).generate_state(1)[0])
-        self._study.sampler = optuna.samplers.TPESampler(seed=seed)
 
     def _take(self, trial: Trial) -> Claim:
         claims = [*trial.user_attrs.get("claims", []), self._identity]
         trial.set_user_attr("claims", claims)
-        settings = {key: each.suggest(trial, key) for key, each in self._space.items()}
+        settings = {}
+        for place, (key, each) in enumerate(self._space.items()):
+            # Every setting of every trial draws a number of its own: no two trials try the same, and one that a worker
+            # left before it had drawn them all goes on with the same ones.
+            seed = int(np.random.SeedSequence([self._seed, trial.number, place]).generate_state(1)[0])
+            self._study.sampler = optuna.samplers.TPESampler(seed=seed)
+            settings[key] = each.suggest(trial, key)
         trial.set_user_attr("settings", settings)
         return Claim(trial.number, settings, len(claims), trial)
 

@@ -38,24 +38,38 @@ def test_forces_that_a_polynomial_describes_are_foretold(name, degree, device):
 @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2", "midpoint"])
 @pytest.mark.parametrize("time_step", [0.01, 0.0002])
 def test_it_saves_iterations_and_changes_no_state(integrator, time_step, device):
-    s = simulator(integrator=integrator, time_step=time_step, device=device)
-    start, steps = s.rest_state(2), 40
-    followed = s.rollout(start, steps)
+    options = {"integrator": integrator, "time_step": time_step, "solver": {"name": "newton"}}
+    pair = [simulator(device=device, **options) for _ in range(2)]
+    start, steps = pair[0].rest_state(2), 40
+    followed = pair[0].rollout(start, steps)
     state, alone = start, []
-    for _ in range(steps):
-        state, report = s.step(state.map(torch.clone))
+    for k in range(steps):  # In turns, so that neither goes on where its own last step has led.
+        state, report = pair[k % 2].step(state)
         alone.append(report)
     sums = [sum(sum(counts) for counts in iterations(reports)) for reports in (followed.reports, alone)]
     assert sums[0] < (1.02 if time_step == 0.01 else 0.9) * sums[1]
     torch.testing.assert_close(followed.q[-1], state.q, rtol=0.0, atol=2e-9)
 
 
-def test_another_motion_begins_anew(device):
-    """What was foretold of one motion is not taken for another one, nor for the same from its start."""
-    s, fresh = (simulator(device=device, solver={"name": "newton"}) for _ in range(2))
+@pytest.mark.parametrize("name", SOLVERS)
+def test_another_motion_begins_anew(name, device):
+    """A roll-out finds, bit for bit, what that of a new simulator finds: neither guesses nor factors are left over."""
+    s, fresh = (simulator(device=device, solver={"name": name}) for _ in range(2))
     s.rollout(pose(s, "bent", 2), 5)
     other = s.rest_state(2)
-    torch.testing.assert_close(s.step(other)[0].q, fresh.step(other)[0].q, rtol=0.0, atol=0.0)
+    torch.testing.assert_close(s.rollout(other, 5).q, fresh.rollout(other, 5).q, rtol=0.0, atol=0.0)
+
+
+def test_an_environment_follows_by_itself(device):
+    """Also where its neighbour is put elsewhere, and where its state is a copy."""
+    s, fresh = (simulator(device=device) for _ in range(2))
+    start = pose(s, "bent", 2)
+    whole = fresh.rollout(start, 6).q
+    state = s.rollout(start, 3).final.map(torch.clone)
+    state.q[1], state.v[1] = s.rest_positions, 0.0
+    for k in range(3):
+        state = s.step(state)[0]
+        torch.testing.assert_close(state.q[0], whole[4 + k, 0], rtol=0.0, atol=0.0)
 
 
 def test_a_failure_is_not_extrapolated(device):

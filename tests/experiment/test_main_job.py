@@ -226,9 +226,8 @@ class TestChanges:
         assert found["resphys"] == before["resphys"]
         assert found["resphys_refined"]["epoch"] == 0
         start = found["resphys"]["validation_rollout_error_mm"]
-        # Here solvers come from other steps than there: their tolerance leaves a few 1e-9 mm.
-        assert found["resphys_refined"]["validation_rollout_error_mm"] == pytest.approx(start, rel=1e-6, abs=2e-8)
-        np.testing.assert_allclose(errors(), errors(finished[0]), rtol=1e-6, atol=2e-8)
+        assert found["resphys_refined"]["validation_rollout_error_mm"] == pytest.approx(start, rel=1e-6)
+        same_errors(errors(), errors(finished[0]))
         before = files()
         assert run(*TINY, *REFINE, IN_RUN, "refinement.epochs=1")[0] == 0
         assert ran(before) == ["refine_resphys", "evaluate", "time", "report"]
@@ -262,15 +261,13 @@ class TestChanges:
         found, before = metrics(), metrics(finished[0])
         for group in ("errors_mm", "errors_vs_reconstruction_mm"):
             lost = {"mean": None, "std": None, "trajectories": 2, "diverged": 1}
-            # After a failure a step begins at what inertia foretells: the solver's tolerance leaves a few 1e-9 mm.
-            near = {"rel": 1e-6, "abs": 2e-8}
-            expected = {model: pytest.approx(summary, **near) for model, summary in before[group].items()}
+            expected = {model: pytest.approx(summary, rel=1e-6) for model, summary in before[group].items()}
             assert found[group] == {**expected, "resphys": lost}
         rows, expected = ([each["errors_mm"] for each in m["per_trajectory"]] for m in (found, before))
-        assert rows[0] == pytest.approx(expected[0], **near)
+        assert rows[0] == pytest.approx(expected[0], rel=1e-6)
         assert rows[1].pop("resphys") is None
         assert expected[1].pop("resphys") is not None
-        assert rows[1] == pytest.approx(expected[1], **near)
+        assert rows[1] == pytest.approx(expected[1], rel=1e-6)
         with read_hdf5("run/rollouts.h5", "rollouts") as file:
             found = file["resphys_observed"][:]
         assert np.isnan(found).all((2, 3)).tolist() == [13 * [False], 5 * [False] + 8 * [True]]

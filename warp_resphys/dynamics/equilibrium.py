@@ -1,6 +1,5 @@
 """The differentiable solve: minimiser of an incremental potential, with its implicit adjoint."""
 
-import weakref
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any, TypeVar
 
@@ -60,7 +59,7 @@ class Workspace:
         self.pattern, self.dtype = pattern, dtype
         self._made: dict[Any, Any] = {}
         self.shards: list[Shard] = []
-        self._last: weakref.ref[torch.Tensor] | None = None
+        self._last: torch.Tensor | None = None
 
     @property
     def parts(self) -> "list[Shard]":
@@ -69,11 +68,11 @@ class Workspace:
 
     def reached(self, q: torch.Tensor) -> None:
         """Remembers the positions (B, N, 3) that the last step of the dynamics has led to."""
-        self._last = weakref.ref(q)
+        self._last = q.detach()
 
-    def follows(self, q: torch.Tensor) -> bool:
-        """Whether a step from these positions, the tensor itself, goes on where the last one has led."""
-        return self._last is not None and self._last() is q
+    def follows(self, q: torch.Tensor) -> torch.Tensor | None:
+        """(B,) environments whose step from these positions goes on where the last one has led; None for no one."""
+        return None if self._last is None else (q.detach() == self._last).flatten(1).all(1)
 
     def gather(self) -> IncrementalPotential:
         """The potential of the whole batch, with the terms and positions that the shards have last had."""
@@ -120,7 +119,7 @@ def equilibrium(
     terms: StepTerms,
     start: torch.Tensor,
     fixed_positions: torch.Tensor,
-    follows: bool = False,
+    follows: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, SolveReport]:
     """x* (B, N, 3), the minimiser of a step's potential, differentiable in its terms and the fixed positions.
 
@@ -203,7 +202,7 @@ class _Equilibrium(torch.autograd.Function):
         workspace: Workspace,
         purpose: str,
         settings: SolverSettings,
-        follows: bool,
+        follows: torch.Tensor | None,
         reports: list[SolveReport],
         names: tuple[str, ...],
         start: torch.Tensor,
@@ -249,7 +248,7 @@ def _solve_shards(
     workspace: Workspace,
     purpose: str,
     settings: SolverSettings,
-    follows: bool,
+    follows: torch.Tensor | None,
     names: tuple[str, ...],
     given: Sequence[torch.Tensor | None],
 ) -> tuple[torch.Tensor, SolveReport]:
@@ -260,7 +259,8 @@ def _solve_shards(
 
     def solve(part: tuple[slice, Workspace, NonlinearSolver]) -> tuple[torch.Tensor, SolveReport]:
         rows, own, solver = part
-        return _solve(own, solver, follows, names, *(_rows(each, rows) for each in tensors))
+        mine = None if follows is None else follows[rows]
+        return _solve(own, solver, mine, names, *(_rows(each, rows) for each in tensors))
 
     assert tensors[0] is not None
     with threads_for(tensors[0][0].numel(), len(parts)):
@@ -290,7 +290,7 @@ def _terms(names: tuple[str, ...], tensors: Sequence[Any]) -> StepTerms:
 def _solve(
     workspace: Workspace,
     solver: NonlinearSolver,
-    follows: bool,
+    follows: torch.Tensor | None,
     names: tuple[str, ...],
     start: Any,
     fixed_positions: Any,

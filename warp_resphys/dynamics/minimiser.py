@@ -76,7 +76,7 @@ class Minimiser:
         for name, values in self._sums.items():
             setattr(progress, name, warp_view(values, wp.float64))
         places = max(memory, 1)
-        self._keeps_pairs = refactor_after is not None  # The tail of a long solve tells the next one little.
+        self._renews = refactor_after is not None
         self._recent = [torch.zeros(b, device=p.device, dtype=torch.int32) for _ in range(3)]
         self._pair_counts = torch.zeros(b, device=p.device, dtype=torch.int32)
         pairs.count = warp_view(self._pair_counts, wp.int32)
@@ -165,18 +165,22 @@ class Minimiser:
         commands = [parts.begin, *parts.judge, self._choose, self._project, parts.aim, self._compare]
         self._loop = p.capture_calls(solve, [*commands, *factors.commands])
 
-    def minimise(self, start: torch.Tensor, follows: bool = False) -> None:
+    def minimise(self, start: torch.Tensor, follows: torch.Tensor | None = None) -> None:
         """Minimises; on a GPU, with tiled factors, without waiting for it.
 
         Args:
             start: (B, N, 3) where inertia alone would lead [m].
-            follows: whether this step goes on where the last one ended: its solution and those before then foretell
-                where to begin, and pairs are kept as long as the factor, if there will be another one.
+            follows: (B,) environments that go on where the last step ended: its solution and those before then foretell
+                where to begin, and factor and pairs are kept. None for no one. A factor that is never renewed serves
+                all, without pairs.
         """
         p = self._potential
-        if not follows:
-            self._recent[0].zero_()
-        if not (follows and self._keeps_pairs):
+        for each in self._recent[0], self._pair_counts, *((self._counts["factored"],) if self._renews else ()):
+            if follows is None:
+                each.zero_()
+            else:
+                each.mul_(follows)
+        if not self._renews:  # The tail of a long solve tells the next one little.
             self._pair_counts.zero_()
         if self._loop is not None:
             p.positions.copy_(start)

@@ -151,12 +151,14 @@ class NonlinearSolver:
             refactor_after=after[settings.name],
         )
 
-    def solve(self, start: torch.Tensor, follows: bool = False) -> SolveReport:
+    def solve(self, start: torch.Tensor, follows: torch.Tensor | None = None) -> SolveReport:
         """Minimises; what it ends at is left in ``potential.positions``.
 
         Args:
             start: (B, N, 3) where inertia alone would lead, or any guess [m].
-            follows: whether this is the step after the one that was solved last, and may begin where that foretells.
+            follows: (B,) environments for which this is the step after the one that was solved last: they may begin
+                where that foretells, with its factor. None for no one. What the others find does not depend on what was
+                solved before.
         """
         self._minimiser.minimise(start, follows)
         return SolveReport(*self._minimiser.outcome())

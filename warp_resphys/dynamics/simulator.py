@@ -281,8 +281,8 @@ class Simulator:
     ) -> tuple[State, SolveReport]:
         """Advances a batch by one time step.
 
-        From the very state that the last step has returned, the solver begins at what the steps before it
-        foretell. From a copy, it begins as from any state: the results agree to the solver's tolerance.
+        From the positions that the last step has led to, the solver begins at what the steps before it foretell; from
+        others it begins anew, and finds what a new simulator would.
 
         Args:
             state: where it is.

@@ -32,9 +32,8 @@ LEAST_CURVATURE = wp.constant(wp.float64(1e-10))
 MOST_HALVINGS = wp.constant(25)
 STALLS = wp.constant(3)
 ASKS_AGAIN = wp.constant(16)  # stalls: one nudge may happen to change little
-BETTER = wp.constant(
-    wp.float64(0.1)
-)  # of the squared error: what makes a higher order, that amplifies fast modes, worth it
+# Of the squared error: what makes a higher order, that amplifies fast modes, worth it.
+BETTER = wp.constant(wp.float64(0.1))
 UNIT = wp.constant(wp.float64(2.0**-52))  # of rounding
 # Of a sum of energies: what rounding leaves of the terms that cancel, per unit of stiffness and of energy.
 ENERGY_ROUNDING = wp.constant(wp.float64(8.0 * 2.0**-52))

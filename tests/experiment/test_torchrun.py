@@ -25,7 +25,7 @@ def torchrun(*arguments, command=(), settings=TINY):
 
 
 _GRADIENTS = """
-import json, sys
+import json
 import torch
 from test_training import trainer
 from warp_resphys.io.team import agreed, is_first, joined
@@ -44,7 +44,7 @@ with joined(torch.device("cpu")):
 """
 
 
-def test_gradients_of_shares_add_up(folder, monkeypatch):
+def test_gradients_of_shares_add_up(folder):
     """Those of each batch of an epoch, the last of which is one sample: a share of it is empty."""
     Path("gradients.py").write_text(_GRADIENTS)
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(REPOSITORY), str(REPOSITORY / "tests/learning")])}

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from main_job import IN_RUN, TINY, run
+from played_run import check_robots
 
 from warp_resphys.data.base_motion import prescribed, rigid
 from warp_resphys.experiment import pipeline
@@ -139,6 +140,7 @@ def test_an_arm_under_pressure_carries_payloads_that_the_networks_see():
     assert np.argsort(-heights).tolist() == np.argsort(payload).tolist()
     tensors, _ = read_checkpoint(Path("run/resphys.safetensors"), "residual force")
     assert len(tensors["actuation.scale"]) == 1 + 2 * 2  # the payload, two pressures and their means
+    check_robots("run")
     code, err = run("experiment=tiny", TRACKED, own, *QUIET)
     assert (code, "data.payload_at is not set" in err) == (2, True)
 
@@ -174,6 +176,7 @@ def test_poses_and_motions_under_pressure_are_identified_and_corrected_together(
         error = read_array(file, "error")[order.index("t000")]
     before = found["errors_mm"]["sysid"]["mean"]
     assert error[1] < 0.2 * before  # [mm]: a force brings the pose to its markers
+    check_robots("run")
 
 
 def test_poses_under_weights_and_releases_are_identified_and_corrected_together():
@@ -186,6 +189,7 @@ def test_poses_under_weights_and_releases_are_identified_and_corrected_together(
     rows = {row["name"]: row["errors_mm"] for row in found["per_trajectory"]}
     assert rows["p50"]["sysid"] < 0.7 * rows["p50"]["simulation"]
     assert rows["p50"]["resphys"] <= 1.2 * rows["p50"]["sysid"]
+    check_robots("run")
     alone = ["laboratory.train=[p70,p60]", "laboratory.validation=[p40]", "laboratory.test=[p50]"]
     static = (
         "+laboratory.trials={" + ",".join(f"p{g}:{{payload:{g / 1000},begins:static}}" for g in (40, 50, 60, 70)) + "}"
@@ -271,6 +275,7 @@ def test_a_base_that_moves_is_told_by_markers_or_by_a_record(known):
     # Markers that are placed to 0.3 mm over 40 mm turn the frame by some 10 mrad, and its rotations by 0.3 of that.
     assert np.abs(base[1, : len(truth), 3:] - truth[:, 3:]).max() < 0.01
     assert np.abs(truth[:, 3:]).max() > 0.19
+    check_robots("run", ("simulation", "sysid", "resphys"))
 
 
 def test_a_base_that_moves_while_markers_are_registered_is_refused():

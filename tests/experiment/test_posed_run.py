@@ -9,6 +9,7 @@ import torch
 from hydra import compose, initialize_config_module
 from main_job import IN_RUN, run
 from omegaconf import OmegaConf
+from played_run import check_robots
 
 from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.experiment.build import bound_markers, build_simulator, finer
@@ -106,6 +107,7 @@ def test_poses_of_unnamed_markers_identify_the_body(poses, tmp_path, monkeypatch
     assert 5.0 * errors["sysid"] < errors["simulation"]
     assert {"simfree", "resphys"} <= errors.keys()
     check_of_the_mesh()
+    check_robots("run")
 
 
 def check_of_the_mesh():

@@ -9,6 +9,7 @@ import torch
 from hydra import compose, initialize_config_module
 from main_job import IN_RUN, run
 from omegaconf import OmegaConf
+from played_run import check_robots
 
 from warp_resphys.data.sight import Sight
 from warp_resphys.dynamics.inputs import Inputs
@@ -122,6 +123,7 @@ def test_limbs_are_identified_by_their_shape(swum, tmp_path, monkeypatch):
     assert not drawn & {"space", "plane_worst"}  # which a camera does not tell
     assert 3.0 * errors["sysid"] < errors["simulation"]
     assert errors["resphys"] < errors["sysid"] + 0.25 * NOISE  # nothing is left to learn
+    check_robots("run")
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import pytest
 from hydra import compose, initialize_config_module
 from main_job import IN_RUN, run
 from omegaconf import OmegaConf
+from played_run import check_robots
 
 from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.experiment.checks import check_configuration
@@ -61,6 +62,7 @@ def test_a_body_whose_muscles_contract_goes_through_every_stage(tmp_path, monkey
     errors = json.loads(Path("run/metrics.json").read_text())["errors_mm"]
     assert all(np.isfinite(errors[each]["mean"]) for each in ("simulation", "sysid", "simfree", "resphys"))
     page = Path("run/report.html").read_text()
+    check_robots("run")
     for said in ("2 muscles under stress", "The body and its stresses", "the limit of 30"):
         assert said in page
 

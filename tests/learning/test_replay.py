@@ -13,9 +13,9 @@ from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.dynamics.integrator import State
 from warp_resphys.dynamics.modes import vibration_modes
 from warp_resphys.io.errors import ConvergenceError, InputError
-from warp_resphys.learning.parameters import configured_parameters, first_guesses
+from warp_resphys.learning.parameters import configured_parameters, first_guesses, tilted_gravity
 from warp_resphys.learning.release import ReleaseSettings, estimate_release, hold, sideways_shapes, velocity_shapes
-from warp_resphys.learning.replay import Replay, Start, sample, tilted_gravity
+from warp_resphys.learning.replay import Replay, Start, sample
 from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
 
 MESH = box_hexahedra(divisions=(4, 1, 1))

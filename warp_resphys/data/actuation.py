@@ -133,12 +133,24 @@ def lagged(commands: torch.Tensor, rise: torch.Tensor, step: float) -> torch.Ten
     """
     if commands.ndim == 2:
         return commands
-    keep = torch.exp(-step / rise.clamp_min(1e-2 * step))[:, None]
     behind, series = torch.zeros_like(commands[0]), []
     for command in commands.unbind():
-        behind = command + keep * (behind - command)
+        behind = followed(command, behind, rise, step)
         series.append(behind)
     return torch.stack(series)
+
+
+def followed(command: torch.Tensor, behind: torch.Tensor, rise: torch.Tensor, step: float) -> torch.Tensor:
+    """(B, C) what `lagged` makes of a command (B, C) in one step, from what it was behind.
+
+    Args:
+        command: during the step.
+        behind: (B, C) at the end of the step before.
+        rise: (B,) time constant [s].
+        step: h [s].
+    """
+    keep = torch.exp(-step / rise.clamp_min(1e-2 * step))[:, None]
+    return command + keep * (behind - command)
 
 
 def delayed(commands: torch.Tensor, delay: torch.Tensor, step: float) -> torch.Tensor:

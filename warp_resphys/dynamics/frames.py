@@ -70,10 +70,11 @@ class BaseFrame:
         poses: (K + 1, B, 6) translations t [m] and rotation vectors of R; past the end the last, before time zero the
             first.
         time_step: h [s].
+        first: the number of the pose that counts as step zero.
     """
 
-    def __init__(self, poses: torch.Tensor, time_step: float) -> None:
-        self._poses, self._step, self._first = poses, time_step, 0
+    def __init__(self, poses: torch.Tensor, time_step: float, first: int = 0) -> None:
+        self._poses, self._step, self._first = poses, time_step, first
         self._rotation = rotations(poses[..., 3:])
 
     def during(self, environments: torch.Tensor, first: torch.Tensor, steps: int) -> "BaseFrame":
@@ -85,9 +86,8 @@ class BaseFrame:
             steps: how long they are.
         """
         at = (first + torch.arange(-1, steps + 1)[:, None]).clamp(0, len(self._poses) - 1)
-        found = BaseFrame(self._poses[at.to(self._poses.device), environments.to(self._poses.device)], self._step)
-        found._first = 1
-        return found
+        poses = self._poses[at.to(self._poses.device), environments.to(self._poses.device)]
+        return BaseFrame(poses, self._step, first=1)
 
     def _at(self, step: int) -> tuple[torch.Tensor, torch.Tensor]:
         """(B, 3, 3) R and (B, 1, 3) t."""

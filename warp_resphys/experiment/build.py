@@ -130,15 +130,19 @@ def build_material(config: Mapping[str, Any], key: str) -> Material:
         raise InputError(f"{key}: {error}") from error
 
 
-def build_body(config: Mapping[str, Any]) -> Body:
+def build_body(config: Mapping[str, Any], mesh: Mesh | None = None) -> Body:
     """A body from the groups ``mesh``, ``physics``, ``fixed``, and any of its actuators' groups and ``fibres``.
+
+    Args:
+        config: these groups.
+        mesh: where it is there already, in place of the group ``mesh``.
 
     Raises:
         InputError: fibres without chambers, another number of chambers than the mesh has, tendons or muscles that do
             not fit, or two inputs.
         MeshError: a mesh that cannot be read or simulated, or no vertex where the body is fixed.
     """
-    mesh = build_mesh(config["mesh"])
+    mesh = build_mesh(config["mesh"]) if mesh is None else mesh
     energies = build_actuators(config, mesh)
     return Body(mesh, energies=tuple(energies), fixed=select_vertices(mesh, **config["fixed"]), **config["physics"])
 

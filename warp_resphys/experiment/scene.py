@@ -97,17 +97,21 @@ class Scene:
             kind: ``simulation`` (uncorrected), ``target`` (which made the trials), ``published``, or ``identified``,
                 which may step with another integrator, and take shorter steps.
         """
-        if kind in self._simulators:
-            return self._simulators[kind]
+        if kind not in self._simulators:
+            body = None if kind == "published" else self.body
+            material = "target" if kind == "target" else "simulation"
+            self._simulators[kind] = build_simulator(self.settings_of(kind), material, body, self.on_failure)
+        return self._simulators[kind]
+
+    def settings_of(self, kind: str) -> dict[str, Any]:
+        """The configuration that `build_simulator` makes a simulator of; for its kinds see there."""
         config = {**self.config, "gravity": self.dataset.gravity.tolist()}
         identify = config.get("identify") or {}
         if kind == "published":
             config |= {**config["published"], "payload_string": None}
         elif kind == "identified" and identify.get("integrator") is not None:
             config |= {"integrator": identify["integrator"], "time_step": config["time_step"] / identify["substeps"]}
-        material, body = ("target" if kind == "target" else "simulation"), (None if kind == "published" else self.body)
-        self._simulators[kind] = build_simulator(config, material, body, self.on_failure)
-        return self._simulators[kind]
+        return config
 
     @property
     def like(self) -> torch.Tensor:
@@ -148,13 +152,19 @@ class Scene:
 
     def _base_movement(self, names: Sequence[str], simulator: Simulator) -> torch.Tensor | None:
         """(K, R, A) what networks are told of the base during each step: what differs between trials and times."""
-        poses = self.dataset.base_at(names, simulator.time_step)
-        everything = self.dataset.base_at(self.dataset.names, simulator.time_step)
-        if poses is None or everything is None:
+        poses, told = self.dataset.base_at(names, simulator.time_step), self.told_of_base(simulator)
+        if poses is None or told is None:
             return None
-        gravity = torch.from_numpy(self.dataset.gravity)
-        told, known = (base_movement(each, simulator.time_step, gravity) for each in (poses, everything))
-        return told[..., known.flatten(0, 1).std(0) > _STANDS_STILL].to(simulator.rest_positions)
+        moved = base_movement(poses, simulator.time_step, torch.from_numpy(self.dataset.gravity))
+        return moved[..., told].to(simulator.rest_positions)
+
+    def told_of_base(self, simulator: Simulator) -> torch.Tensor | None:
+        """(15,) bool, which numbers of `base_movement` networks are told; None where the base stands still."""
+        everything = self.dataset.base_at(self.dataset.names, simulator.time_step)
+        if everything is None:
+            return None
+        known = base_movement(everything, simulator.time_step, torch.from_numpy(self.dataset.gravity))
+        return known.flatten(0, 1).std(0) > _STANDS_STILL
 
     def alike(self, names: Sequence[str]) -> list[tuple[str, ...]]:
         """Trials in groups that begin alike, and can be simulated as one batch."""
@@ -225,17 +235,22 @@ class Scene:
 
         Returns:
             (R, 1) the payloads [kg]; or (K, R, A) during each step, these, each input with its exponential means, and
-            how the base moves (`base_movement`).
+            how the base moves (`base_movement`). Of poses (R, A), whose inputs have lasted.
         """
-        _, inputs, _ = replay.setting(parameters)
+        _, inputs, resting = replay.setting(parameters)
         actuation, told = self.config["actuation"], []
         if self.config["data"].get("payload_at") is not None and (payload or actuation["sees_payload"]):
             rows = self.dataset.rows(replay.trials.names)
             told.append(replay.trials.times.new_tensor(self.dataset.payload[rows])[:, None])
         constants = actuation["filter_time_constants"]
-        driven = [each for name, each in inputs.actuation.items() if name != PAYLOAD.name]
-        series = [remembered(each, constants, replay.simulator.time_step) for each in driven]
+        acting = resting if replay.is_static else inputs
+        driven = [each for name, each in acting.actuation.items() if name != PAYLOAD.name]
         moving = self._base_movement(replay.trials.names, replay.simulator)
+        if replay.is_static:
+            told += [each.repeat(1, 1 + len(constants)) for each in driven]
+            told += [] if moving is None else [moving[0]]
+            return torch.cat(told, -1) if told else None
+        series = [remembered(each, constants, replay.simulator.time_step) for each in driven]
         series += [] if moving is None else [moving]
         if not series:
             return told[0] if told else None

@@ -42,6 +42,7 @@ class StageContext:
     fingerprint: str  # Identifies everything the outputs depend on; resumable files are marked with it
     settings: Mapping[str, Any]  # That the stage declared
     memory: WorkersMemory = field(default_factory=WorkersMemory)  # Of its worker processes, which it is to count
+    upstream: Mapping[str, str] = field(default_factory=dict)  # Fingerprints of the stages that it reads from, by name
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,8 @@ def _context(stage: Stage, run_dir: Path, known: dict[str, str]) -> StageContext
     if stage.name in known or not known.keys() >= set(stage.upstream):
         raise ValueError(f"stage '{stage.name}' is there twice or stands before a stage it reads from")
     known[stage.name] = fingerprint(stage, known)
-    return StageContext(stage.name, run_dir, known[stage.name], stage.settings)
+    upstream = {name: known[name] for name in stage.upstream}
+    return StageContext(stage.name, run_dir, known[stage.name], stage.settings, upstream=upstream)
 
 
 def _record(run_dir: Path, name: str) -> Path:
@@ -176,6 +178,7 @@ def _write_record(stage: Stage, context: StageContext, seconds: float) -> None:
         _record(context.run_dir, stage.name),
         {
             "fingerprint": context.fingerprint,
+            "upstream": dict(context.upstream),
             "seconds": seconds,
             "peak_memory_gib": peak_memory_gib() + context.memory.gib,
             "finished": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -185,6 +188,42 @@ def _write_record(stage: Stage, context: StageContext, seconds: float) -> None:
             "machine": made_on(),
         },
     )
+
+
+def finished_record(run_dir: str | Path, name: str) -> dict[str, Any]:
+    """The record of a stage that is done, whose outputs and all that they were made from are still the same.
+
+    Args:
+        run_dir: the run folder.
+        name: of the stage; its record's ``settings`` are what it was told.
+
+    Raises:
+        DataFileError: there is no such folder, the stage was not run to its end, it was made by another version of
+            this program, or a file of it, or of a stage before it, is missing or has changed since.
+    """
+    folder = Path(run_dir)
+    if not (folder / "stages").is_dir():
+        raise DataFileError(f"{folder} is no run folder: name one that a run of `warp-resphys` has made.")
+    again = "run the command that made it again, to its end"
+    path = _record(folder, name)
+    if not path.is_file():
+        raise DataFileError(f"{folder} is unfinished, as its stage '{name}' was not run to the end: {again}.")
+    record: dict[str, Any] = read_json(path)
+    made, here = (
+        versions.get("warp-resphys", "an unknown version") for versions in (record["versions"], package_versions())
+    )
+    if made.split(".")[:2] != here.split(".")[:2]:
+        raise DataFileError(
+            f"{folder} was made by warp-resphys {made}, and this is {here}: {again} in another run folder, or use the "
+            "version that made it."
+        )
+    for output, identity in record["outputs"].items():
+        if not _is_same(folder / output, identity):
+            raise DataFileError(f"{folder / output} is missing or has changed since it was written: {again}.")
+    for earlier, known in record.get("upstream", {}).items():
+        if finished_record(folder, earlier)["fingerprint"] != known:
+            raise DataFileError(f"{folder} is unfinished, as its stage '{earlier}' was run since '{name}': {again}.")
+    return record
 
 
 def resources_used(run_dir: str | Path, names: Sequence[str]) -> dict[str, Any]:

@@ -78,7 +78,7 @@ class RecurrentMLP(nn.Module):
         Raises:
             InputError: a hidden state of another size.
         """
-        size = (len(x), self.cell.hidden_size)
+        size = (x.shape[0], self.cell.hidden_size)
         if hidden is not None and tuple(hidden.shape) != size:
             raise InputError(f"the hidden state is {tuple(hidden.shape)}: it must be {size}, or None to begin.")
         following = self.cell(x, hidden)

@@ -15,8 +15,8 @@ from ..data.trials import Trials
 from ..dynamics.inputs import Inputs
 from ..dynamics.integrator import State
 from ..dynamics.simulator import Constants, Simulator
-from ..io.errors import ConvergenceError, InputError
-from .parameters import HUNG, MASS_FACTOR, TILTS, known_parameters, parameters_of_parts
+from ..io.errors import ConvergenceError
+from .parameters import HUNG, MASS_FACTOR, check_known, constants_of, known_parameters
 
 _POSE_ITERATIONS = 50
 _POSE_TOLERANCE = 1e-8  # m
@@ -88,7 +88,6 @@ class Replay:
         self.simulator, self.observe, self.trials = simulator, observe, trials
         self.settled: torch.Tensor | None = None
         self.known = known_parameters(simulator)
-        self._of_parts = parameters_of_parts(simulator)
 
     def setting(self, parameters: Parameters | None = None) -> tuple[Constants, Inputs, Inputs]:
         """What E sets of parameters make of R trials, as (E R) environments, the trials running fastest.
@@ -103,16 +102,11 @@ class Replay:
             InputError: an unknown parameter.
         """
         parameters = {} if parameters is None else parameters
-        for name in parameters:
-            if name not in self.known:
-                raise InputError(f"there is no parameter {name!r} to identify: choose from {', '.join(self.known)}.")
+        check_known(parameters, self.known)
         sim, count = self.simulator, len(self.trials.names)
         each = len(next(iter(parameters.values()))) if parameters else 1
         spread = {name: value.repeat_interleave(count) for name, value in parameters.items()}
-        constants = {name: value[:, None] for name, value in spread.items() if name in sim.parameters}
-        constants |= self._by_part(spread)
-        if any(name in spread for name in TILTS):
-            constants["gravity"] = tilted_gravity(sim, *(spread.get(name) for name in TILTS))
+        constants = constants_of(sim, spread)
         inputs = self.trials.inputs.repeat(each)
         changed = self._acting(inputs, spread)
         hung = {name: each for name, each in inputs.fields.items() if name in HUNG}
@@ -122,20 +116,6 @@ class Replay:
         resting = self.trials.resting.repeat(each)
         resting = resting.replace(**self._acting(resting, spread), **hung)
         return sim.prepare(constants), inputs, resting
-
-    def _by_part(self, spread: Parameters) -> dict[str, torch.Tensor]:
-        """(E R, count) constants of energies of which parts have values (E R,) of their own, the others theirs all."""
-        sim, found = self.simulator, dict[str, list[torch.Tensor]]()
-        for name, value in spread.items():
-            if name not in self._of_parts:
-                continue
-            constant, part = self._of_parts[name]
-            if constant not in found:
-                own = spread[constant] if constant in spread else sim.tensor(sim.constants[constant])
-                own = own[:, None] if constant in spread else sim.parameters[constant].shaped(own)
-                found[constant] = list(own.expand(len(value), sim.counts[constant]).unbind(1))
-            found[constant][part] = value
-        return {name: torch.stack(columns, 1) for name, columns in found.items()}
 
     def _acting(self, inputs: Inputs, spread: Parameters) -> dict[str, torch.Tensor]:
         """What commanded inputs come to, of values (E R,) of their parameters."""
@@ -171,24 +151,7 @@ class Replay:
             state = self.simulator.static_equilibrium(resting, constants, start=q)
             self.settled = state.q.detach()
             return state
-        state, pull = State(q, v), None
-        share, before = 1.0, math.inf  # of the way that is gone: less where it leads past the goal
-        for _ in range(_POSE_ITERATIONS):
-            last, pull = pull, force(state, 0)
-            if share == 1.0 and last is not None and torch.equal(pull, last):  # It is of the inputs alone.
-                return state
-            found = self.simulator.static_equilibrium(resting.plus(pull), constants, start=state.q.detach())
-            change = float((found.q - state.q).detach().abs().max())
-            if change < _POSE_TOLERANCE:
-                return found
-            share, before = (0.5 * share if change > before else share), change
-            state = found if share == 1.0 else State(torch.lerp(state.q, found.q, share), state.v)
-        raise ConvergenceError(
-            f"a pose and the force that depends on it did not settle in {_POSE_ITERATIONS} iterations: the force "
-            "is too large to be a correction.",
-            state.q,
-            None,
-        )
+        return settled(self.simulator, resting, constants, State(q, v), lambda state: force(state, 0))
 
     @property
     def is_static(self) -> bool:
@@ -237,32 +200,43 @@ class Replay:
         return torch.where(self.trials.seen[..., None], difference, 0.0)
 
 
-def tilted_gravity(simulator: Simulator, first: torch.Tensor | None, second: torch.Tensor | None) -> torch.Tensor:
-    """(1 or B, 3) the simulator's gravity, turned by components along the axes across it [m/s^2].
+def settled(
+    simulator: Simulator,
+    inputs: Inputs,
+    constants: Constants,
+    guess: State,
+    force: Callable[[State], torch.Tensor],
+) -> State:
+    """The state of rest under constant inputs and a force (B, N, 3) [N] that depends on it.
 
     Args:
-        simulator: gives the gravity that is turned, and its strength.
-        first: (B,) component of the direction along the first axis across gravity (the one of lowest number), or None.
-        second: (B,) along the second.
+        simulator: of the body.
+        inputs: what else acts on it.
+        constants: see `Simulator.prepare`.
+        guess: where to begin.
+        force: of a state.
 
     Raises:
-        InputError: there is no gravity to turn.
+        ConvergenceError: there is no equilibrium, or the body and its force do not settle.
     """
-    gravity = simulator.tensor(simulator.gravity)
-    strength = gravity.norm()
-    if first is None and second is None:
-        return gravity[None]
-    if not float(strength) > 0.0:
-        raise InputError("without gravity its tilt cannot be identified: leave gravity_tilt_1 and gravity_tilt_2 out.")
-    down = gravity / strength
-    axes = torch.eye(3, dtype=gravity.dtype, device=gravity.device)
-    along = int(down.abs().argmax())
-    direction = down[None]
-    for axis, tilt in zip([i for i in range(3) if i != along], (first, second), strict=True):
-        if tilt is not None:
-            across = axes[axis] - (axes[axis] @ down) * down
-            direction = direction + tilt[:, None] * across / across.norm()
-    return strength * direction / direction.norm(dim=1, keepdim=True)
+    state, pull = guess, None
+    share, before = 1.0, math.inf  # of the way that is gone: less where it leads past the goal
+    for _ in range(_POSE_ITERATIONS):
+        last, pull = pull, force(state)
+        if share == 1.0 and last is not None and torch.equal(pull, last):  # It is of the inputs alone.
+            return state
+        found = simulator.static_equilibrium(inputs.plus(pull), constants, start=state.q.detach())
+        change = float((found.q - state.q).detach().abs().max())
+        if change < _POSE_TOLERANCE:
+            return found
+        share, before = (0.5 * share if change > before else share), change
+        state = found if share == 1.0 else State(torch.lerp(state.q, found.q, share), state.v)
+    raise ConvergenceError(
+        f"a pose and the force that depends on it did not settle in {_POSE_ITERATIONS} iterations: the force "
+        "is too large to be a correction.",
+        state.q,
+        None,
+    )
 
 
 def _on_steps(times: torch.Tensor, step: float) -> bool:

@@ -1,0 +1,33 @@
+"""Whether the robots of a run do in its test trials what the evaluation wrote, from the folder and from a file."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+import warp_resphys
+from warp_resphys.io.files import read_array, read_hdf5
+
+
+def check_robots(folder, models=("simulation", "sysid", "simfree", "resphys"), tolerance=1e-8):
+    """Every model's trials as in rollouts.h5 [m], up to what solver tolerances leave."""
+    folder = Path(folder)
+    with read_hdf5(folder / "rollouts.h5", "rollouts") as file:
+        names = [str(each) for each in file.attrs["names"]]
+        expected = {model: read_array(file, f"{model}_observed") for model in models}
+    for model in models:
+        robot = warp_resphys.load(folder, model)
+        kept = robot.save(folder.parent / f"{model}.safetensors")
+        for row, name in enumerate(names):
+            trial = warp_resphys.recorded_trial(robot, name)
+            with torch.no_grad():
+                motion = trial.play(robot)
+                again = trial.play(warp_resphys.load(kept))
+            wanted = expected[model][row, : len(trial.times)]
+            assert np.isfinite(wanted).all()
+            assert np.abs(wanted - wanted[:1]).max() > 1e3 * tolerance or len(wanted) == 1  # There is something to see.
+            magnified = 100.0 if model == "simfree" else 1.0  # A network's states feed on themselves.
+            np.testing.assert_allclose(
+                trial.shown(motion), wanted, atol=magnified * tolerance, err_msg=f"{model}, {name}"
+            )
+            assert torch.equal(motion.q, again.q)

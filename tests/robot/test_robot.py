@@ -1,0 +1,399 @@
+"""A finished run as a robot: it does what the evaluation did, by names, with gradients, and from one file."""
+
+import contextlib
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from main_job import IN_RUN, run
+from played_run import check_robots
+
+import warp_resphys
+from warp_resphys.experiment import pipeline
+from warp_resphys.io.errors import DataFileError, InputError
+from warp_resphys.io.files import read_json, write_json
+from warp_resphys.robot.commands import Commands
+from warp_resphys.robot.program import export_network, told_names
+
+# A short segment with two chambers of some 70 vertices; what is unknown of its pressures is identified.
+SEGMENT = """# @package _global_
+defaults: [sopra, {override /mesh: segment}, _self_]
+name: tiny
+tip: {z: -0.1}
+chambers: {count: 2}
+mesh: {size: 0.03, layers: 0.05, chambers: 2}
+data:
+  {steps: 12, sequences: 5, train: 2, validation: 1, test: 2, horizons: [], rest_seconds: 0.01, cutoff: 20.0}
+markers:
+  tracked: null
+  reference: {B1: [0.03, 0.0, 0.0], B2: [0.0, 0.03, 0.0], B3: [-0.03, -0.03, 0.0]}
+  bind: rigid
+  bind_to: {z: -0.1}
+parallel: {processes: 1, batch: 2}
+identify:
+  substeps: 2
+  integrator: bdf2
+  trials: 1
+  seconds: 0.1
+  max_evaluations: 3
+  grid: null
+  parameters:
+    pressure_factor: {lower: 0.5, upper: 1.5}
+    pressure_delay: {lower: 0.0, upper: 0.05}
+    pressure_rise: {lower: 0.001, upper: 0.1, logarithmic: true}
+  first_guess: {pressure_factor: 0.9, pressure_delay: 0.012, pressure_rise: 0.02}
+network: {position_modes: 2, velocity_modes: 0, force_modes: 2, width: 8}
+trainer: {epochs: 4, rollout_every: 2, batch_size: 16}
+laboratory:
+  mesh: {chamber_lengths: [0.09], caps: [0.005, 0.005], radii: [0.0222, 0.0222], chambers: 2, outline: round,
+    size: 0.02, layers: 0.03, wall: 0.003, web: 0.003}
+  sequences: {rest: 0.01, correlation_time: 0.03}
+"""
+TRACKED = "markers.tracked={T1:[0.02,0.0,-0.1],T2:[0.0,0.02,-0.1],T3:[-0.02,-0.01,-0.1]}"
+COMMAND = [
+    "experiment=tiny",
+    TRACKED,
+    "solver.relative_tolerance=1e-10",
+    "hydra/job_logging=none",
+    "hydra/hydra_logging=none",
+    IN_RUN,
+]
+HIGH = 6e3  # Pa
+
+
+def made(folder, *overrides):
+    place = folder / "configs" / "experiment" / "tiny.yaml"
+    place.parent.mkdir(parents=True)
+    place.write_text(SEGMENT)
+    with pytest.MonkeyPatch.context() as patch, contextlib.chdir(folder):
+        for name in ("make_report", "make_folds_report"):
+            patch.setattr(pipeline, name, lambda context: (context.run_dir / "report.html").write_text("-"))
+        code, err = run(*COMMAND, *overrides)
+    assert (code, err[-600:] if code else "") == (0, "")
+    return folder / "run"
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory):
+    return made(tmp_path_factory.mktemp("arm"))
+
+
+@pytest.fixture(scope="module")
+def robot(arm):
+    return warp_resphys.load(arm)
+
+
+def wave(steps, batch=1):
+    times = torch.arange(steps, dtype=torch.float64)[:, None, None]
+    phase = torch.arange(2 * batch, dtype=torch.float64).reshape(1, batch, 2)
+    return HIGH * torch.sin(0.4 * times + 0.7 * phase).square()
+
+
+class TestRollouts:
+    def test_every_model_does_what_the_evaluation_wrote(self, arm):
+        check_robots(arm)
+
+    def test_a_recurrent_force_takes_its_memory_along(self, tmp_path):
+        folder = made(tmp_path, "network=recurrent", "network.width=8", "trainer=sequences", "trainer.sequence=4",
+                      "trainer.epochs=2", "trainer.rollout_every=2", "actuation.filter_time_constants=[]")  # fmt: skip
+        check_robots(folder, ("resphys", "simfree"))
+        robot = warp_resphys.load(folder)
+        program = torch.export.load(export_network(robot, tmp_path / "force.pt2")).module()
+        state = robot.step(robot.begin(2), pressure=[HIGH, 0.0])
+        told = state.memory["pressure.behind"]
+        found, hidden = program(state.q, state.v, told, state.hidden)
+        predictor = robot._predictor(told, None)
+        predictor.hidden = state.hidden
+        torch.testing.assert_close(found, predictor(state.body, 0))
+        torch.testing.assert_close(hidden, predictor.hidden)
+
+    def test_a_fold_is_a_robot_and_their_parent_says_so(self, tmp_path):
+        folder = made(tmp_path, "data.folds=leave_one_out", "data.limit={train: 2, validation: 1, test: 2}")
+        folds = sorted(folder.glob("fold_*"))
+        assert len(folds) == 2
+        assert warp_resphys.load(folds[0]).description.name == f"run/{folds[0].name}"
+        with pytest.raises(DataFileError, match=rf"is a cross-validation.*{folds[0].name}.*{folds[1].name}"):
+            warp_resphys.load(folder)
+
+    def test_steps_are_a_rollout(self, robot):
+        pressure = wave(5, 2)
+        start = robot.begin(batch=2)
+        with torch.no_grad():
+            motion = robot.rollout(start, pressure=pressure)
+            state = start
+            for now in pressure:
+                state = robot.step(state, pressure=now)
+            assert torch.equal(state.q, motion.q[-1])
+            one = robot.rollout(start.select([1]), pressure=pressure[:, 1:])
+            further = robot.rollout(motion.final, 2, pressure=[HIGH, 0.0])
+        torch.testing.assert_close(one.q[:, 0], motion.q[:, 1], atol=1e-9, rtol=0.0)
+        assert motion.q.shape == (6, 2, robot.simulator.body.n_vertices, 3)
+        assert motion.markers.shape == (6, 2, 3, 3)
+        assert motion.half_widths.shape == (6, 2, 3)
+        assert float((motion.q[-1] - motion.q[0]).abs().max()) > 1e-3
+        assert torch.equal(further.q[0], motion.q[-1])
+        np.testing.assert_allclose(motion.times, robot.time_step * np.arange(6))
+
+    def test_at_rest_it_stays_where_its_force_brings_it(self, robot):
+        with torch.no_grad():
+            rest = robot.settle(pressure={"chamber_1": HIGH})
+            motion = robot.rollout(rest, 3, pressure=[HIGH, 0.0])
+            begun = robot.begin(pressure={"chamber_1": HIGH})
+        assert float((motion.q - rest.q).abs().max()) < 2e-6
+        assert float((begun.q - rest.q).abs().max()) > 1e-5  # without the learned force it rests elsewhere
+
+    def test_what_leaves_the_training_is_said(self, robot):
+        q = robot.begin(2).q.clone()
+        q[1, :, 0] += 0.03 * (q[1, :, 2] / 0.1) ** 2  # m: it was never bent so far
+        with torch.no_grad():
+            motion = robot.rollout(robot.state(q), 2)
+        assert motion.left[-1].tolist() == [False, True]
+        assert not motion.lost.any()
+
+
+class TestGradients:
+    def test_of_inputs_states_and_parameters(self, robot):
+        def tip(pressure, factor, lift):
+            own = robot.with_parameters(
+                youngs_modulus=factor * robot.parameters["youngs_modulus"], pressure_factor=factor
+            )
+            start = own.begin()
+            start = own.state(start.q + lift * torch.tensor([0.0, 0.0, 1.0]) * (start.q[..., 2:] < -0.05), start.v)
+            return own.rollout(start, pressure=pressure).markers[-1, 0, 0, 0]
+
+        values = [wave(3)[:, 0] + 100.0, torch.ones(1, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)]
+        values = [each.requires_grad_(True) for each in values]
+        tip(*values).backward()
+        with torch.no_grad():
+            for at, step in ((0, 30.0), (1, 1e-3), (2, 1e-5)):
+                change = torch.zeros_like(values[at])
+                change.view(-1)[0] = step
+                ends = [tip(*(x + s * change if i == at else x for i, x in enumerate(values))) for s in (1.0, -1.0)]
+                difference = float(ends[0] - ends[1]) / (2.0 * step)
+                assert float(values[at].grad.view(-1)[0]) == pytest.approx(difference, rel=1e-4)
+
+    def test_none_is_kept_where_nothing_needs_one(self, robot):
+        assert not robot.step(robot.begin(), pressure=[HIGH, 0.0]).q.requires_grad
+
+    def test_each_environment_has_its_own_parameters(self, robot):
+        moduli = robot.parameters["youngs_modulus"] * torch.tensor([0.7, 1.0, 1.4], dtype=torch.float64)
+        rises = torch.tensor([0.001, 0.02, 0.1], dtype=torch.float64)
+        delays = torch.tensor([0.0, 0.013, 0.03], dtype=torch.float64)
+        with torch.no_grad():
+            own = robot.with_parameters(youngs_modulus=moduli, pressure_rise=rises, pressure_delay=delays)
+            together = own.rollout(own.begin(3), pressure=wave(4))
+            for row in range(3):
+                one = robot.with_parameters(
+                    youngs_modulus=moduli[row], pressure_rise=rises[row], pressure_delay=delays[row]
+                )
+                alone = one.rollout(one.begin(), pressure=wave(4))
+                torch.testing.assert_close(alone.q[:, 0], together.q[:, row], atol=1e-9, rtol=0.0)
+        assert float((together.q[-1, 0] - together.q[-1, 2]).abs().max()) > 1e-4
+
+
+class TestStates:
+    def test_environments_are_chosen_and_replaced(self, robot):
+        with torch.no_grad():
+            moved = robot.step(robot.begin(2), pressure=[[HIGH, 0.0], [0.0, HIGH]])
+        fresh = robot.begin(2)
+        mixed = moved.where(torch.tensor([True, False]), fresh)
+        assert torch.equal(mixed.q[0], moved.q[0])
+        assert torch.equal(mixed.q[1], fresh.q[1])
+        assert torch.equal(mixed.memory["pressure.queue"][:, 0], moved.memory["pressure.queue"][:, 0])
+        assert not mixed.memory["pressure.queue"][:, 1].any()
+        with torch.no_grad():
+            later = robot.step(mixed, pressure=[HIGH, 0.0])
+            expected = robot.step(moved.select([0]), pressure=[HIGH, 0.0])
+        torch.testing.assert_close(later.q[:1], expected.q, atol=1e-9, rtol=0.0)
+        assert moved.repeat(2).batch == 4
+
+    @pytest.mark.parametrize("delay", [0.0, 0.02, 0.025, 0.07])
+    def test_commands_step_by_step_are_those_of_whole_series(self, delay):
+        from warp_resphys.data.actuation import delayed, lagged, remembered
+
+        def one(value):
+            return torch.tensor([value], dtype=torch.float64)
+
+        series, parameters = wave(12), {"p_factor": one(0.8), "p_delay": one(delay), "p_rise": one(0.04)}
+        commands = Commands("p", parameters, [0.1, 0.5], 0.01)
+        memory = commands.still(torch.zeros(1, 2, dtype=torch.float64))
+        found, told = [], []
+        for each in series:
+            acting, seen, memory = commands.step(memory, each)
+            found.append(acting)
+            told.append(seen)
+        expected = lagged(delayed(0.8 * series, one(delay), 0.01), one(0.04), 0.01)
+        torch.testing.assert_close(torch.stack(found), expected)
+        torch.testing.assert_close(torch.stack(told), remembered(expected, [0.1, 0.5], 0.01))
+        acting, seen, _ = commands.step(commands.still(series[3]), series[3])
+        torch.testing.assert_close(seen, torch.cat([0.8 * series[3]] * 3, -1))
+
+
+class TestFiles:
+    def test_a_table_is_read_as_a_recording(self, robot, tmp_path):
+        with torch.no_grad():
+            motion = robot.rollout(robot.begin(), pressure=wave(6))
+        path = motion.write_csv(tmp_path / "motion.csv")
+        header, *rows = path.read_text().splitlines()
+        assert header.split(",")[:4] == ["time [s]", "T1.x [m]", "T1.y [m]", "T1.z [m]"]
+        assert header.split(",")[-2:] == ["pressure.chamber_1 [Pa]", "pressure.chamber_2 [Pa]"]
+        assert len(rows) == 7
+        recording = warp_resphys.read_recording(path)
+        assert tuple(recording.labels) == robot.labels
+        np.testing.assert_allclose(recording.positions, motion.markers[:, 0].numpy(), atol=1e-9)
+
+    def test_a_series_for_paraview(self, robot, tmp_path):
+        import pyvista
+
+        with torch.no_grad():
+            motion = robot.rollout(robot.begin(), pressure=wave(3))
+        reader = pyvista.get_reader(motion.write_vtk(tmp_path / "arm.pvd"))
+        np.testing.assert_allclose(reader.time_values, motion.times)
+        reader.set_active_time_value(motion.times[-1])
+        body = reader.read()[0]
+        assert body.n_cells == len(robot.simulator.body.mesh.cells)
+        np.testing.assert_allclose(body.points, motion.q[-1, 0].numpy(), atol=1e-9)
+        rest = robot.simulator.body.mesh.vertices
+        np.testing.assert_allclose(body.point_data["displacement"], motion.q[-1, 0].numpy() - rest, atol=1e-9)
+        dots = pyvista.get_reader(tmp_path / "arm_markers.pvd")
+        dots.set_active_time_value(motion.times[-1])
+        np.testing.assert_allclose(dots.read()[0].points, motion.markers[-1, 0].numpy(), atol=1e-9)
+
+    def test_a_scene_in_usd(self, robot, tmp_path):
+        pytest.importorskip("pxr", reason="the extra usd is not installed")
+        from pxr import Usd, UsdGeom
+
+        with torch.no_grad():
+            motion = robot.rollout(robot.begin(), pressure=wave(3))
+        for name in ("arm.usda", "arm.usd"):
+            stage = Usd.Stage.Open(str(motion.write_usd(tmp_path / name)))
+            assert UsdGeom.GetStageUpAxis(stage) == "Z"
+            assert stage.GetEndTimeCode() / stage.GetTimeCodesPerSecond() == pytest.approx(motion.times[-1])
+            body = UsdGeom.Mesh(stage.GetPrimAtPath("/robot/body"))
+            at = np.array(body.GetPointsAttr().Get(3.0))
+            kept = np.unique(warp_resphys.mesh.mesh.boundary_triangles(robot.simulator.body.mesh))
+            np.testing.assert_allclose(at, motion.q[3, 0].numpy()[kept], atol=1e-6)
+            faces = np.array(body.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
+            corners = at[faces]
+            volume = np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0
+            assert volume > 1e-5  # m^3: faces look outwards
+
+    def test_a_program_of_torch(self, robot, tmp_path):
+        path = export_network(robot, tmp_path / "force.pt2")
+        program = torch.export.load(path).module()
+        names = told_names(robot)
+        pressures = ["pressure chamber_1 [Pa]", "pressure chamber_2 [Pa]"]
+        assert names == [*pressures, *(f"mean of {each} over 0.1 s" for each in pressures)]
+        with torch.no_grad():
+            state = robot.rollout(robot.begin(3), pressure=wave(4)).final
+            told = HIGH * torch.tensor([[0.1, 0.2, 0.3, 0.4], [9.0, 0.0, 9.0, 0.0], [0.0, 0.0, 0.0, 0.0]]).double()
+            (force,) = program(state.q, state.v, told, None)
+            expected = robot._predictor(told, None)(state.body, 0)
+        torch.testing.assert_close(force, expected)
+        assert float(force.abs().max()) > 0.0
+
+
+class TestBadInput:
+    @pytest.mark.parametrize(
+        ("call", "sentence"),
+        [
+            (lambda r, s: r.step(s, presure=[0.0]), "no input 'presure': the robot has 'pressure', 'base', 'ext"),
+            (lambda r, s: r.step(s, pressure="high"), "pressure is 'high': it must be numbers"),
+            (lambda r, s: r.step(s, pressure={"3": 1.0}), r"pressure has no part '3': it has 'chamber_1', 'chamber_2'"),
+            (lambda r, s: r.step(s, pressure=[1.0, 2.0, 3.0]), r"pressure has shape \(1, 3\): give \(2,\) values in P"),
+            (lambda r, s: r.step(s, pressure=[float("nan"), 0.0]), r"pressure is n"),
+            (lambda r, s: r.step(s, external_force=[0.0, 0.0, 1.0]), r"external_force has shape \(3,\): give \(\d+, "),
+            (lambda r, s: r.rollout(s, pressure=[0.0, 0.0]), "no number of steps: give `steps`"),
+            (lambda r, s: r.with_parameters(youngs=1.0), "no parameter 'youngs'.*youngs_modulus"),
+            (lambda r, s: r.with_parameters(youngs_modulus=-1.0), "youngs_modulus is -1: it must be positive"),
+            (lambda r, s: r.save("robot.pt"), "robot.pt does not end in .safetensors"),
+            (lambda r, s: r.rollout(s, 1).write_vtk("a.vtk"), "a.vtk does not end in .pvd"),
+            (lambda r, s: r.rollout(s, 1).write_usd("a.obj"), "a.obj does not end in .usd"),
+            (lambda r, s: r.rollout(s, 1).write_csv("a.csv", 1), "environment is 1: the motion has 1"),
+            (lambda r, s: export_network(r, "net.pt"), "net.pt does not end in .pt2"),
+            (lambda r, s: warp_resphys.recorded_trial(r, "t9"), "the trial is 't9': .* has 't000'"),
+        ],
+    )  # fmt: skip
+    def test_calls(self, robot, call, sentence):
+        with pytest.raises(InputError, match=sentence):
+            call(robot, robot.begin())
+
+    def test_models_and_files(self, arm, robot, tmp_path):
+        with pytest.raises(InputError, match=r"the model is 'resfys': .* has 'simulation', .*'sysid'"):
+            warp_resphys.load(arm, "resfys")
+        kept = robot.save(tmp_path / "robot.safetensors")
+        with pytest.raises(InputError, match=r"the model is 'sysid', but .* holds 'resphys'"):
+            warp_resphys.load(kept, "sysid")
+        with pytest.raises(InputError, match="loaded from a file, which has no trials"):
+            warp_resphys.trial_names(warp_resphys.load(kept))
+        sysid = warp_resphys.load(arm, "sysid")
+        with pytest.raises(InputError, match="is a simulator alone: it has learned nothing"):
+            export_network(sysid, tmp_path / "net.pt2")
+        content = bytearray(kept.read_bytes())
+        content[-9] ^= 1
+        kept.write_bytes(content)
+        with pytest.raises(DataFileError, match="does not match its checksum"):
+            warp_resphys.load(kept)
+
+    def test_runs_that_are_not_done_or_of_other_programs(self, arm, tmp_path):
+        with pytest.raises(DataFileError, match="does not exist: name a run folder"):
+            warp_resphys.load(tmp_path / "nothing")
+        with pytest.raises(DataFileError, match="is no run folder"):
+            warp_resphys.load(tmp_path)
+        folder = Path(shutil.copytree(arm, tmp_path / "run"))
+        assert warp_resphys.load(folder).description.model == "resphys"  # a copy is as good
+        record = read_json(folder / "stages/evaluate.json")
+        write_json(folder / "stages/evaluate.json", {**record, "versions": {"warp-resphys": "9.4.0"}})
+        with pytest.raises(DataFileError, match=r"was made by warp-resphys 9\.4\.0, and this is 0\.1\.0: run"):
+            warp_resphys.load(folder)
+        write_json(folder / "stages/evaluate.json", record)
+        trained = read_json(folder / "stages/train_resphys.json")
+        write_json(folder / "stages/train_resphys.json", {**trained, "fingerprint": "other"})
+        with pytest.raises(DataFileError, match="unfinished, as its stage 'train_resphys' was run since 'evaluate'"):
+            warp_resphys.load(folder)
+        (folder / "stages/train_resphys.json").unlink()
+        with pytest.raises(DataFileError, match="unfinished, as its stage 'train_resphys' was not run to the end"):
+            warp_resphys.load(folder)
+        write_json(folder / "stages/train_resphys.json", trained)
+        (folder / "resphys.safetensors").write_bytes(b"-")
+        with pytest.raises(DataFileError, match="is missing or has changed since it was written"):
+            warp_resphys.load(folder)
+        (folder / "stages/evaluate.json").unlink()
+        with pytest.raises(DataFileError, match="unfinished, as its stage 'evaluate' was not run to the end"):
+            warp_resphys.load(folder)
+
+    def test_a_package_that_is_not_there(self, robot, monkeypatch, tmp_path):
+        monkeypatch.setitem(__import__("sys").modules, "pxr", None)
+        with pytest.raises(InputError, match=r"not installed: pip install 'warp-resphys\[usd\]'"):
+            robot.rollout(robot.begin(), 1).write_usd(tmp_path / "a.usd")
+
+
+def test_it_says_what_it_is(robot, arm):
+    text = repr(robot)
+    for said in (
+        "run, resphys: ",
+        "3 markers",
+        "input pressure [Pa]: chamber_1, chamber_2",
+        "identified pressure_delay: ",
+        "mean error",
+    ):
+        assert said in text
+    low, high = robot.inputs["pressure"].low, robot.inputs["pressure"].high
+    assert low[0] >= 0.0
+    assert 1e3 < high[0] <= 2.1e4
+    errors = json.loads((arm / "errors.json").read_text())["errors_mm"]["resphys"]
+    assert robot.description.errors_mm == errors
+
+
+def test_the_lines_of_the_readme(finished, tmp_path, monkeypatch, capsys):
+    text = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
+    (lines,) = re.findall(r"<!-- robot -->\n```python\n(.*?)```", text, flags=re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(finished[0], "runs/beam_oscillation/default")
+    exec(compile(lines, "README.md", "exec"), {})
+    assert 0.0 < float(capsys.readouterr().out.splitlines()[-1]) < 1.0  # mm
+    assert {"beam.safetensors", "beam.pvd", "beam"} <= {path.name for path in Path().iterdir()}

@@ -1,0 +1,137 @@
+"""`load`: a robot of a finished run, or of a file; and the trials of the run, to be driven again."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..energies.strings import PAYLOAD
+from ..experiment.build import choose_device
+from ..experiment.files import STATIC
+from ..experiment.scene import Scene
+from ..io.errors import DataFileError, InputError, listed
+from .description import Description, describe, finished_scene
+from .inputs import BASE
+from .motion import Motion
+from .robot import Robot
+from .state import RobotState
+
+
+def load(path: str | Path, model: str | None = None, device: str = "cpu", on_failure: str = "raise") -> Robot:
+    """The robot of a finished run, or of a file that `Robot.save` wrote.
+
+    Args:
+        path: of the run folder, such as ``runs/sopra/default``, of one of its folds, or of the file.
+        model: which of the experiment's: ``resphys``, the identified simulator with its learned force, if left out;
+            ``sysid``, that simulator alone; ``simulation``, the uncorrected one; ``simfree``, a network alone. A file
+            has one.
+        device: of the simulation: ``cpu``, ``cuda`` or ``auto``.
+        on_failure: ``raise``, or ``count``, see `Robot`.
+
+    Raises:
+        DataFileError: there is no such run, it is unfinished, of another version, or a file of it has changed.
+        InputError: the experiment has no such model, or an unknown device.
+    """
+    place = Path(path).expanduser()
+    where = choose_device(device)
+    if place.is_file():
+        found = Description.read(place)
+        if model not in (None, found.model):
+            raise InputError(
+                f"the model is {model!r}, but {place} holds {found.model!r}: load that, or the run folder."
+            )
+        return Robot(found, where, on_failure)
+    if not place.is_dir():
+        raise DataFileError(f"{place} does not exist: name a run folder, or a file that `Robot.save` wrote.")
+    return Robot(describe(place, model or "resphys"), where, on_failure, folder=place)
+
+
+@dataclass(frozen=True)
+class RecordedTrial:
+    """A trial of a run, for a robot that was loaded from it.
+
+    Attributes:
+        name: of the trial.
+        start: the state that it begins with, as the robot has it.
+        steps: that reach past its last frame; none of a pose.
+        inputs: by name, as `Robot.rollout` takes them.
+        times: (F,) of its frames since then [s].
+        markers: (F, M, 3) what was observed [m], NaN where nothing was seen.
+        shift: (M, 3) by which markers sit beside where they are bound, where a release tells [m].
+    """
+
+    name: str
+    start: RobotState
+    steps: int
+    inputs: Mapping[str, Any]
+    times: NDArray[np.float64]
+    markers: NDArray[np.float64]
+    shift: NDArray[np.float64] | None = None
+
+    def play(self, robot: Robot) -> Motion:
+        """What a robot does in this trial."""
+        return robot.rollout(self.start, self.steps, **self.inputs)
+
+    def shown(self, motion: Motion) -> NDArray[np.float64]:
+        """(F, M, 3) the markers of a motion at the frames [m]."""
+        found = motion.at(self.times)[:, 0].detach().cpu().numpy()
+        return np.asarray(found if self.shift is None else found + self.shift)
+
+    def errors_mm(self, motion: Motion) -> NDArray[np.float64]:
+        """(F, M) distances of a motion's markers from those observed [mm], NaN where nothing was seen."""
+        return np.asarray(1e3 * np.linalg.norm(self.shown(motion) - self.markers, axis=-1))
+
+
+def trial_names(robot: Robot) -> tuple[str, ...]:
+    """The trials of the run that a robot was loaded from.
+
+    Raises:
+        InputError: it was loaded from a file.
+    """
+    return _scene(robot).dataset.names
+
+
+def recorded_trial(robot: Robot, name: str) -> RecordedTrial:
+    """A trial of the run that a robot was loaded from, as it begins by the robot's simulator.
+
+    Raises:
+        InputError: there is no such trial, or the robot was loaded from a file.
+        ConvergenceError: the body cannot be brought where the trial begins.
+    """
+    scene = _scene(robot)
+    known = scene.dataset.names
+    if name not in known:
+        raise InputError(f"the trial is {name!r}: {robot.folder} has {listed(known)}.")
+    simulator, model = scene.model_simulator(robot.description.model), robot.description.model
+    with torch.no_grad():
+        replay = scene.replay(simulator, [name], model)
+        start = scene.start(replay, model)
+        constants, _, resting = replay.setting(scene.parameters(model))
+        inputs = {key: value.to(simulator.rest_positions) for key, value in replay.trials.inputs.actuation.items()}
+        load = float(scene.dataset.payload[scene.dataset.rows([name])[0]])
+        if load:
+            inputs[PAYLOAD.name] = simulator.tensor([load])
+        base = scene.dataset.base_at([name], simulator.time_step)
+        if scene.begins(name) == STATIC:
+            inputs = {key: value[-1] if value.ndim == 3 else value for key, value in inputs.items()}
+            begun, steps = robot.settle(1, **inputs), 0
+        else:
+            begun, steps = robot.state(replay.begin(start, constants, resting).q, start.state.v[0]), replay.steps(start)
+            if base is not None:
+                poses = base.to(simulator.rest_positions)
+                inputs[BASE] = poses[1:]
+                begun = RobotState(begun.body, begun.memory, None, poses[:1].repeat(2, 1, 1), begun.left, begun.lost)
+    trials = replay.trials
+    since = (trials.times - start.delay[:, None]).clamp_min(0.0)[0].cpu().numpy()
+    shift = None if start.shift is None else start.shift[0].cpu().numpy()
+    return RecordedTrial(name, begun, steps, inputs, since, trials.observed[0].cpu().numpy(), shift)
+
+
+def _scene(robot: Robot) -> Scene:
+    if robot.folder is None:
+        raise InputError("the robot was loaded from a file, which has no trials: load its run folder for these.")
+    return finished_scene(robot.folder)

@@ -8,7 +8,7 @@ import torch
 import warp as wp
 from main_job import IN_RUN, TINY, files, run
 
-from warp_resphys.experiment import pipeline
+from warp_resphys import pipeline
 from warp_resphys.mesh.mesh import box_hexahedra
 from warp_resphys.report import bodies, render
 

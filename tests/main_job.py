@@ -7,8 +7,9 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
-from warp_resphys import cli
+from warp_resphys import cli, pipeline
 
 REPOSITORY = Path(__file__).parents[1]
 STAGES = ["simulate", "reconstruct_resphys", "train_resphys", "train_simfree", "evaluate", "time", "report"]
@@ -54,6 +55,15 @@ def end_of(program, *arguments):
         finally:
             sys.argv = argv
     return code, err.getvalue()
+
+
+def run_without_report(place, *arguments):
+    """The folder ``run`` that a command leaves in a place, whose report is no more than a file."""
+    with pytest.MonkeyPatch.context() as patch, contextlib.chdir(place):
+        patch.setattr(pipeline, "make_report", lambda context: (context.run_dir / "report.html").write_text("-"))
+        code, err = run(*arguments)
+    assert (code, err[-900:] if code else "") == (0, "")
+    return place / "run"
 
 
 def run(*arguments):

@@ -22,7 +22,7 @@ from warp_resphys.io.labels import run_label
 from warp_resphys.io.stages import StageInterrupted
 
 REPOSITORY = Path(__file__).parents[1]
-EXPERIMENT = "warp_resphys.experiment.pipeline"
+EXPERIMENT = "warp_resphys.pipeline"
 CONFIG = {
     "config.yaml": """
         defaults:

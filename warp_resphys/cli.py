@@ -43,7 +43,7 @@ NOBODY_READS = 141  # 128 + SIGPIPE
 # run folder, and its purpose.
 COMMANDS: Final[Mapping[str, tuple[str, str]]] = MappingProxyType(
     {
-        "run": ("experiment.pipeline:run_experiment", "run an experiment; the word run may be left out"),
+        "run": ("pipeline:run_experiment", "run an experiment; the word run may be left out"),
         "tune": ("studies.tuning.tune:run_tuning", "search for better settings of the network and its training"),
         "reproduce": ("studies.reproduction:reproduce", "run the simulated beams, and compare with what was published"),
         "robots": ("studies.robots:robots", "run the robots that others recorded, with one page on all of them"),

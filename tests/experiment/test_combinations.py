@@ -8,8 +8,8 @@ import pytest
 from main_job import IN_RUN, TINY, run
 from played_run import check_robots
 
+from warp_resphys import pipeline
 from warp_resphys.data.base_motion import prescribed, rigid
-from warp_resphys.experiment import pipeline
 from warp_resphys.io.files import read_array, read_checkpoint, read_hdf5
 
 # A short segment with two chambers of some 70 vertices, on which everything takes seconds.

@@ -23,13 +23,13 @@ from warp_resphys.experiment.build import bound_markers, build_body
 from warp_resphys.experiment.checks import check_configuration
 from warp_resphys.experiment.files import DATASET, QUALITY, REGISTRATION, TRUTH, Dataset, payload_inputs, read_dataset
 from warp_resphys.experiment.importing import import_recordings
-from warp_resphys.experiment.pipeline import acquisition_stages
 from warp_resphys.experiment.simulate import laboratory_simulator, make_setup
 from warp_resphys.experiment.trials import trials_of
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.files import read_hdf5
 from warp_resphys.io.stages import StageContext, fingerprint, run_stages
 from warp_resphys.learning.replay import Replay, Start
+from warp_resphys.pipeline import acquisition_stages
 
 ROOT = Path(__file__).parents[2]
 TIPS, BASES = tuple(f"Tip - {i}" for i in (1, 2, 3)), tuple(f"Base - {i}" for i in (1, 2, 3))

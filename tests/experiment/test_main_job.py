@@ -30,8 +30,8 @@ from main_job import (
 )
 from omegaconf import OmegaConf
 
-from warp_resphys import box_hexahedra
-from warp_resphys.experiment import learn, models, pipeline
+from warp_resphys import box_hexahedra, pipeline
+from warp_resphys.experiment import learn, models
 from warp_resphys.experiment.build import build_simulator
 from warp_resphys.experiment.checks import check_configuration
 from warp_resphys.experiment.trials import split_of

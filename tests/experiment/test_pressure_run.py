@@ -17,13 +17,14 @@ from hydra import compose, initialize_config_module
 from main_job import IN_RUN, run
 from omegaconf import OmegaConf
 
+from warp_resphys import pipeline
 from warp_resphys.data.actuation import InputSequences
 from warp_resphys.data.markers import bind_markers
 from warp_resphys.data.recordings.arrays import write_recording
 from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.trials import Trials
 from warp_resphys.dynamics.inputs import Inputs
-from warp_resphys.experiment import learn, pipeline, reconstruct
+from warp_resphys.experiment import learn, reconstruct
 from warp_resphys.experiment.build import build_simulator
 from warp_resphys.experiment.checks import check_configuration
 from warp_resphys.experiment.evaluate import summary

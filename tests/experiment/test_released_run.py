@@ -18,7 +18,6 @@ from omegaconf import OmegaConf
 
 from warp_resphys.experiment import identify, report
 from warp_resphys.experiment.folds import Fold, run_folds
-from warp_resphys.experiment.pipeline import learning_stages
 from warp_resphys.experiment.scene import LEARNED, MODELS
 from warp_resphys.experiment.trials import folds_of, split_of
 from warp_resphys.io.fan_out import Workers
@@ -27,6 +26,7 @@ from warp_resphys.io.stages import StageInterrupted, run_stages
 from warp_resphys.learning.identification import Identifier
 from warp_resphys.learning.metrics import marker_errors
 from warp_resphys.learning.networks import NextState, ResidualForce, restore
+from warp_resphys.pipeline import learning_stages
 
 TINY = [
     "experiment=beam_real",

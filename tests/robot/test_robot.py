@@ -13,7 +13,7 @@ from main_job import IN_RUN, run
 from played_run import check_robots
 
 import warp_resphys
-from warp_resphys.experiment import pipeline
+from warp_resphys import pipeline
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.files import read_json, write_json
 from warp_resphys.robot.commands import Commands

@@ -17,7 +17,8 @@ from measured_run import configuration
 from omegaconf import OmegaConf
 from test_tuning_study import dead
 
-from warp_resphys.experiment import learn, pipeline
+from warp_resphys import pipeline
+from warp_resphys.experiment import learn
 from warp_resphys.experiment.checks import check_configuration
 from warp_resphys.io.files import read_checkpoint
 from warp_resphys.learning.training import Trainer

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from importlib.util import find_spec
 from itertools import combinations, product
 from typing import Any, cast
 
@@ -26,7 +27,9 @@ from .actuators import Drive, drive_of
 from .build import build_body, build_material, build_simulator, finer, sight_of
 from .files import STATIC, payload_inputs
 from .identify import ELASTIC, bounds_of
+from .models import SIMFREE
 from .reading import standing_enough
+from .scene import models_of
 from .schema import IN_THE_LOOP, NAME, NETWORK, TRAINER, check, configuration_group
 from .simulate import input_sequences, laboratory_settings, substeps_of, vertical
 from .trials import (
@@ -43,6 +46,7 @@ from .trials import (
 _LONGEST_STRETCH = 0.3  # rho g L / E from which on the size of a body is not believed
 _BYTES_PER_CELL = 4_000  # that a mesh, its points and its matrix take at least
 _SHARE_OF_MEMORY = 0.8
+_LEAST_STEPS = 20  # of a figure that is followed
 
 
 def check_configuration(config: Mapping[str, Any]) -> None:
@@ -99,6 +103,8 @@ def check_configuration(config: Mapping[str, Any]) -> None:
                 "refinement to none, or payload_string to null."
             )
         _check_refinement(config)
+    if config["control"] is not None:
+        _check_control(config, body)
     if config["identify"] is not None:
         if "fibre_stiffness" in config["identify"]["parameters"] and config["fibres"] is None:
             raise InputError("identify.parameters names fibre_stiffness, but fibres is null: give the simulator some.")
@@ -106,6 +112,44 @@ def check_configuration(config: Mapping[str, Any]) -> None:
         known = [name for name in known_parameters(simulator) if hangs or name != MASS_FACTOR]
         _check_identification(config["identify"], known)
         _check_parts(config["identify"], simulator)
+
+
+def _check_control(config: Mapping[str, Any], body: Body) -> None:
+    """Whether what is to be followed can be."""
+    control, drive = config["control"], drive_of(config, body)
+    if find_spec("piqp") is None:
+        raise InputError("control needs a package that is not installed: pip install 'warp-resphys[control]'.")
+    if not sees_markers(config) or folds_of(config) is not None or drive is None:
+        raise InputError(
+            "control is for a robot with markers, pressures, tendons or muscles, of one split of its trials: set "
+            "control=none, or data.folds=null."
+        )
+    for key in ("models", "receding"):
+        odd = [model for model in control[key] if model == SIMFREE or model not in models_of(config)]
+        if odd:
+            raise InputError(f"control.{key} has {odd[0]}: this experiment has {listed(_simulators(config))}.")
+    if not {*control["receding"]} <= {*control["models"]}:
+        raise InputError(f"control.receding must be among control.models, which are {listed(control['models'])}.")
+    odd = [label for label in control["tracked"] if label not in config["markers"]["tracked"]]
+    if odd:
+        raise InputError(
+            f"control.tracked names {odd[0]!r}: markers.tracked has {listed(config['markers']['tracked'])}."
+        )
+    limits, most = control["limits"], config["data"]["input_limit"]
+    if not limits["low"] < limits["high"] or (most is not None and limits["high"] > most):
+        raise InputError(
+            f"control.limits are from {limits['low']:g} to {limits['high']:g}: they must rise, to data.input_limit of "
+            f"{most:g} at most, which is what was learned from."
+        )
+    short = [seconds for seconds in control["seconds"] if seconds < _LEAST_STEPS * config["time_step"]]
+    if short:
+        raise InputError(f"control.seconds has {short[0]:g}: a figure takes {_LEAST_STEPS} steps at least.")
+    if is_laboratory(config) and any(trial.payload for trial in trials_of(config)):
+        raise InputError("control drives a robot without payloads: leave them out of laboratory.trials.")
+
+
+def _simulators(config: Mapping[str, Any]) -> list[str]:
+    return [model for model in models_of(config) if model != SIMFREE]
 
 
 def _check_refinement(config: Mapping[str, Any]) -> None:

@@ -32,6 +32,13 @@ ROLLOUTS: Final = "rollouts.h5"
 ERRORS: Final = "errors.json"
 TIMES: Final = "times.json"
 MESH_CHECK: Final = "mesh_check.json"
+CONTROL: Final = "control.json"
+DRIVEN: Final = "driven.h5"
+# What drives a robot: the beginning of its name, and what it plans with or its gain.
+OPEN: Final = "open_"
+RECEDING: Final = "receding_"
+LINEAR: Final = "linear"
+FEEDBACK: Final = "feedback_"
 METRICS: Final = "metrics.json"
 REPORT: Final = "report.html"
 

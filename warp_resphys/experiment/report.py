@@ -20,13 +20,15 @@ from ..learning.parameters import configured_parameters
 from ..mesh.chambers import Chamber
 from ..mesh.mesh import Mesh, select_vertices
 from ..mesh.surface import closest_points
-from ..report.data import MODELS, Driven, Film, Recordings, RunReport, Trials
+from ..report.data import MODELS, Driven, Film, FollowedPath, Recordings, RunReport, Trials
 from ..report.page import number_text
 from ..report.run_page import write_report
 from .actuators import build_chambers, build_muscles, build_tendons, driving_quantity
 from .build import bound_markers, build_mesh, choose_device, sight_of
 from .files import (
+    CONTROL,
     DATASET,
+    DRIVEN,
     ERRORS,
     IDENTIFICATION,
     MESH_CHECK,
@@ -114,6 +116,7 @@ def make_report(context: StageContext) -> None:
         refinement=_histories(folder, True),
         network_note=network_in_words(config) if learned else "",
         kept_note=kept_in_words(metrics["networks"]) if "resphys" in metrics["networks"] else "",
+        followed=read_followed(folder, config),
         simulator=_in_words(config["simulation"]),
         target=_in_words(config["target"]) if config.get("target") else "",
     )
@@ -178,6 +181,7 @@ def collect_metrics(folder: Path, config: Mapping[str, Any], stages: Sequence[st
     identified, truth = (read_if_there(each) for each in (folder / IDENTIFICATION, common_folder(folder) / TRUTH))
     more = {
         "reconstruction": read_if_there(folder / RECONSTRUCTION),
+        "control": read_if_there(folder / CONTROL) if config["control"] is not None else {},
         "mesh_check": {} if config["mesh_check"] is None else read_if_there(folder / MESH_CHECK),
         "seconds_per_test_trajectory": read_if_there(folder / TIMES).get("seconds", {}) if config["timing"] else {},
         **({"noise_mm": truth["noise_mm"]} if "noise_mm" in truth else {}),
@@ -316,6 +320,22 @@ def _as_seen(film: Film, dataset: Dataset, config: Mapping[str, Any], mesh: Mesh
     sight = sight.select(has)
     at = {model: torch.from_numpy(each) for model, each in film.positions.items()}
     return replace(film, positions={model: sight.carried(q, markers(q)[:, has]).numpy() for model, q in at.items()})
+
+
+def read_followed(folder: Path, config: Mapping[str, Any]) -> list[FollowedPath]:
+    """How controllers have driven a simulated laboratory; nothing where they have not."""
+    if config["control"] is None or config["laboratory"] is None:
+        return []
+    found = []
+    with read_hdf5(folder / DRIVEN, "driven") as file:
+        controllers = [str(each) for each in file.attrs["controllers"]]
+        for name in map(str, file.attrs["names"]):
+            shape, seconds = name.removesuffix("s").rsplit("_", 1)
+            path = read_array(file, f"{name}/path", (None, 3)).astype(np.float64)
+            points = read_array(file, f"{name}/points", (len(controllers), len(path), 3)).astype(np.float64)
+            by_name = dict(zip(controllers, points, strict=True))
+            found.append(FollowedPath(name=shape, seconds=float(seconds), path=path, points=by_name))
+    return found
 
 
 def read_driven(folder: Path, config: Mapping[str, Any]) -> Driven | None:

@@ -20,7 +20,7 @@ from ..io.fan_out import BACKENDS
 from ..learning.networks import ACTIVATIONS, FORCE_BASES, NETWORK_KINDS
 from ..learning.refinement import REFINEMENTS
 from ..learning.training import SCHEDULES, SELECTIONS
-from .scene import FORCE_FRAMES
+from .scene import FORCE_FRAMES, MODELS
 from .trials import BEGINNINGS, FOLDS, SPLITS
 
 
@@ -443,6 +443,48 @@ _ABLATION = Group(
     absent=True,
 )
 
+GRADIENTS: Final = ("reduced", "adjoint")  # of the corrections of plans
+_SHAPE: Final = Kind(
+    lambda value: value in ("circle", "eight") or (_is_word(value) and re.fullmatch("[A-Z]", value) is not None),
+    "circle, eight or a capital letter",
+)
+_MODEL_NAMES: Final = _list(
+    one_of(*MODELS), f"a list of different models of {', '.join(MODELS)}", _SOME, different=True
+)
+_DIFFERENT: Final = _list(POSITIVE, "a list of different positive numbers", _SOME, different=True)
+_CONTROL: Final = Group(
+    {
+        **dict.fromkeys(("models", "receding"), _MODEL_NAMES),
+        "tracked": _list(WORD, "a list of different markers", _SOME, different=True),
+        "shapes": _list(_SHAPE, "a list of different ones of circle, eight and capital letters", _SOME, different=True),
+        "seconds": _DIFFERENT,
+        "centre": _PLACE,
+        "size": POSITIVE,
+        **dict.fromkeys(("right", "up"), _AXIS),
+        "limits": Group({"low": NOT_NEGATIVE, **dict.fromkeys(("high", "rate"), POSITIVE)}),
+        "plan": Group(
+            {
+                **dict.fromkeys(("spacing", "effort", "change", "reach"), POSITIVE),
+                "iterations": NATURAL,
+                "corrections": COUNT,
+                "gradient": one_of(*GRADIENTS),
+            }
+        ),
+        "horizon": Group(
+            {
+                **dict.fromkeys(("seconds", "effort", "change"), POSITIVE),
+                **dict.fromkeys(("pieces", "iterations"), NATURAL),
+            }
+        ),
+        "estimate": Group(dict.fromkeys(("observed", "rate", "bias"), POSITIVE)),
+        "feedback": Group({"gains": _DIFFERENT, "pressed": SHARE, "settles": POSITIVE}),
+        "reduction": Group(
+            {**dict.fromkeys(("modes", "equilibria", "tangents", "motions", "batch"), NATURAL), "seconds": POSITIVE}
+        ),
+    },
+    optional=True,
+)
+
 
 def _laboratory_group(settings: Any) -> Group:
     """What the group ``laboratory`` must be."""
@@ -533,6 +575,7 @@ def configuration_group(config: Mapping[str, Any]) -> Group:
             ),
             "laboratory": _laboratory_group(config.get("laboratory")),
             "ablation": _ABLATION,
+            "control": _CONTROL,
             **dict.fromkeys(("budget", "tuned"), absent(WORD)),
             "tune": absent(Group(each=ANYTHING)),
         }

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 
@@ -34,14 +35,16 @@ class Range:
 
     def hold(self, inputs: torch.Tensor) -> torch.Tensor:
         """(B, A) standardised inputs, those outside at the edge."""
-        return inputs.clamp(*self._edges())
+        return inputs.clamp(*self.edges)
 
     def left(self, inputs: torch.Tensor) -> torch.Tensor:
         """(B,) bool, whether (B, A) standardised inputs are outside."""
-        low, high = self._edges()
+        low, high = self.edges
         return ((inputs < low) | (inputs > high)).any(1)
 
-    def _edges(self) -> tuple[torch.Tensor, torch.Tensor]:
+    @cached_property
+    def edges(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """(A,) each: the least and the largest inputs that the model is told."""
         margin = _MARGIN * (self.high - self.low)
         return self.low - margin, self.high + margin
 

@@ -20,6 +20,9 @@ from .parameters import HUNG, MASS_FACTOR, check_known, constants_of, known_para
 
 _POSE_ITERATIONS = 50
 _POSE_TOLERANCE = 1e-8  # m
+_POSE_MEMORY = 6  # iterations that are combined
+_POSE_RIDGE = 1e-12
+_POSE_PATIENCE = 20  # tries without a better one, after which a pose is given up
 Observe = Callable[[torch.Tensor], torch.Tensor]
 StepForce = Callable[[State, int], torch.Tensor]
 Parameters = Mapping[str, torch.Tensor]
@@ -200,6 +203,45 @@ class Replay:
         return torch.where(self.trials.seen[..., None], difference, 0.0)
 
 
+class _Settling:
+    """Where to try next to find the fixed points of a map, of each environment by itself.
+
+    Anderson's acceleration (J. ACM 12 (1965) 547) about the try that was led the least far: the combination of all
+    tries that would be led nowhere if the map were linear, and from there a share of the way that it leads. The share
+    is halved after a try that was led further than that, and doubled after others.
+    """
+
+    def __init__(self) -> None:
+        self._tried = list[torch.Tensor]()  # (B, 3 N)
+        self._moved = list[torch.Tensor]()  # (B, 3 N) how far the map led from there
+        self._share: torch.Tensor | None = None  # (B, 1)
+
+    def next(self, q: torch.Tensor, change: torch.Tensor) -> torch.Tensor:
+        """(B, N, 3) where to try, after (B, N, 3) was tried, from where the map led so far."""
+        self._tried, self._moved = [*self._tried, q.flatten(1)], [*self._moved, change.flatten(1)]
+        x, f = torch.stack(self._tried), torch.stack(self._moved)  # (m, B, 3 N)
+        size = f.norm(dim=2)
+        best = size.argmin(0)
+        worse = (best < len(x) - 1)[:, None]
+        share = torch.ones_like(x[0, :, :1]) if self._share is None else self._share
+        self._share = torch.where(worse, 0.5 * share, (2.0 * share).clamp_max(1.0))
+        rows = torch.arange(x.shape[1], device=x.device)
+        at, led = x[best, rows], f[best, rows]
+        if len(x) == 1:
+            return (at + led).view_as(q)
+        if len(x) > _POSE_MEMORY:  # The worst try of each environment has no say any more.
+            kept = size.argsort(0)[:_POSE_MEMORY].sort(0).values
+            x, f = (each.gather(0, kept[..., None].expand(-1, -1, each.shape[2])) for each in (x, f))
+            self._tried, self._moved = list(x.unbind()), list(f.unbind())
+        dx, df = ((each - base).swapaxes(0, 1) for each, base in ((x, at), (f, led)))  # (B, m, 3 N)
+        gram = df @ df.mT
+        trace = torch.diagonal(gram, dim1=1, dim2=2).sum(1)
+        ridge = torch.where(trace > 0.0, _POSE_RIDGE * trace, 1.0)[:, None, None]
+        weights = torch.linalg.solve(gram + ridge * torch.eye(gram.shape[1]).to(gram), df @ led[..., None])
+        left = led - (df.mT @ weights)[..., 0]
+        return (at - (dx.mT @ weights)[..., 0] + self._share * left).view_as(q)
+
+
 def settled(
     simulator: Simulator,
     inputs: Inputs,
@@ -217,25 +259,33 @@ def settled(
         force: of a state.
 
     Raises:
-        ConvergenceError: there is no equilibrium, or the body and its force do not settle.
+        ConvergenceError: there is no equilibrium, or the body and its force do not settle; its report says which
+            environments did, (B,).
     """
-    state, pull = guess, None
-    share, before = 1.0, math.inf  # of the way that is gone: less where it leads past the goal
-    for _ in range(_POSE_ITERATIONS):
-        last, pull = pull, force(state)
-        if share == 1.0 and last is not None and torch.equal(pull, last):  # It is of the inputs alone.
+    state, settling, tries = guess, _Settling(), 0
+    pull: torch.Tensor | None = None
+    least: torch.Tensor | None = None
+    for number in range(_POSE_ITERATIONS):
+        before, pull = pull, force(state)
+        if before is not None and torch.equal(pull, before):  # It is of the inputs alone.
             return state
         found = simulator.static_equilibrium(inputs.plus(pull), constants, start=state.q.detach())
-        change = float((found.q - state.q).detach().abs().max())
-        if change < _POSE_TOLERANCE:
+        change = found.q - state.q
+        size = change.detach().abs().amax((1, 2))
+        done = size < _POSE_TOLERANCE
+        if bool(done.all()):
             return found
-        share, before = (0.5 * share if change > before else share), change
-        state = found if share == 1.0 else State(torch.lerp(state.q, found.q, share), state.v)
+        better = least is None or bool(((size < least) & ~done).any())
+        least = size if least is None else torch.minimum(size, least)
+        tries = 0 if better else tries + 1
+        if tries == _POSE_PATIENCE or number == _POSE_ITERATIONS - 1:
+            break
+        state = State(torch.where(done[:, None, None], found.q, settling.next(state.q, change)), state.v)
+    assert least is not None
     raise ConvergenceError(
-        f"a pose and the force that depends on it did not settle in {_POSE_ITERATIONS} iterations: the force "
-        "is too large to be a correction.",
-        state.q,
-        None,
+        "a pose and the force that depends on it did not settle: the force is too large to be a correction.",
+        found.q,
+        least < _POSE_TOLERANCE,
     )
 
 

@@ -108,6 +108,16 @@ class Recordings:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class FollowedPath:
+    """A path, and where controllers had the point that was to follow it."""
+
+    name: str  # Of the shape.
+    seconds: float  # That it takes [s].
+    path: FloatArray  # (T, 3) [m].
+    points: Mapping[str, FloatArray]  # (T, 3) [m], by controller.
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class RunReport:
     """What the page of a run, of a fold, or over the folds may show."""
 
@@ -133,6 +143,7 @@ class RunReport:
     kept_note: str = ""  # Which weights were taken.
     simulator: str = ""  # The simulator that is corrected, in words, such as "E 215 kPa".
     target: str = ""  # What it is brought to, in words.
+    followed: Sequence[FollowedPath] = ()  # What was driven, where there is control.
     pages: Mapping[str, str] = field(default_factory=dict)  # Address of each fold's page, by its test trial.
 
     @property

@@ -11,6 +11,7 @@ import numpy as np
 from markupsafe import Markup
 
 from ..io.files import write_text
+from .control_section import control_section
 from .data import MODELS, RunReport
 from .motion_sections import body_section, motion_section, paths_section, start_drawing
 from .page import (
@@ -308,6 +309,7 @@ SECTIONS: Final[tuple[Callable[[RunReport, Canvas], Part | None], ...]] = (
     scales_section,
     motion_section,
     error_section,
+    control_section,
     paths_section,
     body_section,
     reconstruction_section,

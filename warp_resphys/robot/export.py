@@ -44,6 +44,12 @@ class Track:
     columns: dict[str, FloatArray]
 
 
+def input_columns(name: str, parts: Sequence[str], unit: str, values: FloatArray) -> dict[str, FloatArray]:
+    """(T + 1,) each: columns of what an input was during the step that led there, of values (T, C)."""
+    headers = [f"{name}.{part} [{unit}]" for part in parts]
+    return dict(zip(headers, np.concatenate([values[:1], values]).T, strict=True))
+
+
 def write_csv(path: Path, track: Track) -> Path:
     """See `Motion.write_csv`."""
     labels = track.labels or [f"vertex_{number}" for number in range(track.markers.shape[1])]

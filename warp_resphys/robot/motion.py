@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..io.errors import InputError
 from ..learning.replay import sample
 from .description import Description
-from .export import Track, write_csv, write_usd, write_vtk
+from .export import Track, input_columns, write_csv, write_usd, write_vtk
 from .inputs import RobotInput
 from .state import RobotState
 
@@ -112,8 +112,7 @@ class Motion:
             columns |= {f"{name} half-width [m]": each for name, each in zip(self.robot.labels, widths, strict=True)}
         for known in (each for name, each in self.known_inputs.items() if name in self.inputs and each.is_driven):
             own = _array(self.inputs[known.name][:, environment])
-            headers = [f"{known.name}.{part} [{known.unit}]" for part in known.parts]
-            columns |= dict(zip(headers, np.concatenate([own[:1], own]).T, strict=True))
+            columns |= input_columns(known.name, known.parts, known.unit, own)
         q, v, markers = (_array(each[:, environment]) for each in (self.q, self.v, self.markers))
         return Track(self.robot.mesh, self.times, q, v, self.robot.labels, markers, columns)
 

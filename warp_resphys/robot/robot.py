@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import csc_array
 
 from ..dynamics.frames import BaseFrame, VertexFrames, base_movement, rotations
 from ..dynamics.inputs import Inputs
@@ -50,6 +51,8 @@ class Robot:
         time_step: of a step [s].
         labels: of its markers; none where every vertex is observed.
         frames: with which its learned force turns; None if it does not.
+        parameters: identified values, by name.
+        constants: what these come to.
     """
 
     def __init__(
@@ -85,7 +88,7 @@ class Robot:
             raise InputError(f"{odd[0]} has {len(values[odd[0]])} values, others {count}: give one, or one each.")
         self.parameters = values
         spread = {name: value.expand(count) for name, value in values.items()}
-        self._constants = self.simulator.prepare(constants_of(self.simulator, spread))
+        self.constants = self.simulator.prepare(constants_of(self.simulator, spread))
         filters = self.description.filters if self._learned is not None else ()
         self._commands = {name: Commands(name, values, filters, self.time_step) for name in self.driven}
 
@@ -184,7 +187,7 @@ class Robot:
             return self._new(self.simulator.rest_state(batch), given)
         state = self._new(self.simulator.rest_state(batch), given)
         acting, _, _, _ = self._acting(state, given)
-        return replace(state, body=self.simulator.static_equilibrium(acting, self._constants, batch=batch))
+        return replace(state, body=self.simulator.static_equilibrium(acting, self.constants, batch=batch))
 
     def settle(self, batch: int = 1, **inputs: Given) -> RobotState:
         """Where the robot comes to rest under constant inputs, with its learned force.
@@ -212,9 +215,24 @@ class Robot:
             assert isinstance(found, torch.Tensor)
             return found
 
-        body = settled(self.simulator, acting, self._constants, start.body, force)
+        body = settled(self.simulator, acting, self.constants, start.body, force)
         left = start.left if predictor.left_at is None else predictor.left_at >= 0
         return replace(start, body=body, memory={**start.memory, **memory}, left=left)
+
+    def settle_some(self, batch: int = 1, **inputs: Given) -> tuple[torch.Tensor, torch.Tensor]:
+        """(B, N, 3) where `settle` comes to rest [m], and (B,) bool, which of them do; elsewhere it is no equilibrium.
+
+        Raises:
+            InputError: see `step`.
+            ConvergenceError: the simulator itself has no equilibrium.
+        """
+        try:
+            found = self.settle(batch, **inputs).q
+        except ConvergenceError as error:
+            if not isinstance(error.report, torch.Tensor):
+                raise
+            return error.positions.detach(), error.report
+        return found, torch.ones(batch, dtype=torch.bool, device=found.device)
 
     # How it moves
 
@@ -237,7 +255,7 @@ class Robot:
         if self._learned is not None:
             predictor = self._predictor(told, self._frame(base))
             predictor.hidden = state.hidden
-        rollout = Rollout(self.simulator, predictor, acting, self._constants)
+        rollout = Rollout(self.simulator, predictor, acting, self.constants)
         lost = self._flags(state) if state.lost is None else state.lost
         rollout.resume(lost, 0)
         body = rollout.differentiable_step(state.body)
@@ -293,6 +311,29 @@ class Robot:
             known_inputs=self.inputs,
             final=state,
         )
+
+    # What it consists of, at a state
+
+    def begin_memory(self, inputs: Mapping[str, Given], batch: int = 1) -> dict[str, torch.Tensor]:
+        """What is remembered where constant inputs have lasted; see `RobotState.memory`."""
+        return dict(self._new(self.simulator.rest_state(batch), self._read(inputs, batch)).memory)
+
+    def told(self, state: RobotState, **inputs: Given) -> torch.Tensor | None:
+        """(B, A) what the network is told beside the state during a step; see `program.told_names`."""
+        return self._acting(state, self._read(inputs, state.batch))[1]
+
+    def linearised(
+        self, state: RobotState, **inputs: Given
+    ) -> tuple[csc_array, NDArray[np.float64], NDArray[np.int64]]:
+        """The simulator's Hessian of a step from a state, at that state, without the learned force.
+
+        Returns:
+            The (3 F, 3 F) Hessian and the (3 F,) inertia in it [N/m], and the numbers of the F free vertices.
+        """
+        acting = self._acting(state, self._read(inputs, state.batch))[0]
+        found = self.simulator.linearise(state.body, acting, self.constants)
+        hessian, inertia = found.matrix(state.q)
+        return hessian, inertia, found.free.cpu().numpy()
 
     # Inputs
 

@@ -16,7 +16,6 @@ from ...experiment.checks import check_training, training_settings
 from ...experiment.files import training_file
 from ...experiment.learn import Learning, Snapshot, run_epochs
 from ...experiment.parts import workers_for
-from ...experiment.pipeline import acquire, acquisition_stages, learning_stages, prepare
 from ...experiment.scene import LEARNED, Scene, models_of
 from ...experiment.schema import ANYTHING, COUNT, NAME, NATURAL, POSITIVE, WORD, Group, check, optional
 from ...experiment.trials import folds_of, split_of
@@ -26,6 +25,7 @@ from ...io.files import read_json
 from ...io.progress import Progress, clock
 from ...io.resumable import forget_checkpoint, keep_checkpoint, resume_checkpoint
 from ...io.stages import Stage, StageInterrupted, run_stages
+from ...pipeline import acquire, acquisition_stages, learning_stages, prepare
 from .results import Tuning, print_best, ranked, short_text, write_pictures, write_results
 from .space import SEARCHED_GROUPS, Dimension, fixed_settings, parse_space, with_settings
 from .study import Claim, SharedStudy

@@ -13,20 +13,17 @@ import warp as wp
 from rich.console import Console
 from rich.table import Table
 
-from ..io.errors import DataFileError, InputError
-from ..io.fan_out import ALONE, Workers
-from ..io.files import digest, read_json, write_json
-from ..io.stages import Stage, StageContext, package_versions, resources_used, run_stages
-from ..io.team import is_first, joined, place
-from ..learning.metrics import summarise_folds
-from ..report.page import number_text
-from ..report.verdict import judgement
-from .ablation import ablation_stages, print_ablation
-from .build import choose_device
-from .checks import check_configuration, training_settings
-from .evaluate import check_mesh, evaluate, intervals_of_folds, time_models
-from .files import (
+from .control.files import BASELINES, plan_table, plans_file, reduced_file
+from .control.stages import drive, fit_baselines, plan_motions, reduce_robot
+from .control.task import motions_of
+from .experiment.ablation import ablation_stages, print_ablation
+from .experiment.build import choose_device
+from .experiment.checks import check_configuration, training_settings
+from .experiment.evaluate import check_mesh, evaluate, intervals_of_folds, time_models
+from .experiment.files import (
+    CONTROL,
     DATASET,
+    DRIVEN,
     ERRORS,
     IDENTIFICATION,
     MESH_CHECK,
@@ -43,17 +40,35 @@ from .files import (
     training_file,
     weights_file,
 )
-from .folds import Fold, run_folds
-from .identify import identify
-from .importing import import_recordings, import_scaled
-from .learn import refine, train
-from .models import SIMFREE
-from .parts import workers_for
-from .reconstruct import reconstruct
-from .report import collect_metrics, make_folds_report, make_report
-from .scene import LEARNED, models_of
-from .simulate import run_laboratory, simulate
-from .trials import Split, folds_of, is_laboratory, scaled_trials_of, sees_markers, split_of, test_groups, trials_of
+from .experiment.folds import Fold, run_folds
+from .experiment.identify import identify
+from .experiment.importing import import_recordings, import_scaled
+from .experiment.learn import refine, train
+from .experiment.models import SIMFREE
+from .experiment.parts import workers_for
+from .experiment.reconstruct import reconstruct
+from .experiment.report import collect_metrics, make_folds_report, make_report
+from .experiment.scene import LEARNED, models_of
+from .experiment.simulate import run_laboratory, simulate
+from .experiment.trials import (
+    Split,
+    folds_of,
+    is_laboratory,
+    scaled_trials_of,
+    sees_markers,
+    split_of,
+    test_groups,
+    trials_of,
+)
+from .io.errors import DataFileError, InputError
+from .io.fan_out import ALONE, Workers
+from .io.files import digest, read_json, write_json
+from .io.stages import Stage, StageContext, package_versions, resources_used, run_stages
+from .io.team import is_first, joined, place
+from .learning.metrics import summarise_folds
+from .report.control_section import controller_name
+from .report.page import number_text
+from .report.verdict import judgement
 
 _SIMULATED = (
     *("mesh", "physics", "fixed", "gravity", "time_step", "integrator", "solver", "device", "dtype"),
@@ -72,7 +87,8 @@ _LATER_DATA = ("horizons", "train_fraction", "input_scales")
 _LEARNED_FROM = ("simulation", "markers", "release", "force_frame")
 _OF_NETWORKS = ("actuation", "range_guard")
 _LEARNED_DATA = ("payload_at", "train_fraction", "seconds")
-
+_PLANNED = ("tracked", "shapes", "seconds", "centre", "size", "right", "up", "limits", "plan")
+_OF_HORIZONS = ("receding", "horizon", "estimate", "plan", "reduction")
 
 _MOST_COLUMNS = 5  # folds that stand beside each other in a terminal
 
@@ -228,8 +244,38 @@ def learning_stages(
         add("time", time_models, (TIMES,), {**tested, **_pick(config, "target")}, *learned)
     if config["mesh_check"] is not None:
         add("mesh_check", check_mesh, (MESH_CHECK,), {**tested, **_pick(config, "mesh_check")})
-    last = tuple(stage.name for stage in stages if stage.name in ("evaluate", "time", "mesh_check"))
+    if config["control"] is not None:
+        stages += control_stages(config, base, acquired, workers)
+    last = tuple(stage.name for stage in stages if stage.name in ("evaluate", "time", "mesh_check", "drive"))
     stages.append(Stage("report", make_report, (REPORT,), {"config": shown(config), "acquired": acquired}, last))
+    return stages
+
+
+def control_stages(config: Mapping[str, Any], base: Mapping[str, Any], acquired: str, workers: Workers) -> list[Stage]:
+    """The stages of a run that plan on its models, and where a simulation plays the robot, drive it.
+
+    Args:
+        config: that `check_configuration` accepts.
+        base: the settings that all stages of the split depend on.
+        acquired: see `learning_stages`.
+        workers: that share the motions.
+    """
+    control, stages = config["control"], list[Stage]()
+    for model in reversed(control["models"]):  # The last is to reach the paths, which is seen first.
+        first, own = f"reduce_{model}", {**base, "model": model, "seed": config["seed"], "device": config["device"]}
+        known = {"control": _pick(control, "reduction")}
+        stages.append(Stage(first, reduce_robot, (reduced_file(model),), {**own, **known}, ("evaluate",)))
+        known = {"control": _pick(control, *_PLANNED), "must_reach": model == control["models"][-1]}
+        tables = [plan_table(model, motion) for motion in motions_of(control)]
+        stages.append(Stage(f"plan_{model}", plan_motions, (plans_file(model), *tables), {**own, **known}, (first,)))
+    if config["laboratory"] is None:
+        return stages
+    played = {**base, **_laboratory_settings(config, ()), "device": config["device"]}
+    needs = tuple(stage.name for stage in stages)
+    settings = {**played, "control": {key: value for key, value in control.items() if key not in _OF_HORIZONS}}
+    stages.append(Stage("baselines", fit_baselines, (BASELINES,), settings, ("evaluate",)))
+    work = partial(drive, workers=workers)
+    stages.append(Stage("drive", work, (DRIVEN, CONTROL), {**played, "control": control}, (*needs, "baselines")))
     return stages
 
 
@@ -342,8 +388,19 @@ def _print(metrics: Mapping[str, Any], folder: Path, config: Mapping[str, Any]) 
             console.print(
                 f"{model}: {found['left']} test trials leave the states of the training, from {first:.2f} s on."
             )
+    if metrics.get("control"):
+        console.print(_driven(metrics["control"]["tracking"]))
     if "noise_mm" in metrics:
         console.print(f"The noise of the markers alone is {number_text(metrics['noise_mm'])} mm.")
     for said in judgement(metrics, config):
         console.print(said, soft_wrap=True)
     console.print(f"Report: {folder / REPORT}", soft_wrap=True)
+
+
+def _driven(tracking: Mapping[str, Mapping[str, Any]]) -> Table:
+    """How well each controller followed paths, by the seconds that these took."""
+    columns = [f"in {float(seconds):g} s [mm]" for seconds in tracking]
+    table = Table("controller", *columns, title="Mean distance from the paths that were driven")
+    for name in next(iter(tracking.values())):
+        table.add_row(controller_name(name), *(number_text(each[name]["mean_mm"]) for each in tracking.values()))
+    return table

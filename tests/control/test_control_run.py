@@ -1,0 +1,329 @@
+"""A small experiment with control through its command line: reduced models, plans, and who drives the laboratory."""
+
+import csv
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_module
+from main_job import IN_RUN, run, run_without_report
+from omegaconf import OmegaConf
+
+import warp_resphys
+from warp_resphys import pipeline
+from warp_resphys.control import stages
+from warp_resphys.control.controllers import Horizon, LinearRecedingHorizon, OpenLoop, RecedingHorizon
+from warp_resphys.control.estimate import Estimator, Noise
+from warp_resphys.control.files import plans_file, read_baselines, read_plan, read_reduced, reduced_file
+from warp_resphys.control.open_loop import Follower
+from warp_resphys.control.plan import Limits, Planner, Weights
+from warp_resphys.control.reduced_batch import advance, begin, observed
+from warp_resphys.control.reduction import reduce
+from warp_resphys.control.sampling import Sampling
+from warp_resphys.control.task import Task
+from warp_resphys.experiment.checks import check_configuration
+from warp_resphys.io.errors import InputError
+from warp_resphys.io.files import read_array, read_hdf5
+from warp_resphys.studies.gradient_check import central_difference
+
+CONTROL = [
+    "experiment=tendon_rod_control",
+    *("mesh.layers=3", "mesh.nodes=20", "laboratory.mesh.layers=4", "laboratory.mesh.nodes=20"),
+    *("data.steps=40", "data.sequences=5", "data.train=3", "data.validation=1", "data.test=1"),
+    *("data.horizons=[]", "data.rest_seconds=0.01", "data.cutoff=20.0", "parallel={processes:1,batch:3}"),
+    *("laboratory.sequences.rest=0.01", "laboratory.sequences.correlation_time=0.06"),
+    *("identify.trials=1", "identify.seconds=0.1", "identify.max_evaluations=3", "identify.grid=null"),
+    "+identify.parameters.tendon_tension_factor={lower:0.5,upper:1.5}",
+    "+identify.parameters.tendon_tension_delay={lower:0.0,upper:0.05}",
+    "+identify.parameters.tendon_tension_rise={lower:0.001,upper:0.1,logarithmic:true}",
+    "+identify.first_guess={tendon_tension_factor:0.9,tendon_tension_delay:0.012,tendon_tension_rise:0.02}",
+    *("network={position_modes:2,velocity_modes:2,force_modes:2,width:8}", "trainer={epochs:4,rollout_every:2}"),
+    *("actuation.filter_time_constants=[0.1]", "trainer.batch_size=16", "timing=false"),
+    *("control.models=[sysid,resphys]", "control.shapes=[circle]", "control.seconds=[0.4]", "control.size=0.01"),
+    *("control.plan={corrections:2,reach:0.05}", "control.horizon={seconds:0.1,pieces:3}"),
+    *("control.feedback={gains:[5.0],settles:0.1}",),
+    "control.reduction={modes:4,equilibria:48,tangents:24,motions:3,seconds:2.0,batch:24}",
+    *("hydra/job_logging=none", "hydra/hydra_logging=none", IN_RUN),
+]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    place = tmp_path_factory.mktemp("control")
+    return run_without_report(place, *CONTROL)
+
+
+@pytest.fixture(scope="module")
+def robot(folder):
+    return warp_resphys.load(folder)
+
+
+@pytest.fixture(scope="module")
+def model(folder, robot):
+    """The reduced model of the corrected simulator, with its network in float64."""
+    learned = robot.description.learned
+    range_ = learned.range_
+    known = replace(learned, range_=type(range_)(range_.low.double(), range_.high.double()))
+    known.network.double()
+    yield read_reduced(folder / reduced_file("resphys"), known)
+    learned.network.float()
+
+
+def settings(folder, stage):
+    return json.loads((folder / "stages" / f"{stage}.json").read_text())["settings"]
+
+
+class TestReducedModel:
+    def test_it_moves_as_the_identified_robot_does(self, folder):
+        """On motions that no part of it was fitted to."""
+        found = read_reduced(folder / reduced_file("sysid"), None)
+        assert found.told["window_motion_mm"] > 1.0
+        assert found.told["window_relative"] < 0.05
+
+    def test_it_comes_to_rest_where_the_corrected_robot_does(self, robot, model):
+        inputs = np.array([0.6, 0.0, 0.3])
+        settled = robot.observe(robot.settle(1, tendon_tension=inputs)).flatten().numpy()
+        hangs = robot.observe(robot.settle(1)).flatten().numpy()
+        found = model.observe(model.rest(inputs).z[None], inputs[None])[0]
+        assert np.linalg.norm(settled - hangs) > 5e-3
+        assert np.linalg.norm(found - settled) < 0.05 * np.linalg.norm(settled - hangs)
+
+    @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
+    def test_slopes_are_differences(self, model, integrator):
+        random, known = np.random.default_rng(0), replace(model, integrator=integrator)
+        inputs, basis = 0.3 + 0.8 * random.random((9, 3)), random.standard_normal((9, 3, 2))
+        bias, start = np.full(4, 1e-4), model.rest(np.full(3, 0.4))
+        found = known.respond(start, inputs, basis, bias).slopes
+        for number in range(2):
+            weights = random.standard_normal(found.shape[:2])
+            difference, doubt = central_difference(
+                lambda x, way=basis[..., number], by=weights: float(
+                    (by * known.respond(start, inputs + 0.1 * x * way, None, bias).y).sum()
+                )
+            )
+            slope = 0.1 * (weights * found[..., number]).sum()
+            assert abs(slope - difference) < 1e-6 * abs(difference) + 10.0 * doubt
+
+    def test_the_slopes_of_equilibria_are_differences(self, model):
+        random, inputs = np.random.default_rng(1), np.array([0.6, 0.3, 0.9])
+        weights, way = random.standard_normal(18), random.standard_normal(3)
+        slope = 0.1 * weights @ model.rest_observed(inputs)[1] @ way
+        difference, doubt = central_difference(
+            lambda x: float(weights @ model.rest_observed(inputs + 0.1 * x * way)[0])
+        )
+        assert abs(slope - difference) < 1e-4 * abs(difference) + 10.0 * doubt
+
+    @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
+    def test_a_transition_is_linearised(self, model, integrator):
+        known, inputs, bias = replace(model, integrator=integrator), np.array([0.5, 0.2, 0.9]), np.full(4, 1e-4)
+        start = known.respond(model.rest(np.full(3, 0.4)), np.tile(inputs, (4, 1))).states[-1]
+        _, by_z, by_v, by_bias = known.transition(start, inputs, bias)
+
+        random = np.random.default_rng(1)
+        weights, way = random.standard_normal(8), random.standard_normal(4)
+        sizes = (1e-3 * np.abs(start.z).max(), 0.1, 1e-3 * np.abs(start.z).max())
+        for number, (slope, size) in enumerate(zip((by_z, by_v, by_bias), sizes, strict=True)):
+
+            def after(x, number=number, size=size):
+                z, v, b = (x * size * way * (number == each) for each in range(3))
+                state = known.transition(replace(start, z=start.z + z, v=start.v + v), inputs, bias + b)[0]
+                return float(weights @ np.concatenate([state.z, 0.01 * state.v]))
+
+            difference, doubt = central_difference(after)
+            wanted = size * weights @ np.concatenate([slope[:4], 0.01 * slope[4:]]) @ way
+            assert abs(wanted - difference) < 1e-6 * abs(difference) + 10.0 * doubt
+
+    @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
+    def test_many_at_once_are_each_by_itself(self, model, integrator):
+        """Of which one begins anew on the way."""
+        known, random = replace(model, integrator=integrator), np.random.default_rng(4)
+        rest, inputs = np.full(3, 0.2), 0.2 + 0.8 * random.random((8, 3, 3))
+        first = batch = begin(known, 3, rest)
+        for number, each in enumerate(inputs):
+            if number == 4:
+                batch = first.where(np.array([False, True, False]), batch)
+            batch = advance(known, batch, each)
+        for row, since in enumerate((0, 4, 0)):
+            wanted = known.respond(known.rest(rest), inputs[since:, row]).y[-1]
+            np.testing.assert_allclose(observed(known, batch)[row].ravel(), wanted, atol=1e-12)
+
+    def test_the_estimate_finds_what_markers_tell(self, model):
+        """A model whose equilibria are elsewhere, seen without noise: what it is off by becomes the bias."""
+        inputs, elsewhere = np.array([0.5, 0.2, 0.9]), np.array([2e-4, -1e-4, 5e-5, 0.0])
+        estimator = Estimator(model, Noise(observed=1e-6, rate=0.3, bias=0.05), inputs)
+        state = model.rest(inputs)
+        for _ in range(150):
+            state = model.transition(state, inputs, elsewhere)[0]
+            estimator.predict(inputs)
+            estimator.correct(model.observe(state.z[None], inputs[None])[0].reshape(-1, 3))
+        np.testing.assert_allclose(estimator.state.z, state.z, atol=2e-6)
+        np.testing.assert_allclose(estimator.bias, elsewhere, atol=2e-5)
+
+    @pytest.mark.parametrize(
+        ("change", "said"),
+        [
+            ({"integrator": "midpoint"}, "stepped by midpoint cannot be reduced"),
+        ],
+    )
+    def test_what_it_refuses(self, model, change, said):
+        with pytest.raises(InputError, match=said):
+            replace(model, **change)
+
+    def test_a_data_driven_robot_has_no_stiffness(self, folder):
+        with pytest.raises(InputError, match="has no stiffness to reduce: take resphys or sysid"):
+            reduce(warp_resphys.load(folder, "simfree"), Sampling())
+
+    def test_a_model_with_a_force_is_not_restored_without_it(self, folder):
+        with pytest.raises(InputError, match="has a learned force: give what its robot has learned"):
+            read_reduced(folder / reduced_file("resphys"), None)
+
+    def test_a_path_out_of_reach_is_named_with_the_nearest_point(self, folder, model, robot):
+        control = settings(folder, "drive")["control"]
+        far = {**control, "centre": [0.0, 0.0, -0.35], "plan": {**control["plan"], "reach": 1e-3}}
+        task = Task(far, robot.labels, robot.time_step, 3)
+        with pytest.raises(InputError, match=r"path circle leaves what .*-350.0\) mm, the nearest point .* mm away"):
+            task.check_reach(model)
+
+
+class TestPlans:
+    def test_plans_stay_within_bounds_and_rates(self, folder):
+        plan, limits = read_plan(folder / plans_file("resphys"), "circle_0.4s"), settings(folder, "plan_resphys")
+        limits = limits["control"]["limits"]
+        assert plan.inputs.min() > limits["low"] - 1e-3
+        assert plan.inputs.max() < limits["high"] + 1e-3
+        assert plan.inputs.max() > 0.1
+        steps = np.abs(np.diff(plan.inputs, axis=0, prepend=0.0))
+        assert steps.max() < 1.01 * limits["rate"] * 0.01
+
+    def test_corrections_by_the_simulator_bring_it_closer(self, folder):
+        errors = read_plan(folder / plans_file("resphys"), "circle_0.4s").errors_mm
+        assert len(errors) == 3
+        assert errors.min() < 0.7 * errors[0]
+
+    def test_a_table_for_the_robot_has_the_inputs(self, folder):
+        plan = read_plan(folder / plans_file("sysid"), "circle_0.4s")
+        with (folder / "plans" / "sysid_circle_0.4s.csv").open() as file:
+            rows = list(csv.DictReader(file))
+        names = [f"tendon_tension.{part} [N]" for part in ("front", "left", "right")]
+        found = np.array([[float(row[name]) for name in names] for row in rows])
+        np.testing.assert_allclose(found[1:], plan.inputs, atol=1e-6)
+        tip = np.mean([[[float(row[f"Tip - {n}.{axis} [m]"]) for axis in "xyz"] for row in rows] for n in (1, 2, 3)], 0)
+        np.testing.assert_allclose(tip[1:], plan.points, atol=1e-9)
+
+    def test_the_gradient_of_the_adjoint_is_a_difference(self, robot, model):
+        tracked = np.eye(18)[-3:]
+        limits = Limits(np.zeros(3), np.full(3, 1.5), np.full(3, 50.0))
+        planner = Planner(model, tracked, limits, 6, 2, Weights())
+        follower = Follower(robot, model, planner, 1, "adjoint")
+        random = np.random.default_rng(2)
+        knots, paths = 0.2 + random.random((1, 3, 3)), np.full((1, 6, 3), 0.01)
+        gradient = follower._play(knots, paths, True, lambda steps: None)[1]
+        way = random.standard_normal(knots.shape)
+
+        def half(x):
+            markers = follower._play(knots + 0.05 * x * way, paths, False, lambda steps: None)[0]
+            points = markers[:, 1:] @ tracked.T
+            return float(0.5 * np.square(points - paths).sum())
+
+        difference, doubt = central_difference(half)
+        assert abs(0.05 * (gradient * way).sum() - difference) < 1e-3 * abs(difference) + 10.0 * doubt
+
+    def test_the_adjoint_improves_a_plan_too(self, robot, model, folder):
+        plan = read_plan(folder / plans_file("resphys"), "circle_0.4s")
+        task = Task(settings(folder, "drive")["control"], robot.labels, robot.time_step, 3)
+        follower = Follower(robot, model, task.planner(model, 0.4), 4, "adjoint")
+        errors = follower.follow(plan.path[None]).errors_mm[:, 0]
+        assert errors.min() < 0.8 * errors[0]
+
+
+class TestDriving:
+    def test_all_controllers_drive_and_are_measured(self, folder):
+        found = json.loads((folder / "control.json").read_text())
+        names = ["open_sysid", "open_resphys", "receding_resphys", "receding_linear", "feedback_5"]
+        assert list(found["tracking"]["0.4"]) == names
+        with read_hdf5(folder / "driven.h5", "driven") as file:
+            path, points = (read_array(file, f"circle_0.4s/{key}") for key in ("path", "points"))
+            inputs = read_array(file, "circle_0.4s/inputs")
+        for row, name in enumerate(names):
+            wanted = 1e3 * np.linalg.norm(points[row] - path, axis=1).mean()
+            assert found["tracking"]["0.4"][name]["mean_mm"] == pytest.approx(wanted)
+            assert np.ptp(points[row], axis=0).max() > 1e-3
+        np.testing.assert_allclose(inputs[1], read_plan(folder / plans_file("resphys"), "circle_0.4s").inputs)
+
+    def test_a_new_horizon_drives_again_but_plans_nothing_again(self, folder, monkeypatch):
+        monkeypatch.chdir(folder.parent)
+        monkeypatch.setattr(pipeline, "make_report", lambda context: (context.run_dir / "report.html").write_text("-"))
+        before = {each: (folder / "stages" / f"{each}.json").stat().st_mtime_ns for each in ("plan_resphys", "drive")}
+        monkeypatch.setattr(pipeline, "drive", _marked)
+        monkeypatch.setattr(stages, "work_on", None)  # Nothing but the stage may be run.
+        code, err = run(*CONTROL, "control.horizon.effort=0.02")
+        assert code != 0
+        assert "no more than that." in err
+        after = (folder / "stages" / "plan_resphys.json").stat().st_mtime_ns
+        assert after == before["plan_resphys"]
+        assert _MARKS == ["drive"]
+
+    def test_a_memory_goes_on_where_it_was(self, folder, robot, model):
+        task = Task(settings(folder, "drive")["control"], robot.labels, robot.time_step, 3)
+        path = read_plan(folder / plans_file("resphys"), "circle_0.4s").path
+        rest = robot.observe(robot.begin())[0].numpy()
+        linear = read_baselines(folder / "baselines.safetensors")[0]
+        horizon = Horizon(8, 2, Weights())
+
+        def made():
+            return [
+                RecedingHorizon(model, task.tracked, task.limits, horizon, Noise(), path, rest),
+                LinearRecedingHorizon(linear, task.tracked, task.limits, horizon, path, rest),
+            ]
+
+        first, second = made(), made()
+        random = np.random.default_rng(0)
+        for number in range(6):
+            if number == 3:
+                for old, new in zip(first, second, strict=True):
+                    new.recall({key: value.copy() for key, value in old.remembered().items()})
+            seen = rest + 1e-3 * random.standard_normal(rest.shape)
+            commands = [each.command(number, seen) for each in first]
+            if number >= 3:
+                for each, wanted in zip(second, commands, strict=True):
+                    np.testing.assert_allclose(each.command(number, seen), wanted, atol=1e-9)
+        assert OpenLoop(path).remembered() == {}
+
+
+_MARKS: list[str] = []
+
+
+def _marked(context, workers=None):
+    _MARKS.append(context.name)
+    raise InputError("no more than that.")
+
+
+def configuration(*overrides):
+    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
+        found = compose("config", ["experiment=tendon_rod_control", "mesh.layers=3", "mesh.nodes=20", *overrides])
+    return OmegaConf.to_container(found, resolve=True)
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("control.tracked=[Tip]", "control.tracked names 'Tip': markers.tracked has 'Middle - 1'"),
+        ("control.models=[simfree]", "control.models has simfree: this experiment has 'simulation', 'sysid'"),
+        ("control.models=[sysid]", "control.receding must be among control.models, which are 'sysid'"),
+        ("control.limits.high=9", "control.limits are from 0 to 9: they must rise, to data.input_limit of 1.5"),
+        ("control.shapes=[square]", "control.shapes is .*circle, eight and capital letters"),
+        ("control.seconds=[0.1]", "control.seconds has 0.1: a figure takes 20 steps at least"),
+        ("control.plan.gradient=none", "control.plan.gradient is 'none': it must be one of reduced, adjoint"),
+        ("data.folds=leave_one_out", "control is for a robot with markers, .* of one split of its trials"),
+        (
+            "+laboratory.trials.t000={payload: 0.01};data.payload_at={z: -0.2}",
+            "control drives a robot without payloads: leave them out of laboratory.trials",
+        ),
+        ("control.seconds=[]", "control.seconds is .*: it must be a list of different positive numbers"),
+        ("+control.colour=red", "unknown key 'control.colour'"),
+    ],
+)
+def test_what_no_control_can_be_made_of(override, said):
+    with pytest.raises(InputError, match=said):
+        check_configuration(configuration(*override.split(";")))

@@ -1,0 +1,188 @@
+"""Paths, polynomials, the response of inputs, quadratic programs, and what control has without a simulator."""
+
+import numpy as np
+import pytest
+import torch
+
+from warp_resphys.control.baselines import JacobianFeedback, fit_linear
+from warp_resphys.control.evaluator import Evaluator
+from warp_resphys.control.input_response import InputResponse
+from warp_resphys.control.plan import Limits, Planner, Weights, solve_program, tracked_of
+from warp_resphys.control.polynomials import Polynomial, powers
+from warp_resphys.control.reference import Path
+from warp_resphys.data.actuation import delayed, lagged
+from warp_resphys.io.errors import InputError
+from warp_resphys.learning.networks import build_model
+from warp_resphys.learning.predictors import Range
+
+SHAPES = ["circle", "eight", *"ABCDEFGHIJKLMNOPQRSTUVWXYZ"]
+
+
+class TestPaths:
+    @pytest.mark.parametrize("name", SHAPES)
+    def test_a_path_has_its_size_and_place_and_no_jump(self, name):
+        path = Path(name, 0.05, (0.01, -0.02, -0.3), right=(0.0, 1.0, 0.0), up=(0.0, 0.3, 1.0))
+        points = path.points
+        low, high = points.min(0), points.max(0)
+        assert np.ptp(points[:, 0]) < 1e-12  # In the plane of y and z.
+        np.testing.assert_allclose((high - low).max(), 0.05, rtol=1e-9)
+        np.testing.assert_allclose(0.5 * (low + high), [0.01, -0.02, -0.3], atol=1e-12)
+        assert np.linalg.norm(np.diff(points, axis=0), axis=1).max() < 2.0 * path.length / len(points)
+
+    def test_a_timed_path_begins_and_ends_at_rest(self):
+        lead = np.array([0.0, 0.0, -0.25])
+        found = Path("eight", 0.05, (0.0, 0.0, -0.27)).timed(2.0, 0.01, lead)
+        speed = np.linalg.norm(np.diff(found, axis=0), axis=1) / 0.01
+        assert len(found) == 251
+        np.testing.assert_array_equal(found[0], lead)
+        assert max(speed[0], speed[-1]) < 0.02 * speed.max()
+        even = speed[100:-50]
+        assert even.max() < 1.05 * even.min()
+
+    @pytest.mark.parametrize(
+        ("change", "said"),
+        [
+            ({"name": "square"}, "the path is 'square': choose circle, eight, or a capital letter"),
+            ({"size": 0.0}, "the size of the path circle is 0: it must be positive"),
+            ({"up": (2.0, 0.0, 0.0)}, "the path circle lies in no plane"),
+        ],
+    )
+    def test_what_is_no_path(self, change, said):
+        with pytest.raises(InputError, match=said):
+            _ = Path(**{"name": "circle", "size": 0.1, "centre": (0.0, 0.0, 0.0), **change}).points
+
+    def test_too_fast(self):
+        with pytest.raises(InputError, match=r"is to take 0.05 s: that is less than ten steps"):
+            Path("R", 0.1, (0.0, 0.0, 0.0)).timed(0.05, 0.01)
+
+
+class TestPolynomials:
+    def test_a_cubic_is_found_again_with_its_slopes(self):
+        random = np.random.default_rng(0)
+        points, count = random.random((80, 3)), len(powers(3, 3))
+        wanted = Polynomial(random.standard_normal((count, 2, 2)), 3)
+        found = Polynomial.fitted(points, wanted(points), 3)
+        np.testing.assert_allclose(found(points[:5]), wanted(points[:5]), atol=1e-5)
+        at, step = points[:1], 1e-6
+        for variable in range(3):
+            moved = np.eye(3)[variable] * step
+            slope = (wanted(at + moved) - wanted(at - moved)) / (2.0 * step)
+            np.testing.assert_allclose(wanted.slopes(at)[:, variable], slope, atol=1e-7)
+
+
+class TestInputResponse:
+    @pytest.mark.parametrize(("delay", "rise"), [(0.0, 0.0), (0.013, 0.0), (0.02, 0.03), (0.004, 0.05)])
+    def test_it_is_that_of_the_recordings(self, delay, rise):
+        commands = np.random.default_rng(1).random((20, 2))
+        response = InputResponse(0.01, delay, rise)
+        acting, kept = response(response.still(np.zeros(2)), commands)
+        wanted = delayed(torch.as_tensor(commands)[:, None], torch.tensor([delay], dtype=torch.float64), 0.01)
+        wanted = lagged(wanted, torch.tensor([rise], dtype=torch.float64), 0.01) if rise else wanted
+        np.testing.assert_allclose(acting, wanted[:, 0].numpy(), atol=1e-12)
+        again = response(kept[7], commands[8:])[0]
+        np.testing.assert_allclose(again, acting[8:], atol=1e-12)
+
+
+class TestPrograms:
+    def test_a_bound_and_a_rate_hold(self):
+        """The nearest point to (3, 2) with x at most 1 and y - x at most -0.5."""
+        found = solve_program(
+            np.eye(2),
+            -np.array([3.0, 2.0]),
+            np.array([[-1.0, 1.0]]),
+            np.array([-9.0]),
+            np.array([-0.5]),
+            np.zeros(2),
+            np.array([1.0, 9.0]),
+        )
+        np.testing.assert_allclose(found, [1.0, 0.5], atol=1e-3)
+
+    def test_without_a_solution_it_says_so(self):
+        with pytest.raises(InputError, match="no inputs are within their bounds and rates"):
+            solve_program(
+                np.eye(1), np.zeros(1), np.ones((1, 1)), np.full(1, 2.0), np.full(1, 3.0), np.zeros(1), np.ones(1)
+            )
+
+    def test_a_missing_package_is_named(self, monkeypatch):
+        monkeypatch.setitem(__import__("sys").modules, "piqp", None)
+        with pytest.raises(InputError, match=r"pip install 'warp-resphys\[control\]'"):
+            solve_program(*[np.eye(1), *[np.zeros(1)]], np.ones((1, 1)), *[np.zeros(1)] * 2, np.zeros(1), np.ones(1))
+
+    def test_points_are_means_of_markers(self):
+        markers = np.arange(9.0).reshape(3, 3)
+        np.testing.assert_allclose(tracked_of("abc", ["a", "c"]) @ markers.ravel(), markers[[0, 2]].mean(0))
+        with pytest.raises(InputError, match=r"^tracked names 'd': choose from a, b, c"):
+            tracked_of("abc", ["d"])
+
+
+class TestEvaluator:
+    @pytest.mark.parametrize("activation", ["silu", "normalised_elu"])
+    @pytest.mark.parametrize("blocks", [1, 3])
+    def test_it_is_the_network(self, activation, blocks):
+        torch.manual_seed(0)
+        samples = torch.randn(20, 4, 3, dtype=torch.float64)
+        config = {"kind": "reduced", "position_modes": 3, "velocity_modes": 2, "force_modes": 5, "blocks": blocks,
+                  "layers": 2, "width": 16, "activation": activation}  # fmt: skip
+        network = build_model(config, samples[0], samples, samples, samples, samples[:, 0]).double()
+        network.fit_linear(torch.randn(40, 8), torch.randn(40, 5), 0.1)
+        inputs = 3.0 * torch.randn(7, 8, dtype=torch.float64)
+        range_ = Range.of(torch.randn(30, 8, dtype=torch.float64))
+        for guard in (None, range_):
+            wanted = network.standardised(inputs if guard is None else guard.hold(inputs))[0]
+            np.testing.assert_allclose(Evaluator(network, guard)(inputs.numpy()), wanted.detach().numpy(), atol=1e-12)
+
+
+def driven_line(steps, random, matrices):
+    """A linear system of two states, seen through two markers, from rest."""
+    a, b, c = matrices
+    inputs = np.repeat(random.random((steps // 5, 1)), 5, axis=0)
+    state, seen = np.zeros(2), [np.zeros(6)]
+    for u in inputs:
+        state = a @ state + b @ u
+        seen.append(c @ state)
+    return np.array(seen) + 0.1, inputs
+
+
+class TestBaselines:
+    def made(self):
+        random = np.random.default_rng(3)
+        turn = 0.97 * np.array([[np.cos(0.2), np.sin(0.2)], [-np.sin(0.2), np.cos(0.2)]])
+        matrices = turn, np.array([[0.0], [0.01]]), random.standard_normal((6, 2))
+        return random, matrices
+
+    def test_a_linear_system_is_identified_and_planned_with(self):
+        random, matrices = self.made()
+        trials = [driven_line(100, random, matrices) for _ in range(4)]
+        model = fit_linear(trials[:3], trials[3:], np.ones(1), 0.01)
+        assert model.validation_mm < 1e-3
+        path = driven_line(30, random, matrices)[0][1:]
+        planner = Planner(
+            model, np.eye(6), Limits(np.zeros(1), np.ones(1), np.full(1, 200.0)), 30, 30, Weights(1e-9, 1e-9), 2
+        )
+        plan = planner.plan(model.state([np.full(6, 0.1)] * 4), np.zeros(1), path)
+        played = model.respond(model.state([np.full(6, 0.1)] * 4), plan.inputs).y
+        assert np.abs(played - path).max() < 0.05 * np.abs(path - 0.1).max()
+
+    def test_where_a_path_does_not_matter_nothing_holds_the_points(self):
+        random, matrices = self.made()
+        model = fit_linear([driven_line(100, random, matrices) for _ in range(3)], [], np.ones(1), 0.01)
+        start, path = model.state([np.full(6, 0.1)] * 4), driven_line(30, random, matrices)[0][1:]
+        limits, free = Limits(np.zeros(1), np.ones(1), np.full(1, 200.0)), np.arange(30) < 15
+        planner = Planner(model, np.eye(6), limits, 30, 30, Weights(1e-9, 1e-9), 2)
+        last = np.where(free[:, None], np.nan, path)
+        off = model.respond(start, planner.plan(start, np.zeros(1), last).inputs).y - path
+        held = np.where(free[:, None], 0.1, path)
+        worse = model.respond(start, planner.plan(start, np.zeros(1), held).inputs).y - path
+        assert np.abs(off[~free]).max() < 0.2 * np.abs(worse[~free]).max()
+
+    def test_feedback_finds_a_place_that_its_jacobian_gets_wrong(self):
+        true = np.array([[1e-3, 0.0, 5e-4], [0.0, 2e-3, 0.0]])
+        wrong = true * 1.5 + 2e-4
+        limits = Limits(np.zeros(3), np.full(3, 10.0), np.full(3, 100.0))
+        feedback = JacobianFeedback(wrong, limits, 5.0, 0.01)
+        goal, command = np.array([5e-3, 8e-3]), np.zeros(3)
+        for _ in range(300):
+            command = feedback.command(true @ command, goal, goal)
+            assert (command >= 0.0).all()
+            assert (command <= 10.0).all()
+        np.testing.assert_allclose(true @ command, goal, atol=1e-4)

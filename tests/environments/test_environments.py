@@ -1,0 +1,169 @@
+"""Gymnasium environments on a small run: the checker, seeds, resets in all modes, and what they refuse."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+from main_job import IN_RUN, run_without_report
+
+from warp_resphys.environments.making import TASKS, make_vector, register
+from warp_resphys.environments.tasks import FollowTask, Reach
+from warp_resphys.io.errors import InputError
+
+RUN = [
+    "experiment=tendon_rod",
+    *("mesh.layers=3", "mesh.nodes=20", "laboratory.mesh.layers=4", "laboratory.mesh.nodes=20"),
+    *("data.steps=30", "data.sequences=5", "data.train=3", "data.validation=1", "data.test=1", "data.horizons=[]"),
+    *("data.rest_seconds=0.01", "data.cutoff=20.0", "parallel={processes:1,batch:3}", "timing=false"),
+    *("laboratory.sequences.rest=0.01", "laboratory.sequences.correlation_time=0.06", "identify.grid=null"),
+    *("identify.trials=1", "identify.seconds=0.1", "identify.max_evaluations=3", "trainer={epochs:4,rollout_every:2}"),
+    *("network={position_modes:2,velocity_modes:2,force_modes:2,width:8}", "trainer.batch_size=16"),
+    *("actuation.filter_time_constants=[0.1]", "hydra/job_logging=none", "hydra/hydra_logging=none", IN_RUN),
+]
+QUICK = {"seconds": 0.2, "action_time": 0.05}  # four actions
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    place = tmp_path_factory.mktemp("environments")
+    found = run_without_report(place, *RUN)
+    register()
+    return found
+
+
+def played(environment, steps=6, seed=3):
+    """Observations, rewards and ends of some steps of actions that are always the same."""
+    random = np.random.default_rng(0)
+    found = [environment.reset(seed=seed)[0]]
+    rewards, ends = [], []
+    for _ in range(steps):
+        actions = random.uniform(-1.0, 1.0, environment.action_space.shape).astype(np.float32)
+        seen, reward, terminated, truncated, _ = environment.step(actions)
+        found.append(seen)
+        rewards.append(reward)
+        ends.append(terminated | truncated)
+    return np.stack(found), np.stack(rewards), np.stack(ends)
+
+
+class TestGymnasium:
+    @pytest.mark.parametrize("task", TASKS)
+    def test_its_checker_passes(self, folder, task):
+        name = "".join(word.capitalize() for word in task.split("_"))
+        environment = gym.make(f"warp_resphys/{name}-v0", run=folder, **QUICK)
+        check_env(environment.unwrapped, skip_render_check=True)
+
+    def test_a_vector_of_them_is_made_by_name(self, folder):
+        found = gym.make_vec("warp_resphys/Reach-v0", num_envs=3, run=folder, **QUICK)
+        seen, info = found.reset(seed=0)
+        assert found.num_envs == 3
+        assert seen in found.observation_space
+        assert info == {}
+        assert seen.dtype == np.float32
+
+    @pytest.mark.parametrize("world", ["simulator", "laboratory"])
+    def test_a_seed_tells_all(self, folder, world):
+        first, second = (make_vector("follow", folder, 2, world=world, **QUICK) for _ in range(2))
+        one, two, again = played(first), played(second), played(first)
+        for expected, found in zip(one, two, strict=True):
+            np.testing.assert_array_equal(expected, found)
+        np.testing.assert_allclose(one[0], again[0], atol=1e-3 if world == "laboratory" else 1e-6)
+        other = played(second, seed=4)[0]
+        assert np.abs(other - one[0]).max() > 0.01
+
+    def test_a_robot_does_not_depend_on_those_beside_it(self, folder):
+        few, many = (make_vector("reach", folder, count, **QUICK) for count in (2, 4))
+        few.reset(seed=5)
+        many.reset(seed=5)
+        action = np.zeros((4, 3), dtype=np.float32)
+        np.testing.assert_allclose(few.step(action[:2])[0], many.step(action)[0][:2], atol=1e-4)
+
+
+class TestResets:
+    def test_the_next_step_begins_anew(self, folder):
+        environment = make_vector("reach", folder, 2, **QUICK)
+        seen, rewards, ends = played(environment, 6)
+        np.testing.assert_array_equal(ends, [[False] * 2] * 3 + [[True] * 2] + [[False] * 2] * 2)
+        np.testing.assert_array_equal(rewards[4], [0.0, 0.0])
+        width = environment.single_observation_space.shape[0] - 12  # markers, before commands and goals
+        assert np.abs(seen[4][:, :width]).max() > 0.05
+        assert np.abs(seen[5][:, :width]).max() < 0.02
+
+    def test_the_same_step_begins_anew_and_keeps_the_last_observation(self, folder):
+        environment = make_vector("reach", folder, 2, autoreset_mode=AutoresetMode.SAME_STEP, **QUICK)
+        environment.reset(seed=1)
+        action = np.ones((2, 3), dtype=np.float32)
+        action[:, 1:] = -1.0
+        for _ in range(4):
+            seen, _, _, truncated, info = environment.step(action)
+        assert truncated.all()
+        assert info["_final_obs"].all()
+        assert np.abs(info["final_obs"][0][:9]).max() > 0.05
+        assert np.abs(seen[0][:9]).max() < 0.02
+
+    def test_without_any_an_episode_that_is_over_is_said(self, folder):
+        environment = make_vector("reach", folder, 2, autoreset_mode=AutoresetMode.DISABLED, **QUICK)
+        environment.reset(seed=1)
+        action = np.zeros((2, 3), dtype=np.float32)
+        for _ in range(4):
+            moved = environment.step(action)[0]
+        with pytest.raises(InputError, match="an episode is over: reset it with options"):
+            environment.step(action)
+        seen, _ = environment.reset(options={"reset_mask": np.array([True, False])})
+        np.testing.assert_array_equal(seen[1], moved[1])
+        assert np.abs(seen[0] - moved[0]).max() > 0.05
+
+
+class TestWorlds:
+    def test_parameters_are_those_of_the_identification(self, folder):
+        environment = make_vector("reach", folder, 4, spread=1.0, noise=0.0, **QUICK)
+        environment.reset(seed=0)
+        world = environment._world
+        drawn = world.robot.parameters["youngs_modulus"].numpy()
+        known = world.robot.description
+        assert np.ptp(drawn) > 0.0
+        deviation = known.uncertainty["deviation"]["youngs_modulus"]
+        assert np.abs(drawn - known.parameters["youngs_modulus"]).max() < 4.0 * deviation
+        same = make_vector("reach", folder, 4, spread=0.0, noise=0.0, **QUICK)
+        seen = played(same, 2)[0]
+        np.testing.assert_allclose(seen[0][:, :9], 0.0, atol=1e-6)
+
+    def test_commands_change_no_faster_than_they_can(self, folder):
+        environment = make_vector("reach", folder, 1, action_time=0.01, seconds=0.2)
+        environment.reset(seed=0)
+        seen = environment.step(np.ones((1, 3), dtype=np.float32))[0]
+        at = 2 * 18
+        np.testing.assert_allclose(seen[0, at : at + 3], -1.0 + 2.0 * 0.1, atol=1e-6)
+
+    def test_a_figure_has_no_end_and_no_jump(self):
+        places = np.random.default_rng(0).normal(size=(30, 3)) * [0.03, 0.02, 0.004]
+        task = FollowTask(1, 200, Reach(places, places[0]), 0.05)
+        task.begin(0, np.random.default_rng(1))
+        steps = np.linalg.norm(np.diff(task.goals[0], axis=0), axis=1)
+        assert steps.min() > 0.0
+        assert steps.max() < 0.05 * np.ptp(task.goals[0], axis=0).max() * 10.0
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"task": "dance"}, "the task is 'dance': choose reach, follow, swing_up"),
+        ({"world": "mars"}, "the world is 'mars': choose simulator, reduced, laboratory"),
+        ({"action_time": 0.015}, r"action_time is 0.015 s: it must be a multiple of the step of 0.01 s"),
+        ({"tracked": ["Nose"]}, "tracked names 'Nose': choose from Middle - 1"),
+        ({"render_mode": "human"}, "render_mode is 'human': there are no pictures"),
+        ({"task": "swing_up", "world": "laboratory"}, "swing_up moves the base of a simulated robot"),
+    ],
+)
+def test_what_no_environment_can_be_made_of(folder, change, said):
+    with pytest.raises(InputError, match=said):
+        make_vector(**{"task": "reach", "run": folder, "num_envs": 1, **QUICK, **change})
+
+
+def test_steps_need_a_reset_and_actions_their_shape(folder):
+    environment = make_vector("reach", folder, 2, **QUICK)
+    with pytest.raises(InputError, match="the environment was not reset"):
+        environment.step(np.zeros((2, 3), dtype=np.float32))
+    environment.reset(seed=0)
+    with pytest.raises(InputError, match=r"actions have shape \(3,\): give finite ones of \(2, 3\)"):
+        environment.step(np.zeros(3, dtype=np.float32))

@@ -1,0 +1,1 @@
+"""Inputs that make points of a robot follow a path: references, a reduced model, plans, estimates, and baselines."""

@@ -1,0 +1,200 @@
+"""What control has without a simulator: a linear model of the same recordings, and feedback by a Jacobian.
+
+The linear model is a dynamic mode decomposition with control (Proctor, Brunton and Kutz, SIAM J. Appl. Dyn. Syst. 15
+(2016) 142) of delayed markers, planned with as the reduced model is. The Jacobian is measured by pressing once in every
+input, and corrected on the way by Broyden's rule, applied to means over a while: the body vibrates.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .plan import Limits
+from .reduced import Response
+
+FloatArray = NDArray[np.float64]
+
+_RANKS = (8, 12, 18, 24, 36)  # of which validation chooses
+DELAYS: Final = 4  # markers that tell the state
+_RIDGE = 1e-8
+_AHEAD = 0.3  # s, that validation foretells
+_AVERAGED = 0.25  # s, over which the means of points and inputs are compared, without what vibrates
+_LEARNING = 0.05  # share of Broyden's correction that is taken in a step
+_LITTLE = 1e-3  # of the squared changes of the inputs, as shares of their ranges, that tell little
+_DAMPING = 0.05  # of the largest singular value
+
+
+@dataclass(frozen=True)
+class LinearModel:
+    """s' = A s + B u, y = y_0 + C s, of delayed markers; inputs in units of `scale`.
+
+    Attributes:
+        time_step: h [s].
+        scale: (n,) of the inputs.
+        rest: (3 M,) markers without inputs [m].
+        basis: (D 3 M, q) orthonormal, from D markers, the last first, to s.
+        a: (q, q).
+        b: (q, n).
+        c: (3 M, q).
+        validation_mm: error in what validation foretells.
+    """
+
+    time_step: float
+    scale: FloatArray
+    rest: FloatArray
+    basis: FloatArray
+    a: FloatArray
+    b: FloatArray
+    c: FloatArray
+    validation_mm: float
+
+    @property
+    def parts(self) -> int:
+        """The number n of inputs."""
+        return len(self.scale)
+
+    def state(self, markers: Sequence[FloatArray]) -> FloatArray:
+        """(q,) of the last D markers (3 M,), the last first [m]."""
+        return np.asarray((np.concatenate(markers) - np.tile(self.rest, len(markers))) @ self.basis)
+
+    def respond(
+        self, start: FloatArray, inputs: FloatArray, basis: FloatArray | None = None, bias: FloatArray | None = None
+    ) -> Response:
+        """See `ReducedModel.respond`; it has no bias."""
+        del bias
+        s, states, sloped = start, [], []
+        ds = None if basis is None else np.zeros((len(s), basis.shape[2]))
+        for k, u in enumerate(inputs / self.scale):
+            s = self.a @ s + self.b @ u
+            states.append(s)
+            if basis is not None and ds is not None:
+                ds = self.a @ ds + self.b @ (basis[k] / self.scale[:, None])
+                sloped.append(ds)
+        y = self.rest + np.array(states) @ self.c.T
+        return Response(y, None if basis is None else self.c @ np.array(sloped), [])
+
+    def arrays(self) -> dict[str, FloatArray]:
+        """Its arrays, for a file."""
+        return {name: getattr(self, name) for name in ("scale", "rest", "basis", "a", "b", "c")}
+
+    def plain(self) -> dict[str, float]:
+        """What `restored` needs beside the arrays."""
+        return {"time_step": self.time_step, "validation_mm": self.validation_mm}
+
+    @classmethod
+    def restored(cls, arrays: Mapping[str, FloatArray], plain: Mapping[str, float]) -> "LinearModel":
+        """From `arrays` and `plain`."""
+        return cls(
+            **{name: arrays[name] for name in ("scale", "rest", "basis", "a", "b", "c")},
+            time_step=float(plain["time_step"]),
+            validation_mm=float(plain["validation_mm"]),
+        )
+
+
+def fit_linear(
+    train: Sequence[tuple[FloatArray, FloatArray]],
+    validation: Sequence[tuple[FloatArray, FloatArray]],
+    scale: FloatArray,
+    time_step: float,
+) -> LinearModel:
+    """The linear model of recordings, of the rank that foretells those of validation best.
+
+    Args:
+        train: of each trial, markers (T + 1, 3 M) [m], which begin at rest, and inputs (T, n).
+        validation: the same.
+        scale: (n,) of the inputs.
+        time_step: h [s].
+    """
+    rest = np.mean([markers[0] for markers, _ in train], axis=0)
+
+    def delayed(markers: FloatArray) -> FloatArray:
+        """(T + 2 - D, D 3 M) from the rest, the last first."""
+        off = markers - rest
+        return np.concatenate([off[DELAYS - 1 - j : len(off) - j] for j in range(DELAYS)], axis=1)
+
+    def pairs(trials: Sequence[tuple[FloatArray, FloatArray]]) -> tuple[FloatArray, FloatArray, FloatArray]:
+        rows = [(delayed(y), u[DELAYS - 1 :] / scale) for y, u in trials]
+        return (
+            np.concatenate([x[:-1][: len(u)] for x, u in rows]),
+            np.concatenate([x[1:][: len(u)] for x, u in rows]),
+            np.concatenate([u[: len(x) - 1] for x, u in rows]),
+        )
+
+    before, after, inputs = pairs(train)
+    directions = np.linalg.svd(before, full_matrices=False)[2]
+    width, best = len(rest), None
+    for rank in (each for each in _RANKS if each <= len(directions)):
+        basis = directions[:rank].T
+        known = np.concatenate([before @ basis, inputs], axis=1)
+        normal = known.T @ known
+        normal += _RIDGE * np.trace(normal) / len(normal) * np.eye(len(normal))
+        found = np.linalg.solve(normal, known.T @ (after @ basis)).T
+        made = LinearModel(
+            time_step, scale, rest, basis, found[:, :rank], found[:, rank:], basis[:width], validation_mm=np.inf
+        )
+        error = _foretold(made, validation, delayed)
+        if best is None or error < best.validation_mm:
+            best = LinearModel(**{**made.__dict__, "validation_mm": error})
+    assert best is not None
+    return best
+
+
+def _foretold(model: LinearModel, trials: Sequence[tuple[FloatArray, FloatArray]], delayed: object) -> float:
+    """Mean error of markers ahead [mm]."""
+    steps, errors = max(round(_AHEAD / model.time_step), 1), []
+    for markers, inputs in trials:
+        for at in range(DELAYS - 1, len(inputs) - steps, steps):
+            start = model.state([markers[at - j] for j in range(DELAYS)])
+            found = model.respond(start, inputs[at : at + steps]).y
+            off = (found - markers[at + 1 : at + 1 + steps]).reshape(steps, -1, 3)
+            errors.append(np.linalg.norm(off, axis=2).mean())
+    return 1e3 * float(np.mean(errors)) if errors else np.inf
+
+
+class JacobianFeedback:
+    """Follows a path by how the points moved when the inputs were pressed.
+
+    Args:
+        jacobian: (d, n) of the points by the inputs, measured [m per unit].
+        limits: of the inputs.
+        gain: of the error [1/s].
+        time_step: h [s].
+    """
+
+    def __init__(self, jacobian: FloatArray, limits: Limits, gain: float, time_step: float) -> None:
+        self._jacobian, self._limits, self._gain, self._step = jacobian * limits.range, limits, gain, time_step
+        self._command = np.zeros(len(limits.range))
+        self._size = float(np.linalg.norm(self._jacobian, 2))
+        self._window = max(round(_AVERAGED / time_step), 1)
+        self._past = np.zeros((0, len(jacobian) + len(limits.range)))  # points and shares of the inputs, the last last
+
+    def command(self, point: FloatArray, goal: FloatArray, next_goal: FloatArray) -> FloatArray:
+        """(n,) what to command, of a point (d,), where it should be, and where it should be a step on [m]."""
+        u, h, d = self._command, self._step, len(point)
+        self._past = np.concatenate([self._past, [np.concatenate([point, u])]])[-2 * self._window :]
+        if len(self._past) == 2 * self._window:
+            before, now = (each.mean(0) for each in np.split(self._past, 2))
+            moved, changed = (now - before)[:d], (now - before)[d:]
+            missed = moved - self._jacobian @ changed
+            self._jacobian = self._jacobian + _LEARNING / (changed @ changed + _LITTLE) * np.outer(missed, changed)
+        wanted = next_goal - goal + self._gain * h * (goal - point)
+        j, damping = self._jacobian, _DAMPING * self._size
+        inverse = j.T @ np.linalg.inv(j @ j.T + damping**2 * np.eye(d))
+        change = inverse @ wanted
+        # What moves no point brings the inputs together, away from their bounds.
+        change = change - 0.5 * h * (np.eye(len(u)) - inverse @ j) @ (u - u.mean())
+        most = self._limits.rate * h / self._limits.range
+        self._command = np.clip(u + np.clip(change, -most, most), 0.0, 1.0)
+        return np.asarray(self._limits.low + self._limits.range * self._command)
+
+    @property
+    def memory(self) -> dict[str, FloatArray]:
+        """What the next step depends on."""
+        return {"jacobian": self._jacobian, "shares": self._command, "past": self._past}
+
+    @memory.setter
+    def memory(self, values: Mapping[str, FloatArray]) -> None:
+        self._jacobian, self._command, self._past = (values[key] for key in ("jacobian", "shares", "past"))

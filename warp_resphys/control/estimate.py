@@ -1,0 +1,97 @@
+"""The state of a reduced model from what cameras see: an extended Kalman filter with a bias of the equilibria.
+
+The state is (z, z', b): coordinates, their rates, and b, by how much the real robot's equilibria are elsewhere than the
+model's, which wanders. With b in the state, what a receding plan aims at is where the real robot goes, whatever
+constant error the model has (offset-free control: Pannocchia and Rawlings, AIChE J. 49 (2003) 426).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .reduced import ReducedModel, ReducedState
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations of what a filter does not know.
+
+    Attributes:
+        observed: of a coordinate of a marker [m].
+        rate: of what rates change by in a step beside the model, over their spread in a swing of one millimetre.
+        bias: of what the bias wanders by in a second, as a displacement of the markers [m].
+    """
+
+    observed: float = 1e-4
+    rate: float = 0.3
+    bias: float = 5e-3
+
+
+class Estimator:
+    """Follows a robot by its markers.
+
+    Args:
+        model: of the robot.
+        noise: see the class.
+        inputs: (n,) under which it rests at first.
+        offset: (3 M,) where its markers are beside where the model has them, at rest [m]; none, if left out.
+    """
+
+    def __init__(self, model: ReducedModel, noise: Noise, inputs: FloatArray, offset: FloatArray | None = None) -> None:
+        self.model, self._noise = model, noise
+        self.state, self._inputs = model.rest(inputs), inputs
+        r = model.modes
+        self.bias = np.zeros(r)
+        self.offset = np.zeros(model.curved.shape[2]) if offset is None else offset
+        seen = model.observed_slopes(self.state.z[None], inputs[None])[0]
+        # How far a coordinate moves the markers, on average [m].
+        size = np.linalg.norm(seen, axis=0) / np.sqrt(len(self.offset) / 3.0)
+        one = 1e-3 / size
+        stiffness = np.abs(np.diag(model.stiffness((inputs / model.scale)[None])[0]))
+        self._wander = np.concatenate(
+            [np.zeros(r), (noise.rate * one * np.sqrt(stiffness)) ** 2, (noise.bias / size) ** 2 * model.time_step]
+        )
+        self._covariance = np.diag(np.concatenate([one**2, (one * np.sqrt(stiffness)) ** 2, (2.0 * one) ** 2]))
+
+    def predict(self, inputs: FloatArray) -> None:
+        """One step under inputs (n,)."""
+        r = self.model.modes
+        self.state, by_z, by_v, by_bias = self.model.transition(self.state, inputs, self.bias)
+        transition = np.zeros((3 * r, 3 * r))
+        transition[: 2 * r] = np.concatenate([by_z, by_v, by_bias], axis=1)
+        transition[2 * r :, 2 * r :] = np.eye(r)
+        self._covariance = transition @ self._covariance @ transition.T + np.diag(self._wander)
+        self._inputs = inputs
+
+    @property
+    def memory(self) -> dict[str, FloatArray]:
+        """What the next step depends on."""
+        state = {key: value for key, value in vars(self.state).items() if value is not None}
+        return {**state, "bias": self.bias, "covariance": self._covariance, "inputs": self._inputs}
+
+    @memory.setter
+    def memory(self, values: Mapping[str, FloatArray]) -> None:
+        self.state = ReducedState(**{each.name: values.get(each.name) for each in fields(ReducedState)})  # type: ignore[arg-type]
+        self.bias, self._covariance, self._inputs = (values[key] for key in ("bias", "covariance", "inputs"))
+
+    def correct(self, markers: FloatArray) -> None:
+        """Takes in markers (M, 3) after the step [m]; NaN where one is not seen."""
+        model, r = self.model, self.model.modes
+        seen = np.isfinite(markers).ravel()
+        if not seen.any():
+            return
+        slopes = np.zeros((int(seen.sum()), 3 * r))
+        slopes[:, :r] = model.observed_slopes(self.state.z[None], self._inputs[None])[0][seen]
+        expected = (model.observe(self.state.z[None], self._inputs[None])[0] + self.offset)[seen]
+        spread = slopes @ self._covariance @ slopes.T + self._noise.observed**2 * np.eye(len(slopes))
+        gain = np.linalg.solve(spread, slopes @ self._covariance).T
+        change = gain @ (markers.ravel()[seen] - expected)
+        self._covariance = (np.eye(3 * r) - gain @ slopes) @ self._covariance
+        self._covariance = 0.5 * (self._covariance + self._covariance.T)
+        z, v = self.state.z + change[:r], self.state.v + change[r : 2 * r]
+        self.state = replace(self.state, z=z, v=v)
+        self.bias = self.bias + change[2 * r :]

@@ -1,0 +1,324 @@
+"""Stages: reduced models of the robot, plans on them, baselines without a simulator, and all of them driven."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from typing_extensions import override
+
+from ..dynamics.integrator import State
+from ..experiment.files import CONTROL, DATASET, DRIVEN, FEEDBACK, LINEAR, OPEN, RECEDING, Dataset, read_dataset
+from ..experiment.parts import March, Part, read_parts, remove_parts, split_into_parts, work_on
+from ..io.errors import InputError
+from ..io.fan_out import ALONE, Workers
+from ..io.files import write_json
+from ..io.progress import Progress
+from ..io.resumable import Field, forget_checkpoint, keep_checkpoint, resume_checkpoint
+from ..io.stages import StageContext
+from ..robot.export import Track, input_columns, write_csv
+from ..robot.loading import load
+from ..robot.robot import Robot
+from .baselines import JacobianFeedback, fit_linear
+from .controllers import (
+    Controller,
+    Feedback,
+    LinearRecedingHorizon,
+    OpenLoop,
+    RecedingHorizon,
+    timed_command,
+)
+from .files import (
+    BASELINES,
+    DrivenMotion,
+    PlannedMotion,
+    plain_plans,
+    plan_table,
+    plans_file,
+    plans_from_plain,
+    read_baselines,
+    read_plan,
+    read_reduced,
+    read_told,
+    reduced_file,
+    write_baselines,
+    write_driven,
+    write_plans,
+    write_reduced,
+)
+from .laboratory import Laboratory
+from .open_loop import Follower
+from .reduced import ReducedModel
+from .reduction import reduce
+from .sampling import driven_input
+from .task import Task, motion_name
+
+FloatArray = NDArray[np.float64]
+
+_ALL_SEEN: Final = 0.5  # of the frames of a trial, that must be whole for a linear model
+
+
+def reduce_robot(context: StageContext) -> None:
+    """Writes the reduced model of a model.
+
+    Raises:
+        InputError, ConvergenceError: it cannot be reduced, see `reduction.reduce`.
+    """
+    settings = context.settings
+    robot = load(context.run_dir, settings["model"], settings["device"])
+    sampling = _task(settings, robot).sampling(settings["seed"])
+    with Progress(context.name, sampling.total, "samples") as progress:
+        found = reduce(robot, sampling, progress.advance)
+    write_reduced(context.run_dir / reduced_file(settings["model"]), found)
+
+
+def plan_motions(context: StageContext) -> None:
+    """Writes the plans of all motions on a model, as HDF5 and as tables to be played on a robot.
+
+    Raises:
+        InputError: the robot cannot reach a path, and is the one that must.
+        ConvergenceError: the robot diverges on a plan.
+    """
+    settings, model = context.settings, context.settings["model"]
+    robot = load(context.run_dir, model, settings["device"])
+    task, known = _task(settings, robot), settings["control"]["plan"]
+    reduced = read_reduced(context.run_dir / reduced_file(model), robot.description.learned)
+    if settings["must_reach"]:
+        task.check_reach(reduced)
+    start, seconds = _start(context.run_dir, task), settings["control"]["seconds"]
+    checkpoint = context.run_dir / f"{context.name}.state.safetensors"
+    kept = resume_checkpoint(checkpoint, "plans", context.fingerprint)
+    found = {} if kept is None else plans_from_plain(*kept)
+    followers = {
+        each: Follower(robot, reduced, task.planner(reduced, each), known["corrections"], known["gradient"])
+        for each in seconds
+    }
+    total = sum(each.rollouts * task.steps(time) for time, each in followers.items())
+    done = sum(followers[each].rollouts * task.steps(each) for each in seconds if _names(task, each)[0] in found)
+    with Progress(context.name, total, "steps", done) as progress:
+        for each, follower in followers.items():
+            names = _names(task, each)
+            if names[0] in found:
+                continue
+            paths = np.stack([task.timed(path, each, start) for path in task.paths])
+            made = follower.follow(paths, progress.advance)
+            for row, name in enumerate(names):
+                found[name] = PlannedMotion(
+                    paths[row], made.inputs[row], made.points[row], made.markers[row], made.errors_mm[:, row]
+                )
+            tensors, plain = plain_plans(found)
+            keep_checkpoint(checkpoint, "plans", tensors, {**plain, "fingerprint": context.fingerprint})
+    write_plans(context.run_dir / plans_file(model), found)
+    for name, motion in found.items():
+        write_csv(context.run_dir / plan_table(model, name), _track(robot, motion))
+    forget_checkpoint(checkpoint)
+
+
+def _track(robot: Robot, motion: PlannedMotion) -> Track:
+    """What a table shows of a planned motion: the markers and the inputs."""
+    known, count = driven_input(robot), len(motion.markers)
+    markers, none = motion.markers.reshape(count, -1, 3), np.zeros((count, 0, 3))
+    columns = input_columns(known.name, known.parts, known.unit, motion.inputs)
+    times = robot.time_step * np.arange(count, dtype=np.float64)
+    return Track(robot.description.mesh, times, none, none, robot.labels, markers, columns)
+
+
+def _start(folder: Path, task: Task) -> FloatArray:
+    """(3,) where the point was in the recordings before anything moved [m]."""
+    found = task.tracked @ np.nanmean(read_dataset(folder / DATASET).held, axis=0).ravel()
+    return np.asarray(found)
+
+
+def fit_baselines(context: StageContext) -> None:
+    """Writes the linear model of the recordings, and the Jacobian that the laboratory shows when inputs are pressed.
+
+    Raises:
+        InputError: too few frames of the trials show all markers.
+    """
+    settings = context.settings
+    robot = load(context.run_dir, settings["control"]["models"][-1], settings["device"])
+    task, known, data = _task(settings, robot), driven_input(robot), read_dataset(context.run_dir / DATASET)
+    assert known.high is not None
+    train, validation = (
+        [_series(data, name, known.name, robot.time_step) for name in settings["split"][part]]
+        for part in ("train", "validation")
+    )
+    linear = fit_linear(train, validation or train, np.asarray(known.high), robot.time_step)
+    feedback, limits = settings["control"]["feedback"], task.limits
+    parts, steps = task.parts, max(round(feedback["settles"] / robot.time_step), 2)
+    pressed = feedback["pressed"] * np.diag(limits.range)
+    laboratory = Laboratory(settings, context.run_dir, known.name, parts, len(task.motions))
+    rest, seen = laboratory.rest(), []
+    with Progress(context.name, steps, "steps") as progress:
+        for number in range(steps):
+            laboratory.step(limits.low + pressed)
+            seen.append(laboratory.seen(number + 1))
+            progress.advance()
+    last = np.mean(seen[-max(steps // 5, 1) :], axis=0)
+    moved = (last - rest).reshape(parts, -1) @ task.tracked.T  # (n, d)
+    write_baselines(context.run_dir / BASELINES, linear, moved.T / np.diag(pressed))
+
+
+def _series(data: Dataset, name: str, given: str, time_step: float) -> tuple[FloatArray, FloatArray]:
+    """(T + 1, 3 M) the markers of a trial at the steps of a robot [m], and (T, n) its inputs."""
+    (row,) = data.rows([name])
+    observed = data.observed if data.smoothed is None else data.smoothed
+    seen, times = observed[row].reshape(len(data.times[row]), -1), data.times[row]
+    whole = np.isfinite(seen).all(1)
+    if whole.mean() < _ALL_SEEN:
+        raise InputError(f"trial {name} shows all markers in {100 * whole.mean():.0f} % of its frames: too few.")
+    steps = round(float(times[whole].max()) / time_step)
+    at = time_step * np.arange(steps + 1)
+    markers = np.stack([np.interp(at, times[whole], column[whole]) for column in seen.T], axis=1)
+    inputs = data.inputs[given][row]
+    number = np.minimum((at[:-1] / data.time_step + 1e-9).astype(np.int64), len(inputs) - 1)
+    return markers, inputs[number]
+
+
+def drive(context: StageContext, workers: Workers = ALONE) -> None:
+    """Writes how all controllers drive all motions on the simulated laboratory."""
+    settings = context.settings
+    controllers = controllers_of(settings["control"])
+    robot = load(context.run_dir, settings["control"]["models"][-1], settings["device"])
+    task, parts = _task(settings, robot), list[Part]()
+    for seconds in settings["control"]["seconds"]:
+        for name in _names(task, seconds):
+            parts += split_into_parts(context, (name,), task.steps(seconds) + 1, name)
+    work_on(parts, _Drive, workers)
+    motions = {}
+    for part in parts:
+        (name,) = part.names
+        points, inputs, seconds = (read_parts([part], key).swapaxes(0, 1) for key in ("points", "inputs", "seconds"))
+        path = read_plan(context.run_dir / plans_file(settings["control"]["models"][-1]), name).path
+        motions[name] = DrivenMotion(path, points[:, 1:], inputs[:, 1:], seconds[:, 1:])
+    write_driven(context.run_dir / DRIVEN, controllers, robot.time_step, motions)
+    write_json(context.run_dir / CONTROL, _summary(context.run_dir, settings, controllers, motions))
+    remove_parts(context)
+
+
+def controllers_of(control: Mapping[str, Any]) -> list[str]:
+    """What drives, in the order of the tables."""
+    return [
+        *(f"{OPEN}{model}" for model in control["models"]),
+        *(f"{RECEDING}{model}" for model in control["receding"]),
+        f"{RECEDING}{LINEAR}",
+        *(f"{FEEDBACK}{gain:g}" for gain in control["feedback"]["gains"]),
+    ]
+
+
+class _Drive(March):
+    """One motion, driven by all controllers at once."""
+
+    def __init__(self, part: Part) -> None:
+        self._settings, self._folder, (self._name,) = part.context.settings, part.context.run_dir, part.names
+        names = controllers_of(self._settings["control"])
+        robot = load(self._folder, self._settings["control"]["models"][-1], self._settings["device"])
+        self._task, known = _task(self._settings, robot), driven_input(robot)
+        number = self._task.motions.index(self._name)
+        self._laboratory = Laboratory(self._settings, self._folder, known.name, len(names), number)
+        self._controllers = self._made(robot)
+        self.like, self.frames, count = self._laboratory.state.q, part.frames, len(names)
+        self.fields = {
+            "points": Field((count, 3), "m"),
+            "inputs": Field((count, self._task.parts), known.unit),
+            "seconds": Field((count,), "s"),
+        }
+        self._inputs, self._seconds = np.zeros((count, self._task.parts)), np.zeros(count)
+
+    def _made(self, robot: Robot) -> list[Controller]:
+        control, task, folder = self._settings["control"], self._task, self._folder
+        plans = {model: read_plan(folder / plans_file(model), self._name) for model in control["models"]}
+        rest, path = self._laboratory.rest(), plans[control["models"][-1]].path
+        limits, horizon = task.limits, task.horizon
+        found: list[Controller] = [OpenLoop(plan.inputs) for plan in plans.values()]
+        for model in control["receding"]:
+            learned = robot if model == robot.description.model else load(folder, model, self._settings["device"])
+            reduced: ReducedModel = read_reduced(folder / reduced_file(model), learned.description.learned)
+            found.append(RecedingHorizon(reduced, task.tracked, limits, horizon, task.noise, path, rest[len(found)]))
+        linear, jacobian = read_baselines(folder / BASELINES)
+        found.append(LinearRecedingHorizon(linear, task.tracked, limits, horizon, path, rest[len(found)]))
+        for gain in control["feedback"]["gains"]:
+            feedback = JacobianFeedback(jacobian, limits, gain, task.time_step)
+            found.append(Feedback(feedback, task.tracked, path, rest[len(found)]))
+        return found
+
+    @override
+    def begin(self) -> State:
+        return self._laboratory.state
+
+    @override
+    def step(self, number: int) -> State:
+        seen = self._laboratory.seen(number - 1)
+        pairs = [
+            timed_command(each, number - 1, markers) for each, markers in zip(self._controllers, seen, strict=True)
+        ]
+        self._inputs, self._seconds = np.stack([each[0] for each in pairs]), np.array([each[1] for each in pairs])
+        self._laboratory.step(self._inputs)
+        return self._laboratory.state
+
+    @override
+    def kept(self, number: int) -> dict[str, ArrayLike]:
+        points = self._laboratory.truth().reshape(len(self._controllers), -1) @ self._task.tracked.T
+        return {"points": points, "inputs": self._inputs, "seconds": self._seconds}
+
+    @override
+    def snapshot(self) -> dict[str, torch.Tensor]:
+        found = super().snapshot()
+        for number, each in enumerate(self._controllers):
+            found |= {f"{number}.{key}": torch.from_numpy(value.copy()) for key, value in each.remembered().items()}
+        return found
+
+    @override
+    def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
+        super().restore({key: each for key, each in tensors.items() if "." not in key})
+        self._laboratory.state = self.state
+        for number, controller in enumerate(self._controllers):
+            own = f"{number}."
+            known = {key.removeprefix(own): each.numpy() for key, each in tensors.items() if key.startswith(own)}
+            controller.recall(known)
+
+
+def _summary(
+    folder: Path, settings: Mapping[str, Any], controllers: Sequence[str], motions: Mapping[str, DrivenMotion]
+) -> dict[str, Any]:
+    """What control.json says: errors [mm] by speed and controller, and of each motion; times; the reduced models."""
+    control = settings["control"]
+    by_speed: dict[str, Any] = {}
+    for seconds in control["seconds"]:
+        names = [motion_name(shape, seconds) for shape in control["shapes"]]
+        each = {name: 1e3 * np.linalg.norm(motions[name].points - motions[name].path, axis=2) for name in names}
+        by_speed[f"{seconds:g}"] = {
+            controller: {
+                "mean_mm": float(np.mean([errors[row].mean() for errors in each.values()])),
+                "max_mm": float(max(errors[row].max() for errors in each.values())),
+                "motions_mm": {name: float(errors[row].mean()) for name, errors in each.items()},
+            }
+            for row, controller in enumerate(controllers)
+        }
+    times = np.concatenate([motion.seconds for motion in motions.values()], axis=1)
+    planned = {
+        model: {name: read_plan(folder / plans_file(model), name).errors_mm.tolist() for name in motions}
+        for model in control["models"]
+    }
+    models = {model: read_told(folder / reduced_file(model)) for model in control["models"]}
+    return {
+        "tracking": by_speed,
+        "command_ms": {
+            name: {"median": 1e3 * float(np.median(row)), "largest_of_20": 1e3 * float(np.quantile(row, 0.95))}
+            for name, row in zip(controllers, times, strict=True)
+        },
+        "planned_mm": planned,
+        "reduced": models,
+        "linear_validation_mm": read_baselines(folder / BASELINES)[0].validation_mm,
+    }
+
+
+def _task(settings: Mapping[str, Any], robot: Robot) -> Task:
+    return Task(settings["control"], robot.labels, robot.time_step, len(driven_input(robot).parts))
+
+
+def _names(task: Task, seconds: float) -> list[str]:
+    """Of the motions at a speed."""
+    return [motion_name(path.name, seconds) for path in task.paths]

@@ -1,0 +1,232 @@
+"""Environments of a run, by the names of tasks, and their registration in Gymnasium."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+from typing_extensions import override
+
+from ..control.files import read_reduced, reduced_file
+from ..control.plan import tracked_of
+from ..control.reduced import ReducedModel
+from ..control.reduction import reduce
+from ..control.sampling import Sampling, driven_input
+from ..io.errors import InputError
+from ..io.progress import Progress
+from ..io.stages import finished_record
+from ..robot.inputs import BASE
+from ..robot.loading import load
+from ..robot.robot import Robot
+from .tasks import FollowTask, Reach, ReachTask, SwingTask, Task
+from .vector import Drive, RobotVectorEnv
+from .worlds import LaboratoryWorld, ReducedWorld, RobotWorld, World, rests
+
+FloatArray = NDArray[np.float64]
+
+TASKS: Final = ("reach", "follow", "swing_up")
+WORLDS: Final = ("simulator", "reduced", "laboratory")
+_PLACES: Final = 64  # equilibria that tell where a point can be
+_RISE: Final = 0.1  # s in which an input can go from its least to its greatest value
+_NEAR_TIP: Final = 0.9  # of the largest distance from what is fixed, from which on markers are those of the tip
+_SHOWN: Final = 4  # vertices of a robot without markers, that are seen
+_BASE: Final = 0.01  # m that a base may move to either side
+_BASE_SPEED: Final = 0.2  # m/s
+
+
+def make_vector(
+    task: str,
+    run: str | Path,
+    num_envs: int = 8,
+    model: str | None = None,
+    world: str = "simulator",
+    spread: float = 1.0,
+    seconds: float = 2.0,
+    action_time: float = 0.05,
+    noise: float = 5e-5,
+    tracked: Sequence[str] | None = None,
+    axis: Sequence[float] = (0.0, 0.0, 1.0),
+    render_mode: str | None = None,
+    autoreset_mode: str | gym.vector.AutoresetMode = gym.vector.AutoresetMode.NEXT_STEP,
+    device: str = "cpu",
+    seed: int = 0,
+) -> RobotVectorEnv:
+    """Robots of a run, or of a file, with a task.
+
+    Args:
+        task: ``reach``, ``follow``, or ``swing_up``, by the base.
+        run: the run folder, or a file of `Robot.save`.
+        num_envs: B.
+        model: of the run; ``resphys`` if left out.
+        world: ``simulator``; ``reduced``, its reduced model, which is fast, has no parameters that vary, and is made
+            in some minutes where the run has none; or ``laboratory``, the simulation that plays the real robot.
+        spread: by how many standard deviations of their identification parameters vary between the robots.
+        seconds: of an episode.
+        action_time: of an action [s], a multiple of the time step.
+        noise: standard deviation of the coordinates of markers that are seen [m]; a laboratory has its own.
+        tracked: the markers whose mean has the task; those of the tip, if left out.
+        axis: along which a base moves.
+        render_mode: None, as there are no pictures.
+        autoreset_mode: see Gymnasium.
+        device: of the simulation.
+        seed: of the places at which robots are sampled.
+
+    Raises:
+        InputError: an unknown task or world, or a robot that has no such input.
+        DataFileError: see `load`.
+    """
+    if task not in TASKS:
+        raise InputError(f"the task is {task!r}: choose {', '.join(TASKS)}.")
+    if world not in WORLDS:
+        raise InputError(f"the world is {world!r}: choose {', '.join(WORLDS)}.")
+    robot = load(run, model, device, "count")
+    frames = round(action_time / robot.time_step)
+    if frames < 1 or abs(frames * robot.time_step - action_time) > 1e-9:
+        raise InputError(
+            f"action_time is {action_time:g} s: it must be a multiple of the step of {robot.time_step:g} s."
+        )
+    actions = max(round(seconds / action_time), 1)
+    shown = None if robot.labels else _spread_vertices(robot)
+    made = _World(robot, run, num_envs, world, spread, seed, shown)
+    asked: Task
+    if task == "swing_up":
+        if BASE not in robot.inputs or world != "simulator":
+            raise InputError("swing_up moves the base of a simulated robot: take one that is fixed to something.")
+        along = np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
+        place = made.of_base(along)
+        point = _tip(robot, place.markers()[0], tracked, shown)
+        rest = point @ place.markers()[0].ravel()
+        length = float(np.linalg.norm(rest - _fixed(robot)))
+        up = -np.asarray(robot.simulator.gravity, dtype=np.float64)
+        asked = SwingTask(num_envs, up if up.any() else along, rest, length)
+        drive = Drive(np.full(1, -_BASE), np.full(1, _BASE), np.full(1, _BASE_SPEED), np.zeros(1), frames)
+    else:
+        known = driven_input(robot)
+        assert known.low is not None
+        assert known.high is not None
+        low, high = np.array(known.low), np.array(known.high)
+        place = made.of_input(known.name)
+        point = _tip(robot, place.markers()[0], tracked, shown)
+        shares = np.random.default_rng(seed).random((_PLACES, len(low)))
+        shares[0] = 0.0
+        found = rests(robot, known.name, shares)
+        found = found if shown is None else found[:, list(shown)]
+        places = found.reshape(len(found), -1) @ point.T
+        reach = Reach(places, places[0])
+        asked = (
+            ReachTask(num_envs, actions, reach)
+            if task == "reach"
+            else FollowTask(num_envs, actions, reach, action_time)
+        )
+        drive = Drive(low, high, (high - low) / _RISE, low, frames)
+    return RobotVectorEnv(
+        place,
+        asked,
+        drive,
+        point,
+        actions,
+        place.noise if isinstance(place, LaboratoryWorld) else noise,
+        autoreset_mode,
+        render_mode,
+    )
+
+
+class _World:
+    """Makes the world that was asked for."""
+
+    def __init__(
+        self, robot: Robot, run: str | Path, count: int, world: str, spread: float, seed: int, shown: list[int] | None
+    ) -> None:
+        self._robot, self._run, self._count, self._world = robot, Path(run).expanduser(), count, world
+        self._spread, self._seed, self._shown = spread, seed, shown
+
+    def of_base(self, along: FloatArray) -> World:
+        mixed = np.concatenate([along, np.zeros(3)])[None]
+        return RobotWorld(self._robot, BASE, self._count, self._spread, mixed, self._shown)
+
+    def of_input(self, name: str) -> World:
+        if self._world == "simulator":
+            return RobotWorld(self._robot, name, self._count, self._spread, None, self._shown)
+        if self._world == "reduced":
+            return ReducedWorld(self._reduced(), self._count)
+        settings = finished_record(self._run, "laboratory")["settings"]
+        return LaboratoryWorld({**settings, "device": "cpu"}, self._run, name, self._count, self._seed)
+
+    def _reduced(self) -> ReducedModel:
+        """That of the run, or a new one."""
+        known = self._robot.description
+        path = self._run / reduced_file(known.model)
+        if path.is_file():
+            finished_record(self._run, f"reduce_{known.model}")
+            return read_reduced(path, known.learned)
+        sampling = Sampling(seed=self._seed)
+        with Progress("reduced model", sampling.total, "samples") as progress:
+            return reduce(self._robot, sampling, progress.advance)
+
+
+def _fixed(robot: Robot) -> FloatArray:
+    """(3,) the middle of the fixed vertices [m]."""
+    body = robot.simulator.body
+    return np.asarray(body.mesh.vertices[body.fixed_vertices].mean(axis=0))
+
+
+def _spread_vertices(robot: Robot) -> list[int]:
+    """Some vertices, each as far from the others and from what is fixed as can be."""
+    vertices = robot.simulator.body.mesh.vertices
+    nearest = np.linalg.norm(vertices - _fixed(robot), axis=1)
+    found: list[int] = []
+    for _ in range(_SHOWN):
+        found.append(int(nearest.argmax()))
+        nearest = np.minimum(nearest, np.linalg.norm(vertices - vertices[found[-1]], axis=1))
+    return found
+
+
+def _tip(robot: Robot, markers: FloatArray, tracked: Sequence[str] | None, shown: Sequence[int] | None) -> FloatArray:
+    """(3, 3 M) from markers (M, 3) to the mean of some of them."""
+    names = robot.labels or [str(each) for each in shown or ()]
+    far = np.linalg.norm(markers - _fixed(robot), axis=1)
+    of_tip = [name for name, distance in zip(names, far, strict=True) if distance >= _NEAR_TIP * far.max()]
+    return tracked_of(names, of_tip if tracked is None else tracked)
+
+
+class RobotEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
+    """One robot, as Gymnasium's environments are; for many at once, see `make_vector`, whose arguments it takes."""
+
+    def __init__(self, task: str, run: str | Path, render_mode: str | None = None, **settings: Any) -> None:
+        self._one = make_vector(
+            task, run, 1, render_mode=render_mode, autoreset_mode=gym.vector.AutoresetMode.DISABLED, **settings
+        )
+        self.observation_space, self.action_space = self._one.single_observation_space, self._one.single_action_space
+        self.render_mode = render_mode
+        self.metadata = {key: value for key, value in self._one.metadata.items() if key != "autoreset_mode"}
+
+    @override
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        super().reset(seed=seed)
+        first = int(self.np_random.integers(2**31)) if seed is None else seed
+        found, _ = self._one.reset(seed=first)
+        return found[0], {}
+
+    @override
+    def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        seen, reward, terminated, truncated, info = self._one.step(np.asarray(action)[None])
+        own = {"error_mm": float(info["error_mm"][0])}
+        return seen[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), own
+
+
+def register() -> None:
+    """Makes the tasks known to Gymnasium, as ``warp_resphys/Reach-v0``, ``warp_resphys/Follow-v0`` and so on."""
+    for task in TASKS:
+        name = f"warp_resphys/{''.join(word.capitalize() for word in task.split('_'))}-v0"
+        if name not in gym.registry:
+            gym.register(
+                name,
+                entry_point="warp_resphys.environments.making:RobotEnv",
+                vector_entry_point="warp_resphys.environments.making:make_vector",
+                kwargs={"task": task},
+                disable_env_checker=True,
+            )

@@ -1,0 +1,176 @@
+"""What is to be done: reach a place, follow a figure, swing a body up. Rewards are one at best at each step."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..control.reference import Path
+from ..io.errors import InputError
+
+FloatArray = NDArray[np.float64]
+
+_PREVIEW: Final = (0, 2, 5)  # actions ahead, of the places that a follower is told
+_FIGURES: Final = ("circle", "eight", "R", "E", "S")
+_LAPS_S: Final = (2.0, 5.0)  # s that a figure takes
+_OF_REACH: Final = 0.6  # size of a figure, as a share of the reach
+
+
+@dataclass(frozen=True)
+class Reach:
+    """Where a point of a robot can be at rest.
+
+    Attributes:
+        places: (S, 3) some of these places [m].
+        rest: (3,) where it is without inputs [m].
+    """
+
+    places: FloatArray
+    rest: FloatArray
+
+    @property
+    def size(self) -> float:
+        """The largest distance of the places from their middle [m]."""
+        return float(np.linalg.norm(self.places - self.middle, axis=1).max())
+
+    @property
+    def middle(self) -> FloatArray:
+        """(3,) of the places [m]."""
+        return np.asarray(self.places.mean(axis=0))
+
+    @property
+    def plane(self) -> FloatArray:
+        """(2, 3) the directions in which the places spread most."""
+        directions = np.linalg.svd(self.places - self.middle, full_matrices=False)[2][:2]
+        largest = np.abs(directions).argmax(axis=1)
+        return np.asarray(directions * np.sign(directions[[0, 1], largest])[:, None])
+
+
+class Task(ABC):
+    """What is asked of B robots, of each by itself.
+
+    Attributes:
+        size: that observations of places are divided by [m].
+        width: of what is observed of the task.
+    """
+
+    size: float
+    width: int
+
+    @abstractmethod
+    def begin(self, row: int, random: np.random.Generator) -> None:
+        """A new episode of a robot."""
+
+    @abstractmethod
+    def observed(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
+        """(B, width) of points (B, 3) [m] after so many actions (B,)."""
+
+    @abstractmethod
+    def reward(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
+        """(B,) at most one."""
+
+    @abstractmethod
+    def errors_mm(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
+        """(B,) how far off points are [mm]."""
+
+
+class _Goals(Task):
+    """Places (B, A + 1, 3) where the points are to be after each of A actions [m]."""
+
+    def __init__(self, count: int, actions: int, reach: Reach) -> None:
+        self.goals = np.tile(reach.middle, (count, actions + 1, 1))
+        self.size, self.width, self._reach = reach.size, 3 * len(_PREVIEW), reach
+
+    def observed(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
+        """See `Task.observed`: how far the next places are."""
+        ahead = np.minimum(number[:, None] + np.array(_PREVIEW) + 1, self.goals.shape[1] - 1)
+        wanted = self.goals[np.arange(len(points))[:, None], ahead]
+        return np.asarray(((wanted - points[:, None]) / self.size).reshape(len(points), -1))
+
+    def _now(self, number: NDArray[np.int64]) -> FloatArray:
+        return np.asarray(self.goals[np.arange(len(number)), np.minimum(number, self.goals.shape[1] - 1)])
+
+    def errors_mm(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
+        """See `Task.errors_mm`."""
+        return np.asarray(1e3 * np.linalg.norm(points - self._now(number), axis=1))
+
+    def reward(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
+        """See `Task.reward`: one where they are, and less by their distance over the size of the reach."""
+        return np.asarray(1.0 - 1e-3 * self.errors_mm(points, number) / self.size)
+
+
+class ReachTask(_Goals):
+    """Be at a place, soon, and stay there."""
+
+    def begin(self, row: int, random: np.random.Generator) -> None:
+        """See `Task.begin`: one of the places at which the robot can be at rest."""
+        self.goals[row] = self._reach.places[random.integers(len(self._reach.places))]
+
+
+class FollowTask(_Goals):
+    """Follow a figure in the plane in which the robot reaches furthest.
+
+    Args:
+        count: B.
+        actions: A.
+        reach: of the point.
+        action_time: of an action [s].
+        figures: which are drawn.
+    """
+
+    def __init__(
+        self, count: int, actions: int, reach: Reach, action_time: float, figures: Sequence[str] = _FIGURES
+    ) -> None:
+        super().__init__(count, actions, reach)
+        self._time, self._figures = action_time, tuple(figures)
+
+    def begin(self, row: int, random: np.random.Generator) -> None:
+        """See `Task.begin`: a figure at a speed, from anywhere in it on."""
+        reach = self._reach
+        name = self._figures[random.integers(len(self._figures))]
+        first, second = reach.plane
+        spread = np.ptp((reach.places - reach.middle) @ reach.plane.T, axis=0).min()
+        size = _OF_REACH * float(spread) * random.uniform(0.5, 1.0)
+        curve = Path(name, size, tuple(reach.middle), tuple(first), tuple(second)).points
+        curve = np.concatenate([curve, curve[-2::-1]])  # and back, so that it has no end
+        laps = self._time * np.arange(self.goals.shape[1]) / random.uniform(*_LAPS_S) + random.uniform()
+        at = (laps % 1.0) * (len(curve) - 1)
+        self.goals[row] = np.stack([np.interp(at, np.arange(len(curve)), column) for column in curve.T], axis=1)
+
+
+class SwingTask(Task):
+    """Swing a point up, as far above its rest as its base can make it.
+
+    Args:
+        count: B.
+        up: (3,) direction.
+        rest: (3,) of the point [m].
+        length: of the body, by which heights are divided [m].
+    """
+
+    def __init__(self, count: int, up: FloatArray, rest: FloatArray, length: float) -> None:
+        if not length > 0.0:
+            raise InputError("the body has no length along which it could be swung up.")
+        self._up, self._rest, self._count = up / np.linalg.norm(up), rest, count
+        self.size, self.width = length, 1
+
+    def begin(self, row: int, random: np.random.Generator) -> None:
+        """See `Task.begin`: nothing differs between episodes but the world."""
+
+    def _height(self, points: FloatArray) -> FloatArray:
+        return np.asarray((points - self._rest) @ self._up / self.size)
+
+    def observed(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
+        """See `Task.observed`: the height."""
+        return self._height(points)[:, None]
+
+    def reward(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
+        """See `Task.reward`: the height over the length, where it is above the rest."""
+        return np.clip(self._height(points), 0.0, 1.0)
+
+    def errors_mm(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
+        """See `Task.errors_mm`: what is missing to a length above the rest."""
+        return np.asarray(1e3 * self.size * (1.0 - self._height(points)))

@@ -1,0 +1,211 @@
+"""The environments: B robots that get actions and give what cameras see of them, rewards and ends of episodes."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from numpy.typing import NDArray
+from typing_extensions import override
+
+from ..io.errors import InputError
+from .tasks import Task
+from .worlds import World
+
+FloatArray = NDArray[np.float64]
+Observation = NDArray[np.float32]
+
+_LOST: Final = -10.0  # reward of a simulation that failed
+_SMOOTH: Final = 0.05  # of the mean square change of an action, taken from the reward
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What actions do.
+
+    Attributes:
+        low: (n,) of the input, at actions of -1.
+        high: (n,) at actions of 1.
+        rate: (n,) by which it may change in a second.
+        start: (n,) before the first action.
+        frames: steps of the simulation that an action lasts.
+    """
+
+    low: FloatArray
+    high: FloatArray
+    rate: FloatArray
+    start: FloatArray
+    frames: int
+
+
+class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
+    """B robots with one task, of which each begins anew by itself.
+
+    An observation has, of each of M markers, the place beside where it rests over the size of the task, and the change
+    since the last action; the command of each input, from -1 to 1; and what the task shows. An action is what each
+    input is to become, from -1 to 1, at the rate that it can.
+
+    Args:
+        world: that is stepped.
+        task: that is to be done.
+        drive: what actions do to the input of the world.
+        tracked: (3, 3 M) from the markers to the point of the task.
+        actions: A of an episode, after which it is cut off.
+        noise: standard deviation of each coordinate that is seen [m].
+        autoreset_mode: when robots begin anew, see Gymnasium.
+        render_mode: None, as there are no pictures.
+
+    Raises:
+        InputError: another mode.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        task: Task,
+        drive: Drive,
+        tracked: FloatArray,
+        actions: int,
+        noise: float = 0.0,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        render_mode: str | None = None,
+    ) -> None:
+        if render_mode is not None:
+            raise InputError(f"render_mode is {render_mode!r}: there are no pictures, so leave it out.")
+        self._world, self._task, self._drive, self._tracked = world, task, drive, tracked
+        self._length, self._noise = actions, noise
+        self.num_envs, self.render_mode = world.count, render_mode
+        mode = AutoresetMode(autoreset_mode)
+        rate = round(1.0 / (world.time_step * drive.frames))
+        self.metadata = {"render_modes": [], "render_fps": rate, "autoreset_mode": mode}
+        self._mode = mode
+        world.begin(np.ones(world.count, dtype=np.bool_))
+        self._rest = world.markers()
+        width = 2 * self._rest[0].size + world.parts + task.width
+        self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, (width,), np.float32)
+        self.single_action_space = gym.spaces.Box(-1.0, 1.0, (world.parts,), np.float32)
+        self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, world.count)
+        self.action_space = gym.vector.utils.batch_space(self.single_action_space, world.count)
+        self._random: list[np.random.Generator] | None = None
+        self._commands = np.tile(drive.start, (world.count, 1))
+        self._number = np.zeros(world.count, dtype=np.int64)
+        self._over = np.zeros(world.count, dtype=np.bool_)
+        self._seen = self._before = self._rest
+
+    @override
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begins all episodes, or those of ``options["reset_mask"]``, anew; with parameters drawn anew if all.
+
+        Args:
+            seed: of the first robot, the next of the others; or of each.
+            options: see above.
+        """
+        count = self.num_envs
+        if seed is not None or self._random is None:
+            first = np.random.default_rng().integers(2**31) if seed is None else seed
+            each = (
+                [None if s is None else int(s) for s in first]
+                if isinstance(first, Sequence)
+                else range(int(first), int(first) + count)
+            )
+            self._random = [np.random.default_rng(s) for s in each]
+        mask = (options or {}).get("reset_mask")
+        chosen = np.ones(count, dtype=np.bool_) if mask is None else np.asarray(mask)
+        if chosen.shape != (count,) or chosen.dtype != np.bool_:
+            raise InputError(f"reset_mask must be {count} truth values, one for each robot.")
+        if chosen.all():
+            self._world.vary(self._random)
+        self._begin(chosen)
+        return self._observed(), {}
+
+    def _begin(self, chosen: NDArray[np.bool_]) -> None:
+        assert self._random is not None
+        self._world.begin(chosen)
+        for row in np.flatnonzero(chosen):
+            self._task.begin(int(row), self._random[row])
+        self._commands[chosen] = self._drive.start
+        self._number[chosen], self._over[chosen] = 0, False
+        rows = chosen[:, None, None]
+        self._rest = np.where(rows, self._world.markers(), self._rest)
+        seen = self._cameras(chosen)
+        self._seen, self._before = np.where(rows, seen, self._seen), np.where(rows, seen, self._before)
+
+    def _cameras(self, chosen: NDArray[np.bool_]) -> FloatArray:
+        """(B, M, 3) what is seen of the markers [m], with noise in those of some of the robots."""
+        assert self._random is not None
+        found = self._world.markers().copy()
+        if self._noise:
+            for row in np.flatnonzero(chosen):
+                found[row] += self._noise * self._random[row].standard_normal(found[row].shape)
+        return found
+
+    @property
+    def _points(self) -> FloatArray:
+        """(B, 3) of the task, without noise of what is seen."""
+        return np.asarray(self._world.markers().reshape(self.num_envs, -1) @ self._tracked.T)
+
+    def _observed(self) -> Observation:
+        count, size = self.num_envs, self._task.size
+        off, moved = ((each / size).reshape(count, -1) for each in (self._seen - self._rest, self._seen - self._before))
+        drive = self._drive
+        told = 2.0 * (self._commands - drive.low) / (drive.high - drive.low) - 1.0
+        seen_points = self._seen.reshape(count, -1) @ self._tracked.T
+        task = self._task.observed(seen_points, self._number)
+        return np.concatenate([off, 5.0 * moved, told, task], axis=1).astype(np.float32)
+
+    @override
+    def step(
+        self, actions: NDArray[np.float32]
+    ) -> tuple[Observation, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+        """One action of each robot.
+
+        Args:
+            actions: (B, n) from -1 to 1.
+
+        Raises:
+            InputError: it was not reset before, or actions of another shape.
+        """
+        if self._random is None:
+            raise InputError("the environment was not reset: call env.reset(seed=...) before env.step(...).")
+        given, drive = np.asarray(actions, dtype=np.float64), self._drive
+        if given.shape != (self.num_envs, self._world.parts) or not np.isfinite(given).all():
+            raise InputError(
+                f"actions have shape {given.shape}: give finite ones of {(self.num_envs, self._world.parts)}, from -1 "
+                "to 1."
+            )
+        beginning = self._over.copy() if self._mode is AutoresetMode.NEXT_STEP else np.zeros_like(self._over)
+        if self._mode is AutoresetMode.DISABLED and self._over.any():
+            raise InputError("an episode is over: reset it with options={'reset_mask': ...} before the next step.")
+        wanted = drive.low + 0.5 * (np.clip(given, -1.0, 1.0) + 1.0) * (drive.high - drive.low)
+        most, last = drive.rate * self._world.time_step, self._commands.copy()
+        lost = np.zeros(self.num_envs, dtype=np.bool_)
+        for _ in range(drive.frames):
+            self._commands = self._commands + np.clip(wanted - self._commands, -most, most)
+            lost = self._world.step(self._commands)
+        self._number += 1
+        self._before, self._seen = self._seen, self._cameras(np.ones_like(lost))
+        points = self._points
+        rewards = self._task.reward(points, self._number)
+        changed = (self._commands - last) / (drive.high - drive.low)
+        rewards = rewards - _SMOOTH * np.square(changed).mean(axis=1)
+        rewards = np.where(lost, _LOST, rewards)
+        terminated, truncated = lost.copy(), (self._number >= self._length) & ~lost
+        infos: dict[str, Any] = {"error_mm": self._task.errors_mm(points, self._number)}
+        if beginning.any():
+            self._begin(beginning)
+            rewards = np.where(beginning, 0.0, rewards)
+            terminated, truncated = terminated & ~beginning, truncated & ~beginning
+        self._over = terminated | truncated
+        if self._mode is AutoresetMode.SAME_STEP and self._over.any():
+            over, last_seen = self._over.copy(), self._observed()
+            final = np.empty(self.num_envs, dtype=object)
+            for row in np.flatnonzero(over):
+                final[row] = last_seen[row]
+            infos |= {"final_obs": final, "_final_obs": over}
+            infos |= {"final_info": {"error_mm": infos["error_mm"], "_error_mm": over}, "_final_info": over}
+            self._begin(over)
+        return self._observed(), rewards, terminated, truncated, infos

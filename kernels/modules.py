@@ -1,13 +1,33 @@
 """Where kernels are compiled: one Warp module a part, so that a run compiles what it launches."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from threading import Lock
 from typing import Any
 
 import warp as wp
+
+_SETTINGS = Lock()  # Warp has them for the whole process.
 
 
 def decorators(part: str = "") -> tuple[Callable[..., Any], Callable[..., Any]]:
     """``wp.kernel`` and ``wp.func`` for a part's module; nothing is differentiated by Warp itself."""
     module = f"warp_resphys.{part}" if part else "warp_resphys"
     return functools.partial(wp.kernel, module=module, enable_backward=False), functools.partial(wp.func, module=module)
+
+
+@contextmanager
+def shareable() -> Iterator[None]:
+    """Warp modules that are loaded meanwhile may be launched by several threads at once, on a CPU.
+
+    Otherwise every launch would register the place of its tiles, which these kernels do not use, in a variable that
+    all threads share.
+    """
+    with _SETTINGS:
+        before = wp.config.enable_tiles_in_stack_memory
+        wp.config.enable_tiles_in_stack_memory = False
+        try:
+            yield
+        finally:
+            wp.config.enable_tiles_in_stack_memory = before

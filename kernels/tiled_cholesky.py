@@ -4,24 +4,194 @@ A matrix of n unknowns is stored by rows: row i holds the W + 1 tiles of T colum
 that entry (i, j) of the lower triangle is at column (j // T - i // T + W) T + j % T. Tiles left of the first column,
 and what lies above the diagonal, are never read. In the last tiles, what is beyond n is a unit matrix.
 
-The factorisation is the left-looking one by rows of tiles (Golub and Van Loan 2013, section 4.2.9).
+The factorisation is the left-looking one by columns of tiles (Golub and Van Loan 2013, section 4.2.9). In place of a
+diagonal tile of the factor its inverse is kept: a sweep multiplies by it where substitution would wait for one row
+after another.
+
+Threads of a block have to share tiles and to wait for one another in between. Warp's own tiles do that too, through
+libraries whose compilation takes two minutes for every type; here it is a few lines of C++ that a CPU, on which a block
+is one thread, compiles as well.
 """
 
 import functools
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Final
 
 import warp as wp
 
 from .modules import decorators
 from .reductions import block_max
 
+TILE: Final = 16  # rows and columns of a tile
+BLOCK: Final = 128  # threads that share a matrix, on a GPU
+
+T = wp.constant(TILE)
+
+_SHARED: Final = f"""
+    constexpr int T = {TILE};
+#if defined(__CUDA_ARCH__)
+    #define RESPHYS_SHARED __shared__
+    #define RESPHYS_SYNC __syncthreads();
+    constexpr int LANES = {BLOCK};  // The block's; Q of them work on a row of a tile.
+    constexpr int Q = LANES / T;
+    const int lane = threadIdx.x;
+    #define RESPHYS_SUM(v) for (int o = Q / 2; o > 0; o /= 2) v += __shfl_xor_sync(0xffffffffu, v, o);
+#else
+    #define RESPHYS_SHARED
+    #define RESPHYS_SYNC
+    constexpr int LANES = 1;
+    constexpr int Q = 1;
+    const int lane = 0;
+    #define RESPHYS_SUM(v)
+#endif
+"""
+
+_FACTOR: Final = (
+    _SHARED
+    + """
+    using S = SCALAR;
+    constexpr int V = 16 / sizeof(S);
+    struct alignas(16) Some { S v[V]; };
+    RESPHYS_SHARED S pivot[T][T + 1];
+    RESPHYS_SHARED S inverse[T][T + 1];
+    S* const all = matrix.data;
+    const int stride = matrix.shape[1], tiles = matrix.shape[0] / T, width = stride / T - 1;
+    for (int j = 0; j < tiles; ++j) {
+        const int below = (tiles - j - 1 < width ? tiles - j - 1 : width);  // tiles of this column under the diagonal
+        // What the columns before leave of this one, in pieces of 4 x 4 entries.
+        for (int piece = lane; piece < (below + 1) * 16; piece += LANES) {
+            const int i = j + piece / 16, r = piece % 16 / 4 * 4, c = piece % 4 * 4;
+            if (i == j && c > r) continue;
+            const int first = (i > width ? i - width : 0);
+            const S* a = all + (i * T + r) * stride + (first - i + width) * T;
+            const S* b = all + (j * T + c) * stride + (first - j + width) * T;
+            S sum[4][4] = {};
+            for (int k = 0; k < (j - first) * T; k += V) {
+                Some x[4], y[4];
+                for (int m = 0; m < 4; ++m) {
+                    x[m] = *reinterpret_cast<const Some*>(a + m * stride + k);
+                    y[m] = *reinterpret_cast<const Some*>(b + m * stride + k);
+                }
+                for (int v = 0; v < V; ++v)
+                    for (int m = 0; m < 4; ++m)
+                        for (int n = 0; n < 4; ++n) sum[m][n] += x[m].v[v] * y[n].v[v];
+            }
+            S* out = all + (i * T + r) * stride + (j - i + width) * T + c;
+            for (int m = 0; m < 4; ++m)
+                for (int n = 0; n < 4; ++n) out[m * stride + n] -= sum[m][n];
+        }
+        RESPHYS_SYNC
+        // The diagonal tile as L D L^T, and the inverse of L with it.
+        S* const diagonal = all + j * T * stride + width * T;
+        for (int e = lane; e < T * T; e += LANES) {
+            const int r = e / T, c = e % T;
+            pivot[r][c] = diagonal[r * stride + c];
+            inverse[r][c] = S(r == c);
+        }
+        RESPHYS_SYNC
+        for (int p = 0; p < T - 1; ++p) {
+            const S over = S(1) / pivot[p][p];
+            for (int e = lane; e < T * T; e += LANES) {
+                const int r = e / T, c = e % T;
+                if (r <= p) continue;
+                const S factor = pivot[r][p] * over;
+                if (c > p && c <= r) pivot[r][c] -= factor * pivot[c][p];
+                if (c <= p) inverse[r][c] -= factor * inverse[p][c];
+            }
+            RESPHYS_SYNC
+        }
+        for (int e = lane; e < T * T; e += LANES) {
+            const int r = e / T, c = e % T;
+            const S d = pivot[r][r];
+            inverse[r][c] *= (d > S(0) ? S(1) / sqrt(d) : S(0) / S(0));
+            diagonal[r * stride + c] = inverse[r][c];
+        }
+        RESPHYS_SYNC
+        // The rows under it.
+        for (int e = lane; e < below * T; e += LANES) {
+            const int i = j + 1 + e / T;
+            S* row = all + (i * T + e % T) * stride + (j - i + width) * T;
+            S x[T];
+            for (int c = 0; c < T; ++c) x[c] = row[c];
+            for (int c = 0; c < T; ++c) {
+                S sum = S(0);
+                for (int m = 0; m <= c; ++m) sum += x[m] * inverse[c][m];
+                row[c] = sum;
+            }
+        }
+        RESPHYS_SYNC
+    }
+"""
+)
+
+_SOLVE: Final = (
+    _SHARED
+    + """
+    using S = SCALAR;
+    RESPHYS_SHARED S rest[T];
+    const S* const all = factor.data;
+    S* const x = column.data;
+    const int n = column.shape[0];
+    const int stride = factor.shape[1], tiles = factor.shape[0] / T, width = stride / T - 1;
+    const int h = lane % Q;
+    for (int i = 0; i < tiles; ++i) {
+        const int first = (i > width ? i - width : 0) * T;
+        for (int r = lane / Q; r < T; r += LANES / Q) {
+            const S* row = all + (i * T + r) * stride + (width - i) * T;
+            S sum = S(0);
+            for (int c = first + h; c < i * T; c += Q) sum += row[c] * x[c];
+            RESPHYS_SUM(sum)
+            if (h == 0) rest[r] = (i * T + r < n ? x[i * T + r] - sum : S(0));
+        }
+        RESPHYS_SYNC
+        for (int r = lane / Q; r < T; r += LANES / Q) {
+            const S* inverse = all + (i * T + r) * stride + width * T;
+            S sum = S(0);
+            for (int c = h; c <= r; c += Q) sum += inverse[c] * rest[c];
+            RESPHYS_SUM(sum)
+            if (h == 0 && i * T + r < n) x[i * T + r] = sum;
+        }
+        RESPHYS_SYNC
+    }
+    for (int i = tiles - 1; i >= 0; --i) {
+        const int first = (i > width ? i - width : 0) * T;
+        for (int c = lane / Q; c < T; c += LANES / Q) {
+            const S* inverse = all + i * T * stride + width * T + c;
+            S sum = S(0);
+            for (int r = h; r < T; r += Q)
+                if (r >= c && i * T + r < n) sum += inverse[r * stride] * x[i * T + r];
+            RESPHYS_SUM(sum)
+            if (h == 0) rest[c] = sum;
+        }
+        RESPHYS_SYNC
+        for (int c = lane; c < T; c += LANES)
+            if (i * T + c < n) x[i * T + c] = rest[c];
+        for (int c = first + lane; c < i * T; c += LANES) {
+            const S* over = all + i * T * stride + (width - i) * T + c;
+            S sum = S(0);
+            for (int r = 0; r < T; ++r) sum += over[r * stride] * rest[r];
+            x[c] -= sum;
+        }
+        RESPHYS_SYNC
+    }
+"""
+)
+
 
 @functools.cache
-def tiled_kernels(tile: int, width: int, scalar: Any) -> SimpleNamespace:
-    """Kernels for tiles of T x T numbers of a type, W of them left of the diagonal one."""
-    kernel, _ = decorators(f"tiles.{tile}.{width}.{scalar.__name__}")
-    T, W = wp.constant(tile), wp.constant(width)  # noqa: N806
+def tiled_kernels(scalar: Any) -> SimpleNamespace:
+    """Kernels for numbers of a type, in blocks of ``BLOCK`` threads."""
+    kernel, _ = decorators(f"tiles.{scalar.__name__}")
+    of_type = {"SCALAR": "double" if scalar is wp.float64 else "float"}
+
+    def native(snippet: str) -> Any:
+        return wp.func_native(snippet.replace("SCALAR", of_type["SCALAR"]))
+
+    @native(_FACTOR)
+    def factorise(matrix: wp.array2d[scalar]): ...
+
+    @native(_SOLVE)
+    def substitute(factor: wp.array2d[scalar], column: wp.array[scalar]): ...
 
     @kernel
     def clear(
@@ -43,15 +213,16 @@ def tiled_kernels(tile: int, width: int, scalar: Any) -> SimpleNamespace:
         b, lane = wp.tid()
         if idle[b]:
             return
+        last = factors.shape[2] - T  # where the diagonal tiles begin
         bad = wp.float64(0.0)
         for i in range(lane, factors.shape[1], wp.block_dim()):
-            if not factors[b, i, W * T + i % T] > scalar(0.0):
+            if not factors[b, i, last + i % T] > scalar(0.0):
                 bad = wp.float64(1.0)
         failed = block_max(bad) > wp.float64(0.0)
         again = failed and not clamped[b]
         if failed and not again:
             for i in range(lane, factors.shape[1], wp.block_dim()):
-                factors[b, i, W * T + i % T] = scalar(wp.nan)
+                factors[b, i, last + i % T] = scalar(wp.nan)
         if lane == 0:
             idle[b] = not again
 
@@ -61,22 +232,8 @@ def tiled_kernels(tile: int, width: int, scalar: Any) -> SimpleNamespace:
         matrices: wp.array3d[scalar],  # (B, n rounded up to tiles, (W + 1) T) overwritten by the factors
     ):
         b, _ = wp.tid()
-        if idle[b]:
-            return
-        a = matrices[b]
-        for i in range(a.shape[0] / T):
-            for j in range(wp.max(0, i - W), i + 1):
-                rest = wp.tile_load(a, shape=(T, T), offset=(i * T, (j - i + W) * T), storage="shared")
-                for k in range(wp.max(0, i - W), j):
-                    row = wp.tile_load(a, shape=(T, T), offset=(i * T, (k - i + W) * T), storage="shared")
-                    column = wp.tile_load(a, shape=(T, T), offset=(j * T, (k - j + W) * T), storage="shared")
-                    wp.tile_matmul(row, wp.tile_transpose(column), rest, alpha=-1.0)
-                if j < i:
-                    diagonal = wp.tile_load(a, shape=(T, T), offset=(j * T, W * T), storage="shared")
-                    found = wp.tile_lower_solve(diagonal, wp.tile_transpose(rest))
-                    wp.tile_store(a, wp.tile_transpose(found), offset=(i * T, (j - i + W) * T))
-                else:
-                    wp.tile_store(a, wp.tile_cholesky(rest), offset=(i * T, W * T))
+        if not idle[b]:
+            factorise(matrices[b])
 
     @kernel
     def solve(
@@ -85,32 +242,6 @@ def tiled_kernels(tile: int, width: int, scalar: Any) -> SimpleNamespace:
     ):
         """By forward and backward substitution, one block a right-hand side."""
         b, m, _ = wp.tid()
-        a = factors[wp.min(b, factors.shape[0] - 1)]
-        x = columns[b, m]
-        tiles = a.shape[0] / T
-        for i in range(tiles):
-            rest = wp.tile_load(x, shape=T, offset=i * T, storage="shared")
-            for k in range(wp.max(0, i - W), i):
-                row = wp.tile_load(a, shape=(T, T), offset=(i * T, (k - i + W) * T), storage="shared")
-                known = wp.tile_load(x, shape=T, offset=k * T, storage="shared")
-                wp.tile_matmul(
-                    row, wp.tile_reshape(known, shape=(T, 1)), wp.tile_reshape(rest, shape=(T, 1)), alpha=-1.0
-                )
-            diagonal = wp.tile_load(a, shape=(T, T), offset=(i * T, W * T), storage="shared")
-            wp.tile_store(x, wp.tile_lower_solve(diagonal, rest), offset=i * T)
-        for r in range(tiles):
-            i = tiles - 1 - r
-            rest = wp.tile_load(x, shape=T, offset=i * T, storage="shared")
-            for k in range(i + 1, wp.min(tiles, i + W + 1)):
-                column = wp.tile_load(a, shape=(T, T), offset=(k * T, (i - k + W) * T), storage="shared")
-                known = wp.tile_load(x, shape=T, offset=k * T, storage="shared")
-                wp.tile_matmul(
-                    wp.tile_transpose(column),
-                    wp.tile_reshape(known, shape=(T, 1)),
-                    wp.tile_reshape(rest, shape=(T, 1)),
-                    alpha=-1.0,
-                )
-            diagonal = wp.tile_load(a, shape=(T, T), offset=(i * T, W * T), storage="shared")
-            wp.tile_store(x, wp.tile_upper_solve(wp.tile_transpose(diagonal), rest), offset=i * T)
+        substitute(factors[wp.min(b, factors.shape[0] - 1)], columns[b, m])
 
     return SimpleNamespace(clear=clear, factor=factor, check=check, solve=solve)

@@ -10,7 +10,7 @@ import warp as wp
 from ..energies.launcher import Launches, issue, warp_view
 from ..energies.potential import IncrementalPotential
 from ..kernels import minimisation as kernels
-from ..linalg.tiled import TiledSolver, alone
+from ..linalg.tiled import TiledSolver
 from .hessian import ExactHessian, HessianApproximation
 from .recorded_factors import RecordedFactors
 
@@ -184,8 +184,7 @@ class Minimiser:
             self._pair_counts.zero_()
         if self._loop is not None:
             p.positions.copy_(start)
-            with alone(p.device):
-                p.launch(self._loop)
+            p.launch(self._loop)
             return
         if not self._hessian.ready():
             self._counts["factored"].zero_()

@@ -1,7 +1,6 @@
 """Warp launches on torch's memory, recorded once and made as often as needed."""
 
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from threading import Lock
 from typing import Any
 
@@ -12,8 +11,8 @@ from numpy.typing import NDArray
 
 from ..io.kernel_cache import ensure_kernel_cache
 from ..kernels import points
+from ..kernels.modules import shareable
 
-_SETTINGS = Lock()  # Warp has them for the whole process.
 _CAPTURES = Lock()  # Warp captures what any thread launches: simulators are to be used by one thread while one is new.
 BLOCK = 128  # threads of a GPU that work on one environment
 
@@ -23,22 +22,6 @@ ensure_kernel_cache()  # Before Warp is first used, by this package or by who im
 def warp_view(tensor: torch.Tensor, dtype: Any) -> Any:
     """A Warp array on a tensor's own memory, without a gradient."""
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
-
-
-@contextmanager
-def shareable() -> Iterator[None]:
-    """Warp modules that are loaded meanwhile may be launched by several threads at once, on a CPU.
-
-    Otherwise every launch would register the place of its tiles, which these kernels do not use, in a variable that
-    all threads share.
-    """
-    with _SETTINGS:
-        before = wp.config.enable_tiles_in_stack_memory
-        wp.config.enable_tiles_in_stack_memory = False
-        try:
-            yield
-        finally:
-            wp.config.enable_tiles_in_stack_memory = before
 
 
 class Launcher:

@@ -12,12 +12,13 @@ import torch
 from numpy.typing import NDArray
 
 from ..io.errors import InputError
+from ..kernels.tiled_cholesky import TILE
 from .banded import BandedSolver
 from .dense import DenseSolver
 from .linear_solver import Indices, LinearSolver, bandwidth_reducing_order
 from .multigrid import MultigridSolver
 from .sparse import SparseSolver
-from .tiled import TILE, TiledSolver
+from .tiled import TiledSolver
 
 LINEAR_SOLVERS = ("auto", "banded", "tiled", "dense", "sparse", "multigrid")
 DEAREST_BAND = 4e10  # multiplications of a banded factor on a CPU, beyond which multigrid is the cheaper one

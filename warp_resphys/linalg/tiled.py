@@ -1,7 +1,5 @@
 """Banded Cholesky by blocks of threads: for batches of slender bodies on a GPU, each with a factor of its own."""
 
-from contextlib import AbstractContextManager, nullcontext
-from threading import Lock
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,18 +9,10 @@ import warp as wp
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from ..kernels.tiled_cholesky import tiled_kernels
+from ..kernels.modules import shareable
+from ..kernels.tiled_cholesky import BLOCK, TILE, tiled_kernels
 from .dense import DenseFactor
 from .linear_solver import Factor, Indices, LinearSolver, bandwidth_reducing_order
-
-TILE = 16  # rows and columns of a tile
-BLOCK = 64  # threads that share a matrix
-_ONE_AT_A_TIME = Lock()
-
-
-def alone(device: torch.device) -> AbstractContextManager[object]:
-    """To be held while kernels with tiles run: on a CPU all threads share the place of these."""
-    return _ONE_AT_A_TIME if device.type == "cpu" else nullcontext()
 
 
 class TiledSolver(LinearSolver):
@@ -54,7 +44,7 @@ class TiledSolver(LinearSolver):
         self.dofs = self.unknowns
         self.places = torch.argsort(self.dofs)
         self.scalar = wp.float64 if self.dtype == torch.float64 else wp.float32
-        self.kernels = tiled_kernels(TILE, self.width, self.scalar)
+        self.kernels = tiled_kernels(self.scalar)
 
     @override
     def _factorise(
@@ -76,17 +66,17 @@ class TiledSolver(LinearSolver):
         return failed
 
     def launch(self, kernel: Any, blocks: tuple[int, ...], *arrays: torch.Tensor) -> None:
-        """Launches on torch's stream; on a CPU one at a time, as all threads share the place of tiles there."""
+        """Launches on torch's stream."""
         stream = None
         if self.device.type == "cuda":
             stream = wp.stream_from_torch(torch.cuda.current_stream(self.device))
-        with alone(self.device):
-            self._record(kernel, blocks, *arrays).launch(stream)
+        self._record(kernel, blocks, *arrays).launch(stream)
 
     def _record(self, kernel: Any, blocks: tuple[int, ...], *arrays: torch.Tensor) -> Any:
         views = [wp.from_torch(each, requires_grad=False) for each in arrays]
         options = {"block_dim": BLOCK, "device": str(self.device), "record_cmd": True}
-        return wp.launch_tiled(kernel, dim=list(blocks), inputs=views, **options)
+        with shareable():
+            return wp.launch_tiled(kernel, dim=list(blocks), inputs=views, **options)
 
     def record_factor(self, values: torch.Tensor, idle: torch.Tensor, clamped: torch.Tensor) -> SimpleNamespace:
         """Launches ``clear``, ``factor`` and ``check`` on a value array (B, n_values); see ``kernels.tiled_cholesky``.

@@ -42,6 +42,33 @@ def cell_blocks(
             blocks_out[b, first + c] = block
 
 
+@kernel
+def cell_pair_blocks(
+    idle: wp.array[int],  # (B) not zero where nothing is to be done
+    gradients: wp.array2d[wp.vec3d],
+    points_per_cell: int,
+    tangent_point: wp.array3d[wp.mat33d],  # (B, P, 6)
+    pairs: wp.array2d[int],  # (K (K + 1) / 2, 2) rows a >= columns c
+    block_offset: int,
+    blocks_out: wp.array2d[wp.mat33d],
+):
+    """What `cell_blocks` finds, a thread a block: more arithmetic, and every block is written once."""
+    b, cell, pair = wp.tid()
+    if idle[b] != 0:
+        return
+    a, c = pairs[pair, 0], pairs[pair, 1]
+    total = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
+    for q in range(points_per_cell):
+        p = cell * points_per_cell + q
+        g, h = gradients[p, a], gradients[p, c]
+        t = tangent_point[b, p]
+        total += (g[0] * h[0]) * t[0] + (g[1] * h[1]) * t[2] + (g[2] * h[2]) * t[5]
+        total += (g[1] * h[0]) * t[1] + (g[0] * h[1]) * wp.transpose(t[1])
+        total += (g[2] * h[0]) * t[3] + (g[0] * h[2]) * wp.transpose(t[3])
+        total += (g[2] * h[1]) * t[4] + (g[1] * h[2]) * wp.transpose(t[4])
+    blocks_out[b, block_offset + cell * pairs.shape[0] + pair] = total
+
+
 @functools.cache
 def scatter_kernel(scalar: Any) -> Any:
     """`scatter_blocks` into values of a type, ``wp.float64`` or ``wp.float32``."""

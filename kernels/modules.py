@@ -1,4 +1,4 @@
-"""Where kernels are compiled: one Warp module a part, so that a run compiles what it launches."""
+"""Where kernels are compiled, one Warp module a part, so that a run compiles what it launches; and where they run."""
 
 import functools
 from collections.abc import Callable, Iterator
@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from threading import Lock
 from typing import Any
 
+import torch
 import warp as wp
 
 _SETTINGS = Lock()  # Warp has them for the whole process.
@@ -31,3 +32,19 @@ def shareable() -> Iterator[None]:
             yield
         finally:
             wp.config.enable_tiles_in_stack_memory = before
+
+
+def launch_stream(device: torch.device) -> Any:
+    """Torch's current stream, for launches by Warp; None on a CPU."""
+    if device.type == "cpu":
+        return None
+    handle = torch.cuda.current_stream(device).cuda_stream
+    own = wp.get_device(str(device)).stream
+    # Torch may work on Warp's own stream, which a second object for it would take from Warp when it goes.
+    return own if handle == own.cuda_stream else _stream(str(device), handle)
+
+
+@functools.cache
+def _stream(device: str, handle: int) -> Any:
+    """Kept, as Warp forgets a stream of torch's with its object, and torch uses few of them again and again."""
+    return wp.Stream(device, cuda_stream=handle)

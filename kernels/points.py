@@ -76,6 +76,40 @@ def gather(
 
 
 @kernel
+def cell_forces(
+    gradients: wp.array2d[wp.vec3d],  # (P, K)
+    points_per_cell: int,
+    stress: wp.array2d[wp.mat33d],
+    force_out: wp.array2d[wp.vec3d],  # (B, C K) [N]
+):
+    """The transposed operator of the stress, by cell and local node: what `gather_cells` sums."""
+    b, entry = wp.tid()
+    k = gradients.shape[1]
+    cell = entry / k
+    a = entry - cell * k
+    total = wp.vec3d(ZERO, ZERO, ZERO)
+    for q in range(points_per_cell):
+        p = cell * points_per_cell + q
+        total += stress[b, p] * gradients[p, a]
+    force_out[b, entry] = total
+
+
+@kernel
+def gather_cells(
+    incident_start: wp.array[int],
+    incident: wp.array[int],
+    cell_force: wp.array2d[wp.vec3d],  # (B, C K) [N]
+    force_out: wp.array2d[wp.vec3d],  # (B, N) [N] has them added
+):
+    """Adds what `cell_forces` has found to the force of every vertex."""
+    b, i = wp.tid()
+    total = force_out[b, i]
+    for entry in range(incident_start[i], incident_start[i + 1]):
+        total += cell_force[b, incident[entry]]
+    force_out[b, i] = total
+
+
+@kernel
 def inertia_residual(
     inertia: wp.array2d[wp.float64],  # (B, N) [N/m] mass over the square of the effective time step
     target: wp.array2d[wp.vec3d],  # (B, N) [m] where inertia alone would take the vertex

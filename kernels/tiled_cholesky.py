@@ -36,6 +36,7 @@ _SHARED: Final = f"""
     constexpr int Q = LANES / T;
     const int lane = threadIdx.x;
     #define RESPHYS_SUM(v) for (int o = Q / 2; o > 0; o /= 2) v += __shfl_xor_sync(0xffffffffu, v, o);
+    #define RESPHYS_ANY(v) __syncthreads_or(v)
 #else
     #define RESPHYS_SHARED
     #define RESPHYS_SYNC
@@ -43,6 +44,7 @@ _SHARED: Final = f"""
     constexpr int Q = 1;
     const int lane = 0;
     #define RESPHYS_SUM(v)
+    #define RESPHYS_ANY(v) (v)
 #endif
 """
 
@@ -52,8 +54,8 @@ _FACTOR: Final = (
     using S = SCALAR;
     constexpr int V = 16 / sizeof(S);
     struct alignas(16) Some { S v[V]; };
-    RESPHYS_SHARED S pivot[T][T + 1];
-    RESPHYS_SHARED S inverse[T][T + 1];
+    RESPHYS_SHARED alignas(16) S pivot[T][T + V];
+    RESPHYS_SHARED alignas(16) S inverse[T][T + V];
     S* const all = matrix.data;
     const int stride = matrix.shape[1], tiles = matrix.shape[0] / T, width = stride / T - 1;
     for (int j = 0; j < tiles; ++j) {
@@ -66,15 +68,18 @@ _FACTOR: Final = (
             const S* a = all + (i * T + r) * stride + (first - i + width) * T;
             const S* b = all + (j * T + c) * stride + (first - j + width) * T;
             S sum[4][4] = {};
-            for (int k = 0; k < (j - first) * T; k += V) {
-                Some x[4], y[4];
-                for (int m = 0; m < 4; ++m) {
-                    x[m] = *reinterpret_cast<const Some*>(a + m * stride + k);
-                    y[m] = *reinterpret_cast<const Some*>(b + m * stride + k);
+            for (const S* end = a + (j - first) * T; a < end; a += T, b += T) {
+                #pragma unroll 2
+                for (int k = 0; k < T; k += V) {
+                    Some x[4], y[4];
+                    for (int m = 0; m < 4; ++m) {
+                        x[m] = *reinterpret_cast<const Some*>(a + m * stride + k);
+                        y[m] = *reinterpret_cast<const Some*>(b + m * stride + k);
+                    }
+                    for (int v = 0; v < V; ++v)
+                        for (int m = 0; m < 4; ++m)
+                            for (int n = 0; n < 4; ++n) sum[m][n] += x[m].v[v] * y[n].v[v];
                 }
-                for (int v = 0; v < V; ++v)
-                    for (int m = 0; m < 4; ++m)
-                        for (int n = 0; n < 4; ++n) sum[m][n] += x[m].v[v] * y[n].v[v];
             }
             S* out = all + (i * T + r) * stride + (j - i + width) * T + c;
             for (int m = 0; m < 4; ++m)
@@ -134,6 +139,9 @@ _SOLVE: Final = (
     const int n = column.shape[0];
     const int stride = factor.shape[1], tiles = factor.shape[0] / T, width = stride / T - 1;
     const int h = lane % Q;
+    int some = 0;
+    for (int c = lane; c < n; c += LANES) some |= (x[c] != S(0));
+    if (!RESPHYS_ANY(some)) return;  // Of an environment that needs no direction.
     for (int i = 0; i < tiles; ++i) {
         const int first = (i > width ? i - width : 0) * T;
         for (int r = lane / Q; r < T; r += LANES / Q) {
@@ -199,9 +207,11 @@ def tiled_kernels(scalar: Any) -> SimpleNamespace:
         unit: wp.array[scalar],  # (n rounded up to tiles times (W + 1) T) zero, but for one beyond n on the diagonal
         matrices: wp.array2d[scalar],  # (B, as many)
     ):
-        b, k = wp.tid()
+        """A whole block for what stays is cheaper than a thread for each of its numbers."""
+        b, lane = wp.tid()
         if not idle[b]:
-            matrices[b, k] = unit[k]
+            for k in range(lane, unit.shape[0], wp.block_dim()):
+                matrices[b, k] = unit[k]
 
     @kernel
     def check(

@@ -94,13 +94,14 @@ class HessianAssembly:
         self._overwritten = solver.overwrites
         commands = []
         for s, offset in zip(p.sets, pattern.offsets, strict=True):
-            inputs = [idle, s.gradients, s.points_per_cell]
-            inputs += [p.points_view(p.tangent, s.part, wp.mat33d), offset]
-            commands.append(
-                p.record(
-                    kernels.cell_blocks, (p.batch, s.cells, s.nodes_per_cell), inputs, [warp_view(blocks, wp.mat33d)]
-                )
-            )
+            inputs = [idle, s.gradients, s.points_per_cell, p.points_view(p.tangent, s.part, wp.mat33d)]
+            kernel, threads = kernels.cell_blocks, s.nodes_per_cell
+            if p.by_cells:
+                pairs = np.stack(np.tril_indices(s.nodes_per_cell), axis=1).astype(np.int32)
+                kernel, threads = kernels.cell_pair_blocks, len(pairs)
+                inputs.append(p.upload(pairs, int))
+            out = [warp_view(blocks, wp.mat33d)]
+            commands.append(p.record(kernel, (p.batch, s.cells, threads), [*inputs, offset], out))
         inputs = [
             idle,
             p.upload(pattern.start.astype(np.int32), int),

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from ..io.kernel_cache import ensure_kernel_cache
 from ..kernels import points
-from ..kernels.modules import shareable
+from ..kernels.modules import launch_stream, shareable
 
 _CAPTURES = Lock()  # Warp captures what any thread launches: simulators are to be used by one thread while one is new.
-BLOCK = 128  # threads of a GPU that work on one environment
+BLOCK = 128  # threads of a block on a GPU; of one kernel for all, as a module is compiled for each number of them
 
 ensure_kernel_cache()  # Before Warp is first used, by this package or by who imports it.
 
@@ -32,9 +32,11 @@ class Launcher:
         device: of every buffer.
     """
 
+    by_cells = False  # whether threads work on a cell's nodes and pairs of nodes one by one, which a GPU has enough of
+
     def __init__(self, batch: int, device: torch.device) -> None:
         self.batch, self.device = batch, device
-        self._stream: tuple[torch.cuda.Stream, Any] | None = None
+        self.by_cells = self.by_cells or device.type == "cuda"
 
     def zeros(self, *shape: int) -> torch.Tensor:
         """(B, *shape) on the launcher's device."""
@@ -50,19 +52,31 @@ class Launcher:
 
     def record(self, kernel: Any, dim: tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> Any:
         """A launch to be made by `launch`, as often as needed."""
+        options: dict[str, Any] = {"block_dim": BLOCK, "device": str(self.device), "record_cmd": True}
         with shareable():
-            return wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=str(self.device), record_cmd=True)
+            return wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, **options)
 
     def record_blocks(self, kernel: Any, blocks: int, inputs: list[Any], outputs: list[Any]) -> Any:
         """A launch by blocks of threads that work together, on a CPU of one thread each."""
-        options = {"block_dim": BLOCK, "device": str(self.device), "record_cmd": True}
+        options: dict[str, Any] = {"block_dim": BLOCK, "device": str(self.device), "record_cmd": True}
         with shareable():
             return wp.launch_tiled(kernel, dim=[blocks], inputs=inputs, outputs=outputs, **options)
 
     def gather(self, s: Any, stress: Any, out: torch.Tensor) -> Any:
-        """A launch that adds the transposed operator of a set's stress, a view (B, P) mat33, to (B, N, 3)."""
-        inputs = [s.nodes, s.gradients, s.points_per_cell, s.start, s.incident, stress]
-        return self.record(points.gather, (self.batch, out.shape[1]), inputs, [warp_view(out, wp.vec3d)])
+        """A launch that adds the transposed operator of a set's stress, a view (B, P) mat33, to (B, N, 3).
+
+        Two on a GPU, where a cell's threads read its stress once for all of its nodes.
+        """
+        to = [warp_view(out, wp.vec3d)]
+        if not self.by_cells:
+            inputs = [s.nodes, s.gradients, s.points_per_cell, s.start, s.incident, stress]
+            return self.record(points.gather, (self.batch, out.shape[1]), inputs, to)
+        forces = [warp_view(self.zeros(s.cells * s.nodes_per_cell, 3), wp.vec3d)]
+        cells = (self.batch, s.cells * s.nodes_per_cell)
+        return Several(
+            self.record(points.cell_forces, cells, [s.gradients, s.points_per_cell, stress], forces),
+            self.record(points.gather_cells, (self.batch, out.shape[1]), [s.start, s.incident, *forces], to),
+        )
 
     def product(self, s: Any, tangent: Any, direction: Any, stress: Any) -> Any:
         """A launch of a set's stress (B, P) from its tangent (B, P, 6) mat33 and a direction (B, N) vec3, all views."""
@@ -86,14 +100,7 @@ class Launcher:
 
     def launch(self, *commands: Any) -> None:
         """Makes recorded launches, on torch's stream."""
-        if self.device.type == "cpu":
-            for command in commands:
-                command.launch()
-            return
-        handle = torch.cuda.current_stream(self.device)
-        if self._stream is None or self._stream[0] != handle:
-            self._stream = (handle, wp.stream_from_torch(handle))
-        stream = self._stream[1]
+        stream = launch_stream(self.device)
         for command in commands:
             command.launch(stream)
 
@@ -101,7 +108,7 @@ class Launcher:
 def issue(*commands: Any) -> None:
     """Makes recorded launches one by one, captured ones too: into the graph that is being captured."""
     for command in commands:
-        if isinstance(command, Launches):
+        if isinstance(command, Launches | Several):
             issue(*command.commands)
         else:
             command.launch()
@@ -116,3 +123,15 @@ class Launches:
     def launch(self, stream: Any = None) -> None:
         """All of them, in their order."""
         wp.capture_launch(self._graph, stream)
+
+
+class Several:
+    """Recorded launches that are made like one."""
+
+    def __init__(self, *commands: Any) -> None:
+        self.commands = commands
+
+    def launch(self, stream: Any = None) -> None:
+        """All of them, in their order."""
+        for command in self.commands:
+            command.launch(stream)

@@ -9,7 +9,7 @@ import warp as wp
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from ..kernels.modules import shareable
+from ..kernels.modules import launch_stream, shareable
 from ..kernels.tiled_cholesky import BLOCK, TILE, tiled_kernels
 from .dense import DenseFactor
 from .linear_solver import Factor, Indices, LinearSolver, bandwidth_reducing_order
@@ -67,10 +67,7 @@ class TiledSolver(LinearSolver):
 
     def launch(self, kernel: Any, blocks: tuple[int, ...], *arrays: torch.Tensor) -> None:
         """Launches on torch's stream."""
-        stream = None
-        if self.device.type == "cuda":
-            stream = wp.stream_from_torch(torch.cuda.current_stream(self.device))
-        self._record(kernel, blocks, *arrays).launch(stream)
+        self._record(kernel, blocks, *arrays).launch(launch_stream(self.device))
 
     def _record(self, kernel: Any, blocks: tuple[int, ...], *arrays: torch.Tensor) -> Any:
         views = [wp.from_torch(each, requires_grad=False) for each in arrays]
@@ -89,17 +86,8 @@ class TiledSolver(LinearSolver):
         batch, unit = len(values), torch.zeros(self.n_values, device=self.device, dtype=self.dtype)
         unit[self._padding] = 1.0
         tiles = values.view(-1, *self.shape)
-        views = [wp.from_torch(each, requires_grad=False) for each in (idle, unit, values)]
-        clear = wp.launch(
-            self.kernels.clear,
-            dim=tuple(values.shape),
-            inputs=views,
-            block_dim=BLOCK,  # of the module's other kernels, which would be compiled for another one again
-            device=str(self.device),
-            record_cmd=True,
-        )
         return SimpleNamespace(
-            clear=clear,
+            clear=self._record(self.kernels.clear, (batch,), idle, unit, values),
             factor=self._record(self.kernels.factor, (batch,), idle, tiles),
             check=self._record(self.kernels.check, (batch,), clamped, idle, tiles),
         )

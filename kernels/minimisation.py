@@ -294,13 +294,14 @@ def compare(
 
 
 @kernel
-def summarise(progress: Progress, summary_out: wp.array[int]):
-    """What the host has to know, by the one block of the launch: `dynamics.minimiser`."""
+def summarise(progress: Progress, summary_out: wp.array[int], asleep_out: wp.array[int]):
+    """What the host has to know, by the one block of the launch, and (B) who needs no further evaluation."""
     _, lane = wp.tid()
     active, aiming = wp.float64(0.0), wp.float64(0.0)
     wanting, asking = wp.float64(0.0), wp.float64(0.0)
     for b in range(lane, progress.phase.shape[0], wp.block_dim()):
         asking += wp.float64(progress.asks[b])
+        asleep_out[b] = int(progress.phase[b] >= DONE)
         if progress.phase[b] < DONE:
             active += ONE
         if progress.phase[b] == AIMS:

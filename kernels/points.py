@@ -77,6 +77,7 @@ def gather(
 
 @kernel
 def cell_forces(
+    asleep: wp.array[int],  # (B) not zero where nothing is to be done
     gradients: wp.array2d[wp.vec3d],  # (P, K)
     points_per_cell: int,
     stress: wp.array2d[wp.mat33d],
@@ -84,6 +85,8 @@ def cell_forces(
 ):
     """The transposed operator of the stress, by cell and local node: what `gather_cells` sums."""
     b, entry = wp.tid()
+    if asleep[b] != 0:
+        return
     k = gradients.shape[1]
     cell = entry / k
     a = entry - cell * k

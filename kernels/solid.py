@@ -65,10 +65,13 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         dilation_offset: wp.array2d[wp.float64],  # (B, P) w there
         points_per_cell: int,
         positions: wp.array2d[wp.vec3d],
+        asleep: wp.array[int],  # (B) not zero where nothing is to be done
         stress_out: wp.array2d[wp.mat33d],
         energy_out: wp.array2d[wp.float64],  # (B, P) [J]
     ):
         b, p = wp.tid()
+        if asleep[b] != 0:
+            return
         f = deformation_gradient(positions, nodes, gradients, b, p, p / points_per_cell)
         m = stiffness[b, p]
         energy, stress = response(f, m)

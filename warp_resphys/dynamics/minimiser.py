@@ -115,7 +115,8 @@ class Minimiser:
         judging = [int(memory > 0), tolerances, warp_view(p.inertia, wp.float64), found, origin_view, direction]
         judging += [clamped, positions, gradient, progress, pairs, history]
         accept = p.record_blocks(own.accept, b, judging, [])
-        summarise = p.record_blocks(kernels.summarise, 1, [progress], [warp_view(summary, wp.int32)])
+        seen = [warp_view(summary, wp.int32), warp_view(p.asleep, wp.int32)]
+        summarise = p.record_blocks(kernels.summarise, 1, [progress], seen)
         judge = [*p.evaluation, accept, summarise]
         self._begin, self._aim, self._go_on = p.capture(begin, *judge), p.capture(aim, *judge), p.capture(*judge)
         signs = np.random.default_rng(0).choice([-1.0, 1.0], (_NUDGES, n, 3))
@@ -185,14 +186,18 @@ class Minimiser:
         if self._loop is not None:
             p.positions.copy_(start)
             p.launch(self._loop)
+            p.asleep.zero_()
             return
         if not self._hessian.ready():
             self._counts["factored"].zero_()
-        state = self.begin(start)
-        while state.active:
-            if state.wanting:
-                self.refactor(state)
-            state = self.advance(state)
+        try:
+            state = self.begin(start)
+            while state.active:
+                if state.wanting:
+                    self.refactor(state)
+                state = self.advance(state)
+        finally:
+            p.asleep.zero_()
 
     def begin(self, start: torch.Tensor) -> Summary:
         """Evaluates the potential at a start (B, N, 3) [m]."""

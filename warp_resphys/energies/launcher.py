@@ -30,6 +30,9 @@ class Launcher:
     Args:
         batch: environments B.
         device: of every buffer.
+
+    Attributes:
+        asleep: (B,) not zero for environments whose stresses stay as they are: during a solve, where they are done.
     """
 
     by_cells = False  # whether threads work on a cell's nodes and pairs of nodes one by one, which a GPU has enough of
@@ -37,6 +40,7 @@ class Launcher:
     def __init__(self, batch: int, device: torch.device) -> None:
         self.batch, self.device = batch, device
         self.by_cells = self.by_cells or device.type == "cuda"
+        self.asleep = torch.zeros(batch, device=device, dtype=torch.int32)
 
     def zeros(self, *shape: int) -> torch.Tensor:
         """(B, *shape) on the launcher's device."""
@@ -72,9 +76,9 @@ class Launcher:
             inputs = [s.nodes, s.gradients, s.points_per_cell, s.start, s.incident, stress]
             return self.record(points.gather, (self.batch, out.shape[1]), inputs, to)
         forces = [warp_view(self.zeros(s.cells * s.nodes_per_cell, 3), wp.vec3d)]
-        cells = (self.batch, s.cells * s.nodes_per_cell)
+        cells, asleep = (self.batch, s.cells * s.nodes_per_cell), warp_view(self.asleep, wp.int32)
         return Several(
-            self.record(points.cell_forces, cells, [s.gradients, s.points_per_cell, stress], forces),
+            self.record(points.cell_forces, cells, [asleep, s.gradients, s.points_per_cell, stress], forces),
             self.record(points.gather_cells, (self.batch, out.shape[1]), [s.start, s.incident, *forces], to),
         )
 

@@ -131,7 +131,8 @@ class SolidTerm(Term):
 
     @override
     def step(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
-        return self._kernels.local_step, self._arguments(s, values, positions)
+        asleep = warp_view(self.launcher.asleep, wp.int32)
+        return self._kernels.local_step, [*self._arguments(s, values, positions), asleep]
 
     @override
     def tangent(self, s: PointSet, values: Values, positions: Any, positive: Any) -> tuple[Any, list[Any]]:

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import torch
 
@@ -42,7 +41,7 @@ class Range:
         low, high = self.edges
         return ((inputs < low) | (inputs > high)).any(1)
 
-    @cached_property
+    @property
     def edges(self) -> tuple[torch.Tensor, torch.Tensor]:
         """(A,) each: the least and the largest inputs that the model is told."""
         margin = _MARGIN * (self.high - self.low)

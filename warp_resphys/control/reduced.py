@@ -13,10 +13,10 @@ K phi = omega^2 M phi, and T = Psi^T M Phi,
 
 F being the learned force of fixed outputs, which turns with the body, and alpha and beta the Rayleigh damping. What is
 observed is y = y_0(u) + C(u) dz + H dz dz with dz = z - z_0(u), C being exact for small dz. z_0 and y_0 are cubic
-polynomials of the inputs, A, D, G and C quadratic, H constant, all fitted to what the robot does at sampled inputs
-(interpolation of reduced operators: Amsallem and Farhat, AIAA J. 46 (2008) 1803, in coordinates that are common from
-the beginning). The network acts on the state before a step, as in the robot, so that a step is linear in z; the
-integrator is the robot's own.
+polynomials of the inputs, A, D, G and C quadratic, fitted to equilibria and the vibrations about them (interpolation of
+reduced operators: Amsallem and Farhat, AIAA J. 46 (2008) 1803, in coordinates that are common from the beginning), and
+H is constant, fitted to motions. The network acts on the state before a step, as in the robot, so that a step is linear
+in z; the integrator is the robot's own.
 """
 
 from collections.abc import Mapping, Sequence

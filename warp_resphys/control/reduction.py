@@ -14,7 +14,7 @@ from ..io.errors import ConvergenceError
 from ..learning.networks import Coder
 from ..robot.robot import Robot
 from ..robot.state import RobotState
-from .polynomials import Polynomial, features, powers, solve_ridge
+from .polynomials import Polynomial, solve_ridge
 from .reduced import STATIC_ORDER, TANGENT_ORDER, USUAL_ORDER, ReducedModel, ReducedState
 from .reduced_force import ReducedForce
 from .sampling import Motions, OnProgress, Sampling, Source, Tangent, check_reducible, driven_input
@@ -51,9 +51,12 @@ def reduce(robot: Robot, sampling: Sampling, on_progress: OnProgress = lambda st
     first, modes = sampling.motions, sampling.modes
     made = _with_output(
         made,
-        np.concatenate([z[1:, :first].reshape(-1, modes), z_statics]),
-        np.concatenate([motions.acting[:, :first].reshape(-1, source.parts), statics.u]),
-        np.concatenate([motions.y[1:, :first].reshape(-1, motions.y.shape[2]), statics.y]),
+        (z_statics, statics.u, statics.y),
+        (
+            z[1:, :first].reshape(-1, modes),
+            motions.acting[:, :first].reshape(-1, source.parts),
+            motions.y[1:, :first].reshape(-1, motions.y.shape[2]),
+        ),
     )
     told = _errors(made, motions, z, rates, first)
     frequency = np.sqrt(np.abs(np.linalg.eigvals(made.stiffness(statics.u[:1])[0]))) / (2.0 * np.pi)
@@ -180,17 +183,23 @@ def _common(shapes: torch.Tensor, mass: torch.Tensor) -> torch.Tensor:
     return torch.where(root > 0.0, found / root.clamp_min(1e-300), 0.0)
 
 
-def _with_output(model: ReducedModel, z: FloatArray, u: FloatArray, y: FloatArray) -> ReducedModel:
-    """The same with y_0 and H, of coordinates (S, r), inputs (S, n) and what was observed (S, 3 M) [m]."""
-    off, order = z - model.static(u), model.static.order
-    linear = (model.shown(u) @ off[..., None])[..., 0]
+def _with_output(model: ReducedModel, rests: tuple[FloatArray, ...], motions: tuple[FloatArray, ...]) -> ReducedModel:
+    """The same with y_0, of equilibria, and H, of motions.
+
+    Both are coordinates (S, r), inputs (S, n) and what was observed (S, 3 M) [m]. In fast motions more modes take part
+    than the model has: y_0, fitted to these too, would make up for them and be wrong at rest.
+    """
+
+    def left(z: FloatArray, u: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        off = z - model.static(u)
+        return off, y - (model.shown(u) @ off[..., None])[..., 0]
+
+    observed = Polynomial.fitted(rests[1], left(*rests)[1], model.static.order)
+    off, rest = left(*motions)
     first, second = np.triu_indices(model.modes)
-    known = features(u, powers(model.parts, order))
-    found = solve_ridge(np.concatenate([known, off[:, first] * off[:, second]], axis=1), y - linear)
-    curved = np.zeros((model.modes, model.modes, y.shape[1]))
-    curved[first, second] = 0.5 * found[known.shape[1] :]
-    curved = curved + curved.swapaxes(0, 1)
-    return replace(model, observed=Polynomial(found[: known.shape[1]], order), curved=curved)
+    curved = np.zeros((model.modes, model.modes, rest.shape[1]))
+    curved[first, second] = 0.5 * solve_ridge(off[:, first] * off[:, second], rest - observed(motions[1]))
+    return replace(model, observed=observed, curved=curved + curved.swapaxes(0, 1))
 
 
 def _errors(model: ReducedModel, motions: Motions, z: FloatArray, rates: FloatArray, first: int) -> dict[str, float]:

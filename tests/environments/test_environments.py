@@ -50,8 +50,8 @@ class TestGymnasium:
     @pytest.mark.parametrize("task", TASKS)
     def test_its_checker_passes(self, folder, task):
         name = "".join(word.capitalize() for word in task.split("_"))
-        environment = gym.make(f"warp_resphys/{name}-v0", run=folder, **QUICK)
-        check_env(environment.unwrapped, skip_render_check=True)
+        environment = gym.make(f"warp_resphys/{name}-v0", run=folder, render_mode="rgb_array", **QUICK)
+        check_env(environment.unwrapped)
 
     def test_a_vector_of_them_is_made_by_name(self, folder):
         found = gym.make_vec("warp_resphys/Reach-v0", num_envs=3, run=folder, **QUICK)
@@ -118,7 +118,7 @@ class TestWorlds:
     def test_parameters_are_those_of_the_identification(self, folder):
         environment = make_vector("reach", folder, 4, spread=1.0, noise=0.0, **QUICK)
         environment.reset(seed=0)
-        world = environment._world
+        world = environment.world
         drawn = world.robot.parameters["youngs_modulus"].numpy()
         known = world.robot.description
         assert np.ptp(drawn) > 0.0
@@ -137,11 +137,38 @@ class TestWorlds:
 
     def test_a_figure_has_no_end_and_no_jump(self):
         places = np.random.default_rng(0).normal(size=(30, 3)) * [0.03, 0.02, 0.004]
-        task = FollowTask(1, 200, Reach(places, places[0]), 0.05)
+        task = FollowTask(1, 200, Reach(places, np.zeros((30, 3))), 0.05)
         task.begin(0, np.random.default_rng(1))
         steps = np.linalg.norm(np.diff(task.goals[0], axis=0), axis=1)
         assert steps.min() > 0.0
         assert steps.max() < 0.05 * np.ptp(task.goals[0], axis=0).max() * 10.0
+
+
+class TestPictures:
+    @pytest.mark.parametrize("world", ["simulator", "laboratory"])
+    def test_they_show_body_markers_and_goal_where_these_are(self, folder, world):
+        environment = make_vector("reach", folder, 2, world=world, render_mode="rgb_array", **QUICK)
+        environment.reset(seed=2)
+        first = environment.render()
+        assert len(first) == 2
+        assert all(each.shape == (480, 480, 3) and each.dtype == np.uint8 for each in first)
+        for _ in range(3):
+            environment.step(np.array([[1.0, -1.0, -1.0], [-1.0, -1.0, 1.0]], dtype=np.float32))
+        later = environment.render()
+        blue, red = (
+            [np.argwhere(each[..., one] > each[..., other] + 40.0) for each in map(np.int64, (*first, *later))]
+            for one, other in ((2, 0), (0, 2))
+        )
+        assert min(map(len, blue)) > 1000  # the body
+        assert min(map(len, red)) > 20  # the goal
+        assert np.linalg.norm(blue[0].mean(axis=0) - blue[2].mean(axis=0)) > 2.0  # It moved,
+        assert np.linalg.norm(blue[2].mean(axis=0) - blue[3].mean(axis=0)) > 2.0  # and the other elsewhere.
+        np.testing.assert_allclose(red[0].mean(axis=0), red[2].mean(axis=0), atol=8.0)  # It is partly hidden at most.
+
+    def test_nothing_is_drawn_that_nobody_asked_for(self, folder):
+        environment = make_vector("reach", folder, 1, **QUICK)
+        environment.reset(seed=0)
+        assert environment.render() is None
 
 
 @pytest.mark.parametrize(
@@ -151,7 +178,7 @@ class TestWorlds:
         ({"world": "mars"}, "the world is 'mars': choose simulator, reduced, laboratory"),
         ({"action_time": 0.015}, r"action_time is 0.015 s: it must be a multiple of the step of 0.01 s"),
         ({"tracked": ["Nose"]}, "tracked names 'Nose': choose from Middle - 1"),
-        ({"render_mode": "human"}, "render_mode is 'human': there are no pictures"),
+        ({"render_mode": "human"}, "render_mode is 'human': choose rgb_array"),
         ({"task": "swing_up", "world": "laboratory"}, "swing_up moves the base of a simulated robot"),
     ],
 )

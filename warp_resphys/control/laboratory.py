@@ -15,6 +15,7 @@ from ..experiment.files import REGISTRATION
 from ..experiment.simulate import laboratory_simulator, make_setup, substeps_of
 from ..io.errors import InputError
 from ..io.files import read_json
+from ..mesh.mesh import boundary_triangles
 
 FloatArray = NDArray[np.float64]
 
@@ -71,6 +72,12 @@ class Laboratory:
     def truth(self) -> FloatArray:
         """(B, M, 3) where the markers are, in the frame that the experiment registered [m]."""
         return np.asarray(self._frame.apply(self._read(self.state.q).cpu().numpy()))
+
+    @torch.no_grad()
+    def bodies(self) -> tuple[NDArray[np.int64], FloatArray]:
+        """(S, 3) triangles of the surface, and (B, N, 3) where its vertices are, in that frame [m]."""
+        triangles = boundary_triangles(self._simulator.body.mesh)
+        return triangles, np.asarray(self._frame.apply(self.state.q.double().cpu().numpy()))
 
     def seen(self, number: int) -> FloatArray:
         """(B, M, 3) where cameras have them after a number of steps [m]; the same noise for the same number."""

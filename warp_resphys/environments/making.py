@@ -68,7 +68,7 @@ def make_vector(
         noise: standard deviation of the coordinates of markers that are seen [m]; a laboratory has its own.
         tracked: the markers whose mean has the task; those of the tip, if left out.
         axis: along which a base moves.
-        render_mode: None, as there are no pictures.
+        render_mode: ``rgb_array`` for pictures as arrays, or None.
         autoreset_mode: see Gymnasium.
         device: of the simulation.
         seed: of the places at which robots are sampled.
@@ -99,8 +99,7 @@ def make_vector(
         point = _tip(robot, place.markers()[0], tracked, shown)
         rest = point @ place.markers()[0].ravel()
         length = float(np.linalg.norm(rest - _fixed(robot)))
-        up = -np.asarray(robot.simulator.gravity, dtype=np.float64)
-        asked = SwingTask(num_envs, up if up.any() else along, rest, length)
+        asked = SwingTask(num_envs, _up(robot), rest, length)
         drive = Drive(np.full(1, -_BASE), np.full(1, _BASE), np.full(1, _BASE_SPEED), np.zeros(1), frames)
     else:
         known = driven_input(robot)
@@ -111,10 +110,9 @@ def make_vector(
         point = _tip(robot, place.markers()[0], tracked, shown)
         shares = np.random.default_rng(seed).random((_PLACES, len(low)))
         shares[0] = 0.0
-        found = rests(robot, known.name, shares)
+        found, shares = rests(robot, known.name, shares)
         found = found if shown is None else found[:, list(shown)]
-        places = found.reshape(len(found), -1) @ point.T
-        reach = Reach(places, places[0])
+        reach = Reach(found.reshape(len(found), -1) @ point.T, 2.0 * shares - 1.0)
         asked = (
             ReachTask(num_envs, actions, reach)
             if task == "reach"
@@ -130,7 +128,14 @@ def make_vector(
         place.noise if isinstance(place, LaboratoryWorld) else noise,
         autoreset_mode,
         render_mode,
+        _up(robot),
     )
+
+
+def _up(robot: Robot) -> FloatArray:
+    """(3,) against gravity; z where there is none."""
+    up = -np.asarray(robot.simulator.gravity, dtype=np.float64)
+    return up if up.any() else np.array([0.0, 0.0, 1.0])
 
 
 class _World:
@@ -216,6 +221,11 @@ class RobotEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         seen, reward, terminated, truncated, info = self._one.step(np.asarray(action)[None])
         own = {"error_mm": float(info["error_mm"][0])}
         return seen[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), own
+
+    @override
+    def render(self) -> NDArray[np.uint8] | None:
+        found = self._one.render()
+        return None if found is None else found[0]
 
 
 def register() -> None:

@@ -13,7 +13,7 @@ from ..io.errors import InputError
 
 FloatArray = NDArray[np.float64]
 
-_PREVIEW: Final = (0, 2, 5)  # actions ahead, of the places that a follower is told
+PREVIEW: Final = (0, 2, 5)  # actions ahead, of the places that a follower is told
 _FIGURES: Final = ("circle", "eight", "R", "E", "S")
 _LAPS_S: Final = (2.0, 5.0)  # s that a figure takes
 _OF_REACH: Final = 0.6  # size of a figure, as a share of the reach
@@ -25,11 +25,11 @@ class Reach:
 
     Attributes:
         places: (S, 3) some of these places [m].
-        rest: (3,) where it is without inputs [m].
+        actions: (S, n) from -1 to 1, of the inputs under which it rests there.
     """
 
     places: FloatArray
-    rest: FloatArray
+    actions: FloatArray
 
     @property
     def size(self) -> float:
@@ -76,17 +76,21 @@ class Task(ABC):
     def errors_mm(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
         """(B,) how far off points are [mm]."""
 
+    @abstractmethod
+    def wanted(self, row: int, number: int) -> FloatArray:
+        """(K, 3) places to be at after so many actions, and later [m]."""
 
-class _Goals(Task):
+
+class GoalTask(Task):
     """Places (B, A + 1, 3) where the points are to be after each of A actions [m]."""
 
     def __init__(self, count: int, actions: int, reach: Reach) -> None:
         self.goals = np.tile(reach.middle, (count, actions + 1, 1))
-        self.size, self.width, self._reach = reach.size, 3 * len(_PREVIEW), reach
+        self.size, self.width, self.reach = reach.size, 3 * len(PREVIEW), reach
 
     def observed(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
         """See `Task.observed`: how far the next places are."""
-        ahead = np.minimum(number[:, None] + np.array(_PREVIEW) + 1, self.goals.shape[1] - 1)
+        ahead = np.minimum(number[:, None] + np.array(PREVIEW) + 1, self.goals.shape[1] - 1)
         wanted = self.goals[np.arange(len(points))[:, None], ahead]
         return np.asarray(((wanted - points[:, None]) / self.size).reshape(len(points), -1))
 
@@ -97,20 +101,24 @@ class _Goals(Task):
         """See `Task.errors_mm`."""
         return np.asarray(1e3 * np.linalg.norm(points - self._now(number), axis=1))
 
+    def wanted(self, row: int, number: int) -> FloatArray:
+        """See `Task.wanted`."""
+        return self.goals[row, min(number, self.goals.shape[1] - 1) :]
+
     def reward(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
         """See `Task.reward`: one where they are, and less by their distance over the size of the reach."""
         return np.asarray(1.0 - 1e-3 * self.errors_mm(points, number) / self.size)
 
 
-class ReachTask(_Goals):
+class ReachTask(GoalTask):
     """Be at a place, soon, and stay there."""
 
     def begin(self, row: int, random: np.random.Generator) -> None:
         """See `Task.begin`: one of the places at which the robot can be at rest."""
-        self.goals[row] = self._reach.places[random.integers(len(self._reach.places))]
+        self.goals[row] = self.reach.places[random.integers(len(self.reach.places))]
 
 
-class FollowTask(_Goals):
+class FollowTask(GoalTask):
     """Follow a figure in the plane in which the robot reaches furthest.
 
     Args:
@@ -129,7 +137,7 @@ class FollowTask(_Goals):
 
     def begin(self, row: int, random: np.random.Generator) -> None:
         """See `Task.begin`: a figure at a speed, from anywhere in it on."""
-        reach = self._reach
+        reach = self.reach
         name = self._figures[random.integers(len(self._figures))]
         first, second = reach.plane
         spread = np.ptp((reach.places - reach.middle) @ reach.plane.T, axis=0).min()
@@ -174,3 +182,7 @@ class SwingTask(Task):
     def errors_mm(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
         """See `Task.errors_mm`: what is missing to a length above the rest."""
         return np.asarray(1e3 * self.size * (1.0 - self._height(points)))
+
+    def wanted(self, row: int, number: int) -> FloatArray:
+        """See `Task.wanted`: a length above the rest."""
+        return np.asarray(self._rest + self.size * self._up)[None]

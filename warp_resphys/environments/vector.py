@@ -7,16 +7,18 @@ from typing import Any, Final
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
 from ..io.errors import InputError
+from .picture import Camera, Look
 from .tasks import Task
 from .worlds import World
 
 FloatArray = NDArray[np.float64]
 Observation = NDArray[np.float32]
 
+RENDER_MODES: Final = ("rgb_array",)
 _LOST: Final = -10.0  # reward of a simulation that failed
 _SMOOTH: Final = 0.05  # of the mean square change of an action, taken from the reward
 
@@ -55,7 +57,16 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         actions: A of an episode, after which it is cut off.
         noise: standard deviation of each coordinate that is seen [m].
         autoreset_mode: when robots begin anew, see Gymnasium.
-        render_mode: None, as there are no pictures.
+        render_mode: ``rgb_array`` for pictures, or None.
+        up: (3,) direction that is up in these.
+
+    Attributes:
+        actions: A.
+        frames: steps of the simulation that an action lasts.
+        task: that is to be done.
+        tracked: (3, 3 M).
+        world: that is stepped.
+        rests: (B, M, 3) of the markers, where the robots began [m].
 
     Raises:
         InputError: another mode.
@@ -71,19 +82,22 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         noise: float = 0.0,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
+        up: ArrayLike = (0.0, 0.0, 1.0),
     ) -> None:
-        if render_mode is not None:
-            raise InputError(f"render_mode is {render_mode!r}: there are no pictures, so leave it out.")
-        self._world, self._task, self._drive, self._tracked = world, task, drive, tracked
-        self._length, self._noise = actions, noise
+        if render_mode not in (None, *RENDER_MODES):
+            raise InputError(f"render_mode is {render_mode!r}: choose rgb_array, for pictures as arrays.")
+        self.world, self.task, self._drive, self.tracked = world, task, drive, tracked
+        self.actions, self.frames, self._noise = actions, drive.frames, noise
         self.num_envs, self.render_mode = world.count, render_mode
         mode = AutoresetMode(autoreset_mode)
         rate = round(1.0 / (world.time_step * drive.frames))
-        self.metadata = {"render_modes": [], "render_fps": rate, "autoreset_mode": mode}
+        self.metadata = {"render_modes": [*RENDER_MODES], "render_fps": rate, "autoreset_mode": mode}
+        self._up = np.asarray(up, dtype=np.float64)
+        self._camera: Camera | None = None
         self._mode = mode
         world.begin(np.ones(world.count, dtype=np.bool_))
-        self._rest = world.markers()
-        width = 2 * self._rest[0].size + world.parts + task.width
+        self.rests = world.markers()
+        width = 2 * self.rests[0].size + world.parts + task.width
         self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, (width,), np.float32)
         self.single_action_space = gym.spaces.Box(-1.0, 1.0, (world.parts,), np.float32)
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, world.count)
@@ -92,7 +106,7 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         self._commands = np.tile(drive.start, (world.count, 1))
         self._number = np.zeros(world.count, dtype=np.int64)
         self._over = np.zeros(world.count, dtype=np.bool_)
-        self._seen = self._before = self._rest
+        self._seen = self._before = self.rests
 
     @override
     def reset(
@@ -118,26 +132,26 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         if chosen.shape != (count,) or chosen.dtype != np.bool_:
             raise InputError(f"reset_mask must be {count} truth values, one for each robot.")
         if chosen.all():
-            self._world.vary(self._random)
+            self.world.vary(self._random)
         self._begin(chosen)
         return self._observed(), {}
 
     def _begin(self, chosen: NDArray[np.bool_]) -> None:
         assert self._random is not None
-        self._world.begin(chosen)
+        self.world.begin(chosen)
         for row in np.flatnonzero(chosen):
-            self._task.begin(int(row), self._random[row])
+            self.task.begin(int(row), self._random[row])
         self._commands[chosen] = self._drive.start
         self._number[chosen], self._over[chosen] = 0, False
         rows = chosen[:, None, None]
-        self._rest = np.where(rows, self._world.markers(), self._rest)
+        self.rests = np.where(rows, self.world.markers(), self.rests)
         seen = self._cameras(chosen)
         self._seen, self._before = np.where(rows, seen, self._seen), np.where(rows, seen, self._before)
 
     def _cameras(self, chosen: NDArray[np.bool_]) -> FloatArray:
         """(B, M, 3) what is seen of the markers [m], with noise in those of some of the robots."""
         assert self._random is not None
-        found = self._world.markers().copy()
+        found = self.world.markers().copy()
         if self._noise:
             for row in np.flatnonzero(chosen):
                 found[row] += self._noise * self._random[row].standard_normal(found[row].shape)
@@ -146,15 +160,43 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
     @property
     def _points(self) -> FloatArray:
         """(B, 3) of the task, without noise of what is seen."""
-        return np.asarray(self._world.markers().reshape(self.num_envs, -1) @ self._tracked.T)
+        return np.asarray(self.world.markers().reshape(self.num_envs, -1) @ self.tracked.T)
+
+    @override
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """B pictures (H, W, 3) of the robots, their markers and what is asked of them; None without a render mode.
+
+        Raises:
+            InputError: it was not reset before.
+        """
+        if self.render_mode is None:
+            return None
+        if self._random is None:
+            raise InputError("the environment was not reset: call env.reset(seed=...) before env.render().")
+        triangles, vertices = self.world.bodies()
+        markers, number = self.world.markers(), self._number
+        wanted = [self.task.wanted(row, int(number[row])) for row in range(self.num_envs)]
+        if self._camera is None:
+            # Around the first robot: as large to each side as what it is asked for could be.
+            middle = np.concatenate([self.rests[0], vertices[0]]).mean(axis=0)
+            around = np.concatenate([-np.eye(3), np.eye(3)]) * self.task.size
+            self._camera = Camera(self._up, np.concatenate([self.rests[0], vertices[0], *wanted, middle + around]))
+        errors = self.task.errors_mm(self._points, number)
+        seconds = number * self.world.time_step * self._drive.frames
+        return tuple(
+            self._camera.picture(
+                Look(triangles, vertices[row], markers[row], wanted[row], f"{seconds[row]:.2f} s, {errors[row]:.1f} mm")
+            )
+            for row in range(self.num_envs)
+        )
 
     def _observed(self) -> Observation:
-        count, size = self.num_envs, self._task.size
-        off, moved = ((each / size).reshape(count, -1) for each in (self._seen - self._rest, self._seen - self._before))
+        count, size = self.num_envs, self.task.size
+        off, moved = ((each / size).reshape(count, -1) for each in (self._seen - self.rests, self._seen - self._before))
         drive = self._drive
         told = 2.0 * (self._commands - drive.low) / (drive.high - drive.low) - 1.0
-        seen_points = self._seen.reshape(count, -1) @ self._tracked.T
-        task = self._task.observed(seen_points, self._number)
+        seen_points = self._seen.reshape(count, -1) @ self.tracked.T
+        task = self.task.observed(seen_points, self._number)
         return np.concatenate([off, 5.0 * moved, told, task], axis=1).astype(np.float32)
 
     @override
@@ -172,29 +214,29 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         if self._random is None:
             raise InputError("the environment was not reset: call env.reset(seed=...) before env.step(...).")
         given, drive = np.asarray(actions, dtype=np.float64), self._drive
-        if given.shape != (self.num_envs, self._world.parts) or not np.isfinite(given).all():
+        if given.shape != (self.num_envs, self.world.parts) or not np.isfinite(given).all():
             raise InputError(
-                f"actions have shape {given.shape}: give finite ones of {(self.num_envs, self._world.parts)}, from -1 "
+                f"actions have shape {given.shape}: give finite ones of {(self.num_envs, self.world.parts)}, from -1 "
                 "to 1."
             )
         beginning = self._over.copy() if self._mode is AutoresetMode.NEXT_STEP else np.zeros_like(self._over)
         if self._mode is AutoresetMode.DISABLED and self._over.any():
             raise InputError("an episode is over: reset it with options={'reset_mask': ...} before the next step.")
         wanted = drive.low + 0.5 * (np.clip(given, -1.0, 1.0) + 1.0) * (drive.high - drive.low)
-        most, last = drive.rate * self._world.time_step, self._commands.copy()
+        most, last = drive.rate * self.world.time_step, self._commands.copy()
         lost = np.zeros(self.num_envs, dtype=np.bool_)
         for _ in range(drive.frames):
             self._commands = self._commands + np.clip(wanted - self._commands, -most, most)
-            lost = self._world.step(self._commands)
+            lost = self.world.step(self._commands)
         self._number += 1
         self._before, self._seen = self._seen, self._cameras(np.ones_like(lost))
         points = self._points
-        rewards = self._task.reward(points, self._number)
+        rewards = self.task.reward(points, self._number)
         changed = (self._commands - last) / (drive.high - drive.low)
         rewards = rewards - _SMOOTH * np.square(changed).mean(axis=1)
         rewards = np.where(lost, _LOST, rewards)
-        terminated, truncated = lost.copy(), (self._number >= self._length) & ~lost
-        infos: dict[str, Any] = {"error_mm": self._task.errors_mm(points, self._number)}
+        terminated, truncated = lost.copy(), (self._number >= self.actions) & ~lost
+        infos: dict[str, Any] = {"error_mm": self.task.errors_mm(points, self._number)}
         if beginning.any():
             self._begin(beginning)
             rewards = np.where(beginning, 0.0, rewards)

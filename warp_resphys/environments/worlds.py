@@ -14,12 +14,14 @@ from ..control.reduced import ReducedModel
 from ..control.reduced_batch import advance, begin, observed
 from ..dynamics.integrator import State
 from ..io.errors import InputError
+from ..mesh.mesh import boundary_triangles
 from ..robot.inputs import BASE
 from ..robot.robot import Robot
 from ..robot.state import RobotState
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
 
 _FURTHEST: Final = 20.0  # times the coordinates of equilibria, beyond which a reduced model has failed
 _LEAST: Final = 1e-3  # of the value in an identification, below which a drawn parameter is not taken
@@ -55,6 +57,10 @@ class World(ABC):
     def vary(self, random: Sequence[np.random.Generator]) -> None:
         """Draws parameters anew, of each body by itself; for all of them, before `begin`."""
         del random
+
+    def bodies(self) -> tuple[IntArray, FloatArray]:
+        """(S, 3) triangles of a body's surface, and (B, N, 3) vertices [m]; none where only markers are known."""
+        return np.zeros((0, 3), dtype=np.int64), np.zeros((self.count, 0, 3))
 
 
 class RobotWorld(World):
@@ -138,6 +144,10 @@ class RobotWorld(World):
         found = found if self._shown is None else found[:, list(self._shown)]
         return np.asarray(found.double().cpu().numpy())
 
+    def bodies(self) -> tuple[IntArray, FloatArray]:
+        """See `World.bodies`."""
+        return boundary_triangles(self.robot.simulator.body.mesh), self._state.q.double().cpu().numpy()
+
     @property
     def state(self) -> RobotState:
         """Of the robots."""
@@ -209,9 +219,13 @@ class LaboratoryWorld(World):
         """See `World.markers`; cameras see them with a noise."""
         return self._laboratory.truth()
 
+    def bodies(self) -> tuple[IntArray, FloatArray]:
+        """See `World.bodies`."""
+        return self._laboratory.bodies()
 
-def rests(robot: Robot, given: str, shares: FloatArray) -> FloatArray:
-    """(S, M, 3) where the markers of a robot rest under inputs [m], of those under which it does.
+
+def rests(robot: Robot, given: str, shares: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(S, M, 3) where the markers of a robot rest under inputs [m], and these (S, n), of those under which it does.
 
     Args:
         robot: that is asked.
@@ -226,4 +240,5 @@ def rests(robot: Robot, given: str, shares: FloatArray) -> FloatArray:
     with torch.no_grad():
         q, settled = robot.settle_some(len(shares), **{given: low + shares * (high - low)})
         q = q[settled]
-        return np.asarray(robot.observe(RobotState(State(q, torch.zeros_like(q)))).double().cpu().numpy())
+        found = robot.observe(RobotState(State(q, torch.zeros_like(q)))).double().cpu().numpy()
+    return found, shares[settled.cpu().numpy()]

@@ -35,10 +35,12 @@ from ..experiment.schema import (
     NOT_NEGATIVE,
     POSITIVE,
     TRUTH_VALUE,
+    WORD,
     Group,
     Kind,
     absent,
     check,
+    optional,
 )
 from ..io.errors import InputError
 from ..io.files import write_json
@@ -47,6 +49,7 @@ from ..io.progress import Progress
 from ..io.stages import package_versions
 from ..linalg.threads import threads_for
 from .command import show, table_of
+from .environment_speed import ENVIRONMENT_HEADS, environment_rows, time_environments
 
 PARTS: Final = ("local_step", "tangent", "assembly", "factor", "solve")
 _YARDSTICK_SIZE: Final = 480
@@ -68,6 +71,7 @@ _KEYS: Final = Group(
         **dict.fromkeys(("relative_tolerance", "seconds"), POSITIVE),
         "tip_mass": NOT_NEGATIVE,
         "pressure": FINITE,
+        "environments": Group({"run": optional(WORD), "robots": NATURALS}),
     }
 )
 _MATERIAL: Final = Group({"poissons_ratio": FINITE, "youngs_modulus": POSITIVE})
@@ -141,8 +145,8 @@ def run_benchmark(config: Mapping[str, Any]) -> dict[str, Any]:
 
     Returns:
         ``steps`` (a row for each `Case`), ``parts`` (milliseconds of the parts of a step), ``cold_start`` (seconds of a
-        new process without and with compiled kernels), ``yardstick_ms``, ``hardware``, ``versions``, ``date`` and
-        ``settings``.
+        new process without and with compiled kernels), ``environments`` (see `time_environments`), ``yardstick_ms``,
+        ``hardware``, ``versions``, ``date`` and ``settings``.
 
     Raises:
         InputError: a configuration that cannot be simulated or refined.
@@ -171,7 +175,15 @@ def run_benchmark(config: Mapping[str, Any]) -> dict[str, Any]:
         "steps": steps,
         "parts": parts,
         "cold_start": cold_start(config) if settings["cold_start"] else None,
+        "environments": _environments(settings, config["device"]),
     }
+
+
+def _environments(settings: Mapping[str, Any], device: str) -> list[dict[str, Any]]:
+    asked = settings["environments"]
+    if asked["run"] is None:
+        return []
+    return time_environments(Path(asked["run"]), asked["robots"], settings["repeats"], device)
 
 
 def _cases(config: Mapping[str, Any], settings: Mapping[str, Any], refinement: int) -> list[Case]:
@@ -383,4 +395,7 @@ def benchmark_tables(result: Mapping[str, Any]) -> list[Table]:
         starts = [[kind, *(f"{times[name]:.2f}" for name in names)] for kind, times in result["cold_start"].items()]
         headings = ["kernel cache", *(name.removesuffix("_s").replace("_", " ") for name in names)]
         tables.append(table_of("Seconds of a new process", headings, starts))
+    if result["environments"]:
+        rows = environment_rows(result["environments"])
+        tables.append(table_of("Environments, task reach", ENVIRONMENT_HEADS, rows))
     return tables

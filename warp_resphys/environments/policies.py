@@ -1,0 +1,146 @@
+"""Policies for environments: a scripted one, how well one does, and learning them with Stable-Baselines3."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, Final
+
+import numpy as np
+import torch
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+from typing_extensions import override
+
+from ..control.polynomials import Monomials, Polynomial
+from ..io.errors import InputError
+from .tasks import GoalTask
+from .vector import Observation, RobotVectorEnv
+
+FloatArray = NDArray[np.float64]
+Policy = Callable[[Observation], NDArray[np.float32]]
+
+_ORDER: Final = 2  # of the polynomial that says where the robot rests
+_EFFORT: Final = 3e-3  # of squared actions beside the squared distance, for places of size one
+_ITERATIONS, _STRIDE = 16, 0.25  # of Gauss-Newton, and the longest change of an action in one
+
+
+class ScriptedPolicy:
+    """Commands under which the robot would rest at one of the places that it is told, with as little effort as does.
+
+    What is told of the places says how far they are from the point as it is seen, so that it sees where the point is,
+    too. It knows of no motion: where the robot is slow, it is late, and where it swings, it swings with it.
+
+    Args:
+        environment: with a task of goals, for the robot of which it is.
+        ahead: which of the places that it is told, 0 for the next one.
+
+    Raises:
+        InputError: the task has no goals.
+    """
+
+    def __init__(self, environment: RobotVectorEnv, ahead: int = 0) -> None:
+        task = environment.task
+        if not isinstance(task, GoalTask):
+            raise InputError("the scripted policy goes to places: take reach or follow.")
+        self._rests = Polynomial.fitted(task.reach.actions, task.reach.places / task.size, _ORDER)
+        self._rest, self._tracked, self._size = environment.rests[0].ravel(), environment.tracked, task.size
+        self._parts, self._ahead = task.reach.actions.shape[1], ahead
+
+    def __call__(self, seen: Observation) -> NDArray[np.float32]:
+        """(B, n) actions for observations (B, width)."""
+        width = self._rest.size
+        point = (self._rest + self._size * seen[:, :width].astype(np.float64)) @ self._tracked.T
+        first = 2 * width + self._parts + 3 * self._ahead
+        goal = point + self._size * seen[:, first : first + 3]
+        return self._actions(goal / self._size).astype(np.float32)
+
+    def _actions(self, goals: FloatArray) -> FloatArray:
+        """(B, n) whose resting places are closest to goals (B, 3), by Gauss-Newton's method within the bounds."""
+        found = np.zeros((len(goals), self._parts))
+        for _ in range(_ITERATIONS):
+            slope = self._rests.slopes(Monomials(found))  # (B, n, 3)
+            matrix = slope @ slope.swapaxes(1, 2) + _EFFORT * np.eye(self._parts)
+            force = (slope @ (goals - self._rests(found))[..., None])[..., 0] - _EFFORT * found
+            held = (np.abs(found) >= 1.0) & (found * force > 0.0)  # at a bound, and pushed beyond it
+            matrix = np.where(held[:, :, None] | held[:, None, :], np.eye(self._parts), matrix)
+            moved = np.linalg.solve(matrix, np.where(held, 0.0, force)[..., None])[..., 0]
+            found = np.clip(found + np.clip(moved, -_STRIDE, _STRIDE), -1.0, 1.0)
+        return found
+
+
+def errors_mm(environment: RobotVectorEnv, policy: Policy, seed: int) -> FloatArray:
+    """(A, B) how far points are from what is asked in one episode of each robot [mm]; NaN from a failure on."""
+    seen, _ = environment.reset(seed=seed)
+    found = np.full((environment.actions, environment.num_envs), np.nan)
+    alive = np.ones(environment.num_envs, dtype=np.bool_)
+    for number in range(environment.actions):
+        seen, _, terminated, _, info = environment.step(policy(seen))
+        alive &= ~terminated
+        found[number, alive] = info["error_mm"][alive]
+    return found
+
+
+def learn(
+    environment: RobotVectorEnv, steps: int, seed: int = 0, on_progress: Callable[[int], None] = lambda steps: None
+) -> Any:
+    """A policy by proximal policy optimisation (PPO, Schulman et al. 2017), of Stable-Baselines3.
+
+    Args:
+        environment: with ``autoreset_mode`` SAME_STEP.
+        steps: actions of all robots together.
+        seed: of the network and of what is drawn.
+        on_progress: told how many more actions are done.
+
+    Returns:
+        A ``stable_baselines3.PPO``; `acting` makes a policy of it.
+
+    Raises:
+        InputError: Stable-Baselines3 is not installed, or another reset mode.
+    """
+    try:
+        from stable_baselines3 import PPO
+        from stable_baselines3.common.callbacks import BaseCallback
+
+        from .stable_baselines import Robots
+    except ImportError as error:
+        raise InputError(
+            f"learning a policy needs Stable-Baselines3 ({error}): pip install 'warp-resphys[policies]'."
+        ) from None
+    if environment.metadata["autoreset_mode"] is not AutoresetMode.SAME_STEP:
+        raise InputError("learning needs an environment with autoreset_mode='SameStep'.")
+
+    class Told(BaseCallback):
+        @override
+        def _on_step(self) -> bool:
+            on_progress(environment.num_envs)
+            return True
+
+    with one_thread():
+        made = PPO(
+            "MlpPolicy",
+            Robots(environment),
+            n_steps=max(2048 // environment.num_envs, 8),
+            batch_size=512,
+            n_epochs=6,
+            gamma=0.95,
+            learning_rate=5e-4,
+            policy_kwargs={"net_arch": [128, 128], "log_std_init": -1.0},
+            seed=seed,
+            device="cpu",
+        )
+        return made.learn(steps, Told())
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Torch on one thread: those that share so small a network wait for one another most of the time."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def acting(model: Any) -> Policy:
+    """The policy of a model of Stable-Baselines3, without noise."""
+    return lambda seen: np.asarray(model.predict(seen, deterministic=True)[0], dtype=np.float32)

@@ -47,6 +47,11 @@ COMMANDS: Final[Mapping[str, tuple[str, str]]] = MappingProxyType(
         "tune": ("studies.tuning.tune:run_tuning", "search for better settings of the network and its training"),
         "reproduce": ("studies.reproduction:reproduce", "run the simulated beams, and compare with what was published"),
         "robots": ("studies.robots:robots", "run the robots that others recorded, with one page on all of them"),
+        "film": ("studies.film:film", "make a film of a trial of a run, with any of its models"),
+        "train-policy": (
+            "studies.policy:train_policy",
+            "learn a policy on a run's robot, and try it on its laboratory",
+        ),
         "inspect": ("studies.preparation:inspect", "say what is in a mesh, or how good a recording is"),
         "make-arm": ("studies.preparation:make_arm", "make the mesh of a pneumatic arm"),
         "convert": ("studies.preparation:convert", "bring the published recordings into a format that is safe to open"),

@@ -5,31 +5,12 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
-from main_job import IN_RUN, run_without_report
 
-from warp_resphys.environments.making import TASKS, make_vector, register
+from warp_resphys.environments.making import TASKS, make_vector
 from warp_resphys.environments.tasks import FollowTask, Reach
 from warp_resphys.io.errors import InputError
 
-RUN = [
-    "experiment=tendon_rod",
-    *("mesh.layers=3", "mesh.nodes=20", "laboratory.mesh.layers=4", "laboratory.mesh.nodes=20"),
-    *("data.steps=30", "data.sequences=5", "data.train=3", "data.validation=1", "data.test=1", "data.horizons=[]"),
-    *("data.rest_seconds=0.01", "data.cutoff=20.0", "parallel={processes:1,batch:3}", "timing=false"),
-    *("laboratory.sequences.rest=0.01", "laboratory.sequences.correlation_time=0.06", "identify.grid=null"),
-    *("identify.trials=1", "identify.seconds=0.1", "identify.max_evaluations=3", "trainer={epochs:4,rollout_every:2}"),
-    *("network={position_modes:2,velocity_modes:2,force_modes:2,width:8}", "trainer.batch_size=16"),
-    *("actuation.filter_time_constants=[0.1]", "hydra/job_logging=none", "hydra/hydra_logging=none", IN_RUN),
-]
 QUICK = {"seconds": 0.2, "action_time": 0.05}  # four actions
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    place = tmp_path_factory.mktemp("environments")
-    found = run_without_report(place, *RUN)
-    register()
-    return found
 
 
 def played(environment, steps=6, seed=3):

@@ -2,18 +2,11 @@
 
 import numpy as np
 import pytest
-from main_job import run_without_report
-from test_environments import RUN
 
 from warp_resphys.environments.making import make_vector
 from warp_resphys.environments.policies import ScriptedPolicy, acting, errors_mm, learn
 from warp_resphys.io.errors import InputError
 from warp_resphys.studies.environment_speed import ENVIRONMENT_HEADS, environment_rows, time_environments
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    return run_without_report(tmp_path_factory.mktemp("policies"), *RUN)
 
 
 def still(seen):

@@ -1,5 +1,6 @@
 """Environments of a run, by the names of tasks, and their registration in Gymnasium."""
 
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -166,9 +167,23 @@ class _World:
         if path.is_file():
             finished_record(self._run, f"reduce_{known.model}")
             return read_reduced(path, known.learned)
-        sampling = Sampling(seed=self._seed)
-        with Progress("reduced model", sampling.total, "samples") as progress:
-            return reduce(self._robot, sampling, progress.advance)
+        return _made(str(self._run), _changed(self._run), known.model, self._seed)
+
+
+def _changed(run: Path) -> float:
+    """When a run, or a file of a robot, was written."""
+    record = run / "stages" / "evaluate.json"
+    return (record if record.is_file() else run).stat().st_mtime
+
+
+@functools.lru_cache(maxsize=4)
+def _made(run: str, changed: float, model: str, seed: int) -> ReducedModel:
+    """A new reduced model, which takes minutes: kept for environments that are made one after another."""
+    del changed  # It says that the run is another one.
+    sampling = Sampling(seed=seed)
+    with Progress("reduced model", sampling.total, "samples") as progress:
+        robot = load(run, model if Path(run).is_dir() else None, "cpu", "count")
+        return reduce(robot, sampling, progress.advance)
 
 
 def _fixed(robot: Robot) -> FloatArray:

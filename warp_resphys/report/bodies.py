@@ -165,14 +165,21 @@ def instants(target: FloatArray, bound: FloatArray, simulated: FloatArray) -> li
     return sorted(chosen)
 
 
-def write_film(path: Path, motion: Motion) -> None:
+def write_film(path: Path, motion: Motion, seconds: float | None = None, slower: float | None = None) -> None:
     """Write a film (MP4, H.264) of the first seconds of a motion, slowed down if it is fast, and show how far it is.
+
+    Args:
+        path: Of the file.
+        motion: What is shown.
+        seconds: Of it; 10, or 1.5 of a fast one, if left out.
+        slower: How many times slower it is shown; 4 for a fast one, if left out.
 
     Raises:
         DrawingError: There is no pyvista, no OpenGL driver that works off screen, or no encoder.
         DataFileError: The file cannot be written.
     """
-    slower, longest = (4.0, 1.5) if motion.is_fast else (1.0, 10.0)  # [s] that are shown.
+    usual, usually = (4.0, 1.5) if motion.is_fast else (1.0, 10.0)  # [s] that are shown.
+    slower, longest = usual if slower is None else slower, usually if seconds is None else seconds
     step = float(np.median(np.diff(motion.times)))
     every = max(1, round(1.0 / (slower * step * LARGEST_RATE)))
     shown = motion.at(np.flatnonzero(motion.times <= longest + 1e-9)[::every])

@@ -1,0 +1,81 @@
+"""Learns policies on the reduced models of a run, and tries them, beside scripted ones, on the run's laboratory."""
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from ..experiment.schema import COUNT, NATURAL, WORD, check, one_of
+from ..io.errors import InputError
+from ..io.files import write_json
+from ..io.progress import Progress
+from .command import WORDS, show, table_of
+
+_TASKS: Final = ("reach", "follow")
+_SEED: Final = 1000  # of the episodes in which policies are tried
+_PREVIEWS: Final = 3  # places that a scripted policy may go to
+
+
+def train_policy(config: Mapping[str, Any], folder: Path) -> None:
+    """Prints errors; writes policies and policies.json into the folder ``policies`` of the run.
+
+    Raises:
+        InputError: Gymnasium or Stable-Baselines3 is not installed, or the run has no driven robot or no laboratory.
+        DataFileError: there is no finished run.
+    """
+    del folder
+    check("run", config["run"], WORD)
+    check("skill", config["skill"], one_of(*_TASKS))
+    check("models", config["models"], WORDS)
+    for key in ("steps", "robots", "episodes"):
+        check(key, config[key], NATURAL)
+    check("seed", config["seed"], COUNT)
+    if not config["models"]:
+        raise InputError("models names none: name those on which policies are to learn, as in models=[sysid,resphys].")
+    try:
+        from ..environments.making import make_vector
+        from ..environments.policies import Policy, ScriptedPolicy, acting, errors_mm, learn
+    except ImportError as error:
+        raise InputError(f"policies need Gymnasium ({error}): pip install 'warp-resphys[policies]'.") from None
+    wp.config.log_level = wp.LOG_WARNING
+    run, task, models = Path(config["run"]).expanduser(), config["skill"], config["models"]
+    worlds = {f"reduced {model}": (model, "reduced") for model in models} | {"laboratory": (models[-1], "laboratory")}
+    tried = {name: make_vector(task, run, config["episodes"], model, world) for name, (model, world) in worlds.items()}
+    policies: dict[str, Policy] = {}
+    speeds: dict[str, float] = {}
+    place = run / "policies"
+    place.mkdir(exist_ok=True)
+    for model in models:
+        robots = make_vector(task, run, config["robots"], model, "reduced", autoreset_mode="SameStep")
+        for ahead in range(_PREVIEWS):
+            policies[f"scripted, {model}, place {ahead + 1}"] = ScriptedPolicy(robots, ahead)
+        began = time.perf_counter()
+        with Progress(f"policy on {model}", config["steps"], "actions") as progress:
+            learned = learn(robots, config["steps"], config["seed"], progress.advance)
+        speeds[model] = config["steps"] / (time.perf_counter() - began)
+        policies[f"PPO, {model}"] = acting(learned)
+        learned.save(place / f"{task}_{model}.zip")
+    errors = {
+        name: {world: _told(errors_mm(environment, policy, _SEED)) for world, environment in tried.items()}
+        for name, policy in policies.items()
+    }
+    settings = {key: config[key] for key in ("skill", "models", "steps", "robots", "episodes", "seed")}
+    path = place / f"{task}.json"
+    write_json(path, {"settings": settings, "actions_s": speeds, "errors": errors})
+    rows = [[name, *(_text(each) for each in found.values())] for name, found in errors.items()]
+    table = table_of(f"Mean error in mm, task {task}, {config['episodes']} episodes", ["policy", *worlds], rows)
+    told = ", ".join(f"{model} {speed:.0f}" for model, speed in speeds.items())
+    show(table, f"Actions a second while learning: {told}.", f"Written: {path} and the policies beside it")
+
+
+def _told(errors: NDArray[np.float64]) -> dict[str, float]:
+    return {"mean_mm": float(np.nanmean(errors)), "failed": int(np.isnan(errors).any(axis=0).sum())}
+
+
+def _text(found: Mapping[str, float]) -> str:
+    failed = f" ({found['failed']} failed)" if found["failed"] else ""
+    return f"{found['mean_mm']:.2f}{failed}"

@@ -301,7 +301,8 @@ def summarise(progress: Progress, summary_out: wp.array[int], asleep_out: wp.arr
     wanting, asking = wp.float64(0.0), wp.float64(0.0)
     for b in range(lane, progress.phase.shape[0], wp.block_dim()):
         asking += wp.float64(progress.asks[b])
-        asleep_out[b] = int(progress.phase[b] >= DONE)
+        # One that asks is evaluated once more, even if nothing else is to be tried.
+        asleep_out[b] = int(progress.phase[b] >= DONE and progress.asks[b] == 0)
         if progress.phase[b] < DONE:
             active += ONE
         if progress.phase[b] == AIMS:

@@ -7,7 +7,9 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 from warp_resphys.environments.making import TASKS, make_vector
-from warp_resphys.environments.tasks import FollowTask, Reach
+from warp_resphys.environments.tasks import FollowTask, Reach, ReachTask
+from warp_resphys.environments.vector import Drive, RobotVectorEnv
+from warp_resphys.environments.worlds import World
 from warp_resphys.io.errors import InputError
 
 QUICK = {"seconds": 0.2, "action_time": 0.05}  # four actions
@@ -123,6 +125,48 @@ class TestWorlds:
         steps = np.linalg.norm(np.diff(task.goals[0], axis=0), axis=1)
         assert steps.min() > 0.0
         assert steps.max() < 0.05 * np.ptp(task.goals[0], axis=0).max() * 10.0
+
+
+class Brittle(World):
+    """A point that goes where it is told, and fails in the second of the five steps of its third action."""
+
+    def __init__(self):
+        self.count, self.time_step, self.input, self.parts, self.number = 2, 0.01, "place", 1, 0
+        self.places = np.zeros((2, 1, 3))
+
+    def begin(self, chosen):
+        self.places[chosen] = 0.0
+
+    def step(self, commands):
+        self.number += 1
+        self.places[:, 0, :1] = commands
+        return np.array([self.number == 12, False])
+
+    def markers(self):
+        return self.places
+
+
+class TestFailures:
+    def test_one_in_any_step_of_an_action_ends_the_episode(self):
+        places = np.random.default_rng(0).normal(size=(8, 3))
+        reach = Reach(places, np.zeros((8, 1)))
+        drive = Drive(np.zeros(1), np.ones(1), np.full(1, 10.0), np.zeros(1), 5)
+        robots = RobotVectorEnv(Brittle(), ReachTask(2, 6, reach), drive, np.eye(3), 6)
+        robots.reset(seed=0)
+        found = [robots.step(np.ones((2, 1), dtype=np.float32)) for _ in range(5)]
+        assert [each[2].tolist() for each in found] == [[False] * 2] * 2 + [[True, False]] + [[False] * 2] * 2
+        assert found[2][1][0] == -10.0
+        assert found[3][1][0] == 0.0  # It begins anew,
+        goal = robots.task.goals[0, 0]
+        np.testing.assert_allclose(found[3][4]["error_mm"][0], 1e3 * np.linalg.norm(goal))  # and is told so.
+
+    def test_another_reach_is_what_is_asked_for(self, folder):
+        first = make_vector("reach", folder, 1, "sysid", **QUICK)
+        second = make_vector("reach", folder, 1, "resphys", reach=first.task.reach, **QUICK)
+        assert second.task.size == first.task.size
+        for each in (first, second):
+            each.reset(seed=6)
+        np.testing.assert_array_equal(first.task.goals, second.task.goals)
 
 
 class TestPictures:

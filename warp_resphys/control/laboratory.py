@@ -1,6 +1,7 @@
 """The simulated laboratory, driven by hand: commands go in, and what its cameras see comes out."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -32,6 +33,7 @@ class Laboratory:
         name: of the input.
         batch: B.
         seed: of the noise.
+        on_failure: of a step, ``raise`` or ``count``.
 
     Attributes:
         state: of the bodies.
@@ -41,11 +43,20 @@ class Laboratory:
         InputError: the experiment has recordings in place of a laboratory.
     """
 
-    def __init__(self, settings: Mapping[str, Any], run_dir: Path, name: str, batch: int, seed: int) -> None:
+    def __init__(
+        self,
+        settings: Mapping[str, Any],
+        run_dir: Path,
+        name: str,
+        batch: int,
+        seed: int,
+        on_failure: str = "raise",
+    ) -> None:
         if settings.get("laboratory") is None:
             raise InputError("the experiment has no laboratory: control is tried on a simulated one.")
         setup = make_setup(settings)
-        self._simulator = laboratory_simulator(settings, setup.gravity)
+        simulator = laboratory_simulator(settings, setup.gravity)
+        self._simulator = replace(simulator, solver=replace(simulator.settings, on_failure=on_failure))
         self._constants, self._name, self.batch = self._simulator.prepare(), name, batch
         self.parts = self._simulator.counts[name]
         labels = tuple(settings["markers"]["tracked"])
@@ -62,11 +73,17 @@ class Laboratory:
         return Inputs(**{self._name: given})
 
     @torch.no_grad()
-    def step(self, commands: FloatArray) -> None:
-        """One time step of the experiment under commands (B, n), which stay the same during it."""
-        inputs = self._inputs(commands)
+    def step(self, commands: FloatArray) -> NDArray[np.bool_]:
+        """One time step of the experiment under commands (B, n), which stay the same during it; (B,) which failed.
+
+        Raises:
+            ConvergenceError: one did, and ``on_failure`` is ``raise``.
+        """
+        inputs, failed = self._inputs(commands), np.zeros(self.batch, dtype=np.bool_)
         for _ in range(self._substeps):
-            self.state, _ = self._simulator.step(self.state, inputs, self._constants)
+            self.state, report = self._simulator.step(self.state, inputs, self._constants)
+            failed |= ~report.converged.cpu().numpy()
+        return failed
 
     @torch.no_grad()
     def truth(self) -> FloatArray:

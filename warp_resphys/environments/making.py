@@ -53,6 +53,7 @@ def make_vector(
     autoreset_mode: str | gym.vector.AutoresetMode = gym.vector.AutoresetMode.NEXT_STEP,
     device: str = "cpu",
     seed: int = 0,
+    reach: Reach | None = None,
 ) -> RobotVectorEnv:
     """Robots of a run, or of a file, with a task.
 
@@ -73,6 +74,8 @@ def make_vector(
         autoreset_mode: see Gymnasium.
         device: of the simulation.
         seed: of the places at which robots are sampled.
+        reach: ``task.reach`` of another environment, so that both ask for the same places and show them in the same
+            units; where this robot can rest, if left out.
 
     Raises:
         InputError: an unknown task or world, or a robot that has no such input.
@@ -109,17 +112,18 @@ def make_vector(
         low, high = np.array(known.low), np.array(known.high)
         place = made.of_input(known.name)
         point = _tip(robot, place.markers()[0], tracked, shown)
-        shares = np.random.default_rng(seed).random((_PLACES, len(low)))
-        shares[0] = 0.0
-        found, shares = rests(robot, known.name, shares)
-        found = found if shown is None else found[:, list(shown)]
-        reach = Reach(found.reshape(len(found), -1) @ point.T, 2.0 * shares - 1.0)
+        if reach is None:
+            shares = np.random.default_rng(seed).random((_PLACES, len(low)))
+            shares[0] = 0.0
+            found, shares = rests(robot, known.name, shares)
+            found = found if shown is None else found[:, list(shown)]
+            reach = Reach(found.reshape(len(found), -1) @ point.T, 2.0 * shares - 1.0)
         asked = (
             ReachTask(num_envs, actions, reach)
             if task == "reach"
             else FollowTask(num_envs, actions, reach, action_time)
         )
-        drive = Drive(low, high, (high - low) / _RISE, low, frames)
+        drive = Drive(low, high, (high - low) / _RISE, np.zeros(len(low)), frames)  # Worlds begin without inputs.
     return RobotVectorEnv(
         place,
         asked,

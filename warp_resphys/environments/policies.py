@@ -12,7 +12,7 @@ from typing_extensions import override
 
 from ..control.polynomials import Monomials, Polynomial
 from ..io.errors import InputError
-from .tasks import GoalTask
+from .tasks import GoalTask, Reach
 from .vector import Observation, RobotVectorEnv
 
 FloatArray = NDArray[np.float64]
@@ -32,16 +32,18 @@ class ScriptedPolicy:
     Args:
         environment: with a task of goals, for the robot of which it is.
         ahead: which of the places that it is told, 0 for the next one.
+        reach: where it takes the robot to rest; as the task has it, if left out.
 
     Raises:
         InputError: the task has no goals.
     """
 
-    def __init__(self, environment: RobotVectorEnv, ahead: int = 0) -> None:
+    def __init__(self, environment: RobotVectorEnv, ahead: int = 0, reach: Reach | None = None) -> None:
         task = environment.task
         if not isinstance(task, GoalTask):
             raise InputError("the scripted policy goes to places: take reach or follow.")
-        self._rests = Polynomial.fitted(task.reach.actions, task.reach.places / task.size, _ORDER)
+        known = task.reach if reach is None else reach
+        self._rests = Polynomial.fitted(known.actions, known.places / task.size, _ORDER)
         self._rest, self._tracked, self._size = environment.rests[0].ravel(), environment.tracked, task.size
         self._parts, self._ahead = task.reach.actions.shape[1], ahead
 

@@ -162,6 +162,10 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         """(B, 3) of the task, without noise of what is seen."""
         return np.asarray(self.world.markers().reshape(self.num_envs, -1) @ self.tracked.T)
 
+    def _errors(self) -> FloatArray:
+        """(B,) how far the points are from what is asked now [mm]."""
+        return self.task.errors_mm(self._points, self._number)
+
     @override
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """B pictures (H, W, 3) of the robots, their markers and what is asked of them; None without a render mode.
@@ -181,7 +185,7 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
             middle = np.concatenate([self.rests[0], vertices[0]]).mean(axis=0)
             around = np.concatenate([-np.eye(3), np.eye(3)]) * self.task.size
             self._camera = Camera(self._up, np.concatenate([self.rests[0], vertices[0], *wanted, middle + around]))
-        errors = self.task.errors_mm(self._points, number)
+        errors = self._errors()
         seconds = number * self.world.time_step * self._drive.frames
         return tuple(
             self._camera.picture(
@@ -227,7 +231,7 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         lost = np.zeros(self.num_envs, dtype=np.bool_)
         for _ in range(drive.frames):
             self._commands = self._commands + np.clip(wanted - self._commands, -most, most)
-            lost = self.world.step(self._commands)
+            lost |= self.world.step(self._commands)
         self._number += 1
         self._before, self._seen = self._seen, self._cameras(np.ones_like(lost))
         points = self._points
@@ -236,11 +240,12 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         rewards = rewards - _SMOOTH * np.square(changed).mean(axis=1)
         rewards = np.where(lost, _LOST, rewards)
         terminated, truncated = lost.copy(), (self._number >= self.actions) & ~lost
-        infos: dict[str, Any] = {"error_mm": self.task.errors_mm(points, self._number)}
+        infos: dict[str, Any] = {"error_mm": self._errors()}
         if beginning.any():
             self._begin(beginning)
             rewards = np.where(beginning, 0.0, rewards)
             terminated, truncated = terminated & ~beginning, truncated & ~beginning
+            infos["error_mm"] = np.where(beginning, self._errors(), infos["error_mm"])
         self._over = terminated | truncated
         if self._mode is AutoresetMode.SAME_STEP and self._over.any():
             over, last_seen = self._over.copy(), self._observed()

@@ -162,19 +162,20 @@ class ReducedWorld(World):
         self.input, self.parts = model.name, model.parts
         self._rest = self._batch = begin(model, count, np.zeros(model.parts))
         self._furthest = _FURTHEST * np.abs(model.static.coefficients).max()
+        self._lost = np.zeros(count, dtype=np.bool_)
 
     def begin(self, chosen: BoolArray) -> None:
         """See `World.begin`."""
-        self._batch = self._rest.where(chosen, self._batch)
+        self._batch, self._lost = self._rest.where(chosen, self._batch), self._lost & ~chosen
 
     def step(self, commands: FloatArray) -> BoolArray:
-        """See `World.step`: a model fails that goes further than the robot ever could, and rests from then on."""
+        """See `World.step`: a model fails that goes further than the robot ever could, and rests until it begins."""
         with np.errstate(over="ignore", invalid="ignore"):
             self._batch = advance(self._model, self._batch, commands)
-        lost = ~(np.abs(self._batch.z) < self._furthest).all(axis=1)
-        if lost.any():
-            self._batch = self._rest.where(lost, self._batch)
-        return lost
+        self._lost = self._lost | ~(np.abs(self._batch.z) < self._furthest).all(axis=1)
+        if self._lost.any():
+            self._batch = self._rest.where(self._lost, self._batch)
+        return self._lost
 
     def markers(self) -> FloatArray:
         """See `World.markers`."""
@@ -189,7 +190,8 @@ class LaboratoryWorld(World):
     """
 
     def __init__(self, settings: Mapping[str, Any], run_dir: Path, given: str, count: int, seed: int) -> None:
-        self._laboratory = Laboratory(settings, run_dir, given, count, seed)
+        self._laboratory = Laboratory(settings, run_dir, given, count, seed, "count")
+        self._lost = np.zeros(count, dtype=np.bool_)
         self.count, self.time_step, self.input = count, float(settings["time_step"]), given
         self.parts = self._laboratory.parts
         self._rest = self._laboratory.state
@@ -197,6 +199,10 @@ class LaboratoryWorld(World):
 
     def begin(self, chosen: BoolArray) -> None:
         """See `World.begin`."""
+        self._lost = self._lost & ~chosen
+        self._put_to_rest(chosen)
+
+    def _put_to_rest(self, chosen: BoolArray) -> None:
         if chosen.all():
             self._laboratory.state = self._rest
             return
@@ -211,9 +217,11 @@ class LaboratoryWorld(World):
         self._laboratory.state = State.from_tensors({name: mixed(name, value) for name, value in now.items()})
 
     def step(self, commands: FloatArray) -> BoolArray:
-        """See `World.step`."""
-        self._laboratory.step(commands)
-        return np.zeros(self.count, dtype=np.bool_)
+        """See `World.step`; a body whose simulation fails rests until it begins."""
+        self._lost = self._lost | self._laboratory.step(commands)
+        if self._lost.any():
+            self._put_to_rest(self._lost)
+        return self._lost
 
     def markers(self) -> FloatArray:
         """See `World.markers`; cameras see them with a noise."""

@@ -157,6 +157,7 @@ def run_benchmark(config: Mapping[str, Any]) -> dict[str, Any]:
         check(f"benchmark.materials.{number}", material, _MATERIAL)
     if settings["quick"]:
         settings |= _QUICK
+    environments = _environments(settings, config["device"])  # First, as a run may be none.
     yardstick: list[float] = []
     steps: list[dict[str, Any]] = []
     parts: list[dict[str, Any]] = []
@@ -175,7 +176,7 @@ def run_benchmark(config: Mapping[str, Any]) -> dict[str, Any]:
         "steps": steps,
         "parts": parts,
         "cold_start": cold_start(config) if settings["cold_start"] else None,
-        "environments": _environments(settings, config["device"]),
+        "environments": environments,
     }
 
 

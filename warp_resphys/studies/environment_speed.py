@@ -36,13 +36,14 @@ def time_environments(run: Path, counts: list[int], repeats: int, device: str) -
     for world in worlds:
         for count in counts:
             where = device if world == "simulator" else "cpu"
-            robots = make_vector("reach", run, count, world=world, seconds=100.0, device=where)
+            robots = make_vector("reach", run, count, world=world, spread=0.0, seconds=100.0, device=where)
             robots.reset(seed=0)
             random, seconds = np.random.default_rng(0), []
+            robots.step(np.zeros((count, robots.world.parts), dtype=np.float32))  # Kernels are loaded, buffers made.
             for _ in range(repeats):
                 began = time.perf_counter()
                 for _ in range(_ACTIONS):
-                    robots.step(random.uniform(-1.0, 1.0, robots.action_space.shape).astype(np.float32))
+                    robots.step(random.uniform(-1.0, 1.0, (count, robots.world.parts)).astype(np.float32))
                 seconds.append((time.perf_counter() - began) / _ACTIONS)
             spent = median(seconds)
             actions = count / spent

@@ -21,7 +21,7 @@ _PREVIEWS: Final = 3  # places that a scripted policy may go to
 
 
 def train_policy(config: Mapping[str, Any], folder: Path) -> None:
-    """Prints errors; writes policies and policies.json into the folder ``policies`` of the run.
+    """Prints errors; writes policies and their errors into the folder ``policies`` of the run.
 
     Raises:
         InputError: Gymnasium or Stable-Baselines3 is not installed, or the run has no driven robot or no laboratory.
@@ -39,24 +39,34 @@ def train_policy(config: Mapping[str, Any], folder: Path) -> None:
     try:
         from ..environments.making import make_vector
         from ..environments.policies import Policy, ScriptedPolicy, acting, errors_mm, learn
+        from ..environments.tasks import GoalTask
     except ImportError as error:
         raise InputError(f"policies need Gymnasium ({error}): pip install 'warp-resphys[policies]'.") from None
     wp.config.log_level = wp.LOG_WARNING
     run, task, models = Path(config["run"]).expanduser(), config["skill"], config["models"]
+    reaches = {}
+    for model in models:
+        known = make_vector(task, run, 1, model, "reduced").task
+        assert isinstance(known, GoalTask)
+        reaches[model] = known.reach
+    common = reaches[models[-1]]  # What is asked, and the units in which it is shown, are the same for all.
     worlds = {f"reduced {model}": (model, "reduced") for model in models} | {"laboratory": (models[-1], "laboratory")}
-    tried = {name: make_vector(task, run, config["episodes"], model, world) for name, (model, world) in worlds.items()}
+    tried = {
+        name: make_vector(task, run, config["episodes"], model, world, reach=common)
+        for name, (model, world) in worlds.items()
+    }
     policies: dict[str, Policy] = {}
     speeds: dict[str, float] = {}
     place = run / "policies"
     place.mkdir(exist_ok=True)
     for model in models:
-        robots = make_vector(task, run, config["robots"], model, "reduced", autoreset_mode="SameStep")
+        robots = make_vector(task, run, config["robots"], model, "reduced", autoreset_mode="SameStep", reach=common)
         for ahead in range(_PREVIEWS):
-            policies[f"scripted, {model}, place {ahead + 1}"] = ScriptedPolicy(robots, ahead)
+            policies[f"scripted, {model}, place {ahead + 1}"] = ScriptedPolicy(robots, ahead, reaches[model])
         began = time.perf_counter()
         with Progress(f"policy on {model}", config["steps"], "actions") as progress:
             learned = learn(robots, config["steps"], config["seed"], progress.advance)
-        speeds[model] = config["steps"] / (time.perf_counter() - began)
+        speeds[model] = learned.num_timesteps / (time.perf_counter() - began)
         policies[f"PPO, {model}"] = acting(learned)
         learned.save(place / f"{task}_{model}.zip")
     errors = {
@@ -72,10 +82,15 @@ def train_policy(config: Mapping[str, Any], folder: Path) -> None:
     show(table, f"Actions a second while learning: {told}.", f"Written: {path} and the policies beside it")
 
 
-def _told(errors: NDArray[np.float64]) -> dict[str, float]:
-    return {"mean_mm": float(np.nanmean(errors)), "failed": int(np.isnan(errors).any(axis=0).sum())}
+def _told(errors: NDArray[np.float64]) -> dict[str, float | None]:
+    """Robots that failed count up to their failure; the mean is None where all failed at once."""
+    known = errors[np.isfinite(errors)]
+    return {
+        "mean_mm": float(known.mean()) if len(known) else None,
+        "failed": int(np.isnan(errors).any(axis=0).sum()),
+    }
 
 
-def _text(found: Mapping[str, float]) -> str:
+def _text(found: Mapping[str, float | None]) -> str:
     failed = f" ({found['failed']} failed)" if found["failed"] else ""
-    return f"{found['mean_mm']:.2f}{failed}"
+    return ("-" if found["mean_mm"] is None else f"{found['mean_mm']:.2f}") + failed

@@ -61,6 +61,7 @@ def joined(device: torch.device) -> Iterator[None]:
         logging.disable(logging.WARNING)
     dist.init_process_group("nccl" if device.type == "cuda" else "gloo", timeout=_PATIENCE)
     yield
+    dist.barrier()  # Threads of one that leaves while another is still at it may end both processes.
     dist.destroy_process_group()  # After an error the process is to end, not to wait for the others.
 
 

@@ -190,15 +190,12 @@ _SOLVE: Final = (
 def tiled_kernels(scalar: Any) -> SimpleNamespace:
     """Kernels for numbers of a type, in blocks of ``BLOCK`` threads."""
     kernel, _ = decorators(f"tiles.{scalar.__name__}")
-    of_type = {"SCALAR": "double" if scalar is wp.float64 else "float"}
+    name = "double" if scalar is wp.float64 else "float"
 
-    def native(snippet: str) -> Any:
-        return wp.func_native(snippet.replace("SCALAR", of_type["SCALAR"]))
-
-    @native(_FACTOR)
+    @wp.func_native(_FACTOR.replace("SCALAR", name))
     def factorise(matrix: wp.array2d[scalar]): ...
 
-    @native(_SOLVE)
+    @wp.func_native(_SOLVE.replace("SCALAR", name))
     def substitute(factor: wp.array2d[scalar], column: wp.array[scalar]): ...
 
     @kernel

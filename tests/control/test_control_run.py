@@ -22,6 +22,7 @@ from warp_resphys.control.reduced_batch import advance, begin, observed
 from warp_resphys.control.reduction import reduce
 from warp_resphys.control.sampling import Sampling
 from warp_resphys.control.task import Task
+from warp_resphys.environments.worlds import ReducedWorld
 from warp_resphys.experiment.checks import check_configuration
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_array, read_hdf5
@@ -72,6 +73,25 @@ def model(folder, robot):
 
 def settings(folder, stage):
     return json.loads((folder / "stages" / f"{stage}.json").read_text())["settings"]
+
+
+class TestReducedWorld:
+    def test_it_moves_as_the_model_does_and_a_failure_lasts_until_it_begins(self, model):
+        world = ReducedWorld(model, 2)
+        rest, commands = world.markers(), np.array([[0.4, 0.0, 0.0], [0.0, 0.3, 0.0]])
+        for _ in range(4):
+            assert not world.step(commands).any()
+        for row in range(2):
+            expected = model.respond(model.rest(), np.tile(commands[row], (4, 1))).y[-1]
+            np.testing.assert_allclose(world.markers()[row].ravel(), expected, atol=1e-9)
+        assert np.abs(world.markers() - rest).max() > 1e-4
+        furthest, world._furthest = world._furthest, 0.0
+        assert world.step(commands).all()
+        world._furthest = furthest
+        assert world.step(commands).all()
+        np.testing.assert_array_equal(world.markers(), rest)
+        world.begin(np.array([True, False]))
+        assert world.step(commands).tolist() == [False, True]
 
 
 class TestReducedModel:

@@ -6,7 +6,7 @@ import pytest
 from warp_resphys.environments.making import make_vector
 from warp_resphys.environments.policies import ScriptedPolicy, acting, errors_mm, learn
 from warp_resphys.io.errors import InputError
-from warp_resphys.studies.environment_speed import ENVIRONMENT_HEADS, environment_rows, time_environments
+from warp_resphys.studies.environment_speed import environment_table, time_environments
 
 
 def still(seen):
@@ -84,4 +84,6 @@ def test_speeds_are_those_of_all_robots_and_worlds(folder):
     for row in rows:
         assert row["actions_s"] == pytest.approx(1e3 * row["robots"] / row["ms"])
         assert row["steps_s"] == pytest.approx(5 * row["actions_s"])
-    assert all(len(each) == len(ENVIRONMENT_HEADS) for each in environment_rows(rows))
+    table = environment_table(rows)
+    assert (table.row_count, len(table.columns)) == (4, 5)
+    assert [*table.columns[0].cells] == [row["world"] for row in rows]

@@ -21,6 +21,7 @@ NUDGE: Final = 0.005  # The outline is drawn this far behind the body where they
 TOWARDS_VIEWER: Final = (0.40, -1.0, 0.40)  # A body along x is seen from the side, the end of high x nearer.
 SHADE: Final = 0.25  # Share of the colour that depends on the light; the rest stays readable as a value.
 _SHARP: Final = 30.0  # Between the normals of faces that share an edge of the outline [degrees].
+_HANGING: Final = 0.7  # Cosine between gravity and a body that hangs.
 _DIVERGED: Final = 10.0  # Distance from the target, or from rest, over the body's, beyond which nothing is drawn.
 
 _FAST: Final = 2.5  # [s] that a motion lasts which is shown slowed down, and from its start only,
@@ -276,6 +277,15 @@ def _upwards(gravity: FloatArray) -> FloatArray:
     """(3,) against gravity; along z where there is none."""
     length = float(np.linalg.norm(gravity))
     return -gravity / length if length > 0.0 else np.array([0.0, 0.0, 1.0])
+
+
+def hangs(mesh: Mesh, fixed: IntArray, gravity: FloatArray) -> tuple[bool, FloatArray]:
+    """Whether a body hangs, so that its motion is seen from below, and (N,) how far vertices are from the clamp [m]."""
+    start = mesh.vertices[fixed].mean(axis=0) if len(fixed) else mesh.vertices[0]
+    away = mesh.vertices - start
+    axis = away.mean(axis=0)
+    size = float(np.linalg.norm(axis) * np.linalg.norm(gravity))
+    return bool(size > 0.0 and axis @ gravity > _HANGING * size), np.linalg.norm(away, axis=1)
 
 
 def motion_axes(gravity: FloatArray, positions: FloatArray) -> FloatArray:

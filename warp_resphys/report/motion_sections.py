@@ -11,7 +11,7 @@ import numpy as np
 from markupsafe import Markup
 
 from ..learning.intervals import Intervals
-from .bodies import Motion, distance_scene, largest_distances, write_film
+from .bodies import Motion, distance_scene, hangs, largest_distances, write_film
 from .data import (
     MODELS,
     Driven,
@@ -35,7 +35,6 @@ _MOST_MARKERS: Final = 6  # That are drawn coordinate by coordinate.
 _PLANE_SECONDS: Final = 5.0  # Of a path in the plane.
 _SPACE_SECONDS: Final = 2.5  # And in space, where a longer one cannot be told apart.
 _SEQUENCES: Final = 3  # Trials whose inputs are drawn over time.
-_HANGING: Final = 0.7  # Cosine between gravity and a body that hangs.
 
 
 def start_drawing(data: RunReport, folder: Path, pool: Executor) -> "dict[str, Future[Any]]":
@@ -60,7 +59,7 @@ def motion_of(data: RunReport) -> Motion | None:
     trials, film = data.trials, data.film
     if trials is None:
         return None
-    hangs, away = _hangs(data, trials)
+    seen_from_below, away = hangs(data.mesh, data.fixed, trials.gravity)
     some = None
     if not trials.labels:
         row = trials.worst
@@ -79,16 +78,7 @@ def motion_of(data: RunReport) -> Motion | None:
     bodies = {m: at_times(film.positions[m], film.times, times[frames]) for m in models}
     target, *markers = (q[row][frames][:, some] for q in (trials.target, *(trials.positions[m] for m in models)))
     seen = dict(zip(models, markers, strict=True))
-    return Motion(data.mesh, times[frames], target, bodies, seen, trials.bound[some], trials.gravity, hangs)
-
-
-def _hangs(data: RunReport, trials: Trials) -> tuple[bool, FloatArray]:
-    """Whether the body hangs, so that its motion is seen from below, and (N,) how far vertices are from the clamp."""
-    start = data.mesh.vertices[data.fixed].mean(axis=0) if len(data.fixed) else data.mesh.vertices[0]
-    away = data.mesh.vertices - start
-    axis, down = away.mean(axis=0), trials.gravity
-    size = float(np.linalg.norm(axis) * np.linalg.norm(down))
-    return bool(size > 0.0 and axis @ down > _HANGING * size), np.linalg.norm(away, axis=1)
+    return Motion(data.mesh, times[frames], target, bodies, seen, trials.bound[some], trials.gravity, seen_from_below)
 
 
 def worst_state(trials: Trials, row: int) -> int:

@@ -49,7 +49,7 @@ from ..io.progress import Progress
 from ..io.stages import package_versions
 from ..linalg.threads import threads_for
 from .command import show, table_of
-from .environment_speed import ENVIRONMENT_HEADS, environment_rows, time_environments
+from .environment_speed import environment_table, time_environments
 
 PARTS: Final = ("local_step", "tangent", "assembly", "factor", "solve")
 _YARDSTICK_SIZE: Final = 480
@@ -397,6 +397,5 @@ def benchmark_tables(result: Mapping[str, Any]) -> list[Table]:
         headings = ["kernel cache", *(name.removesuffix("_s").replace("_", " ") for name in names)]
         tables.append(table_of("Seconds of a new process", headings, starts))
     if result["environments"]:
-        rows = environment_rows(result["environments"])
-        tables.append(table_of("Environments, task reach", ENVIRONMENT_HEADS, rows))
+        tables.append(environment_table(result["environments"]))
     return tables

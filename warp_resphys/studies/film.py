@@ -13,7 +13,7 @@ from ..experiment.schema import POSITIVE, WORD, check, optional
 from ..io.errors import InputError
 from ..io.files import read_json
 from ..io.stages import finished_record
-from ..report.bodies import Motion, write_film
+from ..report.bodies import Motion, hangs, write_film
 from ..report.data import MODELS, at_times
 from ..report.render import DrawingError
 from ..robot.loading import load, recorded_trial
@@ -79,7 +79,8 @@ def motion_of(run: Path, trial: str, models: Sequence[str], seconds: float = np.
     mesh = robot.simulator.body.mesh
     bound = robot.observe(robot.state(mesh.vertices))[0].double().cpu().numpy()[some]
     gravity = np.asarray(robot.simulator.gravity, dtype=np.float64)
-    return Motion(mesh, times, played.markers[frames][:, some], positions, markers, bound, gravity)
+    from_below, _ = hangs(mesh, robot.simulator.body.fixed_vertices, gravity)
+    return Motion(mesh, times, played.markers[frames][:, some], positions, markers, bound, gravity, from_below)
 
 
 def _shown(robot: Robot, count: int) -> np.ndarray:
@@ -87,6 +88,6 @@ def _shown(robot: Robot, count: int) -> np.ndarray:
     if robot.labels:
         return np.arange(count)
     body = robot.simulator.body
-    away = np.linalg.norm(body.mesh.vertices - body.mesh.vertices[body.fixed_vertices].mean(axis=0), axis=1)
+    _, away = hangs(body.mesh, body.fixed_vertices, np.asarray(robot.simulator.gravity))
     tip = np.flatnonzero(away >= _AT_THE_TIP * away.max())
     return np.asarray(tip[np.unique(np.linspace(0, len(tip) - 1, _MOST_MARKERS).round().astype(int))])

@@ -1,5 +1,7 @@
 """What tests of reports share."""
 
+import base64
+import hashlib
 import sys
 from html.parser import HTMLParser
 
@@ -11,15 +13,31 @@ class Page(HTMLParser):
 
     def __init__(self, path):
         super().__init__()
-        self.links, self.images, self.text = [], [], ""
+        self.links, self.images, self.text, self.scripts, self.data, self.inside = [], [], "", [], [], None
         self.source = path.read_text(encoding="utf-8")
         self.feed(self.source)
         self.text = " ".join(self.text.replace("\u00a0", " ").split())
 
     def handle_starttag(self, tag, attrs):
         self.links += [value or "" for name, value in attrs if name in ("src", "href", "srcset", "data")]
+        if tag == "script":
+            self.inside = self.scripts if dict(attrs).get("type") is None else self.data
+            self.inside.append("")
         if tag == "img":
             self.images.append(dict(attrs))
 
+    def handle_endtag(self, tag):
+        self.inside = None if tag == "script" else self.inside
+
     def handle_data(self, data):
-        self.text += data
+        if self.inside is None:
+            self.text += data
+        else:
+            self.inside[-1] += data
+
+    def allows_its_scripts_alone(self):
+        """Whether the policy of contents names the scripts that run, and nothing else that may."""
+        digests = [base64.b64encode(hashlib.sha256(each.encode()).digest()).decode() for each in self.scripts]
+        policy = self.source.partition("Content-Security-Policy")[2].partition(">")[0]
+        allowed = policy.partition("script-src ")[2].partition(";")[0].rstrip('"').split()
+        return "default-src 'none'" in policy and allowed == [f"'sha256-{digest}'" for digest in digests]

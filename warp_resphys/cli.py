@@ -48,6 +48,7 @@ COMMANDS: Final[Mapping[str, tuple[str, str]]] = MappingProxyType(
         "reproduce": ("studies.reproduction:reproduce", "run the simulated beams, and compare with what was published"),
         "robots": ("studies.robots:robots", "run the robots that others recorded, with one page on all of them"),
         "film": ("studies.film:film", "make a film of a trial of a run, with any of its models"),
+        "view": ("studies.view:view", "show a run's robot in a browser, to be driven and pulled"),
         "train-policy": (
             "studies.policy:train_policy",
             "learn a policy on a run's robot, and try it on its laboratory",
@@ -106,6 +107,7 @@ _VALUED: Final = (
     *("--info", "-i", "--experimental-rerun"),
 )
 # Of a process that helps another one with a run.
+_PLAIN: Final = re.compile(r"[\w./~=+%@:,-]+")  # A value that means nothing but itself.
 _SILENT: Final = ("hydra.output_subdir=null", "hydra/job_logging=disabled")
 
 
@@ -184,7 +186,7 @@ def _run(command: str | None) -> None:
         if any(argument.startswith("--experimental-rerun") for argument in sys.argv[1:]):
             raise HydraException("--experimental-rerun reads a pickle, which can run code: use overrides")
         chosen, rest = _read(arguments[1:], command)
-        sys.argv = [arguments[0], *_own_options(), *rest, *([] if is_first() else _SILENT)]
+        sys.argv = [arguments[0], *_own_options(), *map(_quoted, rest), *([] if is_first() else _SILENT)]
         if place()[1] > 1 and chosen != "run":
             raise InputError(f"torchrun is for runs: start warp-resphys {chosen} without it.")
         configuration = _CONFIGURATIONS.get(chosen, chosen.replace("-", "_"))
@@ -248,6 +250,13 @@ def _own_options() -> list[str]:
             name = path.relative_to(Path.cwd())
             print(f"warning: {name} is not used: the package has an option of that name", file=sys.stderr)
     return ["--config-dir", str(folder)]
+
+
+def _quoted(argument: str) -> str:
+    """The same argument; a value with an equals sign, as run folders are called, in the quotes that Hydra wants."""
+    key, _, value = argument.partition("=")
+    plain = _PLAIN.fullmatch(value) is not None and "=" in value
+    return f'{key}="{value}"' if plain and not key.startswith("-") else argument
 
 
 def _explain(error: BaseException, started: bool) -> str | None:

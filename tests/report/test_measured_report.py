@@ -59,7 +59,9 @@ def test_page_of_a_split(tmp_path):
     page = report(tmp_path)
     errors = read_json(tmp_path / "errors.json")
     assert all(link.startswith("data:") for link in page.links)
-    assert re.search(r"https?://|<script", page.source) is None
+    assert re.search(r"https?://", page.source) is None
+    assert len(page.scripts) == 1
+    assert page.allows_its_scripts_alone()
     assert all(len(image["alt"]) > 40 for image in page.images)
     for model in MODELS:
         assert f"{errors['errors_mm'][model]['mean']:.3f}" in page.text

@@ -54,7 +54,9 @@ def test_page_needs_nothing_beside_it(finished):
     assert len(page.images) == len(DRAWN | RENDERED)
     assert all(link.startswith("data:") for link in page.links)
     assert all(len(image["alt"]) > 40 for image in page.images)
-    assert re.search(r"https?://|url\(|@import|<script", page.source) is None
+    assert re.search(r"https?://|url\(|@import", page.source) is None
+    assert len(page.scripts) == 1
+    assert page.allows_its_scripts_alone()
     for link in page.links:
         if link.startswith("data:image/svg+xml;base64,"):
             svg = base64.b64decode(link.partition(",")[2]).decode()

@@ -50,3 +50,11 @@ def test_what_cannot_be_filmed_is_said(finished, folder, change, said):
     assert err.startswith("error: ")
     assert said in err
     assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", ["runs/budget=quick", "runs/budget=quick,seed=2", "runs/default"])
+def test_folders_of_runs_need_no_quotes(folder, name):
+    for argument in (f"run={name}", f"run='{name}'"):
+        code, err = end_of(cli.main, "warp-resphys", "film", argument)
+        assert code == 2
+        assert err.startswith(f"error: {name}")

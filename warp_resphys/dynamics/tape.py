@@ -1,6 +1,6 @@
 """Roll-outs on a Warp tape: the second door to the gradients that ``torch.autograd`` gives.
 
-A recorded roll-out stands between its user's kernels on a tape, and ``tape.backward`` differentiates all of it:
+A recorded roll-out stands between its user's kernels on a tape, and ``tape.backward`` differentiates all of it::
 
     with wp.Tape() as tape:
         wp.launch(forces, dim=..., inputs=[parameters], outputs=[forces])

@@ -121,6 +121,7 @@ class Motion:
     bound: FloatArray  # (M, 3) [m] markers on the body at rest.
     gravity: FloatArray  # (3,) which way is down.
     from_below: bool = False  # Whether the second view is from below, where a hanging body moves, not from nearby.
+    target: FloatArray | None = None  # (T, N, 3) [m] of the vertices, where every one is observed.
 
     @property
     def is_fast(self) -> bool:
@@ -137,7 +138,8 @@ class Motion:
         chosen = np.asarray(frames, dtype=np.int64)
         positions, markers = ({m: q[chosen] for m, q in each.items()} for each in (self.positions, self.markers))
         times, measured = self.times[chosen], self.measured[chosen]
-        return replace(self, times=times, measured=measured, positions=positions, markers=markers)
+        target = None if self.target is None else self.target[chosen]
+        return replace(self, times=times, measured=measured, positions=positions, markers=markers, target=target)
 
     def scene(self) -> Scene:
         """The whole body at some instants, and beside it the markers from nearby, or the body from below."""
@@ -203,7 +205,7 @@ def _views(motion: Motion, size: tuple[int, int], headroom: float = 0.0) -> list
     """The whole body, with room for text above it over half its height, and its markers from nearby or from below."""
     body = float(np.ptp(motion.mesh.vertices, axis=0).max())
     positions, simulated = (
-        np.stack([_whole(each, rest, _DIVERGED * body) for each in shown.values()])  # (B, T, N | M, 3)
+        np.stack([whole(each, rest, _DIVERGED * body) for each in shown.values()])  # (B, T, N | M, 3)
         for shown, rest in ((motion.positions, motion.mesh.vertices), (motion.markers, motion.bound))
     )
     seen = np.concatenate([motion.mesh.vertices[None], *positions])
@@ -266,15 +268,15 @@ def _dots(measured: FloatArray, simulated: FloatArray, half: float, radius: floa
     return [*layers, Layer("balls", measured, None, MEASURED, size=size, shift=_BEFORE["dots"] * half)]
 
 
-def _whole(points: FloatArray, rest: FloatArray, largest: float) -> FloatArray:
-    """(T, P, 3) points, NaN in the frames in which one of them is not finite or farther than this from rest."""
+def whole(points: FloatArray, rest: FloatArray, largest: float) -> FloatArray:
+    """Return (T, P, 3) points, NaN in the frames in which one is not finite or farther than this from rest [m]."""
     with np.errstate(invalid="ignore", over="ignore"):
         kept = (np.abs(points - rest) < largest).all(axis=(1, 2), keepdims=True)
     return np.where(kept, points, np.nan)
 
 
-def _upwards(gravity: FloatArray) -> FloatArray:
-    """(3,) against gravity; along z where there is none."""
+def upwards(gravity: FloatArray) -> FloatArray:
+    """Return (3,) against gravity; along z where there is none."""
     length = float(np.linalg.norm(gravity))
     return -gravity / length if length > 0.0 else np.array([0.0, 0.0, 1.0])
 
@@ -295,7 +297,7 @@ def motion_axes(gravity: FloatArray, positions: FloatArray) -> FloatArray:
         gravity: (3,) which way is down; along -z where it is zero.
         positions: (T, N, 3) [m], the first frame at rest; NaN is left out.
     """
-    up = _upwards(gravity)
+    up = upwards(gravity)
     points = positions[np.isfinite(positions).all(axis=2)]
     flat = points - np.outer(points @ up, up)
     _, _, directions = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)
@@ -314,16 +316,22 @@ def axes_from_below(axes: FloatArray, gravity: FloatArray) -> FloatArray:
         axes: (3, 3) of a view that has gravity along its second row, or behind it.
         gravity: (3,) which way is down; along -z where it is zero.
     """
-    towards = -_upwards(gravity)
+    towards = -upwards(gravity)
     return np.stack([axes[0], np.cross(towards, axes[0]), towards])
+
+
+def frame_of(points: FloatArray, axes: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the middle (3,) of what is seen of points (P, 3), and half the width and height that hold it all [m]."""
+    turned = points[np.isfinite(points).all(axis=1)] @ axes.T
+    low, high = turned.min(axis=0), turned.max(axis=0)
+    extent = (high - low)[:2] + 2.0 * _FRAME * (high - low)[:2].max()
+    return 0.5 * (low + high) @ axes, 0.5 * extent
 
 
 def _frame(points: FloatArray, axes: FloatArray, size: tuple[int, int]) -> tuple[FloatArray, float]:
     """The middle (3,) of what is seen of points (P, 3), and half the height of a view that holds it all [m]."""
-    turned = points[np.isfinite(points).all(axis=1)] @ axes.T
-    low, high = turned.min(axis=0), turned.max(axis=0)
-    extent = (high - low)[:2] + 2.0 * _FRAME * (high - low)[:2].max()
-    return 0.5 * (low + high) @ axes, 0.5 * max(extent[1], extent[0] * size[1] / size[0])
+    middle, half = frame_of(points, axes)
+    return middle, max(half[1], half[0] * size[1] / size[0])
 
 
 def _follow(

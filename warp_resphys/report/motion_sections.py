@@ -54,8 +54,13 @@ def _draw_pictures(data: RunReport, motion: Motion) -> list[Pixels]:
     return draw(motion.scene(), *([] if shape is None else [shape]))
 
 
-def motion_of(data: RunReport) -> Motion | None:
-    """Return the motion that is drawn: that of the film; where vertices are observed, of the worst trial at its tip."""
+def motion_of(data: RunReport, *, every_model: bool = False) -> Motion | None:
+    """Return the motion that is drawn: that of the film; where vertices are observed, of the worst trial at its tip.
+
+    Args:
+        data: What the page shows.
+        every_model: Whether all models are in it, not only the two that are compared in pictures.
+    """
     trials, film = data.trials, data.film
     if trials is None:
         return None
@@ -68,7 +73,10 @@ def motion_of(data: RunReport) -> Motion | None:
         some = some[np.unique(np.linspace(0, len(some) - 1, _MOST_MARKERS).round().astype(int))]
     if film is None or film.trial not in trials.names or not shown_models(film.positions):
         return None
-    row, models = trials.names.index(film.trial), shown_models(film.positions)
+    row = trials.names.index(film.trial)
+    models = shown_models(film.positions)
+    if every_model:
+        models = [model for model in MODELS if model in film.positions and model in trials.positions]
     some = shown_markers(trials.target[row]) if some is None else some
     times = trials.times[row]
     frames = np.flatnonzero(np.append(True, np.diff(times) > 0.0))
@@ -78,7 +86,9 @@ def motion_of(data: RunReport) -> Motion | None:
     bodies = {m: at_times(film.positions[m], film.times, times[frames]) for m in models}
     target, *markers = (q[row][frames][:, some] for q in (trials.target, *(trials.positions[m] for m in models)))
     seen = dict(zip(models, markers, strict=True))
-    return Motion(data.mesh, times[frames], target, bodies, seen, trials.bound[some], trials.gravity, seen_from_below)
+    whole = None if trials.labels else trials.target[row][frames]
+    at_rest = trials.bound[some]
+    return Motion(data.mesh, times[frames], target, bodies, seen, at_rest, trials.gravity, seen_from_below, whole)
 
 
 def worst_state(trials: Trials, row: int) -> int:
@@ -116,9 +126,28 @@ def motion_section(data: RunReport, canvas: Canvas) -> Part | None:
             return Drawn("video", said, film=data_address(path.read_bytes(), "video/mp4"))
 
         blocks += canvas.attempt("motion.mp4", film)
+    blocks += _in_space(data, name)
     same = "The same trial" if blocks else f"The trial {name}"
     blocks += canvas.attempt("motion.png", lambda _: _instants_figure(data, motion, same, colours, canvas))
     return Part("The motion" if data.sees_markers else f"One test trial: {name}", blocks)
+
+
+def _in_space(data: RunReport, name: str) -> list[Block]:
+    """The bodies of all models, to be turned and played."""
+    from .view import view_in_space
+
+    motion = motion_of(data, every_model=True)
+    if motion is None:
+        return []
+    shown, compared = shown_models(motion.positions), "markers" if data.sees_markers else "vertices"
+    against = "what was measured" if data.sees_markers else "the target"
+    caption = (
+        f"The trial {name} in space: drag to turn, with Shift to move, pinch or scroll to zoom; arrow keys turn, plus "
+        f"and minus zoom, the space bar plays, comma and full stop step, 0 resets. Colours of errors are distances of "
+        f"the {compared} of the solid body from {against}, from zero to its largest in this trial."
+    )
+    alt = f"The bodies of {', '.join(MODELS[model][0] for model in motion.positions)} in motion, to be turned."
+    return [view_in_space("view", motion, shown, unbroken(caption), alt)]
 
 
 def _instants_figure(data: RunReport, motion: Motion, name: str, colours: str, canvas: Canvas) -> Drawn:

@@ -1,17 +1,20 @@
 """Pages that need nothing beside them: sections of text, tables and figures, and how numbers are written on them."""
 
 import base64
+import hashlib
 import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jinja2
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import NDArray
 
 from ..io.errors import DataFileError
@@ -98,7 +101,37 @@ class Drawn:
     scrolls: bool = False  # Whether it stays wide on a narrow page.
 
 
-Block = Text | Items | Table | Drawn
+@dataclass(frozen=True)
+class ViewInSpace:
+    """Bodies that are turned and played in the browser, and what the script of the page reads of them."""
+
+    name: str  # On the page.
+    caption: str  # What stands below.
+    alt: str  # What it shows, in words.
+    payload: Markup
+    models: Sequence[Mapping[str, Any]]  # `name`, `light` and `dark` colour, and whether it is `shown` at first.
+    frames: int
+    speed: float  # At first, over the real one.
+    observed: str  # What was observed, such as "markers".
+
+
+Block = Text | Items | Table | Drawn | ViewInSpace
+
+
+class Script(NamedTuple):
+    """A script on a page, and what its policy of contents allows by it."""
+
+    text: Markup
+    digest: str
+
+    @classmethod
+    def of(cls, parts: "Sequence[Part]") -> "Script | None":
+        """The script that the blocks of a page need, if they need one."""
+        if not any(isinstance(block, ViewInSpace) for part in parts for block in part.blocks):
+            return None
+        text = resources.files(__package__).joinpath("view.js").read_text(encoding="utf-8")
+        digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")
+        return cls(Markup(text), f"sha256-{digest}")
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,217 @@
+"""The bodies in space on a report's page: what the script reads, and the page in a browser."""
+
+import base64
+import json
+
+import numpy as np
+import pytest
+from browser import opened as browser_of_tests
+from browser import until
+from driven_run import arm_settings
+from driven_run import write_run as write_driven
+from report_page import FAILING, Page
+from vertex_run import settings as vertex_settings
+from vertex_run import write_run as write_vertex
+
+from warp_resphys.experiment.report import make_report
+from warp_resphys.io.stages import StageContext
+from warp_resphys.mesh.mesh import boundary_triangles, box_hexahedra
+from warp_resphys.report import render
+from warp_resphys.report.bodies import Motion
+from warp_resphys.report.view import reduced, view_in_space
+
+RUNS = {"markers": (write_driven, arm_settings), "vertices": (write_vertex, vertex_settings)}
+
+
+def decoded(text, kind):
+    return np.frombuffer(base64.b64decode(text), dtype=kind)
+
+
+def swinging(frames=40, models=("simulation", "resphys")):
+    """A box whose end swings, more with the first model than with the second."""
+    mesh = box_hexahedra((0.1, 0.02, 0.02), divisions=(6, 2, 2))
+    times = 0.05 * np.arange(frames)
+    along = mesh.vertices[:, 0] / 0.1
+    shape = np.stack([0.0 * along, 0.0 * along, along**2], axis=1)
+    each = {
+        model: mesh.vertices + 0.02 * (k + 1) * np.sin(7.0 * times)[:, None, None] * shape
+        for k, model in enumerate(reversed(models))
+    }
+    positions = {model: each[model] for model in models}
+    some = [0, len(mesh.vertices) - 1]
+    target = mesh.vertices + 0.01 * np.sin(7.0 * times)[:, None, None] * shape
+    markers = {model: q[:, some] for model, q in positions.items()}
+    gravity = np.array([0.0, 0.0, -9.81])
+    return Motion(mesh, times, target[:, some], positions, markers, mesh.vertices[some], gravity), target
+
+
+@pytest.mark.parametrize("every_vertex", [False, True])
+def test_what_the_script_reads_are_the_bodies(every_vertex):
+    motion, target = swinging()
+    motion = Motion(**{**vars(motion), "target": target if every_vertex else None})
+    motion.positions["simulation"][30:] = np.nan
+    block = view_in_space("view", motion, ["resphys"], "caption", "alt")
+    data = json.loads(str(block.payload))
+    surface = np.unique(boundary_triangles(motion.mesh))
+    basis = decoded(data["modes"], "<i2").reshape(len(data["scales"]), -1) * np.array(data["scales"])[:, None]
+    weights = decoded(data["weights"], "<f4").reshape(2, 40, -1)
+    rest = decoded(data["rest"], "<f4").reshape(-1, 3)
+    places = rest + (weights @ basis).reshape(2, 40, -1, 3)
+    faces = decoded(data["faces"], "<u4").reshape(-1, 3)
+    np.testing.assert_allclose(rest[faces], motion.mesh.vertices[boundary_triangles(motion.mesh)], atol=1e-8)
+    for place, q in zip(places, motion.positions.values(), strict=True):
+        np.testing.assert_allclose(place, q[:, surface], atol=2.5e-4 * 0.1)
+    expected = target if every_vertex else motion.measured
+    found = motion.positions if every_vertex else motion.markers
+    for model, name in zip(data["models"], motion.positions, strict=True):
+        away = 1e3 * np.linalg.norm(found[name] - expected, axis=2)
+        assert model["largest"] == pytest.approx(np.nanmax(away), rel=1e-3)
+        means = np.array([np.nan if mean is None else mean for mean in model["means"]])
+        np.testing.assert_allclose(means, away.mean(axis=1), rtol=1e-3)
+    if every_vertex:
+        shares = decoded(data["errors"], "u1").reshape(2, 40, -1) / 255
+        away = 1e3 * np.linalg.norm(motion.positions["resphys"][:, surface] - target[:, surface], axis=2)
+        np.testing.assert_allclose(shares[1] * data["models"][1]["largest"], away, atol=away.max() / 400)
+    assert [model["shown"] for model in data["models"]] == [False, True]
+
+
+def test_a_basis_is_as_small_as_it_may_be():
+    random = np.random.default_rng(3)
+    shapes, weights = random.normal(size=(3, 30)), random.normal(size=(2, 20, 3))
+    displacements = (weights @ shapes).reshape(2, 20, 10, 3)
+    displacements[1, 7:] = np.nan
+    basis, found = reduced(displacements, 1e-9, 20)
+    assert basis.shape == (3, 30)
+    np.testing.assert_allclose((found @ basis).reshape(2, 20, 10, 3), displacements, atol=1e-9)
+    assert reduced(displacements, 1e9, 20)[0].shape == (0, 30)
+    assert reduced(displacements, 0.0, 2)[0].shape == (2, 30)
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with browser_of_tests() as found:
+        yield found
+
+
+@pytest.fixture(scope="module", params=RUNS)
+def page(request, tmp_path_factory):
+    folder = tmp_path_factory.mktemp(request.param)
+    write, settings = RUNS[request.param]
+    config = settings()
+    write(folder, config)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(render, "COMMAND", FAILING)  # Nothing else is drawn, which takes seconds.
+        make_report(StageContext("report", folder, "", {"config": config}))
+    return folder / "report.html"
+
+
+def opened(browser, page, width, dark):
+    """The view on the page, at a width, after its first picture."""
+    from selenium.webdriver.common.by import By
+
+    metrics = {"width": width, "height": 900, "deviceScaleFactor": 2 if width < 600 else 1, "mobile": width < 600}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+    scheme = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": scheme})
+    browser.get(page.as_uri())
+    view = browser.find_element(By.ID, "view")
+    browser.execute_script("arguments[0].scrollIntoView()", view)
+    until(lambda: view.get_attribute("data-drawn"))
+    return view
+
+
+def drawn(browser, view):
+    """(H, W, 3) pixels of the canvas after what was asked of it is drawn."""
+    import io
+
+    from matplotlib.image import imread
+
+    script = """const done = arguments[arguments.length - 1], view = arguments[0].view;
+        requestAnimationFrame(() => requestAnimationFrame(() => done(view.canvas.toDataURL())));"""
+    address = browser.execute_async_script(script, view)
+    return imread(io.BytesIO(base64.b64decode(address.partition(",")[2])), format="png")[..., :3]
+
+
+@pytest.mark.parametrize(("width", "dark"), [(1100, False), (390, True)])
+def test_the_view_is_turned_played_and_compared(browser, page, width, dark):
+    from selenium.webdriver import ActionChains
+    from selenium.webdriver.common.by import By
+    from selenium.webdriver.common.keys import Keys
+
+    view = opened(browser, page, width, dark)
+    canvas, clock = (view.find_element(By.CSS_SELECTOR, which) for which in ("canvas", ".clock"))
+    assert browser.execute_script("return document.documentElement.scrollWidth") <= width
+    first = drawn(browser, view)
+    paper = np.array([0x14, 0x18, 0x1D] if dark else [255, 255, 255]) / 255
+    assert np.abs(first[4, 4] - paper).max() < 0.01
+    body = np.abs(first - paper).max(axis=2) > 0.05
+    assert 0.02 < body.mean() < 0.7
+    rows, columns = np.flatnonzero(body.any(axis=1)), np.flatnonzero(body.any(axis=0))
+    assert min(rows[0], columns[0]) > 0
+    assert rows[-1] < len(first) - 1
+    assert columns[-1] < first.shape[1] - 1
+
+    ActionChains(browser).drag_and_drop_by_offset(canvas, 60, 20).perform()
+    turned = drawn(browser, view)
+    assert np.abs(turned - first).max(axis=2).mean() > 0.01
+    canvas.send_keys("0")
+    np.testing.assert_allclose(drawn(browser, view), first, atol=0.02)
+    canvas.send_keys("+")
+    assert (np.abs(drawn(browser, view) - paper).max(axis=2) > 0.05).mean() > body.mean()
+    canvas.send_keys("-", "0", Keys.ARROW_LEFT)
+    assert np.abs(drawn(browser, view) - first).max(axis=2).mean() > 0.005
+    canvas.send_keys("0", ".", ".")
+    assert clock.text != "0.00 s"
+    later = drawn(browser, view)
+    assert np.abs(later - first).max(axis=2).max() > 0.2
+
+    button = view.find_element(By.CLASS_NAME, "play")
+    button.click()
+    assert button.get_attribute("aria-label") == "Pause"
+    before = clock.text
+    until(lambda: clock.text != before)
+    button.click()
+    assert button.get_attribute("aria-label") == "Play"
+    slider = view.find_element(By.CLASS_NAME, "time")
+    browser.execute_script("arguments[0].value = 500; arguments[0].dispatchEvent(new Event('input'))", slider)
+    drawn(browser, view)
+    assert "seconds" in slider.get_attribute("aria-valuetext")
+
+    legend = view.find_element(By.CLASS_NAME, "legend")
+    assert not legend.is_displayed()
+    plain = drawn(browser, view)
+    view.find_element(By.NAME, "errors").click()
+    assert np.abs(drawn(browser, view) - plain).max(axis=2).max() > 0.2
+    assert legend.is_displayed()
+    assert legend.text.endswith("mm")
+    boxes = view.find_elements(By.CSS_SELECTOR, ".models input")
+    shown = view.find_elements(By.CSS_SELECTOR, ".models output")
+    assert len(boxes) == len(shown) > 2
+    assert all(output.text.endswith(" mm") for output in shown)
+    for box in boxes:
+        if box.is_selected():
+            box.click()
+    if markers := view.find_elements(By.NAME, "markers"):
+        markers[0].click()
+    assert np.abs(drawn(browser, view) - paper).max() < 0.01
+    assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
+
+
+def test_a_browser_without_webgl_says_so(browser, page):
+    from selenium.webdriver.common.by import By
+
+    source = "HTMLCanvasElement.prototype.getContext = () => null"
+    added = browser.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": source})
+    try:
+        browser.get(page.as_uri())
+        view = browser.find_element(By.ID, "view")
+        assert "no WebGL 2" in view.find_element(By.CLASS_NAME, "failed").text
+        assert not view.find_element(By.CSS_SELECTOR, "canvas").is_displayed()
+    finally:
+        browser.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", added)
+
+
+def test_the_page_stays_small(page):
+    found = Page(page)
+    assert sum(len(data) for data in found.data) < 1_000_000
+    assert len(found.scripts[0]) < 25_000

@@ -1,0 +1,199 @@
+"""A robot that is stepped as time goes on, and its page in a browser."""
+
+import socket
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+import torch
+from browser import opened, until
+from main_job import end_of
+
+from warp_resphys import cli
+from warp_resphys.io.errors import ConvergenceError, InputError
+from warp_resphys.robot.loading import load
+from warp_resphys.robot.robot import Robot
+from warp_resphys.studies.live import LiveRobot, range_of
+from warp_resphys.studies.view import Page
+
+
+@pytest.fixture
+def live(finished):
+    return LiveRobot(load(finished[0]))
+
+
+def tip_of(live):
+    mesh = live.robot.simulator.body.mesh
+    return np.flatnonzero(mesh.vertices[:, 0] > mesh.vertices[:, 0].max() - 1e-9)
+
+
+def test_a_trial_is_as_the_robot_plays_it(live):
+    live.play_trial("150 g")
+    known = live.trial.play(live.robot)
+    for number in range(12):
+        np.testing.assert_allclose(live.measured, live.trial.markers[number])
+        assert live.step()
+        np.testing.assert_allclose(live.positions, known.q[number + 1, 0], rtol=0.0, atol=1e-9)
+    assert not live.step()
+    assert live.time == pytest.approx(0.12)
+    live.play_trial(None)
+    assert live.measured is None
+    assert live.time == 0.0
+    with pytest.raises(InputError, match="the trial is 'none'"):
+        live.play_trial("none")
+
+
+def test_a_hand_pulls_the_body_to_where_it_is(live):
+    tip = tip_of(live)
+    start = live.positions[tip].mean(axis=0)
+    target = start + [0.0, 0.02, 0.0]
+    live.grab(start)
+    live.drag(target)
+    distances = []
+    for _ in range(60):
+        assert live.step()
+        distances.append(np.linalg.norm(live.positions[tip].mean(axis=0) - target))
+    assert distances[-1] < 0.75 * 0.02
+    still = LiveRobot(live.robot)
+    for _ in range(60):
+        still.step()
+    pulled = live.positions[tip].mean(axis=0) - still.positions[tip].mean(axis=0)
+    assert pulled[1] > 0.005
+    assert np.abs(pulled[[0, 2]]).max() < pulled[1]
+    live.let_go()
+    for _ in range(120):
+        live.step()
+    assert np.abs(live.positions[tip].mean(axis=0)[1] - start[1]) < 0.25 * pulled[1]
+
+
+def test_a_softer_body_hangs_lower_and_comes_back(live):
+    tip = tip_of(live)
+    live.reset()
+    stiff = live.positions[tip, 2].mean()
+    quantity, value = live.parameters["youngs_modulus"]
+    low, high = range_of(quantity, value)
+    assert low == pytest.approx(value / np.exp(1.4))
+    assert high == pytest.approx(value * np.exp(1.4))
+    live.set_parameter("youngs_modulus", low)
+    live.reset()
+    assert live.positions[tip, 2].mean() < stiff - 1e-3
+    live.restore()
+    live.reset()
+    np.testing.assert_allclose(live.positions[tip, 2].mean(), stiff, atol=1e-7)
+    ratio = live.parameters["poissons_ratio"]
+    assert ratio[0].lower < range_of(*ratio)[0] < ratio[1] < range_of(*ratio)[1] < ratio[0].upper
+
+
+def test_the_base_moves_no_faster_than_it_may(live):
+    fixed = live.robot.simulator.body.fixed_vertices
+    before = live.positions[fixed]
+    live.set_input("base", 2, 0.01)
+    live.step()
+    first = live.positions[fixed] - before
+    assert 0.0 < first[:, 2].max() <= live.size * live.robot.time_step * 1.001
+    for _ in range(30):
+        live.step()
+    np.testing.assert_allclose(live.positions[fixed] - before, np.tile([0.0, 0.0, 0.01], (len(fixed), 1)), atol=1e-9)
+    live.set_input("base", 2, 0.0)
+    for _ in range(30):
+        live.step()
+    np.testing.assert_allclose(live.positions[fixed], before, atol=1e-9)
+
+
+def test_what_diverges_stands_still_until_it_is_reset(live, monkeypatch):
+    def fail(*_, **__):
+        raise ConvergenceError("the step failed: take shorter steps.", torch.zeros(1), None)
+
+    before = live.positions
+    with monkeypatch.context() as patch:
+        patch.setattr(Robot, "step", fail)
+        assert not live.step()
+    assert live.said == "Stopped: the step failed: take shorter steps."
+    assert not live.step()
+    np.testing.assert_array_equal(live.positions, before)
+    live.reset()
+    assert live.said == ""
+    assert live.step()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (["port=70000"], "port is 70000: there are none above 65535."),
+        (["port=-1"], "port is -1: "),
+        (["trial=80 g"], "the trial is '80 g': "),
+        (["model=teapot"], "teapot"),
+        (["seconds=0"], "seconds is 0: "),
+    ],
+)
+def test_what_cannot_be_viewed_is_said(finished, folder, change, said):
+    code, err = end_of(cli.main, "warp-resphys", "view", f"run={finished[0]}", "port=0", *change)
+    assert code == 2
+    assert err.startswith("error: ")
+    assert said in err
+
+
+def test_a_port_in_use_and_a_missing_package_are_said(finished, folder, monkeypatch):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        code, err = end_of(cli.main, "warp-resphys", "view", f"run={finished[0]}", f"port={port}")
+    assert code == 2
+    assert err.startswith(f"error: port {port} of 127.0.0.1 cannot be used (Address already in use): choose another")
+    monkeypatch.setitem(sys.modules, "viser", None)
+    code, err = end_of(cli.main, "warp-resphys", "view", f"run={finished[0]}", "port=0")
+    assert (code, err.splitlines()[-1]) == (
+        2,
+        "error: the viewer needs a package that is not installed: pip install 'warp-resphys[view]'.",
+    )
+
+
+def test_a_command_serves_it(finished, folder):
+    pytest.importorskip("viser")
+    code, err = end_of(cli.main, "warp-resphys", "view", f"run={finished[0]}", "port=0", "seconds=1", "trial=150 g")
+    assert code == 0, err
+
+
+def test_a_browser_drives_and_pulls_it(finished):
+    viser = pytest.importorskip("viser")
+    webdriver = pytest.importorskip("selenium.webdriver")
+    from selenium.webdriver.common.by import By
+
+    live = LiveRobot(load(finished[0]))
+    server = viser.ViserServer("127.0.0.1", 0, verbose=False)
+    with opened() as browser:
+        page = Page(server, live)
+
+        def look() -> None:
+            try:
+                browser.set_window_size(1100, 800)
+                browser.get(f"http://127.0.0.1:{server.get_port()}")
+                until(lambda: "pictures a second" in browser.page_source, 60.0)
+                canvas = browser.find_element(By.CSS_SELECTOR, "canvas")
+                hand = webdriver.ActionChains(browser)
+                hand.move_to_element_with_offset(canvas, 0, 0).click_and_hold().move_by_offset(0, -40)
+                hand.move_by_offset(0, -60).pause(1.0).perform()
+                found["pulled"] = live.is_pulled
+                webdriver.ActionChains(browser).release().perform()
+                until(lambda: not live.is_pulled)
+                severe = [each["message"] for each in browser.get_log("browser") if each["level"] == "SEVERE"]
+                found["severe"] = [each for each in severe if "passive event listener" not in each]  # viser's own
+                browser.find_element(By.XPATH, "//button[.='Pause']").click()
+                until(lambda: browser.find_elements(By.XPATH, "//button[.='Go on']"))
+                before = live.time
+                time.sleep(0.5)
+                found["paused"] = live.time == before
+                browser.find_element(By.XPATH, "//button[.='Reset']").click()
+                until(lambda: live.time == 0.0)
+                found["reset"] = True
+            finally:
+                page.stop()
+
+        found = {}
+        thread = threading.Thread(target=look)
+        thread.start()
+        page.run(120.0)  # In this thread, as from the command line.
+        thread.join()
+    server.stop()
+    assert found == {"pulled": True, "severe": [], "paused": True, "reset": True}

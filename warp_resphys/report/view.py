@@ -1,0 +1,136 @@
+"""The bodies of a trial in space, on the page: to be turned, played and compared in a browser.
+
+Vertices of a motion are kept as in a reduced basis: where they are at rest, and the singular vectors that all models'
+displacements need, with their weights in each frame, so that ten seconds of an arm take a few hundred kilobytes.
+"""
+
+import base64
+import json
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from markupsafe import Markup
+from matplotlib import colormaps
+from matplotlib.colors import to_hex
+
+from ..mesh.mesh import boundary_triangles, surface_vertices
+from .bodies import Motion, face_edges, frame_of, motion_axes, sharp_edges, upwards, whole
+from .data import MODELS, FloatArray, mean_distance
+from .figures import TONES
+from .page import ViewInSpace
+from .render import COLOUR_MAP, MEASURED, OUTLINE
+
+_TOLERANCE: Final = 2e-4  # Of the body's size, by which a vertex may be drawn elsewhere,
+_MOST_MODES: Final = 96  # unless that takes more than these.
+_DIVERGED: Final = 3.0  # Of the body's size from rest, beyond which a body is not drawn.
+_STOPS: Final = 32  # Of the colour map.
+_LEVELS: Final = 255  # Of an error, over the model's largest.
+
+
+def view_in_space(name: str, motion: Motion, shown: Sequence[str], caption: str, alt: str) -> ViewInSpace:
+    """Return the view of all bodies of a motion.
+
+    Args:
+        name: Its identifier on the page.
+        motion: What is shown; with a target, bodies are compared with it, without one, markers.
+        shown: Models that are seen at first.
+        caption: What stands below.
+        alt: What it shows, in words.
+    """
+    surface = surface_vertices(motion.mesh)
+    rest, faces = motion.mesh.vertices[surface], np.searchsorted(surface, boundary_triangles(motion.mesh))
+    size = float(np.ptp(motion.mesh.vertices, axis=0).max())
+    places = np.stack([whole(q[:, surface], rest, _DIVERGED * size) for q in motion.positions.values()])  # (B, F, S, 3)
+    basis, weights = reduced(places - rest, _TOLERANCE * size, _MOST_MODES)
+    scales = np.abs(basis).max(axis=1, initial=0.0) / np.iinfo(np.int16).max
+    axes = motion_axes(motion.gravity, np.concatenate([rest[None], *places]))
+    centre, half = frame_of(np.concatenate([rest, places.reshape(-1, 3)]), axes)
+    simulated = np.stack(list(motion.markers.values()))  # (B, F, M, 3)
+    means = mean_distance(simulated, np.broadcast_to(motion.measured, simulated.shape))  # (B, F) [mm]
+    away = 1e3 * _distances(simulated, motion.measured)
+    if motion.target is not None:
+        exact = np.stack([whole(q, motion.mesh.vertices, _DIVERGED * size) for q in motion.positions.values()])
+        means = mean_distance(exact, np.broadcast_to(motion.target, exact.shape))
+        away = 1e3 * _distances(exact[:, :, surface], motion.target[:, surface])
+    largest = np.where(np.isfinite(away), away, 0.0).max(axis=(1, 2), initial=0.0)
+    shares = np.nan_to_num(_LEVELS * away / np.maximum(largest, 1e-300)[:, None, None])
+    models = [
+        {
+            "name": MODELS[model][0],
+            "light": TONES[model].light,
+            "dark": TONES[model].dark,
+            "shown": model in shown,
+            "largest": float(f"{most:.4g}"),
+            "means": [float(f"{mean:.4g}") if np.isfinite(mean) else None for mean in each],
+        }
+        for model, most, each in zip(motion.positions, largest, means, strict=True)
+    ]
+    has_markers = motion.target is None
+    data = {
+        "times": [float(f"{time:.6g}") for time in motion.times],
+        "rest": _encoded(rest, "<f4"),
+        "faces": _encoded(faces, "<u4"),
+        "edges": _encoded(np.searchsorted(surface, face_edges(motion.mesh)), "<u4"),
+        "sharp": _encoded(sharp_edges(rest, faces), "<u4"),
+        "modes": _encoded(np.rint(basis / scales[:, None]), "<i2"),
+        "scales": scales.tolist(),
+        "weights": _encoded(weights, "<f4"),
+        "errors": None if has_markers else _encoded(np.rint(shares), "u1"),
+        "markers": motion.measured.shape[1] if has_markers else 0,
+        "measured": _encoded(motion.measured if has_markers else [], "<f4"),
+        "simulated": _encoded(simulated if has_markers else [], "<f4"),
+        "models": models,
+        "axes": axes.tolist(),
+        "up": upwards(motion.gravity).tolist(),
+        "centre": centre.tolist(),
+        "half": half.tolist(),
+        "colours": [to_hex(stop) for stop in colormaps[COLOUR_MAP](np.linspace(0.0, 1.0, _STOPS))],
+        "ink": {"light": TONES["ink"].light, "dark": TONES["ink"].dark},
+        "outline": OUTLINE,
+        "seen": MEASURED,
+    }
+    payload = Markup(json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"))
+    speed = 0.25 if motion.is_fast else 1.0
+    return ViewInSpace(
+        name, caption, alt, payload, models, len(motion.times), speed, "markers" if has_markers else "vertices"
+    )
+
+
+def _distances(positions: FloatArray, target: FloatArray) -> FloatArray:
+    """(B, F, P) distances of points (B, F, P, 3) from where they should be (F, P, 3)."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        return np.asarray(np.linalg.norm(positions - target, axis=3))
+
+
+def reduced(displacements: FloatArray, tolerance: float, most: int) -> tuple[FloatArray, FloatArray]:
+    """Return the fewest singular vectors (K, 3 S) that give displacements, and their weights (B, F, K).
+
+    Args:
+        displacements: (B, F, S, 3) [m] of S points in F frames of B bodies, NaN in frames that are left out.
+        tolerance: By which a coordinate may be off [m],
+        most: unless that takes more than so many.
+
+    Returns:
+        The vectors, of length one, and the weights [m], NaN in the frames that were left out.
+    """
+    count, frames, *_ = displacements.shape
+    rows = displacements.reshape(count * frames, -1)
+    known = np.isfinite(rows).all(axis=1)
+    remaining = rows[known].copy()
+    _, left = np.linalg.eigh(remaining @ remaining.T)  # There are fewer frames than coordinates, most often.
+    basis = np.empty((0, rows.shape[1]))
+    while len(basis) < min(most, left.shape[1]) and np.abs(remaining).max(initial=0.0) > tolerance:
+        vector = left[:, -1 - len(basis)] @ remaining
+        vector /= np.linalg.norm(vector)
+        remaining -= np.outer(remaining @ vector, vector)
+        basis = np.concatenate([basis, vector[None]])
+    weights = np.full((len(rows), len(basis)), np.nan)
+    weights[known] = rows[known] @ basis.T
+    return basis, weights.reshape(count, frames, -1)
+
+
+def _encoded(values: npt.ArrayLike, kind: str) -> str:
+    """Numbers as the script of the page reads them."""
+    return base64.b64encode(np.ascontiguousarray(values, dtype=np.dtype(kind)).tobytes()).decode("ascii")

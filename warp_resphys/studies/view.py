@@ -1,0 +1,354 @@
+"""A robot in the browser, simulated as one looks at it (viser)."""
+
+import io
+import logging
+import socket
+import threading
+import time
+from collections.abc import Callable, Mapping
+from contextlib import redirect_stdout
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from ..experiment.schema import COUNT, POSITIVE, WORD, check, optional
+from ..io.errors import InputError, ResphysError
+from ..report.bodies import sharp_edges, upwards
+from ..report.figures import TONES
+from ..report.render import MEASURED
+from ..robot.inputs import BASE
+from ..robot.loading import load, trial_names
+from .command import show
+from .live import LiveRobot, range_of
+
+if TYPE_CHECKING:
+    import viser
+
+FloatArray = NDArray[np.float64]
+_RATE: Final = 30.0  # Pictures a second, at most.
+_TOLD_EVERY: Final = 0.25  # [s]
+_BY_HAND: Final = "by hand"
+_HIGHEST_PORT: Final = 65535
+_DOT: Final = 0.02  # Radius of a marker's dot, over the size of the body.
+_HELP: Final = """Drag the body to pull it, drag beside it to turn the view, scroll to zoom, right-drag to move.
+Keys: **space** pauses, **R** resets."""
+_SPEEDS: Final = {"a tenth": 0.1, "a quarter": 0.25, "half": 0.5, "real time": 1.0, "double": 2.0}
+
+
+def view(config: Mapping[str, Any], folder: Path) -> None:
+    """Serves a page until it is interrupted, and says how many pictures a second it has shown.
+
+    Raises:
+        InputError: no viser, a port that is in use, or an unknown model or trial.
+        DataFileError: there is no finished run.
+    """
+    del folder
+    for key, kind in (("run", WORD), ("model", WORD), ("trial", optional(WORD)), ("device", WORD), ("host", WORD)):
+        check(key, config[key], kind)
+    check("port", config["port"], COUNT)
+    check("seconds", config["seconds"], optional(POSITIVE))
+    port = _free_port(config["host"], config["port"])
+    try:
+        import viser
+    except ImportError:
+        raise InputError(
+            "the viewer needs a package that is not installed: pip install 'warp-resphys[view]'."
+        ) from None
+    wp.config.log_level = wp.LOG_WARNING
+    robot = load(Path(config["run"]).expanduser(), config["model"], device=config["device"])
+    live = LiveRobot(robot)
+    if config["trial"] is not None:
+        live.play_trial(config["trial"])
+    live.step()  # Whatever is compiled at the first step is compiled before anyone looks.
+    live.reset()
+    logging.getLogger("websockets").setLevel(logging.WARNING)
+    with redirect_stdout(io.StringIO()):  # Where it listens is said below.
+        server = viser.ViserServer(config["host"], port, label=robot.description.name, verbose=False)
+    try:
+        page = Page(server, live)
+        show(f"Open http://{config['host']}:{port} in a browser; Ctrl-C ends it.")
+        rate = page.run(config["seconds"])
+    finally:
+        with redirect_stdout(io.StringIO()):
+            server.stop()
+    show(f"{rate:.1f} pictures a second")
+
+
+def _free_port(host: str, port: int) -> int:
+    """A port that can be listened at: the one that is asked for, or any for zero.
+
+    Raises:
+        InputError: it is in use, or cannot be listened at.
+    """
+    if port > _HIGHEST_PORT:
+        raise InputError(f"port is {port}: there are none above {_HIGHEST_PORT}.")
+    with socket.socket() as tried:
+        tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            tried.bind((host, port))
+        except OSError as error:
+            raise InputError(
+                f"port {port} of {host} cannot be used ({error.strerror}): choose another with port=, 0 for any."
+            ) from None
+        return int(tried.getsockname()[1])
+
+
+class Page:
+    """What a browser shows of a robot, and what it asks for.
+
+    The robot is stepped in the thread that calls `run`; what a browser asks for waits there for the next picture.
+
+    Args:
+        server: whose page it is.
+        live: the robot.
+    """
+
+    def __init__(self, server: "viser.ViserServer", live: LiveRobot) -> None:
+        self._server, self._live = server, live
+        self._asked: list[Callable[[], None]] = []
+        self._lock = threading.Lock()
+        self._playing, self._speed, self._stopped = True, 1.0, False
+        self.pictures = 0
+        mesh = live.robot.simulator.body.mesh
+        self._scale = 1.0 / live.size  # Of what is shown: cameras are made for bodies of about a metre.
+        self._middle = mesh.vertices.mean(axis=0)
+        self._sharp = sharp_edges(mesh.vertices[live.surface], live.faces)
+        self._set_scene()
+        self._set_controls()
+
+    # Scene
+
+    def _shown(self, points: FloatArray) -> NDArray[np.float32]:
+        return np.asarray((points - self._middle) * self._scale, dtype=np.float32)
+
+    def _real(self, point: tuple[float, float, float]) -> FloatArray:
+        return np.asarray(point, dtype=np.float64) / self._scale + self._middle
+
+    def _set_scene(self) -> None:
+        server, live = self._server, self._live
+        up = upwards(np.asarray(live.robot.simulator.gravity, dtype=np.float64))
+        server.scene.set_up_direction((float(up[0]), float(up[1]), float(up[2])))
+        side = np.cross(up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.9 else [0.0, 1.0, 0.0])
+        camera = server.initial_camera
+        camera.look_at = (0.0, 0.0, 0.0)
+        position = 1.3 * side / np.linalg.norm(side) + 0.35 * up
+        camera.position = (float(position[0]), float(position[1]), float(position[2]))
+        camera.up = (float(up[0]), float(up[1]), float(up[2]))
+        places = self._shown(live.positions[live.surface])
+        blue, grey = _bytes(TONES["resphys"].dark), _bytes(TONES["target"].light)
+        self._body = server.scene.add_mesh_simple(
+            "/body", places, live.faces.astype(np.uint32), color=blue, flat_shading=True, side="double"
+        )
+        self._target = server.scene.add_mesh_simple(
+            "/measured body", places, live.faces.astype(np.uint32), color=grey, opacity=0.4, visible=False
+        )
+        edges = places[self._sharp]
+        self._edges = server.scene.add_line_segments("/edges", edges, (30, 40, 50), thickness=0.003)
+        none = np.zeros((1, 3), dtype=np.float32)
+        self._markers = server.scene.add_point_cloud(
+            "/markers", none, (26, 95, 180), point_size=1.4 * _DOT, point_shape="circle", visible=False
+        )
+        self._measured = server.scene.add_point_cloud(
+            "/measured", none, _bytes(MEASURED), point_size=_DOT, point_shape="circle", visible=False
+        )
+
+        @self._body.on_drag
+        async def _(event: Any) -> None:  # In their order, as they are not awaited.
+            if event.phase == "start":
+                self._ask(partial(live.grab, self._real(event.start_position)))
+            if event.phase == "end":
+                self._ask(live.let_go)
+            else:
+                self._ask(partial(live.drag, self._real(event.end_position)))
+
+    # Controls
+
+    def _ask(self, what: Callable[[], None]) -> None:
+        """Has something done before the next picture."""
+        with self._lock:
+            self._asked.append(what)
+
+    def _set_controls(self) -> None:
+        server, live = self._server, self._live
+        gui, robot = server.gui, live.robot
+        server.gui.configure_theme(dark_mode=False, show_logo=False)
+        described = robot.description
+        gui.add_markdown(f"**{described.name}**, {described.model}\n\n{_HELP}")
+        self._said = gui.add_markdown("")
+        self._play = gui.add_button("Pause")
+        self._play.on_click(lambda _: self._ask(self._turn))
+        gui.add_button("Reset").on_click(lambda _: self._ask(self._reset))
+        gui.add_command("Pause or go on", hotkey="space").on_trigger(lambda _: self._ask(self._turn))
+        gui.add_command("Reset", hotkey="R").on_trigger(lambda _: self._ask(self._reset))
+        speed = gui.add_dropdown("Speed", tuple(_SPEEDS), initial_value="real time")
+        speed.on_update(lambda _: setattr(self, "_speed", _SPEEDS[speed.value]))
+        self._trial: Any = None
+        if robot.folder is not None:
+            name = _BY_HAND if live.trial is None else live.trial.name
+            self._trial = gui.add_dropdown("Motion", (_BY_HAND, *trial_names(robot)), initial_value=name)
+            self._trial.on_update(lambda _: self._ask(partial(self._choose, self._trial.value)))
+        self._sliders: dict[str, list[Any]] = {}
+        for name, known in robot.inputs.items():
+            words = f"{known.quantity.plural or known.name}".capitalize() if name != BASE else "Base"
+            with gui.add_folder(words, expand_by_default=known.low is not None):
+                self._sliders[name] = [self._slider(name, part) for part in range(len(known.parts))]
+        if live.parameters:
+            with gui.add_folder("Material and other parameters", expand_by_default=False):
+                parameters = {name: self._parameter(name) for name in live.parameters}
+                back = gui.add_button("As identified")
+
+                def restore(_: Any) -> None:
+                    for name, slider in parameters.items():
+                        slider.value = live.parameters[name][1]
+                    self._ask(live.restore)
+
+                back.on_click(restore)
+        dark = gui.add_checkbox("Dark", False)
+        dark.on_update(lambda _: gui.configure_theme(dark_mode=dark.value, show_logo=False))
+
+    def _slider(self, name: str, part: int) -> Any:
+        """A slider for a part of an input, in the unit in which people read it."""
+        live, known = self._live, self._live.robot.inputs[name]
+        factor = known.quantity.shown_factor if known.quantity.shown_unit else 1.0
+        unit = known.quantity.shown_unit or known.unit
+        unit = ("m" if part < 3 else "rad") if name == BASE else unit
+        low, high = (factor * float(limit[part]) for limit in live.limits[name])
+        high = high if high > low else low + 1.0
+        label = f"{known.parts[part].replace('_', ' ')} [{unit}]"
+        slider = self._server.gui.add_slider(label, low, high, (high - low) / 500.0, min(max(0.0, low), high))
+
+        def moved(event: Any) -> None:
+            if event.client is not None:  # Not where a trial has moved it.
+                self._ask(partial(self._by_hand, name, part, slider.value / factor))
+
+        slider.on_update(moved)
+        return slider
+
+    def _parameter(self, name: str) -> Any:
+        """A slider for a parameter."""
+        quantity, value = self._live.parameters[name]
+        low, high = range_of(quantity, value)
+        label = f"{name.replace('_', ' ')}{f' [{quantity.unit}]' if quantity.unit else ''}"
+        slider = self._server.gui.add_slider(label, low, high, (high - low) / 1000.0, value)
+        slider.on_update(lambda _: self._ask(partial(self._live.set_parameter, name, slider.value)))
+        return slider
+
+    def _turn(self) -> None:
+        self._playing = not self._playing
+        self._play.label = "Pause" if self._playing else "Go on"
+
+    def _reset(self) -> None:
+        self._live.reset()
+        self._set_sliders()
+
+    def _choose(self, name: str) -> None:
+        if name != (_BY_HAND if self._live.trial is None else self._live.trial.name):
+            self._live.play_trial(None if name == _BY_HAND else name)
+            self._set_sliders()
+
+    def _by_hand(self, name: str, part: int, value: float) -> None:
+        self._live.set_input(name, part, value)
+        if self._trial is not None and self._trial.value != _BY_HAND:
+            self._trial.value = _BY_HAND
+
+    def _set_sliders(self) -> None:
+        """Moves the sliders of inputs to where they are."""
+        for name, sliders in self._sliders.items():
+            known = self._live.robot.inputs[name].quantity
+            factor = known.shown_factor if known.shown_unit else 1.0
+            for part, slider in enumerate(sliders):
+                value = float(np.clip(factor * self._live.inputs[name][part], slider.min, slider.max))
+                if abs(value - slider.value) > 0.5 * slider.step:
+                    slider.value = value
+
+    # Time
+
+    def run(self, seconds: float | None) -> float:
+        """Simulates and shows, until it is interrupted or some seconds are over; the pictures a second."""
+        live, began, last, told = self._live, time.perf_counter(), time.perf_counter(), 0.0
+        due, simulated, counted = 0.0, 0.0, 0
+        try:
+            while not self._stopped and (seconds is None or time.perf_counter() - began < seconds):
+                now = time.perf_counter()
+                self._do_what_is_asked()
+                due = min(due + (now - last) * self._speed, 2.0 * max(self._speed / _RATE, live.robot.time_step))
+                last = now
+                while self._playing and due >= live.robot.time_step and live.step():
+                    due -= live.robot.time_step
+                    simulated += live.robot.time_step
+                due = due if self._playing else 0.0
+                self._show()
+                self.pictures += 1
+                counted += 1
+                if now - told > _TOLD_EVERY:
+                    since = now - told
+                    self._tell(counted / since if told else 0.0, simulated / since if told else 0.0)
+                    told, simulated, counted = now, 0.0, 0
+                time.sleep(max(1.0 / _RATE - (time.perf_counter() - now), 1e-3))
+        except KeyboardInterrupt:
+            pass
+        return self.pictures / (time.perf_counter() - began)
+
+    def stop(self) -> None:
+        """Ends `run`, from another thread."""
+        self._stopped = True
+
+    def _do_what_is_asked(self) -> None:
+        with self._lock:
+            asked, self._asked = self._asked, []
+        for what in asked:
+            try:
+                what()
+            except ResphysError as error:
+                self._live.said = str(error)
+
+    def _show(self) -> None:
+        live = self._live
+        places = self._shown(live.positions)
+        with self._server.atomic():
+            surface = places[live.surface]
+            self._body.vertices = surface
+            self._edges.points = surface[self._sharp]
+            self._dots(self._markers, live.markers)
+            measured = live.measured
+            whole = measured is not None and not live.robot.labels
+            self._dots(self._measured, np.empty((0, 3)) if measured is None or whole else measured)
+            if whole and measured is not None:
+                self._target.vertices = self._shown(measured[live.surface])
+            if self._target.visible != whole:
+                self._target.visible = whole
+
+    def _dots(self, cloud: Any, points: FloatArray) -> None:
+        seen = points[np.isfinite(points).all(axis=1)]
+        if len(seen):
+            cloud.points = self._shown(seen)
+        if cloud.visible != bool(len(seen)):
+            cloud.visible = bool(len(seen))
+
+    def _tell(self, rate: float, pace: float) -> None:
+        """Says in words what is going on."""
+        live = self._live
+        said = [f"{live.time:.2f} s, {rate:.0f} pictures a second, {pace:.2g} times real time"]
+        measured = live.measured
+        if measured is not None:
+            where = live.markers if live.robot.labels else live.positions
+            away = 1e3 * np.linalg.norm(where - measured, axis=1)
+            if np.isfinite(away).any():
+                said.append(f"{float(np.nanmean(away)):.2f} mm from what was measured")
+        if live.has_left:
+            said.append("**The body has left the states of the training.**")
+        if live.said:
+            said.append(f"**{live.said}**")
+        self._said.content = "\n\n".join(said)
+        if live.trial is not None:
+            self._set_sliders()
+
+
+def _bytes(tone: str) -> tuple[int, int, int]:
+    """Red, green and blue of a tone such as #1a5fb4."""
+    red, green, blue = (int(tone[at : at + 2], 16) for at in (1, 3, 5))
+    return red, green, blue

@@ -46,6 +46,7 @@ nb_execution_timeout = 600  # of a cell [s]
 nb_execution_in_temp = True
 nb_execution_raise_on_error = True
 nb_merge_streams = True
+nb_output_stderr = "remove"  # Warp says there that it found no GPU; an error stops the build
 
 autodoc_default_options = {"members": True}
 add_module_names = False

@@ -365,7 +365,8 @@ _OWN = {"my_robot", "my_tentacle", "my_arm", "--cfg"}  # of who reads it
 def documented():
     """Every command line with arguments in the documentation and in the help, without what is said of it."""
     found = set()
-    for path in [*REPOSITORY.glob("*.md"), *REPOSITORY.glob("docs/*.md"), *REPOSITORY.glob("docs/tutorials/*.md"), *REPOSITORY.glob("conf/**/*.yaml")]:
+    patterns = ("*.md", "docs/*.md", "docs/tutorials/*.md", "conf/**/*.yaml")
+    for path in [path for pattern in patterns for path in REPOSITORY.glob(pattern)]:
         text = re.sub(r"\\\n *", "", path.read_text(encoding="utf-8"))
         lines = re.findall(r"^[# ]*warp-resphys (.*)$|`warp-resphys ([^`]*)`", text, flags=re.MULTILINE)
         found |= {re.split(r"  +[\w(]|#", a or b)[0].strip() for a, b in lines}

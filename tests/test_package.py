@@ -166,3 +166,10 @@ def test_a_command_runs_from_an_empty_folder(installed, tmp_path):
 def test_importing_the_package_imports_nothing_heavy(installed, tmp_path):
     program = "import sys, warp_resphys; print(sorted({'torch', 'warp', 'numpy', 'hydra'} & set(sys.modules)))"
     assert call(installed / "python", "-c", program, folder=tmp_path) == "[]\n"
+
+
+def test_a_copy_of_the_repository_hides_no_part_of_an_installation(installed):
+    """As Python has it that is started in the folder of the README's first command."""
+    found = "import warp_resphys.conf, warp_resphys.kernels as k; print(k.__file__); warp_resphys.Simulator"
+    where = call(installed / "python", "-c", found, folder=REPOSITORY)
+    assert Path(where.strip()).parent == REPOSITORY / "kernels"

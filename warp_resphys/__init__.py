@@ -4,7 +4,11 @@ The names below are imported when they are first used, so that importing the pac
 """
 
 import importlib
+from pathlib import Path
 from typing import Any
+
+if not Path(__file__).with_name("kernels").is_dir():  # a copy of the repository, where kernels/ and conf/ lie beside
+    __path__.append(str(Path(__file__).parents[1]))
 
 _MODULES = {
     "ArmGeometry": "mesh.arm_geometry",

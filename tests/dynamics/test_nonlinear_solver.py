@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from warp_resphys.kernels import minimisation as kernels
-from warp_resphys.kernels.minimisation import minimisation_kernels
 
 from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, box_hexahedra, select_vertices
 from warp_resphys.dynamics.inputs import Inputs
@@ -16,6 +14,8 @@ from warp_resphys.dynamics.nonlinear_solver import SOLVERS
 from warp_resphys.energies.launcher import warp_view
 from warp_resphys.energies.materials import MATERIALS
 from warp_resphys.io.errors import ConvergenceError, InputError
+from warp_resphys.kernels import minimisation as kernels
+from warp_resphys.kernels.minimisation import minimisation_kernels
 from warp_resphys.studies.gradient_check import pose
 
 MESH = box_hexahedra((0.06, 0.02, 0.02), (4, 2, 2))

@@ -1,0 +1,184 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation: {extension: .py, format_name: percent}
+#   kernelspec: {display_name: Python 3, language: python, name: python3}
+# ---
+
+# %% [markdown]
+# # Residual forces
+#
+# Identification makes the best of a simulator's parameters. What is wrong with its physics stays. The method of this
+# package asks for the forces that would mend it, step by step, and learns to predict them:
+#
+# 1. **reconstruct**: from each observed state, which force takes the simulator to the next one?
+# 2. **learn** that force as a function of the state,
+# 3. **roll out** the simulator with the learned force, from its own states.
+#
+# The command `warp-resphys` does all of it for an experiment. This page does it by hand, on a beam whose simulator has
+# a wrong modulus, and no viscosity.
+
+# %%
+import matplotlib.pyplot as plt
+import torch
+import warp as wp
+
+from warp_resphys import Body, Corotated, Inputs, Simulator, SolverSettings, State, box_hexahedra, select_vertices
+from warp_resphys.data.markers import MarkerMap
+from warp_resphys.learning.networks import build_model
+from warp_resphys.learning.reconstruction import make_reconstructor
+from warp_resphys.learning.rollout import Rollout, closed_loop
+
+wp.config.log_level = wp.LOG_WARNING
+torch.manual_seed(0)
+torch.set_num_threads(1)  # a small network gains nothing by more, and loses much where cores are busy
+
+mesh = box_hexahedra(size=(0.1, 0.03, 0.03), divisions=(8, 3, 3))  # m
+body = Body(mesh, fixed=select_vertices(mesh, x=0.0))
+tip = select_vertices(mesh, x=0.1)
+settings = SolverSettings(on_failure="count")  # a roll-out that fails is lost, and the others go on
+robot = Simulator(body, Corotated(264e3, 0.45, density=1070.0, stiffness_damping=3e-3), solver=settings)
+simulator = Simulator(body, Corotated(215e3, 0.45, density=1070.0), solver=settings)
+
+# %% [markdown]
+# ## Motions of the robot
+#
+# Weights hang at the tip, the beam comes to rest, and is let go. All motions are one batch; two of them are kept back.
+
+# %%
+weights = torch.tensor([0.05, 0.09, 0.11, 0.13, 0.16, 0.19, 0.21, 0.07, 0.14], dtype=torch.float64)  # kg
+train, test = slice(0, 7), slice(7, 9)
+load = torch.zeros(len(weights), len(mesh.vertices), 3, dtype=torch.float64)  # (B, N, 3) N
+load[:, tip, 2] = -9.81 * weights[:, None] / len(tip)
+held = robot.static_equilibrium(Inputs(external_force=load))
+STEPS = 60  # of 0.01 s
+motion = robot.rollout(held, STEPS)  # q and v (T + 1, B, N, 3)
+
+
+def rolled_out(simulator, predict=None):
+    """(T + 1, B, N, 3) positions of the test motions, from their first state on [m]."""
+    start = State(motion.q[0, test], motion.v[0, test])
+    return closed_loop(Rollout(simulator, predict), start, STEPS).transpose(0, 1)
+
+
+def error(q):
+    """(T + 1,) mean distance of all vertices to where they are on the robot [mm]."""
+    return 1e3 * (q - motion.q[:, test]).norm(dim=-1).mean((1, 2))
+
+
+uncorrected = rolled_out(simulator)
+print(
+    f"uncorrected: {error(uncorrected).mean():.2f} mm; the tip swings over "
+    f"{1e3 * (held.q[test][:, tip, 2].mean() - motion.q[:, test][:, :, tip, 2].mean(-1).max()).abs():.0f} mm"
+)
+
+# %% [markdown]
+# ## Reconstruct
+#
+# The force of a step is the smallest that brings the simulator to what was observed,
+# $\min_f \lVert q^{+}(f) - \hat q^{+} \rVert^2 + \lambda \lVert f \rVert^2$. All vertices are seen here, and
+# Gauss-Newton needs two iterations a step.
+
+# %%
+reconstructor = make_reconstructor(
+    simulator, method="gauss_newton", regularisation=1e-10, tolerance=1e-10, max_iterations=20
+)
+forces, misfit = [], 0.0
+for step in range(STEPS):
+    state = State(motion.q[step], motion.v[step])
+    found = reconstructor.step(state, motion.q[step + 1])
+    forces.append(found.force)
+    misfit = max(misfit, (found.state.q - motion.q[step + 1]).abs().max().item())
+force = torch.stack(forces)  # (T, B, N, 3) N
+print(f"with the force, no vertex is further than {1e3 * misfit:.1e} mm from where it was seen")
+print(f"sums of the forces over the body: up to {force.sum(2).norm(dim=-1).max():.2f} N")
+
+# %% [markdown]
+# ## Learn
+#
+# The network sees few modes of the positions and velocities, and answers in few modes of the force (proper orthogonal
+# decomposition of the training samples). Its linear part is fitted by ridge regression, and the network learns what
+# that leaves. Tensors of torch and arrays of Warp share their memory; nothing is copied between them.
+
+# %%
+samples = [each[:STEPS, train].flatten(0, 1) for each in (motion.q, motion.v, force)]
+layout = {"kind": "reduced", "position_modes": 4, "velocity_modes": 4, "force_modes": 8}
+network = {"blocks": 1, "layers": 2, "width": 64, "activation": "silu"}
+model = build_model({**layout, **network}, simulator.rest_positions, *samples)
+
+q, v, f = samples
+with torch.no_grad():
+    inputs, outputs = model.encode(q, v), model.encode_outputs(f)
+    model.fit_linear(inputs, outputs, noise=1e-3)
+optimiser = torch.optim.Adam(model.network.parameters(), lr=3e-3)
+schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, 400)
+losses = []
+for _ in range(400):
+    optimiser.zero_grad()
+    noisy = inputs + 1e-3 * torch.randn_like(inputs)
+    loss = (model.standardised(noisy)[0] - outputs).square().mean()
+    loss.backward()
+    optimiser.step()
+    schedule.step()
+    losses.append(loss.item())
+print(f"mean squared error of the standardised force: {losses[0]:.1e} to {losses[-1]:.1e}")
+
+# %% [markdown]
+# ## Roll out
+#
+# The hybrid simulator takes the force of its own state at every step. These motions are none that the network has seen.
+
+# %%
+model.eval()
+corrected = rolled_out(simulator, lambda state, step: model(state.q, state.v))
+print(f"uncorrected {error(uncorrected).mean():.3f} mm, corrected {error(corrected).mean():.3f} mm")
+
+# %%
+times = 0.01 * torch.arange(STEPS + 1)
+figure, axes = plt.subplots(1, 2, figsize=(8.5, 3), layout="constrained")
+for label, positions in [("robot", motion.q[:, test]), ("uncorrected", uncorrected), ("corrected", corrected)]:
+    style = {"color": "k", "linewidth": 4, "alpha": 0.25} if label == "robot" else {}
+    axes[0].plot(times, 1e3 * positions[:, 1, tip, 2].mean(-1), label=label, **style)
+axes[0].set(xlabel="time [s]", ylabel="height of the tip, 140 g [mm]")
+axes[0].legend(frameon=False)
+axes[1].semilogy(times[1:], error(uncorrected)[1:], color="C0", label="uncorrected")
+axes[1].semilogy(times[1:], error(corrected)[1:], color="C1", label="corrected")
+axes[1].set(xlabel="time [s]", ylabel="mean error of all vertices [mm]")
+plt.show()
+
+# %% [markdown]
+# ## From markers
+#
+# Of a real robot only a few points are seen. The force is then the smallest of those that bring these points where they
+# were: it explains the markers, and says as little as it can of the rest. Here four vertices of the tip and four half
+# way are seen, with a regularisation that fits noise of a tenth of a millimetre.
+
+# %%
+middle = select_vertices(mesh, x=0.05)
+corners = [0, 3, 12, 15]  # of the 16 vertices of a section
+seen = torch.as_tensor([*middle[corners], *tip[corners]])
+markers = MarkerMap(seen.view(1, -1, 1), torch.ones(1, len(seen), 1, dtype=torch.float64))
+from_markers = make_reconstructor(
+    simulator, "levenberg_marquardt", regularisation=1e-4, tolerance=1e-6, max_iterations=100, markers=markers
+)
+state = State(motion.q[0, 7:8], motion.v[0, 7:8])
+guess, off = None, []
+for step in range(40):
+    measured = motion.q[step + 1, 7:8, seen]
+    measured = measured + 1e-4 * torch.randn_like(measured)
+    found = from_markers.step(state, measured, first_guess=guess)
+    state, guess = found.state, found.force
+    off.append(1e3 * (state.q - motion.q[step + 1, 7:8]).norm(dim=-1).mean().item())
+alone = error(uncorrected)[1:41].mean().item()
+print(
+    f"all vertices, of which 8 were seen with noise: {sum(off) / len(off):.2f} mm off; without a force {alone:.2f} mm"
+)
+
+# %% [markdown]
+# How many markers it takes, and where: `warp-resphys experiment=marker_ablation`. From markers to the report of a robot
+# of your own: [bring your robot](bring_a_beam.py).
+
+# %%
+assert misfit < 1e-6
+assert error(corrected).mean() < 0.05 * error(uncorrected).mean()
+assert sum(off) / len(off) < 0.3 * alone

@@ -43,6 +43,18 @@ def test_every_tutorial_is_in_the_contents_and_says_when_it_is_wrong():
             assert text.startswith("# ---\n# jupyter:")
 
 
+def test_what_the_theory_names_is_in_the_code():
+    theory = (DOCS / "theory.md").read_text(encoding="utf-8")
+    modules = re.findall(r"`((?:control|data|dynamics|energies|fem|learning|linalg)\.[\w.]+)`", theory)
+    kernels = re.findall(r"`(kernels/[\w/]+\.py)`", theory)
+    assert len(modules) > 25
+    assert len(kernels) > 6
+    for name in modules:
+        assert (REPOSITORY / "warp_resphys").joinpath(*name.split(".")).with_suffix(".py").is_file(), name
+    for path in kernels:
+        assert (REPOSITORY / path).is_file(), path
+
+
 @pytest.mark.parametrize(
     ("file", "pattern"),
     [("CITATION.cff", r"^version: (.+)$"), ("CHANGELOG.md", r"^## (?:Unreleased \()?([\d.]+)")],

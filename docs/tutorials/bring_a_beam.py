@@ -98,6 +98,7 @@ defaults:
   - _self_
 name: my_robot
 title: My robot
+mesh: {{divisions: [8, 2, 2]}}
 fixed: {{x: 0.0}}  # the clamped vertices
 tip: {{x: 0.1}}
 simulation:  # from the data sheet
@@ -114,7 +115,7 @@ data:
     light: {{file: light.csv, payload: 0.04}}
     heavy: {{file: heavy.csv, payload: 0.08}}
   payload_at: {{x: 0.1}}
-  seconds: 0.8
+  seconds: 0.7
   folds: null
   train: [bare, heavy]
   test: [light]

@@ -155,7 +155,7 @@ for name, error in errors.items():
 print(", ".join(f"{name} {value:.4g}" for name, value in identified.items()))
 
 # %% [markdown]
-# Identification leaves 1.5 mm, five times what the markers' placement explains, and the learned force does not help:
+# Identification leaves a millimetre and a half, five times what the markers' placement explains, and the learned force does not help:
 # from two motions it learns those motions. That is the moment to ask what the simulator lacks. Silicone creeps, and
 # nothing in this material remembers anything.
 #
@@ -184,9 +184,8 @@ command("experiment=my_creeping_robot")
 run = Path("runs/my_creeping_robot/default")
 creeping, identified = results(run)
 print(f"identified: {errors['sysid']:.2f} mm without, {creeping['sysid']:.2f} mm with creep")
-print(
-    f"a share of {identified['prony_ratio_1']:.2f} within {identified['prony_time_1']:.2f} s (true: 0.15 within 0.10 s)"
-)
+share, within = identified["prony_ratio_1"], identified["prony_time_1"]
+print(f"a share of {share:.2f} within {within:.2f} s (true: 0.15 within 0.10 s)")
 
 # %% [markdown]
 # Now the error is that of the markers' own placement, 0.3 mm, which no physics mends, and nothing is left for a force
@@ -214,5 +213,5 @@ plt.show()
 # %%
 assert errors["sysid"] < 0.6 * errors["simulation"]
 assert creeping["sysid"] < 0.35 * errors["sysid"]
-assert 0.1 < identified["prony_ratio_1"] < 0.25
+assert 0.1 < share < 0.25
 assert abs(trial.errors_mm(played).mean() / creeping["sysid"] - 1) < 0.05

@@ -155,9 +155,9 @@ for name, error in errors.items():
 print(", ".join(f"{name} {value:.4g}" for name, value in identified.items()))
 
 # %% [markdown]
-# Identification leaves a millimetre and a half, five times what the markers' placement explains, and the learned force does not help:
-# from two motions it learns those motions. That is the moment to ask what the simulator lacks. Silicone creeps, and
-# nothing in this material remembers anything.
+# Identification leaves a millimetre and a half, five times what the markers' placement explains, and the learned force
+# does not help: from two motions it learns those motions. That is the moment to ask what the simulator lacks. Silicone
+# creeps, and nothing in this material remembers anything.
 #
 # ## Better physics
 #

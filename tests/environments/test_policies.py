@@ -6,7 +6,8 @@ import pytest
 from warp_resphys.environments.making import make_vector
 from warp_resphys.environments.policies import ScriptedPolicy, acting, errors_mm, learn
 from warp_resphys.io.errors import InputError
-from warp_resphys.studies.environment_speed import environment_table, time_environments
+from warp_resphys.studies.benchmark_tables import benchmark_sheets
+from warp_resphys.studies.environment_speed import time_environments
 
 
 def still(seen):
@@ -84,6 +85,7 @@ def test_speeds_are_those_of_all_robots_and_worlds(folder):
     for row in rows:
         assert row["actions_s"] == pytest.approx(1e3 * row["robots"] / row["ms"])
         assert row["steps_s"] == pytest.approx(5 * row["actions_s"])
-    table = environment_table(rows)
-    assert (table.row_count, len(table.columns)) == (4, 5)
-    assert [*table.columns[0].cells] == [row["world"] for row in rows]
+    result = {"settings": {"device": "cpu"}, "hardware": {"processor": "one"}, "yardstick_ms": 1.0, "steps": []}
+    *_, sheet = benchmark_sheets({**result, "parts": [], "cold_start": None, "environments": rows})
+    assert [row[0] for row in sheet.rows] == [row["world"] for row in rows]
+    assert {len(row) for row in sheet.rows} == {len(sheet.headings)}

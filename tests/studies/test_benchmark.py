@@ -1,5 +1,6 @@
 import json
 import math
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -7,10 +8,12 @@ import pytest
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
+from warp_resphys import cli
 from warp_resphys.experiment.build import build_simulator
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_json, write_json
-from warp_resphys.studies.benchmark import PARTS, benchmark_tables, released, run_benchmark
+from warp_resphys.studies.benchmark import released, run_benchmark
+from warp_resphys.studies.benchmark_tables import PARTS, benchmark_sheets
 
 TINY = [
     "mesh.divisions=[2,1,1]",
@@ -54,14 +57,30 @@ def test_every_case_is_measured(device: str, tmp_path: Path) -> None:
     assert result["yardstick_ms"] > 0.0
     assert result["hardware"]["processor"]
     assert {"torch", "warp-lang", "python"} <= set(result["versions"])
-    assert [table.row_count for table in benchmark_tables(result)] == [len(result["steps"]), 4, 2]
+    assert [len(sheet.rows) for sheet in benchmark_sheets(result)] == [len(result["steps"]), 4, 2]
 
 
 def test_quick_measures_the_coarsest_mesh_alone() -> None:
     result = run_benchmark(configuration("benchmark.quick=true", "benchmark.cold_start=false", "device=cpu"))
     assert {(r["refinement"], r["batch"]) for r in result["steps"]} == {(1, 1)}
     assert result["cold_start"] is None
-    assert len(benchmark_tables(json.loads(json.dumps(result)))) == 2
+    assert len(benchmark_sheets(json.loads(json.dumps(result)))) == 2
+
+
+def test_a_page_holds_what_the_terminal_shows(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    small = ["benchmark.quick=true", "benchmark.cold_start=false", "benchmark.results=pages", "device=cpu"]
+    monkeypatch.setattr(sys, "argv", ["warp-resphys", "benchmark", *TINY, *small])
+    cli.main()
+    said = capsys.readouterr().out
+    (page,) = (folder / "pages").glob("*-benchmark-cpu.md")
+    text = page.read_text()
+    (result,) = (read_json(path) for path in folder.glob("outputs/benchmark/benchmark.json"))
+    for row in result["steps"]:
+        cells = [f"{row['forward_ms']:.2f}", f"{row['backward_ms']:.2f}"]
+        assert any(all(cell in line for cell in (row["solver"], *cells)) for line in text.splitlines())
+        assert all(cell in said for cell in cells)
+    assert "warp-resphys benchmark" in text
+    assert "| warp-lang |" in text
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])

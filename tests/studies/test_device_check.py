@@ -31,7 +31,7 @@ def test_the_cpu_passes(folder, monkeypatch, capsys):
     (page,) = (folder / "pages").glob("*-check-cpu.md")
     text = page.read_text()
     assert "all passed" in text
-    assert "Environment-steps/s" in text
+    assert "Robots' steps/s" in text
     assert (folder / "check" / "check.html").is_file()
 
 

@@ -19,7 +19,6 @@ from typing import Any, Final
 
 import numpy as np
 import torch
-from rich.table import Table
 from threadpoolctl import threadpool_limits
 
 from ..dynamics.assembly import HessianAssembly
@@ -48,10 +47,12 @@ from ..io.machine import hardware
 from ..io.progress import Progress
 from ..io.stages import package_versions
 from ..linalg.threads import threads_for
-from .command import show, table_of
-from .environment_speed import environment_table, time_environments
+from .benchmark_tables import PARTS, benchmark_sheets, machine
+from .command import show
+from .environment_speed import time_environments
+from .runs import Results, made
 
-PARTS: Final = ("local_step", "tangent", "assembly", "factor", "solve")
+PAGE = "benchmark.html"
 _YARDSTICK_SIZE: Final = 480
 _BY_REFINEMENT: Final = Kind(
     lambda value: isinstance(value, Mapping) and bool(value) and all(map(NATURAL.fits, (*value, *value.values()))),
@@ -72,6 +73,7 @@ _KEYS: Final = Group(
         "tip_mass": NOT_NEGATIVE,
         "pressure": FINITE,
         "environments": Group({"run": optional(WORD), "robots": NATURALS}),
+        "results": optional(WORD),
     }
 )
 _MATERIAL: Final = Group({"poissons_ratio": FINITE, "youngs_modulus": POSITIVE})
@@ -134,10 +136,16 @@ class Case:
 
 
 def benchmark(config: Mapping[str, Any], folder: Path) -> None:
-    """Writes benchmark.json into the run folder and prints its tables; see `run_benchmark`."""
+    """Writes benchmark.json and a page into the run folder and prints its tables; see `run_benchmark`."""
     result = run_benchmark(config)
     write_json(folder / "benchmark.json", result)
-    show(*benchmark_tables(result), f"Written: {folder / 'benchmark.json'}")
+    sheets = benchmark_sheets(result)
+    show(*(sheet.for_terminal() for sheet in sheets), f"Written: {folder / 'benchmark.json'}")
+    date, device = f"{datetime.now():%Y-%m-%d}", str(config["device"]).partition(":")[0]
+    verdict = f"{machine(result)}: medians over repeats; a yardstick, the same task in NumPy, takes its turn with them."
+    parts = [*(sheet.for_page() for sheet in sheets), made("benchmark", ("benchmark.environments.run",))]
+    results = Results("Benchmark", date, verdict, parts)
+    results.write(folder / PAGE, config["benchmark"]["results"], f"{date}-benchmark-{device}")
 
 
 def run_benchmark(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -362,40 +370,3 @@ def first_step(began: float, config: str) -> None:
     names = ("import_s", "build_s", "kernels_s", "first_step_s")
     moments = (began, imported, built, kernels, stepped)
     print(json.dumps(dict(zip(names, np.diff(moments).tolist(), strict=True))))
-
-
-def benchmark_tables(result: Mapping[str, Any]) -> list[Table]:
-    """The result for a terminal."""
-    yardstick, machine = result["yardstick_ms"], result["hardware"]
-    where = machine["GPU" if str(result["settings"]["device"]).startswith("cuda") else "processor"]
-    steps = [
-        [
-            row["solver"],
-            f"{row['poissons_ratio']:g}",
-            str(row["unknowns"]),
-            str(row["batch"]),
-            f"{row['forward_ms']:.2f}",
-            f"{row['backward_ms']:.2f}",
-            f"{row['forward_ms'] / yardstick:.2f}",
-            f"{row['iterations']:.1f}",
-            f"{row['factorisations']:.2f}",
-        ]
-        for row in result["steps"]
-    ]
-    headings = ["solver", "nu", "unknowns", "batch", "forward", "backward", "forward / yardstick"]
-    title = f"Milliseconds a step of the whole batch, {where} (yardstick {yardstick:.2f} ms)"
-    tables = [table_of(title, [*headings, "iterations", "factorisations"], steps)]
-    parts = [
-        [str(row["refinement"]), str(row["batch"]), *(f"{row[f'{part}_ms']:.3f}" for part in PARTS)]
-        for row in result["parts"]
-    ]
-    headings = ["refinement", "batch", *(part.replace("_", " ") for part in PARTS)]
-    tables.append(table_of("Milliseconds of the parts", headings, parts))
-    if result["cold_start"] is not None:
-        names = list(result["cold_start"]["cold"])
-        starts = [[kind, *(f"{times[name]:.2f}" for name in names)] for kind, times in result["cold_start"].items()]
-        headings = ["kernel cache", *(name.removesuffix("_s").replace("_", " ") for name in names)]
-        tables.append(table_of("Seconds of a new process", headings, starts))
-    if result["environments"]:
-        tables.append(environment_table(result["environments"]))
-    return tables

@@ -26,7 +26,8 @@ from ..io.stages import run_lock
 from ..linalg.choice import LINEAR_SOLVERS
 from ..mesh.mesh import Mesh, box_hexahedra, box_tetrahedra, select_vertices
 from ..report.page import Cell, Part, Row, Table
-from .benchmark import benchmark_tables, run_benchmark
+from .benchmark import run_benchmark
+from .benchmark_tables import benchmark_sheets, machine
 from .command import WORDS, show, table_of
 from .gradient_check import check_gradients, pose
 from .runs import Results, Run, made, run_all
@@ -93,7 +94,7 @@ def check_device(config: Mapping[str, Any], folder: Path) -> None:
             show(_table(section))
         measured = run_benchmark(config)
         write_json(folder / "benchmark.json", measured)
-        show(*benchmark_tables(measured))
+        show(*(sheet.for_terminal() for sheet in benchmark_sheets(measured)))
         _write(sections, measured, config, folder)
     if not all(section.passed for section in sections):
         raise SystemExit(1)
@@ -241,28 +242,14 @@ def _write(sections: Sequence[Section], measured: Mapping[str, Any], config: Map
         )
         for section in sections
     ]
-    steps = [
-        Row(
-            f"{row['solver']}, nu {row['poissons_ratio']:g}, {row['batch']} environments",
-            [
-                Cell(f"{row['forward_ms']:.2f}"),
-                Cell(f"{row['backward_ms']:.2f}"),
-                Cell(f"{1e3 * row['batch'] / row['forward_ms']:.0f}"),
-                Cell(f"{row['iterations']:.1f}"),
-            ],
-        )
-        for row in measured["steps"]
-    ]
-    unknowns = max(row["unknowns"] for row in measured["steps"])
-    heads = ["Forward [ms]", "Backward [ms]", "Environment-steps/s", "Iterations"]
-    speed = Part(f"Speed, {unknowns} unknowns", [Table("A step", heads, steps)])
+    speed = [sheet.for_page() for sheet in benchmark_sheets(measured)]
     failed = sum(not row[3] for section in sections for row in section.rows)
     count = sum(len(section.rows) for section in sections)
-    where = measured["hardware"]["GPU" if config["device"].startswith("cuda") else "processor"]
+    where = machine(measured)
     verdict = (
         f"{count} checks on {where}: all passed." if not failed else f"{failed} of {count} checks on {where} failed."
     )
     date = f"{datetime.now():%Y-%m-%d}"
-    results = Results("Check of a device", date, verdict, [*checks, speed, made("check")])
+    results = Results("Check of a device", date, verdict, [*checks, *speed, made("check")])
     copies = config["check"]["results"]
     results.write(folder / PAGE, copies, f"{date}-check-{choose_device(config['device']).type}")

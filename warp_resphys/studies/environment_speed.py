@@ -1,18 +1,15 @@
 """Steps a second of the environments of a run, for the benchmark."""
 
 import time
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import median
 from typing import Any, Final
 
 import numpy as np
-from rich.table import Table
 
 from ..control.files import reduced_file
 from ..io.errors import InputError
 from ..robot.loading import load
-from .command import table_of
 
 _ACTIONS: Final = 5  # of a repeat, of which the median is taken
 
@@ -59,13 +56,3 @@ def time_environments(run: Path, counts: list[int], repeats: int, device: str) -
                 }
             )
     return rows
-
-
-def environment_table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Of what `time_environments` has found, for a terminal."""
-    heads = ["world", "robots", "ms an action of all", "actions a second", "steps a second"]
-    cells = [
-        [row["world"], str(row["robots"]), f"{row['ms']:.1f}", f"{row['actions_s']:.0f}", f"{row['steps_s']:.0f}"]
-        for row in rows
-    ]
-    return table_of("Environments, task reach", heads, cells)

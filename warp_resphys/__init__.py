@@ -4,10 +4,12 @@ The names below are imported when they are first used, so that importing the pac
 """
 
 import importlib
+import importlib.util
 from pathlib import Path
 from typing import Any
 
-if not Path(__file__).with_name("kernels").is_dir():  # a copy of the repository, where kernels/ and conf/ lie beside
+# In a copy of the repository that nobody has installed in place, kernels/ and conf/ lie beside this folder.
+if importlib.util.find_spec(f"{__name__}.kernels") is None:
     __path__.append(str(Path(__file__).parents[1]))
 
 _MODULES = {

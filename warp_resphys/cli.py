@@ -106,8 +106,8 @@ _VALUED: Final = (
     *("--cfg", "-c", "--package", "-p", "--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd"),
     *("--info", "-i", "--experimental-rerun"),
 )
-# Of a process that helps another one with a run.
 _PLAIN: Final = re.compile(r"[\w./~=+%@:,-]+")  # A value that means nothing but itself.
+# Of a process that helps another one with a run.
 _SILENT: Final = ("hydra.output_subdir=null", "hydra/job_logging=disabled")
 
 

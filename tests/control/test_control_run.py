@@ -24,8 +24,10 @@ from warp_resphys.control.sampling import Sampling
 from warp_resphys.control.task import Task
 from warp_resphys.environments.worlds import ReducedWorld
 from warp_resphys.experiment.checks import check_configuration
-from warp_resphys.io.errors import InputError
+from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.files import read_array, read_hdf5
+from warp_resphys.studies.benchmark_tables import benchmark_sheets
+from warp_resphys.studies.control_speed import time_commands
 from warp_resphys.studies.gradient_check import central_difference
 
 CONTROL = [
@@ -347,3 +349,18 @@ def configuration(*overrides):
 def test_what_no_control_can_be_made_of(override, said):
     with pytest.raises(InputError, match=said):
         check_configuration(configuration(*override.split(";")))
+
+
+def test_the_benchmark_times_the_commands_of_all_that_plan_anew(folder):
+    rows = time_commands(folder, 1)
+    assert [row["controller"] for row in rows] == ["resphys", "linear", "full simulator"]
+    assert all(row["horizon_s"] == 0.1 and 0.0 < row["ms"] <= row["largest_of_20_ms"] for row in rows)
+    result = {"settings": {"device": "cpu"}, "hardware": {"processor": "one"}, "yardstick_ms": 1.0, "steps": []}
+    *_, sheet = benchmark_sheets({**result, "parts": [], "cold_start": None, "environments": [], "control": rows})
+    assert [row[0] for row in sheet.rows] == [row["controller"] for row in rows]
+    assert "over 0.1 s" in sheet.title
+
+
+def test_commands_are_timed_of_a_run_that_was_driven(tmp_path):
+    with pytest.raises(DataFileError, match="is no run folder"):
+        time_commands(tmp_path, 1)

@@ -1,8 +1,12 @@
 """A policy that knows where a robot rests, what Stable-Baselines3 sees of robots, and how fast these are."""
 
+import json
+
 import numpy as np
 import pytest
+from main_job import end_of
 
+from warp_resphys import cli
 from warp_resphys.environments.making import make_vector
 from warp_resphys.environments.policies import ScriptedPolicy, acting, errors_mm, learn
 from warp_resphys.io.errors import InputError
@@ -77,6 +81,26 @@ class TestLearning:
             learn(robots, 8)
 
 
+def test_the_command_learns_a_policy_once(folder, tmp_path, monkeypatch):
+    """And tries every policy in every world."""
+    pytest.importorskip("stable_baselines3")
+    monkeypatch.chdir(tmp_path)
+    arguments = ("warp-resphys", "train-policy", f"run={folder}", "skill=reach", "models=[sysid]", "robots=4")
+    told, saved = folder / "policies" / "reach.json", folder / "policies" / "reach_sysid.zip"
+    results = []
+    for steps in (64, 64, 128):
+        code, err = end_of(cli.main, *arguments, f"steps={steps}", "episodes=2", "hydra.run.dir=policy")
+        assert code == 0, err
+        results.append((json.loads(told.read_text()), saved.stat().st_mtime_ns))
+    (first, made), (second, kept), (_, anew) = results
+    assert first == second
+    assert made == kept < anew
+    errors = first["errors"]
+    assert list(errors) == [*(f"scripted, sysid, place {place}" for place in (1, 2, 3)), "PPO, sysid"]
+    assert all(each[world]["mean_mm"] > 0.0 for each in errors.values() for world in ("reduced sysid", "laboratory"))
+    assert len({each["laboratory"]["mean_mm"] for each in errors.values()}) > 1
+
+
 def test_speeds_are_those_of_all_robots_and_worlds(folder):
     rows = time_environments(folder, [1, 2], 1, "cpu")
     assert [(row["world"], row["robots"]) for row in rows] == [
@@ -86,6 +110,6 @@ def test_speeds_are_those_of_all_robots_and_worlds(folder):
         assert row["actions_s"] == pytest.approx(1e3 * row["robots"] / row["ms"])
         assert row["steps_s"] == pytest.approx(5 * row["actions_s"])
     result = {"settings": {"device": "cpu"}, "hardware": {"processor": "one"}, "yardstick_ms": 1.0, "steps": []}
-    *_, sheet = benchmark_sheets({**result, "parts": [], "cold_start": None, "environments": rows})
+    *_, sheet = benchmark_sheets({**result, "parts": [], "cold_start": None, "environments": rows, "control": []})
     assert [row[0] for row in sheet.rows] == [row["world"] for row in rows]
     assert {len(row) for row in sheet.rows} == {len(sheet.headings)}

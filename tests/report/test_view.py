@@ -65,7 +65,8 @@ def test_what_the_script_reads_are_the_bodies(every_vertex):
     found = motion.positions if every_vertex else motion.markers
     for model, name in zip(data["models"], motion.positions, strict=True):
         away = 1e3 * np.linalg.norm(found[name] - expected, axis=2)
-        assert model["largest"] == pytest.approx(np.nanmax(away), rel=1e-3)
+        drawn = np.isfinite(motion.positions[name]).all(axis=(1, 2))
+        assert model["largest"] == pytest.approx(away[drawn].max(), rel=1e-3)
         means = np.array([np.nan if mean is None else mean for mean in model["means"]])
         np.testing.assert_allclose(means, away.mean(axis=1), rtol=1e-3)
     if every_vertex:
@@ -83,7 +84,10 @@ def test_a_basis_is_as_small_as_it_may_be():
     basis, found = reduced(displacements, 1e-9, 20)
     assert basis.shape == (3, 30)
     np.testing.assert_allclose((found @ basis).reshape(2, 20, 10, 3), displacements, atol=1e-9)
-    assert reduced(displacements, 1e9, 20)[0].shape == (0, 30)
+    basis, found = reduced(displacements, 1e9, 20)  # Whatever moves so little still says where it is known.
+    np.testing.assert_array_equal(basis, np.zeros((1, 30)))
+    assert np.isfinite(found[0]).all()
+    assert np.isnan(found[1, 7:]).all()
     assert reduced(displacements, 0.0, 2)[0].shape == (2, 30)
 
 

@@ -1,9 +1,12 @@
 """A robot that is stepped as time goes on, and its page in a browser."""
 
+import re
 import socket
 import sys
 import threading
 import time
+from contextlib import contextmanager
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -17,6 +20,15 @@ from warp_resphys.robot.loading import load
 from warp_resphys.robot.robot import Robot
 from warp_resphys.studies.live import LiveRobot, range_of
 from warp_resphys.studies.view import Page
+
+
+@contextmanager
+def closing(server):
+    """The server, stopped at the end."""
+    try:
+        yield server
+    finally:
+        server.stop()
 
 
 @pytest.fixture
@@ -149,10 +161,20 @@ def test_a_port_in_use_and_a_missing_package_are_said(finished, folder, monkeypa
     )
 
 
-def test_a_command_serves_it(finished, folder):
+def test_a_command_serves_it(finished, folder, monkeypatch):
     pytest.importorskip("viser")
+    pages = []
+
+    def show(said):
+        if found := re.search(r"http://\S+", said):
+            pages.append(urlopen(found[0], timeout=30).read())
+
+    monkeypatch.setattr("warp_resphys.studies.view.show", show)
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
     code, err = end_of(cli.main, "warp-resphys", "view", f"run={finished[0]}", "port=0", "seconds=1", "trial=150 g")
     assert code == 0, err
+    assert len(pages) == 1
+    assert b"<html" in pages[0].lower()
 
 
 def test_a_browser_drives_and_pulls_it(finished):
@@ -161,8 +183,7 @@ def test_a_browser_drives_and_pulls_it(finished):
     from selenium.webdriver.common.by import By
 
     live = LiveRobot(load(finished[0]))
-    server = viser.ViserServer("127.0.0.1", 0, verbose=False)
-    with opened() as browser:
+    with opened() as browser, closing(viser.ViserServer("127.0.0.1", 0, verbose=False)) as server:
         page = Page(server, live)
 
         def look() -> None:
@@ -173,8 +194,9 @@ def test_a_browser_drives_and_pulls_it(finished):
                 canvas = browser.find_element(By.CSS_SELECTOR, "canvas")
                 hand = webdriver.ActionChains(browser)
                 hand.move_to_element_with_offset(canvas, 0, 0).click_and_hold().move_by_offset(0, -40)
-                hand.move_by_offset(0, -60).pause(1.0).perform()
-                found["pulled"] = live.is_pulled
+                hand.move_by_offset(0, -60).perform()
+                until(lambda: live.is_pulled)
+                found["pulled"] = True
                 webdriver.ActionChains(browser).release().perform()
                 until(lambda: not live.is_pulled)
                 severe = [each["message"] for each in browser.get_log("browser") if each["level"] == "SEVERE"]
@@ -195,5 +217,4 @@ def test_a_browser_drives_and_pulls_it(finished):
         thread.start()
         page.run(120.0)  # In this thread, as from the command line.
         thread.join()
-    server.stop()
     assert found == {"pulled": True, "severe": [], "paused": True, "reset": True}

@@ -208,6 +208,28 @@ def controllers_of(control: Mapping[str, Any]) -> list[str]:
     ]
 
 
+def receding_controllers(
+    settings: Mapping[str, Any], folder: Path, robot: Robot, path: FloatArray, rests: FloatArray
+) -> list[Controller]:
+    """Those that plan anew at each step, on the reduced models and at last on the linear one.
+
+    Args:
+        settings: of the stage drive.
+        folder: of the run.
+        robot: with the last of the models.
+        path: (T, d) where the point is to be after each step [m].
+        rests: (>= C, M, 3) the markers that each of them sees as the robot hangs without inputs [m].
+    """
+    task, control = _task(settings, robot), settings["control"]
+    limits, horizon, found = task.limits, task.horizon, list[Controller]()
+    for model in control["receding"]:
+        learned = robot if model == robot.description.model else load(folder, model, settings["device"])
+        reduced: ReducedModel = read_reduced(folder / reduced_file(model), learned.description.learned)
+        found.append(RecedingHorizon(reduced, task.tracked, limits, horizon, task.noise, path, rests[len(found)]))
+    linear = read_baselines(folder / BASELINES)[0]
+    return [*found, LinearRecedingHorizon(linear, task.tracked, limits, horizon, path, rests[len(found)])]
+
+
 class _Drive(March):
     """One motion, driven by all controllers at once."""
 
@@ -231,14 +253,9 @@ class _Drive(March):
         control, task, folder = self._settings["control"], self._task, self._folder
         plans = {model: read_plan(folder / plans_file(model), self._name) for model in control["models"]}
         rest, path = self._laboratory.rest(), plans[control["models"][-1]].path
-        limits, horizon = task.limits, task.horizon
         found: list[Controller] = [OpenLoop(plan.inputs) for plan in plans.values()]
-        for model in control["receding"]:
-            learned = robot if model == robot.description.model else load(folder, model, self._settings["device"])
-            reduced: ReducedModel = read_reduced(folder / reduced_file(model), learned.description.learned)
-            found.append(RecedingHorizon(reduced, task.tracked, limits, horizon, task.noise, path, rest[len(found)]))
-        linear, jacobian = read_baselines(folder / BASELINES)
-        found.append(LinearRecedingHorizon(linear, task.tracked, limits, horizon, path, rest[len(found)]))
+        found += receding_controllers(self._settings, folder, robot, path, rest[len(found) :])
+        limits, jacobian = task.limits, read_baselines(folder / BASELINES)[1]
         for gain in control["feedback"]["gains"]:
             feedback = JacobianFeedback(jacobian, limits, gain, task.time_step)
             found.append(Feedback(feedback, task.tracked, path, rest[len(found)]))

@@ -1,23 +1,24 @@
 """Policies for environments: a scripted one, how well one does, and learning them with Stable-Baselines3."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import torch
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from typing_extensions import override
 
 from ..control.polynomials import Monomials, Polynomial
 from ..io.errors import InputError
+from ..linalg.threads import threads_for
 from .tasks import GoalTask, Reach
 from .vector import Observation, RobotVectorEnv
 
 FloatArray = NDArray[np.float64]
 Policy = Callable[[Observation], NDArray[np.float32]]
 
+_NETWORK: Final = 128  # Width of its layers.
 _ORDER: Final = 2  # of the polynomial that says where the robot rests
 _EFFORT: Final = 3e-3  # of squared actions beside the squared distance, for places of size one
 _ITERATIONS, _STRIDE = 16, 0.25  # of Gauss-Newton, and the longest change of an action in one
@@ -69,7 +70,9 @@ class ScriptedPolicy:
         return found
 
 
-def errors_mm(environment: RobotVectorEnv, policy: Policy, seed: int) -> FloatArray:
+def errors_mm(
+    environment: RobotVectorEnv, policy: Policy, seed: int, on_action: Callable[[], None] = lambda: None
+) -> FloatArray:
     """(A, B) how far points are from what is asked in one episode of each robot [mm]; NaN from a failure on."""
     seen, _ = environment.reset(seed=seed)
     found = np.full((environment.actions, environment.num_envs), np.nan)
@@ -78,6 +81,7 @@ def errors_mm(environment: RobotVectorEnv, policy: Policy, seed: int) -> FloatAr
         seen, _, terminated, _, info = environment.step(policy(seen))
         alive &= ~terminated
         found[number, alive] = info["error_mm"][alive]
+        on_action()
     return found
 
 
@@ -104,9 +108,7 @@ def learn(
 
         from .stable_baselines import Robots
     except ImportError as error:
-        raise InputError(
-            f"learning a policy needs Stable-Baselines3 ({error}): pip install 'warp-resphys[policies]'."
-        ) from None
+        raise _missing(error) from None
     if environment.metadata["autoreset_mode"] is not AutoresetMode.SAME_STEP:
         raise InputError("learning needs an environment with autoreset_mode='SameStep'.")
 
@@ -116,7 +118,7 @@ def learn(
             on_progress(environment.num_envs)
             return True
 
-    with one_thread():
+    with threads_for(_NETWORK):
         made = PPO(
             "MlpPolicy",
             Robots(environment),
@@ -125,24 +127,35 @@ def learn(
             n_epochs=6,
             gamma=0.95,
             learning_rate=5e-4,
-            policy_kwargs={"net_arch": [128, 128], "log_std_init": -1.0},
+            policy_kwargs={"net_arch": [_NETWORK, _NETWORK], "log_std_init": -1.0},
             seed=seed,
             device="cpu",
         )
         return made.learn(steps, Told())
 
 
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Torch on one thread: those that share so small a network wait for one another most of the time."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
+def learned_before(path: Path) -> Any:
+    """A ``stable_baselines3.PPO`` that was saved.
+
+    Raises:
+        InputError: Stable-Baselines3 is not installed.
+    """
     try:
-        yield
-    finally:
-        torch.set_num_threads(before)
+        from stable_baselines3 import PPO
+    except ImportError as error:
+        raise _missing(error) from None
+    return PPO.load(path, device="cpu")
+
+
+def _missing(error: ImportError) -> InputError:
+    return InputError(f"learning a policy needs Stable-Baselines3 ({error}): pip install 'warp-resphys[policies]'.")
 
 
 def acting(model: Any) -> Policy:
     """The policy of a model of Stable-Baselines3, without noise."""
-    return lambda seen: np.asarray(model.predict(seen, deterministic=True)[0], dtype=np.float32)
+
+    def act(seen: Observation) -> NDArray[np.float32]:
+        with threads_for(_NETWORK):
+            return np.asarray(model.predict(seen, deterministic=True)[0], dtype=np.float32)
+
+    return act

@@ -34,6 +34,7 @@ _ONE_BY_ONE: Final = ("simulation", "sysid", "simfree", "resphys")  # Marker by 
 _MOST_MARKERS: Final = 6  # That are drawn coordinate by coordinate.
 _PLANE_SECONDS: Final = 5.0  # Of a path in the plane.
 _SPACE_SECONDS: Final = 2.5  # And in space, where a longer one cannot be told apart.
+_MOST_FRAMES: Final = 256  # Of the view in space, as films have.
 _SEQUENCES: Final = 3  # Trials whose inputs are drawn over time.
 
 
@@ -139,6 +140,8 @@ def _in_space(data: RunReport, name: str) -> list[Block]:
     motion = motion_of(data, every_model=True)
     if motion is None:
         return []
+    if (count := len(motion.times)) > _MOST_FRAMES:
+        motion = motion.at(np.unique(np.linspace(0, count - 1, _MOST_FRAMES).round().astype(int)))
     shown, compared = shown_models(motion.positions), "markers" if data.sees_markers else "vertices"
     against = "what was measured" if data.sees_markers else "the target"
     caption = (

@@ -39,7 +39,7 @@ class View {
     const data = JSON.parse(figure.querySelector(".view-data").textContent);
     this.data = data;
     this.gl = this.canvas.getContext("webgl2", {antialias: true, alpha: false, preserveDrawingBuffer: true});
-    if (!this.gl) throw new Error("no WebGL 2");
+    if (!this.gl) throw new Error("This browser has no WebGL 2, which the view in space needs.");
     this.rest = decoded(data.rest, Float32Array);
     this.modes = decoded(data.modes, Int16Array);
     this.weights = decoded(data.weights, Float32Array);
@@ -53,6 +53,11 @@ class View {
     this.controls();
     this.reset();
     new ResizeObserver(() => this.ask()).observe(this.canvas);
+    this.canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
+    this.canvas.addEventListener("webglcontextrestored", () => {
+      this.prepare();
+      this.ask();
+    });
     dark.addEventListener("change", () => this.ask());
   }
 
@@ -184,6 +189,7 @@ class View {
   }
 
   play(on) {
+    if (this.data.times.length < 2) return;
     if (on && this.time >= this.data.times.at(-1)) this.time = this.data.times[0];
     this.playing = on;
     this.button.setAttribute("aria-label", on ? "Pause" : "Play");
@@ -210,7 +216,8 @@ class View {
       const middle = (low + high) >> 1;
       if (times[middle] <= this.time) low = middle; else high = middle;
     }
-    return high === low ? low : low + Math.min((this.time - times[low]) / (times[high] - times[low]), 1.0);
+    const share = (this.time - times[low]) / (times[high] - times[low]);
+    return high === low ? low : low + Math.min(Math.max(share, 0.0), 1.0);
   }
 
   ask() {
@@ -219,7 +226,8 @@ class View {
     requestAnimationFrame((now) => {
       this.asked = false;
       if (this.playing) {
-        this.time += (now - this.last) * 1e-3 * Number(this.speed.value);
+        const since = Math.min(Math.max(now - this.last, 0), 100);  // A hidden page draws nothing; it goes on from there.
+        this.time += since * 1e-3 * Number(this.speed.value);
         if (this.time >= this.data.times.at(-1)) this.time = this.data.times[0];
         this.last = now;
       }
@@ -233,10 +241,11 @@ class View {
     const {place, rest, modes, weights} = this, frames = this.data.times.length, count = this.data.scales.length;
     const low = Math.floor(frame), high = Math.min(low + 1, frames - 1), share = frame - low;
     const row = (at) => (model * frames + at) * count;
-    if (!Number.isFinite(weights[row(low)]) || !Number.isFinite(weights[row(high)])) return false;
+    if (!Number.isFinite(weights[row(low)]) || (share > 0 && !Number.isFinite(weights[row(high)]))) return false;
     place.set(rest);
     for (let mode = 0; mode < count; mode++) {
-      const weight = (1 - share) * weights[row(low) + mode] + share * weights[row(high) + mode];
+      const before = weights[row(low) + mode];
+      const weight = share > 0 ? (1 - share) * before + share * weights[row(high) + mode] : before;
       const factor = weight * this.data.scales[mode], start = mode * place.length;
       if (factor !== 0.0) for (let at = 0; at < place.length; at++) place[at] += factor * modes[start + at];
     }
@@ -402,8 +411,10 @@ for (const figure of document.querySelectorAll("figure.view")) {
     figure.view = new View(figure);
     figure.classList.add("ready");
   } catch (error) {
-    figure.querySelector(".failed").hidden = false;
-    figure.dataset.failed = String(error);
+    const failed = figure.querySelector(".failed");
+    failed.textContent = `${error.message} The pictures show the same motion.`;
+    failed.hidden = false;
+    console.warn(error);
   }
 }
 })();

@@ -44,7 +44,7 @@ def view_in_space(name: str, motion: Motion, shown: Sequence[str], caption: str,
     size = float(np.ptp(motion.mesh.vertices, axis=0).max())
     places = np.stack([whole(q[:, surface], rest, _DIVERGED * size) for q in motion.positions.values()])  # (B, F, S, 3)
     basis, weights = reduced(places - rest, _TOLERANCE * size, _MOST_MODES)
-    scales = np.abs(basis).max(axis=1, initial=0.0) / np.iinfo(np.int16).max
+    scales = np.maximum(np.abs(basis).max(axis=1), np.finfo(np.float32).tiny) / np.iinfo(np.int16).max
     axes = motion_axes(motion.gravity, np.concatenate([rest[None], *places]))
     centre, half = frame_of(np.concatenate([rest, places.reshape(-1, 3)]), axes)
     simulated = np.stack(list(motion.markers.values()))  # (B, F, M, 3)
@@ -54,6 +54,8 @@ def view_in_space(name: str, motion: Motion, shown: Sequence[str], caption: str,
         exact = np.stack([whole(q, motion.mesh.vertices, _DIVERGED * size) for q in motion.positions.values()])
         means = mean_distance(exact, np.broadcast_to(motion.target, exact.shape))
         away = 1e3 * _distances(exact[:, :, surface], motion.target[:, surface])
+    drawn = np.isfinite(places.reshape(*places.shape[:2], -1).sum(axis=2))[..., None]  # (B, F, 1)
+    away = np.where(drawn, away, np.nan)
     largest = np.where(np.isfinite(away), away, 0.0).max(axis=(1, 2), initial=0.0)
     shares = np.nan_to_num(_LEVELS * away / np.maximum(largest, 1e-300)[:, None, None])
     models = [
@@ -113,7 +115,8 @@ def reduced(displacements: FloatArray, tolerance: float, most: int) -> tuple[Flo
         most: unless that takes more than so many.
 
     Returns:
-        The vectors, of length one, and the weights [m], NaN in the frames that were left out.
+        The vectors, of length one, one of zeros where none is needed, and the weights [m], NaN in the frames that were
+        left out.
     """
     count, frames, *_ = displacements.shape
     rows = displacements.reshape(count * frames, -1)
@@ -126,6 +129,8 @@ def reduced(displacements: FloatArray, tolerance: float, most: int) -> tuple[Flo
         vector /= np.linalg.norm(vector)
         remaining -= np.outer(remaining @ vector, vector)
         basis = np.concatenate([basis, vector[None]])
+    if not len(basis):  # Of what is at rest, one that is nothing, so that its weights say which frames are known.
+        basis = np.zeros((1, rows.shape[1]))
     weights = np.full((len(rows), len(basis)), np.nan)
     weights[known] = rows[known] @ basis.T
     return basis, weights.reshape(count, frames, -1)

@@ -26,7 +26,7 @@ from ..dynamics.inputs import Inputs
 from ..dynamics.integrator import State
 from ..dynamics.nonlinear_solver import SOLVERS
 from ..dynamics.simulator import Simulator
-from ..experiment.build import build_body, build_simulator
+from ..experiment.build import build_body, build_simulator, choose_device
 from ..experiment.schema import (
     FINITE,
     NATURAL,
@@ -49,6 +49,7 @@ from ..io.stages import package_versions
 from ..linalg.threads import threads_for
 from .benchmark_tables import PARTS, benchmark_sheets, machine
 from .command import show
+from .control_speed import time_commands
 from .environment_speed import time_environments
 from .runs import Results, made
 
@@ -73,6 +74,7 @@ _KEYS: Final = Group(
         "tip_mass": NOT_NEGATIVE,
         "pressure": FINITE,
         "environments": Group({"run": optional(WORD), "robots": NATURALS}),
+        "control": Group({"run": optional(WORD)}),
         "results": optional(WORD),
     }
 )
@@ -141,9 +143,12 @@ def benchmark(config: Mapping[str, Any], folder: Path) -> None:
     write_json(folder / "benchmark.json", result)
     sheets = benchmark_sheets(result)
     show(*(sheet.for_terminal() for sheet in sheets), f"Written: {folder / 'benchmark.json'}")
-    date, device = f"{datetime.now():%Y-%m-%d}", str(config["device"]).partition(":")[0]
+    date, device = f"{datetime.now():%Y-%m-%d}", result["settings"]["device"].partition(":")[0]
     verdict = f"{machine(result)}: medians over repeats; a yardstick, the same task in NumPy, takes its turn with them."
-    parts = [*(sheet.for_page() for sheet in sheets), made("benchmark", ("benchmark.environments.run",))]
+    parts = [
+        *(sheet.for_page() for sheet in sheets),
+        made("benchmark", ("benchmark.environments.run", "benchmark.control.run")),
+    ]
     results = Results("Benchmark", date, verdict, parts)
     results.write(folder / PAGE, config["benchmark"]["results"], f"{date}-benchmark-{device}")
 
@@ -153,19 +158,20 @@ def run_benchmark(config: Mapping[str, Any]) -> dict[str, Any]:
 
     Returns:
         ``steps`` (a row for each `Case`), ``parts`` (milliseconds of the parts of a step), ``cold_start`` (seconds of a
-        new process without and with compiled kernels), ``environments`` (see `time_environments`), ``yardstick_ms``,
-        ``hardware``, ``versions``, ``date`` and ``settings``.
+        new process without and with compiled kernels), ``environments`` (see `time_environments`), ``control`` (see
+        `time_commands`), ``yardstick_ms``, ``hardware``, ``versions``, ``date`` and ``settings``.
 
     Raises:
         InputError: a configuration that cannot be simulated or refined.
     """
     settings = dict(config["benchmark"])
     check("benchmark", settings, _KEYS)
+    config = {**config, "device": str(choose_device(config["device"]))}  # What auto is here.
     for number, material in enumerate(settings["materials"]):
         check(f"benchmark.materials.{number}", material, _MATERIAL)
     if settings["quick"]:
         settings |= _QUICK
-    environments = _environments(settings, config["device"])  # First, as a run may be none.
+    environments, control = _of_runs(settings, config["device"])  # First, as a run may be none.
     yardstick: list[float] = []
     steps: list[dict[str, Any]] = []
     parts: list[dict[str, Any]] = []
@@ -185,14 +191,19 @@ def run_benchmark(config: Mapping[str, Any]) -> dict[str, Any]:
         "parts": parts,
         "cold_start": cold_start(config) if settings["cold_start"] else None,
         "environments": environments,
+        "control": control,
     }
 
 
-def _environments(settings: Mapping[str, Any], device: str) -> list[dict[str, Any]]:
-    asked = settings["environments"]
-    if asked["run"] is None:
-        return []
-    return time_environments(Path(asked["run"]), asked["robots"], settings["repeats"], device)
+def _of_runs(settings: Mapping[str, Any], device: str) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """The environments and the controllers of runs, where they are named."""
+    trained, driven = settings["environments"], settings["control"]["run"]
+    environments = (
+        []
+        if trained["run"] is None
+        else time_environments(Path(trained["run"]), trained["robots"], settings["repeats"], device)
+    )
+    return environments, [] if driven is None else time_commands(Path(driven), settings["repeats"])
 
 
 def _cases(config: Mapping[str, Any], settings: Mapping[str, Any], refinement: int) -> list[Case]:

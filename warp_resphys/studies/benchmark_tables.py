@@ -26,9 +26,9 @@ class Sheet:
 
     def for_page(self) -> Part:
         """As a section of a page."""
-        first, *others = self.headings
+        first, *others = (each[0].upper() + each[1:] for each in self.headings)
         rows = [Row(name, [Cell(value) for value in values]) for name, *values in self.rows]
-        return Part(self.title, [Table(first.capitalize(), [each.capitalize() for each in others], rows)])
+        return Part(self.title, [Table(first, others, rows)])
 
 
 def machine(result: Mapping[str, Any]) -> str:
@@ -44,6 +44,8 @@ def benchmark_sheets(result: Mapping[str, Any]) -> list[Sheet]:
         sheets.append(_cold_start(result["cold_start"]))
     if result["environments"]:
         sheets.append(_environments(result["environments"]))
+    if result["control"]:
+        sheets.append(_commands(result["control"]))
     return sheets
 
 
@@ -84,9 +86,18 @@ def _cold_start(found: Mapping[str, Mapping[str, float]]) -> Sheet:
 
 
 def _environments(found: Sequence[Mapping[str, Any]]) -> Sheet:
-    headings = ["world", "robots", "ms an action of all", "actions a second", "steps a second"]
+    headings = ["world", "robots", "an action of all, ms", "actions a second", "steps a second"]
     rows = [
         [row["world"], str(row["robots"]), f"{row['ms']:.1f}", f"{row['actions_s']:.0f}", f"{row['steps_s']:.0f}"]
         for row in found
     ]
     return Sheet("Environments, task reach", headings, rows)
+
+
+def _commands(found: Sequence[Mapping[str, Any]]) -> Sheet:
+    headings = ["controller", "a command, ms", "the slowest of 20, ms", "commands a second"]
+    rows = [
+        [row["controller"], f"{row['ms']:.2f}", f"{row['largest_of_20_ms']:.2f}", f"{1e3 / row['ms']:.0f}"]
+        for row in found
+    ]
+    return Sheet(f"Plans that begin anew at each step, over {found[0]['horizon_s']:g} s, one thread", headings, rows)

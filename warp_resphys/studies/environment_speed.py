@@ -1,6 +1,7 @@
 """Steps a second of the environments of a run, for the benchmark."""
 
 import time
+from itertools import product
 from pathlib import Path
 from statistics import median
 from typing import Any, Final
@@ -9,6 +10,7 @@ import numpy as np
 
 from ..control.files import reduced_file
 from ..io.errors import InputError
+from ..io.progress import Progress
 from ..robot.loading import load
 
 _ACTIONS: Final = 5  # of a repeat, of which the median is taken
@@ -32,8 +34,8 @@ def time_environments(run: Path, counts: list[int], repeats: int, device: str) -
     worlds = ["simulator", *(["reduced"] if (run / reduced_file(known.model)).is_file() else [])]
     worlds += ["laboratory"] if (run / "stages" / "laboratory.json").is_file() else []
     rows = []
-    for world in worlds:
-        for count in counts:
+    with Progress("environments", len(worlds) * len(counts) * repeats, "repeats") as progress:
+        for world, count in product(worlds, counts):
             where = device if world == "simulator" else "cpu"
             robots = make_vector("reach", run, count, world=world, spread=0.0, seconds=100.0, device=where)
             robots.reset(seed=0)
@@ -44,6 +46,7 @@ def time_environments(run: Path, counts: list[int], repeats: int, device: str) -
                 for _ in range(_ACTIONS):
                     robots.step(random.uniform(-1.0, 1.0, (count, robots.world.parts)).astype(np.float32))
                 seconds.append((time.perf_counter() - began) / _ACTIONS)
+                progress.advance()
             spent = median(seconds)
             actions = count / spent
             rows.append(

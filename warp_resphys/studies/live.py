@@ -7,7 +7,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..data.markers import Markers
+from ..data.rigid import RigidTransform, kabsch
 from ..energies.base import Quantity
+from ..experiment.build import bound_markers, sight_of
 from ..io.errors import ConvergenceError, InputError
 from ..mesh.mesh import boundary_triangles, surface_vertices
 from ..robot.inputs import BASE
@@ -56,6 +59,7 @@ class LiveRobot:
         weight = mass * float(np.linalg.norm(robot.simulator.gravity)) or mass
         self._stiffness = min(_PULL * weight / self.size, _STIFFEST * mass / robot.time_step**2)  # [N/m]
         self._held: tuple[FloatArray, FloatArray] | None = None  # (N,) weights of what is held, and (3,) where to [m]
+        self._on_body = _markers_on_body(robot)
         self.trial: RecordedTrial | None = None
         self.said = ""
         self.reset()
@@ -83,17 +87,37 @@ class LiveRobot:
         """(M, 3) as they are simulated [m]; none where every vertex is observed."""
         if not self.robot.labels:
             return np.empty((0, 3))
+        found = self._told()
+        return found if self._on_body is None else self._carrying(found).apply(found)
+
+    @property
+    def measured(self) -> FloatArray | None:
+        """(M, 3) what was observed in the trial at this time [m], between two frames linear in time.
+
+        NaN where nothing was seen; None without a trial.
+        """
+        if self.trial is None:
+            return None
+        times, seen = self.trial.times, self.trial.markers
+        frame = max(int(np.searchsorted(times, self.time + _ROUNDING, side="right")) - 1, 0)
+        found = seen[frame]
+        if frame + 1 < len(times) and self.time > times[frame]:
+            share = (self.time - times[frame]) / (times[frame + 1] - times[frame])
+            found = (1.0 - share) * found + share * seen[frame + 1] if share > _ROUNDING else found
+        return found if self._on_body is None else self._carrying(self._told()).apply(found)
+
+    def _told(self) -> FloatArray:
+        """(M, 3) the simulated markers as recordings tell of them [m]."""
         found = self.robot.observe(self.state)[0].double().cpu().numpy()
         shift = None if self.trial is None else self.trial.shift
         return np.asarray(found if shift is None else found + shift)
 
-    @property
-    def measured(self) -> FloatArray | None:
-        """(M, 3) what was observed in the trial at this time [m], NaN where nothing was seen; None without a trial."""
-        if self.trial is None:
-            return None
-        frame = int(np.searchsorted(self.trial.times, self.time + _ROUNDING, side="right")) - 1
-        return self.trial.markers[max(frame, 0)]
+    def _carrying(self, told: FloatArray) -> RigidTransform:
+        """From the frame in which recordings tell of markers to that of the body."""
+        assert self._on_body is not None
+        on_body = self._on_body(self.state.q)[0].double().cpu().numpy()
+        known = np.isfinite(told).all(axis=1)
+        return kabsch(told[known], on_body[known])
 
     @property
     def has_left(self) -> bool:
@@ -141,7 +165,7 @@ class LiveRobot:
         self._held = None
 
     def play_trial(self, name: str | None) -> None:
-        """Begins a recorded trial, or ends it.
+        """Begins a recorded trial where the identified robot begins it, or ends it.
 
         Raises:
             InputError: there is no such trial.
@@ -200,6 +224,15 @@ class LiveRobot:
         now = np.zeros(6) if self.state.base is None else self.state.base[-1, 0].double().cpu().numpy()
         far = np.repeat([self.size, 1.0], 3) * _BASE_SPEED * self.robot.time_step
         return np.asarray(now + np.clip(target - now, -far, far))
+
+
+def _markers_on_body(robot: Robot) -> Markers | None:
+    """Markers where they are on the body; None where they are seen so, and not in a frame of their own."""
+    known = robot.description
+    if known.markers is None or known.bound is None or not sight_of(known.markers, known.labels, known.sets).own:
+        return None
+    found = bound_markers(known.markers, known.mesh, known.bound.numpy(), known.labels)
+    return found.to(robot.simulator.rest_positions)
 
 
 def _changeable(robot: Robot) -> dict[str, tuple[Quantity, float]]:

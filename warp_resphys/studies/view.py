@@ -2,12 +2,14 @@
 
 import io
 import logging
+import re
 import socket
 import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout
 from functools import partial
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -21,7 +23,8 @@ from ..report.bodies import sharp_edges, upwards
 from ..report.figures import TONES
 from ..report.render import MEASURED
 from ..robot.inputs import BASE
-from ..robot.loading import load, trial_names
+from ..robot.loading import RecordedTrial, load, trial_names
+from ..robot.state import RobotState
 from .command import show
 from .live import LiveRobot, range_of
 
@@ -32,6 +35,7 @@ FloatArray = NDArray[np.float64]
 _RATE: Final = 30.0  # Pictures a second, at most.
 _TOLD_EVERY: Final = 0.25  # [s]
 _BY_HAND: Final = "by hand"
+_EVERYWHERE: Final = ("0.0.0.0", "::")  # Hosts that stand for all addresses of a machine.
 _HIGHEST_PORT: Final = 65535
 _DOT: Final = 0.02  # Radius of a marker's dot, over the size of the body.
 _HELP: Final = """Drag the body to pull it, drag beside it to turn the view, scroll to zoom, right-drag to move.
@@ -70,7 +74,8 @@ def view(config: Mapping[str, Any], folder: Path) -> None:
         server = viser.ViserServer(config["host"], port, label=robot.description.name, verbose=False)
     try:
         page = Page(server, live)
-        show(f"Open http://{config['host']}:{port} in a browser; Ctrl-C ends it.")
+        where = "localhost" if config["host"] in _EVERYWHERE else config["host"]
+        show(f"Open http://{where}:{server.get_port()} in a browser; Ctrl-C ends it.")
         rate = page.run(config["seconds"])
     finally:
         with redirect_stdout(io.StringIO()):
@@ -90,6 +95,8 @@ def _free_port(host: str, port: int) -> int:
         tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             tried.bind((host, port))
+        except UnicodeError:
+            raise InputError(f"host is {host!r}, which is no name of a machine: 127.0.0.1 is this one.") from None
         except OSError as error:
             raise InputError(
                 f"port {port} of {host} cannot be used ({error.strerror}): choose another with port=, 0 for any."
@@ -112,6 +119,9 @@ class Page:
         self._asked: list[Callable[[], None]] = []
         self._lock = threading.Lock()
         self._playing, self._speed, self._stopped = True, 1.0, False
+        self._holder: int | None = None  # Whose hand it is.
+        self._shown_state: RobotState | None = None
+        self._shown_trial: RecordedTrial | None = None
         self.pictures = 0
         mesh = live.robot.simulator.body.mesh
         self._scale = 1.0 / live.size  # Of what is shown: cameras are made for bodies of about a metre.
@@ -158,12 +168,24 @@ class Page:
 
         @self._body.on_drag
         async def _(event: Any) -> None:  # In their order, as they are not awaited.
-            if event.phase == "start":
+            if event.phase == "start" and self._holder is None:
+                self._holder = event.client_id
                 self._ask(partial(live.grab, self._real(event.start_position)))
+            if event.client_id != self._holder:
+                return
             if event.phase == "end":
-                self._ask(live.let_go)
+                self._let_go()
             else:
                 self._ask(partial(live.drag, self._real(event.end_position)))
+
+        @server.on_client_disconnect
+        async def _(client: Any) -> None:
+            if client.client_id == self._holder:
+                self._let_go()
+
+    def _let_go(self) -> None:
+        self._holder = None
+        self._ask(self._live.let_go)
 
     # Controls
 
@@ -177,7 +199,7 @@ class Page:
         gui, robot = server.gui, live.robot
         server.gui.configure_theme(dark_mode=False, show_logo=False)
         described = robot.description
-        gui.add_markdown(f"**{described.name}**, {described.model}\n\n{_HELP}")
+        gui.add_markdown(f"**{_plain(described.name)}**, {described.model}\n\n{_HELP}")
         self._said = gui.add_markdown("")
         self._play = gui.add_button("Pause")
         self._play.on_click(lambda _: self._ask(self._turn))
@@ -190,7 +212,7 @@ class Page:
         if robot.folder is not None:
             name = _BY_HAND if live.trial is None else live.trial.name
             self._trial = gui.add_dropdown("Motion", (_BY_HAND, *trial_names(robot)), initial_value=name)
-            self._trial.on_update(lambda _: self._ask(partial(self._choose, self._trial.value)))
+            self._trial.on_update(lambda _: self._ask(self._choose))
         self._sliders: dict[str, list[Any]] = {}
         for name, known in robot.inputs.items():
             words = f"{known.quantity.plural or known.name}".capitalize() if name != BASE else "Base"
@@ -223,7 +245,7 @@ class Page:
 
         def moved(event: Any) -> None:
             if event.client is not None:  # Not where a trial has moved it.
-                self._ask(partial(self._by_hand, name, part, slider.value / factor))
+                self._ask(lambda: self._by_hand(name, part, slider.value / factor))  # As it is by then.
 
         slider.on_update(moved)
         return slider
@@ -234,7 +256,7 @@ class Page:
         low, high = range_of(quantity, value)
         label = f"{name.replace('_', ' ')}{f' [{quantity.unit}]' if quantity.unit else ''}"
         slider = self._server.gui.add_slider(label, low, high, (high - low) / 1000.0, value)
-        slider.on_update(lambda _: self._ask(partial(self._live.set_parameter, name, slider.value)))
+        slider.on_update(lambda _: self._ask(lambda: self._live.set_parameter(name, slider.value)))
         return slider
 
     def _turn(self) -> None:
@@ -245,10 +267,16 @@ class Page:
         self._live.reset()
         self._set_sliders()
 
-    def _choose(self, name: str) -> None:
-        if name != (_BY_HAND if self._live.trial is None else self._live.trial.name):
+    def _choose(self) -> None:
+        name, now = self._trial.value, _BY_HAND if self._live.trial is None else self._live.trial.name
+        if name == now:
+            return
+        try:
             self._live.play_trial(None if name == _BY_HAND else name)
-            self._set_sliders()
+        except ResphysError:
+            self._trial.value = now
+            raise
+        self._set_sliders()
 
     def _by_hand(self, name: str, part: int, value: float) -> None:
         self._live.set_input(name, part, value)
@@ -308,6 +336,9 @@ class Page:
 
     def _show(self) -> None:
         live = self._live
+        if self._shown_state is live.state and self._shown_trial is live.trial:
+            return
+        self._shown_state, self._shown_trial = live.state, live.trial
         places = self._shown(live.positions)
         with self._server.atomic():
             surface = places[live.surface]
@@ -342,10 +373,15 @@ class Page:
         if live.has_left:
             said.append("**The body has left the states of the training.**")
         if live.said:
-            said.append(f"**{live.said}**")
+            said.append(f"**{_plain(live.said)}**")
         self._said.content = "\n\n".join(said)
         if live.trial is not None:
             self._set_sliders()
+
+
+def _plain(text: str) -> str:
+    """A text as Markdown shows it, whatever is in it."""
+    return re.sub(r"([\\`*_{}\[\]()#+!|~-])", r"\\\1", escape(text, quote=False))
 
 
 def _bytes(tone: str) -> tuple[int, int, int]:

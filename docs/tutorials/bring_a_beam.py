@@ -15,7 +15,8 @@
 # ## Recordings
 #
 # Yours come from cameras. Here a finer simulation of another material is filmed: in the cameras' own frame, in
-# millimetres, with noise, and with markers that sit a third of a millimetre from where they should.
+# millimetres, with noise, and with markers that sit some tenths of a millimetre (0.3 in each coordinate) from where
+# they should.
 
 # %%
 import json

@@ -98,8 +98,8 @@ axes[0].legend(loc="center", frameon=False)
 plt.show()
 
 # %% [markdown]
-# The robot does not hang in the middle of the circle: the motion begins where it hangs, and leads to the circle in its
-# first quarter.
+# The robot does not hang in the middle of the circle: the motion begins where it hangs, and leads to the circle in
+# a quarter of the circle's time before it, the first fifth of the motion.
 #
 # ## A plan is a table
 #

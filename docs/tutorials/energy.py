@@ -31,7 +31,7 @@
 #
 # *stress* writes the derivative of the energy by $F$, and the energy; *tangent* writes the second derivative, in six
 # blocks of pairs of columns, of which here only the first is not zero; *adjoint* gets $z = H^{-1}\,dL/dx$ from the
-# solver, and writes $-z \cdot \partial(\text{force})/\partial(\text{parameter})$, a number for each parameter.
+# solver, and writes $z \cdot \partial(\text{force})/\partial(\text{parameter})$, a number for each parameter.
 
 # %%
 from collections.abc import Callable, Mapping, Sequence

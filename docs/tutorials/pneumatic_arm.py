@@ -132,8 +132,9 @@ plt.show()
 # ## Your own arm
 #
 # A mesh with closed chambers, pressures and markers in CSV files and some twenty lines of configuration make an
-# experiment of it: [robots driven by pressure](../pressure.md). On SoPrA's simulated laboratory, identification leaves
-# 0.45 mm and the learned force 0.23 ([results](../results/index.md)).
+# experiment of it: [robots driven by pressure](../pressure.md). With the threads of SoPrA in the simulator
+# (`experiment=sopra_fibres`), identification leaves 0.45 mm on its simulated laboratory, and the learned force 0.23
+# ([results](../results/index.md)).
 #
 # The pressures were found for a simulator. How well they do on a robot depends on how well the simulator was corrected:
 # that is [control](control.py).

@@ -75,7 +75,7 @@ print(
 # %% [markdown]
 # ## Reconstruct
 #
-# The force of a step is the smallest that brings the simulator to what was observed,
+# The force of a step brings the simulator as close to what was observed as a small force can,
 # $\min_f \lVert q^{+}(f) - \hat q^{+} \rVert^2 + \lambda \lVert f \rVert^2$. All vertices are seen here, and
 # Gauss-Newton needs two iterations a step.
 
@@ -149,9 +149,9 @@ plt.show()
 # %% [markdown]
 # ## From markers
 #
-# Of a real robot only a few points are seen. The force is then the smallest of those that bring these points where they
-# were: it explains the markers, and says as little as it can of the rest. Here four vertices of the tip and four half
-# way are seen, with a regularisation that fits noise of a tenth of a millimetre.
+# Of a real robot only a few points are seen. The force is then a small one that brings these points close to where
+# they were: it explains the markers, and says as little as it can of the rest. Here four vertices of the tip and four
+# half way are seen, with a regularisation that fits noise of a tenth of a millimetre.
 
 # %%
 middle = select_vertices(mesh, x=0.05)

@@ -8,7 +8,7 @@ Kelvin-Voigt viscosity of retardation time beta has c = d = beta / h_e, W = c R 
 stage starts from, and w = d tr R.
 
 Branch k relaxes shear: G(t) = mu (1 + sum_k g_k exp(-t / tau_k)), mu being the modulus that is left after a long time,
-and volume stays elastic, as is usual for rubber. It carries the strain H_k, its share of what has not relaxed yet:
+and lambda stays elastic, as is usual for rubber. It carries the strain H_k, its share of what has not relaxed yet:
 
     dH/dt = dE/dt - H / tau,     second Piola-Kirchhoff stress  2 mu g H .
 

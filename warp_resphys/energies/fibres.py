@@ -31,9 +31,9 @@ _LARGEST_ANGLE = 85.0  # degrees
 class Fibres(Energy):
     """Inextensible thread wound around every chamber, in its surface: it holds a chamber from growing wide.
 
-    The energy of an area of the surface is ``k/2 s(lambda - 1)^2`` for each family of windings, lambda being the
-    stretch along it and k the stiffness of one thread [N] over the distance of its turns [m]. A thread cannot push: s
-    is zero for lambda < 1, and reaches its full slope at the strain `toe`.
+    The energy of an area of the surface is ``k s(lambda - 1)`` for each family of windings, lambda being the stretch
+    along it and k the stiffness of one thread [N] over the distance of its turns [m]. A thread cannot push: s(x) is
+    zero for x < 0, and its derivative, the force, reaches its full slope at the strain `toe`.
     """
 
     parameters: ClassVar[tuple[Quantity, ...]] = (Quantity("fibre_stiffness", "N/m", 0.0, closed=True, per="chamber"),)

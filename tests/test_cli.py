@@ -16,7 +16,7 @@ import pytest
 from hydra import compose, initialize_config_module
 from hydra._internal.utils import get_args_parser
 
-from warp_resphys import cli
+from warp_resphys import __version__, cli
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.labels import run_label
 from warp_resphys.io.stages import StageInterrupted
@@ -401,6 +401,9 @@ class TestProcess:
                 "experiment.run_experiment = run",
             ]
         )
+
+    def test_the_version_is_that_of_the_package(self, config_dir):
+        assert self.start(config_dir, "", "--version").communicate(timeout=60)[0] == f"warp-resphys {__version__}\n"
 
     def test_help_imports_nothing_heavy(self, config_dir):
         heavy = """

@@ -28,6 +28,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 from yaml import MarkedYAMLError
 
+from . import __version__
 from .io.errors import InputError, ResphysError
 from .io.files import OWN_OPTIONS, is_disk_full
 from .io.labels import run_label
@@ -122,7 +123,10 @@ def main(command: str | None = None) -> None:
         command: one of COMMANDS; where left out, the first bare word of the command line, and without one, run.
     """
     with _ends_where_nobody_reads():
-        _run(command)
+        if "--version" in sys.argv[1:]:  # Hydra's own would name Hydra's.
+            print(f"warp-resphys {__version__}")
+        else:
+            _run(command)
 
 
 @contextmanager

@@ -4,6 +4,7 @@ import csv
 import json
 from dataclasses import replace
 
+import imageio_ffmpeg
 import numpy as np
 import pytest
 from hydra import compose, initialize_config_module
@@ -20,6 +21,7 @@ from warp_resphys.control.open_loop import Follower
 from warp_resphys.control.plan import Limits, Planner, Weights
 from warp_resphys.control.reduced_batch import advance, begin, observed
 from warp_resphys.control.reduction import reduce
+from warp_resphys.control.replay import replay
 from warp_resphys.control.sampling import Sampling
 from warp_resphys.control.task import Task
 from warp_resphys.environments.worlds import ReducedWorld
@@ -272,6 +274,45 @@ class TestDriving:
             assert found["tracking"]["0.4"][name]["mean_mm"] == pytest.approx(wanted)
             assert np.ptp(points[row], axis=0).max() > 1e-3
         np.testing.assert_allclose(inputs[1], read_plan(folder / plans_file("resphys"), "circle_0.4s").inputs)
+
+    def test_a_replay_does_again_what_was_done(self, folder):
+        names = ["receding_resphys", "feedback_5"]
+        found = replay(folder, "circle_0.4s", names)
+        with read_hdf5(folder / "driven.h5", "driven") as file:
+            path, points = (read_array(file, f"circle_0.4s/{key}") for key in ("path", "points"))
+        np.testing.assert_allclose(found.points[:, 1:], points[[2, 4]], atol=1e-6)
+        np.testing.assert_allclose(found.driven.path, path)
+        assert found.times == pytest.approx(0.01 * np.arange(len(path) + 1))
+        assert found.bodies.shape[:2] == (2, len(path) + 1)
+        assert found.triangles.max() < found.bodies.shape[2]
+        tip = np.linalg.norm(found.bodies - found.points[:, :, None], axis=3).min(axis=2)
+        assert tip.max() < 0.01  # The markers go with the body.
+        assert len(replay(folder, "circle_0.4s", names[:1], 0.05).times) == 6
+
+    def test_a_film_of_it_is_a_command(self, folder, tmp_path, can_draw):
+        place = f"file={tmp_path / 'film.mp4'}"
+        code, err = run("film", f"run={folder}", "motion=circle_0.4s", place, "seconds=0.1", *CONTROL[-3:-1])
+        assert code == 0, err
+        told = next(imageio_ffmpeg.read_frames(str(tmp_path / "film.mp4")))
+        assert told["size"] == (1120, 480)  # Open loop on SysID and on ResPhys, side by side.
+        assert told["duration"] == pytest.approx(0.12, abs=0.05)
+
+    @pytest.mark.parametrize(
+        ("change", "said"),
+        [
+            (["motion=square_1s"], "motion names square_1s: choose of circle_0.4s."),
+            (["motion=circle_0.4s", "controllers=[me]"], "controllers names me: choose of open_sysid, open_resphys, "),
+            (["motion=circle_0.4s", "controllers=[]"], "controllers names none: choose of open_sysid, "),
+            (["motion=circle_0.4s", "controllers=[a,b,c,d]"], "controllers names 4: a film shows at most 3 "),
+            (["motion=circle_0.4s", "trial=t000"], "trial is of films of trials, and motion of one of control: "),
+            (["controllers=[open_sysid]"], "controllers drive motions: name one by motion=, such as "),
+        ],
+    )
+    def test_what_cannot_be_filmed_is_said(self, folder, change, said):
+        code, err = run("film", f"run={folder}", *change, *CONTROL[-3:-1])
+        assert code == 2
+        assert said in err
+        assert err.count("\n") == 1
 
     def test_a_new_horizon_drives_again_but_plans_nothing_again(self, folder, monkeypatch):
         monkeypatch.chdir(folder.parent)

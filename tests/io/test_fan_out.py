@@ -179,6 +179,40 @@ def test_workers_end_with_their_parent(tmp_path):
     assert before == {path: path.stat().st_mtime_ns for path in tmp_path.glob("alive_*")}
 
 
+def test_workers_that_wait_or_tell_nothing_end_with_their_parent(tmp_path):
+    program = "from test_fan_out import *\nfrom pathlib import Path\n"
+    program += "list(fan_out(ponders, [(Path(sys.argv[1]), each) for each in (0.0, 300.0)], Workers(2), print, "
+    program += "Path(sys.argv[1])))"
+    parent = subprocess.Popen([sys.executable, "-c", program, str(tmp_path)], cwd=Path(__file__).parent)
+    deadline = time.monotonic() + 60.0
+    while len([*tmp_path.glob("ponders_*")]) < 2 and time.monotonic() < deadline:
+        time.sleep(0.1)
+    workers = [int(path.name.removeprefix("ponders_")) for path in tmp_path.glob("ponders_*")]
+    assert len(workers) == 2
+    parent.kill()
+    parent.wait()
+    deadline = time.monotonic() + 20.0
+    while any(map(lives, workers)) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not any(map(lives, workers))
+
+
+def lives(process):
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def ponders(task, advance):
+    folder, seconds = task
+    (folder / f"ponders_{os.getpid()}").touch()
+    while len([*folder.glob("ponders_*")]) < 2:  # One for each.
+        time.sleep(0.01)
+    time.sleep(seconds)
+
+
 def works_on(folder, advance):
     for _ in range(1000):
         (folder / f"alive_{os.getpid()}").write_text(str(time.time_ns()))

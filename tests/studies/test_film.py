@@ -42,6 +42,7 @@ def test_a_command_makes_it(finished, folder, can_draw):
         (["models=[]"], "models names none: choose some of "),
         (["slower=0"], "slower is 0: "),
         (["run=nowhere"], "nowhere"),
+        (["motion=eight_4s"], "no motion was driven in "),
     ],
 )
 def test_what_cannot_be_filmed_is_said(finished, folder, change, said):

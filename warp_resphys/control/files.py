@@ -142,8 +142,11 @@ class DrivenMotion:
     seconds: FloatArray
 
 
+_DRIVEN: Final = tuple(each.name for each in fields(DrivenMotion))
+
+
 def write_driven(path: Path, controllers: Sequence[str], time_step: float, motions: Mapping[str, DrivenMotion]) -> None:
-    """Writes driven motions by name; the report reads it."""
+    """Writes driven motions by name, for `read_driven`; the report reads it, too."""
     attributes: dict[str, Any] = {"names": list(motions), "controllers": list(controllers), "time_step": time_step}
     with atomic_hdf5(path, DRIVEN.removesuffix(".h5"), attributes) as file:
         for name, each in motions.items():
@@ -152,3 +155,9 @@ def write_driven(path: Path, controllers: Sequence[str], time_step: float, motio
             create(group, "points", each.points, "m", time_axis=1)
             create(group, "inputs", each.inputs, time_axis=1)
             create(group, "seconds", each.seconds, "s", time_axis=1)
+
+
+def read_driven(path: Path, motion: str) -> DrivenMotion:
+    """One of the motions."""
+    with read_hdf5(path, DRIVEN.removesuffix(".h5")) as file:
+        return DrivenMotion(*(read_array(file, f"{motion}/{name}").astype(np.float64) for name in _DRIVEN))

@@ -11,6 +11,7 @@ import os
 import signal
 import socket
 import threading
+import time
 import traceback
 import warnings
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -40,6 +41,7 @@ Run = Callable[[Sequence[Call], int], Generator["_Outcome", None, None]]  # does
 _LOSSES = 3  # one after the other without a result in between, after which work is given up
 _IDLE_SECONDS = 60.0  # after which a worker of this machine ends
 _LOOK_SECONDS = 0.1  # between looks at the progress
+_PARENT_SECONDS = 0.02  # between a worker's looks at whether the process that started it is still there
 _ANSWER_SECONDS = 10.0  # that a cluster has to answer in
 _LOST = {  # errors, by name, that say that a worker is gone
     *("BrokenProcessPool", "TerminatedWorkerError", "KilledWorker", "CommClosedError"),
@@ -120,7 +122,6 @@ def fan_out(
         return
     peaks: dict[tuple[str, int], float] = {}
     count, losses, attempt = workers.count, 0, 0
-    parent = os.getpid() if workers.backend == "local" else None
     folder.mkdir(parents=True, exist_ok=True)
     with (
         TemporaryDirectory(prefix=".progress_", dir=folder, ignore_cleanup_errors=True) as place,
@@ -130,9 +131,7 @@ def fan_out(
         try:
             while left:
                 over = Path(place, f"over_{attempt}")
-                calls = [
-                    (function, number, task, Path(place, str(number)), over, parent) for number, task in left.items()
-                ]
+                calls = [(function, number, task, Path(place, str(number)), over) for number, task in left.items()]
                 try:
                     with closing(run(calls, count)) as outcomes:
                         for outcome in outcomes:
@@ -172,10 +171,8 @@ def _raise_for(outcome: _Outcome) -> None:
         raise WorkerFaultError(f"a worker process failed:\n{outcome.content}")
 
 
-def _work(
-    function: Callable[[Any, Advance], Any], number: int, task: Any, journal: Path, over: Path, parent: int | None
-) -> _Outcome:
-    """Does a task in a worker process, until nobody wants it: what handed it out has ended, or says that it is over."""
+def _work(function: Callable[[Any, Advance], Any], number: int, task: Any, journal: Path, over: Path) -> _Outcome:
+    """Does a task in a worker process, until what handed it out says that it is over, or has removed the folder."""
     be_quiet()
     wp.config.log_level = wp.LOG_WARNING  # Every worker would greet otherwise.
     if threading.current_thread() is threading.main_thread():
@@ -190,8 +187,6 @@ def _work(
     with threadpool_limits(1), journal.open("a", encoding="utf-8", buffering=1) as written:
 
         def advance(count: int = 1, **fields: object) -> None:
-            if parent is not None and os.getppid() != parent:
-                os._exit(1)
             if over.exists() or not over.parent.exists():
                 raise WorkerError("the work was given up, or handed out again.")
             written.write(json.dumps([count, fields], default=str) + "\n")
@@ -253,8 +248,20 @@ class _Followed:
 
 @contextmanager
 def _local(workers: Workers) -> Iterator[Run]:
-    with parallel_config("loky", inner_max_num_threads=1, idle_worker_timeout=_IDLE_SECONDS):
+    ends = {"initializer": _end_with, "initargs": (os.getpid(),)}
+    with parallel_config("loky", inner_max_num_threads=1, idle_worker_timeout=_IDLE_SECONDS, **ends):
         yield _by_joblib
+
+
+def _end_with(parent: int) -> None:
+    """Ends this process once the one that started it has ended, whatever it does or waits for then."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(_PARENT_SECONDS)
+        os._exit(1)
+
+    threading.Thread(target=watch, name="parent", daemon=True).start()
 
 
 def _by_joblib(calls: Sequence[Call], count: int) -> Generator[_Outcome, None, None]:

@@ -187,15 +187,27 @@ def write_film(path: Path, motion: Motion, seconds: float | None = None, slower:
     every = max(1, round(1.0 / (slower * step * LARGEST_RATE)))
     shown = motion.at(np.flatnonzero(motion.times <= longest + 1e-9)[::every])
     *others, last = (MODELS[model][0] for model in shown.positions)
-    scene = Scene(
-        _views(shown, _FILM_VIEW, _HEADROOM),
-        _FILM_VIEW,
-        background="white",
-        fps=1.0 / (slower * step * every),
-        texts=[f"{time:.2f} s" for time in shown.times],
-        legend=[*((name, RINGS[0]) for name in others), (last, RINGS[1]), ("measured", MEASURED)],
+    first, second = _views(shown, _FILM_VIEW, _HEADROOM)
+    legend = [*((name, RINGS[0]) for name in others), (last, RINGS[1]), ("measured", MEASURED)]
+    write_scene(
+        path,
+        Scene(
+            [replace(first, legend=legend), second],
+            _FILM_VIEW,
+            background="white",
+            fps=1.0 / (slower * step * every),
+            texts=[f"{time:.2f} s" for time in shown.times],
+        ),
     )
-    with Progress("video", len(shown.times), "frames") as progress:
+
+
+def write_scene(path: Path, scene: Scene) -> None:
+    """Write a film (MP4, H.264) of a scene with a text for every frame, and show how far it is.
+
+    Raises:
+        DrawingError, DataFileError: See `write_film`.
+    """
+    with Progress("video", len(scene.texts), "frames") as progress:
         content = film(scene, progress)
     with atomic_path(path) as partial:
         partial.write_bytes(content)

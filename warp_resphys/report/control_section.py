@@ -31,7 +31,7 @@ def control_section(data: RunReport, canvas: Canvas) -> Part | None:
     slowest = max(control["seconds"])
     drawn = [each for each in data.followed if each.seconds == slowest]
     if drawn:
-        chosen = _chosen(control)
+        chosen = compared_controllers(control)
         named = {each: controller_name(each) for each in chosen}
         names = ", ".join(named.values())
         alt = f"{len(drawn)} paths of {slowest:g} s, and where the point went, by {names}."
@@ -88,8 +88,8 @@ def _table(tracking: Mapping[str, Any]) -> Table:
     return Table("Mean error of the point [mm]", [f"Paths in {float(speed):g} s" for speed in speeds], rows)
 
 
-def _chosen(control: Mapping[str, Any]) -> list[str]:
-    """Those that are drawn: what most can be compared by."""
+def compared_controllers(control: Mapping[str, Any]) -> list[str]:
+    """Those that are drawn of the group ``control``: what most can be compared by."""
     models = [model for model in control["models"] if model in ("sysid", control["models"][-1])]
     return [*(f"open_{model}" for model in models), *(f"receding_{model}" for model in control["receding"][-1:])]
 

@@ -69,6 +69,7 @@ class View:
     axes: FloatArray  # (3, 3) rows: to the right, up, towards the viewer.
     focus: FloatArray  # (3,) or (F, 3) [m] what is in the middle.
     half_height: float  # Of what is seen [m].
+    legend: Sequence[tuple[str, str]] = ()  # Texts and colours, at its top.
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +82,7 @@ class Scene:
     samples: int = 4  # A pixel; 0 where surfaces are translucent, which are then drawn in their order.
     towards_light: Sequence[float] = TOWARDS_LIGHT
     intensity: float = 1.0  # Of the light.
-    texts: Sequence[str] = ()  # One a frame, in the first view.
-    legend: Sequence[tuple[str, str]] = ()  # Texts and colours, beside it.
+    texts: Sequence[str] = ()  # One a frame, in the first view, before its legend.
     fps: float = 25.0  # Of a film.
 
 

@@ -181,12 +181,15 @@ def _ring(radius: float, axes: FloatArray) -> tuple[FloatArray, Any]:
 
 
 def _add_texts(plotter: Any, scene: Any) -> Any:
-    """The time, which is returned, and the legend beside it, where no player's controls hide them."""
+    """The time, which is returned, and the legends beside it, where no player's controls hide them."""
+    top = scene.size[1] - 32
+    for column, view in enumerate(scene.views):
+        plotter.subplot(0, column)
+        left = 14 if column else 90
+        for name, colour in view.legend:
+            plotter.add_text(name, position=(left, top), font_size=9, color=colour)
+            left += 24 + 9 * len(name)
     plotter.subplot(0, 0)
-    top, left = scene.size[1] - 32, 90
-    for name, colour in scene.legend:
-        plotter.add_text(name, position=(left, top), font_size=9, color=colour)
-        left += 24 + 9 * len(name)
     return plotter.add_text(scene.texts[0], position=(14, top), font_size=10, color=INK)
 
 

@@ -1,6 +1,7 @@
-"""A film of any trial of a run, and of any models of it."""
+"""A film of any trial of a run and any models of it, or of the laboratory as controllers drove it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
@@ -8,50 +9,105 @@ import numpy as np
 import torch
 import warp as wp
 
-from ..experiment.files import METRICS
+from ..control.replay import driven_settings, replay
+from ..experiment.files import METRICS, OPEN
 from ..experiment.schema import POSITIVE, WORD, check, optional
 from ..io.errors import InputError
 from ..io.files import read_json
 from ..io.stages import finished_record
-from ..report.bodies import Motion, hangs, write_film
+from ..report.bodies import Motion, hangs, write_film, write_scene
+from ..report.control_section import compared_controllers
 from ..report.data import MODELS, at_times
+from ..report.driven_film import DrivenBodies
 from ..report.render import DrawingError
 from ..robot.loading import load, recorded_trial
 from ..robot.robot import Robot
 from .command import WORDS, show
 
 _USUAL: Final = ("simulation", "resphys")
+_MOST_VIEWS: Final = 3  # of controllers, side by side
 _MOST_MARKERS: Final = 6  # vertices that are shown where every one is observed
 _AT_THE_TIP: Final = 0.97  # of the largest distance from what is fixed, from which on they are
 
 
 def film(config: Mapping[str, Any], folder: Path) -> None:
-    """Plays a trial by some models and writes the film into the run folder, or where ``file`` says.
+    """Plays a trial by some models, or a driven motion by some controllers, and writes the film.
+
+    It goes into the run folder, or where ``file`` says.
 
     Raises:
-        InputError: an unknown trial or model, a trial that is a pose, or a machine that cannot draw.
+        InputError: an unknown trial, model, motion or controller, a pose for a trial, or a machine that cannot draw.
         DataFileError: there is no finished run, or the film cannot be written.
     """
     del folder
     check("run", config["run"], WORD)
-    for key, kind in (("trial", WORD), ("models", WORDS), ("file", WORD), ("slower", POSITIVE), ("seconds", POSITIVE)):
+    for key, kind in (("trial", WORD), ("motion", WORD), ("file", WORD), ("slower", POSITIVE), ("seconds", POSITIVE)):
         check(key, config[key], optional(kind))
+    for key in ("models", "controllers"):
+        check(key, config[key], optional(WORDS))
     wp.config.log_level = wp.LOG_WARNING
-    run = Path(config["run"]).expanduser()
+    path = _film_of_motion(config) if config["motion"] is not None else _film_of_trial(config)
+    show(f"Written: {path}")
+
+
+def _film_of_trial(config: Mapping[str, Any]) -> Path:
+    """Writes a film of a trial, and says where."""
+    if config["controllers"] is not None:
+        raise InputError("controllers drive motions: name one by motion=, such as motion=eight_4s.")
+    run, models, seconds = Path(config["run"]).expanduser(), config["models"], config["seconds"]
     finished_record(run, "evaluate")
     found = read_json(run / METRICS)
-    models, name, seconds = config["models"], config["trial"], config["seconds"]
     if models is None:
         models = [each for each in _USUAL if each in found["errors_mm"]] or list(found["errors_mm"])[:2]
-    name = found["per_trajectory"][0]["name"] if name is None else name
+    name = found["per_trajectory"][0]["name"] if config["trial"] is None else config["trial"]
     motion = motion_of(run, name, models, np.inf if seconds is None else seconds)
+    path = _path(config, run, name)
+    with _drawing():
+        write_film(path, motion, seconds, config["slower"])
+    return path
+
+
+def _film_of_motion(config: Mapping[str, Any]) -> Path:
+    """Writes a film of a motion as controllers drove it, and says where."""
+    for key in ("trial", "models"):
+        if config[key] is not None:
+            raise InputError(f"{key} is of films of trials, and motion of one of control: leave one of them out.")
+    run, name, seconds = Path(config["run"]).expanduser(), config["motion"], config["seconds"]
+    control, controllers = driven_settings(run)["control"], config["controllers"]
+    if controllers is None:
+        controllers = [each for each in compared_controllers(control) if each.startswith(OPEN)]
+    if len(controllers) > _MOST_VIEWS:
+        raise InputError(f"controllers names {len(controllers)}: a film shows at most {_MOST_VIEWS} side by side.")
+    found = replay(run, name, controllers, np.inf if seconds is None else seconds)
+    shown = DrivenBodies(
+        found.times,
+        found.triangles,
+        dict(zip(controllers, found.bodies, strict=True)),
+        dict(zip(controllers, found.points, strict=True)),
+        found.driven.path,
+        np.array([control["right"], control["up"]], dtype=np.float64),
+        found.gravity,
+    )
+    path = _path(config, run, name)
+    with _drawing():
+        write_scene(path, shown.scene(1.0 if config["slower"] is None else config["slower"]))
+    return path
+
+
+def _path(config: Mapping[str, Any], run: Path, name: str) -> Path:
+    """Where the film goes to."""
     path = run / "films" / f"{name}.mp4" if config["file"] is None else Path(config["file"]).expanduser()
     path.parent.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+@contextmanager
+def _drawing() -> Iterator[None]:
+    """Says in a sentence where this machine cannot draw."""
     try:
-        write_film(path, motion, seconds, config["slower"])
+        yield
     except DrawingError as error:
         raise InputError(f"no film can be drawn on this machine: {error}.") from None
-    show(f"Written: {path}")
 
 
 def motion_of(run: Path, trial: str, models: Sequence[str], seconds: float = np.inf) -> Motion:

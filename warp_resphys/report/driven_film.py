@@ -1,0 +1,131 @@
+"""A film of bodies side by side, as controllers drive a point of them along a path."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from .bodies import BODIES, LARGEST_RATE, frame_of, sharp_edges, upwards
+from .control_section import controller_name
+from .figures import TONES
+from .render import INK, FloatArray, IntArray, Layer, Scene, View, view_axes
+
+_SIZE: Final = (560, 480)  # [px] of each view.
+_TILT: Final = 1.2  # How far a level path is seen from its near side, over how far from above;
+_ABOVE: Final = 0.3  # an upright one is seen from so far above.
+_DRAWING: Final = 0.6  # Longer side of the drawing, over that of the body;
+_GAP: Final = 0.15  # how far it is from the body, over the same.
+_HEADROOM: Final = 0.12  # For the text above a view, over half its height.
+_BEFORE: Final = {"edges": 0.01, "path": 4.0, "trail": 4.5, "point": 5.0}  # The body, over half a view's height.
+_POINT: Final = 0.02  # Radius, over half a view's height.
+_LINES: Final = ((4.0, 2.0), (6.0, 3.0))  # Widths [px] of the path and of the trail, on the body and in the drawing.
+_APART: Final = 0.012  # Corners of lines, at least, over the same: shorter ones have ragged rims.
+
+
+@dataclass(frozen=True, eq=False)
+class DrivenBodies:
+    """The simulated laboratory as each of some controllers drove it, at the same T times."""
+
+    times: FloatArray  # (T,) since the first command [s].
+    triangles: IntArray  # (S, 3) of the surface.
+    positions: Mapping[str, FloatArray]  # (T, N, 3) [m] of the vertices, by controller.
+    points: Mapping[str, FloatArray]  # (T, 3) [m] where the point was, of the same controllers.
+    path: FloatArray  # (P, 3) [m] where it was to be.
+    plane: FloatArray  # (2, 3) to the right and upwards in the plane of the path.
+    gravity: FloatArray  # (3,) which way is down.
+
+    def scene(self, slower: float = 1.0) -> Scene:
+        """Each body in a view of its own, with the path and a trail of where the point has been, there and enlarged.
+
+        Args:
+            slower: How many times slower it is shown.
+        """
+        step = float(self.times[1] - self.times[0])
+        every = max(1, round(1.0 / (slower * step * LARGEST_RATE)))
+        frames = np.arange(0, len(self.times), every)
+        axes, placed = path_axes(self.plane, self.gravity), self._placed()
+        seen = [*(each.reshape(-1, 3) for each in self.positions.values()), placed(self.path)]
+        middle, half = frame_of(np.concatenate([*seen, *(placed(each) for each in self.points.values())]), axes)
+        height = max(half[1], half[0] * _SIZE[1] / _SIZE[0])
+        room = _HEADROOM * height
+        legends = [[(controller_name(name), _colour(name))] for name in self.positions]
+        legends[0].append(("to be drawn", TONES["muted"].light))
+        views = [
+            View(self._layers(name, frames, height, placed), axes, middle + room * axes[1], height + room, legend)
+            for name, legend in zip(self.positions, legends, strict=True)
+        ]
+        texts = [f"{time:.2f} s" for time in self.times[frames]]
+        return Scene(views, _SIZE, background="white", fps=1.0 / (slower * step * every), texts=texts)
+
+    def _placed(self) -> Callable[[FloatArray], FloatArray]:
+        """Where points (..., 3) of the plane are in a drawing beside the body, larger and as seen from before it."""
+        axes = path_axes(self.plane, self.gravity)
+        body = np.concatenate([each.reshape(-1, 3) for each in self.positions.values()]) @ axes[:2].T
+        low, high = body.min(axis=0), body.max(axis=0)
+        longer = float((high - low).max())
+        right = self.plane[0] / np.linalg.norm(self.plane[0])
+        up = self.plane[1] - (self.plane[1] @ right) * right
+        across = np.stack([right, up / np.linalg.norm(up)])
+        drawn = np.concatenate([self.path, *self.points.values()]) @ across.T
+        first, last = drawn.min(axis=0), drawn.max(axis=0)
+        larger = _DRAWING * longer / float((last - first).max())
+        size, tall = larger * (last - first), high[1] - low[1] > high[0] - low[0]
+        beside = (high[0] + _GAP * longer, 0.5 * (low[1] + high[1] - size[1]))
+        above = (0.5 * (low[0] + high[0] - size[0]), high[1] + _GAP * longer)
+        corner = np.array(beside if tall else above) - larger * first
+        return lambda points: (larger * (points @ across.T) + corner) @ axes[:2]
+
+    def _layers(
+        self, controller: str, frames: IntArray, half: float, placed: Callable[[FloatArray], FloatArray]
+    ) -> list[Layer]:
+        before, colour = {name: half * each for name, each in _BEFORE.items()}, _colour(controller)
+        body, grey = self.positions[controller][frames], TONES["target"].light
+        layers = [
+            Layer("surface", body, self.triangles, BODIES[1], light=(0.72, 0.3)),
+            Layer("lines", body, sharp_edges(body[0], self.triangles), INK, size=1.5, shift=before["edges"]),
+        ]
+        for place, (wide, thin) in ((np.asarray, _LINES[0]), (placed, _LINES[1])):
+            path, points = place(self.path), place(self.points[controller])
+            corners = _corners(path, _APART * half)
+            trail = points[np.minimum(_corners(points, _APART * half), frames[:, None])]  # What is not yet drawn is
+            trail = np.concatenate([trail, points[frames, None]], axis=1)  # where the point is.
+            layers += [
+                Layer("lines", path[corners], _chain(len(corners)), grey, size=wide, shift=before["path"]),
+                Layer("lines", trail, _chain(trail.shape[1]), colour, size=thin, shift=before["trail"]),
+                Layer("balls", points[frames, None], None, colour, size=_POINT * half, shift=before["point"]),
+            ]
+        return layers
+
+
+def path_axes(plane: FloatArray, gravity: FloatArray) -> FloatArray:
+    """(3, 3) as `view_axes`, of a view in which letters in a plane can be read and what is up is above.
+
+    Args:
+        plane: (2, 3) to the right and upwards in it.
+        gravity: (3,) which way is down.
+    """
+    up, normal = upwards(gravity), np.cross(*plane)
+    normal /= np.linalg.norm(normal)
+    level = float(normal @ up)
+    upright = 1.0 - level**2
+    near = plane[1] / np.linalg.norm(plane[1])
+    return view_axes(normal - _TILT * level * near + _ABOVE * upright * up, up)
+
+
+def _corners(points: FloatArray, apart: float) -> IntArray:
+    """Numbers of the first and last of some points (T, 3), and of those between that are so far along from another."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    _, first = np.unique(np.floor(along / apart), return_index=True)
+    return np.unique(np.append(first, len(points) - 1))
+
+
+def _chain(count: int) -> IntArray:
+    """(count - 1, 2) lines from each point to the next."""
+    return np.stack([np.arange(count - 1), np.arange(1, count)], axis=1)
+
+
+def _colour(controller: str) -> str:
+    """Of its model, as in the figures."""
+    model = controller.partition("_")[2]
+    return TONES[model if model in TONES else "ink"].light

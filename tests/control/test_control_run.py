@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 
 import warp_resphys
 from warp_resphys import pipeline
-from warp_resphys.control import stages
+from warp_resphys.control import reduction, stages
 from warp_resphys.control.controllers import Horizon, LinearRecedingHorizon, OpenLoop, RecedingHorizon
 from warp_resphys.control.estimate import Estimator, Noise
 from warp_resphys.control.files import plans_file, read_baselines, read_plan, read_reduced, reduced_file
@@ -26,7 +26,7 @@ from warp_resphys.control.sampling import Sampling
 from warp_resphys.control.task import Task
 from warp_resphys.environments.worlds import ReducedWorld
 from warp_resphys.experiment.checks import check_configuration
-from warp_resphys.io.errors import DataFileError, InputError
+from warp_resphys.io.errors import ConvergenceError, DataFileError, InputError
 from warp_resphys.io.files import read_array, read_hdf5
 from warp_resphys.studies.benchmark_tables import benchmark_sheets
 from warp_resphys.studies.control_speed import time_commands
@@ -48,7 +48,7 @@ CONTROL = [
     *("control.models=[sysid,resphys]", "control.shapes=[circle]", "control.seconds=[0.4]", "control.size=0.01"),
     *("control.plan={corrections:2,reach:0.05}", "control.horizon={seconds:0.1,pieces:3}"),
     *("control.feedback={gains:[5.0],settles:0.1}",),
-    "control.reduction={modes:4,equilibria:48,tangents:24,motions:3,seconds:2.0,batch:24}",
+    "control.reduction={modes:[4],equilibria:48,tangents:24,motions:3,seconds:2.0,batch:24}",
     *("hydra/job_logging=none", "hydra/hydra_logging=none", IN_RUN),
 ]
 
@@ -104,6 +104,30 @@ class TestReducedModel:
         found = read_reduced(folder / reduced_file("sysid"), None)
         assert found.told["window_motion_mm"] > 1.0
         assert found.told["window_relative"] < 0.05
+
+    def test_of_several_numbers_of_modes_the_best_is_taken(self, folder):
+        """Of three, one of a pair of vibrations of a round rod is missing."""
+        robot = warp_resphys.load(folder, "sysid")
+        sampling = Sampling((3, 4), equilibria=48, tangents=24, motions=3, seconds=2.0)
+        told = reduce(robot, sampling).told
+        assert told["modes"] == 4
+        assert list(told["tried"]) == ["3", "4"]
+        assert told["window_relative"] == told["tried"]["4"] < 0.7 * told["tried"]["3"]
+
+    def test_a_number_of_modes_that_fails_leaves_the_others(self, folder, monkeypatch):
+        robot = warp_resphys.load(folder, "sysid")
+        sampling = Sampling((3, 4), equilibria=24, tangents=12, motions=2, seconds=0.8)
+        errors = reduction._errors
+
+        def fails(model, *rest):
+            return {**errors(model, *rest), **({} if model.modes in kept else {"window_error_mm": float("nan")})}
+
+        monkeypatch.setattr(reduction, "_errors", fails)
+        kept = [3]
+        assert reduce(robot, sampling).modes == 3
+        kept = []
+        with pytest.raises(ConvergenceError, match="the reduced model of 4 modes diverges"):
+            reduce(robot, sampling)
 
     def test_it_comes_to_rest_where_the_corrected_robot_does(self, robot, model):
         inputs = np.array([0.6, 0.0, 0.3])
@@ -384,6 +408,10 @@ def configuration(*overrides):
             "control drives a robot without payloads: leave them out of laboratory.trials",
         ),
         ("control.seconds=[]", "control.seconds is .*: it must be a list of different positive numbers"),
+        (
+            "control.reduction.modes=[4,4]",
+            "control.reduction.modes is .*: it must be a list of different whole numbers",
+        ),
         ("+control.colour=red", "unknown key 'control.colour'"),
     ],
 )

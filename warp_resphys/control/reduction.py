@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import torch
@@ -25,6 +25,15 @@ _LEAST_SETTLED: Final = 0.9  # of the equilibria
 _WINDOW: Final = 0.3  # s, in which a motion is foretold to tell the error
 
 
+class _Statics(NamedTuple):
+    """S equilibria."""
+
+    q: torch.Tensor  # (S, N, 3) [m]
+    y: FloatArray  # (S, 3 M) what is observed [m]
+    u: FloatArray  # (S, n) inputs as shares
+    outputs: FloatArray | None  # (S, c) of the network
+
+
 def reduce(robot: Robot, sampling: Sampling, on_progress: OnProgress = lambda steps: None) -> ReducedModel:
     """The reduced model of a robot.
 
@@ -35,7 +44,7 @@ def reduce(robot: Robot, sampling: Sampling, on_progress: OnProgress = lambda st
 
     Raises:
         InputError: see `sampling.check_reducible` and `sampling.driven_input`.
-        ConvergenceError: no equilibrium is found for inputs within the range of the trials.
+        ConvergenceError: no equilibrium is found for inputs within the range of the trials, by the robot or by a model.
     """
     check_reducible(robot)
     source = Source(robot, driven_input(robot))
@@ -44,34 +53,50 @@ def reduce(robot: Robot, sampling: Sampling, on_progress: OnProgress = lambda st
     tangents = []
     for row in range(min(sampling.tangents, len(statics.u))):
         outputs = None if statics.outputs is None else statics.outputs[row]
-        tangents.append(source.tangent(statics.q[row : row + 1], statics.u[row], sampling.modes, outputs))
+        tangents.append(source.tangent(statics.q[row : row + 1], statics.u[row], max(sampling.modes), outputs))
         on_progress(1)
     on_progress(sampling.tangents - len(tangents))
+    counts = {"asked": sampling.equilibria, "equilibria": len(statics.u), "tangents": len(tangents)}
+    best, tried, failure = None, dict[str, float](), None
+    for modes in sampling.modes:
+        slowest = [each.slowest(modes) for each in tangents]
+        try:
+            made = _fitted(source, slowest, statics, motions, sampling.motions)
+        except ConvergenceError as error:
+            failure = error
+            continue
+        tried[str(modes)] = made.told["window_relative"]
+        if best is None or made.told["window_error_mm"] < best.told["window_error_mm"]:
+            best = made
+    if best is None:
+        assert failure is not None
+        raise failure
+    return replace(best, told={**best.told, **counts, "motions": sampling.motions, "tried": tried})
+
+
+def _fitted(
+    source: Source, tangents: Sequence[Tangent], statics: _Statics, motions: Motions, first: int
+) -> ReducedModel:
+    """A model in as many coordinates as there are vibrations, fitted to the first motions and tried on the others.
+
+    Raises:
+        ConvergenceError: it comes to rest nowhere, or diverges.
+    """
     made, z_statics, z, rates = _assembled(source, tangents, statics, motions)
-    first, modes = sampling.motions, sampling.modes
     made = _with_output(
         made,
         (z_statics, statics.u, statics.y),
         (
-            z[1:, :first].reshape(-1, modes),
+            z[1:, :first].reshape(-1, made.modes),
             motions.acting[:, :first].reshape(-1, source.parts),
             motions.y[1:, :first].reshape(-1, motions.y.shape[2]),
         ),
     )
-    told = _errors(made, motions, z, rates, first)
     frequency = np.sqrt(np.abs(np.linalg.eigvals(made.stiffness(statics.u[:1])[0]))) / (2.0 * np.pi)
-    counts = {"asked": sampling.equilibria, "equilibria": len(statics.u), "tangents": len(tangents)}
-    counts |= {"motions": first, "modes": modes}
-    return replace(made, told={**told, **counts, "frequencies_hz": np.sort(frequency).tolist()})
-
-
-class _Statics(NamedTuple):
-    """S equilibria."""
-
-    q: torch.Tensor  # (S, N, 3) [m]
-    y: FloatArray  # (S, 3 M) what is observed [m]
-    u: FloatArray  # (S, n) inputs as shares
-    outputs: FloatArray | None  # (S, c) of the network
+    told: dict[str, Any] = _errors(made, motions, z, rates, first)
+    if not np.isfinite(told["window_error_mm"]):
+        raise ConvergenceError(f"the reduced model of {made.modes} modes diverges.", statics.q, None)
+    return replace(made, told={**told, "modes": made.modes, "frequencies_hz": np.sort(frequency).tolist()})
 
 
 def _equilibria(source: Source, sampling: Sampling, on_progress: OnProgress) -> _Statics:

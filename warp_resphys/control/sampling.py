@@ -33,7 +33,7 @@ class Sampling:
     """How much is sampled.
 
     Attributes:
-        modes: r, coordinates of the reduced model.
+        modes: numbers r of coordinates of the reduced model, of which the one with the least error is taken.
         equilibria: for z_0 and y_0.
         tangents: of these, about which vibrations are found.
         motions: for H, and as many again that tell the error.
@@ -42,7 +42,7 @@ class Sampling:
         seed: of all that is drawn.
     """
 
-    modes: int = 8
+    modes: tuple[int, ...] = (4, 6, 8)
     equilibria: int = 192
     tangents: int = 96
     motions: int = 6
@@ -97,6 +97,16 @@ class Tangent:
     damping: FloatArray
     shown: FloatArray
     push: FloatArray | None
+
+    def slowest(self, modes: int) -> "Tangent":
+        """The same in fewer vibrations."""
+        return Tangent(
+            self.shapes[:, :modes],
+            self.stiffness[:modes, :modes],
+            self.damping[:modes, :modes],
+            self.shown[:, :modes],
+            None if self.push is None else self.push[:modes],
+        )
 
 
 def driven_input(robot: Robot) -> RobotInput:

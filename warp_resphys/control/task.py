@@ -91,7 +91,8 @@ class Task:
 
     def sampling(self, seed: int) -> Sampling:
         """For reduced models."""
-        return Sampling(**self.settings["reduction"], seed=seed)
+        known = self.settings["reduction"]
+        return Sampling(**{**known, "modes": tuple(known["modes"])}, seed=seed)
 
     def check_reach(self, model: ReducedModel) -> None:
         """Sees to it that the robot can come to rest at every point of the paths.

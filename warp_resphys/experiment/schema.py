@@ -479,7 +479,11 @@ _CONTROL: Final = Group(
         "estimate": Group(dict.fromkeys(("observed", "rate", "bias"), POSITIVE)),
         "feedback": Group({"gains": _DIFFERENT, "pressed": SHARE, "settles": POSITIVE}),
         "reduction": Group(
-            {**dict.fromkeys(("modes", "equilibria", "tangents", "motions", "batch"), NATURAL), "seconds": POSITIVE}
+            {
+                "modes": _list(NATURAL, "a list of different whole numbers, one or more", _SOME, different=True),
+                **dict.fromkeys(("equilibria", "tangents", "motions", "batch"), NATURAL),
+                "seconds": POSITIVE,
+            }
         ),
     },
     optional=True,

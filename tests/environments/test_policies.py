@@ -1,6 +1,7 @@
 """A policy that knows where a robot rests, what Stable-Baselines3 sees of robots, and how fast these are."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from warp_resphys.environments.policies import ScriptedPolicy, acting, errors_mm
 from warp_resphys.io.errors import InputError
 from warp_resphys.studies.benchmark_tables import benchmark_sheets
 from warp_resphys.studies.environment_speed import time_environments
+from warp_resphys.studies.policy import _text
 
 
 def still(seen):
@@ -81,24 +83,70 @@ class TestLearning:
             learn(robots, 8)
 
 
-def test_the_command_learns_a_policy_once(folder, tmp_path, monkeypatch):
-    """And tries every policy in every world."""
+def test_the_command_learns_and_tries_once(folder, tmp_path, monkeypatch):
+    """Every policy in every world; what is known of the same question is not asked again."""
     pytest.importorskip("stable_baselines3")
     monkeypatch.chdir(tmp_path)
     arguments = ("warp-resphys", "train-policy", f"run={folder}", "skill=reach", "models=[sysid]", "robots=4")
-    told, saved = folder / "policies" / "reach.json", folder / "policies" / "reach_sysid.zip"
-    results = []
-    for steps in (64, 64, 128):
-        code, err = end_of(cli.main, *arguments, f"steps={steps}", "episodes=2", "hydra.run.dir=policy")
+    place, tried = folder / "policies", []
+
+    def counted(environment, *rest):
+        tried.append(environment.num_envs)
+        return errors_mm(environment, *rest)
+
+    monkeypatch.setattr("warp_resphys.environments.policies.errors_mm", counted)
+
+    def commanded(steps, seeds):
+        code, err = end_of(cli.main, *arguments, f"steps={steps}", f"seeds={seeds}", "episodes=2", "hydra.run.dir=here")
         assert code == 0, err
-        results.append((json.loads(told.read_text()), saved.stat().st_mtime_ns))
-    (first, made), (second, kept), (_, anew) = results
-    assert first == second
-    assert made == kept < anew
-    errors = first["errors"]
-    assert list(errors) == [*(f"scripted, sysid, place {place}" for place in (1, 2, 3)), "PPO, sysid"]
-    assert all(each[world]["mean_mm"] > 0.0 for each in errors.values() for world in ("reduced sysid", "laboratory"))
-    assert len({each["laboratory"]["mean_mm"] for each in errors.values()}) > 1
+        tries = len(tried)
+        tried.clear()
+        made = [(place / f"reach_sysid_{seed}.zip").stat().st_mtime_ns for seed in seeds]
+        return json.loads((place / "reach.json").read_text())["errors"], tries, made
+
+    first, tries, made = commanded(64, [0])
+    scripted = [f"scripted, sysid, place {number}" for number in (1, 2, 3)]
+    assert list(first) == [*scripted, "PPO, sysid, seed 0"]
+    assert all(each[world]["mean_mm"] > 0.0 for each in first.values() for world in ("reduced sysid", "laboratory"))
+    assert len({each["laboratory"]["mean_mm"] for each in first.values()}) > 1
+    assert tries == 8
+
+    trials = place / "reach_trials.json"
+    kept = json.loads(trials.read_text())
+    del kept["PPO, sysid, seed 0"]["reduced sysid"]  # As if it had been interrupted before that trial.
+    trials.write_text(json.dumps(kept))
+    second, tries, again = commanded(64, [0])
+    assert (second, tries, again) == (first, 1, made)
+
+    third, tries, both = commanded(64, [0, 1])
+    assert (tries, both[0]) == (2, made[0])
+    assert third["PPO, sysid, seed 1"] != third["PPO, sysid, seed 0"] == first["PPO, sysid, seed 0"]
+
+    _, tries, anew = commanded(128, [0])
+    assert tries == 2
+    assert anew[0] > made[0]
+
+
+def test_policies_of_several_seeds_are_told_in_one_row():
+    alike = [{"mean_mm": 2.0, "failed": 0}, {"mean_mm": None, "failed": 2}, {"mean_mm": 4.0, "failed": 1}]
+    assert _text(alike[:1]) == "2.00"
+    assert _text(alike[1:2]) == "- (2 failed)"
+    assert _text(alike) == "3.00 (2.00 to 4.00) (3 failed)"
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ("seeds=[]", r"seeds is empty: name those with which policies are to learn, as in seeds=\[0,1,2\]"),
+        ("seeds=[0,0]", "different whole numbers"),
+        ("models=[]", "models is empty"),
+    ],
+)
+def test_wrong_settings_are_refused(folder, tmp_path, monkeypatch, wrong, said):
+    monkeypatch.chdir(tmp_path)
+    code, err = end_of(cli.main, "warp-resphys", "train-policy", f"run={folder}", wrong, "hydra.run.dir=here")
+    assert code == 2
+    assert re.search(said, err)
 
 
 def test_speeds_are_those_of_all_robots_and_worlds(folder):

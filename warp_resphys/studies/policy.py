@@ -1,7 +1,8 @@
 """Learns policies on the reduced models of a run, and tries them, beside scripted ones, on the run's laboratory."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -9,7 +10,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from ..experiment.schema import COUNT, NATURAL, WORD, check, one_of
+from ..experiment.schema import COUNTS, NATURAL, WORD, check, one_of
 from ..io.errors import InputError
 from ..io.files import read_json, write_json
 from ..io.progress import Progress
@@ -17,6 +18,7 @@ from ..io.stages import finished_record
 from .command import WORDS, show, table_of
 
 _TASKS: Final = ("reach", "follow")
+_EXAMPLES: Final = {"models": "models=[sysid,resphys]", "seeds": "seeds=[0,1,2]"}
 _SEED: Final = 1000  # of the episodes in which policies are tried
 _PREVIEWS: Final = 3  # places that a scripted policy may go to
 
@@ -24,7 +26,8 @@ _PREVIEWS: Final = 3  # places that a scripted policy may go to
 def train_policy(config: Mapping[str, Any], folder: Path) -> None:
     """Prints errors; writes policies and their errors into the folder ``policies`` of the run.
 
-    A policy that was learned before, in the same way from the same run, is not learned again.
+    A policy that was learned before, in the same way from the same run, is not learned again, nor tried again in the
+    same episodes: what was interrupted goes on.
 
     Raises:
         InputError: Gymnasium or Stable-Baselines3 is not installed, or the run has no driven robot or no laboratory.
@@ -36,12 +39,12 @@ def train_policy(config: Mapping[str, Any], folder: Path) -> None:
     check("models", config["models"], WORDS)
     for key in ("steps", "robots", "episodes"):
         check(key, config[key], NATURAL)
-    check("seed", config["seed"], COUNT)
-    if not config["models"]:
-        raise InputError("models names none: name those on which policies are to learn, as in models=[sysid,resphys].")
+    check("seeds", config["seeds"], COUNTS)
+    for key in ("models", "seeds"):
+        if not config[key]:
+            raise InputError(f"{key} is empty: name those with which policies are to learn, as in {_EXAMPLES[key]}.")
     try:
         from ..environments.making import make_vector
-        from ..environments.policies import Policy, ScriptedPolicy, acting, errors_mm, learn, learned_before
         from ..environments.tasks import GoalTask
     except ImportError as error:
         raise InputError(f"policies need Gymnasium ({error}): pip install 'warp-resphys[policies]'.") from None
@@ -52,47 +55,96 @@ def train_policy(config: Mapping[str, Any], folder: Path) -> None:
         goal = make_vector(task, run, 1, model, "reduced").task
         assert isinstance(goal, GoalTask)
         reaches[model] = goal.reach
-    common = reaches[models[-1]]  # What is asked, and the units in which it is shown, are the same for all.
     worlds = {f"reduced {model}": (model, "reduced") for model in models} | {"laboratory": (models[-1], "laboratory")}
-    tried = {
-        name: make_vector(task, run, config["episodes"], model, world, reach=common)
+    # What is asked, and the units in which it is shown, are the same for all.
+    environments = {
+        name: make_vector(task, run, config["episodes"], model, world, reach=reaches[models[-1]])
         for name, (model, world) in worlds.items()
     }
-    policies: dict[str, Policy] = {}
-    speeds: dict[str, float] = {}
-    place = run / "policies"
-    place.mkdir(exist_ok=True)
+    (run / "policies").mkdir(exist_ok=True)
+    found, speeds = _policies(config, run, reaches)
+    _try(found, environments, run / "policies" / f"{task}_trials.json", config["episodes"])
+    path = run / "policies" / f"{task}.json"
+    settings = {key: config[key] for key in ("skill", "models", "steps", "robots", "episodes", "seeds")}
+    write_json(
+        path, {"settings": settings, "actions_s": speeds, "errors": {name: one.errors for name, one in found.items()}}
+    )
+    groups: dict[str, list[_Found]] = {}
+    for one in found.values():
+        groups.setdefault(one.group, []).append(one)
+    rows = [
+        [group, *(_text([one.errors[world] for one in ones]) for world in worlds)] for group, ones in groups.items()
+    ]
+    title = f"Mean error in mm, task {task}, {config['episodes']} episodes"
+    if len(config["seeds"]) > 1:
+        title += f", policies of {len(config['seeds'])} seeds (least to most)"
+    rates = ", ".join(f"{model} {np.mean(speed):.0f}" for model, speed in speeds.items())
+    wrote = f"Written: {path} and the policies beside it"
+    show(table_of(title, ["policy", *worlds], rows), f"Actions a second while learning: {rates}.", wrote)
+
+
+@dataclass(frozen=True)
+class _Found:
+    """A policy, of which kind it is, what made it, and its errors by world."""
+
+    group: str
+    policy: Callable[..., NDArray[np.float32]]
+    asked: Mapping[str, Any]
+    errors: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+
+def _policies(
+    config: Mapping[str, Any], run: Path, reaches: Mapping[str, Any]
+) -> tuple[dict[str, _Found], dict[str, list[float]]]:
+    """Policies by name, scripted ones and those that are learned now or were before, and actions a second by model."""
+    from ..environments.making import make_vector
+    from ..environments.policies import ScriptedPolicy, acting, learn, learned_before
+
+    task, models = config["skill"], config["models"]
+    origin = {"run": finished_record(run, "evaluate")["fingerprint"], "last": models[-1]}
+    found: dict[str, _Found] = {}
+    speeds: dict[str, list[float]] = {model: [] for model in models}
     for model in models:
-        robots = make_vector(task, run, config["robots"], model, "reduced", autoreset_mode="SameStep", reach=common)
+        robots = make_vector(
+            task, run, config["robots"], model, "reduced", autoreset_mode="SameStep", reach=reaches[models[-1]]
+        )
         for ahead in range(_PREVIEWS):
-            policies[f"scripted, {model}, place {ahead + 1}"] = ScriptedPolicy(robots, ahead, reaches[model])
-        saved, about = place / f"{task}_{model}.zip", place / f"{task}_{model}.json"
-        asked = {key: config[key] for key in ("steps", "robots", "seed")} | {"last": models[-1]}
-        asked["run"] = finished_record(run, "evaluate")["fingerprint"]
-        known = read_json(about) if about.is_file() and saved.is_file() else {}
-        if known.get("asked") != asked:
-            about.unlink(missing_ok=True)
-            began = time.perf_counter()
-            with Progress(f"policy on {model}", config["steps"], "actions") as progress:
-                learned = learn(robots, config["steps"], config["seed"], progress.advance)
-            learned.save(saved)
-            known = {"asked": asked, "actions_s": learned.num_timesteps / (time.perf_counter() - began)}
-            write_json(about, known)
-        speeds[model] = known["actions_s"]
-        policies[f"PPO, {model}"] = acting(learned_before(saved))
-    errors: dict[str, dict[str, Any]] = {name: {} for name in policies}
-    total = len(policies) * sum(environment.actions for environment in tried.values())
-    with Progress("trials", total, "actions") as progress:
-        for name, policy in policies.items():
-            for world, environment in tried.items():
-                errors[name][world] = _told(errors_mm(environment, policy, _SEED, progress.advance))
-    settings = {key: config[key] for key in ("skill", "models", "steps", "robots", "episodes", "seed")}
-    path = place / f"{task}.json"
-    write_json(path, {"settings": settings, "actions_s": speeds, "errors": errors})
-    rows = [[name, *(_text(each) for each in found.values())] for name, found in errors.items()]
-    table = table_of(f"Mean error in mm, task {task}, {config['episodes']} episodes", ["policy", *worlds], rows)
-    rates = ", ".join(f"{model} {speed:.0f}" for model, speed in speeds.items())
-    show(table, f"Actions a second while learning: {rates}.", f"Written: {path} and the policies beside it")
+            name = f"scripted, {model}, place {ahead + 1}"
+            found[name] = _Found(name, ScriptedPolicy(robots, ahead, reaches[model]), origin)
+        for seed in config["seeds"]:
+            saved, about = (run / "policies" / f"{task}_{model}_{seed}{suffix}" for suffix in (".zip", ".json"))
+            asked = {"steps": config["steps"], "robots": config["robots"], "seed": seed, **origin}
+            known = read_json(about) if about.is_file() and saved.is_file() else {}
+            if known.get("asked") != asked:
+                about.unlink(missing_ok=True)
+                began = time.perf_counter()
+                with Progress(f"policy on {model}, seed {seed}", config["steps"], "actions") as progress:
+                    learned = learn(robots, config["steps"], seed, progress.advance)
+                learned.save(saved)
+                known = {"asked": asked, "actions_s": learned.num_timesteps / (time.perf_counter() - began)}
+                write_json(about, known)
+            speeds[model].append(known["actions_s"])
+            name = f"PPO, {model}"
+            found[f"{name}, seed {seed}"] = _Found(name, acting(learned_before(saved)), asked)
+    return found, speeds
+
+
+def _try(found: Mapping[str, _Found], environments: Mapping[str, Any], path: Path, episodes: int) -> None:
+    """Fills errors of policies in all worlds; what is known of the same episodes, as `path` has it, is not tried."""
+    from ..environments.policies import errors_mm
+
+    kept = read_json(path) if path.is_file() else {}
+    asked = {name: {**one.asked, "episodes": episodes} for name, one in found.items()}
+    every = [(name, world) for name in found for world in environments]
+    left = [(name, world) for name, world in every if kept.get(name, {}).get(world, {}).get("asked") != asked[name]]
+    total, to_do = (sum(environments[world].actions for _, world in pairs) for pairs in (every, left))
+    with Progress("trials", total, "actions", total - to_do) as progress:
+        for name, world in left:
+            errors = errors_mm(environments[world], found[name].policy, _SEED, progress.advance)
+            kept.setdefault(name, {})[world] = {"asked": asked[name], **_told(errors)}
+            write_json(path, kept)
+    for name, world in every:
+        found[name].errors[world] = {key: kept[name][world][key] for key in ("mean_mm", "failed")}
 
 
 def _told(errors: NDArray[np.float64]) -> dict[str, float | None]:
@@ -104,6 +156,11 @@ def _told(errors: NDArray[np.float64]) -> dict[str, float | None]:
     }
 
 
-def _text(found: Mapping[str, float | None]) -> str:
-    failed = f" ({found['failed']} failed)" if found["failed"] else ""
-    return ("-" if found["mean_mm"] is None else f"{found['mean_mm']:.2f}") + failed
+def _text(found: Sequence[Mapping[str, Any]]) -> str:
+    """The mean of policies that were learned alike, the least and the most of them, and how many robots failed."""
+    means = [each["mean_mm"] for each in found if each["mean_mm"] is not None]
+    failures = sum(each["failed"] for each in found)
+    text = f"{np.mean(means):.2f}" if means else "-"
+    if len(means) > 1:
+        text += f" ({min(means):.2f} to {max(means):.2f})"
+    return text + (f" ({failures} failed)" if failures else "")

@@ -2,6 +2,7 @@
 
 import base64
 import json
+import re
 
 import numpy as np
 import pytest
@@ -179,7 +180,9 @@ def test_the_view_is_turned_played_and_compared(browser, page, width, dark):
     slider = view.find_element(By.CLASS_NAME, "time")
     browser.execute_script("arguments[0].value = 500; arguments[0].dispatchEvent(new Event('input'))", slider)
     drawn(browser, view)
-    assert "seconds" in slider.get_attribute("aria-valuetext")
+    at, end = (float(number) for number in re.findall(r"\d+\.\d+", slider.get_attribute("aria-valuetext")))
+    assert at == pytest.approx(end / 2, abs=0.011)
+    assert clock.text == f"{at:.2f} s"
 
     legend = view.find_element(By.CLASS_NAME, "legend")
     assert not legend.is_displayed()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import logging
 import os
 import re
@@ -29,7 +28,7 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 from yaml import MarkedYAMLError
 
 from . import __version__
-from .io.errors import InputError, ResphysError
+from .io.errors import InputError, ResphysError, did_you_mean
 from .io.files import OWN_OPTIONS, is_disk_full
 from .io.labels import run_label
 from .io.team import is_first, place
@@ -228,7 +227,7 @@ def _read(arguments: Sequence[str], command: str | None) -> tuple[str, list[str]
         command = rest.pop(words[0]) if words else "run"
         words = [at - 1 for at in words[1:]]
     if command not in COMMANDS:
-        raise InputError(f"unknown command '{command}'{_did_you_mean(command, list(COMMANDS))} (--help lists all)")
+        raise InputError(f"unknown command '{command}'{did_you_mean(command, list(COMMANDS))} (--help lists all)")
     if command in _WORDS and words:
         quoted = ["'{}'".format(rest[at].replace("'", r"\'")) for at in words]
         rest[words[0]] = f"{_WORDS[command]}=[{','.join(quoted)}]"
@@ -278,7 +277,7 @@ def _explain(error: BaseException, started: bool) -> str | None:
     if isinstance(error, MissingConfigException) and error.missing_cfg_file is not None and error.options:
         group, _, option = error.missing_cfg_file.rpartition("/")
         known = ", ".join(error.options)
-        return f"unknown {group} '{option}'{_did_you_mean(option, error.options)}; known are {known}"
+        return f"unknown {group} '{option}'{did_you_mean(option, error.options)}; known are {known}"
     if isinstance(error, HydraException) and isinstance(cause, (ConfigAttributeError, ConfigKeyError)):
         return _explain_key(error, cause)
     if isinstance(error, OverrideParseException):
@@ -313,7 +312,7 @@ def _explain_key(error: HydraException, cause: OmegaConfBaseException) -> str:
     if wanted in known:  # The value has a key of its own that does not exist.
         wanted = str(cause.full_key)
     same_name = [key for key in known if key.rpartition(".")[2] == wanted.rpartition(".")[2]]
-    hint = _did_you_mean(wanted, known, preferred=same_name)
+    hint = did_you_mean(wanted, known, preferred=same_name)
     return f"unknown key '{wanted}'{hint} (--cfg job lists all keys, +{wanted}=... adds a new one)"
 
 
@@ -327,11 +326,6 @@ def _keys(config: Any, prefix: str = "") -> Iterator[str]:
         for key, value in config.items():
             yield f"{prefix}{key}"
             yield from _keys(value, f"{prefix}{key}.")
-
-
-def _did_you_mean(wanted: str, known: Sequence[str], preferred: Sequence[str] = ()) -> str:
-    matches = list(preferred[:3]) or difflib.get_close_matches(wanted, known, n=3, cutoff=0.6)
-    return f", did you mean {' or '.join(repr(match) for match in matches)}?" if matches else ""
 
 
 def _sentence(error: BaseException) -> str:

@@ -1,5 +1,6 @@
 """What can go wrong in a way that the user can mend: one sentence each, exit code 2 on the command line."""
 
+import difflib
 from collections.abc import Sequence
 from typing import Any
 
@@ -47,3 +48,15 @@ class ConvergenceError(ResphysError, RuntimeError):
 def listed(names: Sequence[str]) -> str:
     """Names in quotation marks, separated by commas, for a message."""
     return ", ".join(f"'{name}'" for name in names) or "none"
+
+
+def did_you_mean(wanted: str, known: Sequence[str], preferred: Sequence[str] = ()) -> str:
+    """The end of a sentence on an unknown name that offers the nearest known ones; empty where none is near.
+
+    Args:
+        wanted: the unknown name.
+        known: names that exist.
+        preferred: those that are offered whatever they look like.
+    """
+    matches = list(preferred[:3]) or difflib.get_close_matches(wanted, known, n=3, cutoff=0.6)
+    return f", did you mean {' or '.join(repr(match) for match in matches)}?" if matches else ""

@@ -105,7 +105,7 @@ def digest(path: str | Path) -> str:
 
 
 def to_plain(data: Any) -> Any:
-    """Turns mappings, sequences, NumPy values and paths into what JSON knows; others raise TypeError."""
+    """Turns mappings, sequences, NumPy values, paths and settings into what JSON knows; others raise TypeError."""
     if isinstance(data, Mapping):
         return {str(key): to_plain(value) for key, value in data.items()}
     if isinstance(data, (list, tuple)):
@@ -116,6 +116,8 @@ def to_plain(data: Any) -> Any:
         return str(data)
     if data is None or isinstance(data, (str, bool, int, float)):
         return data
+    if hasattr(data, "plain"):  # Settings, without importing pydantic for them
+        return data.plain()
     raise TypeError(f"{type(data).__name__} cannot be written as JSON")
 
 

@@ -1,0 +1,100 @@
+"""Settings: a frozen class for each group of a configuration, with type, range, unit, meaning and default of its keys.
+
+    class Swing(Settings):
+        '''A harmonic motion.'''
+
+        frequency: Positive = setting(unit="Hz")
+        phase: float = setting(0.0, "at time zero", unit="rad")
+
+A class is the only place where a key is declared. `parse` makes an object of plain nested data, such as YAML gives,
+and raises one sentence where a value cannot be used. Types are strict, as those of YAML are: a truth value is not a
+number, nor is a word, whole numbers may stand for floating-point ones, and lists become tuples. Relations between keys
+are checked where both are visible, in a ``model_validator`` that raises a ValueError; its message begins with a key of
+the class, which `parse` completes to the dotted key.
+"""
+
+import hashlib
+import json
+from typing import Annotated, Any, Self, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError
+from pydantic_core import PydanticUndefined
+
+from .errors import InputError
+from .setting_errors import sentence
+
+T = TypeVar("T")
+S = TypeVar("S", bound="Settings")
+
+Positive = Annotated[float, Field(gt=0.0)]
+NotNegative = Annotated[float, Field(ge=0.0)]
+Share = Annotated[float, Field(gt=0.0, le=1.0)]
+Natural = Annotated[int, Field(ge=1)]
+Count = Annotated[int, Field(ge=0)]
+Word = Annotated[str, Field(min_length=1)]
+Many = Annotated[tuple[T, ...], Strict(False)]  # a list of any length
+Some = Annotated[tuple[T, ...], Strict(False), Field(min_length=1)]  # a list of one or more
+Pair = Annotated[tuple[T, T], Strict(False)]
+Vector = Annotated[tuple[float, float, float], Strict(False)]
+
+
+class Settings(BaseModel):
+    """Base of all classes of settings. Objects are constant, and equal where their content is."""
+
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, validate_default=True, protected_namespaces=()
+    )
+
+    def plain(self) -> dict[str, Any]:
+        """Nested data that JSON and YAML know."""
+        return self.model_dump(mode="json")
+
+    def fingerprint(self) -> str:
+        """SHA-256 of the content, in hexadecimal: equal for equal settings, in any order of keys."""
+        text = json.dumps(self.plain(), sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def changed(self, **values: Any) -> Self:
+        """The same settings with other values of some keys.
+
+        Raises:
+            InputError: a value that cannot be used.
+        """
+        return parse(type(self), {**{name: getattr(self, name) for name in type(self).model_fields}, **values})
+
+    @classmethod
+    def of(cls, source: "Settings", **values: Any) -> Self:
+        """The keys of this class from another object that has them, and ``values`` of those that it has not."""
+        known = {name: getattr(source, name) for name in cls.model_fields if hasattr(source, name)}
+        return cls(**{**known, **values})
+
+
+def setting(default: Any = PydanticUndefined, description: str = "", unit: str = "", **limits: Any) -> Any:
+    """Declares a key of a class of settings.
+
+    Args:
+        default: value of a key that is left out; without one, the key is required.
+        description: for the reference page and for editors.
+        unit: such as ``m/s^2``; it stands in error messages, too.
+        limits: other arguments of `pydantic.Field`, such as ``gt`` or ``le``.
+    """
+    return Field(default, description=description or None, json_schema_extra={"unit": unit} if unit else None, **limits)
+
+
+def parse(settings: type[S], values: Any, where: str = "") -> S:
+    """Makes an object of nested plain data.
+
+    Args:
+        settings: class of the object.
+        values: mapping of its keys; what is left out has its default.
+        where: dotted key of the group, for messages; empty for a whole configuration.
+
+    Raises:
+        InputError: an unknown or missing key, a value of another type or out of range, or values that do not fit each
+            other. The sentence has the dotted key, the value, and what it must be.
+    """
+    try:
+        return settings.model_validate(values)
+    except ValidationError as error:
+        schema = settings.model_json_schema()
+        raise InputError(sentence(schema, values, where, error.errors(include_url=False))) from None

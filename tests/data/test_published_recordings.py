@@ -264,7 +264,7 @@ def test_wrong_beam_files(tmp_path, beam):
 
 def test_command(tmp_path, beam):
     def run(*arguments):
-        command = [sys.executable, str(ROOT / "scripts" / "convert_recordings.py"), *arguments]
+        command = [sys.executable, "-m", "warp_resphys", "inspect", "convert", *arguments]
         return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
 
     done = run("layout=beam", f"source={beam}", "output=converted")

@@ -344,8 +344,8 @@ def test_a_row_that_compares_nothing_is_an_infinite_error(adjoint, difference, e
 
 
 def run_script(tmp_path, monkeypatch, *arguments):
-    monkeypatch.setattr(sys, "argv", ["gradcheck.py", *arguments, f"hydra.run.dir={tmp_path}"])
-    cli.main("gradcheck")
+    monkeypatch.setattr(sys, "argv", ["warp-resphys", "verify", "gradients", *arguments, f"hydra.run.dir={tmp_path}"])
+    cli.main()
 
 
 @pytest.mark.parametrize("values", [(0.0, 0.0), (math.nan, 1.0), (1.0, math.nan)])

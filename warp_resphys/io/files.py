@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 FORMAT = "warp_resphys"
 FORMAT_VERSION = 1
 CHUNK_STEPS = 64
-OWN_OPTIONS = "configs"  # In the working directory: the user's configuration groups and their options.
 USER_BLOCK = 512  # bytes before an HDF5 file's own, which hold a checksum of those
 _CHECKSUM = b"warp_resphys, CRC-32 of what follows the first 512 bytes: "
 LARGEST_ARRAYS = 4 << 30  # bytes in one file

@@ -1,9 +1,10 @@
-"""Names of run folders."""
+"""Names of folders: those of runs, and that of the user's own options."""
 
 import hashlib
 import re
 from collections.abc import Sequence
 
+OWN_OPTIONS = "configs"  # in the working directory: groups of the configuration and their options
 _LABEL_LENGTH = 100
 
 

@@ -61,7 +61,8 @@ def _cheapest(rows: Indices, cols: Indices, n_nodes: int, block: int, device: to
     """By what a factor takes of memory, and by the operations that a wide band costs.
 
     A band of width w takes n w numbers and n w^2 operations, dense n^2 and n^3 / 3; where the band is wide, a sparse
-    factor fills in less. The limit on a CPU was measured (``warp-resphys size-study``); those on a GPU are arithmetic.
+    factor fills in less. The limit on a CPU was measured (``warp-resphys benchmark sizes``); those on a GPU are
+    arithmetic.
     """
     order = bandwidth_reducing_order(rows, cols, n_nodes)
     place = np.argsort(order)

@@ -250,6 +250,6 @@ def _write(sections: Sequence[Section], measured: Mapping[str, Any], config: Map
         f"{count} checks on {where}: all passed." if not failed else f"{failed} of {count} checks on {where} failed."
     )
     date = f"{datetime.now():%Y-%m-%d}"
-    results = Results("Check of a device", date, verdict, [*checks, *speed, made("check")])
+    results = Results("Check of a device", date, verdict, [*checks, *speed, made("verify device")])
     copies = config["check"]["results"]
     results.write(folder / PAGE, copies, f"{date}-check-{choose_device(config['device']).type}")

@@ -61,7 +61,10 @@ def robots(config: Mapping[str, Any], folder: Path) -> None:
             parts = [summary(config["robots"], found, failed)]
             parts += [details(name, config["robots"][name], each, pictures) for name, each in found.items()]
         parts += [_not_run(config, results, [name for name in absent if name not in found])]
-        parts += [machines(config["robots"], found), command_part(NAME, hidden=("data", "runs", "results"))]
+        parts += [
+            machines(config["robots"], found),
+            command_part("reproduce robots", hidden=("data", "runs", "results")),
+        ]
         page_of = Results(
             "Robots",
             f"{datetime.now():%Y-%m-%d}",

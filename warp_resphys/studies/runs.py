@@ -117,7 +117,7 @@ def made(command: str, hidden: Sequence[str] = ()) -> Part:
     """How a page was made: by which command, on which machine, with which versions.
 
     Args:
-        command: its name.
+        command: its name, as in "verify device".
         hidden: keys whose values are folders of that machine.
     """
     known = {**hardware(), "commit": commit() or "not known", **package_versions()}
@@ -128,7 +128,9 @@ def made(command: str, hidden: Sequence[str] = ()) -> Part:
 def command_part(command: str, hidden: Sequence[str] = ()) -> Part:
     """By which command a page was made; see `made`."""
     given = [(each, each.partition("=")[0]) for each in HydraConfig.get().overrides.task]
-    line = shlex.join(["warp-resphys", command, *(f"{key}=FOLDER" if key in hidden else each for each, key in given)])
+    line = shlex.join(
+        ["warp-resphys", *command.split(), *(f"{key}=FOLDER" if key in hidden else each for each, key in given)]
+    )
     return Part("Command", [Items([line], code=True)])
 
 

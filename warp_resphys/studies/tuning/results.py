@@ -14,7 +14,8 @@ import numpy as np
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
-from ...io.files import OWN_OPTIONS, write_json, write_text
+from ...io.files import write_json, write_text
+from ...io.labels import OWN_OPTIONS
 from ...report.page import (
     NO_BREAK_SPACE,
     Canvas,

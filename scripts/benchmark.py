@@ -1,6 +1,0 @@
-"""`warp-resphys benchmark`, by the name of a script."""
-
-from warp_resphys.cli import main
-
-if __name__ == "__main__":
-    main("benchmark")

@@ -1,0 +1,193 @@
+"""The commands of `warp-resphys`: what a command line asks for, and the help.
+
+A command is a word, and some have a second one: ``benchmark``, ``benchmark sizes``. Nothing heavy is imported here.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from types import MappingProxyType
+from typing import Final
+
+from .io.errors import InputError, did_you_mean
+from .io.labels import OWN_OPTIONS
+
+CONFIG_PACKAGE: Final = "warp_resphys.conf"
+USER_ERROR: Final = 2  # exit code where the user can mend what is wrong
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command.
+
+    Attributes:
+        purpose: what it is for, in a line.
+        function: as in ``studies.sizes:size_study``, below this package; it takes the configuration as plain data, and
+            the run folder.
+        word: the key of the configuration that takes one word after the command.
+        words: the key that takes all words after the command, as a list.
+    """
+
+    purpose: str
+    function: str
+    word: str | None = None
+    words: str | None = None
+
+
+COMMANDS: Final[Mapping[str, Command]] = MappingProxyType(
+    {
+        "run": Command("run an experiment; the word run may be left out", "pipeline:run_experiment"),
+        "tune": Command("search for better settings of the network and its training", "studies.tuning.tune:run_tuning"),
+        "reproduce": Command("run the published beams, beside what was published", "studies.reproduction:reproduce"),
+        "reproduce robots": Command("run the robots that others recorded, on one page", "studies.robots:robots"),
+        "inspect": Command("what is in a mesh, or how good a recording is", "studies.preparation:inspect"),
+        "inspect compare": Command(
+            "a recording of a beam that is let go, beside its simulation", "studies.recording_comparison:compare"
+        ),
+        "inspect convert": Command("bring published recordings into a safe format", "studies.preparation:convert"),
+        "inspect make-arm": Command("make the mesh of a pneumatic arm", "studies.preparation:make_arm"),
+        "view": Command("a run's robot in the browser, to be driven and pulled", "studies.view:view", word="run"),
+        "view film": Command("a film of a trial of a run, with any of its models", "studies.film:film", word="run"),
+        "benchmark": Command("time steps, forward and backward, and their parts", "studies.benchmark:benchmark"),
+        "benchmark sizes": Command("time and memory by linear solver and size of the body", "studies.sizes:size_study"),
+        "benchmark peers": Command("a step beside another simulator's, at equal error", "studies.peers:peer_study"),
+        "benchmark elements": Command("sag of a beam, by element and refinement", "studies.elements:element_study"),
+        "benchmark locking": Command(
+            "deflection of an arm, by element and refinement", "studies.locking:locking_study"
+        ),
+        "verify": Command(
+            "simulate reference trajectories, and compare every vertex", "studies.verification:verify", words="files"
+        ),
+        "verify gradients": Command(
+            "compare adjoint gradients with central differences", "studies.gradient_check:gradcheck"
+        ),
+        "verify device": Command(
+            "compare a device with the CPU, and time both: a page of results", "studies.device_check:check_device"
+        ),
+        "train-policy": Command(
+            "learn a policy on a run's robot, and try it on its laboratory",
+            "studies.policy:train_policy",
+            word="run",
+        ),
+    }
+)
+
+RETIRED: Final[Mapping[str, str]] = MappingProxyType(  # old names of commands
+    {
+        "robots": "reproduce robots",
+        "compare": "inspect compare",
+        "convert": "inspect convert",
+        "make-arm": "inspect make-arm",
+        "film": "view film",
+        "size-study": "benchmark sizes",
+        "peer-study": "benchmark peers",
+        "element-study": "benchmark elements",
+        "locking-study": "benchmark locking",
+        "gradcheck": "verify gradients",
+        "check": "verify device",
+    }
+)
+
+# Hydra's options whose next word is their value.
+VALUED: Final = (
+    *("--cfg", "-c", "--package", "-p", "--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd"),
+    *("--info", "-i", "--experimental-rerun"),
+)
+_OPTIONS: Final = """\
+--cfg job         show all keys and their values, for these settings
+--multirun, -m    run a sweep
+--version         show the version of warp-resphys
+--hydra-help      show the other flags"""
+
+
+def configuration(command: str) -> str:
+    """Name of a command's YAML in conf/."""
+    return "config" if command == "run" else re.sub("[ -]", "_", command)
+
+
+def parse(arguments: Sequence[str]) -> tuple[str, list[str]]:
+    """Splits a command line into the name of a command and arguments for Hydra.
+
+    Raises:
+        InputError: there is no such command.
+    """
+    rest = list(arguments)
+    words = [
+        at
+        for at, argument in enumerate(rest)
+        if ("=" not in argument or _is_path(argument))
+        and argument[:1] not in ("-", "+", "~")
+        and (at == 0 or rest[at - 1] not in VALUED)
+    ]
+    name = rest[words[0]] if words else "run"
+    if name in RETIRED:
+        new = RETIRED[name].split()
+        line = shlex.join(["warp-resphys", *new, *rest[: words[0]], *rest[words[0] + 1 :]])
+        raise InputError(f"'{name}' is now part of {new[0]}: {line}")
+    if name not in COMMANDS:
+        firsts = [command for command in COMMANDS if " " not in command]
+        raise InputError(f"unknown command '{name}'{did_you_mean(name, firsts)} (--help lists all)")
+    parts = [command.partition(" ")[2] for command in COMMANDS if command.startswith(f"{name} ")]
+    named = words[:1]
+    if len(words) > 1 and rest[words[1]] in parts:
+        name, named = f"{name} {rest[words[1]]}", words[:2]
+    after, command = words[len(named) :], COMMANDS[name]
+    if after and parts and not (command.word or command.words) and len(named) == 1:
+        hint = did_you_mean(rest[after[0]], parts)
+        raise InputError(f"{name} has no part '{rest[after[0]]}'{hint} (its parts are {', '.join(parts)})")
+    quoted = ["'{}'".format(rest[at].replace("'", r"\'")) for at in after]
+    dropped = set(named)
+    if command.word and after:
+        rest[after[0]] = f"{command.word}={quoted[0]}"
+    elif command.words and after:
+        rest[after[0]] = f"{command.words}=[{','.join(quoted)}]"
+        dropped |= set(after[1:])
+    return name, [argument for at, argument in enumerate(rest) if at not in dropped]
+
+
+def _is_path(argument: str) -> bool:
+    """Whether an argument names a file or folder, which may have an equals sign: runs/beam_oscillation/seed=1."""
+    return os.sep in argument and Path(argument).exists()
+
+
+def help_text(command: str) -> str:
+    """What a command is for, lines to try, and its keys; of a run, all commands, groups and options."""
+    import yaml
+
+    text = resources.files(CONFIG_PACKAGE).joinpath(f"{configuration(command)}.yaml").read_text(encoding="utf-8")
+    content = yaml.safe_load(text)
+    examples = content["hydra"]["help"]["header"]
+    if command == "run":
+        return "\n".join([*_lines(COMMANDS), "", examples, "Groups and their options:", "", *_groups(), "", _OPTIONS])
+    parts = {name: part for name, part in COMMANDS.items() if name.startswith(f"{command} ")}
+    head = [f"warp-resphys {command}: {COMMANDS[command].purpose}", "", *_lines(parts), *[""][: len(parts)], examples]
+    groups = [
+        f"{group}={option}" for each in content["defaults"] if isinstance(each, dict) for group, option in each.items()
+    ]
+    if "config" in content["defaults"]:
+        groups.append("all groups and keys of a run, as warp-resphys --help lists them")
+    keys = re.sub(r"^(?:defaults|hydra):\n(?:(?: .*)?(?:\n|\Z))*", "", text, flags=re.MULTILINE).rstrip()
+    return "\n".join(
+        [*head, "Keys and their values:", "", keys, *[f"# also: {', '.join(groups)}"][: len(groups)], "", _OPTIONS]
+    )
+
+
+def _lines(commands: Mapping[str, Command]) -> list[str]:
+    """A line for each command, and one on their help."""
+    lines = [f"warp-resphys {name:18}  {command.purpose}" for name, command in commands.items()]
+    return [*lines, f"warp-resphys {'COMMAND --help':18}  more of one of them"] if lines else []
+
+
+def _groups() -> list[str]:
+    """A line for each group of the configuration: its options, the user's own ones too."""
+    places = [Path(str(resources.files(CONFIG_PACKAGE))), Path.cwd() / OWN_OPTIONS]
+    options: dict[str, set[str]] = {}
+    for path in [path for place in places for path in place.glob("*/*.yaml")]:
+        options.setdefault(path.parent.name, set()).add(path.stem)
+    return [f"{group}: {', '.join(sorted(names))}" for group, names in sorted(options.items())]

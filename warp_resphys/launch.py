@@ -1,0 +1,188 @@
+"""Runs a command with the configuration that Hydra composes, and turns errors into one sentence."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import sys
+from collections.abc import Iterator, Sequence
+from importlib import import_module, resources
+from pathlib import Path
+from typing import Any, Final
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import (
+    HydraException,
+    InstantiationException,
+    MissingConfigException,
+    OverrideParseException,
+)
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+from yaml import MarkedYAMLError
+
+from .commands import CONFIG_PACKAGE, USER_ERROR, configuration
+from .io.errors import InputError, ResphysError, did_you_mean
+from .io.labels import OWN_OPTIONS, run_label
+from .io.pipes import ends_where_nobody_reads
+from .io.team import is_first, place
+
+INTERRUPTED: Final = 130
+_PLAIN: Final = re.compile(r"[\w./~=+%@:,-]+")  # A value that means nothing but itself.
+# Of a process that helps another one with a run.
+_SILENT: Final = ("hydra.output_subdir=null", "hydra/job_logging=disabled")
+
+
+def launch(command: str, function: str, arguments: Sequence[str]) -> None:
+    """Runs a command, as `cli.main` says.
+
+    Args:
+        command: its name.
+        function: its module below this package and its function, as in "studies.sizes:size_study".
+        arguments: for Hydra.
+    """
+    reported: list[BaseException] = []
+    started = False
+
+    def job(config: DictConfig) -> Any:
+        nonlocal started
+        started = True
+        try:
+            module, _, name = function.partition(":")
+            settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+            folder = Path(HydraConfig.get().runtime.output_dir)
+            with ends_where_nobody_reads():
+                return getattr(import_module(f"{__package__}.{module}"), name)(settings, folder)
+        except Exception as error:
+            sentence = _explain(error, started)
+            if sentence is None or full_error:
+                raise
+            if is_first():
+                print(f"error: {sentence}", file=sys.stderr, flush=True)
+            reported.append(error)
+            if HydraConfig.get().mode == RunMode.RUN:
+                raise SystemExit(USER_ERROR) from error
+            raise
+
+    full_error = os.environ.get("HYDRA_FULL_ERROR") == "1"
+    before = sys.argv
+    raise_exceptions = logging.raiseExceptions
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra hands errors on instead of printing them and leaving
+    logging.raiseExceptions = False  # a log file on a full disk must not fill the screen with tracebacks
+    OmegaConf.register_new_resolver("run_label", run_label, replace=True)
+    try:
+        if any(argument.startswith("--experimental-rerun") for argument in arguments):
+            raise HydraException("--experimental-rerun reads a pickle, which can run code: use overrides")
+        if place()[1] > 1 and command != "run":
+            raise InputError(f"torchrun is for runs: start warp-resphys {command} without it.")
+        sys.argv = [before[0], *_own_options(), *map(_quoted, arguments), *([] if is_first() else _SILENT)]
+        hydra.main(version_base="1.3", config_path=f"pkg://{CONFIG_PACKAGE}", config_name=configuration(command))(job)()
+    except KeyboardInterrupt as error:
+        print(f"\n{error}" if str(error) else "\ninterrupted", file=sys.stderr, flush=True)
+        raise SystemExit(INTERRUPTED) from None
+    except Exception as error:
+        sentence = _explain(error, started)
+        if sentence is None or full_error:
+            raise
+        if is_first() and not any(error is known for known in reported):
+            print(f"error: {sentence}", file=sys.stderr, flush=True)
+        raise SystemExit(USER_ERROR) from None
+    finally:
+        sys.argv = before
+        logging.raiseExceptions = raise_exceptions
+        if not full_error:
+            del os.environ["HYDRA_FULL_ERROR"]
+
+
+def _own_options() -> list[str]:
+    """The arguments that add the user's own options, if there are any; they give way to a --config-dir that follows."""
+    folder = Path.cwd() / OWN_OPTIONS
+    if not folder.is_dir():
+        return []
+    packaged = resources.files(CONFIG_PACKAGE)
+    for path in sorted(folder.glob("*/*.yaml")):
+        if packaged.joinpath(path.parent.name, path.name).is_file():
+            name = path.relative_to(Path.cwd())
+            print(f"warning: {name} is not used: the package has an option of that name", file=sys.stderr)
+    return ["--config-dir", str(folder)]
+
+
+def _quoted(argument: str) -> str:
+    """The same argument; a value with an equals sign, as run folders are called, in the quotes that Hydra wants."""
+    key, _, value = argument.partition("=")
+    plain = _PLAIN.fullmatch(value) is not None and "=" in value
+    return f'{key}="{value}"' if plain and not key.startswith("-") else argument
+
+
+def _explain(error: BaseException, started: bool) -> str | None:
+    """The sentence to print for an error that the user can mend; None for a fault of the program.
+
+    Before the job has started, it is the command line that is wrong.
+    """
+    cause = error.__cause__
+    if isinstance(error, ResphysError):
+        return str(error)
+    if isinstance(error, BrokenPipeError):
+        return None
+    if isinstance(error, InstantiationException) and cause is not None:
+        return _explain(cause, started)
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file is not None and error.options:
+        group, _, option = error.missing_cfg_file.rpartition("/")
+        known = ", ".join(error.options)
+        return f"unknown {group} '{option}'{did_you_mean(option, error.options)}; known are {known}"
+    if isinstance(error, HydraException) and isinstance(cause, (ConfigAttributeError, ConfigKeyError)):
+        return _explain_key(error, cause)
+    if isinstance(error, OverrideParseException):
+        return f"cannot read the override {error.override!r} ({_sentence(error)}): write key=value"
+    if isinstance(error, (HydraException, OmegaConfBaseException)):
+        return _sentence(error)
+    from .io.files import is_disk_full  # which takes longer to import than this module
+
+    if is_disk_full(error):
+        name = getattr(error, "filename", None)
+        place = f" while writing {name}" if name else ""
+        return f"disk is full{place}: free some space and run the same command again"
+    if started:
+        return None
+    if isinstance(error, MarkedYAMLError):
+        mark = error.problem_mark
+        place = "a configuration" if mark is None else f"{mark.name}, line {mark.line + 1}"
+        return f"{place} cannot be read as YAML ({error.problem}): mend it there or in the lines before"
+    if isinstance(error, OSError):
+        return f"cannot write {error.filename} ({error.strerror}): choose another run folder"
+    return _sentence(error) if isinstance(error, ValueError) else None
+
+
+def _explain_key(error: HydraException, cause: OmegaConfBaseException) -> str:
+    """Names the closest keys where one was set that does not exist."""
+    named = re.search(r"'([^']+)'", str(error))
+    wanted = named.group(1) if named else str(cause.full_key)
+    root = {} if cause.parent_node is None else OmegaConf.to_container(cause.parent_node._get_root())
+    known = [key for key in _keys(root) if key.partition(".")[0] != "hydra"]
+    if wanted in known:  # The value has a key of its own that does not exist.
+        wanted = str(cause.full_key)
+    same_name = [key for key in known if key.rpartition(".")[2] == wanted.rpartition(".")[2]]
+    hint = did_you_mean(wanted, known, preferred=same_name)
+    return f"unknown key '{wanted}'{hint} (--cfg job lists all keys, +{wanted}=... adds a new one)"
+
+
+def _keys(config: Any, prefix: str = "") -> Iterator[str]:
+    """The dotted names of all entries of a configuration."""
+    if isinstance(config, dict):
+        for key, value in config.items():
+            yield f"{prefix}{key}"
+            yield from _keys(value, f"{prefix}{key}.")
+
+
+def _sentence(error: BaseException) -> str:
+    """The message of a library in one line, without the parts that do not help."""
+    text = re.split(r"\n\s*(?:Config search|Search path|full_key|object_type|reference_type|See )", str(error))[0]
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    if isinstance(error, OmegaConfBaseException) and error.full_key and error.full_key not in lines[0]:
+        lines.append(f"(at {error.full_key})")
+    if isinstance(error.__cause__, (OmegaConfBaseException, ResphysError)):
+        lines.append(f"({_sentence(error.__cause__)})")
+    return " ".join(lines)

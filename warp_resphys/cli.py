@@ -8,7 +8,6 @@ from . import __version__
 from .commands import COMMANDS, USER_ERROR, help_text, parse
 from .io.errors import InputError
 from .io.pipes import ends_where_nobody_reads
-from .io.team import is_first
 
 
 def main() -> None:
@@ -28,8 +27,7 @@ def main() -> None:
                 print(help_text(command))
                 return
         except InputError as error:
-            if is_first():
-                print(f"error: {error}", file=sys.stderr, flush=True)
+            print(f"error: {error}", file=sys.stderr, flush=True)
             raise SystemExit(USER_ERROR) from None
         from .launch import launch
 

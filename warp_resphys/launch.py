@@ -25,15 +25,12 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 from yaml import MarkedYAMLError
 
 from .commands import CONFIG_PACKAGE, USER_ERROR, configuration
-from .io.errors import InputError, ResphysError, did_you_mean
+from .io.errors import ResphysError, did_you_mean
 from .io.labels import OWN_OPTIONS, run_label
 from .io.pipes import ends_where_nobody_reads
-from .io.team import is_first, place
 
 INTERRUPTED: Final = 130
 _PLAIN: Final = re.compile(r"[\w./~=+%@:,-]+")  # A value that means nothing but itself.
-# Of a process that helps another one with a run.
-_SILENT: Final = ("hydra.output_subdir=null", "hydra/job_logging=disabled")
 
 
 def launch(command: str, function: str, arguments: Sequence[str]) -> None:
@@ -60,8 +57,7 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
             sentence = _explain(error, started)
             if sentence is None or full_error:
                 raise
-            if is_first():
-                print(f"error: {sentence}", file=sys.stderr, flush=True)
+            print(f"error: {sentence}", file=sys.stderr, flush=True)
             reported.append(error)
             if HydraConfig.get().mode == RunMode.RUN:
                 raise SystemExit(USER_ERROR) from error
@@ -76,9 +72,7 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
     try:
         if any(argument.startswith("--experimental-rerun") for argument in arguments):
             raise HydraException("--experimental-rerun reads a pickle, which can run code: use overrides")
-        if place()[1] > 1 and command != "run":
-            raise InputError(f"torchrun is for runs: start warp-resphys {command} without it.")
-        sys.argv = [before[0], *_own_options(), *map(_quoted, arguments), *([] if is_first() else _SILENT)]
+        sys.argv = [before[0], *_own_options(), *map(_quoted, arguments)]
         hydra.main(version_base="1.3", config_path=f"pkg://{CONFIG_PACKAGE}", config_name=configuration(command))(job)()
     except KeyboardInterrupt as error:
         print(f"\n{error}" if str(error) else "\ninterrupted", file=sys.stderr, flush=True)
@@ -87,7 +81,7 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
         sentence = _explain(error, started)
         if sentence is None or full_error:
             raise
-        if is_first() and not any(error is known for known in reported):
+        if not any(error is known for known in reported):
             print(f"error: {sentence}", file=sys.stderr, flush=True)
         raise SystemExit(USER_ERROR) from None
     finally:

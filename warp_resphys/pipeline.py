@@ -60,11 +60,10 @@ from .experiment.trials import (
     test_groups,
     trials_of,
 )
-from .io.errors import DataFileError, InputError
+from .io.errors import DataFileError
 from .io.fan_out import ALONE, Workers
 from .io.files import digest, read_json, write_json
 from .io.stages import Stage, StageContext, package_versions, resources_used, run_stages
-from .io.team import is_first, joined, place
 from .learning.metrics import summarise_folds
 from .report.control_section import controller_name
 from .report.page import number_text
@@ -210,8 +209,7 @@ def learning_stages(
     stages: list[Stage] = []
 
     def add(name: str, work: Work, outputs: tuple[str, ...], settings: Mapping[str, Any], *upstream: str) -> None:
-        together = work is train and (config["in_the_loop"] is None or settings["model"] == SIMFREE)
-        stages.append(Stage(name, work, outputs, {**base, **settings}, (*needs, *upstream), together))
+        stages.append(Stage(name, work, outputs, {**base, **settings}, (*needs, *upstream)))
 
     if needs:
         stages.append(Stage("identify", identify, (IDENTIFICATION,), {**base, **_pick(config, "identify", "seed")}))
@@ -302,19 +300,10 @@ def acquire(config: Mapping[str, Any], folder: Path, wait: bool = False) -> tupl
 def run_experiment(plain: dict[str, Any], folder: Path) -> None:
     """Runs what has changed, writes metrics.json into the run folder and prints the errors.
 
-    Of several processes that torchrun has started, the first one does; the others help it to train.
-
     Raises:
-        InputError: a value that cannot be used, or several processes for an experiment of many runs.
+        InputError: a value that cannot be used.
     """
     prepare(plain)
-    if place()[1] > 1 and ("ablation" in plain or folds_of(plain) is not None):
-        raise InputError("torchrun is for one training: set data.folds=null and an experiment without an ablation.")
-    with joined(choose_device(plain["device"])):
-        _run_experiment(plain, folder)
-
-
-def _run_experiment(plain: dict[str, Any], folder: Path) -> None:
     if "ablation" in plain:
         run_stages(ablation_stages(plain, simulated(plain), shown(plain)), folder)
         print_ablation(plain, folder)
@@ -324,8 +313,6 @@ def _run_experiment(plain: dict[str, Any], folder: Path) -> None:
     if folds is None:
         stages = learning_stages(plain, split_of(plain), ".", acquired)
         run_stages(stages, folder)
-        if not is_first():
-            return
         metrics = collect_metrics(folder, plain, [stage.name for stage in (*first, *stages)])
     else:
         metrics = _run_folds(plain, folder, folds, first, acquired)

@@ -17,7 +17,6 @@ from ..io.files import read_array, read_hdf5, write_checkpoint, write_json
 from ..io.progress import Progress
 from ..io.resumable import forget_checkpoint, keep_checkpoint, resume_checkpoint
 from ..io.stages import StageContext
-from ..io.team import agreed, is_first
 from ..learning.markers_in_the_loop import MarkersInTheLoop, MotionLoss, Watched, cross_validated_epochs
 from ..learning.networks import ResidualForce, StateMap, build_model, build_next_state
 from ..learning.predictors import Range
@@ -305,18 +304,14 @@ def fit(context: StageContext, prepared: Prepared, refined: bool = False) -> Non
     """
     model, trainer = context.settings["model"], prepared.trainer
     checkpoint = context.run_dir / f"{context.name}.safetensors"
-    found = agreed(resume_checkpoint(checkpoint, "training", context.fingerprint) if is_first() else None)
-    if found is not None:
+    if (found := resume_checkpoint(checkpoint, "training", context.fingerprint)) is not None:
         trainer.resume(*found)
 
     def save(kept: Snapshot) -> None:
-        if is_first():
-            keep_checkpoint(checkpoint, "training", kept[0], {**kept[1], "fingerprint": context.fingerprint})
+        keep_checkpoint(checkpoint, "training", kept[0], {**kept[1], "fingerprint": context.fingerprint})
 
     run_epochs(context.name, trainer, save)
     best = trainer.use_best()
-    if not is_first():
-        return
     kept = {
         "selection": trainer.selection,
         "epoch": trainer.state.best_epoch,

@@ -26,7 +26,6 @@ from .errors import DataFileError, InputError
 from .files import FORMAT_VERSION, digest, read_json, to_plain, write_json
 from .memory import WorkersMemory, peak_memory_gib
 from .resumable import forget_checkpoint, keep_checkpoint, resume_checkpoint
-from .team import agreed, is_first
 
 log = logging.getLogger(__name__)
 
@@ -54,7 +53,6 @@ class Stage:
     outputs: tuple[str, ...]  # Names of the files that it writes, relative to the run folder
     settings: Mapping[str, Any]  # Plain nested settings that the outputs depend on, and no others
     upstream: tuple[str, ...] = ()  # Names of the stages whose outputs it reads
-    together: bool = False  # Whether all processes that torchrun has started run it, of which the first one writes
 
 
 class StageInterrupted(KeyboardInterrupt):
@@ -98,29 +96,13 @@ def run_stages(
     run_dir = Path(run_dir)
     known: dict[str, str] = {}
     seconds: dict[str, float] = {}
-    if not is_first():
-        _help(stages, run_dir)
-        return seconds
     with run_lock(run_dir, wait):
         for stage in stages:
             begins(stage.name)
             context = _context(stage, run_dir, known)
             took = _valid_seconds(stage, context)
-            if stage.together:
-                agreed(took is None)
             seconds[stage.name] = _run_stage(stage, context, [*seconds]) if took is None else took
-        agreed(True)
     return seconds
-
-
-def _help(stages: Sequence[Stage], run_dir: Path) -> None:
-    """Runs those stages that all processes run, when the first one does, and returns when it is done with all."""
-    known: dict[str, str] = {}
-    for stage in stages:
-        context = _context(stage, run_dir, known)
-        if stage.together and agreed(False):
-            stage.function(context)
-    agreed(False)
 
 
 def up_to_date(stages: Sequence[Stage], run_dir: str | Path) -> bool:

@@ -11,7 +11,6 @@ import torch
 from typing_extensions import override
 
 from ..io.errors import InputError
-from ..io.team import add_up, place
 from .networks import Model, StateMap
 
 SCHEDULES = ("cosine", "step")
@@ -212,11 +211,9 @@ class Trainer(EpochTrainer[Model]):
         for loss, weight in self._batches():
             self._optimiser.zero_grad()
             loss.backward()
-            add_up(p.grad for p in self.model.network.parameters() if p.grad is not None)
             self._optimiser.step()
             total += loss.detach() * weight
             count += weight
-        add_up([total])
         self.model.eval()
         unit = float(self.model.remainder) ** 2
         with torch.no_grad():
@@ -224,14 +221,12 @@ class Trainer(EpochTrainer[Model]):
         return {"train_loss": float(total) / count * unit, "validation_loss": validation, "learning_rate": rate}
 
     def _batches(self) -> Iterator[tuple[torch.Tensor, float]]:
-        """This process's part of the mean loss of each batch of one pass, and how many samples are in the batch."""
+        """Yields the mean loss of each batch of one pass over the samples, and the number of samples in it."""
         inputs, outputs = self._train
-        first, step = place()
         order = torch.randperm(len(inputs), generator=self._random).to(inputs.device)
         for batch in order.split(self.config["batch_size"]):
-            found, _ = self.model.standardised(self._noisy(inputs[batch])[first::step])
-            mine = self._squares(found, outputs[batch[first::step]])
-            yield mine.sum() / (len(batch) * outputs.shape[1]), len(batch)
+            found, _ = self.model.standardised(self._noisy(inputs[batch]))
+            yield self._squares(found, outputs[batch]).mean(), len(batch)
 
     def _validate(self) -> torch.Tensor:
         """The mean validation loss."""
@@ -273,12 +268,10 @@ class SequenceTrainer(Trainer[Model]):
     @override
     def _batches(self) -> Iterator[tuple[torch.Tensor, float]]:
         inputs, outputs, inside = self._train_series
-        first, step = place()
         hidden = None
         for span in torch.arange(len(inputs)).split(self.config["sequence"]):
-            mine, count = (slice(None), slice(first, None, step)), float(inside[span].sum())
-            x = self._noisy(inputs[span])[mine]
-            loss, hidden = self._through(x, outputs[span][mine], inside[span][mine], hidden, count)
+            count = float(inside[span].sum())
+            loss, hidden = self._through(self._noisy(inputs[span]), outputs[span], inside[span], hidden, count)
             yield loss, count
             hidden = hidden.detach()
 

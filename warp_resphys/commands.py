@@ -50,7 +50,6 @@ COMMANDS: Final[Mapping[str, Command]] = MappingProxyType(
         "inspect compare": Command(
             "a recording of a beam that is let go, beside its simulation", "studies.recording_comparison:compare"
         ),
-        "inspect convert": Command("bring published recordings into a safe format", "studies.preparation:convert"),
         "inspect make-arm": Command("make the mesh of a pneumatic arm", "studies.preparation:make_arm"),
         "view": Command("a run's robot in the browser, to be driven and pulled", "studies.view:view", word="run"),
         "view film": Command("a film of a trial of a run, with any of its models", "studies.film:film", word="run"),
@@ -82,7 +81,6 @@ RETIRED: Final[Mapping[str, str]] = MappingProxyType(  # old names of commands
     {
         "robots": "reproduce robots",
         "compare": "inspect compare",
-        "convert": "inspect convert",
         "make-arm": "inspect make-arm",
         "film": "view film",
         "size-study": "benchmark sizes",

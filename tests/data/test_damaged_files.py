@@ -2,13 +2,11 @@
 
 import contextlib
 import multiprocessing
-import pickle
 import resource
 import time
 import tracemalloc
 import warnings
 from concurrent.futures import ProcessPoolExecutor
-from functools import partial
 from pathlib import Path
 
 import ezc3d
@@ -16,7 +14,6 @@ import h5py
 import numpy as np
 import pytest
 
-from warp_resphys.data.recordings.published import read_published_arm
 from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.recordings.segment import read_published_segment
 from warp_resphys.io import decoding
@@ -75,12 +72,6 @@ def write_segment(path):
     np.savez_compressed(path, pressure_mbar=np.array([50.0, 75.0]), markers=markers, rate_hz=100.0)
 
 
-def write_pickle(path, protocol):
-    data = {"data": np.zeros((2, 3, 15, 3)), "p": np.arange(36.0).reshape(2, 3, 6), "note": [1, {"x": (None, "y")}]}
-    data["data"][:, 1:] = 0.01
-    path.write_bytes(pickle.dumps(data, protocol=protocol))
-
-
 def write_box(path):
     mesh = box_tetrahedra((0.1, 0.03, 0.03), (2, 1, 1))
     write_mesh(path, mesh)
@@ -99,9 +90,6 @@ ELSEWHERE = {
     "a.msh": (write_box, read_surfaces),
     "a.vtk": (write_box, read_mesh),
     "a.vtu": (write_box, read_mesh),
-    "zero.pkl": (partial(write_pickle, protocol=0), read_published_arm),
-    "two.pkl": (partial(write_pickle, protocol=2), read_published_arm),
-    "five.pkl": (partial(write_pickle, protocol=5), read_published_arm),
 }
 
 

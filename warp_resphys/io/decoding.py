@@ -1,21 +1,19 @@
 """Files of other programs, decoded by the libraries for them in a process of little memory and time.
 
-A damaged file makes ezc3d, HDF5 and pickle, which are C++ and C, crash, loop or claim gigabytes, and meshio loop over
-what was cut off. So this file is also a program: it decodes one file, within limits that its caller sets, and hands
+A damaged file makes ezc3d and HDF5, which are C++ and C, crash, loop or claim gigabytes, and meshio loop over what was
+cut off. So this file is also a program: it decodes one file, within limits that its caller sets, and hands
 plain arrays on. It imports nothing of the package, which would take longer than most files do.
 """
 
 import contextlib
 import io
 import os
-import pickle
-import re
 import signal
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,10 +36,10 @@ class DecodingError(Exception):
 
 
 def decode(library: str, path: Path, *names: str) -> Arrays:
-    """The arrays of `c3d_arrays`, `mesh_arrays`, `hdf5_arrays` or `pickled_arrays`, made in a process of its own.
+    """The arrays of `c3d_arrays`, `mesh_arrays` or `hdf5_arrays`, made in a process of its own.
 
     Args:
-        library: "ezc3d", "meshio", "h5py" or "pickle".
+        library: "ezc3d", "meshio" or "h5py".
         path: An existing file.
         names: Of `hdf5_arrays`.
 
@@ -186,78 +184,6 @@ def _named_surfaces(content: Any) -> dict[str, list[NDArray[np.int64]]]:
     return members
 
 
-class _Inert:
-    """Stands in a pickle for an array, or for its type: what it was called with and its state, not yet believed."""
-
-    def __init__(self, *arguments: Any) -> None:
-        self.arguments = arguments
-        self.state: Any = None
-
-    def __setstate__(self, state: Any) -> None:
-        self.state = state
-
-
-def _from_buffer(data: Any, kind: Any, shape: Any, order: Any = "C") -> _Inert:
-    array = _Inert()
-    array.state = (1, shape, kind, order == "F", data)
-    return array
-
-
-class _InertUnpickler(pickle.Unpickler):
-    """Makes plain values, and stand-ins of what NumPy's arrays need; every other name is refused, so nothing runs."""
-
-    _KNOWN: ClassVar[dict[str, Callable[..., Any]]] = {
-        "numpy.dtype": _Inert,
-        "numpy.ndarray": _Inert,
-        "_codecs.encode": lambda text, _: str.encode(text, "latin1"),  # how protocols before the third write bytes
-        "__builtin__.bytes": lambda: b"",
-        "multiarray._reconstruct": _Inert,
-        "multiarray.scalar": lambda kind, data=b"": _from_buffer(data, kind, ()),
-        "numeric._frombuffer": _from_buffer,
-    }
-
-    def find_class(self, module: str, name: str) -> Any:
-        called = f"{module}.{name}"
-        inert = self._KNOWN.get(re.sub(r"^numpy\._?core\.", "", called))  # before and since NumPy 2
-        if inert is None:
-            raise DecodingError(
-                f"it would construct {called!r}, where only arrays and plain values may be: do not open it with "
-                "anything else either"
-            )
-        return inert
-
-
-def pickled_arrays(path: str) -> Arrays:
-    """Of a pickled dictionary, bare or within a .npy file: its arrays of numbers, by key, in float64.
-
-    Raises:
-        DecodingError: It is no dictionary, has other arrays, or names anything but what NumPy's arrays need.
-    """
-    with open(path, "rb") as file:
-        if file.read(6) == np.lib.format.MAGIC_PREFIX:  # then a version, and the length of the header that follows
-            version = file.read(2)
-            length = file.read(2 if version[:1] == b"\x01" else 4)
-            file.seek(int.from_bytes(length, "little"), os.SEEK_CUR)
-        else:
-            file.seek(0)
-        content = _InertUnpickler(file).load()
-    if isinstance(content, _Inert):  # numpy.save makes an array of one object of a dictionary
-        content = content.state[4][0]
-    if not isinstance(content, dict):
-        raise DecodingError("it holds no dictionary of arrays")
-    return {str(key): _believed(value) for key, value in content.items() if isinstance(value, _Inert)}
-
-
-def _believed(array: _Inert) -> NDArray[np.float64]:
-    """The numbers that a stand-in was told of."""
-    _, shape, kind, fortran, data = array.state
-    code = kind.arguments[0]
-    if code[0] not in "biuf" or not code[1:].isdigit() or not isinstance(data, bytes | bytearray):
-        raise DecodingError("it has an array that does not hold numbers")
-    flat = np.frombuffer(data, kind.state[1].replace("|", "=") + code)
-    return flat.reshape(shape, order="F" if fortran else "C").astype(np.float64)
-
-
 def _limit(memory: int, seconds: int) -> None:
     """Bounds this process, where the system can."""
     with contextlib.suppress(ImportError):
@@ -278,8 +204,7 @@ def _main(memory: str, seconds: str, library: str, path: str, *names: str) -> in
     os.dup2(nowhere, 2)
     too_much = f"it takes more than {int(memory) >> 20} MiB of memory"
     try:
-        decoders: dict[str, Callable[..., Arrays]] = {"ezc3d": c3d_arrays, "meshio": mesh_arrays}
-        decoders |= {"h5py": hdf5_arrays, "pickle": pickled_arrays}
+        decoders: dict[str, Callable[..., Arrays]] = {"ezc3d": c3d_arrays, "meshio": mesh_arrays, "h5py": hdf5_arrays}
         arrays: dict[str, Any] = {**decoders[library](path, *names)}
         np.savez(answer, **arrays)
         answer.close()

@@ -7,12 +7,12 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from ..data.recordings.segment import convert_segment
 from ..io.errors import InputError
 from ..io.files import digest, read_json, write_json
 from ..io.labels import run_label
 from ..io.stages import run_lock
 from ..report.page import Items, Part, figures_beside
-from .preparation import CONVERTERS
 from .robot_results import Measured, details, machines, summary, verdict
 from .runs import Results, Run, asked_for, command_part, fail_for, run_all
 
@@ -133,9 +133,9 @@ def _run(config: Mapping[str, Any], name: str, folder: Path) -> Run:
     if robot["recordings"] is not None:
         place = _place(config, name)
         _check_files(name, place, robot["files"])
-        if "convert" in robot:
-            source, place = place / robot["convert"]["source"], folder / "recordings" / name
-            CONVERTERS[robot["convert"]["layout"]](source, place)
+        if "segment" in robot:
+            source, place = place / robot["segment"], folder / "recordings" / name
+            convert_segment(source, place)
         quoted = str(place.resolve()).replace("\\", r"\\").replace("'", r"\'")
         overrides.append(f"data.folder='{quoted}'")
     arguments = (f"experiment={robot['experiment']}", *overrides)

@@ -45,8 +45,8 @@ def read_recording(
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         raise DataFileError(
-            f"{path} is no recording that can be read: give a file that ends in {', '.join(READERS)}, or convert it "
-            "with warp-resphys inspect convert."
+            f"{path} is no recording that can be read: give a file that ends in {', '.join(READERS)}, as "
+            "docs/recordings.md has them."
         )
     if table is not None and reader is not read_raw_text:
         raise DataFileError(f"{path} is no text, so that data.table cannot tell what its columns are: leave that out.")

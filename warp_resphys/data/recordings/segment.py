@@ -6,15 +6,14 @@ z = 0. The chamber that is inflated is the one towards +x: the tip goes towards 
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from ...io.errors import DataFileError
 from ...io.files import read_arrays
-from .arrays import numbers
+from .arrays import numbers, write_recording
 from .jumps import mask_repeats
-from .published import write_trials
 from .recording import SI_PER_ACTUATION_UNIT, RawRecording, Recording, to_recording
 from .release import valve_opening
 
@@ -65,13 +64,15 @@ def read_published_segment(path: str | Path) -> dict[int, Recording]:
     }
 
 
-def convert_segment(source: str | Path, folder: Path) -> list[dict[str, Any]]:
-    """Writes each trial as segment_050.h5 (50 mbar) and so on, and index.json; returns what that says of each."""
-    trials = [
-        (mbar, recording, {"pressure_mbar": mbar, "valve_opening_s": -recording.start})
-        for mbar, recording in read_published_segment(source).items()
-    ]
-    return write_trials(folder, "segment", trials, SEGMENT_NOMINAL)
+def convert_segment(source: str | Path, folder: str | Path) -> None:
+    """Writes each trial into a folder as a recording of its own: segment_050.h5 for 50 mbar, and so on.
+
+    Raises:
+        DataFileError: see `read_published_segment`, or a file cannot be written.
+    """
+    for mbar, recording in read_published_segment(source).items():
+        attributes = {"pressure_mbar": mbar, "valve_opening_s": -recording.start}
+        write_recording(Path(folder) / f"segment_{mbar:03d}.h5", recording, attributes)
 
 
 def _trial(raw: RawRecording, mbar: float, path: Path) -> Recording:

@@ -315,7 +315,7 @@ class TestDriving:
 
     def test_a_film_of_it_is_a_command(self, folder, tmp_path, can_draw):
         place = f"file={tmp_path / 'film.mp4'}"
-        code, err = run("film", f"run={folder}", "motion=circle_0.4s", place, "seconds=0.1", *CONTROL[-3:-1])
+        code, err = run("view", "film", f"run={folder}", "motion=circle_0.4s", place, "seconds=0.1", *CONTROL[-3:-1])
         assert code == 0, err
         told = next(imageio_ffmpeg.read_frames(str(tmp_path / "film.mp4")))
         assert told["size"] == (1120, 480)  # Open loop on SysID and on ResPhys, side by side.
@@ -333,7 +333,7 @@ class TestDriving:
         ],
     )
     def test_what_cannot_be_filmed_is_said(self, folder, change, said):
-        code, err = run("film", f"run={folder}", *change, *CONTROL[-3:-1])
+        code, err = run("view", "film", f"run={folder}", *change, *CONTROL[-3:-1])
         assert code == 2
         assert said in err
         assert err.count("\n") == 1

@@ -308,7 +308,7 @@ SMALL = ["mesh.divisions=[2,1,1]", "gradcheck.steps=1", "gradcheck.batch=1", "gr
 @pytest.mark.parametrize("solver", ["quasi_newton", "newton"])
 def test_configured_check(solver):
     with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        config = compose("gradcheck", [*SMALL, f"solver={solver}", "experiment=beam_oscillation"])
+        config = compose("verify_gradients", [*SMALL, f"solver={solver}", "experiment=beam_oscillation"])
     results = list(check_configured(OmegaConf.to_container(config)))
     assert [(nu, name) for nu, name, _ in results] == [(0.45, "bent"), (0.499, "bent")]
     for _, _, rows in results:

@@ -35,7 +35,7 @@ ROTATION = Rotation.from_euler("xyz", [0.4, -1.5, 2.0])
 
 def configured(*overrides):
     with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        return OmegaConf.to_container(compose("compare", list(overrides)), resolve=True)
+        return OmegaConf.to_container(compose("inspect_compare", list(overrides)), resolve=True)
 
 
 def recorded(displacement, release):
@@ -206,7 +206,7 @@ def test_refused_settings(tmp_path, override, sentence):
 
 def test_command_line_tells_what_is_wrong_in_one_sentence(tmp_path):
     (tmp_path / "notes.c3d").write_text("not a recording")
-    command = [sys.executable, "-m", "warp_resphys.cli", "compare", "recording.path=notes.c3d"]
+    command = [sys.executable, "-m", "warp_resphys.cli", "inspect", "compare", "recording.path=notes.c3d"]
     result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert result.returncode == 2
     assert result.stderr.strip().splitlines() == [

@@ -13,7 +13,7 @@ SMALL = ("check.experiments=[]", "check.steps=1", "benchmark.quick=true", "hydra
 
 def run(monkeypatch, capsys, *arguments):
     """Exit code, and what was printed."""
-    monkeypatch.setattr(sys, "argv", ["warp-resphys", "check", *arguments])
+    monkeypatch.setattr(sys, "argv", ["warp-resphys", "verify", "device", *arguments])
     try:
         cli.main()
     except SystemExit as end:

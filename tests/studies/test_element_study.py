@@ -9,7 +9,7 @@ from warp_resphys import cli
 
 def rows(monkeypatch, capsys, *arguments):
     """First cells of each row of the table, the sag, and the time of a step; without a table, what was wrong."""
-    monkeypatch.setattr(sys, "argv", ["warp-resphys", "element-study", *arguments])
+    monkeypatch.setattr(sys, "argv", ["warp-resphys", "benchmark", "elements", *arguments])
     try:
         cli.main()
     except SystemExit:

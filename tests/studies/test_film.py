@@ -25,7 +25,7 @@ def test_the_motion_is_that_of_the_evaluation(finished):
 
 
 def test_a_command_makes_it(finished, folder, can_draw):
-    code, err = end_of(cli.main, "warp-resphys", "film", f"run={finished[0]}", "file=motion.mp4", "slower=2")
+    code, err = end_of(cli.main, "warp-resphys", "view", "film", f"run={finished[0]}", "file=motion.mp4", "slower=2")
     assert code == 0, err
     frames = imageio_ffmpeg.read_frames("motion.mp4")
     told = next(frames)
@@ -46,7 +46,7 @@ def test_a_command_makes_it(finished, folder, can_draw):
     ],
 )
 def test_what_cannot_be_filmed_is_said(finished, folder, change, said):
-    code, err = end_of(cli.main, "warp-resphys", "film", f"run={finished[0]}", *change)
+    code, err = end_of(cli.main, "warp-resphys", "view", "film", f"run={finished[0]}", *change)
     assert code == 2
     assert err.startswith("error: ")
     assert said in err
@@ -56,6 +56,6 @@ def test_what_cannot_be_filmed_is_said(finished, folder, change, said):
 @pytest.mark.parametrize("name", ["runs/budget=quick", "runs/budget=quick,seed=2", "runs/default"])
 def test_folders_of_runs_need_no_quotes(folder, name):
     for argument in (f"run={name}", f"run='{name}'"):
-        code, err = end_of(cli.main, "warp-resphys", "film", argument)
+        code, err = end_of(cli.main, "warp-resphys", "view", "film", argument)
         assert code == 2
         assert err.startswith(f"error: {name}")

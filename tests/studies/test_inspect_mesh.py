@@ -204,7 +204,7 @@ def test_a_body_in_two_pieces_with_an_open_chamber(tmp_path, arm):
 
 
 def test_make_arm_writes_what_it_says(tmp_path):
-    text = make_arm(configured("make_arm", "mesh.size=0.01", "mesh.layers=0.03", "file=own.msh"), tmp_path)
+    text = make_arm(configured("inspect_make_arm", "mesh.size=0.01", "mesh.layers=0.03", "file=own.msh"), tmp_path)
     rows = rows_of(text)
     mesh = read_mesh(tmp_path / "own.msh")
     assert rows["vertices"] == f"{len(mesh.vertices)} = {3 * len(mesh.vertices):,} degrees of freedom"
@@ -229,19 +229,19 @@ def test_make_arm_writes_what_it_says(tmp_path):
 )
 def test_wrong_settings(tmp_path, overrides, error, message):
     with pytest.raises(error, match=message):
-        make_arm(configured("make_arm", *overrides), tmp_path)
+        make_arm(configured("inspect_make_arm", *overrides), tmp_path)
 
 
 @pytest.mark.parametrize(
     ("command", "arguments", "message"),
     [
-        ("make-arm", ["mesh.wall=0.02"], "error: where the arm's radius is 21.29 mm, 3 chambers do not fit"),
+        ("inspect make-arm", ["mesh.wall=0.02"], "error: where the arm's radius is 21.29 mm, 3 chambers do not fit"),
         ("inspect", ["mesh.path=nowhere.vtk"], "error: nowhere.vtk: there is no such mesh file"),
         ("inspect", [], "error: nothing to inspect: name a file, as in mesh.path=FILE or recording.path=FILE."),
     ],
 )
 def test_commands_end_with_one_sentence(tmp_path, command, arguments, message):
-    line = [sys.executable, "-m", "warp_resphys.cli", command, *arguments]
+    line = [sys.executable, "-m", "warp_resphys.cli", *command.split(), *arguments]
     done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert done.stderr.strip().splitlines()[-1].startswith(message)

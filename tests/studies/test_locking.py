@@ -37,7 +37,7 @@ SMALL = (
 
 def configured(*overrides):
     with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        return OmegaConf.to_container(compose("locking_study", list(overrides)), resolve=True)
+        return OmegaConf.to_container(compose("benchmark_locking", list(overrides)), resolve=True)
 
 
 def row(size, layers, value, element=HEXAHEDRA, vertices=None):

@@ -14,7 +14,7 @@ OURS = [{"ms": 1.0, "error_mm": 1e-2}, {"ms": 3.0, "error_mm": 1e-4}, {"ms": 2.0
 
 def run(monkeypatch, capsys, *arguments):
     """What the command printed, or, where it was refused, what was wrong."""
-    monkeypatch.setattr(sys, "argv", ["warp-resphys", "peer-study", *arguments])
+    monkeypatch.setattr(sys, "argv", ["warp-resphys", "benchmark", "peers", *arguments])
     try:
         cli.main()
     except SystemExit:

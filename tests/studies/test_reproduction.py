@@ -200,9 +200,9 @@ def test_a_run_that_ends_without_a_sentence_points_to_its_log(tmp_path, monkeypa
 def test_ctrl_c_stops_the_run_and_keeps_what_it_has(folder):
     """The signal reaches the reproduction alone; it hands it on to the run, which is out of reach of the terminal."""
     program = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-    program += "from warp_resphys.cli import main\nmain('reproduce')"
+    program += "from warp_resphys.cli import main\nmain()"
     arguments = [each for each in TINY if not each.startswith("overrides")]
-    command = [sys.executable, "-c", program, *arguments, "only=[beam_oscillation/default]"]
+    command = [sys.executable, "-c", program, "reproduce", *arguments, "only=[beam_oscillation/default]"]
     child = subprocess.Popen(
         command,
         text=True,

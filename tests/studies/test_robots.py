@@ -33,7 +33,7 @@ ARGUMENTS = [
 
 def run(*arguments):
     """Exit code of the command in this process, and what it wrote to stderr."""
-    return end_of(cli.main, "warp-resphys", "robots", *arguments)
+    return end_of(cli.main, "warp-resphys", "reproduce", "robots", *arguments)
 
 
 @pytest.fixture(scope="module")
@@ -131,7 +131,7 @@ def test_a_robot_that_fails_keeps_its_row_and_says_so(finished, tmp_path, monkey
 
 def configured():
     with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        return OmegaConf.to_container(compose("robots"), resolve=True)["robots"]
+        return OmegaConf.to_container(compose("reproduce_robots"), resolve=True)["robots"]
 
 
 def test_every_robot_is_an_experiment_whose_files_are_known():

@@ -11,7 +11,7 @@ from warp_resphys.studies.sizes import exponents
 
 def run(monkeypatch, capsys, *arguments):
     """What the command printed, or, where it was refused, what was wrong."""
-    monkeypatch.setattr(sys, "argv", ["warp-resphys", "size-study", *arguments])
+    monkeypatch.setattr(sys, "argv", ["warp-resphys", "benchmark", "sizes", *arguments])
     try:
         cli.main()
     except SystemExit:

@@ -147,7 +147,7 @@ def remember(history: History, positions: wp.array2d[wp.vec3d], b: int, lane: in
 @kernel
 def begin(
     force: wp.array2d[wp.vec3d],  # (B, N) [N]
-    stiffness: wp.array3d[wp.float64],  # (B, P, T) [J]
+    stiffness: wp.array[wp.float64],  # (B) sum over the solids' points [J]
     positions: wp.array2d[wp.vec3d],  # (B, N) where inertia alone would lead; becomes the start [m]
     tolerances: Tolerances,
     origin_out: wp.array2d[wp.vec3d],
@@ -156,7 +156,7 @@ def begin(
 ):
     """Starts where the last steps foretell, and sums what does not change during this solve."""
     b, lane = wp.tid()
-    square, total = wp.float64(0.0), wp.float64(0.0)
+    square = wp.float64(0.0)
     known = history.known[b]
     if progress.phase[b] != DONE:  # The solve before has failed.
         known = 0
@@ -168,10 +168,7 @@ def begin(
         start = start + foretold(history, b, i, order)
         positions[b, i] = start
         origin_out[b, i] = start
-    for p in range(lane, stiffness.shape[1], wp.block_dim()):
-        for t in range(stiffness.shape[2]):
-            total += stiffness[b, p, t]
-    square, total = block_sum(square), block_sum(total)
+    square = block_sum(square)
     if lane == 0:
         history.known[b] = known
         progress.phase[b] = BEGINS
@@ -187,7 +184,7 @@ def begin(
         progress.smallest[b] = INFINITE
         progress.rounding[b] = INFINITE
         progress.force[b] = wp.sqrt(square)
-        progress.stiffness[b] = total
+        progress.stiffness[b] = stiffness[b]
 
 
 @kernel

@@ -60,7 +60,7 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         nodes: wp.array2d[int],
         gradients: wp.array2d[wp.vec3d],
         stiffness: wp.array2d[moduli],  # (B, P) moduli times the point's volumes [J]
-        viscosity: wp.array[wp.vec2d],  # (B) c and d of `dynamics.viscosity`, -
+        viscosity: wp.array[wp.vec2d],  # (B) c and d of `energies.viscosity`, -
         strain_offset: wp.array2d[wp.mat33d],  # (B, P) W there
         dilation_offset: wp.array2d[wp.float64],  # (B, P) w there
         points_per_cell: int,

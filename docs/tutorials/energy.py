@@ -44,10 +44,11 @@ import torch
 import warp as wp
 
 from warp_resphys import Body, Corotated, Simulator, State, box_hexahedra, select_vertices
-from warp_resphys.energies.base import Energy, PartTerm, Quantity
+from warp_resphys.energies.base import Energy, PartTerm
 from warp_resphys.energies.launcher import warp_view
 from warp_resphys.fem.elements import Points
 from warp_resphys.kernels.points import line_at
+from warp_resphys.stepping.quantity import Quantity
 
 wp.config.log_level = wp.LOG_WARNING
 

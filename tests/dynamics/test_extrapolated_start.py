@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, box_hexahedra, select_vertices
-from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.dynamics.nonlinear_solver import SOLVERS
+from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.studies.gradient_check import pose
 
 MESH = box_hexahedra((0.06, 0.02, 0.02), (4, 2, 2))

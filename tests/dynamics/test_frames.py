@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 from warp_resphys import Body, Corotated, Simulator, box_hexahedra, select_vertices
 from warp_resphys.data.base_motion import prescribed, rigid
 from warp_resphys.dynamics.frames import BaseFrame, VertexFrames, base_movement
-from warp_resphys.dynamics.inputs import Inputs
-from warp_resphys.dynamics.integrator import State
 from warp_resphys.learning.predictors import LearnedPredictor, Range
+from warp_resphys.stepping.inputs import Inputs
+from warp_resphys.stepping.state import State
 
 
 def deformed(body, stretch):

@@ -26,8 +26,8 @@ from warp_resphys import (
 )
 from warp_resphys.dynamics import equilibrium
 from warp_resphys.dynamics.hessian import ExactHessian
-from warp_resphys.dynamics.inputs import Inputs
-from warp_resphys.dynamics.integrator import INTEGRATORS
+from warp_resphys.stepping.inputs import Inputs
+from warp_resphys.stepping.integrators import INTEGRATORS
 from warp_resphys.studies.gradient_check import (
     POSES,
     GradientRow,

@@ -17,9 +17,9 @@ from warp_resphys import (
     box_tetrahedra,
     select_vertices,
 )
-from warp_resphys.dynamics.inputs import Inputs
-from warp_resphys.dynamics.integrator import INTEGRATORS
 from warp_resphys.io.errors import InputError
+from warp_resphys.stepping.inputs import Inputs
+from warp_resphys.stepping.integrators import INTEGRATORS
 
 SOFT = Corotated(2e4, 0.3, density=1000.0, mass_damping=1.0, stiffness_damping=3e-3)
 MESH = box_hexahedra((0.04, 0.02, 0.02), (2, 1, 1))

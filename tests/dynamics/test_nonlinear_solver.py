@@ -8,7 +8,6 @@ import torch
 import warp as wp
 
 from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, box_hexahedra, select_vertices
-from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.dynamics.minimiser import Minimiser
 from warp_resphys.dynamics.nonlinear_solver import SOLVERS
 from warp_resphys.energies.launcher import warp_view
@@ -16,6 +15,7 @@ from warp_resphys.energies.materials import MATERIALS
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.kernels import minimisation as kernels
 from warp_resphys.kernels.minimisation import minimisation_kernels
+from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.studies.gradient_check import pose
 
 MESH = box_hexahedra((0.06, 0.02, 0.02), (4, 2, 2))

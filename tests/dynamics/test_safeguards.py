@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, box_hexahedra, select_vertices
-from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.linalg.choice import make_linear_solver
+from warp_resphys.stepping.inputs import Inputs
 
 MESH = box_hexahedra((0.06, 0.03, 0.03), (2, 1, 1))
 CLAMPED = Body(MESH, fixed=select_vertices(MESH, x=0.0))

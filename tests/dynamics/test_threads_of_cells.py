@@ -4,12 +4,12 @@ import pytest
 import torch
 
 from warp_resphys.dynamics.assembly import HessianAssembly
-from warp_resphys.dynamics.inputs import Inputs
-from warp_resphys.dynamics.integrator import State
 from warp_resphys.dynamics.simulator import Simulator
 from warp_resphys.energies.launcher import Launcher
 from warp_resphys.fem.body import Body
 from warp_resphys.mesh.mesh import box_hexahedra, box_tetrahedra, select_vertices
+from warp_resphys.stepping.inputs import Inputs
+from warp_resphys.stepping.state import State
 
 MESHES = {
     "hexahedra": box_hexahedra((0.1, 0.03, 0.03), (4, 2, 2)),

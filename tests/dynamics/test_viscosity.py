@@ -10,11 +10,11 @@ import pytest
 import torch
 
 from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, box_hexahedra, select_vertices
-from warp_resphys.dynamics.inputs import Inputs
-from warp_resphys.dynamics.integrator import INTEGRATORS
 from warp_resphys.dynamics.modes import vibration_modes
 from warp_resphys.energies.materials import make_material
 from warp_resphys.io.errors import InputError
+from warp_resphys.stepping.inputs import Inputs
+from warp_resphys.stepping.integrators import INTEGRATORS
 from warp_resphys.studies.gradient_check import POSES, central_difference, check_gradients, pose
 
 MESH = box_hexahedra((0.04, 0.02, 0.02), (2, 1, 1))
@@ -113,7 +113,7 @@ def test_the_state_of_the_branches_turns_with_the_body():
     gravity = torch.tensor([[0.0, 0.0, -9.8]], dtype=torch.float64)
     simulator = Simulator(Body(MESH), TWO_BRANCHES, 0.005, integrator="bdf2", solver=TIGHT)  # free to turn
     carried = simulator.rollout(pose(simulator, "bent", 1), 5, parameters={"gravity": gravity}).final
-    turned = State.from_tensors({k: x if k == "overstrain" else x @ turn.T for k, x in carried.tensors().items()})
+    turned = State.from_tensors({k: x if k.startswith("memory.") else x @ turn.T for k, x in carried.tensors().items()})
     first = simulator.rollout(carried, 5, parameters={"gravity": gravity})
     second = simulator.rollout(turned, 5, parameters={"gravity": gravity @ turn.T})
     torch.testing.assert_close(second.q[-1], first.q[-1] @ turn.T, rtol=0.0, atol=1e-10)
@@ -124,10 +124,10 @@ def test_a_roll_out_goes_on_from_its_last_state(integrator):
     simulator = Simulator(CLAMPED, TWO_BRANCHES, integrator=integrator, solver=TIGHT)
     whole = simulator.rollout(simulator.rest_state(2), 8, pull(0.2, 2))
     half = simulator.rollout(simulator.rest_state(2), 4, pull(0.2, 2)).final
-    assert half.overstrain.shape[:2] == (2, 2)
+    assert half.memory["viscous_strain"].shape[:2] == (2, 2)
     again = State.from_tensors({name: each.clone() for name, each in half.tensors().items()})
     torch.testing.assert_close(simulator.rollout(again, 4, pull(0.2, 2)).q[-1], whole.q[-1], rtol=0.0, atol=1e-11)
-    relaxed = replace(again, overstrain=None)
+    relaxed = replace(again, memory={})
     assert float((simulator.rollout(relaxed, 4, pull(0.2, 2)).q[-1] - whole.q[-1]).abs().max()) > 1e-5
 
 
@@ -137,7 +137,7 @@ def test_poses_know_nothing_of_branches_and_branches_that_do_nothing_cost_nothin
     torch.testing.assert_close(*poses, rtol=0.0, atol=1e-12)
     runs = [Simulator(CLAMPED, m).rollout(Simulator(CLAMPED, m).rest_state(), 3).final for m in (idle, absent)]
     assert torch.equal(runs[0].q, runs[1].q)
-    assert runs[0].overstrain is None
+    assert not runs[0].memory
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
@@ -153,13 +153,15 @@ def test_gradients_of_what_the_branches_carry():
     simulator = Simulator(CLAMPED, TWO_BRANCHES, solver=TIGHT)
     state = simulator.rollout(pose(simulator, "bent", 1), 2).final
     random = torch.Generator().manual_seed(0)
-    weights, noise = (torch.randn(x.shape, generator=random).double() for x in (state.q, state.overstrain))
+    weights, noise = (
+        torch.randn(x.shape, generator=random).double() for x in (state.q, state.memory["viscous_strain"])
+    )
     direction = 1e-2 * (noise + noise.mT)
 
-    def loss(overstrain):
-        return (weights * simulator.rollout(replace(state, overstrain=overstrain), 2).q[-1]).sum()
+    def loss(strain):
+        return (weights * simulator.rollout(replace(state, memory={"viscous_strain": strain}), 2).q[-1]).sum()
 
-    carried = state.overstrain.clone().requires_grad_()
+    carried = state.memory["viscous_strain"].clone().requires_grad_()
     (gradient,) = torch.autograd.grad(loss(carried), carried)
     with torch.no_grad():
         wanted, _ = central_difference(lambda step: float(loss(carried + step * direction)))
@@ -202,8 +204,8 @@ def test_wrong_branches_are_refused(make, said):
 @pytest.mark.parametrize("wrong", [torch.zeros(1, 2, 3, 3), 5, torch.full((1, 1, 18, 3, 3), math.nan).double()])
 def test_a_state_of_other_branches_is_refused(wrong):
     simulator = Simulator(CLAMPED, CREEPING)
-    with pytest.raises(InputError, match=r"state\.overstrain"):
-        simulator.step(replace(simulator.rest_state(), overstrain=wrong))
+    with pytest.raises(InputError, match="viscous_strain"):
+        simulator.step(replace(simulator.rest_state(), memory={"viscous_strain": wrong}))
 
 
 def test_configured_branches_are_those_of_the_material():
@@ -227,7 +229,9 @@ def test_what_a_step_left_behind_has_no_part_in_a_pose():
 def test_single_precision_keeps_its_type():
     simulator = Simulator(CLAMPED, TWO_BRANCHES, dtype=torch.float32, solver=SolverSettings(relative_tolerance=1e-5))
     final = simulator.rollout(simulator.rest_state(), 3, Inputs(pull(0.2).external_force.float())).final
-    assert final.overstrain.dtype == torch.float32
+    assert final.memory["viscous_strain"].dtype == torch.float32
     double = Simulator(CLAMPED, TWO_BRANCHES, solver=TIGHT)
     exact = double.rollout(double.rest_state(), 3, pull(0.2)).final
-    torch.testing.assert_close(final.overstrain.double(), exact.overstrain, rtol=0.0, atol=1e-5)
+    torch.testing.assert_close(
+        final.memory["viscous_strain"].double(), exact.memory["viscous_strain"], rtol=0.0, atol=1e-5
+    )

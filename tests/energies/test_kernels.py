@@ -8,6 +8,7 @@ import torch
 from warp_resphys import Body, Mesh, box_hexahedra, box_tetrahedra, select_vertices
 from warp_resphys.dynamics.assembly import BlockPattern, HessianAssembly
 from warp_resphys.energies.materials import MATERIALS
+from warp_resphys.energies.placed import Placed
 from warp_resphys.energies.potential import IncrementalPotential, StepTerms
 from warp_resphys.energies.solid import Solid
 from warp_resphys.linalg.choice import make_linear_solver
@@ -33,9 +34,9 @@ GRADIENTS = np.concatenate(
 
 
 def potential_of(body, model, batch, device):
-    solid = Solid(body.discretisation, MATERIALS[model](), device, torch.float64)
+    solid = Solid(body.discretisation, MATERIALS[model]())
     fixed = torch.as_tensor(body.fixed_vertices, device=device)
-    return IncrementalPotential([(solid, solid.points(body.mesh))], body.n_vertices, fixed, batch, device)
+    return IncrementalPotential([Placed(solid, solid.points(body.mesh))], body.n_vertices, fixed, batch, device)
 
 
 def unit_potential(
@@ -252,7 +253,7 @@ def loaded_potential(mesh):
         np.concatenate([getattr(s, name).sum(axis=1) for s in sets]) for name in ("shape_volume", "volume_volume")
     ]
     stiffness = [torch.as_tensor(v) * (1.0 + noise(b, 1)) * scale for v, scale in zip(volumes, (1e5, 1e6), strict=True)]
-    strain = 0.01 * noise(b, potential.solid.n_points, 3, 3)
+    strain = 0.01 * noise(b, sum(s.n_points for s in sets), 3, 3)
     main = noise(b, n, 3), 1e4 * (1 + noise(b, n)), noise(b, n, 3)
     values = {"viscosity": noise(b, 2), "strain_offset": strain + strain.mT, "dilation_offset": strain[..., 0, 0]}
     potential.set_terms(StepTerms(*main, {"stiffness": torch.stack(stiffness, dim=-1), **values}))

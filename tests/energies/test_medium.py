@@ -20,9 +20,9 @@ from warp_resphys import (
     box_tetrahedra,
     select_vertices,
 )
-from warp_resphys.dynamics.integrator import INTEGRATORS
 from warp_resphys.io.errors import InputError
 from warp_resphys.mesh.mesh import boundary_faces, quadratic
+from warp_resphys.stepping.integrators import INTEGRATORS
 from warp_resphys.studies.gradient_check import POSES, check_gradients
 
 SIZE = (0.04, 0.03, 0.02)

@@ -20,8 +20,8 @@ from warp_resphys import (
     box_hexahedra,
     select_vertices,
 )
-from warp_resphys.dynamics.integrator import INTEGRATORS
 from warp_resphys.io.errors import InputError
+from warp_resphys.stepping.integrators import INTEGRATORS
 from warp_resphys.studies.gradient_check import POSES, check_gradients
 
 BEAM = box_hexahedra((0.1, 0.03, 0.03), (6, 2, 2))
@@ -48,11 +48,11 @@ def swing(sim, angle, steps, mass=0.05, length=0.2):
     rest = sim.rest_state()
     tied = rest.q[:, TIP].mean(1, keepdim=True)
     offset = length * torch.tensor([math.sin(angle), 0.0, -math.cos(angle)], dtype=torch.float64)
-    state = replace(rest, payload=State(tied + offset, torch.zeros_like(tied)))
+    state = replace(rest, memory={"payload_position": tied + offset, "payload_velocity": torch.zeros_like(tied)})
     found = [offset]
     for _ in range(steps):
         state, _ = sim.step(state, weight(mass))
-        found.append((state.payload.q - state.q[:, TIP].mean(1, keepdim=True))[0, 0])
+        found.append((state.memory["payload_position"] - state.q[:, TIP].mean(1, keepdim=True))[0, 0])
     return torch.stack(found)
 
 
@@ -82,7 +82,7 @@ def test_a_body_that_falls_faster_than_its_weight_leaves_it_behind(integrator):
     sim, steps = simulator(integrator=integrator), 4
     loaded, bare = (sim.rollout(sim.rest_state(), steps, weight(each)) for each in (0.05, 0.0))
     torch.testing.assert_close(loaded.q, bare.q, rtol=0.0, atol=1e-5)
-    fallen = float(sim.rest_positions[TIP, 2].mean()) - 0.2 - float(loaded.final.payload.q[0, 0, 2])
+    fallen = float(sim.rest_positions[TIP, 2].mean()) - 0.2 - float(loaded.final.memory["payload_position"][0, 0, 2])
     assert fallen == pytest.approx(0.5 * G * (steps * sim.time_step) ** 2, rel=0.3)
     assert float(bare.q[-1, 0, TIP, 2].mean()) < 0.03 - 0.5 * G * (steps * sim.time_step) ** 2
 
@@ -108,7 +108,7 @@ def test_an_equilibrium_stays(integrator, compliance):
     torch.testing.assert_close(start.q[0], glued.q[0], rtol=0.0, atol=1e-9)
     after = sim.rollout(start, 20, weight(0.05, 0.0))
     torch.testing.assert_close(after.q[-1], start.q, rtol=0.0, atol=1e-8)
-    hangs = (after.final.payload.q - after.final.q[:, TIP].mean(1, keepdim=True))[0, 0]
+    hangs = (after.final.memory["payload_position"] - after.final.q[:, TIP].mean(1, keepdim=True))[0, 0]
     assert float(-hangs[2]) == pytest.approx(0.2 + 0.05 * G * compliance, abs=1e-5)
 
 
@@ -138,10 +138,10 @@ def test_states_travel():
     sim = simulator()
     final = sim.rollout(sim.rest_state(), 3, weight(0.05)).final
     again = State.from_tensors(final.tensors())
-    assert torch.equal(again.payload.q, final.payload.q)
+    assert torch.equal(again.memory["payload_position"], final.memory["payload_position"])
     first, second = (simulator().step(each, weight(0.05))[0] for each in (final, again))
     assert torch.equal(first.q, second.q)
-    assert torch.equal(first.payload.v, second.payload.v)
+    assert torch.equal(first.memory["payload_velocity"], second.memory["payload_velocity"])
 
 
 @pytest.mark.parametrize(
@@ -163,7 +163,7 @@ def test_states_travel():
         ),
         (
             lambda: Simulator(Body(BEAM, fixed=CLAMP)).step(simulator().step(simulator().rest_state())[0]),
-            "the state has a payload, but the body has no strings: leave it out.",
+            "Unknown memory 'payload_position' of the state.",
         ),
     ],
 )

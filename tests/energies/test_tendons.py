@@ -292,7 +292,7 @@ def test_a_tendon_cannot_push():
             lambda: simulator(route(0.01), route(0.03)),
             "guide 1 of tendon 2, at [0.0, 0.01, 0.03] m, lies 10 mm",
         ),
-        (lambda: replace(simulator(route(0.01)), coupling="explicit"), "tendons act at the end of a step alone"),
+        (lambda: replace(simulator(route(0.01)), coupling="explicit"), "is a follower load"),
     ],
 )
 def test_what_cannot_be_routed_is_refused(make, said):

@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from warp_resphys import Body, Corotated, Mesh, PointMass, Simulator, State, box_hexahedra, select_vertices
-from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.energies.materials import make_material
 from warp_resphys.io.errors import InputError, MeshError, ResphysError
+from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.studies.gradient_check import check_configured
 
 MESH = box_hexahedra((0.02, 0.01, 0.01), (2, 1, 1))

@@ -18,7 +18,6 @@ from warp_resphys.data.recordings.arrays import write_recording
 from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.recordings.recording import Recording
 from warp_resphys.data.trials import Trials
-from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.experiment.build import bound_markers, build_body
 from warp_resphys.experiment.checks import check_configuration
 from warp_resphys.experiment.files import DATASET, QUALITY, REGISTRATION, TRUTH, Dataset, payload_inputs, read_dataset
@@ -30,6 +29,7 @@ from warp_resphys.io.files import read_hdf5
 from warp_resphys.io.stages import StageContext, fingerprint, run_stages
 from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.pipeline import acquisition_stages
+from warp_resphys.stepping.inputs import Inputs
 
 ROOT = Path(__file__).parents[2]
 TIPS, BASES = tuple(f"Tip - {i}" for i in (1, 2, 3)), tuple(f"Base - {i}" for i in (1, 2, 3))

@@ -11,11 +11,11 @@ from main_job import IN_RUN, run
 from omegaconf import OmegaConf
 from played_run import check_robots
 
-from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.experiment.build import bound_markers, build_simulator, finer
 from warp_resphys.experiment.checks import check_configuration
 from warp_resphys.experiment.files import read_dataset
 from warp_resphys.io.errors import InputError
+from warp_resphys.stepping.inputs import Inputs
 
 MODULUS = 420e3  # Pa, of the body that is recorded; the experiment expects 505 kPa
 OFFSETS = {"first": 1e-3, "second": -8e-4}  # m, around the axis, by which its tendons run elsewhere

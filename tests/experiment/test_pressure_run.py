@@ -23,7 +23,6 @@ from warp_resphys.data.markers import bind_markers
 from warp_resphys.data.recordings.arrays import write_recording
 from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.trials import Trials
-from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.experiment import learn, reconstruct
 from warp_resphys.experiment.build import build_simulator
 from warp_resphys.experiment.checks import check_configuration
@@ -39,6 +38,7 @@ from warp_resphys.learning.identification import Bounds, Identifier
 from warp_resphys.learning.predictors import Range
 from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.mesh.mesh import select_vertices
+from warp_resphys.stepping.inputs import Inputs
 
 # A short segment with two chambers of some 70 vertices, on which everything takes seconds.
 SEGMENT = """# @package _global_

@@ -12,11 +12,11 @@ from omegaconf import OmegaConf
 from played_run import check_robots
 
 from warp_resphys.data.sight import Sight
-from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.experiment.build import bound_markers, build_simulator
 from warp_resphys.experiment.checks import check_configuration
 from warp_resphys.experiment.files import read_dataset
 from warp_resphys.io.errors import InputError
+from warp_resphys.stepping.inputs import Inputs
 
 FACTOR = 1.3  # of the contraction that the winch is told
 STEPS = 24

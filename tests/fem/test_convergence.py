@@ -20,9 +20,9 @@ from warp_resphys import (
     quadratic,
     select_vertices,
 )
-from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.energies.materials import MATERIALS
 from warp_resphys.fem.elements import physical_gradients
+from warp_resphys.stepping.inputs import Inputs
 
 BEAM = (0.1, 0.03, 0.03)
 SILICONE = {"youngs_modulus": 264e3, "density": 1070.0}

@@ -17,13 +17,13 @@ from warp_resphys import (
     box_tetrahedra,
     quadratic,
 )
-from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.energies.materials import MATERIALS
 from warp_resphys.energies.potential import StepTerms
 from warp_resphys.fem.elements import discretise, physical_gradients
 from warp_resphys.io.errors import InputError
 from warp_resphys.mesh.elements import BY_NODES, ELEMENTS, FACES, conical_simplex, degree_two_tetrahedron, gauss_box
 from warp_resphys.mesh.mesh import surface_vertices
+from warp_resphys.stepping.inputs import Inputs
 
 SIZE, DIVISIONS = (0.03, 0.02, 0.02), (3, 2, 2)
 SHAPES = {name: element.shape for name, element in ELEMENTS.items()}

@@ -11,12 +11,12 @@ import torch
 from warp_resphys import Body, Simulator
 from warp_resphys.data.markers import bind_markers
 from warp_resphys.data.trials import Trials
-from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.dynamics.nonlinear_solver import SolverSettings
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.learning.identification import Bounds, Identifier
 from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
+from warp_resphys.stepping.inputs import Inputs
 
 MESH = box_hexahedra(divisions=(4, 1, 1))
 TIP = select_vertices(MESH, x=0.1)

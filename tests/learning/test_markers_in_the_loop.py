@@ -7,7 +7,6 @@ import torch
 from warp_resphys import Body, Simulator, State, box_hexahedra, select_vertices
 from warp_resphys.data.markers import bind_markers
 from warp_resphys.data.trials import Trials
-from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.experiment.scene import at_steps
 from warp_resphys.experiment.schema import IN_THE_LOOP, check
 from warp_resphys.io.errors import ConvergenceError, InputError
@@ -16,6 +15,7 @@ from warp_resphys.learning.markers_in_the_loop import MarkersInTheLoop, MotionLo
 from warp_resphys.learning.metrics import marker_errors
 from warp_resphys.learning.networks import build_model
 from warp_resphys.learning.replay import Replay, Start
+from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.studies.gradient_check import central_difference
 
 MESH = box_hexahedra(divisions=(2, 1, 1))

@@ -7,7 +7,6 @@ from torch import nn
 
 from warp_resphys import Body, Corotated, Simulator, State, box_hexahedra, select_vertices
 from warp_resphys.dynamics import modes
-from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.dynamics.modes import RestStiffness, vibration_modes
 from warp_resphys.experiment.schema import NETWORK, check
 from warp_resphys.io.errors import InputError
@@ -25,6 +24,7 @@ from warp_resphys.learning.networks import (
     restore,
 )
 from warp_resphys.learning.predictors import LearnedPredictor, Range
+from warp_resphys.stepping.inputs import Inputs
 
 REDUCED = {"kind": "reduced", "position_modes": 3, "velocity_modes": 4, "force_modes": 5}
 ARCHITECTURE = {"blocks": 2, "layers": 1, "width": 16, "activation": "normalised_elu"}

@@ -11,13 +11,13 @@ from scipy.spatial.transform import Rotation
 from warp_resphys import Body, Simulator
 from warp_resphys.data.markers import KINDS, MarkerMap, bind_markers
 from warp_resphys.data.trials import Trials
-from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.io.errors import InputError
 from warp_resphys.learning.identification import Bounds, Identifier, Prior
 from warp_resphys.learning.placement import Accuracy, PlacedMarkers, Placement, Stems, estimate
 from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
 from warp_resphys.mesh.poses import twisted
+from warp_resphys.stepping.inputs import Inputs
 
 MESH = box_hexahedra((0.1, 0.03, 0.03), (5, 2, 2))
 REST = torch.as_tensor(MESH.vertices)

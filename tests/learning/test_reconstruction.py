@@ -6,10 +6,10 @@ import scipy.optimize
 import torch
 
 from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, box_hexahedra, select_vertices
-from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.learning.reconstruction import make_reconstructor
 from warp_resphys.learning.rollout import Rollout, closed_loop
+from warp_resphys.stepping.inputs import Inputs
 
 INTEGRATORS = ("implicit_euler", "bdf2", "midpoint")
 H = 0.01

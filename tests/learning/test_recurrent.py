@@ -3,11 +3,11 @@
 import pytest
 import torch
 
-from warp_resphys.dynamics.integrator import State
 from warp_resphys.io.errors import InputError
 from warp_resphys.learning.networks import ResidualForce, build_model, restore
 from warp_resphys.learning.predictors import LearnedPredictor
 from warp_resphys.learning.training import Samples, SequenceTrainer
+from warp_resphys.stepping.state import State
 
 NETWORK = {
     "kind": "reduced",

@@ -9,7 +9,6 @@ from measured_run import configuration
 
 from warp_resphys import Body, Corotated, Simulator, box_hexahedra, select_vertices
 from warp_resphys.data.trials import Trials
-from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.dynamics.nonlinear_solver import SolverSettings
 from warp_resphys.experiment.checks import check_configuration
 from warp_resphys.experiment.schema import check, refinement_group
@@ -17,6 +16,7 @@ from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.networks import build_model
 from warp_resphys.learning.refinement import Motion, SolverInTheLoop, WindowLoss, Windows
+from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.studies.gradient_check import central_difference
 
 MESH = box_hexahedra((0.06, 0.02, 0.02), (3, 1, 1))

@@ -9,14 +9,14 @@ import torch
 from warp_resphys import Body, Corotated, PointMass, Simulator, Tendons
 from warp_resphys.data.markers import bind_markers
 from warp_resphys.data.trials import Trials
-from warp_resphys.dynamics.inputs import Inputs
-from warp_resphys.dynamics.integrator import State
 from warp_resphys.dynamics.modes import vibration_modes
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.learning.parameters import configured_parameters, first_guesses, tilted_gravity
 from warp_resphys.learning.release import ReleaseSettings, estimate_release, hold, sideways_shapes, velocity_shapes
 from warp_resphys.learning.replay import Replay, Start, sample
 from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
+from warp_resphys.stepping.inputs import Inputs
+from warp_resphys.stepping.state import State
 
 MESH = box_hexahedra(divisions=(4, 1, 1))
 TIP = select_vertices(MESH, x=0.1)

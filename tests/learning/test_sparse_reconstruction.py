@@ -7,10 +7,10 @@ import torch
 
 from warp_resphys import Body, Corotated, Simulator, State, box_hexahedra, select_vertices
 from warp_resphys.data.markers import KINDS, MarkerMap, bind_markers
-from warp_resphys.dynamics.inputs import Inputs
 from warp_resphys.dynamics.modes import vibration_modes
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.learning.reconstruction import make_reconstructor
+from warp_resphys.stepping.inputs import Inputs
 
 MESH = box_hexahedra((0.06, 0.03, 0.03), (2, 1, 1))
 BODY = Body(MESH, fixed=select_vertices(MESH, x=0.0))

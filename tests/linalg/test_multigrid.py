@@ -5,8 +5,6 @@ import pytest
 import torch
 
 from warp_resphys.dynamics.assembly import HessianAssembly
-from warp_resphys.dynamics.inputs import Inputs
-from warp_resphys.dynamics.integrator import State
 from warp_resphys.dynamics.nonlinear_solver import SolverSettings
 from warp_resphys.dynamics.simulator import Simulator
 from warp_resphys.energies.materials import make_material
@@ -15,6 +13,8 @@ from warp_resphys.linalg import multigrid
 from warp_resphys.linalg.conjugate_gradients import conjugate_gradients
 from warp_resphys.linalg.multigrid import MultigridSolver
 from warp_resphys.mesh.mesh import box_hexahedra, box_tetrahedra, select_vertices
+from warp_resphys.stepping.inputs import Inputs
+from warp_resphys.stepping.state import State
 
 SIZE = (0.1, 0.03, 0.03)
 pytestmark = pytest.mark.numerics

@@ -10,13 +10,13 @@ import torch
 from numpy.typing import NDArray
 
 from ..data.rigid import RigidTransform, kabsch
-from ..dynamics.inputs import Inputs
 from ..experiment.build import bound_markers
 from ..experiment.files import REGISTRATION
 from ..experiment.simulate import laboratory_simulator, make_setup, substeps_of
 from ..io.errors import InputError
 from ..io.files import read_json
 from ..mesh.mesh import boundary_triangles
+from ..stepping.inputs import Inputs
 
 FloatArray = NDArray[np.float64]
 

@@ -9,11 +9,11 @@ import torch
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-from ..dynamics.integrator import State
 from ..io.errors import ConvergenceError
 from ..learning.networks import Coder
 from ..robot.robot import Robot
 from ..robot.state import RobotState
+from ..stepping.state import State
 from .polynomials import Polynomial, solve_ridge
 from .reduced import STATIC_ORDER, TANGENT_ORDER, USUAL_ORDER, ReducedModel, ReducedState
 from .reduced_force import ReducedForce

@@ -11,12 +11,12 @@ import torch
 from numpy.typing import NDArray
 
 from ..data.actuation import InputSequences
-from ..dynamics.integrator import State
 from ..experiment.models import Learned
 from ..io.errors import InputError
 from ..robot.inputs import RobotInput
 from ..robot.robot import Robot
 from ..robot.state import RobotState
+from ..stepping.state import State
 from .input_response import InputResponse
 
 FloatArray = NDArray[np.float64]

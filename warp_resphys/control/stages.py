@@ -9,7 +9,6 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
-from ..dynamics.integrator import State
 from ..experiment.files import CONTROL, DATASET, DRIVEN, FEEDBACK, LINEAR, OPEN, RECEDING, Dataset, read_dataset
 from ..experiment.parts import March, Part, read_parts, remove_parts, split_into_parts, work_on
 from ..io.errors import InputError
@@ -21,6 +20,7 @@ from ..io.stages import StageContext
 from ..robot.export import Track, input_columns, write_csv
 from ..robot.loading import load
 from ..robot.robot import Robot
+from ..stepping.state import State
 from .baselines import JacobianFeedback, fit_linear
 from .controllers import (
     Controller,

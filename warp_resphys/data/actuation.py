@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..energies.base import Quantity
 from ..io.errors import DataFileError, InputError
+from ..stepping.quantity import Quantity
 
 FloatArray = NDArray[np.float64]
 

@@ -4,8 +4,8 @@ from dataclasses import dataclass, field, replace
 
 import torch
 
-from ..dynamics.inputs import Inputs
 from ..io.errors import InputError
+from ..stepping.inputs import Inputs
 
 
 @dataclass(frozen=True)

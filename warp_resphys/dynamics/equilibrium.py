@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 from torch.autograd import forward_ad
 from typing_extensions import override
 
-from ..energies.base import Energy
+from ..energies.placed import Placed
 from ..energies.potential import IncrementalPotential, StepTerms
-from ..fem.elements import Points
 from ..io.errors import ConvergenceError
 from ..linalg.choice import make_linear_solver
 from ..linalg.linear_solver import LinearSolver
@@ -32,7 +31,7 @@ class Workspace:
     """Buffers, launches and factors for one batch size of a body.
 
     Args:
-        energies: of the body, the solid's first, each with its sets of points.
+        energies: of the body.
         n_vertices: N.
         fixed: (D,) fixed vertices.
         pattern: block structure of the Hessian.
@@ -46,7 +45,7 @@ class Workspace:
 
     def __init__(
         self,
-        energies: Sequence[tuple[Energy, Sequence[Points]]],
+        energies: Sequence[Placed],
         n_vertices: int,
         fixed: NDArray[np.int64],
         pattern: BlockPattern,
@@ -135,8 +134,9 @@ def equilibrium(
     Raises:
         ConvergenceError: see `nonlinear_solver.SolverSettings.on_failure`.
     """
-    names, main = tuple(terms.values), (terms.target, terms.inertia, terms.force)
-    tensors = (start, fixed_positions, *main, *terms.values.values())
+    values = {name: terms.values[name] for name in workspace.potential.terms.values}
+    names, main = tuple(values), (terms.target, terms.inertia, terms.force)
+    tensors = (start, fixed_positions, *main, *values.values())
     # What differentiates forward is to be told that it cannot.
     graded = torch.is_grad_enabled() and any(each is not None and each.requires_grad for each in tensors[1:])
     if graded or forward_ad._current_level >= 0:

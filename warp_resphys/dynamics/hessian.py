@@ -143,9 +143,10 @@ class ProjectiveHessian(HessianApproximation):
         return torch.as_tensor(products, device=self._potential.device, dtype=torch.float64)
 
     def _terms(self) -> tuple[torch.Tensor, ...]:
-        t = self._potential.terms
-        curvatures = ((term.curvature(t.values), term.sets) for term in self._potential.energies)
-        return t.inertia, *(values[:, s.own] for values, sets in curvatures for s in sets)
+        p = self._potential
+        pairs = zip(p.energies, p.own_values, strict=True)
+        curvatures = ((term.curvature(values), term.sets) for term, values in pairs)
+        return p.terms.inertia, *(values[:, s.own] for values, sets in curvatures for s in sets)
 
     @override
     def ready(self) -> bool:

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from ..energies.potential import StepTerms
 from ..linalg.linear_solver import Factor
 from ..linalg.sparse import SparseSolver
+from ..stepping.state import ImplicitStage, State
 from .assembly import HessianAssembly
 from .equilibrium import Workspace
-from .integrator import ImplicitStage, State
 
 
 class Linearisation:

@@ -100,9 +100,7 @@ class Minimiser:
         positions, gradient = warp_view(p.positions, wp.vec3d), warp_view(self._gradient, wp.vec3d)
         direction, origin_view = warp_view(self._direction, wp.vec3d), warp_view(origin, wp.vec3d)
         right, vertex_at = warp_view(self._right, vector), p.upload(hessian.vertex_at.astype(np.int32), int)
-        stiffness = p.terms.values["stiffness"]
-        assert stiffness is not None
-        loads = [warp_view(p.terms.force, wp.vec3d), warp_view(stiffness, wp.float64)]
+        loads = [warp_view(p.terms.force, wp.vec3d), warp_view(p.stiffness, wp.float64)]
         beginning = [*loads, positions, tolerances, origin_view, progress, history]
         begin = p.record_blocks(kernels.begin, b, beginning, [])
         self._idle, self._clamp = (torch.zeros(b, device=p.device, dtype=torch.bool) for _ in range(2))

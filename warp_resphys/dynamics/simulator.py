@@ -10,28 +10,25 @@ from typing import Any, cast
 import numpy as np
 import torch
 
-from ..energies.base import Energy, Quantity
+from ..energies.base import Energy
 from ..energies.explicit import HeldEnergy
-from ..energies.materials import PRONY_RATIO, PRONY_TIME, Corotated, Material
-from ..energies.medium import FacePoints, Medium
+from ..energies.materials import Corotated, Material
+from ..energies.placed import Placed
 from ..energies.potential import StepTerms
-from ..energies.solid import Solid, device_matrix, spread
-from ..energies.strings import Strings
+from ..energies.solid import Solid
 from ..fem.body import Body
-from ..fem.elements import Points
 from ..io.errors import ConvergenceError, InputError
 from ..linalg.threads import shards_of
+from ..stepping.constants import Constants
+from ..stepping.inputs import Inputs, check_tensor
+from ..stepping.integrators import make_integrator
+from ..stepping.quantity import Quantity
+from ..stepping.state import ImplicitStage, State
 from .assembly import BlockPattern
-from .constants import Constants
+from .energy_set import EnergySet
 from .equilibrium import Workspace, equilibrium, ramped
-from .hanging import HangingWeights
-from .inputs import Inputs, check_tensor
-from .integrator import ImplicitStage, State, make_integrator
 from .linearisation import Linearisation
 from .nonlinear_solver import SolveReport, SolverSettings
-from .step_parts import StepPart
-from .surrounding import Surrounding
-from .viscosity import check_overstrain, relaxed, viscous_values, without_viscosity
 
 log = logging.getLogger(__name__)
 
@@ -139,48 +136,31 @@ class Simulator:
         body = self.body
         self.rest_positions = self.tensor(body.mesh.vertices)  # (N, 3) [m]
         self.fixed = torch.as_tensor(body.fixed_vertices, device=self.device)
-        solid = Solid(body.discretisation, self.material, self.device, self.dtype)
-        self._energies: list[tuple[Energy, Any]] = [(solid, solid.points(body.mesh))]
-        own_energies = cast(Sequence[Energy], body.energies)
-        self._energies += list(zip(own_energies, body.energy_points, strict=True))
+        placed = [*self._solids(), *map(Placed, cast(Sequence[Energy], body.energies), body.energy_points)]
+        self._set = EnergySet(placed, body, self.rest_positions, self.method, self.time_step)
+        own = self._set
         self._pattern = BlockPattern(
-            body.mesh.vertices, body.fixed_vertices, [points for _, sets in self._energies for points in sets]
+            body.mesh.vertices, body.fixed_vertices, [points for each in placed for points in each.points]
         )
-        own = [quantity for energy in body.energies for quantity in energy.parameters]
-        self.parameters: dict[str, Quantity] = {**self.material.quantities, **{each.name: each for each in own}}
-        self.parameters["gravity"] = _GRAVITY
-        self.inputs: dict[str, Quantity] = {each.name: each for energy in body.energies for each in energy.inputs}
-        self.constants: dict[str, Any] = {**self.material.constants, "gravity": [list(self.gravity)]}
-        self.counts = dict.fromkeys(self.material.quantities, len(body.mesh.cells)) | {"gravity": 3}
-        self.parts: dict[str, tuple[str, ...]] = {}
-        for energy in own_energies:
-            self.constants |= energy.constants
-            self.counts |= {each.name: energy.count for each in (*energy.parameters, *energy.inputs)}
-            self.parts |= dict.fromkeys([each.name for each in energy.parameters], energy.names)
-        bound = [type(each).__name__.lower() for each in own_energies if each.implicit_only]
-        if self.coupling == "explicit" and bound:
-            raise InputError(f"coupling is explicit, but {bound[0]} act at the end of a step alone: choose implicit.")
-        self._strings = next((each for each in own_energies if isinstance(each, Strings)), None)
+        self.parameters: dict[str, Quantity] = {**own.parameters, "gravity": _GRAVITY}
+        self.constants: dict[str, Any] = {**own.constants, "gravity": [list(self.gravity)]}
+        self.counts = {**own.counts, "gravity": 3}
+        self.inputs, self.parts = own.inputs, own.parts
+        followers = [q.name for each in placed if each.energy.implicit_only for q in each.energy.inputs]
+        if self.coupling == "explicit" and followers:
+            raise InputError(
+                f"coupling is explicit, but {followers[0]} is a follower load, which acts at the end of a step: choose "
+                "implicit."
+            )
         self._workspaces: dict[int, Workspace] = {}
         self._held: dict[tuple[int, str], HeldEnergy] = {}
-        self._mass_volume = device_matrix(body.mass_volume, self.device, self.dtype)
-        self._load_volume = device_matrix(body.load_volume, self.device, self.dtype)
         self._attached_mass = self.tensor(body.attached_mass)
-        parts = (self._step_part(*pair) for pair in zip(own_energies, body.energy_points, strict=True))
-        self._step_parts = [part for part in parts if part is not None]
         self._built = True
 
-    def _step_part(self, energy: Energy, points: Sequence[Points]) -> StepPart | None:
-        """What an energy does over steps, if it depends on where these start."""
-        if isinstance(energy, Strings):
-            shares = self.tensor(energy.shares(self.body.n_vertices))
-            return HangingWeights(energy, shares, self.method, self.time_step)
-        if isinstance(energy, Medium):
-            (faces,) = points
-            assert isinstance(faces, FacePoints)
-            volume = self._load_volume.sum(1).to_dense() if energy.buoyancy else None
-            return Surrounding.of(faces, volume, self.rest_positions)
-        return None
+    def _solids(self) -> list[Placed]:
+        """Returns the solid of the body, or of each of its regions that has a material of its own."""
+        solid = Solid(self.body.discretisation, self.material)
+        return [Placed(solid, solid.points(self.body.mesh))]
 
     def __setattr__(self, name: str, value: object) -> None:
         """Refuses changes: what was uploaded would not follow them.
@@ -215,26 +195,14 @@ class Simulator:
             self.parameters[name].check(value)
         given = {**self.constants, **(parameters or {})}
         tensors = {name: self.parameters[name].shaped(self.tensor(value)) for name, value in given.items()}
-        values = {name: v for energy, _ in self._energies for name, v in energy.prepare(tensors).items()}
-        density, damping = tensors["density"], tensors["stiffness_damping"][:, 0]
-        ratio, time = (self._branches(tensors, quantity) for quantity in (PRONY_RATIO, PRONY_TIME))
+        values, mass = self._set.prepare(tensors)
         return Constants(
-            mass=spread(self._mass_volume, density) + self._attached_mass,
-            load_mass=spread(self._load_volume, density) + self._attached_mass,
+            mass=mass.inertia + self._attached_mass,
+            load_mass=mass.weight + self._attached_mass,
             gravity=tensors["gravity"],
-            mass_damping=tensors["mass_damping"],
-            stiffness_damping=damping,
-            damped=bool((damping > 0).any()) or damping.requires_grad,
-            prony_ratio=ratio,
-            prony_time=time,
-            relaxes=bool((ratio > 0).any()) or ratio.requires_grad,
+            mass_damping=mass.damping,
             values=values,
         )
-
-    def _branches(self, tensors: Mapping[str, torch.Tensor], quantity: Quantity) -> torch.Tensor:
-        """(1 or B, K) a constant of the material's Prony branches."""
-        found = [tensors[f"{quantity.name}_{k + 1}"] for k in range(len(self.material.prony))]
-        return torch.cat(torch.broadcast_tensors(*found), 1) if found else self.rest_positions.new_zeros(1, 0)
 
     def workspace(self, batch: int) -> Workspace:
         """Buffers for a batch size, made at their first use."""
@@ -247,7 +215,7 @@ class Simulator:
 
     def _make_workspace(self, batch: int) -> Workspace:
         n, fixed = self.body.n_vertices, self.body.fixed_vertices
-        return Workspace(self._energies, n, fixed, self._pattern, batch, torch.device(self.device), self.dtype)
+        return Workspace(self._set.placed, n, fixed, self._pattern, batch, torch.device(self.device), self.dtype)
 
     def held_energy(self, name: str, batch: int) -> HeldEnergy:
         """The energy with an input of that name, by itself in a given state.
@@ -256,14 +224,15 @@ class Simulator:
             InputError: no energy of the body has that input.
         """
         if (batch, name) not in self._held:
-            found = [e for e, _ in self._energies for quantity in e.inputs if quantity.name == name]
-            if not found:
+            acting = [each for each in self._set.placed if name in each.named({q.name: q for q in each.energy.inputs})]
+            if not acting:
                 known = ", ".join(self.inputs) or "none"
-                raise InputError(f"no energy of the body has the input {name}: they have {known}.")
-            if found[0].implicit_only:
-                raise InputError(f"{name} acts through the body as it is at the end of a step: it cannot be held.")
+                raise InputError(f"Unknown input {name}. The energies of this body accept {known}.")
+            energy = acting[0].energy
+            if energy.implicit_only:
+                raise InputError(f"{name} is a follower load, so it cannot be held constant over a step.")
             device = torch.device(self.device)
-            self._held[batch, name] = HeldEnergy(self.body, found[0], batch, device)
+            self._held[batch, name] = HeldEnergy(self.body, energy, batch, device)
         return self._held[batch, name]
 
     def rest_state(self, batch: int = 1) -> State:
@@ -323,10 +292,8 @@ class Simulator:
     ) -> State:
         """The state that the stage's solution leads to."""
         new = self.method.finish(state, x, self.time_step)
-        for part in self._step_parts:
-            new = replace(new, **part.after(state, stage, inputs, constants, x))
-        if constants.relaxes:
-            new = replace(new, overstrain=self.relaxed(constants, state, new.q))
+        memory = self._end_step(state, stage, inputs, constants, x, new.q)
+        new = replace(new, memory=memory)
         if stage.end == 1.0 or not len(self.fixed):
             return new
         # A prescribed motion has a velocity of its own; extrapolated from mid-step it would ring.
@@ -334,9 +301,24 @@ class Simulator:
         moved = torch.zeros_like(now) if inputs.fixed_positions is None else inputs.fixed_positions - now
         return replace(new, v=new.v.index_copy(1, self.fixed, moved / self.time_step))
 
-    def relaxed(self, constants: Constants, state: State, q: torch.Tensor) -> torch.Tensor:
-        """(B, K, P, 3, 3) strains of the Prony branches where a step leads from a state to positions q (B, N, 3)."""
-        return relaxed(self.workspace(state.batch).potential.solid, constants, state, q, self.time_step)
+    def _end_step(
+        self, state: State, stage: ImplicitStage, inputs: Inputs, constants: Constants, x: torch.Tensor, q: torch.Tensor
+    ) -> dict[str, torch.Tensor]:
+        """Returns what the energies remember after a step with the solution x that leads to positions q."""
+        terms = self.workspace(state.batch).potential.energies
+        return self._set.end_step(state, stage, inputs, constants, terms, x, q)
+
+    def remember(self, state: State, q: torch.Tensor, constants: Constants) -> State:
+        """Returns the state at positions that are known, with what the energies remember of a step to them.
+
+        Args:
+            state: where the step starts.
+            q: (B, N, 3) positions where it ends [m].
+            constants: from `prepare`.
+        """
+        stage = self.method.stage(state, self.time_step)
+        x = self.method.solution_for(state, q)
+        return State(q, state.v, memory=self._end_step(state, stage, _NOTHING, constants, x, q))
 
     def linearise(
         self, state: State, inputs: Inputs | None = None, parameters: Parameters | Constants | None = None
@@ -367,21 +349,21 @@ class Simulator:
     def _terms(self, state: State, stage: ImplicitStage, inputs: Inputs, constants: Constants) -> StepTerms:
         """The incremental potential of a step, differentiable in everything that it depends on."""
         batch, h = state.batch, stage.step
-        solid = self.workspace(batch).potential.solid
         # Mass damping is linear in x: it joins inertia and moves the target.
         damping = constants.mass_damping[..., None] * h  # (1 or B, 1, 1)
         mass, force = constants.mass, self._loads(inputs, constants, batch)
         if inputs.attached_mass is not None:
             mass = mass + inputs.attached_mass
-        viscous = viscous_values(solid, constants, state, stage, self.time_step)
-        values = self._values(constants, inputs, batch, viscous)
-        for part in self._step_parts:
-            values |= part.values(state, stage, inputs, constants)
+        energies = self.workspace(batch).potential.energies
+        values = self._set.acting(constants, inputs, batch)
+        values |= self._set.begin_step(state, stage, inputs, constants, energies)
         if self.coupling == "explicit":
-            for energy, _ in self._energies:
-                for quantity in energy.inputs if energy.is_load else ():
-                    force = force + self.held_energy(quantity.name, batch).force(state.q, values[quantity.name])
-                    values[quantity.name] = torch.zeros_like(values[quantity.name])
+            loads = [each for each in self._set.placed if each.energy.is_load]
+            for name in (name for each in loads for name in each.named({q.name: q for q in each.energy.inputs})):
+                value = values[name]
+                assert value is not None
+                force = force + self.held_energy(name, batch).force(state.q, value)
+                values[name] = torch.zeros_like(value)
         return StepTerms(
             target=(stage.target + damping * stage.velocity_reference) / (1.0 + damping),
             inertia=(mass / h**2 * (1.0 + damping[..., 0])).expand(batch, -1),
@@ -389,25 +371,16 @@ class Simulator:
             values=values,
         )
 
-    def _values(
-        self, constants: Constants, inputs: Inputs, batch: int, viscous: Mapping[str, torch.Tensor | None]
-    ) -> dict[str, Any]:
-        """What the energies' terms need in a step."""
-        values: dict[str, Any] = {**constants.values, **viscous}
-        for energy, _ in self._energies:
-            for quantity in energy.inputs:
-                given = inputs.actuation.get(quantity.name)
-                values[quantity.name] = self.rest_positions.new_zeros(batch, energy.count) if given is None else given
-        return values
-
     def _loads(self, inputs: Inputs, constants: Constants, batch: int, static: bool = False) -> torch.Tensor:
         """(1 or B, N, 3) gravity, external force and what parts add in equilibria or in steps [N]."""
         mass = constants.load_mass
         if inputs.attached_mass is not None:
             mass = mass + inputs.attached_mass
         weight = mass[..., None] * constants.gravity[:, None]
-        for load in (inputs.external_force, *(p.load(inputs, constants, batch, static) for p in self._step_parts)):
-            weight = weight if load is None else weight + load
+        if inputs.external_force is not None:
+            weight = weight + inputs.external_force
+        for load in self._set.loads(constants, inputs, batch, static):
+            weight = weight + load
         return weight
 
     def static_equilibrium(
@@ -468,16 +441,16 @@ class Simulator:
     ) -> tuple[torch.Tensor, SolveReport]:
         """(B, N, 3) the equilibrium under a share of all loads, inputs and motion of the clamp [m]."""
         batch = len(rest)
-        still = without_viscosity(batch, self.rest_positions)
-        values = self._values(constants, inputs, batch, still)
-        for part in self._step_parts:
-            values |= part.still(batch)
-        driven = {quantity.name: share * values[quantity.name] for e, _ in self._energies for quantity in e.inputs}
+        values = self._set.acting(constants, inputs, batch)
+        for name in self.inputs:
+            value = values[name]
+            values[name] = None if value is None else share * value
+        values |= self._set.at_rest(batch)
         terms = StepTerms(
             target=rest,
             inertia=self.rest_positions.new_zeros(batch, self.body.n_vertices),
             force=share * self._loads(inputs, constants, batch, static=True).expand(batch, -1, -1),
-            values={**values, **driven},
+            values=values,
         )
         workspace, clamp = self.workspace(batch), rest[:, self.fixed]
         most = min(self.settings.max_iterations, _MOST_ITERATIONS)
@@ -534,21 +507,13 @@ class Simulator:
             fields |= {f"state.previous[{i}]": each for i, each in enumerate(state.previous)}
         for unit, (name, values) in zip(itertools.cycle(("m", "m/s")), fields.items(), strict=False):
             check_tensor(name, values, (batch, n, 3), unit, "vertex", like)
-        if state.payload is not None:
-            if self._strings is None:
-                raise InputError("the state has a payload, but the body has no strings: leave it out.")
-            shape = (batch, self._strings.count, 3)
-            for name, unit in (("q", "m"), ("v", "m/s")):
-                check_tensor(f"state.payload.{name}", getattr(state.payload, name), shape, unit, "string", like)
         self._check_inputs(inputs, batch)
         constants.check_batch(batch)
-        if state.overstrain is not None:
-            solid = self.workspace(batch).potential.solid
-            check_overstrain(state.overstrain, (batch, len(self.material.prony), solid.n_points, 3, 3), like)
+        self._set.check_memory(state.memory, batch, like)
 
     def _check_inputs(self, inputs: Inputs, batch: int) -> None:
         """One sentence on the first input that cannot be simulated."""
         if not isinstance(inputs, Inputs):
             raise InputError(f"the inputs are a {type(inputs).__name__}: give Inputs(external_force=...), say.")
-        energies, counts = [energy for energy, _ in self._energies], (self.body.n_vertices, len(self.fixed))
-        inputs.check(energies, batch, *counts, self.rest_positions)
+        accepted = {name: (quantity, self.counts[name]) for name, quantity in self.inputs.items()}
+        inputs.check(accepted, batch, self.body.n_vertices, len(self.fixed), self.rest_positions)

@@ -21,8 +21,8 @@ import torch
 import warp as wp
 
 from ..io.errors import InputError
-from .inputs import Inputs
-from .integrator import State
+from ..stepping.inputs import Inputs
+from ..stepping.state import State
 from .nonlinear_solver import SolveReport
 from .simulator import Simulator
 

@@ -1,9 +1,16 @@
-"""What an energy is: its points, the quantities that it depends on, its kernels and their derivatives.
+"""The contract of an energy: its points, parameters, inputs and memory, its kernels and their derivatives.
 
-An `Energy` is constant and lives on the host, as a part of a `fem.body.Body`. It says which parameters it has
-(constants that may be identified) and which inputs (what acts through it over time), and makes a `Term` of a batch:
-kernels on its points, and their arguments. Solver, adjoint, tape, gradient check, identification and configuration
-ask it, and know no energy by name.
+=================  =========  ===============================================================================
+class              lives      what it does
+=================  =========  ===============================================================================
+`Energy`           host       declares parameters (constants that may be identified) and inputs (what acts
+                              through it over time), and makes the other two
+`BoundEnergy`      simulator  turns parameters into values, begins and ends a step, declares its memory
+`Term`             batch      kernels on the points, and their arguments
+=================  =========  ===============================================================================
+
+Simulator, solver, adjoint, tape, gradient check, identification and configuration know this contract and no energy by
+name.
 """
 
 from abc import ABC, abstractmethod
@@ -16,87 +23,73 @@ import torch
 import warp as wp
 from numpy.typing import NDArray
 
+from ..fem.body import Body
 from ..fem.elements import Points
 from ..io.errors import InputError
 from ..mesh.mesh import Mesh
+from ..stepping.constants import Constants, Mass
+from ..stepping.inputs import Inputs, check_tensor
+from ..stepping.integrators import Integrator
+from ..stepping.quantity import Parameter, Quantity
+from ..stepping.state import ImplicitStage, State
 from .launcher import Launcher, warp_view
 
-Parameter = float | Sequence[float] | NDArray[np.float64] | torch.Tensor
 Values = Mapping[str, torch.Tensor | None]
 
 
 @dataclass(frozen=True)
-class Quantity:
-    """A number that a simulation depends on."""
+class Memory:
+    """A tensor that an energy carries from one step to the next, in `State.memory`."""
 
-    name: str  # by which parameters and inputs are given
-    unit: str  # of its values
-    lower: float = -np.inf  # all values are greater
-    upper: float = np.inf  # all values are less
-    closed: bool = False  # whether `lower` itself is allowed
-    # what there may be a value each of, such as ``element`` or ``chamber``; without it, only environments
-    per: str = ""
-    typical: float = 1.0  # about how large it is: an input, or a parameter that may be anything
-    words: str = ""  # what an input is called in a sentence, and
-    shown_unit: str = ""  # the unit in which people read it,
-    shown_factor: float = 1.0  # of which this many make one of `unit`
+    name: str
+    unit: str
+    shape: tuple[int, ...]  # without the environments
+    per: str  # what its first axis counts, such as ``string``
 
-    def shown(self, value: float) -> str:
-        """A value as people read it."""
-        return f"{self.shown_factor * value:.4g} {self.shown_unit}"
+    def check(self, values: Any, batch: int, like: torch.Tensor) -> None:
+        """Refuses values of another shape, type or device, or that are not finite.
 
-    @property
-    def plural(self) -> str:
-        """What several of it are called."""
-        return f"{self.words}{'es' if self.words.endswith('s') else 's'}"
-
-    @property
-    def wanted(self) -> str:
-        """Its range in words."""
-        unit = f", in {self.unit}" if self.unit else ""
-        if self.lower == 0.0 and np.isinf(self.upper):
-            return ("zero or more" if self.closed else "positive") + unit
-        ends = [f"greater than {self.lower:g}"] if np.isfinite(self.lower) else []
-        ends += [f"less than {self.upper:g}"] if np.isfinite(self.upper) else []
-        return (" and ".join(ends) or "finite") + unit
-
-    def varied(self, value: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
-        """A value within the range for every x, and the given one for zero.
-
-        At first it changes by a factor exp(x), or by x times its size or `typical` where it may be anything.
-        """
-        if np.isfinite(self.lower) and np.isfinite(self.upper):
-            width = self.upper - self.lower
-            return self.lower + width * torch.sigmoid(torch.logit((value - self.lower) / width) + x)
-        if np.isfinite(self.lower):
-            return self.lower + (value - self.lower) * torch.exp(x)
-        return value + value.abs().amax().clamp_min(self.typical) * x
-
-    def check(self, value: Any) -> None:
-        """Refuses a value out of range.
+        Args:
+            values: of the memory.
+            batch: environments B.
+            like: a tensor on the device and of the type of the simulator.
 
         Raises:
-            InputError: it is no number or array of numbers, or one of them is out of range.
+            InputError: in one sentence that names the memory.
         """
-        try:
-            values = torch.as_tensor(value, dtype=torch.float64).detach().cpu()
-        except (TypeError, ValueError, RuntimeError):
-            raise InputError(f"{self.name} is {value!r}: it must be a number, {self.wanted}.") from None
-        inside = (values >= self.lower if self.closed else values > self.lower) & (values < self.upper)
-        inside &= torch.isfinite(values)
-        if values.numel() == 0 or values.ndim > 2:
+        shape = (batch, *self.shape)
+        if isinstance(values, torch.Tensor) and tuple(values.shape) != shape:
             raise InputError(
-                f"{self.name} has shape {tuple(values.shape)}: give a number, (M,), (B, 1) or (B, M) values."
+                f"state.memory[{self.name!r}] has shape {tuple(values.shape)}: it must be {shape} (environments, "
+                f"{self.per}s, ...); take the state from a simulator of this body, or leave the memory out."
             )
-        if not bool(inside.all()):
-            wrong = values[~inside].flatten()[0].item()
-            raise InputError(f"{self.name} is {wrong:g}: it must be {self.wanted}.")
+        check_tensor(f"state.memory[{self.name!r}]", values, shape, self.unit, self.per, like)
 
-    def shaped(self, values: torch.Tensor) -> torch.Tensor:
-        """A number, (n,), (B, 1) or (B, n) values as (1 or B, 1 or n); keeps the autograd graph."""
-        if not self.per:
-            return values.reshape(-1, 1)
-        return values.reshape(1, -1) if values.ndim < 2 else values
+
+@dataclass(frozen=True)
+class Placement:
+    """What an energy needs of the simulator that it is bound to."""
+
+    body: Body
+    points: tuple[Points, ...]  # of the energy
+    rest_positions: torch.Tensor  # (N, 3) [m], on the simulator's device and of its type
+    method: Integrator
+    time_step: float  # h [s]
+
+    def tensor(self, values: Any) -> torch.Tensor:
+        """Returns values on the simulator's device, in its type."""
+        return torch.as_tensor(values, device=self.rest_positions.device, dtype=self.rest_positions.dtype)
+
+
+@dataclass(frozen=True)
+class Step:
+    """One time step, as an energy sees it."""
+
+    state: State  # where it starts
+    stage: ImplicitStage  # the implicit solve that the integrator makes of it
+    inputs: Inputs
+    constants: Constants
+    term: "Term"  # of the energy and the state's batch
 
 
 class PointSet:
@@ -167,11 +160,15 @@ class Energy(ABC):
 
     @abstractmethod
     def points(self, mesh: Mesh) -> tuple[Points, ...]:
-        """Its sets of points on a body's rest shape."""
+        """Returns the energy's sets of points on a body's rest shape."""
 
     @abstractmethod
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "Term":
-        """Its kernels for a batch."""
+        """Returns the energy's kernels for a batch."""
+
+    def bind(self, placement: Placement) -> "BoundEnergy":
+        """Returns the energy on a simulator's device; an energy that depends on where a step starts has its own."""
+        return BoundEnergy(self, placement)
 
     def prepare(self, constants: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         """What its terms need of the constants, computed once a roll-out.
@@ -198,6 +195,65 @@ class Energy(ABC):
         return values.expand(-1, self.count)
 
 
+class BoundEnergy:
+    """An energy over the steps of a simulator. This one has no memory, and acts by its parameters and inputs alone.
+
+    Args:
+        energy: that it is of.
+        placement: in the simulator.
+
+    Attributes:
+        memory: what it carries from step to step.
+    """
+
+    memory: tuple[Memory, ...] = ()
+
+    def __init__(self, energy: Energy, placement: Placement) -> None:
+        self.energy, self.placement = energy, placement
+
+    def prepare(self, parameters: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor | None]:
+        """Returns the values that follow from the parameters, computed once a roll-out; see `Energy.prepare`."""
+        return dict(self.energy.prepare(parameters))
+
+    def mass(self, parameters: Mapping[str, torch.Tensor]) -> Mass | None:
+        """Returns the mass that the energy's matter has, if it has any."""
+        del parameters
+        return None
+
+    def begin_step(self, step: Step) -> dict[str, torch.Tensor | None]:
+        """Returns the values of the energy's term that depend on the step."""
+        del step
+        return {}
+
+    def at_rest(self, batch: int) -> dict[str, torch.Tensor | None]:
+        """Returns those values for an equilibrium, where nothing moves."""
+        del batch
+        return {}
+
+    def load(self, inputs: Inputs, constants: Constants, batch: int, static: bool) -> torch.Tensor | None:
+        """Returns a force (1 or B, N, 3) that does not depend on where the body is [N].
+
+        Args:
+            inputs: of the step.
+            constants: of the roll-out.
+            batch: environments B.
+            static: whether it is for an equilibrium, not for a step.
+        """
+        del inputs, constants, batch, static
+        return None
+
+    def end_step(self, step: Step, x: torch.Tensor, q: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Returns the memory (B, ...) after a step, by name.
+
+        Args:
+            step: that ends.
+            x: (B, N, 3) solution of its implicit stage [m].
+            q: (B, N, 3) positions that it leads to [m].
+        """
+        del step, x, q
+        return {}
+
+
 class Term(ABC):
     """An energy's kernels on the points of a batch.
 
@@ -221,6 +277,11 @@ class Term(ABC):
     @abstractmethod
     def shapes(self) -> Mapping[str, tuple[int, ...]]:
         """Shape, without the batch, of every value that a step has for it."""
+
+    def total_stiffness(self, values: Values) -> torch.Tensor | None:
+        """Returns the sum (B,) of a solid's moduli times volumes [J], by which rounding of its energy is judged."""
+        del values
+        return None
 
     def before(self, values: Values, positions: Any) -> list[Any]:
         """Launches that the kernels of `step` and `tangent` need to have been made at the positions."""

@@ -19,7 +19,8 @@ from ..io.errors import InputError, MeshError
 from ..kernels import fibres as kernels
 from ..mesh.chambers import Chamber
 from ..mesh.mesh import Mesh
-from .base import Energy, Parameter, PointSet, Quantity, Values, ValueTerm
+from ..stepping.quantity import Parameter, Quantity
+from .base import Energy, PointSet, Values, ValueTerm
 from .launcher import Launcher, warp_view
 
 _CAP = 0.7  # cosine between a face's normal and the chamber's axis from which on the face is an end, without fibres

@@ -25,7 +25,7 @@ from typing_extensions import override
 
 from ..io.errors import InputError
 from ..kernels.materials import corotated, mooney_rivlin, stable_neo_hookean
-from .base import Parameter, Quantity
+from ..stepping.quantity import Parameter, Quantity
 
 
 def constant(default: float, name: str, unit: str, lower: float = 0.0, **more: Any) -> Any:
@@ -60,7 +60,7 @@ class Material(ABC):
     # Kelvin-Voigt viscosity of retardation time beta [s]; for small strains the force -beta K v
     stiffness_damping: Parameter = constant(0.0, "stiffness_damping", "s", closed=True, per="", common=True)
     # generalised Maxwell (Prony) branches, each of the ratio of its shear modulus to mu, which is what is left after a
-    # long time, and its relaxation time [s]; see `dynamics.viscosity`
+    # long time, and its relaxation time [s]; see `energies.viscosity`
     prony: Sequence[tuple[Parameter, Parameter]] = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:

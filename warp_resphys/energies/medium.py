@@ -25,7 +25,10 @@ from ..io.errors import InputError
 from ..kernels import medium as kernels
 from ..mesh.elements import FACES
 from ..mesh.mesh import Mesh, boundary_faces
-from .base import Energy, Parameter, PointSet, Quantity, Term, Values
+from ..stepping.constants import Constants
+from ..stepping.inputs import Inputs
+from ..stepping.quantity import Parameter, Quantity
+from .base import BoundEnergy, Energy, Placement, PointSet, Step, Term, Values
 from .launcher import Launcher, warp_view
 
 
@@ -93,6 +96,64 @@ class Medium(Energy):
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "MediumTerm":
         return MediumTerm(launcher, sets)
+
+    @override
+    def bind(self, placement: Placement) -> "BoundMedium":
+        return BoundMedium(self, placement)
+
+
+class BoundMedium(BoundEnergy):
+    """A medium over the steps of a simulator: where the surface was, where it points, and buoyancy."""
+
+    def __init__(self, medium: Medium, placement: Placement) -> None:
+        super().__init__(medium, placement)
+        (points,) = placement.points
+        assert isinstance(points, FacePoints)
+        self._nodes = torch.as_tensor(points.nodes, device=placement.rest_positions.device)  # (F, K)
+        self._shares = placement.tensor(points.gradients[0, :, :, 0])  # (Q, K) of the vertices in the points
+        self._slopes = placement.tensor(points.slopes)  # (Q, K, 2)
+        self._weights = placement.tensor(points.weights)  # (Q,)
+        volume = placement.tensor(placement.body.load_volume.sum(axis=1))  # (N,) [m^3]
+        self._volume = volume if medium.buoyancy else None
+
+    @override
+    def begin_step(self, step: Step) -> dict[str, torch.Tensor | None]:
+        """Returns values with the areas and normals of the start of the step."""
+        h, batch, stage = step.stage.step, step.state.batch, step.stage
+        tangents = torch.einsum("qkd,bfki->bfqdi", self._slopes, step.state.q[:, self._nodes])
+        area = torch.linalg.cross(tangents[..., 0, :], tangents[..., 1, :]) * self._weights[:, None]
+        names = ("medium_density", "drag_linear", "drag_normal", "drag_tangential", "added_layer")
+        density, linear, normal, tangential, layer = map(step.constants.value, names)
+        drag = 0.5 * density / h**2
+        coefficients = torch.cat(
+            torch.broadcast_tensors(linear / h, drag * normal, drag * tangential, density * layer / h**2), 1
+        )
+        return {
+            "medium_reference": self._at_points(stage.velocity_reference),
+            "medium_target": self._at_points(stage.target),
+            "medium_area": area.flatten(1, 2),
+            "medium_coefficients": coefficients[:, None].expand(batch, -1, -1),
+        }
+
+    @override
+    def at_rest(self, batch: int) -> dict[str, torch.Tensor | None]:
+        zeros = self._weights.new_zeros(batch, 1, 1)
+        places = zeros.expand(-1, len(self._nodes) * len(self._weights), 3)
+        names = ("medium_reference", "medium_target", "medium_area")
+        return {**dict.fromkeys(names, places), "medium_coefficients": zeros.expand(-1, 1, 4)}
+
+    @override
+    def load(self, inputs: Inputs, constants: Constants, batch: int, static: bool) -> torch.Tensor | None:
+        """Returns buoyancy: the weight of the medium that the body displaces, upwards."""
+        del inputs, batch, static
+        if self._volume is None:
+            return None
+        displaced = constants.value("medium_density") * self._volume
+        return -displaced[..., None] * constants.gravity[:, None]
+
+    def _at_points(self, field: torch.Tensor) -> torch.Tensor:
+        """Returns (B, P, 3) of (B, N, 3) values at the vertices."""
+        return torch.einsum("qk,bfki->bfqi", self._shares, field[:, self._nodes]).flatten(1, 2)
 
 
 class MediumTerm(Term):

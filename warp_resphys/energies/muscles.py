@@ -25,7 +25,8 @@ from ..fem.elements import Points, physical_gradients
 from ..io.errors import InputError
 from ..kernels import muscles as kernels
 from ..mesh.mesh import Mesh
-from .base import Energy, Parameter, PartTerm, PointSet, Quantity, Values
+from ..stepping.quantity import Parameter, Quantity
+from .base import Energy, PartTerm, PointSet, Values
 from .launcher import Launcher, warp_view
 
 STRESS = Quantity(

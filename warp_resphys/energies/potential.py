@@ -16,12 +16,11 @@ from typing import Any
 import torch
 import warp as wp
 
-from ..fem.elements import Points
 from ..kernels import points as kernels
 from ..kernels import reductions
-from .base import Energy, PointSet, Term
+from .base import PointSet, Term
 from .launcher import Launcher, Launches, warp_view
-from .solid import SolidTerm
+from .placed import Placed
 
 
 @dataclass(frozen=True)
@@ -42,7 +41,7 @@ class IncrementalPotential(Launcher):
     Holds the buffers that its recorded kernel launches work on. Evaluations refer to the last `set_terms`.
 
     Args:
-        energies: of the body, the solid's first, each with its sets of points.
+        energies: of the body.
         n_vertices: N.
         fixed: (D,) fixed vertices.
         batch: environments B.
@@ -50,6 +49,8 @@ class IncrementalPotential(Launcher):
 
     Attributes:
         energies: their terms.
+        own_values: the buffers of the current values of each of them, by the energy's own names.
+        stiffness: (B,) sum of the solids' moduli times volumes [J], by which rounding of the energy is judged.
         sets: the sets of points of all of them.
         free_mask: (N,) one at free vertices, zero at fixed ones.
         evaluation: launches that set ``residual``, and the sums of it and of the energy, at ``positions``:
@@ -68,7 +69,7 @@ class IncrementalPotential(Launcher):
 
     def __init__(
         self,
-        energies: Sequence[tuple[Energy, Sequence[Points]]],
+        energies: Sequence[Placed],
         n_vertices: int,
         fixed: torch.Tensor,
         batch: int,
@@ -80,9 +81,10 @@ class IncrementalPotential(Launcher):
         self.sets: list[PointSet] = []
         self._loads: list[bool] = []
         first = 0
-        for energy, sets in energies:
-            start, mine = first, []
-            for points in sets:
+        self._placed = tuple(energies)
+        for each in energies:
+            energy, start, mine = each.energy, first, list[PointSet]()
+            for points in each.points:
                 part = slice(first, first + points.n_points)
                 own = slice(part.start - start, part.stop - start)
                 mine.append(PointSet(self, points, n_vertices, part, own))
@@ -93,9 +95,12 @@ class IncrementalPotential(Launcher):
         self._n_points = first
         self.free_mask = torch.ones(n_vertices, device=device, dtype=torch.float64)
         self.free_mask[fixed] = 0.0
-        shapes = {name: shape for term in self.energies for name, shape in term.shapes.items()}
+        pairs = list(zip(energies, self.energies, strict=True))
+        shapes = {name: shape for each, term in pairs for name, shape in each.named(term.shapes).items()}
         values: dict[str, torch.Tensor | None] = {name: self.zeros(*shape) for name, shape in shapes.items()}
+        self.own_values = [each.own_values(values, term) for each, term in pairs]
         self.terms = StepTerms(self.zeros(n_vertices, 3), self.zeros(n_vertices), self.zeros(n_vertices, 3), values)
+        self.stiffness = self.zeros()
         self.positions = self.zeros(n_vertices, 3)
         self._position_view = warp_view(self.positions, wp.vec3d)
         self.residual = self.zeros(n_vertices, 3)
@@ -108,13 +113,6 @@ class IncrementalPotential(Launcher):
         self.low_rank: torch.Tensor | None = None
         self._direction = self.zeros(n_vertices, 3)
         self._adjoints: list[Callable[[], dict[str, torch.Tensor]]] = []
-
-    @property
-    def solid(self) -> SolidTerm:
-        """The solid's term."""
-        term = self.energies[0]
-        assert isinstance(term, SolidTerm)
-        return term
 
     def _record_evaluation(self) -> None:
         t, b = self.terms, self.batch
@@ -131,13 +129,13 @@ class IncrementalPotential(Launcher):
         )
         self._internal_commands: list[Any] = []
         self._load_commands: list[Any] = []
-        for term, is_load in zip(self.energies, self._loads, strict=True):
+        for term, values, is_load in zip(self.energies, self.own_values, self._loads, strict=True):
             commands = self._load_commands if is_load else self._internal_commands
-            commands += term.before(t.values, self._position_view)
+            commands += term.before(values, self._position_view)
             for s in term.sets:
                 stress = self.points_view(self._stress, s.part, wp.mat33d)
                 outputs = [stress, self.points_view(self._point_energy, s.part, wp.float64)]
-                kernel, inputs = term.step(s, t.values, self._position_view)
+                kernel, inputs = term.step(s, values, self._position_view)
                 commands += [
                     self.record(kernel, (b, s.n_points), inputs, outputs),
                     self.gather(s, stress, self.residual),
@@ -162,6 +160,10 @@ class IncrementalPotential(Launcher):
             value = terms.values[name]
             if value is not None and buffer is not None:
                 buffer.copy_(value.detach())
+        self.stiffness.zero_()
+        for term, values in zip(self.energies, self.own_values, strict=True):
+            if (total := term.total_stiffness(values)) is not None:
+                self.stiffness += total
 
     @property
     def force(self) -> torch.Tensor:
@@ -195,7 +197,8 @@ class IncrementalPotential(Launcher):
         if idle is not None:
             self.positive.masked_fill_(idle, -1)
         self.launch(self.tangent_launches)
-        found = [term.low_rank(self.terms.values, self._position_view) for term in self.energies]
+        pairs = zip(self.energies, self.own_values, strict=True)
+        found = [term.low_rank(values, self._position_view) for term, values in pairs]
         columns = [each for each in found if each is not None]
         self.low_rank = torch.cat(columns, 2) if columns else None
 
@@ -222,11 +225,11 @@ class IncrementalPotential(Launcher):
         self._product = self.zeros(self.n_vertices, 3)
         tangents, products = [], []
         positive, direction = warp_view(self.positive, wp.int32), warp_view(self._direction, wp.vec3d)
-        for term in self.energies:
-            tangents += term.before(self.terms.values, self._position_view)
+        for term, values in zip(self.energies, self.own_values, strict=True):
+            tangents += term.before(values, self._position_view)
             for s in term.sets:
                 tangent = self.points_view(blocks, s.part, wp.mat33d)
-                kernel, inputs = term.tangent(s, self.terms.values, self._position_view, positive)
+                kernel, inputs = term.tangent(s, values, self._position_view, positive)
                 tangents.append(self.record(kernel, (self.batch, s.n_points), inputs, [tangent]))
                 stress = self.points_view(self._product_stress, s.part, wp.mat33d)
                 products += [
@@ -257,9 +260,13 @@ class IncrementalPotential(Launcher):
         """
         self.prepare_adjoint()
         self._direction.copy_(adjoint)
-        return {name: value for differentiate in self._adjoints for name, value in differentiate().items()}
+        slopes: dict[str, torch.Tensor] = {}
+        for each, differentiate in zip(self._placed, self._adjoints, strict=True):
+            slopes |= each.named(differentiate())
+        return slopes
 
     def prepare_adjoint(self) -> None:
         """Buffers and launches of `value_adjoint`, made at their first use."""
         if not self._adjoints:
-            self._adjoints = [t.adjoint(self.terms.values, self.positions, self._direction) for t in self.energies]
+            pairs = zip(self.energies, self.own_values, strict=True)
+            self._adjoints = [t.adjoint(values, self.positions, self._direction) for t, values in pairs]

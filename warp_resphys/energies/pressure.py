@@ -20,7 +20,8 @@ from ..io.errors import InputError
 from ..kernels import pressure as kernels
 from ..mesh.chambers import Chamber, check_chambers
 from ..mesh.mesh import Mesh
-from .base import Energy, PointSet, Quantity, Values, ValueTerm
+from ..stepping.quantity import Quantity
+from .base import Energy, PointSet, Values, ValueTerm
 from .launcher import Launcher, warp_view
 
 PRESSURE = Quantity(

@@ -1,21 +1,30 @@
 """The solid: elastic energy of a material, and its viscosity (Kelvin-Voigt and generalised Maxwell)."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Final
 
 import numpy as np
 import scipy.sparse
 import torch
 import warp as wp
+from numpy.typing import NDArray
 from typing_extensions import override
 
-from ..fem.elements import Discretisation, Points
+from ..fem.elements import Discretisation, Points, SolidPoints
 from ..io.errors import InputError
 from ..kernels import solid as kernels
 from ..mesh.mesh import Mesh
-from .base import Energy, PointSet, Quantity, Term, Values
+from ..stepping.constants import Constants, Mass
+from ..stepping.quantity import Parameter, Quantity
+from .base import BoundEnergy, Energy, Memory, Placement, PointSet, Step, Term, Values
 from .launcher import Launcher, warp_view
-from .materials import Material
+from .materials import PRONY_RATIO, PRONY_TIME, Material
+from .viscosity import Viscosity
+
+VISCOUS_STRAIN: Final = "viscous_strain"
+VISCOUS: Final = ("viscosity", "strain_offset", "dilation_offset")  # values of a step, see `energies.viscosity`
 
 
 def device_matrix(matrix: scipy.sparse.sparray, device: torch.device, dtype: torch.dtype) -> torch.Tensor:
@@ -41,51 +50,135 @@ def spread(operator: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
     return torch.sparse.mm(operator, values.expand(-1, m).mT).mT
 
 
+@dataclass(frozen=True)
 class Solid(Energy):
-    """The energy of a material in a discretised body.
+    """The energy of a material in a body, or in a region of it; a body may have several.
 
     The step's values are ``stiffness`` (B, P, T), the moduli times the points' volumes [J]; and, see
-    `dynamics.viscosity`, ``viscosity`` (B, 2), c and d; ``strain_offset`` (B, P, 3, 3), W; and ``dilation_offset``
-    (B, P), w.
+    `energies.viscosity`, ``viscosity`` (B, 2), c and d; ``strain_offset`` (B, P, 3, 3), W; and ``dilation_offset``
+    (B, P), w. Its memory is ``viscous_strain`` (B, K, P, 3, 3), the strain that each Prony branch still carries.
 
     Args:
-        discretisation: of the body.
+        discretisation: of the body, or of some of its cells.
         material: its law and constants.
-        device: of its operators.
-        dtype: of its operators.
+        cells: (M,) numbers of these cells; None for all of them.
     """
 
-    def __init__(
-        self, discretisation: Discretisation, material: Material, device: torch.device, dtype: torch.dtype
-    ) -> None:
-        self.material, self._sets = material, discretisation.point_sets
-        volumes = {
-            "shape": scipy.sparse.vstack([s.shape_volume for s in self._sets]),
-            "volume": scipy.sparse.vstack([s.volume_volume for s in self._sets]),
-        }
-        self._volumes = {rule: device_matrix(matrix, device, dtype) for rule, matrix in volumes.items()}
+    discretisation: Discretisation
+    material: Material
+    cells: NDArray[np.int64] | None = None
+
+    @property
+    @override
+    def parameters(self) -> tuple[Quantity, ...]:
+        return tuple(self.material.quantities.values())
+
+    @property
+    @override
+    def constants(self) -> Mapping[str, Parameter]:
+        return self.material.constants
+
+    @property
+    @override
+    def count(self) -> int:
+        return len(self.discretisation.element_volumes)
+
+    @property
+    @override
+    def names(self) -> tuple[str, ...]:
+        return ()  # Nobody asks for the constants of one cell by name.
 
     @override
     def points(self, mesh: Mesh) -> tuple[Points, ...]:
-        return self._sets
+        return self.discretisation.point_sets
 
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "SolidTerm":
-        carried = torch.stack([volumes.sum(1).to_dense() for volumes in self._volumes.values()])
-        rules = list(self._volumes)
-        return SolidTerm(launcher, sets, self.material, carried[[rules.index(each) for each in self.material.rules]].T)
-
-    @property
-    def quantities(self) -> Mapping[str, Quantity]:
-        """The material's constants, density and mass damping included."""
-        return self.material.quantities
+        own = self.discretisation.point_sets
+        carried = np.concatenate([np.stack([v.sum(axis=1) for v in _volumes(s, self.material)], 1) for s in own])
+        return SolidTerm(launcher, sets, self.material, carried)
 
     @override
-    def prepare(self, constants: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        moduli = torch.broadcast_tensors(*self.material.moduli(constants))
-        rules = self.material.rules
-        spreads = [spread(self._volumes[rule], each) for rule, each in zip(rules, moduli, strict=True)]
-        return {"stiffness": torch.stack(spreads, dim=-1)}
+    def bind(self, placement: Placement) -> "BoundSolid":
+        return BoundSolid(self, placement)
+
+
+def _volumes(points: SolidPoints, material: Material) -> list[scipy.sparse.csr_array]:
+    """Returns the (P, M) volumes that points carry of the cells for each modulus of a material [m^3]."""
+    by_rule = {"shape": points.shape_volume, "volume": points.volume_volume}
+    return [by_rule[rule] for rule in material.rules]
+
+
+class BoundSolid(BoundEnergy):
+    """A solid over the steps of a simulator: its stiffness, its mass, and the viscous strain that it remembers."""
+
+    def __init__(self, solid: Solid, placement: Placement) -> None:
+        super().__init__(solid, placement)
+        self._solid = solid
+        like, sets = placement.rest_positions, solid.discretisation.point_sets
+        rules = {"shape": [s.shape_volume for s in sets], "volume": [s.volume_volume for s in sets]}
+        self._stiffness_volume = {
+            rule: device_matrix(scipy.sparse.vstack(matrices), like.device, like.dtype)
+            for rule, matrices in rules.items()
+        }
+        cells = slice(None) if solid.cells is None else solid.cells
+        self._mass_volume, self._load_volume = (
+            device_matrix(matrix.tocsc()[:, cells], like.device, like.dtype)
+            for matrix in (placement.body.mass_volume, placement.body.load_volume)
+        )
+        shape = (len(solid.material.prony), sum(s.n_points for s in sets), 3, 3)
+        self.memory = (Memory(VISCOUS_STRAIN, "strain", shape, "branch"),) if shape[0] else ()
+
+    @override
+    def prepare(self, parameters: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor | None]:
+        material = self._solid.material
+        moduli = torch.broadcast_tensors(*material.moduli(parameters))
+        spreads = [spread(self._stiffness_volume[rule], m) for rule, m in zip(material.rules, moduli, strict=True)]
+        damping, ratio, time = parameters["stiffness_damping"][:, 0], None, None
+        if material.prony:
+            names = [[f"{q.name}_{k + 1}" for k in range(len(material.prony))] for q in (PRONY_RATIO, PRONY_TIME)]
+            ratio, time = (torch.cat(torch.broadcast_tensors(*(parameters[n] for n in own)), 1) for own in names)
+            if not (ratio.requires_grad or bool((ratio > 0).any())):
+                ratio = time = None
+        acting = damping.requires_grad or bool((damping > 0).any())
+        return {
+            "stiffness": torch.stack(spreads, dim=-1),
+            "stiffness_damping": damping if acting else None,
+            "prony_ratio": ratio,
+            "prony_time": time,
+        }
+
+    @override
+    def mass(self, parameters: Mapping[str, torch.Tensor]) -> Mass:
+        inertia, weight = (spread(volume, parameters["density"]) for volume in (self._mass_volume, self._load_volume))
+        return Mass(inertia, weight, parameters["mass_damping"])
+
+    def _viscosity(self, constants: Constants) -> Viscosity:
+        damping, ratio, time = (constants.values[name] for name in ("stiffness_damping", "prony_ratio", "prony_time"))
+        acts = damping is not None
+        still = self.placement.rest_positions.new_zeros(1)
+        return Viscosity(still if damping is None else damping, acts, ratio, time)
+
+    def _values(self, *values: torch.Tensor | None) -> dict[str, torch.Tensor | None]:
+        return dict(zip(VISCOUS, values, strict=True))
+
+    @override
+    def begin_step(self, step: Step) -> dict[str, torch.Tensor | None]:
+        carried = step.state.memory.get(VISCOUS_STRAIN)
+        viscosity, strain = self._viscosity(step.constants), partial(GreenStrain.apply, step.term)
+        return self._values(*viscosity.step_values(strain, step.state.q, carried, step.stage, self.placement.time_step))
+
+    @override
+    def at_rest(self, batch: int) -> dict[str, torch.Tensor | None]:
+        return self._values(self.placement.rest_positions.new_zeros(batch, 2), None, None)
+
+    @override
+    def end_step(self, step: Step, x: torch.Tensor, q: torch.Tensor) -> dict[str, torch.Tensor]:
+        viscosity = self._viscosity(step.constants)
+        if viscosity.ratio is None:
+            return {}
+        strain, carried = partial(GreenStrain.apply, step.term), step.state.memory.get(VISCOUS_STRAIN)
+        return {VISCOUS_STRAIN: viscosity.relax(strain, step.state.q, carried, q, self.placement.time_step)}
 
 
 class SolidTerm(Term):
@@ -98,25 +191,26 @@ class SolidTerm(Term):
         carried: (P, T) volumes that the points carry for each modulus [m^3].
     """
 
-    def __init__(self, launcher: Launcher, sets: Sequence[PointSet], material: Material, carried: torch.Tensor) -> None:
+    def __init__(
+        self, launcher: Launcher, sets: Sequence[PointSet], material: Material, carried: NDArray[np.float64]
+    ) -> None:
         super().__init__(launcher, sets)
         law = type(material).law
         self._kernels, self._vector = kernels.solid_kernels(law), law.moduli
         self._moduli = len(material.rules)
-        self._carried = carried.double().cpu().numpy()
+        self._carried = carried
         self._curvature = torch.as_tensor(material.curvature, device=launcher.device, dtype=torch.float64)
 
     @property
     @override
     def shapes(self) -> Mapping[str, tuple[int, ...]]:
         points = self.n_points
-        viscous = {"viscosity": (2,), "strain_offset": (points, 3, 3), "dilation_offset": (points,)}
-        return {"stiffness": (points, self._moduli), **viscous}
+        shapes = ((points, self._moduli), (2,), (points, 3, 3), (points,))
+        return dict(zip(("stiffness", *VISCOUS), shapes, strict=True))
 
     def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
         """What the kernels of this energy have in common."""
-        own, stiffness, strain = self.launcher, values["stiffness"], values["strain_offset"]
-        viscosity, dilation = values["viscosity"], values["dilation_offset"]
+        own, (stiffness, viscosity, strain, dilation) = self.launcher, (values[name] for name in self.shapes)
         assert stiffness is not None
         assert viscosity is not None
         assert strain is not None
@@ -145,14 +239,18 @@ class SolidTerm(Term):
         return stiffness @ self._curvature
 
     @override
+    def total_stiffness(self, values: Values) -> torch.Tensor:
+        stiffness = values["stiffness"]
+        assert stiffness is not None
+        return stiffness.flatten(1).sum(1)
+
+    @override
     def adjoint(
         self, values: Values, positions: torch.Tensor, direction: torch.Tensor
     ) -> Callable[[], dict[str, torch.Tensor]]:
         own, shapes = self.launcher, self.shapes
-        out = {name: own.zeros(*shape) for name, shape in shapes.items()}
-        out["viscosity"] = own.zeros(self.n_points, 2)
-        types = {"stiffness": self._vector, "viscosity": wp.vec2d, "strain_offset": wp.mat33d}
-        types["dilation_offset"] = wp.float64
+        out = {name: own.zeros(*shape) for name, shape in {**shapes, "viscosity": (self.n_points, 2)}.items()}
+        types = dict(zip(shapes, (self._vector, wp.vec2d, wp.mat33d, wp.float64), strict=True))
         commands = []
         for s in self.sets:
             carried = own.upload(self._carried[s.own], self._vector)

@@ -29,7 +29,11 @@ from ..fem.elements import Points
 from ..io.errors import InputError
 from ..kernels import strings as kernels
 from ..mesh.mesh import Mesh
-from .base import Energy, Parameter, PointSet, Quantity, Term, Values
+from ..stepping.constants import Constants
+from ..stepping.inputs import Inputs
+from ..stepping.quantity import Parameter, Quantity
+from ..stepping.state import ImplicitStage, State
+from .base import BoundEnergy, Energy, Memory, Placement, PointSet, Step, Term, Values
 from .launcher import Launcher, warp_view
 
 PAYLOAD = Quantity(
@@ -110,26 +114,108 @@ class Strings(Energy):
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "StringTerm":
         return StringTerm(launcher, sets, self)
 
-    def stiffness(self, mass: torch.Tensor, compliance: torch.Tensor) -> torch.Tensor:
-        """K [N/m], of the inertia M = m / h^2 [N/m] and the compliance."""
-        return mass / (1.0 + compliance * mass)
+    @override
+    def bind(self, placement: Placement) -> "BoundStrings":
+        return BoundStrings(self, placement)
 
-    def taken(
-        self, tied: torch.Tensor, free: torch.Tensor, mass: torch.Tensor, values: Mapping[str, torch.Tensor]
-    ) -> torch.Tensor:
-        """(B, S, 3) where the masses go in a stage [m].
+
+class BoundStrings(BoundEnergy):
+    """The weights of strings over the steps of a simulator: where they are, how they act in a step, where they go.
+
+    The memory is ``payload_position`` [m] and ``payload_velocity`` [m/s], (B, S, 3), and for a method that looks back
+    the same one step earlier. Where a state has none, the weights are below where they are tied, on taut strings.
+    """
+
+    def __init__(self, strings: Strings, placement: Placement) -> None:
+        super().__init__(strings, placement)
+        self._strings = strings
+        self._shares = placement.tensor(strings.shares(placement.body.n_vertices))  # (S, N)
+        shape = (strings.count, 3)
+        self.memory = tuple(
+            Memory(f"payload_{when}{what}", unit, shape, "string")
+            for when in ("", "previous_")
+            for what, unit in (("position", "m"), ("velocity", "m/s"))
+        )
+
+    def _masses(self, inputs: Inputs, batch: int) -> torch.Tensor:
+        """Returns the masses (B, S) [kg]; nothing hangs where none are given."""
+        given = inputs.actuation.get(PAYLOAD.name)
+        return self._shares.new_zeros(batch, self._strings.count) if given is None else given
+
+    @override
+    def load(self, inputs: Inputs, constants: Constants, batch: int, static: bool) -> torch.Tensor | None:
+        if not static:
+            return None
+        gravity = constants.gravity.expand(batch, 3)
+        return torch.einsum("bs,sn,bc->bnc", self._masses(inputs, batch), self._shares, gravity)
+
+    @override
+    def begin_step(self, step: Step) -> dict[str, torch.Tensor | None]:
+        mass, compliance = self._inertia(step), step.constants.value("string_compliance")
+        free = self._free(self._stage(self._weights(step)), step.constants)
+        return {"string_target": free, "string_stiffness": mass / (1.0 + compliance * mass)}
+
+    @override
+    def at_rest(self, batch: int) -> dict[str, torch.Tensor | None]:
+        """Returns values of strings that do nothing: what they pull at rest is a load."""
+        zeros = self._shares.new_zeros(batch, self._strings.count)
+        return {"string_target": zeros[..., None].expand(-1, -1, 3), "string_stiffness": zeros}
+
+    @override
+    def end_step(self, step: Step, x: torch.Tensor, q: torch.Tensor) -> dict[str, torch.Tensor]:
+        weights = self._weights(step)
+        free = self._free(self._stage(weights), step.constants)
+        tied = torch.einsum("sn,bnc->bsc", self._shares, x)
+        at = self._pulled(tied, free, self._inertia(step), step.constants)
+        new = self.placement.method.finish(weights, at, self.placement.time_step)
+        values = (new.q, new.v, *(new.previous or ()))
+        return {memory.name: value for memory, value in zip(self.memory, values, strict=False)}
+
+    def _inertia(self, step: Step) -> torch.Tensor:
+        """Returns M = m / h^2 (B, S) [N/m]."""
+        return self._masses(step.inputs, step.state.batch) / step.stage.step**2
+
+    def _weights(self, step: Step) -> State:
+        """Returns the state of the weights, (B, S, 3), at the start of a step.
+
+        Without gravity nothing tightens a string, and a weight is where it is tied.
+        """
+        state, constants = step.state, step.constants
+        remembered = [state.memory[memory.name] for memory in self.memory if memory.name in state.memory]
+        if len(remembered) >= 2:
+            previous = (remembered[2], remembered[3]) if len(remembered) == 4 else None
+            return State(remembered[0], remembered[1], previous)
+        gravity = constants.gravity.expand(state.batch, 3)[:, None]
+        size = gravity.norm(dim=-1, keepdim=True)
+        pull = self._masses(step.inputs, state.batch) * size[..., 0]
+        length = constants.value("string_length") + constants.value("string_compliance") * pull
+        length = length + 0.5 * self._strings.toe
+        down = torch.where(size > 0.0, gravity / size, 0.0)
+        tied = [torch.einsum("sn,bnc->bsc", self._shares, field) for field in (state.q, state.v)]
+        return State(tied[0] + length[..., None] * down, tied[1])
+
+    def _stage(self, weights: State) -> ImplicitStage:
+        return self.placement.method.stage(weights, self.placement.time_step)
+
+    def _free(self, stage: ImplicitStage, constants: Constants) -> torch.Tensor:
+        """Returns where inertia and gravity alone take the weights (B, S, 3) [m]."""
+        return stage.target + stage.step**2 * constants.gravity[:, None]
+
+    def _pulled(self, tied: torch.Tensor, free: torch.Tensor, mass: torch.Tensor, constants: Constants) -> torch.Tensor:
+        """Returns where the weights go in a stage (B, S, 3) [m].
 
         Args:
-            tied: (B, S, 3) a, what the strings are tied to at its end [m].
-            free: (B, S, 3) y, where the masses would go without strings [m].
+            tied: (B, S, 3) a, where the strings are tied at its end [m].
+            free: (B, S, 3) y, where the weights would go without strings [m].
             mass: (B, S) M [N/m].
-            values: the parameters.
+            constants: of the roll-out.
         """
-        line = tied - free
+        line, toe = tied - free, self._strings.toe
         distance = line.norm(dim=-1)
-        excess = distance - values["string_length"]
-        pull = torch.where(excess > self.toe, excess - 0.5 * self.toe, 0.5 * excess.clamp_min(0.0) ** 2 / self.toe)
-        share = pull / (1.0 + values["string_compliance"] * mass) / distance.clamp_min(torch.finfo(line.dtype).tiny)
+        excess = distance - constants.value("string_length")
+        pull = torch.where(excess > toe, excess - 0.5 * toe, 0.5 * excess.clamp_min(0.0) ** 2 / toe)
+        compliance = constants.value("string_compliance")
+        share = pull / (1.0 + compliance * mass) / distance.clamp_min(torch.finfo(line.dtype).tiny)
         return free + share[..., None] * line
 
 

@@ -33,7 +33,8 @@ from ..io.errors import InputError
 from ..kernels import tendons as kernels
 from ..mesh.location import locate
 from ..mesh.mesh import Mesh
-from .base import Energy, Parameter, PartTerm, PointSet, Quantity, Values
+from ..stepping.quantity import Parameter, Quantity
+from .base import Energy, PartTerm, PointSet, Values
 from .launcher import Launcher, warp_view
 
 

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from ..control.laboratory import Laboratory
 from ..control.reduced import ReducedModel
 from ..control.reduced_batch import advance, begin, observed
-from ..dynamics.integrator import State
 from ..io.errors import InputError
 from ..mesh.mesh import boundary_triangles
 from ..robot.inputs import BASE
 from ..robot.robot import Robot
 from ..robot.state import RobotState
+from ..stepping.state import State
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

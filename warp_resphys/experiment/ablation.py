@@ -16,7 +16,6 @@ from rich.table import Table
 from typing_extensions import override
 
 from ..data.markers import MarkerMap
-from ..dynamics.integrator import State
 from ..dynamics.simulator import Simulator
 from ..io.fan_out import ALONE, Workers
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5, read_json, write_json, write_text
@@ -26,6 +25,7 @@ from ..learning.reconstruction import make_reconstructor
 from ..mesh.mesh import surface_vertices
 from ..report.ablation_page import AblationReport, write_ablation_report
 from ..report.page import number_text
+from ..stepping.state import State
 from .build import build_mesh, build_simulator, simulation_device
 from .files import METRICS, REPORT
 from .parts import Part, remove_parts, split_into_parts, work_on, workers_for

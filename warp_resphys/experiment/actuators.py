@@ -8,7 +8,7 @@ from typing import Any, Final, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ..energies.base import Energy, Quantity
+from ..energies.base import Energy
 from ..energies.fibres import Fibres
 from ..energies.medium import Medium
 from ..energies.muscles import CONTRACTION as MUSCLE_CONTRACTION
@@ -20,6 +20,7 @@ from ..fem.body import Body
 from ..io.errors import InputError
 from ..mesh.chambers import Chamber, find_chambers
 from ..mesh.mesh import Mesh, select_cells, select_vertices
+from ..stepping.quantity import Quantity
 
 # By group, and the word of its key ``commanded``: the input.
 _COMMANDED: Final[Mapping[str, Mapping[str, Quantity]]] = {

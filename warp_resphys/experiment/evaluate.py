@@ -11,7 +11,6 @@ import torch
 from numpy.typing import NDArray
 
 from ..data.trials import Trials
-from ..dynamics.integrator import State
 from ..io.errors import ConvergenceError
 from ..io.fan_out import ALONE, Workers
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5, write_json
@@ -20,6 +19,7 @@ from ..io.stages import StageContext
 from ..learning.intervals import LEVEL, Intervals
 from ..learning.metrics import errors_per_marker, marker_errors, median_filter, summarise, summarise_each
 from ..learning.replay import Start
+from ..stepping.state import State
 from .build import finer
 from .files import ERRORS, MESH_CHECK, ROLLOUTS, STATIC, TIMES, read_dataset, reconstruction_file
 from .models import POSE_STEPS, SIMFREE, ModelRollout, first_frame, learned_of

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from ..data.base_motion import at_times
 from ..data.trials import Trials
 from ..dynamics.frames import rotations
-from ..dynamics.inputs import Inputs
 from ..energies.strings import PAYLOAD, Strings
 from ..fem.body import Body
 from ..io.errors import InputError
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5, read_json
 from ..mesh.mesh import select_vertices
+from ..stepping.inputs import Inputs
 
 FloatArray = NDArray[np.float64]
 

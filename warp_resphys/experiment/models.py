@@ -12,7 +12,6 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
-from ..dynamics.integrator import State
 from ..dynamics.simulator import Simulator
 from ..io.errors import ConvergenceError
 from ..io.files import read_checkpoint
@@ -22,6 +21,7 @@ from ..learning.networks import NextState, ResidualForce, StateMap, restore
 from ..learning.predictors import LearnedPredictor, Range
 from ..learning.replay import Start
 from ..learning.rollout import Rollout
+from ..stepping.state import State
 from .files import GIVEN, weights_file
 from .parts import March
 from .scene import LEARNED, Scene

@@ -19,7 +19,6 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import threadpool_limits
 
-from ..dynamics.integrator import State
 from ..io.errors import InputError
 from ..io.fan_out import Advance, Workers, fan_out
 from ..io.files import read_array, read_hdf5
@@ -27,6 +26,7 @@ from ..io.machine import available_cores
 from ..io.progress import Progress
 from ..io.resumable import Field, ResumableHDF5, forget_checkpoint, keep_checkpoint, resume_checkpoint
 from ..io.stages import StageContext
+from ..stepping.state import State
 from .build import simulation_device
 
 _KEEP_SECONDS = 10.0

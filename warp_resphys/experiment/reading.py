@@ -16,9 +16,9 @@ from ..data.recordings.recording import Recording
 from ..data.recordings.text import Table
 from ..data.registration import axes_rotation
 from ..data.sight import Sight
-from ..dynamics.inputs import Inputs
 from ..dynamics.simulator import Simulator
 from ..io.errors import DataFileError, InputError, listed
+from ..stepping.inputs import Inputs
 from .actuators import Drive
 from .build import bound_markers, sight_of
 from .files import STATIC, payload_inputs

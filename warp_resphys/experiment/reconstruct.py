@@ -11,8 +11,6 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
-from ..dynamics.inputs import Inputs
-from ..dynamics.integrator import State
 from ..dynamics.simulator import Simulator
 from ..io.fan_out import ALONE, Workers
 from ..io.files import atomic_hdf5, create, write_json
@@ -21,6 +19,8 @@ from ..io.stages import StageContext
 from ..learning.metrics import marker_errors
 from ..learning.reconstruction import Reconstructor, make_reconstructor
 from ..learning.rollout import Rollout
+from ..stepping.inputs import Inputs
+from ..stepping.state import State
 from .files import RECONSTRUCTION, read_if_there, reconstruction_file
 from .parts import March, Part, read_parts, remove_parts, split_into_parts, work_on
 from .scene import Scene

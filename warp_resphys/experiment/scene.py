@@ -17,7 +17,6 @@ from ..data.markers import Markers
 from ..data.sight import SeenMarkers
 from ..data.trials import Trials
 from ..dynamics.frames import BaseFrame, VertexFrames, base_movement
-from ..dynamics.integrator import State
 from ..dynamics.simulator import Simulator
 from ..energies.strings import PAYLOAD
 from ..fem.body import Body
@@ -26,6 +25,7 @@ from ..io.files import read_json
 from ..learning.placement import PlacedMarkers, Placement
 from ..learning.release import ReleaseSettings, estimate_release
 from ..learning.replay import Replay, Start
+from ..stepping.state import State
 from .build import bound_markers, build_body, build_simulator, sight_of
 from .files import DATASET, GIVEN, IDENTIFICATION, SCALED_DATASET, STATIC, Dataset, read_dataset
 

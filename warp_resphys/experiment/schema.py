@@ -11,7 +11,6 @@ from typing import Any, Final
 from ..data.markers import KINDS as BINDINGS
 from ..data.recordings.recording import METRES_PER_UNIT
 from ..data.sight import FRAMES
-from ..dynamics.integrator import INTEGRATORS
 from ..dynamics.simulator import COUPLINGS
 from ..fem.body import MASS_MODES
 from ..fem.elements import VOLUME_INTEGRATIONS
@@ -20,6 +19,7 @@ from ..io.fan_out import BACKENDS
 from ..learning.networks import ACTIVATIONS, FORCE_BASES, NETWORK_KINDS
 from ..learning.refinement import REFINEMENTS
 from ..learning.training import SCHEDULES, SELECTIONS
+from ..stepping.integrators import INTEGRATORS
 from .scene import FORCE_FRAMES, MODELS
 from .trials import BEGINNINGS, FOLDS, SPLITS
 

@@ -22,8 +22,6 @@ from ..data.base_motion import check_steps, in_frame, prescribed, rigid
 from ..data.recordings.arrays import write_recording
 from ..data.recordings.recording import Recording
 from ..data.rigid import RigidTransform
-from ..dynamics.inputs import Inputs
-from ..dynamics.integrator import State
 from ..dynamics.simulator import Simulator
 from ..io.errors import InputError
 from ..io.fan_out import ALONE, Workers
@@ -33,6 +31,8 @@ from ..io.stages import StageContext
 from ..learning.replay import sample
 from ..mesh.mesh import select_vertices
 from ..mesh.poses import twisted
+from ..stepping.inputs import Inputs
+from ..stepping.state import State
 from .actuators import driven_parts, driving_quantity
 from .build import bound_markers, build_mesh, build_simulator
 from .files import DATASET, GIVEN, STATIC, TRUTH, Dataset, payload_inputs

@@ -37,7 +37,7 @@ class Points:
 
 
 @dataclass(frozen=True)
-class PointSet(Points):
+class SolidPoints(Points):
     """Points of a solid."""
 
     # (C Q, M) sparse; volume of each element that the point carries for the shape term [m^3]
@@ -49,7 +49,7 @@ class PointSet(Points):
 class Discretisation:
     """All that a body's mesh and integration rule determine."""
 
-    point_sets: tuple[PointSet, ...]  # where the energy is evaluated
+    point_sets: tuple[SolidPoints, ...]  # where the energy is evaluated
     element_volumes: Array  # (M,) [m^3]
     # (N, M) sparse; integral of N_a over each element [m^3]: consistent body forces
     load_volume: scipy.sparse.csr_array
@@ -124,7 +124,7 @@ def _isoparametric(mesh: Mesh, full: bool) -> Discretisation:
     lumped = load if element.mass_rule is None else _hrz_lumping(mesh, element_volumes)
     n = len(mesh.vertices)
     return Discretisation(
-        (PointSet(mesh.cells, gradients, _one_hot(shape_volume), _one_hot(volume_volume)),),
+        (SolidPoints(mesh.cells, gradients, _one_hot(shape_volume), _one_hot(volume_volume)),),
         element_volumes,
         _per_vertex(mesh.cells, n, load),
         _per_vertex(mesh.cells, n, lumped),
@@ -183,7 +183,7 @@ def _linear_tetrahedra(mesh: Mesh, full: bool) -> Discretisation:
     quarter = _per_vertex(mesh.cells, n, np.repeat(volumes / 4.0, 4, axis=1))
     own = _one_hot(volumes)
     nothing = scipy.sparse.csr_array((m, m))
-    cells = PointSet(mesh.cells, gradients, own, own if full else nothing)
+    cells = SolidPoints(mesh.cells, gradients, own, own if full else nothing)
     sets = (cells,) if full else (cells, _vertex_patches(mesh, gradients[:, 0], quarter))
     return Discretisation(sets, volumes[:, 0], quarter, quarter)
 
@@ -219,7 +219,7 @@ def mean_gradients(
     return nodes, padded
 
 
-def _vertex_patches(mesh: Mesh, gradients: Array, quarter: scipy.sparse.csr_array) -> PointSet:
+def _vertex_patches(mesh: Mesh, gradients: Array, quarter: scipy.sparse.csr_array) -> SolidPoints:
     """One point a vertex with the mean gradient operator of the cells around it."""
     nodes, operator = mean_gradients(mesh.cells, gradients, quarter)
-    return PointSet(nodes, operator[:, None], scipy.sparse.csr_array((len(nodes), len(mesh.cells))), quarter)
+    return SolidPoints(nodes, operator[:, None], scipy.sparse.csr_array((len(nodes), len(mesh.cells))), quarter)

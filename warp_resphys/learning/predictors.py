@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 
 from ..dynamics.frames import BaseFrame, VertexFrames
-from ..dynamics.integrator import State
+from ..stepping.state import State
 from .networks import NextState, StateMap
 
 _MARGIN = 0.25  # of the width of the training range, by which a roll-out may exceed it on either side

@@ -23,13 +23,13 @@ import torch
 from typing_extensions import override
 
 from ..data.markers import Markers
-from ..dynamics.inputs import Inputs
-from ..dynamics.integrator import State
 from ..dynamics.modes import vibration_modes
 from ..dynamics.simulator import Constants, Simulator
 from ..io.errors import ConvergenceError, InputError
 from ..linalg.least_squares import minimise
 from ..linalg.threads import threads_for
+from ..stepping.inputs import Inputs
+from ..stepping.state import State
 from .reconstruction_problems import FullStateProblem, MarkerForceProblem, MarkerPositionProblem, Step, StepProblem
 
 log = logging.getLogger(__name__)

@@ -9,13 +9,13 @@ import torch
 from typing_extensions import override
 
 from ..data.markers import Markers
-from ..dynamics.inputs import Inputs
-from ..dynamics.integrator import State
 from ..dynamics.linearisation import Linearisation
 from ..dynamics.simulator import Constants, Simulator
 from ..io.errors import ConvergenceError
 from ..linalg.conjugate_gradients import conjugate_gradients
 from ..linalg.least_squares import Move, Point, Problem, ridge
+from ..stepping.inputs import Inputs
+from ..stepping.state import State
 
 
 @dataclass(frozen=True)

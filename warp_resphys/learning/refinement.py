@@ -15,9 +15,9 @@ from typing_extensions import override
 
 from ..data.trials import Trials
 from ..dynamics.frames import BaseFrame, VertexFrames
-from ..dynamics.integrator import State
 from ..dynamics.simulator import Simulator
 from ..io.errors import ConvergenceError, InputError
+from ..stepping.state import State
 from .full_batch import FullBatchTrainer
 from .networks import ResidualForce
 from .predictors import LearnedPredictor, Range
@@ -102,7 +102,7 @@ class WindowLoss:
         self._model, self._make_simulator, self._observe = model, make_simulator, observe
         self._window, self._batch_size = window, batch_size
         self._parameters, self._frames, self._range = parameters or {}, frames, range_
-        self._overstrains: dict[int, tuple[Motion, torch.Tensor | None]] = {}  # by the motion's identity
+        self._memories: dict[int, tuple[Motion, dict[str, torch.Tensor]]] = {}  # by the motion's identity
         simulator = make_simulator()
         self._first_frame = 1 if simulator.integrator == "bdf2" else 0  # BDF2 looks back.
         rest = simulator.rest_positions
@@ -150,28 +150,30 @@ class WindowLoss:
             total += each * (float(squares.detach().sum()) + failed * self.failure)
         return total
 
-    def _carried(self, simulator: Simulator, motion: Motion) -> torch.Tensor | None:
-        """(R, W, K, P, 3, 3) what the material has not relaxed yet of a motion where its windows start; None without.
+    def _remembered(self, simulator: Simulator, motion: Motion) -> dict[str, torch.Tensor]:
+        """Returns the memory of the energies where the windows of a motion start, by name, each (R, W, ...).
 
-        The branches go through every state of the motion, from its first known one on, in which they are relaxed; while
-        none is known, it stands still.
+        It goes through every state of the motion from the first known one on, in which the body has been at rest for
+        long; while none is known, the body stands still. Empty where nothing is remembered.
         """
-        if id(motion) not in self._overstrains:
+        if id(motion) not in self._memories:
             constants, *_ = Replay(simulator, self._observe, motion.trials).setting(self._parameters)
-            found, state = [], simulator.rest_state(len(motion.q))
+            memories, state = list[Mapping[str, torch.Tensor]](), simulator.rest_state(len(motion.q))
             began = torch.zeros(state.batch, dtype=torch.bool, device=state.q.device)
-            for frame in range(motion.q.shape[1] if constants.relaxes else 0):
+            for frame in range(motion.q.shape[1]):
                 q = motion.q[:, frame]
                 known = torch.isfinite(q).flatten(1).all(1)
-                before = torch.where((known & ~began)[:, None, None], q, state.q)  # relaxed where it is first known
+                before = torch.where((known & ~began)[:, None, None], q, state.q)  # at rest where it is first known
                 q, began = torch.where(known[:, None, None], q, before), began | known
                 with torch.no_grad():
-                    overstrain = simulator.relaxed(constants, replace(state, q=before), q)
-                state = replace(state, q=q, overstrain=overstrain)
+                    state = simulator.remember(replace(state, q=before), q, constants)
+                if not state.memory:
+                    break
                 if frame >= self._first_frame and (frame - self._first_frame) % self._window == 0:
-                    found.append(overstrain)
-            self._overstrains[id(motion)] = (motion, torch.stack(found, 1) if found else None)
-        return self._overstrains[id(motion)][1]
+                    memories.append(state.memory)
+            names = memories[0] if memories else ()
+            self._memories[id(motion)] = (motion, {n: torch.stack([m[n] for m in memories], 1) for n in names})
+        return self._memories[id(motion)][1]
 
     def _parts(self, windows: Windows) -> list[torch.Tensor]:
         """Numbers of windows that are simulated at once: of one motion each."""
@@ -207,9 +209,9 @@ class WindowLoss:
         previous = None
         if self._first_frame:
             previous = (motion.q[run, frame - 1], motion.v[run, frame - 1])
-        carried = self._carried(simulator, motion)
-        overstrain = None if carried is None else carried[run, (frame - self._first_frame) // self._window]
-        state = State(motion.q[run, frame], motion.v[run, frame], previous, overstrain)
+        start = (frame - self._first_frame) // self._window
+        memory = {name: values[run, start] for name, values in self._remembered(simulator, motion).items()}
+        state = State(motion.q[run, frame], motion.v[run, frame], previous, memory)
         constants, inputs, _ = Replay(simulator, self._observe, motion.trials.select(run.tolist())).setting(
             self._parameters
         )

@@ -13,12 +13,12 @@ import torch
 from typing_extensions import override
 
 from ..data.trials import Trials
-from ..dynamics.inputs import Inputs
-from ..dynamics.integrator import State
 from ..dynamics.modes import resolved, vibration_modes, with_signs
 from ..dynamics.simulator import Simulator
 from ..io.errors import ConvergenceError, InputError
 from ..linalg.least_squares import Move, Point, Problem, damped, minimise
+from ..stepping.inputs import Inputs
+from ..stepping.state import State
 from .replay import Observe, Replay, Start
 
 _HOLD_ITERATIONS = 100

@@ -12,10 +12,10 @@ import torch
 
 from ..data.actuation import delayed, lagged
 from ..data.trials import Trials
-from ..dynamics.inputs import Inputs
-from ..dynamics.integrator import State
 from ..dynamics.simulator import Constants, Simulator
 from ..io.errors import ConvergenceError
+from ..stepping.inputs import Inputs
+from ..stepping.state import State
 from .parameters import HUNG, MASS_FACTOR, check_known, constants_of, known_parameters
 
 _POSE_ITERATIONS = 50

@@ -4,9 +4,9 @@ from collections.abc import Callable
 
 import torch
 
-from ..dynamics.inputs import Inputs
-from ..dynamics.integrator import State
 from ..dynamics.simulator import Constants, Simulator
+from ..stepping.inputs import Inputs
+from ..stepping.state import State
 
 FURTHEST = 10.0  # No robot moves ten times its own length from its clamp; a roll-out that does has diverged.
 

@@ -8,10 +8,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ..energies.base import Quantity
 from ..learning.metrics import PublishedError, published_errors
 from ..mesh.chambers import Chamber
 from ..mesh.mesh import Mesh
+from ..stepping.quantity import Quantity
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

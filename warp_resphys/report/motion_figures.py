@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
 
-from ..energies.base import Quantity
+from ..stepping.quantity import Quantity
 from .data import Driven, FloatArray
 from .figures import (
     CHAMBER_COLOURS,

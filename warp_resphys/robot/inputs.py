@@ -9,9 +9,10 @@ import torch
 from numpy.typing import ArrayLike
 
 from ..dynamics.simulator import Simulator
-from ..energies.base import Energy, Quantity
+from ..energies.base import Energy
 from ..energies.strings import PAYLOAD
 from ..io.errors import InputError, listed
+from ..stepping.quantity import Quantity
 from .description import Description
 
 BASE: Final = "base"

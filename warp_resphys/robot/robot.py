@@ -12,8 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csc_array
 
 from ..dynamics.frames import BaseFrame, VertexFrames, base_movement, rotations
-from ..dynamics.inputs import Inputs
-from ..dynamics.integrator import State
 from ..energies.strings import PAYLOAD, Strings
 from ..experiment.files import payload_inputs
 from ..experiment.models import POSE_STEPS
@@ -24,6 +22,8 @@ from ..learning.parameters import MASS_FACTOR, check_known, constants_of, known_
 from ..learning.predictors import LearnedPredictor
 from ..learning.replay import settled
 from ..learning.rollout import FURTHEST, Rollout
+from ..stepping.inputs import Inputs
+from ..stepping.state import State
 from .commands import Commands
 from .description import Description
 from .inputs import BASE, FORCE, Given, InputReader, inputs_of

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import torch
 
-from ..dynamics.integrator import State
+from ..stepping.state import State
 from .commands import Memory
 
 

@@ -22,8 +22,6 @@ import torch
 from threadpoolctl import threadpool_limits
 
 from ..dynamics.assembly import HessianAssembly
-from ..dynamics.inputs import Inputs
-from ..dynamics.integrator import State
 from ..dynamics.nonlinear_solver import SOLVERS
 from ..dynamics.simulator import Simulator
 from ..experiment.build import build_body, build_simulator, choose_device
@@ -47,6 +45,8 @@ from ..io.machine import hardware
 from ..io.progress import Progress
 from ..io.stages import package_versions
 from ..linalg.threads import threads_for
+from ..stepping.inputs import Inputs
+from ..stepping.state import State
 from .benchmark_tables import PARTS, benchmark_sheets, machine
 from .command import show
 from .control_speed import time_commands

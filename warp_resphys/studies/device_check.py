@@ -12,7 +12,6 @@ from typing import Any, Final
 import torch
 import warp as wp
 
-from ..dynamics.inputs import Inputs
 from ..dynamics.nonlinear_solver import SOLVERS, SolverSettings
 from ..dynamics.simulator import Simulator
 from ..energies.materials import make_material
@@ -26,6 +25,7 @@ from ..io.stages import run_lock
 from ..linalg.choice import LINEAR_SOLVERS
 from ..mesh.mesh import Mesh, box_hexahedra, box_tetrahedra, select_vertices
 from ..report.page import Cell, Part, Row, Table
+from ..stepping.inputs import Inputs
 from .benchmark import run_benchmark
 from .benchmark_tables import benchmark_sheets, machine
 from .command import WORDS, show, table_of

@@ -9,13 +9,13 @@ import numpy as np
 import torch
 import warp as wp
 
-from ..dynamics.inputs import Inputs
-from ..dynamics.integrator import State
 from ..dynamics.simulator import Simulator
 from ..energies.materials import Corotated
 from ..experiment.schema import at_most, check
 from ..fem.body import Body
 from ..mesh.mesh import Mesh, box_hexahedra, box_tetrahedra, select_vertices
+from ..stepping.inputs import Inputs
+from ..stepping.state import State
 from .command import show, table_of
 
 _FINEST = 4

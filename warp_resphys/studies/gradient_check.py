@@ -11,14 +11,14 @@ import torch
 import warp as wp
 from rich.table import Table
 
-from ..dynamics.inputs import Inputs
-from ..dynamics.integrator import State
 from ..dynamics.simulator import Simulator
-from ..energies.base import Quantity
 from ..experiment.build import build_simulator
 from ..experiment.schema import COUNT, NATURAL, NUMBERS, POSITIVE, Group, Kind, check
 from ..io.errors import InputError
 from ..mesh.poses import twisted
+from ..stepping.inputs import Inputs
+from ..stepping.quantity import Quantity
+from ..stepping.state import State
 from .command import show, table_of
 
 Loss = Callable[[torch.Tensor], torch.Tensor]

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from ..data.markers import Markers
 from ..data.rigid import RigidTransform, kabsch
-from ..energies.base import Quantity
 from ..experiment.build import bound_markers, sight_of
 from ..io.errors import ConvergenceError, InputError
 from ..mesh.mesh import boundary_triangles, surface_vertices
 from ..robot.inputs import BASE
 from ..robot.loading import RecordedTrial, recorded_trial
 from ..robot.robot import Robot
+from ..stepping.quantity import Quantity
 
 FloatArray = NDArray[np.float64]
 MATERIAL: Final = ("youngs_modulus", "poissons_ratio", "density", "mass_damping", "stiffness_damping")

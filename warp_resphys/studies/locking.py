@@ -16,7 +16,6 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from ..dynamics.inputs import Inputs
 from ..dynamics.nonlinear_solver import SolverSettings
 from ..dynamics.simulator import GRAVITY, Simulator
 from ..energies.fibres import Fibres
@@ -33,6 +32,7 @@ from ..mesh.chambers import find_chambers
 from ..mesh.mesh import Mesh, quadratic
 from ..mesh.readers import read_mesh
 from ..report.figures import STYLE, TONES, new_figure, save_png
+from ..stepping.inputs import Inputs
 from .command import show, table_of, write_csv
 from .elements import step_time
 

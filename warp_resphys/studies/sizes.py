@@ -11,8 +11,6 @@ import numpy as np
 import torch
 import warp as wp
 
-from ..dynamics.inputs import Inputs
-from ..dynamics.integrator import State
 from ..dynamics.nonlinear_solver import SolverSettings
 from ..dynamics.simulator import Simulator
 from ..energies.materials import Corotated
@@ -25,6 +23,8 @@ from ..io.memory import peak_memory_gib
 from ..io.progress import Progress, be_quiet
 from ..linalg.choice import LINEAR_SOLVERS
 from ..mesh.mesh import Mesh, box_hexahedra, box_tetrahedra, select_vertices
+from ..stepping.inputs import Inputs
+from ..stepping.state import State
 from .benchmark import now
 from .command import WORDS, show, table_of
 

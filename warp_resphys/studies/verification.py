@@ -14,8 +14,6 @@ import torch
 import warp as wp
 from numpy.typing import NDArray
 
-from ..dynamics.inputs import Inputs
-from ..dynamics.integrator import State
 from ..dynamics.nonlinear_solver import SolverSettings
 from ..dynamics.simulator import Simulator
 from ..energies.materials import Material, make_material
@@ -24,6 +22,8 @@ from ..fem.body import Body
 from ..io.errors import ConvergenceError, DataFileError, InputError
 from ..io.files import read_arrays
 from ..mesh.mesh import Mesh, box_hexahedra, select_vertices
+from ..stepping.inputs import Inputs
+from ..stepping.state import State
 
 LARGEST_ERROR = 1e-8  # m
 

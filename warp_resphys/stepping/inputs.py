@@ -1,13 +1,12 @@
 """What acts on a batch of bodies over time."""
 
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
 
-from ..energies.base import Energy
 from ..io.errors import InputError
+from .quantity import Quantity
 
 
 class Inputs:
@@ -118,35 +117,40 @@ class Inputs:
         series = self._series()
         return Inputs(**{name: pick(v) if series[name] else v for name, v in self.fields.items()})
 
-    def check(self, energies: Sequence[Energy], batch: int, vertices: int, fixed: int, like: torch.Tensor) -> None:
+    def check(
+        self,
+        accepted: Mapping[str, tuple[Quantity, int]],
+        batch: int,
+        vertices: int,
+        fixed: int,
+        like: torch.Tensor,
+    ) -> None:
         """Refuses what cannot be simulated, in one sentence on the first such field.
 
         Args:
-            energies: of the body.
+            accepted: inputs of the body's energies by name, each with its number of values n.
             batch: B.
             vertices: N.
             fixed: D.
             like: a tensor on the device and of the type of the simulator.
 
         Raises:
-            InputError: an input that no energy uses, a field of another shape or type, or values that are not finite or
-                out of their range.
+            InputError: an unknown input, a field of another shape or type, or values that are not finite or out of
+                their range.
         """
         known = {
             "external_force": ((batch, vertices, 3), "N", "vertex"),
             "fixed_positions": ((batch, fixed, 3), "m", "vertex"),
             "attached_mass": ((batch, vertices), "kg", "vertex"),
         }
-        own = {q.name: ((batch, energy.count), q.unit, q.per) for energy in energies for q in energy.inputs}
-        bounded = {q.name: q for energy in energies for q in energy.inputs if q.lower > -math.inf or q.upper < math.inf}
+        own = {name: ((batch, count), quantity.unit, quantity.per) for name, (quantity, count) in accepted.items()}
         for name, values in self.fields.items():
             if name not in known and name not in own:
-                others = ", ".join(own) or "none"
-                raise InputError(f"there is an input {name}, but no energy of the body takes it: they take {others}.")
+                raise InputError(f"Unknown input {name}. This body accepts {', '.join([*known, *own])}.")
             shape, unit, place = (known | own)[name]
             check_tensor(name, values, shape, unit, place, like)
-            if name in bounded:
-                bounded[name].check(values)
+            if name in accepted:
+                accepted[name][0].check(values)
 
 
 def check_tensor(name: str, values: Any, shape: tuple[int, ...], unit: str, place: str, like: torch.Tensor) -> None:

@@ -6,74 +6,14 @@ is five lines, and its gradients follow from those of the one nonlinear solve.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 
 import torch
 from typing_extensions import override
 
 from ..io.errors import InputError
+from .state import ImplicitStage, State
 
 INTEGRATORS = ("implicit_euler", "bdf2", "midpoint")
-_PAYLOAD = "payload_"
-
-
-@dataclass(frozen=True)
-class State:
-    """Positions and velocities of a batch, with the state before where a method looks back."""
-
-    q: torch.Tensor  # (B, N, 3) [m]
-    v: torch.Tensor  # (B, N, 3) [m/s]
-    previous: tuple[torch.Tensor, torch.Tensor] | None = None  # (q, v) one step earlier, or None
-    # (B, K, P, 3, 3) strain that each Prony branch of the material still carries at each of the solid's points; None
-    # where all have relaxed, as in a body that has been at rest for long
-    overstrain: torch.Tensor | None = None
-    # (B, S, 3) of the weights that hang on the body's strings; None where these hang still below where they are tied
-    payload: "State | None" = None
-
-    @property
-    def batch(self) -> int:
-        """B."""
-        return self.q.shape[0]
-
-    def map(self, change: Callable[[torch.Tensor], torch.Tensor]) -> "State":
-        """The state with every tensor changed."""
-        return State.from_tensors({name: change(each) for name, each in self.tensors().items()})
-
-    def detach(self) -> "State":
-        """The same state, cut off from the autograd graph."""
-        return self.map(torch.Tensor.detach)
-
-    def tensors(self) -> dict[str, torch.Tensor]:
-        """What it consists of, by name."""
-        found = {"q": self.q, "v": self.v}
-        if self.previous is not None:
-            found |= {"previous_q": self.previous[0], "previous_v": self.previous[1]}
-        if self.overstrain is not None:
-            found["overstrain"] = self.overstrain
-        if self.payload is not None:
-            found |= {f"{_PAYLOAD}{name}": each for name, each in self.payload.tensors().items()}
-        return found
-
-    @classmethod
-    def from_tensors(cls, tensors: Mapping[str, torch.Tensor]) -> "State":
-        """The state of `tensors`; others than its own are left out."""
-        previous = (tensors["previous_q"], tensors["previous_v"]) if "previous_q" in tensors else None
-        hung = {name.removeprefix(_PAYLOAD): each for name, each in tensors.items() if name.startswith(_PAYLOAD)}
-        payload = cls.from_tensors(hung) if hung else None
-        return cls(tensors["q"], tensors["v"], previous, tensors.get("overstrain"), payload)
-
-
-@dataclass(frozen=True)
-class ImplicitStage:
-    """The solve that a step comes down to."""
-
-    step: float  # effective step h_e [s]
-    target: torch.Tensor  # (B, N, 3) y, where inertia alone would go [m]
-    velocity_reference: torch.Tensor  # (B, N, 3) r with velocity (x - r) / h_e at the solution [m]
-    # (position, weight) pairs whose weighted strains the strain rate starts from
-    strain_weights: tuple[tuple[torch.Tensor, float], ...]
-    end: float = 1.0  # fraction of the time step that x stands at
 
 
 class Integrator(ABC):

@@ -1,0 +1,146 @@
+"""All energies of a simulator as one: their quantities, their values over a step, and what they remember.
+
+An energy knows its own names (``youngs_modulus``). Where a simulator has several of a kind, such as the solids of two
+regions, the names in the simulator begin with a prefix (``tip_youngs_modulus``); this is the only place that adds it
+and takes it away.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, TypeVar
+
+import torch
+
+from ..energies.base import BoundEnergy, Memory, Placement, Term
+from ..energies.placed import Placed
+from ..fem.body import Body
+from ..io.errors import InputError
+from ..stepping.constants import Constants, Mass
+from ..stepping.inputs import Inputs
+from ..stepping.integrators import Integrator
+from ..stepping.quantity import Quantity
+from ..stepping.state import ImplicitStage, State
+
+T = TypeVar("T")
+
+
+class EnergySet:
+    """The energies of a simulator.
+
+    Args:
+        placed: the energies, with their points and the prefixes of their names.
+        body: that they belong to.
+        rest_positions: (N, 3) [m], on the simulator's device and of its type.
+        method: the integrator.
+        time_step: h [s].
+
+    Attributes:
+        parameters: quantities of the energies by name in the simulator.
+        inputs: what acts through the energies over time, by name.
+        constants: values of the parameters.
+        counts: how many values a parameter may have, and an input has, beside the environments, by name.
+        parts: names of the parts that have a value each, such as tendons, by the name of the parameter.
+        memory: what the energies remember, by name.
+    """
+
+    def __init__(
+        self,
+        placed: Sequence[Placed],
+        body: Body,
+        rest_positions: torch.Tensor,
+        method: Integrator,
+        time_step: float,
+    ) -> None:
+        self.placed = tuple(placed)
+        self._bound: list[BoundEnergy] = []
+        self.parameters: dict[str, Quantity] = {}
+        self.inputs: dict[str, Quantity] = {}
+        self.constants: dict[str, Any] = {}
+        self.counts: dict[str, int] = {}
+        self.parts: dict[str, tuple[str, ...]] = {}
+        self.memory: dict[str, Memory] = {}
+        for each in placed:
+            energy, named = each.energy, each.named
+            bound = energy.bind(Placement(body, each.points, rest_positions, method, time_step))
+            self._bound.append(bound)
+            own = named({q.name: replace(q, name=f"{each.prefix}{q.name}") for q in energy.parameters})
+            acting = named({q.name: replace(q, name=f"{each.prefix}{q.name}") for q in energy.inputs})
+            self.parameters |= own
+            self.inputs |= acting
+            self.constants |= named(energy.constants)
+            self.counts |= dict.fromkeys([*own, *acting], energy.count)
+            self.parts |= dict.fromkeys(own, energy.names) if energy.names else {}
+            self.memory |= named({m.name: replace(m, name=f"{each.prefix}{m.name}") for m in bound.memory})
+
+    def prepare(self, parameters: Mapping[str, torch.Tensor]) -> tuple[dict[str, torch.Tensor | None], Mass]:
+        """Returns the values that follow from parameters by name, and the mass of the matter."""
+        values: dict[str, torch.Tensor | None] = {}
+        masses: list[Mass] = []
+        for each, bound in self._pairs:
+            own = each.own(parameters)
+            values |= each.named(bound.prepare(own))
+            if (mass := bound.mass(own)) is not None:
+                masses.append(mass)
+        return values, masses[0] if len(masses) == 1 else Mass.joined(masses)
+
+    @property
+    def _pairs(self) -> Iterable[tuple[Placed, BoundEnergy]]:
+        return zip(self.placed, self._bound, strict=True)
+
+    def acting(self, constants: Constants, inputs: Inputs, batch: int) -> dict[str, torch.Tensor | None]:
+        """Returns the values of the energies' terms that follow from parameters and inputs; absent inputs are zero."""
+        values = dict(constants.values)
+        for name in self.inputs:
+            given = inputs.actuation.get(name)
+            values[name] = constants.gravity.new_zeros(batch, self.counts[name]) if given is None else given
+        return values
+
+    def loads(self, constants: Constants, inputs: Inputs, batch: int, static: bool) -> Iterator[torch.Tensor]:
+        """Yields forces (1 or B, N, 3) that do not depend on where the body is [N]."""
+        for each, bound in self._pairs:
+            load = bound.load(each.own_inputs(inputs), each.own_constants(constants), batch, static)
+            if load is not None:
+                yield load
+
+    def begin_step(
+        self, state: State, stage: ImplicitStage, inputs: Inputs, constants: Constants, terms: Sequence[Term]
+    ) -> dict[str, torch.Tensor | None]:
+        """Returns the values of the energies' terms that depend on the step."""
+        values: dict[str, torch.Tensor | None] = {}
+        for (each, bound), term in zip(self._pairs, terms, strict=True):
+            values |= each.named(bound.begin_step(each.step(state, stage, inputs, constants, term)))
+        return values
+
+    def at_rest(self, batch: int) -> dict[str, torch.Tensor | None]:
+        """Returns those values for an equilibrium."""
+        return {name: value for each, bound in self._pairs for name, value in each.named(bound.at_rest(batch)).items()}
+
+    def end_step(
+        self,
+        state: State,
+        stage: ImplicitStage,
+        inputs: Inputs,
+        constants: Constants,
+        terms: Sequence[Term],
+        x: torch.Tensor,
+        q: torch.Tensor,
+    ) -> dict[str, torch.Tensor]:
+        """Returns what the energies remember after a step with the solution x (B, N, 3) that leads to positions q."""
+        memory: dict[str, torch.Tensor] = {}
+        for (each, bound), term in zip(self._pairs, terms, strict=True):
+            memory |= each.named(bound.end_step(each.step(state, stage, inputs, constants, term), x, q))
+        return memory
+
+    def check_memory(self, memory: Mapping[str, torch.Tensor], batch: int, like: torch.Tensor) -> None:
+        """Refuses memory that the energies do not have.
+
+        Raises:
+            InputError: an unknown name, another shape or type, or values that are not finite.
+        """
+        for name, values in memory.items():
+            if name not in self.memory:
+                known = ", ".join(self.memory) or "nothing"
+                raise InputError(
+                    f"Unknown memory {name!r} of the state. The energies of this body remember {known}; leave it out."
+                )
+            self.memory[name].check(values, batch, like)

@@ -1,0 +1,99 @@
+r"""Viscosity of a solid over one implicit stage: Kelvin-Voigt, and generalised Maxwell (Prony) branches.
+
+Both are quadratic in the Green strain E(x) of the stage's solution: a step keeps one potential, with the density
+
+    mu (c E - 2 W) : E + lambda / 2 (d tr E - 2 w) tr E .
+
+Kelvin-Voigt viscosity of retardation time beta has c = d = beta / h_e, W = c R with the strain R that the integrator's
+stage starts from, and w = d tr R.
+
+Branch k relaxes shear: G(t) = mu (1 + sum_k g_k exp(-t / tau_k)), mu being the modulus that is left after a long time,
+and lambda stays elastic, as is usual for rubber. It carries the strain H_k, the part that has not relaxed yet:
+
+    dH/dt = dE/dt - H / tau,     second Piola-Kirchhoff stress  2 mu g H .
+
+For a strain that changes evenly during s seconds that is solved exactly, and unconditionally stably, by
+
+    H(s) = exp(-s / tau) H(0) + gamma (E(s) - E(0)),     gamma = (1 - exp(-s / tau)) tau / s
+
+(Taylor, Pister and Goudreau 1970; Simo and Hughes, Computational Inelasticity, 1998, section 10.3). So a branch adds
+g gamma to c, and g (gamma E(0) - exp(-s / tau) H(0)) to W: however many there are, a step costs the same.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import reduce
+
+import torch
+
+from ..stepping.state import ImplicitStage
+
+Strain = Callable[[torch.Tensor], torch.Tensor]  # (B, N, 3) positions to the Green strain (B, P, 3, 3)
+StepValues = tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None]
+
+
+@dataclass(frozen=True)
+class Viscosity:
+    """Viscous constants of a solid; None for a part that does not act."""
+
+    damping: torch.Tensor  # (1 or B,) retardation time beta [s]
+    acts: bool  # whether beta may be other than zero
+    ratio: torch.Tensor | None  # (1 or B, K) moduli of the Prony branches over mu
+    time: torch.Tensor | None  # (1 or B, K) their relaxation times [s]
+
+    def step_values(
+        self, strain: Strain, q: torch.Tensor, carried: torch.Tensor | None, stage: ImplicitStage, time_step: float
+    ) -> StepValues:
+        """Returns c and d (B, 2), W (B, P, 3, 3) and w (B, P) of a step, the last two None where nothing acts.
+
+        Args:
+            strain: of the solid.
+            q: (B, N, 3) positions at the start [m].
+            carried: (B, K, P, 3, 3) strains H of the branches at the start; None for relaxed ones.
+            stage: of the integrator.
+            time_step: h [s].
+        """
+        batch = len(q)
+        c = d = (self.damping / stage.step).expand(batch)
+        offset = dilation = None
+        if self.acts:
+            offset = _scale(d, reduce(torch.add, [w * strain(x) for x, w in stage.strain_weights]))
+            dilation = offset.diagonal(dim1=-2, dim2=-1).sum(-1)
+        if self.ratio is None or self.time is None:
+            return d[:, None].expand(batch, 2), offset, dilation
+        decay, gamma = relaxation(self.time, stage.end * time_step)
+        added = (self.ratio * gamma).expand(batch, -1).sum(1)
+        branches = _scale(added, strain(q))
+        if carried is not None:
+            branches = branches - torch.einsum("bk,bkpij->bpij", (self.ratio * decay).expand(batch, -1), carried)
+        c, offset = c + added, branches if offset is None else offset + branches
+        dilation = branches.new_zeros(branches.shape[:2]) if dilation is None else dilation
+        return torch.stack([c, d], 1), offset, dilation
+
+    def relax(
+        self, strain: Strain, q: torch.Tensor, carried: torch.Tensor | None, end: torch.Tensor, seconds: float
+    ) -> torch.Tensor:
+        """Returns the strains H (B, K, P, 3, 3) of the branches after a motion.
+
+        Args:
+            strain: of the solid.
+            q: (B, N, 3) positions at its start [m].
+            carried: (B, K, P, 3, 3) strains H at its start; None for relaxed branches.
+            end: (B, N, 3) positions at its end [m].
+            seconds: its duration [s].
+        """
+        assert self.time is not None
+        decay, gamma = (x[..., None, None, None] for x in relaxation(self.time, seconds))
+        strained = gamma * (strain(end) - strain(q))[:, None].to(gamma.dtype)
+        return strained if carried is None else strained + decay * carried
+
+
+def relaxation(time: torch.Tensor, seconds: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Returns exp(-s / tau) and gamma, (1 or B, K), of relaxation times tau [s]."""
+    ratio = seconds / time
+    return torch.exp(-ratio), -torch.expm1(-ratio) / ratio
+
+
+def _scale(values: torch.Tensor, tensors: torch.Tensor) -> torch.Tensor:
+    """Returns (B,) values times (B, P, 3, 3) tensors."""
+    return values[:, None, None, None] * tensors

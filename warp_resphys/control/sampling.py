@@ -138,7 +138,7 @@ def check_reducible(robot: Robot) -> None:
         raise InputError(f"{known.name} has no markers: control follows markers of the robot.")
     if known.told_of_base is not None:
         raise InputError(f"the base of {known.name} moves: control is for robots whose base stands still.")
-    if robot.simulator.material.prony:
+    if any(material.prony for material in robot.simulator.materials.values()):
         raise InputError(
             "a material that relaxes has a memory of its own, which is not reduced: leave out its branches."
         )

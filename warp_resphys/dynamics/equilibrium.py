@@ -34,6 +34,7 @@ class Workspace:
         energies: of the body.
         n_vertices: N.
         fixed: (D,) fixed vertices.
+        held: (H,) vertices that are no unknowns: the fixed ones, and those that others determine.
         pattern: block structure of the Hessian.
         batch: environments.
         device: of every buffer.
@@ -48,13 +49,15 @@ class Workspace:
         energies: Sequence[Placed],
         n_vertices: int,
         fixed: NDArray[np.int64],
+        held: NDArray[np.int64],
         pattern: BlockPattern,
         batch: int,
         device: torch.device,
         dtype: torch.dtype,
     ) -> None:
         self.fixed = torch.as_tensor(fixed, device=device)
-        self.potential = IncrementalPotential(energies, n_vertices, self.fixed, batch, device)
+        unknown = torch.as_tensor(held, device=device)
+        self.potential = IncrementalPotential(energies, n_vertices, unknown, batch, device)
         self.pattern, self.dtype = pattern, dtype
         self._made: dict[Any, Any] = {}
         self.shards: list[Shard] = []

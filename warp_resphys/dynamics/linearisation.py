@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import scipy.sparse
@@ -9,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..energies.potential import StepTerms
+from ..fem.coordinates import DeviceCoordinates
 from ..linalg.linear_solver import Factor
 from ..linalg.sparse import SparseSolver
 from ..stepping.state import ImplicitStage, State
@@ -26,6 +28,7 @@ class Linearisation:
         terms: of the step.
         stage: of the integrator.
         fixed_positions: (B, D, 3) where the fixed vertices are at the stage [m].
+        coordinates: of the body; forces on vertices that others determine act on these, and displacements follow.
         finish: the state that a solution x leads to.
         linear_solver: which one factorises H.
 
@@ -42,19 +45,20 @@ class Linearisation:
         terms: StepTerms,
         stage: ImplicitStage,
         fixed_positions: torch.Tensor,
+        coordinates: DeviceCoordinates,
         finish: Callable[[torch.Tensor], State],
         linear_solver: str,
     ) -> None:
         self.stage, self.finish, self._workspace, self._name = stage, finish, workspace, linear_solver
-        self._fixed_positions = fixed_positions
+        self._fixed_positions, self._coordinates, self._terms = fixed_positions, coordinates, terms
         self.start = self.hold(stage.target)
         self._potential = workspace.potential
         self._potential.set_terms(terms)
         self.free = torch.as_tensor(workspace.pattern.free, device=self._potential.device)
 
     def hold(self, x: torch.Tensor) -> torch.Tensor:
-        """X with the fixed vertices where they are."""
-        return x.index_copy(1, self._workspace.fixed, self._fixed_positions)
+        """Returns x with the fixed vertices where they are, and those that others determine where these put them."""
+        return self._coordinates.expand(x.index_copy(1, self._workspace.fixed, self._fixed_positions))
 
     def residual(self, x: torch.Tensor) -> torch.Tensor:
         """(B, N, 3) g at x [N], zero at fixed vertices: the force that the step lacks to end there."""
@@ -69,7 +73,9 @@ class Linearisation:
 
     def solve(self, right: torch.Tensor) -> torch.Tensor:
         """(B, 3 N, m) solutions of H y = r for (B, 3 N, m) right-hand sides; zero at fixed vertices."""
-        return self._workspace.hessian(self._name).solve(right)
+        fields = self._coordinates.reduce(right.unflatten(1, (-1, 3)))
+        solution = self._workspace.hessian(self._name).solve(fields.flatten(1, 2))
+        return self._coordinates.expand(solution.unflatten(1, (-1, 3))).flatten(1, 2)
 
     def update(self, x: torch.Tensor) -> None:
         """Makes H ready for `product` and `shifted` at x, without a factor."""
@@ -104,6 +110,17 @@ class Linearisation:
             columns = scipy.sparse.csc_array(columns.cpu().numpy())
             matrix = scipy.sparse.csc_array(matrix + columns @ columns.T)
         return matrix, np.repeat(p.inertia[0].cpu().numpy()[pattern.free], 3)
+
+    def inertia_matrix(self, x: torch.Tensor) -> scipy.sparse.csc_array:
+        """Returns the part (3 F, 3 F) of H that is inertia [N/m], that of rigid parts and glued vertices included."""
+        whole, diagonal = self.matrix(x)
+        if not len(self._coordinates.dependent):
+            return scipy.sparse.csc_array(scipy.sparse.diags_array(diagonal))
+        still = {n: v * 0.0 if v is not None and n.endswith("inertia") else v for n, v in self._terms.values.items()}
+        self._potential.set_terms(replace(self._terms, inertia=0.0 * self._terms.inertia, values=still))
+        elastic, _ = self.matrix(x)
+        self._potential.set_terms(self._terms)
+        return scipy.sparse.csc_array(whole - elastic)
 
 
 class _ShiftedHessian:

@@ -32,12 +32,12 @@ def vibration_modes(simulator: Simulator, count: int) -> torch.Tensor:
         InputError: no mode, or more modes than there are free coordinates.
     """
     stiffness, inertia, free = _about_rest(simulator)
-    unknowns = len(inertia)
+    unknowns = inertia.shape[0]
     if not 1 <= count <= unknowns:
         raise InputError(f"{count} vibration modes were asked for, but the body has 1 to {unknowns}.")
-    root = np.sqrt(inertia)
-    unscale = scipy.sparse.diags_array(1.0 / root)
-    scaled = (unscale @ stiffness @ unscale).tocsc()
+    root = _root(inertia)
+    unscale = _inverse(root)
+    scaled = (unscale.T @ stiffness @ unscale).tocsc()
     number = min(count + _MORE, unknowns)
     if unknowns <= max(_DENSE, number):
         values, shapes = scipy.linalg.eigh(scaled.toarray(), subset_by_index=[0, number - 1])
@@ -49,7 +49,7 @@ def vibration_modes(simulator: Simulator, count: int) -> torch.Tensor:
         values, shapes = values[order], shapes[:, order]
     same = _SAME * np.abs(values) + _ZERO * scaled.diagonal().max()
     shapes = resolved(values, shapes, simulator.body.mesh.vertices[free], same)[:, :count]
-    orthonormal = with_signs(np.linalg.qr(root[:, None] * shapes)[0])
+    orthonormal = with_signs(np.linalg.qr(root.T @ shapes)[0])
     basis = simulator.rest_positions.new_zeros(simulator.body.n_vertices, 3, count)
     basis[free] = simulator.tensor(orthonormal.reshape(-1, 3, count))
     return basis.flatten(0, 1)
@@ -82,14 +82,40 @@ def with_signs(shapes: FloatArray) -> FloatArray:
     return shapes * np.sign(np.take_along_axis(shapes, first[None], 0))
 
 
-def _about_rest(simulator: Simulator) -> tuple[scipy.sparse.csc_array, FloatArray, NDArray[np.int64]]:
-    """Elastic stiffness (3 F, 3 F) [N/m] and inertia (3 F,) of the F free vertices at rest, and these vertices."""
+def _blocks(inertia: scipy.sparse.csc_array) -> NDArray[np.int64]:
+    """Returns the coordinates that an inertia matrix couples with others, (m,)."""
+    return np.flatnonzero(np.diff(inertia.indptr) > 1)
+
+
+def _root(inertia: scipy.sparse.csc_array) -> scipy.sparse.csc_array:
+    """Returns the triangular R with R^T R = M, whose coupled coordinates, those of rigid parts and glue, are few."""
+    coupled, root = _blocks(inertia), scipy.sparse.diags_array(np.sqrt(inertia.diagonal())).tolil()
+    if len(coupled):
+        block = inertia[coupled][:, coupled].toarray()
+        root[np.ix_(coupled, coupled)] = np.linalg.cholesky(block).T
+    return scipy.sparse.csc_array(root)
+
+
+def _inverse(root: scipy.sparse.csc_array) -> scipy.sparse.csc_array:
+    """Returns R^-1."""
+    coupled = np.flatnonzero((np.diff(root.indptr) > 1) | (np.diff(root.tocsr().indptr) > 1))
+    inverse = scipy.sparse.diags_array(1.0 / root.diagonal()).tolil()
+    if len(coupled):
+        inverse[np.ix_(coupled, coupled)] = np.linalg.inv(root[coupled][:, coupled].toarray())
+    return scipy.sparse.csc_array(inverse)
+
+
+def _about_rest(
+    simulator: Simulator,
+) -> tuple[scipy.sparse.csc_array, scipy.sparse.csc_array, NDArray[np.int64]]:
+    """Returns elastic stiffness and inertia (3 F, 3 F) [N/m] of the F free vertices at rest, and these vertices."""
     simulator = replace(simulator, dtype=torch.float64)  # The slowest vibrations are below the rounding of float32.
     rest = simulator.rest_state()
-    elastic = simulator.prepare({"stiffness_damping": 0.0})
+    elastic = simulator.prepare({name: 0.0 for name in simulator.parameters if name.endswith("stiffness_damping")})
     found = simulator.linearise(rest, parameters=elastic)
-    hessian, inertia = found.matrix(rest.q)
-    return (hessian - scipy.sparse.diags_array(inertia)).tocsc(), inertia, found.free.cpu().numpy()
+    hessian, _ = found.matrix(rest.q)
+    inertia = found.inertia_matrix(rest.q)
+    return scipy.sparse.csc_array(hessian - inertia), inertia, found.free.cpu().numpy()
 
 
 class RestStiffness:
@@ -109,13 +135,15 @@ class RestStiffness:
         self._matrix = stiffness
         self._factor = scipy.sparse.linalg.splu(stiffness)
         self._dofs = (3 * free[:, None] + np.arange(3)).ravel()
-        self._size = 3 * simulator.body.n_vertices
+        coordinates, n = simulator.body.coordinates, simulator.body.n_vertices
+        self._map = scipy.sparse.csr_array(scipy.sparse.kron(coordinates.matrix, np.eye(3)))  # (3 N, 3 N)
+        self._size = 3 * n
 
     def displacements(self, forces: FloatArray) -> FloatArray:
         """(3 N, m) K^-1 f of (3 N, m) [m]; zero at fixed vertices."""
         out = np.zeros((self._size, forces.shape[1]))
-        out[self._dofs] = self._factor.solve(forces[self._dofs])
-        return out
+        out[self._dofs] = self._factor.solve((self._map.T @ forces)[self._dofs])
+        return np.asarray(self._map @ out)
 
     def forces(self, displacements: FloatArray) -> FloatArray:
         """(3 N, m) K u of (3 N, m) [N]; zero at fixed vertices."""

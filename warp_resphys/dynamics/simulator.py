@@ -15,6 +15,7 @@ from ..energies.explicit import HeldEnergy
 from ..energies.materials import Corotated, Material
 from ..energies.placed import Placed
 from ..energies.potential import StepTerms
+from ..energies.rigid import PointInertia, rigid_energies
 from ..energies.solid import Solid
 from ..fem.body import Body
 from ..io.errors import ConvergenceError, InputError
@@ -37,6 +38,7 @@ _MOST_LENGTHS = 100.0  # that a body at rest may be away from its rest shape
 COUPLINGS = ("implicit", "explicit")
 _MOST_ITERATIONS = 100  # of Newton's method for an equilibrium; a few are enough where it is near
 _NOTHING = Inputs()
+_DEPENDENT = "dependent_"  # begins the names of the inertia of vertices that others determine
 _GRAVITY = Quantity("gravity", "m/s^2", per="axis")
 
 Parameters = Mapping[str, Any]
@@ -80,7 +82,9 @@ class Simulator:
 
     Args:
         body: what is simulated.
-        material: its constants; every method takes other values by name (``parameters``).
+        material: of the body, or of each of its mesh's regions by name; every method takes other values of its
+            constants by name (``parameters``), that of a region with its name and an underscore in front, as in
+            ``tip_youngs_modulus``.
         time_step: h [s].
         gravity: acceleration (3,) [m/s^2].
         integrator: ``implicit_euler``, ``bdf2`` or ``midpoint``.
@@ -107,7 +111,7 @@ class Simulator:
     """
 
     body: Body
-    material: Material = field(default_factory=Corotated)
+    material: Material | Mapping[str, Material] = field(default_factory=Corotated)
     time_step: float = 0.01
     gravity: Sequence[float] = GRAVITY
     integrator: str = "implicit_euler"
@@ -136,11 +140,15 @@ class Simulator:
         body = self.body
         self.rest_positions = self.tensor(body.mesh.vertices)  # (N, 3) [m]
         self.fixed = torch.as_tensor(body.fixed_vertices, device=self.device)
-        placed = [*self._solids(), *map(Placed, cast(Sequence[Energy], body.energies), body.energy_points)]
+        self._coordinates = body.coordinates.on(self.rest_positions)
+        placed = [*self._solids(), *self._rigid_parts()]
+        for energy, points in zip(cast(Sequence[Energy], body.energies), body.energy_points, strict=True):
+            placed.append(Placed.on(body, energy, points))
         self._set = EnergySet(placed, body, self.rest_positions, self.method, self.time_step)
         own = self._set
+        self._held = np.union1d(body.fixed_vertices, body.coordinates.dependent)  # what is no unknown of a solve
         self._pattern = BlockPattern(
-            body.mesh.vertices, body.fixed_vertices, [points for each in placed for points in each.points]
+            body.mesh.vertices, self._held, [points for each in placed for points in each.points]
         )
         self.parameters: dict[str, Quantity] = {**own.parameters, "gravity": _GRAVITY}
         self.constants: dict[str, Any] = {**own.constants, "gravity": [list(self.gravity)]}
@@ -153,14 +161,47 @@ class Simulator:
                 "implicit."
             )
         self._workspaces: dict[int, Workspace] = {}
-        self._held: dict[tuple[int, str], HeldEnergy] = {}
+        self._held_energies: dict[tuple[int, str], HeldEnergy] = {}
         self._attached_mass = self.tensor(body.attached_mass)
         self._built = True
 
+    @property
+    def materials(self) -> dict[str, Material]:
+        """Materials by the name of their region; of an empty name where the body has one."""
+        return {"": self.material} if isinstance(self.material, Material) else dict(self.material)
+
     def _solids(self) -> list[Placed]:
-        """Returns the solid of the body, or of each of its regions that has a material of its own."""
-        solid = Solid(self.body.discretisation, self.material)
-        return [Placed(solid, solid.points(self.body.mesh))]
+        """Returns the solid of the body, or one for each region that has a material of its own.
+
+        Raises:
+            InputError: the regions with a material do not cover the body's cells once each.
+        """
+        body = self.body
+        if isinstance(self.material, Material):
+            cells = body.soft_cells
+            solid = Solid(body.discretisation if cells is None else body.discretised(cells), self.material, cells)
+            return [Placed.on(body, solid, solid.points(body.mesh))]
+        regions = {name: body.mesh.region(name) for name in self.material}
+        numbers = [*regions.values(), *map(body.mesh.region, body.rigid), np.zeros(0, dtype=np.int64)]
+        owners = np.bincount(np.concatenate(numbers), minlength=len(body.mesh.cells))
+        if (owners != 1).any():
+            without, several = int((owners == 0).sum()), int((owners > 1).sum())
+            raise InputError(
+                f"the regions with a material ({', '.join(regions) or 'none'}) and the rigid parts leave {without} of "
+                f"{len(owners)} cells without one, and give {several} more than one: each cell needs one."
+            )
+        solids = {name: Solid(body.discretised(cells), self.material[name], cells) for name, cells in regions.items()}
+        return [Placed.on(body, solid, solid.points(body.mesh), f"{name}_") for name, solid in solids.items()]
+
+    def _rigid_parts(self) -> list[Placed]:
+        """Returns the energies of rigid parts, and the inertia of vertices that others determine."""
+        body, placed = self.body, list[Placed]()
+        for name in body.controls:
+            for energy in rigid_energies(body, name, body.rigid[name]):
+                placed.append(Placed(energy, energy.points(body.mesh), f"{name}_"))
+        if body.coordinates:
+            placed.append(Placed(PointInertia(body.coordinates.points), (body.coordinates.points,), _DEPENDENT))
+        return placed
 
     def __setattr__(self, name: str, value: object) -> None:
         """Refuses changes: what was uploaded would not follow them.
@@ -215,7 +256,9 @@ class Simulator:
 
     def _make_workspace(self, batch: int) -> Workspace:
         n, fixed = self.body.n_vertices, self.body.fixed_vertices
-        return Workspace(self._set.placed, n, fixed, self._pattern, batch, torch.device(self.device), self.dtype)
+        return Workspace(
+            self._set.placed, n, fixed, self._held, self._pattern, batch, torch.device(self.device), self.dtype
+        )
 
     def held_energy(self, name: str, batch: int) -> HeldEnergy:
         """The energy with an input of that name, by itself in a given state.
@@ -223,7 +266,7 @@ class Simulator:
         Raises:
             InputError: no energy of the body has that input.
         """
-        if (batch, name) not in self._held:
+        if (batch, name) not in self._held_energies:
             acting = [each for each in self._set.placed if name in each.named({q.name: q for q in each.energy.inputs})]
             if not acting:
                 known = ", ".join(self.inputs) or "none"
@@ -232,8 +275,8 @@ class Simulator:
             if energy.implicit_only:
                 raise InputError(f"{name} is a follower load, so it cannot be held constant over a step.")
             device = torch.device(self.device)
-            self._held[batch, name] = HeldEnergy(self.body, energy, batch, device)
-        return self._held[batch, name]
+            self._held_energies[batch, name] = HeldEnergy(self.body, energy, batch, device)
+        return self._held_energies[batch, name]
 
     def rest_state(self, batch: int = 1) -> State:
         """The undeformed body at rest.
@@ -278,6 +321,7 @@ class Simulator:
         clamped = self._fixed_at(state, stage, inputs)
         follows = workspace.follows(state.q)
         x, report = equilibrium(workspace, "dynamics", self.settings, terms, stage.target, clamped, follows)
+        x = self._coordinates.expand(x)
         new = self._finish(state, stage, inputs, constants, x)
         workspace.reached(new.q)
         return new, report
@@ -342,6 +386,7 @@ class Simulator:
             self._terms(state, stage, inputs, constants),
             stage,
             self._fixed_at(state, stage, inputs),
+            self._coordinates,
             partial(self._finish, state, stage, inputs, constants),
             self.settings.linear_solver,
         )
@@ -364,12 +409,13 @@ class Simulator:
                 assert value is not None
                 force = force + self.held_energy(name, batch).force(state.q, value)
                 values[name] = torch.zeros_like(value)
-        return StepTerms(
-            target=(stage.target + damping * stage.velocity_reference) / (1.0 + damping),
-            inertia=(mass / h**2 * (1.0 + damping[..., 0])).expand(batch, -1),
-            force=force.expand(batch, -1, -1),
-            values=values,
-        )
+        target = (stage.target + damping * stage.velocity_reference) / (1.0 + damping)
+        inertia = (mass / h**2 * (1.0 + damping[..., 0])).expand(batch, -1)
+        dependent = self._coordinates.dependent
+        if len(dependent):
+            values[f"{_DEPENDENT}inertia"] = inertia[:, dependent]
+            values[f"{_DEPENDENT}target"] = target[:, dependent]
+        return StepTerms(target, inertia, self._coordinates.reduce(force.expand(batch, -1, -1)), values)
 
     def _loads(self, inputs: Inputs, constants: Constants, batch: int, static: bool = False) -> torch.Tensor:
         """(1 or B, N, 3) gravity, external force and what parts add in equilibria or in steps [N]."""
@@ -449,14 +495,15 @@ class Simulator:
         terms = StepTerms(
             target=rest,
             inertia=self.rest_positions.new_zeros(batch, self.body.n_vertices),
-            force=share * self._loads(inputs, constants, batch, static=True).expand(batch, -1, -1),
+            force=share * self._coordinates.reduce(self._loads(inputs, constants, batch, True).expand(batch, -1, -1)),
             values=values,
         )
         workspace, clamp = self.workspace(batch), rest[:, self.fixed]
         most = min(self.settings.max_iterations, _MOST_ITERATIONS)
         settings = replace(self.settings, name="newton", on_failure="raise", max_iterations=most)
         at = clamp if inputs.fixed_positions is None else torch.lerp(clamp, inputs.fixed_positions, share)
-        return equilibrium(workspace, "statics", settings, terms, start, at)
+        x, report = equilibrium(workspace, "statics", settings, terms, start, at)
+        return self._coordinates.expand(x), report
 
     def rollout(
         self,

@@ -194,10 +194,10 @@ class MediumTerm(Term):
         """See `Term.adjoint`; through the energy's own derivatives, which torch takes twice."""
         (s,) = self.sets
         nodes = torch.as_tensor(s.source.nodes, device=self.launcher.device)
-        shares = torch.as_tensor(s.source.gradients[0, :, :, 0], device=self.launcher.device)  # (Q, K)
+        shares = torch.as_tensor(s.source.gradients[..., 0], device=self.launcher.device)  # (F, Q, K)
 
         def at_points(field: torch.Tensor) -> torch.Tensor:
-            return torch.einsum("qk,bfki->bfqi", shares, field[:, nodes]).flatten(1, 2)
+            return torch.einsum("fqk,bfki->bfqi", shares, field[:, nodes]).flatten(1, 2)
 
         def differentiate() -> dict[str, torch.Tensor]:
             with torch.enable_grad():

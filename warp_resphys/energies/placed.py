@@ -6,6 +6,7 @@ from typing import TypeVar
 
 import torch
 
+from ..fem.body import Body
 from ..fem.elements import Points
 from ..stepping.constants import Constants
 from ..stepping.inputs import Inputs
@@ -20,8 +21,15 @@ class Placed:
     """An energy, its points in the simulator, and the prefix of its names there, such as ``tip_``."""
 
     energy: Energy
-    points: tuple[Points, ...]
+    points: tuple[Points, ...]  # whose operators act on control vertices, see `fem.coordinates`
     prefix: str = ""
+    # the same with operators on all vertices, where the two differ
+    own_points: tuple[Points, ...] | None = None
+
+    @classmethod
+    def on(cls, body: Body, energy: Energy, points: tuple[Points, ...], prefix: str = "") -> "Placed":
+        """Places an energy on a body, given its points there."""
+        return cls(energy, tuple(map(body.coordinates.compose, points)), prefix, points)
 
     def named(self, values: Mapping[str, T]) -> dict[str, T]:
         """Returns values by the energy's names under their names in the simulator."""

@@ -239,7 +239,7 @@ class SolidTerm(Term):
         return stiffness @ self._curvature
 
     @override
-    def total_stiffness(self, values: Values) -> torch.Tensor:
+    def total_stiffness(self, values: Values) -> torch.Tensor | None:
         stiffness = values["stiffness"]
         assert stiffness is not None
         return stiffness.flatten(1).sum(1)

@@ -77,7 +77,8 @@ def check_configuration(config: Mapping[str, Any]) -> None:
     body = build_body(config)
     select_vertices(body.mesh, **config["tip"])
     simulator = build_simulator(config, body=body)
-    _check_size(body, simulator.material, config["gravity"])
+    for material in simulator.materials.values():
+        _check_size(body, material, config["gravity"])
     if recorded:
         _check_recorded(config, body)
         probe = MarkerMap.at_vertices(torch.zeros(1, 1, dtype=torch.int64))

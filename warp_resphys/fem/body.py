@@ -1,6 +1,6 @@
 """A body: the constant part of a simulation, in NumPy on the host."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Protocol
@@ -10,8 +10,11 @@ import scipy.sparse
 from numpy.typing import ArrayLike, NDArray
 
 from ..io.errors import InputError
+from ..mesh.location import locate
 from ..mesh.mesh import Mesh
+from .coordinates import Coordinates, rigid_weights
 from .elements import Discretisation, Points, discretise
+from .rigid import Glue, Rigid
 
 MASS_MODES = ("row_sum", "per_vertex")
 
@@ -89,7 +92,11 @@ class Body:
     point_masses: Sequence[PointMass] = field(default=())  # attached weights
     # what acts in or on the body beside its material: pressure, fibres (`energies.base.Energy`)
     energies: Sequence[OnBody] = field(default=())
-    # the sets of points of each of them
+    # regions of the mesh that move as rigid parts, by name
+    rigid: Mapping[str, Rigid] = field(default_factory=dict)
+    # vertices that follow a region whose mesh does not match theirs
+    glued: Sequence[Glue] = field(default=())
+    # the sets of points of each of the energies
     energy_points: tuple[tuple[Points, ...], ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -111,6 +118,8 @@ class Body:
         if twice:
             raise InputError(f"two energies of the body depend on {twice[0]}: put them into one.")
         object.__setattr__(self, "energy_points", tuple(each.points(self.mesh) for each in self.energies))
+        if self.rigid or self.glued:
+            self.coordinates  # noqa: B018  # What cannot move so is refused here.
 
     @property
     def n_vertices(self) -> int:
@@ -125,7 +134,81 @@ class Body:
     @cached_property
     def discretisation(self) -> Discretisation:
         """Integration points and volumes."""
-        return discretise(self.mesh, self.volume_integration)
+        return discretise(self.mesh, self.volume_integration, cracks=bool(self.glued))
+
+    @cached_property
+    def soft_cells(self) -> NDArray[np.int64] | None:
+        """(m,) cells of no rigid part; None where all cells are soft."""
+        if not self.rigid:
+            return None
+        rigid = np.concatenate([self.mesh.region(name) for name in self.rigid])
+        return np.setdiff1d(np.arange(len(self.mesh.cells)), rigid)
+
+    @property
+    def controls(self) -> dict[str, NDArray[np.int64]]:
+        """Four control vertices of each rigid part that is free to move, by name."""
+        return self._dependence[0]
+
+    @property
+    def coordinates(self) -> Coordinates:
+        """Vertices as weighted sums of control vertices."""
+        return self._dependence[1]
+
+    @cached_property
+    def _dependence(self) -> tuple[dict[str, NDArray[np.int64]], Coordinates]:
+        """Control vertices of the rigid parts, and the map from control vertices to all.
+
+        Raises:
+            InputError: a part of which some vertices are fixed and others are not, two parts that share vertices, a
+                flat part, or glued vertices that are fixed, rigid, or too far from what they are glued to.
+            MeshError: an unknown region.
+        """
+        weights: dict[int, tuple[NDArray[np.int64], NDArray[np.float64]]] = {}
+        controls: dict[str, NDArray[np.int64]] = {}
+        taken: dict[int, str] = {}
+        for name in self.rigid:
+            members = np.unique(self.mesh.cells[self.mesh.region(name)])
+            held = int(np.isin(members, self.fixed_vertices).sum())
+            if held == len(members):
+                continue
+            if held:
+                raise InputError(
+                    f"{held} of the {len(members)} vertices of the rigid part {name!r} are fixed: fix all of them, or "
+                    "none."
+                )
+            if shared := next((taken[i] for i in members.tolist() if i in taken), None):
+                raise InputError(f"the rigid parts {shared!r} and {name!r} share vertices: make them one region.")
+            taken |= dict.fromkeys(members.tolist(), name)
+            controls[name], own = rigid_weights(self.mesh.vertices, members, name)
+            weights |= own
+        for glue in self.glued:
+            weights |= self._glued_weights(glue, taken)
+        return controls, Coordinates.of(self.n_vertices, weights)
+
+    def _glued_weights(
+        self, glue: Glue, rigid: Mapping[int, str]
+    ) -> dict[int, tuple[NDArray[np.int64], NDArray[np.float64]]]:
+        """Returns control vertices and weights of glued vertices: the shape functions of the cells they lie in."""
+        vertices = np.unique(_vertex_indices(glue.vertices, self.n_vertices, "glued vertices"))
+        cells = self.mesh.cells[self.mesh.region(glue.to)]
+        for what, others in (("fixed", self.fixed_vertices), ("part of a rigid part", np.array(list(rigid)))):
+            if np.isin(vertices, others).any():
+                raise InputError(f"a vertex that is glued to {glue.to!r} is {what}: leave it out of the glue.")
+        if np.isin(vertices, cells).any():
+            raise InputError(f"a vertex that is glued to {glue.to!r} belongs to it: glue vertices of another region.")
+        used, renumbered = np.unique(cells, return_inverse=True)
+        found = locate(Mesh(self.mesh.vertices[used], renumbered.reshape(cells.shape)), self.mesh.vertices[vertices])
+        if float(found.outside.max()) > glue.tolerance:
+            far = int(found.outside.argmax())
+            raise InputError(
+                f"vertex {vertices[far]} is {found.outside[far]:.3g} m from the region {glue.to!r} that it is glued "
+                f"to, farther than the tolerance of {glue.tolerance:g} m: move the meshes together, or raise it."
+            )
+        return {int(i): (cells[c], w) for i, c, w in zip(vertices, found.cells, found.weights, strict=True)}
+
+    def discretised(self, cells: NDArray[np.int64]) -> Discretisation:
+        """Returns integration points and volumes of some cells."""
+        return discretise(self.mesh, self.volume_integration, cells, cracks=bool(self.glued))
 
     @cached_property
     def mass_volume(self) -> scipy.sparse.csr_array:

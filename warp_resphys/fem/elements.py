@@ -5,7 +5,7 @@ there is ``F = sum_a x_a (grad N_a)^T``, and says how much of each element's vol
 volume term of the energy. Gauss points, element centres and averages over vertex patches are all of this form.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse
@@ -76,8 +76,10 @@ def _per_vertex(cells: NDArray[np.int64], n_vertices: int, values: Array) -> sci
     return matrix.tocsr()
 
 
-def discretise(mesh: Mesh, volume_integration: str = "centre") -> Discretisation:
-    """The points, masses and loads of a mesh.
+def discretise(
+    mesh: Mesh, volume_integration: str = "centre", cells: NDArray[np.int64] | None = None, cracks: bool = False
+) -> Discretisation:
+    """The points, masses and loads of a mesh, or of some of its cells.
 
     The shape term takes the points of the element's rule. The volume term is under-integrated against locking
     (``centre``), on deformation gradients that are projected on few polynomials of each element (Simo and Hughes 1998,
@@ -89,6 +91,8 @@ def discretise(mesh: Mesh, volume_integration: str = "centre") -> Discretisation
     Args:
         mesh: the rest shape.
         volume_integration: ``centre`` or ``full``.
+        cells: (M',) numbers of the cells; all where left out. Averages over patches stay within these cells.
+        cracks: whether vertices may coincide, as those of parts that are glued together do.
 
     Raises:
         InputError: an unknown volume integration.
@@ -98,11 +102,27 @@ def discretise(mesh: Mesh, volume_integration: str = "centre") -> Discretisation
         raise InputError(
             f"volume_integration is {volume_integration!r}: choose one of {', '.join(VOLUME_INTEGRATIONS)}."
         )
-    check_mesh(mesh)
+    if cells is not None:
+        return _discretise_cells(mesh, volume_integration, cells, cracks)
+    check_mesh(mesh, cracks)
     full = volume_integration == "full"
     if mesh.element.volume_modes is None:
         return _linear_tetrahedra(mesh, full)
     return _isoparametric(mesh, full)
+
+
+def _discretise_cells(mesh: Mesh, volume_integration: str, cells: NDArray[np.int64], cracks: bool) -> Discretisation:
+    """Discretises the mesh that some cells alone would be, and numbers its vertices as the whole mesh does."""
+    used, renumbered = np.unique(mesh.cells[cells], return_inverse=True)
+    part = Mesh(mesh.vertices[used], renumbered.reshape(-1, mesh.cells.shape[1]))
+    own = discretise(part, volume_integration, cracks=cracks)
+    spread = scipy.sparse.csr_array((np.ones(len(used)), (used, np.arange(len(used)))), (len(mesh.vertices), len(used)))
+    return Discretisation(
+        tuple(replace(points, nodes=used[points.nodes]) for points in own.point_sets),
+        own.element_volumes,
+        scipy.sparse.csr_array(spread @ own.load_volume),
+        scipy.sparse.csr_array(spread @ own.lumped_volume),
+    )
 
 
 def _isoparametric(mesh: Mesh, full: bool) -> Discretisation:

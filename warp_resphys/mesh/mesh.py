@@ -4,8 +4,8 @@ Nodes are numbered as VTK numbers them. Lengths are metres; conversion from othe
 `warp_resphys.mesh.readers`, which reads files.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.sparse
@@ -27,16 +27,18 @@ COINCIDENT_DISTANCE = 1e-9  # largest distance of vertices that count as one, ov
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Vertices and cells of one kind, constant once built.
+    """Vertices and cells of one kind, constant once built, with named regions of cells.
 
-    Building one checks shapes and number types only; `check_mesh` checks what the numbers mean.
+    Building one checks shapes, number types and regions only; `check_mesh` checks what the numbers mean.
 
     Raises:
-        MeshError: An array has the wrong shape, or the indices are not integers.
+        MeshError: An array has the wrong shape, the indices are not integers, or a region is empty or has a cell that
+            the mesh does not have.
     """
 
     vertices: FloatArray  # (N, 3) [m] rest positions
     cells: IntArray  # (M, K) vertex indices in VTK's order, of one of `elements.ELEMENTS`
+    regions: Mapping[str, IntArray] = field(default_factory=dict)  # (m,) sorted cell numbers by name
 
     def __post_init__(self) -> None:
         """Check shapes and number types, and store contiguous float64 and int64 arrays."""
@@ -48,11 +50,30 @@ class Mesh:
             raise MeshError(f"cells must be (M, {known}) integers, not {cells.shape} of {cells.dtype}")
         object.__setattr__(self, "vertices", np.ascontiguousarray(vertices, dtype=np.float64))
         object.__setattr__(self, "cells", np.ascontiguousarray(cells, dtype=np.int64))
+        regions = {name: np.unique(np.asarray(numbers)) for name, numbers in self.regions.items()}
+        for name, numbers in regions.items():
+            if not len(numbers) or numbers.dtype.kind not in "iu" or numbers[0] < 0 or numbers[-1] >= len(cells):
+                raise MeshError(
+                    f"the region {name!r} must be the numbers of one or more of the mesh's {len(cells)} cells; turn a "
+                    "mask into them with np.flatnonzero"
+                )
+        object.__setattr__(self, "regions", {name: numbers.astype(np.int64) for name, numbers in regions.items()})
 
     @property
     def element(self) -> Element:
         """Kind of the cells."""
         return BY_NODES[self.cells.shape[1]]
+
+    def region(self, name: str) -> IntArray:
+        """Returns the cells of a region, (m,) sorted numbers.
+
+        Raises:
+            MeshError: The mesh has no region of that name.
+        """
+        if name not in self.regions:
+            known = ", ".join(self.regions) or "no regions"
+            raise MeshError(f"the mesh has no region {name!r}; it has {known}")
+        return self.regions[name]
 
     @property
     def kind(self) -> str:
@@ -134,14 +155,18 @@ def quadratic(mesh: Mesh, kind: str = "") -> Mesh:
         vertices.append(mesh.vertices[found].mean(axis=1))
         cells.append(count + member.reshape(-1, len(corners)))
         count += len(found)
-    return Mesh(np.concatenate(vertices), np.concatenate(cells, axis=1))
+    return Mesh(np.concatenate(vertices), np.concatenate(cells, axis=1), mesh.regions)
 
 
-def check_mesh(mesh: Mesh) -> None:
+def check_mesh(mesh: Mesh, cracks: bool = False) -> None:
     """Check that a finite-element method can use the mesh.
 
     The Jacobian determinant of each cell's map from its reference cell must be positive at the quadrature
     points and at the nodes.
+
+    Args:
+        mesh: To be checked.
+        cracks: Whether vertices may coincide, as those of parts that are glued together do.
 
     Raises:
         MeshError: The mesh is empty; a coordinate is not finite; an index is out of range; a vertex belongs
@@ -154,7 +179,8 @@ def check_mesh(mesh: Mesh) -> None:
     _refuse(np.any((cells < 0) | (cells >= count), axis=1), "cells", f"have indices outside 0 to {count - 1}")
     unused = np.bincount(cells.ravel(), minlength=count) == 0
     _refuse(unused, "vertices", "belong to no cell; reading with drop_unreferenced leaves them out")
-    _refuse(_coincident(vertices), "vertices", "lie on another one, a crack between cells; merge them")
+    if not cracks:
+        _refuse(_coincident(vertices), "vertices", "lie on another one, a crack between cells; merge or glue them")
     volumes, determinants = _normalised_volumes(mesh)
     _refuse(np.abs(volumes) < DEGENERATE_VOLUME, "cells", "are flat; remove them or mesh the body anew")
     _refuse(determinants < DEGENERATE_VOLUME, "cells", "are inverted or folded; reorder or move their nodes")

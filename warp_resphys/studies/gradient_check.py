@@ -229,7 +229,8 @@ def check_configured(config: Mapping[str, Any]) -> Iterator[tuple[float, str, li
     simulator = build_simulator({**config, "solver": solver})
     for poissons_ratio in wanted["poissons_ratios"]:
         changed: dict[str, Any] = {"poissons_ratio": poissons_ratio, **damping}
-        checked = replace(simulator, material=replace(simulator.material, **changed))
+        materials = {region: replace(material, **changed) for region, material in simulator.materials.items()}
+        checked = replace(simulator, material=materials.get("", materials))
         for name in wanted["poses"]:
             yield poissons_ratio, name, check_gradients(checked, name, wanted["steps"], wanted["batch"], wanted["seed"])
 

@@ -1,0 +1,167 @@
+"""Bodies of several solids, rigid parts and glued meshes."""
+
+import numpy as np
+import pytest
+import torch
+
+from tests.fem.test_coordinates import beam, two_boxes
+from warp_resphys import (
+    Body,
+    Corotated,
+    Inputs,
+    Mesh,
+    Simulator,
+    SolverSettings,
+    StableNeoHookean,
+    State,
+    box_hexahedra,
+    select_vertices,
+)
+from warp_resphys.dynamics.modes import RestStiffness, vibration_modes
+from warp_resphys.fem.rigid import Glue, Rigid
+from warp_resphys.io.errors import InputError
+from warp_resphys.studies.gradient_check import central_difference
+
+TIGHT = SolverSettings(relative_tolerance=1e-11)
+SILICONE = Corotated(2e5, 0.45, prony=[(0.2, 0.1)], stiffness_damping=1e-3)
+
+
+def clamped(**more):
+    mesh = beam((6, 2, 2))
+    return Body(mesh, fixed=select_vertices(mesh, x=0.0), **more)
+
+
+def test_two_regions_of_one_material_are_one_solid():
+    whole, parts = Simulator(clamped(), SILICONE), Simulator(clamped(), {"beam": SILICONE, "cap": SILICONE})
+    one, two = (s.rollout(s.rest_state(), 6) for s in (whole, parts))
+    torch.testing.assert_close(one.q, two.q, rtol=0.0, atol=1e-13)
+    strains = torch.cat([two.final.memory["beam_viscous_strain"], two.final.memory["cap_viscous_strain"]], 2)
+    shared = one.final.memory["viscous_strain"]
+    assert float((strains.norm() - shared.norm()).abs()) < 1e-9 * float(shared.norm())
+
+
+@pytest.mark.parametrize("name", ["beam_youngs_modulus", "cap_poissons_ratio", "cap_density", "cap_mass_damping"])
+def test_gradients_by_the_constants_of_a_region(name):
+    materials = {"beam": Corotated(3e5, 0.45, mass_damping=0.3), "cap": StableNeoHookean(1e5, 0.499, mass_damping=0.1)}
+    simulator = Simulator(clamped(), materials, solver=TIGHT, integrator="bdf2")
+    weights = torch.randn(1, simulator.body.n_vertices, 3, generator=torch.Generator().manual_seed(0)).double()
+
+    def loss(value):
+        return (weights * simulator.rollout(simulator.rest_state(), 3, parameters={name: value}).q[-1]).sum()
+
+    value = torch.tensor([float(simulator.constants[name])], dtype=torch.float64, requires_grad=True)
+    (gradient,) = torch.autograd.grad(loss(value), value)
+    with torch.no_grad():
+        found, uncertain = central_difference(lambda x: float(loss(value * (1.0 + 1e-3 * x))))
+    assert float(1e-3 * (gradient * value).detach()) == pytest.approx(found, abs=3.0 * uncertain + 1e-6 * abs(found))
+
+
+def test_regions_with_a_material_cover_every_cell_once():
+    body = clamped()
+    with pytest.raises(InputError, match="leave 16 of 24 cells without one"):
+        Simulator(body, {"cap": SILICONE})
+    with pytest.raises(InputError, match="cap"):
+        Simulator(clamped(rigid={"cap": Rigid()}), {"beam": SILICONE, "cap": SILICONE})
+
+
+def deviation(mesh, cells, q):
+    """Largest entry of F^T F - I of a part's best affine map, and the error of that map [m]."""
+    members = np.unique(mesh.cells[cells])
+    places = np.c_[mesh.vertices[members], np.ones(len(members))]
+    affine = np.linalg.lstsq(places, q[members], rcond=None)[0]
+    return np.abs(affine[:3] @ affine[:3].T - np.eye(3)).max(), np.abs(places @ affine - q[members]).max()
+
+
+def test_a_cap_is_rigid_to_a_ten_thousandth_of_its_size_and_its_weight_bends_the_beam():
+    body = clamped(rigid={"cap": Rigid(density=3000.0)})
+    simulator = Simulator(body, Corotated(2e5, 0.45))
+    q = simulator.static_equilibrium().q[0].numpy()
+    stretch, error = deviation(body.mesh, body.mesh.region("cap"), q)
+    assert stretch < 1e-4
+    assert error < 1e-15
+    # The moment and the force at the cap's face are those of its weight: so much mass as a load bends it as much.
+    stiff = {"beam": Corotated(2e5, 0.45), "cap": Corotated(1e10, 0.3, density=3000.0)}
+    other = Simulator(clamped(), stiff, solver=SolverSettings(name="newton")).static_equilibrium().q[0].numpy()
+    assert np.abs(q - other).max() < 1e-3 * np.abs(q - body.mesh.vertices).max()
+
+
+@pytest.mark.parametrize(("integrator", "order"), [("implicit_euler", 1), ("bdf2", 2)])
+def test_a_rigid_box_turns_as_eulers_equations_say(integrator, order):
+    """About an axis near that of the largest moment of inertia, so that it nutates."""
+    mesh = box_hexahedra((0.1, 0.05, 0.03), (2, 1, 1))
+    body = Body(Mesh(mesh.vertices, mesh.cells, {"all": np.arange(2)}), rigid={"all": Rigid(1000.0)})
+    spin = np.array([2.0, 1.0, 10.0])
+    inertia = 1000.0 * 0.1 * 0.05 * 0.03 / 12.0 * np.array([0.05**2 + 0.03**2, 0.1**2 + 0.03**2, 0.1**2 + 0.05**2])
+    momentum, turn, h = inertia * spin, np.eye(3), 1e-4
+
+    def slope(r):
+        w = r @ ((r.T @ momentum) / inertia)
+        return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]]) @ r
+
+    for _ in range(2000):
+        a = slope(turn)
+        b = slope(turn + 0.5 * h * a)
+        c = slope(turn + 0.5 * h * b)
+        turn = turn + h / 6.0 * (a + 2.0 * b + 2.0 * c + slope(turn + h * c))
+    errors = []
+    for steps in (20, 40):
+        simulator = Simulator(body, {}, time_step=0.2 / steps, gravity=(0.0, 0.0, 0.0), integrator=integrator)
+        start = simulator.rest_state()
+        arm = start.q - start.q.mean(1, keepdim=True)
+        v = torch.linalg.cross(torch.as_tensor(spin).expand_as(arm), arm)
+        q = simulator.rollout(State(start.q, v), steps).q[-1, 0].numpy()
+        assert deviation(mesh, np.arange(2), q)[0] < 1e-4
+        wanted = arm[0].numpy() @ turn.T + start.q.mean(1).numpy()
+        errors.append(np.abs(q - wanted).max())
+    assert np.log2(errors[0] / errors[1]) > order - 0.3
+    assert errors[1] < (2e-2, 2e-3)[order - 1]
+
+
+@pytest.mark.parametrize("name", ["cap_density", "youngs_modulus"])
+def test_gradients_through_a_rigid_part(name):
+    simulator = Simulator(
+        clamped(rigid={"cap": Rigid(2000.0)}), Corotated(2e5, 0.499, mass_damping=0.2), solver=TIGHT, integrator="bdf2"
+    )
+    random = torch.Generator().manual_seed(0)
+    weights, force = (torch.randn(1, simulator.body.n_vertices, 3, generator=random).double() for _ in range(2))
+
+    def loss(value, load):
+        inputs = Inputs(external_force=1e-3 * load * force)
+        return (weights * simulator.rollout(simulator.rest_state(), 4, inputs, {name: value}).q[-1]).sum()
+
+    value = torch.tensor([float(simulator.constants[name])], dtype=torch.float64, requires_grad=True)
+    load = torch.ones((), dtype=torch.float64, requires_grad=True)
+    by_value, by_load = torch.autograd.grad(loss(value, load), (value, load))
+    with torch.no_grad():
+        one = central_difference(lambda x: float(loss(value * (1.0 + 1e-2 * x), load)))
+        two = central_difference(lambda x: float(loss(value, load + 1e-1 * x)))
+    for found, (wanted, uncertain) in ((1e-2 * by_value * value, one), (1e-1 * by_load, two)):
+        assert float(found) == pytest.approx(wanted, abs=3.0 * uncertain + 1e-6 * abs(wanted))
+
+
+def test_boxes_that_are_glued_bend_like_one():
+    mesh, ends = two_boxes()
+    fixed = select_vertices(mesh, x=0.0)
+    glued = Simulator(Body(mesh, fixed, glued=[Glue(ends, "left")]), Corotated(2e5, 0.45)).static_equilibrium()
+    whole = box_hexahedra((0.1, 0.03, 0.03), (10, 3, 3))
+    one = Simulator(Body(whole, select_vertices(whole, x=0.0)), Corotated(2e5, 0.45)).static_equilibrium()
+    sag = [float((q[0, :, 2] - torch.as_tensor(m.vertices[:, 2])).min()) for q, m in ((glued.q, mesh), (one.q, whole))]
+    assert sag[0] == pytest.approx(sag[1], rel=0.05)
+    face = torch.as_tensor(ends)
+    inside = np.flatnonzero(np.isclose(mesh.vertices[:, 0], 0.05) & (np.arange(len(mesh.vertices)) < ends.min()))
+    corners = [i for i in inside if np.isclose(mesh.vertices[ends], mesh.vertices[i]).all(1).any()]
+    for i in corners:  # Corners coincide at rest, and stay together.
+        twin = face[np.isclose(mesh.vertices[ends], mesh.vertices[i]).all(1).argmax()]
+        torch.testing.assert_close(glued.q[0, i], glued.q[0, twin], rtol=0.0, atol=1e-15)
+
+
+def test_modes_and_stiffness_of_a_body_with_a_rigid_part():
+    body = clamped(rigid={"cap": Rigid(density=1000.0)})
+    simulator = Simulator(body, Corotated(2e5, 0.45))
+    stiff = {"beam": Corotated(2e5, 0.45), "cap": Corotated(2e10, 0.3, density=1000.0)}
+    other = Simulator(clamped(), stiff)
+    force = np.zeros((3 * body.n_vertices, 1))
+    force[-1] = 1e-3
+    moved, wanted = (RestStiffness(s).displacements(force) for s in (simulator, other))
+    np.testing.assert_allclose(moved, wanted, atol=1e-3 * np.abs(wanted).max())
+    assert vibration_modes(simulator, 4).shape == (3 * body.n_vertices, 4)

@@ -1,0 +1,91 @@
+"""Vertices as weighted sums of control vertices: rigid parts and glue."""
+
+import numpy as np
+import pytest
+import torch
+
+from warp_resphys import Body, Mesh, box_hexahedra, box_tetrahedra, select_vertices
+from warp_resphys.fem.coordinates import Coordinates, barycentric, control_vertices
+from warp_resphys.fem.rigid import Glue, Rigid
+from warp_resphys.io.errors import InputError
+
+
+def beam(cells=(10, 3, 3)):
+    mesh = box_hexahedra((0.1, 0.03, 0.03), cells)
+    cap = np.arange(len(mesh.cells) - 2 * cells[1] * cells[2], len(mesh.cells))
+    return Mesh(mesh.vertices, mesh.cells, {"beam": np.arange(cap[0]), "cap": cap})
+
+
+def two_boxes(gap=0.0):
+    """A box of 2 x 2 cells in section, and one of 3 x 3 that begins where it ends."""
+    one, two = box_hexahedra((0.05, 0.03, 0.03), (5, 2, 2)), box_hexahedra((0.05, 0.03, 0.03), (5, 3, 3))
+    vertices = np.concatenate([one.vertices, two.vertices + [0.05 + gap, 0.0, 0.0]])
+    cells = np.concatenate([one.cells, two.cells + len(one.vertices)])
+    first = np.arange(len(one.cells))
+    mesh = Mesh(vertices, cells, {"left": first, "right": np.arange(len(first), len(cells))})
+    ends = np.flatnonzero(np.isclose(vertices[:, 0], 0.05 + gap) & (np.arange(len(vertices)) >= len(one.vertices)))
+    return mesh, ends
+
+
+@pytest.mark.parametrize("mesh", [beam(), box_tetrahedra((0.1, 0.03, 0.03), (5, 2, 2), order=2)])
+def test_weights_of_a_rigid_part_are_small_and_give_its_vertices(mesh):
+    members = np.unique(mesh.cells[-5:])
+    controls = control_vertices(mesh.vertices, members, "cap")
+    weights = barycentric(mesh.vertices[controls], mesh.vertices[members])
+    np.testing.assert_allclose(weights @ mesh.vertices[controls], mesh.vertices[members], atol=1e-15)
+    assert np.abs(weights).max() < 1.0 + 1e-6
+
+
+def test_composed_points_see_what_all_vertices_show():
+    body = Body(beam(), rigid={"cap": Rigid()})
+    random = np.random.default_rng(0)
+    control = torch.as_tensor(random.normal(size=(1, body.n_vertices, 3)))
+    device = body.coordinates.on(control)
+    x = device.expand(control)[0].numpy()
+    np.testing.assert_allclose(body.coordinates.matrix @ control[0].numpy(), x, atol=1e-12)
+    for points in body.discretisation.point_sets:
+        composed = body.coordinates.compose(points)
+        assert not np.isin(composed.nodes[np.abs(composed.gradients).sum((1, 3)) > 0], body.coordinates.dependent).any()
+        whole = np.einsum("cki,cqkj->cqij", x[points.nodes], points.gradients)
+        own = np.einsum("cki,cqkj->cqij", control[0].numpy()[composed.nodes], composed.gradients)
+        np.testing.assert_allclose(own, whole, rtol=0, atol=1e-9 * np.abs(whole).max())
+    forces = torch.as_tensor(random.normal(size=control.shape))
+    work = (device.reduce(forces) * control).sum()
+    torch.testing.assert_close(work, (forces * device.expand(control)).sum())
+
+
+def test_glue_to_a_vertex_that_is_glued_is_resolved():
+    one, two = np.array([1.0]), np.array([0.25, 0.75])
+    chain = Coordinates.of(4, {1: (np.array([0]), one), 2: (np.array([0, 1]), two), 3: (np.array([2]), one)})
+    np.testing.assert_allclose(chain.matrix.toarray()[:, 0], np.ones(4))
+    with pytest.raises(InputError, match="determine each other"):
+        Coordinates.of(2, {0: (np.array([1]), one), 1: (np.array([0]), one)})
+
+
+def test_a_body_without_parts_keeps_its_points():
+    body = Body(beam())
+    points = body.discretisation.point_sets[0]
+    assert not body.coordinates
+    assert body.coordinates.compose(points) is points
+
+
+MESH, ENDS = two_boxes()
+FAR, FAR_ENDS = two_boxes(gap=0.002)
+FLAT = Mesh(beam().vertices, beam().cells, {"cap": np.arange(81, 90), "next": np.arange(72, 81)})
+
+
+@pytest.mark.parametrize(
+    ("make", "key"),
+    [
+        (lambda: Body(beam(), select_vertices(beam(), x=0.1), rigid={"cap": Rigid()}), "'cap' are fixed"),
+        (lambda: Body(FLAT, rigid={"cap": Rigid(), "next": Rigid()}), "share vertices"),
+        (lambda: Body(MESH, glued=[Glue(ENDS, "right")]), "belongs to it"),
+        (lambda: Body(MESH, ENDS[:1], glued=[Glue(ENDS, "left")]), "is fixed"),
+        (lambda: Body(MESH, rigid={"right": Rigid()}, glued=[Glue(ENDS, "left")]), "part of a rigid part"),
+        (lambda: Body(FAR, glued=[Glue(FAR_ENDS, "left")]), "farther than the tolerance"),
+        (lambda: Rigid(stiffness=0.0), "must be positive, in Pa"),
+    ],
+)
+def test_what_cannot_be_rigid_or_glued_is_refused(make, key):
+    with pytest.raises(InputError, match=key):
+        make()

@@ -1,0 +1,224 @@
+r"""Rigid parts as affine bodies, and inertia of vertices that others determine.
+
+A part that covers cells of the mesh is moved by four of its vertices r_c (`fem.coordinates`), and has one deformation
+gradient F (Lan et al., Affine Body Dynamics, 2022). The energy kappa V |F - R(F)|^2 keeps F close to a rotation. The
+part's mass acts through
+
+    1 / 2 integral rho |x - y|^2 dV = rho / 2 sum_p |sum_c L_cp (r_c - y_c)|^2,      L L^T = integral w w^T dV,
+
+w being the barycentric coordinates: the mass and the tensor of inertia of the cells are exact, and for a rotation the
+motion is that of a rigid body.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import scipy.sparse
+import torch
+import warp as wp
+from numpy.typing import NDArray
+from typing_extensions import override
+
+from ..fem.body import Body
+from ..fem.coordinates import barycentric
+from ..fem.elements import Points, SolidPoints, physical_gradients
+from ..fem.rigid import Rigid
+from ..kernels import point_inertia as kernels
+from ..mesh.elements import conical_simplex, gauss_box
+from ..mesh.mesh import Mesh
+from ..stepping.constants import Mass
+from ..stepping.quantity import Parameter, Quantity
+from .base import BoundEnergy, Energy, Placement, PointSet, Step, Term, Values
+from .launcher import Launcher, warp_view
+from .materials import Corotated
+from .solid import VISCOUS, SolidTerm
+
+
+@dataclass(frozen=True)
+class PointInertia(Energy):
+    """Inertia of points; their values are ``inertia`` (B, P) [N/m] and ``target`` (B, P, 3) [m] of a step."""
+
+    own_points: Points
+
+    @override
+    def points(self, mesh: Mesh) -> tuple[Points, ...]:
+        return (self.own_points,)
+
+    @override
+    def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "PointInertiaTerm":
+        return PointInertiaTerm(launcher, sets)
+
+    @override
+    def bind(self, placement: Placement) -> "BoundInertia":
+        return BoundInertia(self, placement)
+
+
+class BoundInertia(BoundEnergy):
+    """Inertia of vertices that others determine, over the steps of a simulator, which gives its values."""
+
+    @override
+    def at_rest(self, batch: int) -> dict[str, torch.Tensor | None]:
+        (points,) = self.placement.points
+        zeros = self.placement.rest_positions.new_zeros(batch, points.n_points)
+        return {"inertia": zeros, "target": zeros[..., None].expand(-1, -1, 3)}
+
+
+@dataclass(frozen=True)
+class RigidInertia(PointInertia):
+    """Inertia and weight of a rigid part; the parameter is its ``density`` [kg/m^3]."""
+
+    parameters: ClassVar[tuple[Quantity, ...]] = (Quantity("density", "kg/m^3", 0.0),)
+
+    controls: NDArray[np.int64]  # (4,) vertices
+    cells: NDArray[np.int64]  # (m,)
+    density: Parameter
+
+    @property
+    @override
+    def constants(self) -> Mapping[str, Parameter]:
+        return {"density": self.density}
+
+    @override
+    def bind(self, placement: Placement) -> "BoundRigidInertia":
+        return BoundRigidInertia(self, placement)
+
+
+class BoundRigidInertia(BoundInertia):
+    """A rigid part's mass over the steps of a simulator."""
+
+    def __init__(self, part: RigidInertia, placement: Placement) -> None:
+        super().__init__(part, placement)
+        like = placement.rest_positions
+        self._controls = torch.as_tensor(part.controls, device=like.device)
+        self._factor = placement.tensor(part.own_points.gradients[0, :, :, 0])  # (P, 4) L^T
+        volume = placement.body.load_volume.tocsc()[:, part.cells].sum(axis=1)
+        self._volume = placement.tensor(volume)  # (N,) of which the weight acts at each vertex [m^3]
+
+    @override
+    def mass(self, parameters: Mapping[str, torch.Tensor]) -> Mass:
+        weight = parameters["density"] * self._volume
+        return Mass(torch.zeros_like(weight), weight, weight.new_zeros(1, 1))
+
+    @override
+    def begin_step(self, step: Step) -> dict[str, torch.Tensor | None]:
+        inertia = step.constants.value("density") / step.stage.step**2
+        target = torch.einsum("pc,bci->bpi", self._factor, step.stage.target[:, self._controls])
+        return {"inertia": inertia.expand(step.state.batch, len(self._factor)), "target": target}
+
+
+class PointInertiaTerm(Term):
+    """Kernels of the inertia of points."""
+
+    @property
+    @override
+    def shapes(self) -> Mapping[str, tuple[int, ...]]:
+        return {"inertia": (self.n_points,), "target": (self.n_points, 3)}
+
+    def _views(self, values: Values) -> list[Any]:
+        inertia, target = values["inertia"], values["target"]
+        assert inertia is not None
+        assert target is not None
+        return [warp_view(inertia, wp.float64), warp_view(target, wp.vec3d)]
+
+    @override
+    def step(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
+        return kernels.local_step, [s.nodes, s.gradients, *self._views(values), s.points_per_cell, positions]
+
+    @override
+    def tangent(self, s: PointSet, values: Values, positions: Any, positive: Any) -> tuple[Any, list[Any]]:
+        del positions, positive  # It is constant, and has no negative eigenvalues.
+        return kernels.tangent, self._views(values)[:1]
+
+    @override
+    def curvature(self, values: Values) -> torch.Tensor:
+        inertia = values["inertia"]
+        assert inertia is not None
+        return inertia
+
+    @override
+    def adjoint(
+        self, values: Values, positions: torch.Tensor, direction: torch.Tensor
+    ) -> Callable[[], dict[str, torch.Tensor]]:
+        own, (s,) = self.launcher, self.sets
+        by_inertia, by_target = own.zeros(self.n_points), own.zeros(self.n_points, 3)
+        fields = [warp_view(field, wp.vec3d) for field in (positions, direction)]
+        inputs = [s.nodes, s.gradients, *self._views(values), s.points_per_cell, *fields]
+        outputs = [warp_view(by_inertia, wp.float64), warp_view(by_target, wp.vec3d)]
+        command = own.record(kernels.slopes, (own.batch, self.n_points), inputs, outputs)
+
+        def differentiate() -> dict[str, torch.Tensor]:
+            own.launch(command)
+            return {"inertia": by_inertia.clone(), "target": by_target.clone()}
+
+        return differentiate
+
+
+@dataclass(frozen=True)
+class Rigidity(Energy):
+    """The energy kappa V |F - R(F)|^2 that keeps a part's deformation gradient close to a rotation."""
+
+    own_points: SolidPoints  # the one point of the part, with its volume
+    stiffness: float  # kappa [Pa]
+
+    @override
+    def points(self, mesh: Mesh) -> tuple[Points, ...]:
+        return (self.own_points,)
+
+    @override
+    def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> SolidTerm:
+        volume = float(self.own_points.shape_volume.sum())
+        return SolidTerm(launcher, sets, Corotated(), np.array([[volume, 0.0]]))
+
+    @override
+    def bind(self, placement: Placement) -> "BoundRigidity":
+        return BoundRigidity(self, placement)
+
+
+class BoundRigidity(BoundEnergy):
+    """The rigidity of a part over the steps of a simulator."""
+
+    @override
+    def prepare(self, parameters: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor | None]:
+        del parameters
+        rigidity = self.energy
+        assert isinstance(rigidity, Rigidity)
+        scale = rigidity.stiffness * float(rigidity.own_points.shape_volume.sum())
+        return {"stiffness": self.placement.tensor([[[scale, 0.0]]])}
+
+    @override
+    def at_rest(self, batch: int) -> dict[str, torch.Tensor | None]:
+        still = self.placement.rest_positions.new_zeros(batch, 2)
+        return dict(zip(VISCOUS, (still, None, None), strict=True))
+
+    @override
+    def begin_step(self, step: Step) -> dict[str, torch.Tensor | None]:
+        return self.at_rest(step.state.batch)
+
+
+def rigid_energies(body: Body, name: str, part: Rigid) -> list[Energy]:
+    """Returns the energies of a rigid part of a body: its rigidity and its inertia."""
+    cells, controls = body.mesh.region(name), body.controls[name]
+    corners = body.mesh.vertices[controls]
+    # The gradients of barycentric coordinates do not ask how the corners are ordered.
+    gradients = np.linalg.inv(np.vstack([corners.T, np.ones(4)]))[:, :3]
+    moments, volume = _moments(body.mesh, cells, corners)
+    carried = scipy.sparse.csr_array(np.array([[volume]]))
+    point = SolidPoints(controls[None], gradients[None, None], carried, scipy.sparse.csr_array((1, 1)))
+    operators = np.zeros((1, 4, 4, 3))
+    operators[0, :, :, 0] = np.linalg.cholesky(moments).T
+    inertia = RigidInertia(Points(controls[None], operators), controls, cells, part.density)
+    return [Rigidity(point, part.stiffness), inertia]
+
+
+def _moments(mesh: Mesh, cells: NDArray[np.int64], corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Returns the integral (4, 4) of w w^T over cells [m^3] and their volume, w being barycentric coordinates."""
+    simplex = mesh.element.faces.shape[1] in (3, 6)
+    points, weights = conical_simplex(4) if simplex else gauss_box(4)
+    values, reference = mesh.element.shape(points)
+    _, determinants = physical_gradients(mesh.vertices, mesh.cells[cells], reference)
+    volumes = (determinants * weights).ravel()
+    places = np.einsum("qk,cki->cqi", values, mesh.vertices[mesh.cells[cells]]).reshape(-1, 3)
+    w = barycentric(corners, places)
+    return np.einsum("p,pa,pb->ab", volumes, w, w), float(volumes.sum())

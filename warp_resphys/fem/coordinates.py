@@ -1,0 +1,211 @@
+"""Vertices as weighted sums of control vertices, x = W r.
+
+A free vertex is its own control vertex. One that is glued to a face has the shape functions of that face as weights.
+A rigid part is an affine body (Lan et al., Affine Body Dynamics, 2022): four of its own vertices control it, and the
+weights of the others are their barycentric coordinates. As W acts on each component alike, a point's operator
+F = sum_a x_a g_a^T stays of that form, F = sum_c r_c (sum_a W_ac g_a)^T: energies see control vertices only, and the
+Hessian in r is W^T H W without ever forming H.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TypeVar
+
+import numpy as np
+import scipy.sparse
+import torch
+from numpy.typing import NDArray
+
+from ..io.errors import InputError
+from .elements import Points
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+P = TypeVar("P", bound=Points)
+
+_FLAT = 1e-3  # smallest height of the tetrahedron that controls a rigid part, over the part's size
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """The map W of a body; the identity where nothing depends on other vertices."""
+
+    n_vertices: int  # N
+    dependent: IntArray  # (S,) vertices that others determine, ascending
+    weights: scipy.sparse.csr_array  # (S, N) of the control vertices in each of them
+
+    @classmethod
+    def of(cls, n_vertices: int, weights: Mapping[int, tuple[IntArray, FloatArray]]) -> "Coordinates":
+        """Builds the map from the control vertices and weights of each dependent vertex.
+
+        A dependent vertex may be a weighted sum of others that are dependent too; these are resolved.
+
+        Raises:
+            InputError: two vertices determine each other.
+        """
+        dependent = np.array(sorted(weights), dtype=np.int64)
+        own = np.ones(n_vertices)
+        own[dependent] = 0.0
+        rows = [np.full(len(weights[i][0]), i) for i in dependent]
+        if rows:
+            columns, values = (np.concatenate([weights[i][k] for i in dependent]) for k in (0, 1))
+            given = scipy.sparse.csr_array((values, (np.concatenate(rows), columns)), (n_vertices, n_vertices))
+        else:
+            given = scipy.sparse.csr_array((n_vertices, n_vertices))
+        whole = scipy.sparse.csr_array(scipy.sparse.diags_array(own) + given)
+        for _ in range(len(dependent)):
+            if not whole[:, dependent].nnz:
+                break
+            whole = scipy.sparse.csr_array(whole @ whole)
+            whole.eliminate_zeros()
+        if len(dependent) and whole[:, dependent].nnz:
+            raise InputError("glued vertices determine each other: glue one side of an interface to the other only.")
+        return cls(n_vertices, dependent, scipy.sparse.csr_array(whole[dependent]))
+
+    def __bool__(self) -> bool:
+        """Whether any vertex depends on others."""
+        return len(self.dependent) > 0
+
+    @cached_property
+    def matrix(self) -> scipy.sparse.csr_array:
+        """(N, N) W; columns of dependent vertices are empty."""
+        own = np.ones(self.n_vertices)
+        own[self.dependent] = 0.0
+        rows = np.arange(len(self.dependent)), self.dependent
+        place = scipy.sparse.csr_array((np.ones(len(self.dependent)), rows[::-1]), (self.n_vertices, len(rows[0])))
+        return scipy.sparse.csr_array(scipy.sparse.diags_array(own) + place @ self.weights)
+
+    @cached_property
+    def _rows(self) -> dict[int, tuple[IntArray, FloatArray]]:
+        """Control vertices and weights of every dependent vertex."""
+        w = self.weights
+        return {
+            int(vertex): (w.indices[w.indptr[k] : w.indptr[k + 1]], w.data[w.indptr[k] : w.indptr[k + 1]])
+            for k, vertex in enumerate(self.dependent)
+        }
+
+    def compose(self, points: P) -> P:
+        """Returns points whose operators act on control vertices."""
+        touched = np.flatnonzero(np.isin(points.nodes, self.dependent).any(axis=1))
+        if not len(touched):
+            return points
+        lists: list[tuple[IntArray, FloatArray]] = []
+        for cell in touched:
+            nodes, operators = points.nodes[cell], points.gradients[cell]  # (K,), (Q, K, 3)
+            sums = dict[int, FloatArray]()
+            for a, node in enumerate(nodes.tolist()):
+                controls, weights = self._rows.get(node, (np.array([node]), np.ones(1)))
+                for control, weight in zip(controls.tolist(), weights, strict=True):
+                    sums[control] = sums.get(control, 0.0) + weight * operators[:, a]
+            lists.append((np.array(list(sums), dtype=np.int64), np.stack(list(sums.values()), axis=1)))
+        width = max(points.nodes.shape[1], *(len(nodes) for nodes, _ in lists))
+        cells, per_cell, old = points.gradients.shape[:3]
+        # What pads a cell repeats its first vertex with an operator of zero, which contributes nothing.
+        nodes = np.repeat(points.nodes[:, :1], width, axis=1)
+        operators = np.zeros((cells, per_cell, width, 3))
+        nodes[:, :old], operators[:, :, :old] = points.nodes, points.gradients
+        for cell, (own, operator) in zip(touched, lists, strict=True):
+            nodes[cell], operators[cell] = own[0], 0.0
+            nodes[cell, : len(own)], operators[cell, :, : len(own)] = own, operator
+        return replace(points, nodes=nodes, gradients=operators)
+
+    @cached_property
+    def points(self) -> Points:
+        """One point per dependent vertex, whose operator's first column gives its position."""
+        width = int(np.diff(self.weights.indptr).max())
+        nodes = np.zeros((len(self.dependent), width), dtype=np.int64)
+        operators = np.zeros((len(self.dependent), 1, width, 3))
+        for row, (controls, weights) in enumerate(self._rows.values()):
+            nodes[row], nodes[row, : len(controls)] = controls[0], controls
+            operators[row, 0, : len(controls), 0] = weights
+        return Points(nodes, operators)
+
+    def on(self, like: torch.Tensor) -> "DeviceCoordinates":
+        """Returns the map on the device and in the type of a tensor."""
+        return DeviceCoordinates(self, like)
+
+
+class DeviceCoordinates:
+    """`Coordinates` on a device.
+
+    Attributes:
+        dependent: (S,) vertices that others determine.
+    """
+
+    def __init__(self, coordinates: Coordinates, like: torch.Tensor) -> None:
+        self.dependent = torch.as_tensor(coordinates.dependent, device=like.device)
+        matrix = coordinates.weights.tocoo()
+        indices = torch.as_tensor(np.stack([matrix.row, matrix.col]).astype(np.int64))
+        values = torch.as_tensor(matrix.data)
+        weights = torch.sparse_coo_tensor(indices, values, matrix.shape, check_invariants=False)
+        self._weights = weights.to(device=like.device, dtype=like.dtype).coalesce()  # (S, N)
+        self._transposed = self._weights.mT.coalesce()
+
+    def _times(self, matrix: torch.Tensor, fields: torch.Tensor) -> torch.Tensor:
+        """Returns a sparse matrix (r, n) times (B, n, ...)."""
+        columns = fields.movedim(1, 0).reshape(fields.shape[1], -1)
+        rest = (fields.shape[0], *fields.shape[2:])
+        return torch.sparse.mm(matrix, columns).reshape(matrix.shape[0], *rest).movedim(0, 1)
+
+    def expand(self, r: torch.Tensor) -> torch.Tensor:
+        """Returns a field (B, N, ...) with its values at dependent vertices set from the control vertices."""
+        if not len(self.dependent):
+            return r
+        kept = r.index_fill(1, self.dependent, 0.0)
+        return r.index_copy(1, self.dependent, self._times(self._weights, kept))
+
+    def reduce(self, forces: torch.Tensor) -> torch.Tensor:
+        """Returns W^T f of forces (B, N, ...): those at dependent vertices act on the control vertices."""
+        if not len(self.dependent):
+            return forces
+        moved = self._times(self._transposed, forces.index_select(1, self.dependent))
+        return forces.index_fill(1, self.dependent, 0.0) + moved
+
+
+def control_vertices(vertices: FloatArray, candidates: IntArray, name: str) -> IntArray:
+    """Returns four vertices that span a large tetrahedron, by which the others are controlled with small weights.
+
+    Args:
+        vertices: (N, 3) at rest [m].
+        candidates: vertices to choose from.
+        name: of the part, for messages.
+
+    Raises:
+        InputError: all candidates lie in a plane.
+    """
+    places = vertices[candidates]
+    size = float(np.linalg.norm(np.ptp(places, axis=0)))
+    chosen = [int(np.argmin(places @ np.array([1.0, 1e-3, 1e-6])))]
+    for _ in range(3):
+        base = places[chosen]
+        basis = np.linalg.qr((base[1:] - base[0]).T)[0] if len(chosen) > 1 else np.zeros((3, 0))
+        offsets = places - base[0]
+        heights = np.linalg.norm(offsets - (offsets @ basis) @ basis.T, axis=1)
+        chosen.append(int(heights.argmax()))
+        if not heights.max() > _FLAT * size:
+            raise InputError(f"the rigid part {name!r} is flat: it needs vertices that do not lie in a plane.")
+    for _ in range(10):  # Exchanges that make the tetrahedron larger: then no weight is greater than one.
+        weights = barycentric(places[chosen], places)
+        point, corner = np.unravel_index(int(np.abs(weights).argmax()), weights.shape)
+        if abs(weights[point, corner]) < 1.0 + 1e-9:
+            break
+        chosen[corner] = int(point)
+    return np.sort(candidates[chosen])
+
+
+def barycentric(corners: FloatArray, places: FloatArray) -> FloatArray:
+    """Returns the weights (n, 4) of four corners in places (n, 3): they sum to one and give the places."""
+    system = np.vstack([corners.T, np.ones(len(corners))])
+    return np.linalg.solve(system, np.vstack([places.T, np.ones(len(places))])).T
+
+
+def rigid_weights(
+    vertices: FloatArray, members: Sequence[int] | IntArray, name: str
+) -> tuple[IntArray, dict[int, tuple[IntArray, FloatArray]]]:
+    """Returns the four control vertices of a rigid part, and control vertices and weights of its other vertices."""
+    members = np.unique(np.asarray(members, dtype=np.int64))
+    controls = control_vertices(vertices, members, name)
+    others = np.setdiff1d(members, controls)
+    weights = barycentric(vertices[controls], vertices[others])
+    return controls, {int(i): (controls, w) for i, w in zip(others, weights, strict=True)}

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from warp_resphys.report.driven_film import DrivenBodies, path_axes
+from warp_resphys.report.camera import path_axes
+from warp_resphys.report.driven_film import DrivenBodies
 from warp_resphys.report.figures import TONES
 
 X, Y, Z = np.eye(3)
@@ -38,7 +39,7 @@ def bodies(step, count):
 @pytest.mark.parametrize(("step", "slower", "frames", "fps"), [(0.01, 1.0, 26, 25.0), (0.01, 4.0, 101, 25.0)])
 def test_a_trail_ends_where_the_point_is(step, slower, frames, fps):
     shown = bodies(step, 101)
-    scene = shown.scene(slower)
+    scene = shown.film(slower)
     assert len(scene.texts) == frames
     assert scene.fps == pytest.approx(fps)
     assert (scene.texts[0], scene.texts[-1]) == ("0.00 s", "1.00 s")
@@ -62,7 +63,7 @@ def test_a_trail_ends_where_the_point_is(step, slower, frames, fps):
 
 def test_the_drawing_is_the_path_enlarged_beside_the_body():
     shown = bodies(0.01, 101)
-    for view in shown.scene().views:
+    for view in shown.film().views:
         body, _, path, trail, ball, larger_path, larger_trail, larger_ball = (
             each.points.reshape(-1, 3) @ view.axes[:2].T for each in view.layers
         )

@@ -22,11 +22,12 @@ from warp_resphys.learning.metrics import PUBLISHED_MM, PUBLISHED_WINDOWS_MM, me
 from warp_resphys.mesh.chambers import find_chambers
 from warp_resphys.mesh.mesh import Mesh
 from warp_resphys.mesh.readers import write_mesh
-from warp_resphys.report import figures, mesh, motion_figures, page, render
-from warp_resphys.report.bodies import Motion, axes_from_below, motion_axes
+from warp_resphys.report import body_picture, figures, motion_figures, page, render
+from warp_resphys.report.bodies import ComparedMotion
+from warp_resphys.report.body_picture import MeshSummary
+from warp_resphys.report.camera import axes_from_below, motion_axes
 from warp_resphys.report.data import Driven, along_body, drawn_markers, tip_markers
 from warp_resphys.report.figures import CHAMBER_COLOURS, TONES
-from warp_resphys.report.mesh import MeshSummary
 from warp_resphys.report.motion_sections import _sequences
 from warp_resphys.report.page import Cell, Picture
 from warp_resphys.report.run_page import largest_filtered, range_texts
@@ -495,7 +496,7 @@ def test_second_view_is_from_below():
         name: np.concatenate([bent(arm.vertices, rest)[:1], bent(arm.vertices, push)[-1:]]) for name in ("resphys",)
     }
     markers = np.concatenate([bent(places, rest)[:1], bent(places, push)[-1:]])
-    shown = Motion(
+    shown = ComparedMotion(
         arm, np.arange(2.0), markers, moved, {"resphys": markers}, places, np.array([0.0, 0.0, -9.8]), from_below=True
     )
     (frames,) = render.draw(shown.scene())
@@ -514,11 +515,13 @@ def test_picture_of_the_arm_has_markers_where_it_is_whole(tmp_path):
     arm = shipped_arm("arm_hexahedra_500")
     body = MeshSummary(arm, 1070.0, np.flatnonzero(arm.vertices[:, 2] == 0.0), find_chambers(arm))
     near = [np.flatnonzero(np.abs(arm.vertices[:, 2] - z) < 0.01) for z in (-0.05, -0.1, -0.15, -0.2)]
-    places = np.array([arm.vertices[some[(arm.vertices[some] @ mesh._TOWARDS_VIEWER).argmax()]] for some in near])
+    places = np.array(
+        [arm.vertices[some[(arm.vertices[some] @ body_picture._TOWARDS_VIEWER).argmax()]] for some in near]
+    )
     below = np.append(places, [[0.0, 0.0, arm.vertices[:, 2].min() - 0.05]], axis=0)  # on a stem below the tip
-    mesh.draw_mesh(tmp_path / "plain.png", body)
-    mesh.draw_mesh(tmp_path / "dots.png", body, places)
-    mesh.draw_mesh(tmp_path / "below.png", body, below)
+    body_picture.draw_mesh(tmp_path / "plain.png", body)
+    body_picture.draw_mesh(tmp_path / "dots.png", body, places)
+    body_picture.draw_mesh(tmp_path / "below.png", body, below)
     plain, dots, longer = (imread(tmp_path / f"{name}.png")[..., :3] for name in ("plain", "dots", "below"))
     changed = np.abs(plain - dots).max(axis=2) > 0.2
     left, middle, right = (part.sum() for part in np.array_split(changed, 3, axis=1))

@@ -29,7 +29,8 @@ from warp_resphys.io.stages import StageContext
 from warp_resphys.learning.metrics import PUBLISHED_MM
 from warp_resphys.mesh.mesh import box_hexahedra
 from warp_resphys.report import figures, motion_figures, render
-from warp_resphys.report.bodies import Motion, instants, motion_axes, write_film
+from warp_resphys.report.bodies import ComparedMotion, instants
+from warp_resphys.report.camera import motion_axes
 from warp_resphys.report.data import at_times, best_and_worst, mean_distance, shown_models
 from warp_resphys.report.figures import TONES
 from warp_resphys.report.page import Cell
@@ -412,7 +413,7 @@ def motion(frames=3, model="simulation"):
     times = np.arange(1, frames + 1) * 0.02
     positions = {name: sag(mesh.vertices, times, 0.05, name) for name in (model, "resphys")}
     markers = {name: sag(bound, times, 0.05, name) for name in positions}
-    return Motion(mesh, times, sag(bound, times, 0.05), positions, markers, bound, DOWN)
+    return ComparedMotion(mesh, times, sag(bound, times, 0.05), positions, markers, bound, DOWN)
 
 
 @pytest.mark.usefixtures("can_draw")
@@ -455,7 +456,7 @@ def test_film_moves_and_is_slower_than_the_motion(tmp_path, capsys):
     imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
     shown = motion(4)
     shown.measured[2, 1] = np.nan
-    write_film(tmp_path / "motion.mp4", shown)
+    render.write_film(tmp_path / "motion.mp4", shown.film())
     assert "4/4 frames" in capsys.readouterr().err
     reader = imageio_ffmpeg.read_frames(str(tmp_path / "motion.mp4"))
     about = next(reader)
@@ -477,5 +478,5 @@ def test_film_moves_and_is_slower_than_the_motion(tmp_path, capsys):
 def test_a_film_that_cannot_be_made_says_why(tmp_path, monkeypatch, script, reason):
     monkeypatch.setattr(render, "COMMAND", (sys.executable, "-c", script))
     with pytest.raises(render.DrawingError, match=reason):
-        write_film(tmp_path / "motion.mp4", motion())
+        render.write_film(tmp_path / "motion.mp4", motion().film())
     assert not list(Path(tmp_path).iterdir())

@@ -18,7 +18,7 @@ from warp_resphys.experiment.report import make_report
 from warp_resphys.io.stages import StageContext
 from warp_resphys.mesh.mesh import boundary_triangles, box_hexahedra
 from warp_resphys.report import render
-from warp_resphys.report.bodies import Motion
+from warp_resphys.report.bodies import ComparedMotion
 from warp_resphys.report.view import reduced, view_in_space
 
 RUNS = {"markers": (write_driven, arm_settings), "vertices": (write_vertex, vertex_settings)}
@@ -43,13 +43,13 @@ def swinging(frames=40, models=("simulation", "resphys")):
     target = mesh.vertices + 0.01 * np.sin(7.0 * times)[:, None, None] * shape
     markers = {model: q[:, some] for model, q in positions.items()}
     gravity = np.array([0.0, 0.0, -9.81])
-    return Motion(mesh, times, target[:, some], positions, markers, mesh.vertices[some], gravity), target
+    return ComparedMotion(mesh, times, target[:, some], positions, markers, mesh.vertices[some], gravity), target
 
 
 @pytest.mark.parametrize("every_vertex", [False, True])
 def test_what_the_script_reads_are_the_bodies(every_vertex):
     motion, target = swinging()
-    motion = Motion(**{**vars(motion), "target": target if every_vertex else None})
+    motion = ComparedMotion(**{**vars(motion), "target": target if every_vertex else None})
     motion.positions["simulation"][30:] = np.nan
     block = view_in_space("view", motion, ["resphys"], "caption", "alt")
     data = json.loads(str(block.payload))

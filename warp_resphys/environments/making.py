@@ -246,6 +246,10 @@ class RobotEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         found = self._one.render()
         return None if found is None else found[0]
 
+    @override
+    def close(self) -> None:
+        self._one.close()
+
 
 def register() -> None:
     """Makes the tasks known to Gymnasium, as ``warp_resphys/Reach-v0``, ``warp_resphys/Follow-v0`` and so on."""

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
 from ..io.errors import InputError
-from .picture import Camera, Look
+from .picture import Camera
 from .tasks import Task
 from .worlds import World
 
@@ -172,6 +172,7 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
 
         Raises:
             InputError: it was not reset before.
+            DrawingError: nothing can be drawn on this machine.
         """
         if self.render_mode is None:
             return None
@@ -187,12 +188,14 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
             self._camera = Camera(self._up, np.concatenate([self.rests[0], vertices[0], *wanted, middle + around]))
         errors = self._errors()
         seconds = number * self.world.time_step * self._drive.frames
-        return tuple(
-            self._camera.picture(
-                Look(triangles, vertices[row], markers[row], wanted[row], f"{seconds[row]:.2f} s, {errors[row]:.1f} mm")
-            )
-            for row in range(self.num_envs)
-        )
+        texts = [f"{at:.2f} s, {error:.1f} mm" for at, error in zip(seconds, errors, strict=True)]
+        return tuple(self._camera.pictures(triangles, vertices, markers, wanted, texts))
+
+    @override
+    def close_extras(self, **kwargs: Any) -> None:
+        """Ends the process that draws pictures."""
+        if self._camera is not None:
+            self._camera.close()
 
     def _observed(self) -> Observation:
         count, size = self.num_envs, self.task.size

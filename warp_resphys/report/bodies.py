@@ -1,42 +1,37 @@
-"""Bodies in pictures: coloured by their distance from a target, at instants with markers, and in a film."""
+"""Scenes of bodies: coloured by their distance from a target, or in motion with measured and simulated markers."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from ..io.files import atomic_path
-from ..io.progress import Progress
 from ..mesh.mesh import Mesh, boundary_faces, boundary_triangles
 from ..mesh.surface import closest_points
+from .camera import axes_from_below, frame_of, height_of, motion_axes, picture_size
 from .data import MODELS, mean_distance
-from .render import INK, MEASURED, OUTLINE, FloatArray, IntArray, Layer, Scene, View, film, view_axes
+from .render import INK, MEASURED, OUTLINE, FloatArray, IntArray, Layer, Scene, View, pace, view_axes
 
-LONGER_SIDE: Final = 1100  # Of a picture of a body coloured by its distance [px].
+_LONGER_SIDE: Final = 1100  # Of a picture of a body coloured by its distance [px].
 MARGIN: Final = 0.02  # Around the bodies there, as the lengths below relative to the longer side of what is seen.
 _WIDTHS: Final = (0.0034, 0.0018)  # Of the outline, and of the lines around faces.
-NUDGE: Final = 0.005  # The outline is drawn this far behind the body where they coincide.
+_NUDGE: Final = 0.005  # The outline is drawn this far behind the body where they coincide.
 TOWARDS_VIEWER: Final = (0.40, -1.0, 0.40)  # A body along x is seen from the side, the end of high x nearer.
 SHADE: Final = 0.25  # Share of the colour that depends on the light; the rest stays readable as a value.
 _SHARP: Final = 30.0  # Between the normals of faces that share an edge of the outline [degrees].
-_HANGING: Final = 0.7  # Cosine between gravity and a body that hangs.
 _DIVERGED: Final = 10.0  # Distance from the target, or from rest, over the body's, beyond which nothing is drawn.
 
 _FAST: Final = 2.5  # [s] that a motion lasts which is shown slowed down, and from its start only,
 _FINE: Final = 0.025  # where its frames are no farther apart [s].
-LARGEST_RATE: Final = 25.0  # Frames a second, of the film.
 BODIES: Final = ("#6b7580", "#8db4e8")  # Of the bodies behind, and of the last one.
-RINGS: Final = ("#6b7580", "#1a5fb4")  # Of their markers.
-_FRAME: Final = 0.06  # Around what is seen of a motion, over its longer side.
-_HEADROOM: Final = 0.12  # For the text above a film's first view, over half its height.
+_RINGS: Final = ("#6b7580", "#1a5fb4")  # Of their markers.
+BODY_LIGHT: Final = (0.72, 0.3)
+HEADROOM: Final = 0.12  # For the text above a film's view, over half its height.
 _LEAST_NEAR: Final = 0.03  # Of the body's size, half the height of the view from nearby, as of one marker alone.
 _MOST_NEAR: Final = 1.6  # How far the other models' markers may widen the view from nearby.
-_TILT: Final = (0.30, 0.30)  # From the right and from above.
-_FILM_VIEW: Final = (560, 480)  # [px] of each of two.
+FILM_VIEW: Final = (560, 480)  # [px] of each view.
 _PICTURE_VIEW: Final = (480, 408)
-_RADII: Final = {_FILM_VIEW: 0.013, _PICTURE_VIEW: 0.02}  # Of a dot, over the height of a view; pictures are small.
+_RADII: Final = {FILM_VIEW: 0.013, _PICTURE_VIEW: 0.02}  # Of a dot, over the height of a view; pictures are small.
 _RING: Final = 1.9  # Radius of a simulated marker's ring, over that of a dot.
 _WIDER: Final = 0.35  # That of each other model's ring.
 _BEHIND: Final = 0.3  # Opacity of the bodies that the last one is compared with.
@@ -44,7 +39,7 @@ _BEFORE: Final = {"lines": 0.01, "others": -4.0, "rings": 2.5, "dots": 5.0}  # T
 
 
 def largest_distances(mesh: Mesh, positions: Mapping[str, FloatArray], target: FloatArray) -> dict[str, float | None]:
-    """Return how far each body (N, 3) is from the target's vertices (N, 3) at most [m]; None where it has diverged."""
+    """Return the largest distance of each body (N, 3) from the target's vertices (N, 3) [m]; None where it diverged."""
     far = _DIVERGED * np.ptp(mesh.vertices, axis=0).max()
     return {
         name: float(np.linalg.norm(q - target, axis=1).max()) if np.all(np.abs(q - target) < far) else None
@@ -63,30 +58,28 @@ def distance_scene(mesh: Mesh, positions: Mapping[str, FloatArray], target: Floa
     Returns:
         A view of each body; None where all of them have diverged.
     """
-    found = largest_distances(mesh, positions, target)
-    largest = {name: max(most, 1e-15) for name, most in found.items() if most is not None}
+    distances = largest_distances(mesh, positions, target)
+    largest = {name: max(most, 1e-15) for name, most in distances.items() if most is not None}
     if not largest:
         return None
     axes = view_axes(TOWARDS_VIEWER)
-    seen = np.concatenate([mesh.vertices, *(positions[name] for name in largest)]) @ axes.T  # (P, 3) [m]
-    lower, upper = seen.min(axis=0), seen.max(axis=0)
-    length = (upper - lower)[:2].max()  # [m]
-    extent = (upper - lower)[:2] + 2.0 * MARGIN * length
+    focus, half = frame_of(np.concatenate([mesh.vertices, *(positions[name] for name in largest)]), axes, MARGIN)
+    nudge = 2.0 * _NUDGE * half.max()  # [m]
     triangles, edges = boundary_triangles(mesh), face_edges(mesh)
-    outline, line = (width * LONGER_SIDE for width in _WIDTHS)
+    outline, line = (width * _LONGER_SIDE for width in _WIDTHS)
     sharp = sharp_edges(mesh.vertices, triangles)
-    rest = Layer("lines", mesh.vertices, sharp, OUTLINE, size=outline, shift=-NUDGE * length)
+    rest = Layer("lines", mesh.vertices, sharp, OUTLINE, size=outline, shift=-nudge)
     views = []
     for name, most in largest.items():
         q, paint = positions[name], np.linalg.norm(positions[name] - target, axis=1) / most
         surface = Layer("surface", q, triangles, paint=paint, light=(1.0 - SHADE, SHADE))
-        rims = Layer("lines", q, edges, "black", size=line, opacity=0.35, shift=0.2 * NUDGE * length)
-        views.append(View([surface, rims, rest], axes, 0.5 * (lower + upper) @ axes, 0.5 * extent[1]))
-    return Scene(views, np.ceil(extent * LONGER_SIDE / extent.max()).astype(int).tolist(), samples=8)
+        rims = Layer("lines", q, edges, "black", size=line, opacity=0.35, shift=0.2 * nudge)
+        views.append(View([surface, rims, rest], axes, focus, half[1]))
+    return Scene(views, picture_size(half, _LONGER_SIDE))
 
 
 def face_edges(mesh: Mesh) -> IntArray:
-    """(E, 2) vertices of the lines around the faces of the boundary, each line once."""
+    """Return the lines (E, 2) around the faces of the boundary, each line once."""
     sides, corners = boundary_faces(mesh), mesh.element.face.corners
     rims = sides[:, :corners]
     if sides.shape[1] > corners:  # Middles of the edges come after the corners.
@@ -96,7 +89,7 @@ def face_edges(mesh: Mesh) -> IntArray:
 
 
 def sharp_edges(points: FloatArray, triangles: IntArray) -> IntArray:
-    """(E, 2) edges at which triangles (S, 3) of points (P, 3) meet at a sharp angle, or at which a surface ends."""
+    """Return edges (E, 2) at which triangles (S, 3) of points (P, 3) meet at a sharp angle, or a surface ends."""
     corners = points[triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
@@ -110,7 +103,7 @@ def sharp_edges(points: FloatArray, triangles: IntArray) -> IntArray:
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class ComparedMotion:
     """A measured motion and simulations of it, at the same T times."""
 
     mesh: Mesh  # The body at rest.
@@ -133,8 +126,8 @@ class Motion:
         """The frames that are shown, as `instants` chooses them for the first model."""
         return instants(self.measured, self.bound, next(iter(self.markers.values())))
 
-    def at(self, frames: Sequence[int] | IntArray) -> "Motion":
-        """Some of the frames."""
+    def at(self, frames: Sequence[int] | IntArray) -> "ComparedMotion":
+        """Return some of the frames."""
         chosen = np.asarray(frames, dtype=np.int64)
         positions, markers = ({m: q[chosen] for m, q in each.items()} for each in (self.positions, self.markers))
         times, measured = self.times[chosen], self.measured[chosen]
@@ -142,8 +135,24 @@ class Motion:
         return replace(self, times=times, measured=measured, positions=positions, markers=markers, target=target)
 
     def scene(self) -> Scene:
-        """The whole body at some instants, and beside it the markers from nearby, or the body from below."""
+        """Return the whole body at some instants, and beside it the markers from nearby, or the body from below."""
         return Scene(_views(self.at(self.instants), _PICTURE_VIEW), _PICTURE_VIEW)
+
+    def film(self, seconds: float | None = None, slower: float | None = None) -> Scene:
+        """Return a film of the first seconds, slowed down if the motion is fast.
+
+        Args:
+            seconds: That are shown; 10, or 1.5 of a fast motion, if left out.
+            slower: How many times slower it is shown; 4 for a fast motion, if left out.
+        """
+        usual, longest = (4.0, 1.5) if self.is_fast else (1.0, 10.0)
+        frames, fps = pace(self.times, usual if slower is None else slower)
+        shown = self.at(frames[self.times[frames] <= (longest if seconds is None else seconds) + 1e-9])
+        *others, last = (MODELS[model][0] for model in shown.positions)
+        first, second = _views(shown, FILM_VIEW, HEADROOM)
+        legend = [*((name, _RINGS[0]) for name in others), (last, _RINGS[1]), ("measured", MEASURED)]
+        texts = [f"{time:.2f} s" for time in shown.times]
+        return Scene([replace(first, legend=legend), second], FILM_VIEW, background="white", fps=fps, texts=texts)
 
 
 def instants(target: FloatArray, bound: FloatArray, simulated: FloatArray) -> list[int]:
@@ -168,74 +177,40 @@ def instants(target: FloatArray, bound: FloatArray, simulated: FloatArray) -> li
     return sorted(chosen)
 
 
-def write_film(path: Path, motion: Motion, seconds: float | None = None, slower: float | None = None) -> None:
-    """Write a film (MP4, H.264) of the first seconds of a motion, slowed down if it is fast, and show how far it is.
-
-    Args:
-        path: Of the file.
-        motion: What is shown.
-        seconds: Of it; 10, or 1.5 of a fast one, if left out.
-        slower: How many times slower it is shown; 4 for a fast one, if left out.
-
-    Raises:
-        DrawingError: There is no pyvista, no OpenGL driver that works off screen, or no encoder.
-        DataFileError: The file cannot be written.
-    """
-    usual, usually = (4.0, 1.5) if motion.is_fast else (1.0, 10.0)  # [s] that are shown.
-    slower, longest = usual if slower is None else slower, usually if seconds is None else seconds
-    step = float(np.median(np.diff(motion.times)))
-    every = max(1, round(1.0 / (slower * step * LARGEST_RATE)))
-    shown = motion.at(np.flatnonzero(motion.times <= longest + 1e-9)[::every])
-    *others, last = (MODELS[model][0] for model in shown.positions)
-    first, second = _views(shown, _FILM_VIEW, _HEADROOM)
-    legend = [*((name, RINGS[0]) for name in others), (last, RINGS[1]), ("measured", MEASURED)]
-    write_scene(
-        path,
-        Scene(
-            [replace(first, legend=legend), second],
-            _FILM_VIEW,
-            background="white",
-            fps=1.0 / (slower * step * every),
-            texts=[f"{time:.2f} s" for time in shown.times],
-        ),
-    )
+def without_diverged(points: FloatArray, rest: FloatArray, far: float) -> FloatArray:
+    """Return points (..., P, 3), NaN in the frames in which one is not finite or farther than this from rest [m]."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        kept = (np.abs(points - rest) < far).all(axis=(-2, -1), keepdims=True)
+    return np.where(kept, points, np.nan)
 
 
-def write_scene(path: Path, scene: Scene) -> None:
-    """Write a film (MP4, H.264) of a scene with a text for every frame, and show how far it is.
-
-    Raises:
-        DrawingError, DataFileError: See `write_film`.
-    """
-    with Progress("video", len(scene.texts), "frames") as progress:
-        content = film(scene, progress)
-    with atomic_path(path) as partial:
-        partial.write_bytes(content)
-
-
-def _views(motion: Motion, size: tuple[int, int], headroom: float = 0.0) -> list[View]:
+def _views(motion: ComparedMotion, size: tuple[int, int], headroom: float = 0.0) -> list[View]:
     """The whole body, with room for text above it over half its height, and its markers from nearby or from below."""
-    body = float(np.ptp(motion.mesh.vertices, axis=0).max())
-    positions, simulated = (
-        np.stack([whole(each, rest, _DIVERGED * body) for each in shown.values()])  # (B, T, N | M, 3)
-        for shown, rest in ((motion.positions, motion.mesh.vertices), (motion.markers, motion.bound))
-    )
-    seen = np.concatenate([motion.mesh.vertices[None], *positions])
+    rest = motion.mesh.vertices
+    far = _DIVERGED * float(np.ptp(rest, axis=0).max())
+    positions = without_diverged(np.stack([*motion.positions.values()]), rest, far)  # (B, T, N, 3)
+    simulated = without_diverged(np.stack([*motion.markers.values()]), motion.bound, far)  # (B, T, M, 3)
+    seen = np.concatenate([rest[None], *positions])
     axes = motion_axes(motion.gravity, seen)
     everything = np.concatenate([each.reshape(-1, 3) for each in (seen, simulated, motion.measured)])
-    middle, half = _frame(everything, axes, size)
+    middle, half = frame_of(everything, axes)
+    height = height_of(half, size)
     if motion.from_below:
         second = axes_from_below(axes, motion.gravity)
-        near, near_half = _frame(everything, second, size)
+        near, half = frame_of(everything, second)
+        near_height = height_of(half, size)
     else:
         second = axes
-        near, near_half = _follow(motion.measured, simulated, axes, size, _LEAST_NEAR * body)
+        near, near_height = _follow(motion, simulated, axes, size)
         near = np.where(np.isfinite(near), near, middle)
-    room = headroom * half
-    layers = [*_bodies(motion.mesh, positions, half), _stems(motion, positions[-1], simulated[-1])]
+    layers = [*_bodies(motion.mesh, positions, height), _stems(motion, positions[-1], simulated[-1])]
+    room = headroom * height
     return [
-        View([*layers, *_dots(motion.measured, simulated, height, _RADII[size])], turned, focus, height)
-        for turned, focus, height in ((axes, middle + room * axes[1], half + room), (second, near, near_half))
+        View([*layers, *_dots(motion.measured, simulated, half_height, _RADII[size])], turned, focus, half_height)
+        for turned, focus, half_height in (
+            (axes, middle + room * axes[1], height + room),
+            (second, near, near_height),
+        )
     ]
 
 
@@ -247,119 +222,60 @@ def _bodies(mesh: Mesh, positions: FloatArray, half: float) -> list[Layer]:
     triangles, edges = boundary_triangles(mesh), face_edges(mesh)
     sharp = sharp_edges(mesh.vertices, triangles)
     sharp = sharp if len(sharp) else edges
-    layers, light, before = [], (0.72, 0.3), {name: half * each for name, each in _BEFORE.items()}
+    layers, before = [], {name: half * each for name, each in _BEFORE.items()}
     *others, solid = positions
     for q in others:
-        layers.append(Layer("surface", q, triangles, BODIES[0], opacity=_BEHIND, light=light, shift=before["others"]))
+        behind = {"opacity": _BEHIND, "light": BODY_LIGHT, "shift": before["others"]}
+        layers.append(Layer("surface", q, triangles, BODIES[0], **behind))
         layers.append(Layer("lines", q, sharp, BODIES[0], size=2.0, shift=before["lines"]))
-    layers.append(Layer("surface", solid, triangles, BODIES[1], light=light))
+    layers.append(Layer("surface", solid, triangles, BODIES[1], light=BODY_LIGHT))
     layers.append(Layer("lines", solid, edges, INK, size=1.0, opacity=0.3, shift=before["lines"]))
     layers.append(Layer("lines", solid, sharp, INK, size=2.0, shift=before["lines"]))
     return layers
 
 
-def _stems(motion: Motion, positions: FloatArray, markers: FloatArray) -> Layer:
+def _stems(motion: ComparedMotion, positions: FloatArray, markers: FloatArray) -> Layer:
     """Lines to (T, M, 3) a body's markers from the points of it that are closest to them at rest."""
-    found = closest_points(motion.mesh, motion.bound)
-    corners = motion.mesh.vertices[found.triangles]  # (M, 3, 3)
+    closest = closest_points(motion.mesh, motion.bound)
+    corners = motion.mesh.vertices[closest.triangles]  # (M, 3, 3)
     unit = np.full((len(markers[0]), 1, 3), corners.max() or 1.0)
     matrix = np.concatenate([corners.transpose(0, 2, 1), unit], axis=1)
-    right = np.concatenate([found.points, unit[:, :, 0]], axis=1)
+    right = np.concatenate([closest.points, unit[:, :, 0]], axis=1)
     weights = (np.linalg.pinv(matrix) @ right[..., None])[..., 0]  # (M, 3), their sum one
-    feet = np.einsum("tmki,mk->tmi", positions[:, found.triangles], weights)
-    ends = np.stack([feet, markers], axis=2).reshape(len(markers), -1, 3)
-    return Layer("lines", ends, np.arange(ends.shape[1]).reshape(-1, 2), OUTLINE, size=2.0)
+    feet = np.einsum("tmki,mk->tmi", positions[:, closest.triangles], weights)
+    return stems(feet, markers, OUTLINE, 2.0)
+
+
+def stems(feet: FloatArray, markers: FloatArray, colour: str, width: float) -> Layer:
+    """Return lines [px wide] from feet (..., M, 3) to markers (..., M, 3) [m]."""
+    ends = np.stack([feet, markers], axis=-2).reshape(*markers.shape[:-2], -1, 3)
+    return Layer("lines", ends, np.arange(ends.shape[-2]).reshape(-1, 2), colour, size=width)
 
 
 def _dots(measured: FloatArray, simulated: FloatArray, half: float, radius: float) -> list[Layer]:
     """Dots of the measured markers (T, M, 3) and rings of the simulated ones (B, T, M, 3), in front of all else."""
     size, layers = 2.0 * half * radius, []
     for behind, places in zip(reversed(range(len(simulated))), simulated, strict=True):
-        colour, wide = RINGS[0 if behind else 1], (_RING + _WIDER * behind) * size
+        colour, wide = _RINGS[0 if behind else 1], (_RING + _WIDER * behind) * size
         layers.append(Layer("rings", places, None, colour, size=wide, shift=_BEFORE["rings"] * half))
     return [*layers, Layer("balls", measured, None, MEASURED, size=size, shift=_BEFORE["dots"] * half)]
 
 
-def whole(points: FloatArray, rest: FloatArray, largest: float) -> FloatArray:
-    """Return (T, P, 3) points, NaN in the frames in which one is not finite or farther than this from rest [m]."""
-    with np.errstate(invalid="ignore", over="ignore"):
-        kept = (np.abs(points - rest) < largest).all(axis=(1, 2), keepdims=True)
-    return np.where(kept, points, np.nan)
-
-
-def upwards(gravity: FloatArray) -> FloatArray:
-    """Return (3,) against gravity; along z where there is none."""
-    length = float(np.linalg.norm(gravity))
-    return -gravity / length if length > 0.0 else np.array([0.0, 0.0, 1.0])
-
-
-def hangs(mesh: Mesh, fixed: IntArray, gravity: FloatArray) -> tuple[bool, FloatArray]:
-    """Whether a body hangs, so that its motion is seen from below, and (N,) how far vertices are from the clamp [m]."""
-    start = mesh.vertices[fixed].mean(axis=0) if len(fixed) else mesh.vertices[0]
-    away = mesh.vertices - start
-    axis = away.mean(axis=0)
-    size = float(np.linalg.norm(axis) * np.linalg.norm(gravity))
-    return bool(size > 0.0 and axis @ gravity > _HANGING * size), np.linalg.norm(away, axis=1)
-
-
-def motion_axes(gravity: FloatArray, positions: FloatArray) -> FloatArray:
-    """(3, 3) as `view_axes`: what extends or moves most across gravity goes to the right.
-
-    Args:
-        gravity: (3,) which way is down; along -z where it is zero.
-        positions: (T, N, 3) [m], the first frame at rest; NaN is left out.
-    """
-    up = upwards(gravity)
-    points = positions[np.isfinite(positions).all(axis=2)]
-    flat = points - np.outer(points @ up, up)
-    _, _, directions = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)
-    right = directions[0] - (directions[0] @ up) * up
-    right /= np.linalg.norm(right)
-    moved = np.nanmax(np.linalg.norm(positions - positions[0], axis=2), axis=0)  # (N,)
-    towards_end = moved @ (positions[0] - positions[0].mean(axis=0))
-    right = -right if towards_end @ right < 0.0 else right
-    return view_axes(np.cross(right, up) + _TILT[0] * right + _TILT[1] * up, up)
-
-
-def axes_from_below(axes: FloatArray, gravity: FloatArray) -> FloatArray:
-    """Return (3, 3) as `view_axes`, of a view from below with the same direction to the right.
-
-    Args:
-        axes: (3, 3) of a view that has gravity along its second row, or behind it.
-        gravity: (3,) which way is down; along -z where it is zero.
-    """
-    towards = -upwards(gravity)
-    return np.stack([axes[0], np.cross(towards, axes[0]), towards])
-
-
-def frame_of(points: FloatArray, axes: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the middle (3,) of what is seen of points (P, 3), and half the width and height that hold it all [m]."""
-    turned = points[np.isfinite(points).all(axis=1)] @ axes.T
-    low, high = turned.min(axis=0), turned.max(axis=0)
-    extent = (high - low)[:2] + 2.0 * _FRAME * (high - low)[:2].max()
-    return 0.5 * (low + high) @ axes, 0.5 * extent
-
-
-def _frame(points: FloatArray, axes: FloatArray, size: tuple[int, int]) -> tuple[FloatArray, float]:
-    """The middle (3,) of what is seen of points (P, 3), and half the height of a view that holds it all [m]."""
-    middle, half = frame_of(points, axes)
-    return middle, max(half[1], half[0] * size[1] / size[0])
-
-
 def _follow(
-    measured: FloatArray, simulated: FloatArray, axes: FloatArray, size: tuple[int, int], least: float
+    motion: ComparedMotion, simulated: FloatArray, axes: FloatArray, size: tuple[int, int]
 ) -> tuple[FloatArray, float]:
-    """(T, 3) middle of the markers in each frame, and half the height of a view that holds them, or the least one [m].
+    """(T, 3) middle of the markers in each frame, and half the height of a view that holds them [m].
 
-    Where not all markers were seen, those of the last model say where the middle is. The other models' markers are in
-    the view unless they are far off.
+    Where not all markers were seen, those (B, T, M, 3) of the last model say where the middle is. The other models'
+    markers are in the view unless they are far off.
     """
+    measured, least = motion.measured, _LEAST_NEAR * float(np.ptp(motion.mesh.vertices, axis=0).max())
     places = np.where(np.isfinite(measured).all(axis=(1, 2), keepdims=True), measured, simulated[-1])
     middle = places.mean(axis=1)
 
     def half(points: FloatArray) -> float:
         reach = np.nanmax(np.abs((points - middle[:, None]) @ axes[:2].T), axis=(0, 1))
-        return float(max(reach[1], reach[0] * size[1] / size[0], least))
+        return max(height_of(reach, size), least)
 
     everything = half(np.concatenate([measured, *simulated], axis=1))
     return middle, 1.25 * min(everything, _MOST_NEAR * half(measured))

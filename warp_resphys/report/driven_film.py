@@ -6,21 +6,20 @@ from typing import Final
 
 import numpy as np
 
-from .bodies import BODIES, LARGEST_RATE, frame_of, sharp_edges, upwards
+from .bodies import BODIES, BODY_LIGHT, FILM_VIEW, HEADROOM, sharp_edges
+from .camera import frame_of, height_of, path_axes
 from .control_section import controller_name
 from .figures import TONES
-from .render import INK, FloatArray, IntArray, Layer, Scene, View, view_axes
+from .render import INK, FloatArray, IntArray, Layer, Scene, View, chain, pace
 
-_SIZE: Final = (560, 480)  # [px] of each view.
-_TILT: Final = 1.2  # How far a level path is seen from its near side, over how far from above;
-_ABOVE: Final = 0.3  # an upright one is seen from so far above.
 _DRAWING: Final = 0.6  # Longer side of the drawing, over that of the body;
 _GAP: Final = 0.15  # how far it is from the body, over the same.
-_HEADROOM: Final = 0.12  # For the text above a view, over half its height.
 _BEFORE: Final = {"edges": 0.01, "path": 4.0, "trail": 4.5, "point": 5.0}  # The body, over half a view's height.
 _POINT: Final = 0.02  # Radius, over half a view's height.
 _LINES: Final = ((4.0, 2.0), (6.0, 3.0))  # Widths [px] of the path and of the trail, on the body and in the drawing.
 _APART: Final = 0.012  # Corners of lines, at least, over the same: shorter ones have ragged rims.
+
+Placement = Callable[[FloatArray], FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,20 +34,18 @@ class DrivenBodies:
     plane: FloatArray  # (2, 3) to the right and upwards in the plane of the path.
     gravity: FloatArray  # (3,) which way is down.
 
-    def scene(self, slower: float = 1.0) -> Scene:
-        """Each body in a view of its own, with the path and a trail of where the point has been, there and enlarged.
+    def film(self, slower: float = 1.0) -> Scene:
+        """Return each body in a view of its own, with the path and a trail of where the point has been, also enlarged.
 
         Args:
             slower: How many times slower it is shown.
         """
-        step = float(self.times[1] - self.times[0])
-        every = max(1, round(1.0 / (slower * step * LARGEST_RATE)))
-        frames = np.arange(0, len(self.times), every)
+        frames, fps = pace(self.times, slower)
         axes, placed = path_axes(self.plane, self.gravity), self._placed()
         seen = [*(each.reshape(-1, 3) for each in self.positions.values()), placed(self.path)]
-        middle, half = frame_of(np.concatenate([*seen, *(placed(each) for each in self.points.values())]), axes)
-        height = max(half[1], half[0] * _SIZE[1] / _SIZE[0])
-        room = _HEADROOM * height
+        middle, half = frame_of(np.concatenate([*seen, *map(placed, self.points.values())]), axes)
+        height = height_of(half, FILM_VIEW)
+        room = HEADROOM * height
         legends = [[(controller_name(name), _colour(name))] for name in self.positions]
         legends[0].append(("to be drawn", TONES["muted"].light))
         views = [
@@ -56,9 +53,9 @@ class DrivenBodies:
             for name, legend in zip(self.positions, legends, strict=True)
         ]
         texts = [f"{time:.2f} s" for time in self.times[frames]]
-        return Scene(views, _SIZE, background="white", fps=1.0 / (slower * step * every), texts=texts)
+        return Scene(views, FILM_VIEW, background="white", fps=fps, texts=texts)
 
-    def _placed(self) -> Callable[[FloatArray], FloatArray]:
+    def _placed(self) -> Placement:
         """Where points (..., 3) of the plane are in a drawing beside the body, larger and as seen from before it."""
         axes = path_axes(self.plane, self.gravity)
         body = np.concatenate([each.reshape(-1, 3) for each in self.positions.values()]) @ axes[:2].T
@@ -76,13 +73,11 @@ class DrivenBodies:
         corner = np.array(beside if tall else above) - larger * first
         return lambda points: (larger * (points @ across.T) + corner) @ axes[:2]
 
-    def _layers(
-        self, controller: str, frames: IntArray, half: float, placed: Callable[[FloatArray], FloatArray]
-    ) -> list[Layer]:
+    def _layers(self, controller: str, frames: IntArray, half: float, placed: Placement) -> list[Layer]:
         before, colour = {name: half * each for name, each in _BEFORE.items()}, _colour(controller)
         body, grey = self.positions[controller][frames], TONES["target"].light
         layers = [
-            Layer("surface", body, self.triangles, BODIES[1], light=(0.72, 0.3)),
+            Layer("surface", body, self.triangles, BODIES[1], light=BODY_LIGHT),
             Layer("lines", body, sharp_edges(body[0], self.triangles), INK, size=1.5, shift=before["edges"]),
         ]
         for place, (wide, thin) in ((np.asarray, _LINES[0]), (placed, _LINES[1])):
@@ -91,26 +86,11 @@ class DrivenBodies:
             trail = points[np.minimum(_corners(points, _APART * half), frames[:, None])]  # What is not yet drawn is
             trail = np.concatenate([trail, points[frames, None]], axis=1)  # where the point is.
             layers += [
-                Layer("lines", path[corners], _chain(len(corners)), grey, size=wide, shift=before["path"]),
-                Layer("lines", trail, _chain(trail.shape[1]), colour, size=thin, shift=before["trail"]),
+                Layer("lines", path[corners], chain(len(corners)), grey, size=wide, shift=before["path"]),
+                Layer("lines", trail, chain(trail.shape[1]), colour, size=thin, shift=before["trail"]),
                 Layer("balls", points[frames, None], None, colour, size=_POINT * half, shift=before["point"]),
             ]
         return layers
-
-
-def path_axes(plane: FloatArray, gravity: FloatArray) -> FloatArray:
-    """(3, 3) as `view_axes`, of a view in which letters in a plane can be read and what is up is above.
-
-    Args:
-        plane: (2, 3) to the right and upwards in it.
-        gravity: (3,) which way is down.
-    """
-    up, normal = upwards(gravity), np.cross(*plane)
-    normal /= np.linalg.norm(normal)
-    level = float(normal @ up)
-    upright = 1.0 - level**2
-    near = plane[1] / np.linalg.norm(plane[1])
-    return view_axes(normal - _TILT * level * near + _ABOVE * upright * up, up)
 
 
 def _corners(points: FloatArray, apart: float) -> IntArray:
@@ -118,11 +98,6 @@ def _corners(points: FloatArray, apart: float) -> IntArray:
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     _, first = np.unique(np.floor(along / apart), return_index=True)
     return np.unique(np.append(first, len(points) - 1))
-
-
-def _chain(count: int) -> IntArray:
-    """(count - 1, 2) lines from each point to the next."""
-    return np.stack([np.arange(count - 1), np.arange(1, count)], axis=1)
 
 
 def _colour(controller: str) -> str:

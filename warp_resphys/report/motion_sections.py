@@ -11,7 +11,8 @@ import numpy as np
 from markupsafe import Markup
 
 from ..learning.intervals import Intervals
-from .bodies import Motion, distance_scene, hangs, largest_distances, write_film
+from .bodies import ComparedMotion, distance_scene, largest_distances
+from .camera import hangs
 from .data import (
     MODELS,
     Driven,
@@ -27,7 +28,7 @@ from .data import (
     tip_markers,
 )
 from .page import Block, Canvas, Drawn, Part, data_address, drawn_file, largest_text
-from .render import Pixels, draw
+from .render import Pixels, draw, write_film
 from .verdict import unbroken
 
 _ONE_BY_ONE: Final = ("simulation", "sysid", "simfree", "resphys")  # Marker by marker, where all would hide each other.
@@ -46,16 +47,16 @@ def start_drawing(data: RunReport, folder: Path, pool: Executor) -> "dict[str, F
     started: dict[str, Future[Any]] = {"pictures": pool.submit(_draw_pictures, data, motion)}
     # A film takes longer than all else on the page; of vertices, it shows no more than the instants.
     if data.sees_markers and len(motion.times) > 1:
-        started["video"] = pool.submit(write_film, folder / "motion.mp4", motion)
+        started["video"] = pool.submit(write_film, folder / "motion.mp4", motion.film())
     return started
 
 
-def _draw_pictures(data: RunReport, motion: Motion) -> list[Pixels]:
+def _draw_pictures(data: RunReport, motion: ComparedMotion) -> list[Pixels]:
     shape = None if data.trials is None or data.sees_markers else distance_scene(data.mesh, *_bodies(data.trials))
     return draw(motion.scene(), *([] if shape is None else [shape]))
 
 
-def motion_of(data: RunReport, *, every_model: bool = False) -> Motion | None:
+def motion_of(data: RunReport, *, every_model: bool = False) -> ComparedMotion | None:
     """Return the motion that is drawn: that of the film; where vertices are observed, of the worst trial at its tip.
 
     Args:
@@ -89,7 +90,9 @@ def motion_of(data: RunReport, *, every_model: bool = False) -> Motion | None:
     seen = dict(zip(models, markers, strict=True))
     whole = None if trials.labels else trials.target[row][frames]
     at_rest = trials.bound[some]
-    return Motion(data.mesh, times[frames], target, bodies, seen, at_rest, trials.gravity, seen_from_below, whole)
+    return ComparedMotion(
+        data.mesh, times[frames], target, bodies, seen, at_rest, trials.gravity, seen_from_below, whole
+    )
 
 
 def worst_state(trials: Trials, row: int) -> int:
@@ -153,7 +156,7 @@ def _in_space(data: RunReport, name: str) -> list[Block]:
     return [view_in_space("view", motion, shown, unbroken(caption), alt)]
 
 
-def _instants_figure(data: RunReport, motion: Motion, name: str, colours: str, canvas: Canvas) -> Drawn:
+def _instants_figure(data: RunReport, motion: ComparedMotion, name: str, colours: str, canvas: Canvas) -> Drawn:
     """The body at a few instants, and its markers."""
     from . import motion_figures
 
@@ -356,7 +359,7 @@ def body_section(data: RunReport, canvas: Canvas) -> Part | None:
     alt = f"The body at rest from outside, cut open and translucent, with {parts} in colours."
 
     def body(path: Path) -> Drawn:
-        from .mesh import MeshSummary, draw_mesh
+        from .body_picture import MeshSummary, draw_mesh
 
         density = float(data.settings["simulation"]["density"])
         coloured = f"{quantity.per}s".capitalize()

@@ -15,7 +15,8 @@ from scipy.optimize import isotonic_regression
 
 from ..io.files import atomic_path
 from ..mesh.mesh import Mesh, boundary_triangles
-from .bodies import face_edges, sharp_edges
+from .bodies import face_edges, sharp_edges, stems
+from .camera import frame_of, picture_size
 from .data import Recordings
 from .render import BODY, CLAMPED, INK, MEASURED, FloatArray, IntArray, Layer, Pixels, Scene, View, draw, view_axes
 
@@ -23,8 +24,9 @@ NOMINAL: Final = "#0072b2"  # Blue of Okabe and Ito (2008).
 _GREY: Final = "#5b6570"
 _VIEWS: Final = {"From above": (0.62, -1.0, 0.52), "From the side": (0.0, -1.0, 0.0)}  # Towards the viewer.
 _DPI: Final = 160
-_FINER: Final = 2  # Drawn so many times finer, as smooth rims and translucency do not go together.
-_LONGER_SIDE: Final = 6.6  # Of a view [inch].
+_FINER: Final = 2  # Drawn so many times finer, as translucent surfaces are sorted without smooth rims.
+_LONGER_SIDE: Final = 6.6  # Of a panel [inch].
+_MARGIN: Final = 0.04  # Around what is seen, over its longer side.
 _LETTER: Final = 0.088  # Widest that the letters of a name are on average [inch].
 _TITLE, _HEAD, _STRIP, _PAD = 0.7, 0.42, 0.9, 0.12  # [inch] of the title above, above and below a view, around all.
 _LABEL_HEIGHT: Final = 0.36  # [inch]
@@ -32,195 +34,192 @@ _RADIUS: Final = 0.016  # Of a marker, over the longest side of the body.
 _RING: Final = 1.55  # Radius of a nominal position's ring, in radii of a marker.
 _FOOT: Final = 0.42  # That of the small ball at the foot of a stem.
 _NUDGE: Final = 0.1  # Lines are drawn this far before the surface, over the radius of a marker.
-_LIGHT: Final = 0.55  # Its intensity.
 
 
 @dataclass(frozen=True)
-class _View:
-    """What a camera without perspective sees."""
+class Panel:
+    """One side from which the body is drawn."""
 
     title: str
     axes: FloatArray  # (3, 3) rows: to the right, up, towards the viewer.
-    middle: FloatArray  # (3,) coordinates along these [m] of the middle of what is seen.
-    pixels: FloatArray  # (2,) width and height of the picture, whole numbers.
-    inch: float  # How much of the body an inch of the picture is [m].
+    focus: FloatArray  # (3,) [m] what is in the middle.
+    half: FloatArray  # (2,) half the width and height that are seen [m].
 
     @property
-    def size(self) -> FloatArray:
-        """(2,) width and height [inch]."""
-        return self.pixels / (_FINER * _DPI)
+    def inch(self) -> float:
+        """How much of the body an inch of the picture is [m]."""
+        return float(2.0 * self.half.max() / _LONGER_SIDE)
 
     @property
     def corners(self) -> tuple[FloatArray, FloatArray]:
         """The lowest and the highest coordinates (2,) that are seen [m], to the right and up."""
-        half = 0.5 * self.inch * self.size
-        return self.middle[:2] - half, self.middle[:2] + half
+        middle = self.project(self.focus)
+        return middle - self.half, middle + self.half
 
     def project(self, points: FloatArray) -> FloatArray:
-        """(..., 2) coordinates of points (..., 3) [m] in the picture, to the right and up."""
+        """Return coordinates (..., 2) of points (..., 3) [m] in the picture, to the right and up."""
         return points @ self.axes[:2].T
 
     def scene(self, layers: Sequence[Layer]) -> Scene:
-        view = View(layers, self.axes, self.middle @ self.axes, 0.5 * self.inch * self.size[1])
-        return Scene([view], self.pixels.astype(int).tolist(), background="white", samples=0, intensity=_LIGHT)
+        """Return the scene that is drawn beneath names and rings."""
+        size = picture_size(self.half, _FINER * _DPI * _LONGER_SIDE)
+        return Scene([View(layers, self.axes, self.focus, self.half[1])], size, background="white", sorts=True)
 
 
-def draw_registration(path: Path, found: Recordings, fixed: IntArray) -> None:
-    """Draws the body, the measured markers and what they are bound to, from two sides, with names and residuals.
+def draw_registration(path: Path, recordings: Recordings, fixed: IntArray) -> None:
+    """Draw the body, the measured markers and what they are bound to, from two sides, with names and residuals.
 
     Args:
         path: The PNG file to write.
-        found: Markers that were not seen are not drawn.
+        recordings: Markers that were not seen are not drawn.
         fixed: Vertices of the clamped region.
 
     Raises:
         DrawingError: There is no pyvista, or no OpenGL driver that works off screen.
         DataFileError: The file cannot be written.
     """
-    seen, mesh = np.isfinite(found.positions).all(axis=1), found.mesh
-    points = np.concatenate([mesh.vertices, found.positions[seen], found.nominal])
-    radius = _RADIUS * float(np.ptp(mesh.vertices, axis=0).max())
-    views = [_view(name, towards, points, 2.0 * radius) for name, towards in _VIEWS.items()]
-    triangles = boundary_triangles(mesh)
-    clamped = triangles[np.isin(triangles, fixed).all(axis=1)]
-    layers = _layers(mesh, clamped, found.positions[seen], found.feet[seen], radius)
-    pictures = [frames[0] for frames in draw(*(view.scene(layers) for view in views))]
+    seen = np.isfinite(recordings.positions).all(axis=1)
+    panels = panels_of(np.concatenate([recordings.mesh.vertices, recordings.positions[seen], recordings.nominal]))
+    radius = _RADIUS * float(np.ptp(recordings.mesh.vertices, axis=0).max())
+    layers = registration_layers(recordings.mesh, fixed, recordings.positions[seen], recordings.feet[seen], radius)
+    pictures = [frames[0] for frames in draw(*(panel.scene(layers) for panel in panels))]
     with mpl.rc_context({"font.size": 9, "text.color": INK}):
-        figure = _compose(views, pictures, found, radius)
+        figure = _compose(panels, pictures, recordings, radius)
         with atomic_path(path) as partial:
             figure.savefig(partial, dpi=_DPI, format="png", facecolor="white", bbox_inches="tight", pad_inches=_PAD)
 
 
-def _view(title: str, towards: Sequence[float], points: FloatArray, margin: float) -> _View:
-    """The view that holds all points (P, 3), with a margin [m] around them."""
-    axes = view_axes(towards)
-    turned = points @ axes.T
-    low, high = turned.min(axis=0), turned.max(axis=0)
-    extent = (high - low)[:2] + 2.0 * margin
-    inch = float(extent.max()) / _LONGER_SIDE
-    return _View(title, axes, 0.5 * (low + high), np.ceil(_FINER * _DPI * extent / inch), inch)
+def panels_of(points: FloatArray) -> list[Panel]:
+    """Return the panels, which hold all points (P, 3) [m] with a margin around them."""
+    found = []
+    for title, towards in _VIEWS.items():
+        axes = view_axes(towards)
+        found.append(Panel(title, axes, *frame_of(points, axes, _MARGIN)))
+    return found
 
 
-def _layers(mesh: Mesh, clamped: IntArray, markers: FloatArray, feet: FloatArray, radius: float) -> list[Layer]:
-    """The translucent body with what is clamped (C, 3) of its triangles, and markers (M, 3) [m] on stems."""
+def registration_layers(
+    mesh: Mesh, fixed: IntArray, markers: FloatArray, feet: FloatArray, radius: float
+) -> list[Layer]:
+    """Return the translucent body with its clamped region, and markers (M, 3) on stems from their feet (M, 3) [m]."""
     q, triangles, lift = mesh.vertices, boundary_triangles(mesh), _NUDGE * radius
+    clamped = triangles[np.isin(triangles, fixed).all(axis=1)]
     line = 2.0 * _FINER  # [px] of a thin one.
-    layers = [Layer("surface", q, triangles, BODY, opacity=0.42, light=(0.78, 0.5))]
+    layers = [Layer("surface", q, triangles, BODY, opacity=0.42, light=(0.78, 0.28))]
     if len(clamped):
         rim = sharp_edges(q, clamped)  # Seen edge-on, this is all of it.
-        layers.append(Layer("surface", q, clamped, CLAMPED, opacity=0.75, light=(0.7, 0.4), shift=lift))
+        layers.append(Layer("surface", q, clamped, CLAMPED, opacity=0.75, light=(0.7, 0.22), shift=lift))
         layers.append(Layer("lines", q, rim, CLAMPED, size=5.0 * line))
     sharp = sharp_edges(q, triangles)
     layers.append(Layer("lines", q, face_edges(mesh), INK, opacity=0.22, size=line, shift=lift))
     if len(sharp):
         layers.append(Layer("lines", q, sharp, CLAMPED, opacity=0.75, size=1.8 * line))
     if len(markers):
-        stems = np.stack([feet, markers], axis=1).reshape(-1, 3)
         layers += [
-            Layer("lines", stems, np.arange(len(stems)).reshape(-1, 2), INK, size=3.0 * line),
-            Layer("balls", feet, None, INK, size=_FOOT * radius, light=(0.8, 0.3)),
-            Layer("balls", markers, None, MEASURED, size=radius, light=(0.72, 0.75)),
+            stems(feet, markers, INK, 3.0 * line),
+            Layer("balls", feet, None, INK, size=_FOOT * radius, light=(0.8, 0.16)),
+            Layer("balls", markers, None, MEASURED, size=radius, light=(0.72, 0.41)),
         ]
     return layers
 
 
-def _compose(views: Sequence[_View], pictures: Sequence[Pixels], found: Recordings, radius: float) -> Figure:
+def _compose(panels: Sequence[Panel], pictures: Sequence[Pixels], recordings: Recordings, radius: float) -> Figure:
     """The views, one above the other or side by side, with names, rings, axes and a scale.
 
     The figure has an inch, so that all places are in inches; how much of the plane is written is seen at the end.
     """
-    (wide, tall), (other_wide, other_tall) = (view.size for view in views)
-    longest = max(len(text) for each in range(len(found.labels)) for text in _label(found, each))
+    (wide, tall), (other_wide, other_tall) = sizes = [2.0 * panel.half / panel.inch for panel in panels]
+    longest = max(len(text) for each in range(len(recordings.labels)) for text in _label(recordings, each))
     margin = _LETTER * max(longest, 9) + 0.15
     corners = [(0.0, 0.0), (wide + 2.0 * margin, tall - other_tall)]
     if wide + other_wide > 1.6 * max(tall, other_tall):
         corners[1] = (0.5 * (wide - other_wide), -_HEAD - _STRIP - other_tall)
     figure = Figure(figsize=(1.0, 1.0))
     middle, lowest = 0.5 * max(wide, corners[1][0] + other_wide), min(0.0, corners[1][1])
-    figure.text(middle, tall + _TITLE, found.drawn, ha="center", va="center", fontsize=12, fontweight="bold")
-    for view, picture, corner in zip(views, pictures, corners, strict=True):
-        axes = figure.add_axes((*corner, *view.size))
-        low, high = view.corners
+    figure.text(middle, tall + _TITLE, recordings.drawn, ha="center", va="center", fontsize=12, fontweight="bold")
+    for panel, picture, corner, size in zip(panels, pictures, corners, sizes, strict=True):
+        axes = figure.add_axes((*corner, *size))
+        low, high = panel.corners
         axes.imshow(picture, extent=(low[0], high[0], low[1], high[1]), aspect="auto")
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         axes.set_axis_off()
-        axes.set_title(view.title, fontsize=10, color=_GREY, pad=14)
-        _directions(axes, view, margin)
-        _rings(axes, view, found, radius)
-        _names(axes, view, found, radius)
-    _scale(axes, view, margin)
+        axes.set_title(panel.title, fontsize=10, color=_GREY, pad=14)
+        _directions(axes, panel, margin)
+        _rings(axes, panel, recordings, radius)
+        _names(axes, panel, recordings, radius)
+    _scale(axes, panel, margin)
     handles = _legend()
     place, columns = (middle, lowest - _STRIP), len(handles)
     figure.legend(handles=handles, loc="upper center", bbox_to_anchor=place, ncols=columns, frameon=False, fontsize=9)
     return figure
 
 
-def _directions(axes: Axes, view: _View, margin: float) -> None:
+def _directions(axes: Axes, panel: Panel, margin: float) -> None:
     """Arrows along x, y and z in the margin [inch] at the lower left."""
-    origin = view.corners[0] - view.inch * np.array([margin - 0.3, _STRIP - 0.2])
-    for direction, name in zip(view.axes[:2].T, "xyz", strict=True):
+    origin = panel.corners[0] - panel.inch * np.array([margin - 0.3, _STRIP - 0.2])
+    for direction, name in zip(panel.axes[:2].T, "xyz", strict=True):
         length = float(np.linalg.norm(direction))
         if length > 0.1:
-            end = origin + 0.36 * view.inch * direction
+            end = origin + 0.36 * panel.inch * direction
             arrow = {"arrowstyle": "-|>", "color": _GREY, "linewidth": 1.1, "shrinkA": 0, "shrinkB": 0}
             axes.annotate("", tuple(end), tuple(origin), arrowprops=arrow, annotation_clip=False)
-            x, y = end + 0.11 * view.inch * direction / length
+            x, y = end + 0.11 * panel.inch * direction / length
             axes.text(x, y, name, ha="center", va="center", color=_GREY, fontsize=9, clip_on=False)
 
 
-def _scale(axes: Axes, view: _View, margin: float) -> None:
+def _scale(axes: Axes, panel: Panel, margin: float) -> None:
     """A bar of a round length in the margin [inch] at the lower right."""
-    low, high = view.corners
-    length = _round_length(0.3 * (high - low)[0])
-    right, height = high[0] + view.inch * (margin - 0.25), low[1] - view.inch * (_STRIP - 0.2)
+    low, high = panel.corners
+    length = round_length(0.3 * (high - low)[0])
+    right, height = high[0] + panel.inch * (margin - 0.25), low[1] - panel.inch * (_STRIP - 0.2)
     line: dict[str, Any] = {"linewidth": 2.0, "clip_on": False, "solid_capstyle": "butt"}
     axes.plot([right - length, right], [height, height], color=_GREY, **line)
-    middle, above = right - 0.5 * length, height + 0.06 * view.inch
+    middle, above = right - 0.5 * length, height + 0.06 * panel.inch
     axes.text(middle, above, f"{1e3 * length:g} mm", ha="center", va="bottom", color=_GREY)
 
 
-def _round_length(longest: float) -> float:
-    """The longest of 1, 2, 5, 10, ... [mm] that is not longer than what is given [m]."""
+def round_length(longest: float) -> float:
+    """Return the longest of 1, 2, 5, 10, ... [mm] that is not longer than what is given [m]."""
     decade = 10.0 ** np.floor(np.log10(longest))
     return float(max(factor * decade for factor in (1.0, 2.0, 5.0) if factor * decade <= longest * (1.0 + 1e-9)))
 
 
-def _rings(axes: Axes, view: _View, found: Recordings, radius: float) -> None:
+def _rings(axes: Axes, panel: Panel, recordings: Recordings, radius: float) -> None:
     """Rings at the nominal positions, with lines to the markers that are outside of them."""
-    for ring, marker in zip(view.project(found.nominal), view.project(found.positions), strict=True):
+    for ring, marker in zip(panel.project(recordings.nominal), panel.project(recordings.positions), strict=True):
         axes.add_patch(Circle((ring[0], ring[1]), _RING * radius, fill=False, edgecolor=NOMINAL, linewidth=1.5))
         if np.linalg.norm(marker - ring) > _RING * radius:
             axes.plot(*np.stack([ring, marker]).T, color=NOMINAL, linewidth=1.0, linestyle=(0, (3, 2)))
 
 
-def _names(axes: Axes, view: _View, found: Recordings, radius: float) -> None:
+def _names(axes: Axes, panel: Panel, recordings: Recordings, radius: float) -> None:
     """Names and residuals of the markers that were seen in columns on both sides, with leaders to them."""
-    at = view.project(found.positions)  # (M, 2) [m]
+    at = panel.project(recordings.positions)  # (M, 2) [m]
     seen = np.flatnonzero(np.isfinite(at).all(axis=1))
     on_the_left = at[:, 0] < np.median(at[seen, 0])
-    for side, edge in ((-1.0, view.corners[0][0]), (1.0, view.corners[1][0])):
+    for side, edge in ((-1.0, panel.corners[0][0]), (1.0, panel.corners[1][0])):
         group = seen[on_the_left[seen] == (side < 0.0)]
         group = group[np.argsort(at[group, 1], kind="stable")]
         align: Any = "right" if side < 0.0 else "left"
-        for each, height in zip(group, _spread(at[group, 1], _LABEL_HEIGHT * view.inch), strict=True):
-            end, x = np.array([edge + side * 0.05 * view.inch, height]), edge + side * 0.1 * view.inch
+        for each, height in zip(group, spread(at[group, 1], _LABEL_HEIGHT * panel.inch), strict=True):
+            end, x = np.array([edge + side * 0.05 * panel.inch, height]), edge + side * 0.1 * panel.inch
             away = 1.2 * radius / float(np.linalg.norm(end - at[each]))
             start = at[each] + min(away, 1.0) * (end - at[each])
             axes.plot(*np.stack([start, end]).T, color=_GREY, linewidth=0.7, clip_on=False)
-            name, note = _label(found, each)
-            colour = MEASURED if name in found.outliers else _GREY
+            name, note = _label(recordings, each)
+            colour = MEASURED if name in recordings.outliers else _GREY
             axes.text(x, height, name, ha=align, va="bottom", fontweight="bold", clip_on=False)
             axes.text(x, height, note, ha=align, va="top", fontsize=8, color=colour, clip_on=False)
 
 
-def _label(found: Recordings, marker: int) -> tuple[str, str]:
+def _label(recordings: Recordings, marker: int) -> tuple[str, str]:
     """Name of a marker, and how well it fits."""
-    name = found.labels[marker]
-    return name, f"{found.residual_mm[marker]:.2f} mm" + ", left out" * (name in found.outliers)
+    name = recordings.labels[marker]
+    return name, f"{recordings.residual_mm[marker]:.2f} mm" + ", left out" * (name in recordings.outliers)
 
 
-def _spread(heights: FloatArray, least: float) -> FloatArray:
-    """Sorted heights moved apart to a least distance, as little as that takes in the mean square."""
+def spread(heights: FloatArray, least: float) -> FloatArray:
+    """Return sorted heights moved apart to a least distance, as little as that takes in the mean square."""
     apart = least * np.arange(len(heights))  # With these taken off they need only be in order.
     return isotonic_regression(heights - apart).x + apart if len(heights) else heights
 

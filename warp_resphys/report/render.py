@@ -1,27 +1,32 @@
-"""Pictures and films of layers in views, which another process draws off screen with pyvista.
+"""Pictures and films of bodies: what a scene consists of, and the process that draws it with pyvista, off screen.
 
-Where there is no OpenGL driver, VTK ends the process that asks for a picture. Hence pyvista is only ever imported in a
-process of its own, `warp_resphys.report.render_scene`.
+Where no OpenGL driver works, VTK ends the process that asks for a picture. Hence pyvista is only ever imported in a
+process of its own, `warp_resphys.report.render_process`, which takes scenes and gives back frames through pipes.
 """
 
+import io
 import json
 import logging
 import os
 import signal
+import struct
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Sequence
+import weakref
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, is_dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any, Final
+from tempfile import TemporaryFile
+from typing import IO, Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..io.errors import ResphysError
+from ..io.files import atomic_path
 from ..io.progress import Progress
 
 FloatArray = NDArray[np.float64]
@@ -29,9 +34,9 @@ IntArray = NDArray[np.int64]
 Pixels = NDArray[np.uint8]
 
 _LOG = logging.getLogger(__name__)
-COMMAND: Final = (sys.executable, "-P", "-m", "warp_resphys.report.render_scene")
-UNWRITTEN: Final = 74  # What a drawing process returns that found no room for its frames.
-TIME_OUT: Final = 300.0  # [s]; a picture takes about one.
+COMMAND: Final = (sys.executable, "-P", "-m", "warp_resphys.report.render_process")
+TIME_OUT: Final = 300.0  # [s] for a scene; a picture takes about one.
+LARGEST_RATE: Final = 25.0  # Frames a second of a film, at most.
 COLOUR_MAP: Final = "viridis"
 BODY: Final = "#a9bccf"
 CLAMPED: Final = "#33485e"
@@ -39,6 +44,7 @@ MEASURED: Final = "#d55e00"  # Vermilion of Okabe and Ito (2008).
 INK: Final = "#1c2127"
 OUTLINE: Final = "#808891"  # Of the undeformed body: one grey that reads on a light and on a dark page.
 TOWARDS_LIGHT: Final = (0.15, -0.75, 1.0)
+_CODEC: Final = ["-f", "mp4", "-crf", "23", "-preset", "fast", "-threads", "1", "-movflags", "+faststart", "-bitexact"]
 
 
 class DrawingError(ResphysError):
@@ -63,7 +69,7 @@ class Layer:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What one of the views side by side shows, without perspective."""
+    """One of the views side by side, without perspective."""
 
     layers: Sequence[Layer]  # In the order in which they are drawn.
     axes: FloatArray  # (3, 3) rows: to the right, up, towards the viewer.
@@ -79,11 +85,9 @@ class Scene:
     views: Sequence[View]
     size: Sequence[int]  # (2,) width and height of each view [px]; even for a film.
     background: str | None = None  # A colour; None for a transparent one.
-    samples: int = 4  # A pixel; 0 where surfaces are translucent, which are then drawn in their order.
-    towards_light: Sequence[float] = TOWARDS_LIGHT
-    intensity: float = 1.0  # Of the light.
+    sorts: bool = False  # Whether translucent surfaces are sorted by depth, at the price of smooth rims.
     texts: Sequence[str] = ()  # One a frame, in the first view, before its legend.
-    fps: float = 25.0  # Of a film.
+    fps: float = LARGEST_RATE  # Of a film.
 
 
 def view_axes(towards_viewer: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> FloatArray:
@@ -94,81 +98,142 @@ def view_axes(towards_viewer: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Flo
     return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True))
 
 
+def chain(count: int) -> IntArray:
+    """(count - 1, 2) lines from each of some points to the next."""
+    return np.stack([np.arange(count - 1), np.arange(1, count)], axis=1)
+
+
+class Renderer:
+    """A process that draws one scene after the other; a context manager.
+
+    Raises:
+        DrawingError: The process cannot be started.
+    """
+
+    def __init__(self) -> None:
+        environment = dict(os.environ)
+        if sys.platform == "linux":  # Neither X nor OSMesa is looked for where there is none.
+            environment.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
+        self._messages = TemporaryFile()  # noqa: SIM115
+        pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": self._messages}
+        try:
+            self._process = subprocess.Popen(COMMAND, env=environment, **pipes)
+        except OSError as error:
+            raise _failure(error.strerror or str(error)) from error
+        self._end = weakref.finalize(self, _end, self._process, self._messages)
+
+    def __enter__(self) -> "Renderer":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the process; so does whatever forgets the renderer."""
+        self._end()
+
+    def frames(self, scene: Scene) -> Iterator[Pixels]:
+        """Yield frames (H, V * W, 3 | 4): red, green, blue and, without a background, opacity, from 0 to 255.
+
+        Raises:
+            DrawingError: There is no pyvista, no OpenGL driver that works off screen, or it takes too long.
+        """
+        end = time.monotonic() + TIME_OUT
+        timer = threading.Timer(TIME_OUT, self._process.kill)
+        timer.start()
+        try:
+            assert self._process.stdin is not None
+            self._process.stdin.write(packed(scene))
+            self._process.stdin.flush()
+            while any(shape := struct.unpack("<3I", self._read(12))):
+                yield np.frombuffer(self._read(int(np.prod(shape))), np.uint8).reshape(shape)
+        except (BrokenPipeError, EOFError):
+            raise _failure(self._reason(late=time.monotonic() >= end)) from None
+        finally:
+            timer.cancel()
+
+    def _read(self, count: int) -> bytes:
+        assert self._process.stdout is not None
+        content = self._process.stdout.read(count)
+        if len(content) < count:
+            raise EOFError
+        return content
+
+    def _reason(self, *, late: bool) -> str:
+        """Why the process has ended."""
+        code = self._process.wait()
+        self._messages.seek(0)
+        said = self._messages.read().decode(errors="replace").strip()
+        _LOG.debug("the drawing process wrote: %s", said)
+        if code < 0:  # The signal that ended it tells more than what VTK says before.
+            return f"not done after {TIME_OUT:g} s" if late else str(signal.strsignal(-code))
+        return said.rpartition("\n")[2].strip().rstrip(".") or f"exit code {code}"
+
+
+def _end(process: subprocess.Popen[bytes], messages: IO[bytes]) -> None:
+    process.kill()
+    process.wait()
+    messages.close()
+    for pipe in (process.stdin, process.stdout):
+        with suppress(BrokenPipeError):  # Of what it has not read.
+            if pipe is not None:
+                pipe.close()
+
+
 def draw(*scenes: Scene) -> list[Pixels]:
     """Draw scenes, in one process, as its start takes longer than most pictures.
 
     Returns:
-        Of each scene (F, H, V * W, 3 | 4) red, green, blue and, without a background, opacity, 0 to 255.
+        Of each scene (F, H, V * W, 3 | 4), see `Renderer.frames`.
 
     Raises:
         DrawingError: There is no pyvista, or no OpenGL driver that works off screen.
     """
-    with TemporaryDirectory() as folder:
-        _run(scenes, Path(folder) / "frames.npz")
-        with np.load(Path(folder) / "frames.npz", allow_pickle=False) as frames:
-            return [frames[f"arr_{each}"] for each in range(len(scenes))]
+    with Renderer() as renderer:
+        return [np.stack(list(renderer.frames(scene))) for scene in scenes]
 
 
-def film(scene: Scene, progress: Progress) -> bytes:
-    """Return a film (MP4, H.264) of a scene.
-
-    Args:
-        scene: With a background.
-        progress: Of the frames.
+def write_film(path: Path, scene: Scene) -> None:
+    """Write a film (MP4, H.264) of a scene with a background and a text for every frame; shows its progress.
 
     Raises:
         DrawingError: There is no pyvista, no OpenGL driver that works off screen, or no encoder.
+        DataFileError: The file cannot be written.
     """
-    with TemporaryDirectory() as folder:
-        target = Path(folder) / "film.mp4"
-        _run([scene], target, progress)
-        return target.read_bytes()
-
-
-def _run(scenes: Sequence[Scene], target: Path, progress: Progress | None = None) -> None:
-    """Have another process draw, in so much time, and count the frames that it says are done."""
-    source = target.with_name("scenes.npz")
-    _write_scenes(source, scenes)
-    environment = dict(os.environ)
-    if sys.platform == "linux":  # Neither X nor OSMesa is looked for where there is none.
-        environment.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
-    pipes: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
-    end, said = time.monotonic() + TIME_OUT, []
-    try:
-        command = [*COMMAND, str(source), str(target)]
-        process = subprocess.Popen(command, env=environment, text=True, errors="replace", **pipes)
-    except OSError as error:
-        raise _failure(error.strerror or str(error)) from error
-    timer = threading.Timer(TIME_OUT, process.kill)
-    timer.start()
-    with process:
+    size = (scene.size[0] * len(scene.views), scene.size[1])
+    options: dict[str, Any] = {"codec": "libx264", "quality": None, "ffmpeg_log_level": "error"}
+    with atomic_path(path) as target, Progress("video", len(scene.texts), "frames") as progress, Renderer() as renderer:
+        frames = renderer.frames(scene)
+        first = next(frames)
+        target.touch()  # A place that cannot be written to is named here.
         try:
-            for line in process.stdout or ():
-                if not line.startswith("frame"):
-                    said.append(line.strip())
-                elif progress is not None:
-                    progress.advance()
-        except BaseException:
-            process.kill()
-            raise
-        finally:
-            timer.cancel()
-    if process.returncode:
-        _LOG.debug("the drawing process wrote: %s", "\n".join(said))
-        reason = ([f"exit code {process.returncode}"] + [line for line in said if line])[-1].rstrip(".")
-        if process.returncode < 0:  # The signal that ended it tells more than what VTK says before.
-            late = time.monotonic() >= end
-            reason = f"not done after {TIME_OUT:g} s" if late else str(signal.strsignal(-process.returncode))
-        elif process.returncode == UNWRITTEN:
+            import imageio_ffmpeg
+
+            encoder = imageio_ffmpeg.write_frames(str(target), size, fps=scene.fps, output_params=_CODEC, **options)
+            encoder.send(None)
+            encoder.send(np.ascontiguousarray(first))
+            progress.advance()
+            for frame in frames:
+                encoder.send(np.ascontiguousarray(frame))
+                progress.advance()
+            encoder.close()
+        except (ImportError, RuntimeError, OSError) as error:
+            reason = str(error).strip().rpartition("\n")[2].rstrip(".")
             raise DrawingError(
-                "the deformed body cannot be drawn, since there was no room in the temporary folder "
-                f"{target.parent.parent} ({reason}): free some space there"
-            )
-        raise _failure(reason)
+                f"the film cannot be encoded ({reason}): install the Python package imageio-ffmpeg, and make room for "
+                f"it in {path.parent}"
+            ) from error
 
 
-def _write_scenes(path: Path, scenes: Sequence[Scene]) -> None:
-    """Write scenes as JSON, with names in place of the arrays, which stand beside it, each of them once."""
+def pace(times: FloatArray, slower: float) -> tuple[IntArray, float]:
+    """Return which of the frames of a motion at times (T,) [s] a film shows, and how many of them a second."""
+    step = float(np.median(np.diff(times)))
+    every = max(1, round(1.0 / (slower * step * LARGEST_RATE)))
+    return np.arange(0, len(times), every), 1.0 / (slower * step * every)
+
+
+def packed(scene: Scene) -> bytes:
+    """Return a scene as JSON with names in place of its arrays, these once each, and before all that its length."""
     arrays: dict[str, Any] = {}
 
     def plain(value: Any) -> Any:
@@ -177,8 +242,9 @@ def _write_scenes(path: Path, scenes: Sequence[Scene]) -> None:
             return f"array_{id(value)}"
         return vars(value) if is_dataclass(value) else value.item()
 
-    spec = json.dumps(scenes, default=plain)
-    np.savez(path, spec=np.array(spec), **arrays)
+    spec, content = json.dumps(scene, default=plain), io.BytesIO()
+    np.savez(content, spec=np.array(spec), **arrays)
+    return struct.pack("<Q", content.tell()) + content.getvalue()
 
 
 def _failure(reason: str) -> DrawingError:

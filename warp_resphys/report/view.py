@@ -16,7 +16,8 @@ from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
 from ..mesh.mesh import boundary_triangles, surface_vertices
-from .bodies import Motion, face_edges, frame_of, motion_axes, sharp_edges, upwards, whole
+from .bodies import ComparedMotion, face_edges, sharp_edges, without_diverged
+from .camera import frame_of, motion_axes, upwards
 from .data import MODELS, FloatArray, mean_distance
 from .figures import TONES
 from .page import ViewInSpace
@@ -29,7 +30,7 @@ _STOPS: Final = 32  # Of the colour map.
 _LEVELS: Final = 255  # Of an error, over the model's largest.
 
 
-def view_in_space(name: str, motion: Motion, shown: Sequence[str], caption: str, alt: str) -> ViewInSpace:
+def view_in_space(name: str, motion: ComparedMotion, shown: Sequence[str], caption: str, alt: str) -> ViewInSpace:
     """Return the view of all bodies of a motion.
 
     Args:
@@ -42,7 +43,9 @@ def view_in_space(name: str, motion: Motion, shown: Sequence[str], caption: str,
     surface = surface_vertices(motion.mesh)
     rest, faces = motion.mesh.vertices[surface], np.searchsorted(surface, boundary_triangles(motion.mesh))
     size = float(np.ptp(motion.mesh.vertices, axis=0).max())
-    places = np.stack([whole(q[:, surface], rest, _DIVERGED * size) for q in motion.positions.values()])  # (B, F, S, 3)
+    places = np.stack(
+        [without_diverged(q[:, surface], rest, _DIVERGED * size) for q in motion.positions.values()]
+    )  # (B, F, S, 3)
     basis, weights = reduced(places - rest, _TOLERANCE * size, _MOST_MODES)
     scales = np.maximum(np.abs(basis).max(axis=1), np.finfo(np.float32).tiny) / np.iinfo(np.int16).max
     axes = motion_axes(motion.gravity, np.concatenate([rest[None], *places]))
@@ -51,7 +54,9 @@ def view_in_space(name: str, motion: Motion, shown: Sequence[str], caption: str,
     means = mean_distance(simulated, np.broadcast_to(motion.measured, simulated.shape))  # (B, F) [mm]
     away = 1e3 * _distances(simulated, motion.measured)
     if motion.target is not None:
-        exact = np.stack([whole(q, motion.mesh.vertices, _DIVERGED * size) for q in motion.positions.values()])
+        exact = np.stack(
+            [without_diverged(q, motion.mesh.vertices, _DIVERGED * size) for q in motion.positions.values()]
+        )
         means = mean_distance(exact, np.broadcast_to(motion.target, exact.shape))
         away = 1e3 * _distances(exact[:, :, surface], motion.target[:, surface])
     drawn = np.isfinite(places.reshape(*places.shape[:2], -1).sum(axis=2))[..., None]  # (B, F, 1)

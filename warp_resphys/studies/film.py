@@ -15,11 +15,12 @@ from ..experiment.schema import POSITIVE, WORD, check, optional
 from ..io.errors import InputError
 from ..io.files import read_json
 from ..io.stages import finished_record
-from ..report.bodies import Motion, hangs, write_film, write_scene
+from ..report.bodies import ComparedMotion
+from ..report.camera import hangs
 from ..report.control_section import compared_controllers
 from ..report.data import MODELS, at_times
 from ..report.driven_film import DrivenBodies
-from ..report.render import DrawingError
+from ..report.render import DrawingError, write_film
 from ..robot.loading import load, recorded_trial
 from ..robot.robot import Robot
 from .command import WORDS, show
@@ -63,7 +64,7 @@ def _film_of_trial(config: Mapping[str, Any]) -> Path:
     motion = motion_of(run, name, models, np.inf if seconds is None else seconds)
     path = _path(config, run, name)
     with _drawing():
-        write_film(path, motion, seconds, config["slower"])
+        write_film(path, motion.film(seconds, config["slower"]))
     return path
 
 
@@ -90,7 +91,7 @@ def _film_of_motion(config: Mapping[str, Any]) -> Path:
     )
     path = _path(config, run, name)
     with _drawing():
-        write_scene(path, shown.scene(1.0 if config["slower"] is None else config["slower"]))
+        write_film(path, shown.film(1.0 if config["slower"] is None else config["slower"]))
     return path
 
 
@@ -110,7 +111,7 @@ def _drawing() -> Iterator[None]:
         raise InputError(f"no film can be drawn on this machine: {error}.") from None
 
 
-def motion_of(run: Path, trial: str, models: Sequence[str], seconds: float = np.inf) -> Motion:
+def motion_of(run: Path, trial: str, models: Sequence[str], seconds: float = np.inf) -> ComparedMotion:
     """The first seconds of a trial, as measured and as models of a run play it.
 
     Raises:
@@ -136,7 +137,7 @@ def motion_of(run: Path, trial: str, models: Sequence[str], seconds: float = np.
     bound = robot.observe(robot.state(mesh.vertices))[0].double().cpu().numpy()[some]
     gravity = np.asarray(robot.simulator.gravity, dtype=np.float64)
     from_below, _ = hangs(mesh, robot.simulator.body.fixed_vertices, gravity)
-    return Motion(mesh, times, played.markers[frames][:, some], positions, markers, bound, gravity, from_below)
+    return ComparedMotion(mesh, times, played.markers[frames][:, some], positions, markers, bound, gravity, from_below)
 
 
 def _shown(robot: Robot, count: int) -> np.ndarray:

@@ -16,7 +16,7 @@ from ..mesh.chambers import find_chambers
 from ..mesh.mesh import FloatArray, Mesh, Place, boundary_triangles, connected_parts, quadratic, select_vertices
 from ..mesh.quality import scaled_jacobian
 from ..mesh.readers import read_mesh, read_surfaces, read_vertices, write_mesh
-from ..report.mesh import MeshSummary, draw_mesh
+from ..report.body_picture import MeshSummary, draw_mesh
 from .command import aligned
 
 _MILLI: Final = 1e3

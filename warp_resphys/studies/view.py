@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from ..experiment.schema import COUNT, POSITIVE, WORD, check, optional
 from ..io.errors import InputError, ResphysError
-from ..report.bodies import sharp_edges, upwards
+from ..report.bodies import sharp_edges
+from ..report.camera import upwards
 from ..report.figures import TONES
 from ..report.render import MEASURED
 from ..robot.inputs import BASE

@@ -1,63 +1,55 @@
-"""Draws scenes, frame by frame: a program for a process of its own; see `warp_resphys.report.render` for why.
+"""Draws scenes with pyvista: the program of the process that `warp_resphys.report.render.Renderer` starts.
 
-`python -m warp_resphys.report.render_scene scenes.npz frames.npz` (or `film.mp4`, of one scene); it writes a line to
-stdout for every frame that is done.
+It reads scenes from stdin, as `render.packed` writes them, until that is closed, and writes to stdout the shape and the
+pixels of every frame, and after each scene a shape of zeros.
 """
 
+import io
 import json
+import os
+import struct
 import sys
 from collections.abc import Iterator
 from types import SimpleNamespace
-from typing import Any, Final
+from typing import Any, BinaryIO, Final
 
 import numpy as np
 
-from .render import COLOUR_MAP, INK, OUTLINE, UNWRITTEN, FloatArray, Pixels
+from .render import COLOUR_MAP, INK, OUTLINE, TOWARDS_LIGHT, FloatArray, Pixels
 
 _FAR: Final = 20.0  # Of the eye, in half heights of the view.
-_PEELS: Final = 12  # Layers of translucent surface that are told apart.
+_PEELS: Final = 12  # Layers of translucent surface that are sorted.
+_SAMPLES: Final = 8  # A pixel, where there are no such layers.
 _CORNERS: Final = 48  # Of a ring.
 _RING_WIDTH: Final = 2.5  # [px]
-_CODEC: Final = ["-crf", "23", "-preset", "fast", "-threads", "1", "-movflags", "+faststart", "-bitexact"]
 
 
-def main(source: str, target: str) -> None:
-    """Draw scenes.
+def main() -> None:
+    """Draw scenes until there are no more."""
+    source = sys.stdin.buffer
+    target = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # What VTK prints is no frame.
+    while (scene := _read(source)) is not None:
+        for frame in _frames(scene):
+            target.write(struct.pack("<3I", *frame.shape))
+            target.write(np.ascontiguousarray(frame))
+        target.write(bytes(12))
+        target.flush()
 
-    Args:
-        source: The .npz file of the scenes.
-        target: Where to write: frames (F, H, V * W, 3 | 4) of each scene as .npz, or a film of one as .mp4.
-    """
-    with np.load(source, allow_pickle=False) as held:
+
+def _read(source: BinaryIO) -> Any:
+    """The next scene; None at the end."""
+    head = source.read(8)
+    if not head:
+        return None
+    content = io.BytesIO(source.read(*struct.unpack("<Q", head)))
+    with np.load(content, allow_pickle=False) as held:
         arrays = dict(held)
 
     def named(plain: dict[str, Any]) -> SimpleNamespace:
         return SimpleNamespace(**{key: arrays.get(str(each), each) for key, each in plain.items()})
 
-    scenes: list[Any] = json.loads(str(arrays.pop("spec")), object_hook=named)
-    if not target.endswith(".mp4"):
-        write_frames(target, [np.stack(list(_frames(scene))) for scene in scenes])
-        return
-    import imageio_ffmpeg
-
-    (scene,) = scenes
-    size = (scene.size[0] * len(scene.views), scene.size[1])
-    encoder = imageio_ffmpeg.write_frames(
-        target, size, fps=scene.fps, codec="libx264", quality=None, ffmpeg_log_level="error", output_params=_CODEC
-    )
-    encoder.send(None)
-    for frame in _frames(scene):
-        encoder.send(np.ascontiguousarray(frame))
-    encoder.close()
-
-
-def write_frames(target: str, frames: list[Pixels]) -> None:
-    """Write frames, or end the process with `UNWRITTEN` where there is no room for them."""
-    try:
-        np.savez(target, *frames)
-    except OSError as error:
-        print(error.strerror or error)
-        sys.exit(UNWRITTEN)
+    return json.loads(str(arrays.pop("spec")), object_hook=named)
 
 
 def _frames(scene: Any) -> Iterator[Pixels]:
@@ -68,18 +60,17 @@ def _frames(scene: Any) -> Iterator[Pixels]:
     plotter: Any = pyvista.Plotter(
         shape=(1, len(views)), off_screen=True, border=False, lighting="none", window_size=[len(views) * width, height]
     )
-    if scene.samples:
-        plotter.enable_anti_aliasing("msaa", multi_samples=scene.samples, all_renderers=True)
-    else:
+    if scene.sorts:
         plotter.render_window.SetMultiSamples(0)  # Depth peeling needs whole pixels.
+    else:
+        plotter.enable_anti_aliasing("msaa", multi_samples=_SAMPLES, all_renderers=True)
     plotter.set_background(white or OUTLINE, all_renderers=True)  # Transparent, but for a share of it in smooth rims.
-    light = {"position": scene.towards_light, "focal_point": (0.0, 0.0, 0.0), "intensity": scene.intensity}
-    plotter.add_light(pyvista.Light(light_type="scene light", **light))
+    plotter.add_light(pyvista.Light(light_type="scene light", position=TOWARDS_LIGHT, focal_point=(0.0, 0.0, 0.0)))
     things = []
     for column, view in enumerate(views):
         plotter.subplot(0, column)
-        things += [_Thing(plotter, layer, view.axes) for layer in view.layers]
-        if not scene.samples:
+        things += [_DrawnLayer(plotter, layer, view.axes) for layer in view.layers]
+        if scene.sorts:
             plotter.enable_depth_peeling(_PEELS)
     time = _add_texts(plotter, scene) if scene.texts else None
     for frame in range(max(len(scene.texts), *(len(thing.points) for thing in things))):
@@ -100,7 +91,6 @@ def _frames(scene: Any) -> Iterator[Pixels]:
         if not white and not picture[..., 3].any():
             raise RuntimeError("the picture is empty")
         yield picture
-        print("frame", frame, flush=True)
     plotter.close()
 
 
@@ -109,7 +99,7 @@ def _at(values: FloatArray, frame: int) -> Any:
     return values[min(frame, len(values) - 1)]
 
 
-class _Thing:
+class _DrawnLayer:
     """A layer in the current view, with a corner or a centre at each of its points (1 | F, P, 3)."""
 
     def __init__(self, plotter: Any, layer: Any, axes: FloatArray) -> None:
@@ -194,4 +184,4 @@ def _add_texts(plotter: Any, scene: Any) -> Any:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main()

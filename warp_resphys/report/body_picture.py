@@ -16,15 +16,15 @@ from ..mesh.elements import ELEMENTS
 from ..mesh.mesh import Mesh, boundary_triangles, face_triangles
 from ..mesh.quality import cell_volumes
 from .bodies import face_edges, sharp_edges
+from .camera import frame_of, picture_size
 from .figures import CHAMBER_COLOURS, in_style
-from .render import BODY, CLAMPED, INK, MEASURED, FloatArray, IntArray, Layer, Scene, View, draw, view_axes
+from .render import BODY, CLAMPED, INK, MEASURED, FloatArray, IntArray, Layer, Scene, View, chain, draw, view_axes
 
 _TOWARDS_VIEWER: Final = (0.32, -1.0, 0.28)
-_TOWARDS_LIGHT: Final = (0.35, -0.9, 0.8)
 _CUT: Final = "#d3dde7"
 _LIFT: Final = 2e-3  # Of lines above the surface that they lie on, over the body's longest side.
 _DOT: Final = 0.011  # Radius of a marker, over the body's longest side.
-_MARGIN: Final = 1.04  # What a view shows, over the body.
+_MARGIN: Final = 0.02  # Around the body, over its longer side.
 _LONGER_SIDE: Final = 1400  # of a view [px]
 _DPI: Final = 200
 _NARROWEST: Final = 0.3  # width of a view over its height
@@ -36,7 +36,7 @@ _ROPE: Final = 4.0  # Width of a tendon over that of a thin line.
 
 @dataclass(frozen=True, eq=False)
 class MeshSummary:
-    """What there is to know about a mesh."""
+    """A mesh with its material, its clamped vertices, and its chambers or tendons."""
 
     mesh: Mesh
     density: float  # Of its material [kg/m^3].
@@ -47,18 +47,18 @@ class MeshSummary:
 
     @property
     def volume(self) -> float:
-        """Of the cells [m^3]."""
+        """Volume of the cells [m^3]."""
         return float(cell_volumes(self.mesh).sum())
 
     def chamber_volume(self, chamber: Chamber) -> float:
-        """Of a chamber [m^3], by the divergence theorem."""
+        """Return the volume of a chamber [m^3], by the divergence theorem."""
         corners = self.mesh.vertices[face_triangles(chamber.faces)]
         return float(-np.linalg.det(corners - corners.mean(axis=(0, 1))).sum() / 6.0)
 
 
 @in_style()
 def draw_mesh(path: Path, summary: MeshSummary, markers: FloatArray | None = None) -> None:
-    """Draws a body from outside, cut open along its length, and translucent, with chambers and tendons in colours.
+    """Draw a body from outside, cut open along its length, and translucent, with chambers and tendons in colours.
 
     Args:
         path: The PNG file to write.
@@ -72,14 +72,11 @@ def draw_mesh(path: Path, summary: MeshSummary, markers: FloatArray | None = Non
     dots = np.empty((0, 3)) if markers is None else markers
     shown = dots[np.isfinite(dots).all(axis=1)]
     radius = _DOT * float(np.ptp(summary.mesh.vertices, axis=0).max())
-    turned = np.concatenate([summary.mesh.vertices, shown - radius, shown + radius]) @ axes.T
-    sides = _MARGIN * np.ptp(turned, axis=0)[:2]
-    size = np.ceil(_LONGER_SIDE * np.maximum(sides, _NARROWEST * sides.max()) / sides.max()).astype(int)
-    focus = 0.5 * (turned.min(axis=0) + turned.max(axis=0)) @ axes
-    half = 0.5 * max(sides[1], sides[0] * size[1] / size[0])
-    views = [View(layers, axes, focus, half) for layers in _layers(summary, dots, max(1.0, size[1] / 900.0))]
-    scene = Scene(views, size.tolist(), background="white", samples=0, towards_light=_TOWARDS_LIGHT)
-    ((picture,),) = draw(scene)
+    focus, half = frame_of(np.concatenate([summary.mesh.vertices, shown - radius, shown + radius]), axes, _MARGIN)
+    half = np.maximum(half, _NARROWEST * half.max())
+    size = picture_size(half, _LONGER_SIDE)
+    views = [View(layers, axes, focus, half[1]) for layers in _layers(summary, dots, max(1.0, size[1] / 900.0))]
+    ((picture,),) = draw(Scene(views, size, background="white", sorts=True))
     volumes = {each.name.replace("_", " "): _CUBIC_CENTI * summary.chamber_volume(each) for each in summary.chambers}
     labels = [*(f"{name}: {volume:.1f} cm³" for name, volume in volumes.items())]
     labels += [name.replace("_", " ") for name in summary.tendons]
@@ -98,11 +95,6 @@ def draw_mesh(path: Path, summary: MeshSummary, markers: FloatArray | None = Non
         figure.legend(handles=handles, loc="lower center", ncols=columns, frameon=False)
     with atomic_path(path) as target:
         figure.savefig(target, format="png", dpi=_DPI)
-
-
-def _along(count: int) -> IntArray:
-    """(count - 1, 2) lines from each point to the next."""
-    return np.stack([np.arange(count - 1), np.arange(1, count)], axis=1)
 
 
 def _layers(summary: MeshSummary, markers: FloatArray, line: float) -> list[list[Layer]]:
@@ -124,7 +116,7 @@ def _layers(summary: MeshSummary, markers: FloatArray, line: float) -> list[list
     solid = mesh.cells[:, : ELEMENTS[mesh.element.linear].nodes]
     lift, cut_light = _LIFT * size, (0.5, 0.55)
     routes = [
-        Layer("lines", guides, _along(len(guides)), colour, size=_ROPE * line)
+        Layer("lines", guides, chain(len(guides)), colour, size=_ROPE * line)
         for guides, colour in zip(summary.tendons.values(), cycle(CHAMBER_COLOURS[len(chambers) :]))
     ]
     balls = Layer("balls", markers, None, MEASURED, size=_DOT * size, light=(0.6, 0.5))

@@ -5,6 +5,9 @@ import hashlib
 import sys
 from html.parser import HTMLParser
 
+from warp_resphys.experiment.report import make_report
+from warp_resphys.io.stages import StageContext
+
 FAILING = (sys.executable, "-c", "raise SystemExit('no OpenGL here')")
 
 
@@ -41,3 +44,9 @@ class Page(HTMLParser):
         policy = self.source.partition("Content-Security-Policy")[2].partition(">")[0]
         allowed = policy.partition("script-src ")[2].partition(";")[0].rstrip('"').split()
         return "default-src 'none'" in policy and allowed == [f"'sha256-{digest}'" for digest in digests]
+
+
+def report(folder, settings, make=make_report):
+    """The page that is made of a run folder."""
+    make(StageContext("report", folder, "", {"config": settings}))
+    return Page(folder / "report.html")

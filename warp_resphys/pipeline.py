@@ -65,9 +65,9 @@ from .io.fan_out import ALONE, Workers
 from .io.files import digest, read_json, write_json
 from .io.stages import Stage, StageContext, package_versions, resources_used, run_stages
 from .learning.metrics import summarise_folds
+from .report.conclusions import conclusions
 from .report.control_section import controller_name
 from .report.page import number_text
-from .report.verdict import judgement
 
 _SIMULATED = (
     *("mesh", "physics", "fixed", "gravity", "time_step", "integrator", "solver", "device", "dtype"),
@@ -379,7 +379,7 @@ def _print(metrics: Mapping[str, Any], folder: Path, config: Mapping[str, Any]) 
         console.print(_driven(metrics["control"]["tracking"]))
     if "noise_mm" in metrics:
         console.print(f"The noise of the markers alone is {number_text(metrics['noise_mm'])} mm.")
-    for said in judgement(metrics, config):
+    for said in conclusions(metrics, config):
         console.print(said, soft_wrap=True)
     console.print(f"Report: {folder / REPORT}", soft_wrap=True)
 

@@ -30,11 +30,13 @@ def played(environment, steps=6, seed=3):
 
 
 class TestGymnasium:
+    @pytest.mark.usefixtures("can_draw")
     @pytest.mark.parametrize("task", TASKS)
     def test_its_checker_passes(self, folder, task):
         name = "".join(word.capitalize() for word in task.split("_"))
         environment = gym.make(f"warp_resphys/{name}-v0", run=folder, render_mode="rgb_array", **QUICK)
         check_env(environment.unwrapped)
+        environment.close()
 
     def test_a_vector_of_them_is_made_by_name(self, folder):
         found = gym.make_vec("warp_resphys/Reach-v0", num_envs=3, run=folder, **QUICK)
@@ -170,6 +172,7 @@ class TestFailures:
 
 
 class TestPictures:
+    @pytest.mark.usefixtures("can_draw")
     @pytest.mark.parametrize("world", ["simulator", "laboratory"])
     def test_they_show_body_markers_and_goal_where_these_are(self, folder, world):
         environment = make_vector("reach", folder, 2, world=world, render_mode="rgb_array", **QUICK)
@@ -189,6 +192,7 @@ class TestPictures:
         assert np.linalg.norm(blue[0].mean(axis=0) - blue[2].mean(axis=0)) > 2.0  # It moved,
         assert np.linalg.norm(blue[2].mean(axis=0) - blue[3].mean(axis=0)) > 2.0  # and the other elsewhere.
         np.testing.assert_allclose(red[0].mean(axis=0), red[2].mean(axis=0), atol=8.0)  # It is partly hidden at most.
+        environment.close()
 
     def test_nothing_is_drawn_that_nobody_asked_for(self, folder):
         environment = make_vector("reach", folder, 1, **QUICK)

@@ -117,11 +117,38 @@ def test_sharp_edges_are_those_of_the_box_and_the_rim_of_a_part():
     ],
     ids=["crash", "import", "time-out"],
 )
-def test_why_nothing_can_be_drawn(monkeypatch, script, time_out, reason):
+def test_why_nothing_can_be_drawn(tmp_path, monkeypatch, script, time_out, reason):
     monkeypatch.setattr(render, "COMMAND", (sys.executable, "-c", script))
     monkeypatch.setattr(render, "TIME_OUT", time_out)
     mesh = box_hexahedra(divisions=(1, 1, 1))
-    with pytest.raises(render.DrawingError, match=r"cannot draw .* on this machine \(") as caught:
-        drawn(mesh, {"box": mesh.vertices}, mesh.vertices)
+    scene = distance_scene(mesh, {"box": mesh.vertices}, mesh.vertices)
+    with pytest.raises(render.DrawingError) as caught:
+        render.draw(scene)
     assert reason in str(caught.value)
     assert "libegl1" in str(caught.value)
+    with pytest.raises(render.DrawingError) as caught:
+        render.write_film(tmp_path / "motion.mp4", scene)
+    assert reason in str(caught.value)
+    assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.usefixtures("can_draw")
+def test_one_process_draws_scene_after_scene_until_it_is_forgotten():
+    mesh = box_hexahedra(divisions=(1, 1, 1))
+    scene = distance_scene(mesh, {"box": mesh.vertices}, mesh.vertices)
+    renderer = render.Renderer()
+    first, second = (list(renderer.frames(scene)) for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+    ended = renderer._end.peek()[2][0]
+    del renderer
+    assert ended.poll() is not None
+
+
+@pytest.mark.usefixtures("can_draw")
+def test_a_film_that_cannot_be_encoded_says_so(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    mesh = box_hexahedra(divisions=(1, 1, 1))
+    scene = distance_scene(mesh, {"box": mesh.vertices}, mesh.vertices)
+    with pytest.raises(render.DrawingError, match="imageio-ffmpeg"):
+        render.write_film(tmp_path / "motion.mp4", scene)
+    assert not [*tmp_path.iterdir()]

@@ -10,12 +10,10 @@ from browser import opened as browser_of_tests
 from browser import until
 from driven_run import arm_settings
 from driven_run import write_run as write_driven
-from report_page import FAILING, Page
+from report_page import FAILING, Page, report
 from vertex_run import settings as vertex_settings
 from vertex_run import write_run as write_vertex
 
-from warp_resphys.experiment.report import make_report
-from warp_resphys.io.stages import StageContext
 from warp_resphys.mesh.mesh import boundary_triangles, box_hexahedra
 from warp_resphys.report import render
 from warp_resphys.report.bodies import ComparedMotion
@@ -106,7 +104,7 @@ def page(request, tmp_path_factory):
     write(folder, config)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(render, "COMMAND", FAILING)  # Nothing else is drawn, which takes seconds.
-        make_report(StageContext("report", folder, "", {"config": config}))
+        report(folder, config)
     return folder / "report.html"
 
 

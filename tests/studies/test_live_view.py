@@ -122,11 +122,11 @@ def test_what_diverges_stands_still_until_it_is_reset(live, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(Robot, "step", fail)
         assert not live.step()
-    assert live.said == "Stopped: the step failed: take shorter steps."
+    assert live.failure == "Stopped: the step failed: take shorter steps."
     assert not live.step()
     np.testing.assert_array_equal(live.positions, before)
     live.reset()
-    assert live.said == ""
+    assert live.failure == ""
     assert live.step()
 
 

@@ -23,7 +23,7 @@ from ..io.resumable import Field
 from ..io.stages import Stage, StageContext, package_versions, resources_used
 from ..learning.reconstruction import make_reconstructor
 from ..mesh.mesh import surface_vertices
-from ..report.ablation_page import AblationReport, write_ablation_report
+from ..report.ablation_page import write_ablation_report
 from ..report.page import number_text
 from ..stepping.state import State
 from .build import build_mesh, build_simulator, simulation_device
@@ -194,16 +194,8 @@ def report_ablation(context: StageContext) -> None:
     mesh = build_mesh(config["mesh"])
     surface = surface_vertices(mesh)
     fixed = build_simulator(config).body.fixed_vertices
-    data = AblationReport(
-        title=config["title"],
-        experiment=config["name"],
-        metrics=_metrics(context.run_dir, config),
-        settings=config,
-        vertices=len(mesh.vertices),
-        surface=len(surface),
-        free_surface=len(np.setdiff1d(surface, fixed)),
-    )
-    write_ablation_report(context.run_dir / REPORT, data)
+    counts = {"vertices": len(mesh.vertices), "surface": len(surface), "free": len(np.setdiff1d(surface, fixed))}
+    write_ablation_report(context.run_dir / REPORT, _metrics(context.run_dir, config), config, **counts)
 
 
 def _metrics(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..energies.materials import make_material
 from ..io.errors import DataFileError
 from ..io.files import read_array, read_hdf5, read_json
 from ..io.stages import StageContext, package_versions, resources_used
@@ -20,8 +19,8 @@ from ..learning.parameters import configured_parameters
 from ..mesh.chambers import Chamber
 from ..mesh.mesh import Mesh, select_vertices
 from ..mesh.surface import closest_points
-from ..report.data import MODELS, Driven, Film, FollowedPath, Recordings, RunReport, Trials
-from ..report.page import number_text
+from ..report.data import MODELS, Driven, Film, FollowedPath, Recordings, RunReport, TrialResults
+from ..report.notes import error_notes, kept_note, material_note, network_note, published_note
 from ..report.run_page import write_report
 from .actuators import build_chambers, build_muscles, build_tendons, driving_quantity
 from .build import bound_markers, build_mesh, choose_device, sight_of
@@ -49,40 +48,9 @@ from .files import (
     training_file,
 )
 from .scene import LEARNED
-from .trials import is_laboratory, sees_markers
+from .trials import sees_markers
 
 FloatArray = NDArray[np.float64]
-
-_SELECTED_BY = {"rollout": "roll-out error", "validation_loss": "validation loss"}
-_PUBLISHED_NETWORK = {"kind": "nodal", "blocks": 5, "layers": 3, "width": 512, "activation": "normalised_elu"}
-_PUBLISHED_TRAINER = {
-    "epochs": 1000,
-    "batch_size": 256,
-    "learning_rate": 1e-3,
-    "schedule": "step",
-    "weight_decay": 1e-5,
-    "noise": 0.0,
-    "linear_noise": None,
-    "scale_weight": 0.0,
-    "selection": "validation_loss",
-}
-_AGAINST = "The published errors are measured against the reconstructed trajectories, ours against the target."
-_MASS = {
-    "per_vertex": " This run computes masses and volumes as the published code does.",
-    "row_sum": (
-        " The published simulator doubles the beam's mass and locks (physics=published computes the same); "
-        "this run does not, so that its uncorrected error is another one."
-    ),
-}
-_OF_A_BEAM = (
-    "The published errors are those of other data: recordings with ten markers on the beam's sides, whose weight is "
-    "cut off at the release, compared with trajectories reconstructed from them; the published uncorrected simulation "
-    "has the published setting, the published SysID elastic parameters only."
-)
-_OF_AN_ARM = {
-    True: "The published errors are those of another body: recordings of a real arm, which this run has not seen.",
-    False: "The published errors are those of the published simulator, of 494 vertices, on the authors' recordings.",
-}
 
 
 def make_report(context: StageContext) -> None:
@@ -99,6 +67,7 @@ def make_report(context: StageContext) -> None:
     channels = () if driven is None else driven.channels
     tip = {} if trials.labels else config.get("tip") or {}
     learned = "resphys" in metrics["errors_mm"] and not config.get("in_the_loop")
+    network = (config["network"], config["trainer"], config.get("refinement") or {}) if learned else None
     data = RunReport(
         **_common_parts(config, metrics, mesh),
         tip=select_vertices(mesh, **tip) if tip else np.empty(0, dtype=np.int64),
@@ -114,11 +83,11 @@ def make_report(context: StageContext) -> None:
         truth=truth.get("material", {}),
         training=_histories(folder, False),
         refinement=_histories(folder, True),
-        network_note=network_in_words(config) if learned else "",
-        kept_note=kept_in_words(metrics["networks"]) if "resphys" in metrics["networks"] else "",
+        network_note="" if network is None else network_note(*network),
+        kept_note=kept_note(metrics["networks"]),
         followed=read_followed(folder, config),
-        simulator=_in_words(config["simulation"]),
-        target=_in_words(config["target"]) if config.get("target") else "",
+        simulator=material_note(config["simulation"]),
+        target=material_note(config["target"]) if config.get("target") else "",
     )
     write_report(folder / REPORT, data)
 
@@ -203,42 +172,7 @@ def data_sheet(config: Mapping[str, Any], identification: Mapping[str, Any]) -> 
     return configured_parameters(config, (*names, "youngs_modulus", "poissons_ratio"))
 
 
-def error_notes(sideways: Mapping[str, float], truth: Mapping[str, Any], mesh: Mapping[str, Any]) -> list[str]:
-    """How the bodies of the test trials were held, and what of the errors is noise or mesh, where that is known."""
-    notes = []
-    if sideways:
-        each = ", ".join(f"{distance:.1f} mm ({trial})" for trial, distance in sideways.items())
-        notes.append(
-            "The first frames of a trial tell how far sideways its body was held: the markers by "
-            f"{each}, as the identified simulator has it. Every simulator begins with its own estimate."
-        )
-    if "noise_mm" in truth:
-        notes.append(f"The noise of the markers alone is {truth['noise_mm']:.2f} mm.")
-    return [*notes, mesh_note(mesh)] if mesh else notes
-
-
-def mesh_note(found: Mapping[str, Any]) -> str:
-    """What a finer mesh changes, in words."""
-    cells, finer = found["cells"]
-    model = "the identified simulator" if found["model"] == "sysid" else "the simulator"
-    finer_mesh = f"a mesh of {finer:,} in place of {cells:,} cells"
-    if "failed" in found:
-        return f"What of the errors is mesh is not known: on {finer_mesh}, {found['failed']}"
-    before, after = map(number_text, found["errors_mm"])
-    return (
-        f"How much of the errors is mesh: on {finer_mesh}, with the same constants, the markers of {model} are "
-        f"{number_text(found['moved_mm'])} mm elsewhere, and its error is {after} mm in place of {before} mm."
-    )
-
-
-def published_note(config: Mapping[str, Any]) -> str:
-    """How the published errors of this experiment came about."""
-    if not sees_markers(config):
-        return _AGAINST + _MASS[config["physics"]["mass"]]
-    return _OF_AN_ARM[is_laboratory(config)] if config.get("chambers") else _OF_A_BEAM
-
-
-def read_trials(folder: Path, config: Mapping[str, Any]) -> Trials:
+def read_trials(folder: Path, config: Mapping[str, Any]) -> TrialResults:
     """What was observed in the test trials of a split and what the models made of them, as long as it counts.
 
     Roll-outs at other inputs than those of the data set are left out.
@@ -269,7 +203,7 @@ def read_trials(folder: Path, config: Mapping[str, Any]) -> Trials:
         length = max(1, int((times <= seconds).any(axis=0).sum()))
     if set(begins) == {STATIC}:  # Beside motions, poses have as many frames, of one time.
         length = 1
-    return Trials(
+    return TrialResults(
         names=tuple(test),
         labels=dataset.labels,
         begins=begins,
@@ -379,7 +313,7 @@ def _driven_chambers(chambers: tuple[Chamber, ...], names: tuple[str, ...]) -> t
     return tuple(found[name] for name in names)
 
 
-def _at_rest(mesh: Mesh, trials: Trials, film: Film | None) -> tuple[Mesh, dict[str, FloatArray]]:
+def _at_rest(mesh: Mesh, trials: TrialResults, film: Film | None) -> tuple[Mesh, dict[str, FloatArray]]:
     """The body as it rests, and how far each marker has moved there (3,) [m], by label.
 
     Where trials begin at rest, that is how the simulator to correct has it before anything drives it; else it is
@@ -433,54 +367,3 @@ def read_recordings(
         feet=feet,
         mesh=mesh,
     )
-
-
-def network_in_words(config: dict[str, Any]) -> str:
-    """Which network predicts the residual force, and how it is trained; says where it is the published one."""
-    network, trainer = config["network"], config["trainer"]
-    who = "The published network" if network.items() >= _PUBLISHED_NETWORK.items() else "Our network"
-    basis = "force, positions and velocities of every vertex"
-    if network["kind"] == "reduced":
-        sizes = (network[f"{name}_modes"] for name in ("position", "velocity", "force"))
-        basis = "a reduced basis of {} position, {} velocity and {} force modes".format(*sizes)
-    blocks = "1 block" if network["blocks"] == 1 else f"{network['blocks']} blocks"
-    how = "as published" if trainer.items() >= _PUBLISHED_TRAINER.items() else "our way"
-    linear = "" if trainer["linear_noise"] is None else ", beside a linear part from ridge regression"
-    said = (
-        f"ResPhys: {who[0].lower()}{who[1:]}, in {basis}, {blocks} of {network['layers']} hidden layers of "
-        f"{network['width']}{linear}; trained {how}, {trainer['epochs']} epochs, weights chosen by "
-        f"{_SELECTED_BY[trainer['selection']]}."
-    )
-    if config.get("refinement", {}).get("kind", "none") != "none":
-        said += f" Then refined through the simulator, over windows of {config['refinement']['window']} steps."
-    return said
-
-
-def kept_in_words(networks: dict[str, Any]) -> str:
-    """Which weights of the residual force were taken, and what they do on the validation split."""
-    kept = networks["resphys"]
-    said = f"Kept: epoch {kept['epoch']}, by {_SELECTED_BY[kept['selection']]}; {_validated(kept)}."
-    refined = networks.get("resphys_refined")
-    if refined is None:
-        return said
-    if refined["epoch"] == 0:
-        return f"{said} No epoch of the refinement was better: the weights are those from before it."
-    return f"{said} Taken in the end: epoch {refined['epoch']} of the refinement; {_validated(refined)}."
-
-
-def _validated(kept: dict[str, Any]) -> str:
-    error = kept["validation_rollout_error_mm"]
-    if error is None:
-        return "its roll-outs of the validation split diverge"
-    return f"its mean roll-out error on the validation split is {number_text(error)} mm"
-
-
-def _in_words(material: dict[str, Any]) -> str:
-    """Young's modulus and Poisson's ratio, or what else it is given by, and the model where it is not the usual one."""
-    constants: dict[str, Any] = dict(make_material(**material).constants)
-    model = material.get("model", "corotated")
-    if "youngs_modulus" in constants:
-        words = f"E {constants['youngs_modulus'] / 1e3:g} kPa, ν {constants['poissons_ratio']:g}"  # noqa: RUF001
-    else:
-        words = ", ".join(f"{name.replace('_', ' ')} {constants[name] / 1e3:g} kPa" for name in [*constants][:-3])
-    return words if model == "corotated" else f"{words}, {model.replace('_', ' ')}"

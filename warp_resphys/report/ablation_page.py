@@ -1,71 +1,101 @@
-"""The report of the marker ablation: one HTML page that needs nothing beside it, and its figure as a PNG file."""
+"""The page of the marker ablation: a box plot, its numbers, and how the motion was reconstructed."""
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
+from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from ..io.files import write_text
 from .figures import TONES, FloatArray, in_style, new_figure, use_logarithm
 from .page import (
     NO_BREAK_SPACE,
-    draw_picture,
-    duration_text,
+    Canvas,
+    Cell,
+    Part,
+    Row,
+    Table,
+    Text,
+    experiment_kicker,
     figures_beside,
-    flatten,
     number_text,
-    page_template,
+    write_page,
 )
 
 _LOG = logging.getLogger(__name__)
-FIGURE = "marker_ablation"
+_COLUMNS: Final[Mapping[str, str]] = {
+    "median_mm": "Median [mm]",
+    "lower_quartile_mm": "Lower quartile",
+    "upper_quartile_mm": "Upper quartile",
+    "interquartile_range_mm": "Interquartile range",
+    "largest_mm": "Largest",
+    "misfit_median_mm": "At the markers",
+}
 
 
-@dataclass(frozen=True)
-class AblationReport:
-    """Everything that the page shows."""
-
-    title: str  # The page's heading.
-    experiment: str  # Its name.
-    metrics: Mapping[str, Any]  # `uncorrected_mm`, `by_markers` (a row a number of markers), resources and versions.
-    settings: Mapping[str, Any]  # The run's configuration, nested.
-    vertices: int  # Of the mesh.
-    surface: int  # Those on its surface.
-    free_surface: int  # Those of them that are not clamped.
-
-
-def write_ablation_report(path: Path, data: AblationReport) -> None:
+def write_ablation_report(
+    path: Path, metrics: Mapping[str, Any], settings: Mapping[str, Any], *, vertices: int, surface: int, free: int
+) -> None:
     """Write the page, and its figure into `figures/` beside it.
 
     Args:
         path: The page's file, such as `report.html`; missing folders are made.
-        data: What to show.
+        metrics: `uncorrected_mm`, `by_markers` (a row a number of markers), resources and versions.
+        settings: The run's configuration.
+        vertices: How many the mesh has.
+        surface: How many of them are on its surface,
+        free: and how many of these are not clamped.
 
     Raises:
         DataFileError: A file could not be written.
     """
-    with figures_beside(path) as folder:
-        draw = partial(marker_boxes, box_errors(data.metrics), data.metrics["uncorrected_mm"])
-        picture = draw_picture(folder, FIGURE, draw, describe_boxes(data.metrics))
-    rows = data.metrics["by_markers"]
-    page = page_template("ablation.html").render(
-        title=data.title,
-        data=data,
-        metrics=data.metrics,
-        pictures={FIGURE: picture},
-        verdict=verdict(rows, data.metrics["uncorrected_mm"]),
-        clamped=[row["markers"] for row in rows if row["markers"] > data.free_surface],
-        number=number_text,
-        duration=duration_text,
-        settings=list(flatten(data.settings)),
+    rows, uncorrected = metrics["by_markers"], metrics["uncorrected_mm"]
+    caption = (
+        f"Mean distance of all {vertices} vertices from the target over the {settings['data']['steps']} steps of one "
+        "motion, of which the reconstruction sees the markers alone. The orange line is the median of "
+        f"{settings['ablation']['draws']} random sets of markers, the box extends from the lower to the upper "
+        "quartile, the whiskers to the smallest and the largest error."
     )
-    write_text(path, page)
+    note = (
+        f"The last column is the median distance of the markers themselves. Uncorrected, the simulation is "
+        f"{number_text(uncorrected)}{NO_BREAK_SPACE}mm off on average. The sets are drawn from the {free} surface "
+        "vertices that are not clamped."
+    )
+    if more := [str(row["markers"]) for row in rows if row["markers"] > free]:
+        note += (
+            f" {', '.join(more)} markers are more than these, and are drawn from all {surface} surface vertices, as "
+            "published."
+        )
+    body = [Row(str(row["markers"]), [Cell(number_text(row[key])) for key in _COLUMNS]) for row in rows]
+    with figures_beside(path) as folder:
+        draw = partial(marker_boxes, box_errors(metrics), uncorrected)
+        figure = Canvas(folder).figure("marker_ablation", draw, describe_boxes(metrics), caption)
+    write_page(
+        path,
+        [
+            Part("", [figure, Table("Markers", [*_COLUMNS.values()], body, note)]),
+            Part("How it was reconstructed", [Text(_how_reconstructed(settings))]),
+        ],
+        title=settings["title"],
+        kicker=experiment_kicker(settings["name"]),
+        verdict=verdict(rows, uncorrected),
+        metrics=metrics,
+        settings=settings,
+    )
     _LOG.info("report written: %s", path)
+
+
+def _how_reconstructed(settings: Mapping[str, Any]) -> str:
+    modes = settings["ablation"]["modes"]
+    free = f"among the inertial forces of the {modes} slowest vibrations" if modes else "free at every vertex"
+    return Markup(
+        "Step by step from the known first state, with the force of least |markers&nbsp;–&nbsp;observed|<sup>2</sup> + "  # noqa: RUF001
+        "λ&nbsp;|force|<sup>2</sup>, where λ is {}&nbsp;m²/N², {}. The published study takes "
+        "1.0&nbsp;×&nbsp;10⁻⁴&nbsp;m²/N² for λ."  # noqa: RUF001
+    ).format(number_text(settings["reconstruction"]["regularisation"]), free)
 
 
 def verdict(rows: Sequence[Mapping[str, Any]], uncorrected: float) -> str:
@@ -85,12 +115,12 @@ def verdict(rows: Sequence[Mapping[str, Any]], uncorrected: float) -> str:
 
 def _from_here_on(rows: Sequence[Mapping[str, Any]], key: str, below: float) -> int | None:
     """The smallest number of markers from which on a value stays below a threshold."""
-    found = None
+    least = None
     for row in sorted(rows, key=lambda row: -int(row["markers"])):
         if not row[key] < below:
             break
-        found = int(row["markers"])
-    return found
+        least = int(row["markers"])
+    return least
 
 
 def box_errors(metrics: Mapping[str, Any]) -> dict[int, FloatArray]:
@@ -117,7 +147,7 @@ def marker_boxes(
         narrow: Whether the figure is for a narrow page.
     """
     ink: dict[str, Any] = {"color": TONES["ink"].light, "linewidth": 0.9}
-    median = {"color": TONES["simulation"].light, "linewidth": 2.0}
+    grey, median = TONES["muted"].light, {"color": TONES["simulation"].light, "linewidth": 2.0}
     figure = new_figure(3.6, 3.4, narrow=narrow)
     axes, count = figure.subplots(), len(errors)
     lines: Any = {"boxprops": ink, "whiskerprops": ink, "capprops": ink, "medianprops": median}
@@ -127,7 +157,6 @@ def marker_boxes(
         start = 0.5 + sum(markers < published[0] for markers in errors)
         levels["published median: below" if narrow else "published: the median is below"] = (start, published[1])
     for text, (start, level) in levels.items():
-        grey = TONES["muted"].light
         axes.plot([start, count + 0.5], [level, level], color=grey, linewidth=1.1, linestyle="--")
         axes.annotate(text, (count + 0.5, level), (-2, 3), textcoords="offset points", ha="right", color=grey)
     axes.set_xlim(0.5, count + 0.5)

@@ -225,8 +225,8 @@ def _bodies(mesh: Mesh, positions: FloatArray, half: float) -> list[Layer]:
     layers, before = [], {name: half * each for name, each in _BEFORE.items()}
     *others, solid = positions
     for q in others:
-        behind = {"opacity": _BEHIND, "light": BODY_LIGHT, "shift": before["others"]}
-        layers.append(Layer("surface", q, triangles, BODIES[0], **behind))
+        others_shift = before["others"]
+        layers.append(Layer("surface", q, triangles, BODIES[0], opacity=_BEHIND, light=BODY_LIGHT, shift=others_shift))
         layers.append(Layer("lines", q, sharp, BODIES[0], size=2.0, shift=before["lines"]))
     layers.append(Layer("surface", solid, triangles, BODIES[1], light=BODY_LIGHT))
     layers.append(Layer("lines", solid, edges, INK, size=1.0, opacity=0.3, shift=before["lines"]))

@@ -20,7 +20,7 @@ from .camera import frame_of, picture_size
 from .figures import CHAMBER_COLOURS, in_style
 from .render import BODY, CLAMPED, INK, MEASURED, FloatArray, IntArray, Layer, Scene, View, chain, draw, view_axes
 
-_TOWARDS_VIEWER: Final = (0.32, -1.0, 0.28)
+TOWARDS_VIEWER: Final = (0.32, -1.0, 0.28)
 _CUT: Final = "#d3dde7"
 _LIFT: Final = 2e-3  # Of lines above the surface that they lie on, over the body's longest side.
 _DOT: Final = 0.011  # Radius of a marker, over the body's longest side.
@@ -68,7 +68,7 @@ def draw_mesh(path: Path, summary: MeshSummary, markers: FloatArray | None = Non
     Raises:
         DrawingError: There is no pyvista, or no OpenGL driver that works off screen.
     """
-    axes = view_axes(_TOWARDS_VIEWER)
+    axes = view_axes(TOWARDS_VIEWER)
     dots = np.empty((0, 3)) if markers is None else markers
     shown = dots[np.isfinite(dots).all(axis=1)]
     radius = _DOT * float(np.ptp(summary.mesh.vertices, axis=0).max())
@@ -110,11 +110,11 @@ def _layers(summary: MeshSummary, markers: FloatArray, line: float) -> list[list
     chambers = list(zip((face_triangles(chamber.faces) for chamber in summary.chambers), cycle(CHAMBER_COLOURS)))
     inner = np.concatenate([np.empty(0, dtype=np.int64), *(faces.ravel() for faces, _ in chambers)])
     outer = triangles[~np.isin(triangles[:, 0], inner)]
-    normal = np.array(_TOWARDS_VIEWER)
+    normal = np.array(TOWARDS_VIEWER)
     normal[np.ptp(vertices, axis=0).argmax()] = 0.0  # The body is cut along its longest side.
     plane = np.stack([normal, vertices.mean(axis=0)])
     solid = mesh.cells[:, : ELEMENTS[mesh.element.linear].nodes]
-    lift, cut_light = _LIFT * size, (0.5, 0.55)
+    lift, cut_light = _LIFT * size, (0.55, 0.6)
     routes = [
         Layer("lines", guides, chain(len(guides)), colour, size=_ROPE * line)
         for guides, colour in zip(summary.tendons.values(), cycle(CHAMBER_COLOURS[len(chambers) :]))
@@ -123,21 +123,21 @@ def _layers(summary: MeshSummary, markers: FloatArray, line: float) -> list[list
     clamped = Layer("balls", vertices[summary.fixed], None, CLAMPED, size=0.5 * _DOT * size, light=(0.7, 0.3))
     dots = [balls] if len(markers) else []
     outside = [
-        Layer("surface", vertices, triangles, BODY, light=(0.55, 0.5)),
+        Layer("surface", vertices, triangles, BODY, light=(0.6, 0.6)),
         Layer("lines", vertices, face_edges(mesh), INK, size=line, opacity=0.6, shift=lift),
         *([clamped] if len(summary.fixed) else []),
         *dots,
     ]
     cut = [
         Layer("surface", vertices, outer, BODY, light=cut_light, plane=plane),
-        Layer("slice", vertices, solid, _CUT, light=(0.9, 0.1), plane=plane),
+        Layer("slice", vertices, solid, _CUT, light=(0.93, 0.12), plane=plane),
         Layer("slice_edges", vertices, solid, INK, size=line, opacity=0.55, shift=lift, plane=plane),
         *(Layer("surface", vertices, faces, colour, light=cut_light, plane=plane) for faces, colour in chambers),
     ]
     translucent = [
-        Layer("surface", vertices, outer, BODY, opacity=0.22, light=(0.8, 0.4)),
+        Layer("surface", vertices, outer, BODY, opacity=0.22, light=(0.82, 0.45)),
         Layer("lines", vertices, sharp_edges(vertices, outer), CLAMPED, size=line, opacity=0.5),
-        *(Layer("surface", vertices, faces, colour, light=(0.55, 0.5)) for faces, colour in chambers),
+        *(Layer("surface", vertices, faces, colour, light=(0.6, 0.6)) for faces, colour in chambers),
         *routes,
         *dots,
     ]

@@ -33,7 +33,7 @@ _OTHER: Final = 0.25  # How far from the tip's height another marker must be to 
 
 
 @dataclass(frozen=True, eq=False)
-class Trials:
+class TrialResults:
     """What was observed in the R test trials, and what the models made of them."""
 
     names: tuple[str, ...]
@@ -128,7 +128,7 @@ class RunReport:
     tip: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))  # Where all vertices are observed.
     chambers: tuple[Chamber, ...] = ()  # The closed ones that are under pressure.
     tendons: Mapping[str, FloatArray] = field(default_factory=dict)  # (G, 3) their guides [m], by name.
-    trials: Trials | None = None  # Of the test; None over the folds.
+    trials: TrialResults | None = None  # Of the test; None over the folds.
     film: Film | None = None  # The bodies in one of them.
     driven: Driven | None = None  # What drives it.
     recordings: Recordings | None = None  # Quality and registration of all trials.
@@ -191,7 +191,7 @@ def mean_distance(positions: FloatArray, target: FloatArray) -> FloatArray:
     return mean
 
 
-def best_and_worst(trials: Trials) -> list[int]:
+def best_and_worst(trials: TrialResults) -> list[int]:
     """Return the motions in which the last model of the table is farthest off, and closest; one where there is one."""
     moving = [row for row, begins in enumerate(trials.begins) if begins != "static"]
     errors = trials.errors_mm[next(m for m in reversed(list(MODELS)) if m in trials.positions)][moving]

@@ -1,6 +1,5 @@
 """Sections of the page of a run on its motion, and on the body and the inputs that drive it."""
 
-from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import replace
 from functools import partial
@@ -10,7 +9,6 @@ from typing import Any, Final
 import numpy as np
 from markupsafe import Markup
 
-from ..learning.intervals import Intervals
 from .bodies import ComparedMotion, distance_scene, largest_distances
 from .camera import hangs
 from .data import (
@@ -19,24 +17,18 @@ from .data import (
     Film,
     FloatArray,
     RunReport,
-    Trials,
+    TrialResults,
     at_times,
-    best_and_worst,
-    drawn_markers,
     shown_markers,
     shown_models,
-    tip_markers,
 )
 from .page import Block, Canvas, Drawn, Part, data_address, drawn_file, largest_text
 from .render import Pixels, draw, write_film
 from .verdict import unbroken
 
-_ONE_BY_ONE: Final = ("simulation", "sysid", "simfree", "resphys")  # Marker by marker, where all would hide each other.
-_MOST_MARKERS: Final = 6  # That are drawn coordinate by coordinate.
-_PLANE_SECONDS: Final = 5.0  # Of a path in the plane.
-_SPACE_SECONDS: Final = 2.5  # And in space, where a longer one cannot be told apart.
+_MOST_POINTS: Final = 6  # Of the tip that are shown, where every vertex is observed.
 _MOST_FRAMES: Final = 256  # Of the view in space, as films have.
-_SEQUENCES: Final = 3  # Trials whose inputs are drawn over time.
+_SEQUENCES: Final = 3  # TrialResults whose inputs are drawn over time.
 
 
 def start_drawing(data: RunReport, folder: Path, pool: Executor) -> "dict[str, Future[Any]]":
@@ -72,7 +64,7 @@ def motion_of(data: RunReport, *, every_model: bool = False) -> ComparedMotion |
         row = trials.worst
         film = Film(trials.names[row], trials.times[row], {m: q[row] for m, q in trials.positions.items()})
         some = data.tip if len(data.tip) else np.flatnonzero(away >= away.max() - 1e-9)
-        some = some[np.unique(np.linspace(0, len(some) - 1, _MOST_MARKERS).round().astype(int))]
+        some = some[np.unique(np.linspace(0, len(some) - 1, _MOST_POINTS).round().astype(int))]
     if film is None or film.trial not in trials.names or not shown_models(film.positions):
         return None
     row = trials.names.index(film.trial)
@@ -95,13 +87,13 @@ def motion_of(data: RunReport, *, every_model: bool = False) -> ComparedMotion |
     )
 
 
-def worst_state(trials: Trials, row: int) -> int:
+def worst_state(trials: TrialResults, row: int) -> int:
     """Return the frame of a trial at which the uncorrected simulation, or the first model, is farthest off."""
     errors = trials.plain_errors_mm[row]
     return int(np.argmax(np.where(np.isfinite(errors), errors, -1.0)))
 
 
-def _bodies(trials: Trials) -> tuple[dict[str, FloatArray], FloatArray]:
+def _bodies(trials: TrialResults) -> tuple[dict[str, FloatArray], FloatArray]:
     """(N, 3) the bodies [m] in the worst frame of the worst trial by model, and the target."""
     at = trials.worst, worst_state(trials, trials.worst)
     return {m: trials.positions[m][at] for m in shown_models(trials.positions)}, trials.target[at]
@@ -176,7 +168,7 @@ def _instants_figure(data: RunReport, motion: ComparedMotion, name: str, colours
     return canvas.figure("motion", partial(motion_figures.motion_instants, frames, titles), alt, said)
 
 
-def _vertex_figures(data: RunReport, trials: Trials, canvas: Canvas) -> list[Block]:
+def _vertex_figures(data: RunReport, trials: TrialResults, canvas: Canvas) -> list[Block]:
     """The tip over time, and the bodies coloured by their error."""
     from . import motion_figures
 
@@ -220,130 +212,6 @@ def _largest(differences: FloatArray) -> str:
     return largest_text(np.where(np.isnan(distances), np.inf, distances))
 
 
-def paths_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """The motion of markers: of the tip where inputs drive it, else coordinate by coordinate."""
-    trials = data.trials
-    if trials is None or not trials.labels or not trials.moves:
-        return None
-    places = dict(zip(("worst", "best"), best_and_worst(trials), strict=False))
-    which = {"worst": "", "best": ""}
-    if len(places) > 1:
-        which["worst"] = ", in which the last model of the table is farthest off"
-        which["best"] = ", in which the same model is closest"
-    if data.driven is None:
-        found = [_markers(data, trials, row, at, which[at], canvas) for at, row in places.items()]
-        return Part("Marker by marker", found)
-    driven = _driven_markers(data, trials, places["worst"], data.driven, canvas)
-    if trials.own_frame or len(trials.axes) < 3:  # Where the tip is in space is not told.
-        return Part("Marker by marker", [driven])
-    blocks = [_plane(data, trials, row, at, which[at], canvas) for at, row in places.items()]
-    return Part("The tip", [*blocks[:1], _space(data, trials, places["worst"], canvas), driven, *blocks[1:]])
-
-
-def _bands(data: RunReport, trials: Trials, row: int, kept: Sequence[int]) -> dict[str, FloatArray]:
-    """(T, M) half-widths [m] of the prediction intervals of some markers, by model, of the last one that has any."""
-    known = data.metrics.get("intervals", {}).get("models", {})
-    model = next((m for m in ("resphys", "sysid") if "factor" in known.get(m, {}) and m in trials.positions), None)
-    if model is None:
-        return {}
-    widths = Intervals.from_plain(known[model]).half_widths(trials.positions[model][row], trials.bound)
-    return {model: widths[:, kept]}
-
-
-def _band_note(bands: Mapping[str, FloatArray]) -> str:
-    return " The band around it is to hold nine of ten measured coordinates." if bands else ""
-
-
-def _markers(data: RunReport, trials: Trials, row: int, place: str, which: str, canvas: Canvas) -> Drawn:
-    """Coordinates of the markers that move most."""
-    from . import motion_figures
-
-    reach = np.nanmax(np.linalg.norm(trials.target[row] - trials.bound, axis=2), axis=0, initial=0.0)
-    shown = shown_markers(trials.target[row])
-    kept = np.sort(shown[np.argsort(-reach[shown])[:_MOST_MARKERS]])
-    moved = {m: (trials.positions[m][row] - trials.bound)[:, kept] for m in _ONE_BY_ONE if m in trials.positions}
-    target, labels = (trials.target[row] - trials.bound)[:, kept], [trials.labels[marker] for marker in kept]
-    name, hidden = trials.names[row], len(shown) - len(kept)
-    bands, series = _bands(data, trials, row, kept.tolist()), (trials.times[row], target, moved)
-    return canvas.figure(
-        f"paths_{place}",
-        partial(motion_figures.marker_paths, *series, labels, coordinates=trials.axes, bands=bands),
-        f"Coordinates of the markers over time in the trial {name}: measured as dots, the models as lines.",
-        f"Trial {name}{which}: coordinates of the markers from where they were held.{_band_note(bands)}"
-        + (f" The {hidden} markers that move least are not drawn." if hidden else ""),
-    )
-
-
-def _start(trials: Trials, row: int) -> FloatArray:
-    """(M, 3) where markers were seen first [m]."""
-    first = trials.target[row, 0]
-    return np.where(np.isfinite(first), first, trials.bound)
-
-
-def _tip_paths(data: RunReport, trials: Trials, row: int, seconds: float) -> tuple[Any, ...]:
-    """(T,) first times [s], and (T, 3) how the mean of the markers at the tip moves [m]: measured, and by model."""
-    shown = shown_markers(trials.target[row])
-    tip = np.intersect1d(tip_markers(trials.bound, data.mesh.vertices[data.fixed]), shown)
-    tip = tip if len(tip) else shown
-    rest = _start(trials, row)[tip].mean(axis=0)
-    near = trials.times[row] <= seconds + 1e-9
-    models = {m: trials.positions[m] for m in MODELS if m in trials.positions}
-    seen, *paths = (q[row][near][:, tip].mean(axis=1) - rest for q in (trials.target, *models.values()))
-    return trials.times[row][near], seen, dict(zip(models, paths, strict=True))
-
-
-def _plane(data: RunReport, trials: Trials, row: int, place: str, which: str, canvas: Canvas) -> Drawn:
-    """The path of the tip in the plane."""
-    from . import motion_figures
-
-    name = trials.names[row]
-    _, seen, paths = _tip_paths(data, trials, row, _PLANE_SECONDS)
-    return canvas.figure(
-        f"plane_{place}",
-        partial(motion_figures.tip_planes, seen, paths),
-        f"Path of the tip in the plane of x and y in the trial {name}: measured in grey, the models over it.",
-        f"Path of the tip across gravity over the first {min(_PLANE_SECONDS, trials.times[row, -1]):g} s of the trial "
-        f"{name}{which}: displacement of the mean of the markers at the tip, measured in grey. What leaves the frame "
-        "is cut.",
-    )
-
-
-def _space(data: RunReport, trials: Trials, row: int, canvas: Canvas) -> Drawn:
-    """The path of the tip in space."""
-    from . import motion_figures
-
-    name = trials.names[row]
-    times, seen, paths = _tip_paths(data, trials, row, _SPACE_SECONDS)
-    last = [m for m in ("sysid", "resphys") if m in paths] or list(paths)[-1:]
-    return canvas.figure(
-        "space",
-        partial(motion_figures.tip_in_space, times, seen, {m: paths[m] for m in last}),
-        f"Path of the tip in space in the trial {name}: measured in grey, the models as lines beside it.",
-        f"The first {min(_SPACE_SECONDS, trials.times[row, -1]):g} s of the trial {name} in space, with points every "
-        "0.5 s that are joined to the measured ones.",
-    )
-
-
-def _driven_markers(data: RunReport, trials: Trials, row: int, driven: Driven, canvas: Canvas) -> Drawn:
-    """Markers over what drives them."""
-    from . import motion_figures
-
-    name, start = trials.names[row], _start(trials, row)
-    kept = drawn_markers(trials.target[row], trials.bound, data.mesh.vertices[data.fixed])
-    compared = [m for m in _ONE_BY_ONE[1:] if m in trials.positions] or [m for m in MODELS if m in trials.positions]
-    moved = {m: (trials.positions[m][row] - start)[:, kept] for m in compared}
-    target, labels = (trials.target[row] - start)[:, kept], [trials.labels[marker] for marker in kept]
-    words, per = driven.quantity.plural, driven.quantity.per
-    own = replace(driven, values={words.capitalize(): driven.values[name]})
-    bands, series = _bands(data, trials, row, kept), (trials.times[row], target, moved)
-    return canvas.figure(
-        "markers",
-        partial(motion_figures.marker_paths, *series, labels, own, coordinates=trials.axes, bands=bands),
-        f"Coordinates of markers over time in the trial {name}, and below them the {words} of the {per}s.",
-        f"The trial {name}: displacement of markers from rest, and the {words} that drive it.{_band_note(bands)}",
-    )
-
-
 def body_section(data: RunReport, canvas: Canvas) -> Part | None:
     """The body with its chambers or tendons, and what drives them."""
     trials, driven = data.trials, data.driven
@@ -371,11 +239,11 @@ def body_section(data: RunReport, canvas: Canvas) -> Part | None:
     return Part(f"The body and its {quantity.plural}", [*blocks, *_input_figures(driven, trials, canvas)])
 
 
-def _input_figures(driven: Driven, trials: Trials, canvas: Canvas) -> list[Drawn]:
+def _input_figures(driven: Driven, trials: TrialResults, canvas: Canvas) -> list[Drawn]:
     """The inputs of a few trials over time, and those of the poses."""
     from . import motion_figures
 
-    over_time, poses = _sequences(driven, trials), {}
+    over_time, poses = input_sequences(driven, trials), {}
     for name in driven.poses:
         poses[f"{name} (test)" if name in trials.names else name] = driven.values[name]
     words, per = driven.quantity.plural.capitalize(), driven.quantity.per
@@ -396,7 +264,7 @@ def _input_figures(driven: Driven, trials: Trials, canvas: Canvas) -> list[Drawn
     return blocks
 
 
-def _sequences(driven: Driven, trials: Trials) -> dict[str, FloatArray]:
+def input_sequences(driven: Driven, trials: TrialResults) -> dict[str, FloatArray]:
     """A few trials' inputs by the panels' titles: of the test, of the training, and at the highest inputs."""
     values = {name: each for name, each in driven.values.items() if name not in driven.poses}
     test = [name for name in trials.names if name in values]

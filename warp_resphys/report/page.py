@@ -18,7 +18,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from ..io.errors import DataFileError
-from ..io.files import disk_full_error, is_disk_full
+from ..io.files import disk_full_error, is_disk_full, write_text
 from ..learning.metrics import PublishedError
 from .render import DrawingError
 
@@ -208,8 +208,63 @@ def draw_picture(folder: Path, name: str, draw: "Callable[..., Drawing]", alt: s
     return Picture(wide, narrow, alt)
 
 
-def page_template(name: str) -> jinja2.Template:
-    """Return one of the templates in this package."""
+def write_page(
+    path: Path,
+    parts: Sequence[Part],
+    *,
+    title: str,
+    kicker: str,
+    verdict: str,
+    conclusions: Sequence[str] = (),
+    metrics: Mapping[str, Any] | None = None,
+    settings: Mapping[str, Any] | None = None,
+    timed: Table | None = None,
+) -> None:
+    """Write a page: its heading, what stands above and below that, its sections, and how they were computed.
+
+    Args:
+        path: The page's file.
+        parts: Its sections.
+        title: Its heading.
+        kicker: What stands above the heading.
+        verdict: What stands below it, and
+        conclusions: further sentences there.
+        metrics: Of a run: `seconds` by stage, `peak_memory_gib`, `versions` and `device`.
+        settings: Of the same run.
+        timed: How long the simulations of that run take.
+
+    Raises:
+        DataFileError: The file cannot be written.
+    """
+    page = _template("page.html").render(
+        title=title,
+        kicker=kicker,
+        verdict=verdict,
+        conclusions=conclusions,
+        parts=parts,
+        script=Script.of(parts),
+        kind_of=lambda block: type(block).__name__,
+        metrics=metrics,
+        settings=list(flatten(settings or {})),
+        timed=timed,
+        duration=duration_text,
+    )
+    write_text(path, page)
+
+
+def markdown(title: str, verdict: str, parts: Sequence[Part], folder: str) -> str:
+    """Return a page in Markdown, with its figures as PNG files in a folder beside it."""
+    kind_of = {"kind_of": lambda block: type(block).__name__}
+    page = _template("study.md").render(title=title, verdict=verdict, parts=parts, folder=folder, **kind_of)
+    return page.replace(NO_BREAK_SPACE, " ") + "\n"
+
+
+def experiment_kicker(name: str) -> Markup:
+    """Return what stands above the heading of the page of an experiment."""
+    return Markup("experiment <code>{}</code>").format(name)
+
+
+def _template(name: str) -> jinja2.Template:
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("warp_resphys", "report"),
         undefined=jinja2.StrictUndefined,

@@ -32,7 +32,7 @@ def main() -> None:
     while (scene := _read(source)) is not None:
         for frame in _frames(scene):
             target.write(struct.pack("<3I", *frame.shape))
-            target.write(np.ascontiguousarray(frame))
+            target.write(frame.tobytes())
         target.write(bytes(12))
         target.flush()
 

@@ -10,10 +10,12 @@ from typing import Any, Final
 import numpy as np
 from markupsafe import Markup
 
-from ..io.files import write_text
+from .conclusions import best, conclusions, epochs_kept, untrained
 from .control_section import control_section
 from .data import MODELS, RunReport
-from .motion_sections import body_section, motion_section, paths_section, start_drawing
+from .identification_section import identification_section
+from .marker_section import paths_section
+from .motion_sections import body_section, motion_section, start_drawing
 from .page import (
     NONE,
     Canvas,
@@ -21,30 +23,28 @@ from .page import (
     Items,
     Part,
     Row,
-    Script,
     Table,
     Text,
     duration_text,
     error_parts,
+    experiment_kicker,
     figures_beside,
-    flatten,
     largest_text,
     mm_text,
     number_text,
-    page_template,
     published_parts,
+    write_page,
 )
 from .sections import (
     against,
     horizons_section,
-    identification_section,
     model_table,
     quality_section,
     registration_section,
     scales_section,
     training_section,
 )
-from .verdict import best, epochs_kept, judgement, unbroken, untrained, verdict
+from .verdict import unbroken, verdict
 
 _LOG = logging.getLogger(__name__)
 
@@ -81,26 +81,22 @@ def write_report(path: Path, data: RunReport) -> None:
         DataFileError: A file could not be written.
     """
     with figures_beside(path) as folder, ThreadPoolExecutor(1) as pool:
-        canvas = Canvas(folder, start_drawing(data, folder, pool))  # In other processes, while this one draws figures.
+        canvas = Canvas(folder, start_drawing(data, folder, pool))  # In another process, while this one draws figures.
         ready = sorted(SECTIONS, key=lambda section: section is motion_section)  # It waits for those.
-        found = {section: section(data, canvas) for section in ready}
-    parts = [part for section in SECTIONS if (part := found[section]) is not None]
+        made = {section: section(data, canvas) for section in ready}
     seconds = data.metrics.get("seconds_per_test_trajectory", {})
     timed = [Row(name, [Cell(duration_text(seconds[m]["mean"]))]) for m, name in _TIMED.items() if m in seconds]
-    page = page_template("report.html").render(
+    write_page(
+        path,
+        [part for section in SECTIONS if (part := made[section]) is not None],
         title=data.settings["title"],
-        data=data,
-        metrics=data.metrics,
+        kicker=experiment_kicker(data.experiment),
         verdict=verdict(data),
-        judged=judgement(data.metrics, data.settings),
-        parts=parts,
-        script=Script.of(parts),
-        kind_of=lambda block: type(block).__name__,
+        conclusions=conclusions(data.metrics, data.settings),
+        metrics=data.metrics,
+        settings=data.settings,
         timed=Table("Model", ["Wall time"], timed) if timed else None,
-        duration=duration_text,
-        settings=list(flatten(data.settings)),
     )
-    write_text(path, page)
     _LOG.info("report written: %s", path)
 
 

@@ -11,7 +11,7 @@ from ..experiment.trials import variation_of
 from ..learning import metrics as paper
 from ..mesh.mesh import select_vertices, surface_vertices
 from ..report import ablation_page, figures, motion_figures
-from ..report.data import MODEL_NAMES, Trials
+from ..report.data import MODEL_NAMES, TrialResults
 from ..report.page import (
     NO_BREAK_SPACE,
     NONE,
@@ -202,7 +202,7 @@ def _study_figures(config: Mapping[str, Any], name: str, drawn: Mapping[str, Run
     ]
 
 
-def _tip_motion(settings: Mapping[str, Any], test: Trials, paths: Mapping[str, Any]) -> dict[str, Any]:
+def _tip_motion(settings: Mapping[str, Any], test: TrialResults, paths: Mapping[str, Any]) -> dict[str, Any]:
     """(T + 1, 3) displacement of the tip [m] of the target and the models."""
     mesh = build_mesh(settings["mesh"])
     tip = select_vertices(mesh, **settings["tip"])

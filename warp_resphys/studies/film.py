@@ -1,7 +1,6 @@
 """A film of any trial of a run and any models of it, or of the laboratory as controllers drove it."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,7 +19,7 @@ from ..report.camera import hangs
 from ..report.control_section import compared_controllers
 from ..report.data import MODELS, at_times
 from ..report.driven_film import DrivenBodies
-from ..report.render import DrawingError, write_film
+from ..report.render import DrawingError, Scene, write_film
 from ..robot.loading import load, recorded_trial
 from ..robot.robot import Robot
 from .command import WORDS, show
@@ -47,76 +46,59 @@ def film(config: Mapping[str, Any], folder: Path) -> None:
     for key in ("models", "controllers"):
         check(key, config[key], optional(WORDS))
     wp.config.log_level = wp.LOG_WARNING
-    path = _film_of_motion(config) if config["motion"] is not None else _film_of_trial(config)
+    run = Path(config["run"]).expanduser()
+    name, scene = _film_of_trial(run, config) if config["motion"] is None else _film_of_motion(run, config)
+    path = run / "films" / f"{name}.mp4" if config["file"] is None else Path(config["file"]).expanduser()
+    try:
+        write_film(path, scene)
+    except DrawingError as error:
+        raise InputError(f"no film can be drawn on this machine: {error}.") from None
     show(f"Written: {path}")
 
 
-def _film_of_trial(config: Mapping[str, Any]) -> Path:
-    """Writes a film of a trial, and says where."""
+def _film_of_trial(run: Path, config: Mapping[str, Any]) -> tuple[str, Scene]:
+    """Name and film of a trial."""
     if config["controllers"] is not None:
         raise InputError("controllers drive motions: name one by motion=, such as motion=eight_4s.")
-    run, models, seconds = Path(config["run"]).expanduser(), config["models"], config["seconds"]
     finished_record(run, "evaluate")
-    found = read_json(run / METRICS)
+    metrics, models, seconds = read_json(run / METRICS), config["models"], config["seconds"]
     if models is None:
-        models = [each for each in _USUAL if each in found["errors_mm"]] or list(found["errors_mm"])[:2]
-    name = found["per_trajectory"][0]["name"] if config["trial"] is None else config["trial"]
+        models = [each for each in _USUAL if each in metrics["errors_mm"]] or list(metrics["errors_mm"])[:2]
+    name = metrics["per_trajectory"][0]["name"] if config["trial"] is None else config["trial"]
     motion = motion_of(run, name, models, np.inf if seconds is None else seconds)
-    path = _path(config, run, name)
-    with _drawing():
-        write_film(path, motion.film(seconds, config["slower"]))
-    return path
+    return name, motion.film(seconds, config["slower"])
 
 
-def _film_of_motion(config: Mapping[str, Any]) -> Path:
-    """Writes a film of a motion as controllers drove it, and says where."""
+def _film_of_motion(run: Path, config: Mapping[str, Any]) -> tuple[str, Scene]:
+    """Name and film of a motion as controllers drove it."""
     for key in ("trial", "models"):
         if config[key] is not None:
             raise InputError(f"{key} is of films of trials, and motion of one of control: leave one of them out.")
-    run, name, seconds = Path(config["run"]).expanduser(), config["motion"], config["seconds"]
+    name, seconds = config["motion"], config["seconds"]
     control, controllers = driven_settings(run)["control"], config["controllers"]
     if controllers is None:
         controllers = [each for each in compared_controllers(control) if each.startswith(OPEN)]
     if len(controllers) > _MOST_VIEWS:
         raise InputError(f"controllers names {len(controllers)}: a film shows at most {_MOST_VIEWS} side by side.")
-    found = replay(run, name, controllers, np.inf if seconds is None else seconds)
+    played = replay(run, name, controllers, np.inf if seconds is None else seconds)
     shown = DrivenBodies(
-        found.times,
-        found.triangles,
-        dict(zip(controllers, found.bodies, strict=True)),
-        dict(zip(controllers, found.points, strict=True)),
-        found.driven.path,
+        played.times,
+        played.triangles,
+        dict(zip(controllers, played.bodies, strict=True)),
+        dict(zip(controllers, played.points, strict=True)),
+        played.driven.path,
         np.array([control["right"], control["up"]], dtype=np.float64),
-        found.gravity,
+        played.gravity,
     )
-    path = _path(config, run, name)
-    with _drawing():
-        write_film(path, shown.film(1.0 if config["slower"] is None else config["slower"]))
-    return path
-
-
-def _path(config: Mapping[str, Any], run: Path, name: str) -> Path:
-    """Where the film goes to."""
-    path = run / "films" / f"{name}.mp4" if config["file"] is None else Path(config["file"]).expanduser()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return path
-
-
-@contextmanager
-def _drawing() -> Iterator[None]:
-    """Says in a sentence where this machine cannot draw."""
-    try:
-        yield
-    except DrawingError as error:
-        raise InputError(f"no film can be drawn on this machine: {error}.") from None
+    return name, shown.film(1.0 if config["slower"] is None else config["slower"])
 
 
 def motion_of(run: Path, trial: str, models: Sequence[str], seconds: float = np.inf) -> ComparedMotion:
-    """The first seconds of a trial, as measured and as models of a run play it.
+    """Return the first seconds of a trial, as measured and as models of a run play it.
 
     Raises:
-        InputError: see `film`.
-        DataFileError: likewise.
+        InputError: an unknown trial or model, or a pose.
+        DataFileError: there is no finished run.
     """
     unknown = [name for name in models if name not in MODELS]
     if unknown or not models:

@@ -30,7 +30,7 @@ _MOVED: Final = (0.25, 0.5)  # How far the base may be moved, over the body's si
 
 
 class LiveRobot:
-    """Steps a robot; see `step`.
+    """A robot that is stepped, with what a hand does to it in between.
 
     Args:
         robot: of one environment.
@@ -43,7 +43,7 @@ class LiveRobot:
         limits: (low, high) of each input's parts (C,) that a hand may set.
         parameters: what may be changed, by name: its quantity and the value that it had.
         time: since the begin of the motion [s].
-        said: why it stands still; empty where it does not.
+        failure: why it stands still; empty where it does not.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -61,7 +61,7 @@ class LiveRobot:
         self._held: tuple[FloatArray, FloatArray] | None = None  # (N,) weights of what is held, and (3,) where to [m]
         self._on_body = _markers_on_body(robot)
         self.trial: RecordedTrial | None = None
-        self.said = ""
+        self.failure = ""
         self.reset()
 
     def _limits(self, name: str) -> tuple[FloatArray, FloatArray]:
@@ -87,8 +87,8 @@ class LiveRobot:
         """(M, 3) as they are simulated [m]; none where every vertex is observed."""
         if not self.robot.labels:
             return np.empty((0, 3))
-        found = self._told()
-        return found if self._on_body is None else self._carrying(found).apply(found)
+        seen = self._as_recorded()
+        return seen if self._on_body is None else self._to_body(seen).apply(seen)
 
     @property
     def measured(self) -> FloatArray | None:
@@ -104,20 +104,20 @@ class LiveRobot:
         if frame + 1 < len(times) and self.time > times[frame]:
             share = (self.time - times[frame]) / (times[frame + 1] - times[frame])
             found = (1.0 - share) * found + share * seen[frame + 1] if share > _ROUNDING else found
-        return found if self._on_body is None else self._carrying(self._told()).apply(found)
+        return found if self._on_body is None else self._to_body(self._as_recorded()).apply(found)
 
-    def _told(self) -> FloatArray:
-        """(M, 3) the simulated markers as recordings tell of them [m]."""
+    def _as_recorded(self) -> FloatArray:
+        """(M, 3) the simulated markers in the frame of the recordings [m]."""
         found = self.robot.observe(self.state)[0].double().cpu().numpy()
         shift = None if self.trial is None else self.trial.shift
         return np.asarray(found if shift is None else found + shift)
 
-    def _carrying(self, told: FloatArray) -> RigidTransform:
-        """From the frame in which recordings tell of markers to that of the body."""
+    def _to_body(self, recorded: FloatArray) -> RigidTransform:
+        """From the frame of the recordings, in which markers (M, 3) are given, to that of the body."""
         assert self._on_body is not None
         on_body = self._on_body(self.state.q)[0].double().cpu().numpy()
-        known = np.isfinite(told).all(axis=1)
-        return kabsch(told[known], on_body[known])
+        seen = np.isfinite(recorded).all(axis=1)
+        return kabsch(recorded[seen], on_body[seen])
 
     @property
     def has_left(self) -> bool:
@@ -132,7 +132,7 @@ class LiveRobot:
     # What a hand does
 
     def set_input(self, name: str, part: int, value: float) -> None:
-        """Commands a value; a trial that plays ends there."""
+        """Commands a value; ends the trial that plays."""
         self.trial = None
         self.inputs[name][part] = value
 
@@ -175,22 +175,22 @@ class LiveRobot:
         self.reset()
 
     def reset(self) -> None:
-        """Begins anew: at the trial's start, or at rest without inputs."""
-        self.time, self.said, self._held = 0.0, "", None
+        """Starts again: at the trial's start, or at rest without inputs."""
+        self.time, self.failure, self._held = 0.0, "", None
         for values in self.inputs.values():
             values[:] = 0.0
         with torch.no_grad():
             self.state = self.robot.begin() if self.trial is None else self.trial.start
 
     def restore(self) -> None:
-        """Takes back every change of a parameter."""
+        """Undoes every change of a parameter."""
         self.robot = self._original
 
     # What time does
 
     def step(self) -> bool:
-        """Goes on by one time step, unless the trial is over or the simulation has failed; says whether it did."""
-        if self.said or (self.trial is not None and self.time >= self.trial.times[-1] - _ROUNDING):
+        """Simulates one time step, unless the trial is over or the simulation has failed; returns whether it did."""
+        if self.failure or (self.trial is not None and self.time >= self.trial.times[-1] - _ROUNDING):
             return False
         acting = dict[str, torch.Tensor | FloatArray](self._commanded())
         if self._held is not None:
@@ -200,7 +200,7 @@ class LiveRobot:
             with torch.no_grad():
                 state = self.robot.step(self.state, **acting)
         except ConvergenceError as error:
-            self.said = f"Stopped: {error}"
+            self.failure = f"Stopped: {error}"
             return False
         self.state, self.time = state, self.time + self.robot.time_step
         return True
@@ -249,7 +249,7 @@ def _changeable(robot: Robot) -> dict[str, tuple[Quantity, float]]:
 
 
 def range_of(quantity: Quantity, value: float) -> tuple[float, float]:
-    """Between which values a parameter may be set, about the one that it has."""
+    """Returns the lowest and highest value to which a parameter may be set, around its own."""
     at = torch.tensor(value, dtype=torch.float64)
     if value == quantity.lower:  # Such as no damping.
         return value, value + quantity.typical

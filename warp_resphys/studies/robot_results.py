@@ -8,6 +8,7 @@ from typing import Any
 
 from ..io.errors import InputError
 from ..learning.metrics import Gain, paired_gain
+from ..report.conclusions import held_out
 from ..report.page import (
     MINUS,
     NONE,
@@ -24,7 +25,7 @@ from ..report.page import (
     error_parts,
     number_text,
 )
-from ..report.verdict import held_out, learned_in_part
+from ..report.verdict import learned_in_part
 from .runs import Run
 
 _MODELS = ("simulation", "sysid", "simfree", "resphys")

@@ -23,9 +23,8 @@ from ..io.files import disk_full_error, is_disk_full, read_json, write_text
 from ..io.machine import commit, hardware
 from ..io.progress import clock
 from ..io.stages import package_versions
-from ..report.page import Cell, Drawn, Items, Part, Row, Table
+from ..report.page import Cell, Drawn, Items, Part, Row, Table, markdown, write_page
 from .command import WORDS
-from .page import markdown, write_page
 
 _UP_TO_DATE_SECONDS = 8.0  # for a run that finds nothing to do
 _LINE_SECONDS = 60.0

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 _RATE: Final = 30.0  # Pictures a second, at most.
-_TOLD_EVERY: Final = 0.25  # [s]
+_STATUS_EVERY: Final = 0.25  # [s]
 _BY_HAND: Final = "by hand"
 _EVERYWHERE: Final = ("0.0.0.0", "::")  # Hosts that stand for all addresses of a machine.
 _HIGHEST_PORT: Final = 65535
@@ -117,7 +117,7 @@ class Page:
 
     def __init__(self, server: "viser.ViserServer", live: LiveRobot) -> None:
         self._server, self._live = server, live
-        self._asked: list[Callable[[], None]] = []
+        self._requests: list[Callable[[], None]] = []
         self._lock = threading.Lock()
         self._playing, self._speed, self._stopped = True, 1.0, False
         self._holder: int | None = None  # Whose hand it is.
@@ -190,10 +190,10 @@ class Page:
 
     # Controls
 
-    def _ask(self, what: Callable[[], None]) -> None:
-        """Has something done before the next picture."""
+    def _ask(self, request: Callable[[], None]) -> None:
+        """Queues a request, which is handled before the next picture."""
         with self._lock:
-            self._asked.append(what)
+            self._requests.append(request)
 
     def _set_controls(self) -> None:
         server, live = self._server, self._live
@@ -201,11 +201,11 @@ class Page:
         server.gui.configure_theme(dark_mode=False, show_logo=False)
         described = robot.description
         gui.add_markdown(f"**{_plain(described.name)}**, {described.model}\n\n{_HELP}")
-        self._said = gui.add_markdown("")
+        self._status = gui.add_markdown("")
         self._play = gui.add_button("Pause")
-        self._play.on_click(lambda _: self._ask(self._turn))
+        self._play.on_click(lambda _: self._ask(self._toggle))
         gui.add_button("Reset").on_click(lambda _: self._ask(self._reset))
-        gui.add_command("Pause or go on", hotkey="space").on_trigger(lambda _: self._ask(self._turn))
+        gui.add_command("Pause or go on", hotkey="space").on_trigger(lambda _: self._ask(self._toggle))
         gui.add_command("Reset", hotkey="R").on_trigger(lambda _: self._ask(self._reset))
         speed = gui.add_dropdown("Speed", tuple(_SPEEDS), initial_value="real time")
         speed.on_update(lambda _: setattr(self, "_speed", _SPEEDS[speed.value]))
@@ -260,7 +260,7 @@ class Page:
         slider.on_update(lambda _: self._ask(lambda: self._live.set_parameter(name, slider.value)))
         return slider
 
-    def _turn(self) -> None:
+    def _toggle(self) -> None:
         self._playing = not self._playing
         self._play.label = "Pause" if self._playing else "Go on"
 
@@ -298,12 +298,12 @@ class Page:
 
     def run(self, seconds: float | None) -> float:
         """Simulates and shows, until it is interrupted or some seconds are over; the pictures a second."""
-        live, began, last, told = self._live, time.perf_counter(), time.perf_counter(), 0.0
+        live, began, last, updated = self._live, time.perf_counter(), time.perf_counter(), 0.0
         due, simulated, counted = 0.0, 0.0, 0
         try:
             while not self._stopped and (seconds is None or time.perf_counter() - began < seconds):
                 now = time.perf_counter()
-                self._do_what_is_asked()
+                self._handle_requests()
                 due = min(due + (now - last) * self._speed, 2.0 * max(self._speed / _RATE, live.robot.time_step))
                 last = now
                 while self._playing and due >= live.robot.time_step and live.step():
@@ -313,10 +313,10 @@ class Page:
                 self._show()
                 self.pictures += 1
                 counted += 1
-                if now - told > _TOLD_EVERY:
-                    since = now - told
-                    self._tell(counted / since if told else 0.0, simulated / since if told else 0.0)
-                    told, simulated, counted = now, 0.0, 0
+                if now - updated > _STATUS_EVERY:
+                    since = now - updated
+                    self._show_status(counted / since if updated else 0.0, simulated / since if updated else 0.0)
+                    updated, simulated, counted = now, 0.0, 0
                 time.sleep(max(1.0 / _RATE - (time.perf_counter() - now), 1e-3))
         except KeyboardInterrupt:
             pass
@@ -326,14 +326,14 @@ class Page:
         """Ends `run`, from another thread."""
         self._stopped = True
 
-    def _do_what_is_asked(self) -> None:
+    def _handle_requests(self) -> None:
         with self._lock:
-            asked, self._asked = self._asked, []
-        for what in asked:
+            requests, self._requests = self._requests, []
+        for request in requests:
             try:
-                what()
+                request()
             except ResphysError as error:
-                self._live.said = str(error)
+                self._live.failure = str(error)
 
     def _show(self) -> None:
         live = self._live
@@ -361,21 +361,21 @@ class Page:
         if cloud.visible != bool(len(seen)):
             cloud.visible = bool(len(seen))
 
-    def _tell(self, rate: float, pace: float) -> None:
-        """Says in words what is going on."""
+    def _show_status(self, rate: float, pace: float) -> None:
+        """Writes time, rates and distances beside the body."""
         live = self._live
-        said = [f"{live.time:.2f} s, {rate:.0f} pictures a second, {pace:.2g} times real time"]
+        lines = [f"{live.time:.2f} s, {rate:.0f} pictures a second, {pace:.2g} times real time"]
         measured = live.measured
         if measured is not None:
             where = live.markers if live.robot.labels else live.positions
             away = 1e3 * np.linalg.norm(where - measured, axis=1)
             if np.isfinite(away).any():
-                said.append(f"{float(np.nanmean(away)):.2f} mm from what was measured")
+                lines.append(f"{float(np.nanmean(away)):.2f} mm from what was measured")
         if live.has_left:
-            said.append("**The body has left the states of the training.**")
-        if live.said:
-            said.append(f"**{_plain(live.said)}**")
-        self._said.content = "\n\n".join(said)
+            lines.append("**The body has left the states of the training.**")
+        if live.failure:
+            lines.append(f"**{_plain(live.failure)}**")
+        self._status.content = "\n\n".join(lines)
         if live.trial is not None:
             self._set_sliders()
 

@@ -28,9 +28,9 @@ from ...report.page import (
     duration_text,
     flatten,
     number_text,
+    write_page,
 )
 from ..command import show, table_of, write_csv
-from ..page import write_page
 from . import figures
 from .space import Dimension, with_settings
 from .study import Outcome, SharedStudy

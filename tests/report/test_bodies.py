@@ -1,0 +1,117 @@
+"""Pictures and films of motions: bodies, dots and rings where they are, and films as long as the motion."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from driven_run import LIMIT, arm_settings, bent
+from matplotlib.image import imread
+from measured_run import TRACKED, sag
+
+from warp_resphys.experiment.build import shipped_arm
+from warp_resphys.mesh.chambers import find_chambers
+from warp_resphys.mesh.mesh import box_hexahedra
+from warp_resphys.report import body_picture, render
+from warp_resphys.report.bodies import ComparedMotion
+from warp_resphys.report.body_picture import MeshSummary, draw_mesh
+
+DOWN = np.array([0.0, 0.0, -9.8])
+
+
+def motion(frames=3, model="simulation"):
+    mesh = box_hexahedra(divisions=(3, 1, 1))
+    bound = np.array(list(TRACKED.values()))
+    times = np.arange(1, frames + 1) * 0.02
+    positions = {name: sag(mesh.vertices, times, 0.05, name) for name in (model, "resphys")}
+    markers = {name: sag(bound, times, 0.05, name) for name in positions}
+    return ComparedMotion(mesh, times, sag(bound, times, 0.05), positions, markers, bound, DOWN)
+
+
+def halves(scene):
+    """(F, 2, H, W, 4) of each frame the two views."""
+    (frames,) = render.draw(scene)
+    return np.stack(np.split(frames.astype(int), 2, axis=2), axis=1)
+
+
+@pytest.mark.usefixtures("can_draw")
+def test_instants_show_bodies_dots_and_rings():
+    shown = motion(2)
+    shown.positions["resphys"][1] *= 1e200
+    shown.markers["resphys"][1] = np.nan
+    pixels = halves(shown.scene())
+    assert pixels.shape[:2] == (2, 2)
+    solid = pixels[..., 3] > 200
+    blue = solid & (pixels[..., 2] > pixels[..., 0] + 40)
+    dots = solid & (pixels[..., 0] > pixels[..., 2] + 150)
+    assert blue[0].sum(axis=(1, 2)).min() > 20_000
+    assert blue[1].sum() == 0  # It has diverged.
+    assert dots.sum(axis=(2, 3)).min() > 300
+    rows, columns = np.nonzero(dots[0, 1])  # From nearby, the markers' middle is that of the view.
+    assert abs(rows.mean() / dots.shape[2] - 0.5) < 0.05
+    assert abs(columns.mean() / dots.shape[3] - 0.5) < 0.05
+
+
+@pytest.mark.usefixtures("can_draw")
+def test_one_marker_alone_is_seen_from_a_distance_that_shows_its_body():
+    several = motion(2)
+    markers = {model: each[:, :1] for model, each in several.markers.items()}
+    alone = replace(several, measured=several.measured[:, :1], markers=markers, bound=several.bound[:1])
+    _, near = alone.scene().views
+    assert near.half_height >= 0.03 * 0.1
+    assert (halves(alone.scene())[0, 0, ..., 3] > 200).mean() > 0.3
+
+
+@pytest.mark.usefixtures("can_draw")
+def test_second_view_is_from_below():
+    arm = shipped_arm("arm_hexahedra_500")
+    places = np.array(list(arm_settings()["markers"]["tracked"].values()))
+    push = np.array([[LIMIT, 0.0, 0.0, 0.0, 0.0, 0.0]] * 30)  # Along x.
+    body, markers = (
+        np.concatenate([bent(points, np.zeros((1, 6)))[:1], bent(points, push)[-1:]])
+        for points in (arm.vertices, places)
+    )
+    models = {"resphys": body}, {"resphys": markers}
+    frames = halves(ComparedMotion(arm, np.arange(2.0), markers, *models, places, DOWN, from_below=True).scene())
+    solid = frames[..., 3] > 200
+    dots = solid & (frames[..., 0] > frames[..., 2] + 150)
+    height, width = (np.ptp(np.argwhere(solid[0, 1]), axis=0) + 1).tolist()
+    assert 0.8 < height / width < 1.25  # The end of the arm is about round.
+    tall, wide = (np.ptp(np.argwhere(solid[0, 0]), axis=0) + 1).tolist()
+    assert tall > 3 * wide
+    assert abs(np.argwhere(dots[1, 1]).mean(axis=0) - np.argwhere(dots[0, 1]).mean(axis=0)).max() > 10
+
+
+@pytest.mark.usefixtures("can_draw")
+def test_picture_of_an_arm_has_markers_where_it_is_whole(tmp_path):
+    arm = shipped_arm("arm_hexahedra_500")
+    body = MeshSummary(arm, 1070.0, np.flatnonzero(arm.vertices[:, 2] == 0.0), find_chambers(arm))
+    near = [np.flatnonzero(np.abs(arm.vertices[:, 2] - z) < 0.01) for z in (-0.05, -0.1, -0.15, -0.2)]
+    nearest = [some[(arm.vertices[some] @ body_picture.TOWARDS_VIEWER).argmax()] for some in near]
+    places = arm.vertices[nearest]
+    below = np.append(places, [[0.0, 0.0, arm.vertices[:, 2].min() - 0.05]], axis=0)  # on a stem below the tip
+    for name, markers in (("plain", None), ("dots", places), ("below", below)):
+        draw_mesh(tmp_path / f"{name}.png", body, markers)
+    plain, dots, longer = (imread(tmp_path / f"{name}.png")[..., :3] for name in ("plain", "dots", "below"))
+    changed = np.abs(plain - dots).max(axis=2) > 0.2
+    left, middle, right = (part.sum() for part in np.array_split(changed, 3, axis=1))
+    assert middle == 0
+    assert min(left, right) > 500
+    inked = [int((each[: int(0.9 * len(each))].min(axis=2) < 0.95).sum()) for each in (longer, plain)]
+    assert inked[0] < 0.9 * inked[1]  # the picture reaches as far, so that the body is smaller in it
+
+
+@pytest.mark.usefixtures("can_draw")
+def test_film_moves_and_is_slower_than_the_motion(tmp_path, capsys):
+    imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    shown = motion(4)
+    shown.measured[2, 1] = np.nan
+    render.write_film(tmp_path / "motion.mp4", shown.film())
+    assert "4/4 frames" in capsys.readouterr().err
+    reader = imageio_ffmpeg.read_frames(str(tmp_path / "motion.mp4"))
+    about = next(reader)
+    width, height = about["size"]
+    assert about["fps"] == pytest.approx(12.5)  # 50 Hz, four times slower.
+    frames = [np.frombuffer(frame, np.uint8).reshape(height, width, 3).astype(int) for frame in reader]
+    assert len(frames) == 4
+    assert np.abs(frames[1] - frames[0]).mean() > 1.0
+    assert (tmp_path / "motion.mp4").stat().st_size < 200_000

@@ -1,0 +1,188 @@
+"""Figures: what is drawn where, in which colours, and what does not set the scale."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from warp_resphys.energies.pressure import PRESSURE
+from warp_resphys.report import control_figures, figures, learning_figures, motion_figures
+from warp_resphys.report.data import Driven, FollowedPath
+from warp_resphys.report.figures import CHAMBER_COLOURS, TONES, use_logarithm
+from warp_resphys.report.motion_sections import input_sequences
+
+TIMES = np.arange(20) * 0.01
+MEASURED = np.zeros((20, 1, 3))
+MEASURED[:, 0, 2] = 0.01 * np.sin(30.0 * TIMES)
+
+
+@pytest.mark.parametrize(
+    ("errors", "labels"),
+    [
+        ((0.3, 6.0), ["0.5", "1", "2", "5"]),
+        ((2.0, 3.0), ["1", "2", "5", "10"]),
+        ((1e-3, 50.0), ["0.001", "0.01", "0.1", "1", "10"]),
+        ((1.2e-5, 9e-5), ["10⁻⁵", "2·10⁻⁵", "5·10⁻⁵", "10⁻⁴"]),
+    ],
+)
+def test_a_logarithmic_axis_has_enough_labels(errors, labels):
+    axes = Figure().subplots()
+    axes.plot(errors)
+    use_logarithm(axes)
+    axes.figure.canvas.draw()
+    low, high = axes.get_ylim()
+    inside = [tick.get_text() for tick in axes.get_yticklabels() if low <= tick.get_position()[1] <= high]
+    assert inside == labels
+
+
+class TestErrors:
+    def test_a_model_without_error_does_not_hide_the_others(self):
+        rows = np.full((2, 5), 0.5)
+        (axes,) = figures.error_over_time({"simulation": rows, "resphys": 0.0 * rows}, 0.01, narrow=False).axes
+        low, high = axes.get_ylim()
+        assert axes.get_yscale() == "log"
+        assert low <= 0.5 <= high
+        assert not axes.texts
+
+    def test_lines_are_filtered_and_thin_behind(self):
+        rows = np.ones((2, 200))
+        rows[:, 100:110] = 9.0
+        rows[1, 180:] = np.inf
+        (axes,) = figures.error_over_time({"resphys": rows}, 0.01, window=1.0, narrow=True).axes
+        thin, thick = axes.lines
+        assert thin.get_linewidth() < 1.0 < thick.get_linewidth()
+        assert np.nanmax(thin.get_ydata()) == 9.0
+        assert np.nanmax(thick.get_ydata()) == 1.0
+        np.testing.assert_allclose(thick.get_xdata()[[0, -1]], [0.0, 1.99])
+        assert np.isnan(thin.get_ydata()[180:]).all()
+        (axes,) = figures.error_over_time({"resphys": rows}, 0.01, narrow=False).axes
+        (only,) = axes.lines
+        assert np.nanmax(only.get_ydata()) == 9.0
+
+    def test_lines_end_where_a_trial_diverged(self):
+        rows = np.array([[1.0, 1.0, 1.0], [3.0, np.nan, np.inf]])
+        (line,) = figures.error_over_time({"resphys": rows}, np.arange(1.0, 4.0), narrow=False).axes[0].lines
+        np.testing.assert_allclose(line.get_ydata(), [2.0, 1.0, np.nan])
+
+    def test_points_are_missing_where_a_rollout_diverged(self):
+        errors = {"resphys": {1.0: 2.0, 1.5: 3.0}, "simfree": {1.0: 4.0}}
+        (axes,) = figures.error_over_scale(errors, narrow=False).axes
+        np.testing.assert_array_equal(axes.lines[0].get_ydata(), [2.0, 3.0])
+        np.testing.assert_array_equal(axes.lines[1].get_ydata(), [4.0, np.nan])
+
+
+class TestLearning:
+    def test_one_epoch_is_seen_and_named_by_a_whole_number(self):
+        record = {"epoch": 1, "train_loss": 3e-5, "validation_loss": 1.5e-4, "learning_rate": 1e-3}
+        losses, rate = learning_figures.training_curves([record], narrow=False).axes
+        assert all(line.get_marker() == "." for line in (*losses.lines, *rate.lines))
+        low, high = rate.get_xlim()
+        assert [tick for tick in rate.get_xticks() if low <= tick <= high] == [1.0]
+
+    def test_a_landscape_marks_its_points(self):
+        modulus, ratio = np.array([1e5, 2e5, 3e5]), np.array([0.4, 0.45])
+        loss = np.array([[1.0, 2.0], [0.1, 0.2], [np.nan, 1.0]])
+        points = {"data sheet": (2.64e5, 0.499), "lowest of the grid": (2e5, 0.4)}
+        surface = learning_figures.landscape(modulus, ratio, loss, points, narrow=True).axes[0]
+        assert [tuple(np.ravel(line.get_data())) for line in surface.lines] == [(264.0, 0.499), (200.0, 0.4)]
+        assert len(surface.collections) == 2
+        curve = learning_figures.landscape(modulus, np.array([]), loss[:, 1], points, narrow=False).axes[0]
+        assert tuple(np.ravel(curve.lines[-1].get_data())) == (200.0, 0.2)
+
+    def test_the_start_that_was_kept_is_bold(self):
+        histories = {"sysid": [[{"loss": 1.0}, {"loss": 3.0}, {"loss": 0.5}], [{"loss": 2.0}, {"loss": 0.1}], []]}
+        (axes,) = learning_figures.loss_histories(histories, narrow=False).axes
+        assert [line.get_color() for line in axes.lines] == [TONES["muted"].light, TONES["sysid"].light]
+        np.testing.assert_allclose(axes.lines[0].get_ydata(), [1.0, 1.0, 0.5])
+
+
+class TestMotion:
+    def test_a_model_that_runs_away_does_not_set_the_scale(self):
+        wild = MEASURED + np.exp(50.0 * TIMES)[:, None, None]
+        figure = motion_figures.marker_paths(TIMES, MEASURED, {"resphys": wild}, ["A"], narrow=False)
+        spans = [np.ptp(axes.get_ylim()) for axes in figure.axes[:3]]
+        assert spans[2] < 50.0
+        assert 0.05 * np.ptp(MEASURED[..., 2]) * 1e3 < spans[1] < 5.0  # [mm]
+
+    def test_it_does_not_set_the_scale_of_the_tip_either(self):
+        angle = np.linspace(0.0, 6.0, 50)
+        measured = 0.02 * np.stack([np.cos(angle), np.sin(angle), 0.1 * angle], axis=1)
+        measured[10] = np.nan
+        wild = measured * np.exp(angle)[:, None]
+        wild[40:] = np.nan
+        flat = motion_figures.tip_planes(measured, {"sysid": measured, "resphys": wild}, narrow=False)
+        for axes in flat.axes:
+            assert np.ptp(axes.get_xlim()) == np.ptp(axes.get_ylim()) < 70.0  # [mm], of a motion of 40
+        figure = motion_figures.tip_in_space(0.01 * np.arange(50), measured, {"resphys": wild}, narrow=True)
+        assert np.ptp(figure.axes[0].get_zlim()) < 40.0
+        drawn = np.concatenate([np.stack(line.get_data_3d(), axis=1) for line in figure.axes[0].lines])
+        assert np.nanmax(np.abs(drawn)) < 60.0
+
+    def test_prediction_intervals_are_bands_around_their_model(self):
+        shown = {"sysid": 1.2 * MEASURED, "resphys": 1.1 * MEASURED}
+        widths = {"resphys": np.linspace(1e-3, 3e-3, 20)[:, None]}
+        figure = motion_figures.marker_paths(TIMES, MEASURED, shown, ["A"], bands=widths, narrow=False)
+        (band,) = figure.axes[2].collections
+        corners = band.get_paths()[0].vertices
+        for time, middle, width in zip(TIMES, 1.1 * MEASURED[:, 0, 2], widths["resphys"][:, 0], strict=True):
+            reached = corners[np.isclose(corners[:, 0], time), 1]
+            assert [reached.min(), reached.max()] == pytest.approx([1e3 * (middle - width), 1e3 * (middle + width)])
+
+    def test_markers_stand_over_the_pressures(self):
+        times = 0.1 * np.arange(4)
+        moved = np.repeat(np.array([0.0, 1e-3, 2e-3, 3e-3])[:, None, None], 3, axis=2)
+        driven = Driven(PRESSURE, ("chamber_1",), {"Pressures": np.full((3, 1), 5e3)})
+        figure = motion_figures.marker_paths(times, moved, {"resphys": moved}, ["A"], driven, narrow=False)
+        *coordinates, below = figure.axes
+        assert len(coordinates) == 3
+        assert all(axes.get_xlim() == below.get_xlim() for axes in coordinates)
+        measured_line, model_line = coordinates[2].lines
+        np.testing.assert_allclose(measured_line.get_ydata(), [0.0, 1.0, 2.0, 3.0], atol=1e-12)
+        assert model_line.get_color() == TONES["resphys"].light
+        assert [text.get_text() for text in figure.legends[0].get_texts()] == ["chamber 1"]
+
+
+class TestInputs:
+    def test_pressures_are_in_kilopascal_in_the_chambers_colours(self):
+        pressure = np.array([[0.0, 1e3], [2e4, 3e3]])
+        driven = Driven(PRESSURE, ("one", "two"), {"a": pressure, "b": 2 * pressure}, 2e4)
+        figure = motion_figures.input_sequences(0.5, driven, narrow=False)
+        first, second = figure.axes
+        assert second.get_xlim() == (0.0, 1.0)
+        assert [line.get_ydata()[0] for line in first.lines] == [20.0]
+        np.testing.assert_allclose(first.patches[1].get_data().values, [1.0, 3.0])
+        np.testing.assert_allclose(first.patches[1].get_data().edges, [0.0, 0.5, 1.0])
+        assert [text.get_text() for text in figure.legends[0].get_texts()] == ["one", "two", "limit"]
+        assert [line.get_color() for line in figure.legends[0].get_lines()[:2]] == list(CHAMBER_COLOURS[:2])
+
+    def test_those_of_poses_are_bars_of_the_chambers_in_use(self):
+        poses = {"a": np.array([[9e3, 0.0, 1e3]]), "b (test)": np.array([[0.0, 0.0, 0.0], [3e3, 0.0, 5e3]])}
+        figure = motion_figures.pose_inputs(Driven(PRESSURE, ("one", "two", "three"), poses, 2e4), narrow=False)
+        (axes,) = figure.axes
+        assert axes.get_xlabel() == "pressure [kPa]"
+        assert [tick.get_text() for tick in axes.get_yticklabels()] == ["a", "b (test)"]
+        assert [bar.get_width() for bar in axes.patches] == [9.0, 3.0, 1.0, 5.0]
+        assert [text.get_text() for text in figure.legends[0].get_texts()] == ["one", "three", "limit"]
+        assert [line.get_xdata()[0] for line in axes.lines] == [20.0]
+
+    def test_poses_are_not_drawn_over_time(self):
+        rows, trials = np.ones((3, 1)), SimpleNamespace(names=("b", "q"))
+        driven = Driven(PRESSURE, ("one",), {"p": rows, "a": rows, "b": rows, "q": rows}, poses=("p", "q"))
+        assert list(input_sequences(driven, trials)) == ["a, a trial of the training", "b, a test trial"]
+        assert input_sequences(replace(driven, poses=tuple("pabq")), trials) == {}
+
+
+@pytest.mark.parametrize("narrow", [False, True])
+def test_followed_paths_are_drawn_in_their_plane(narrow):
+    path = np.stack([np.linspace(0.0, 0.02, 5), np.zeros(5), np.linspace(0.0, 0.01, 5)], axis=1)
+    paths = [
+        FollowedPath(name=name, seconds=2.0, path=path, points={"open_sysid": 1.1 * path}) for name in ("line", "bow")
+    ]
+    figure = control_figures.followed_paths(paths, {"open_sysid": "SysID"}, np.eye(3)[[0, 2]], narrow=narrow)
+    asked, driven = figure.axes[0].lines
+    np.testing.assert_allclose(np.ptp(asked.get_xdata()), 20.0)  # [mm]
+    np.testing.assert_allclose(np.ptp(driven.get_ydata()), 11.0)
+    assert driven.get_color() == TONES["sysid"].light
+    assert [axes.get_title(loc="left") for axes in figure.axes] == ["line", "bow"]

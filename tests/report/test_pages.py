@@ -1,0 +1,300 @@
+"""The reports of motions with markers, driven by pressure or let go, on made-up runs."""
+
+import re
+
+import measured_run as beam
+import numpy as np
+import pytest
+from chambered import hollow_box
+from driven_run import BASE, MODELS, arm_settings, data, errors_of, write_run
+from measured_run import FRAMES, SECONDS, STEP, TRACKED, TRIALS, write_folds, write_recordings, write_split
+from report_page import report
+
+from warp_resphys.experiment import report as stage
+from warp_resphys.experiment.build import build_mesh
+from warp_resphys.experiment.report import make_folds_report, read_driven, read_film, read_recordings, read_trials
+from warp_resphys.io.errors import DataFileError
+from warp_resphys.io.files import read_json, write_json
+from warp_resphys.io.stages import StageContext
+from warp_resphys.mesh.mesh import Mesh, box_hexahedra
+from warp_resphys.mesh.readers import write_mesh
+from warp_resphys.report import page as page_module
+from warp_resphys.report.data import best_and_worst
+from warp_resphys.report.page import NONE, Picture
+
+BEAM = beam.config()
+FIGURES_OF_AN_ARM = {
+    *("error_over_time", "landscape", "loss_history", "markers", "plane_best", "plane_worst", "inputs", "space"),
+    *("training_resphys", "training_simfree"),
+}
+
+
+@pytest.fixture
+def no_figures(no_drawing, monkeypatch):
+    """Figures are drawn in tests of their own; here their names are kept."""
+
+    def draw(folder, name, _, alt):
+        (folder / f"{name}.png").touch()
+        return Picture("data:,", "data:,", alt)
+
+    monkeypatch.setattr(page_module, "draw_picture", draw)
+
+
+def figures_in(folder):
+    return {path.stem for path in (folder / "figures").iterdir()}
+
+
+class TestArms:
+    @pytest.mark.usefixtures("no_drawing")
+    def test_page(self, tmp_path):
+        settings = arm_settings()
+        write_run(tmp_path, settings, steps=200)
+        page = report(tmp_path, settings)
+        errors = errors_of(tmp_path)
+        assert all(link.startswith("data:") for link in page.links)
+        assert re.search(r"https?://", page.source) is None
+        assert page.allows_its_scripts_alone()
+        assert all(len(image["alt"]) > 40 for image in page.images)
+        for model in MODELS:
+            assert f"{errors['errors_mm'][model]['mean']:.3f} ± " in page.text
+            assert f"{errors['per_marker'][model]['Ring 2 - 3']:.3f}" in page.text
+            assert f"{errors['median_filtered'][model]:.3f} mm (" in page.text
+            assert all(f"{row['errors_mm'][model]:.3f}" in page.text for row in errors["per_trajectory"])
+        for said in (
+            *("; published: 21.1 % less)", "7.31 ± 3.54", "No recordings are configured", "fibres around the chambers"),
+            *("The noise of the markers alone is 0.08 mm.", "to 0.120 mm from the observed ones, 0.610 mm at most"),
+            "mean over 3 test trials of 4 s and 12 markers",
+            "SimFree: 2 of 3 roll-outs left the states of the training, the first after 0.84 s (test_00).",
+            *("dashed, the limit of 20 kPa", "Young's modulus [kPa]215237250", "1 min 15 s", "no OpenGL here"),
+        ):
+            assert said in page.text
+        for absent in ("Longer than the training", "Beyond the inputs", "A line ends", "±  is"):
+            assert absent not in page.text
+        assert figures_in(tmp_path) == FIGURES_OF_AN_ARM
+
+    @pytest.mark.usefixtures("no_figures")
+    def test_longer_rollouts_of_which_one_diverged(self, tmp_path):
+        settings = arm_settings("sopra_extrapolation", data=data(folder="recordings", train_fraction=0.5))
+        write_run(tmp_path, settings, horizons=(1, 2), diverged=("simfree",), simulated=False)
+        page = report(tmp_path, settings)
+        growth = errors_of(tmp_path)["growth"]["resphys"]
+        assert f"{'grows' if growth > 0 else 'falls'} by {abs(100 * growth):.1f} %." in page.text
+        for said in ("Longer than the training", "First 1 s", "A line ends", "of 494 vertices", "9.89 ± 5.02"):
+            assert said in page.text
+        assert page.text.count("1 of 3 diverged") == 2
+        assert "No recordings are configured" not in page.text
+
+    @pytest.mark.usefixtures("no_figures")
+    def test_higher_pressures(self, tmp_path):
+        settings = arm_settings("sopra_overpressure", data=data(input_scales=[1.25, 1.75]))
+        write_run(tmp_path, settings, test=2, scales=(1.25, 1.75))
+        text, scales = report(tmp_path, settings).text, errors_of(tmp_path)["scales"]
+        assert f"At 1.75 times the inputs of the training the error is {scales['1.75']['resphys']['mean']:.3f}" in text
+        assert all(f"{scales[f][m]['mean']:.3f} ± " in text for f in ("1", "1.25", "1.75") for m in MODELS)
+        assert "none of 2 (1.25 times), 2 of 2 (1.75 times), the first after 0.40 s" in text
+        assert "error_over_scale" in figures_in(tmp_path)
+        trials, pressures = read_trials(tmp_path, settings), read_driven(tmp_path, settings)
+        assert trials.names == ("test_00", "test_01")
+        assert len(pressures.scaled) == 4
+        assert set(pressures.scaled) < pressures.values.keys()
+        assert trials.errors_mm["resphys"][:, 1:].mean() == pytest.approx(scales["1"]["resphys"]["mean"], rel=1e-5)
+
+    @pytest.mark.usefixtures("no_drawing")
+    def test_one_chamber_one_trial_and_two_models(self, tmp_path):
+        box = hollow_box("hexahedron")
+        turned = box.vertices[:, [2, 1, 0]] * [1.0, 1.0, -1.0] - [0.01, 0.015, 0.0]
+        write_mesh(tmp_path / "box.vtk", Mesh(turned, box.cells))
+        settings = arm_settings("segment_real", 2)
+        settings["mesh"] = {"kind": "file", "path": str(tmp_path / "box.vtk"), "units": "m", "order": 1}
+        settings["mesh"]["drop_unreferenced"] = True
+        settings["markers"] = {"tracked": {"Tip": [0.0, 0.01, -0.06]}, "reference": BASE}
+        settings["data"] = data(folder="recordings", input_limit=None)
+        write_run(tmp_path, settings, train=0, test=1, chambers=1, models=("simulation", "resphys"), simulated=False)
+        page = report(tmp_path, settings)
+        for said in ("On trial test_00, which", "1 test trial of 2 s and 1 marker, ±", "Pressures of the trial."):
+            assert said in page.text
+        assert "ResPhys: the roll-out never left the states of the training." in page.text
+        for absent in ("SysID", "Published", "The published", "Identification", "dashed", "median filter"):
+            assert absent not in page.text
+        without = {"landscape", "loss_history", "plane_best", "training_simfree"}
+        assert figures_in(tmp_path) == FIGURES_OF_AN_ARM - without
+
+    @pytest.mark.usefixtures("no_figures")
+    def test_settings_are_shown_and_what_diverged_is_said(self, tmp_path):
+        settings = arm_settings()
+        write_run(tmp_path, settings, test=1, train=1, steps=60)
+        metrics = read_json(tmp_path / "errors.json")
+        metrics["errors_mm"]["resphys"] = {"mean": None, "std": None, "trajectories": 3, "diverged": 1}
+        write_json(tmp_path / "errors.json", metrics)
+        page = report(tmp_path, settings)
+        assert "data.input_limit20000.0" in page.text
+        assert "ResPhys diverged in 1 of 3 roll-outs" in page.text
+
+    @pytest.mark.parametrize("name", ["dataset.h5", "rollouts.h5", "errors.json", "registration.json"])
+    def test_a_missing_file_is_one_sentence(self, tmp_path, name):
+        settings = arm_settings()
+        write_run(tmp_path, settings, test=1, steps=40, models=("resphys",))
+        (tmp_path / name).unlink()
+        with pytest.raises(DataFileError, match=name) as caught:
+            report(tmp_path, settings)
+        assert "\n" not in str(caught.value)
+        assert not (tmp_path / "report.html").exists()
+
+    def test_files_that_do_not_belong_together_are_refused(self, tmp_path):
+        settings = arm_settings()
+        write_run(tmp_path, settings, test=2, steps=40, models=("resphys",))
+        other = tmp_path / "other"
+        write_run(other, settings, test=3, steps=40, models=("resphys",))
+        (other / "rollouts.h5").replace(tmp_path / "rollouts.h5")
+        with pytest.raises(DataFileError, match=r"rollouts.h5 names trials that .* does not hold \(test_02\)"):
+            read_trials(tmp_path, settings)
+        write_run(tmp_path, settings, test=2, steps=40, models=("resphys",), chambers=7)
+        with pytest.raises(DataFileError, match=r"pressures of chamber_7, but the body's chambers are chamber_1, "):
+            report(tmp_path, settings)
+
+    def test_what_is_read(self, tmp_path):
+        settings = arm_settings()
+        write_run(tmp_path, settings, diverged=("simfree",))
+        trials, film = read_trials(tmp_path, settings), read_film(tmp_path, settings, build_mesh(settings["mesh"]))
+        pressures = read_driven(tmp_path, settings)
+        assert pressures.scaled == ()
+        assert trials.times[0, [0, -1]].tolist() == [0.0, pytest.approx(2.0)]
+        assert np.isnan(trials.target[0, 30:36, 1]).all()
+        assert np.isinf(trials.errors_mm["simfree"][0, 60:]).all()
+        expected = errors_of(tmp_path)["errors_mm"]
+        for model in ("sysid", "resphys"):
+            assert trials.errors_mm[model][:, 1:].mean() == pytest.approx(expected[model]["mean"], rel=1e-5)
+        assert film.positions["resphys"].shape[0] == len(film.times) == 51
+        assert list(pressures.values) == ["train_00", "train_01", "test_00", "test_01", "test_02"]
+        assert pressures.values["test_00"].shape == (100, 6)
+
+    def test_recordings_are_shown_on_the_body_as_it_hangs(self, tmp_path, monkeypatch):
+        settings, shown = arm_settings(), []
+        write_run(tmp_path, settings, test=1, steps=40, models=("simulation",), sag=0.004)
+        monkeypatch.setattr(stage, "write_report", lambda _, data: shown.append(data))
+        stage.make_report(StageContext("report", tmp_path, "", {"config": settings}))
+        (found,) = shown
+        sagged = found.mesh.vertices[:, 2].min() - found.recordings.mesh.vertices[:, 2].min()
+        assert sagged == pytest.approx(0.004, abs=1e-6)
+        nominal = dict(zip(found.recordings.labels, found.recordings.nominal[:, 2], strict=True))
+        assert nominal["Base - 1"] == BASE["Base - 1"][2]
+        for label, moved in (("Ring 3 - 1", -0.004), ("Ring 1 - 1", -0.001)):
+            assert nominal[label] - settings["markers"]["tracked"][label][2] == pytest.approx(moved, abs=3e-4)
+
+
+class TestBeams:
+    @pytest.mark.usefixtures("no_drawing")
+    def test_page_of_a_split(self, tmp_path):
+        write_recordings(tmp_path)
+        write_split(tmp_path, ["bare", "load52"])
+        page = report(tmp_path, BEAM)
+        errors = read_json(tmp_path / "errors.json")
+        assert page.allows_its_scripts_alone()
+        for model in beam.MODELS:
+            assert f"{errors['errors_mm'][model]['mean']:.3f}" in page.text
+            assert f"{errors['per_marker'][model]['Tip - 2']:.3f}" in page.text
+            assert all(f"{row['errors_mm'][model]:.3f}" in page.text for row in errors["per_trajectory"])
+        assert "No recordings are configured" not in page.text
+        for said in (
+            "On 2 trials, which no training or identification saw, the simulated markers are",
+            *("5.46 ± 1.78", "251.3 ± 2.5", "stable neo hookean", "left out", "1 min 35 s", "no OpenGL here"),
+            "Young's modulus and Poisson's ratio (\N{MINUS SIGN}0.96)",
+            "bare: Base - 1 jumps once, by 0.31 mm, in frame 80.",
+            "Trial load52, in which the last model of the table is farthest off",
+            *("90 % should lie within ± 3 mm", "87 % do.", "nine of ten measured coordinates"),
+        ):
+            assert said in page.text
+        learned = {f"training_{model}" for model in ("simfree", "resphys_uncorrected", "resphys")}
+        others = {"error_over_time", "landscape", "loss_history", "paths_worst", "paths_best"}
+        assert figures_in(tmp_path) == learned | others
+
+    @pytest.mark.usefixtures("no_drawing")
+    def test_what_is_not_there_is_left_out_and_what_diverged_is_said(self, tmp_path):
+        write_recordings(tmp_path)
+        write_split(tmp_path, ["bare", "load52"], models=("simulation", "resphys"), diverged=("resphys",))
+        for name in ("identification.json", "training_resphys.json", "truth.json"):
+            (tmp_path / name).unlink()
+        page = report(tmp_path, {**BEAM, "name": "my_robot", "data": {**BEAM["data"], "folder": None}})
+        assert "ResPhys diverged in 1 of 2 roll-outs" in page.text
+        assert page.text.count("1 of 2 diverged") == 1
+        for said in ("No recordings are configured", "A line ends where the first roll-out has diverged."):
+            assert said in page.text
+        for absent in ("SysID", "SimFree", "Published", "Identification", "Training", "Against"):
+            assert absent not in page.text.replace("no training or identification", "")
+        assert figures_in(tmp_path) == {"error_over_time", "paths_worst", "paths_best"}
+
+    @pytest.mark.usefixtures("no_figures")
+    def test_a_learned_force_without_an_epoch_wins_nothing(self, tmp_path):
+        write_recordings(tmp_path)
+        write_split(tmp_path, ["bare", "load52"], models=("simulation", "sysid_elastic", "sysid", "resphys"))
+        errors = read_json(tmp_path / "errors.json")
+        for row in (errors["errors_mm"], *(each["errors_mm"] for each in errors["per_trajectory"])):
+            row["resphys"] = row["sysid"]
+        write_json(tmp_path / "errors.json", errors)
+        history = read_json(tmp_path / "training_resphys.json")
+        write_json(tmp_path / "training_resphys.json", {**history, "kept": {**history["kept"], "epoch": 0}})
+        identified = read_json(tmp_path / "identification.json")
+        identified["sysid"]["parameters"]["youngs_modulus"] = 2e6
+        write_json(tmp_path / "identification.json", identified)
+        ranges = {"parameters": {"youngs_modulus": {"lower": 5e4, "upper": 2e6}}}
+        page = report(tmp_path, BEAM | {"identify": ranges})
+        head = page.text[: page.text.index("Error of the markers")]
+        mean = f"{errors['errors_mm']['sysid']['mean']:.3f}"
+        assert re.search(f"{mean} mm from the measured ones over the first [0-9.]+ s with SysID;", head)
+        for said in ("ResPhys) adds nothing to SysID", "Identification (SysID) leaves", "upper bound, 2e+06: widen"):
+            assert said in head
+        assert "no force: none of its training was kept" in page.text
+        assert re.findall(r'class="answer"><th scope="row">([^<]+)<', page.source) == ["SysID"]
+
+    @pytest.mark.usefixtures("no_drawing")
+    def test_page_over_folds_leads_to_theirs(self, tmp_path):
+        write_folds(tmp_path, models=("simulation", "sysid", "resphys"))
+        metrics = read_json(tmp_path / "metrics.json")
+        folds = metrics["folds"]
+        folds["bare"]["errors_mm"]["resphys"]["mean"] = None
+        del folds["load52"]["errors_mm"]["sysid"]
+        write_json(tmp_path / "metrics.json", metrics)
+        page = report(tmp_path, BEAM, make_folds_report)
+        links = [link for link in page.links if not link.startswith("data:")]
+        assert links == [f"fold_{trial}/report.html" for trial in TRIALS]
+        said = page.text
+        assert "On 3 trials, each of them kept back once" in said
+        assert f"bare{folds['bare']['errors_mm']['simulation']['mean']:.3f}" in said
+        assert "diverged" in said[said.index("Test trial [mm]") : said.index("load52")]
+        assert f"load52{folds['load52']['errors_mm']['simulation']['mean']:.3f}{NONE}" in said
+        assert f"Mean{metrics['errors_mm']['simulation']['mean']:.3f}" in said
+        assert all(words in said for words in ("jumps once", "Root mean square"))
+
+    def test_trials_are_read_as_long_as_they_count(self, tmp_path):
+        write_folds(tmp_path, models=("simulation", "resphys"))
+        trials = read_trials(tmp_path / "fold_load101", BEAM)
+        assert trials.names == ("load101",)
+        assert trials.positions["resphys"].shape == trials.target.shape
+        assert trials.times[0, -1] <= SECONDS < trials.times[0, -1] + STEP
+        assert np.isfinite(trials.target).all()
+        whole = read_trials(tmp_path / "fold_load101", {**BEAM, "data": {**BEAM["data"], "seconds": None}})
+        assert whole.target.shape[1] == FRAMES
+        assert np.isnan(whole.target[0, -3:]).all()
+        expected = read_json(tmp_path / "fold_load101" / "errors.json")["errors_mm"]
+        for model, rows in trials.errors_mm.items():  # The markers have noise, the errors of the file have none.
+            assert rows.mean() == pytest.approx(expected[model]["mean"], abs=0.1)
+        hidden = read_trials(tmp_path / "fold_bare", BEAM)
+        assert np.isnan(hidden.target[0, 9:16, 1]).all()
+        assert np.isfinite(hidden.errors_mm["resphys"]).all()
+
+    def test_the_trial_that_fits_worst_is_drawn(self, tmp_path):
+        write_recordings(tmp_path)
+        found = read_recordings(tmp_path, BEAM, box_hexahedra(divisions=(3, 1, 1)), {})
+        assert found.drawn == "load101"
+        assert found.outliers == ("Base - 3",)
+        assert found.labels == (*TRACKED, "Base - 1", "Base - 2", "Base - 3")
+        assert found.nominal[0].tolist() == TRACKED["Tip - 1"]
+        np.testing.assert_allclose(found.feet[0], [0.1, 0.0153, 0.03], atol=1e-12)
+
+    def test_trials_in_order_of_their_errors(self, tmp_path):
+        write_recordings(tmp_path)
+        write_split(tmp_path, list(TRIALS), models=("simulation", "resphys"))
+        trials = read_trials(tmp_path, BEAM)
+        assert [trials.names[each] for each in best_and_worst(trials)] == ["load101", "bare"]
+        write_split(tmp_path, list(TRIALS), models=("simulation", "resphys"), diverged=("resphys",))
+        assert best_and_worst(read_trials(tmp_path, BEAM))[0] == 0

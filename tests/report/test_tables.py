@@ -1,0 +1,229 @@
+"""Tables of the page, and which trials, markers and frames are shown."""
+
+import numpy as np
+import pytest
+
+from warp_resphys.io.errors import InputError
+from warp_resphys.learning.metrics import PUBLISHED_MM, PUBLISHED_WINDOWS_MM, median_filter, published_errors
+from warp_resphys.mesh.mesh import box_hexahedra
+from warp_resphys.report.bodies import instants
+from warp_resphys.report.camera import axes_from_below, motion_axes
+from warp_resphys.report.data import along_body, at_times, drawn_markers, mean_distance, shown_models, tip_markers
+from warp_resphys.report.identification_section import parameter_rows, placement_text, uncertainty_text
+from warp_resphys.report.page import MINUS, NO_BREAK_SPACE, NONE, Cell
+from warp_resphys.report.run_page import published_beside
+from warp_resphys.report.sections import against, horizon_table, quality_rows, residual_table, scale_table
+
+DOWN = np.array([0.0, 0.0, -9.8])
+
+
+def summary(mean, diverged=0):
+    return {"mean": mean, "std": None if mean is None else 0.1, "trajectories": 3, "diverged": diverged}
+
+
+ERRORS = {"sysid": summary(2.0), "resphys": summary(1.0)}
+MORE = {"sysid": summary(None, 1), "resphys": summary(1.5)}
+
+
+class TestErrors:
+    def test_by_horizon(self):
+        metrics = {"horizons": {"10": MORE, "5": ERRORS}, "growth": {"sysid": None, "resphys": 0.5}}
+        table = horizon_table(metrics, PUBLISHED_WINDOWS_MM["sopra_extrapolation"])
+        assert table.columns == ["SysID", "ResPhys"]
+        assert {row.head: row.cells for row in table.rows} == {
+            "First 5 s": [Cell("2.000 ± 0.100", "7.51 ± 3.63"), Cell("1.000 ± 0.100", "5.79 ± 3.09")],
+            "First 10 s": [Cell("1 of 3 diverged", "7.57 ± 3.59"), Cell("1.500 ± 0.100", "6.10 ± 3.22")],
+            "Growth": [Cell(NONE, "+0.8 %"), Cell("+50.0 %", "+5.4 %")],
+        }
+        (row,) = horizon_table({"horizons": {"5": ERRORS}}, {}).rows
+        assert row.cells == [Cell("2.000 ± 0.100"), Cell("1.000 ± 0.100")]
+        assert horizon_table({}, {}) is None
+
+    def test_by_scale_of_the_inputs(self):
+        table = scale_table({"1.25": MORE, "1": ERRORS})
+        assert {row.head: row.cells for row in table.rows} == {
+            "\N{MULTIPLICATION SIGN} 1": [Cell("2.000 ± 0.100"), Cell("1.000 ± 0.100", f"{MINUS}50 %")],
+            "\N{MULTIPLICATION SIGN} 1.25": [Cell("1 of 3 diverged"), Cell("1.500 ± 0.100")],
+        }
+        assert scale_table({}) is None
+
+    def test_against_what_was_identified_and_published(self):
+        means = {"simulation": 0.9, "sysid_elastic": 0.8, "sysid": None, "resphys": 0.2}
+        base, share = against({model: summary(mean) for model, mean in means.items()})
+        assert base == "sysid_elastic"
+        assert share["resphys"] == f"{MINUS}75 %"
+        assert "sysid" not in share
+        published = PUBLISHED_MM["beam_real"]
+        beside = published_beside(published, ["published", "simulation", "sysid", "resphys"])
+        assert beside.keys() == {"published", "sysid", "simfree", "resphys"}
+        beside = published_beside(published, ["simulation", "sysid_elastic", "sysid"])
+        assert beside["sysid_elastic"] == ("1.32", "± 1.38")
+
+    def test_published_numbers_are_those_of_the_same_experiment(self):
+        assert published_errors("sopra_extrapolation") is PUBLISHED_MM["sopra_extrapolation"]
+        assert published_errors("sopra_overpressure") is PUBLISHED_MM["sopra"]
+        assert published_errors("beam_real_repeated") is PUBLISHED_MM["beam_real"]
+        assert published_errors("segment_real") == {}
+
+    def test_they_count_what_was_seen(self):
+        measured = np.zeros((1, 4, 2, 3))
+        measured[0, 1, 0] = np.nan
+        measured[0, 2] = np.nan
+        markers = np.zeros((1, 4, 2, 3))
+        markers[0, :, 0, 0], markers[0, :, 1, 2] = 0.001, 0.003
+        markers[0, 2:, 0] = np.nan
+        np.testing.assert_allclose(mean_distance(markers, measured)[0], [2.0, 3.0, np.nan, np.inf])
+
+
+class TestIdentification:
+    @pytest.fixture
+    def identified(self):
+        return {
+            "parameters": {"youngs_modulus": 251.3e3, "stiffness_damping": 0.0029},
+            "at_bounds": ["stiffness_damping"],
+            "uncertainty": {
+                "deviation": {"youngs_modulus": 2513.0, "stiffness_damping": 1e-4},
+                "correlation": [[1.0, 0.5], [0.5, 1.0]],
+                "poorest": {"youngs_modulus": 0.1, "stiffness_damping": 0.99},
+                "poorest_deviation": 0.034,
+            },
+        }
+
+    def test_a_row_a_parameter(self, identified):
+        modulus, damping = parameter_rows(identified, {"youngs_modulus": 264e3}, {"youngs_modulus": 250e3})
+        assert modulus.head == "Young's modulus [kPa]"
+        assert modulus.cells == [Cell("264"), Cell("251.3", beside="± 2.5"), Cell("250"), Cell("")]
+        assert damping.head == "Damping by stiffness [ms]"
+        assert damping.cells == [Cell(NONE), Cell("2.90", beside="± 0.10"), Cell(NONE), Cell("yes")]
+        identified["parameters"]["youngs_modulus"] = -3.0
+        assert parameter_rows(identified, {}, {})[0].cells[1].text == "0.0"
+        assert parameter_rows({**identified, "uncertainty": None}, {}, {})[0].cells[1].text == f"{MINUS}0.003"
+
+    @pytest.mark.parametrize(
+        ("parameter", "value", "head", "text"),
+        [
+            ("prony_ratio_1", 0.25, "Prony ratio 1", "0.25"),
+            ("prony_time_2", 0.3125, "Relaxation time 2 [s]", "0.3125"),
+            ("tendon_offset_1_left", 0.002, "First offset of the tendon 'left' [mm]", "2"),
+            ("pressure_delay", 0.03, "Delay of the pressures [ms]", "30"),
+            ("unknown", 2.0, "unknown", "2"),
+        ],
+    )
+    def test_names_and_units(self, parameter, value, head, text):
+        (row,) = parameter_rows({"parameters": {parameter: value}, "at_bounds": []}, {}, {})
+        assert (row.head, row.cells[1].text) == (head, text)
+
+    def test_what_the_data_cannot_tell(self, identified):
+        said = uncertainty_text("sysid", identified, {}).replace(NO_BREAK_SPACE, " ")
+        assert said == "SysID: the data tell least about damping by stiffness, to 3.4 % of the range."
+        assert uncertainty_text("sysid", {**identified, "uncertainty": None}, {}) == ""
+        identified["uncertainty"] |= {"poorest_deviation": 1.9, "correlation": [[1.0, -0.95], [-0.95, 1.0]]}
+        said = uncertainty_text("sysid", identified, {})
+        assert "a prior would settle it" in said
+        assert f"cannot tell apart Young's modulus and damping by stiffness ({MINUS}0.95)" in said
+
+    @pytest.mark.parametrize(("deviation", "informs"), [(2.5e3, True), (9.9e3, False)])
+    def test_what_the_data_add_nothing_to_is_said_to_be_its_prior(self, identified, deviation, informs):
+        identified["uncertainty"]["deviation"]["youngs_modulus"] = deviation
+        ranges = {"youngs_modulus": {"prior": {"mean": 250e3, "deviation": 10e3}}}
+        said = uncertainty_text("sysid", identified, ranges)
+        assert said.endswith("at 250 ± 10 kPa.") is not informs
+
+    def test_where_markers_and_recordings_lie(self):
+        offsets = {"A": [0.001, 0.0, 0.0], "B": [0.0, 0.003, 0.004]}
+        said = placement_text("sysid", {"offsets": offsets, "shift": [0.0, 0.002, 0.0], "turn": [0.0, 0.0, 0.1]})
+        said = said.replace(NO_BREAK_SPACE, " ")
+        assert "B the furthest, by 5.0 mm" in said
+        assert "2.0 mm and 5.7° off" in said
+
+
+def test_rows_of_markers_that_were_never_seen():
+    marker = {"label": "A", "seen": 0.0, "gaps": 1, "longest_gap_frames": 9, "masked_frames": 9, "jumps": []}
+    (row,) = quality_rows({"markers": [{**marker, "noise_mm": None, "drift_mm": None}]})
+    assert [row.head, *(cell.text for cell in row.cells)] == ["A", "0.0 %", "1", "9", "9", "0", "", ""]
+    table = residual_table({"t": {"rms_mm": 0.5, "residual_mm": {"A": None, "B": 0.5}, "outliers": []}})
+    assert table.columns == ["A", "B", "Root mean square"]
+    assert table.rows[0].cells == [Cell(NONE), Cell("0.50"), Cell("0.50")]
+    many = {str(marker): 0.1 for marker in range(9)}
+    table = residual_table({"t": {"rms_mm": 0.5, "residual_mm": many, "outliers": ["3"]}})
+    assert table.columns == ["t"]
+    assert [row.head for row in table.rows] == [*many, "Root mean square"]
+    assert table.rows[3].cells == [Cell("0.10", "left out")]
+
+
+class TestWhatIsShown:
+    def test_bodies_are_brought_to_the_frames(self):
+        positions = np.arange(4.0)[:, None, None] * np.ones((1, 2, 3))
+        times = np.array([0.0, 0.1, 0.2, 0.3])
+        between = at_times(positions, times, np.array([0.0, 0.05, 0.11, 0.3, 0.5]))
+        np.testing.assert_allclose(between[:, 0, 0], [0.0, 0.5, 1.1, 3.0, 3.0])
+        positions[2:] = np.nan
+        np.testing.assert_array_equal(at_times(positions, times, np.array([0.1, 0.11]))[:, 0, 0], [1.0, np.nan])
+
+    def test_instants_lie_apart(self):
+        measured, rest = np.zeros((100, 1, 3)), np.zeros((1, 3))
+        measured[40, 0, 2] = -1.0
+        simulated = measured.copy()
+        simulated[97, 0, 0] = 1.0
+        assert instants(measured, rest, simulated) == [25, 40, 97]  # The last is too close to where the model is worst.
+        simulated[70, 0, 0] = 2.0
+        assert instants(measured, rest, simulated) == [40, 70, 99]
+        measured[70] = np.nan
+        assert instants(measured, rest, simulated) == [25, 40, 97]
+        assert instants(measured[:1], rest, simulated[:1]) == [0]
+
+    def test_markers_at_the_tip_and_one_above_it(self):
+        clamped = np.array([[0.01, 0.0, 0.0], [-0.01, 0.0, 0.0]])
+        bound = np.array([[0.0, 0.0, -0.1], [0.0, 0.0, -0.27], [0.01, 0.0, -0.265], [0.0, 0.0, -0.15]])
+        assert tip_markers(bound, clamped).tolist() == [1, 2]
+        np.testing.assert_allclose(along_body(bound, clamped)[0], 0.1, atol=1e-3)
+        measured = np.repeat(bound[None], 5, axis=0)
+        measured[2, 2, 0] += 0.02
+        measured[3, :2, 0] += 0.01
+        measured[4, 3] = np.nan
+        assert drawn_markers(measured, bound, clamped) == [2, 0]
+        assert drawn_markers(measured[:, 1:2], bound[1:2], clamped) == [0]
+        for unseen, shown in ((2, [1, 0]), (1, [0]), (0, [3])):  # which that trial does not have
+            measured[:, unseen] = np.nan
+            assert drawn_markers(measured, bound, clamped) == shown
+
+    def test_the_uncorrected_model_and_the_best_one(self):
+        assert shown_models({"resphys": 0, "simulation": 0, "sysid": 0}) == ["simulation", "resphys"]
+        assert shown_models({"sysid": 0, "published": 0}) == ["published", "sysid"]
+
+    def test_the_free_end_is_on_the_right_and_gravity_down(self):
+        rest = box_hexahedra(divisions=(4, 1, 1)).vertices
+        bent = rest + np.linspace(0.0, 0.1, 10)[:, None, None] * rest[:, :1] * [0.0, 0.0, -1.0]
+        axes = motion_axes(DOWN, bent)
+        np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+        assert axes[0, 0] > 0.9
+        assert axes[1, 2] > 0.9
+        assert motion_axes(DOWN, bent * [-1.0, 1.0, 1.0])[0, 0] < -0.9
+        assert motion_axes(DOWN, bent[..., [2, 1, 0]] * [1.0, 1.0, -1.0])[1, 2] > 0.9
+        assert np.isfinite(motion_axes(np.zeros(3), bent)).all()
+        below = axes_from_below(axes, DOWN)
+        np.testing.assert_allclose(below[[0, 2]], [axes[0], [0.0, 0.0, -1.0]], atol=1e-12)
+        assert np.linalg.det(below) == pytest.approx(1.0)
+        np.testing.assert_array_equal(axes_from_below(axes, np.zeros(3)), below)
+
+
+class TestMedianFilter:
+    def test_it_is_one_of_a_second(self):
+        values = np.random.default_rng(1).normal(size=(2, 300))
+        smooth = median_filter(values, 0.01)
+        for at in (0, 20, 50, 150, 299):  # half a second to both sides: 50 steps
+            np.testing.assert_allclose(smooth[:, at], np.median(values[:, max(0, at - 50) : at + 51], axis=1))
+        step = (np.arange(300) >= 150).astype(float)
+        np.testing.assert_array_equal(median_filter(step, 0.01), step)
+        spike = np.zeros(300)
+        spike[100:150] = 5.0  # shorter than half of the window
+        assert median_filter(spike, 0.01).max() == 0.0
+        assert median_filter(spike, 0.02).max() == 5.0  # at this step it lasts a second
+
+    def test_it_leaves_out_what_is_not_known(self):
+        values = np.array([1.0, np.nan, 3.0, np.inf, np.nan, np.nan, np.nan])
+        filtered = median_filter(values, 1.0, 2.0)
+        np.testing.assert_array_equal(filtered, [1.0, 2.0, np.inf, np.inf, np.inf, np.nan, np.nan])
+        for step, window in ((0.0, 1.0), (0.01, -1.0), (np.nan, 1.0)):
+            with pytest.raises(InputError, match="both must be positive"):
+                median_filter(values, step, window)

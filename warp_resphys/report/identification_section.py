@@ -1,0 +1,205 @@
+"""The section on identification: its parameters, how well the trials determine them, and the loss around them."""
+
+import math
+import re
+from collections.abc import Mapping
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+
+from ..learning.parameters import command_of
+from .data import MODELS, FloatArray, RunReport
+from .page import MINUS, NO_BREAK_SPACE, NONE, Canvas, Cell, Drawn, Part, Row, Table, Text
+
+# A name, the unit that it is written in, and how many of these make an SI unit.
+Wording = tuple[str, str, float]
+_PARAMETERS: Final[Mapping[str, Wording]] = {
+    "youngs_modulus": ("Young's modulus", "kPa", 1e-3),
+    "poissons_ratio": ("Poisson's ratio", "", 1.0),
+    "density": ("Density", "kg/m³", 1.0),
+    "mass_damping": ("Damping by mass", "1/s", 1.0),
+    "stiffness_damping": ("Damping by stiffness", "ms", 1e3),
+    "attached_mass_factor": ("Factor of the attached masses", "", 1.0),
+    "gravity_tilt_1": ("First tilt of gravity", "°", 180.0 / np.pi),
+    "gravity_tilt_2": ("Second tilt of gravity", "°", 180.0 / np.pi),
+    "tendon_offset_1": ("First offset of the tendons", "mm", 1e3),
+    "tendon_offset_2": ("Second offset of the tendons", "mm", 1e3),
+}
+_COMMANDS: Final[Mapping[str, Wording]] = {
+    "factor": ("Factor", "", 1.0),
+    "delay": ("Delay", "ms", 1e3),
+    "rise": ("Time constant", "ms", 1e3),
+}
+_WHOLE: Final = 99.5  # [%] of a parameter's range.
+_OPEN: Final = "and leave that open over the whole range: a prior would settle it"
+_TIED: Final = 0.9  # From this correlation on, two parameters are named as not told apart.
+_NOTHING_NEW: Final = 0.8  # Share of a prior's deviation from which on the data tell next to nothing of a parameter.
+
+
+def identification_section(data: RunReport, canvas: Canvas) -> Part | None:
+    """Return what was identified, how well the data tell it, and the loss around it."""
+    identified = {name: data.identification[name] for name in MODELS if name in data.identification}
+    if not identified:
+        return None
+    columns = ["Data sheet", "Identified", *(["True"] if data.truth else []), "At a bound"]
+    blocks: list[Any] = [
+        Table(MODELS[name][0], columns, parameter_rows(each, data.start, data.truth))
+        for name, each in identified.items()
+    ]
+    ranges = (data.settings.get("identify") or {}).get("parameters", {})
+    uncertain = [said for name, each in identified.items() if (said := uncertainty_text(name, each, ranges))]
+    notes = []
+    if uncertain:
+        notes.append(
+            "± is one standard deviation in the Gauss-Newton approximation, for residuals that are correlated in time."
+        )
+    if data.truth:
+        model = data.truth.get("model", "corotated").replace("_", " ")
+        notes.append(f"The true values are those of the simulated laboratory, whose material is {model}.")
+    blocks += [Text(" ".join(notes), note=True)] if notes else []
+    blocks += [Text(said) for said in uncertain]
+    placed = {name: each["placement"] for name, each in identified.items() if each.get("placement")}
+    blocks += [Text(placement_text(name, each)) for name, each in placed.items()]
+    return Part("Identification", [*blocks, *_loss_figures(data, identified, canvas)])
+
+
+def _loss_figures(data: RunReport, identified: Mapping[str, Any], canvas: Canvas) -> list[Drawn]:
+    """The losses of the identifications over their evaluations, and over a grid."""
+    from . import learning_figures
+
+    drawn = []
+    if histories := {name: each["history"] for name, each in identified.items() if any(each["history"])}:
+        drawn.append(
+            canvas.figure(
+                "loss_history",
+                partial(learning_figures.loss_histories, histories),
+                "Loss of the identification over its evaluations, a line a start, on a logarithmic axis.",
+                "Lowest loss so far over the evaluations, a line a start; the start that was kept is the bold one. The "
+                "loss is the mean squared distance of the markers over the square of the motion’s amplitude.",  # noqa: RUF001
+            )
+        )
+    if grid := data.identification.get("landscape"):
+        loss, modulus = (np.array(grid[key], dtype=np.float64) for key in ("loss", "youngs_modulus"))
+        ratio = np.atleast_1d(np.array(grid.get("poissons_ratio", []), dtype=np.float64))
+        points = _landscape_points(data, loss, modulus, ratio)
+        marked = "; ".join(f"{name} at {1e-3 * e:.4g} kPa" for name, (e, _) in points.items())
+        drawn.append(
+            canvas.figure(
+                "landscape",
+                partial(learning_figures.landscape, modulus, ratio, loss, points),
+                f"Loss over Young's modulus{' and Poisson’s ratio' if loss.ndim > 1 else ''}: {marked}.",  # noqa: RUF001
+                "The loss on a grid around what SysID has identified, the other parameters held there. It is empty "
+                "where no simulation succeeded.",
+            )
+        )
+    return drawn
+
+
+def _landscape_points(
+    data: RunReport, loss: FloatArray, modulus: FloatArray, ratio: FloatArray
+) -> dict[str, tuple[float, float]]:
+    """Modulus [Pa] and ratio of what is marked in the landscape."""
+    points: dict[str, tuple[float, float]] = {}
+    if np.isfinite(loss).any():
+        row, *column = np.unravel_index(int(np.nanargmin(loss)), loss.shape)
+        points["lowest of the grid"] = (float(modulus[row]), float(ratio[column[0]]) if column else 0.0)
+    own = data.identification.get("sysid", {}).get("parameters", {})
+    own = {"poissons_ratio": data.start.get("poissons_ratio", 0.0), **own}
+    for name, values in {"data sheet": data.start, "identified": own, "true": data.truth}.items():
+        if {"youngs_modulus", "poissons_ratio"} <= values.keys():
+            points[name] = (values["youngs_modulus"], values["poissons_ratio"])
+    return points
+
+
+def parameter_rows(identified: Mapping[str, Any], start: Mapping[str, float], truth: Mapping[str, Any]) -> list[Row]:
+    """Return a row a parameter: the data sheet's value, what was identified, the true one if known, if at a bound."""
+    deviations = (identified.get("uncertainty") or {}).get("deviation", {})
+    rows = []
+    for parameter, value in identified["parameters"].items():
+        words, unit, factor = _wording(parameter)
+        deviation = deviations.get(parameter)
+        beside = f"± {factor * deviation:.{_decimals(factor * deviation)}f}" if deviation else ""
+        cells = [Cell(_digits(start.get(parameter), factor)), Cell(_digits(value, factor, deviation), beside=beside)]
+        cells += [Cell(_digits(truth.get(parameter), factor))] if truth else []
+        cells.append(Cell("yes" if parameter in identified["at_bounds"] else ""))
+        rows.append(Row(f"{words} [{unit}]" if unit else words, cells))
+    return rows
+
+
+def _wording(parameter: str) -> Wording:
+    """Name, unit and factor of a parameter, also of one of a tendon, of a branch or of the commands of an input."""
+    driven, command = command_of(parameter)
+    if driven:
+        (kind, unit, factor), words = _COMMANDS[command], driven.rpartition("_")[2]
+        return f"{kind} of the {words}{'es' if words.endswith('s') else 's'}", unit, factor
+    if offset := re.fullmatch(r"(tendon_offset_[12])_(.+)", parameter):
+        kind, unit, factor = _PARAMETERS[offset[1]]
+        return f"{kind.removesuffix(' of the tendons')} of the tendon '{offset[2]}'", unit, factor
+    if branch := re.fullmatch(r"prony_(ratio|time)_(\d+)", parameter):
+        kind, number = branch.groups()
+        return (f"Relaxation time {number}", "s", 1.0) if kind == "time" else (f"Prony ratio {number}", "", 1.0)
+    return _PARAMETERS.get(parameter, (parameter, "", 1.0))
+
+
+def _digits(value: float | None, factor: float, deviation: float | None = None) -> str:
+    """A value in its unit, with as many decimals as its standard deviation deserves, or four digits."""
+    if value is None:
+        return NONE
+    if not deviation:
+        return f"{factor * value:.4g}".replace("-", MINUS)
+    text = f"{factor * value:.{_decimals(factor * deviation)}f}"
+    return text.replace("-", MINUS) if float(text) else text.lstrip("-")
+
+
+def _decimals(deviation: float) -> int:
+    """For two digits of a standard deviation."""
+    return max(0, 1 - math.floor(math.log10(deviation)))
+
+
+def placement_text(name: str, placed: Mapping[str, Any]) -> str:
+    """Say how far from where they should be an identification found the markers and the recordings."""
+    away = {label: 1e3 * math.dist(offset, (0.0, 0.0, 0.0)) for label, offset in placed["offsets"].items()}
+    furthest = max(away, key=lambda label: away[label])
+    shift, turn = (math.hypot(*placed[key]) for key in ("shift", "turn"))
+    said = (
+        f"{MODELS[name][0]}, with the parameters: markers sit beside their nominal places, {furthest} the furthest, by "
+        f"{away[furthest]:.1f} mm; the recordings lie {1e3 * shift:.1f} mm and {math.degrees(turn):.1f}° off."
+    )
+    return said.replace(" mm", f"{NO_BREAK_SPACE}mm")
+
+
+def uncertainty_text(name: str, identified: Mapping[str, Any], ranges: Mapping[str, Any]) -> str:
+    """Say which parameters the data of a model's identification cannot tell, or tell apart; empty if that is not known.
+
+    Args:
+        name: of the model.
+        identified: its identification.
+        ranges: of the parameters, with what was known of them before.
+    """
+    uncertainty = identified.get("uncertainty")
+    if not uncertainty:
+        return ""
+    names = list(identified["parameters"])
+    words = {parameter: _wording(parameter)[0] for parameter in names}
+    words = {p: w if w.startswith(("Young", "Poisson", "Prony")) else w[0].lower() + w[1:] for p, w in words.items()}
+    largest = max(abs(weight) for weight in uncertainty["poorest"].values())
+    along = [words[p] for p, weight in uncertainty["poorest"].items() if abs(weight) > 0.4 * largest]
+    share = 100.0 * uncertainty["poorest_deviation"]
+    said = f"{MODELS[name][0]}: the data tell least about {' together with '.join(along)}, "
+    said += f"to {share:.2g} % of the range" if share < _WHOLE else _OPEN
+    correlation = np.array(uncertainty["correlation"], dtype=np.float64)
+    tied = [
+        f"{words[names[i]]} and {words[names[j]]} ({correlation[i, j]:+.2f})".replace("-", MINUS)
+        for j in range(len(names))
+        for i in range(j)
+        if abs(correlation[i, j]) > _TIED
+    ]
+    said += f"; they cannot tell apart {', '.join(tied)}, by their correlation." if tied else "."
+    for parameter, deviation in uncertainty["deviation"].items():
+        prior = (ranges.get(parameter) or {}).get("prior")
+        if prior is not None and deviation > _NOTHING_NEW * prior["deviation"]:
+            _, unit, factor = _wording(parameter)
+            where = f"{_digits(prior['mean'], factor)} ± {_digits(prior['deviation'], factor)} {unit}".rstrip()
+            said += f" They tell next to nothing of {words[parameter]}: it stays where its prior has it, at {where}."
+    return said.replace(" %", f"{NO_BREAK_SPACE}%")

@@ -1,0 +1,127 @@
+"""Sentences on the page of a run about how it was set up: its simulator, its network, and what its errors contain."""
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+from ..energies.materials import make_material
+from .page import number_text
+
+_SELECTED_BY: Final = {"rollout": "roll-out error", "validation_loss": "validation loss"}
+_PUBLISHED_NETWORK: Final = {"kind": "nodal", "blocks": 5, "layers": 3, "width": 512, "activation": "normalised_elu"}
+_PUBLISHED_TRAINER: Final = {
+    "epochs": 1000,
+    "batch_size": 256,
+    "learning_rate": 1e-3,
+    "schedule": "step",
+    "weight_decay": 1e-5,
+    "noise": 0.0,
+    "linear_noise": None,
+    "scale_weight": 0.0,
+    "selection": "validation_loss",
+}
+_AGAINST: Final = "The published errors are measured against the reconstructed trajectories, ours against the target."
+_MASS: Final = {
+    "per_vertex": " This run computes masses and volumes as the published code does.",
+    "row_sum": (
+        " The published simulator doubles the beam's mass and locks (physics=published computes the same); "
+        "this run does not, so that its uncorrected error is another one."
+    ),
+}
+_OF_A_BEAM: Final = (
+    "The published errors are those of other data: recordings with ten markers on the beam's sides, whose weight is "
+    "cut off at the release, compared with trajectories reconstructed from them; the published uncorrected simulation "
+    "has the published setting, the published SysID elastic parameters only."
+)
+_OF_AN_ARM: Final = {
+    True: "The published errors are those of another body: recordings of a real arm, which this run has not seen.",
+    False: "The published errors are those of the published simulator, of 494 vertices, on the authors' recordings.",
+}
+
+
+def published_note(config: Mapping[str, Any]) -> str:
+    """Return how the published errors of an experiment came about."""
+    if config.get("markers") is None:
+        return _AGAINST + _MASS[config["physics"]["mass"]]
+    return _OF_AN_ARM[config["data"]["folder"] is None] if config.get("chambers") else _OF_A_BEAM
+
+
+def error_notes(sideways: Mapping[str, float], truth: Mapping[str, Any], mesh_check: Mapping[str, Any]) -> list[str]:
+    """Return how the bodies of the test trials were held, and how much of the errors is noise or mesh, where known.
+
+    Args:
+        sideways: how far bodies were held sideways [mm], by trial.
+        truth: of a simulated laboratory, with `noise_mm`.
+        mesh_check: what a finer mesh changes.
+    """
+    notes = []
+    if sideways:
+        each = ", ".join(f"{distance:.1f} mm ({trial})" for trial, distance in sideways.items())
+        notes.append(
+            "The first frames of a trial tell how far sideways its body was held: the markers by "
+            f"{each}, as the identified simulator has it. Every simulator begins with its own estimate."
+        )
+    if "noise_mm" in truth:
+        notes.append(f"The noise of the markers alone is {truth['noise_mm']:.2f} mm.")
+    if not mesh_check:
+        return notes
+    cells, finer = mesh_check["cells"]
+    model = "the identified simulator" if mesh_check["model"] == "sysid" else "the simulator"
+    finer_mesh = f"a mesh of {finer:,} in place of {cells:,} cells"
+    if "failed" in mesh_check:
+        return [*notes, f"How much of the errors is mesh is not known: on {finer_mesh}, {mesh_check['failed']}"]
+    before, after = map(number_text, mesh_check["errors_mm"])
+    return [
+        *notes,
+        f"How much of the errors is mesh: on {finer_mesh}, with the same constants, the markers of {model} are "
+        f"{number_text(mesh_check['moved_mm'])} mm elsewhere, and its error is {after} mm in place of {before} mm.",
+    ]
+
+
+def network_note(network: Mapping[str, Any], trainer: Mapping[str, Any], refinement: Mapping[str, Any]) -> str:
+    """Return which network predicts the residual force, and how it is trained; says where it is the published one."""
+    who = "the published network" if network.items() >= _PUBLISHED_NETWORK.items() else "our network"
+    basis = "force, positions and velocities of every vertex"
+    if network["kind"] == "reduced":
+        sizes = (network[f"{name}_modes"] for name in ("position", "velocity", "force"))
+        basis = "a reduced basis of {} position, {} velocity and {} force modes".format(*sizes)
+    blocks = "1 block" if network["blocks"] == 1 else f"{network['blocks']} blocks"
+    how = "as published" if trainer.items() >= _PUBLISHED_TRAINER.items() else "our way"
+    linear = "" if trainer["linear_noise"] is None else ", beside a linear part from ridge regression"
+    said = (
+        f"ResPhys: {who}, in {basis}, {blocks} of {network['layers']} hidden layers of {network['width']}{linear}; "
+        f"trained {how}, {trainer['epochs']} epochs, weights chosen by {_SELECTED_BY[trainer['selection']]}."
+    )
+    if refinement.get("kind", "none") != "none":
+        said += f" Then refined through the simulator, over windows of {refinement['window']} steps."
+    return said
+
+
+def kept_note(networks: Mapping[str, Any]) -> str:
+    """Return which weights of the residual force were taken, and their error in validation; empty without any."""
+    kept, refined = networks.get("resphys"), networks.get("resphys_refined")
+    if kept is None:
+        return ""
+    said = f"Kept: epoch {kept['epoch']}, by {_SELECTED_BY[kept['selection']]}; {_validated(kept)}."
+    if refined is None:
+        return said
+    if refined["epoch"] == 0:
+        return f"{said} No epoch of the refinement was better: the weights are those from before it."
+    return f"{said} Taken in the end: epoch {refined['epoch']} of the refinement; {_validated(refined)}."
+
+
+def _validated(kept: Mapping[str, Any]) -> str:
+    error = kept["validation_rollout_error_mm"]
+    if error is None:
+        return "its roll-outs of the validation split diverge"
+    return f"its mean roll-out error on the validation split is {number_text(error)} mm"
+
+
+def material_note(material: Mapping[str, Any]) -> str:
+    """Return the constants of a material, and its model where it is not the usual one."""
+    constants: dict[str, Any] = dict(make_material(**material).constants)
+    model = material.get("model", "corotated")
+    if "youngs_modulus" in constants:
+        words = f"E {constants['youngs_modulus'] / 1e3:g} kPa, ν {constants['poissons_ratio']:g}"  # noqa: RUF001
+    else:
+        words = ", ".join(f"{name.replace('_', ' ')} {constants[name] / 1e3:g} kPa" for name in [*constants][:-3])
+    return words if model == "corotated" else f"{words}, {model.replace('_', ' ')}"

@@ -18,9 +18,8 @@ from warp_resphys.io.files import read_json, write_json
 from warp_resphys.io.stages import StageContext
 from warp_resphys.mesh.mesh import Mesh, box_hexahedra
 from warp_resphys.mesh.readers import write_mesh
-from warp_resphys.report import page as page_module
 from warp_resphys.report.data import best_and_worst
-from warp_resphys.report.page import NONE, Picture
+from warp_resphys.report.page import NONE, Canvas, Drawn, Picture
 
 BEAM = beam.config()
 FIGURES_OF_AN_ARM = {
@@ -33,11 +32,11 @@ FIGURES_OF_AN_ARM = {
 def no_figures(no_drawing, monkeypatch):
     """Figures are drawn in tests of their own; here their names are kept."""
 
-    def draw(folder, name, _, alt):
-        (folder / f"{name}.png").touch()
-        return Picture("data:,", "data:,", alt)
+    def figure(canvas, name, _, alt, caption):
+        (canvas.folder / f"{name}.png").touch()
+        return Drawn(name, caption, Picture("data:,", "data:,", alt))
 
-    monkeypatch.setattr(page_module, "draw_picture", draw)
+    monkeypatch.setattr(Canvas, "figure", figure)
 
 
 def figures_in(folder):

@@ -133,15 +133,14 @@ def test_why_nothing_can_be_drawn(tmp_path, monkeypatch, script, time_out, reaso
 
 
 @pytest.mark.usefixtures("can_draw")
-def test_one_process_draws_scene_after_scene_until_it_is_forgotten():
+def test_one_process_draws_scene_after_scene():
     mesh = box_hexahedra(divisions=(1, 1, 1))
-    scene = distance_scene(mesh, {"box": mesh.vertices}, mesh.vertices)
-    renderer = render.Renderer()
-    first, second = (list(renderer.frames(scene)) for _ in range(2))
-    np.testing.assert_array_equal(first, second)
-    ended = renderer._end.peek()[2][0]
-    del renderer
-    assert ended.poll() is not None
+    small = distance_scene(mesh, {"box": mesh.vertices}, mesh.vertices)
+    wide = distance_scene(mesh, {"box": mesh.vertices, "other": mesh.vertices}, mesh.vertices)
+    with render.Renderer() as renderer:
+        (first,), (both,), (again,) = (list(renderer.frames(scene)) for scene in (small, wide, small))
+    np.testing.assert_array_equal(first, again)
+    assert both.shape[1] == 2 * first.shape[1]
 
 
 @pytest.mark.usefixtures("can_draw")

@@ -1,5 +1,7 @@
 """Tables of the page, and which trials, markers and frames are shown."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ from warp_resphys.learning.metrics import PUBLISHED_MM, PUBLISHED_WINDOWS_MM, me
 from warp_resphys.mesh.mesh import box_hexahedra
 from warp_resphys.report.bodies import instants
 from warp_resphys.report.camera import axes_from_below, motion_axes
+from warp_resphys.report.control_section import control_section
 from warp_resphys.report.data import along_body, at_times, drawn_markers, mean_distance, shown_models, tip_markers
 from warp_resphys.report.identification_section import parameter_rows, placement_text, uncertainty_text
 from warp_resphys.report.page import MINUS, NO_BREAK_SPACE, NONE, Cell
@@ -73,6 +76,28 @@ class TestErrors:
         markers[0, :, 0, 0], markers[0, :, 1, 2] = 0.001, 0.003
         markers[0, 2:, 0] = np.nan
         np.testing.assert_allclose(mean_distance(markers, measured)[0], [2.0, 3.0, np.nan, np.inf])
+
+
+def test_control_is_told_by_controller_and_speed():
+    errors = {"mean_mm": 1.0, "max_mm": 2.0}
+    metrics = {
+        "tracking": {"4.0": {"open_sysid": errors, "receding_resphys": {**errors, "mean_mm": 0.5}}, "2.0": {}},
+        "reduced": {"sysid": dict.fromkeys(("modes", "window_s", "window_error_mm", "whole_error_mm"), 1)},
+        "planned_mm": {"sysid": {"eight": [3.0, 0.5, 1.0], "circle": [5.0, 1.5]}},
+        "command_ms": {"receding_resphys": {"median": 2.0, "largest_of_20": 4.0}, "open_sysid": {}},
+    }
+    metrics["reduced"]["sysid"]["window_relative"] = 0.01
+    control = {"seconds": [4.0], "shapes": ["eight"], "tracked": ["A", "B"], "size": 0.04}
+    data = SimpleNamespace(metrics={"control": metrics}, settings={"control": control}, followed=())
+    task, table, _, facts = control_section(data, None).blocks
+    assert "the mean of A and B, follows 1 paths (eight) of 40 mm" in task.text
+    plan, receding = table.rows
+    assert plan.head == "SysID, open loop"
+    assert plan.cells == [Cell("1.000", beside="at most 2.000"), Cell(NONE)]
+    assert (receding.answer, plan.answer) == (True, False)
+    assert any("to 1.000 mm after corrections" in said and "to 4.000 mm before" in said for said in facts.items)
+    assert any("a command takes 2.0 ms" in said for said in facts.items)
+    assert control_section(SimpleNamespace(metrics={}, settings={"control": None}), None) is None
 
 
 class TestIdentification:

@@ -14,7 +14,7 @@ _SIZE: Final = (480, 480)  # px
 _TURN, _TILT = np.radians(-35.0), np.radians(20.0)  # of the eye, about the vertical and over the horizon
 _MARGIN: Final = 0.12  # around what is shown, over its longer side
 _GOAL: Final = "#d1495b"
-_RADII: Final = {"marker": 0.015, "goal": 0.024}  # over half the height of the picture
+_RADII: Final = {"marker": 0.015, "goal": 0.022}  # over half the height of the picture
 _BEFORE: Final = {"edges": 0.01, "goals": 4.0, "markers": 5.0}  # the body, over the same
 
 
@@ -64,7 +64,7 @@ class Camera:
         before = {name: self._half * share for name, share in _BEFORE.items()}
         radii = {name: self._half * share for name, share in _RADII.items()}
         layers = [
-            Layer("rings", paths[:, :1], None, _GOAL, size=radii["goal"], shift=before["goals"]),
+            Layer("balls", paths[:, :1], None, _GOAL, size=radii["goal"], shift=before["goals"]),
             Layer("balls", markers, None, INK, size=radii["marker"], shift=before["markers"]),
         ]
         if most > 1:

@@ -1,16 +1,14 @@
 """The section on control: how well paths are followed on the simulated laboratory, and how that was planned."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
+from statistics import fmean
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .data import MODELS, RunReport
 from .page import NONE, Canvas, Cell, Items, Part, Row, Table, Text, mm_text, number_text, percent_text
-
-FloatArray = NDArray[np.float64]
 
 _KINDS: Final[Mapping[str, tuple[str, str]]] = {  # by the beginning of a controller's name: its name and its meaning
     "open_": ("{}, open loop", "planned once, on the whole path, and played"),
@@ -21,13 +19,13 @@ _KINDS: Final[Mapping[str, tuple[str, str]]] = {  # by the beginning of a contro
 
 
 def control_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """How well paths are followed; None where there is no control, or no simulation that plays the robot."""
+    """Return how well paths are followed; None where nothing is controlled, or no simulation plays the robot."""
     from . import control_figures
 
-    found, control = data.metrics.get("control") or {}, data.settings.get("control")
-    if not found or control is None:
+    metrics, control = data.metrics.get("control") or {}, data.settings.get("control")
+    if not metrics or control is None:
         return None
-    blocks: list[Any] = [Text(_what(control), "control"), _table(found["tracking"])]
+    blocks: list[Any] = [Text(_task(control), "control"), _table(metrics["tracking"])]
     slowest = max(control["seconds"])
     drawn = [each for each in data.followed if each.seconds == slowest]
     if drawn:
@@ -43,12 +41,12 @@ def control_section(data: RunReport, canvas: Canvas) -> Part | None:
         blocks.append(
             canvas.figure("control", partial(control_figures.followed_paths, drawn, named, plane), alt, caption)
         )
-    blocks += [Text("How it was planned", heading=True), Items(_facts(found), "planned")]
+    blocks += [Text("How it was planned", heading=True), Items(_facts(metrics), "planned")]
     return Part("Control", blocks)
 
 
 def controller_name(controller: str) -> str:
-    """In words."""
+    """Return the name of a controller in words."""
     return _words(controller)[0]
 
 
@@ -60,7 +58,7 @@ def _words(controller: str) -> tuple[str, str]:
     return name.format(MODELS[rest][0] if rest in MODELS else rest), meaning
 
 
-def _what(control: Mapping[str, Any]) -> str:
+def _task(control: Mapping[str, Any]) -> str:
     shapes, tracked = control["shapes"], control["tracked"]
     named = f"the mean of {', '.join(tracked[:-1])} and {tracked[-1]}" if len(tracked) > 1 else tracked[0]
     return (
@@ -71,53 +69,45 @@ def _what(control: Mapping[str, Any]) -> str:
 
 
 def _table(tracking: Mapping[str, Any]) -> Table:
-    speeds = list(tracking)
+    first = next(iter(tracking.values()))
+    best = min(first, key=lambda controller: float(first[controller]["mean_mm"]))
+
+    def cell(errors: Mapping[str, Any] | None) -> Cell:
+        if errors is None:
+            return Cell(NONE)
+        return Cell(number_text(errors["mean_mm"]), beside=f"at most {number_text(errors['max_mm'])}")
+
     rows = []
-    best = min(tracking[speeds[0]], key=lambda each: float(tracking[speeds[0]][each]["mean_mm"]))
-    for controller in tracking[speeds[0]]:
-        cells = []
-        for speed in speeds:
-            each = tracking[speed].get(controller)
-            cells.append(
-                Cell(NONE)
-                if each is None
-                else Cell(number_text(each["mean_mm"]), beside=f"at most {number_text(each['max_mm'])}")
-            )
+    for controller in first:
         name, meaning = _words(controller)
-        rows.append(Row(name, cells, controller == best, meaning))
-    return Table("Mean error of the point [mm]", [f"Paths in {float(speed):g} s" for speed in speeds], rows)
+        rows.append(Row(name, [cell(each.get(controller)) for each in tracking.values()], controller == best, meaning))
+    return Table("Mean error of the point [mm]", [f"Paths in {float(speed):g} s" for speed in tracking], rows)
 
 
 def compared_controllers(control: Mapping[str, Any]) -> list[str]:
-    """Those that are drawn of the group ``control``: what most can be compared by."""
+    """Return the controllers of the group ``control`` that are drawn."""
     models = [model for model in control["models"] if model in ("sysid", control["models"][-1])]
     return [*(f"open_{model}" for model in models), *(f"receding_{model}" for model in control["receding"][-1:])]
 
 
-def _facts(found: Mapping[str, Any]) -> list[str]:
+def _facts(metrics: Mapping[str, Any]) -> list[str]:
     said = []
-    for model, told in found["reduced"].items():
-        window, whole = mm_text(told["window_error_mm"]), mm_text(told["whole_error_mm"])
+    for model, reduced in metrics["reduced"].items():
+        window, whole = mm_text(reduced["window_error_mm"]), mm_text(reduced["whole_error_mm"])
         said.append(
-            f"{MODELS[model][0]} in {told['modes']} modes: over {told['window_s']:g} s, {window} from the full model, "
-            f"{percent_text(told['window_relative'], 1)} of its motion; over whole motions, {whole}."
+            f"{MODELS[model][0]} in {reduced['modes']} modes: over {reduced['window_s']:g} s, {window} from the full "
+            f"model, {percent_text(reduced['window_relative'], 1)} of its motion; over whole motions, {whole}."
         )
-    for model, motions in found["planned_mm"].items():
-        first, last = (
-            float(np.mean([series[at] if at == 0 else min(series) for series in _whole(motions)])) for at in (0, -1)
-        )
+    for model, motions in metrics["planned_mm"].items():  # By motion: the error before and after each correction.
+        first, last = fmean(each[0] for each in motions.values()), fmean(min(each) for each in motions.values())
         said.append(
             f"{MODELS[model][0]} follows its own plans to {mm_text(last)} after corrections by its full simulator, to "
             f"{mm_text(first)} before."
         )
-    for controller, times in found["command_ms"].items():
+    for controller, times in metrics["command_ms"].items():
         if controller.startswith("receding_"):
             said.append(
                 f"{controller_name(controller)}: a command takes {times['median']:.1f} ms, 95 % of them less than "
                 f"{times['largest_of_20']:.1f} ms, estimate and plan together, on one core."
             )
     return said
-
-
-def _whole(motions: Mapping[str, Sequence[float]]) -> list[list[float]]:
-    return [list(each) for each in motions.values()]

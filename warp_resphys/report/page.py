@@ -151,8 +151,22 @@ class Canvas:
     missing: set[str] = field(default_factory=set)  # Why something cannot be drawn on this machine.
 
     def figure(self, name: str, draw: "Callable[..., Drawing]", alt: str, caption: str) -> Drawn:
-        """Return a figure in two widths; see `draw_picture`."""
-        return Drawn(name, caption, draw_picture(self.folder, name, draw, alt))
+        """Draw a figure in two widths, for a wide and for a narrow page, and save the wide one as a PNG file.
+
+        Args:
+            name: Of the figure, and of the file.
+            draw: Makes the figure; takes the keyword `narrow`.
+            alt: What it shows, in words.
+            caption: What stands below.
+        """
+        from . import figures
+
+        both = [draw(narrow=narrow) for narrow in (False, True)]
+        for figure in both:
+            figures.settle(figure)
+        figures.save_png(both[0], self.folder / f"{name}.png")
+        wide, narrow = (data_address(figures.themed_svg(figure, name), "image/svg+xml") for figure in both)
+        return Drawn(name, caption, Picture(wide, narrow, alt))
 
     def attempt(self, file: str, draw: Callable[[Path], Drawn]) -> list[Block]:
         """Return what is drawn into a file, or why it cannot be, unless that was said before.
@@ -187,25 +201,6 @@ def figures_beside(path: Path) -> Iterator[Path]:
         if is_disk_full(error):
             raise disk_full_error(folder) from error
         raise DataFileError(f"cannot write figures to {folder}: {error.strerror or error}") from error
-
-
-def draw_picture(folder: Path, name: str, draw: "Callable[..., Drawing]", alt: str) -> Picture:
-    """Draw a figure in two widths, for a page, and save the wide one as a PNG file.
-
-    Args:
-        folder: Of the PNG file.
-        name: Of the figure, and of the file.
-        draw: Makes the figure; takes the keyword `narrow`.
-        alt: What it shows, in words.
-    """
-    from . import figures
-
-    both = [draw(narrow=narrow) for narrow in (False, True)]
-    for figure in both:
-        figures.settle(figure)
-    figures.save_png(both[0], folder / f"{name}.png")
-    wide, narrow = (data_address(figures.themed_svg(figure, name), "image/svg+xml") for figure in both)
-    return Picture(wide, narrow, alt)
 
 
 def write_page(

@@ -29,8 +29,9 @@ def main() -> None:
     source = sys.stdin.buffer
     target = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # What VTK prints is no frame.
+    drawer = _Drawer()
     while (scene := _read(source)) is not None:
-        for frame in _frames(scene):
+        for frame in drawer.frames(scene):
             target.write(struct.pack("<3I", *frame.shape))
             target.write(frame.tobytes())
         target.write(bytes(12))
@@ -52,46 +53,64 @@ def _read(source: BinaryIO) -> Any:
     return json.loads(str(arrays.pop("spec")), object_hook=named)
 
 
-def _frames(scene: Any) -> Iterator[Pixels]:
-    """(H, V * W, 3 | 4) of each frame."""
-    import pyvista
+class _Drawer:
+    """Draws scenes into a window, which is kept for the next scene of the same layout."""
 
-    views, (width, height), white = scene.views, scene.size, scene.background
-    plotter: Any = pyvista.Plotter(
-        shape=(1, len(views)), off_screen=True, border=False, lighting="none", window_size=[len(views) * width, height]
-    )
-    if scene.sorts:
-        plotter.render_window.SetMultiSamples(0)  # Depth peeling needs whole pixels.
-    else:
-        plotter.enable_anti_aliasing("msaa", multi_samples=_SAMPLES, all_renderers=True)
-    plotter.set_background(white or OUTLINE, all_renderers=True)  # Transparent, but for a share of it in smooth rims.
-    plotter.add_light(pyvista.Light(light_type="scene light", position=TOWARDS_LIGHT, focal_point=(0.0, 0.0, 0.0)))
-    things = []
-    for column, view in enumerate(views):
-        plotter.subplot(0, column)
-        things += [_DrawnLayer(plotter, layer, view.axes) for layer in view.layers]
-        if scene.sorts:
-            plotter.enable_depth_peeling(_PEELS)
-    time = _add_texts(plotter, scene) if scene.texts else None
-    for frame in range(max(len(scene.texts), *(len(thing.points) for thing in things))):
-        for thing in things:
-            thing.move(frame)
-        if time is not None:
-            time.input = scene.texts[frame]
-        for column, view in enumerate(views):
+    def __init__(self) -> None:
+        self._layout: tuple[Any, ...] = ()
+        self._plotter: Any = None
+
+    def _window(self, scene: Any) -> Any:
+        """An empty window with a light."""
+        import pyvista
+
+        (width, height), count = scene.size, len(scene.views)
+        if self._layout != (layout := (width, height, count, scene.sorts)):
+            size = [count * width, height]
+            self._plotter = pyvista.Plotter(
+                shape=(1, count), off_screen=True, border=False, lighting="none", window_size=size
+            )
+            self._layout = layout
+            if scene.sorts:
+                self._plotter.render_window.SetMultiSamples(0)  # Depth peeling needs whole pixels.
+            else:
+                self._plotter.enable_anti_aliasing("msaa", multi_samples=_SAMPLES, all_renderers=True)
+        self._plotter.clear()
+        # Where it is transparent, smooth rims have a share of the background's colour.
+        self._plotter.set_background(scene.background or OUTLINE, all_renderers=True)
+        light = {"light_type": "scene light", "position": TOWARDS_LIGHT, "focal_point": (0.0, 0.0, 0.0)}
+        self._plotter.add_light(pyvista.Light(**light))
+        return self._plotter
+
+    def frames(self, scene: Any) -> Iterator[Pixels]:
+        """(H, V * W, 3 | 4) of each frame."""
+        plotter, layers = self._window(scene), []
+        plotter.suppress_rendering = True  # Which a window that was used does with everything that is added to it.
+        for column, view in enumerate(scene.views):
             plotter.subplot(0, column)
-            focus, distance = _at(np.atleast_2d(view.focus), frame), _FAR * view.half_height
-            plotter.camera.position = focus + distance * view.axes[2]
-            plotter.camera.focal_point, plotter.camera.up = focus, view.axes[1]
-            plotter.enable_parallel_projection()
-            plotter.camera.parallel_scale = view.half_height
-            plotter.camera.clipping_range = (0.05 * distance, 2.0 * distance)
-        plotter.render()
-        picture = plotter.screenshot(None, transparent_background=not white, return_img=True)
-        if not white and not picture[..., 3].any():
-            raise RuntimeError("the picture is empty")
-        yield picture
-    plotter.close()
+            layers += [_DrawnLayer(plotter, layer, view.axes) for layer in view.layers]
+            if scene.sorts:
+                plotter.enable_depth_peeling(_PEELS)
+        time = _add_texts(plotter, scene) if scene.texts else None
+        plotter.suppress_rendering = False
+        for frame in range(max(len(scene.texts), *(len(layer.points) for layer in layers))):
+            for layer in layers:
+                layer.move(frame)
+            if time is not None:
+                time.input = scene.texts[frame]
+            for column, view in enumerate(scene.views):
+                plotter.subplot(0, column)
+                focus, distance = _at(np.atleast_2d(view.focus), frame), _FAR * view.half_height
+                plotter.camera.position = focus + distance * view.axes[2]
+                plotter.camera.focal_point, plotter.camera.up = focus, view.axes[1]
+                plotter.enable_parallel_projection()
+                plotter.camera.parallel_scale = view.half_height
+                plotter.camera.clipping_range = (0.05 * distance, 2.0 * distance)
+            plotter.render()
+            picture = plotter.screenshot(None, transparent_background=not scene.background, return_img=True)
+            if not scene.background and not picture[..., 3].any():
+                raise RuntimeError("the picture is empty")
+            yield picture
 
 
 def _at(values: FloatArray, frame: int) -> Any:

@@ -63,6 +63,8 @@ class TestGains:
         worse = {"sysid": PublishedError(1.0, 0.1), "resphys": PublishedError(1.5, 0.1)}
         assert "; published: 50.0 % more)" in said_of("resphys", gains(errors, {}, worse))
         assert "published" not in said_of("resphys", gains(errors, {}, published_errors("my_robot")))
+        identified = gains({"simulation": [3.0, 3.0], **errors}, {}, PUBLISHED_MM["sopra"])
+        assert "published" not in said_of("sysid", identified)  # They identify other parameters.
 
     @pytest.mark.parametrize(
         ("after", "said"),

@@ -112,7 +112,7 @@ def make_folds_report(context: StageContext) -> None:
 
 
 def _common_parts(config: Mapping[str, Any], metrics: Mapping[str, Any], mesh: Mesh) -> dict[str, Any]:
-    """What all pages show."""
+    """The parts of the report that all pages have."""
     return {
         "metrics": metrics,
         "settings": config,
@@ -123,7 +123,7 @@ def _common_parts(config: Mapping[str, Any], metrics: Mapping[str, Any], mesh: M
 
 
 def common_folder(folder: Path) -> Path:
-    """Where the files lie that do not depend on the fold: here, or beside the folders of the folds."""
+    """Folder of the files that do not depend on the fold: this one, or the one that has the folds' folders."""
     return folder if (folder / DATASET).is_file() else folder.parent
 
 
@@ -134,7 +134,7 @@ def _histories(folder: Path, refined: bool) -> dict[str, Any]:
 
 
 def collect_metrics(folder: Path, config: Mapping[str, Any], stages: Sequence[str] | None = None) -> dict[str, Any]:
-    """What metrics.json of a split says.
+    """Content of metrics.json of a split.
 
     Errors, the noise in them where known, which weights were kept, what was identified and reconstructed, time and
     memory of the stages (those that are done in the order of their end, if left out), versions and device.
@@ -167,13 +167,13 @@ def collect_metrics(folder: Path, config: Mapping[str, Any], stages: Sequence[st
 
 
 def data_sheet(config: Mapping[str, Any], identification: Mapping[str, Any]) -> dict[str, float]:
-    """What the simulator has of all that was identified, and of what the landscape is drawn over."""
-    names = {name for found in identification.values() for name in found.get("parameters", {})}
+    """Values on the data sheet of the identified parameters and of those of the landscape."""
+    names = {name for identified in identification.values() for name in identified.get("parameters", {})}
     return configured_parameters(config, (*names, "youngs_modulus", "poissons_ratio"))
 
 
 def read_trials(folder: Path, config: Mapping[str, Any]) -> TrialResults:
-    """What was observed in the test trials of a split and what the models made of them, as long as it counts.
+    """Reads the observations of the test trials of a split and the models' roll-outs, for the time that counts.
 
     Roll-outs at other inputs than those of the data set are left out.
 
@@ -218,7 +218,7 @@ def read_trials(folder: Path, config: Mapping[str, Any]) -> TrialResults:
 
 
 def _seen(config: Mapping[str, Any], dataset: Dataset) -> dict[str, Any]:
-    """How markers are seen, for the pictures."""
+    """Along which axes and in which frame markers are seen, for the pictures."""
     labels = dataset.labels
     if not labels:
         return {}
@@ -257,10 +257,10 @@ def _as_seen(film: Film, dataset: Dataset, config: Mapping[str, Any], mesh: Mesh
 
 
 def read_followed(folder: Path, config: Mapping[str, Any]) -> list[FollowedPath]:
-    """How controllers have driven a simulated laboratory; nothing where they have not."""
+    """Reads the paths that controllers followed on a simulated laboratory; empty without control."""
     if config["control"] is None or config["laboratory"] is None:
         return []
-    found = []
+    followed = []
     with read_hdf5(folder / DRIVEN, "driven") as file:
         controllers = [str(each) for each in file.attrs["controllers"]]
         for name in map(str, file.attrs["names"]):
@@ -268,12 +268,12 @@ def read_followed(folder: Path, config: Mapping[str, Any]) -> list[FollowedPath]
             path = read_array(file, f"{name}/path", (None, 3)).astype(np.float64)
             points = read_array(file, f"{name}/points", (len(controllers), len(path), 3)).astype(np.float64)
             by_name = dict(zip(controllers, points, strict=True))
-            found.append(FollowedPath(name=shape, seconds=float(seconds), path=path, points=by_name))
-    return found
+            followed.append(FollowedPath(name=shape, seconds=float(seconds), path=path, points=by_name))
+    return followed
 
 
 def read_driven(folder: Path, config: Mapping[str, Any]) -> Driven | None:
-    """What drives all trials of a split; None where nothing does."""
+    """Reads the inputs of all trials of a split; None without inputs."""
     dataset, scaled = read_dataset(common_folder(folder) / DATASET), _read_scaled(folder)
     quantity = driving_quantity(config)
     if quantity is None or quantity.name not in dataset.inputs:
@@ -300,17 +300,17 @@ def _routes(config: Mapping[str, Any], mesh: Mesh) -> dict[str, FloatArray]:
 
 
 def _driven_chambers(chambers: tuple[Chamber, ...], names: tuple[str, ...]) -> tuple[Chamber, ...]:
-    """Those of a body's chambers that are under pressure, in the order of the pressures."""
+    """The chambers of a body that are under pressure, in the order of the pressures."""
     if not chambers:
         return ()
-    found = {chamber.name: chamber for chamber in chambers}
-    unknown = [name for name in names if name not in found]
+    by_name = {chamber.name: chamber for chamber in chambers}
+    unknown = [name for name in names if name not in by_name]
     if unknown:
         raise DataFileError(
             f"{DATASET} has pressures of {', '.join(unknown)}, but the body's chambers are "
-            f"{', '.join(found) or 'none'}: take the mesh that the trials were imported for."
+            f"{', '.join(by_name) or 'none'}: take the mesh that the trials were imported for."
         )
-    return tuple(found[name] for name in names)
+    return tuple(by_name[name] for name in names)
 
 
 def _at_rest(mesh: Mesh, trials: TrialResults, film: Film | None) -> tuple[Mesh, dict[str, FloatArray]]:

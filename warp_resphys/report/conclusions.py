@@ -20,6 +20,7 @@ _STEPS: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = {
 }
 _BASES: Final = {"simulation": "the uncorrected simulation", "sysid": "SysID"}
 _PLACES: Final = {"sysid": "parameters", "sysid_elastic": "elastic"}  # In the group `identify`.
+_LEARNED: Final = ("simfree", "resphys")  # Whose gains are published; what was identified differs.
 _CLOSE: Final = 1e-4  # Of a parameter's range.
 _REFINED: Final = "_refined"  # What a network refined through the simulator is called, after its model.
 _CALIBRATED: Final[Mapping[str, str]] = {  # Where prediction intervals come from.
@@ -104,14 +105,15 @@ def gains(
     Args:
         errors: of each model on the same held-out trials [mm], None where its roll-out diverged.
         epochs: kept by the learned models, in each fold.
-        published: errors [mm], of which the gain is named beside ours.
+        published: errors [mm], of which the gains of learned models are named beside ours.
     """
     said, theirs = [], published or {}
     for model, (name, bases) in _STEPS.items():
         base = next((each for each in bases if each in errors), None)
         if model not in errors or base is None:
             continue
-        beside = _beside(theirs[base].mean, theirs[model].mean) if {model, base} <= theirs.keys() else ""
+        compared = model in _LEARNED and {model, base} <= theirs.keys()
+        beside = _beside(theirs[base].mean, theirs[model].mean) if compared else ""
         sentence = _gain(name, _BASES[base], errors[model], errors[base], list(epochs.get(model, ())), beside)
         said.append(sentence[0].upper() + sentence[1:])
     if said and all(len(each) == 1 for each in errors.values()):
@@ -120,7 +122,7 @@ def gains(
 
 
 def _beside(before: float, after: float) -> str:
-    """What was published of the same gain."""
+    """The published gain."""
     return f"; published: {100.0 * abs(1.0 - after / before):.1f} % {'less' if after <= before else 'more'}"
 
 
@@ -166,25 +168,27 @@ def advice(folds: Sequence[Sequence[Identified]]) -> list[str]:
     return [f"In {n} of {len(folds)} folds, {said}" if len(folds) > 1 else said for said, n in counted.items()]
 
 
-def _advice(found: Identified) -> str:
-    close, name = _CLOSE * (found.upper - found.lower), found.key.rpartition(".")[2]
-    for end, bound in (("lower", found.lower), ("upper", found.upper)):
-        if abs(found.value - bound) <= close:
-            widen = f"widen {found.key}.{end} if the body can be so" if bound else f"take it out (~{found.key})"
+def _advice(identified: Identified) -> str:
+    close, name = _CLOSE * (identified.upper - identified.lower), identified.key.rpartition(".")[2]
+    for end, bound in (("lower", identified.lower), ("upper", identified.upper)):
+        if abs(identified.value - bound) <= close:
+            widen = (
+                f"widen {identified.key}.{end} if the body can be so" if bound else f"take it out (~{identified.key})"
+            )
             return (
                 f"{name} was identified at its {end} bound, {bound:g}: {widen}, or look for what it makes up for, "
                 "such as a wrong weight, mesh or registration."
             )
-    if found.has_prior or abs(found.value - found.start) > close:
+    if identified.has_prior or abs(identified.value - identified.start) > close:
         return ""
     return (
-        f"{name} stayed at its first guess, {found.start:g}: raise identify.max_evaluations or identify.starts, or "
-        f"take it out (~{found.key}) if the trials do not tell about it."
+        f"{name} stayed at its first guess, {identified.start:g}: raise identify.max_evaluations or identify.starts, "
+        f"or take it out (~{identified.key}) if the trials do not tell about it."
     )
 
 
 def _identified(metrics: Mapping[str, Any], settings: Mapping[str, Any]) -> list[Identified]:
-    """What a fold has identified, beside how that is configured."""
+    """The identified parameters of a fold, with their configured ranges."""
     config = settings.get("identify") or {}
     identified = []
     for model, place in _PLACES.items():

@@ -1,4 +1,4 @@
-"""What the page of a run may show; whatever a run does not have is left out."""
+"""Data that the page of a run shows; whatever a run does not have is left out."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -34,7 +34,7 @@ _OTHER: Final = 0.25  # How far from the tip's height another marker must be to 
 
 @dataclass(frozen=True, eq=False)
 class TrialResults:
-    """What was observed in the R test trials, and what the models made of them."""
+    """Observations of the R test trials, and the roll-outs of the models in them."""
 
     names: tuple[str, ...]
     labels: tuple[str, ...]  # Of the M markers; empty where all vertices are observed, so that M = N.
@@ -66,7 +66,7 @@ class TrialResults:
 
     @property
     def moves(self) -> bool:
-        """Whether there is time in it, and not only poses."""
+        """Whether there are motions, and not only poses."""
         return self.target.shape[1] > 1
 
 
@@ -93,7 +93,7 @@ class Driven:
 
 @dataclass(frozen=True, eq=False)
 class Recordings:
-    """How the recordings are, and how they were registered."""
+    """Quality of the recordings, and their registration on the body."""
 
     quality: Mapping[str, Any]  # By trial, as `warp_resphys.data.recordings.quality.Quality.to_plain` gives it.
     residuals: Mapping[str, Any]  # By trial: `rms_mm`, `residual_mm` and `shift_mm` by label, `outliers`.
@@ -119,7 +119,7 @@ class FollowedPath:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RunReport:
-    """What the page of a run, of a fold, or over the folds may show."""
+    """Data of the page of a run, of a fold, or over the folds."""
 
     metrics: Mapping[str, Any]  # What `metrics.json` holds of a split, or of all folds.
     settings: Mapping[str, Any]  # The run's configuration, nested.
@@ -163,12 +163,12 @@ class RunReport:
 
     @property
     def models(self) -> list[str]:
-        """Those that there are errors of, in the order of the tables."""
+        """Models that have errors, in the order of the tables."""
         return [model for model in MODELS if model in self.metrics["errors_mm"]]
 
     @property
     def seconds(self) -> float | None:
-        """How much of each trial counts after its release; None for all of it."""
+        """Seconds of each trial after its release that count; None for all of it."""
         seconds: float | None = self.settings["data"].get("seconds")
         return seconds
 
@@ -207,15 +207,15 @@ def shown_models(positions: Mapping[str, Any]) -> list[str]:
     return [m for m in (plain, solid) if m is not None]
 
 
-def at_times(positions: FloatArray, known: FloatArray, times: FloatArray) -> FloatArray:
-    """Return (T, N, 3) positions at some times, linear between those that are known.
+def at_times(positions: FloatArray, frames: FloatArray, times: FloatArray) -> FloatArray:
+    """Return (T, N, 3) positions at some times, linear between the frames.
 
     Args:
         positions: (F, N, 3) [m]; what is not finite is not used where it has no weight.
-        known: (F,) increasing times of these [s].
+        frames: (F,) increasing times of the positions [s].
         times: (T,) [s]; before the first and after the last one nothing moves.
     """
-    at = np.interp(times, known, np.arange(len(known), dtype=np.float64))
+    at = np.interp(times, frames, np.arange(len(frames), dtype=np.float64))
     low = np.floor(at + 1e-9).astype(int)
     share = np.maximum(at - low, 0.0)[:, None, None]
     after = positions[np.minimum(low + 1, len(positions) - 1)]

@@ -56,7 +56,7 @@ class DrivenBodies:
         return Scene(views, FILM_VIEW, background="white", fps=fps, texts=texts)
 
     def _placed(self) -> Placement:
-        """Where points (..., 3) of the plane are in a drawing beside the body, larger and as seen from before it."""
+        """Places of points (..., 3) of the plane in a drawing beside the body, larger and seen from the front."""
         axes = path_axes(self.plane, self.gravity)
         body = np.concatenate([each.reshape(-1, 3) for each in self.positions.values()]) @ axes[:2].T
         low, high = body.min(axis=0), body.max(axis=0)
@@ -101,6 +101,6 @@ def _corners(points: FloatArray, apart: float) -> IntArray:
 
 
 def _colour(controller: str) -> str:
-    """Of its model, as in the figures."""
+    """Colour of the controller's model in the figures."""
     model = controller.partition("_")[2]
     return TONES[model if model in TONES else "ink"].light

@@ -112,8 +112,8 @@ def landscape(
         axes.plot(_KILO * modulus, curve, color=TONES["sysid"].light)
         use_logarithm(axes)
         axes.set_ylabel("loss")
-        known, e = np.isfinite(curve), np.array([e for e, _ in points.values()])
-        heights = np.interp(e, modulus[known], curve[known]) if known.any() else []
+        finite, e = np.isfinite(curve), np.array([e for e, _ in points.values()])
+        heights = np.interp(e, modulus[finite], curve[finite]) if finite.any() else []
         places = {name: (_KILO * e, float(h)) for (name, (e, _)), h in zip(points.items(), heights, strict=False)}
     for (name, place), marker in zip(places.items(), "oDs^", strict=False):
         tone = TONES["simulation"].light if marker == "D" else "white"

@@ -98,11 +98,11 @@ def _paths(
 
 def _bands(data: RunReport, trials: TrialResults, row: int, kept: Sequence[int]) -> dict[str, FloatArray]:
     """(T, M) half-widths [m] of the prediction intervals of some markers, by model, of the last one that has any."""
-    known = data.metrics.get("intervals", {}).get("models", {})
-    model = next((m for m in ("resphys", "sysid") if "factor" in known.get(m, {}) and m in trials.positions), None)
+    intervals = data.metrics.get("intervals", {}).get("models", {})
+    model = next((m for m in ("resphys", "sysid") if "factor" in intervals.get(m, {}) and m in trials.positions), None)
     if model is None:
         return {}
-    widths = Intervals.from_plain(known[model]).half_widths(trials.positions[model][row], trials.bound)
+    widths = Intervals.from_plain(intervals[model]).half_widths(trials.positions[model][row], trials.bound)
     return {model: widths[:, kept]}
 
 

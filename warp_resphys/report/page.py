@@ -144,7 +144,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Canvas:
-    """Where the figures of a page are drawn."""
+    """Draws the figures of a page into a folder."""
 
     folder: Path  # Of their files.
     started: Mapping[str, "Future[Any]"] = field(default_factory=dict)  # What other processes draw already, by name.
@@ -282,8 +282,8 @@ def mm_text(value: float | None) -> str:
 
 def largest_text(errors: NDArray[np.float64]) -> str:
     """Return the largest of errors [mm] in words; NaN is left out, what is infinite has diverged."""
-    known = errors[~np.isnan(errors)]
-    return mm_text(float(known.max())) if len(known) and np.isfinite(known).all() else "infinity (it diverged)"
+    values = errors[~np.isnan(errors)]
+    return mm_text(float(values.max())) if len(values) and np.isfinite(values).all() else "infinity (it diverged)"
 
 
 def error_parts(summary: Mapping[str, Any]) -> tuple[str, str]:

@@ -47,7 +47,7 @@ class Panel:
 
     @property
     def inch(self) -> float:
-        """How much of the body an inch of the picture is [m]."""
+        """Length on the body that an inch of the picture shows [m]."""
         return float(2.0 * self.half.max() / _LONGER_SIDE)
 
     @property
@@ -91,11 +91,11 @@ def draw_registration(path: Path, recordings: Recordings, fixed: IntArray) -> No
 
 def panels_of(points: FloatArray) -> list[Panel]:
     """Return the panels, which hold all points (P, 3) [m] with a margin around them."""
-    found = []
+    panels = []
     for title, towards in _VIEWS.items():
         axes = view_axes(towards)
-        found.append(Panel(title, axes, *frame_of(points, axes, _MARGIN)))
-    return found
+        panels.append(Panel(title, axes, *frame_of(points, axes, _MARGIN)))
+    return panels
 
 
 def registration_layers(
@@ -225,7 +225,7 @@ def spread(heights: FloatArray, least: float) -> FloatArray:
 
 
 def _legend() -> list[Any]:
-    """What the marks are."""
+    """Handles of the legend."""
     none: dict[str, Any] = {"linestyle": "none", "marker": "o"}
     hollow: dict[str, Any] = {"markerfacecolor": "none", "markeredgewidth": 1.5}
     return [

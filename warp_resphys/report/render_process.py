@@ -114,7 +114,7 @@ class _Drawer:
 
 
 def _at(values: FloatArray, frame: int) -> Any:
-    """What there is of (1 | F, ...) in a frame."""
+    """The value of a frame, of constant (1, ...) or moving (F, ...) values."""
     return values[min(frame, len(values) - 1)]
 
 

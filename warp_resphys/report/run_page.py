@@ -155,7 +155,7 @@ def published_beside(published: Mapping[str, Any], models: Sequence[str]) -> dic
 
 
 def _what_is_measured(data: RunReport) -> str:
-    """Which distances the errors are means of, and what else there is to say of them."""
+    """Definition of the errors, with notes on what they contain."""
     trials, span = data.trials, ""
     if data.seconds is not None:
         span = f", the frames of the first {data.seconds:g} s after the release,"
@@ -181,20 +181,20 @@ def _what_is_measured(data: RunReport) -> str:
             f"{_count(len(trials.names), 'test trial')}, {_count(steps, 'step')} and {len(data.mesh.vertices)} "
             "vertices, ± the standard deviation over trials and steps of the mean over the vertices."
         )
-    found = data.metrics.get("reconstruction", {})
-    learned = [_reconstruction_text(model, each, _observed(data)) for model, each in found.items()]
+    reconstructed = data.metrics.get("reconstruction", {})
+    learned = [_reconstruction_text(model, each, _observed(data)) for model, each in reconstructed.items()]
     published = [data.published_note] if data.published else []
     return unbroken(" ".join([said, *data.notes, *learned, *published]))
 
 
-def _reconstruction_text(model: str, found: Mapping[str, Any], of: str) -> str:
+def _reconstruction_text(model: str, reconstructed: Mapping[str, Any], of: str) -> str:
     said = (
         f"The reconstruction for {MODELS[model][0]} brings the {of} of the training trials to "
-        f"{mm_text(found['mean_mm'])} from the observed ones, {mm_text(found['max_mm'])} at most"
+        f"{mm_text(reconstructed['mean_mm'])} from the observed ones, {mm_text(reconstructed['max_mm'])} at most"
     )
-    if "replayed_mm" not in found:
+    if "replayed_mm" not in reconstructed:
         return f"{said}."
-    replayed = found["replayed_mm"]
+    replayed = reconstructed["replayed_mm"]
     lead = "make it fail on" if replayed is None else f"lead {mm_text(replayed)} from the {of} of"
     return f"{said}; replayed in the simulator, its forces {lead} the validation trials."
 
@@ -213,9 +213,9 @@ def range_texts(metrics: Mapping[str, Any], trials: Sequence[str]) -> list[str]:
     Metrics may have `range`, by model `first_s`: when a trial left [s]; and `scales_range`, by scale of the inputs.
     """
     said = []
-    found, beyond = metrics.get("range", {}), metrics.get("scales_range", {})
-    for model in (model for model in MODELS if model in found):
-        first = found[model]["first_s"]
+    left_by, beyond = metrics.get("range", {}), metrics.get("scales_range", {})
+    for model in (model for model in MODELS if model in left_by):
+        first = left_by[model]["first_s"]
         count = f"{len(first) or 'none'} of {len(trials)} roll-outs" if len(trials) > 1 else "the roll-out"
         never = " never" * (len(trials) == 1 and not first)
         text = f"{MODELS[model][0]}: {count}{never} left the states of the training{_when(first)}."
@@ -255,9 +255,9 @@ def error_section(data: RunReport, canvas: Canvas) -> Part | None:
     rows = {row["name"]: row["errors_mm"] for row in metrics["per_trajectory"]}
     if len(rows) > 1:
         blocks.append(model_table("Each trial [mm]", _numbers(rows)))
-    if found := metrics.get("per_marker"):
-        shown = [label for label in trials.labels if any(label in markers for markers in found.values())]
-        each = {label: {m: markers.get(label) for m, markers in found.items()} for label in shown}
+    if by_model := metrics.get("per_marker"):
+        shown = [label for label in trials.labels if any(label in markers for markers in by_model.values())]
+        each = {label: {m: markers.get(label) for m, markers in by_model.items()} for label in shown}
         blocks.append(model_table("Each marker [mm]", _numbers(each)))
     return Part("Error over time" if trials.moves else "Each trial", blocks) if blocks else None
 
@@ -281,17 +281,17 @@ def _error_caption(data: RunReport, window: float | None) -> str:
 
 def largest_filtered(metrics: Mapping[str, Any]) -> str:
     """Say how large the error of a single trial becomes with each model that did not diverge; empty where not known."""
-    found = metrics.get("median_filtered", {})
-    parts = [f"{mm_text(found[m])} ({MODELS[m][0]})" for m in MODELS if found.get(m) is not None]
+    largest = metrics.get("median_filtered", {})
+    parts = [f"{mm_text(largest[m])} ({MODELS[m][0]})" for m in MODELS if largest.get(m) is not None]
     return f"In single trials the filtered error reaches {', '.join(parts)}." if parts else ""
 
 
 def reconstruction_section(data: RunReport, canvas: Canvas) -> Part | None:
     """How far the roll-outs are from what the network learns."""
-    found = data.metrics.get("errors_vs_reconstruction_mm", {})
-    if not found:
+    errors = data.metrics.get("errors_vs_reconstruction_mm", {})
+    if not errors:
         return None
-    rows = [Row(MODELS[model][0], [_pair(error_parts(found[model]))]) for model in MODELS if model in found]
+    rows = [Row(MODELS[model][0], [_pair(error_parts(errors[model]))]) for model in MODELS if model in errors]
     said = (
         "The network learns from reconstructed trajectories. Their own distance from the target is in the first table; "
         "this is how far the roll-outs are from them."

@@ -137,13 +137,13 @@ def growth_text(
     published: Mapping[str, Mapping[str, PublishedError]],
 ) -> str:
     """Say how the error of ResPhys grows with the length of the roll-outs; empty where it is not known."""
-    found = growth.get("resphys")
-    if found is None or len(horizons) < 2:
+    own = growth.get("resphys")
+    if own is None or len(horizons) < 2:
         return ""
     first, *_, last = sorted(horizons, key=float)
     theirs = published_growth(published, first, last).get("resphys")
     beside = "" if theirs is None else f" (published: {100.0 * theirs:.1f} %)"
-    by = f"{'grows' if found >= 0.0 else 'falls'} by {100.0 * abs(found):.1f} %{beside}"
+    by = f"{'grows' if own >= 0.0 else 'falls'} by {100.0 * abs(own):.1f} %{beside}"
     return f"From {float(first):g} s to {float(last):g} s the error of ResPhys {by}."
 
 
@@ -158,6 +158,6 @@ def scale_text(errors: Mapping[str, Mapping[str, Any]]) -> str:
     if not errors:
         return ""
     largest = max(errors, key=float)
-    found = {m: errors[largest][m]["mean"] for m in ("resphys", "sysid", "simfree") if m in errors[largest]}
-    parts = ", ".join(f"{mm_text(mean)} with {MODELS[model][0]}" for model, mean in found.items())
+    means = {m: errors[largest][m]["mean"] for m in ("resphys", "sysid", "simfree") if m in errors[largest]}
+    parts = ", ".join(f"{mm_text(mean)} with {MODELS[model][0]}" for model, mean in means.items())
     return f"At {float(largest):g} times the inputs of the training the error is {parts}." if parts else ""

@@ -125,8 +125,8 @@ def reduced(displacements: FloatArray, tolerance: float, most: int) -> tuple[Flo
     """
     count, frames, *_ = displacements.shape
     rows = displacements.reshape(count * frames, -1)
-    known = np.isfinite(rows).all(axis=1)
-    remaining = rows[known].copy()
+    finite = np.isfinite(rows).all(axis=1)
+    remaining = rows[finite].copy()
     _, left = np.linalg.eigh(remaining @ remaining.T)  # There are fewer frames than coordinates, most often.
     basis = np.empty((0, rows.shape[1]))
     while len(basis) < min(most, left.shape[1]) and np.abs(remaining).max(initial=0.0) > tolerance:
@@ -134,10 +134,10 @@ def reduced(displacements: FloatArray, tolerance: float, most: int) -> tuple[Flo
         vector /= np.linalg.norm(vector)
         remaining -= np.outer(remaining @ vector, vector)
         basis = np.concatenate([basis, vector[None]])
-    if not len(basis):  # Of what is at rest, one that is nothing, so that its weights say which frames are known.
+    if not len(basis):  # Of what is at rest, one that is nothing, so that its weights say which frames are finite.
         basis = np.zeros((1, rows.shape[1]))
     weights = np.full((len(rows), len(basis)), np.nan)
-    weights[known] = rows[known] @ basis.T
+    weights[finite] = rows[finite] @ basis.T
     return basis, weights.reshape(count, frames, -1)
 
 

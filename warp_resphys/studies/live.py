@@ -66,13 +66,13 @@ class LiveRobot:
 
     def _limits(self, name: str) -> tuple[FloatArray, FloatArray]:
         """Least and greatest values of an input's parts."""
-        known = self._original.inputs[name]
+        robot_input = self._original.inputs[name]
         if name == BASE:
             far = np.repeat([_MOVED[0] * self.size, _MOVED[1]], 3)
             return -far, far
-        if known.low is None or known.high is None:
-            return np.zeros(len(known.parts)), np.full(len(known.parts), known.quantity.typical)
-        least, most = np.minimum(known.low, 0.0), np.maximum(known.high, 0.0)
+        if robot_input.low is None or robot_input.high is None:
+            return np.zeros(len(robot_input.parts)), np.full(len(robot_input.parts), robot_input.quantity.typical)
+        least, most = np.minimum(robot_input.low, 0.0), np.maximum(robot_input.high, 0.0)
         return _BEYOND * least, _BEYOND * most
 
     # What is shown
@@ -100,17 +100,17 @@ class LiveRobot:
             return None
         times, seen = self.trial.times, self.trial.markers
         frame = max(int(np.searchsorted(times, self.time + _ROUNDING, side="right")) - 1, 0)
-        found = seen[frame]
+        shown = seen[frame]
         if frame + 1 < len(times) and self.time > times[frame]:
             share = (self.time - times[frame]) / (times[frame + 1] - times[frame])
-            found = (1.0 - share) * found + share * seen[frame + 1] if share > _ROUNDING else found
-        return found if self._on_body is None else self._to_body(self._as_recorded()).apply(found)
+            shown = (1.0 - share) * shown + share * seen[frame + 1] if share > _ROUNDING else shown
+        return shown if self._on_body is None else self._to_body(self._as_recorded()).apply(shown)
 
     def _as_recorded(self) -> FloatArray:
         """(M, 3) the simulated markers in the frame of the recordings [m]."""
-        found = self.robot.observe(self.state)[0].double().cpu().numpy()
+        markers = self.robot.observe(self.state)[0].double().cpu().numpy()
         shift = None if self.trial is None else self.trial.shift
-        return np.asarray(found if shift is None else found + shift)
+        return np.asarray(markers if shift is None else markers + shift)
 
     def _to_body(self, recorded: FloatArray) -> RigidTransform:
         """From the frame of the recordings, in which markers (M, 3) are given, to that of the body."""
@@ -228,24 +228,24 @@ class LiveRobot:
 
 def _markers_on_body(robot: Robot) -> Markers | None:
     """Markers where they are on the body; None where they are seen so, and not in a frame of their own."""
-    known = robot.description
-    if known.markers is None or known.bound is None or not sight_of(known.markers, known.labels, known.sets).own:
+    about = robot.description
+    if about.markers is None or about.bound is None or not sight_of(about.markers, about.labels, about.sets).own:
         return None
-    found = bound_markers(known.markers, known.mesh, known.bound.numpy(), known.labels)
-    return found.to(robot.simulator.rest_positions)
+    markers = bound_markers(about.markers, about.mesh, about.bound.numpy(), about.labels)
+    return markers.to(robot.simulator.rest_positions)
 
 
 def _changeable(robot: Robot) -> dict[str, tuple[Quantity, float]]:
     """Parameters that are one number, identified ones first, with their values."""
-    simulator, found = robot.simulator, dict[str, tuple[Quantity, float]]()
+    simulator, changeable = robot.simulator, dict[str, tuple[Quantity, float]]()
     for name in (*robot.parameters, *MATERIAL):
         quantity = simulator.parameters.get(name)
-        if quantity is None or name in found or name == "gravity":
+        if quantity is None or name in changeable or name == "gravity":
             continue
         value = simulator.tensor(robot.parameters.get(name, simulator.constants.get(name, float("nan"))))
         if value.numel() == 1 and bool(torch.isfinite(value).all()):
-            found[name] = (quantity, float(value))
-    return found
+            changeable[name] = (quantity, float(value))
+    return changeable
 
 
 def range_of(quantity: Quantity, value: float) -> tuple[float, float]:

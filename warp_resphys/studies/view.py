@@ -106,7 +106,7 @@ def _free_port(host: str, port: int) -> int:
 
 
 class Page:
-    """What a browser shows of a robot, and what it asks for.
+    """The page of a robot in a browser, and the requests that come from there.
 
     The robot is stepped in the thread that calls `run`; what a browser asks for waits there for the next picture.
 
@@ -215,10 +215,10 @@ class Page:
             self._trial = gui.add_dropdown("Motion", (_BY_HAND, *trial_names(robot)), initial_value=name)
             self._trial.on_update(lambda _: self._ask(self._choose))
         self._sliders: dict[str, list[Any]] = {}
-        for name, known in robot.inputs.items():
-            words = f"{known.quantity.plural or known.name}".capitalize() if name != BASE else "Base"
-            with gui.add_folder(words, expand_by_default=known.low is not None):
-                self._sliders[name] = [self._slider(name, part) for part in range(len(known.parts))]
+        for name, robot_input in robot.inputs.items():
+            words = f"{robot_input.quantity.plural or robot_input.name}".capitalize() if name != BASE else "Base"
+            with gui.add_folder(words, expand_by_default=robot_input.low is not None):
+                self._sliders[name] = [self._slider(name, part) for part in range(len(robot_input.parts))]
         if live.parameters:
             with gui.add_folder("Material and other parameters", expand_by_default=False):
                 parameters = {name: self._parameter(name) for name in live.parameters}
@@ -235,13 +235,13 @@ class Page:
 
     def _slider(self, name: str, part: int) -> Any:
         """A slider for a part of an input, in the unit in which people read it."""
-        live, known = self._live, self._live.robot.inputs[name]
-        factor = known.quantity.shown_factor if known.quantity.shown_unit else 1.0
-        unit = known.quantity.shown_unit or known.unit
+        live, robot_input = self._live, self._live.robot.inputs[name]
+        factor = robot_input.quantity.shown_factor if robot_input.quantity.shown_unit else 1.0
+        unit = robot_input.quantity.shown_unit or robot_input.unit
         unit = ("m" if part < 3 else "rad") if name == BASE else unit
         low, high = (factor * float(limit[part]) for limit in live.limits[name])
         high = high if high > low else low + 1.0
-        label = f"{known.parts[part].replace('_', ' ')} [{unit}]"
+        label = f"{robot_input.parts[part].replace('_', ' ')} [{unit}]"
         slider = self._server.gui.add_slider(label, low, high, (high - low) / 500.0, min(max(0.0, low), high))
 
         def moved(event: Any) -> None:
@@ -287,8 +287,8 @@ class Page:
     def _set_sliders(self) -> None:
         """Moves the sliders of inputs to where they are."""
         for name, sliders in self._sliders.items():
-            known = self._live.robot.inputs[name].quantity
-            factor = known.shown_factor if known.shown_unit else 1.0
+            quantity = self._live.robot.inputs[name].quantity
+            factor = quantity.shown_factor if quantity.shown_unit else 1.0
             for part, slider in enumerate(sliders):
                 value = float(np.clip(factor * self._live.inputs[name][part], slider.min, slider.max))
                 if abs(value - slider.value) > 0.5 * slider.step:

@@ -25,6 +25,7 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 from yaml import MarkedYAMLError
 
 from .commands import CONFIG_PACKAGE, USER_ERROR, configuration
+from .io.atomic import is_disk_full
 from .io.errors import ResphysError, did_you_mean
 from .io.labels import OWN_OPTIONS, run_label
 from .io.pipes import ends_where_nobody_reads
@@ -133,8 +134,6 @@ def _explain(error: BaseException, started: bool) -> str | None:
         return f"cannot read the override {error.override!r} ({_sentence(error)}): write key=value"
     if isinstance(error, (HydraException, OmegaConfBaseException)):
         return _sentence(error)
-    from .io.files import is_disk_full  # which takes longer to import than this module
-
     if is_disk_full(error):
         name = getattr(error, "filename", None)
         place = f" while writing {name}" if name else ""

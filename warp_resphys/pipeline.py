@@ -60,9 +60,10 @@ from .experiment.trials import (
     test_groups,
     trials_of,
 )
+from .io.atomic import digest
 from .io.errors import DataFileError
 from .io.fan_out import ALONE, Workers
-from .io.files import digest, read_json, write_json
+from .io.files import read_json, write_json
 from .io.stages import Stage, StageContext, package_versions, resources_used, run_stages
 from .learning.metrics import summarise_folds
 from .report.conclusions import conclusions

@@ -170,9 +170,9 @@ class TestBadInput:
     @pytest.mark.parametrize(
         ("kilobytes", "full"),
         [
-            (10, "simulate_parts/part_000.h5.journal"),
+            (10, "simulate_parts/part_000.frames_0000000.safetensors"),
             (172, "simulate_parts/part_000.h5"),
-            (230, "reconstruct_resphys_parts/part0_000.h5.journal"),
+            (230, "reconstruct_resphys_parts/part0_000.frames_0000001.safetensors"),
         ],
     )
     def test_full_disk(self, finished, folder, no_report, kilobytes, full):

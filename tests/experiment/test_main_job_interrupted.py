@@ -28,8 +28,8 @@ class Interruption:
         self.done = Counter()
         append, run_epoch = ResumableHDF5.append, EpochTrainer.run_epoch
 
-        def interrupted_append(file, **arrays):
-            append(file, **arrays)
+        def interrupted_append(file, state, **arrays):
+            append(file, state, **arrays)
             self.count(file.kind)
 
         def interrupted_epoch(trainer):
@@ -77,7 +77,7 @@ class TestInterruption:
         repeated = interruption.done - whole
         assert sorted(repeated.elements()) in ([], ["epochs"])  # the epoch that the signal fell into
         same_errors(errors(), errors("whole"))
-        assert not [*Path("run").rglob("*.journal"), *Path("run").rglob("*.state*"), *Path("run").glob("*_parts")]
+        assert not [*Path("run").rglob("*.frames*"), *Path("run").glob("*_parts")]
         assert not list(Path("run").glob("train_*.safetensors"))
 
     def test_ctrl_c_while_refining(self, finished, folder, interruption):
@@ -133,7 +133,7 @@ class TestInterruption:
         return child
 
     def test_ctrl_c_in_a_real_process(self, finished, folder):
-        child = self.start("run/simulate_parts/part_000.h5.journal")
+        child = self.start("run/simulate_parts/part_000.frames_0000000.safetensors")
         child.send_signal(signal.SIGINT)
         err = child.communicate(timeout=60)[1]
         assert child.returncode == 130, err
@@ -143,7 +143,7 @@ class TestInterruption:
         same_errors(errors(), errors(finished[0]))
 
     def test_killed_without_warning(self, finished, folder):
-        child = self.start("run/reconstruct_resphys_parts/part0_000.h5.journal")
+        child = self.start("run/reconstruct_resphys_parts/part0_000.frames_0000000.safetensors")
         child.kill()
         err = child.communicate(timeout=60)[1]
         assert child.returncode == -signal.SIGKILL, err

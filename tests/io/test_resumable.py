@@ -1,4 +1,4 @@
-"""Files that are written step by step: they go on after an interruption, a crash or a full disk."""
+"""Work that goes on after an interruption, a crash or a full disk."""
 
 import os
 import signal
@@ -9,194 +9,149 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from warp_resphys.io import files
 from warp_resphys.io.errors import DataFileError
-from warp_resphys.io.resumable import Field, ResumableHDF5
+from warp_resphys.io.resumable import (
+    Field,
+    ResumableHDF5,
+    forget_checkpoint,
+    is_final,
+    keep_checkpoint,
+    resume_checkpoint,
+)
 
 REPOSITORY = Path(__file__).parents[2]
+FIELDS = {"force": Field((4, 3), "N", batch_axes=1), "iterations": Field((), "1", "int64")}
+TENSORS = {"weight": torch.arange(6.0).reshape(2, 3).T}
 
 
-def start_python(program: str, *arguments: object, **options: object) -> subprocess.Popen:
+def start_python(program: str, *arguments: object) -> subprocess.Popen:
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-c", textwrap.dedent(program), *map(str, arguments)]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    return subprocess.Popen(command, env=environment, text=True, **{**pipes, **options})
+    return subprocess.Popen(command, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
-FIELDS = {"force": Field((4, 3), "N"), "iterations": Field((), "1", "int64")}
+def force(frame: int) -> np.ndarray:
+    return np.full((4, 3), 1.0 + frame) + np.arange(12).reshape(4, 3)
 
 
-def force(step: int) -> np.ndarray:
-    return np.full((4, 3), 1.0 + step) + np.arange(12).reshape(4, 3)
+def resumable(path: Path, fingerprint: str = "f", frames: int = 10) -> ResumableHDF5:
+    return ResumableHDF5(path, "forces", fingerprint, frames, FIELDS)
 
 
-def resumable(path: Path, fingerprint: str = "f", steps: int = 10) -> ResumableHDF5:
-    return ResumableHDF5(path, "forces", fingerprint, steps, FIELDS)
+def compute(path: Path, upto: int, *arguments: object, finish: bool = True) -> list[int]:
+    """Computes frames, which are numbered by the state that they go on from; returns those that were computed."""
+    computed = []
+    with resumable(path, *arguments) as file:
+        while file.done < upto:
+            frame = int(file.state["last"]) + 1 if file.done else 0
+            file.append({"last": torch.tensor(frame)}, force=force(frame), iterations=frame)
+            computed.append(frame)
+        if finish:
+            file.finish({"rest": (np.ones(3), "m")})
+    return computed
 
 
-def write(file: ResumableHDF5, upto: int) -> None:
-    for step in range(file.done, upto):
-        file.append(force=force(step), iterations=step)
-
-
-def write_and_stop(file: ResumableHDF5, upto: int) -> None:
-    write(file, upto)
-    raise KeyboardInterrupt
+def checkpoints(path: Path) -> list[Path]:
+    return sorted(path.parent.glob("*.safetensors"))
 
 
 class TestResumable:
-    def test_goes_on_where_it_stopped_and_ends_in_a_plain_hdf5_file(self, tmp_path):
+    def test_goes_on_where_it_was_left_and_ends_in_a_plain_hdf5_file(self, tmp_path):
         path = tmp_path / "run" / "forces.h5"
-        with pytest.raises(KeyboardInterrupt), resumable(path) as file:
-            write_and_stop(file, 4)
-        assert not path.exists()
-        with resumable(path) as file:
-            assert file.done == 4
-            assert np.array_equal(file.read(3)["force"], force(3))
-            write(file, 10)
-            file.finish({"solver": "newton"}, {"rest": (np.ones(3), "m")})
+        assert compute(path, 4, finish=False) == [0, 1, 2, 3]
+        assert compute(path, 6, finish=False) == [4, 5]
+        assert not is_final(path, "forces", "f")
+        assert compute(path, 10) == [6, 7, 8, 9]
+        assert is_final(path, "forces", "f")
+        assert not is_final(path, "forces", "g")
         assert os.listdir(path.parent) == ["forces.h5"]
-        with files.read_hdf5(path, "forces") as h5:
-            assert np.array_equal(files.read_array(h5, "force"), [force(step) for step in range(10)])
-            assert files.read_array(h5, "iterations").tolist() == list(range(10))
-            assert (h5["force"].attrs["units"], h5["rest"].attrs["units"]) == ("N", "m")
-            assert h5.attrs["solver"] == "newton"
+        with files.read_hdf5(path, "forces") as file:
+            assert np.array_equal(files.read_array(file, "force"), np.stack([force(frame) for frame in range(10)], 1))
+            assert files.read_array(file, "iterations").tolist() == list(range(10))
+            assert (file["force"].attrs["units"], file["rest"].attrs["units"]) == ("N", "m")
 
-    def test_steps_in_any_order_find_their_places(self, tmp_path):
-        path, order = tmp_path / "forces.h5", [3, 0, 2, 1]
-        with resumable(path, steps=4) as file:
-            for step in order:
-                file.append(force=force(step), iterations=step)
-            for wrong in ([0, 1, 2, 2], [0, 1, 2], [1, 2, 3, 4]):
-                with pytest.raises(ValueError, match="each step has a place of its own"):
-                    file.finish(order=wrong)
-            file.finish(order=order)
-        with files.read_hdf5(path, "forces") as h5:
-            assert files.read_array(h5, "iterations").tolist() == [0, 1, 2, 3]
-            assert np.array_equal(files.read_array(h5, "force")[3], force(3))
+    def test_ctrl_c_loses_nothing(self, tmp_path):
+        def compute_three(file: ResumableHDF5) -> None:
+            for frame in range(3):
+                file.append({"last": torch.tensor(frame)}, force=force(frame), iterations=frame)
+            raise KeyboardInterrupt
 
-    def test_a_finished_file_is_not_computed_again(self, tmp_path):
+        with pytest.raises(KeyboardInterrupt), resumable(tmp_path / "a.h5") as file:
+            compute_three(file)
+        assert compute(tmp_path / "a.h5", 10) == list(range(3, 10))
+
+    def test_other_settings_start_afresh_and_keep_the_old_file_until_the_end(self, tmp_path, caplog):
         path = tmp_path / "forces.h5"
-        with resumable(path) as file:
-            write(file, 10)
-            file.finish()
-        identity = path.stat().st_mtime_ns
-        with resumable(path) as file:
-            assert file.done == 10
-            assert np.array_equal(file.read(7)["force"], force(7))
-            file.finish()
-        assert path.stat().st_mtime_ns == identity
-        content = bytearray(path.read_bytes())
-        content[content.index(force(7).tobytes())] ^= 1
-        path.write_bytes(content)
-        with pytest.raises(DataFileError, match=r"forces\.h5 is damaged"), resumable(path):
-            pass
-        assert path.read_bytes() == content
+        compute(path, 10)
+        assert len(compute(path, 9, "g", finish=False)) == 9
+        assert is_final(path, "forces", "f")
+        assert len(compute(path, 1, "h", finish=False)) == 1
+        assert "belongs to other settings" in caplog.text
+        assert len(compute(path, 11, "h", 11)) == 11
 
-    def test_other_inputs_start_afresh_and_keep_the_old_file_until_the_end(self, tmp_path, caplog):
+    @pytest.mark.parametrize("damaged", [0, 1, 2])
+    def test_frames_of_a_damaged_checkpoint_and_later_ones_are_computed_again(self, tmp_path, damaged):
         path = tmp_path / "forces.h5"
-        with resumable(path) as file:
-            write(file, 10)
-            file.finish()
-        with resumable(path, "g") as file:
-            write(file, 9)
-        with files.read_hdf5(path, "forces") as h5:
-            assert h5.attrs["fingerprint"] == "f"
-        with resumable(path, "h") as file:
-            assert file.done == 0
-            assert "discarding forces.h5.journal" in caplog.text
-        with resumable(path, "h", steps=11) as file:
-            assert file.done == 0
+        for upto in (3, 5, 8):
+            compute(path, upto, finish=False)
+        last = (0, 1, 3)[damaged]  # Kept after the first frame, and wherever a run was left.
+        place = checkpoints(path)[damaged]
+        content = bytearray(place.read_bytes())
+        content[-9] ^= 1
+        place.write_bytes(content)
+        assert compute(path, 10) == list(range(last, 10))
+        with files.read_hdf5(path, "forces") as file:
+            assert np.array_equal(files.read_array(file, "force")[:, 5], force(5))
 
-    def test_batches(self, tmp_path):
-        fields = {"q": Field((3, 2), "m", batch_axes=1), "loss": Field((), "1")}
-        with ResumableHDF5(tmp_path / "a.h5", "k", "f", 100, fields) as file:
-            for step in range(100):
-                file.append(q=10 * step + np.arange(6).reshape(3, 2), loss=step)
-            assert file.read(2)["q"].shape == (3, 2)
-            file.finish()
-            assert np.array_equal(file.read(2)["q"], 20 + np.arange(6).reshape(3, 2))
-        with files.read_hdf5(tmp_path / "a.h5", "k") as h5:
-            assert h5["q"].chunks == (1, 64, 2)
-            assert h5["q"].shape == (3, 100, 2)
-            assert np.array_equal(h5["q"][1, 7], [72, 73])
-
-    @pytest.mark.parametrize("damage", ["cut record", "cut header", "flipped bit", "zeros"])
-    def test_records_that_did_not_reach_the_disk_are_computed_again(self, tmp_path, damage):
-        path = tmp_path / "forces.h5"
-        with resumable(path) as file:
-            write(file, 8)
-        content = bytearray(file.journal.read_bytes())
-        record = content.index(force(5).tobytes())
-        if damage == "cut record":
-            del content[record + 20 :]
-        elif damage == "cut header":
-            del content[20:]
-        elif damage == "flipped bit":
-            content[record + 20] ^= 1
-        else:
-            content[record:] = bytes(len(content) - record)
-        file.journal.write_bytes(content)
-        with resumable(path) as file:
-            assert file.done == (0 if damage == "cut header" else 5)
-            write(file, 10)
-            file.finish()
-            assert np.array_equal(file.read(5)["force"], force(5))
-
-    def test_the_system_may_write_less_than_it_was_given(self, tmp_path, monkeypatch):
-        pwrite = os.pwrite
-        monkeypatch.setattr(os, "pwrite", lambda file, data, offset: pwrite(file, data[:7], offset))
-        with resumable(tmp_path / "a.h5") as file:
-            write(file, 3)
-        with resumable(tmp_path / "a.h5") as file:
-            assert file.done == 3
+    def test_a_damaged_file_is_an_error(self, tmp_path):
+        compute(tmp_path / "forces.h5", 10)
+        content = bytearray((tmp_path / "forces.h5").read_bytes())
+        content[-9] ^= 1
+        (tmp_path / "forces.h5").write_bytes(content)
+        with pytest.raises(DataFileError, match=r"forces\.h5 is damaged"):
+            is_final(tmp_path / "forces.h5", "forces", "f")
 
     def test_misuse(self, tmp_path):
         with resumable(tmp_path / "a.h5") as file:
-            with pytest.raises(ValueError, match="consists of"):
-                file.append(force=force(0))
             with pytest.raises(ValueError, match=r"shape \(3,\) where \(4, 3\)"):
-                file.append(force=np.zeros(3), iterations=1)
-            with pytest.raises(ValueError, match="0 of 10 steps"):
+                file.append({}, force=np.zeros(3), iterations=1)
+            with pytest.raises(ValueError, match="0 of 10 frames"):
                 file.finish()
-            with pytest.raises(ValueError, match="not among the 0"):
-                file.read(0)
-            write(file, 10)
-            with pytest.raises(ValueError, match="no further step"):
-                file.append(force=force(0), iterations=1)
 
     @pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGINT])
-    def test_a_killed_process_loses_the_current_step_at_most(self, tmp_path, end):
+    def test_a_process_that_is_ended_goes_on_from_a_whole_frame(self, tmp_path, end):
         program = """
-            import signal, sys, numpy as np
-            from warp_resphys.io.resumable import Field, ResumableHDF5
+            import signal, sys, numpy as np, torch
+            from pathlib import Path
+            from warp_resphys.io import resumable
             signal.signal(signal.SIGINT, signal.default_int_handler)
-            steps = 1_000_000
-            with ResumableHDF5(sys.argv[1], "k", "f", steps, {"x": Field((5000,), "m")}) as file:
-                print("resumed", file.done, flush=True)
-                for step in range(file.done, steps):
-                    file.append(x=np.full(5000, step))
+            resumable.KEEP_SECONDS = 0.01
+            fields = {"x": resumable.Field((500,), "m")}
+            with resumable.ResumableHDF5(Path(sys.argv[1]), "k", "f", 10_000, fields) as file:
+                print(file.done, flush=True)
+                while file.done < file.frames:
+                    last = int(file.state["last"]) if file.done else -1
+                    file.append({"last": torch.tensor(last + 1)}, x=np.full(500, last + 1))
                     print(file.done, flush=True)
         """
-        path = tmp_path / "a.h5"
-        last = 0
-        for round_ in range(2):
+        path, last = tmp_path / "a.h5", 0
+        for _ in range(2):
             child = start_python(program, path)
-            resumed = int(child.stdout.readline().split()[1])
-            # the record that the signal cut off may have been whole already
-            assert last <= resumed <= last + 1
-            for _ in range(40 + 13 * round_):
+            first = int(child.stdout.readline())
+            assert first >= last if end == signal.SIGINT else first > 0 or last == 0
+            while len(checkpoints(path)) < 3 or last < first + 20:
                 last = int(child.stdout.readline())
             child.send_signal(end)
-            rest = child.stdout.read().split("\n")
-            last = max([last, *map(int, rest[:-1])])
+            last = max([last, *map(int, child.stdout.read().split("\n")[:-1])])
             child.wait(timeout=20)
             assert child.returncode in (-end, 130)
-        with ResumableHDF5(path, "k", "f", 1_000_000, {"x": Field((5000,), "m")}) as file:
-            assert last <= file.done <= last + 1
-            assert last > 90
-            assert all(np.all(file.read(step)["x"] == step) for step in range(file.done))
+        fields = {"x": Field((500,), "m")}
+        with ResumableHDF5(path, "k", "f", 10_000, fields) as file:
+            assert 0 < file.done <= last + 1
+            assert int(file.state["last"]) == file.done - 1
 
 
 class TestDiskFull:
@@ -213,51 +168,62 @@ class TestDiskFull:
             signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
             resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
-        def hdf5():
-            with files.atomic_hdf5(folder / "data.h5", "k") as file:
-                for name in "abc":
-                    files.create(file, name, np.zeros((640, 100)))
+        def frames(name, count, numbers):
+            with ResumableHDF5(folder / name, "k", "f", count, {"x": Field((numbers,), "m")}) as file:
+                print("done", file.done)
+                while file.done < count:
+                    file.append({}, x=np.full(numbers, file.done))
+                file.finish(constants={"c": (np.zeros(5000), "m")})
 
-        def journal():
-            with ResumableHDF5(folder / "long.h5", "k", "f", 100, {"x": Field((100,), "m")}) as file:
-                print("resumed", file.done)
-                for step in range(file.done, file.steps):
-                    file.append(x=np.full(100, step))
-                file.finish()
+        def json():
+            files.write_json(folder / "a.json", [0] * 40000)
 
-        def final():
-            with ResumableHDF5(folder / "last.h5", "k", "f", 45, {"x": Field((100,), "m")}) as file:
-                print("resumed", file.done)
-                for step in range(file.done, file.steps):
-                    file.append(x=np.full(100, step))
-                file.finish(constants={"c": (np.zeros(1000), "m")})
-
-        for function in (hdf5, journal, final, lambda: files.write_json(folder / "a.json", [0] * 40000)):
+        for work in (lambda: frames("first.h5", 2, 6000), lambda: frames("last.h5", 3, 100), json):
             try:
-                function()
+                work()
             except DataFileError as error:
                 print(error)
     """
 
-    def test_clear_sentence_no_half_file_and_the_work_is_kept(self, tmp_path):
+    def test_one_sentence_no_half_file_and_the_work_is_kept(self, tmp_path):
         child = start_python(self.program, tmp_path, 40_000)
-        lines, errors = child.communicate(timeout=30)
+        lines, errors = child.communicate(timeout=200)
         assert (child.returncode, errors) == (0, "")
-        again = ": free some space and run the same command again"
-        journals = [tmp_path / "long.h5.journal", tmp_path / "last.h5.journal"]
-        kept = "; what was computed is kept in"
-        assert lines.splitlines() == [
-            f"disk is full while writing {tmp_path / 'data.h5'}{again}",
-            "resumed 0",
-            f"disk is full while writing {journals[0]}{again}{kept} {journals[0]}",
-            "resumed 0",
-            f"disk is full while writing {tmp_path / 'last.h5'}{again}{kept} {journals[1]}",
-            f"disk is full while writing {tmp_path / 'a.json'}{again}",
-        ]
-        assert sorted(tmp_path.iterdir()) == sorted(journals)
+        full = [f"disk is full while writing {tmp_path / name}" for name in ("first.frames", "last.h5", "a.json")]
+        lines = lines.splitlines()
+        assert [lines[0], lines[2]] == ["done 0", "done 0"]
+        assert all(line.startswith(start) for line, start in zip([lines[1], *lines[3:]], full, strict=True))
+        assert {path.name.partition(".")[0] for path in tmp_path.iterdir()} == {"last"}
         child = start_python(self.program, tmp_path, 0)
-        lines, errors = child.communicate(timeout=30)
-        assert (child.returncode, errors) == (0, "")
-        assert lines.splitlines() == ["resumed 49", "resumed 45"]
-        with files.read_hdf5(tmp_path / "long.h5", "k") as file:
-            assert np.array_equal(file["x"][:, 0], np.arange(100))
+        lines, errors = child.communicate(timeout=200)
+        assert (child.returncode, errors, lines.splitlines()) == (0, "", ["done 0", "done 3"])
+        with files.read_hdf5(tmp_path / "last.h5", "k") as file:
+            assert np.array_equal(file["x"][:, 0], np.arange(3))
+
+
+class TestCheckpoints:
+    def test_other_settings_and_other_versions_are_not_gone_on_from(self, tmp_path, caplog):
+        path = tmp_path / "a.safetensors"
+        keep_checkpoint(path, "network", TENSORS, {"fingerprint": "f"})
+        assert torch.equal(resume_checkpoint(path, "network", "f")[0]["weight"], TENSORS["weight"])
+        assert resume_checkpoint(path, "network", "g") is None
+        assert resume_checkpoint(tmp_path / "none", "network", "f") is None
+        assert "belongs to other settings" in caplog.text
+        files.write_checkpoint(path, "network", TENSORS, {"fingerprint": "f"})
+        assert resume_checkpoint(path, "network", "f") is None
+        assert "another version" in caplog.text
+
+    def test_a_damaged_checkpoint_gives_way_to_the_one_before(self, tmp_path, caplog):
+        path = tmp_path / "train.safetensors"
+        for epoch in (1, 2, 3):
+            keep_checkpoint(path, "training", TENSORS, {"fingerprint": "f", "epoch": epoch})
+        assert resume_checkpoint(path, "training", "f")[1]["epoch"] == 3
+        content = path.read_bytes()
+        path.write_bytes(content[:-3] + bytes([content[-3] ^ 4]) + content[-2:])
+        assert resume_checkpoint(path, "training", "f")[1]["epoch"] == 2
+        assert f"{path} is damaged" in caplog.text
+        path.unlink()  # As if the program had been killed between two files.
+        assert resume_checkpoint(path, "training", "f")[1]["epoch"] == 2
+        assert resume_checkpoint(path, "training", "g") is None
+        forget_checkpoint(path)
+        assert not list(tmp_path.iterdir())

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
 from ..experiment.files import CONTROL, DATASET, DRIVEN, FEEDBACK, LINEAR, OPEN, RECEDING, Dataset, read_dataset
-from ..experiment.parts import March, Part, read_parts, remove_parts, split_into_parts, work_on
+from ..experiment.parts import ResumableRollout, TrialPart, read_parts, remove_parts, split_into_parts, work_on
 from ..io.errors import InputError
 from ..io.fan_out import ALONE, Workers
 from ..io.files import write_json
@@ -182,7 +182,7 @@ def drive(context: StageContext, workers: Workers = ALONE) -> None:
     settings = context.settings
     controllers = controllers_of(settings["control"])
     robot = load(context.run_dir, settings["control"]["models"][-1], settings["device"])
-    task, parts = _task(settings, robot), list[Part]()
+    task, parts = _task(settings, robot), list[TrialPart]()
     for seconds in settings["control"]["seconds"]:
         for name in _names(task, seconds):
             parts += split_into_parts(context, (name,), task.steps(seconds) + 1, name)
@@ -230,10 +230,10 @@ def receding_controllers(
     return [*found, LinearRecedingHorizon(linear, task.tracked, limits, horizon, path, rests[len(found)])]
 
 
-class _Drive(March):
+class _Drive(ResumableRollout):
     """One motion, driven by all controllers at once."""
 
-    def __init__(self, part: Part) -> None:
+    def __init__(self, part: TrialPart) -> None:
         self._settings, self._folder, (self._name,) = part.context.settings, part.context.run_dir, part.names
         names = controllers_of(self._settings["control"])
         robot = load(self._folder, self._settings["control"]["models"][-1], self._settings["device"])

@@ -28,7 +28,7 @@ from ..report.page import number_text
 from ..stepping.state import State
 from .build import build_mesh, build_simulator, simulation_device
 from .files import METRICS, REPORT
-from .parts import Part, remove_parts, split_into_parts, work_on, workers_for
+from .parts import TrialPart, remove_parts, split_into_parts, work_on, workers_for
 from .reconstruct import Reconstructing
 from .simulate import held_state
 
@@ -123,7 +123,7 @@ class _FromMarkers(Reconstructing):
     What is kept are the mean distances (draws,) of all vertices and of the markers [m], and the sets.
     """
 
-    def __init__(self, part: Part) -> None:
+    def __init__(self, part: TrialPart) -> None:
         settings, self._count = part.context.settings, part.more
         simulator = build_simulator(settings, "simulation")
         self.like, draws = simulator.rest_positions, settings["ablation"]["draws"]

@@ -23,7 +23,7 @@ from ..stepping.state import State
 from .build import finer
 from .files import ERRORS, MESH_CHECK, ROLLOUTS, STATIC, TIMES, read_dataset, reconstruction_file
 from .models import POSE_STEPS, SIMFREE, ModelRollout, first_frame, learned_of
-from .parts import Part, padded, remove_parts, split_into_parts, work_on
+from .parts import TrialPart, padded, remove_parts, split_into_parts, work_on
 from .scene import LEARNED, Scene, models_of
 
 FloatArray = NDArray[np.float64]
@@ -69,9 +69,9 @@ def evaluate(context: StageContext, workers: Workers = ALONE) -> None:
 
 def _parts(
     context: StageContext, scene: Scene, names: Sequence[str], models: Sequence[str], filmed: str, label: str = ""
-) -> dict[str, list[Part]]:
+) -> dict[str, list[TrialPart]]:
     """The roll-outs of some trials, by model."""
-    found: dict[str, list[Part]] = {model: [] for model in models if model in models_of(context.settings)}
+    found: dict[str, list[TrialPart]] = {model: [] for model in models if model in models_of(context.settings)}
     for number, some in enumerate(scene.alike(names)):
         for model, parts in found.items():
             rests = POSE_STEPS if model == SIMFREE and scene.begins(some[0]) == STATIC else 0
@@ -80,13 +80,13 @@ def _parts(
     return found
 
 
-def _all_observed(scene: Scene, model: str, parts: Sequence[Part]) -> FloatArray:
+def _all_observed(scene: Scene, model: str, parts: Sequence[TrialPart]) -> FloatArray:
     """(R, T, M, 3) what is observed of a model's roll-outs [m], in the order of the parts."""
     return padded([_observed(scene, model, part) for part in parts], scene.dataset.observed.shape[1])
 
 
 def _intervals(
-    scene: Scene, calibrating: Mapping[str, Sequence[Part]], tested: Mapping[str, FloatArray]
+    scene: Scene, calibrating: Mapping[str, Sequence[TrialPart]], tested: Mapping[str, FloatArray]
 ) -> dict[str, Any]:
     """Prediction intervals by model, and how often they hold in the test trials; see `learning.intervals`."""
     settings, rest = scene.config, scene.dataset.bound
@@ -114,14 +114,14 @@ def _counted(scene: Scene, names: Sequence[str]) -> FloatArray:
     return observed
 
 
-def _rolled_out(part: Part) -> ModelRollout:
+def _rolled_out(part: TrialPart) -> ModelRollout:
     """A model over the trials of a part."""
     scene = Scene(part.context.settings, part.context.run_dir, "count")
     model, filmed = part.more
     return ModelRollout(scene, model, part.names, learned_of(scene, model), filmed=filmed)
 
 
-def _observed(scene: Scene, model: str, part: Part) -> FloatArray:
+def _observed(scene: Scene, model: str, part: TrialPart) -> FloatArray:
     """(R, T, M, 3) what is observed of a model's roll-outs at the frames of the trials [m]."""
     series, delay, shift = (torch.from_numpy(part.read(name)) for name in ("points", "delay", "shift"))
     replay = scene.replay(scene.model_simulator(model), part.names)

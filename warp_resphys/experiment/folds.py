@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Callable, Mapping
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,12 +17,12 @@ Stages = Callable[[Workers], list[Stage]]
 
 @dataclass(frozen=True)
 class Fold:
-    """One of them.
+    """One fold of a cross-validation.
 
     Attributes:
         name: of the trial that is left out.
         folder: of its files.
-        stages: by the workers that share their work; can be sent to another process.
+        stages: makes its stages for the workers that share their work; can be sent to another process.
     """
 
     name: str
@@ -32,13 +31,13 @@ class Fold:
 
 
 def run_folds(folds: Mapping[str, Fold], workers: Workers) -> None:
-    """Runs those that are not up to date: as many at once as there are workers, or one with all of these.
+    """Runs the folds that are not up to date: as many at once as there are workers; the last one alone has all of them.
 
     The numbers do not depend on the workers.
 
     Raises:
-        WorkerError: a fold failed; the others keep what they have.
-        StageInterrupted: Ctrl-C; so does every one.
+        WorkerError: a fold failed; the others keep what they have computed.
+        StageInterrupted: Ctrl-C; all folds keep what they have computed.
     """
     left = [fold for fold in folds.values() if not up_to_date(fold.stages(ALONE), fold.folder)]
     if workers.alone or len(left) <= 1:
@@ -56,11 +55,9 @@ def run_folds(folds: Mapping[str, Fold], workers: Workers) -> None:
             running.pop(name, None)
         progress.advance(count, now=", ".join(running.values()))
 
-    crew = fan_out(_run, left, workers.at_most(len(left)), advance, left[0].folder.parent)
     try:
-        with Progress(f"{len(left)} folds", total, "stages") as progress, closing(crew) as results:
-            for _ in results:
-                pass
+        with Progress(f"{len(left)} folds", total, "stages") as progress:
+            fan_out(_run, left, workers.at_most(len(left)), advance, left[0].folder.parent)
     except KeyboardInterrupt as error:
         raise StageInterrupted(
             f"interrupted in the folds {', '.join(running)}; they keep what they have saved, as do those before them, "
@@ -69,7 +66,7 @@ def run_folds(folds: Mapping[str, Fold], workers: Workers) -> None:
 
 
 def _run(fold: Fold, advance: Advance) -> None:
-    """Runs a fold in a worker process, which tells each stage that it begins."""
+    """Runs a fold in a worker process; `advance` is called at the beginning of every stage."""
     logging.basicConfig(level=logging.WARNING, format=f"fold {fold.name}: %(message)s", force=True)
     counts = iter([0])
     try:

@@ -23,7 +23,7 @@ from ..learning.replay import Start
 from ..learning.rollout import Rollout
 from ..stepping.state import State
 from .files import GIVEN, weights_file
-from .parts import March
+from .parts import ResumableRollout
 from .scene import LEARNED, Scene
 
 FloatArray = NDArray[np.float64]
@@ -76,7 +76,7 @@ def load(folder: Path, model: str, device: torch.device, refined: bool = False) 
     return Learned(network, range_, str(description["force_frame"]))
 
 
-class ModelRollout(March):
+class ModelRollout(ResumableRollout):
     """A model over some trials that begin alike, step by step.
 
     Args:

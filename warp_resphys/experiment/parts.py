@@ -1,14 +1,12 @@
-"""Trials through time, in one process or several: what is done is not done again, however a run ends.
+"""Trials rolled out frame by frame, in one process or several; an interrupted run goes on where it was.
 
-A stage splits its trials into parts. Each part is a `March`: frame by frame it writes to a journal, and every few
-seconds it keeps the state that the next frame goes on from.
+A stage splits its trials into parts, each with a file of its own. A `ResumableRollout` computes the frames of a part,
+and `io.resumable.ResumableHDF5` keeps them with the state that the next frame goes on from.
 """
 
 import shutil
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -24,23 +22,21 @@ from ..io.fan_out import Advance, Workers, fan_out
 from ..io.files import read_array, read_hdf5
 from ..io.machine import available_cores
 from ..io.progress import Progress
-from ..io.resumable import Field, ResumableHDF5, forget_checkpoint, keep_checkpoint, resume_checkpoint
+from ..io.resumable import Field, ResumableHDF5, is_final
 from ..io.stages import StageContext
 from ..stepping.state import State
 from .build import simulation_device
 
-_KEEP_SECONDS = 10.0
 
-
-class March(ABC):
-    """Some trials, frame by frame.
+class ResumableRollout(ABC):
+    """Computes some trials frame by frame.
 
     Attributes:
-        frames: how many there are.
-        fields: what is kept of each.
-        like: a tensor on the device of the trials.
+        frames: number of frames.
+        fields: the arrays of a frame that go to the file.
+        like: a tensor of the type and on the device of the trials.
         state: of the last frame.
-        shown: beside the progress.
+        shown: named values to show beside the progress.
     """
 
     frames: int
@@ -59,20 +55,20 @@ class March(ABC):
 
     @abstractmethod
     def kept(self, number: int) -> dict[str, ArrayLike]:
-        """What is kept of a frame."""
+        """The arrays of a frame, which is that of `state`, for the file."""
 
     def constants(self) -> dict[str, tuple[ArrayLike, str]]:
-        """What is kept beside the frames, with units."""
+        """Arrays that do not depend on the frame, with units, for the file."""
         return {}
 
     def frame(self, number: int) -> dict[str, ArrayLike]:
-        """Goes on to a frame; what is kept of it."""
+        """Computes a frame from the one before; returns its arrays for the file."""
         with torch.no_grad():
             self.state = self.begin() if number == 0 else self.step(number)
             return self.kept(number)
 
     def snapshot(self) -> dict[str, torch.Tensor]:
-        """What the next frame goes on from; none of it is changed in place."""
+        """Tensors that the next frame goes on from; they are not changed in place."""
         return self.state.tensors()
 
     def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
@@ -81,15 +77,15 @@ class March(ABC):
 
 
 @dataclass(frozen=True)
-class Part:
-    """Some of the trials of a stage.
+class TrialPart:
+    """Some of the trials of a stage, and their file.
 
     Attributes:
         context: of the stage.
         names: of the trials.
-        path: the file with what was made of them.
-        frames: of a trial.
-        more: what else the function is told.
+        path: of the file.
+        frames: number of frames of a trial.
+        more: further arguments for what makes the roll-out.
     """
 
     context: StageContext
@@ -98,72 +94,54 @@ class Part:
     frames: int
     more: Any = None
 
-    def write(self, motion: March, advance: Advance) -> None:
-        """Writes the part's file, from where an interrupted march was; tells of the frames that are done."""
-        fingerprint, each = self.context.fingerprint, len(self.names)
-        checkpoint = self.path.with_name(f"{self.path.stem}.state.safetensors")
-        with ResumableHDF5(self.path, self.context.name, fingerprint, motion.frames, motion.fields) as file:
-            if file.done == file.steps:
-                advance(each * file.done)
-            else:
-                found = resume_checkpoint(checkpoint, "state", fingerprint)
-                done = 0 if found is None else int(found[1]["done"])
-                file.rewind(done if done <= file.done else 0)
-                if found is not None and file.done:
-                    motion.restore(found[0])
-                advance(each * file.done)
-                kept = following = (motion.snapshot() if file.done else {}, file.done)
-                saved = time.monotonic()
-
-                def keep() -> None:
-                    tensors, frames = following if file.done == following[1] else kept
-                    if 0 < frames < file.steps:
-                        keep_checkpoint(checkpoint, "state", tensors, {"done": frames, "fingerprint": fingerprint})
-
-                try:
-                    while file.done < file.steps:
-                        arrays = motion.frame(file.done)
-                        following = (motion.snapshot(), file.done + 1)
-                        file.append(**arrays)
-                        kept = following
-                        if time.monotonic() - saved > _KEEP_SECONDS:
-                            keep()
-                            saved = time.monotonic()
-                        advance(each, **motion.shown)
-                finally:
-                    keep()
-            file.finish(constants=motion.constants())
-        forget_checkpoint(checkpoint)
+    def write(self, make: "Callable[[TrialPart], ResumableRollout]", advance: Advance) -> None:
+        """Computes the frames from where an interrupted run was, and writes the file; `advance` counts the frames."""
+        count = len(self.names)
+        if self.done:
+            advance(count * self.frames)
+            return
+        rollout = make(self)
+        arguments = self.path, self.context.name, self.context.fingerprint, rollout.frames, rollout.fields
+        with ResumableHDF5(*arguments) as file:
+            if file.done:
+                rollout.restore(file.state)
+            advance(count * file.done)
+            while file.done < file.frames:
+                arrays = rollout.frame(file.done)
+                file.append(rollout.snapshot(), **arrays)
+                advance(count, **rollout.shown)
+            file.finish(rollout.constants())
 
     def read(self, name: str) -> NDArray[Any]:
-        """An array of its file."""
+        """An array of the file.
+
+        Raises:
+            DataFileError: the file or the array is missing or damaged.
+        """
         with read_hdf5(self.path, self.context.name) as file:
             return read_array(file, name)
 
     @property
     def done(self) -> bool:
-        """Whether its file was made from the same settings."""
-        if not self.path.is_file():
-            return False
-        with read_hdf5(self.path, self.context.name) as file:
-            return str(file.attrs.get("fingerprint")) == self.context.fingerprint
+        """Whether the file is there, made from the same settings."""
+        return is_final(self.path, self.context.name, self.context.fingerprint)
 
 
 def split_into_parts(
     context: StageContext, names: Sequence[str], frames: int, label: str = "part", more: Any = None
-) -> list[Part]:
-    """Parts of at most as many trials as the stage simulates at once (``batch``); all of them, if that is not set.
+) -> list[TrialPart]:
+    """Parts of at most ``batch`` trials, a setting of the stage; one part of all trials, if that is not set.
 
     Args:
         context: of the stage.
         names: of the trials.
         frames: of a trial.
         label: that the files' names begin with.
-        more: see `Part`.
+        more: see `TrialPart`.
     """
     folder, size = _folder(context), context.settings.get("batch") or len(names)
     return [
-        Part(context, tuple(names[first : first + size]), folder / f"{label}_{first:03d}.h5", frames, more)
+        TrialPart(context, tuple(names[first : first + size]), folder / f"{label}_{first:03d}.h5", frames, more)
         for first in range(0, len(names), size)
     ]
 
@@ -191,43 +169,41 @@ def workers_for(config: Mapping[str, Any], wanted: int | None) -> Workers:
     return Workers(wanted, backend, config["parallel"]["address"])
 
 
-def work_on(parts: Sequence[Part], function: Callable[[Part], March], workers: Workers) -> None:
-    """Marches through those parts that are not done yet.
+def work_on(parts: Sequence[TrialPart], make: Callable[[TrialPart], ResumableRollout], workers: Workers) -> None:
+    """Computes those parts that are not done yet, and writes their files.
 
     Args:
-        parts: each with its own file.
-        function: makes the march of a part; defined at the top of a module.
-        workers: that share them.
+        parts: of one stage.
+        make: makes the roll-out of a part; defined at the top of a module.
+        workers: that share the parts.
 
     Raises:
-        ConvergenceError, WorkerError: a part could not be done.
-        DataFileError: a part could not be written.
+        ConvergenceError, WorkerError: a part could not be computed.
+        DataFileError: a file could not be written.
     """
-    left = [part for part in parts if not part.done]
+    left, first = [part for part in parts if not part.done], parts[0]
     total, missing = (sum(part.frames * len(part.names) for part in some) for some in (parts, left))
-    with Progress(parts[0].context.name, total, "frames", total - missing) as progress:
+    with Progress(first.context.name, total, "frames", total - missing) as progress:
         if workers.alone or (workers.backend == "local" and len(parts) == 1):
             with threadpool_limits(1):  # As in a worker process: the same numbers, however many there are.
                 for part in left:
-                    part.write(function(part), progress.advance)
-            return
-        work, crew, first = partial(_quietly, function), workers.at_most(len(left)), parts[0]
-        with closing(fan_out(work, left, crew, progress.advance, first.path.parent, first.context.memory)) as results:
-            for _ in results:
-                pass
+                    part.write(make, progress.advance)
+        else:
+            crew, memory = workers.at_most(len(left)), first.context.memory
+            fan_out(partial(_write, make), left, crew, progress.advance, first.path.parent, memory)
 
 
-def _quietly(function: Callable[[Part], March], part: Part, advance: Advance) -> None:
-    part.write(function(part), lambda count=1, **shown: advance(count))
+def _write(make: Callable[[TrialPart], ResumableRollout], part: TrialPart, advance: Advance) -> None:
+    part.write(make, lambda count=1, **shown: advance(count))
 
 
-def read_parts(parts: Sequence[Part], name: str) -> NDArray[Any]:
-    """The (R, T, ...) arrays of that name of all parts; those with fewer frames are padded with NaN."""
+def read_parts(parts: Sequence[TrialPart], name: str) -> NDArray[Any]:
+    """The arrays (R, T, ...) of a name in all parts, one after the other; NaN past the end of shorter ones."""
     return padded([part.read(name) for part in parts])
 
 
 def padded(found: Sequence[NDArray[Any]], frames: int = 0) -> NDArray[Any]:
-    """Arrays (R, T, ...) one after the other, with as many frames as the longest, or more: NaN past their ends."""
+    """Joins arrays (R, T, ...) along R, with as many frames as the longest has, or more: NaN past their ends."""
     frames = max(frames, *(each.shape[1] for each in found))
     ends = [[(0, 0), (0, frames - each.shape[1]), *[(0, 0)] * (each.ndim - 2)] for each in found]
     return np.concatenate(
@@ -236,5 +212,5 @@ def padded(found: Sequence[NDArray[Any]], frames: int = 0) -> NDArray[Any]:
 
 
 def remove_parts(context: StageContext) -> None:
-    """Removes what is no longer needed when a stage is done."""
+    """Removes the files of a stage's parts."""
     shutil.rmtree(_folder(context), ignore_errors=True)

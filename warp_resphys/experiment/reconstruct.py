@@ -22,7 +22,7 @@ from ..learning.rollout import Rollout
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .files import RECONSTRUCTION, read_if_there, reconstruction_file
-from .parts import March, Part, read_parts, remove_parts, split_into_parts, work_on
+from .parts import ResumableRollout, TrialPart, read_parts, remove_parts, split_into_parts, work_on
 from .scene import Scene
 
 log = logging.getLogger(__name__)
@@ -45,7 +45,7 @@ def reconstruct(context: StageContext, workers: Workers = ALONE) -> None:
     """
     settings, model = context.settings, context.settings["model"]
     scene = Scene(settings, context.run_dir)
-    parts: list[Part] = []
+    parts: list[TrialPart] = []
     for number, names in enumerate(scene.alike(settings["reconstructed"])):
         last = float(scene.trials(names).times.max()) / scene.model_simulator(model).time_step
         frames = max(scene.learned_steps(int(last + 1e-6)), 1) + 1
@@ -93,7 +93,7 @@ def reconstructing_simulator(scene: Scene, model: str) -> Simulator:
     return dataclasses.replace(simulator, integrator="bdf2") if rings else simulator
 
 
-class Reconstructing(March):
+class Reconstructing(ResumableRollout):
     """Bodies that are brought to what was observed of them, each step from the force of the one before.
 
     Attributes:
@@ -127,7 +127,7 @@ class _OfTrials(Reconstructing):
     What is kept are q, v and the force (B, N, 3), and the distance of what is observed (B,) [mm].
     """
 
-    def __init__(self, part: Part) -> None:
+    def __init__(self, part: TrialPart) -> None:
         settings = part.context.settings
         scene = Scene(settings, part.context.run_dir)
         simulator = reconstructing_simulator(scene, settings["model"])

@@ -36,7 +36,7 @@ from ..stepping.state import State
 from .actuators import driven_parts, driving_quantity
 from .build import bound_markers, build_mesh, build_simulator
 from .files import DATASET, GIVEN, STATIC, TRUTH, Dataset, payload_inputs
-from .parts import March, Part, read_parts, remove_parts, split_into_parts, work_on
+from .parts import ResumableRollout, TrialPart, read_parts, remove_parts, split_into_parts, work_on
 from .trials import Trial, known_trials, scaled_trials_of, trials_of
 
 log = logging.getLogger(__name__)
@@ -96,10 +96,10 @@ def _carried(
     return [simulator.tensor(rigid(each).apply(np.broadcast_to(fixed, (len(trials), *fixed.shape)))) for each in poses]
 
 
-class _Free(March):
+class _Free(ResumableRollout):
     """Bodies that are let go and swing on their own, or with what they are fixed to."""
 
-    def __init__(self, part: Part) -> None:
+    def __init__(self, part: TrialPart) -> None:
         settings = part.context.settings
         self._data, self._simulator = settings["data"], build_simulator(settings, "target")
         self._trials = [trial for trial in trials_of(settings) if trial.name in part.names]
@@ -344,14 +344,14 @@ def _frames_of(settings: Mapping[str, Any], begins: str) -> int:
     return max(int(laboratory["seconds"] / laboratory["time_step"]) + 1, 2) + 1
 
 
-class _Played(March):
+class _Played(ResumableRollout):
     """Bodies of the laboratory: released from where they are held, driven by their inputs, or in a pose.
 
     Released bodies are simulated step by step from time zero on; driven ones are kept at the frames, with as
     many smaller steps between these as fit. What is kept are the tracked markers, in the frame of the body.
     """
 
-    def __init__(self, part: Part) -> None:
+    def __init__(self, part: TrialPart) -> None:
         settings = part.context.settings
         setup, markers = make_setup(settings), settings["markers"]
         simulator = self._simulator = laboratory_simulator(settings, setup.gravity)

@@ -1,18 +1,14 @@
-"""Reading and writing files: each one appears whole or not at all, and none can run code when it is opened.
+"""Reading and writing JSON, HDF5, NumPy and safetensors files, none of which can run code when it is opened.
 
-A file is written under another name, brought to the disk and then renamed. HDF5 files are built in memory
-first: an HDF5 library that meets a full disk cannot close its file any more and crashes the interpreter at
-exit. A file should therefore fit into memory two or three times. Long computations write step by step: see
-`resumable`.
+All are written by `atomic.atomic_path`. HDF5 files are built in memory first: an HDF5 library that meets a full disk
+cannot close its file any more and crashes the interpreter at exit. A file should therefore fit into memory two or
+three times. Long computations write as they go on: see `resumable`.
 """
 
 from __future__ import annotations
 
 import contextlib
-import errno
-import hashlib
 import json
-import os
 import struct
 import tokenize
 import zipfile
@@ -25,6 +21,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
+from .atomic import SEAL, atomic_path, is_as_written, read_error, write_sealed
 from .decoding import DecodingError, refuse_data_elsewhere
 from .errors import DataFileError
 
@@ -34,73 +31,13 @@ if TYPE_CHECKING:
 FORMAT = "warp_resphys"
 FORMAT_VERSION = 1
 CHUNK_STEPS = 64
-USER_BLOCK = 512  # bytes before an HDF5 file's own, which hold a checksum of those
-_CHECKSUM = b"warp_resphys, CRC-32 of what follows the first 512 bytes: "
+USER_BLOCK = 512  # bytes before an HDF5 file's own, which hold its checksum
 LARGEST_ARRAYS = 4 << 30  # bytes in one file
 # What numpy.load raises for a file that is damaged or made up.
 _ARRAY_FAULTS = (
     *(EOFError, LookupError, MemoryError, OverflowError, RuntimeError, SyntaxError, TypeError, ValueError),
     *(struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error),
 )
-_DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-
-
-def is_disk_full(error: BaseException) -> bool:
-    """Whether an error says, by number or text, that a disk, a quota or a file-size limit is exhausted."""
-    message = str(error).lower()
-    return getattr(error, "errno", None) in _DISK_FULL or any(
-        os.strerror(code).lower() in message for code in _DISK_FULL
-    )
-
-
-def disk_full_error(path: str | Path, kept: str | Path | None = None) -> DataFileError:
-    """The error to raise when there was no space for `path`; `kept` is where the work done so far lies."""
-    rest = "" if kept is None else f"; what was computed is kept in {kept}"
-    return DataFileError(f"disk is full while writing {path}: free some space and run the same command again{rest}")
-
-
-@contextlib.contextmanager
-def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Gives a temporary path; what is written there takes the place of `path` when the block ends without an error.
-
-    Raises:
-        DataFileError: the disk is full, or the place cannot be written to.
-    """
-    path = Path(path)
-    partial = path.with_name(path.name + ".partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            yield partial
-            _sync(partial)
-            os.replace(partial, path)
-            _sync(path.parent)
-        finally:
-            partial.unlink(missing_ok=True)
-    except Exception as error:
-        if is_disk_full(error):
-            raise disk_full_error(path) from error
-        places = (str(partial), *(str(folder) for folder in path.parents))
-        if isinstance(error, OSError) and str(error.filename) in places:
-            raise DataFileError(
-                f"cannot write {path} ({error.strerror}): make the place writable or choose another one"
-            ) from error
-        raise
-
-
-def _sync(path: Path) -> None:
-    """Waits until the file or folder has reached the disk."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def digest(path: str | Path) -> str:
-    """SHA-256 of a file's content, in hexadecimal."""
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def to_plain(data: Any) -> Any:
@@ -137,17 +74,9 @@ def read_json(path: str | Path) -> Any:
     try:
         return json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
-        raise _read_error(path, error) from error
+        raise read_error(path, error) from error
     except ValueError as error:
         raise DataFileError(f"{path} is not a JSON file ({error}): delete it or write it again") from error
-
-
-def _read_error(path: str | Path, error: OSError) -> DataFileError:
-    if isinstance(error, FileNotFoundError):
-        return DataFileError(f"{path} does not exist: check the path, or run the stage that writes it")
-    if isinstance(error, (PermissionError, IsADirectoryError)):
-        return DataFileError(f"cannot read {path} ({error.strerror}): check the path and its permissions")
-    return DataFileError(f"cannot read {path} ({error}): make or fetch it again")
 
 
 @contextlib.contextmanager
@@ -162,7 +91,6 @@ def atomic_hdf5(path: str | Path, kind: str, attributes: Mapping[str, Any] | Non
     in_memory = {"driver": "core", "backing_store": False, "block_size": 1 << 20}
     with (
         atomic_path(path) as partial,
-        open(partial, "wb") as output,
         h5py.File(partial.name, "w", libver=("v110", "v110"), userblock_size=USER_BLOCK, **in_memory) as file,
     ):
         file.attrs.update({**(attributes or {}), "format": FORMAT, "version": FORMAT_VERSION, "kind": kind})
@@ -170,13 +98,11 @@ def atomic_hdf5(path: str | Path, kind: str, attributes: Mapping[str, Any] | Non
         yield file
         file.attrs["complete"] = True
         file.flush()
-        content = file.id.get_file_image()  # without the first block
-        output.write(_first_block(zlib.crc32(content)))
-        output.write(content)
+        write_sealed(partial, SEAL.encode().ljust(USER_BLOCK, b"\n"), file.id.get_file_image())
 
 
 def create(group: h5py.Group, name: str, array: npt.ArrayLike, units: str = "1", time_axis: int = 0) -> h5py.Dataset:
-    """Stores an array as a checksummed dataset, in chunks of 64 steps along `time_axis`.
+    """Stores an array as a dataset, in chunks of 64 steps along `time_axis`.
 
     Args:
         group: Where to store it.
@@ -187,7 +113,7 @@ def create(group: h5py.Group, name: str, array: npt.ArrayLike, units: str = "1",
     """
     values = np.asarray(array)
     chunks = chunk_shape(values.shape, time_axis)
-    dataset = group.create_dataset(name, data=values, chunks=chunks, fletcher32=chunks is not None)
+    dataset = group.create_dataset(name, data=values, chunks=chunks)
     dataset.attrs["units"] = units
     return dataset
 
@@ -210,8 +136,9 @@ def open_hdf5(path: str | Path) -> Iterator[h5py.File]:
     path = Path(path)
     with contextlib.ExitStack() as stack:
         try:
-            with open(path, "rb"):
-                file = stack.enter_context(h5py.File(path, "r"))
+            if not is_as_written(path, USER_BLOCK):  # Reading damaged texts might not end.
+                raise ValueError("it does not match its checksum")
+            file = stack.enter_context(h5py.File(path, "r"))
             refuse_data_elsewhere(file)
         except (DecodingError, OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
             raise hdf5_error(path, error) from error
@@ -235,41 +162,19 @@ def hdf5_error(path: Path, error: Exception) -> DataFileError:
     if "unable to lock" in message:
         return DataFileError(f"{path} is being written by another process: wait until that has ended")
     if isinstance(error, OSError) and error.filename is not None:
-        return _read_error(path, error)
+        return read_error(path, error)
     detail = message.splitlines()[0] if message else type(error).__name__
     return DataFileError(f"{path} is damaged ({detail}): delete it and make or fetch it again")
-
-
-def _check(path: Path) -> None:
-    """Refuses a file that does not match the checksum before it; files of earlier versions have none."""
-    try:
-        with path.open("rb") as file:
-            head, crc = file.read(USER_BLOCK), 0
-            if not head.startswith(_CHECKSUM):
-                return
-            while part := file.read(1 << 20):
-                crc = zlib.crc32(part, crc)
-    except OSError as error:
-        raise _read_error(path, error) from error
-    if head != _first_block(crc):
-        raise hdf5_error(path, ValueError("it does not match its checksum"))
-
-
-def _first_block(crc: int) -> bytes:
-    return (_CHECKSUM + b"%08x" % crc).ljust(USER_BLOCK, b"\n")
 
 
 @contextlib.contextmanager
 def read_hdf5(path: str | Path, expected_kind: str) -> Iterator[h5py.File]:
     """Opens a file that `atomic_hdf5` wrote.
 
-    HDF5 itself has no checksum of texts of variable length, and reading damaged ones may not end.
-
     Raises:
         DataFileError: as `open_hdf5`; also a file of another program, kind or newer version, or an unfinished
             one.
     """
-    _check(Path(path))
     with open_hdf5(path) as file:
         origin, version, kind, complete = (
             str(file.attrs.get(name)) for name in ("format", "version", "kind", "complete")
@@ -307,7 +212,7 @@ def read_arrays(path: str | Path, names: Sequence[str] | None = None) -> dict[st
                 raise ValueError(f"its arrays take more than {LARGEST_ARRAYS >> 30} GiB")
             return {name: content[name] for name in content.files if names is None or name in names}
     except OSError as error:
-        raise _read_error(path, error) from error
+        raise read_error(path, error) from error
     except _ARRAY_FAULTS as error:
         reason = "it holds Python objects, which can run code" if "allow_pickle" in str(error) else str(error)
         raise DataFileError(
@@ -357,20 +262,9 @@ def write_checkpoint(
 
     own = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
     text = json.dumps(to_plain(metadata))
-    header = {"format": FORMAT, "version": str(FORMAT_VERSION), "kind": kind}
+    header = {"format": FORMAT, "version": str(FORMAT_VERSION), "kind": kind, "checksum": SEAL, "metadata": text}
     with atomic_path(path) as partial:
-        partial.write_bytes(save(own, metadata={**header, "metadata": text, "checksum": _checksum(own, text)}))
-
-
-def _checksum(tensors: Mapping[str, torch.Tensor], metadata: str) -> str:
-    """CRC-32 of the metadata and of the tensors with their names, types and shapes."""
-    import torch
-
-    crc = zlib.crc32(metadata.encode())
-    for name, tensor in sorted(tensors.items()):
-        crc = zlib.crc32(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode(), crc)
-        crc = zlib.crc32(tensor.flatten().view(torch.uint8).numpy().tobytes(), crc)
-    return f"{crc:08x}"
+        write_sealed(partial, save(own, metadata=header))
 
 
 def read_checkpoint(path: str | Path, expected_kind: str) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
@@ -382,7 +276,11 @@ def read_checkpoint(path: str | Path, expected_kind: str) -> tuple[dict[str, tor
     from safetensors import SafetensorError, safe_open
 
     try:
-        with open(path, "rb"), safe_open(path, framework="pt", device="cpu") as file:
+        if not is_as_written(path, Path(path).stat().st_size):
+            raise DataFileError(
+                f"{path} is damaged (it does not match its checksum): delete it and run the same command again"
+            )
+        with safe_open(path, framework="pt", device="cpu") as file:
             header = file.metadata() or {}
             if header.get("format") != FORMAT:
                 raise DataFileError(f"{path} was not written by {FORMAT}: check the path")
@@ -393,14 +291,9 @@ def read_checkpoint(path: str | Path, expected_kind: str) -> tuple[dict[str, tor
                     f"{FORMAT_VERSION}, is needed: check the path"
                 )
             tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
-            checksum = _checksum(tensors, header["metadata"])
-            if header.get("checksum", checksum) != checksum:  # Files of earlier versions have none.
-                raise DataFileError(
-                    f"{path} is damaged (it does not match its checksum): delete it and run the same command again"
-                )
             return tensors, json.loads(header["metadata"])
     except OSError as error:
-        raise _read_error(path, error) from error
+        raise read_error(path, error) from error
     except (SafetensorError, ValueError, KeyError) as error:
         raise DataFileError(
             f"{path} is no complete safetensors file ({error}): delete it and run the same command again"

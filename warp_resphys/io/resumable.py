@@ -1,275 +1,188 @@
-"""Work that survives any interruption.
+"""Work that goes on where it was interrupted, however it ended.
 
-`ResumableHDF5` is for what is computed step by step. The steps go to a journal beside the final file: a header that
-says what is being computed, then one record a step, appended with a checksum. A record that was cut short by a kill, a
-crash or a full disk does not match its checksum and is computed again; all whole ones are kept. The finished journal is
-turned into an HDF5 file and removed.
-
-`keep_checkpoint` is for all else: what the work goes on from, as a whole, in place of what was kept before.
+`keep_checkpoint` is for work that goes on from one state: each checkpoint takes the place of the one before.
+`ResumableHDF5` is for work that goes on frame by frame and keeps all of them: every ten seconds, it adds a checkpoint
+with the frames since the last one and the state after them; the last frame turns all of them into one HDF5 file.
 """
 
-from __future__ import annotations
-
-import json
+import glob
 import logging
 import os
 import time
-import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import torch
 
 from .errors import DataFileError
-from .files import (
-    atomic_hdf5,
-    create,
-    disk_full_error,
-    is_disk_full,
-    read_array,
-    read_checkpoint,
-    read_hdf5,
-    write_checkpoint,
-)
-
-if TYPE_CHECKING:
-    import torch
+from .files import atomic_hdf5, create, read_checkpoint, read_hdf5, write_checkpoint
 
 log = logging.getLogger(__name__)
 
-_SYNC_SECONDS = 2.0
-_LAYOUT = 2  # of what stages keep in checkpoints
-_CHECKSUM = "CRC-32"
+KEEP_SECONDS = 10.0  # between two checkpoints
+_LAYOUT = 2  # of the content of checkpoints
 
 
 @dataclass(frozen=True)
 class Field:
-    """One array of every step."""
+    """One array of every frame."""
 
-    shape: tuple[int, ...]  # Its shape in one step; () for a number
+    shape: tuple[int, ...]  # of one frame; () for a number
     units: str  # SI units, stored beside the dataset; "1" for numbers without a unit
     dtype: str = "float64"  # NumPy's name of its type
-    # How many of its leading axes stand before the one that counts steps in the final dataset: with 1, steps of
-    # (B, N, 3) become (B, T, N, 3), with 0 they become (T, B, N, 3)
+    # Number of its axes that stand before the one of the frames in the file: with 1, frames of (B, N, 3) become
+    # (B, T, N, 3), with 0 they become (T, B, N, 3)
     batch_axes: int = 0
 
 
 class ResumableHDF5:
-    """An HDF5 file that is computed one step (a frame, a trajectory, ...) at a time.
+    """An HDF5 file that is computed frame by frame, and the state that the next frame goes on from.
 
-    Use it as a context manager. `done` says how many steps an earlier, interrupted run left; go on from
-    there::
+    Use it as a context manager, which keeps on leaving what was appended. `done` is the number of frames that an
+    earlier run left, `state` the state after them::
 
         with ResumableHDF5(path, "forces", fingerprint, frames, fields) as file:
-            for step in range(file.done, file.steps):
-                file.append(forces=...)
+            while file.done < file.frames:
+                ...
+                file.append(state, force=...)
             file.finish()
 
-    Work that belongs to another fingerprint, or to other fields, is discarded. An existing file at `path`
-    stays in place until `finish` replaces it; if it is already the one asked for, all steps are done.
+    Frames of another fingerprint are discarded. An older file at `path` stays there until `finish` replaces it.
 
     Args:
-        path: Where the final HDF5 file is to appear.
-        kind: What the file holds, as for `files.atomic_hdf5`.
-        fingerprint: Identifies the inputs of the computation; steps of another fingerprint are not used.
-        steps: How many there are.
-        fields: The arrays of one step by name.
+        path: of the HDF5 file.
+        kind: of the file, see `files.atomic_hdf5`.
+        fingerprint: identifies all that the frames depend on.
+        frames: how many there are.
+        fields: the arrays of one frame by name.
     """
 
-    def __init__(self, path: str | Path, kind: str, fingerprint: str, steps: int, fields: Mapping[str, Field]) -> None:
-        self.path, self.kind, self.fingerprint = Path(path), kind, fingerprint
-        self.steps, self.done, self.fields = steps, 0, dict(fields)
-        self.journal = self.path.with_name(self.path.name + ".journal")
-        layout = {name: [f.shape, np.dtype(f.dtype).str, f.units, f.batch_axes] for name, f in self.fields.items()}
-        header = {"format": "warp_resphys journal 1", "kind": kind, "fingerprint": fingerprint}
-        self._header = (json.dumps({**header, "steps": steps, "fields": layout}) + "\n").encode()
-        parts = [(name, field.dtype, field.shape) for name, field in self.fields.items()]
-        self._record = np.dtype([*parts, (_CHECKSUM, "<u4")])
-        self._descriptor: int | None = None
-        self._finished = False
-        self._synced = 0.0
+    def __init__(self, path: Path, kind: str, fingerprint: str, frames: int, fields: Mapping[str, Field]) -> None:
+        self.path, self.kind, self.fingerprint = path, kind, fingerprint
+        self.frames, self.fields = frames, dict(fields)
+        self._arrays = {
+            name: np.empty((*f.shape[: f.batch_axes], frames, *f.shape[f.batch_axes :]), f.dtype)
+            for name, f in self.fields.items()
+        }
+        self._last: tuple[int, Mapping[str, torch.Tensor]] = (0, {})  # frames that are done, state after them
+        self._kept = 0  # frames that are in checkpoints
+        self._next = 0.0  # time of the next checkpoint
 
-    def __enter__(self) -> ResumableHDF5:
-        """Opens the journal, or makes one, and counts the steps that are done.
+    @property
+    def done(self) -> int:
+        """Number of frames that are done."""
+        return self._last[0]
 
-        Raises:
-            DataFileError: the disk is full, the place cannot be written to, or there is a file that is damaged or not
-                ours.
-        """
-        if self._is_final():
-            self.journal.unlink(missing_ok=True)
-            self._finished, self.done = True, self.steps
-            return self
-        try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._descriptor = os.open(self.journal, os.O_RDWR | os.O_CREAT, 0o666)
-            self.done = self._resume()
-        except BaseException as error:
-            self._close()
-            if isinstance(error, OSError):
-                raise self._write_error(error) from error
-            raise
-        self._synced = time.monotonic()
+    @property
+    def state(self) -> Mapping[str, torch.Tensor]:
+        """The state after these frames; empty before the first one."""
+        return self._last[1]
+
+    def __enter__(self) -> "ResumableHDF5":
+        """Reads the checkpoints of an earlier run, up to the first one that is damaged or of another fingerprint."""
+        for path in self._checkpoints():
+            try:
+                tensors, metadata = read_checkpoint(path, "frames")
+            except DataFileError as error:
+                log.warning("not going on from a checkpoint: %s", error)
+                break
+            done = metadata.pop("done")
+            if metadata != self._metadata(self.done):
+                log.warning("not going on from %s: it belongs to other settings", path)
+                break
+            for name in self.fields:
+                self._arrays[name][self._at(name, slice(self.done, done))] = tensors[f"frames.{name}"].numpy()
+            self._last = done, {key[6:]: tensor for key, tensor in tensors.items() if key.startswith("state.")}
+        self._kept = self.done
+        for path in self._checkpoints():
+            if path >= self._checkpoint(self.done):
+                path.unlink()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Keeps what was computed, whatever the block ended with."""
-        self._close()
+        self._keep()
 
-    def append(self, **arrays: npt.ArrayLike) -> None:
-        """Writes the arrays of the next step; once this returns, a killed process does not lose them.
+    def append(self, state: Mapping[str, torch.Tensor], **arrays: npt.ArrayLike) -> None:
+        """Adds the arrays of the next frame and the state after it, which is not to be changed in place.
 
         Raises:
-            DataFileError: the disk is full; the steps before this one are kept.
+            DataFileError: a checkpoint cannot be written.
         """
-        if self._descriptor is None or self.done == self.steps:
-            raise ValueError(f"{self.path} takes no further step: {self.done} of {self.steps} are written")
-        if arrays.keys() != self.fields.keys():
-            raise ValueError(f"a step of {self.path} consists of {[*self.fields]}, not of {[*arrays]}")
-        record = np.zeros(1, self._record)
         for name, field in self.fields.items():
             values = np.asarray(arrays[name], dtype=field.dtype)
             if values.shape != field.shape:
                 raise ValueError(f"'{name}' has the shape {values.shape} where {field.shape} is needed")
-            record[name] = values
-        record[_CHECKSUM] = self._checksum(record, self.done)
-        try:
-            self._write(record.tobytes(), self._offset(self.done))
-            self.done += 1
-            if time.monotonic() - self._synced > _SYNC_SECONDS:  # A power cut loses a few seconds of work at most.
-                os.fsync(self._descriptor)
-                self._synced = time.monotonic()
-        except OSError as error:
-            raise self._write_error(error) from error
+            self._arrays[name][self._at(name, self.done)] = values
+        self._last = self.done + 1, state  # in one assignment, for a Ctrl-C in between
+        if time.monotonic() >= self._next:  # After the first frame, too: a place that cannot be written shows at once.
+            self._keep()
+            self._next = time.monotonic() + KEEP_SECONDS
 
-    def rewind(self, steps: int) -> None:
-        """Forgets all but the first steps, which are written anew."""
-        if not self._finished and steps < self.done:
-            assert self._descriptor is not None
-            os.ftruncate(self._descriptor, self._offset(steps))
-            self.done = steps
-
-    def read(self, step: int) -> dict[str, npt.NDArray[Any]]:
-        """The arrays of a step that is done.
-
-        Raises:
-            DataFileError: the step cannot be read.
-        """
-        if not 0 <= step < self.done:
-            raise ValueError(f"step {step} of {self.path} is not among the {self.done} that are done")
-        if self._finished:
-            with read_hdf5(self.path, self.kind) as file:
-                places = {name: (*(slice(None),) * field.batch_axes, step) for name, field in self.fields.items()}
-                return {name: read_array(file, name, index=place) for name, place in places.items()}
-        record = self._whole(step)
-        if record is None:
-            raise DataFileError(f"{self.journal} is damaged: delete it and run the same command again")
-        return {name: record[name][0].copy() for name in self.fields}
-
-    def finish(
-        self,
-        attributes: Mapping[str, Any] | None = None,
-        constants: Mapping[str, tuple[npt.ArrayLike, str]] | None = None,
-        order: Sequence[int] | None = None,
-    ) -> None:
-        """Writes the final file, replaces an older one by it, and removes the journal.
+    def finish(self, constants: Mapping[str, tuple[npt.ArrayLike, str]] | None = None) -> None:
+        """Writes the HDF5 file and removes the checkpoints.
 
         Args:
-            attributes: Attributes of the final file.
-            constants: Arrays that do not depend on the step, each with its units.
-            order: Where each step, as they were appended, stands in the final file; in that order if left out.
+            constants: arrays that do not depend on the frame, with their units.
 
         Raises:
-            DataFileError: the disk is full; all steps are kept in the journal.
+            DataFileError: the file cannot be written; the frames are kept in checkpoints.
         """
-        if self._finished:
+        if self.done != self.frames:
+            raise ValueError(f"{self.path} cannot be finished: {self.done} of {self.frames} frames are done")
+        with atomic_hdf5(self.path, self.kind, {"fingerprint": self.fingerprint}) as file:
+            for name, (array, units) in (constants or {}).items():
+                create(file, name, array, units)
+            for name, field in self.fields.items():
+                create(file, name, self._arrays[name], field.units, time_axis=field.batch_axes)
+        self._kept = self.done
+        for path in self._checkpoints():
+            path.unlink()
+
+    def _keep(self) -> None:
+        """Writes a checkpoint of the frames since the last one."""
+        done, state = self._last
+        if done == self._kept:
             return
-        if self.done != self.steps:
-            raise ValueError(f"{self.path} cannot be finished: {self.done} of {self.steps} steps are written")
-        places = np.arange(self.steps) if order is None else np.asarray(order)
-        if not np.array_equal(np.sort(places), np.arange(self.steps)):
-            raise ValueError(f"{self.path} cannot be finished in the order {order}: each step has a place of its own")
-        own = {**(attributes or {}), "fingerprint": self.fingerprint}
-        records = np.memmap(self.journal, self._record, "r", len(self._header), self.steps) if self.steps else None
-        try:
-            with atomic_hdf5(self.path, self.kind, own) as file:
-                for name, (array, units) in (constants or {}).items():
-                    create(file, name, array, units)
-                for name, field in self.fields.items():
-                    values = np.empty((self.steps, *field.shape), field.dtype)
-                    if records is not None:
-                        values[places] = records[name]
-                    values = np.moveaxis(values, 0, field.batch_axes)
-                    create(file, name, values, field.units, time_axis=field.batch_axes)
-        except DataFileError as error:
-            if error.__cause__ is not None and is_disk_full(error.__cause__):
-                raise disk_full_error(self.path, self.journal) from error
-            raise
-        self._finished = True
-        self._close()
-        self.journal.unlink()
+        frames = slice(self._kept, done)
+        tensors = {
+            f"frames.{name}": torch.from_numpy(self._arrays[name][self._at(name, frames)].copy())
+            for name in self.fields
+        }
+        tensors |= {f"state.{name}": tensor for name, tensor in state.items()}
+        metadata = {**self._metadata(self._kept), "done": done}
+        write_checkpoint(self._checkpoint(self._kept), "frames", tensors, metadata)
+        self._kept = done
 
-    def _is_final(self) -> bool:
-        """Whether the final file is there, of the same computation; one that is damaged or not ours is an error."""
-        if not self.path.is_file():
-            return False
-        with read_hdf5(self.path, self.kind) as file:  # Its checksum is looked at.
-            return str(file.attrs.get("fingerprint")) == self.fingerprint
+    def _metadata(self, first: int) -> dict[str, Any]:
+        layout = {name: [*field.shape, field.dtype, field.batch_axes] for name, field in self.fields.items()}
+        return {"fingerprint": self.fingerprint, "frames": self.frames, "fields": layout, "first": first}
 
-    def _resume(self) -> int:
-        """Counts the whole records of the journal and cuts off the rest; starts it anew if it is not ours."""
-        assert self._descriptor is not None
-        found, done = os.pread(self._descriptor, len(self._header), 0), 0
-        if found == self._header:
-            while done < self.steps and self._whole(done) is not None:
-                done += 1
-            os.ftruncate(self._descriptor, self._offset(done))
-            return done
-        if found:
-            log.warning("discarding %s: it belongs to other settings or was cut short", self.journal.name)
-        os.ftruncate(self._descriptor, 0)
-        self._write(self._header, 0)
-        return 0
+    def _at(self, name: str, frames: int | slice) -> tuple[int | slice, ...]:
+        """The index of some frames in an array."""
+        return (*(slice(None),) * self.fields[name].batch_axes, frames)
 
-    def _whole(self, step: int) -> npt.NDArray[Any] | None:
-        """The record of a step, (1,), or None if it is incomplete or does not match its checksum."""
-        assert self._descriptor is not None
-        content = os.pread(self._descriptor, self._record.itemsize, self._offset(step))
-        if len(content) != self._record.itemsize:
-            return None
-        record = np.frombuffer(content, self._record)
-        return record if record[_CHECKSUM] == self._checksum(record, step) else None
+    def _checkpoint(self, first: int) -> Path:
+        return self.path.with_name(f"{self.path.stem}.frames_{first:07d}.safetensors")
 
-    def _checksum(self, record: npt.NDArray[Any], step: int) -> int:
-        return zlib.crc32(memoryview(record.tobytes())[:-4], step)
+    def _checkpoints(self) -> list[Path]:
+        return sorted(self.path.parent.glob(f"{glob.escape(self.path.stem)}.frames_*.safetensors"))
 
-    def _offset(self, step: int) -> int:
-        return len(self._header) + step * self._record.itemsize
 
-    def _write(self, data: bytes, offset: int) -> None:
-        assert self._descriptor is not None
-        rest = memoryview(data)
-        while rest:
-            written = os.pwrite(self._descriptor, rest, offset)
-            rest, offset = rest[written:], offset + written
+def is_final(path: Path, kind: str, fingerprint: str) -> bool:
+    """Whether a file of `ResumableHDF5` is there that was made from the same settings.
 
-    def _close(self) -> None:
-        if self._descriptor is not None:
-            os.close(self._descriptor)
-            self._descriptor = None
-
-    def _write_error(self, error: OSError) -> DataFileError:
-        if is_disk_full(error):
-            return disk_full_error(self.journal, self.journal)
-        return DataFileError(
-            f"cannot write {self.journal} ({error.strerror}): make the place writable or choose another one"
-        )
+    Raises:
+        DataFileError: the file is damaged, or another program's.
+    """
+    if not path.is_file():
+        return False
+    with read_hdf5(path, kind) as file:
+        return str(file.attrs.get("fingerprint")) == fingerprint
 
 
 def keep_checkpoint(path: Path, kind: str, tensors: Mapping[str, torch.Tensor], metadata: Mapping[str, Any]) -> None:
@@ -284,7 +197,7 @@ def keep_checkpoint(path: Path, kind: str, tensors: Mapping[str, torch.Tensor], 
 
 
 def resume_checkpoint(path: Path, kind: str, fingerprint: str) -> tuple[dict[str, torch.Tensor], dict[str, Any]] | None:
-    """The last checkpoint of `keep_checkpoint` that is whole and has this "fingerprint" in its metadata, if any."""
+    """The last checkpoint of `keep_checkpoint` that is whole and has this fingerprint; None if there is none."""
     for candidate in (path, _before(path)):
         if not candidate.exists():
             continue
@@ -303,7 +216,7 @@ def resume_checkpoint(path: Path, kind: str, fingerprint: str) -> tuple[dict[str
 
 
 def forget_checkpoint(path: Path) -> None:
-    """Removes what `keep_checkpoint` wrote."""
+    """Removes the checkpoints that `keep_checkpoint` wrote."""
     path.unlink(missing_ok=True)
     _before(path).unlink(missing_ok=True)
 

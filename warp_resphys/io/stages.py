@@ -1,8 +1,7 @@
-"""Runs the stages of an experiment, each of them only when something that it depends on has changed.
+"""Runs the stages of an experiment; a stage runs again only when something that it depends on has changed.
 
-Stages talk through files in the run folder. Beside its outputs, a stage leaves a record of what they were
-made from (`stages/<name>.json`); the fingerprint in it covers the stage's settings and those of all stages
-before it.
+A stage reads and writes files in the run folder. Beside its outputs, it leaves a record of what they were made from
+(`stages/<name>.json`); the fingerprint in it covers the settings of the stage and of all stages before it.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ import fcntl
 import hashlib
 import json
 import logging
-import os
 import platform
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,10 +20,10 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from .atomic import digest
 from .errors import DataFileError, InputError
-from .files import FORMAT_VERSION, digest, read_json, to_plain, write_json
+from .files import FORMAT_VERSION, read_json, to_plain, write_json
 from .memory import WorkersMemory, peak_memory_gib
-from .resumable import forget_checkpoint, keep_checkpoint, resume_checkpoint
 
 log = logging.getLogger(__name__)
 
@@ -34,25 +32,25 @@ _PACKAGES = ("warp-resphys", "warp-lang", "torch", "numpy", "scipy", "cholespy",
 
 @dataclass(frozen=True)
 class StageContext:
-    """What a stage is told when it runs."""
+    """The arguments of a stage's function."""
 
-    name: str  # The stage's
-    run_dir: Path  # The run folder; outputs are written there
-    fingerprint: str  # Identifies everything the outputs depend on; resumable files are marked with it
-    settings: Mapping[str, Any]  # That the stage declared
-    memory: WorkersMemory = field(default_factory=WorkersMemory)  # Of its worker processes, which it is to count
-    upstream: Mapping[str, str] = field(default_factory=dict)  # Fingerprints of the stages that it reads from, by name
+    name: str  # of the stage
+    run_dir: Path  # the run folder, where outputs are written
+    fingerprint: str  # identifies all that the outputs depend on; resumable files are marked with it
+    settings: Mapping[str, Any]  # of the stage
+    memory: WorkersMemory = field(default_factory=WorkersMemory)  # of its worker processes
+    upstream: Mapping[str, str] = field(default_factory=dict)  # fingerprints of the stages that it reads from, by name
 
 
 @dataclass(frozen=True)
 class Stage:
     """A step of an experiment, from files to files."""
 
-    name: str  # Its name, also that of its record
-    function: Callable[[StageContext], None]  # Does the work; it writes each output whole or not at all
-    outputs: tuple[str, ...]  # Names of the files that it writes, relative to the run folder
-    settings: Mapping[str, Any]  # Plain nested settings that the outputs depend on, and no others
-    upstream: tuple[str, ...] = ()  # Names of the stages whose outputs it reads
+    name: str  # also of its record
+    function: Callable[[StageContext], None]  # does the work; writes each output whole or not at all
+    outputs: tuple[str, ...]  # names of the files that it writes, relative to the run folder
+    settings: Mapping[str, Any]  # all settings that the outputs depend on, and no others
+    upstream: tuple[str, ...] = ()  # names of the stages whose outputs it reads
 
 
 class StageInterrupted(KeyboardInterrupt):
@@ -80,10 +78,10 @@ def run_stages(
     """Runs those of the stages whose outputs are missing, damaged or made from other settings.
 
     Args:
-        stages: In the order in which they run; a stage comes after those it reads from.
-        run_dir: The run folder, made where it is missing; one process at a time may use it.
-        wait: Whether to wait for another process that uses it, in place of raising.
-        begins: Told the name of each stage before it is looked at.
+        stages: in the order in which they run; a stage comes after those it reads from.
+        run_dir: the run folder, made where it is missing; one process at a time may use it.
+        wait: whether to wait for another process that uses it, in place of raising.
+        begins: called with the name of a stage before it is checked and run.
 
     Returns:
         The seconds that each stage took, summed over interrupted runs.
@@ -112,7 +110,7 @@ def up_to_date(stages: Sequence[Stage], run_dir: str | Path) -> bool:
 
 
 def _context(stage: Stage, run_dir: Path, known: dict[str, str]) -> StageContext:
-    """What a stage is told; adds its fingerprint to those of the stages before it."""
+    """The context of a stage; adds its fingerprint to those of the stages before it."""
     if stage.name in known or not known.keys() >= set(stage.upstream):
         raise ValueError(f"stage '{stage.name}' is there twice or stands before a stage it reads from")
     known[stage.name] = fingerprint(stage, known)
@@ -126,9 +124,9 @@ def _record(run_dir: Path, name: str) -> Path:
 
 def _run_stage(stage: Stage, context: StageContext, finished: list[str]) -> float:
     """Runs one stage, writes its record and returns its seconds, those of interrupted runs included."""
-    spent = _record(context.run_dir, stage.name).with_suffix(".state.safetensors")
-    before = resume_checkpoint(spent, "stage", context.fingerprint)
-    seconds = 0.0 if before is None else float(before[1]["seconds"])
+    interrupted = _record(context.run_dir, stage.name).with_suffix(".interrupted.json")
+    before = read_json(interrupted) if interrupted.is_file() else {}
+    seconds = float(before["seconds"]) if before.get("fingerprint") == context.fingerprint else 0.0
     log.info("%s: %s", stage.name, f"going on after {seconds:.0f} s" if seconds else "started")
     start = time.perf_counter() - seconds
     try:
@@ -136,19 +134,16 @@ def _run_stage(stage: Stage, context: StageContext, finished: list[str]) -> floa
         seconds = time.perf_counter() - start
         _write_record(stage, context, seconds)
     except (Exception, KeyboardInterrupt) as error:
-        metadata = {"fingerprint": context.fingerprint, "seconds": time.perf_counter() - start}
-        try:
-            keep_checkpoint(spent, "stage", {}, metadata)
-        except DataFileError as fault:  # It must not hide why the stage is unfinished.
-            log.warning("the time spent in '%s' is not kept: %s", context.name, fault)
+        with suppress(DataFileError):  # A full disk must not hide why the stage is unfinished.
+            write_json(interrupted, {"fingerprint": context.fingerprint, "seconds": time.perf_counter() - start})
         if not isinstance(error, KeyboardInterrupt):
             raise
-        whole = f"finished and kept: {', '.join(finished)}; " if finished else ""
+        kept = f"finished and kept: {', '.join(finished)}; " if finished else ""
         raise StageInterrupted(
-            f"interrupted in stage '{stage.name}' ({whole}what '{stage.name}' has saved is kept); "
+            f"interrupted in stage '{stage.name}' ({kept}what '{stage.name}' has saved is kept); "
             f"the same command goes on from there"
         ) from error
-    forget_checkpoint(spent)
+    interrupted.unlink(missing_ok=True)
     log.info("%s: done in %.1f s", stage.name, seconds)
     return seconds
 
@@ -173,11 +168,11 @@ def _write_record(stage: Stage, context: StageContext, seconds: float) -> None:
 
 
 def finished_record(run_dir: str | Path, name: str) -> dict[str, Any]:
-    """The record of a stage that is done, whose outputs and all that they were made from are still the same.
+    """The record of a finished stage, whose outputs and all that they were made from are still the same.
 
     Args:
         run_dir: the run folder.
-        name: of the stage; its record's ``settings`` are what it was told.
+        name: of the stage, whose ``settings`` are in the record.
 
     Raises:
         DataFileError: there is no such folder, the stage was not run to its end, it was made by another version of
@@ -209,18 +204,17 @@ def finished_record(run_dir: str | Path, name: str) -> dict[str, Any]:
 
 
 def resources_used(run_dir: str | Path, names: Sequence[str]) -> dict[str, Any]:
-    """What `metrics.json` says of stages that are done: the seconds of each, and the largest known peak of memory."""
+    """The seconds of stages that are done, and the largest of their recorded peaks of memory, for `metrics.json`."""
     paths = {name: _record(Path(run_dir), name) for name in names}
     records = {name: read_json(path) for name, path in paths.items() if path.is_file()}
-    peaks = [record["peak_memory_gib"] for record in records.values() if "peak_memory_gib" in record]
     return {
         "seconds": {name: record["seconds"] for name, record in records.items()},
-        "peak_memory_gib": max(peaks, default=None),
+        "peak_memory_gib": max((record["peak_memory_gib"] for record in records.values()), default=None),
     }
 
 
 def _identity(path: Path) -> dict[str, Any]:
-    """What tells an output from another file of the same name."""
+    """Size, time and digest of a file, which tell it from another one of the same name."""
     status = path.stat()
     return {"bytes": status.st_size, "modified_ns": status.st_mtime_ns, "sha256": digest(path)}
 
@@ -258,7 +252,9 @@ def _is_same(path: Path, identity: Mapping[str, Any]) -> bool:
 def run_lock(run_dir: str | Path, wait: bool = False) -> Iterator[None]:
     """Holds a run folder for this process; the operating system lets go of it however the process ends.
 
-    See `run_stages` for the arguments.
+    Args:
+        run_dir: the run folder, made where it is missing.
+        wait: whether to wait for another process that holds it, in place of raising.
 
     Raises:
         InputError: another process holds it.
@@ -267,28 +263,26 @@ def run_lock(run_dir: str | Path, wait: bool = False) -> Iterator[None]:
     path = Path(run_dir) / ".lock"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        file = path.open("a")
     except OSError as error:
         raise DataFileError(
             f"cannot write the run folder {run_dir} ({error.strerror}): make it writable or choose another"
         ) from error
-    try:
+    with file:
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             if not wait:
                 raise InputError(
                     f"another process is writing the run folder {run_dir}: wait for it or choose another one"
                 ) from error
             log.info("waiting for another process that is writing the run folder %s", run_dir)
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            fcntl.flock(file, fcntl.LOCK_EX)
         except OSError as error:
             raise DataFileError(
                 f"cannot lock the run folder {run_dir} ({error.strerror}): choose one on another disk"
             ) from error
         yield
-    finally:
-        os.close(descriptor)
 
 
 def package_versions() -> dict[str, str]:

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from ..io.atomic import atomic_path
 from ..io.decoding import Arrays, DecodingError, decode, mesh_arrays
 from ..io.errors import MeshError
-from ..io.files import atomic_path
 from .elements import ELEMENTS
 from .mesh import FloatArray, IntArray, Mesh, boundary_faces, check_mesh, quadratic
 

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from ..io.files import atomic_path
+from ..io.atomic import atomic_path
 from ..mesh.chambers import Chamber
 from ..mesh.elements import ELEMENTS
 from ..mesh.mesh import Mesh, boundary_triangles, face_triangles

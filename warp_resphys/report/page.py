@@ -17,8 +17,9 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
+from ..io.atomic import disk_full_error, is_disk_full
 from ..io.errors import DataFileError
-from ..io.files import disk_full_error, is_disk_full, write_text
+from ..io.files import write_text
 from ..learning.metrics import PublishedError
 from .render import DrawingError
 

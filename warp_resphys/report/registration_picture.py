@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch
 from scipy.optimize import isotonic_regression
 
-from ..io.files import atomic_path
+from ..io.atomic import atomic_path
 from ..mesh.mesh import Mesh, boundary_triangles
 from .bodies import face_edges, sharp_edges, stems
 from .camera import frame_of, picture_size

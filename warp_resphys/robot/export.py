@@ -11,8 +11,9 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from numpy.typing import NDArray
 
+from ..io.atomic import atomic_path
 from ..io.errors import InputError
-from ..io.files import atomic_path, write_text
+from ..io.files import write_text
 from ..mesh.mesh import Mesh, boundary_triangles, surface_vertices
 
 FloatArray = NDArray[np.float64]

@@ -9,8 +9,8 @@ import torch
 from torch import nn
 
 from ..dynamics.frames import VertexFrames
+from ..io.atomic import atomic_path
 from ..io.errors import InputError
-from ..io.files import atomic_path
 from ..learning.networks import RecurrentMLP, StateMap
 from ..learning.predictors import Range
 from .robot import Robot

@@ -23,8 +23,9 @@ from ..energies.materials import make_material
 from ..energies.pressure import Pressure
 from ..experiment.schema import NATURAL, check
 from ..fem.body import Body
+from ..io.atomic import atomic_path, digest
 from ..io.errors import InputError
-from ..io.files import atomic_path, digest, read_json, write_json
+from ..io.files import read_json, write_json
 from ..io.progress import Progress
 from ..mesh.arm import mesh_arm
 from ..mesh.arm_geometry import arm_geometry

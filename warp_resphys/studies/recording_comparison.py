@@ -29,8 +29,9 @@ from ..dynamics.simulator import Simulator
 from ..energies.materials import make_material
 from ..experiment.schema import ANYTHING, COUNT, FINITE, MATERIAL, NOT_NEGATIVE, POSITIVE, WORD, Group, check, optional
 from ..fem.body import Body, PointMass
+from ..io.atomic import atomic_path
 from ..io.errors import DataFileError, InputError
-from ..io.files import atomic_path, write_json
+from ..io.files import write_json
 from ..mesh.mesh import box_hexahedra, select_vertices
 from ..report.figures import STYLE, TONES, save_png
 from .command import aligned

@@ -27,8 +27,9 @@ from ..data.recordings.quality import (
 from ..data.recordings.reading import read_recording
 from ..data.recordings.recording import Recording
 from ..experiment.schema import ANYTHING, COUNT, NOT_NEGATIVE, POSITIVE, WORD, Group, check, optional
+from ..io.atomic import atomic_path
 from ..io.errors import InputError
-from ..io.files import atomic_path, write_json
+from ..io.files import write_json
 from ..report.figures import STYLE, TONES, new_figure, save_png
 from .command import WORDS, aligned
 

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from ..data.recordings.segment import convert_segment
+from ..io.atomic import digest
 from ..io.errors import InputError
-from ..io.files import digest, read_json, write_json
+from ..io.files import read_json, write_json
 from ..io.labels import run_label
 from ..io.stages import run_lock
 from ..report.page import Items, Part, figures_beside

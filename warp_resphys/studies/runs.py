@@ -18,8 +18,9 @@ from rich.markup import escape
 
 from ..experiment.files import METRICS
 from ..experiment.schema import check, optional
+from ..io.atomic import disk_full_error, is_disk_full
 from ..io.errors import DataFileError, InputError, ResphysError
-from ..io.files import disk_full_error, is_disk_full, read_json, write_text
+from ..io.files import read_json, write_text
 from ..io.machine import commit, hardware
 from ..io.progress import clock
 from ..io.stages import package_versions

@@ -6,7 +6,7 @@ import logging
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -166,12 +166,8 @@ def _share(task: _Task, tuning: Tuning, workers: Workers) -> None:
             results(count)
 
     try:
-        with (
-            Progress(f"{crew.count} workers", study.trials, "trials", done) as progress,
-            closing(fan_out(_join, [task] * crew.count, crew, advance, study.folder)) as ended,
-        ):
-            for _ in ended:
-                pass
+        with Progress(f"{crew.count} workers", study.trials, "trials", done) as progress:
+            fan_out(_join, [task] * crew.count, crew, advance, study.folder)
     except KeyboardInterrupt as error:
         raise StageInterrupted(
             "interrupted; whole epochs of the trials that ran are kept, and the same command goes on from there"

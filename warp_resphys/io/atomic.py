@@ -1,0 +1,115 @@
+"""Files that appear whole or not at all, and show when they were damaged later.
+
+A file is written under another name, brought to the disk and then renamed. `write_sealed` puts a checksum of the whole
+file into the place that its head keeps for it, which `is_as_written` compares.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import os
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+
+from .errors import DataFileError
+
+_SEAL = b"warp_resphys CRC-32 "
+SEAL = (_SEAL + b"0" * 8).decode()  # what the head of a file to be sealed holds
+_DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+@contextlib.contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """Gives a temporary path; what is written there takes the place of `path` when the block ends without an error.
+
+    Raises:
+        DataFileError: the disk is full, or the place cannot be written to.
+    """
+    path = Path(path)
+    partial = path.with_name(path.name + ".partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            yield partial
+            _sync(partial)
+            os.replace(partial, path)
+            _sync(path.parent)
+        finally:
+            partial.unlink(missing_ok=True)
+    except Exception as error:
+        if is_disk_full(error):
+            raise disk_full_error(path) from error
+        places = (str(partial), *(str(folder) for folder in path.parents))
+        if isinstance(error, OSError) and str(error.filename) in places:
+            raise DataFileError(
+                f"cannot write {path} ({error.strerror}): make the place writable or choose another one"
+            ) from error
+        raise
+
+
+def _sync(path: Path) -> None:
+    """Waits until the file or folder has reached the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def is_disk_full(error: BaseException) -> bool:
+    """Whether an error says, by number or text, that a disk, a quota or a file-size limit is exhausted."""
+    message = str(error).lower()
+    return getattr(error, "errno", None) in _DISK_FULL or any(
+        os.strerror(code).lower() in message for code in _DISK_FULL
+    )
+
+
+def disk_full_error(path: str | Path) -> DataFileError:
+    """The error to raise when there was no space for a file."""
+    return DataFileError(f"disk is full while writing {path}: free some space and run the same command again")
+
+
+def digest(path: str | Path) -> str:
+    """SHA-256 of a file's content, in hexadecimal."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def write_sealed(path: Path, head: bytes, content: bytes = b"") -> None:
+    """Writes a file whose head contains `SEAL`, which receives the checksum of head and content."""
+    before, _, after = head.partition(SEAL.encode())
+    with path.open("wb") as file:
+        file.write(before + _SEAL + b"%08x" % zlib.crc32(content, zlib.crc32(head)) + after)
+        file.write(content)
+
+
+def is_as_written(path: str | Path, head_bytes: int) -> bool:
+    """Whether a file of `write_sealed` still has the content of its checksum; true for files without one.
+
+    Args:
+        path: of the file.
+        head_bytes: length of the head.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
+    with open(path, "rb") as file:
+        before, seal, after = file.read(head_bytes).partition(_SEAL)
+        if not seal:
+            return True
+        crc = zlib.crc32(before + SEAL.encode() + after[8:])
+        while part := file.read(1 << 20):
+            crc = zlib.crc32(part, crc)
+    return after[:8] == b"%08x" % crc
+
+
+def read_error(path: str | Path, error: OSError) -> DataFileError:
+    """The error to raise for one of the operating system when a file was read."""
+    if isinstance(error, FileNotFoundError):
+        return DataFileError(f"{path} does not exist: check the path, or run the stage that writes it")
+    if isinstance(error, (PermissionError, IsADirectoryError)):
+        return DataFileError(f"cannot read {path} ({error.strerror}): check the path and its permissions")
+    return DataFileError(f"cannot read {path} ({error}): make or fetch it again")

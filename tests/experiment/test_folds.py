@@ -107,7 +107,9 @@ def test_ctrl_c_says_what_was_on_and_the_rest_is_kept(tmp_path):
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
     process = subprocess.Popen([sys.executable, str(script)], stderr=subprocess.PIPE, text=True, env=environment)
     start = time.monotonic()
-    while not [*tmp_path.glob("fold_*/stages/first.json")] and process.poll() is None and time.monotonic() - start < 300.0:
+    while (
+        not [*tmp_path.glob("fold_*/stages/first.json")] and process.poll() is None and time.monotonic() - start < 300.0
+    ):
         time.sleep(0.1)
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=200.0)

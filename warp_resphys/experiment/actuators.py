@@ -27,6 +27,9 @@ _COMMANDED: Final[Mapping[str, Mapping[str, Quantity]]] = {
     "tendons": {"tension": TENSION, "contraction": CONTRACTION},
     "muscles": {"stress": STRESS, "contraction": MUSCLE_CONTRACTION},
 }
+DRIVING_QUANTITIES: Final[Mapping[str, Quantity]] = {
+    quantity.name: quantity for quantity in (PRESSURE, *(q for group in _COMMANDED.values() for q in group.values()))
+}
 
 
 def build_actuators(config: Mapping[str, Any], mesh: Mesh) -> list[Energy]:

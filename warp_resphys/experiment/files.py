@@ -18,6 +18,7 @@ from ..io.errors import InputError
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5, read_json
 from ..mesh.mesh import select_vertices
 from ..stepping.inputs import Inputs
+from .actuators import DRIVING_QUANTITIES
 
 FloatArray = NDArray[np.float64]
 
@@ -94,8 +95,8 @@ class Dataset:
         bound: (M, 3) the markers on the undeformed body [m]; None for vertices.
         smoothed: (R, T, M, 3) what forces are to explain of the markers [m]; None for all of it.
         velocity: (R, T, N, 3) of the vertices [m/s], where a simulation knows them.
-        inputs: (R, K, C) during each step, by name, such as ``pressure`` [Pa].
-        channels: what the C are called, by input.
+        inputs: (R, K, C) during each step, by name, such as ``pressure`` [Pa]; see `actuators.DRIVING_QUANTITIES`.
+        channels: names of the C values, by input.
         base: (R, K + 1, 6) how what the body is fixed to has moved at the steps, see `data.base_motion`; None where it
             stands still.
     """
@@ -143,7 +144,7 @@ class Dataset:
                     axis = int(name in ("observed", "smoothed", "velocity"))
                     create(file, name, getattr(self, name), units=unit, time_axis=axis)
             for name, values in self.inputs.items():
-                create(file, name, values, units="Pa", time_axis=1)
+                create(file, name, values, units=DRIVING_QUANTITIES[name].unit or "1", time_axis=1)
 
     def joined(self, other: "Dataset") -> "Dataset":
         """These trials and others of the same body after them, with as many frames."""

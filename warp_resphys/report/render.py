@@ -25,8 +25,8 @@ from typing import IO, Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..io.atomic import atomic_path
 from ..io.errors import ResphysError
-from ..io.files import atomic_path
 from ..io.progress import Progress
 
 FloatArray = NDArray[np.float64]

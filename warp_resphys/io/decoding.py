@@ -11,7 +11,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -136,10 +136,11 @@ def refuse_data_elsewhere(file: "h5py.File") -> None:
 
 
 def mesh_arrays(path: str, file_format: str | None = None) -> Arrays:
-    """Of a file that meshio reads: `points` (N, 3), the types of its cells, volume cells and named surfaces.
+    """Of a file that meshio reads: `points` (N, 3), the types of its cells, volume cells, named surfaces and regions.
 
     `types` names the types; `solid/TYPE` are the cells (M, k) of those that fill a volume, `surface/NAME` the corners
-    (F, 3 | 4) of the faces of each named surface. Other errors than this one are meshio's, of any kind.
+    (F, 3 | 4) of the faces of each named surface, `region/NAME` the numbers (m,) of the volume cells of each named
+    region. Other errors than this one are meshio's, of any kind.
 
     Raises:
         DecodingError: meshio knows no way to read the file.
@@ -161,27 +162,46 @@ def mesh_arrays(path: str, file_format: str | None = None) -> Arrays:
             data = np.empty((len(block), 0)) if polyhedra else block.data
             solids.setdefault(f"solid/{block.type}", []).append(np.asarray(data, dtype=np.int64))
     surfaces = {f"surface/{name}": parts for name, parts in _named_surfaces(content).items()}
-    return arrays | {name: np.concatenate(parts) for name, parts in (solids | surfaces).items()}
+    regions = {f"region/{name}": parts for name, parts in _named_regions(content).items()}
+    return arrays | {name: np.concatenate(parts) for name, parts in (solids | surfaces | regions).items()}
 
 
 def _named_surfaces(content: Any) -> dict[str, list[NDArray[np.int64]]]:
-    """Corners (F, 3 | 4) of the faces of each named surface, block by block: gmsh's physical groups, or cell sets."""
-    groups = {tuple(int(n) for n in tag): name for name, tag in content.field_data.items() if len(tag) == 2}
+    """Corners (F, 3 | 4) of the faces of each named surface, block by block."""
     members: dict[str, list[NDArray[np.int64]]] = {}
+    for name, number, cells in _groups(content, 2):
+        block = content.cells[number]
+        if block.type in _SURFACE_CELLS:
+            corners = np.asarray(block.data, dtype=np.int64)[:, : _SURFACE_CELLS[block.type]]
+            members.setdefault(name, []).append(corners[cells])
+    return members
+
+
+def _named_regions(content: Any) -> dict[str, list[NDArray[np.int64]]]:
+    """Numbers (M,) of the cells of each named region among all cells that fill a volume, block by block."""
+    sizes = [len(block) if block.dim == 3 else 0 for block in content.cells]
+    first = np.cumsum([0, *sizes])
+    members: dict[str, list[NDArray[np.int64]]] = {}
+    for name, number, cells in _groups(content, 3):
+        members.setdefault(name, []).append(first[number] + cells)
+    return members
+
+
+def _groups(content: Any, dimension: int) -> Iterator[tuple[str, int, NDArray[np.int64]]]:
+    """Yields the name, the number of the block and the cells there of gmsh's physical groups, or of cell sets."""
+    groups = {tuple(int(n) for n in tag): name for name, tag in content.field_data.items() if len(tag) == 2}
     for number, block in enumerate(content.cells):
-        if block.type not in _SURFACE_CELLS:
+        if block.dim != dimension:
             continue
-        corners = np.asarray(block.data, dtype=np.int64)[:, : _SURFACE_CELLS[block.type]]
         if _PHYSICAL in content.cell_data:
             tags = np.asarray(content.cell_data[_PHYSICAL][number])
             for tag in np.unique(tags).tolist():
-                if (tag, 2) in groups:
-                    members.setdefault(groups[tag, 2], []).append(corners[tags == tag])
+                if (tag, dimension) in groups:
+                    yield groups[tag, dimension], number, np.flatnonzero(tags == tag)
             continue
         for name, sets in content.cell_sets.items():
             if sets[number] is not None and len(sets[number]):
-                members.setdefault(name, []).append(corners[np.asarray(sets[number], dtype=np.int64)])
-    return members
+                yield name, number, np.asarray(sets[number], dtype=np.int64)
 
 
 def _limit(memory: int, seconds: int) -> None:

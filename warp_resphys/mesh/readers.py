@@ -26,7 +26,8 @@ _PHYSICAL, _GEOMETRICAL = "gmsh:physical", "gmsh:geometrical"  # meshio's names 
 def read_mesh(path: str | os.PathLike[str], units: str = "m", order: int = 1, drop_unreferenced: bool = False) -> Mesh:
     """Read and check a tetrahedral or hexahedral mesh in any format that meshio reads.
 
-    Points, lines and surface cells of the file are ignored, as are its data fields.
+    Points, lines and surface cells of the file are ignored, as are its data fields. Named volumes, gmsh's physical
+    groups or the cell sets of other formats, become the regions of the mesh.
 
     Args:
         path: The file; its extension tells the format.
@@ -84,10 +85,11 @@ def read_surfaces(
 
 
 def write_mesh(path: str | os.PathLike[str], mesh: Mesh, surfaces: Mapping[str, IntArray] | None = None) -> None:
-    """Write a mesh in metres, and its surfaces (F, 3 | 4 | 6 | 8 | 9) by name, which only .msh, gmsh's format, keeps.
+    """Write a mesh in metres; only .msh, gmsh's format, keeps its regions and surfaces (F, 3 | 4 | 6 | 8 | 9) by name.
 
     Raises:
-        MeshError: The extension is unknown to meshio, or its format does not know such cells.
+        MeshError: The extension is unknown to meshio, its format does not know such cells, or a cell belongs to several
+            regions, which gmsh's format cannot say.
         DataFileError: The disk is full, or the place cannot be written to.
     """
     import meshio
@@ -97,9 +99,16 @@ def write_mesh(path: str | os.PathLike[str], mesh: Mesh, surfaces: Mapping[str, 
     blocks, groups, fields = [(kind, mesh.cells)], [np.zeros(len(mesh.cells), dtype=np.int64)], {}
     as_gmsh = path.suffix == ".msh"
     if as_gmsh:
-        fields["body"] = np.array([1, 3])
+        owners = np.bincount(np.concatenate([*mesh.regions.values(), groups[0][:0]]), minlength=len(mesh.cells))
+        if (owners > 1).any():
+            raise MeshError(f"{path}: {int((owners > 1).sum())} cells belong to several regions; gmsh's keep to one")
+        if (owners == 0).any():
+            fields["body"] = np.array([1, 3])
         groups[0] += 1
-        for number, (name, faces) in enumerate((surfaces or {}).items(), start=2):
+        for number, (name, cells) in enumerate(mesh.regions.items(), start=2):
+            fields[name] = np.array([number, 3])
+            groups[0][cells] = number
+        for number, (name, faces) in enumerate((surfaces or {}).items(), start=2 + len(mesh.regions)):
             fields[name] = np.array([number, 2])
             blocks.append(({3: "triangle", 4: "quad", 6: "triangle6", 8: "quad8", 9: "quad9"}[faces.shape[1]], faces))
             groups.append(np.full(len(faces), number))
@@ -129,15 +138,16 @@ def _read(path: Path, units: str, order: int, drop_unreferenced: bool) -> tuple[
         raise MeshError(f"{path}: there is no such mesh file")
     content = _read_file(path)
     try:
-        mesh = Mesh(content["points"], _volume_cells(content).copy())
+        regions = {k.removeprefix("region/"): cells for k, cells in content.items() if k.startswith("region/")}
+        mesh = Mesh(content["points"], _volume_cells(content).copy(), regions)
         places = np.arange(len(mesh.vertices))
         used = np.unique(mesh.cells)
         if drop_unreferenced and used[0] >= 0 and used[-1] < len(places):  # others are refused below
             places[:] = -1
             places[used] = np.arange(len(used))
-            mesh = Mesh(mesh.vertices[used], places[mesh.cells])
+            mesh = Mesh(mesh.vertices[used], places[mesh.cells], regions)
         check_mesh(mesh)
-        mesh = Mesh(mesh.vertices * METRES[units], mesh.cells)
+        mesh = Mesh(mesh.vertices * METRES[units], mesh.cells, regions)
         _check_size(mesh, units)
         return quadratic(mesh) if order == 2 and mesh.kind == mesh.element.linear else mesh, content, places
     except MeshError as error:

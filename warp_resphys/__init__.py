@@ -45,6 +45,7 @@ _MODULES = {
     "fill_surface": "mesh.tetrahedra",
     "rod": "mesh.rod",
     "select_vertices": "mesh.mesh",
+    "Scene": "fem.scene",
     "Simulator": "dynamics.simulator",
     "Medium": "energies.medium",
     "Muscle": "energies.muscles",

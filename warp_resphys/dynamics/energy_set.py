@@ -61,7 +61,9 @@ class EnergySet:
         self.memory: dict[str, Memory] = {}
         for each in placed:
             energy, named = each.energy, each.named
-            bound = energy.bind(Placement(body, each.own_points or each.points, rest_positions, method, time_step))
+            points = each.all_points or each.points
+            place = Placement(each.body or body, each.first, points, rest_positions, method, time_step)
+            bound = energy.bind(place)
             self._bound.append(bound)
             own = named({q.name: replace(q, name=f"{each.prefix}{q.name}") for q in energy.parameters})
             acting = named({q.name: replace(q, name=f"{each.prefix}{q.name}") for q in energy.inputs})

@@ -16,7 +16,7 @@ from ..energies.materials import Corotated, Material
 from ..energies.placed import Placed
 from ..energies.potential import StepTerms
 from ..energies.rigid import PointInertia, rigid_energies
-from ..energies.solid import Solid
+from ..energies.solid import solids_of
 from ..fem.body import Body
 from ..io.errors import ConvergenceError, InputError
 from ..linalg.threads import shards_of
@@ -42,6 +42,7 @@ _DEPENDENT = "dependent_"  # begins the names of the inertia of vertices that ot
 _GRAVITY = Quantity("gravity", "m/s^2", per="axis")
 
 Parameters = Mapping[str, Any]
+Materials = Mapping[str, Any]  # a material, or the materials of regions, by the name of the region or body
 
 
 @dataclass(frozen=True)
@@ -76,15 +77,38 @@ def _device(name: str | torch.device) -> torch.device:
     return device
 
 
+def _flat(materials: Materials) -> dict[str, Material]:
+    """Returns the materials of bodies and of their regions by name, as in ``finger_tip``."""
+    flat: dict[str, Material] = {}
+    for name, material in materials.items():
+        own = {"": material} if isinstance(material, Material) else _flat(material)
+        flat |= {f"{name}_{region}" if region else name: value for region, value in own.items()}
+    return flat
+
+
+def _material_of(material: Material | Materials, name: str) -> Material | Materials:
+    """Returns the material of a body by its name; all bodies may have the same.
+
+    Raises:
+        InputError: no material for the body.
+    """
+    if not name or isinstance(material, Material):
+        return material
+    if name not in material:
+        raise InputError(f"The body {name!r} has no material. Give one: there are {', '.join(material) or 'none'}.")
+    own = material[name]
+    return own
+
+
 @dataclass
 class Simulator:
     """Steps a body through time.
 
     Args:
-        body: what is simulated.
-        material: of the body, or of each of its mesh's regions by name; every method takes other values of its
-            constants by name (``parameters``), that of a region with its name and an underscore in front, as in
-            ``tip_youngs_modulus``.
+        body: what is simulated; a `fem.scene.Scene` of several bodies is one, too.
+        material: of the body, or of each of its mesh's regions by name, or of each body of a scene by name; every
+            method takes other values of its constants by name (``parameters``), those of a region or body with its name
+            and an underscore in front, as in ``tip_youngs_modulus``.
         time_step: h [s].
         gravity: acceleration (3,) [m/s^2].
         integrator: ``implicit_euler``, ``bdf2`` or ``midpoint``.
@@ -111,7 +135,7 @@ class Simulator:
     """
 
     body: Body
-    material: Material | Mapping[str, Material] = field(default_factory=Corotated)
+    material: Material | Materials = field(default_factory=Corotated)
     time_step: float = 0.01
     gravity: Sequence[float] = GRAVITY
     integrator: str = "implicit_euler"
@@ -138,23 +162,19 @@ class Simulator:
         self.settings = settings
         self.method = make_integrator(self.integrator)
         body = self.body
-        self.rest_positions = self.tensor(body.mesh.vertices)  # (N, 3) [m]
+        self.rest_positions = self.tensor(body.vertices)  # (N, 3) [m]
         self.fixed = torch.as_tensor(body.fixed_vertices, device=self.device)
         self._coordinates = body.coordinates.on(self.rest_positions)
-        placed = [*self._solids(), *self._rigid_parts()]
-        for energy, points in zip(cast(Sequence[Energy], body.energies), body.energy_points, strict=True):
-            placed.append(Placed.on(body, energy, points))
+        placed = self._place_energies()
         self._set = EnergySet(placed, body, self.rest_positions, self.method, self.time_step)
         own = self._set
         self._held = np.union1d(body.fixed_vertices, body.coordinates.dependent)  # what is no unknown of a solve
-        self._pattern = BlockPattern(
-            body.mesh.vertices, self._held, [points for each in placed for points in each.points]
-        )
+        self._pattern = BlockPattern(body.vertices, self._held, [points for each in placed for points in each.points])
         self.parameters: dict[str, Quantity] = {**own.parameters, "gravity": _GRAVITY}
         self.constants: dict[str, Any] = {**own.constants, "gravity": [list(self.gravity)]}
         self.counts = {**own.counts, "gravity": 3}
         self.inputs, self.parts = own.inputs, own.parts
-        followers = [q.name for each in placed if each.energy.implicit_only for q in each.energy.inputs]
+        followers = [name for each in placed if each.energy.implicit_only for name in each.input_names]
         if self.coupling == "explicit" and followers:
             raise InputError(
                 f"coupling is explicit, but {followers[0]} is a follower load, which acts at the end of a step: choose "
@@ -167,40 +187,26 @@ class Simulator:
 
     @property
     def materials(self) -> dict[str, Material]:
-        """Materials by the name of their region; of an empty name where the body has one."""
-        return {"": self.material} if isinstance(self.material, Material) else dict(self.material)
+        """Materials by the name of their region or body; of an empty name where there is one for all."""
+        return {"": self.material} if isinstance(self.material, Material) else _flat(self.material)
 
-    def _solids(self) -> list[Placed]:
-        """Returns the solid of the body, or one for each region that has a material of its own.
-
-        Raises:
-            InputError: the regions with a material do not cover the body's cells once each.
-        """
-        body = self.body
-        if isinstance(self.material, Material):
-            cells = body.soft_cells
-            solid = Solid(body.discretisation if cells is None else body.discretised(cells), self.material, cells)
-            return [Placed.on(body, solid, solid.points(body.mesh))]
-        regions = {name: body.mesh.region(name) for name in self.material}
-        numbers = [*regions.values(), *map(body.mesh.region, body.rigid), np.zeros(0, dtype=np.int64)]
-        owners = np.bincount(np.concatenate(numbers), minlength=len(body.mesh.cells))
-        if (owners != 1).any():
-            without, several = int((owners == 0).sum()), int((owners > 1).sum())
-            raise InputError(
-                f"the regions with a material ({', '.join(regions) or 'none'}) and the rigid parts leave {without} of "
-                f"{len(owners)} cells without one, and give {several} more than one: each cell needs one."
-            )
-        solids = {name: Solid(body.discretised(cells), self.material[name], cells) for name, cells in regions.items()}
-        return [Placed.on(body, solid, solid.points(body.mesh), f"{name}_") for name, solid in solids.items()]
-
-    def _rigid_parts(self) -> list[Placed]:
-        """Returns the energies of rigid parts, and the inertia of vertices that others determine."""
-        body, placed = self.body, list[Placed]()
-        for name in body.controls:
-            for energy in rigid_energies(body, name, body.rigid[name]):
-                placed.append(Placed(energy, energy.points(body.mesh), f"{name}_"))
-        if body.coordinates:
-            placed.append(Placed(PointInertia(body.coordinates.points), (body.coordinates.points,), _DEPENDENT))
+    def _place_energies(self) -> list[Placed]:
+        """Returns the energies of all bodies: their solids, their rigid parts, and what acts in or on them."""
+        whole, placed = self.body, list[Placed]()
+        for name, body, first in whole.members:
+            begin = f"{name}_" if name else ""
+            material = _material_of(self.material, name)
+            own: list[tuple[Energy, str]] = [(solid, f"{begin}{prefix}") for solid, prefix in solids_of(body, material)]
+            for part in body.controls:
+                own += [(energy, f"{begin}{part}_") for energy in rigid_energies(body, part, body.rigid[part])]
+            pairs: list[tuple[Energy, Any, str]] = [
+                (energy, energy.points(body.mesh), prefix) for energy, prefix in own
+            ]
+            acting = zip(cast(Sequence[Energy], body.energies), body.energy_points, strict=True)
+            pairs += [(energy, points, begin) for energy, points in acting]
+            placed += [Placed.on(whole, body, first, energy, points, prefix) for energy, points, prefix in pairs]
+        if whole.coordinates:
+            placed.append(Placed(PointInertia(whole.coordinates.points), (whole.coordinates.points,), _DEPENDENT))
         return placed
 
     def __setattr__(self, name: str, value: object) -> None:
@@ -267,15 +273,15 @@ class Simulator:
             InputError: no energy of the body has that input.
         """
         if (batch, name) not in self._held_energies:
-            acting = [each for each in self._set.placed if name in each.named({q.name: q for q in each.energy.inputs})]
+            acting = [each for each in self._set.placed if name in each.input_names]
             if not acting:
                 known = ", ".join(self.inputs) or "none"
                 raise InputError(f"Unknown input {name}. The energies of this body accept {known}.")
-            energy = acting[0].energy
+            energy, (points,) = acting[0].energy, acting[0].all_points or acting[0].points
             if energy.implicit_only:
                 raise InputError(f"{name} is a follower load, so it cannot be held constant over a step.")
             device = torch.device(self.device)
-            self._held_energies[batch, name] = HeldEnergy(self.body, energy, batch, device)
+            self._held_energies[batch, name] = HeldEnergy(energy, points, self.body.n_vertices, batch, device)
         return self._held_energies[batch, name]
 
     def rest_state(self, batch: int = 1) -> State:
@@ -403,8 +409,7 @@ class Simulator:
         values = self._set.acting(constants, inputs, batch)
         values |= self._set.begin_step(state, stage, inputs, constants, energies)
         if self.coupling == "explicit":
-            loads = [each for each in self._set.placed if each.energy.is_load]
-            for name in (name for each in loads for name in each.named({q.name: q for q in each.energy.inputs})):
+            for name in (name for each in self._set.placed if each.energy.is_load for name in each.input_names):
                 value = values[name]
                 assert value is not None
                 force = force + self.held_energy(name, batch).force(state.q, value)

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
+import scipy.sparse
 import torch
 import warp as wp
 from numpy.typing import NDArray
@@ -68,13 +69,30 @@ class Memory:
 
 @dataclass(frozen=True)
 class Placement:
-    """What an energy needs of the simulator that it is bound to."""
+    """What an energy needs of the simulator that it is bound to, whose vertices may be those of several bodies."""
 
-    body: Body
-    points: tuple[Points, ...]  # of the energy
-    rest_positions: torch.Tensor  # (N, 3) [m], on the simulator's device and of its type
+    body: Body  # that the energy belongs to
+    first: int  # number of that body's first vertex
+    points: tuple[Points, ...]  # of the energy, by the simulator's vertices
+    rest_positions: torch.Tensor  # (N, 3) of all bodies [m], on the simulator's device and of its type
     method: Integrator
     time_step: float  # h [s]
+
+    @property
+    def mass_volume(self) -> scipy.sparse.csc_array:
+        """(N, M) volume of each of the body's elements that each vertex carries as mass [m^3]."""
+        return self._padded(self.body.mass_volume)
+
+    @property
+    def load_volume(self) -> scipy.sparse.csc_array:
+        """(N, M) volume of each of the body's elements whose weight acts on each vertex [m^3]."""
+        return self._padded(self.body.load_volume)
+
+    def _padded(self, matrix: scipy.sparse.csr_array) -> scipy.sparse.csc_array:
+        """Returns a matrix (N', M) of the body's vertices with rows for all."""
+        coo = matrix.tocoo()
+        shape = (len(self.rest_positions), matrix.shape[1])
+        return scipy.sparse.csc_array((coo.data, (coo.row + self.first, coo.col)), shape)
 
     def tensor(self, values: Any) -> torch.Tensor:
         """Returns values on the simulator's device, in its type."""

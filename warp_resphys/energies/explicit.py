@@ -10,7 +10,7 @@ import torch
 import warp as wp
 from typing_extensions import override
 
-from ..fem.body import Body
+from ..fem.elements import Points
 from .base import Energy, PartTerm, PointSet
 from .launcher import Launcher, warp_view
 
@@ -19,17 +19,17 @@ class HeldEnergy(Launcher):
     """One energy of a body with a value for each of its parts, differentiable by positions and values.
 
     Args:
-        body: that it is of.
         energy: such as `pressure.Pressure`.
+        points: of the energy.
+        n_vertices: N.
         batch: environments B.
         device: of every tensor.
     """
 
-    def __init__(self, body: Body, energy: Energy, batch: int, device: torch.device) -> None:
+    def __init__(self, energy: Energy, points: Points, n_vertices: int, batch: int, device: torch.device) -> None:
         super().__init__(batch, device)
-        (points,) = energy.points(body.mesh)
         everything = slice(0, points.n_points)
-        self._set = PointSet(self, points, body.n_vertices, everything, everything)
+        self._set = PointSet(self, points, n_vertices, everything, everything)
         term = energy.term(self, [self._set])
         assert isinstance(term, PartTerm)
         self.term = term

@@ -113,7 +113,7 @@ class BoundMedium(BoundEnergy):
         self._shares = placement.tensor(points.gradients[0, :, :, 0])  # (Q, K) of the vertices in the points
         self._slopes = placement.tensor(points.slopes)  # (Q, K, 2)
         self._weights = placement.tensor(points.weights)  # (Q,)
-        volume = placement.tensor(placement.body.load_volume.sum(axis=1))  # (N,) [m^3]
+        volume = placement.tensor(placement.load_volume.sum(axis=1))  # (N,) [m^3]
         self._volume = volume if medium.buoyancy else None
 
     @override

@@ -1,6 +1,6 @@
 """An energy in a simulator: its points there, and what its names begin with."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -24,12 +24,31 @@ class Placed:
     points: tuple[Points, ...]  # whose operators act on control vertices, see `fem.coordinates`
     prefix: str = ""
     # the same with operators on all vertices, where the two differ
-    own_points: tuple[Points, ...] | None = None
+    all_points: tuple[Points, ...] | None = None
+    body: Body | None = None  # that the energy belongs to
+    first: int = 0  # number of that body's first vertex in the simulator
 
     @classmethod
-    def on(cls, body: Body, energy: Energy, points: tuple[Points, ...], prefix: str = "") -> "Placed":
-        """Places an energy on a body, given its points there."""
-        return cls(energy, tuple(map(body.coordinates.compose, points)), prefix, points)
+    def on(
+        cls, whole: Body, body: Body, first: int, energy: Energy, points: Sequence[Points], prefix: str = ""
+    ) -> "Placed":
+        """Places an energy of a body in a simulator.
+
+        Args:
+            whole: the simulator's body or scene.
+            body: the body.
+            first: number of its first vertex in the simulator.
+            energy: to be placed.
+            points: of the energy, by the body's own vertices.
+            prefix: of the energy's names.
+        """
+        shifted = tuple(replace(own, nodes=own.nodes + first) if first else own for own in points)
+        return cls(energy, tuple(map(whole.coordinates.compose, shifted)), prefix, shifted, body, first)
+
+    @property
+    def input_names(self) -> list[str]:
+        """Names of the energy's inputs in the simulator."""
+        return [f"{self.prefix}{quantity.name}" for quantity in self.energy.inputs]
 
     def named(self, values: Mapping[str, T]) -> dict[str, T]:
         """Returns values by the energy's names under their names in the simulator."""

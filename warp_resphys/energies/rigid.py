@@ -71,7 +71,6 @@ class RigidInertia(PointInertia):
 
     parameters: ClassVar[tuple[Quantity, ...]] = (Quantity("density", "kg/m^3", 0.0),)
 
-    controls: NDArray[np.int64]  # (4,) vertices
     cells: NDArray[np.int64]  # (m,)
     density: Parameter
 
@@ -91,9 +90,9 @@ class BoundRigidInertia(BoundInertia):
     def __init__(self, part: RigidInertia, placement: Placement) -> None:
         super().__init__(part, placement)
         like = placement.rest_positions
-        self._controls = torch.as_tensor(part.controls, device=like.device)
+        self._controls = torch.as_tensor(placement.points[0].nodes[0], device=like.device)
         self._factor = placement.tensor(part.own_points.gradients[0, :, :, 0])  # (P, 4) L^T
-        volume = placement.body.load_volume.tocsc()[:, part.cells].sum(axis=1)
+        volume = placement.load_volume[:, part.cells].sum(axis=1)
         self._volume = placement.tensor(volume)  # (N,) of which the weight acts at each vertex [m^3]
 
     @override
@@ -208,7 +207,7 @@ def rigid_energies(body: Body, name: str, part: Rigid) -> list[Energy]:
     point = SolidPoints(controls[None], gradients[None, None], carried, scipy.sparse.csr_array((1, 1)))
     operators = np.zeros((1, 4, 4, 3))
     operators[0, :, :, 0] = np.linalg.cholesky(moments).T
-    inertia = RigidInertia(Points(controls[None], operators), controls, cells, part.density)
+    inertia = RigidInertia(Points(controls[None], operators), cells, part.density)
     return [Rigidity(point, part.stiffness), inertia]
 
 

@@ -12,6 +12,7 @@ import warp as wp
 from numpy.typing import NDArray
 from typing_extensions import override
 
+from ..fem.body import Body
 from ..fem.elements import Discretisation, Points, SolidPoints
 from ..io.errors import InputError
 from ..kernels import solid as kernels
@@ -109,6 +110,33 @@ def _volumes(points: SolidPoints, material: Material) -> list[scipy.sparse.csr_a
     return [by_rule[rule] for rule in material.rules]
 
 
+def solids_of(body: Body, material: Material | Mapping[str, Material]) -> list[tuple[Solid, str]]:
+    """Returns the solid of a body with the prefix of its names, or one for each region that has a material.
+
+    Args:
+        body: of which the rigid parts have no material.
+        material: of the whole body, or by region.
+
+    Raises:
+        InputError: the regions with a material do not cover the cells of no rigid part once each.
+    """
+    if isinstance(material, Material):
+        cells = body.soft_cells
+        if cells is not None and not len(cells):
+            return []
+        return [(Solid(body.discretisation if cells is None else body.discretised(cells), material, cells), "")]
+    regions = {name: body.mesh.region(name) for name in material}
+    numbers = [*regions.values(), *map(body.mesh.region, body.rigid), np.zeros(0, dtype=np.int64)]
+    owners = np.bincount(np.concatenate(numbers), minlength=len(body.mesh.cells))
+    if (owners != 1).any():
+        without, several = int((owners == 0).sum()), int((owners > 1).sum())
+        raise InputError(
+            f"the regions with a material ({', '.join(regions) or 'none'}) and the rigid parts leave {without} of "
+            f"{len(owners)} cells without one, and give {several} more than one: each cell needs one."
+        )
+    return [(Solid(body.discretised(cells), material[name], cells), f"{name}_") for name, cells in regions.items()]
+
+
 class BoundSolid(BoundEnergy):
     """A solid over the steps of a simulator: its stiffness, its mass, and the viscous strain that it remembers."""
 
@@ -123,8 +151,8 @@ class BoundSolid(BoundEnergy):
         }
         cells = slice(None) if solid.cells is None else solid.cells
         self._mass_volume, self._load_volume = (
-            device_matrix(matrix.tocsc()[:, cells], like.device, like.dtype)
-            for matrix in (placement.body.mass_volume, placement.body.load_volume)
+            device_matrix(matrix[:, cells], like.device, like.dtype)
+            for matrix in (placement.mass_volume, placement.load_volume)
         )
         shape = (len(solid.material.prony), sum(s.n_points for s in sets), 3, 3)
         self.memory = (Memory(VISCOUS_STRAIN, "strain", shape, "branch"),) if shape[0] else ()

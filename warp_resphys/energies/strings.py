@@ -85,13 +85,6 @@ class Strings(Energy):
     def constants(self) -> Mapping[str, Parameter]:
         return {"string_length": self.length, "string_compliance": self.compliance}
 
-    def shares(self, n_vertices: int) -> NDArray[np.float64]:
-        """(S, N) of the vertices in the place that each string is tied to."""
-        found = np.zeros((self.count, n_vertices))
-        for row, vertices in zip(found, self.tied_to, strict=True):
-            row[vertices] = 1.0 / len(vertices)
-        return found
-
     @override
     def points(self, mesh: Mesh) -> tuple[Points, ...]:
         """One a string, whose operators are the shares of its vertices.
@@ -129,7 +122,10 @@ class BoundStrings(BoundEnergy):
     def __init__(self, strings: Strings, placement: Placement) -> None:
         super().__init__(strings, placement)
         self._strings = strings
-        self._shares = placement.tensor(strings.shares(placement.body.n_vertices))  # (S, N)
+        (points,) = placement.points
+        shares = np.zeros((strings.count, len(placement.rest_positions)))
+        np.add.at(shares, (np.arange(strings.count)[:, None], points.nodes), points.gradients[:, 0, :, 0])
+        self._shares = placement.tensor(shares)  # (S, N) of the vertices in the place that each string is tied to
         shape = (strings.count, 3)
         self.memory = tuple(
             Memory(f"payload_{when}{what}", unit, shape, "string")

@@ -1,6 +1,6 @@
 """A body: the constant part of a simulation, in NumPy on the host."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Protocol
@@ -120,6 +120,16 @@ class Body:
         object.__setattr__(self, "energy_points", tuple(each.points(self.mesh) for each in self.energies))
         if self.rigid or self.glued:
             self.coordinates  # noqa: B018  # What cannot move so is refused here.
+
+    @property
+    def members(self) -> "Iterator[tuple[str, Body, int]]":
+        """The body itself, as a scene of one: an empty name, the body, and the number of its first vertex."""
+        yield "", self, 0
+
+    @property
+    def vertices(self) -> NDArray[np.float64]:
+        """(N, 3) rest positions [m]."""
+        return self.mesh.vertices
 
     @property
     def n_vertices(self) -> int:

@@ -1,0 +1,75 @@
+"""Several bodies in one simulator."""
+
+import numpy as np
+import pytest
+import torch
+
+from warp_resphys import (
+    Body,
+    Corotated,
+    Inputs,
+    Mesh,
+    Rigid,
+    Scene,
+    Simulator,
+    StableNeoHookean,
+    Strings,
+    box_hexahedra,
+    box_tetrahedra,
+    select_vertices,
+)
+from warp_resphys.io.errors import InputError
+
+SOFT = Corotated(2e5, 0.45)
+
+
+def finger():
+    mesh = box_hexahedra((0.1, 0.03, 0.03), (4, 1, 1))
+    return Body(mesh, select_vertices(mesh, x=0.0), energies=[Strings([select_vertices(mesh, x=0.1)], 0.1)])
+
+
+def ball():
+    """A rigid body of other cells, free to fall."""
+    mesh = box_tetrahedra((0.02, 0.02, 0.02), (1, 1, 1), order=2)
+    return Body(Mesh(mesh.vertices, mesh.cells, {"all": np.arange(len(mesh.cells))}), rigid={"all": Rigid(900.0)})
+
+
+def test_bodies_of_a_scene_move_as_each_alone():
+    scene = Scene({"finger": finger(), "ball": ball()})
+    weight = Inputs(payload=torch.tensor([[0.05]], dtype=torch.float64))
+    together = Simulator(scene, SOFT)
+    assert {"finger_youngs_modulus", "finger_string_length", "ball_all_density"} <= together.parameters.keys()
+    motion = together.rollout(together.rest_state(), 6, scene.inputs({"finger": weight}))
+    for name, body, material, inputs in (("finger", finger(), SOFT, weight), ("ball", ball(), {}, Inputs())):
+        alone = Simulator(body, material)
+        own = alone.rollout(alone.rest_state(), 6, inputs)
+        torch.testing.assert_close(motion.q[:, :, scene.place(name)], own.q, rtol=0.0, atol=1e-9)
+        for key, value in own.final.memory.items():
+            torch.testing.assert_close(motion.final.memory[f"{name}_{key}"], value, rtol=0.0, atol=1e-9)
+
+
+def test_forces_and_clamps_go_to_the_body_that_is_named():
+    two = Body(box_hexahedra((0.1, 0.03, 0.03), (2, 1, 1)), fixed=[0, 1])
+    scene = Scene({"a": two, "b": finger()})
+    force = torch.ones(1, two.n_vertices, 3, dtype=torch.float64)
+    inputs = scene.inputs({"a": Inputs(external_force=force)})
+    assert float(inputs.external_force[:, scene.place("a")].min()) == 1.0
+    assert float(inputs.external_force[:, scene.place("b")].abs().max()) == 0.0
+    clamp = torch.zeros(1, 2, 3, dtype=torch.float64)
+    with pytest.raises(InputError, match="fixed_positions of b are missing"):
+        scene.inputs({"a": Inputs(fixed_positions=clamp)})
+    with pytest.raises(InputError, match="Unknown body 'c'"):
+        scene.inputs({"c": Inputs()})
+
+
+def test_materials_and_the_joined_mesh_of_a_scene():
+    scene = Scene({"a": finger(), "b": finger()})
+    assert scene.mesh.region("b").tolist() == [4, 5, 6, 7]
+    simulator = Simulator(scene, {"a": SOFT, "b": StableNeoHookean()})
+    assert list(simulator.materials) == ["a", "b"]
+    with pytest.raises(InputError, match="'b' has no material"):
+        Simulator(scene, {"a": SOFT})
+    with pytest.raises(InputError, match="share no mesh"):
+        Scene({"a": finger(), "ball": ball()}).mesh  # noqa: B018
+    with pytest.raises(InputError, match="one or more bodies"):
+        Scene({})

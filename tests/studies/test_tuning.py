@@ -15,17 +15,19 @@ import pytest
 from main_job import IN_RUN, TINY, files, run
 from measured_run import configuration
 from omegaconf import OmegaConf
-from test_tuning_study import dead
+from optuna.trial import TrialState
 
 from warp_resphys import pipeline
 from warp_resphys.experiment import learn
 from warp_resphys.experiment.checks import check_configuration
+from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_checkpoint
 from warp_resphys.learning.training import Trainer
 from warp_resphys.studies.tuning import figures as tuning_figures
+from warp_resphys.studies.tuning import results as tuning_results
 from warp_resphys.studies.tuning import tune
-from warp_resphys.studies.tuning.space import Choice, Range
-from warp_resphys.studies.tuning.study import SharedStudy
+from warp_resphys.studies.tuning.space import Dimension
+from warp_resphys.studies.tuning.study import JOURNAL, Study
 
 REPOSITORY = Path(__file__).parents[2]
 SPACE = [
@@ -45,13 +47,16 @@ SEARCH = [
     *SPACE,
 ]
 FOLDER = Path("run/tune/resphys")
-WIDTHS = {"network.width": Choice((8, 16, 32)), "trainer.gamma": Range(0.8, 1.0, log=False, whole=False)}
+WIDTHS = {
+    "network.width": Dimension.of("width", [8, 32, 16]),
+    "trainer.gamma": Dimension.of("gamma", {"low": 0.8, "high": 1.0}),
+}
 
 
 @pytest.fixture
 def no_pictures(monkeypatch):
     """Pictures take most of a tiny search's time, and the report of a tiny run's."""
-    monkeypatch.setattr(tune, "write_pictures", lambda tuning: None)
+    monkeypatch.setattr(tuning_results, "_write_page", lambda *arguments: None)
     monkeypatch.setattr(pipeline, "make_report", lambda context: (context.run_dir / "report.html").write_text("-"))
 
 
@@ -61,7 +66,7 @@ def table(folder=FOLDER):
 
 
 def results(folder=FOLDER):
-    """What was tried and what came of it, whatever the order."""
+    """Settings and results of all trials, whatever the order."""
     keys = ("state", "rollout_error_mm", "network.width", "network.blocks", "network.layers", "trainer.learning_rate")
     return sorted(tuple(row[key] for key in keys) for row in table(folder))
 
@@ -84,8 +89,7 @@ class TestSearch:
     def test_what_it_leaves(self, searched):
         found = {str(path.relative_to(searched / FOLDER)) for path in (searched / FOLDER).rglob("*") if path.is_file()}
         pages = {"tune.html", "tune.json", "trials.csv", "history.png", "importance.png", "settings.png"}
-        locks = {"study.lock", "results.lock"}
-        assert found == pages | locks | {"study.journal"}
+        assert found == pages | {"study.journal", "study.lock", "results.lock"}
         rows = table(searched / FOLDER)
         assert [row["state"] for row in rows] == TRIALS * ["complete"]
         assert all(row["network.width"] in ("8", "16") for row in rows)
@@ -124,21 +128,6 @@ class TestSearch:
         assert {name: now[name] for name in before if not name.endswith(".log")} == {
             name: content for name, content in before.items() if not name.endswith(".log")
         }
-
-    def test_workers_find_what_one_process_finds(self, searched, folder):
-        """Two processes, one of which is killed in its trial; so few trials are drawn without looking at others."""
-        environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
-        command = [sys.executable, "-m", "warp_resphys.cli", *SEARCH, "parallel.processes=2", IN_RUN]
-        search = subprocess.Popen(command, env=environment, text=True, stderr=subprocess.PIPE)
-        while not (workers := at_work()):
-            assert search.poll() is None, search.communicate()[1]
-            time.sleep(0.01)
-        os.kill(workers[0], signal.SIGKILL)
-        err = search.communicate(timeout=120)[1]
-        assert search.returncode == 0, err
-        assert "a worker process was lost" in err
-        assert f"{TRIALS}/{TRIALS} trials" in err
-        assert results() == results(searched / FOLDER)
 
     def test_simfree_is_tuned_by_itself(self, folder, no_pictures):
         assert run(*SEARCH, IN_RUN, "tune.model=simfree", "tune.trials=2")[0] == 0
@@ -192,9 +181,9 @@ def start(hang: bool):
 import time
 from warp_resphys.learning.training import Trainer
 from warp_resphys.experiment import learn
-from warp_resphys.studies.tuning import tune
+from warp_resphys.studies.tuning import results
 learn._CHECKPOINT_SECONDS = 0.0
-tune.write_pictures = lambda tuning: None
+results._write_page = lambda *arguments: None
 run_epoch, done = Trainer.run_epoch, []
 def hanging(trainer):
     if len(done) == 16:
@@ -213,7 +202,7 @@ def hanging(trainer):
 
 @pytest.mark.usefixtures("no_pictures")
 class TestCrashes:
-    def test_one_of_two_workers_is_killed_in_the_middle_of_a_trial(self, searched, folder):
+    def test_one_of_two_processes_is_killed_in_the_middle_of_a_trial(self, searched, folder):
         doomed = start(hang=True)
         while not Path("hanging").exists():
             assert doomed.poll() is None, doomed.communicate()[1]
@@ -224,17 +213,29 @@ class TestCrashes:
         assert other.poll() is None  # It waits for the one that hangs, and that lives.
         doomed.kill()
         doomed.communicate()
-        err = other.communicate(timeout=60)[1]
+        err = other.communicate(timeout=400)[1]
         assert other.returncode == 0, err
         # The same trials as in a search that nothing disturbed, each with the same result, and each once.
         assert results() == results(searched / FOLDER)
         taken = [line for line in err.splitlines() if line.startswith("trial 1: ")]
         assert len(taken) == 1
         assert f"{EPOCHS}/{EPOCHS} epochs" in taken[0]
-        journal = [json.loads(line) for line in (FOLDER / "study.journal").read_text().splitlines()]
-        claims = [log["user_attr"]["claims"] for log in journal if "claims" in log.get("user_attr", {})]
-        assert sorted(len(each) for each in claims) == [1] * TRIALS + [2]
         assert not list((FOLDER / "trials").iterdir())
+
+    def test_a_worker_process_is_killed(self, searched, folder):
+        """Its trial is done by another one; so few trials are drawn without looking at others."""
+        environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+        command = [sys.executable, "-m", "warp_resphys.cli", *SEARCH, "parallel.processes=2", IN_RUN]
+        search = subprocess.Popen(command, env=environment, text=True, stderr=subprocess.PIPE)
+        while not (workers := at_work()):
+            assert search.poll() is None, search.communicate()[1]
+            time.sleep(0.01)
+        os.kill(workers[0], signal.SIGKILL)
+        err = search.communicate(timeout=400)[1]
+        assert search.returncode == 0, err
+        assert "a worker process was lost" in err
+        assert f"{TRIALS}/{TRIALS} trials" in err
+        assert results() == results(searched / FOLDER)
 
     def test_a_trial_goes_on_from_its_checkpoint(self, searched, folder, monkeypatch):
         before = signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -245,7 +246,6 @@ class TestCrashes:
                 code, err = run(*SEARCH, IN_RUN)
                 assert code == 130
                 assert "interrupted in trial" in err
-                assert "the same command goes on from there" in err
                 assert "Traceback" not in err
             assert run(*SEARCH, IN_RUN)[0] == 0
         finally:
@@ -255,47 +255,13 @@ class TestCrashes:
         assert run(*SEARCH, IN_RUN)[0] == 0  # nothing is left to do
         assert interrupted.done <= (TRIALS + 1) * EPOCHS + 2
 
-    def test_a_worker_that_wakes_too_late_tells_nothing(self, folder, monkeypatch):
-        """While the first trial trains, another process takes it over and finishes it."""
-        run_epoch, taken = Trainer.run_epoch, []
-
-        def overtaken(trainer):
-            if not taken and seen[0].holders():
-                (claims,) = FOLDER.glob("study.journal")
-                study = join_journal(claims.parent)
-                taken.append(study.claim())
-                assert study.tell(taken[0], 123.0, 1.0)
-            return run_epoch(trainer)
-
-        def join_journal(path):
-            study = object.__new__(SharedStudy)
-            study.__dict__ |= {
-                **seen[0].__dict__,
-                "_is_alive": dead,
-                "_identity": {"token": "b", "host": "b", "pid": 2},
-            }
-            return study
-
-        seen, whole = [], SharedStudy.__init__
-
-        def remembered(self, *arguments):
-            whole(self, *arguments)
-            seen.append(self)
-
-        monkeypatch.setattr(SharedStudy, "__init__", remembered)
-        monkeypatch.setattr(Trainer, "run_epoch", overtaken)
-        assert run(*SEARCH, IN_RUN)[0] == 0
-        rows = table()
-        assert [row["rollout_error_mm"] == "123.0" for row in rows] == [True] + (TRIALS - 1) * [False]
-        assert not list((FOLDER / "trials").iterdir())
-
 
 def at_work():
-    """The processes that run a trial."""
-    journal = FOLDER / "study.journal"
+    """The processes that have run a trial."""
+    journal = FOLDER / JOURNAL
     lines = journal.read_text().splitlines() if journal.exists() else []
-    claims = [json.loads(line).get("user_attr", {}).get("claims") for line in lines if line.endswith("}")]
-    return [each[-1]["pid"] for each in claims if each]
+    processes = [json.loads(line).get("user_attr", {}).get("process") for line in lines if line.endswith("}")]
+    return [int(each.partition(":")[2]) for each in processes if each]
 
 
 def table_has(count):
@@ -305,48 +271,140 @@ def table_has(count):
         return False
 
 
+def study_in(folder, trials=3, space=None, conditions=None):
+    return Study(folder, space or WIDTHS, {"seed": 0} if conditions is None else conditions, trials, 0)
+
+
+class TestStudy:
+    def test_racing_processes_try_as_many_as_were_asked_for(self, tmp_path):
+        program = f"""
+import time
+from pathlib import Path
+from warp_resphys.studies.tuning.space import Dimension
+from warp_resphys.studies.tuning.study import Study
+folder = Path({str(tmp_path)!r})
+space = {{"trainer.gamma": Dimension.of("gamma", {{"low": 0.8, "high": 1.0}})}}
+print("ready", flush=True)
+while not (folder / "go").exists():
+    time.sleep(1e-4)
+study = Study(folder, space, {{}}, 21, 0)
+while (claim := study.claim()) is not None:
+    study.end(claim, claim.settings["trainer.gamma"], 1.0)
+    print(claim.number, claim.settings["trainer.gamma"], flush=True)
+"""
+        environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+        command = [sys.executable, "-c", program]
+        children = [subprocess.Popen(command, env=environment, text=True, stdout=subprocess.PIPE) for _ in range(3)]
+        assert [child.stdout.readline() for child in children] == 3 * ["ready\n"]
+        (tmp_path / "go").touch()
+        lines = [child.communicate(timeout=100)[0].splitlines() for child in children]
+        assert [child.returncode for child in children] == [0, 0, 0]
+        assert all(lines)  # they did race
+        tried = [line.split() for part in lines for line in part]
+        assert sorted(int(number) for number, _ in tried) == list(range(21))
+        assert len({gamma for _, gamma in tried}) == 21
+
+    def test_a_trial_whose_process_is_gone_is_continued_under_its_number(self, tmp_path):
+        left, kept = study_in(tmp_path).claim(), study_in(tmp_path).claim()
+        assert [left.number, kept.number] == [0, 1]
+        left.lock.release()  # as the system does for a process that ends
+        study = study_in(tmp_path)
+        taken, new = study.claim(), study.claim()
+        assert (taken.number, taken.settings, new.number) == (0, left.settings, 2)
+        assert study.claim() is None
+        study.end(taken, 7.0, 1.0)
+        study_in(tmp_path).end(left, 5.0, 1.0)  # a process that was only taken for dead changes nothing
+        assert [(each.number, each.state, each.error) for each in study.outcomes()] == [
+            (0, "complete", 7.0),
+            (1, "running", None),
+            (2, "running", None),
+        ]
+
+    def test_trials_that_fail_do_not_count_and_those_that_are_given_up_do(self, tmp_path):
+        study = study_in(tmp_path, trials=2)
+        study.end(study.claim(), None, 1.0, TrialState.FAIL)
+        pruned = study.claim()
+        pruned.trial.report(0.5, 3)
+        study.end(pruned, None, 1.0, TrialState.PRUNED)
+        study.end(study.claim(), math.inf, 1.0)
+        assert study.claim() is None
+        found = [(each.state, each.error) for each in study.outcomes()]
+        assert found == [("failed", None), ("pruned", 0.5), ("complete", math.inf)]
+        assert study_in(tmp_path, trials=3).claim().number == 3  # more can be asked for later
+
+    def test_the_same_seed_tries_the_same_and_importance_finds_what_matters(self, tmp_path):
+        tried = []
+        for name in ("one", "two"):
+            study = study_in(tmp_path / name, trials=20)
+            assert study.importance() == {}
+            while (claim := study.claim()) is not None:
+                study.end(claim, abs(claim.settings["trainer.gamma"] - 0.85), 1.0)
+                tried.append(claim.settings)
+        assert tried[:20] == tried[20:]
+        assert len({settings["trainer.gamma"] for settings in tried}) == 20
+        assert study.importance()["trainer.gamma"] > 0.7
+
+    def test_a_half_written_line_is_cut_off(self, tmp_path):
+        study = study_in(tmp_path)
+        study.end(study.claim(), 1.0, 1.0)
+        journal = tmp_path / JOURNAL
+        journal.write_bytes(journal.read_bytes() + b'{"op_code": 5, "work')
+        assert study_in(tmp_path).claim().number == 1
+
+    @pytest.mark.parametrize(
+        ("space", "conditions", "key"),
+        [
+            ({**WIDTHS, "network.width": Dimension.of("width", [8, 16])}, None, "space.network.width"),
+            ({"network.width": WIDTHS["network.width"]}, None, "space.trainer.gamma"),
+            (None, {"seed": 1}, "seed"),
+            (None, {"seed": 0, "data": {"steps": 3}}, "data.steps"),
+        ],
+    )
+    def test_of_another_space_or_other_conditions(self, tmp_path, space, conditions, key):
+        study_in(tmp_path)
+        with pytest.raises(InputError, match=f"another setting: {key} was "):
+            study_in(tmp_path, space=space, conditions=conditions)
+
+
 @pytest.mark.usefixtures("no_pictures")
 class TestBadInput:
     @pytest.mark.parametrize(
-        ("override", "sentence"),
+        ("override", "key"),
         [
-            ("tune.space.network.width=[8,32]", "has another setting: the search space of network.width was one of 8,"),
-            (
-                "~tune.space.trainer.gamma",
-                "another setting: the search space of trainer.gamma was 0.8 to 1, now it",
-            ),
-            ("trainer.epochs=7", "has another setting: trainer.epochs was 6, now it is 7; go on with the old setting"),
-            ("seed=2", "has another setting: seed was 0, now it is 2"),
-            ("data.steps=13", "has another setting: data.steps was 12, now it is 13"),
+            ("tune.space.network.width=[8,32]", "space.network.width"),
+            ("trainer.epochs=7", "trainer.epochs"),
+            ("seed=2", "seed"),
+            ("data.steps=13", "data.steps"),
         ],
     )
-    def test_a_study_of_something_else(self, searched, monkeypatch, override, sentence):
+    def test_a_study_of_something_else(self, searched, monkeypatch, override, key):
         monkeypatch.chdir(searched)
         kept = (FOLDER / "study.journal", Path("run/dataset.h5"))
         before = [path.read_bytes() for path in kept]
         code, err = run(*SEARCH, IN_RUN, override)
         assert code == 2
-        last = err.splitlines()[-1]
-        assert last.startswith("error: the study in ")
-        assert sentence in last
+        assert f"has another setting: {key} was " in err.splitlines()[-1]
         assert [path.read_bytes() for path in kept] == before
 
     @pytest.mark.parametrize(
         ("override", "sentence"),
         [
             ("tune.model=sysid", "tune.model is 'sysid': choose one of simfree, resphys."),
-            ("tune.trials=0", "tune.trials is 0: it must be a whole number, one or more."),
-            ("tune.trial_seconds=soon", "tune.trial_seconds is 'soon': it must be a positive number, or null."),
-            ("tune.save_as=a/b", "tune.save_as is 'a/b': it must be letters, digits, _ and - alone"),
-            ("tune.space.trainer.gamma={low:0.8,high:1.2}", "tune: trainer.gamma is 1.2: it must be more than 0"),
-            (
-                "tune.space.network.width=[8.5,16]",
-                "tune: network.width is 8.5: it must be a whole number from 1 to 16,384.",
-            ),
+            ("tune.trials=0", "tune.trials is 0"),
+            ("tune.trial_seconds=soon", "tune.trial_seconds is 'soon'"),
+            ("tune.save_as=a/b", "tune.save_as is 'a/b'"),
+            ("tune.space=3", "tune.space is 3"),
+            ("+tune.space.data.steps=[1,2]", "unknown key 'tune.space.data'"),
+            ("tune.space.network.width=[8]", "tune.space.network.width is [8]"),
+            ("tune.space.network.width=[8,8]", "tune.space.network.width is [8, 8]"),
+            ("tune.space.network.width=8", "tune.space.network.width is 8"),
+            ("tune.space.trainer.gamma={low:1.0,high:0.8}", "tune.space.trainer.gamma is "),
+            ("tune.space.trainer.gamma={low:0.8,high:1.2}", "tune: trainer.gamma is 1.2"),
+            ("tune.space.network.width=[8.5,16]", "tune: network.width is 8.5"),
             ("+tune.space.network.depth=[1,2]", "unknown key 'network.depth' in the group tune"),
             ("+tune.settings.network.width=8", "tune.settings.network.width and tune.space.network.width exclude"),
-            ("simfree=3", "simfree is 3: it must be a group of settings."),
-            ("+simfree.network.width=-1", "simfree: network.width is -1: it must be a whole number from 1 to 16,384."),
+            ("simfree=3", "simfree is 3"),
+            ("+simfree.network.width=-1", "simfree: network.width is -1"),
         ],
     )
     def test_settings(self, folder, override, sentence):
@@ -405,7 +463,8 @@ class TestBadInput:
         experiment, *others = overrides
         config = configuration(*others, experiment=experiment.partition("=")[2])
         check_configuration(config)
-        assert {key.partition(".")[0] for key in tune.check_tuning(config)} == groups
+        _, space, _ = tune.check_tuning(config)
+        assert {key.partition(".")[0] for key in space} == groups
 
     def test_settings_that_the_data_do_not_allow_end_the_search_and_the_trial_does_not_count(self, folder):
         code, err = run(*SEARCH, IN_RUN, "+tune.space.network.force_modes=[500,1000]")
@@ -427,5 +486,6 @@ def test_figures_of_searches_that_found_nothing(narrow, tmp_path):
     for errors, pruned in ((nothing, nothing), (np.array([np.inf, 1.0, np.nan]), np.array([np.nan, np.nan, 2.0]))):
         tuning_figures.search_history(errors, pruned, None, narrow=narrow).savefig(tmp_path / "history.png")
     tuning_figures.importance_bars({}, narrow=narrow).savefig(tmp_path / "importance.png")
-    space = {"width": WIDTHS["network.width"], "rate": Range(1e-4, 1e-2, log=True, whole=False)}
+    rate = Dimension.of("rate", {"low": 1e-4, "high": 1e-2, "log": True})
+    space = {"width": WIDTHS["network.width"], "rate": rate}
     tuning_figures.setting_scatter(np.array([]), [], space, narrow=narrow).savefig(tmp_path / "settings.png")

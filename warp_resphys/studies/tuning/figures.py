@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator, PercentFormatter
 
 from ...report.figures import STYLE, TONES, FloatArray, new_figure, use_logarithm
-from .space import Choice, Dimension
+from .space import Dimension
 
 _GIVEN_UP = TONES["muted"].light
 _TOLD = TONES["resphys"].light
@@ -105,16 +105,17 @@ def _errors_axis(axes: Axes) -> None:
 def _places(axes: Axes, dimension: Dimension, values: Sequence[float | str]) -> FloatArray:
     """Where the values of a setting lie on an axis, which is labelled with them."""
     axes.xaxis.set_minor_locator(NullLocator())
-    if isinstance(dimension, Choice):
+    if dimension.values:
         axes.set_xticks(range(len(dimension.values)), [str(value) for value in dimension.values])
         axes.set_xlim(-0.5, len(dimension.values) - 0.5)
         return np.array([dimension.values.index(value) for value in values], dtype=np.float64)
-    low, high = float(dimension.low), float(dimension.high)
+    low, high = map(float, dimension.ends)
     if dimension.log:
         axes.set_xscale("log", subs=[])
         axes.set_xlim(low / (high / low) ** 0.06, high * (high / low) ** 0.06)
         axes.xaxis.set_major_locator(LogLocator(numticks=5))
     else:
         axes.set_xlim(low - 0.06 * (high - low), high + 0.06 * (high - low))
-        axes.xaxis.set_major_locator(MaxNLocator("auto" if dimension.whole else 5, integer=dimension.whole))
+        whole = isinstance(dimension.ends[0], int)
+        axes.xaxis.set_major_locator(MaxNLocator("auto" if whole else 5, integer=whole))
     return np.array(values, dtype=np.float64)

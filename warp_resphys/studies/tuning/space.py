@@ -1,115 +1,107 @@
-"""Search spaces: which settings vary, and over what."""
+"""The group `tune` of the configuration: what is searched, over which values, and how long."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
-from optuna.trial import Trial
+from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
+from pydantic import Field
 
-from ...experiment.schema import ANYTHING, Group, absent, check, dotted, is_finite
+from ...experiment.schema import is_finite
 from ...io.errors import InputError
+from ...io.settings import Count, Natural, Positive, Settings, Word, setting
 
-SEARCHED_GROUPS = ("network", "trainer", "in_the_loop")
+Name = Annotated[str, Field(pattern=r"^[\w-]+$", json_schema_extra={"wanted": "letters, digits, _ and - alone"})]
+
+
+class Groups(Settings):
+    """Settings of a training, by the group that they are in."""
+
+    network: dict[str, Any] = setting({})
+    trainer: dict[str, Any] = setting({})
+    in_the_loop: dict[str, Any] = setting({})
+
+    def dotted(self) -> dict[str, Any]:
+        """The settings by dotted key, such as ``network.width``."""
+        return {f"{group}.{name}": value for group, values in self.plain().items() for name, value in values.items()}
+
+
+class Tune(Settings):
+    """A search for settings of a network and its training."""
+
+    model: Word = setting(description="resphys or simfree")
+    trials: Natural = setting(description="finished trials, over all processes")
+    trial_seconds: Positive | None = setting(None, "after which a trial is given up", unit="s")
+    seed: Count = setting(0, "of what is tried")
+    study: Name = setting(description="folder in tune/ of the run folder")
+    save_as: Name = setting(description="name of the option in configs/tuned that has the best settings")
+    space: Groups = setting(description="what is searched: lists of values, or ranges {low: .., high: .., log: ..}")
+    settings: Groups = setting(Groups(), "what all trials have otherwise than a run")
+
+    @property
+    def dimensions(self) -> "dict[str, Dimension]":
+        """What may vary, by dotted key, sorted.
+
+        Raises:
+            InputError: nothing varies, or something is neither a list of values nor a range.
+        """
+        found = {key: Dimension.of(f"tune.space.{key}", given) for key, given in self.space.dotted().items()}
+        if not found:
+            raise InputError("tune.space is empty: it must name at least one setting, such as network.width.")
+        return dict(sorted(found.items()))
 
 
 @dataclass(frozen=True)
-class Range:
-    """All numbers between two."""
+class Dimension:
+    """What a setting may be.
 
-    low: float
-    high: float
-    log: bool  # whether equal ratios count alike, instead of equal differences
-    whole: bool  # whether only whole numbers are meant
+    Attributes:
+        distribution: of what a sampler draws. Of a list of numbers, which is sorted, that is the place in it, since
+            neighbours resemble each other.
+        values: of the list; empty for a range.
+    """
+
+    distribution: BaseDistribution
+    values: tuple[Any, ...] = ()
+
+    @classmethod
+    def of(cls, key: str, given: Any) -> "Dimension":
+        """From the value of a key of the configuration."""
+        try:
+            if isinstance(given, list) and len(set(given)) == len(given) > 1:
+                if all(map(is_finite, given)):
+                    return cls(IntDistribution(0, len(given) - 1), tuple(sorted(given)))
+                if all(isinstance(value, (str, bool)) or is_finite(value) for value in given):
+                    return cls(CategoricalDistribution(given), tuple(given))
+            if isinstance(given, Mapping) and is_finite(given.get("low")) and is_finite(given.get("high")):
+                whole = isinstance(given["low"], int) and isinstance(given["high"], int)
+                return cls((IntDistribution if whole else FloatDistribution)(**given))
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{key} is {given}: {error}.") from error
+        raise InputError(
+            f"{key} is {given}: write two or more different numbers or words, as in [8, 16], or a range, as in "
+            "{low: 1.0e-4, high: 1.0e-2, log: true}."
+        )
+
+    def value(self, drawn: Any) -> Any:
+        """The setting that a drawn value stands for."""
+        return self.values[drawn] if self.values and isinstance(self.distribution, IntDistribution) else drawn
+
+    @property
+    def log(self) -> bool:
+        """Whether equal ratios count alike, instead of equal differences."""
+        return bool(getattr(self.distribution, "log", False))
 
     @property
     def ends(self) -> tuple[Any, ...]:
-        """The values that limit the others."""
-        return (self.low, self.high)
-
-    def suggest(self, trial: Trial, key: str) -> Any:
-        """What a sampler draws, or has drawn."""
-        if self.whole:
-            return trial.suggest_int(key, int(self.low), int(self.high), log=self.log)
-        return trial.suggest_float(key, self.low, self.high, log=self.log)
+        """The values of a list, or the limits of a range."""
+        return self.values or (self.distribution.low, self.distribution.high)  # type: ignore[attr-defined]
 
     def __str__(self) -> str:
         """In words."""
-        return f"{self.low:g} to {self.high:g}{' (log)' if self.log else ''}"
-
-
-@dataclass(frozen=True)
-class Choice:
-    """One of some values; numbers stand in their order, from the smallest to the largest.
-
-    Of numbers, the sampler draws the place, as neighbours resemble each other.
-    """
-
-    values: tuple[Any, ...]
-
-    @property
-    def ordered(self) -> bool:
-        """Whether the values are numbers."""
-        return all(map(is_finite, self.values))
-
-    @property
-    def ends(self) -> tuple[Any, ...]:
-        """All values."""
-        return self.values
-
-    def suggest(self, trial: Trial, key: str) -> Any:
-        """What a sampler draws, or has drawn."""
-        if self.ordered:
-            return self.values[trial.suggest_int(key, 0, len(self.values) - 1)]
-        return trial.suggest_categorical(key, self.values)
-
-    def __str__(self) -> str:
-        """In words."""
-        return f"one of {', '.join(map(str, self.values))}"
-
-
-Dimension = Range | Choice
-
-
-def parse_space(space: Any) -> dict[str, Dimension]:
-    """The configured search space.
-
-    Args:
-        space: nested as the configuration is: ``{network: {width: [64, 128]}, trainer: {gamma: {low: 0.8,
-            high: 1.0}}}``.
-
-    Returns:
-        What each setting may be, by its dotted key, sorted by key.
-
-    Raises:
-        InputError: a key outside of the groups that can be searched, or no range.
-    """
-    check("tune.space", space, Group({group: absent(Group(each=ANYTHING)) for group in SEARCHED_GROUPS}))
-    found = {
-        f"{group}.{name}": _parse_dimension(f"tune.space.{group}.{name}", given)
-        for group, ranges in space.items()
-        for name, given in ranges.items()
-    }
-    if not found:
-        raise InputError("tune.space is empty: it must name at least one setting, such as network.width.")
-    return dict(sorted(found.items()))
-
-
-def _parse_dimension(key: str, given: Any) -> Dimension:
-    if isinstance(given, list):
-        if len(given) < 2 or any(given.count(value) > 1 for value in given):
-            raise InputError(f"{key} is {given}: it must list two or more different values.")
-        if not all(isinstance(value, (str, bool)) or is_finite(value) for value in given):
-            raise InputError(f"{key} is {given}: it must list numbers or words.")
-        choice = Choice(tuple(given))
-        return Choice(tuple(sorted(given))) if choice.ordered else choice
-    if not isinstance(given, Mapping) or not {"low", "high"} <= given.keys() <= {"low", "high", "log"}:
-        raise InputError(f"{key} is {given!r}: write {{low: 1.0e-4, high: 1.0e-2, log: true}} or a list of values.")
-    low, high, log = given["low"], given["high"], given.get("log", False)
-    if not (is_finite(low) and is_finite(high) and low < high):
-        raise InputError(f"{key} is {dict(given)}: low and high must be finite numbers, and low the smaller one.")
-    if not isinstance(log, bool) or (log and low <= 0):
-        raise InputError(f"{key} is {dict(given)}: log must be true or false, and true needs positive numbers.")
-    return Range(low, high, log, whole=isinstance(low, int) and isinstance(high, int))
+        if self.values:
+            return f"one of {', '.join(map(str, self.values))}"
+        return f"{self.ends[0]:g} to {self.ends[1]:g}{' (log)' if self.log else ''}"
 
 
 def with_settings(groups: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -119,8 +111,3 @@ def with_settings(groups: Mapping[str, Any], settings: Mapping[str, Any]) -> dic
         group, _, name = key.partition(".")
         result[group] = {**result[group], name: value}
     return result
-
-
-def fixed_settings(tune: Mapping[str, Any]) -> dict[str, Any]:
-    """What all trials have otherwise than a run, by dotted key, from the group ``tune``."""
-    return {key: value for key, value in dotted(tune["settings"]) if value not in ({}, None) or "." in key}

@@ -44,11 +44,18 @@ COMMANDS: Final[Mapping[str, Command]] = MappingProxyType(
     {
         "run": Command("run an experiment; the word run may be left out", "pipeline:run_experiment"),
         "tune": Command("search for better settings of the network and its training", "studies.tuning.tune:run_tuning"),
-        "reproduce": Command("run the published beams, beside what was published", "studies.reproduction:reproduce"),
-        "reproduce robots": Command("run the robots that others recorded, on one page", "studies.robots:robots"),
-        "inspect": Command("what is in a mesh, or how good a recording is", "studies.preparation:inspect"),
+        "reproduce": Command(
+            "run published beams, or recorded robots, and write a page on them",
+            "studies.reproduction:reproduce",
+            words="only",
+        ),
+        "inspect": Command(
+            "what is in a mesh, or how good a recording is", "studies.preparation:inspect", words="files"
+        ),
         "inspect compare": Command(
-            "a recording of a beam that is let go, beside its simulation", "studies.recording_comparison:compare"
+            "a recording of a beam that is let go, beside its simulation",
+            "studies.recording_comparison:compare",
+            word="recording.path",
         ),
         "inspect make-arm": Command("make the mesh of a pneumatic arm", "studies.preparation:make_arm"),
         "view": Command("a run's robot in the browser, to be driven and pulled", "studies.view:view", word="run"),
@@ -97,6 +104,7 @@ VALUED: Final = (
     *("--cfg", "-c", "--package", "-p", "--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd"),
     *("--info", "-i", "--experimental-rerun"),
 )
+_PLAIN: Final = re.compile(r"[\w./-]+")  # a word that means itself to Hydra
 _OPTIONS: Final = """\
 --cfg job         show all keys and their values, for these settings
 --multirun, -m    run a sweep
@@ -139,7 +147,10 @@ def parse(arguments: Sequence[str]) -> tuple[str, list[str]]:
     if after and parts and not (command.word or command.words) and len(named) == 1:
         hint = did_you_mean(rest[after[0]], parts)
         raise InputError(f"{name} has no part '{rest[after[0]]}'{hint} (its parts are {', '.join(parts)})")
-    quoted = ["'{}'".format(rest[at].replace("'", r"\'")) for at in after]
+    quoted = [
+        word if _PLAIN.fullmatch(word) else "'{}'".format(word.replace("'", r"\'"))
+        for word in map(rest.__getitem__, after)
+    ]
     dropped = set(named)
     if command.word and after:
         rest[after[0]] = f"{command.word}={quoted[0]}"

@@ -11,18 +11,21 @@ from omegaconf import OmegaConf
 
 from warp_resphys import cli
 from warp_resphys.io.errors import InputError, MeshError
+from warp_resphys.io.settings import parse
 from warp_resphys.mesh.arm import mesh_arm, name_surfaces
 from warp_resphys.mesh.arm_geometry import ArmGeometry
 from warp_resphys.mesh.cavities import open_cavities
 from warp_resphys.mesh.mesh import Mesh, boundary_faces, box_hexahedra, box_tetrahedra, quadratic
 from warp_resphys.mesh.quality import cell_volumes, scaled_jacobian
 from warp_resphys.mesh.readers import read_mesh, read_surfaces, read_vertices, write_mesh
+from warp_resphys.studies.inspection import Arm, Inspection
 from warp_resphys.studies.mesh_inspection import inspect_mesh, make_arm
 
 
 def configured(name, *overrides):
     with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        return OmegaConf.to_container(compose(name, list(overrides)), resolve=True)
+        config = OmegaConf.to_container(compose(name, list(overrides)), resolve=True)
+        return parse(Inspection if name == "inspect" else Arm, config)
 
 
 def rows_of(text):
@@ -236,8 +239,8 @@ def test_wrong_settings(tmp_path, overrides, error, message):
     ("command", "arguments", "message"),
     [
         ("inspect make-arm", ["mesh.wall=0.02"], "error: where the arm's radius is 21.29 mm, 3 chambers do not fit"),
-        ("inspect", ["mesh.path=nowhere.vtk"], "error: nowhere.vtk: there is no such mesh file"),
-        ("inspect", [], "error: nothing to inspect: name a file, as in mesh.path=FILE or recording.path=FILE."),
+        ("inspect", ["nowhere.vtk"], "error: nowhere.vtk: there is no such mesh file"),
+        ("inspect", [], "error: nothing to inspect: name a mesh or a recording"),
     ],
 )
 def test_commands_end_with_one_sentence(tmp_path, command, arguments, message):

@@ -15,6 +15,9 @@ from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.recordings.recording import Recording
 from warp_resphys.data.recordings.release import Release
 from warp_resphys.io.errors import DataFileError, InputError
+from warp_resphys.io.settings import parse
+from warp_resphys.studies.inspection import Inspection
+from warp_resphys.studies.preparation import with_files
 from warp_resphys.studies.recording_quality import inspect_recording, recording_quality
 
 LABELS = ("tip", "base 1", "base 2")
@@ -22,7 +25,7 @@ LABELS = ("tip", "base 1", "base 2")
 
 def configured(*overrides):
     with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        return OmegaConf.to_container(compose("inspect", list(overrides)), resolve=True)
+        return parse(Inspection, OmegaConf.to_container(compose("inspect", list(overrides)), resolve=True))
 
 
 def held_then_initial_motion(base=0.0):
@@ -92,6 +95,13 @@ def test_picture_shows_what_is_seen_filled_and_masked():
     figure.canvas.draw()
 
 
+def test_files_are_told_by_their_ends():
+    found = with_files(configured("files=[a.c3d,body.vtk,b.h5]"))
+    assert (found.recording.path, found.compare_with, found.mesh["path"]) == ("a.c3d", ("b.h5",), "body.vtk")
+    with pytest.raises(InputError, match=r"a\.msh and b\.msh are two meshes"):
+        with_files(configured("files=[a.msh,b.msh]"))
+
+
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
@@ -109,7 +119,7 @@ def test_wrong_settings(tmp_path, path, overrides, message):
 
 
 def test_command_ends_with_one_sentence(tmp_path, path):
-    command = [sys.executable, "-m", "warp_resphys.cli", "inspect", f"recording.path={path}", "still=[foot]"]
+    command = [sys.executable, "-m", "warp_resphys.cli", "inspect", str(path), "still=[foot]"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert done.stderr.strip().splitlines()[-1].startswith(f"error: {path} has no marker named 'foot'; it has 'tip'")
@@ -120,5 +130,5 @@ def test_beam_recording(tmp_path, shared_data):
     path = shared_data / "beam_mocap" / "beam_load101_V2_a.c3d"
     moving = [label for label in read_recording(path).labels if label.startswith("Tip")]
     config = configured(f"recording.path={path}", "still=[Base - 1,Base - 2,Base - 3]")
-    text = inspect_recording({**config, "moving": moving}, tmp_path)
+    text = inspect_recording(config.changed(moving=moving), tmp_path)
     assert "Base - 1 jumps 15 times, farthest by 1.22 mm, in frame 61." in text

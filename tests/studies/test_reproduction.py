@@ -19,7 +19,7 @@ from omegaconf import OmegaConf
 from warp_resphys import cli
 from warp_resphys.io.errors import InputError
 from warp_resphys.report.page import error_parts, number_text
-from warp_resphys.studies.reproduction import plan
+from warp_resphys.studies.rows import Reproduction
 from warp_resphys.studies.runs import Run, _Pace, execute
 
 TINY = [
@@ -37,6 +37,10 @@ DEFAULT = Path("runs/beam_oscillation")
 def configured(*overrides):
     with initialize_config_module("warp_resphys.conf", version_base="1.3"):
         return OmegaConf.to_container(compose("reproduce", list(overrides)), resolve=True)
+
+
+def plan(config):
+    return Reproduction.read(config).beams()
 
 
 def run(*arguments):
@@ -70,13 +74,13 @@ class TestPage:
         assert [f"[{number}/4] {name}" for number, name in enumerate(STARTED[:3], 1)] == re.findall(
             r"^(\[[123]/4\] [\w/]+), about \d+:\d\d left in all$", err, flags=re.MULTILINE
         )
-        page = (root / "outputs/reproduce/reproduction.html").read_text()
+        page = (root / "outputs/reproduce/beams/reproduction.html").read_text()
         assert "Twisting beam: here: data.twist_axis is &#39;w&#39;" in page
         assert len(list((root / "runs/marker_ablation").glob("*/metrics.json"))) == 1
 
     def test_each_published_number_stands_beside_ours(self, finished):
         root, _, _ = finished
-        text = (root / "outputs/reproduce/results.md").read_text()
+        text = (root / "outputs/reproduce/beams/results.md").read_text()
         ours, network = (
             metrics(root, "beam_oscillation", variant)["errors_mm"] for variant in ("default", "published_network")
         )
@@ -100,7 +104,7 @@ class TestPage:
         assert "| Testing trajectories | 5 | 2 |" in text
 
     def test_the_page_needs_nothing_beside_it(self, finished):
-        page = (finished[0] / "outputs/reproduce/reproduction.html").read_text()
+        page = (finished[0] / "outputs/reproduce/beams/reproduction.html").read_text()
         assert not re.search(r"""<(?:script|img|link|iframe|source)\b[^>]*\b(?:src|href)\s*=\s*["'](?!data:)""", page)
         assert len(re.findall(r"<figure ", page)) == 3
         assert "4.488" in page
@@ -156,10 +160,10 @@ class TestPlan:
     @pytest.mark.parametrize(
         ("override", "sentence"),
         [
-            ("only=[beam_twst]", "only names 'beam_twst', which is no experiment or run: there are beam_oscillation, "),
-            ("only=[]", "only is []: name at least one experiment or run"),
-            ("only=beam_twist", "only is 'beam_twist': it must be a list of words, or null."),
-            ("overrides=[1]", "overrides is [1]: it must be a list of words."),
+            ("only=[beam_twst]", "only names 'beam_twst': there are beams, robots, beam_oscillation, "),
+            ("only=[]", "only is []: "),
+            ("only=beam_twist", "only is 'beam_twist': it must be a list of "),
+            ("overrides=[1]", "overrides is [1]: it must be a list of words"),
             ("experiments.beam_twist.variants=[quick]", "experiments.beam_twist.variants names 'quick': there are "),
         ],
     )
@@ -168,9 +172,9 @@ class TestPlan:
             plan(configured(override))
 
     def test_bad_input_on_the_command_line(self, folder):
-        code, err = run("only=[sopra]", "hydra/job_logging=none", "hydra/hydra_logging=none")
+        code, err = run("sopra_fibres", "hydra/job_logging=none", "hydra/hydra_logging=none")
         assert code == 2
-        assert err.startswith("error: only names 'sopra'")
+        assert err.startswith("error: only names 'sopra_fibres'")
         assert len(err.splitlines()) == 1
 
 
@@ -219,6 +223,6 @@ def test_ctrl_c_stops_the_run_and_keeps_what_it_has(folder):
     assert child.returncode == 130, err
     assert "interrupted in run 1 of 1, beam_oscillation/default" in err
     assert "Traceback" not in err
-    assert not Path("outputs/reproduce/reproduction.html").exists()
+    assert not Path("outputs/reproduce/beams/reproduction.html").exists()
     assert "interrupted in stage 'simulate'" in Path("outputs/reproduce/logs/beam_oscillation-default.log").read_text()
     assert found[0].stat().st_size > 0

@@ -33,7 +33,7 @@ ARGUMENTS = [
 
 def run(*arguments):
     """Exit code of the command in this process, and what it wrote to stderr."""
-    return end_of(cli.main, "warp-resphys", "reproduce", "robots", *arguments)
+    return end_of(cli.main, "warp-resphys", "reproduce", *arguments)
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,10 @@ def finished(tmp_path_factory):
 def test_a_robot_has_a_row_a_picture_and_what_was_tested(finished):
     (folder,) = (finished / "runs/tendon_rod").iterdir()
     metrics = json.loads((folder / "metrics.json").read_text())
-    for text in ((finished / "docs/robots.md").read_text(), (finished / "outputs/robots/results.md").read_text()):
+    for text in (
+        (finished / "docs/robots.md").read_text(),
+        (finished / "outputs/reproduce/robots/results.md").read_text(),
+    ):
         row = next(line for line in text.splitlines() if line.startswith("| SoPrA |"))
         cells = [cell.strip() for cell in row.split("|")[1:-1]]
         means = [error_parts(metrics["errors_mm"][m])[0] for m in ("simulation", "sysid", "simfree", "resphys")]
@@ -60,7 +63,7 @@ def test_a_robot_has_a_row_a_picture_and_what_was_tested(finished):
         assert "mm elsewhere" in text
         assert "Tentacle: no folder tentacle" in text
     assert (finished / "docs/robots/sopra.png").is_file()
-    page = (finished / "outputs/robots/robots.html").read_text()
+    page = (finished / "outputs/reproduce/robots/robots.html").read_text()
     assert "pressures of six chambers" in page
     assert str(finished) not in page
     assert "data=FOLDER" in page
@@ -95,7 +98,11 @@ def test_robots_of_earlier_runs_keep_their_rows(finished, tmp_path, monkeypatch)
 @pytest.mark.parametrize(
     ("kept", "arguments", "said"),
     [
-        ('{"sopra": {"mean": 1.0}}', [], "robots.json is not what this version keeps of earlier runs: move it away"),
+        (
+            '{"sopra": {"mean": 1.0}}',
+            [],
+            "robots.json is not what this version keeps of earlier runs (sopra.day is missing",
+        ),
         (
             None,
             ["budget=quick"],
@@ -131,7 +138,7 @@ def test_a_robot_that_fails_keeps_its_row_and_says_so(finished, tmp_path, monkey
 
 def configured():
     with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        return OmegaConf.to_container(compose("reproduce_robots"), resolve=True)["robots"]
+        return OmegaConf.to_container(compose("reproduce"), resolve=True)["robots"]
 
 
 def test_every_robot_is_an_experiment_whose_files_are_known():
@@ -167,8 +174,9 @@ def test_recordings_that_are_not_those_of_the_page_are_refused(content, said, tm
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["only=[starfish]"], "only names 'starfish', which is no robot: there are sopra"),
-        (["only=[]"], "name at least one robot"),
+        (["only=[starfish]"], "only names 'starfish': there are beams, robots, beam_oscillation"),
+        (["only=[]"], "only is []"),
+        (["robots", "robots.tentacle.minutes=3"], "robots.tentacle.minutes is 3"),
         (["only=[tentacle]"], "data is None, where there is none of tentacle"),
         (["only=[tentacle]", "data=nowhere"], "data is nowhere, where there is none of tentacle"),
     ],

@@ -1,4 +1,4 @@
-"""What the runs of a reproduction have left, as the sections of its page: published numbers beside ours."""
+"""The page of published beams: published numbers beside ours, from the runs."""
 
 import shlex
 from collections.abc import Mapping, Sequence
@@ -28,6 +28,7 @@ from ..report.page import (
     number_text,
     published_parts,
 )
+from .rows import Reproduction
 from .runs import Run
 
 _NONE = Cell(NONE)
@@ -48,11 +49,11 @@ _TIMED = {
 Runs = Mapping[str, Run]  # by variant
 
 
-def compare(config: Mapping[str, Any], results: Sequence[Run], canvas: Canvas) -> tuple[str, list[Part]]:
+def compare(reproduction: Reproduction, results: Sequence[Run], canvas: Canvas) -> tuple[str, list[Part]]:
     """The page's verdict and its sections.
 
     Args:
-        config: with the keys of ``conf/reproduce.yaml``.
+        reproduction: of conf/reproduce.yaml.
         results: runs that have ended, in order.
         canvas: where the figures are drawn.
     """
@@ -62,25 +63,25 @@ def compare(config: Mapping[str, Any], results: Sequence[Run], canvas: Canvas) -
             done.setdefault(each.experiment, {})[each.variant] = each
     studies = {name: runs for name, runs in done.items() if "errors_mm" in next(iter(runs.values())).metrics}
     set_up = {name: runs for name, runs in studies.items() if name in paper.PUBLISHED_SETUP}
-    parts = [setup_section(config, set_up)] if set_up else []
-    parts += [study_section(config, name, runs, canvas) for name, runs in studies.items()]
-    timing = config["timing"]
-    if timed := {v: r for v, r in done.get(timing["experiment"], {}).items() if v in timing["variants"]}:
-        parts.append(timing_section(config, timed))
-    parts += [ablation_section(config, name, runs, canvas) for name, runs in done.items() if name not in studies]
-    parts.append(runs_section(config, results))
-    if missing := {name: errors for name, errors in paper.PUBLISHED_MM.items() if name not in config["experiments"]}:
+    parts = [setup_section(reproduction, set_up)] if set_up else []
+    parts += [study_section(reproduction, name, runs, canvas) for name, runs in studies.items()]
+    timing = reproduction.timing
+    if timed := {v: r for v, r in done.get(timing.experiment, {}).items() if v in timing.variants}:
+        parts.append(timing_section(reproduction, timed))
+    parts += [ablation_section(reproduction, name, runs, canvas) for name, runs in done.items() if name not in studies]
+    parts.append(runs_section(reproduction, results))
+    if missing := {name: errors for name, errors in paper.PUBLISHED_MM.items() if name not in reproduction.experiments}:
         parts.append(missing_section(missing))
-    return verdict(config, done), parts
+    return verdict(reproduction, done), parts
 
 
-def verdict(config: Mapping[str, Any], done: Mapping[str, Runs]) -> str:
+def verdict(reproduction: Reproduction, done: Mapping[str, Runs]) -> str:
     """The first run of each experiment in a sentence."""
     said = []
     for name, runs in done.items():
-        run, known = next(iter(runs.values())), config["experiments"][name]
+        run, known = next(iter(runs.values())), reproduction.experiments[name]
         metrics = run.metrics
-        title = known["title"] if run.variant == known["variants"][0] else f"{known['title']} ({_label(config, run)})"
+        title = known.title if run.variant == known.variants[0] else f"{known.title} ({_label(reproduction, run)})"
         if "by_markers" in metrics:
             said.append(f"{title}: {ablation_page.verdict(metrics['by_markers'], metrics['uncorrected_mm'])}")
             continue
@@ -90,24 +91,24 @@ def verdict(config: Mapping[str, Any], done: Mapping[str, Runs]) -> str:
     return " ".join(said).replace(" mm", f"{NO_BREAK_SPACE}mm") or "No run has succeeded."
 
 
-def _label(config: Mapping[str, Any], run: Run) -> str:
-    return str(config["variants"][run.variant]["label"]).lower()
+def _label(reproduction: Reproduction, run: Run) -> str:
+    return str(reproduction.variants[run.variant].label).lower()
 
 
-def _columns(config: Mapping[str, Any], runs: Runs) -> list[str]:
-    return ["Published", *(config["variants"][variant]["label"] for variant in runs)]
+def _columns(reproduction: Reproduction, runs: Runs) -> list[str]:
+    return ["Published", *(reproduction.variants[variant].label for variant in runs)]
 
 
 def _reasons(deviations: Sequence[str]) -> list[Text | Items]:
     return [Text("Why they differ", heading=True), Items(deviations)] if deviations else []
 
 
-def setup_section(config: Mapping[str, Any], studies: Mapping[str, Runs]) -> Part:
+def setup_section(reproduction: Reproduction, studies: Mapping[str, Runs]) -> Part:
     """The published tables of parameters, each experiment beside its published set-up."""
     columns: list[str] = []
     values: list[Mapping[str, float]] = []
     for name, runs in studies.items():
-        columns += [f"{config['experiments'][name]['title']}, published", "here"]
+        columns += [f"{reproduction.experiments[name].title}, published", "here"]
         values += [paper.PUBLISHED_SETUP[name], _setup(next(iter(runs.values())).settings)]
     rows = [
         Row(key[:1].upper() + key[1:], [Cell(_value(key, each[key])) if key in each else _NONE for each in values])
@@ -144,9 +145,9 @@ def _value(key: str, value: float) -> str:
     return f"{value:g} s" if key == "step size" else f"{value:g}"
 
 
-def study_section(config: Mapping[str, Any], name: str, runs: Runs, canvas: Canvas) -> Part:
+def study_section(reproduction: Reproduction, name: str, runs: Runs, canvas: Canvas) -> Part:
     """Roll-out errors of one experiment, and how they and the tip go over time."""
-    group = config["experiments"][name]
+    group = reproduction.experiments[name]
     published = paper.PUBLISHED_MM.get(name, {})
     measured = [run.metrics["errors_mm"] for run in runs.values()]
     rows = [
@@ -165,13 +166,13 @@ def study_section(config: Mapping[str, Any], name: str, runs: Runs, canvas: Canv
         "Mean distance of the vertices over all test trajectories and steps, ± its standard deviation. A roll-out that "
         "diverged leaves no mean. Reconstruction: the simulator with forces fitted to the test trajectory itself."
     )
-    table = Table("Roll-out error [mm]", _columns(config, runs), rows, note)
-    drawn = {role: runs[variant] for role, variant in group["drawn"].items() if variant in runs}
+    table = Table("Roll-out error [mm]", _columns(reproduction, runs), rows, note)
+    drawn = {role: runs[variant] for role, variant in group.drawn.items() if variant in runs}
     drawn.setdefault("models", next(iter(runs.values())))
-    return Part(group["title"], [table, *_study_figures(config, name, drawn, canvas), *_reasons(group["deviations"])])
+    return Part(group.title, [table, *_study_figures(reproduction, name, drawn, canvas), *_reasons(group.deviations)])
 
 
-def _study_figures(config: Mapping[str, Any], name: str, drawn: Mapping[str, Run], canvas: Canvas) -> list[Drawn]:
+def _study_figures(reproduction: Reproduction, name: str, drawn: Mapping[str, Run], canvas: Canvas) -> list[Drawn]:
     settings = drawn["models"].settings
     test = read_trials(drawn["models"].folder, settings)
     paths = {model: test.positions[model][test.worst] for model in ("simulation", "resphys")}
@@ -181,7 +182,7 @@ def _study_figures(config: Mapping[str, Any], name: str, drawn: Mapping[str, Run
         paths["published_network"] = other.positions["resphys"][test.worst]
         errors["published_network"] = other.errors_mm["resphys"]
     published = {model: each.mean for model, each in paper.PUBLISHED_MM.get(name, {}).items() if model in errors}
-    label = _label(config, drawn["models"])
+    label = _label(reproduction, drawn["models"])
     lines = "; ".join(f"{MODEL_NAMES[model]} {error:g} mm" for model, error in published.items())
     beside = f" Dashed: the published means ({lines})." if published else ""
     return [
@@ -211,7 +212,7 @@ def _tip_motion(settings: Mapping[str, Any], test: TrialResults, paths: Mapping[
     return {name: q[:, tip].mean(axis=1) - rest for name, q in whole.items()}
 
 
-def timing_section(config: Mapping[str, Any], runs: Runs) -> Part:
+def timing_section(reproduction: Reproduction, runs: Runs) -> Part:
     """The published time benchmark."""
     measured = [(run.metrics["seconds_per_test_trajectory"], run.settings["data"]["steps"]) for run in runs.values()]
     rows = [
@@ -226,17 +227,17 @@ def timing_section(config: Mapping[str, Any], runs: Runs) -> Part:
     ]
     counts = " and ".join(sorted({str(steps) for _, steps in measured}))
     note = f"Published: trajectories of {paper.PUBLISHED_SECONDS_STEPS} steps; here: of {counts}."
-    table = Table("Time per trajectory [s]", _columns(config, runs), rows, note)
-    return Part("Time benchmark", [table, *_reasons(config["timing"]["deviations"])])
+    table = Table("Time per trajectory [s]", _columns(reproduction, runs), rows, note)
+    return Part("Time benchmark", [table, *_reasons(reproduction.timing.deviations)])
 
 
 def _time_cell(mean: float, std: float, steps: int) -> Cell:
     return Cell(f"{mean:.3f} ± {std:.3f}", f"{1e3 * mean / steps:.2g} ms a step")
 
 
-def ablation_section(config: Mapping[str, Any], name: str, runs: Runs, canvas: Canvas) -> Part:
+def ablation_section(reproduction: Reproduction, name: str, runs: Runs, canvas: Canvas) -> Part:
     """The published box plot of the marker ablation, as ours and in numbers."""
-    group, run = config["experiments"][name], next(iter(runs.values()))
+    group, run = reproduction.experiments[name], next(iter(runs.values()))
     metrics, settings = run.metrics, run.settings
     rows = []
     for row in metrics["by_markers"]:
@@ -256,14 +257,14 @@ def ablation_section(config: Mapping[str, Any], name: str, runs: Runs, canvas: C
     boxes = partial(ablation_page.marker_boxes, ablation_page.box_errors(metrics), metrics["uncorrected_mm"], published)
     caption = "Box: lower quartile, median (orange), upper quartile; whiskers to the smallest and the largest error."
     figure = canvas.figure(name, boxes, ablation_page.describe_boxes(metrics), caption)
-    return Part(group["title"], [Table("Markers", columns, rows, note), figure, *_reasons(group["deviations"])])
+    return Part(group.title, [Table("Markers", columns, rows, note), figure, *_reasons(group.deviations)])
 
 
-def runs_section(config: Mapping[str, Any], results: Sequence[Run]) -> Part:
+def runs_section(reproduction: Reproduction, results: Sequence[Run]) -> Part:
     """What was run: time and memory of each run, or why it failed."""
     rows, failures = [], []
     for run in results:
-        head = f"{config['experiments'][run.experiment]['title']}: {_label(config, run)}"
+        head = f"{reproduction.experiments[run.experiment].title}: {_label(reproduction, run)}"
         if run.failure is None:
             metrics = run.metrics
             memory = metrics["peak_memory_gib"]

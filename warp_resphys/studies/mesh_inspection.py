@@ -1,13 +1,11 @@
 """What there is to know about a mesh before it is simulated, and the commands that say it and make an arm."""
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from ..experiment.build import build_mesh
-from ..experiment.schema import POSITIVE, check
 from ..io.errors import MeshError
 from ..mesh.arm import mesh_arm, name_surfaces
 from ..mesh.arm_geometry import arm_geometry
@@ -18,43 +16,42 @@ from ..mesh.quality import scaled_jacobian
 from ..mesh.readers import read_mesh, read_surfaces, read_vertices, write_mesh
 from ..report.body_picture import MeshSummary, draw_mesh
 from .command import aligned
+from .inspection import Arm, Inspection
 
 _MILLI: Final = 1e3
 _CUBIC_CENTI: Final = 1e6
 
 
-def make_arm(config: Mapping[str, Any], folder: Path) -> str:
+def make_arm(arm: Arm, folder: Path) -> str:
     """Generates an arm, writes the mesh and a picture, and returns a table.
 
     Raises:
         ResphysError: A setting of the wrong kind, or an arm that cannot be made.
     """
-    check("density", config["density"], POSITIVE)
-    settings = config["mesh"]
+    settings = arm.mesh
     if settings["order"] not in (1, 2) or (settings["order"] == 2 and settings["cells"] != "tetrahedra"):
         raise MeshError(f"mesh.order is {settings['order']!r}: choose 1, or 2 for tetrahedra with edge midpoints.")
     mesh, surfaces = mesh_arm(arm_geometry(settings), settings["size"], settings["cells"], settings["layers"])
     if settings["order"] == 2:
         mesh = quadratic(mesh)
         surfaces = name_surfaces(mesh)
-    write_mesh(folder / config["file"], mesh, surfaces)
-    summary = MeshSummary(mesh, config["density"], np.unique(surfaces["base"]), find_chambers(mesh))
-    if config["picture"]:
+    write_mesh(folder / arm.file, mesh, surfaces)
+    summary = MeshSummary(mesh, arm.density, np.unique(surfaces["base"]), find_chambers(mesh))
+    if arm.picture:
         draw_mesh(folder / "arm.png", summary)
     return aligned([*summary_rows(summary), ("clamped at the base", f"{len(summary.fixed)} vertices")], left=2)
 
 
-def inspect_mesh(config: Mapping[str, Any], folder: Path) -> str:
+def inspect_mesh(settings: Inspection, folder: Path) -> str:
     """Returns a table of what is in a mesh, and draws it.
 
     Raises:
         ResphysError: A setting of the wrong kind, a file that cannot be read, or a mesh that cannot be simulated.
     """
-    check("density", config["density"], POSITIVE)
     rows: list[tuple[str, str]] = []
-    read = config["mesh"]["kind"] == "file"
+    read = settings.mesh["kind"] == "file"
     if read:
-        path, units, order = (config["mesh"][key] for key in ("path", "units", "order"))
+        path, units, order = (settings.mesh[key] for key in ("path", "units", "order"))
         points = read_vertices(path, units)
         mesh = read_mesh(path, units, order, drop_unreferenced=True)
         unused = len(points) - len(read_mesh(path, units, drop_unreferenced=True).vertices)
@@ -64,19 +61,19 @@ def inspect_mesh(config: Mapping[str, Any], folder: Path) -> str:
         surfaces = read_surfaces(path, units, order, True)
         names = ", ".join(f"{name} ({len(faces)})" for name, faces in surfaces.items())
     else:
-        mesh = build_mesh({key: each for key, each in config["mesh"].items() if (key, each) != ("path", None)})
+        mesh = build_mesh({key: each for key, each in settings.mesh.items() if (key, each) != ("path", None)})
         points = mesh.vertices
-    chosen = {axis: at for axis, at in config["fixed"].items() if at is not None and axis != "tolerance"}
-    place = Place(**config["fixed"]) if chosen else None
-    fixed = np.empty(0, dtype=np.int64) if place is None else select_vertices(mesh, **config["fixed"])
-    summary = MeshSummary(mesh, config["density"], fixed, find_chambers(mesh))
+    chosen = {axis: at for axis, at in settings.fixed.items() if at is not None and axis != "tolerance"}
+    place = Place(**settings.fixed) if chosen else None
+    fixed = np.empty(0, dtype=np.int64) if place is None else select_vertices(mesh, **settings.fixed)
+    summary = MeshSummary(mesh, settings.density, fixed, find_chambers(mesh))
     rows += summary_rows(summary)
     if place is not None:
         rows.append(("fixed", f"{place.holds(points).sum()} vertices at {place} m, {len(fixed)} of them used"))
     if read:
         rows.append(("surfaces with a name", names or "none"))
     rows.append(("open cavities", _cavities(mesh)))
-    if config["picture"]:
+    if settings.picture:
         draw_mesh(folder / "mesh.png", summary)
     return aligned(rows, left=2)
 

@@ -4,23 +4,33 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from ..experiment.schema import COUNTS, NATURAL, WORD, check, one_of
 from ..io.errors import InputError
 from ..io.files import read_json, write_json
 from ..io.progress import Progress
+from ..io.settings import Count, Natural, Settings, Some, Word, parse, setting
 from ..io.stages import finished_record
-from .command import WORDS, show, table_of
+from .command import show, table_of
 
-_TASKS: Final = ("reach", "follow")
-_EXAMPLES: Final = {"models": "models=[sysid,resphys]", "seeds": "seeds=[0,1,2]"}
 _SEED: Final = 1000  # of the episodes in which policies are tried
 _PREVIEWS: Final = 3  # places that a scripted policy may go to
+
+
+class Policies(Settings):
+    """Policies that are learned, and how they are tried."""
+
+    run: Word = setting(description="folder of a run with a laboratory")
+    skill: Literal["reach", "follow"]
+    models: Some[Word] = setting(description="on which policies learn, such as sysid and resphys")
+    steps: Natural = setting(description="actions of all robots together")
+    robots: Natural = setting(description="that learn at once")
+    episodes: Natural = setting(description="in which policies are tried")
+    seeds: Some[Count]
 
 
 def train_policy(config: Mapping[str, Any], folder: Path) -> None:
@@ -34,22 +44,14 @@ def train_policy(config: Mapping[str, Any], folder: Path) -> None:
         DataFileError: there is no finished run.
     """
     del folder
-    check("run", config["run"], WORD)
-    check("skill", config["skill"], one_of(*_TASKS))
-    check("models", config["models"], WORDS)
-    for key in ("steps", "robots", "episodes"):
-        check(key, config[key], NATURAL)
-    check("seeds", config["seeds"], COUNTS)
-    for key in ("models", "seeds"):
-        if not config[key]:
-            raise InputError(f"{key} is empty: name those with which policies are to learn, as in {_EXAMPLES[key]}.")
+    settings = parse(Policies, config)
     try:
         from ..environments.making import make_vector
         from ..environments.tasks import GoalTask
     except ImportError as error:
         raise InputError(f"policies need Gymnasium ({error}): pip install 'warp-resphys[policies]'.") from None
     wp.config.log_level = wp.LOG_WARNING
-    run, task, models = Path(config["run"]).expanduser(), config["skill"], config["models"]
+    run, task, models = Path(settings.run).expanduser(), settings.skill, settings.models
     reaches = {}
     for model in models:
         goal = make_vector(task, run, 1, model, "reduced").task
@@ -58,16 +60,16 @@ def train_policy(config: Mapping[str, Any], folder: Path) -> None:
     worlds = {f"reduced {model}": (model, "reduced") for model in models} | {"laboratory": (models[-1], "laboratory")}
     # What is asked, and the units in which it is shown, are the same for all.
     environments = {
-        name: make_vector(task, run, config["episodes"], model, world, reach=reaches[models[-1]])
+        name: make_vector(task, run, settings.episodes, model, world, reach=reaches[models[-1]])
         for name, (model, world) in worlds.items()
     }
     (run / "policies").mkdir(exist_ok=True)
-    found, speeds = _policies(config, run, reaches)
-    _try(found, environments, run / "policies" / f"{task}_trials.json", config["episodes"])
+    found, speeds = _policies(settings, run, reaches)
+    _try(found, environments, run / "policies" / f"{task}_trials.json", settings.episodes)
     path = run / "policies" / f"{task}.json"
-    settings = {key: config[key] for key in ("skill", "models", "steps", "robots", "episodes", "seeds")}
+    asked = {key: value for key, value in settings.plain().items() if key != "run"}
     write_json(
-        path, {"settings": settings, "actions_s": speeds, "errors": {name: one.errors for name, one in found.items()}}
+        path, {"settings": asked, "actions_s": speeds, "errors": {name: one.errors for name, one in found.items()}}
     )
     groups: dict[str, list[_Found]] = {}
     for one in found.values():
@@ -75,9 +77,9 @@ def train_policy(config: Mapping[str, Any], folder: Path) -> None:
     rows = [
         [group, *(_text([one.errors[world] for one in ones]) for world in worlds)] for group, ones in groups.items()
     ]
-    title = f"Mean error in mm, task {task}, {config['episodes']} episodes"
-    if len(config["seeds"]) > 1:
-        title += f", policies of {len(config['seeds'])} seeds (least to most)"
+    title = f"Mean error in mm, task {task}, {settings.episodes} episodes"
+    if len(settings.seeds) > 1:
+        title += f", policies of {len(settings.seeds)} seeds (least to most)"
     rates = ", ".join(f"{model} {np.mean(speed):.0f}" for model, speed in speeds.items())
     wrote = f"Written: {path} and the policies beside it"
     show(table_of(title, ["policy", *worlds], rows), f"Actions a second while learning: {rates}.", wrote)
@@ -94,32 +96,32 @@ class _Found:
 
 
 def _policies(
-    config: Mapping[str, Any], run: Path, reaches: Mapping[str, Any]
+    settings: Policies, run: Path, reaches: Mapping[str, Any]
 ) -> tuple[dict[str, _Found], dict[str, list[float]]]:
     """Policies by name, scripted ones and those that are learned now or were before, and actions a second by model."""
     from ..environments.making import make_vector
     from ..environments.policies import ScriptedPolicy, acting, learn, learned_before
 
-    task, models = config["skill"], config["models"]
+    task, models = settings.skill, settings.models
     origin = {"run": finished_record(run, "evaluate")["fingerprint"], "last": models[-1]}
     found: dict[str, _Found] = {}
     speeds: dict[str, list[float]] = {model: [] for model in models}
     for model in models:
         robots = make_vector(
-            task, run, config["robots"], model, "reduced", autoreset_mode="SameStep", reach=reaches[models[-1]]
+            task, run, settings.robots, model, "reduced", autoreset_mode="SameStep", reach=reaches[models[-1]]
         )
         for ahead in range(_PREVIEWS):
             name = f"scripted, {model}, place {ahead + 1}"
             found[name] = _Found(name, ScriptedPolicy(robots, ahead, reaches[model]), origin)
-        for seed in config["seeds"]:
+        for seed in settings.seeds:
             saved, about = (run / "policies" / f"{task}_{model}_{seed}{suffix}" for suffix in (".zip", ".json"))
-            asked = {"steps": config["steps"], "robots": config["robots"], "seed": seed, **origin}
+            asked = {"steps": settings.steps, "robots": settings.robots, "seed": seed, **origin}
             known = read_json(about) if about.is_file() and saved.is_file() else {}
             if known.get("asked") != asked:
                 about.unlink(missing_ok=True)
                 began = time.perf_counter()
-                with Progress(f"policy on {model}, seed {seed}", config["steps"], "actions") as progress:
-                    learned = learn(robots, config["steps"], seed, progress.advance)
+                with Progress(f"policy on {model}, seed {seed}", settings.steps, "actions") as progress:
+                    learned = learn(robots, settings.steps, seed, progress.advance)
                 learned.save(saved)
                 known = {"asked": asked, "actions_s": learned.num_timesteps / (time.perf_counter() - began)}
                 write_json(about, known)

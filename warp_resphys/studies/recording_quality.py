@@ -1,6 +1,6 @@
 """The quality of a recording as a picture, and the command that makes it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import cycle
 from pathlib import Path
 from typing import Any, Final
@@ -26,26 +26,18 @@ from ..data.recordings.quality import (
 )
 from ..data.recordings.reading import read_recording
 from ..data.recordings.recording import Recording
-from ..experiment.schema import ANYTHING, COUNT, NOT_NEGATIVE, POSITIVE, WORD, Group, check, optional
 from ..io.atomic import atomic_path
 from ..io.errors import InputError
 from ..io.files import write_json
 from ..report.figures import STYLE, TONES, new_figure, save_png
-from .command import WORDS, aligned
+from .command import aligned
+from .inspection import Inspection
 
 FloatArray = NDArray[np.float64]
 
 # Okabe and Ito (2008), without yellow: everyone can tell them apart.
 MARKER_COLOURS: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#1c2127")
 _STATES: Final = {"seen": "#dde1e6", "filled": "#e69f00", "masked": "#c4481b"}
-_KEYS: Final = Group(
-    {
-        "recording": Group({"path": WORD, "rate": optional(POSITIVE), "labels": optional(WORDS)}, each=ANYTHING),
-        **dict.fromkeys(("still", "moving", "compare_with"), WORDS),
-        **{"longest_gap": COUNT, "least_jump": NOT_NEGATIVE, "largest_distortion": NOT_NEGATIVE},
-    },
-    each=ANYTHING,
-)
 _MILLI: Final = 1e3
 _ROW: Final = 0.16  # [in] of a marker in the raster
 _LEGEND_COLUMNS: Final = 6
@@ -104,7 +96,7 @@ def _draw_marker(
     )
 
 
-def inspect_recording(config: Mapping[str, Any], folder: Path) -> str:
+def inspect_recording(settings: Inspection, folder: Path) -> str:
     """Examines a recording, and writes quality.json and quality.png.
 
     Returns:
@@ -114,23 +106,22 @@ def inspect_recording(config: Mapping[str, Any], folder: Path) -> str:
         ResphysError: A value in the configuration cannot be used, a recording cannot be read, or a marker on the base
             was moved between two of them.
     """
-    check("", config, _KEYS)
-    if config["compare_with"] and len(config["still"]) < 2:
+    still, longest_gap = settings.still, settings.longest_gap
+    if settings.compare_with and len(still) < 2:
         raise InputError("compare_with needs two or more markers on the base to compare: name them in still.")
-    settings = config["recording"]
-    given = (settings["units"], settings["rate"], settings["labels"])
-    recording = read_recording(settings["path"], *given)
-    still = config["still"]
-    release = release_of(recording, config["moving"], config["longest_gap"]) if config["moving"] else None
-    result = quality(recording, still, release, longest_gap=config["longest_gap"], least_jump=config["least_jump"])
-    trials = [recording, *(read_recording(path, *given) for path in config["compare_with"])]
+    file = settings.recording
+    given = (file.units, file.rate, file.labels)
+    recording = read_recording(str(file.path), *given)
+    release = release_of(recording, settings.moving, longest_gap) if settings.moving else None
+    result = quality(recording, still, release, longest_gap=longest_gap, least_jump=settings.least_jump)
+    trials = [recording, *(read_recording(path, *given) for path in settings.compare_with)]
     motions = compare_base(trials, still) if len(trials) > 1 else []
     figure = recording_quality(recording, result)
     write_json(folder / "quality.json", {**result.to_plain(), "base": [_plain(motion, still) for motion in motions]})
     with atomic_path(folder / "quality.png") as partial:
         save_png(figure, partial)
     if len(trials) > 1:
-        check_base(trials, still, largest_distortion=config["largest_distortion"])
+        check_base(trials, still, largest_distortion=settings.largest_distortion)
     return _text(result, motions)
 
 

@@ -1,61 +1,85 @@
-"""Every experiment in turn, and one page that sets published results beside ours."""
+"""The command `reproduce`: published beams and recorded robots through the ordinary command, on one page a kind."""
 
-from collections.abc import Mapping
+import shutil
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from ..io.errors import InputError
-from ..io.labels import run_label
+from ..io.files import write_json
 from ..io.stages import run_lock
-from ..report.page import Canvas, figures_beside
+from ..report.page import Canvas, Items, Part, figures_beside
+from . import robot_results
 from .comparison import compare
-from .runs import Results, Run, asked_for, fail_for, made, run_all
+from .robot_results import Measured
+from .rows import BEAMS, ROBOTS, Reproduction
+from .runs import Results, Run, command_part, fail_for, made, run_all
 
-PAGE = "reproduction.html"
+_PICTURES = ("figures/body.png", "fold_*/figures/body.png", "figures/registration.png")
+_HIDDEN = ("data", "runs", "results")  # keys whose values are folders of this machine
 
 
 def reproduce(config: Mapping[str, Any], folder: Path) -> None:
-    """Runs what is configured; writes the page and logs into the run folder, and where asked a dated page of results.
+    """Runs the rows that are asked for; writes logs, and a page for each kind, into the run folder.
+
+    With ``results``, the page of beams is kept there too, under its date, and that of robots as robots.md; robots.json
+    keeps the results of each robot, and the page has the robots of earlier runs, with day and machine.
 
     Raises:
-        InputError: a value that cannot be used.
-        ResphysError: a run failed; the others were run, and the page is written.
+        InputError: a value that cannot be used, recordings that are not those of a row, or a robots.json that cannot
+            be continued.
+        ResphysError: a run failed; the others were run, and the pages are written.
         RunsInterrupted: Ctrl-C.
     """
-    runs = plan(config)
+    settings = Reproduction.read(config)
+    beams = settings.beams()
+    present, absent = settings.wanted_robots()
     with run_lock(folder):
-        results = run_all(runs, folder / "logs")
-        page = folder / PAGE
-        with figures_beside(page) as pictures:
-            said, parts = compare(config, results, Canvas(pictures))
-        date = f"{datetime.now():%Y-%m-%d}"
-        dated = Results("Reproduction", date, said, [*parts, made("reproduce")])
-        dated.write(page, config["results"], f"{date}-reproduction")
+        kept = None if settings.results is None else Path(settings.results) / f"{ROBOTS}.json"
+        robot_results.check_kept(kept, present, settings.beyond)
+        robots = [settings.robot(name, folder) for name in present]
+        results = run_all([*beams, *robots], folder / "logs")
+        if beams:
+            _write_beams(settings, results[: len(beams)], folder / BEAMS / "reproduction.html")
+        if robots:
+            _write_robots(settings, results[len(beams) :], absent, kept, folder / ROBOTS / f"{ROBOTS}.html")
     fail_for(results)
 
 
-def plan(config: Mapping[str, Any]) -> list[Run]:
-    """The runs that are asked for, in order.
-
-    Raises:
-        InputError: a value of the wrong kind, or a name that does not exist.
-    """
-    groups = config["experiments"]
-    pairs = [(experiment, variant) for experiment, group in groups.items() for variant in group["variants"]]
-    known = sorted({*groups, *("/".join(pair) for pair in pairs)})
-    wanted = asked_for(config, known, "experiment or run")
-    return [_run(config, *pair) for pair in pairs if {pair[0], "/".join(pair)} & wanted]
+def _write_beams(settings: Reproduction, results: Sequence[Run], page: Path) -> None:
+    """Writes the page that sets what was published beside our results."""
+    with figures_beside(page) as pictures:
+        said, parts = compare(settings, results, Canvas(pictures))
+    date = f"{datetime.now():%Y-%m-%d}"
+    parts.append(made("reproduce", _HIDDEN))
+    Results("Reproduction", date, said, parts).write(page, settings.results, f"{date}-reproduction")
 
 
-def _run(config: Mapping[str, Any], experiment: str, name: str) -> Run:
-    if name not in config["variants"]:
-        raise InputError(
-            f"experiments.{experiment}.variants names {name!r}: there are {', '.join(config['variants'])}."
-        )
-    variant = config["variants"][name]
-    overrides = [*variant["overrides"], *config["experiments"][experiment]["overrides"], *config["overrides"]]
-    if config["budget"] != "full":
-        overrides.append(f"budget={config['budget']}")
-    folder = Path(config["runs"]) / experiment / run_label(overrides, ("experiment", "device"))
-    return Run(experiment, name, (f"experiment={experiment}", *overrides), folder, variant["minutes"][config["budget"]])
+def _write_robots(
+    settings: Reproduction, results: Sequence[Run], absent: Sequence[str], kept: Path | None, page: Path
+) -> None:
+    """Writes the page with a row for each robot, of this run or of earlier ones."""
+    new = {run.experiment: Measured.of_run(run, settings.beyond) for run in results if run.failure is None}
+    known = robot_results.read_kept(kept)  # once more: another process may have finished in the meantime
+    found = {name: each for name in settings.robots if (each := new.get(name, known.get(name))) is not None}
+    failed = {run.experiment: str(run.failure) for run in results if run.failure is not None}
+    with figures_beside(page) as pictures:
+        for run in results:
+            body = next((path for pattern in _PICTURES for path in sorted(run.folder.glob(pattern))), None)
+            if body is not None and run.failure is None:
+                shutil.copy(body, pictures / f"{run.experiment}.png")
+        for name in found.keys() - new.keys():
+            with suppress(FileNotFoundError):
+                shutil.copy(Path(str(settings.results)) / ROBOTS / f"{name}.png", pictures)
+        parts = [robot_results.summary(settings.robots, found, failed)]
+        parts += [robot_results.details(name, settings.robots[name], each, pictures) for name, each in found.items()]
+    items = [f"{settings.robots[name].title} failed: {failure}" for name, failure in failed.items()]
+    for robot in (settings.robots[name] for name in absent if name not in found):
+        items.append(f"{robot.title}: no folder {robot.recordings} in `data`. {robot.source}")
+    parts += [Part("Not run", [Items(items)])] if items else []
+    parts += [robot_results.machines(settings.robots, found), command_part("reproduce", _HIDDEN)]
+    said, date = robot_results.verdict(settings.robots, found), f"{datetime.now():%Y-%m-%d}"
+    Results("Robots", date, said, [part for part in parts if part.blocks]).write(page, settings.results, ROBOTS)
+    if kept is not None:
+        write_json(kept, {name: each.plain() for name, each in {**found, **known, **new}.items()})

@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,15 +17,13 @@ from rich.console import Console
 from rich.markup import escape
 
 from ..experiment.files import METRICS
-from ..experiment.schema import check, optional
 from ..io.atomic import disk_full_error, is_disk_full
-from ..io.errors import DataFileError, InputError, ResphysError
+from ..io.errors import DataFileError, ResphysError
 from ..io.files import read_json, write_text
 from ..io.machine import commit, hardware
 from ..io.progress import clock
 from ..io.stages import package_versions
 from ..report.page import Cell, Drawn, Items, Part, Row, Table, markdown, write_page
-from .command import WORDS
 
 _UP_TO_DATE_SECONDS = 8.0  # for a run that finds nothing to do
 _LINE_SECONDS = 60.0
@@ -68,22 +66,6 @@ class Run:
         """What is kept of the stage that measured its errors, the last of those of its folds."""
         paths = [path for each in (".", "fold_*") for path in self.folder.glob(f"{each}/stages/evaluate.json")]
         return max((dict(read_json(path)) for path in paths), key=lambda found: str(found["finished"]))
-
-
-def asked_for(config: Mapping[str, Any], known: Sequence[str], kind: str) -> set[str]:
-    """What the key ``only`` names; all that is known where it is null.
-
-    Raises:
-        InputError: a value of the wrong kind, nothing, or a name that does not exist.
-    """
-    check("overrides", config["overrides"], WORDS)
-    check("only", config["only"], optional(WORDS))
-    wanted = known if config["only"] is None else config["only"]
-    if foreign := [name for name in wanted if name not in known]:
-        raise InputError(f"only names {foreign[0]!r}, which is no {kind}: there are {', '.join(known)}.")
-    if not wanted:
-        raise InputError(f"only is []: name at least one {kind}, or leave it null for all.")
-    return set(wanted)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,8 @@
 """The reports of motions with markers, driven by pressure or let go, on made-up runs."""
 
 import re
+from dataclasses import replace
+from types import SimpleNamespace
 
 import measured_run as beam
 import numpy as np
@@ -19,6 +21,7 @@ from warp_resphys.io.stages import StageContext
 from warp_resphys.mesh.mesh import Mesh, box_hexahedra
 from warp_resphys.mesh.readers import write_mesh
 from warp_resphys.report.data import best_and_worst
+from warp_resphys.report.marker_section import paths_section
 from warp_resphys.report.page import NONE, Canvas, Drawn, Picture
 
 BEAM = beam.config()
@@ -166,6 +169,23 @@ class TestArms:
         assert film.positions["resphys"].shape[0] == len(film.times) == 51
         assert list(pressures.values) == ["train_00", "train_01", "test_00", "test_01", "test_02"]
         assert pressures.values["test_00"].shape == (100, 6)
+
+    def test_the_tip_is_shown_where_its_place_in_space_is_known(self, tmp_path):
+        settings = arm_settings()
+        write_run(tmp_path, settings, steps=40)
+        trials, mesh = read_trials(tmp_path, settings), build_mesh(settings["mesh"])
+        canvas = SimpleNamespace(figure=lambda name, *_: name)
+
+        def drawn(shown, driven):
+            data = {"mesh": mesh, "fixed": [0], "metrics": {}, "trials": shown, "driven": driven}
+            part = paths_section(SimpleNamespace(**data), canvas)
+            return None if part is None else part.blocks
+
+        driven = read_driven(tmp_path, settings)
+        assert drawn(trials, driven) == ["plane_worst", "space", "markers", "plane_best"]
+        assert drawn(replace(trials, axes=(0, 2)), driven) == ["markers"]
+        assert drawn(trials, None) == ["paths_worst", "paths_best"]
+        assert drawn(replace(trials, labels=()), None) is None
 
     def test_recordings_are_shown_on_the_body_as_it_hangs(self, tmp_path, monkeypatch):
         settings, shown = arm_settings(), []

@@ -32,6 +32,7 @@ from .progress import be_quiet
 log = logging.getLogger(__name__)
 
 Advance = Callable[..., None]
+_Status = tuple[int, dict[str, object]]  # units that a task has counted, and the named values that it gave last
 
 _ATTEMPTS = 3
 _IDLE_SECONDS = 60.0  # after which a worker of this machine ends
@@ -107,11 +108,12 @@ def fan_out(
         return []
     folder.mkdir(parents=True, exist_ok=True)
     for attempt in range(1, _ATTEMPTS + 1):
+        known: dict[str, _Status] = {}
         try:
             with (
                 TemporaryDirectory(prefix=".progress_", dir=folder, ignore_cleanup_errors=True) as place,
                 _BACKENDS[workers.backend](workers),
-                _followed(Path(place), advance),
+                _followed(Path(place), known, advance),
             ):
                 calls = [delayed(_work)(function, task, Path(place, str(at))) for at, task in enumerate(tasks)]
                 # One job alone would be done in this process.
@@ -127,6 +129,7 @@ def fan_out(
                 ) from error
             workers = workers.at_most(workers.count // 2) if workers.backend == "local" else workers
             log.warning("a worker process was lost: its work is done again, %d at once", workers.count)
+            advance(-sum(total for total, _ in known.values()))
     if memory is not None:
         peaks: dict[tuple[str, int], float] = {}
         for _, worker, peak in outcomes:
@@ -185,9 +188,8 @@ class _ProgressFile:
 
 
 @contextmanager
-def _followed(folder: Path, advance: Advance) -> Iterator[None]:
-    """Hands on the progress of all tasks; takes back what was counted where the block ends with an error."""
-    known: dict[str, tuple[int, dict[str, object]]] = {}
+def _followed(folder: Path, known: dict[str, _Status], advance: Advance) -> Iterator[None]:
+    """Hands on what the progress files of tasks say; `known` has what was handed on, by name of the file."""
     ended = threading.Event()
 
     def look() -> None:
@@ -207,11 +209,6 @@ def _followed(folder: Path, advance: Advance) -> Iterator[None]:
     thread.start()
     try:
         yield
-    except Exception:
-        ended.set()
-        thread.join()
-        advance(-sum(total for total, _ in known.values()))
-        raise
     finally:
         ended.set()
         thread.join()

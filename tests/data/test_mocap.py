@@ -1,12 +1,11 @@
-import contextlib
 import dataclasses
-import struct
 from pathlib import Path
 
 import ezc3d
 import numpy as np
 import pytest
 
+from warp_resphys.data.recordings.c3d import read_raw_c3d
 from warp_resphys.data.recordings.processing import fill_gaps
 from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.recordings.recording import Recording
@@ -41,6 +40,9 @@ def test_read_c3d_converts_units_and_keeps_occlusions(tmp_path, trajectory):
     assert recording.labels == ("a", "b", "c")
     assert recording.rate == 200.0
     np.testing.assert_allclose(recording.positions, 1e-3 * trajectory, rtol=1e-6, atol=1e-9)
+    raw = read_raw_c3d(tmp_path / "small.c3d")
+    assert (raw.unit, raw.rate, list(raw.labels)) == ("mm", 200.0, ["a", "b", "c"])
+    np.testing.assert_allclose(raw.positions[0], trajectory[0], rtol=1e-6)
     picked = recording.select(["c", "a"])
     np.testing.assert_array_equal(picked.positions, recording.positions[:, [2, 0]])
 
@@ -75,7 +77,7 @@ def test_truncated_file(tmp_path, trajectory, part):
     cut = tmp_path / "cut.c3d"
     cut.write_bytes(content[: int(part * len(content))])
     with pytest.raises(DataFileError, match="truncated"):
-        read_recording(cut)
+        read_raw_c3d(cut)
 
 
 @pytest.mark.parametrize(
@@ -99,16 +101,16 @@ def test_a_changed_byte_that_crashes_the_decoder_or_makes_it_claim_memory_or_tim
         read_recording(path)
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_bytes_overwritten_in_the_parameters_never_escape_as_anything_else(tmp_path, trajectory, seed):
+@pytest.mark.parametrize("seed", range(3))
+def test_overwritten_parameters_are_refused_in_one_sentence(tmp_path, trajectory, seed):
     content = bytearray(write_c3d(tmp_path / "whole.c3d", trajectory, "abc").read_bytes())
     generator = np.random.default_rng(seed)
     for at in generator.integers(512, 1024, size=20):
-        struct.pack_into("B", content, at, generator.integers(256))
+        content[at] = generator.integers(256)
     path = tmp_path / "damaged.c3d"
     path.write_bytes(content)
-    with contextlib.suppress(DataFileError):
-        assert read_recording(path).positions.shape[2] == 3
+    with pytest.raises(DataFileError, match=r"damaged\.c3d cannot be decoded \(.+\): copy or export it again"):
+        read_recording(path)
 
 
 def test_unknown_unit(tmp_path, trajectory):

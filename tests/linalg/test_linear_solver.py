@@ -5,9 +5,7 @@ import pytest
 import scipy.linalg
 import torch
 
-from warp_resphys.io.errors import InputError
 from warp_resphys.linalg import sparse
-from warp_resphys.linalg.banded import BandedSolver
 from warp_resphys.linalg.choice import make_linear_solver
 from warp_resphys.linalg.linear_solver import bandwidth_reducing_order
 
@@ -217,13 +215,3 @@ def test_band_storage_is_lapacks():
     for matrix, band in zip(dense, bands, strict=True):
         reference = np.linalg.solve(matrix[np.ix_(order, order)], right)
         np.testing.assert_allclose(scipy.linalg.solveh_banded(band.T, right, lower=True), reference, rtol=1e-9)
-
-
-def test_bad_choices_are_refused():
-    with pytest.raises(
-        InputError, match="linear_solver is 'lu': choose one of auto, banded, tiled, dense, sparse, multigrid"
-    ):
-        make("lu", 3)
-    with pytest.raises(InputError, match="linear_solver=banded runs on the CPU alone"):
-        make("banded", 3, "cuda")
-    assert isinstance(make("auto", 3), BandedSolver)

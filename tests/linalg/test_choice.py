@@ -1,0 +1,40 @@
+"""The linear solver that `auto` takes, and what it refuses."""
+
+import numpy as np
+import pytest
+import torch
+
+from warp_resphys.io.errors import InputError
+from warp_resphys.linalg.banded import BandedSolver
+from warp_resphys.linalg.choice import make_linear_solver
+from warp_resphys.linalg.dense import DenseSolver
+from warp_resphys.linalg.tiled import TiledSolver
+
+CPU = torch.device("cpu")
+
+
+def chain(count):
+    """Rows and columns of the lower triangle of a chain of nodes."""
+    nodes = np.arange(count)
+    return np.concatenate([nodes, nodes[1:]]), np.concatenate([nodes, nodes[:-1]])
+
+
+@pytest.mark.parametrize(("name", "kind"), [("auto", BandedSolver), ("dense", DenseSolver), ("tiled", TiledSolver)])
+def test_a_chain_is_solved_by_every_choice(name, kind):
+    rows, cols = chain(40)
+    solver = make_linear_solver(name, rows, cols, 40, 1, CPU, torch.float64)
+    assert isinstance(solver, kind)
+    matrix = np.zeros((40, 40))
+    matrix[rows, cols] = matrix[cols, rows] = np.where(rows == cols, 3.0, -1.0)
+    values = torch.zeros(1, solver.n_values, dtype=torch.float64)
+    values[0, torch.as_tensor(solver.address[:, 0]).long()] = torch.as_tensor(matrix[rows, cols])
+    right = np.arange(40.0)
+    solution = solver.factor(values).solve(torch.as_tensor(right).reshape(1, 40, 1))
+    np.testing.assert_allclose(solution[0, :, 0].numpy(), np.linalg.solve(matrix, right), rtol=1e-10)
+
+
+def test_bad_choices_are_refused():
+    with pytest.raises(InputError, match="linear_solver is 'lu'"):
+        make_linear_solver("lu", *chain(3), 3, 3, CPU, torch.float64)
+    with pytest.raises(InputError, match="linear_solver=banded"):
+        make_linear_solver("banded", *chain(3), 3, 3, torch.device("cuda"), torch.float64)

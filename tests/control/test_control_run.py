@@ -28,9 +28,8 @@ from warp_resphys.environments.worlds import ReducedWorld
 from warp_resphys.experiment.checks import check_configuration
 from warp_resphys.io.errors import ConvergenceError, DataFileError, InputError
 from warp_resphys.io.files import read_array, read_hdf5
-from warp_resphys.studies.benchmark_tables import benchmark_sheets
-from warp_resphys.studies.control_speed import time_commands
 from warp_resphys.studies.gradient_check import central_difference
+from warp_resphys.studies.run_speed import command_sheet, time_commands
 
 CONTROL = [
     "experiment=tendon_rod_control",
@@ -424,8 +423,7 @@ def test_the_benchmark_times_the_commands_of_all_that_plan_anew(folder):
     rows = time_commands(folder, 1)
     assert [row["controller"] for row in rows] == ["resphys", "linear", "full simulator"]
     assert all(row["horizon_s"] == 0.1 and 0.0 < row["ms"] <= row["largest_of_20_ms"] for row in rows)
-    result = {"settings": {"device": "cpu"}, "hardware": {"processor": "one"}, "yardstick_ms": 1.0, "steps": []}
-    *_, sheet = benchmark_sheets({**result, "parts": [], "cold_start": None, "environments": [], "control": rows})
+    sheet = command_sheet(rows)
     assert [row[0] for row in sheet.rows] == [row["controller"] for row in rows]
     assert "over 0.1 s" in sheet.title
 

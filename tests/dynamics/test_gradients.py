@@ -1,16 +1,10 @@
 """Adjoint gradients against central differences in float64."""
 
-import contextlib
-import io
 import math
-import sys
 from dataclasses import replace
 
 import pytest
 import torch
-from hydra import compose, initialize_config_module
-from omegaconf import OmegaConf
-from rich.console import Console
 
 from warp_resphys import (
     Body,
@@ -21,7 +15,6 @@ from warp_resphys import (
     State,
     box_hexahedra,
     box_tetrahedra,
-    cli,
     select_vertices,
 )
 from warp_resphys.dynamics import equilibrium
@@ -32,9 +25,7 @@ from warp_resphys.studies.gradient_check import (
     POSES,
     GradientRow,
     central_difference,
-    check_configured,
     check_gradients,
-    gradient_table,
     pose,
 )
 
@@ -302,32 +293,6 @@ def test_gradients_add_up_over_a_shared_parameter():
     torch.testing.assert_close(gradients[0], gradients[1].sum(), rtol=1e-9, atol=0.0)
 
 
-SMALL = ["mesh.divisions=[2,1,1]", "gradcheck.steps=1", "gradcheck.batch=1", "gradcheck.poses=[bent]"]
-
-
-@pytest.mark.parametrize("solver", ["quasi_newton", "newton"])
-def test_configured_check(solver):
-    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        config = compose("verify_gradients", [*SMALL, f"solver={solver}", "experiment=beam_oscillation"])
-    results = list(check_configured(OmegaConf.to_container(config)))
-    assert [(nu, name) for nu, name, _ in results] == [(0.45, "bent"), (0.499, "bent")]
-    for _, _, rows in results:
-        assert_equal(rows)
-
-
-def test_table_shows_what_differs():
-    rows = [GradientRow("E, scalar", 1.0, 1.0 + 1e-9), GradientRow("density", 2.0, 2.1), GradientRow("v", 0.0, 0.0)]
-    console = Console(width=100, file=io.StringIO(), color_system="standard", force_terminal=True)
-    console.print(gradient_table(rows, "nu = 0.45, bent", 1e-6))
-    lines = console.file.getvalue().splitlines()
-    red = [line for line in lines if "\x1b[31m" in line]
-    assert len(red) == 2
-    assert "density" in red[0]
-    assert "4.8e-02" in red[0]
-    assert "v " in red[1]
-    assert "inf" in red[1]
-
-
 @pytest.mark.parametrize(
     ("adjoint", "difference", "error"),
     [
@@ -343,32 +308,8 @@ def test_a_row_that_compares_nothing_is_an_infinite_error(adjoint, difference, e
     assert GradientRow("", adjoint, difference).relative_error == error
 
 
-def run_script(tmp_path, monkeypatch, *arguments):
-    monkeypatch.setattr(sys, "argv", ["warp-resphys", "verify", "gradients", *arguments, f"hydra.run.dir={tmp_path}"])
-    cli.main()
-
-
-@pytest.mark.parametrize("values", [(0.0, 0.0), (math.nan, 1.0), (1.0, math.nan)])
-def test_script_fails_where_a_row_compares_nothing(values, tmp_path, monkeypatch, capsys):
-    rows = [GradientRow("v", *values), GradientRow("E, scalar", 1.0, 1.0)]
-    monkeypatch.setattr("warp_resphys.studies.gradient_check.check_configured", lambda _: iter([(0.45, "rest", rows)]))
-    with pytest.raises(SystemExit) as ended:
-        run_script(tmp_path, monkeypatch)
-    assert ended.value.code == 1
-    assert "Largest relative error: inf" in capsys.readouterr().out
-
-
 def test_a_body_without_a_clamp_has_no_row_for_it():
     free = Simulator(Body(MESHES["hexahedron"]), DAMPED, solver=TIGHT)
     rows = check_gradients(free, "bent", steps=1, batch=1)
     assert [row.parameter for row in rows] == [kind for kind in KINDS if kind != "fixed_positions"]
     assert all(row.relative_error <= 1e-6 for row in rows)
-
-
-@pytest.mark.parametrize(("tolerance", "code"), [(1e-6, 0), (1e-16, 1)])
-def test_script_fails_beyond_the_tolerance(tolerance, code, tmp_path, monkeypatch, capsys):
-    arguments = [*SMALL, "gradcheck.poissons_ratios=[0.45]", f"gradcheck.tolerance={tolerance}"]
-    with pytest.raises(SystemExit) if code else contextlib.nullcontext() as ended:
-        run_script(tmp_path, monkeypatch, *arguments)
-    assert ended is None or ended.value.code == code
-    assert "Largest relative error" in capsys.readouterr().out

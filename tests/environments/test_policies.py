@@ -11,9 +11,8 @@ from warp_resphys import cli
 from warp_resphys.environments.making import make_vector
 from warp_resphys.environments.policies import ScriptedPolicy, acting, errors_mm, learn
 from warp_resphys.io.errors import InputError
-from warp_resphys.studies.benchmark_tables import benchmark_sheets
-from warp_resphys.studies.environment_speed import time_environments
 from warp_resphys.studies.policy import _text
+from warp_resphys.studies.run_speed import environment_sheet, time_environments
 
 
 def still(seen):
@@ -157,7 +156,6 @@ def test_speeds_are_those_of_all_robots_and_worlds(folder):
     for row in rows:
         assert row["actions_s"] == pytest.approx(1e3 * row["robots"] / row["ms"])
         assert row["steps_s"] == pytest.approx(5 * row["actions_s"])
-    result = {"settings": {"device": "cpu"}, "hardware": {"processor": "one"}, "yardstick_ms": 1.0, "steps": []}
-    *_, sheet = benchmark_sheets({**result, "parts": [], "cold_start": None, "environments": rows, "control": []})
+    sheet = environment_sheet(rows)
     assert [row[0] for row in sheet.rows] == [row["world"] for row in rows]
     assert {len(row) for row in sheet.rows} == {len(sheet.headings)}

@@ -8,7 +8,6 @@ from warp_resphys import Body, Corotated, Mesh, PointMass, Simulator, State, box
 from warp_resphys.energies.materials import make_material
 from warp_resphys.io.errors import InputError, MeshError, ResphysError
 from warp_resphys.stepping.inputs import Inputs
-from warp_resphys.studies.gradient_check import check_configured
 
 MESH = box_hexahedra((0.02, 0.01, 0.01), (2, 1, 1))
 BODY = Body(MESH, fixed=select_vertices(MESH, x=0.0))
@@ -263,39 +262,3 @@ def test_mesh_with_vertices_that_no_cell_uses():
 def test_inverted_mesh():
     with refused("inverted", MeshError):
         Simulator(Body(Mesh(MESH.vertices, MESH.cells[:, [4, 5, 6, 7, 0, 1, 2, 3]])))
-
-
-GRADCHECK = {
-    "dtype": "float64",
-    "gradcheck": {
-        "poses": ["rest"],
-        "poissons_ratios": [0.45],
-        "steps": 1,
-        "batch": 1,
-        "seed": 0,
-        "tolerance": 1e-6,
-        "relative_tolerance": 1e-10,
-        "mass_damping": 1.0,
-        "stiffness_damping": 1e-3,
-    },
-}
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"poses": ["folded"]}, "gradcheck.poses has 'folded': choose from rest, bent, twisted"),
-        ({"steps": 0}, "gradcheck.steps is 0: it must be a whole number, one or more"),
-        ({"steps": 2.5}, "gradcheck.steps is 2.5: it must be a whole number, one or more"),
-        ({"batch": "two"}, "gradcheck.batch is 'two': it must be a whole number, one or more"),
-        ({"seed": -1}, "gradcheck.seed is -1: it must be a whole number, zero or more"),
-        ({"poissons_ratios": []}, "gradcheck.poissons_ratios is .*: it must be a list of numbers"),
-        ({"mass_damping": 0.0}, "gradcheck.mass_damping is 0.0: it must be a positive number"),
-    ],
-)
-def test_gradient_check(changes, message):
-    config = GRADCHECK | {"gradcheck": GRADCHECK["gradcheck"] | changes}
-    with refused(message):
-        next(check_configured(config))
-    with refused("dtype is 'float32': gradients are checked in float64"):
-        next(check_configured(GRADCHECK | {"dtype": "float32"}))

@@ -1,65 +1,37 @@
 """The table of linear solvers by size."""
 
-import json
-import sys
-
 import pytest
+from command_line import outcome
 
-from warp_resphys import cli
+from warp_resphys.io.files import read_json
 from warp_resphys.studies.sizes import exponents
 
 
-def run(monkeypatch, capsys, *arguments):
-    """What the command printed, or, where it was refused, what was wrong."""
-    monkeypatch.setattr(sys, "argv", ["warp-resphys", "benchmark", "sizes", *arguments])
-    try:
-        cli.main()
-    except SystemExit:
-        return capsys.readouterr().err
-    return capsys.readouterr().out
-
-
-def test_rows(folder, monkeypatch, capsys):
-    said = run(
-        monkeypatch,
-        capsys,
-        "elements=[hexahedron8]",
-        "hexahedron_divisions=[[4,2,2],[8,2,2]]",
-        "linear_solvers=[banded,multigrid]",
-        "poissons_ratios=[0.45]",
-        "repeats=1",
-    )
+def test_rows(folder):
+    sizes = ["elements=[hexahedron8]", "hexahedron_divisions=[[4,2,2],[8,2,2]]", "poissons_ratios=[0.45]", "repeats=1"]
+    ended = outcome("benchmark", "sizes", *sizes, "linear_solvers=[banded,multigrid]")
     (written,) = folder.rglob("size_study.json")
-    rows = json.loads(written.read_text())["rows"]
-    assert [(row["linear_solver"], row["unknowns"]) for row in rows] == [
-        ("banded", 108),
-        ("multigrid", 108),
-        ("banded", 216),
-        ("multigrid", 216),
-    ]
+    rows = read_json(written)["rows"]
+    cases = [("banded", 108), ("multigrid", 108), ("banded", 216), ("multigrid", 216)]
+    assert [(row["linear_solver"], row["unknowns"]) for row in rows] == cases
     assert all(row[key] > 0.0 for row in rows for key in ("forward_s", "adjoint_s", "memory_gib", "iterations"))
     # A factor for every iterate where it costs little, and one that serves several where it does not.
     assert all((row["factorisations"] == row["iterations"]) == (row["linear_solver"] == "multigrid") for row in rows)
-    assert "Exponents" in said
+    assert "Exponents" in ended.out
 
 
-def test_a_case_that_takes_too_long_leaves_out_the_larger_ones(folder, monkeypatch, capsys):
-    said = run(
-        monkeypatch,
-        capsys,
-        "elements=[tetrahedron10]",
-        "tetrahedron_divisions=[[2,1,1],[4,1,1]]",
-        "linear_solvers=[banded]",
-        "poissons_ratios=[0.45]",
-        "longest=0.2",
-    )
-    assert said.count("more than 0.2 s") == 1
+def test_a_case_that_takes_too_long_leaves_out_the_larger_ones(folder):
+    sizes = ["elements=[tetrahedron10]", "tetrahedron_divisions=[[2,1,1],[4,1,1]]", "poissons_ratios=[0.45]"]
+    ended = outcome("benchmark", "sizes", *sizes, "linear_solvers=[banded]", "longest=0.2")
+    assert ended.out.count("more than 0.2 s") == 1
+    assert "2 x 1 x 1" in ended.out
+    assert "4 x 1 x 1" not in ended.out
 
 
-def test_a_solver_that_is_not_there(folder, monkeypatch, capsys):
-    assert "linear_solvers is ['lu']: it must be some of auto, banded" in run(
-        monkeypatch, capsys, "linear_solvers=[lu]"
-    )
+def test_a_solver_that_is_not_there(folder):
+    ended = outcome("benchmark", "sizes", "linear_solvers=[lu]")
+    assert ended.code == 2
+    assert "linear_solvers is ['lu']" in ended.err or "linear_solvers[0] is 'lu'" in ended.err
 
 
 def test_exponents():

@@ -1,12 +1,10 @@
 """Reference trajectories: the documented format, the comparison, and the command's exit codes."""
 
-import sys
-from unittest import mock
-
 import numpy as np
 import pytest
+from command_line import outcome
 
-from warp_resphys import Body, Corotated, Inputs, Simulator, SolverSettings, State, box_hexahedra, cli, select_vertices
+from warp_resphys import Body, Corotated, Inputs, Simulator, SolverSettings, State, box_hexahedra, select_vertices
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.studies.verification import box_of_vertices, compare_with_reference, read_reference
 
@@ -15,13 +13,8 @@ FILES = ("beam_tip_load_nu045.npz", "beam_tip_load_nu0499.npz", "beam_twist_nu04
 
 
 def verify(*arguments):
-    """Exit code of the command in this process."""
-    with mock.patch.object(sys, "argv", ["warp-resphys", "verify", *map(str, arguments), "hydra.run.dir=run"]):
-        try:
-            cli.main()
-        except SystemExit as end:
-            return end.code
-    return 0
+    """How the command ends."""
+    return outcome("verify", *arguments, "hydra.run.dir=run")
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -33,14 +26,15 @@ def test_reference_is_reproduced(name, reference_data, device):
         assert 2 < result.iterations < 40
 
 
-def test_reference_is_reproduced_by_projective_dynamics(reference_data, capsys):
-    assert verify(reference_data / FILES[0], "solvers=[projective_dynamics]", "tolerance=1e-6") == 0
-    assert "beam_tip_load_nu045" in capsys.readouterr().out
+def test_reference_is_reproduced_by_projective_dynamics(reference_data):
+    ended = verify(reference_data / FILES[0], "solvers=[projective_dynamics]", "tolerance=1e-6")
+    assert ended.code == 0
+    assert "beam_tip_load_nu045" in ended.out
 
 
 @pytest.mark.slow
 def test_all_references_are_reproduced_by_all_solvers(reference_data):
-    assert verify(*(reference_data / name for name in FILES)) == 0
+    assert verify(*(reference_data / name for name in FILES)).code == 0
 
 
 def trajectory(mesh, steps=3):
@@ -76,105 +70,86 @@ def test_any_box_grid_is_recovered():
     np.testing.assert_array_equal(mesh.vertices, UNEVEN.vertices)
 
 
-def test_every_solver_reproduces_a_file_of_another_grid(tmp_path, capsys):
-    assert verify(write(tmp_path)) == 0
-    lines = capsys.readouterr().out.splitlines()[-3:]
+def test_every_solver_reproduces_a_file_of_another_grid(tmp_path):
+    ended = verify(write(tmp_path))
+    assert ended.code == 0
+    lines = ended.out.splitlines()[-3:]
     assert [line.split()[1] for line in lines] == ["projective_dynamics", "quasi_newton", "newton"]
     assert all(float(line.split()[-1]) <= 1e-8 for line in lines)
 
 
 @pytest.mark.parametrize("key", ["q", "youngs_modulus", "density", "dt", "gravity", "f_ext"])
-def test_a_perturbed_file_fails(key, tmp_path, capsys):
+def test_a_perturbed_file_fails(key, tmp_path):
     changed = np.array(CONTENT[key], dtype=float)
     if key == "q":
         changed[-1, -1, -1] += 2e-8
     else:
         changed *= 1.001
-    path = write(tmp_path, **{key: changed})
-    assert verify(path, "solvers=[newton]") == 1
-    assert "exceeds 1e-08" in capsys.readouterr().out
+    ended = verify(write(tmp_path, **{key: changed}), "solvers=[newton]")
+    assert ended.code == 1
+    assert "exceeds 1e-08" in ended.out
 
 
 def test_largest_error_is_a_distance(tmp_path):
     q = CONTENT["q"].copy()
     q[2, 5] += [3e-5, 0.0, 4e-5]
-    result = compare_with_reference(
-        read_reference(write(tmp_path, q=q)), SolverSettings("newton", relative_tolerance=1e-8)
-    )
+    settings = SolverSettings("newton", relative_tolerance=1e-8)
+    result = compare_with_reference(read_reference(write(tmp_path, q=q)), settings)
     assert result.largest_error == pytest.approx(5e-5, rel=1e-4)
 
 
 def test_one_bad_file_among_good_ones_fails(tmp_path):
     good, bad = write(tmp_path), write(tmp_path, "bad.npz", q=CONTENT["q"] + 1e-6 * (CONTENT["q"] > 0.23))
-    assert verify(bad, good, "solvers=[newton]") == 1
+    assert verify(bad, good, "solvers=[newton]").code == 1
 
 
-def test_no_convergence_fails(tmp_path, capsys):
-    assert verify(write(tmp_path), "solvers=[newton]", "max_iterations=1") == 1
-    assert "not converged" in capsys.readouterr().out
+def test_no_convergence_fails(tmp_path):
+    ended = verify(write(tmp_path), "solvers=[newton]", "max_iterations=1")
+    assert ended.code == 1
+    assert "not converged" in ended.out
 
 
 @pytest.mark.parametrize(
     ("without", "changes", "message"),
     [
-        (["f_ext", "dt"], {}, "lacks dt, f_ext: a reference trajectory has youngs_modulus"),
-        ([], {"masses": np.ones(3)}, "has masses: a reference trajectory has youngs_modulus"),
+        (["f_ext", "dt"], {}, "lacks dt, f_ext"),
         (["v"], {"w": np.ones(3)}, "lacks v and has w"),
-        ([], {"q": CONTENT["q"][:-1]}, r"q is \(3, 24, 3\) of float64, but must be \(T \+ 1, N, 3\)"),
-        ([], {"gravity": np.ones(2)}, r"gravity is \(2,\) of float64, but must be \(3\)"),
-        ([], {"density": np.ones(2)}, r"density is \(2,\) of float64, but must be a single number"),
-        ([], {"dt": np.array("0.01")}, "dt is .* but must be a single number with real numbers"),
+        ([], {"q": CONTENT["q"][:-1]}, r"q is \(3, 24, 3\)"),
+        ([], {"gravity": np.ones(2)}, r"gravity is \(2,\)"),
+        ([], {"density": np.ones(2)}, r"density is \(2,\)"),
+        ([], {"dt": np.array("0.01")}, "dt is .* real numbers"),
         ([], {"v": np.full_like(CONTENT["v"], np.nan)}, "v has values that are not finite"),
-        ([], {"dt": 0.0}, "dt is 0: it must be positive, in seconds"),
+        ([], {"dt": 0.0}, "dt is 0"),
         ([], {"vertices": CONTENT["vertices"][::-1]}, "24 vertices with 4 x 3 x 2 distinct coordinates"),
-        ([], {"vertices": CONTENT["vertices"] * [1, 1, 0]}, "are no box grid in x-major order"),
-        ([], {"poissons_ratio": 0.5}, "poissons_ratio is 0.5: it must be greater than -1 and less than 0.5"),
+        ([], {"vertices": CONTENT["vertices"] * [1, 1, 0]}, "box grid"),
+        ([], {"poissons_ratio": 0.5}, "poissons_ratio is 0.5"),
     ],
 )
-def test_foreign_content_is_refused(without, changes, message, tmp_path, capsys):
+def test_foreign_content_is_refused(without, changes, message, tmp_path):
     path = write(tmp_path, without=without, **changes)
     with pytest.raises((DataFileError, InputError), match=message):
         read_reference(path)
-    assert verify(path) == 2
-    captured = capsys.readouterr()
-    assert captured.err.count("\n") == 1
-    assert captured.err.startswith(f"error: {path}")
+    ended = verify(path)
+    assert ended.code == 2
+    assert ended.err.startswith(f"error: {path}")
+    assert ended.err.count("\n") == 1
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("text.npz", b"not an archive", "is no NumPy archive"),
-        ("empty.npz", b"", "is no NumPy archive"),
-        ("truncated.npz", None, "is no NumPy archive"),
-        ("missing.npz", ..., "does not exist"),
-    ],
-)
-def test_foreign_files_are_refused(name, content, message, tmp_path, capsys):
-    path = tmp_path / name
-    if content is None:
-        content = write(tmp_path).read_bytes()[:-200]
-    if content is not ...:
-        path.write_bytes(content)
-    assert verify(path) == 2
-    error = capsys.readouterr().err
-    assert error.startswith(f"error: {path} {message}")
-    assert "pickle.load" not in error
+def test_foreign_files_are_refused(tmp_path):
+    good = write(tmp_path).read_bytes()
+    for name, content in {"text.npz": b"not an archive", "empty.npz": b"", "truncated.npz": good[:-200]}.items():
+        (tmp_path / name).write_bytes(content)
+        ended = verify(tmp_path / name)
+        assert (ended.code, f"{name} is no NumPy archive" in ended.err) == (2, True)
+    assert "does not exist" in verify(tmp_path / "missing.npz").err
+    objects = verify(write(tmp_path, gravity=np.array([0.0, "x", None], dtype=object)))  # would need a pickle
+    assert "is no NumPy archive of plain arrays" in objects.err
+    np.save(tmp_path / "array.npy", np.ones(3))
+    assert "is a single array" in verify(tmp_path / "array.npy").err
 
 
-def test_pickled_objects_are_never_loaded(tmp_path, capsys):
-    path = write(tmp_path, gravity=np.array([0.0, "x", None], dtype=object))
-    assert verify(path) == 2
-    assert "is no NumPy archive of plain arrays" in capsys.readouterr().err
-
-
-def test_a_single_array_is_no_trajectory(tmp_path):
-    path = tmp_path / "array.npy"
-    np.save(path, np.ones(3))
-    with pytest.raises(DataFileError, match="is a single array"):
-        read_reference(path)
-
-
-def test_a_tolerance_of_zero_is_refused(tmp_path, capsys):
-    assert verify(write(tmp_path), "tolerance=0") == 2
-    assert "solver.relative_tolerance is 0: it must be positive" in capsys.readouterr().err
+def test_bad_settings(tmp_path):
+    ended = verify(write(tmp_path), "tolerance=0")
+    assert ended.code == 2
+    assert "tolerance is 0" in ended.err
+    assert "name reference trajectories" in verify().err

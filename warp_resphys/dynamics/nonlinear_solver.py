@@ -22,6 +22,7 @@ launches one graph that does both.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import Literal, get_args
 
 import torch
 
@@ -32,7 +33,8 @@ from .assembly import BlockPattern
 from .hessian import ExactHessian, HessianApproximation, ProjectiveHessian
 from .minimiser import Minimiser
 
-SOLVERS = ("projective_dynamics", "quasi_newton", "newton")
+SolverName = Literal["projective_dynamics", "quasi_newton", "newton"]
+SOLVERS: tuple[SolverName, ...] = get_args(SolverName)
 FACTORS = ("double", "single")
 
 

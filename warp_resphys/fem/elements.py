@@ -6,6 +6,7 @@ volume term of the energy. Gauss points, element centres and averages over verte
 """
 
 from dataclasses import dataclass, replace
+from typing import Literal, get_args
 
 import numpy as np
 import scipy.sparse
@@ -15,7 +16,8 @@ from ..io.errors import InputError
 from ..mesh.elements import Array
 from ..mesh.mesh import Mesh, check_mesh
 
-VOLUME_INTEGRATIONS = ("centre", "full")
+VolumeIntegration = Literal["centre", "full"]
+VOLUME_INTEGRATIONS: tuple[VolumeIntegration, ...] = get_args(VolumeIntegration)
 
 
 @dataclass(frozen=True)

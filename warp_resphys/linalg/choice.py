@@ -6,6 +6,7 @@ CHOLMOD (cholespy) on a GPU, the smallest on a GPU to batched dense Cholesky.
 """
 
 from collections.abc import Callable
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -20,7 +21,8 @@ from .multigrid import MultigridSolver
 from .sparse import SparseSolver
 from .tiled import TiledSolver
 
-LINEAR_SOLVERS = ("auto", "banded", "tiled", "dense", "sparse", "multigrid")
+LinearSolverName = Literal["auto", "banded", "tiled", "dense", "sparse", "multigrid"]
+LINEAR_SOLVERS: tuple[LinearSolverName, ...] = get_args(LinearSolverName)
 DEAREST_BAND = 4e10  # multiplications of a banded factor on a CPU, beyond which multigrid is the cheaper one
 WIDEST_BAND = 600  # unknowns, beyond which tiles of a band hold mostly fill on a GPU
 MOST_DENSE = 4000  # unknowns

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.table import Table
 
 from ..experiment.schema import Kind
@@ -19,7 +19,7 @@ WORDS: Final = Kind(
 _LOG_WIDTH: Final = 140  # of tables that go to a file, in characters
 
 
-def show(*parts: Table | str) -> None:
+def show(*parts: RenderableType) -> None:
     """Prints tables and sentences, as wide as the terminal."""
     console = Console(width=None if sys.stdout.isatty() else _LOG_WIDTH)
     for part in parts:

@@ -1,13 +1,12 @@
-"""Whether a device computes what the CPU does, and how fast: one command, and a page on what it found."""
+"""Whether a device computes what the CPU does, and how fast: one command, and a page of its results."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import torch
 import warp as wp
@@ -17,57 +16,76 @@ from ..dynamics.simulator import Simulator
 from ..energies.materials import make_material
 from ..experiment.build import choose_device
 from ..experiment.files import METRICS
-from ..experiment.schema import NATURAL, POSITIVE, WORD, Group, check, optional
-from ..fem.body import Body
 from ..io.errors import ResphysError
 from ..io.files import write_json
+from ..io.settings import Many, Natural, Positive, Settings, Word, parse
 from ..io.stages import run_lock
 from ..linalg.choice import LINEAR_SOLVERS
-from ..mesh.mesh import Mesh, box_hexahedra, box_tetrahedra, select_vertices
-from ..report.page import Cell, Part, Row, Table
+from ..mesh.mesh import Mesh
 from ..stepping.inputs import Inputs
-from .benchmark import run_benchmark
-from .benchmark_tables import benchmark_sheets, machine
-from .command import WORDS, show, table_of
+from .beam import ELEMENT_NAMES, Divisions, Element, beam_mesh, clamped
+from .benchmark import benchmark_sheets, machine, run_benchmark
+from .command import show
 from .gradient_check import check_gradients, pose
 from .runs import Results, Run, made, run_all
+from .tables import Sheet
 
 PAGE = "check.html"
 POSITION_BOUND: Final = {torch.float64: 1e-8, torch.float32: 1e-5}  # m, over a trajectory
 GRADIENT_BOUND: Final = 1e-6  # relative
+RATIOS: Final = (0.45, 0.499)
 _TOLERANCE: Final = {torch.float64: 1e-9, torch.float32: 1e-5}  # of the solvers that are compared
-_SIZE: Final = (0.1, 0.03, 0.03)  # m
 _MATERIAL: Final = {"youngs_modulus": 2.64e5, "density": 1070.0, "mass_damping": 0.5, "stiffness_damping": 0.002}
 _CPU_ONLY: Final = {"banded"}
-_KEYS: Final = Group(
-    {"steps": NATURAL, "experiments": WORDS, "overrides": WORDS, "minutes": POSITIVE, "results": optional(WORD)}
-)
 
 
-@dataclass
+class CheckSettings(Settings):
+    """The group ``check`` of ``conf/verify_device.yaml``, which has what the keys mean, and their values."""
+
+    steps: Natural
+    experiments: Many[Word]
+    overrides: Many[Word]
+    minutes: Positive
+    results: Word | None
+
+
+class Check(NamedTuple):
+    """A comparison and its outcome."""
+
+    name: str
+    found: str
+    asked: str
+    passed: bool
+
+
+@dataclass(frozen=True)
 class Section:
-    """Checks of one kind."""
+    """Checks of one kind, and the seconds that they took."""
 
     title: str
-    rows: list[tuple[str, str, str, bool]] = field(default_factory=list)  # what, found, asked, whether it passed
-    seconds: float = 0.0
-
-    def bound(self, name: str, found: float, most: float, unit: str = "") -> None:
-        """A figure that must not exceed another."""
-        unit = f" {unit}" if unit else ""
-        self.rows.append((name, f"{found:.1e}{unit}", f"{most:.0e}{unit}", found <= most))
-
-    def attempt(self, name: str, measure: Callable[[], tuple[float, float, str]]) -> None:
-        """A figure, its bound and their unit; or the error that comes in its place."""
-        try:
-            self.bound(name, *measure())
-        except (ResphysError, RuntimeError) as error:
-            self.rows.append((name, (str(error).strip() or repr(error)).splitlines()[0], "no error", False))
+    checks: Sequence[Check]
+    seconds: float
 
     @property
     def passed(self) -> bool:
-        """Whether all did."""
-        return all(row[3] for row in self.rows)
+        """Whether every check passed."""
+        return all(check.passed for check in self.checks)
+
+    def sheet(self, title: str) -> Sheet:
+        """The checks as a table."""
+        rows = [[check.name, check.found, check.asked, "passed" if check.passed else "FAILED"] for check in self.checks]
+        failed = [number for number, check in enumerate(self.checks) if not check.passed]
+        return Sheet(title, ["check", "found", "asked", ""], rows, failed, note=f"{self.seconds:.0f} s")
+
+
+def bounded(name: str, measure: Callable[[], float], bound: float, unit: str = "") -> Check:
+    """The check that a figure does not exceed a bound; an error in its place is a failure."""
+    unit = f" {unit}" if unit else ""
+    try:
+        figure = measure()
+    except (ResphysError, RuntimeError) as error:
+        return Check(name, (str(error).strip() or repr(error)).splitlines()[0], "no error", False)
+    return Check(name, f"{figure:.1e}{unit}", f"{bound:.0e}{unit}", figure <= bound)
 
 
 def check_device(config: Mapping[str, Any], folder: Path) -> None:
@@ -77,109 +95,88 @@ def check_device(config: Mapping[str, Any], folder: Path) -> None:
         InputError: a value that cannot be used.
         RunsInterrupted: Ctrl-C in an experiment.
     """
-    settings = config["check"]
-    check("check", settings, _KEYS)
+    settings = parse(CheckSettings, config["check"], "check")
     wp.config.log_level = wp.LOG_WARNING
     device = choose_device(config["device"])
-    config = {**config, "device": str(device)}
-    sections: list[Section] = []
+    work = {
+        "Trajectories beside the CPU's": lambda: trajectory_checks(device, settings.steps),
+        "Gradients beside differences": lambda: gradient_checks(device),
+        "Memory of torch and Warp": lambda: memory_checks(device, settings.steps),
+    }
+    if settings.experiments:
+        work["Experiments, one epoch and their roll-outs"] = lambda: experiment_checks(settings, str(device), folder)
     with run_lock(folder):
-        for title, work in _SECTIONS.items():
-            with _timed(title, sections) as section:
-                work(section, device, settings["steps"])
-            show(_table(section))
-        if settings["experiments"]:
-            with _timed("Experiments, one epoch and their roll-outs", sections) as section:
-                _run_experiments(section, settings, str(device), folder)
-            show(_table(section))
-        measured = run_benchmark(config)
+        sections = [_run(title, checks) for title, checks in work.items()]
+        measured = run_benchmark({**config, "device": str(device)})
         write_json(folder / "benchmark.json", measured)
-        show(*(sheet.for_terminal() for sheet in benchmark_sheets(measured)))
-        _write(sections, measured, config, folder)
-    if not all(section.passed for section in sections):
+        sheets = benchmark_sheets(measured)
+        show(*sheets)
+        place, count = machine(measured), sum(len(section.checks) for section in sections)
+        failed = sum(not check.passed for section in sections for check in section.checks)
+        outcome = (
+            f"{failed} of {count} checks on {place} failed." if failed else f"{count} checks on {place}: all passed."
+        )
+        tables = [*(section.sheet(section.title) for section in sections), *sheets]
+        date = f"{datetime.now():%Y-%m-%d}"
+        parts = [*(table.for_page() for table in tables), made("verify device")]
+        results = Results("Check of a device", date, outcome, parts)
+        results.write(folder / PAGE, settings.results, f"{date}-check-{device.type}")
+    if failed:
         raise SystemExit(1)
 
 
-@contextmanager
-def _timed(title: str, sections: list[Section]) -> Iterator[Section]:
-    section = Section(title)
-    sections.append(section)
+def _run(title: str, checks: Callable[[], Iterator[Check]]) -> Section:
+    """Runs the checks of a section, and prints them."""
     began = time.perf_counter()
-    yield section
-    section.seconds = time.perf_counter() - began
+    done = list(checks())
+    section = Section(title, done, time.perf_counter() - began)
+    show(section.sheet(f"{title}, {section.seconds:.0f} s"))
+    return section
 
 
-def _meshes() -> dict[str, Mesh]:
-    return {
-        "8-node hexahedra": box_hexahedra(_SIZE, (10, 3, 3)),
-        "10-node tetrahedra": box_tetrahedra(_SIZE, (5, 2, 2), order=2),
-    }
-
-
-def _beam(mesh: Mesh, poissons_ratio: float, **options: Any) -> Simulator:
-    body = Body(mesh, fixed=select_vertices(mesh, x=0.0))
-    return Simulator(body, make_material("corotated", **_MATERIAL, poissons_ratio=poissons_ratio), 0.01, **options)
-
-
-def _trajectory(simulator: Simulator, steps: int, batch: int = 2) -> torch.Tensor:
-    """(T + 1, B, N, 3) of a beam that is let go from a bend, and one that is let go from a smaller one [m]."""
-    with torch.no_grad():
-        return simulator.rollout(pose(simulator, "bent", batch), steps, Inputs()).q
-
-
-def _trajectories(section: Section, device: torch.device, steps: int) -> None:
-    """Every solver in both types against Newton's method on the CPU with LAPACK's banded factors."""
+def trajectory_checks(
+    device: torch.device, steps: int, bounds: Mapping[torch.dtype, float] = POSITION_BOUND
+) -> Iterator[Check]:
+    """Every solver in both number types against Newton's method on the CPU with LAPACK's banded factors."""
+    others = [name for name in LINEAR_SOLVERS if name != "auto" and (device.type == "cpu" or name not in _CPU_ONLY)]
+    cases = [
+        *((solver, "auto", torch.float64) for solver in SOLVERS),
+        *(("quasi_newton", name, torch.float64) for name in others),
+        ("quasi_newton", "auto", torch.float32),
+    ]
+    exact = SolverSettings("newton", relative_tolerance=1e-11, linear_solver="banded")
     for element, mesh in _meshes().items():
-        for ratio in (0.45, 0.499):
-            exact = SolverSettings("newton", relative_tolerance=1e-11, linear_solver="banded")
+        for ratio in RATIOS:
             reference = _trajectory(_beam(mesh, ratio, solver=exact), steps)
-            cases = [(solver, "auto", torch.float64) for solver in SOLVERS]
-            others = [
-                name for name in LINEAR_SOLVERS if name != "auto" and (device.type == "cpu" or name not in _CPU_ONLY)
-            ]
-            cases += [("quasi_newton", name, torch.float64) for name in others]
-            cases += [("quasi_newton", "auto", torch.float32)]
+
             for solver, linear, dtype in cases:
+                settings = SolverSettings(solver, _TOLERANCE[dtype], max_iterations=100_000, linear_solver=linear)
+                beam = partial(_beam, mesh, ratio, solver=settings, device=device, dtype=dtype)
                 name = f"{element}, nu {ratio:g}, {solver}, {linear}, {str(dtype).removeprefix('torch.')}"
-                section.attempt(name, partial(_departure, mesh, ratio, solver, linear, dtype, device, reference))
+                yield bounded(name, partial(_departure, beam, reference), bounds[dtype], "m")
 
 
-def _departure(
-    mesh: Mesh,
-    ratio: float,
-    solver: str,
-    linear: str,
-    dtype: torch.dtype,
-    device: torch.device,
-    reference: torch.Tensor,
-) -> tuple[float, float, str]:
-    settings = SolverSettings(
-        solver, relative_tolerance=_TOLERANCE[dtype], linear_solver=linear, max_iterations=100_000
-    )
-    simulator = _beam(mesh, ratio, solver=settings, device=device, dtype=dtype)
-    found = _trajectory(simulator, len(reference) - 1).cpu().double()
-    return float(torch.linalg.vector_norm(found - reference, dim=-1).max()), POSITION_BOUND[dtype], "m"
+def _departure(beam: Callable[[], Simulator], reference: torch.Tensor) -> float:
+    """Largest distance of a vertex from a trajectory (T + 1, 2, N, 3) [m]."""
+    positions = _trajectory(beam(), len(reference) - 1).cpu().double()
+    return float(torch.linalg.vector_norm(positions - reference, dim=-1).max())
 
 
-def _gradients(section: Section, device: torch.device, steps: int) -> None:
+def gradient_checks(device: torch.device) -> Iterator[Check]:
     """Adjoints against central differences, for every input and parameter."""
-    del steps
-    mesh = _meshes()["8-node hexahedra"]
-    for ratio in (0.45, 0.499):
+    solver = SolverSettings("quasi_newton", relative_tolerance=1e-12)
+    for ratio in RATIOS:
+        simulator = _beam(_meshes()["8-node hexahedra"], ratio, solver=solver, device=device)
         for name in ("rest", "twisted"):
-            settings = SolverSettings("quasi_newton", relative_tolerance=1e-12)
-
-            def largest(
-                ratio: float = ratio, name: str = name, settings: SolverSettings = settings
-            ) -> tuple[float, float, str]:
-                rows = check_gradients(_beam(mesh, ratio, solver=settings, device=device), name)
-                return max(row.relative_error for row in rows), GRADIENT_BOUND, ""
-
-            section.attempt(f"nu {ratio:g}, {name}", largest)
+            yield bounded(f"nu {ratio:g}, {name}", partial(_largest_error, simulator, name), GRADIENT_BOUND)
 
 
-def _shared_memory(section: Section, device: torch.device, steps: int) -> None:
-    """What kernels write is in torch's memory, where it was from the start, and nothing leaves the device."""
+def _largest_error(simulator: Simulator, pose_name: str) -> float:
+    return max(row.relative_error for row in check_gradients(simulator, pose_name))
+
+
+def memory_checks(device: torch.device, steps: int) -> Iterator[Check]:
+    """Whether kernels write to torch's memory, where it was from the start, and nothing leaves the device."""
     simulator = _beam(_meshes()["8-node hexahedra"], 0.45, device=device)
     potential = simulator.workspace(2).parts[0][1].potential
     names = ("residual", "tangent", "energy")  # zero until a kernel has written them
@@ -190,66 +187,36 @@ def _shared_memory(section: Section, device: torch.device, steps: int) -> None:
     for name in names:
         tensor = getattr(potential, name)
         same = empty[name] and bool(tensor.any()) and tensor.data_ptr() == addresses[name]
-        section.rows.append((f"{name}, written by kernels", "shared" if same else "copied", "shared", same))
+        yield Check(f"{name}, written by kernels", "shared" if same else "copied", "shared", same)
     for name, tensor in {"positions": end.q, "velocities": end.v}.items():
-        there = tensor.device.type == device.type
-        section.rows.append((f"{name} of a roll-out", tensor.device.type, device.type, there))
+        place = tensor.device.type
+        yield Check(f"{name} of a roll-out", place, device.type, place == device.type)
 
 
-_SECTIONS: Final[Mapping[str, Callable[[Section, torch.device, int], None]]] = {
-    "Trajectories beside the CPU's": _trajectories,
-    "Gradients beside differences": _gradients,
-    "Memory of torch and Warp": _shared_memory,
-}
-
-
-def _run_experiments(section: Section, settings: Mapping[str, Any], device: str, folder: Path) -> None:
-    """Each through the ordinary command, in a folder below that of the check."""
-    overrides = (*settings["overrides"], f"device={device}")
+def experiment_checks(settings: CheckSettings, device: str, folder: Path) -> Iterator[Check]:
+    """Whether experiments finish, by the ordinary command, in folders below that of the check."""
+    overrides = (*settings.overrides, f"device={device}")
     runs = [
-        Run(name, "", (f"experiment={name}", *overrides), folder / "runs" / name, settings["minutes"])
-        for name in settings["experiments"]
+        Run(name, "", (f"experiment={name}", *overrides), folder / "runs" / name, settings.minutes)
+        for name in settings.experiments
     ]
     for run in run_all(runs, folder / "logs"):
-        found = run.failure or "finished"
-        section.rows.append(
-            (run.experiment, found, "finished", run.failure is None and (run.folder / METRICS).is_file())
-        )
+        finished = run.failure is None and (run.folder / METRICS).is_file()
+        yield Check(run.experiment, run.failure or "finished", "finished", finished)
 
 
-def _table(section: Section) -> Any:
-    table = table_of(f"{section.title}, {section.seconds:.0f} s", ["check", "found", "asked", ""], [])
-    for name, found, asked, passed in section.rows:
-        table.add_row(name, found, asked, "passed" if passed else "FAILED", style=None if passed else "red")
-    return table
+def _meshes() -> dict[str, Mesh]:
+    size = (0.1, 0.03, 0.03)  # m
+    divisions: dict[Element, Divisions] = {"hexahedron8": (10, 3, 3), "tetrahedron10": (5, 2, 2)}
+    return {ELEMENT_NAMES[element]: beam_mesh(element, size, counts) for element, counts in divisions.items()}
 
 
-def _write(sections: Sequence[Section], measured: Mapping[str, Any], config: Mapping[str, Any], folder: Path) -> None:
-    checks = [
-        Part(
-            section.title,
-            [
-                Table(
-                    "Check",
-                    ["Found", "Asked", ""],
-                    [
-                        Row(name, [Cell(found), Cell(asked), Cell("passed" if passed else "FAILED")])
-                        for name, found, asked, passed in section.rows
-                    ],
-                    note=f"{section.seconds:.0f} s",
-                )
-            ],
-        )
-        for section in sections
-    ]
-    speed = [sheet.for_page() for sheet in benchmark_sheets(measured)]
-    failed = sum(not row[3] for section in sections for row in section.rows)
-    count = sum(len(section.rows) for section in sections)
-    where = machine(measured)
-    verdict = (
-        f"{count} checks on {where}: all passed." if not failed else f"{failed} of {count} checks on {where} failed."
-    )
-    date = f"{datetime.now():%Y-%m-%d}"
-    results = Results("Check of a device", date, verdict, [*checks, *speed, made("verify device")])
-    copies = config["check"]["results"]
-    results.write(folder / PAGE, copies, f"{date}-check-{choose_device(config['device']).type}")
+def _beam(mesh: Mesh, poissons_ratio: float, **options: Any) -> Simulator:
+    material = make_material("corotated", **_MATERIAL, poissons_ratio=poissons_ratio)
+    return Simulator(clamped(mesh), material, 0.01, **options)
+
+
+def _trajectory(simulator: Simulator, steps: int) -> torch.Tensor:
+    """(T + 1, 2, N, 3) of a beam that is let go from a bend, and one that is let go from a smaller one [m]."""
+    with torch.no_grad():
+        return simulator.rollout(pose(simulator, "bent", 2), steps, Inputs()).q

@@ -5,35 +5,41 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import torch
 import warp as wp
-from rich.table import Table
 
 from ..dynamics.simulator import Simulator
 from ..experiment.build import build_simulator
-from ..experiment.schema import COUNT, NATURAL, NUMBERS, POSITIVE, Group, Kind, check
 from ..io.errors import InputError
+from ..io.settings import Count, Natural, Positive, Settings, Some, parse, setting
 from ..mesh.poses import twisted
 from ..stepping.inputs import Inputs
 from ..stepping.quantity import Quantity
 from ..stepping.state import State
-from .command import show, table_of
+from .command import show
+from .tables import Sheet
 
 Loss = Callable[[torch.Tensor], torch.Tensor]
-POSES = ("rest", "bent", "twisted")
-_KEYS = Group(
-    {
-        "poses": Kind(lambda value: isinstance(value, list) and bool(value), "a list of poses"),
-        "poissons_ratios": Kind(lambda value: NUMBERS.fits(value) and bool(value), "a list of numbers"),
-        "seed": COUNT,
-        **dict.fromkeys(("steps", "batch"), NATURAL),
-        **dict.fromkeys(("tolerance", "relative_tolerance", "mass_damping", "stiffness_damping"), POSITIVE),
-    }
-)
+Pose = Literal["rest", "bent", "twisted"]
+POSES: tuple[Pose, ...] = get_args(Pose)
 _HALVINGS = 6  # of the step of a difference
 _ACCURACY = 1e-8  # relative, at which a difference is good enough
+
+
+class GradientSettings(Settings):
+    """The group ``gradcheck`` of ``conf/verify_gradients.yaml``, which has what the keys mean, and their values."""
+
+    poses: Some[Pose]
+    poissons_ratios: Some[float]
+    steps: Natural
+    batch: Natural
+    seed: Count
+    tolerance: Positive
+    relative_tolerance: Positive
+    mass_damping: Positive = setting(unit="1/s")
+    stiffness_damping: Positive = setting(unit="s")
 
 
 @dataclass(frozen=True)
@@ -198,17 +204,19 @@ class _Problem:
 def gradcheck(config: Mapping[str, Any], folder: Path) -> None:
     """Prints a table for every Poisson's ratio and pose; exits with 1 where an error exceeds the tolerance."""
     wp.config.log_level = wp.LOG_WARNING
-    tolerance = config["gradcheck"]["tolerance"]
+    settings = parse(GradientSettings, config["gradcheck"], "gradcheck")
     largest = 0.0
-    for poissons_ratio, pose, rows in check_configured(config):
-        show(gradient_table(rows, f"nu = {poissons_ratio:g}, {pose}", tolerance))
+    for poissons_ratio, pose_name, rows in check_configured(config, settings):
+        show(gradient_sheet(rows, f"nu = {poissons_ratio:g}, {pose_name}", settings.tolerance))
         largest = max([largest, *(row.relative_error for row in rows)])
-    show(f"Largest relative error: {largest:.1e}, {tolerance:.0e} allowed.")
-    if not largest <= tolerance:
+    show(f"Largest relative error: {largest:.1e}, {settings.tolerance:.0e} allowed.")
+    if not largest <= settings.tolerance:
         raise SystemExit(1)
 
 
-def check_configured(config: Mapping[str, Any]) -> Iterator[tuple[float, str, list[GradientRow]]]:
+def check_configured(
+    config: Mapping[str, Any], settings: GradientSettings
+) -> Iterator[tuple[float, str, list[GradientRow]]]:
     """Checks the gradients of a configured body, material and solver.
 
     Yields:
@@ -217,28 +225,25 @@ def check_configured(config: Mapping[str, Any]) -> Iterator[tuple[float, str, li
     Raises:
         ResphysError: a value that cannot be simulated, float32, whose rounding drowns differences, or no convergence.
     """
-    wanted = config["gradcheck"]
-    check("gradcheck", wanted, _KEYS)
-    for name in wanted["poses"]:
-        if name not in POSES:
-            raise InputError(f"gradcheck.poses has {name!r}: choose from {', '.join(POSES)}.")
     if config["dtype"] != "float64":
         raise InputError(f"dtype is {config['dtype']!r}: gradients are checked in float64.")
-    damping = {key: wanted[key] for key in ("mass_damping", "stiffness_damping")}
-    solver = {**config["solver"], "relative_tolerance": wanted["relative_tolerance"]}
+    solver = {**config["solver"], "relative_tolerance": settings.relative_tolerance}
     simulator = build_simulator({**config, "solver": solver})
-    for poissons_ratio in wanted["poissons_ratios"]:
+    damping = {"mass_damping": settings.mass_damping, "stiffness_damping": settings.stiffness_damping}
+    for poissons_ratio in settings.poissons_ratios:
         changed: dict[str, Any] = {"poissons_ratio": poissons_ratio, **damping}
         materials = {region: replace(material, **changed) for region, material in simulator.materials.items()}
         checked = replace(simulator, material=materials.get("", materials))
-        for name in wanted["poses"]:
-            yield poissons_ratio, name, check_gradients(checked, name, wanted["steps"], wanted["batch"], wanted["seed"])
+        for name in settings.poses:
+            yield poissons_ratio, name, check_gradients(checked, name, settings.steps, settings.batch, settings.seed)
 
 
-def gradient_table(rows: list[GradientRow], title: str, tolerance: float) -> Table:
+def gradient_sheet(rows: list[GradientRow], title: str, tolerance: float) -> Sheet:
     """Adjoint, difference, its uncertainty and relative error of each parameter, in red beyond the tolerance."""
-    table = table_of(title, ["parameter", "adjoint", "difference", "uncertain\nby", "relative\nerror"], [])
-    for row in rows:
-        values = (f"{row.adjoint:.6e}", f"{row.difference:.6e}", f"{row.uncertainty:.1e}", f"{row.relative_error:.1e}")
-        table.add_row(row.parameter, *values, style=None if row.relative_error <= tolerance else "red")
-    return table
+    cells = [
+        [row.parameter, f"{row.adjoint:.6e}", f"{row.difference:.6e}", f"{row.uncertainty:.1e}"]
+        + [f"{row.relative_error:.1e}"]
+        for row in rows
+    ]
+    failed = [number for number, row in enumerate(rows) if not row.relative_error <= tolerance]
+    return Sheet(title, ["parameter", "adjoint", "difference", "uncertain\nby", "relative\nerror"], cells, failed)

@@ -4,29 +4,29 @@ Coarse and nearly incompressible meshes lock: they bend less than the arm that t
 error of the mesh is extrapolated from hexahedra that are refined evenly, and borne out by another kind of element.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from math import cos, pi, radians, sin
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 import torch
 from matplotlib import rc_context
 from matplotlib.figure import Figure
-from rich.table import Table
+from pydantic import Strict
 
 from ..dynamics.nonlinear_solver import SolverSettings
 from ..dynamics.simulator import GRAVITY, Simulator
 from ..energies.fibres import Fibres
 from ..energies.materials import make_material
 from ..energies.pressure import Pressure
-from ..experiment.schema import NATURAL, check
 from ..fem.body import Body
 from ..io.atomic import atomic_path, digest
 from ..io.errors import InputError
 from ..io.files import read_json, write_json
 from ..io.progress import Progress
+from ..io.settings import Many, Natural, Positive, Settings, Share, Some, Word, parse, setting
 from ..mesh.arm import mesh_arm
 from ..mesh.arm_geometry import arm_geometry
 from ..mesh.chambers import find_chambers
@@ -34,38 +34,69 @@ from ..mesh.mesh import Mesh, quadratic
 from ..mesh.readers import read_mesh
 from ..report.figures import STYLE, TONES, new_figure, save_png
 from ..stepping.inputs import Inputs
-from .command import show, table_of, write_csv
-from .elements import step_time
+from .beam import ELEMENT_NAMES, Element
+from .command import show, write_csv
+from .tables import Sheet
+from .timing import step_time
 
-HEXAHEDRA, SERENDIPITY, BIQUADRATIC = "8-node hexahedra", "20-node hexahedra", "27-node hexahedra"
-LINEAR, QUADRATIC = "4-node tetrahedra", "10-node tetrahedra"
 LOADS: Final[Mapping[str, str]] = {
     "gravity": "gravity, base tilted",
     "fibres": "pressure, with fibres",
     "pressure": "pressure, without fibres",
 }
-# By key of the group ``study``: the element, the kind of mesh where it is quadratic, and how it is drawn.
-_ELEMENTS: Final = {
-    "hexahedra": (HEXAHEDRA, None, "sysid", "o"),
-    "hexahedra_20": (SERENDIPITY, "hexahedron20", "reconstruction", "D"),
-    "hexahedra_27": (BIQUADRATIC, "hexahedron27", "simfree", "P"),
-    "linear_tetrahedra": (LINEAR, None, "simulation", "^"),
-    "quadratic_tetrahedra": (QUADRATIC, "tetrahedron10", "resphys", "s"),
+_STYLES: Final[Mapping[Element, tuple[str, str]]] = {  # tone and mark
+    "hexahedron8": ("sysid", "o"),
+    "hexahedron20": ("reconstruction", "D"),
+    "hexahedron27": ("simfree", "P"),
+    "tetrahedron4": ("simulation", "^"),
+    "tetrahedron10": ("resphys", "s"),
 }
-_NOT_MEASURED: Final = {*_ELEMENTS, "file", "units", "within"}  # what the result of one mesh does not depend on
+Hexahedra = Annotated[tuple[Positive, Positive, bool], Strict(False)]  # size and height of a layer [m], whether timed
+Tetrahedra = Annotated[tuple[Positive, bool], Strict(False)]  # size [m], whether timed
+
+
+class Windings(Settings):
+    """Fibres around the chambers."""
+
+    angles: Some[float] = setting(unit="degrees")
+    toe: Positive
+    stiffness: Positive = setting(unit="N/m")
+
+
+class LockingStudy(Settings):
+    """The group ``study`` of ``conf/benchmark_locking.yaml``, which has what the keys mean, and their values."""
+
+    meshes: dict[Element, Many[Hexahedra] | Many[Tetrahedra]]
+    file: Word | None
+    units: Word
+    chamber: Natural
+    pressure: float = setting(unit="Pa")
+    tilt: float = setting(unit="degrees")
+    material: dict[str, Any]
+    fibres: Windings
+    relative_tolerance: Positive
+    time_step: Positive = setting(unit="s")
+    steps: Natural
+    repeats: Natural
+    within: Share
 
 
 @dataclass(frozen=True)
 class Case:
     """A mesh of the study."""
 
-    name: str  # of a file for its results
-    element: str
+    element: Element
     size: float | None = None  # of the elements in the section [m]; None for a file
     layers: float | None = None  # height of those of hexahedra [m]
     file: str | None = None  # that it is read from
     units: str = "m"  # of that file
     timed: bool = True  # whether steps are timed, and the deflection without fibres is computed
+
+    @property
+    def name(self) -> str:
+        """The name of a file for its results."""
+        lengths = [f"{1e3 * length:g}" for length in (self.size, self.layers) if length is not None]
+        return "_".join([self.element, *(lengths or ["file"])])
 
     def mesh(self, geometry: Mapping[str, Any]) -> Mesh:
         """The mesh, of an arm with these measures.
@@ -73,25 +104,28 @@ class Case:
         Raises:
             MeshError: it cannot be made or read.
         """
+        linear = self.element in ("hexahedron8", "tetrahedron4")
         if self.file is not None:
-            return read_mesh(self.file, self.units, 2 if self.element == QUADRATIC else 1, drop_unreferenced=True)
-        mesh, _ = mesh_arm(arm_geometry(geometry), float(self.size or 0.0), self.element.split()[1], self.layers)
-        kind = next(kind for element, kind, *_ in _ELEMENTS.values() if element == self.element)
-        return quadratic(mesh, kind) if kind else mesh
+            return read_mesh(self.file, self.units, 1 if linear else 2, drop_unreferenced=True)
+        cells = "hexahedra" if self.element.startswith("hexahedron") else "tetrahedra"
+        mesh, _ = mesh_arm(arm_geometry(geometry), float(self.size or 0.0), cells, self.layers)
+        return mesh if linear else quadratic(mesh, self.element)
 
 
-def cases(study: Mapping[str, Any]) -> Iterator[Case]:
-    """The meshes of a study, from the group ``study``."""
-    if study["file"] is not None:
-        for element, name in ((LINEAR, "linear"), (QUADRATIC, "quadratic")):
-            yield Case(f"file_{name}", element, file=str(study["file"]), units=study["units"])
-    for key, (element, *_) in _ELEMENTS.items():
-        for *lengths, timed in study[key]:
-            name = "_".join([key, *(f"{1e3 * length:g}" for length in lengths)])
-            yield Case(name, element, **dict(zip(("size", "layers"), lengths, strict=False)), timed=timed)
+def cases(study: LockingStudy) -> list[Case]:
+    """The meshes of a study: those of a file, then those that are made."""
+    elements: tuple[Element, ...] = () if study.file is None else ("tetrahedron4", "tetrahedron10")
+    return [
+        *(Case(element, file=study.file, units=study.units) for element in elements),
+        *(
+            Case(element, size, layers[0] if layers else None, timed=timed)
+            for element, meshes in study.meshes.items()
+            for size, *layers, timed in meshes
+        ),
+    ]
 
 
-def measure(mesh: Mesh, study: Mapping[str, Any], timed: bool = True) -> dict[str, Any]:
+def measure(mesh: Mesh, study: LockingStudy, timed: bool = True) -> dict[str, Any]:
     """Deflections of an arm that hangs along -z from its highest vertices, and the time of a step.
 
     Returns:
@@ -101,10 +135,8 @@ def measure(mesh: Mesh, study: Mapping[str, Any], timed: bool = True) -> dict[st
     Raises:
         ResphysError: the mesh has no such chamber, or an equilibrium was not found.
     """
-    for key in ("chamber", "steps", "repeats"):
-        check(f"study.{key}", study[key], NATURAL)
     chambers = find_chambers(mesh)
-    number = study["chamber"]
+    number = study.chamber
     if number > len(chambers):
         raise InputError(f"study.chamber is {number}, but the mesh has {len(chambers)} closed chambers.")
     heights = mesh.vertices[:, 2]
@@ -113,13 +145,13 @@ def measure(mesh: Mesh, study: Mapping[str, Any], timed: bool = True) -> dict[st
     tip = torch.as_tensor(np.flatnonzero(heights < heights.min() + tolerance))
     driven = Pressure(chambers)
     bare = Body(mesh, fixed=fixed, energies=[driven])
-    wound = Body(mesh, fixed=fixed, energies=[driven, Fibres(chambers, **study["fibres"])])
-    material = make_material(**study["material"])
+    wound = Body(mesh, fixed=fixed, energies=[driven, Fibres(chambers, **study.fibres.plain())])
+    material = make_material(**study.material)
     pressure = torch.zeros(1, len(chambers), dtype=torch.float64)
-    pressure[0, number - 1] = study["pressure"]
-    tilt, weight = radians(study["tilt"]), abs(GRAVITY[2])
-    solver = SolverSettings(relative_tolerance=study["relative_tolerance"])
-    hanging = Simulator(bare, material, time_step=study["time_step"], solver=solver)
+    pressure[0, number - 1] = study.pressure
+    tilt, weight = radians(study.tilt), abs(GRAVITY[2])
+    solver = SolverSettings(relative_tolerance=study.relative_tolerance)
+    hanging = Simulator(bare, material, time_step=study.time_step, solver=solver)
     tilted = Simulator(bare, material, gravity=(weight * sin(tilt), 0.0, -weight * cos(tilt)), solver=solver)
     reinforced = Simulator(wound, material, solver=solver)
 
@@ -138,9 +170,9 @@ def measure(mesh: Mesh, study: Mapping[str, Any], timed: bool = True) -> dict[st
         "iterations": None,
     }
     if timed:
-        ramp = 0.5 - 0.5 * np.cos(2.0 * pi * np.arange(1, study["steps"] + 1) / study["steps"])  # swells and ebbs once
+        ramp = 0.5 - 0.5 * np.cos(2.0 * pi * np.arange(1, study.steps + 1) / study.steps)  # swells and ebbs once
         inputs = [Inputs(pressure=float(share) * pressure) for share in ramp]
-        result |= step_time(hanging, hanging.static_equilibrium().detach(), inputs, study["repeats"])
+        result |= step_time(hanging, hanging.static_equilibrium().detach(), inputs, study.repeats)
     return result
 
 
@@ -160,8 +192,8 @@ def converged(rows: Sequence[Mapping[str, Any]], load: str) -> dict[str, float] 
         finest 10-node tetrahedra (NaN without any). None where no two hexahedral meshes have one ratio.
     """
     key = f"{load}_mm"
-    known = [row for row in rows if row["size"] and row[key] is not None]
-    hexahedra = [row for row in known if row["element"] == HEXAHEDRA]
+    measured = [row for row in rows if row["size"] and row[key] is not None]
+    hexahedra = [row for row in measured if row["element"] == "hexahedron8"]
     pairs = [
         (coarse, fine)
         for fine in hexahedra
@@ -173,7 +205,7 @@ def converged(rows: Sequence[Mapping[str, Any]], load: str) -> dict[str, float] 
         return None
     coarse, fine = max(pairs, key=lambda pair: (pair[1]["vertices"], pair[0]["vertices"]))
     ratio = coarse["size"] / fine["size"]
-    others = [row for row in known if row["element"] == QUADRATIC]
+    others = [row for row in measured if row["element"] == "tetrahedron10"]
     other = max(others, key=lambda row: row["vertices"])[key] if others else float("nan")
     value = fine[key] + (fine[key] - coarse[key]) / (ratio**2 - 1.0)
     return {"mm": value, "finest_mm": fine[key], "other_mm": other}
@@ -192,50 +224,47 @@ def cheapest(rows: Sequence[Mapping[str, Any]], within: float) -> Mapping[str, A
 
 
 def locking_study(config: Mapping[str, Any], folder: Path) -> None:
-    """Writes study.json, study.csv and study.png into the run folder and prints the table; see `run_study`."""
-    show(*run_study(config, folder), f"Written: {folder}/study.json, study.csv, study.png")
+    """Writes study.json, study.csv and study.png into the run folder, and prints the table and what follows from it.
 
-
-def run_study(config: Mapping[str, Any], folder: Path) -> list[Table | str]:
-    """Measures every mesh that has no result yet, writes the files, and returns the table and what follows from it.
-
-    The result of each mesh is kept in the folder ``meshes``.
+    The result of each mesh is kept in the folder ``meshes``: an interrupted study goes on where it was.
 
     Raises:
-        ResphysError: see `measure`.
+        ResphysError: a value that cannot be used, a mesh that cannot be made, or an equilibrium that was not found.
     """
-    study, within = config["study"], config["study"]["within"]
-    rows = _measured(config, folder)
+    study = parse(LockingStudy, config["study"], "study")
+    rows = _measured(study, config["mesh"], folder)
     limits = {load: converged(rows, load) for load in LOADS}
     for row in rows:
         for load, limit in limits.items():
             if limit is not None and row[f"{load}_mm"] is not None:
                 row[f"{load}_deviation"] = row[f"{load}_mm"] / limit["mm"] - 1.0
-    best = cheapest(rows, within)
+    best = cheapest(rows, study.within)
     name = None if best is None else best["name"]
-    write_json(folder / "study.json", {"rows": rows, "converged": limits, "cheapest": name, "study": study})
+    write_json(folder / "study.json", {"rows": rows, "converged": limits, "cheapest": name, "study": study.plain()})
     write_csv(folder / "study.csv", rows)
     with rc_context(STYLE), atomic_path(folder / "study.png") as partial:
-        save_png(deflections(rows, limits, within), partial)
-    return [study_table(rows), conclusion(limits, best, within)]
+        save_png(deflections(rows, limits, study.within), partial)
+    conclusion = _conclusion(limits, best, study.within)
+    show(_table(rows), conclusion, f"Written: {folder}/study.json, study.csv, study.png")
 
 
-def _measured(config: Mapping[str, Any], folder: Path) -> list[dict[str, Any]]:
-    """A row for each mesh: what an earlier study with the same settings has measured, or what is measured now."""
-    study, rows = config["study"], []
-    geometry = {key: value for key, value in config["mesh"].items() if key not in ("size", "layers", "cells", "order")}
-    loads = {key: value for key, value in study.items() if key not in _NOT_MEASURED}
-    chosen = list(cases(study))
+def _measured(study: LockingStudy, mesh: Mapping[str, Any], folder: Path) -> list[dict[str, Any]]:
+    """A row for each mesh, from an earlier study with the same settings or measured now."""
+    rows = []
+    geometry = {key: value for key, value in mesh.items() if key not in ("size", "layers", "cells", "order")}
+    # A result does not depend on the other meshes, nor on what is concluded from it.
+    loads = study.model_dump(mode="json", exclude={"meshes", "file", "units", "within"})
+    chosen = cases(study)
     with Progress("locking study", total=len(chosen), unit="meshes") as progress:
         for case in chosen:
-            place = folder / "meshes" / f"{case.name}.json"
+            path = folder / "meshes" / f"{case.name}.json"
             content = None if case.file is None else digest(case.file)
             settings = {"case": asdict(case), "content": content, "mesh": geometry, "study": loads}
-            kept = read_json(place) if place.exists() else {}
+            kept = read_json(path) if path.exists() else {}
             if kept.get("settings") != settings:
-                row = {**asdict(case), **measure(case.mesh(config["mesh"]), study, case.timed)}
+                row = {"name": case.name, **asdict(case), **measure(case.mesh(mesh), study, case.timed)}
                 kept = {"settings": settings, "row": row}
-                write_json(place, kept)
+                write_json(path, kept)
             rows.append(kept["row"])
             progress.advance(mesh=case.name, tip=kept["row"]["fibres_mm"])
     return rows
@@ -253,10 +282,10 @@ def deflections(rows: Sequence[Mapping[str, Any]], limits: Mapping[str, Any], wi
             axes.axhline(sign * value, color=TONES["muted"].light, linewidth=1.0, label=f"converged, ±{within:.0%}")
             ends = (sign * value * (1.0 - within), sign * value * (1.0 + within))
             axes.axhspan(*ends, color=TONES["rule"].light, zorder=0)
-        for element, _, tone, mark in _ELEMENTS.values():
-            known = [row for row in rows if row["element"] == element and row[f"{load}_mm"] is not None]
-            for own, label in ((True, element), (False, f"{element}, your file")):
-                points = sorted((r["vertices"], sign * r[f"{load}_mm"]) for r in known if (r["file"] is None) == own)
+        for element, (tone, mark) in _STYLES.items():
+            measured = [row for row in rows if row["element"] == element and row[f"{load}_mm"] is not None]
+            for own, label in ((True, ELEMENT_NAMES[element]), (False, f"{ELEMENT_NAMES[element]}, your file")):
+                points = sorted((r["vertices"], sign * r[f"{load}_mm"]) for r in measured if (r["file"] is None) == own)
                 if points:
                     face = TONES[tone].light if own else "white"
                     style = {"color": TONES[tone].light, "markerfacecolor": face, "markersize": 5, "label": label}
@@ -267,34 +296,34 @@ def deflections(rows: Sequence[Mapping[str, Any]], limits: Mapping[str, Any], wi
     return figure
 
 
-def study_table(rows: Sequence[Mapping[str, Any]]) -> Table:
+def _table(rows: Sequence[Mapping[str, Any]]) -> Sheet:
     """Every mesh, with its deflections [mm] and, in per cent, how far they are from converged."""
     lines = []
-    for row in sorted(rows, key=lambda row: (row["element"], row["file"] is not None, row["vertices"])):
-        sizes = ", ".join(f"{1e3 * row[key]:.3g}" for key in ("size", "layers") if row[key])
+    for row in sorted(rows, key=lambda row: (ELEMENT_NAMES[row["element"]], row["file"] is not None, row["vertices"])):
         cells = []
         for load in LOADS:
             value, deviation = row[f"{load}_mm"], row.get(f"{load}_deviation")
             percent = "" if deviation is None else f" ({100.0 * deviation:+.1f} %)"
             cells.append("-" if value is None else f"{value:.2f}{percent}")
+        sizes = ", ".join(f"{1e3 * row[key]:.3g}" for key in ("size", "layers") if row[key])
         duration = "-" if row["step_ms"] is None else f"{row['step_ms']:.1f}"
-        where = Path(row["file"]).name if row["file"] else sizes
-        lines.append([row["element"], where, str(row["vertices"]), f"{row['chamber_cm3']:.2f}", *cells, duration])
+        first = [ELEMENT_NAMES[row["element"]], Path(row["file"]).name if row["file"] else sizes, str(row["vertices"])]
+        lines.append([*first, f"{row['chamber_cm3']:.2f}", *cells, duration])
     headings = ["element", "size, layers (mm)", "vertices", "chamber (cm3)", *LOADS.values(), "step (ms)"]
-    return table_of("Deflection of the tip in mm, and its deviation from the converged value", headings, lines)
+    return Sheet("Deflection of the tip in mm, and its deviation from the converged value", headings, lines)
 
 
-def conclusion(limits: Mapping[str, Any], best: Mapping[str, Any] | None, within: float) -> str:
+def _conclusion(limits: Mapping[str, Any], best: Mapping[str, Any] | None, within: float) -> str:
     """The converged values, and the mesh to take."""
-    known = [
+    values = [
         f"{LOADS[load]} {limit['mm']:.2f} mm (finest hexahedra {limit['finest_mm']:.2f}, finest 10-node tetrahedra "
         f"{limit['other_mm']:.2f})"
         for load, limit in limits.items()
         if limit is not None
     ]
-    if not known:
+    if not values:
         return "No two hexahedral meshes have one ratio of sizes, so nothing was extrapolated."
-    text = f"Converged, extrapolated from hexahedra: {'; '.join(known)}."
+    text = f"Converged, extrapolated from hexahedra: {'; '.join(values)}."
     if best is None:
         return f"{text} No mesh whose steps were timed is within {within:.0%} under gravity and with fibres."
     return (

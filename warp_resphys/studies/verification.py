@@ -7,23 +7,24 @@ vertices only, in x-major order; the hexahedra between them follow from the dist
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 import warp as wp
 from numpy.typing import NDArray
 
-from ..dynamics.nonlinear_solver import SolverSettings
+from ..dynamics.nonlinear_solver import SolverName, SolverSettings
 from ..dynamics.simulator import Simulator
 from ..energies.materials import Material, make_material
 from ..experiment.build import choose_device
-from ..fem.body import Body
 from ..io.errors import ConvergenceError, DataFileError, InputError
 from ..io.files import read_arrays
-from ..mesh.mesh import Mesh, box_hexahedra, select_vertices
+from ..io.settings import Natural, Positive, Settings, Some, Word, parse
+from ..mesh.mesh import Mesh, box_hexahedra
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
+from .beam import clamped
 
 LARGEST_ERROR = 1e-8  # m
 
@@ -44,34 +45,43 @@ REFERENCE_SHAPES: dict[str, tuple[int | str, ...]] = {
 _GRID_TOLERANCE = 1e-9  # of the box's length: distance within which coordinates count as equal
 
 
+class VerifySettings(Settings):
+    """The configuration ``verify``, which has what the keys mean, and their values."""
+
+    files: Some[Word]
+    solvers: Some[SolverName]
+    tolerance: Positive
+    max_iterations: Natural
+    device: Word
+
+
 def verify(config: Mapping[str, Any], folder: Path) -> None:
     """Prints the largest vertex error of each file and solver; exits with 1 where one exceeds `LARGEST_ERROR`.
 
     Raises:
         InputError: no file is named, or a value cannot be used.
-        DataFileError: see `read_reference`.
+        DataFileError: a file is no reference trajectory.
     """
-    if not config["files"] or not isinstance(config["files"], list):
+    if not config["files"]:
         raise InputError("name reference trajectories, as in warp-resphys verify FILE...")
+    settings = parse(VerifySettings, config)
     wp.config.log_level = wp.LOG_WARNING
-    device, tolerance = choose_device(config["device"]), config["tolerance"]
-    references = {path: read_reference(path) for path in map(Path, config["files"])}
-    within = True
+    device = choose_device(settings.device)
+    references = {path: read_reference(path) for path in map(Path, settings.files)}
+    passed = True
     print(f"{'file':32}{'solver':22}{'tolerance':>10}{'iterations':>12}{'largest error [m]':>20}")
     for path, reference in references.items():
-        for name in config["solvers"]:
-            settings = SolverSettings(name, relative_tolerance=tolerance, max_iterations=config["max_iterations"])
+        for name in settings.solvers:
+            solver = SolverSettings(name, settings.tolerance, max_iterations=settings.max_iterations)
             try:
-                result = compare_with_reference(reference, settings, device)
-            except ConvergenceError as error:
-                passed, said = False, f"  not converged: {error}"
-            else:
-                passed = result.largest_error <= LARGEST_ERROR
-                said = f"{result.iterations:12.1f}{result.largest_error:20.2e}"
-                said += "" if passed else f"  exceeds {LARGEST_ERROR:.0e}"
-            within &= passed
-            print(f"{path.stem:32}{name:22}{tolerance:10.0e}{said}", flush=True)
-    if not within:
+                error, iterations = compare_with_reference(reference, solver, device)
+                outcome = f"{iterations:12.1f}{error:20.2e}"
+                outcome += "" if error <= LARGEST_ERROR else f"  exceeds {LARGEST_ERROR:.0e}"
+                passed &= error <= LARGEST_ERROR
+            except ConvergenceError as failure:
+                passed, outcome = False, f"  not converged: {failure}"
+            print(f"{path.stem:32}{name:22}{settings.tolerance:10.0e}{outcome}", flush=True)
+    if not passed:
         raise SystemExit(1)
 
 
@@ -88,9 +98,8 @@ class ReferenceTrajectory:
     v: FloatArray  # (T + 1, N, 3) [m/s]
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """Outcome of a comparison."""
+class Comparison(NamedTuple):
+    """Departure of a simulation from a reference trajectory."""
 
     largest_error: float  # distance of a vertex from the reference, over all steps [m]
     iterations: float  # mean global steps of the solver a time step
@@ -187,8 +196,7 @@ def compare_with_reference(
         ConvergenceError: the solver failed.
     """
     mesh, gravity = reference.mesh, [float(g) for g in reference.gravity]
-    fixed = select_vertices(mesh, x=float(mesh.vertices[:, 0].min()))
-    body = Body(mesh, fixed=fixed, mass="per_vertex", volume_integration="full")
+    body = clamped(mesh, mass="per_vertex", volume_integration="full")
     simulator = Simulator(body, reference.material, reference.time_step, gravity, solver=settings, device=device)
     q, v, forces = (simulator.tensor(x) for x in (reference.q, reference.v, reference.forces))
     with torch.no_grad():

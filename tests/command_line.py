@@ -1,0 +1,41 @@
+"""The command line in this process."""
+
+import contextlib
+import io
+import sys
+from typing import NamedTuple
+from unittest import mock
+
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+
+from warp_resphys import cli
+
+
+class Outcome(NamedTuple):
+    """How a command ended."""
+
+    code: int
+    out: str
+    err: str
+
+
+def outcome(*arguments: object) -> Outcome:
+    """Runs `warp-resphys` with these arguments in the working directory."""
+    out, err, code = io.StringIO(), io.StringIO(), 0
+    with (
+        mock.patch.object(sys, "argv", ["warp-resphys", *map(str, arguments)]),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
+        try:
+            cli.main()
+        except SystemExit as end:
+            code = end.code
+    return Outcome(code, out.getvalue(), err.getvalue())
+
+
+def configuration(name: str, *overrides: str) -> dict:
+    """A configuration of the package as plain data."""
+    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
+        return OmegaConf.to_container(compose(name, list(overrides)), resolve=True)

@@ -1,0 +1,160 @@
+"""Clocks for the studies of speed: medians over repeats, roll-outs with their gradients, steps, and new processes.
+
+Machines differ, and so does one machine from minute to minute. Cases therefore take turns, medians are reported, and a
+fixed task of LAPACK, the *yardstick*, takes its turn with them: times divided by the yardstick's can be compared.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from statistics import median
+from typing import Any, Final
+
+import numpy as np
+import torch
+from threadpoolctl import threadpool_limits
+
+from ..dynamics.simulator import Simulator
+from ..stepping.inputs import Inputs
+from ..stepping.state import State
+
+CPU: Final = torch.device("cpu")
+_YARDSTICK_SIZE: Final = 480
+_CHILD: Final = """
+import sys, time
+began = time.perf_counter()
+from {module} import {name}
+imported = time.perf_counter() - began
+import json
+print(json.dumps([imported, {name}(json.load(sys.stdin))]))
+"""
+
+
+def now(device: torch.device = CPU) -> float:
+    """Seconds on a clock, once the device has finished its work."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
+
+
+def median_seconds(task: Callable[[], object], repeats: int, device: torch.device = CPU) -> float:
+    """Median of the seconds that a task takes on a device."""
+    seconds = []
+    for _ in range(repeats):
+        began = now(device)
+        task()
+        seconds.append(now(device) - began)
+    return median(seconds)
+
+
+def yardstick_seconds() -> float:
+    """Seconds of a product and a Cholesky factor of 480 x 480 matrices in NumPy on one thread, the median of five."""
+    n = _YARDSTICK_SIZE
+    random = np.random.default_rng(0).standard_normal((n, n))
+    with threadpool_limits(1):
+        return median_seconds(lambda: np.linalg.cholesky(random @ random.T + n * np.eye(n)), 5)
+
+
+@dataclass
+class TimedRollout:
+    """A roll-out that is repeated, with the gradient of its last state's squares."""
+
+    simulator: Simulator
+    start: State
+    steps: int
+    inputs: Inputs = field(default_factory=Inputs)
+    forward: list[float] = field(default_factory=list)  # [s] of each roll-out
+    backward: list[float] = field(default_factory=list)  # [s] of each gradient
+    iterations: float = 0.0  # mean a step, in the last roll-out
+    factorisations: float = 0.0  # mean a step, in the last roll-out
+
+    def measure(self, parameters: Mapping[str, torch.Tensor] | None = None) -> None:
+        """Times one more roll-out and gradient, by the start and by those inputs and parameters that require one."""
+        device, given = self.start.q.device, [*self.inputs.fields.values(), *(parameters or {}).values()]
+        q, v = (tensor.clone().requires_grad_(True) for tensor in (self.start.q, self.start.v))
+        began = now(device)
+        trajectory = self.simulator.rollout(State(q, v), self.steps, self.inputs, parameters)
+        self.forward.append(now(device) - began)
+        loss = trajectory.q[-1].square().sum() + trajectory.v[-1].square().sum()
+        began = now(device)
+        torch.autograd.grad(loss, [q, v, *(tensor for tensor in given if tensor.requires_grad)])
+        self.backward.append(now(device) - began)
+        self.iterations = float(np.mean([r.iterations.double().mean().item() for r in trajectory.reports]))
+        self.factorisations = float(np.mean([r.factorisations.double().mean().item() for r in trajectory.reports]))
+
+    @property
+    def unknowns(self) -> int:
+        """Coordinates of the free vertices of one environment."""
+        return 3 * (self.simulator.body.n_vertices - len(self.simulator.fixed))
+
+    def a_step(self, statistic: Callable[[list[float]], float]) -> tuple[float, float]:
+        """A statistic of the seconds forward and backward, of one step of the whole batch."""
+        return statistic(self.forward) / self.steps, statistic(self.backward) / self.steps
+
+
+def step_time(simulator: Simulator, start: State, inputs: Sequence[Inputs], repeats: int) -> dict[str, float]:
+    """Processor time and solver iterations of a step, in the mean over a roll-out.
+
+    Args:
+        simulator: that steps.
+        start: of the roll-out.
+        inputs: of each step.
+        repeats: of the roll-out, after a first one that is not timed.
+
+    Returns:
+        ``step_ms``, the mean over the steps of their medians over the repeats [ms], and ``iterations``.
+    """
+    times = np.empty((1 + repeats, len(inputs)))  # [ms]
+    iterations = []
+    prepared = simulator.prepare()
+    with torch.no_grad():
+        for row in times:
+            state = start
+            for step, acting in enumerate(inputs):
+                began = time.process_time()
+                state, report = simulator.step(state, acting, prepared)
+                row[step] = 1e3 * (time.process_time() - began)
+                iterations.append(float(report.iterations[0]))
+    return {"step_ms": float(np.median(times[1:], axis=0).mean()), "iterations": float(np.mean(iterations))}
+
+
+def run_in_new_process(
+    function: Callable[[Any], Any], argument: Any, timeout: float | None = None, environment: Mapping[str, str] = {}
+) -> tuple[float, Any]:
+    """Calls a function of a module in a process of its own, so that its imports, kernels and memory are its own.
+
+    Args:
+        function: of a module.
+        argument: plain data that JSON can write.
+        timeout: seconds after which the process is ended.
+        environment: variables that the process has beside those of this one.
+
+    Returns:
+        Seconds that importing the module took, and what the function returned, as JSON reads it.
+
+    Raises:
+        TimeoutError: it took longer than ``timeout``.
+        RuntimeError: the process failed; the message is that of its error.
+    """
+    code = _CHILD.format(module=function.__module__, name=function.__name__)
+    try:
+        run = subprocess.run(
+            [sys.executable, "-c", code],
+            input=json.dumps(argument),
+            env={**os.environ, **environment},
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=timeout,
+        )
+    except subprocess.TimeoutExpired:
+        raise TimeoutError(f"more than {timeout:g} s") from None
+    if run.returncode != 0:
+        *_, last = [f"exit code {run.returncode}", *run.stderr.strip().splitlines()]
+        raise RuntimeError(last.partition("Error: ")[2] or last)
+    imported, result = json.loads(run.stdout.splitlines()[-1])
+    return imported, result

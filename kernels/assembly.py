@@ -5,32 +5,32 @@ from typing import Any
 
 import warp as wp
 
-from .modules import decorators
+from .modules import named_module
+
+wp.set_module_options({"enable_backward": False})
 
 ZERO = wp.float64(0.0)
 
-kernel, _ = decorators()
 
-
-@kernel
+@wp.kernel
 def cell_blocks(
-    idle: wp.array[int],  # (B) not zero where nothing is to be done
+    active: wp.array[int],  # (B) zero where nothing is to be done
     gradients: wp.array2d[wp.vec3d],
     points_per_cell: int,
-    tangent_point: wp.array3d[wp.mat33d],  # (B, P, 6)
+    tangent: wp.array3d[wp.mat33d],  # (B, P, 6)
     block_offset: int,
     blocks_out: wp.array2d[wp.mat33d],  # (B, C K (K + 1) / 2 from block_offset on) [N/m], rows a >= columns c
 ):
     """Block (a, c) of a cell: d force_a / d x_c."""
     b, cell, a = wp.tid()
-    if idle[b] != 0:
+    if active[b] == 0:
         return
     k = gradients.shape[1]
     first = block_offset + cell * (k * (k + 1)) / 2 + (a * (a + 1)) / 2
     for q in range(points_per_cell):
         p = cell * points_per_cell + q
         g = gradients[p, a]
-        t = tangent_point[b, p]
+        t = tangent[b, p]
         x = g[0] * t[0] + g[1] * t[1] + g[2] * t[3]
         y = g[0] * wp.transpose(t[1]) + g[1] * t[2] + g[2] * t[4]
         z = g[0] * wp.transpose(t[3]) + g[1] * wp.transpose(t[4]) + g[2] * t[5]
@@ -42,26 +42,26 @@ def cell_blocks(
             blocks_out[b, first + c] = block
 
 
-@kernel
+@wp.kernel
 def cell_pair_blocks(
-    idle: wp.array[int],  # (B) not zero where nothing is to be done
+    active: wp.array[int],  # (B) zero where nothing is to be done
     gradients: wp.array2d[wp.vec3d],
     points_per_cell: int,
-    tangent_point: wp.array3d[wp.mat33d],  # (B, P, 6)
+    tangent: wp.array3d[wp.mat33d],  # (B, P, 6)
     pairs: wp.array2d[int],  # (K (K + 1) / 2, 2) rows a >= columns c
     block_offset: int,
     blocks_out: wp.array2d[wp.mat33d],
 ):
-    """What `cell_blocks` finds, a thread a block: more arithmetic, and every block is written once."""
+    """The same as `cell_blocks`, a thread a block: more arithmetic, and every block is written once."""
     b, cell, pair = wp.tid()
-    if idle[b] != 0:
+    if active[b] == 0:
         return
     a, c = pairs[pair, 0], pairs[pair, 1]
     total = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
     for q in range(points_per_cell):
         p = cell * points_per_cell + q
         g, h = gradients[p, a], gradients[p, c]
-        t = tangent_point[b, p]
+        t = tangent[b, p]
         total += (g[0] * h[0]) * t[0] + (g[1] * h[1]) * t[2] + (g[2] * h[2]) * t[5]
         total += (g[1] * h[0]) * t[1] + (g[0] * h[1]) * wp.transpose(t[1])
         total += (g[2] * h[0]) * t[3] + (g[0] * h[2]) * wp.transpose(t[3])
@@ -69,14 +69,36 @@ def cell_pair_blocks(
     blocks_out[b, block_offset + cell * pairs.shape[0] + pair] = total
 
 
+@wp.kernel
+def line_pair_blocks(
+    active: wp.array[int],  # (B) zero where nothing is to be done
+    weights: wp.array2d[wp.float64],  # (P, K)
+    points_per_cell: int,
+    tangent: wp.array3d[wp.mat33d],  # (B, P, 1)
+    pairs: wp.array2d[int],
+    block_offset: int,
+    blocks_out: wp.array2d[wp.mat33d],
+):
+    """The same as `cell_pair_blocks`, where an energy is a function of a vector."""
+    b, cell, pair = wp.tid()
+    if active[b] == 0:
+        return
+    a, c = pairs[pair, 0], pairs[pair, 1]
+    total = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
+    for q in range(points_per_cell):
+        p = cell * points_per_cell + q
+        total += (weights[p, a] * weights[p, c]) * tangent[b, p, 0]
+    blocks_out[b, block_offset + cell * pairs.shape[0] + pair] = total
+
+
 @functools.cache
 def scatter_kernel(scalar: Any) -> Any:
     """`scatter_blocks` into values of a type, ``wp.float64`` or ``wp.float32``."""
-    kernel, _ = decorators("" if scalar is wp.float64 else scalar.__name__)
+    module = named_module(f"assembly.{scalar.__name__}")
 
-    @kernel
+    @wp.kernel(module=module)
     def scatter_blocks(
-        idle: wp.array[int],  # (B) not zero where nothing is to be done
+        active: wp.array[int],  # (B) zero where nothing is to be done
         block_start: wp.array[int],  # (blocks + 1) where a matrix block's contributions begin
         contribution: wp.array[int],  # cell block, or -1 - cell block where it enters transposed
         diagonal_vertex: wp.array[int],  # (blocks) the vertex of a diagonal block, else -1
@@ -87,7 +109,7 @@ def scatter_kernel(scalar: Any) -> Any:
     ):
         """The entries of a layout: the sums of the blocks of the cells, and inertia on the diagonal."""
         b, block = wp.tid()
-        if idle[b] != 0:
+        if active[b] == 0:
             return
         total = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
         for entry in range(block_start[block], block_start[block + 1]):

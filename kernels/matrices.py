@@ -2,17 +2,13 @@
 
 import warp as wp
 
-from .modules import decorators
-
 # Squared size of the last update at which an iteration has converged to rounding: Newton's squares its error.
 UPDATE_TOLERANCE, NEWTON_TOLERANCE = wp.float64(1.0e-30), wp.float64(1.0e-16)
 SINGULAR, NEARLY_A_LINE = wp.float64(1.0e-12), wp.float64(1.0e-3)
 ZERO, HALF, ONE = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0)
 
-_, function = decorators()
 
-
-@function
+@wp.func
 def cofactor(a: wp.mat33d) -> wp.mat33d:
     """Derivative of the determinant: det(A) A^-T, also where A is singular."""
     return wp.mat33d(
@@ -28,7 +24,7 @@ def cofactor(a: wp.mat33d) -> wp.mat33d:
     )
 
 
-@function
+@wp.func
 def signed_svd(f: wp.mat33d):
     """F = U diag(s) V^T with det U = det V = 1; the smallest s carries the sign of det F."""
     u, s, v = wp.svd3(f)
@@ -41,7 +37,7 @@ def signed_svd(f: wp.mat33d):
     return u, s, v
 
 
-@function
+@wp.func
 def polar_rotation(f: wp.mat33d) -> wp.mat33d:
     """Rotation of the polar decomposition, det R = 1.
 
@@ -65,7 +61,7 @@ def polar_rotation(f: wp.mat33d) -> wp.mat33d:
     return r
 
 
-@function
+@wp.func
 def nearest_unimodular(f: wp.mat33d) -> wp.mat33d:
     """The matrix D with det D = 1 that minimises ||F - D||.
 

@@ -1,6 +1,6 @@
 """Drag and added mass of a medium on a surface over an implicit stage: stress and tangent.
 
-The first column of F = sum_a x_a g_a^T is the place of a point of the surface. With its area a and normal n at the
+A point sees the place x = sum_a g_a x_a on the surface. With its area a and normal n at the
 start of the step, d its way since then, e its distance from where inertia alone would take it, and the coefficients
 c = (linear, normal, tangential, inertial) of the step, its energy is
 
@@ -9,15 +9,14 @@ c = (linear, normal, tangential, inertial) of the step, its energy is
 
 import warp as wp
 
-from .modules import decorators
 from .points import line_at
+
+wp.set_module_options({"enable_backward": False})
 
 ZERO, HALF, THIRD = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0 / 3.0)
 
-kernel, function = decorators("medium")
 
-
-@function
+@wp.func
 def split(way: wp.vec3d, area: wp.vec3d):
     """Size and normal of an area, and the parts of a way across it (a length) and along it (a vector)."""
     n = wp.normalize(area)
@@ -25,22 +24,25 @@ def split(way: wp.vec3d, area: wp.vec3d):
     return wp.length(area), n, across, way - across * n
 
 
-@kernel
+@wp.kernel
 def local_step(
+    active: wp.array[int],  # (B) zero where nothing is to be done
     nodes: wp.array2d[int],
-    gradients: wp.array2d[wp.vec3d],
+    weights: wp.array2d[wp.float64],
     reference: wp.array2d[wp.vec3d],  # (B, P) where the point was [m]
     target: wp.array2d[wp.vec3d],  # (B, P) where inertia alone would take it [m]
     area: wp.array2d[wp.vec3d],  # (B, P) a n [m^2]
     coefficients: wp.array2d[wp.vec4d],  # (B, 1)
     points_per_cell: int,
     positions: wp.array2d[wp.vec3d],
-    stress_out: wp.array2d[wp.mat33d],
+    stress_out: wp.array2d[wp.vec3d],
     energy_out: wp.array2d[wp.float64],
 ):
     """Force and energy of each point."""
     b, p = wp.tid()
-    x = line_at(positions, nodes, gradients, b, p, p / points_per_cell)
+    if active[b] == 0:
+        return
+    x = line_at(positions, nodes, weights, b, p, p / points_per_cell)
     d = x - reference[b, p]
     e = x - target[b, p]
     c = coefficients[b, 0]
@@ -48,26 +50,30 @@ def local_step(
     slip = wp.length(along)
     inertial = wp.dot(e, n)
     force = a * (c[0] * d + (c[1] * wp.abs(across) * across + c[3] * inertial) * n + c[2] * slip * along)
-    stress_out[b, p] = wp.mat33d(force[0], ZERO, ZERO, force[1], ZERO, ZERO, force[2], ZERO, ZERO)
+    stress_out[b, p] = force
     cubes = c[1] * wp.abs(across) * across * across + c[2] * slip * slip * slip
     energy_out[b, p] = a * (HALF * (c[0] * wp.dot(d, d) + c[3] * inertial * inertial) + THIRD * cubes)
 
 
-@kernel
+@wp.kernel
 def tangent(
+    active: wp.array[int],
+    clamp: wp.array[int],  # (B) of no effect: the energy is convex
     nodes: wp.array2d[int],
-    gradients: wp.array2d[wp.vec3d],
+    weights: wp.array2d[wp.float64],
     reference: wp.array2d[wp.vec3d],
     target: wp.array2d[wp.vec3d],
     area: wp.array2d[wp.vec3d],
     coefficients: wp.array2d[wp.vec4d],
     points_per_cell: int,
     positions: wp.array2d[wp.vec3d],
-    tangent_out: wp.array3d[wp.mat33d],
+    tangent_out: wp.array3d[wp.mat33d],  # (B, P, 1)
 ):
-    """Block (0, 0); the energy is convex, so that it has no negative eigenvalues."""
+    """The second derivative; the energy is convex, so that it has no negative eigenvalues."""
     b, p = wp.tid()
-    d = line_at(positions, nodes, gradients, b, p, p / points_per_cell) - reference[b, p]
+    if active[b] == 0:
+        return
+    d = line_at(positions, nodes, weights, b, p, p / points_per_cell) - reference[b, p]
     c = coefficients[b, 0]
     a, n, across, along = split(d, area[b, p])
     slip = wp.length(along)
@@ -79,7 +85,4 @@ def tangent(
     block[0, 0] += even
     block[1, 1] += even
     block[2, 2] += even
-    nothing = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
-    for k in range(6):
-        tangent_out[b, p, k] = nothing
     tangent_out[b, p, 0] = block

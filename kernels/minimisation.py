@@ -18,8 +18,10 @@ from typing import Any
 
 import warp as wp
 
-from .modules import decorators
+from .modules import named_module
 from .reductions import block_max, block_sum
+
+wp.set_module_options({"enable_backward": False})
 
 BEGINS, AIMS, TRIES, DONE, STUCK = (wp.constant(k) for k in range(5))
 FACTOR, CLAMPED_FACTOR = wp.constant(1), wp.constant(2)  # requests
@@ -37,8 +39,6 @@ BETTER = wp.constant(wp.float64(0.1))
 UNIT = wp.constant(wp.float64(2.0**-52))  # of rounding
 # Of a sum of energies: what rounding leaves of the terms that cancel, per unit of stiffness and of energy.
 ENERGY_ROUNDING = wp.constant(wp.float64(8.0 * 2.0**-52))
-
-kernel, function = decorators("minimisation")
 
 
 @wp.struct
@@ -98,13 +98,13 @@ class Tolerances:
     refactor_after: int  # iterations of a solve, more of which are to be fewer by a new factor
 
 
-@function
+@wp.func
 def correction(history: History, b: int, i: int, age: int) -> wp.vec3d:
     """Of a vertex, 0 for the newest."""
     return history.correction[b, (history.newest[b] + 3 - age) % 3, i]
 
 
-@function
+@wp.func
 def foretold(history: History, b: int, i: int, order: int) -> wp.vec3d:
     """The polynomial through the last corrections, one step on: none, the last one, a line, a parabola."""
     guess = wp.vec3d()
@@ -118,7 +118,7 @@ def foretold(history: History, b: int, i: int, order: int) -> wp.vec3d:
     return guess
 
 
-@function
+@wp.func
 def remember(history: History, positions: wp.array2d[wp.vec3d], b: int, lane: int):
     """Adds a solution, and chooses the order that would have foretold it best."""
     lanes = wp.block_dim()
@@ -144,7 +144,7 @@ def remember(history: History, positions: wp.array2d[wp.vec3d], b: int, lane: in
         history.order[b] = best
 
 
-@kernel
+@wp.kernel
 def begin(
     force: wp.array2d[wp.vec3d],  # (B, N) [N]
     stiffness: wp.array[wp.float64],  # (B) sum over the solids' points [J]
@@ -187,14 +187,14 @@ def begin(
         progress.stiffness[b] = stiffness[b]
 
 
-@kernel
-def choose(progress: Progress, idle_out: wp.array[wp.bool], clamp_out: wp.array[wp.bool], pairs: wp.array[int]):
+@wp.kernel
+def choose(progress: Progress, active_out: wp.array[int], clamp_out: wp.array[int], pairs: wp.array[int]):
     """Which environments are factorised next, and which of these are clamped; forgets the pairs of the old factors."""
     b = wp.tid()
     wanted = progress.wanted[b]
     chosen = progress.phase[b] == AIMS and wanted > 0
-    idle_out[b] = not chosen
-    clamp_out[b] = chosen and wanted == CLAMPED_FACTOR
+    active_out[b] = int(chosen)
+    clamp_out[b] = int(chosen and wanted == CLAMPED_FACTOR)
     if chosen:
         progress.wanted[b] = 0
         progress.factored[b] = 1
@@ -203,38 +203,33 @@ def choose(progress: Progress, idle_out: wp.array[wp.bool], clamp_out: wp.array[
         pairs[b] = 0
 
 
-@kernel
+@wp.kernel
 def mark(
-    idle: wp.array[wp.bool],  # (B) see `choose`
-    clamp: wp.array[wp.bool],
-    clamped: wp.array[wp.bool],  # (B) of the factors that there are
-    positive_out: wp.array[int],  # (B) what the tangent is to be: 1 positive, 0 as it is, -1 left alone
-    idle_out: wp.array[int],
+    active: wp.array[int],  # (B) zero where the factor stays
+    clamp: wp.array[int],  # (B)
+    clamped_out: wp.array[wp.bool],  # (B) whether the factor is that of a clamped matrix
 ):
-    """What is asked of tangent and assembly."""
+    """Notes which of the factors to be made are those of clamped matrices."""
     b = wp.tid()
-    idle_out[b] = int(idle[b])
-    positive_out[b] = -1
-    if not idle[b]:
-        clamped[b] = clamp[b]
-        positive_out[b] = int(clamp[b])
+    if active[b] != 0:
+        clamped_out[b] = clamp[b] != 0
 
 
-@kernel
-def repeat(idle: wp.array[wp.bool], clamp: wp.array[wp.bool], wanting_out: wp.array[int]):
+@wp.kernel
+def repeat(active: wp.array[int], clamp: wp.array[int], wanting_out: wp.array[int]):
     """Which are to be factorised again, clamped: how many there are, by the one block of the launch."""
     _, lane = wp.tid()
     wanting = wp.float64(0.0)
-    for b in range(lane, idle.shape[0], wp.block_dim()):
-        if not idle[b]:
-            clamp[b] = True
+    for b in range(lane, active.shape[0], wp.block_dim()):
+        if active[b] != 0:
+            clamp[b] = 1
             wanting += ONE
     wanting = block_sum(wanting)
     if lane == 0:
         wanting_out[0] = int(wanting)
 
 
-@kernel
+@wp.kernel
 def nudge(
     progress: Progress,
     signs: wp.array2d[wp.vec3d],  # (., N) up or down, at random: several draws
@@ -258,7 +253,7 @@ def nudge(
         positions[b, i] = positions[b, i] + unit * signs[draw, i]
 
 
-@kernel
+@wp.kernel
 def compare(
     progress: Progress,
     kept: wp.array2d[wp.vec3d],  # (B, N) positions before `nudge` [m]
@@ -290,16 +285,16 @@ def compare(
             progress.phase[b] = DONE
 
 
-@kernel
-def summarise(progress: Progress, summary_out: wp.array[int], asleep_out: wp.array[int]):
-    """What the host has to know, by the one block of the launch, and (B) who needs no further evaluation."""
+@wp.kernel
+def summarise(progress: Progress, summary_out: wp.array[int], active_out: wp.array[int]):
+    """What the host has to know, by the one block of the launch, and (B) who needs a further evaluation."""
     _, lane = wp.tid()
     active, aiming = wp.float64(0.0), wp.float64(0.0)
     wanting, asking = wp.float64(0.0), wp.float64(0.0)
     for b in range(lane, progress.phase.shape[0], wp.block_dim()):
         asking += wp.float64(progress.asks[b])
         # One that asks is evaluated once more, even if nothing else is to be tried.
-        asleep_out[b] = int(progress.phase[b] >= DONE and progress.asks[b] == 0)
+        active_out[b] = int(progress.phase[b] < DONE or progress.asks[b] != 0)
         if progress.phase[b] < DONE:
             active += ONE
         if progress.phase[b] == AIMS:
@@ -314,14 +309,14 @@ def summarise(progress: Progress, summary_out: wp.array[int], asleep_out: wp.arr
         summary_out[3] = int(asking)
 
 
-@function
+@wp.func
 def may_be_rounding(progress: Progress, b: int, norm: wp.float64, iterations: int, stalls: int) -> bool:
     """Whether to measure what rounding makes of a residual that does not fall: once, and again when that went on."""
     stuck = iterations >= STALLS and stalls >= STALLS
     return stuck and (norm <= progress.rounding[b] or stalls % ASKS_AGAIN == 0)
 
 
-@function
+@wp.func
 def give_up(progress: Progress, tolerances: Tolerances, clamped: wp.array[wp.bool], b: int):
     """Stays where it was: a new factor, and a clamped one, get a try before the environment counts as stuck."""
     progress.phase[b] = AIMS
@@ -339,7 +334,7 @@ def give_up(progress: Progress, tolerances: Tolerances, clamped: wp.array[wp.boo
         progress.wanted[b] = CLAMPED_FACTOR
 
 
-@function
+@wp.func
 def within_rounding(
     tolerances: Tolerances,
     inertia: wp.array2d[wp.float64],
@@ -364,7 +359,7 @@ def within_rounding(
 @functools.cache
 def minimisation_kernels(scalar: Any) -> SimpleNamespace:
     """Kernels whose pairs, right-hand sides and solutions are of a type, ``wp.float64`` or ``wp.float32``."""
-    kernel, function = decorators(f"minimisation.{scalar.__name__}")
+    module = named_module(f"minimisation.{scalar.__name__}")
     vector = wp.vec3d if scalar is wp.float64 else wp.vec3f
 
     @wp.struct
@@ -379,13 +374,13 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
         a: wp.array2d[wp.float64]  # (B, M) by age, oldest first: coefficients of `project`
         b: wp.array2d[wp.float64]  # (B, M) those of `aim`, and S g for a while
 
-    @function
+    @wp.func(module=module)
     def place(pairs: Pairs, b: int, age: int) -> int:
         """Of the pair of an age, 0 for the oldest."""
         m = pairs.s.shape[1]
         return (pairs.last[b] - pairs.count[b] + 1 + age + m) % m
 
-    @kernel
+    @wp.kernel(module=module)
     def project(
         progress: Progress,
         pairs: Pairs,
@@ -421,7 +416,7 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
                 value -= pairs.a[b, i] * wp.vec3d(pairs.y[b, place(pairs, b, i), v])
             right_out[b, p] = vector(value)
 
-    @kernel
+    @wp.kernel(module=module)
     def aim(
         progress: Progress,
         pairs: Pairs,
@@ -481,7 +476,7 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
             else:
                 progress.phase[b] = STUCK
 
-    @function
+    @wp.func(module=module)
     def add_pair(
         pairs: Pairs,
         b: int,
@@ -525,7 +520,7 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
             pairs.last[b] = new
             pairs.count[b] = wp.min(k + 1, m)
 
-    @kernel
+    @wp.kernel(module=module)
     def accept(
         remembers: int,  # 1: pairs are kept
         tolerances: Tolerances,

@@ -1,7 +1,7 @@
-"""Where kernels are compiled, one Warp module a part, so that a run compiles what it launches; and where they run."""
+"""Warp modules, of which a run compiles those it launches from, and the streams that kernels run on."""
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from threading import Lock
 from typing import Any
@@ -12,10 +12,11 @@ import warp as wp
 _SETTINGS = Lock()  # Warp has them for the whole process.
 
 
-def decorators(part: str = "") -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """``wp.kernel`` and ``wp.func`` for a part's module; nothing is differentiated by Warp itself."""
-    module = f"warp_resphys.{part}" if part else "warp_resphys"
-    return functools.partial(wp.kernel, module=module, enable_backward=False), functools.partial(wp.func, module=module)
+def named_module(part: str) -> wp.Module:
+    """Returns the Warp module of a part that is made more than once, by law or by type; nothing is differentiated."""
+    module = wp.get_module(f"{__package__}.{part}")
+    wp.set_module_options({"enable_backward": False}, module)
+    return module
 
 
 @contextmanager

@@ -1,52 +1,55 @@
-"""Inertia of points that weighted sums of vertices move: k / 2 |x - y|^2 with x the first column of F."""
+"""Inertia of points that weighted sums of vertices move: k / 2 |x - y|^2."""
 
 import warp as wp
 
-from .modules import decorators
 from .points import line_at
+
+wp.set_module_options({"enable_backward": False})
 
 ZERO, HALF = wp.float64(0.0), wp.float64(0.5)
 
-kernel, function = decorators("point_inertia")
 
-
-@kernel
+@wp.kernel
 def local_step(
+    active: wp.array[int],  # (B) zero where nothing is to be done
     nodes: wp.array2d[int],
-    gradients: wp.array2d[wp.vec3d],
+    weights: wp.array2d[wp.float64],
     inertia: wp.array2d[wp.float64],  # (B, P) k, mass over the square of the effective time step [N/m]
     target: wp.array2d[wp.vec3d],  # (B, P) y, where inertia alone would take the point [m]
     points_per_cell: int,
     positions: wp.array2d[wp.vec3d],
-    stress_out: wp.array2d[wp.mat33d],
+    stress_out: wp.array2d[wp.vec3d],
     energy_out: wp.array2d[wp.float64],
 ):
     """Inertial force k (x - y), and its energy."""
     b, p = wp.tid()
-    offset = line_at(positions, nodes, gradients, b, p, p / points_per_cell) - target[b, p]
+    if active[b] == 0:
+        return
+    offset = line_at(positions, nodes, weights, b, p, p / points_per_cell) - target[b, p]
     pull = inertia[b, p] * offset
-    stress_out[b, p] = wp.mat33d(pull[0], ZERO, ZERO, pull[1], ZERO, ZERO, pull[2], ZERO, ZERO)
+    stress_out[b, p] = pull
     energy_out[b, p] = HALF * wp.dot(pull, offset)
 
 
-@kernel
+@wp.kernel
 def tangent(
+    active: wp.array[int],
+    clamp: wp.array[int],  # (B) of no effect: the energy is convex
     inertia: wp.array2d[wp.float64],
-    tangent_out: wp.array3d[wp.mat33d],
+    tangent_out: wp.array3d[wp.mat33d],  # (B, P, 1)
 ):
-    """Block (0, 0) is k times the identity."""
+    """K times the identity."""
     b, p = wp.tid()
-    nothing = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
-    for block in range(6):
-        tangent_out[b, p, block] = nothing
+    if active[b] == 0:
+        return
     k = inertia[b, p]
     tangent_out[b, p, 0] = wp.mat33d(k, ZERO, ZERO, ZERO, k, ZERO, ZERO, ZERO, k)
 
 
-@kernel
+@wp.kernel
 def slopes(
     nodes: wp.array2d[int],
-    gradients: wp.array2d[wp.vec3d],
+    weights: wp.array2d[wp.float64],
     inertia: wp.array2d[wp.float64],
     target: wp.array2d[wp.vec3d],
     points_per_cell: int,
@@ -58,7 +61,7 @@ def slopes(
     """-z . d residual by the inertia and by the target."""
     b, p = wp.tid()
     cell = p / points_per_cell
-    offset = line_at(positions, nodes, gradients, b, p, cell) - target[b, p]
-    dz = line_at(direction, nodes, gradients, b, p, cell)
+    offset = line_at(positions, nodes, weights, b, p, cell) - target[b, p]
+    dz = line_at(direction, nodes, weights, b, p, cell)
     inertia_out[b, p] = -wp.dot(offset, dz)
     target_out[b, p] = inertia[b, p] * dz

@@ -3,18 +3,18 @@
 import warp as wp
 
 from .matrices import cofactor
-from .modules import decorators
 from .points import deformation_gradient
 
-ZERO = wp.float64(0.0)
+wp.set_module_options({"enable_backward": False})
 
-kernel, _ = decorators("pressure")
+ZERO = wp.float64(0.0)
 
 
 # The potential of a uniform gauge pressure p is -p V (Bonet and Wood 2008, section 8.5.2), and a chamber's faces
 # look into it: V = -sum_q w_q det F, F = [x, t1, t2].
-@kernel
+@wp.kernel
 def local_step(
+    active: wp.array[int],  # (B) zero where nothing is to be done
     nodes: wp.array2d[int],
     gradients: wp.array2d[wp.vec3d],
     weights: wp.array[wp.float64],  # (P) a third of the quadrature weight
@@ -27,14 +27,18 @@ def local_step(
 ):
     """-p V and its derivative."""
     b, p = wp.tid()
+    if active[b] == 0:
+        return
     f = deformation_gradient(positions, nodes, gradients, b, p, p / points_per_cell)
     scale = weights[p] * pressure[b, chamber[p]]
     stress_out[b, p] = scale * cofactor(f)
     energy_out[b, p] = scale * wp.determinant(f)
 
 
-@kernel
+@wp.kernel
 def tangent(
+    active: wp.array[int],
+    clamp: wp.array[int],  # (B) not zero: leave it out, as it has eigenvalues of both signs
     nodes: wp.array2d[int],
     gradients: wp.array2d[wp.vec3d],
     weights: wp.array[wp.float64],
@@ -42,14 +46,15 @@ def tangent(
     pressure: wp.array2d[wp.float64],
     points_per_cell: int,
     positions: wp.array2d[wp.vec3d],
-    positive: wp.array[int],  # (B) 1: leave it out, as it has eigenvalues of both signs
     tangent_out: wp.array3d[wp.mat33d],
 ):
     """Column k of cof F is the product of the next two columns of F."""
     b, p = wp.tid()
+    if active[b] == 0:
+        return
     f = deformation_gradient(positions, nodes, gradients, b, p, p / points_per_cell)
     scale = weights[p] * pressure[b, chamber[p]]
-    if positive[b] == 1:
+    if clamp[b] != 0:
         scale = ZERO
     columns = wp.transpose(f)
     out = tangent_out[b, p]
@@ -63,7 +68,7 @@ def tangent(
     out[5] = nothing
 
 
-@kernel
+@wp.kernel
 def adjoint(
     nodes: wp.array2d[int],
     gradients: wp.array2d[wp.vec3d],

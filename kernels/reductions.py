@@ -6,26 +6,25 @@ thread of the block has to come to a reduction, which is a barrier too.
 
 import warp as wp
 
-from .modules import decorators
+wp.set_module_options({"enable_backward": False})
+
 
 ZERO = wp.float64(0.0)
 
-kernel, function = decorators("reductions")
 
-
-@function
+@wp.func
 def block_sum(value: wp.float64) -> wp.float64:
     """The sum over a block, known to every thread of it."""
     return wp.tile_sum(wp.tile(value))[0]
 
 
-@function
+@wp.func
 def block_max(value: wp.float64) -> wp.float64:
     """The maximum over a block, known to every thread of it."""
     return wp.tile_max(wp.tile(value))[0]
 
 
-@kernel
+@wp.kernel
 def masked_norm(
     free: wp.array[wp.float64],  # (N) one at free vertices, zero at fixed ones
     vectors: wp.array2d[wp.vec3d],  # (B, N) set to zero at fixed vertices
@@ -43,7 +42,7 @@ def masked_norm(
         norm_out[b] = wp.sqrt(total)
 
 
-@kernel
+@wp.kernel
 def totals(
     free: wp.array[wp.float64],
     vertex_energy: wp.array2d[wp.float64],  # (B, N) [J]

@@ -5,15 +5,15 @@ from types import ModuleType, SimpleNamespace
 
 import warp as wp
 
-from .modules import decorators
+from .modules import named_module
 from .points import deformation_gradient, green_strain
+
+wp.set_module_options({"enable_backward": False})
 
 ZERO, HALF, TWO = wp.float64(0.0), wp.float64(0.5), wp.float64(2.0)
 
-base_kernel, _ = decorators()
 
-
-@base_kernel
+@wp.kernel
 def strain(
     nodes: wp.array2d[int],
     gradients: wp.array2d[wp.vec3d],
@@ -26,7 +26,7 @@ def strain(
     strain_out[b, p] = green_strain(deformation_gradient(positions, nodes, gradients, b, p, p / points_per_cell))
 
 
-@base_kernel
+@wp.kernel
 def strain_adjoint(
     nodes: wp.array2d[int],
     gradients: wp.array2d[wp.vec3d],
@@ -45,18 +45,19 @@ def strain_adjoint(
 @functools.cache
 def solid_kernels(law: ModuleType) -> SimpleNamespace:
     """Kernels for one of ``kernels.materials``."""
-    kernel, function = decorators(law.NAME)
+    module = named_module(f"solid.{law.NAME}")
     response, slopes, elastic_tangent, moduli = law.response, law.slopes, law.tangent, law.moduli
     mu_of, lambda_of = (moduli(*(wp.float64(pair[i]) for pair in law.LAME)) for i in (0, 1))
 
-    @function
+    @wp.func(module=module)
     def isotropic(strain: wp.mat33d, dilation: wp.float64, shape: wp.float64, volume: wp.float64) -> wp.mat33d:
         """2 mu E + lambda e I."""
         t = volume * dilation
         return TWO * shape * strain + wp.mat33d(t, ZERO, ZERO, ZERO, t, ZERO, ZERO, ZERO, t)
 
-    @kernel
+    @wp.kernel(module=module)
     def local_step(
+        active: wp.array[int],  # (B) zero where nothing is to be done
         nodes: wp.array2d[int],
         gradients: wp.array2d[wp.vec3d],
         stiffness: wp.array2d[moduli],  # (B, P) moduli times the point's volumes [J]
@@ -65,12 +66,11 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         dilation_offset: wp.array2d[wp.float64],  # (B, P) w there
         points_per_cell: int,
         positions: wp.array2d[wp.vec3d],
-        asleep: wp.array[int],  # (B) not zero where nothing is to be done
         stress_out: wp.array2d[wp.mat33d],
         energy_out: wp.array2d[wp.float64],  # (B, P) [J]
     ):
         b, p = wp.tid()
-        if asleep[b] != 0:
+        if active[b] == 0:
             return
         f = deformation_gradient(positions, nodes, gradients, b, p, p / points_per_cell)
         m = stiffness[b, p]
@@ -87,7 +87,7 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         stress_out[b, p] = stress
         energy_out[b, p] = energy
 
-    @function
+    @wp.func(module=module)
     def add_viscous_tangent(
         f: wp.mat33d, stress: wp.mat33d, shape: wp.float64, volume: wp.float64, out: wp.array[wp.mat33d]
     ):
@@ -104,8 +104,10 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
                 block[2, 2] += stress[k, n]
                 out[(k * (k + 1)) / 2 + n] += block
 
-    @kernel
+    @wp.kernel(module=module)
     def tangent(
+        active: wp.array[int],
+        clamp: wp.array[int],  # (B) not zero where eigenvalues are clamped at zero
         nodes: wp.array2d[int],
         gradients: wp.array2d[wp.vec3d],
         stiffness: wp.array2d[moduli],
@@ -114,28 +116,27 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         dilation_offset: wp.array2d[wp.float64],
         points_per_cell: int,
         positions: wp.array2d[wp.vec3d],
-        positive: wp.array[int],  # (B) 1: clamp the eigenvalues at zero; -1: nobody asks for this tangent
         tangent_out: wp.array3d[wp.mat33d],
     ):
         b, p = wp.tid()
-        if positive[b] < 0:
+        if active[b] == 0:
             return
         f = deformation_gradient(positions, nodes, gradients, b, p, p / points_per_cell)
         m = stiffness[b, p]
         out = tangent_out[b, p]
-        elastic_tangent(f, m, positive[b], out)
+        elastic_tangent(f, m, clamp[b] != 0, out)
         c = viscosity[b]
         if c[0] + c[1] > ZERO:
             shape, bulk = wp.dot(mu_of, m), wp.dot(lambda_of, m)
             strain = green_strain(f)
             rest = c[1] * wp.trace(strain) - dilation_offset[b, p]
             stress = isotropic(c[0] * strain - strain_offset[b, p], rest, shape, bulk)
-            if positive[b] == 1:
+            if clamp[b] != 0:
                 # The stress part of the viscous Hessian may be indefinite: a clamped Hessian leaves it out.
                 stress = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
             add_viscous_tangent(f, stress, c[0] * shape, c[1] * bulk, out)
 
-    @kernel
+    @wp.kernel(module=module)
     def adjoint(
         nodes: wp.array2d[int],
         gradients: wp.array2d[wp.vec3d],
@@ -162,7 +163,7 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         bulk = wp.dot(lambda_of, m)
         c = viscosity[b]
         # A stiffness of zero has a derivative too (nu = 0): what is skipped depends on the volumes alone.
-        result = -slopes(f, dz, carried[p])
+        result = -slopes(f, dz, m, carried[p])
         rise = wp.transpose(f) * dz
         rise = HALF * (rise + wp.transpose(rise))
         swelling = wp.trace(rise)

@@ -2,12 +2,8 @@
 
 import warp as wp
 
-from .modules import decorators
-
 SMALLEST_STRETCH_SUM = wp.float64(1.0e-3)  # below it, a tangent divides by this
 ZERO, HALF = wp.float64(0.0), wp.float64(0.5)
-
-_, function = decorators()
 
 
 # In the frame of the SVD F = U diag(s) V^T, with dF' = U^T dF V, the tangent of an isotropic energy is
@@ -16,21 +12,21 @@ _, function = decorators()
 # with direct = (flip + twist) / 2 and cross = (flip - twist) / 2 off the diagonal, where flip and twist are the
 # eigenvalues (sigma_i - sigma_j) / (s_i - s_j) and (sigma_i + sigma_j) / (s_i + s_j) of the symmetric and skew
 # pairs (Smith, de Goes, Kim 2019), written so that equal singular values do not divide by zero.
-@function
+@wp.func
 def spectral_blocks(
     u: wp.mat33d,
     v: wp.mat33d,
     normal: wp.mat33d,
     flip: wp.vec3d,
     twist: wp.vec3d,
-    positive: int,
+    clamp: bool,
     out: wp.array[wp.mat33d],
 ):
-    """The six blocks; with `positive`, of the nearest tangent without negative eigenvalues.
+    """The six blocks; with `clamp`, of the nearest tangent without negative eigenvalues.
 
     `flip` and `twist` are numbered by the axis that their pair leaves out.
     """
-    if positive == 1:
+    if clamp:
         q, e = wp.eig3(normal)
         clamped = wp.diag(wp.vec3d(wp.max(e[0], ZERO), wp.max(e[1], ZERO), wp.max(e[2], ZERO)))
         normal = q * clamped * wp.transpose(q)

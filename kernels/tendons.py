@@ -8,18 +8,17 @@ that of a spring that only pulls, stretched by what the tendon is longer than it
 
 import warp as wp
 
-from .fibres import tension
-from .modules import decorators
+from .laws.thread import pull as thread_pull
 from .points import deformation_gradient
+
+wp.set_module_options({"enable_backward": False})
 
 ZERO, ONE = wp.float64(0.0), wp.float64(1.0)
 OFFSET_UNIT = 5e-3  # of the offsets [m], about the size of cells, so that the columns of F are of one size
 PER_UNIT_OFFSET = wp.float64(1.0 / OFFSET_UNIT)
 
-kernel, function = decorators("tendons")
 
-
-@function
+@wp.func
 def direction_of(line: wp.vec3d) -> wp.vec3d:
     """The unit vector along a piece; zero for one without a length."""
     length = wp.length(line)
@@ -29,8 +28,9 @@ def direction_of(line: wp.vec3d) -> wp.vec3d:
     return result
 
 
-@kernel
+@wp.kernel
 def pull(
+    active: wp.array[int],  # (B) zero where nothing is to be done
     nodes: wp.array2d[int],
     gradients: wp.array2d[wp.vec3d],
     first: wp.array[int],  # (T + 1) pieces of each tendon
@@ -48,19 +48,22 @@ def pull(
 ):
     """The tension of each tendon, and where it runs."""
     b, t = wp.tid()
+    if active[b] == 0:
+        return
     c = wp.vec3d(ONE, PER_UNIT_OFFSET * first_offset[b, t], PER_UNIT_OFFSET * second_offset[b, t])
     along_out[b, t] = c
     longer = ZERO
     for p in range(first[t], first[t + 1]):
         f = deformation_gradient(positions, nodes, gradients, b, p, p)
         longer += wp.length(f * c) - wp.length(rest[p] * c)
-    energy, force, slope = tension(longer + contraction[b, t], toe)
+    energy, force, slope = thread_pull(longer + contraction[b, t], toe)
     spring_out[b, t] = wp.vec3d(energy, force, slope)
     tension_out[b, t] = commanded[b, t] + stiffness[b, t] * force
 
 
-@kernel
+@wp.kernel
 def local_step(
+    active: wp.array[int],  # (B) zero where nothing is to be done
     nodes: wp.array2d[int],
     gradients: wp.array2d[wp.vec3d],
     first: wp.array[int],
@@ -76,6 +79,8 @@ def local_step(
 ):
     """T L of the commanded tension, and the spring's energy with the first piece."""
     b, p = wp.tid()
+    if active[b] == 0:
+        return
     t = tendon[p]
     c = along[b, t]
     line = deformation_gradient(positions, nodes, gradients, b, p, p) * c
@@ -86,8 +91,10 @@ def local_step(
     energy_out[b, p] = energy
 
 
-@kernel
+@wp.kernel
 def tangent(
+    active: wp.array[int],
+    clamp: wp.array[int],  # (B) of no effect: a tendon only pulls, so that no eigenvalue is negative
     nodes: wp.array2d[int],
     gradients: wp.array2d[wp.vec3d],
     tendon: wp.array[int],
@@ -98,6 +105,8 @@ def tangent(
 ):
     """Block (i, j) is c_i c_j T / l (1 - u u^T), at a given tension; its change couples all pieces of a tendon."""
     b, p = wp.tid()
+    if active[b] == 0:
+        return
     c = along[b, tendon[p]]
     line = deformation_gradient(positions, nodes, gradients, b, p, p) * c
     length = wp.length(line)
@@ -114,7 +123,7 @@ def tangent(
     tangent_out[b, p, 5] = (c[2] * c[2]) * block
 
 
-@kernel
+@wp.kernel
 def directions(
     nodes: wp.array2d[int],
     gradients: wp.array2d[wp.vec3d],
@@ -130,7 +139,7 @@ def directions(
     direction_out[b, p] = wp.outer(direction_of(line), c)
 
 
-@kernel
+@wp.kernel
 def adjoint(
     nodes: wp.array2d[int],
     gradients: wp.array2d[wp.vec3d],

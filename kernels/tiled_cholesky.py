@@ -19,7 +19,7 @@ from typing import Any, Final
 
 import warp as wp
 
-from .modules import decorators
+from .modules import named_module
 from .reductions import block_max
 
 TILE: Final = 16  # rows and columns of a tile
@@ -189,7 +189,7 @@ _SOLVE: Final = (
 @functools.cache
 def tiled_kernels(scalar: Any) -> SimpleNamespace:
     """Kernels for numbers of a type, in blocks of ``BLOCK`` threads."""
-    kernel, _ = decorators(f"tiles.{scalar.__name__}")
+    module = named_module(f"tiles.{scalar.__name__}")
     name = "double" if scalar is wp.float64 else "float"
 
     @wp.func_native(_FACTOR.replace("SCALAR", name))
@@ -198,27 +198,27 @@ def tiled_kernels(scalar: Any) -> SimpleNamespace:
     @wp.func_native(_SOLVE.replace("SCALAR", name))
     def substitute(factor: wp.array2d[scalar], column: wp.array[scalar]): ...
 
-    @kernel
+    @wp.kernel(module=module)
     def clear(
-        idle: wp.array[wp.bool],  # (B) those that stay as they are
+        active: wp.array[int],  # (B) zero where nothing is to be done
         unit: wp.array[scalar],  # (n rounded up to tiles times (W + 1) T) zero, but for one beyond n on the diagonal
         matrices: wp.array2d[scalar],  # (B, as many)
     ):
         """A whole block for what stays is cheaper than a thread for each of its numbers."""
         b, lane = wp.tid()
-        if not idle[b]:
+        if active[b] != 0:
             for k in range(lane, unit.shape[0], wp.block_dim()):
                 matrices[b, k] = unit[k]
 
-    @kernel
+    @wp.kernel(module=module)
     def check(
+        active: wp.array[int],  # (B) stays one for those alone that failed, and may be clamped yet
         clamped: wp.array[wp.bool],  # (B) matrices that are positive definite by force
-        idle: wp.array[wp.bool],  # (B) becomes False for those alone that failed, and may be clamped yet
         factors: wp.array3d[scalar],  # (B, n rounded up to tiles, (W + 1) T) NaN where clamped ones have failed
     ):
         """Which matrices were not positive definite, one block a matrix."""
         b, lane = wp.tid()
-        if idle[b]:
+        if active[b] == 0:
             return
         last = factors.shape[2] - T  # where the diagonal tiles begin
         bad = wp.float64(0.0)
@@ -231,18 +231,18 @@ def tiled_kernels(scalar: Any) -> SimpleNamespace:
             for i in range(lane, factors.shape[1], wp.block_dim()):
                 factors[b, i, last + i % T] = scalar(wp.nan)
         if lane == 0:
-            idle[b] = not again
+            active[b] = int(again)
 
-    @kernel
+    @wp.kernel(module=module)
     def factor(
-        idle: wp.array[wp.bool],  # (B) those that stay as they are
+        active: wp.array[int],  # (B) zero where nothing is to be done
         matrices: wp.array3d[scalar],  # (B, n rounded up to tiles, (W + 1) T) overwritten by the factors
     ):
         b, _ = wp.tid()
-        if not idle[b]:
+        if active[b] != 0:
             factorise(matrices[b])
 
-    @kernel
+    @wp.kernel(module=module)
     def solve(
         factors: wp.array3d[scalar],  # (B or 1, n rounded up to tiles, (W + 1) T)
         columns: wp.array3d[scalar],  # (B, m, n) right-hand sides, overwritten by the solutions

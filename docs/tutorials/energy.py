@@ -8,9 +8,9 @@
 # %% [markdown]
 # # Write your own energy
 #
-# Materials, pressure, fibres, tendons, muscles and water are energies. A new one is a class with its points and three
-# Warp kernels; solver, adjoint, tape and identification take it as they take the others, and know no energy by name.
-# This page writes a floor that a block falls on.
+# Materials, pressure, fibres, tendons, muscles and water are energies. A new one is a Warp function and a class of a
+# few lines; solver, adjoint, tape and identification take it as they take the others, and know no energy by name. This
+# page writes a floor that a block falls on, and an elastic string.
 #
 # ## The equation
 #
@@ -21,20 +21,15 @@
 # which is twice differentiable where contact begins, so that Newton steps and gradients do not see a corner. Its
 # parameters are $k$ [N/m²] and $z_0$ [m].
 #
-# ## Points
+# ## The function and the class
 #
-# Every energy of this package is a function of a matrix at points, $F_p = \sum_a x_a g_{pa}^\top$: in a solid, $g$ are
-# gradients of shape functions and $F$ is the deformation gradient; along a fibre only the first column of $F$ is used.
-# With one node a point and $g = (1, 0, 0)$, the first column is the position of a vertex. That is all a floor needs.
-#
-# ## Kernels
-#
-# *stress* writes the derivative of the energy by $F$, and the energy; *tangent* writes the second derivative, in six
-# blocks of pairs of columns, of which here only the first is not zero; *adjoint* gets $z = H^{-1}\,dL/dx$ from the
-# solver, and writes $z \cdot \partial(\text{force})/\partial(\text{parameter})$, a number for each parameter.
+# An energy is summed over points. A point sees a weighted sum of a few vertices: where a vertex is, the way from one to
+# another, or, as a matrix, the deformation gradient in a cell. The energy of a point is a Warp function of this and of
+# the point's values, which are the parameters and inputs that the class declares, in their order, with units and ranges
+# that are checked for whoever gives them. Warp differentiates the function for the forces; their own derivatives, for
+# Newton steps and gradients, are differences of fourth order of these, exact to about nine digits.
 
 # %%
-from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -44,149 +39,34 @@ import torch
 import warp as wp
 
 from warp_resphys import Body, Corotated, Simulator, State, box_hexahedra, select_vertices
-from warp_resphys.energies.base import Energy, PartTerm
-from warp_resphys.energies.launcher import warp_view
-from warp_resphys.fem.elements import Points
-from warp_resphys.kernels.points import line_at
+from warp_resphys.energies.pointwise import PointwiseEnergy, at_vertices, between
 from warp_resphys.stepping.quantity import Quantity
 
 wp.config.log_level = wp.LOG_WARNING
 
-ZERO, TWO, THREE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(2.0)), wp.constant(wp.float64(3.0))
+
+@wp.func
+def floor_energy(x: wp.vec3d, values: wp.vec2d) -> wp.float64:
+    depth = wp.max(values[1] - x[2], wp.float64(0.0))
+    return values[0] * depth * depth * depth / wp.float64(3.0)
 
 
-@wp.kernel(enable_backward=False)
-def floor_stress(
-    nodes: wp.array2d[int],  # (C, K) vertex of each node
-    operators: wp.array2d[wp.vec3d],  # (P, K) g
-    stiffness: wp.array2d[wp.float64],  # (B, 1) k
-    height: wp.array2d[wp.float64],  # (B, 1) z_0
-    points_per_cell: int,
-    positions: wp.array2d[wp.vec3d],  # (B, N)
-    stress_out: wp.array2d[wp.mat33d],  # (B, P)
-    energy_out: wp.array2d[wp.float64],
-):
-    b, p = wp.tid()
-    x = line_at(positions, nodes, operators, b, p, p / points_per_cell)
-    depth = wp.max(height[b, 0] - x[2], ZERO)
-    force = stiffness[b, 0] * depth * depth
-    stress_out[b, p] = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, -force, ZERO, ZERO)  # d(energy)/dz is -force
-    energy_out[b, p] = force * depth / THREE
-
-
-@wp.kernel(enable_backward=False)
-def floor_tangent(
-    nodes: wp.array2d[int],
-    operators: wp.array2d[wp.vec3d],
-    stiffness: wp.array2d[wp.float64],
-    height: wp.array2d[wp.float64],
-    points_per_cell: int,
-    positions: wp.array2d[wp.vec3d],
-    positive: wp.array[int],  # (B) 1: leave out what is negative, which is never here
-    tangent_out: wp.array3d[wp.mat33d],  # (B, P, 6)
-):
-    b, p = wp.tid()
-    x = line_at(positions, nodes, operators, b, p, p / points_per_cell)
-    slope = TWO * stiffness[b, 0] * wp.max(height[b, 0] - x[2], ZERO)
-    nothing = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
-    for block in range(6):
-        tangent_out[b, p, block] = nothing
-    tangent_out[b, p, 0] = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, slope)
-
-
-@wp.kernel(enable_backward=False)
-def floor_adjoint(
-    nodes: wp.array2d[int],
-    operators: wp.array2d[wp.vec3d],
-    stiffness: wp.array2d[wp.float64],
-    height: wp.array2d[wp.float64],
-    points_per_cell: int,
-    positions: wp.array2d[wp.vec3d],
-    direction: wp.array2d[wp.vec3d],  # (B, N) z
-    by_parameter_out: wp.array3d[wp.float64],  # (B, P, 2)
-):
-    b, p = wp.tid()
-    x = line_at(positions, nodes, operators, b, p, p / points_per_cell)
-    z = line_at(direction, nodes, operators, b, p, p / points_per_cell)
-    depth = wp.max(height[b, 0] - x[2], ZERO)
-    by_parameter_out[b, p, 0] = z[2] * depth * depth  # by k: the energy's derivative by z is -k d^2
-    by_parameter_out[b, p, 1] = z[2] * TWO * stiffness[b, 0] * depth  # by z_0
-
-
-# %% [markdown]
-# ## The energy
-#
-# `Energy` lives on the host and is part of a body: what its parameters are called, their units and ranges, which are
-# checked for whoever gives them, and its points. `term` makes the part that has a batch: kernels and their arguments.
-
-
-# %%
 @dataclass(frozen=True)
-class Floor(Energy):
+class Floor(PointwiseEnergy):
     """A floor that pushes vertices up."""
 
-    parameters: ClassVar[tuple[Quantity, ...]] = (
+    parameters: ClassVar = (
         Quantity("floor_stiffness", "N/m^2", 0.0, closed=True),  # zero or more
         Quantity("floor_height", "m", typical=0.01),  # any
     )
+    density: ClassVar = floor_energy
+    size: ClassVar = 1e-3  # metres; differences have steps of 3e-4 of it
     vertices: np.ndarray  # those that may touch it
-    stiffness: float  # k [N/m^2]
-    height: float  # z_0 [m]
-
-    @property
-    def constants(self) -> Mapping[str, float]:
-        return {"floor_stiffness": self.stiffness, "floor_height": self.height}
+    floor_stiffness: float  # k [N/m^2]
+    floor_height: float  # z_0 [m]
 
     def points(self, mesh):
-        """One point at each vertex."""
-        operators = np.zeros((len(self.vertices), 1, 1, 3))  # (C, Q, K, 3)
-        operators[..., 0] = 1.0
-        return (Points(np.asarray(self.vertices)[:, None], operators),)
-
-    def term(self, launcher, sets):
-        return FloorTerm(launcher, sets, self)
-
-
-class FloorTerm(PartTerm):
-    """Its kernels, for a batch; `PartTerm` because there are values for parts, of which a floor has one."""
-
-    def __init__(self, launcher, sets: Sequence, floor: Floor) -> None:
-        (s,) = sets
-        super().__init__(
-            launcher, sets, "floor_stiffness", np.zeros(s.n_points, dtype=np.int64), np.ones(s.n_points), floor.count
-        )
-
-    @property
-    def shapes(self) -> Mapping[str, tuple[int, ...]]:
-        """Of what a step needs to know."""
-        return {"floor_stiffness": (1,), "floor_height": (1,)}
-
-    def arguments(self, s, values, positions):
-        return [s.nodes, s.gradients, *self.views(values), s.points_per_cell, positions]
-
-    def step(self, s, values, positions):
-        return floor_stress, self.arguments(s, values, positions)
-
-    def tangent(self, s, values, positions, positive):
-        return floor_tangent, [*self.arguments(s, values, positions), positive]
-
-    def curvature(self, values) -> torch.Tensor:
-        """(B, P) how stiff a point is at most, for small motions: here, a millimetre below the floor."""
-        return values["floor_stiffness"] * 2e-3 * torch.ones_like(self.weight)
-
-    def adjoint(self, values, positions, direction) -> Callable[[], dict[str, torch.Tensor]]:
-        """Records the launch; what it returns makes it, and sums over the points."""
-        own, (s,) = self.launcher, self.sets
-        out = own.zeros(self.n_points, 2)
-        at, z = (warp_view(each, wp.vec3d) for each in (positions, direction))
-        inputs = [*self.arguments(s, values, at), z]
-        command = own.record(floor_adjoint, (own.batch, s.n_points), inputs, [warp_view(out, wp.float64)])
-
-        def differentiate() -> dict[str, torch.Tensor]:
-            own.launch(command)
-            return {name: self.sum_parts(part) for name, part in zip(self.shapes, out.unbind(-1), strict=True)}
-
-        return differentiate
+        return (at_vertices(self.vertices),)
 
 
 # %% [markdown]
@@ -195,7 +75,7 @@ class FloorTerm(PartTerm):
 # %%
 mesh = box_hexahedra(size=(0.04, 0.04, 0.04), divisions=(4, 4, 4))  # m
 bottom, top = select_vertices(mesh, z=0.0), select_vertices(mesh, z=0.04)
-body = Body(mesh, energies=[Floor(bottom, stiffness=1e5, height=-0.02)])
+body = Body(mesh, energies=[Floor(bottom, floor_stiffness=1e5, floor_height=-0.02)])
 silicone = Corotated(youngs_modulus=50e3, poissons_ratio=0.45, density=1070.0, stiffness_damping=2e-3)
 simulator = Simulator(body, silicone, time_step=0.002, integrator="bdf2", relative_tolerance=1e-9)
 print("parameters:", ", ".join(simulator.parameters))
@@ -212,7 +92,7 @@ axis.legend(frameon=False)
 plt.show()
 
 # %% [markdown]
-# When it has come to rest, the floor must carry its weight, whatever the kernels say in between.
+# When it has come to rest, the floor must carry its weight, whatever the function says in between.
 
 # %%
 depth = (-0.02 - height[-1, bottom]).clamp_min(0.0)
@@ -247,11 +127,56 @@ for number, step in enumerate((1.0, 1e-7)):
     print(f"{list(simulator.parameters)[-3:-1][number]}: adjoint {adjoint:.9e}, differences {difference:.9e}")
 
 # %% [markdown]
+# ## An elastic string
+#
+# The same for the way from one vertex to another: a spring along a diagonal of the block. With stiffness $k$ and length
+# $L$ it has the energy $\tfrac{k}{2} (|x| - L)^2$. With `per`, every spring has values of its own.
+
+
+# %%
+@wp.func
+def spring_energy(x: wp.vec3d, values: wp.vec2d) -> wp.float64:
+    longer = wp.length(x) - values[1]
+    return wp.float64(0.5) * values[0] * longer * longer
+
+
+@dataclass(frozen=True)
+class Spring(PointwiseEnergy):
+    """Springs between pairs of vertices."""
+
+    parameters: ClassVar = (
+        Quantity("spring_stiffness", "N/m", 0.0, per="spring"),
+        Quantity("spring_length", "m", 0.0, per="spring"),
+    )
+    density: ClassVar = spring_energy
+    size: ClassVar = 0.01
+    pairs: np.ndarray  # (S, 2)
+    spring_stiffness: float  # k [N/m]
+    spring_length: float  # L [m]
+
+    @property
+    def count(self):
+        return len(self.pairs)
+
+    def points(self, mesh):
+        return (between(self.pairs, part=np.arange(self.count)),)
+
+
+ends = np.array([[bottom[0], top[-1]]])  # a diagonal of the block, which is 69 mm long
+tied = Body(mesh, fixed=bottom, energies=[Spring(ends, spring_stiffness=20.0, spring_length=0.05)])
+pulled = Simulator(tied, silicone).static_equilibrium().q[0]
+length = np.linalg.norm(pulled[ends[0, 0]] - pulled[ends[0, 1]])
+print(f"the spring is {1e3 * length:.2f} mm long and pulls with {20.0 * (length - 0.05):.3f} N")
+
+# %% [markdown]
+# Memory is declared in the same way, with a function of where a step starts and ends; `warp_resphys.energies.friction`
+# is an example of 40 lines.
+#
 # ## From here to an experiment
 #
-# In `warp_resphys`, an energy's class lies in `warp_resphys/energies`, its kernels in `kernels`, and
-# `warp_resphys/experiment/actuators.py` says how a configuration asks for it; its parameters can then be identified by
-# name ([contributing](../contributing.md)).
+# In `warp_resphys`, an energy lies in `warp_resphys/energies`, and `warp_resphys/experiment/actuators.py` says how a
+# configuration asks for it; its parameters can then be identified by name ([contributing](../contributing.md)). Where
+# speed counts, kernels are written by hand, as those of pressure are.
 
 # %%
 assert abs(carried / weight - 1) < 1e-3

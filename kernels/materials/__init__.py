@@ -7,6 +7,6 @@ The energy of a point is ``sum_t m_t W_t(F)``, the moduli m_t times the volume t
 - ``LAME``: for each modulus, what it adds to the Lame constants (mu, lambda) of small strains,
 - ``moduli``, the vector type of the m_t,
 - ``response(f, m) -> energy, stress``,
-- ``slopes(f, df, carried) -> dP/dm_t : df`` for every t; anything for those whose volume ``carried`` is zero,
-- ``tangent(f, m, positive, out)``: the blocks of dP/dF; with ``positive``, without negative eigenvalues.
+- ``slopes(f, df, m, carried) -> dP/dm_t : df`` for every t; anything for those whose volume ``carried`` is zero,
+- ``tangent(f, m, clamp, out)``: the blocks of dP/dF; with ``clamp``, without negative eigenvalues.
 """

@@ -7,17 +7,15 @@ has the trace ``3 e``: for small strains the second term is that of linear elast
 import warp as wp
 
 from ..matrices import nearest_unimodular, polar_rotation, signed_svd
-from ..modules import decorators
 from ..spectral import SMALLEST_STRETCH_SUM, spectral_blocks
 
 NAME, LAME = "corotated", ((1.0, 0.0), (0.0, 1.0 / 3.0))
 ZERO, HALF, ONE, TWO = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0), wp.float64(2.0)
 
-_, function = decorators(NAME)
 moduli = wp.types.vector(2, wp.float64)  # (mu, lambda)
 
 
-@function
+@wp.func
 def response(f: wp.mat33d, m: moduli):
     """Both terms are w/2 dist^2(F, manifold), so that P = w (F - its projection)."""
     energy = ZERO
@@ -33,8 +31,8 @@ def response(f: wp.mat33d, m: moduli):
     return energy, stress
 
 
-@function
-def slopes(f: wp.mat33d, df: wp.mat33d, carried: moduli) -> moduli:
+@wp.func
+def slopes(f: wp.mat33d, df: wp.mat33d, m: moduli, carried: moduli) -> moduli:
     """See ``kernels.materials``."""
     found = moduli(ZERO, ZERO)
     if carried[0] != ZERO:
@@ -44,7 +42,7 @@ def slopes(f: wp.mat33d, df: wp.mat33d, carried: moduli) -> moduli:
     return found
 
 
-@function
+@wp.func
 def second_derivatives(s: wp.vec3d, d: wp.vec3d, shape: wp.float64, volume: wp.float64):
     """Normal (3, 3), flip and twist by the index of the axis left out; d are the singular values of D."""
     # D shares F's singular frame: s = d + m cof(d), prod d = 1. Differentiating both gives the 3x3 block of
@@ -68,7 +66,7 @@ def second_derivatives(s: wp.vec3d, d: wp.vec3d, shape: wp.float64, volume: wp.f
 # The rotation R of F = R S turns by dR = [w]_x R, w = A^-1 a, where A = tr(S) I - R S R^T and a is the axial vector
 # of dF R^T - R dF^T. A change x of column n of F has a = (R e_n) x x, so that block (k, n) of dR is
 # -[R e_k]_x A^-1 [R e_n]_x.
-@function
+@wp.func
 def rotation_tangent(f: wp.mat33d, shape: wp.float64, out: wp.array[wp.mat33d]):
     """The blocks of the shape term, 2 mu (dF - dR), for det F > 0."""
     r = polar_rotation(f)
@@ -88,15 +86,15 @@ def rotation_tangent(f: wp.mat33d, shape: wp.float64, out: wp.array[wp.mat33d]):
             out[(k * (k + 1)) / 2 + n] = block
 
 
-@function
-def tangent(f: wp.mat33d, m: moduli, positive: int, out: wp.array[wp.mat33d]):
+@wp.func
+def tangent(f: wp.mat33d, m: moduli, clamp: bool, out: wp.array[wp.mat33d]):
     """By the singular values where a rotation does not do."""
-    if positive == 1 or m[1] != ZERO or wp.determinant(f) < SMALLEST_STRETCH_SUM:
+    if clamp or m[1] != ZERO or wp.determinant(f) < SMALLEST_STRETCH_SUM:
         u, s, v = signed_svd(f)
         d = s
         if m[1] != ZERO:
             d = wp.get_diag(wp.transpose(u) * nearest_unimodular(f) * v)
         normal, flip, twist = second_derivatives(s, d, m[0], m[1])
-        spectral_blocks(u, v, normal, flip, twist, positive, out)
+        spectral_blocks(u, v, normal, flip, twist, clamp, out)
     else:
         rotation_tangent(f, m[0], out)

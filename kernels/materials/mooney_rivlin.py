@@ -9,24 +9,22 @@ that one it stays finite where elements invert.
 import warp as wp
 
 from ..matrices import cofactor, signed_svd
-from ..modules import decorators
 from ..spectral import spectral_blocks
 
 NAME, LAME = "mooney_rivlin", ((2.0, 0.0), (2.0, 0.0), (0.0, 1.0))
 ZERO, HALF, ONE, TWO = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0), wp.float64(2.0)
 THREE, FOUR = wp.float64(3.0), wp.float64(4.0)
 
-_, function = decorators(NAME)
 moduli = wp.types.vector(3, wp.float64)  # (c10, c01, lambda)
 
 
-@function
+@wp.func
 def volume_slope(m: moduli, jac: wp.float64) -> wp.float64:
     """Derivative of the terms in J by J."""
     return TWO * m[0] * (jac - TWO) - FOUR * m[1] + m[2] * (jac - ONE)
 
 
-@function
+@wp.func
 def response(f: wp.mat33d, m: moduli):
     """The energy above and its derivative."""
     first = wp.ddot(f, f)
@@ -39,8 +37,8 @@ def response(f: wp.mat33d, m: moduli):
     return energy, stress + volume_slope(m, jac) * cof
 
 
-@function
-def slopes(f: wp.mat33d, df: wp.mat33d, carried: moduli) -> moduli:
+@wp.func
+def slopes(f: wp.mat33d, df: wp.mat33d, m: moduli, carried: moduli) -> moduli:
     """See ``kernels.materials``."""
     jac = wp.determinant(f)
     along = wp.ddot(cofactor(f), df)
@@ -50,7 +48,7 @@ def slopes(f: wp.mat33d, df: wp.mat33d, carried: moduli) -> moduli:
 
 # With the principal stresses sigma_i of I2, 2 s_i (s_j^2 + s_k^2), and of a function g of J, g' s_j s_k:
 # the flip of the pair (i, j) is 2 (s_k^2 - s_i s_j) and -g' s_k, its twist 2 (s_k^2 + s_i s_j) and g' s_k.
-@function
+@wp.func
 def clamped_tangent(f: wp.mat33d, m: moduli, out: wp.array[wp.mat33d]):
     """The blocks of the nearest tangent without negative eigenvalues."""
     u, s, v = signed_svd(f)
@@ -67,15 +65,15 @@ def clamped_tangent(f: wp.mat33d, m: moduli, out: wp.array[wp.mat33d]):
         normal[j, i] += FOUR * m[1] * s[i] * s[j] + slope * s[k]
         flip[k] = TWO * m[0] + TWO * m[1] * (s[k] * s[k] - s[i] * s[j]) - slope * s[k]
         twist[k] = TWO * m[0] + TWO * m[1] * (s[k] * s[k] + s[i] * s[j]) + slope * s[k]
-    spectral_blocks(u, v, normal, flip, twist, 1, out)
+    spectral_blocks(u, v, normal, flip, twist, True, out)
 
 
 # A change x of column n of F changes column k of I1 F - F F^T F by
 # (2 f_k f_n^T - f_n f_k^T - C_kn I + [k = n] (I1 I - F F^T)) x, with C = F^T F.
-@function
-def tangent(f: wp.mat33d, m: moduli, positive: int, out: wp.array[wp.mat33d]):
+@wp.func
+def tangent(f: wp.mat33d, m: moduli, clamp: bool, out: wp.array[wp.mat33d]):
     """The blocks of dP/dF, by the equation above."""
-    if positive == 1:
+    if clamp:
         clamped_tangent(f, m, out)
         return
     first = wp.ddot(f, f)

@@ -7,18 +7,16 @@ elasticity.
 import warp as wp
 
 from ..matrices import cofactor, signed_svd
-from ..modules import decorators
 from ..spectral import spectral_blocks
 
 NAME, LAME = "stable_neo_hookean", ((1.0, 0.0), (0.0, 1.0))
 ZERO, HALF, ONE, TWO = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0), wp.float64(2.0)
 THREE = wp.float64(3.0)
 
-_, function = decorators(NAME)
 moduli = wp.types.vector(2, wp.float64)  # (mu, lambda)
 
 
-@function
+@wp.func
 def response(f: wp.mat33d, m: moduli):
     """The energy above and its derivative."""
     energy = ZERO
@@ -33,15 +31,15 @@ def response(f: wp.mat33d, m: moduli):
     return energy, stress
 
 
-@function
-def slopes(f: wp.mat33d, df: wp.mat33d, carried: moduli) -> moduli:
+@wp.func
+def slopes(f: wp.mat33d, df: wp.mat33d, m: moduli, carried: moduli) -> moduli:
     """See ``kernels.materials``."""
     change = wp.determinant(f) - ONE
     along = wp.ddot(cofactor(f), df)
     return moduli(wp.ddot(f, df) + (change - ONE) * along, change * along)
 
 
-@function
+@wp.func
 def clamped_tangent(f: wp.mat33d, m: moduli, out: wp.array[wp.mat33d]):
     """The blocks of the nearest tangent without negative eigenvalues."""
     u, s, v = signed_svd(f)
@@ -59,13 +57,13 @@ def clamped_tangent(f: wp.mat33d, m: moduli, out: wp.array[wp.mat33d]):
         normal[j, i] += slope * s[k]
         flip[k] = m[0] - slope * s[k]
         twist[k] = m[0] + slope * s[k]
-    spectral_blocks(u, v, normal, flip, twist, 1, out)
+    spectral_blocks(u, v, normal, flip, twist, True, out)
 
 
-@function
-def tangent(f: wp.mat33d, m: moduli, positive: int, out: wp.array[wp.mat33d]):
+@wp.func
+def tangent(f: wp.mat33d, m: moduli, clamp: bool, out: wp.array[wp.mat33d]):
     """The blocks of mu F + (mu (J - 2) + lambda (J - 1)) cof F."""
-    if positive == 1:
+    if clamp:
         clamped_tangent(f, m, out)
         return
     jac = wp.determinant(f)

@@ -317,7 +317,7 @@ class DiagonalMetric:
         self.inverse, self.vertex_at = inverse, vertex_at
         self.clamped = torch.ones(len(inverse), dtype=torch.bool)
 
-    def refactor(self, clamp=None, idle=None):
+    def refactor(self, clamp=None, active=None):
         """It is always the same."""
 
     def solve_in_place(self, right):

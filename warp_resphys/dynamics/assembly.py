@@ -79,31 +79,29 @@ class HessianAssembly:
     """Recorded launches from the tangent of a potential to the value array of a linear solver.
 
     Attributes:
-        launches: they set the entries in ``values`` of environments whose ``idle`` is zero.
+        launches: they set the entries in ``values`` of the environments that the potential's tangent was made for.
         values: (B, n_values).
-        idle: (B,).
     """
 
     def __init__(self, potential: IncrementalPotential, solver: LinearSolver, pattern: BlockPattern) -> None:
         p = potential
         self._potential = p
-        self.idle = torch.zeros(p.batch, dtype=torch.int32, device=p.device)
-        idle = warp_view(self.idle, wp.int32)
+        active = warp_view(p.tangent_active, wp.int32)
         blocks = p.zeros(pattern.n_cell_blocks, 3, 3)
         self.values = torch.zeros(p.batch, solver.n_values, device=p.device, dtype=solver.dtype)
         self._overwritten = solver.overwrites
         commands = []
-        for s, offset in zip(p.sets, pattern.offsets, strict=True):
-            inputs = [idle, s.gradients, s.points_per_cell, p.points_view(p.tangent, s.part, wp.mat33d)]
+        for s, tangent, offset in zip(p.sets, p.tangents, pattern.offsets, strict=True):
+            inputs = [active, s.gradients, s.points_per_cell, warp_view(tangent, wp.mat33d)]
             kernel, threads = kernels.cell_blocks, s.nodes_per_cell
-            if p.by_cells:
+            if p.by_cells or s.width == 1:
                 pairs = np.stack(np.tril_indices(s.nodes_per_cell), axis=1).astype(np.int32)
-                kernel, threads = kernels.cell_pair_blocks, len(pairs)
+                kernel, threads = kernels.line_pair_blocks if s.width == 1 else kernels.cell_pair_blocks, len(pairs)
                 inputs.append(p.upload(pairs, int))
             out = [warp_view(blocks, wp.mat33d)]
             commands.append(p.record(kernel, (p.batch, s.cells, threads), [*inputs, offset], out))
         inputs = [
-            idle,
+            active,
             p.upload(pattern.start.astype(np.int32), int),
             p.upload(pattern.contribution.astype(np.int32), int),
             p.upload(pattern.diagonal_vertex.astype(np.int32), int),
@@ -117,20 +115,12 @@ class HessianAssembly:
         commands.append(p.record(kernels.scatter_kernel(scalar), dim, inputs, [values]))
         self.launches = p.capture(*commands)
 
-    def __call__(self, idle: torch.Tensor | None = None) -> torch.Tensor:
-        """(B, n_values) from the potential's last `update_tangent`; overwritten by the next call.
-
-        Args:
-            idle: (B,) environments whose values stay as they are.
-        """
-        if idle is None:
-            self.idle.zero_()
-        else:
-            self.idle.copy_(idle)
-        if self._overwritten:
-            if idle is None:
-                self.values.zero_()
-            else:
-                self.values.masked_fill_(~idle[:, None], 0.0)
-        self._potential.launch(self.launches)
+    def __call__(self) -> torch.Tensor:
+        """Returns (B, n_values) from the potential's last `update_tangent`; overwritten by the next call."""
+        p = self._potential
+        if self._overwritten and p.all_active:
+            self.values.zero_()
+        elif self._overwritten:
+            self.values.masked_fill_(p.tangent_active.bool()[:, None], 0.0)
+        p.launch(self.launches)
         return self.values

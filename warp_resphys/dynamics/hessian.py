@@ -30,12 +30,13 @@ class HessianApproximation(ABC):
         """Whether there is a factor that may serve the current terms."""
 
     @abstractmethod
-    def refactor(self, clamp: torch.Tensor | None = None, idle: torch.Tensor | None = None) -> None:
+    def refactor(self, clamp: torch.Tensor | None = None, active: torch.Tensor | None = None) -> None:
         """Factorises at the potential's positions.
 
         Args:
             clamp: (B,) environments whose matrix is to be positive definite by force.
-            idle: (B,) environments that keep the factor they have, if they have one.
+            active: (B,) environments that get a new factor; the others keep theirs, if they have one. All where left
+                out.
         """
 
     @abstractmethod
@@ -71,28 +72,28 @@ class ExactHessian(HessianApproximation):
         return self._factor is not None
 
     @override
-    def refactor(self, clamp: torch.Tensor | None = None, idle: torch.Tensor | None = None) -> None:
+    def refactor(self, clamp: torch.Tensor | None = None, active: torch.Tensor | None = None) -> None:
         clamp = torch.zeros_like(self.clamped) if clamp is None else clamp
-        self.clamped.copy_(clamp if idle is None else torch.where(idle, self.clamped, clamp))
-        self._factorise(idle)
+        self.clamped.copy_(clamp if active is None else torch.where(active, clamp, self.clamped))
+        self._factorise(active)
         assert self._factor is not None
         if not self._factor.failed.any():
             return
         failed = torch.as_tensor(self._factor.failed, device=self.clamped.device) & ~self.clamped
-        failed = failed if idle is None else failed & ~idle
+        failed = failed if active is None else failed & active
         if bool(failed.any()):
             self.clamped |= failed
-            self._factorise(~failed)
+            self._factorise(failed)
 
-    def _factorise(self, idle: torch.Tensor | None) -> None:
-        self._potential.update_tangent(self.clamped, idle)
-        self._factor = self._factor_of(self.assembly(idle), idle=idle)
+    def _factorise(self, active: torch.Tensor | None) -> None:
+        self._potential.update_tangent(self.clamped, active)
+        self._factor = self._factor_of(self.assembly(), active=active)
 
-    def _factor_of(self, values: torch.Tensor, definite: bool = True, idle: torch.Tensor | None = None) -> Factor:
+    def _factor_of(self, values: torch.Tensor, definite: bool = True, active: torch.Tensor | None = None) -> Factor:
         """Of assembled values, and what couples vertices beside them."""
         columns = self._potential.low_rank
         columns = None if columns is None else columns[:, self._dofs].to(self.linear.dtype)
-        return self.linear.factor(values, definite, columns, idle, self._factor)
+        return self.linear.factor(values, definite, columns, None if active is None else ~active, self._factor)
 
     def refactor_exact(self) -> None:
         """Factorises the Hessian as it is, indefinite or not: for adjoints."""
@@ -154,8 +155,8 @@ class ProjectiveHessian(HessianApproximation):
         return self._key is not None and all(map(torch.equal, self._key, terms))
 
     @override
-    def refactor(self, clamp: torch.Tensor | None = None, idle: torch.Tensor | None = None) -> None:
-        del clamp, idle  # The matrix is positive definite as it is, and serves later steps.
+    def refactor(self, clamp: torch.Tensor | None = None, active: torch.Tensor | None = None) -> None:
+        del clamp, active  # The matrix is positive definite as it is, and serves later steps.
         self._key = tuple(t.clone() for t in self._terms())
         inertia, *weights = (t[:1] if bool((t == t[:1]).all()) else t for t in self._key)
         batch = max(len(t) for t in (inertia, *weights))

@@ -103,8 +103,7 @@ class Minimiser:
         loads = [warp_view(p.terms.force, wp.vec3d), warp_view(p.stiffness, wp.float64)]
         beginning = [*loads, positions, tolerances, origin_view, progress, history]
         begin = p.record_blocks(kernels.begin, b, beginning, [])
-        self._idle, self._clamp = (torch.zeros(b, device=p.device, dtype=torch.bool) for _ in range(2))
-        chosen = [warp_view(each, wp.bool) for each in (self._idle, self._clamp)]
+        chosen = [warp_view(each, wp.int32) for each in (p.tangent_active, p.clamp)]
         self._choose = p.record(kernels.choose, (b,), [progress, *chosen, pairs.count], [])
         aiming = [progress, pairs, vertex_at, gradient]
         self._project = p.record_blocks(own.project, b, aiming, [right])
@@ -113,7 +112,7 @@ class Minimiser:
         judging = [int(memory > 0), tolerances, warp_view(p.inertia, wp.float64), found, origin_view, direction]
         judging += [clamped, positions, gradient, progress, pairs, history]
         accept = p.record_blocks(own.accept, b, judging, [])
-        seen = [warp_view(summary, wp.int32), warp_view(p.asleep, wp.int32)]
+        seen = [warp_view(summary, wp.int32), warp_view(p.active, wp.int32)]
         summarise = p.record_blocks(kernels.summarise, 1, [progress], seen)
         judge = [*p.evaluation, accept, summarise]
         self._begin, self._aim, self._go_on = p.capture(begin, *judge), p.capture(aim, *judge), p.capture(*judge)
@@ -138,7 +137,7 @@ class Minimiser:
         p, h, parts = self._potential, self._hessian, self._parts
         assert isinstance(h, ExactHessian)
         assert isinstance(h.linear, TiledSolver)
-        factors = RecordedFactors(p, h.assembly, h.linear, self._idle, self._clamp, h.clamped, self._right)
+        factors = RecordedFactors(p, h.assembly, h.linear, h.clamped, self._right)
         conditions = (warp_view(self._summary[k : k + 1], wp.int32) for k in range(len(Summary._fields)))
         active, aiming, wanting, asking = conditions
 
@@ -184,7 +183,7 @@ class Minimiser:
         if self._loop is not None:
             p.positions.copy_(start)
             p.launch(self._loop)
-            p.asleep.zero_()
+            p.active.fill_(1)
             return
         if not self._hessian.ready():
             self._counts["factored"].zero_()
@@ -195,7 +194,7 @@ class Minimiser:
                     self.refactor(state)
                 state = self.advance(state)
         finally:
-            p.asleep.zero_()
+            p.active.fill_(1)
 
     def begin(self, start: torch.Tensor) -> Summary:
         """Evaluates the potential at a start (B, N, 3) [m]."""
@@ -217,9 +216,10 @@ class Minimiser:
 
     def refactor(self, state: Summary) -> None:
         """Factorises for the environments that need it, at their iterates."""
-        self._potential.launch(self._choose)
-        everyone = state.wanting == self._potential.batch
-        self._hessian.refactor(self._clamp, None if everyone else self._idle)
+        p = self._potential
+        p.launch(self._choose)
+        everyone = state.wanting == p.batch
+        self._hessian.refactor(p.clamp.bool(), None if everyone else p.tangent_active.bool())
 
     def outcome(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
         """(B,) directions, last residual over balancing forces, whether it has converged, and factorisations."""

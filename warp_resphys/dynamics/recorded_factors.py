@@ -14,11 +14,10 @@ class RecordedFactors:
     """What `hessian.ExactHessian` does for the host, clamped where the Hessian is indefinite, as launches.
 
     Args:
-        potential: whose Hessian it is, without `low rank <IncrementalPotential.low_rank>`.
+        potential: whose Hessian it is, without `low rank <IncrementalPotential.low_rank>`. `factorise` works on the
+            environments of its ``tangent_active``, and leaves in it none but those whose factor is not finite.
         assembly: of the Hessian in the solver's layout.
         linear: the solver.
-        idle: (B,) environments that keep the factor they have; changed by `factorise`.
-        clamp: (B,) those whose matrix is to be positive definite by force; changed too.
         clamped: (B,) those whose factor is that of such a matrix.
         right: (B, F, 3) residuals [N] that `solve` overwrites by displacements [m], in the order of the solver.
 
@@ -31,19 +30,16 @@ class RecordedFactors:
         potential: IncrementalPotential,
         assembly: HessianAssembly,
         linear: TiledSolver,
-        idle: torch.Tensor,
-        clamp: torch.Tensor,
         clamped: torch.Tensor,
         right: torch.Tensor,
     ) -> None:
         p, b = potential, potential.batch
         self._again = warp_view(torch.zeros(1, dtype=torch.int32, device=p.device), wp.int32)
-        states = [warp_view(each, wp.bool) for each in (idle, clamp, clamped)]
-        asked = [warp_view(each, wp.int32) for each in (p.positive, assembly.idle)]
-        mark = p.record(minimisation.mark, (b,), states, asked)
-        made = linear.record_factor(assembly.values, idle, clamped)
+        asked = [warp_view(each, wp.int32) for each in (p.tangent_active, p.clamp)]
+        mark = p.record(minimisation.mark, (b,), asked, [warp_view(clamped, wp.bool)])
+        made = linear.record_factor(assembly.values, p.tangent_active, clamped)
         self._factorise = [mark, p.tangent_launches, made.clear, assembly.launches, made.factor, made.check]
-        self._repeat = p.record_blocks(minimisation.repeat, 1, states[:2], [self._again])
+        self._repeat = p.record_blocks(minimisation.repeat, 1, asked, [self._again])
         self._solve = linear.record_solve(assembly.values, right.flatten(1))
         self.commands = [*self._factorise, self._repeat, self._solve]
 

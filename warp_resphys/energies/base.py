@@ -23,6 +23,7 @@ import scipy.sparse
 import torch
 import warp as wp
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from ..fem.body import Body
 from ..fem.elements import Points
@@ -65,6 +66,14 @@ class Memory:
                 f"{self.per}s, ...); take the state from a simulator of this body, or leave the memory out."
             )
         check_tensor(f"state.memory[{self.name!r}]", values, shape, self.unit, self.per, like)
+
+
+@dataclass(frozen=True)
+class PartPoints(Points):
+    """Points that each belong to a part of an energy, such as a chamber or a tendon, and have a weight there."""
+
+    part: NDArray[np.int64]  # (P,) number of the part
+    weights: NDArray[np.float64]  # (P,) by which the point's energy counts: a volume, an area, a length, or one
 
 
 @dataclass(frozen=True)
@@ -123,6 +132,7 @@ class PointSet:
         n_points: P = C Q.
         n_vertices: N.
         nodes: (C, K).
+        width: components of an operator: 3, or 1 where the energy is a function of a vector, see ``kernels.points``.
         gradients: (P, K) operators.
         start: (N + 1) where a vertex's entries of ``incident`` begin.
         incident: cell K + local node of every cell that a vertex belongs to.
@@ -131,16 +141,26 @@ class PointSet:
     def __init__(self, launcher: Launcher, points: Points, n_vertices: int, part: slice, own: slice) -> None:
         self.source, self.part, self.own, self.n_points = points, part, own, points.n_points
         self.n_vertices = n_vertices
-        self.cells, self.points_per_cell, self.nodes_per_cell, _ = points.gradients.shape
+        self.cells, self.points_per_cell, self.nodes_per_cell, self.width = points.gradients.shape
         owner = points.nodes.ravel()
         # A padded node repeats its patch's own vertex with a zero gradient and contributes nothing.
         entries = np.flatnonzero(np.abs(points.gradients).sum(axis=(1, 3)).ravel() > 0.0)
         order = entries[np.argsort(owner[entries], kind="stable")]
         start = np.searchsorted(owner[order], np.arange(n_vertices + 1))
         self.nodes = launcher.upload(points.nodes.astype(np.int32), int)
-        self.gradients = launcher.upload(points.gradients.reshape(-1, self.nodes_per_cell, 3), wp.vec3d)
+        shape = (-1, self.nodes_per_cell) if self.width == 1 else (-1, self.nodes_per_cell, 3)
+        self.gradients = launcher.upload(points.gradients.reshape(shape), wp.float64 if self.width == 1 else wp.vec3d)
         self.start = launcher.upload(start.astype(np.int32), int)
         self.incident = launcher.upload(order.astype(np.int32), int)
+
+    @property
+    def blocks(self) -> int:
+        """3 x 3 blocks of a point's tangent."""
+        return 1 if self.width == 1 else 6
+
+    def stress_view(self, stress: torch.Tensor) -> Any:
+        """Returns the Warp array of a stress (B, P, 3, width)."""
+        return warp_view(stress[..., 0], wp.vec3d) if self.width == 1 else warp_view(stress, wp.mat33d)
 
 
 class Energy(ABC):
@@ -301,9 +321,9 @@ class Term(ABC):
         del values
         return None
 
-    def before(self, values: Values, positions: Any) -> list[Any]:
-        """Launches that the kernels of `step` and `tangent` need to have been made at the positions."""
-        del values, positions
+    def before(self, values: Values, positions: Any, active: Any) -> list[Any]:
+        """Returns launches that the kernels of `step` and `tangent` need to have been made at the positions."""
+        del values, positions, active
         return []
 
     def low_rank(self, values: Values, positions: Any) -> torch.Tensor | None:
@@ -313,11 +333,11 @@ class Term(ABC):
 
     @abstractmethod
     def step(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
-        """Kernel of stress and energy, and its inputs."""
+        """Returns the kernel of stress and energy, and its inputs after ``active``."""
 
     @abstractmethod
-    def tangent(self, s: PointSet, values: Values, positions: Any, positive: Any) -> tuple[Any, list[Any]]:
-        """Kernel of the tangent's blocks, and its inputs."""
+    def tangent(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
+        """Returns the kernel of the tangent's blocks, and its inputs after ``active`` and ``clamp``."""
 
     @abstractmethod
     def curvature(self, values: Values) -> torch.Tensor:
@@ -337,34 +357,26 @@ class Term(ABC):
 
 
 class PartTerm(Term):
-    """A term on points that each belong to one of the energy's parts, with a value for every part.
+    """A term on `PartPoints`, of which one value is given for every part.
 
     Args:
         launcher: of the potential.
         sets: one set of points.
         value: the name of the step's value, (B, count).
-        part: (P,) number of each point's part.
-        weights: (P,) of the points.
         count: of the parts.
     """
 
-    def __init__(
-        self,
-        launcher: Launcher,
-        sets: Sequence[PointSet],
-        value: str,
-        part: NDArray[np.int64],
-        weights: NDArray[np.float64],
-        count: int,
-    ) -> None:
+    def __init__(self, launcher: Launcher, sets: Sequence[PointSet], value: str, count: int) -> None:
         super().__init__(launcher, sets)
+        (s,) = sets
+        assert isinstance(s.source, PartPoints)
         self.value, self.count = value, count
-        self.weights = launcher.upload(weights, wp.float64)
-        self.part = launcher.upload(part.astype(np.int32), int)
-        own = np.eye(count)[part]
+        self.weights = launcher.upload(s.source.weights, wp.float64)
+        self.part = launcher.upload(s.source.part.astype(np.int32), int)
+        own = np.eye(count)[s.source.part]
         self._own = torch.as_tensor(own, device=launcher.device)  # (P, count) one in its part
-        self.part_of = torch.as_tensor(part, device=launcher.device)
-        self.weight = torch.as_tensor(weights, device=launcher.device)
+        self.part_of = torch.as_tensor(s.source.part, device=launcher.device)
+        self.weight = torch.as_tensor(s.source.weights, device=launcher.device)
 
     @property
     def shapes(self) -> Mapping[str, tuple[int, ...]]:
@@ -381,25 +393,87 @@ class PartTerm(Term):
         return values @ self._own
 
 
-class ValueTerm(PartTerm):
-    """One whose derivatives all come from those by one value a part."""
+class ReadingTerm(Term):
+    """A term on `PartPoints` whose kernels read any number of values at each point; see ``kernels.values``.
 
-    @abstractmethod
-    def slope(self, s: PointSet, positions: Any, direction: Any) -> tuple[Any, list[Any]]:
-        """Kernel of each point's part of the loss's derivative by its part's value, and its inputs."""
+    Args:
+        launcher: of the potential.
+        sets: one set of points.
+        kernels: ``local_step``, ``tangent`` and ``adjoint``, and the vector type ``values``.
+        shapes: of the values, in the order of the vector: (count,) or (count, n) for one, or n, a part; or (P,) of
+            values that are a point's own.
+        count: of the parts.
+        own: names of the values that are a point's own.
+        extra: arguments of the kernels after the values.
+    """
 
+    def __init__(
+        self,
+        launcher: Launcher,
+        sets: Sequence[PointSet],
+        kernels: Any,
+        shapes: Mapping[str, tuple[int, ...]],
+        count: int,
+        own: Sequence[str] = (),
+        extra: Sequence[Any] = (),
+    ) -> None:
+        super().__init__(launcher, sets)
+        (s,) = sets
+        assert isinstance(s.source, PartPoints)
+        self._kernels, self._shapes, self._point_values, self._extra = kernels, dict(shapes), frozenset(own), extra
+        self.part_of = torch.as_tensor(s.source.part, device=launcher.device)
+        self.weight = torch.as_tensor(s.source.weights, device=launcher.device)
+        self._own = torch.as_tensor(np.eye(count)[s.source.part], device=launcher.device)  # (P, count) one in its part
+        self._weights = launcher.upload(s.source.weights, wp.float64)
+        self._places = {name: self._places_of(name, s.source.part) for name in self._shapes}
+        self._place = launcher.upload(np.concatenate(list(self._places.values())).astype(np.int32), int)
+        sizes = [int(np.prod(shape)) for name, shape in self._shapes.items() for _ in self._places[name]]
+        self._sizes = launcher.upload(np.array(sizes, dtype=np.int32), int)
+
+    def _places_of(self, name: str, part: NDArray[np.int64]) -> NDArray[np.int64]:
+        """(n, P) where in a row of its array the values of each point are."""
+        columns = int(np.prod(self._shapes[name][1:]))
+        first = np.arange(len(part)) if name in self._point_values else part
+        return np.stack([first * columns + k for k in range(columns)])
+
+    @property
+    @override
+    def shapes(self) -> Mapping[str, tuple[int, ...]]:
+        return self._shapes
+
+    def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
+        tensors = [values[name] for name in self._shapes for _ in self._places[name]]
+        addresses = np.array([tensor.data_ptr() for tensor in tensors if tensor is not None], dtype=np.uint64)
+        read = [self.launcher.upload(addresses, wp.uint64), self._sizes, self._place]
+        return [s.nodes, s.gradients, self._weights, *read, *self._extra, s.points_per_cell, positions]
+
+    @override
+    def step(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
+        return self._kernels.local_step, self._arguments(s, values, positions)
+
+    @override
+    def tangent(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
+        return self._kernels.tangent, self._arguments(s, values, positions)
+
+    @override
     def adjoint(
         self, values: Values, positions: torch.Tensor, direction: torch.Tensor
     ) -> Callable[[], dict[str, torch.Tensor]]:
-        """See `Term.adjoint`."""
-        del values
         own, (s,) = self.launcher, self.sets
-        out = own.zeros(self.n_points)
-        kernel, inputs = self.slope(s, warp_view(positions, wp.vec3d), warp_view(direction, wp.vec3d))
-        command = own.record(kernel, (own.batch, s.n_points), inputs, [warp_view(out, wp.float64)])
+        out = own.zeros(self.n_points, self._kernels.values._length_)
+        inputs = [*self._arguments(s, values, warp_view(positions, wp.vec3d)), warp_view(direction, wp.vec3d)]
+        view = warp_view(out, self._kernels.values)
+        command = own.record(self._kernels.adjoint, (own.batch, s.n_points), inputs, [view])
 
         def differentiate() -> dict[str, torch.Tensor]:
             own.launch(command)
-            return {self.value: self.sum_parts(out)}
+            found, first = {}, 0
+            for name, shape in self._shapes.items():
+                slope = out[..., first : first + len(self._places[name])]
+                if name not in self._point_values:
+                    slope = torch.einsum("bpn,pc->bcn", slope, self._own)
+                found[name] = slope.reshape(own.batch, *shape).clone()
+                first += len(self._places[name])
+            return found
 
         return differentiate

@@ -47,10 +47,11 @@ class HeldEnergy(Launcher):
     def evaluate(self, positions: torch.Tensor, values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Energy of each part (B, count) [J] and force (B, N, 3) [N], without gradients."""
         positions, values = positions.double(), values.double()
-        s, (stress, energy) = self._set, (self.zeros(self._set.n_points, 3, 3), self.zeros(self._set.n_points))
+        s = self._set
+        stress, energy = self.zeros(s.n_points, 3, s.width), self.zeros(s.n_points)
         kernel, inputs = self.term.step(s, {self.term.value: values.contiguous()}, self._view(positions))
-        view = warp_view(stress, wp.mat33d)
-        step = self.record(kernel, (self.batch, s.n_points), inputs, [view, warp_view(energy, wp.float64)])
+        view, active = s.stress_view(stress), warp_view(self.active, wp.int32)
+        step = self.record(kernel, (self.batch, s.n_points), [active, *inputs], [view, warp_view(energy, wp.float64)])
         force = torch.zeros_like(positions)
         self.launch(step, self.gather(s, view, force))
         return self.term.sum_parts(energy), force.neg_()
@@ -61,12 +62,13 @@ class HeldEnergy(Launcher):
         """Transposed derivatives of `force` by positions and values, applied to (B, N, 3): (B, N, 3) and (B, count)."""
         positions, values, adjoint = positions.double(), values.double(), adjoint.double()
         s, held = self._set, {self.term.value: values.contiguous()}
-        blocks, stress = self.zeros(s.n_points, 6, 3, 3), self.zeros(s.n_points, 3, 3)
-        exact = torch.zeros(self.batch, device=self.device, dtype=torch.int32)
-        kernel, inputs = self.term.tangent(s, held, self._view(positions), warp_view(exact, wp.int32))
-        tangent, view, out = warp_view(blocks, wp.mat33d), warp_view(stress, wp.mat33d), torch.zeros_like(positions)
+        view = s.stress_view(self.zeros(s.n_points, 3, s.width))
+        tangent = warp_view(self.zeros(s.n_points, s.blocks, 3, 3), wp.mat33d)
+        masks = [warp_view(each, wp.int32) for each in (self.active, torch.zeros_like(self.active))]
+        kernel, inputs = self.term.tangent(s, held, self._view(positions))
+        out = torch.zeros_like(positions)
         self.launch(
-            self.record(kernel, (self.batch, s.n_points), inputs, [tangent]),
+            self.record(kernel, (self.batch, s.n_points), [*masks, *inputs], [tangent]),
             # The second derivative of an energy is symmetric: it is its own transpose.
             self.product(s, tangent, self._view(adjoint), view),
             self.gather(s, view, out),

@@ -1,12 +1,12 @@
 """Threads wound around chambers, in their surface.
 
-A point's operator g_a holds the derivative along a fibre, so that the first column of F = sum_a x_a g_a^T is the
-deformed fibre and its length the stretch.
+A point's operator g_a is the derivative of a shape function along a fibre, so that sum_a g_a x_a is the deformed fibre
+and its length the stretch.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -14,14 +14,15 @@ import warp as wp
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from ..fem.surface_elements import SurfacePoints, face_rule
+from ..fem.surface_elements import face_rule
 from ..io.errors import InputError, MeshError
-from ..kernels import fibres as kernels
+from ..kernels.axial import axial_kernels
+from ..kernels.laws import thread as law
 from ..mesh.chambers import Chamber
 from ..mesh.mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
-from .base import Energy, PointSet, Values, ValueTerm
-from .launcher import Launcher, warp_view
+from .base import Energy, PartPoints, PointSet, ReadingTerm, Values
+from .launcher import Launcher
 
 _CAP = 0.7  # cosine between a face's normal and the chamber's axis from which on the face is an end, without fibres
 _ALIGNED = 0.8  # cosine between a chamber's axis and the direction that fibres are wound around, at least
@@ -81,7 +82,7 @@ class Fibres(Energy):
         return {"fibre_stiffness": self.stiffness}
 
     @override
-    def points(self, mesh: Mesh) -> tuple[SurfacePoints, ...]:
+    def points(self, mesh: Mesh) -> tuple[PartPoints, ...]:
         """The points at which the energy is integrated; the ends of chambers have none.
 
         Raises:
@@ -109,58 +110,26 @@ class Fibres(Energy):
                 slopes = np.einsum("qkj,fqij,fqi->fqk", gradients, dual, direction)
                 operators.append(np.where(wound[..., None], slopes, 0.0))
                 areas.append(np.where(wound, area * weights, 0.0))
-        slopes = np.concatenate(operators)  # (C, Q, K)
-        operator = np.zeros((*slopes.shape, 3))
-        operator[..., 0] = slopes
         families = len(self.angles)
         nodes = np.concatenate([np.tile(chamber.faces, (families, 1)) for chamber in self.chambers])
         each = [families * len(c.faces) * len(weights) for c in self.chambers]
         numbers = np.repeat(np.arange(len(self.chambers)), each)
-        return (SurfacePoints(nodes, operator, np.concatenate(areas).ravel(), numbers),)
+        return (PartPoints(nodes, np.concatenate(operators)[..., None], numbers, np.concatenate(areas).ravel()),)
 
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "FibreTerm":
-        (s,) = sets
-        assert isinstance(s.source, SurfacePoints)
-        term = FibreTerm(launcher, sets, "fibre_stiffness", s.source.chamber, s.source.weights, self.count)
-        term.toe = wp.float64(self.toe)
-        return term
+        shapes = {"fibre_stiffness": (self.count,)}
+        return FibreTerm(launcher, sets, axial_kernels(law), shapes, self.count, extra=[wp.float64(self.toe)])
 
 
-class FibreTerm(ValueTerm):
-    """Kernels of the thread around every chamber.
-
-    Attributes:
-        toe: strain over which it tightens.
-    """
-
-    toe: Any
-
-    @override
-    def step(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
-        return kernels.local_step, self._arguments(s, values, positions)
-
-    def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
-        stiffness = values["fibre_stiffness"]
-        assert stiffness is not None
-        surface = [s.nodes, s.gradients, self.weights, self.part]
-        return [*surface, warp_view(stiffness, wp.float64), self.toe, s.points_per_cell, positions]
-
-    @override
-    def tangent(self, s: PointSet, values: Values, positions: Any, positive: Any) -> tuple[Any, list[Any]]:
-        del positive  # A thread only pulls: its tangent has no negative eigenvalues.
-        return kernels.tangent, self._arguments(s, values, positions)
+class FibreTerm(ReadingTerm):
+    """Kernels of the thread around every chamber."""
 
     @override
     def curvature(self, values: Values) -> torch.Tensor:
         stiffness = values["fibre_stiffness"]
         assert stiffness is not None
         return self.weight * stiffness[:, self.part_of]
-
-    @override
-    def slope(self, s: PointSet, positions: Any, direction: Any) -> tuple[Any, list[Any]]:
-        inputs = [s.nodes, s.gradients, self.weights, self.toe, s.points_per_cell, positions, direction]
-        return kernels.adjoint, inputs
 
 
 def _long_axis(chamber: Chamber, mesh: Mesh, near: Sequence[float] | None) -> NDArray[np.float64]:

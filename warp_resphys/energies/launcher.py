@@ -32,7 +32,7 @@ class Launcher:
         device: of every buffer.
 
     Attributes:
-        asleep: (B,) not zero for environments whose stresses stay as they are: during a solve, where they are done.
+        active: (B,) zero for environments that kernels leave as they are: during a solve, those that are done.
     """
 
     by_cells = False  # whether threads work on a cell's nodes and pairs of nodes one by one, which a GPU has enough of
@@ -40,7 +40,7 @@ class Launcher:
     def __init__(self, batch: int, device: torch.device) -> None:
         self.batch, self.device = batch, device
         self.by_cells = self.by_cells or device.type == "cuda"
-        self.asleep = torch.zeros(batch, device=device, dtype=torch.int32)
+        self.active = torch.ones(batch, device=device, dtype=torch.int32)
 
     def zeros(self, *shape: int) -> torch.Tensor:
         """(B, *shape) on the launcher's device."""
@@ -67,25 +67,26 @@ class Launcher:
             return wp.launch_tiled(kernel, dim=[blocks], inputs=inputs, outputs=outputs, **options)
 
     def gather(self, s: Any, stress: Any, out: torch.Tensor) -> Any:
-        """A launch that adds the transposed operator of a set's stress, a view (B, P) mat33, to (B, N, 3).
+        """A launch that adds the transposed operator of a set's stress, see `PointSet.stress_view`, to (B, N, 3).
 
         Two on a GPU, where a cell's threads read its stress once for all of its nodes.
         """
-        to = [warp_view(out, wp.vec3d)]
+        to, kernels = [warp_view(out, wp.vec3d)], points.gather_kernels(s.width)
         if not self.by_cells:
             inputs = [s.nodes, s.gradients, s.points_per_cell, s.start, s.incident, stress]
-            return self.record(points.gather, (self.batch, out.shape[1]), inputs, to)
+            return self.record(kernels.gather, (self.batch, out.shape[1]), inputs, to)
         forces = [warp_view(self.zeros(s.cells * s.nodes_per_cell, 3), wp.vec3d)]
-        cells, asleep = (self.batch, s.cells * s.nodes_per_cell), warp_view(self.asleep, wp.int32)
+        cells, active = (self.batch, s.cells * s.nodes_per_cell), warp_view(self.active, wp.int32)
         return Several(
-            self.record(points.cell_forces, cells, [asleep, s.gradients, s.points_per_cell, stress], forces),
+            self.record(kernels.cell_forces, cells, [active, s.gradients, s.points_per_cell, stress], forces),
             self.record(points.gather_cells, (self.batch, out.shape[1]), [s.start, s.incident, *forces], to),
         )
 
     def product(self, s: Any, tangent: Any, direction: Any, stress: Any) -> Any:
-        """A launch of a set's stress (B, P) from its tangent (B, P, 6) mat33 and a direction (B, N) vec3, all views."""
+        """A launch of a set's stress from its tangent (B, P, blocks) mat33 and a direction (B, N) vec3, all views."""
         inputs = [s.nodes, s.gradients, s.points_per_cell, tangent, direction]
-        return self.record(points.tangent_product, (self.batch, s.n_points), inputs, [stress])
+        kernel = points.line_tangent_product if s.width == 1 else points.tangent_product
+        return self.record(kernel, (self.batch, s.n_points), inputs, [stress])
 
     def capture(self, *commands: Any) -> "Launches":
         """Recorded launches as one: a graph, on a CPU too, whose launches cost a sixth of as many single ones."""

@@ -17,7 +17,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from itertools import chain
-from types import ModuleType
 from typing import Any, ClassVar
 
 import torch
@@ -25,6 +24,7 @@ from typing_extensions import override
 
 from ..io.errors import InputError
 from ..kernels.materials import corotated, mooney_rivlin, stable_neo_hookean
+from ..kernels.materials.density import density_law
 from ..stepping.quantity import Parameter, Quantity
 
 
@@ -48,8 +48,9 @@ class Material(ABC):
     that require gradients receive them from every simulated quantity.
     """
 
-    law: ClassVar[ModuleType]  # the module of ``kernels.materials``
-    # for each modulus of the law, whether it belongs to the ``shape`` or the ``volume`` rule of integration
+    law: ClassVar[Any]  # the module of ``kernels.materials``, or a law with the same attributes
+    # for each modulus of the law, whether it belongs to the ``shape`` or the ``volume`` rule of integration, or is a
+    # ``mean`` over the volume of a point
     rules: ClassVar[tuple[str, ...]]
     # for each modulus, an upper bound of what it adds to the tangent's eigenvalues for small strains
     curvature: ClassVar[tuple[float, ...]]
@@ -152,6 +153,42 @@ class MooneyRivlin(Material):
         """c10, c01 and lambda = K - 2/3 mu."""
         c10, c01 = constants["c10"], constants["c01"]
         return c10, c01, constants["bulk_modulus"] - 4.0 / 3.0 * (c10 + c01)
+
+
+@dataclass(frozen=True)
+class DensityMaterial(Material):
+    """A material whose energy is a Warp function of F and of the material's own constants, in their order [J/m^3].
+
+    The function may be nonlinear in the constants. `volume_energy` is integrated at fewer points, against locking: what
+    makes a material nearly incompressible belongs there.
+
+    Attributes:
+        energy_density: W(F: mat33d, p: a vector of float64).
+        volume_energy: U, of the same kind; None for none.
+    """
+
+    energy_density: ClassVar[Any]
+    volume_energy: ClassVar[Any] = None
+
+    def __init_subclass__(cls, **more: Any) -> None:
+        """Makes the law of the functions."""
+        super().__init_subclass__(**more)
+        cls.law = density_law(cls.__name__, cls.energy_density, cls.volume_energy or cls.energy_density)
+        count = len(cls.law.LAME) - 4
+        cls.rules = ("shape", "volume", "shape", "volume", *("mean",) * count)
+        cls.curvature = (0.0, 0.0, 2.0, 1.0, *(0.0,) * count)
+
+    @abstractmethod
+    def lame(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns the Lame constants mu and lambda of small strains [Pa], of constants of shape (1 or B, 1 or M)."""
+
+    @override
+    def moduli(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
+        """Returns one for both volumes, the Lame constants, and the constants of the functions."""
+        own = [constants[each.name] for each in fields(self) if each.metadata and not each.kw_only]
+        volume = torch.ones_like(own[0])
+        under_integrated = volume if self.volume_energy else torch.zeros_like(volume)
+        return volume, under_integrated, *self.lame(constants), *own
 
 
 MATERIALS: dict[str, type[Material]] = {

@@ -89,8 +89,7 @@ class Medium(Energy):
         face = FACES[faces.shape[1]]
         places, weights = face.rule(2)
         values, slopes = face.shape(places)
-        operator = np.zeros((len(faces), *values.shape, 3))
-        operator[..., 0] = values
+        operator = np.tile(values[..., None], (len(faces), 1, 1, 1))
         return (FacePoints(faces, operator, np.asarray(slopes), np.asarray(weights)),)
 
     @override
@@ -176,8 +175,7 @@ class MediumTerm(Term):
         return kernels.local_step, self._arguments(s, values, positions)
 
     @override
-    def tangent(self, s: PointSet, values: Values, positions: Any, positive: Any) -> tuple[Any, list[Any]]:
-        del positive  # The energy is convex.
+    def tangent(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
         return kernels.tangent, self._arguments(s, values, positions)
 
     @override

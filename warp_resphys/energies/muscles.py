@@ -5,15 +5,15 @@ At a point with the unit direction a the fibre has the stretch lambda = |F a|, a
     sigma lambda + k s(lambda - 1 + c),     tension  t = sigma + k s'(lambda - 1 + c)   [Pa of the rest shape],
 
 an active stress sigma, and a fibre of stiffness k that an active contraction c shortens, s being half the square of
-what is positive, rounded over a short strain (`kernels.muscles.tension`). A negative stress pushes, as an inflated
+what is positive, rounded over a short strain (`kernels.laws.muscle`). A negative stress pushes, as an inflated
 chamber does whose walls are not modelled. Without an input, fibres of a stiffness are a
 reinforcement: the solid is stiffer along them where it is stretched (Spencer, Continuum Theory of the Mechanics of
 Fibre-Reinforced Composites, 1984), and as it was where it is compressed.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -21,13 +21,14 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
-from ..fem.elements import Points, physical_gradients
+from ..fem.elements import physical_gradients
 from ..io.errors import InputError
-from ..kernels import muscles as kernels
+from ..kernels.axial import axial_kernels
+from ..kernels.laws import muscle as law
 from ..mesh.mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
-from .base import Energy, PartTerm, PointSet, Values
-from .launcher import Launcher, warp_view
+from .base import Energy, PartPoints, PointSet, ReadingTerm, Values
+from .launcher import Launcher
 
 STRESS = Quantity(
     *("muscle_stress", "Pa"),
@@ -40,14 +41,6 @@ STRESS = Quantity(
 CONTRACTION = Quantity(
     *("muscle_contraction", ""), per="muscle", typical=0.05, words="contraction", shown_unit="%", shown_factor=1e2
 )
-
-
-@dataclass(frozen=True)
-class MusclePoints(Points):
-    """Quadrature points of the cells of muscles; a cell that two of them cross is there twice."""
-
-    muscle: NDArray[np.int64]  # (P,) number of its muscle
-    volume: NDArray[np.float64]  # (P,) [m^3]
 
 
 @dataclass(frozen=True)
@@ -126,8 +119,8 @@ class Muscles(Energy):
         return {"muscle_stiffness": self.stiffness}
 
     @override
-    def points(self, mesh: Mesh) -> tuple[MusclePoints, ...]:
-        """The points at which the energy is integrated, those of the solid's shape term.
+    def points(self, mesh: Mesh) -> tuple[PartPoints, ...]:
+        """Returns the quadrature points of the cells; a cell that two muscles cross is there twice.
 
         Raises:
             InputError: a cell that there is not.
@@ -144,14 +137,11 @@ class Muscles(Energy):
             gradients, determinants = physical_gradients(
                 mesh.vertices, mesh.cells[cells], mesh.element.shape(points)[1]
             )
-            operator = np.zeros_like(gradients)  # (C, Q, K, 3)
-            operator[..., 0] = np.einsum("cqki,ci->cqk", gradients, unit)
             nodes.append(mesh.cells[cells])
-            operators.append(operator)
+            operators.append(np.einsum("cqki,ci->cqk", gradients, unit)[..., None])
             volumes.append((determinants * weights).ravel())
             numbers.append(np.full(determinants.size, number))
-        cells, operator = np.concatenate(nodes), np.concatenate(operators)
-        return (MusclePoints(cells, operator, np.concatenate(numbers), np.concatenate(volumes)),)
+        return (PartPoints(*map(np.concatenate, (nodes, operators, numbers, volumes))),)
 
     def lines(self, mesh: Mesh) -> dict[str, NDArray[np.float64]]:
         """(2, 3) a line through the middle of each muscle, as far as its cells reach along it [m], by name."""
@@ -167,40 +157,12 @@ class Muscles(Energy):
 
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "MuscleTerm":
-        return MuscleTerm(launcher, sets, self)
+        shapes = dict.fromkeys(("muscle_stress", "muscle_contraction", "muscle_stiffness"), (self.count,))
+        return MuscleTerm(launcher, sets, axial_kernels(law), shapes, self.count, extra=[wp.float64(self.toe)])
 
 
-class MuscleTerm(PartTerm):
-    """Kernels of muscles.
-
-    Args:
-        launcher: of the potential.
-        sets: the points.
-        muscles: whose they are.
-    """
-
-    def __init__(self, launcher: Launcher, sets: Sequence[PointSet], muscles: Muscles) -> None:
-        (s,) = sets
-        assert isinstance(s.source, MusclePoints)
-        super().__init__(launcher, sets, "muscle_stress", s.source.muscle, s.source.volume, muscles.count)
-        self._toe = wp.float64(muscles.toe)
-
-    @property
-    @override
-    def shapes(self) -> Mapping[str, tuple[int, ...]]:
-        return dict.fromkeys(("muscle_stress", "muscle_contraction", "muscle_stiffness"), (self.count,))
-
-    def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
-        volume = [s.nodes, s.gradients, self.weights, self.part]
-        return [*volume, *self.views(values), self._toe, s.points_per_cell, positions]
-
-    @override
-    def step(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
-        return kernels.local_step, self._arguments(s, values, positions)
-
-    @override
-    def tangent(self, s: PointSet, values: Values, positions: Any, positive: Any) -> tuple[Any, list[Any]]:
-        return kernels.tangent, [*self._arguments(s, values, positions), positive]
+class MuscleTerm(ReadingTerm):
+    """Kernels of muscles."""
 
     @override
     def curvature(self, values: Values) -> torch.Tensor:
@@ -208,22 +170,3 @@ class MuscleTerm(PartTerm):
         assert stress is not None
         assert stiffness is not None
         return self.weight * (stress.clamp_min(0.0) + stiffness)[:, self.part_of]
-
-    @override
-    def adjoint(
-        self, values: Values, positions: torch.Tensor, direction: torch.Tensor
-    ) -> Callable[[], dict[str, torch.Tensor]]:
-        """See `Term.adjoint`."""
-        own, (s,) = self.launcher, self.sets
-        out = own.zeros(self.n_points, 3)
-        _, contraction, stiffness = self.views(values)
-        views = [warp_view(each, wp.vec3d) for each in (positions, direction)]
-        volume = [s.nodes, s.gradients, self.weights, self.part]
-        inputs = [*volume, contraction, stiffness, self._toe, s.points_per_cell, *views]
-        command = own.record(kernels.adjoint, (own.batch, s.n_points), inputs, [warp_view(out, wp.vec3d)])
-
-        def differentiate() -> dict[str, torch.Tensor]:
-            own.launch(command)
-            return {name: self.sum_parts(part) for name, part in zip(self.shapes, out.unbind(-1), strict=True)}
-
-        return differentiate

@@ -9,7 +9,7 @@ energies: the solid's, elastic and dissipative, and those of the body's other en
 pressure.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -60,11 +60,12 @@ class IncrementalPotential(Launcher):
         residual_norm: (B,) norm of the residual there [N].
         low_rank: (B, 3 N, r) columns C of the last `update_tangent`: what the Hessian has beside `tangent` is C C^T.
             None for nothing.
-        tangent_launches: what sets `tangent`, in environments whose ``positive`` (B,) is not -1; clamped where it is 1.
-            Both are made with `tangent`.
+        tangent_active: (B,) zero for environments whose tangent stays as it is.
+        clamp: (B,) not zero for environments whose tangent has its eigenvalues clamped at zero.
+        all_active: whether the last `update_tangent` was for all environments.
+        tangent_launches: launches that set `tangents`; made with them.
     """
 
-    positive: torch.Tensor
     tangent_launches: Launches
 
     def __init__(
@@ -104,12 +105,14 @@ class IncrementalPotential(Launcher):
         self.positions = self.zeros(n_vertices, 3)
         self._position_view = warp_view(self.positions, wp.vec3d)
         self.residual = self.zeros(n_vertices, 3)
-        self._stress = self.zeros(self._n_points, 3, 3)
+        self._stress = [self.zeros(s.n_points, 3, s.width) for s in self.sets]
         self._point_energy = self.zeros(self._n_points)
         self._vertex_energy = self.zeros(n_vertices)
         self.energy, self.energy_size, self.balance, self.residual_norm = (self.zeros() for _ in range(4))
         self._record_evaluation()
-        self._tangent: torch.Tensor | None = None
+        self._tangents: list[torch.Tensor] = []
+        self.tangent_active, self.clamp = (torch.zeros(batch, device=device, dtype=torch.int32) for _ in range(2))
+        self.all_active = True
         self.low_rank: torch.Tensor | None = None
         self._direction = self.zeros(n_vertices, 3)
         self._adjoints: list[Callable[[], dict[str, torch.Tensor]]] = []
@@ -127,17 +130,18 @@ class IncrementalPotential(Launcher):
             ],
             [warp_view(self.residual, wp.vec3d), warp_view(self._vertex_energy, wp.float64)],
         )
+        active, stresses = warp_view(self.active, wp.int32), iter(self._stress)
         self._internal_commands: list[Any] = []
         self._load_commands: list[Any] = []
         for term, values, is_load in zip(self.energies, self.own_values, self._loads, strict=True):
             commands = self._load_commands if is_load else self._internal_commands
-            commands += term.before(values, self._position_view)
+            commands += term.before(values, self._position_view, active)
             for s in term.sets:
-                stress = self.points_view(self._stress, s.part, wp.mat33d)
+                stress = s.stress_view(next(stresses))
                 outputs = [stress, self.points_view(self._point_energy, s.part, wp.float64)]
                 kernel, inputs = term.step(s, values, self._position_view)
                 commands += [
-                    self.record(kernel, (b, s.n_points), inputs, outputs),
+                    self.record(kernel, (b, s.n_points), [active, *inputs], outputs),
                     self.gather(s, stress, self.residual),
                 ]
         free, residual = warp_view(self.free_mask, wp.float64), warp_view(self.residual, wp.vec3d)
@@ -183,19 +187,17 @@ class IncrementalPotential(Launcher):
         self.launch(self._evaluation)
         return self.energy.clone(), self.balance.clone()
 
-    def update_tangent(self, positive: torch.Tensor | None = None, idle: torch.Tensor | None = None) -> None:
+    def update_tangent(self, clamp: torch.Tensor | None = None, active: torch.Tensor | None = None) -> None:
         """Computes dP/dF at ``positions``.
 
         Args:
-            positive: (B,) environments whose eigenvalues are clamped at zero; none where left out.
-            idle: (B,) environments whose tangent nobody asks for; none where left out.
+            clamp: (B,) environments whose eigenvalues are clamped at zero; none where left out.
+            active: (B,) environments whose tangent is computed; all where left out.
         """
-        self._prepare_tangent()
-        self.positive.zero_()
-        if positive is not None:
-            self.positive.copy_(positive)
-        if idle is not None:
-            self.positive.masked_fill_(idle, -1)
+        self._prepare_tangents()
+        self.all_active = active is None
+        self.clamp.zero_() if clamp is None else self.clamp.copy_(clamp)
+        self.tangent_active.fill_(1) if active is None else self.tangent_active.copy_(active)
         self.launch(self.tangent_launches)
         pairs = zip(self.energies, self.own_values, strict=True)
         found = [term.low_rank(values, self._position_view) for term, values in pairs]
@@ -208,30 +210,29 @@ class IncrementalPotential(Launcher):
         return any(term.couples_cells for term in self.energies)
 
     @property
-    def tangent(self) -> torch.Tensor:
-        """(B, P, 6, 3, 3) blocks of dP/dF of the last `update_tangent` [J]; see ``kernels``."""
-        return self._prepare_tangent()
+    def tangents(self) -> list[torch.Tensor]:
+        """For each of `sets`, (B, P, blocks, 3, 3) of dP/dF [J] from the last `update_tangent`; see ``kernels``."""
+        return self._prepare_tangents()
 
-    def _prepare_tangent(self) -> torch.Tensor:
+    def _prepare_tangents(self) -> list[torch.Tensor]:
         """Buffers and launches of second derivatives, made at their first use."""
-        if self._tangent is None:
-            self._tangent = self.zeros(self._n_points, 6, 3, 3)
-            self._record_tangent(self._tangent)
-        return self._tangent
+        if not self._tangents:
+            self._tangents = [self.zeros(s.n_points, s.blocks, 3, 3) for s in self.sets]
+            self._record_tangents(iter(self._tangents))
+        return self._tangents
 
-    def _record_tangent(self, blocks: torch.Tensor) -> None:
-        self.positive = torch.zeros(self.batch, device=self.device, dtype=torch.int32)
-        self._product_stress = self.zeros(self._n_points, 3, 3)
+    def _record_tangents(self, blocks: Iterator[torch.Tensor]) -> None:
         self._product = self.zeros(self.n_vertices, 3)
         tangents, products = [], []
-        positive, direction = warp_view(self.positive, wp.int32), warp_view(self._direction, wp.vec3d)
+        masks = [warp_view(self.tangent_active, wp.int32), warp_view(self.clamp, wp.int32)]
+        direction = warp_view(self._direction, wp.vec3d)
         for term, values in zip(self.energies, self.own_values, strict=True):
-            tangents += term.before(values, self._position_view)
+            tangents += term.before(values, self._position_view, masks[0])
             for s in term.sets:
-                tangent = self.points_view(blocks, s.part, wp.mat33d)
-                kernel, inputs = term.tangent(s, values, self._position_view, positive)
-                tangents.append(self.record(kernel, (self.batch, s.n_points), inputs, [tangent]))
-                stress = self.points_view(self._product_stress, s.part, wp.mat33d)
+                tangent = warp_view(next(blocks), wp.mat33d)
+                kernel, inputs = term.tangent(s, values, self._position_view)
+                tangents.append(self.record(kernel, (self.batch, s.n_points), [*masks, *inputs], [tangent]))
+                stress = s.stress_view(self.zeros(s.n_points, 3, s.width))
                 products += [
                     self.product(s, tangent, direction, stress),
                     self.gather(s, stress, self._product),

@@ -6,7 +6,7 @@ deformed face. The enclosed volume is the sum of -w/3 x . (t1 x t2) = -w/3 det F
 and the potential of a gauge pressure p is -p V (Bonet and Wood 2008, section 8.5.2).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -15,13 +15,13 @@ import torch
 import warp as wp
 from typing_extensions import override
 
-from ..fem.surface_elements import SurfacePoints, face_rule, owners
+from ..fem.surface_elements import face_rule
 from ..io.errors import InputError
 from ..kernels import pressure as kernels
 from ..mesh.chambers import Chamber, check_chambers
 from ..mesh.mesh import Mesh
 from ..stepping.quantity import Quantity
-from .base import Energy, PointSet, Values, ValueTerm
+from .base import Energy, PartPoints, PartTerm, PointSet, Values
 from .launcher import Launcher, warp_view
 
 PRESSURE = Quantity(
@@ -58,7 +58,7 @@ class Pressure(Energy):
         return tuple(chamber.name for chamber in self.chambers)
 
     @override
-    def points(self, mesh: Mesh) -> tuple[SurfacePoints, ...]:
+    def points(self, mesh: Mesh) -> tuple[PartPoints, ...]:
         """The points at which the volume of the chambers is integrated, exactly.
 
         Raises:
@@ -69,46 +69,44 @@ class Pressure(Energy):
         values, gradients = shape(points)
         nodes = np.concatenate([chamber.faces for chamber in self.chambers])
         operator = np.concatenate([values[..., None], gradients], axis=2)  # (Q, K, 3)
-        count = len(nodes)
-        return (
-            SurfacePoints(
-                nodes,
-                np.broadcast_to(operator, (count, *operator.shape)).copy(),
-                np.tile(weights / 3.0, count),
-                owners(self.chambers, len(weights)),
-            ),
-        )
+        everywhere = np.broadcast_to(operator, (len(nodes), *operator.shape)).copy()
+        owner = np.repeat(np.arange(self.count), [len(chamber.faces) * len(weights) for chamber in self.chambers])
+        return (PartPoints(nodes, everywhere, owner, np.tile(weights / 3.0, len(nodes))),)
 
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "PressureTerm":
-        (s,) = sets
-        assert isinstance(s.source, SurfacePoints)
-        return PressureTerm(launcher, sets, "pressure", s.source.chamber, s.source.weights, self.count)
+        return PressureTerm(launcher, sets, "pressure", self.count)
 
 
-class PressureTerm(ValueTerm):
+class PressureTerm(PartTerm):
     """Kernels of pressure."""
 
     @override
     def step(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
-        return kernels.local_step, self._arguments(s, values, positions)
-
-    def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
-        pressure = values["pressure"]
-        assert pressure is not None
         surface = [s.nodes, s.gradients, self.weights, self.part]
-        return [*surface, warp_view(pressure, wp.float64), s.points_per_cell, positions]
+        return kernels.local_step, [*surface, *self.views(values), s.points_per_cell, positions]
 
     @override
-    def tangent(self, s: PointSet, values: Values, positions: Any, positive: Any) -> tuple[Any, list[Any]]:
-        inputs = [*self._arguments(s, values, positions), positive]
-        return kernels.tangent, inputs
+    def tangent(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
+        return kernels.tangent, self.step(s, values, positions)[1]
 
     @override
     def curvature(self, values: Values) -> torch.Tensor:
         return torch.zeros_like(self.weight)[None]
 
     @override
-    def slope(self, s: PointSet, positions: Any, direction: Any) -> tuple[Any, list[Any]]:
-        inputs = [s.nodes, s.gradients, self.weights, s.points_per_cell, positions, direction]
-        return kernels.adjoint, inputs
+    def adjoint(
+        self, values: Values, positions: torch.Tensor, direction: torch.Tensor
+    ) -> Callable[[], dict[str, torch.Tensor]]:
+        del values
+        own, (s,) = self.launcher, self.sets
+        out = own.zeros(self.n_points)
+        views = [warp_view(each, wp.vec3d) for each in (positions, direction)]
+        inputs = [s.nodes, s.gradients, self.weights, s.points_per_cell, *views]
+        command = own.record(kernels.adjoint, (own.batch, s.n_points), inputs, [warp_view(out, wp.float64)])
+
+        def differentiate() -> dict[str, torch.Tensor]:
+            own.launch(command)
+            return {self.value: self.sum_parts(out)}
+
+        return differentiate

@@ -126,8 +126,8 @@ class PointInertiaTerm(Term):
         return kernels.local_step, [s.nodes, s.gradients, *self._views(values), s.points_per_cell, positions]
 
     @override
-    def tangent(self, s: PointSet, values: Values, positions: Any, positive: Any) -> tuple[Any, list[Any]]:
-        del positions, positive  # It is constant, and has no negative eigenvalues.
+    def tangent(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
+        del positions
         return kernels.tangent, self._views(values)[:1]
 
     @override
@@ -205,8 +205,7 @@ def rigid_energies(body: Body, name: str, part: Rigid) -> list[Energy]:
     moments, volume = _moments(body.mesh, cells, corners)
     carried = scipy.sparse.csr_array(np.array([[volume]]))
     point = SolidPoints(controls[None], gradients[None, None], carried, scipy.sparse.csr_array((1, 1)))
-    operators = np.zeros((1, 4, 4, 3))
-    operators[0, :, :, 0] = np.linalg.cholesky(moments).T
+    operators = np.asarray(np.linalg.cholesky(moments).T[None, :, :, None], dtype=np.float64)
     inertia = RigidInertia(Points(controls[None], operators), cells, part.density)
     return [Rigidity(point, part.stiffness), inertia]
 

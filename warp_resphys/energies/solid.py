@@ -106,7 +106,7 @@ class Solid(Energy):
 
 def _volumes(points: SolidPoints, material: Material) -> list[scipy.sparse.csr_array]:
     """Returns the (P, M) volumes that points carry of the cells for each modulus of a material [m^3]."""
-    by_rule = {"shape": points.shape_volume, "volume": points.volume_volume}
+    by_rule = _shares(points)
     return [by_rule[rule] for rule in material.rules]
 
 
@@ -137,6 +137,13 @@ def solids_of(body: Body, material: Material | Mapping[str, Material]) -> list[t
     return [(Solid(body.discretised(cells), material[name], cells), f"{name}_") for name, cells in regions.items()]
 
 
+def _shares(points: SolidPoints) -> dict[str, scipy.sparse.csr_array]:
+    """Returns the (P, M) shares of the cells in the points by the rule of a modulus: volumes [m^3], or of a mean."""
+    whole = points.shape_volume + points.volume_volume
+    mean = scipy.sparse.csr_array(scipy.sparse.diags_array(1.0 / whole.sum(axis=1)) @ whole)
+    return {"shape": points.shape_volume, "volume": points.volume_volume, "mean": mean}
+
+
 class BoundSolid(BoundEnergy):
     """A solid over the steps of a simulator: its stiffness, its mass, and the viscous strain that it remembers."""
 
@@ -144,10 +151,10 @@ class BoundSolid(BoundEnergy):
         super().__init__(solid, placement)
         self._solid = solid
         like, sets = placement.rest_positions, solid.discretisation.point_sets
-        rules = {"shape": [s.shape_volume for s in sets], "volume": [s.volume_volume for s in sets]}
-        self._stiffness_volume = {
-            rule: device_matrix(scipy.sparse.vstack(matrices), like.device, like.dtype)
-            for rule, matrices in rules.items()
+        shares = [_shares(s) for s in sets]
+        self._shares = {
+            rule: device_matrix(scipy.sparse.vstack([each[rule] for each in shares]), like.device, like.dtype)
+            for rule in set(solid.material.rules)
         }
         cells = slice(None) if solid.cells is None else solid.cells
         self._mass_volume, self._load_volume = (
@@ -161,7 +168,7 @@ class BoundSolid(BoundEnergy):
     def prepare(self, parameters: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor | None]:
         material = self._solid.material
         moduli = torch.broadcast_tensors(*material.moduli(parameters))
-        spreads = [spread(self._stiffness_volume[rule], m) for rule, m in zip(material.rules, moduli, strict=True)]
+        spreads = [spread(self._shares[rule], m) for rule, m in zip(material.rules, moduli, strict=True)]
         damping, ratio, time = parameters["stiffness_damping"][:, 0], None, None
         if material.prony:
             names = [[f"{q.name}_{k + 1}" for k in range(len(material.prony))] for q in (PRONY_RATIO, PRONY_TIME)]
@@ -253,12 +260,11 @@ class SolidTerm(Term):
 
     @override
     def step(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
-        asleep = warp_view(self.launcher.asleep, wp.int32)
-        return self._kernels.local_step, [*self._arguments(s, values, positions), asleep]
+        return self._kernels.local_step, self._arguments(s, values, positions)
 
     @override
-    def tangent(self, s: PointSet, values: Values, positions: Any, positive: Any) -> tuple[Any, list[Any]]:
-        return self._kernels.tangent, [*self._arguments(s, values, positions), positive]
+    def tangent(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
+        return self._kernels.tangent, self._arguments(s, values, positions)
 
     @override
     def curvature(self, values: Values) -> torch.Tensor:
@@ -270,7 +276,7 @@ class SolidTerm(Term):
     def total_stiffness(self, values: Values) -> torch.Tensor | None:
         stiffness = values["stiffness"]
         assert stiffness is not None
-        return stiffness.flatten(1).sum(1)
+        return stiffness[..., self._curvature > 0.0].flatten(1).sum(1)
 
     @override
     def adjoint(

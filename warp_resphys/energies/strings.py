@@ -15,9 +15,9 @@ So the body's solve has no further unknown, whatever hangs on it. A string that 
 speeds along it away, as in a perfectly inelastic impact.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -25,16 +25,16 @@ import warp as wp
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from ..fem.elements import Points
 from ..io.errors import InputError
-from ..kernels import strings as kernels
+from ..kernels.axial import axial_kernels
+from ..kernels.laws import string as law
 from ..mesh.mesh import Mesh
 from ..stepping.constants import Constants
 from ..stepping.inputs import Inputs
 from ..stepping.quantity import Parameter, Quantity
 from ..stepping.state import ImplicitStage, State
-from .base import BoundEnergy, Energy, Memory, Placement, PointSet, Step, Term, Values
-from .launcher import Launcher, warp_view
+from .base import BoundEnergy, Energy, Memory, PartPoints, Placement, PointSet, ReadingTerm, Step, Values
+from .launcher import Launcher
 
 PAYLOAD = Quantity(
     "payload", "kg", 0.0, closed=True, per="string", typical=0.05, words="weight", shown_unit="g", shown_factor=1e3
@@ -86,7 +86,7 @@ class Strings(Energy):
         return {"string_length": self.length, "string_compliance": self.compliance}
 
     @override
-    def points(self, mesh: Mesh) -> tuple[Points, ...]:
+    def points(self, mesh: Mesh) -> tuple[PartPoints, ...]:
         """One a string, whose operators are the shares of its vertices.
 
         Raises:
@@ -98,14 +98,15 @@ class Strings(Energy):
                 raise InputError(f"string {number} is tied to a vertex that is not among the {count} of the mesh.")
         # What pads a list repeats its first vertex with a zero share, which contributes nothing.
         nodes = np.array([np.pad(each, (0, most - len(each)), constant_values=each[0]) for each in self.tied_to])
-        operator = np.zeros((self.count, 1, most, 3))
+        operator = np.zeros((self.count, 1, most, 1))
         for row, each in zip(operator, self.tied_to, strict=True):
-            row[0, : len(each), 0] = 1.0 / len(each)
-        return (Points(nodes, operator),)
+            row[0, : len(each)] = 1.0 / len(each)
+        return (PartPoints(nodes, operator, np.arange(self.count), np.ones(self.count)),)
 
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "StringTerm":
-        return StringTerm(launcher, sets, self)
+        shapes = {"string_target": (self.count, 3), "string_stiffness": (self.count,), "string_length": (self.count,)}
+        return StringTerm(launcher, sets, axial_kernels(law), shapes, self.count, extra=[wp.float64(self.toe)])
 
     @override
     def bind(self, placement: Placement) -> "BoundStrings":
@@ -215,61 +216,11 @@ class BoundStrings(BoundEnergy):
         return free + share[..., None] * line
 
 
-class StringTerm(Term):
-    """Kernels of the springs that strings with weights are for a body in a stage.
-
-    Args:
-        launcher: of the potential.
-        sets: one point a string.
-        strings: whose they are.
-    """
-
-    def __init__(self, launcher: Launcher, sets: Sequence[PointSet], strings: Strings) -> None:
-        super().__init__(launcher, sets)
-        self.count, self._toe = strings.count, wp.float64(strings.toe)
-
-    @property
-    @override
-    def shapes(self) -> Mapping[str, tuple[int, ...]]:
-        return {"string_target": (self.count, 3), "string_stiffness": (self.count,), "string_length": (self.count,)}
-
-    def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
-        target, stiffness, length = (values[name] for name in self.shapes)
-        assert target is not None
-        assert stiffness is not None
-        assert length is not None
-        springs = [warp_view(target, wp.vec3d), warp_view(stiffness, wp.float64), warp_view(length, wp.float64)]
-        return [s.nodes, s.gradients, *springs, self._toe, positions]
-
-    @override
-    def step(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
-        return kernels.local_step, self._arguments(s, values, positions)
-
-    @override
-    def tangent(self, s: PointSet, values: Values, positions: Any, positive: Any) -> tuple[Any, list[Any]]:
-        del positive  # A string only pulls: its tangent has no negative eigenvalues.
-        return kernels.tangent, self._arguments(s, values, positions)
+class StringTerm(ReadingTerm):
+    """Kernels of the springs that strings with weights are for a body in a stage."""
 
     @override
     def curvature(self, values: Values) -> torch.Tensor:
         stiffness = values["string_stiffness"]
         assert stiffness is not None
         return stiffness
-
-    @override
-    def adjoint(
-        self, values: Values, positions: torch.Tensor, direction: torch.Tensor
-    ) -> Callable[[], dict[str, torch.Tensor]]:
-        """See `Term.adjoint`."""
-        own, (s,) = self.launcher, self.sets
-        by_target, by_others = own.zeros(self.count, 3), own.zeros(self.count, 3)
-        inputs = [*self._arguments(s, values, warp_view(positions, wp.vec3d)), warp_view(direction, wp.vec3d)]
-        outputs = [warp_view(by_target, wp.vec3d), warp_view(by_others, wp.vec3d)]
-        command = own.record(kernels.slopes, (own.batch, self.count), inputs, outputs)
-
-        def differentiate() -> dict[str, torch.Tensor]:
-            own.launch(command)
-            found = (by_target.clone(), by_others[..., 0].clone(), by_others[..., 1].clone())
-            return dict(zip(self.shapes, found, strict=True))
-
-        return differentiate

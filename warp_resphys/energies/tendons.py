@@ -28,21 +28,19 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
-from ..fem.elements import Points
 from ..io.errors import InputError
 from ..kernels import tendons as kernels
 from ..mesh.location import locate
 from ..mesh.mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
-from .base import Energy, PartTerm, PointSet, Values
+from .base import Energy, PartPoints, PartTerm, PointSet, Values
 from .launcher import Launcher, warp_view
 
 
 @dataclass(frozen=True)
-class TendonPoints(Points):
+class TendonPoints(PartPoints):
     """The pieces of tendons between their guides, tendon after tendon; the operators are those of the kernels' F."""
 
-    tendon: NDArray[np.int64]  # (P,) number of its tendon
     rest: NDArray[np.float64]  # (P, 3, 3) F of the undeformed body [m]
 
 
@@ -208,7 +206,7 @@ class Tendons(Energy):
         operator = np.zeros((len(nodes), 1, most, 3))
         for row, each in enumerate(operators):
             operator[row, 0, : len(each)] = each
-        return (TendonPoints(padded, operator, np.array(tendon), np.concatenate(rest)),)
+        return (TendonPoints(padded, operator, np.array(tendon), np.ones(len(tendon)), np.concatenate(rest)),)
 
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "TendonTerm":
@@ -240,8 +238,8 @@ class TendonTerm(PartTerm):
     def __init__(self, launcher: Launcher, sets: Sequence[PointSet], tendons: Tendons) -> None:
         (s,) = sets
         assert isinstance(s.source, TendonPoints)
-        numbers = s.source.tendon
-        super().__init__(launcher, sets, "tendon_tension", numbers, np.ones(len(numbers)), tendons.count)
+        numbers = s.source.part
+        super().__init__(launcher, sets, "tendon_tension", tendons.count)
         self._toe = wp.float64(tendons.toe)
         self._first = launcher.upload(np.searchsorted(numbers, np.arange(tendons.count + 1)).astype(np.int32), int)
         self._rest = launcher.upload(s.source.rest, wp.mat33d)
@@ -268,11 +266,11 @@ class TendonTerm(PartTerm):
         return warp_view(self._along, wp.vec3d), warp_view(self._tension, wp.float64)
 
     @override
-    def before(self, values: Values, positions: Any) -> list[Any]:
+    def before(self, values: Values, positions: Any, active: Any) -> list[Any]:
         (s,) = self.sets
         tension, contraction, stiffness, *offsets = self.views(values)
         runs = [s.nodes, s.gradients, self._first, self._rest, *offsets]
-        inputs = [*runs, tension, contraction, stiffness, self._toe, positions]
+        inputs = [active, *runs, tension, contraction, stiffness, self._toe, positions]
         outputs = [*self._found, warp_view(self._spring, wp.vec3d)]
         return [self.launcher.record(kernels.pull, (self.launcher.batch, self.count), inputs, outputs)]
 
@@ -285,8 +283,7 @@ class TendonTerm(PartTerm):
         ]
 
     @override
-    def tangent(self, s: PointSet, values: Values, positions: Any, positive: Any) -> tuple[Any, list[Any]]:
-        del positive  # A tendon only pulls: its tangent has no negative eigenvalues.
+    def tangent(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
         return kernels.tangent, [s.nodes, s.gradients, self.part, *self._found, positions]
 
     @override
@@ -328,7 +325,7 @@ class TendonTerm(PartTerm):
         inputs = [s.nodes, s.gradients, self.part, self._rest, *self._found, *views]
         outputs = [warp_view(shorter, wp.float64), warp_view(by_offset, wp.vec2d), warp_view(longer, wp.vec2d)]
         launches = [
-            *self.before(values, views[0]),
+            *self.before(values, views[0], warp_view(own.active, wp.int32)),
             own.record(kernels.adjoint, (own.batch, s.n_points), inputs, outputs),
         ]
 

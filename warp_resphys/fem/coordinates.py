@@ -92,7 +92,7 @@ class Coordinates:
             return points
         lists: list[tuple[IntArray, FloatArray]] = []
         for cell in touched:
-            nodes, operators = points.nodes[cell], points.gradients[cell]  # (K,), (Q, K, 3)
+            nodes, operators = points.nodes[cell], points.gradients[cell]  # (K,), (Q, K, 1 or 3)
             sums = dict[int, FloatArray]()
             for a, node in enumerate(nodes.tolist()):
                 controls, weights = self._rows.get(node, (np.array([node]), np.ones(1)))
@@ -100,10 +100,10 @@ class Coordinates:
                     sums[control] = sums.get(control, 0.0) + weight * operators[:, a]
             lists.append((np.array(list(sums), dtype=np.int64), np.stack(list(sums.values()), axis=1)))
         width = max(points.nodes.shape[1], *(len(nodes) for nodes, _ in lists))
-        cells, per_cell, old = points.gradients.shape[:3]
+        cells, per_cell, old, components = points.gradients.shape
         # What pads a cell repeats its first vertex with an operator of zero, which contributes nothing.
         nodes = np.repeat(points.nodes[:, :1], width, axis=1)
-        operators = np.zeros((cells, per_cell, width, 3))
+        operators = np.zeros((cells, per_cell, width, components))
         nodes[:, :old], operators[:, :, :old] = points.nodes, points.gradients
         for cell, (own, operator) in zip(touched, lists, strict=True):
             nodes[cell], operators[cell] = own[0], 0.0
@@ -112,10 +112,10 @@ class Coordinates:
 
     @cached_property
     def points(self) -> Points:
-        """One point per dependent vertex, whose operator's first column gives its position."""
+        """One point per dependent vertex, which sees the vertex's position."""
         width = int(np.diff(self.weights.indptr).max())
         nodes = np.zeros((len(self.dependent), width), dtype=np.int64)
-        operators = np.zeros((len(self.dependent), 1, width, 3))
+        operators = np.zeros((len(self.dependent), 1, width, 1))
         for row, (controls, weights) in enumerate(self._rows.values()):
             nodes[row], nodes[row, : len(controls)] = controls[0], controls
             operators[row, 0, : len(controls), 0] = weights

@@ -25,7 +25,9 @@ class Points:
     """Cells with the same number of nodes and of points, each point with the matrix F = sum_a x_a g_a^T."""
 
     nodes: NDArray[np.int64]  # (C, K) vertex of each node of a cell
-    gradients: Array  # (C, Q, K, 3) operators g_a; in a solid, gradients of the shape functions in rest space [1/m]
+    # (C, Q, K, 3) operators g_a; in a solid, gradients of the shape functions in rest space [1/m]. (C, Q, K, 1) where
+    # the energy is a function of a vector sum_a g_a x_a
+    gradients: Array
 
     @property
     def points_per_cell(self) -> int:

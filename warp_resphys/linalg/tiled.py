@@ -52,8 +52,9 @@ class TiledSolver(LinearSolver):
     ) -> Factor:
         values[:, self._padding] = 1.0
         whole = None if definite else values.clone()
-        idle = torch.zeros(len(values), device=values.device, dtype=torch.bool) if idle is None else idle
-        self.launch(self.kernels.factor, (len(values),), idle, values.view(-1, *self.shape))
+        everyone = torch.ones(len(values), device=values.device, dtype=torch.int32)
+        active = everyone if idle is None else everyone.masked_fill_(idle, 0)
+        self.launch(self.kernels.factor, (len(values),), active, values.view(-1, *self.shape))
         factor = _TiledFactor(values, self)
         if whole is None or not factor.failed.any():
             return factor
@@ -75,21 +76,22 @@ class TiledSolver(LinearSolver):
         with shareable():
             return wp.launch_tiled(kernel, dim=list(blocks), inputs=views, **options)
 
-    def record_factor(self, values: torch.Tensor, idle: torch.Tensor, clamped: torch.Tensor) -> SimpleNamespace:
+    def record_factor(self, values: torch.Tensor, active: torch.Tensor, clamped: torch.Tensor) -> SimpleNamespace:
         """Launches ``clear``, ``factor`` and ``check`` on a value array (B, n_values); see ``kernels.tiled_cholesky``.
 
         Args:
             values: filled between the first two, and overwritten by the factors.
-            idle: (B,) matrices that stay as they are. `check` leaves those alone that failed and were not clamped.
+            active: (B,) zero for matrices that stay as they are, and after `check` for all but those that failed and
+                were not clamped.
             clamped: (B,) matrices that are positive definite by force: their factors are not finite if they fail.
         """
         batch, unit = len(values), torch.zeros(self.n_values, device=self.device, dtype=self.dtype)
         unit[self._padding] = 1.0
         tiles = values.view(-1, *self.shape)
         return SimpleNamespace(
-            clear=self._record(self.kernels.clear, (batch,), idle, unit, values),
-            factor=self._record(self.kernels.factor, (batch,), idle, tiles),
-            check=self._record(self.kernels.check, (batch,), clamped, idle, tiles),
+            clear=self._record(self.kernels.clear, (batch,), active, unit, values),
+            factor=self._record(self.kernels.factor, (batch,), active, tiles),
+            check=self._record(self.kernels.check, (batch,), active, clamped, tiles),
         )
 
     def record_solve(self, factors: torch.Tensor, columns: torch.Tensor) -> Any:

@@ -1,0 +1,128 @@
+"""Energies of a length: stress, tangent and derivatives by values, for any law of the tension.
+
+The vector at a point, sum_a g_a x_a - o, has the length l and the unit vector u. With the point's weight w and its
+values v, a law gives
+
+    e(l, v),   tension t = de/dl,   slope dt/dl,   and dt/dv,
+
+so that the stress is w t u and the tangent w (slope u u^T + t / l (1 - u u^T)), which has a negative eigenvalue only
+where a law pushes. The origin o is zero, or the first three values of a law that is tied to a given place.
+"""
+
+import functools
+from types import ModuleType, SimpleNamespace
+
+import warp as wp
+
+from .modules import named_module
+from .points import line_at
+from .values import value_reader
+
+ZERO = wp.float64(0.0)
+
+
+@functools.cache
+def axial_kernels(law: ModuleType) -> SimpleNamespace:
+    """Kernels for one of ``kernels.laws``."""
+    module = named_module(f"axial.{law.NAME}")
+    vector, tension, tied = law.values, law.tension, law.TIED
+    read_values = value_reader(vector)
+
+    @wp.func(module=module)
+    def stretched(x: wp.vec3d, v: vector):
+        """The unit vector along what is stretched, and its length."""
+        if wp.static(tied):
+            x -= wp.vec3d(v[0], v[1], v[2])
+        length = wp.length(x)
+        if length > ZERO:
+            x = x / length
+        return x, length
+
+    @wp.kernel(module=module)
+    def local_step(
+        active: wp.array[int],  # (B) zero where nothing is to be done
+        nodes: wp.array2d[int],
+        operators: wp.array2d[wp.float64],  # (P, K)
+        weights: wp.array[wp.float64],  # (P) w
+        addresses: wp.array[wp.uint64],  # see `values`
+        sizes: wp.array[int],
+        places: wp.array2d[int],
+        toe: wp.float64,  # length over which the law tightens
+        points_per_cell: int,
+        positions: wp.array2d[wp.vec3d],
+        stress_out: wp.array2d[wp.vec3d],
+        energy_out: wp.array2d[wp.float64],  # (B, P) [J]
+    ):
+        b, p = wp.tid()
+        if active[b] == 0:
+            return
+        v = read_values(addresses, sizes, places, b, p)
+        u, length = stretched(line_at(positions, nodes, operators, b, p, p / points_per_cell), v)
+        energy, pull, _slope, _by_values = tension(length, toe, v)
+        stress_out[b, p] = (weights[p] * pull) * u
+        energy_out[b, p] = weights[p] * energy
+
+    @wp.kernel(module=module)
+    def tangent(
+        active: wp.array[int],
+        clamp: wp.array[int],  # (B) not zero where eigenvalues are clamped at zero
+        nodes: wp.array2d[int],
+        operators: wp.array2d[wp.float64],
+        weights: wp.array[wp.float64],
+        addresses: wp.array[wp.uint64],
+        sizes: wp.array[int],
+        places: wp.array2d[int],
+        toe: wp.float64,
+        points_per_cell: int,
+        positions: wp.array2d[wp.vec3d],
+        tangent_out: wp.array3d[wp.mat33d],  # (B, P, 1)
+    ):
+        b, p = wp.tid()
+        if active[b] == 0:
+            return
+        v = read_values(addresses, sizes, places, b, p)
+        u, length = stretched(line_at(positions, nodes, operators, b, p, p / points_per_cell), v)
+        _energy, pull, slope, _by_values = tension(length, toe, v)
+        across, along = ZERO, weights[p] * slope
+        if length > ZERO:
+            across = weights[p] * pull / length
+        if clamp[b] != 0:
+            across = wp.max(across, ZERO)
+        block = (along - across) * wp.outer(u, u)
+        block[0, 0] += across
+        block[1, 1] += across
+        block[2, 2] += across
+        tangent_out[b, p, 0] = block
+
+    # The residual is w t u, so that -z . d residual/dv is -w dt/dv u . dz, with dz = sum_a g_a z_a. The origin moves
+    # the vector the other way: its derivative is the tangent times dz.
+    @wp.kernel(module=module)
+    def adjoint(
+        nodes: wp.array2d[int],
+        operators: wp.array2d[wp.float64],
+        weights: wp.array[wp.float64],
+        addresses: wp.array[wp.uint64],
+        sizes: wp.array[int],
+        places: wp.array2d[int],
+        toe: wp.float64,
+        points_per_cell: int,
+        positions: wp.array2d[wp.vec3d],
+        direction: wp.array2d[wp.vec3d],  # (B, N) z = H^-1 dL/dx [m]
+        values_out: wp.array2d[vector],  # (B, P) this point's part of dL/dv
+    ):
+        b, p = wp.tid()
+        v = read_values(addresses, sizes, places, b, p)
+        u, length = stretched(line_at(positions, nodes, operators, b, p, p / points_per_cell), v)
+        dz = line_at(direction, nodes, operators, b, p, p / points_per_cell)
+        _energy, pull, slope, by_values = tension(length, toe, v)
+        axial = wp.dot(u, dz)
+        result = (-weights[p] * axial) * by_values
+        if wp.static(tied):
+            moved = (slope * axial) * u
+            if length > ZERO:
+                moved += (pull / length) * (dz - axial * u)
+            for i in range(3):
+                result[i] = weights[p] * moved[i]
+        values_out[b, p] = result
+
+    return SimpleNamespace(local_step=local_step, tangent=tangent, adjoint=adjoint, values=vector)

@@ -1,0 +1,240 @@
+"""Kernels of an energy that is one Warp function of what a point sees and of its values.
+
+The function e(f, v) has the energy of a point of weight one. f is a vector or a matrix, see `points`, and says by its
+type which of both; v is the vector of values. From it follow
+
+- the stress w de/df, exact: Warp differentiates the function;
+- the tangent w d2e/df2, by differences of fourth order of the exact stress, of the step h = 3e-4 of the size of f that
+  the energy declares. The error is about h^4/30 of a fifth derivative, and 1e-12 of the stress over the size of f from
+  rounding: 1e-9 of the tangent or better, where e is smooth over h (tests/energies/test_pointwise.py);
+- the derivatives by the values, -z . d residual/dv = -w d/ds de/dv(f + s dz) with dz = sum_a g_a z_a, by the same
+  differences of the exact de/dv along dz.
+
+A clamped tangent is the nearest one without negative eigenvalues.
+"""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from .modules import named_module
+from .points import deformation_gradient, line_at
+from .values import value_reader
+
+STEP = wp.constant(wp.float64(3e-4))  # of differences, over the size of f
+OFFSETS, SHARES = wp.constant(wp.vec4d(1.0, -1.0, 2.0, -2.0)), wp.constant(wp.vec4d(8.0, -8.0, -1.0, 1.0))
+TWELVE, ZERO, HALF, ONE = wp.float64(12.0), wp.float64(0.0), wp.float64(0.5), wp.float64(1.0)
+SWEEPS = wp.constant(30)
+CONVERGED = wp.constant(wp.float64(1e-30))  # squared entries off the diagonal, over all
+
+mat99 = wp.types.matrix((9, 9), wp.float64)
+
+
+@wp.func
+def without_negative_eigenvalues(h: mat99) -> mat99:
+    """The nearest positive semidefinite matrix to a symmetric one, by Jacobi's rotations."""
+    v = wp.identity(n=9, dtype=wp.float64)
+    total = wp.ddot(h, h)
+    for _sweep in range(SWEEPS):
+        off = ZERO
+        for i in range(9):
+            for j in range(i):
+                off += h[i, j] * h[i, j]
+        if off <= CONVERGED * total:
+            break
+        for i in range(9):
+            for j in range(i):
+                if h[i, j] != ZERO:
+                    angle = (h[j, j] - h[i, i]) / (h[i, j] + h[i, j])
+                    t = ONE / (wp.abs(angle) + wp.sqrt(angle * angle + ONE))
+                    if angle < ZERO:
+                        t = -t
+                    c = ONE / wp.sqrt(t * t + ONE)
+                    s = t * c
+                    for k in range(9):
+                        x, y = h[i, k], h[j, k]
+                        h[i, k] = c * x - s * y
+                        h[j, k] = s * x + c * y
+                    for k in range(9):
+                        x, y = h[k, i], h[k, j]
+                        h[k, i] = c * x - s * y
+                        h[k, j] = s * x + c * y
+                        x, y = v[k, i], v[k, j]
+                        v[k, i] = c * x - s * y
+                        v[k, j] = s * x + c * y
+    result = mat99()
+    for k in range(9):
+        eigenvalue = wp.max(h[k, k], ZERO)
+        for i in range(9):
+            for j in range(9):
+                result[i, j] = result[i, j] + eigenvalue * v[i, k] * v[j, k]
+    return result
+
+
+@wp.func
+def write_blocks(hessian: mat99, clamp: bool, out: wp.array[wp.mat33d]):
+    """The six blocks of a second derivative, of which rows and columns go by column and row of F."""
+    hessian = HALF * (hessian + wp.transpose(hessian))
+    if clamp:
+        hessian = without_negative_eigenvalues(hessian)
+    for m in range(3):
+        for n in range(m + 1):
+            block = wp.mat33d()
+            for i in range(3):
+                for j in range(3):
+                    block[i, j] = hessian[3 * m + i, 3 * n + j]
+            out[(m * (m + 1)) / 2 + n] = block
+
+
+@functools.cache
+def pointwise_kernels(density: Any) -> SimpleNamespace:
+    """Returns the kernels of a function, and its type of values."""
+    shape, vector = density.input_types.values()
+    module = named_module(f"pointwise.{density.module.name}.{density.key}")
+    # Unrolled, the loops below would take minutes to compile.
+    wp.set_module_options({"max_unroll": 1}, module)
+    line = shape is wp.vec3d
+    see, operator, inner = (line_at, wp.float64, wp.dot) if line else (deformation_gradient, wp.vec3d, wp.ddot)
+    read_values = value_reader(vector)
+
+    @wp.kernel(module=module)
+    def local_step(
+        active: wp.array[int],  # (B) zero where nothing is to be done
+        nodes: wp.array2d[int],
+        operators: wp.array2d[operator],
+        weights: wp.array[wp.float64],  # (P) w
+        addresses: wp.array[wp.uint64],  # see `values`
+        sizes: wp.array[int],
+        places: wp.array2d[int],
+        size: wp.float64,  # of f
+        points_per_cell: int,
+        positions: wp.array2d[wp.vec3d],
+        stress_out: wp.array2d[shape],
+        energy_out: wp.array2d[wp.float64],  # (B, P) [J]
+    ):
+        b, p = wp.tid()
+        if active[b] == 0:
+            return
+        v = read_values(addresses, sizes, places, b, p)
+        f = see(positions, nodes, operators, b, p, p / points_per_cell)
+        stress, _by_values = wp.grad(density)(f, v)
+        stress_out[b, p] = weights[p] * stress
+        energy_out[b, p] = weights[p] * density(f, v)
+
+    @wp.kernel(module=module)
+    def adjoint(
+        nodes: wp.array2d[int],
+        operators: wp.array2d[operator],
+        weights: wp.array[wp.float64],
+        addresses: wp.array[wp.uint64],
+        sizes: wp.array[int],
+        places: wp.array2d[int],
+        size: wp.float64,
+        points_per_cell: int,
+        positions: wp.array2d[wp.vec3d],
+        direction: wp.array2d[wp.vec3d],  # (B, N) z = H^-1 dL/dx [m]
+        values_out: wp.array2d[vector],  # (B, P) this point's part of dL/dv
+    ):
+        b, p = wp.tid()
+        v = read_values(addresses, sizes, places, b, p)
+        f = see(positions, nodes, operators, b, p, p / points_per_cell)
+        dz = see(direction, nodes, operators, b, p, p / points_per_cell)
+        length = wp.sqrt(inner(dz, dz))
+        result = vector()
+        if length > ZERO:
+            h = STEP * size / length
+            for k in range(4):
+                _stress, by_values = wp.grad(density)(f + (OFFSETS[k] * h) * dz, v)
+                result += SHARES[k] * by_values
+            result = (-weights[p] / (TWELVE * h)) * result
+        values_out[b, p] = result
+
+    tangent = (_line_tangent if line else _tangent)(density, vector, module, read_values)
+    return SimpleNamespace(local_step=local_step, tangent=tangent, adjoint=adjoint, values=vector)
+
+
+def _line_tangent(density: Any, vector: Any, module: wp.Module, read_values: Any) -> Any:
+    """Returns the kernel of the tangent by a vector, one block."""
+
+    @wp.kernel(module=module)
+    def tangent(
+        active: wp.array[int],
+        clamp: wp.array[int],  # (B) not zero where eigenvalues are clamped at zero
+        nodes: wp.array2d[int],
+        operators: wp.array2d[wp.float64],
+        weights: wp.array[wp.float64],
+        addresses: wp.array[wp.uint64],
+        sizes: wp.array[int],
+        places: wp.array2d[int],
+        size: wp.float64,
+        points_per_cell: int,
+        positions: wp.array2d[wp.vec3d],
+        tangent_out: wp.array3d[wp.mat33d],  # (B, P, 1)
+    ):
+        b, p = wp.tid()
+        if active[b] == 0:
+            return
+        v = read_values(addresses, sizes, places, b, p)
+        x = line_at(positions, nodes, operators, b, p, p / points_per_cell)
+        h = STEP * size
+        rows = wp.mat33d()
+        for n in range(3):
+            slope = wp.vec3d()
+            for k in range(4):
+                moved = x
+                moved[n] = x[n] + OFFSETS[k] * h
+                stress, _by_values = wp.grad(density)(moved, v)
+                slope += SHARES[k] * stress
+            for i in range(3):
+                rows[n, i] = slope[i]
+        block = (HALF * weights[p] / (TWELVE * h)) * (rows + wp.transpose(rows))
+        if clamp[b] != 0:
+            q, e = wp.eig3(block)
+            positive = wp.diag(wp.vec3d(wp.max(e[0], ZERO), wp.max(e[1], ZERO), wp.max(e[2], ZERO)))
+            block = q * positive * wp.transpose(q)
+        tangent_out[b, p, 0] = block
+
+    return tangent
+
+
+def _tangent(density: Any, vector: Any, module: wp.Module, read_values: Any) -> Any:
+    """Returns the kernel of the tangent by a matrix, six blocks."""
+
+    @wp.kernel(module=module)
+    def tangent(
+        active: wp.array[int],
+        clamp: wp.array[int],
+        nodes: wp.array2d[int],
+        operators: wp.array2d[wp.vec3d],
+        weights: wp.array[wp.float64],
+        addresses: wp.array[wp.uint64],
+        sizes: wp.array[int],
+        places: wp.array2d[int],
+        size: wp.float64,
+        points_per_cell: int,
+        positions: wp.array2d[wp.vec3d],
+        tangent_out: wp.array3d[wp.mat33d],  # (B, P, 6)
+    ):
+        b, p = wp.tid()
+        if active[b] == 0:
+            return
+        v = read_values(addresses, sizes, places, b, p)
+        f = deformation_gradient(positions, nodes, operators, b, p, p / points_per_cell)
+        scale = weights[p] / (TWELVE * STEP * size)
+        hessian = mat99()
+        for n in range(3):
+            for j in range(3):
+                slope = wp.mat33d()
+                for k in range(4):
+                    moved = f
+                    moved[j, n] = f[j, n] + OFFSETS[k] * STEP * size
+                    stress, _by_values = wp.grad(density)(moved, v)
+                    slope += SHARES[k] * stress
+                for m in range(3):
+                    for i in range(3):
+                        hessian[3 * n + j, 3 * m + i] = scale * slope[i, m]
+        write_blocks(hessian, clamp[b] != 0, tangent_out[b, p])
+
+    return tangent

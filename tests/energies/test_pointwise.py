@@ -1,0 +1,162 @@
+"""Energies that are one Warp function, against hand-written kernels, eigenvalues and differences."""
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from warp_resphys import (
+    Body,
+    Corotated,
+    Inputs,
+    Muscle,
+    Muscles,
+    Simulator,
+    SolverSettings,
+    box_hexahedra,
+    select_vertices,
+)
+from warp_resphys.energies.pointwise import PointwiseEnergy, at_vertices, between
+from warp_resphys.io.errors import InputError
+from warp_resphys.stepping.quantity import Quantity
+from warp_resphys.studies.gradient_check import check_gradients, pose
+
+MESH = box_hexahedra((0.06, 0.02, 0.02), (3, 1, 1))
+CLAMP, TIP = select_vertices(MESH, x=0.0), select_vertices(MESH, x=0.06)
+TIGHT = SolverSettings("newton", relative_tolerance=1e-12)
+MATERIAL = Corotated(1e5, 0.45, mass_damping=0.5, stiffness_damping=2e-3)
+FIBRES = Muscles([Muscle(range(2), (1.0, 0.0, 0.2))], stiffness=4e4)
+VALUES = {"muscle_stress": 2e4, "muscle_contraction": 0.5}  # where no fibre is near its toe
+
+
+@wp.func
+def fibre(x: wp.vec3d, v: wp.vec3d) -> wp.float64:
+    """That of `Muscles` beyond the toe; the values are stress, contraction and stiffness."""
+    length = wp.length(x)
+    force = length - wp.float64(1.0) + v[1] - wp.float64(0.5e-3)
+    return v[0] * length + v[2] * (wp.float64(0.5) * force * force + wp.float64(0.025e-6))
+
+
+@dataclass(frozen=True)
+class Fibre(PointwiseEnergy):
+    inputs: ClassVar = (Quantity("muscle_stress", "Pa"), Quantity("muscle_contraction", ""))
+    parameters: ClassVar = (Quantity("muscle_stiffness", "Pa", 0.0),)
+    density: ClassVar = fibre
+    muscle_stiffness: float = 4e4
+
+    @property
+    def value_names(self):
+        return ("muscle_stress", "muscle_contraction", "muscle_stiffness")
+
+    def points(self, mesh):
+        return FIBRES.points(mesh)
+
+
+@wp.func
+def spring(x: wp.vec3d, v: wp.vec2d) -> wp.float64:
+    longer = wp.length(x) - v[1]
+    return wp.float64(0.5) * v[0] * longer * longer
+
+
+@dataclass(frozen=True)
+class Spring(PointwiseEnergy):
+    """Springs between vertices, pair after pair with values of its own."""
+
+    parameters: ClassVar = (
+        Quantity("spring_stiffness", "N/m", 0.0, per="spring"),
+        Quantity("spring_length", "m", 0.0, per="spring"),
+    )
+    density: ClassVar = spring
+    size: ClassVar[float] = 0.05
+    pairs: list = field(default_factory=lambda: [[CLAMP[0], TIP[3]], [CLAMP[1], TIP[2]]])
+    spring_stiffness: float = 50.0
+    spring_length: float = 0.05
+
+    @property
+    def count(self):
+        return len(self.pairs)
+
+    def points(self, mesh):
+        return (between(self.pairs, np.arange(self.count)),)
+
+
+def simulator(energy, **options):
+    return Simulator(Body(MESH, fixed=CLAMP, energies=[energy]), MATERIAL, solver=TIGHT, **options)
+
+
+def acting(s, batch=2):
+    return Inputs(**{name: torch.full((batch, 1), value, dtype=torch.float64) for name, value in VALUES.items()})
+
+
+@pytest.mark.parametrize("at", ["rest", "bent"])
+def test_stress_tangent_and_adjoint_equal_hand_written_kernels(at):
+    found = []
+    for energy in (FIBRES, Fibre()):
+        s = simulator(energy)
+        state, stiffness = pose(s, at, 2), torch.full((2, 1), 4e4, dtype=torch.float64, requires_grad=True)
+        inputs = Inputs(**{name: value.requires_grad_() for name, value in acting(s).actuation.items()})
+        here = s.linearise(state, acting(s))
+        x = state.q + 1e-3 * torch.randn(state.q.shape, generator=torch.Generator().manual_seed(0)).double()
+        residual = here.residual(x)
+        here.update(x)
+        product = here.product(torch.sin(50.0 * x))
+        end, _ = s.step(state, inputs, {"muscle_stiffness": stiffness})
+        leaves = [*inputs.actuation.values(), stiffness]
+        found.append([residual, product, *torch.autograd.grad((end.q**2).sum() + end.q[..., 2].sum(), leaves)])
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(one, other, rtol=2e-9, atol=1e-9 * float(other.abs().max()))
+
+
+def test_a_clamped_tangent_has_no_negative_eigenvalue():
+    """Springs that push have a negative stiffness across; the clamped one is what is left without it."""
+    s = simulator(Spring(spring_length=0.2))
+    s.linearise(s.rest_state(2))
+    p = s.workspace(2).potential
+    p.positions.copy_(s.rest_positions)
+    p.update_tangent()
+    exact = p.tangents[-1].clone()
+    p.update_tangent(torch.tensor([True, False]))
+    values, vectors = torch.linalg.eigh(exact[0, :, 0])
+    assert float(values.min()) < -1.0
+    wanted = vectors @ torch.diag_embed(values.clamp_min(0.0)) @ vectors.mT
+    torch.testing.assert_close(p.tangents[-1][0, :, 0], wanted, rtol=0.0, atol=1e-9 * float(values.max()))
+    torch.testing.assert_close(p.tangents[-1][1], exact[1])
+
+
+@pytest.mark.parametrize("start", ["rest", "bent"])
+def test_gradients_of_a_rollout_equal_differences(start):
+    rows = check_gradients(simulator(Spring()), start, steps=2)
+    assert {"spring_stiffness, each spring", "spring_length, each environment"} <= {row.parameter for row in rows}
+    assert {row.parameter: row.relative_error for row in rows if not row.relative_error <= 1e-6} == {}
+
+
+def test_an_environment_that_is_done_stays_as_it_is():
+    s = simulator(Spring())
+    s.linearise(s.rest_state(2))
+    p = s.workspace(2).potential
+    p.positions.copy_(s.rest_positions)
+    p.evaluate()
+    before = p.residual.clone()
+    p.active[1] = 0
+    p.positions.mul_(1.1)
+    p.evaluate()
+    stresses = p._stress
+    assert all(bool(stress[0].ne(stress[1]).any()) for stress in stresses)
+    p.active.fill_(1)
+    p.positions.copy_(s.rest_positions)
+    p.evaluate()
+    torch.testing.assert_close(p.residual, before, rtol=0.0, atol=0.0)
+
+
+def test_another_number_of_values_is_refused():
+    class Wrong(Spring):
+        parameters: ClassVar = Spring.parameters[:1]
+
+        def points(self, mesh):
+            return (at_vertices(TIP, np.zeros(len(TIP))),)
+
+    with pytest.raises(InputError, match="Wrong takes 2 values"):
+        simulator(Wrong()).workspace(1)

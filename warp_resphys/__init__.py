@@ -20,6 +20,7 @@ _MODULES = {
     "Material": "energies.materials",
     "StableNeoHookean": "energies.materials",
     "MooneyRivlin": "energies.materials",
+    "Gent": "energies.materials",
     "make_material": "energies.materials",
     "Inputs": "stepping.inputs",
     "Glue": "fem.rigid",

@@ -6,6 +6,7 @@ material                 shape terms                                         vol
 `Corotated`              ``mu ||F - R(F)||^2``                               ``lambda / 2 ||F - D(F)||^2``
 `StableNeoHookean`       ``mu/2 (||F||^2 - 3) - mu (J - 1) + mu/2 (J-1)^2``  ``lambda / 2 (J - 1)^2``
 `MooneyRivlin`           that with c10 = mu/2, ``c01 ((I2 - 3) - 4 (J-1))``  ``lambda / 2 (J - 1)^2``
+`Gent`                   that W by ``-J_m mu / 2 ln(1 - 2 W / (J_m mu))``    ``lambda / 2 (J - 1)^2``
 =======================  ==================================================  ====================================
 
 R is the rotation of the polar decomposition, D the nearest matrix of determinant one, J = det F. The equations and
@@ -23,7 +24,7 @@ import torch
 from typing_extensions import override
 
 from ..io.errors import InputError
-from ..kernels.materials import corotated, mooney_rivlin, stable_neo_hookean
+from ..kernels.materials import corotated, gent, mooney_rivlin, stable_neo_hookean
 from ..kernels.materials.density import density_law
 from ..stepping.quantity import Parameter, Quantity
 
@@ -191,10 +192,33 @@ class DensityMaterial(Material):
         return volume, under_integrated, *self.lame(constants), *own
 
 
+@dataclass(frozen=True)
+class Gent(DensityMaterial):
+    """Rubber that stiffens without bound as its chains come to their full length (Gent 1996).
+
+    With a large limit J_m it is `StableNeoHookean`. Past 95 % of the limit the energy goes on as its own parabola, so
+    that a search may pass through what a real specimen would not survive.
+    """
+
+    energy_density: ClassVar[Any] = gent.energy_density
+    volume_energy: ClassVar[Any] = gent.volume_energy
+
+    shear_modulus: Parameter = constant(90e3, "shear_modulus", "Pa")  # mu [Pa]
+    limit: Parameter = constant(30.0, "limit", "")  # J_m, of I1 - 3
+    bulk_modulus: Parameter = constant(44e6, "bulk_modulus", "Pa")  # K [Pa]
+
+    @override
+    def lame(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns mu and K - 2/3 mu."""
+        mu = constants["shear_modulus"]
+        return mu, constants["bulk_modulus"] - 2.0 / 3.0 * mu
+
+
 MATERIALS: dict[str, type[Material]] = {
     "corotated": Corotated,
     "stable_neo_hookean": StableNeoHookean,
     "mooney_rivlin": MooneyRivlin,
+    "gent": Gent,
 }
 
 

@@ -1,0 +1,27 @@
+"""``-mu J_m / 2 ln(1 - x) + lambda / 2 (J - 1)^2``, x = (I1 - 3 - 2 (J - 1) + (J - 1)^2) / J_m.
+
+The rubber of Gent (Rubber Chemistry and Technology 69, 1996), made compressible as `stable_neo_hookean`, which it is
+for a large limit J_m. The values are mu, J_m and the bulk modulus lambda + 2/3 mu.
+"""
+
+import warp as wp
+
+ROOM = wp.constant(wp.float64(0.95))  # of the limit, up to which the energy is Gent's
+
+
+@wp.func
+def energy_density(f: wp.mat33d, p: wp.vec3d) -> wp.float64:
+    """-mu J_m / 2 ln(1 - x), x = (I1 - 3 - 2 (J - 1) + (J - 1)^2) / J_m; its parabola beyond 95 % of the limit."""
+    change = wp.determinant(f) - wp.float64(1.0)
+    x = (wp.ddot(f, f) - wp.float64(3.0) - wp.float64(2.0) * change + change * change) / p[1]
+    inside = wp.min(x, ROOM)
+    beyond = (x - inside) / (wp.float64(1.0) - ROOM)
+    rise = beyond + wp.float64(0.5) * beyond * beyond - wp.log(wp.float64(1.0) - inside)
+    return wp.float64(0.5) * p[0] * p[1] * rise
+
+
+@wp.func
+def volume_energy(f: wp.mat33d, p: wp.vec3d) -> wp.float64:
+    """Lambda / 2 (J - 1)^2."""
+    change = wp.determinant(f) - wp.float64(1.0)
+    return wp.float64(0.5) * (p[2] - wp.float64(2.0 / 3.0) * p[0]) * change * change

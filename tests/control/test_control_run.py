@@ -19,7 +19,6 @@ from warp_resphys.control.estimate import Estimator, Noise
 from warp_resphys.control.files import plans_file, read_baselines, read_plan, read_reduced, reduced_file
 from warp_resphys.control.open_loop import Follower
 from warp_resphys.control.plan import Limits, Planner, Weights
-from warp_resphys.control.reduced_batch import advance, begin, observed
 from warp_resphys.control.reduction import reduce
 from warp_resphys.control.replay import replay
 from warp_resphys.control.sampling import Sampling
@@ -101,17 +100,17 @@ class TestReducedModel:
     def test_it_moves_as_the_identified_robot_does(self, folder):
         """On motions that no part of it was fitted to."""
         found = read_reduced(folder / reduced_file("sysid"), None)
-        assert found.told["window_motion_mm"] > 1.0
-        assert found.told["window_relative"] < 0.05
+        assert found.quality["window_motion_mm"] > 1.0
+        assert found.quality["window_relative"] < 0.05
 
     def test_of_several_numbers_of_modes_the_best_is_taken(self, folder):
         """Of three, one of a pair of vibrations of a round rod is missing."""
         robot = warp_resphys.load(folder, "sysid")
         sampling = Sampling((3, 4), equilibria=48, tangents=24, motions=3, seconds=2.0)
-        told = reduce(robot, sampling).told
-        assert told["modes"] == 4
-        assert list(told["tried"]) == ["3", "4"]
-        assert told["window_relative"] == told["tried"]["4"] < 0.7 * told["tried"]["3"]
+        quality = reduce(robot, sampling).quality
+        assert quality["modes"] == 4
+        assert list(quality["tried"]) == ["3", "4"]
+        assert quality["window_relative"] == quality["tried"]["4"] < 0.7 * quality["tried"]["3"]
 
     def test_a_number_of_modes_that_fails_leaves_the_others(self, folder, monkeypatch):
         robot = warp_resphys.load(folder, "sysid")
@@ -132,7 +131,7 @@ class TestReducedModel:
         inputs = np.array([0.6, 0.0, 0.3])
         settled = robot.observe(robot.settle(1, tendon_tension=inputs)).flatten().numpy()
         hangs = robot.observe(robot.settle(1)).flatten().numpy()
-        found = model.observe(model.rest(inputs).z[None], inputs[None])[0]
+        found = model.observe(model.rest(inputs))[0]
         assert np.linalg.norm(settled - hangs) > 5e-3
         assert np.linalg.norm(found - settled) < 0.05 * np.linalg.norm(settled - hangs)
 
@@ -164,18 +163,18 @@ class TestReducedModel:
     @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
     def test_a_transition_is_linearised(self, model, integrator):
         known, inputs, bias = replace(model, integrator=integrator), np.array([0.5, 0.2, 0.9]), np.full(4, 1e-4)
-        start = known.respond(model.rest(np.full(3, 0.4)), np.tile(inputs, (4, 1))).states[-1]
-        _, by_z, by_v, by_bias = known.transition(start, inputs, bias)
+        start = known.move(model.rest(np.full(3, 0.4)), np.tile(inputs, (4, 1, 1))).end
+        slopes = np.split(known.transition(start, inputs, bias)[1], 3, axis=1)
 
         random = np.random.default_rng(1)
         weights, way = random.standard_normal(8), random.standard_normal(4)
         sizes = (1e-3 * np.abs(start.z).max(), 0.1, 1e-3 * np.abs(start.z).max())
-        for number, (slope, size) in enumerate(zip((by_z, by_v, by_bias), sizes, strict=True)):
+        for number, (slope, size) in enumerate(zip(slopes, sizes, strict=True)):
 
             def after(x, number=number, size=size):
                 z, v, b = (x * size * way * (number == each) for each in range(3))
                 state = known.transition(replace(start, z=start.z + z, v=start.v + v), inputs, bias + b)[0]
-                return float(weights @ np.concatenate([state.z, 0.01 * state.v]))
+                return float(weights @ np.concatenate([state.z[0], 0.01 * state.v[0]]))
 
             difference, doubt = central_difference(after)
             wanted = size * weights @ np.concatenate([slope[:4], 0.01 * slope[4:]]) @ way
@@ -186,14 +185,14 @@ class TestReducedModel:
         """Of which one begins anew on the way."""
         known, random = replace(model, integrator=integrator), np.random.default_rng(4)
         rest, inputs = np.full(3, 0.2), 0.2 + 0.8 * random.random((8, 3, 3))
-        first = batch = begin(known, 3, rest)
+        first = batch = known.rest(rest, 3)
         for number, each in enumerate(inputs):
             if number == 4:
                 batch = first.where(np.array([False, True, False]), batch)
-            batch = advance(known, batch, each)
+            batch = known.move(batch, each[None]).end
         for row, since in enumerate((0, 4, 0)):
             wanted = known.respond(known.rest(rest), inputs[since:, row]).y[-1]
-            np.testing.assert_allclose(observed(known, batch)[row].ravel(), wanted, atol=1e-12)
+            np.testing.assert_allclose(known.observe(batch)[row], wanted, atol=1e-12)
 
     def test_the_estimate_finds_what_markers_tell(self, model):
         """A model whose equilibria are elsewhere, seen without noise: what it is off by becomes the bias."""
@@ -203,7 +202,7 @@ class TestReducedModel:
         for _ in range(150):
             state = model.transition(state, inputs, elsewhere)[0]
             estimator.predict(inputs)
-            estimator.correct(model.observe(state.z[None], inputs[None])[0].reshape(-1, 3))
+            estimator.correct(model.observe(state)[0].reshape(-1, 3))
         np.testing.assert_allclose(estimator.state.z, state.z, atol=2e-6)
         np.testing.assert_allclose(estimator.bias, elsewhere, atol=2e-5)
 

@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys.control.baselines import JacobianFeedback, fit_linear
+from warp_resphys.control.baselines import fit_linear
+from warp_resphys.control.controllers import JacobianFeedback
 from warp_resphys.control.evaluator import Evaluator
-from warp_resphys.control.input_response import InputResponse
 from warp_resphys.control.plan import Limits, Planner, Weights, solve_program, tracked_of
 from warp_resphys.control.polynomials import Polynomial, powers
 from warp_resphys.control.reference import Path
-from warp_resphys.data.actuation import delayed, lagged
 from warp_resphys.io.errors import InputError
 from warp_resphys.learning.networks import build_model
 from warp_resphys.learning.predictors import Range
@@ -68,19 +67,6 @@ class TestPolynomials:
             moved = np.eye(3)[variable] * step
             slope = (wanted(at + moved) - wanted(at - moved)) / (2.0 * step)
             np.testing.assert_allclose(wanted.slopes(at)[:, variable], slope, atol=1e-7)
-
-
-class TestInputResponse:
-    @pytest.mark.parametrize(("delay", "rise"), [(0.0, 0.0), (0.013, 0.0), (0.02, 0.03), (0.004, 0.05)])
-    def test_it_is_that_of_the_recordings(self, delay, rise):
-        commands = np.random.default_rng(1).random((20, 2))
-        response = InputResponse(0.01, delay, rise)
-        acting, kept = response(response.still(np.zeros(2)), commands)
-        wanted = delayed(torch.as_tensor(commands)[:, None], torch.tensor([delay], dtype=torch.float64), 0.01)
-        wanted = lagged(wanted, torch.tensor([rise], dtype=torch.float64), 0.01) if rise else wanted
-        np.testing.assert_allclose(acting, wanted[:, 0].numpy(), atol=1e-12)
-        again = response(kept[7], commands[8:])[0]
-        np.testing.assert_allclose(again, acting[8:], atol=1e-12)
 
 
 class TestPrograms:
@@ -179,10 +165,11 @@ class TestBaselines:
         true = np.array([[1e-3, 0.0, 5e-4], [0.0, 2e-3, 0.0]])
         wrong = true * 1.5 + 2e-4
         limits = Limits(np.zeros(3), np.full(3, 10.0), np.full(3, 100.0))
-        feedback = JacobianFeedback(wrong, limits, 5.0, 0.01)
-        goal, command = np.array([5e-3, 8e-3]), np.zeros(3)
-        for _ in range(300):
-            command = feedback.command(true @ command, goal, goal)
+        goal, command = np.array([5e-3, 8e-3, 0.0]), np.zeros(3)
+        tracked = np.eye(2, 3)
+        feedback = JacobianFeedback(wrong, limits, 5.0, 0.01, tracked, np.tile(goal[:2], (300, 1)), np.zeros((1, 3)))
+        for number in range(300):
+            command = feedback.command(number, np.append(true @ command, 0.0)[None])
             assert (command >= 0.0).all()
             assert (command <= 10.0).all()
-        np.testing.assert_allclose(true @ command, goal, atol=1e-4)
+        np.testing.assert_allclose(true @ command, goal[:2], atol=1e-4)

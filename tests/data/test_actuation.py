@@ -1,10 +1,9 @@
-"""Random pressures, valves that lag, and memory."""
+"""Random pressures, and the check of recorded ones."""
 
 import numpy as np
 import pytest
-import torch
 
-from warp_resphys.data.actuation import InputSequences, check_inputs, delayed, lagged, remembered
+from warp_resphys.data.actuation import InputSequences, check_inputs
 from warp_resphys.energies.pressure import PRESSURE
 from warp_resphys.energies.tendons import TENSION
 from warp_resphys.io.errors import DataFileError, InputError
@@ -70,48 +69,8 @@ def test_recorded_pressures_are_checked():
         check_inputs(high, PRESSURE, 2, 2e4, "a.h5")
 
 
-def test_a_lag_follows_a_step_exponentially_and_has_a_derivative():
-    command = torch.full((50, 1, 1), 2e4, dtype=torch.float64)
-    rise = torch.tensor([0.07], dtype=torch.float64, requires_grad=True)
-    found = lagged(command, rise, STEP)
-    times = STEP * torch.arange(1, 51, dtype=torch.float64)
-    torch.testing.assert_close(found[:, 0, 0], 2e4 * (1 - torch.exp(-times / rise)))
-    found.sum().backward()
-    expected = -(2e4 * torch.exp(-times / 0.07) * times / 0.07**2).sum()
-    torch.testing.assert_close(rise.grad[0], expected)
-
-
-def test_memory_keeps_what_the_pressure_was():
-    pressure = torch.zeros(100, 1, 2, dtype=torch.float64)
-    pressure[20:, :, 0] = 1e4
-    told = remembered(pressure, [0.1, 1.0], STEP)
-    assert told.shape == (100, 1, 6)
-    torch.testing.assert_close(told[..., :2], pressure)
-    assert not told[:20].any()
-    fast, slow = told[-1, 0, 2], told[-1, 0, 4]
-    assert float(fast) == pytest.approx(1e4, rel=1e-3)
-    assert float(slow) == pytest.approx(1e4 * (1 - np.exp(-0.8)), rel=1e-9)
-    torch.testing.assert_close(remembered(pressure, [], STEP), pressure)
-
-
 def test_a_gauge_that_is_a_little_off_zero_is_believed_and_one_that_is_far_off_is_not():
     tension = np.array([[-0.01, 1.0], [0.2, 0.5]])
     np.testing.assert_array_equal(check_inputs(tension, TENSION, 2, 2.0, "a.h5"), [[0.0, 1.0], [0.2, 0.5]])
     with pytest.raises(DataFileError, match=r"a\.h5: the tension of tendon 1 is -0.5 N in frame 1: it must be zero or"):
         check_inputs(np.array([[0.0], [-0.5]]), TENSION, 1, 2.0, "a.h5")
-
-
-def test_a_delay_moves_commands_and_shares_a_step():
-    command = torch.arange(1.0, 6.0, dtype=torch.float64)[:, None, None].expand(-1, 3, 2)
-    late = torch.tensor([0.0, 2.0, 1.25], dtype=torch.float64) * STEP
-    found = delayed(command, late, STEP)[..., 0]
-    assert found[:, 0].tolist() == [1.0, 2.0, 3.0, 4.0, 5.0]
-    assert found[:, 1].tolist() == [0.0, 0.0, 1.0, 2.0, 3.0]
-    torch.testing.assert_close(found[:, 2], torch.tensor([0.0, 0.75, 1.75, 2.75, 3.75], dtype=torch.float64))
-    assert torch.equal(delayed(command[0], late, STEP), command[0])  # What acts all the time has no beginning.
-
-
-def test_a_delay_is_differentiable():
-    command = torch.rand(6, 2, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    late = (torch.tensor([0.3, 1.6], dtype=torch.float64) * STEP).requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: delayed(command, x, STEP), (late,), eps=1e-4 * STEP, atol=1e-6)

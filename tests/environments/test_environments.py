@@ -6,10 +6,10 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
+from warp_resphys.control.world import World
 from warp_resphys.environments.making import TASKS, make_vector
 from warp_resphys.environments.tasks import FollowTask, Reach, ReachTask
-from warp_resphys.environments.vector import Drive, RobotVectorEnv
-from warp_resphys.environments.worlds import World
+from warp_resphys.environments.vector import ActionMapping, RobotVectorEnv
 from warp_resphys.io.errors import InputError
 
 QUICK = {"seconds": 0.2, "action_time": 0.05}  # four actions
@@ -152,8 +152,8 @@ class TestFailures:
     def test_one_in_any_step_of_an_action_ends_the_episode(self):
         places = np.random.default_rng(0).normal(size=(8, 3))
         reach = Reach(places, np.zeros((8, 1)))
-        drive = Drive(np.zeros(1), np.ones(1), np.full(1, 10.0), np.zeros(1), 5)
-        robots = RobotVectorEnv(Brittle(), ReachTask(2, 6, reach), drive, np.eye(3), 6)
+        mapping = ActionMapping(np.zeros(1), np.ones(1), np.full(1, 10.0), np.zeros(1), 5)
+        robots = RobotVectorEnv(Brittle(), ReachTask(2, 6, reach), mapping, np.eye(3), 6)
         robots.reset(seed=0)
         found = [robots.step(np.ones((2, 1), dtype=np.float32)) for _ in range(5)]
         assert [each[2].tolist() for each in found] == [[False] * 2] * 2 + [[True, False]] + [[False] * 2] * 2

@@ -127,9 +127,9 @@ def test_idle_matrices_keep_the_factor_they_have(device, cholespy):
                 expected = expected + scale @ scale.transpose(0, 2, 1)
             found = after.solve(right).cpu()
             np.testing.assert_allclose(found, np.linalg.solve(expected, right.cpu()), rtol=1e-9, atol=1e-9)
-            in_place = right[:, solver.unknowns, 0].contiguous()
+            in_place = right[:, solver.dofs, 0].contiguous()
             after.solve_in_place(in_place)
-            np.testing.assert_allclose(in_place.cpu(), found[:, solver.unknowns.cpu(), 0], rtol=1e-9, atol=1e-12)
+            np.testing.assert_allclose(in_place.cpu(), found[:, solver.dofs.cpu(), 0], rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("unknown", [0, 15, 16, 35])
@@ -139,7 +139,7 @@ def test_a_pivot_that_is_not_positive_is_found_wherever_it_is(unknown, device):
     for kind in layouts(device):
         solver = make(kind, 3, device)
         bad = dense.copy()
-        at = int(solver.unknowns[unknown])
+        at = int(solver.dofs[unknown])
         bad[1, at, at] = -1.0
         assert solver.factor(values_of(solver, bad)).failed.tolist() == [False, True, False]
 
@@ -190,9 +190,9 @@ def test_a_correction_of_low_rank_is_as_accurate_in_place(device):
     expected = np.linalg.solve(dense + (columns @ columns.mT).cpu().numpy(), columns.cpu().numpy())
     for kind in layouts(device):
         solver = make(kind, 3, device)
-        in_place = columns[:, solver.unknowns, 0].contiguous()
+        in_place = columns[:, solver.dofs, 0].contiguous()
         solver.factor(values_of(solver, dense), columns=columns).solve_in_place(in_place)
-        wanted = expected[:, solver.unknowns.cpu().numpy(), 0]
+        wanted = expected[:, solver.dofs.cpu().numpy(), 0]
         np.testing.assert_allclose(in_place.cpu(), wanted, rtol=0, atol=1e-6 * np.abs(wanted).max())
 
 

@@ -74,7 +74,7 @@ def test_iterations_hardly_grow_with_the_mesh():
     counts = []
     for refinement in (1, 2):
         solver, values = system(beam(refinement))
-        (cycle,) = (each._cycle for each in solver.factor(values).systems)
+        (cycle,) = (each.cycle for each in solver.factor(values).factors)
         matrix = torch.as_tensor(dense(solver, values))
         right = torch.as_tensor(np.random.default_rng(1).normal(size=(1, solver.n)))
         counts.append(conjugate_gradients(lambda x, a=matrix: x @ a, cycle.apply, right, 1e-8).iterations)
@@ -84,7 +84,7 @@ def test_iterations_hardly_grow_with_the_mesh():
 
 def test_the_cycle_is_symmetric_and_positive_definite():
     solver, values = system(beam(poissons_ratio=0.499))
-    (cycle,) = (each._cycle for each in solver.factor(values).systems)
+    (cycle,) = (each.cycle for each in solver.factor(values).factors)
     assert cycle._levels
     operator = cycle.apply(torch.eye(solver.n, dtype=torch.float64)).numpy()
     np.testing.assert_allclose(operator, operator.T, rtol=0, atol=1e-10 * np.abs(operator).max())
@@ -121,7 +121,7 @@ def test_a_cycle_serves_later_matrices_until_it_is_worn():
     first = solver.factor(values)
     first.solve(right)
     near = solver.factor(1.1 * values)
-    assert near.systems[0]._cycle is first.systems[0]._cycle
+    assert near.factors[0].cycle is first.factors[0].cycle
     np.testing.assert_allclose(1.1 * near.solve(right), first.solve(right), rtol=0, atol=1e-9)
     diagonal = torch.as_tensor((solver._rows == solver._cols)[: solver.n_values])
     bent = values.clone()
@@ -136,8 +136,8 @@ def test_a_cycle_serves_later_matrices_until_it_is_worn():
     stiffer[:, diagonal] *= torch.as_tensor(10.0 ** np.random.default_rng(3).uniform(0, 4, size=int(diagonal.sum())))
     later = solver.factor(stiffer)
     later.solve(right)
-    assert later.systems[0]._cycle.worn
-    assert solver.factor(stiffer).systems[0]._cycle is not first.systems[0]._cycle
+    assert later.factors[0].cycle.worn
+    assert solver.factor(stiffer).factors[0].cycle is not first.factors[0].cycle
 
 
 @pytest.mark.parametrize("name", ["quasi_newton", "newton", "projective_dynamics"])

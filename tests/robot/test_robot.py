@@ -16,7 +16,6 @@ import warp_resphys
 from warp_resphys import pipeline
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.files import read_json, write_json
-from warp_resphys.robot.commands import Commands
 from warp_resphys.robot.program import export_network, told_names
 
 # A short segment with two chambers of some 70 vertices; what is unknown of its pressures is identified.
@@ -210,27 +209,6 @@ class TestStates:
             expected = robot.step(moved.select([0]), pressure=[HIGH, 0.0])
         torch.testing.assert_close(later.q[:1], expected.q, atol=1e-9, rtol=0.0)
         assert moved.repeat(2).batch == 4
-
-    @pytest.mark.parametrize("delay", [0.0, 0.02, 0.025, 0.07])
-    def test_commands_step_by_step_are_those_of_whole_series(self, delay):
-        from warp_resphys.data.actuation import delayed, lagged, remembered
-
-        def one(value):
-            return torch.tensor([value], dtype=torch.float64)
-
-        series, parameters = wave(12), {"p_factor": one(0.8), "p_delay": one(delay), "p_rise": one(0.04)}
-        commands = Commands("p", parameters, [0.1, 0.5], 0.01)
-        memory = commands.still(torch.zeros(1, 2, dtype=torch.float64))
-        found, told = [], []
-        for each in series:
-            acting, seen, memory = commands.step(memory, each)
-            found.append(acting)
-            told.append(seen)
-        expected = lagged(delayed(0.8 * series, one(delay), 0.01), one(0.04), 0.01)
-        torch.testing.assert_close(torch.stack(found), expected)
-        torch.testing.assert_close(torch.stack(told), remembered(expected, [0.1, 0.5], 0.01))
-        acting, seen, _ = commands.step(commands.still(series[3]), series[3])
-        torch.testing.assert_close(seen, torch.cat([0.8 * series[3]] * 3, -1))
 
 
 class TestFiles:

@@ -1,19 +1,17 @@
-"""What control has without a simulator: a linear model of the same recordings, and feedback by a Jacobian.
+"""A linear model of the recordings, without a simulator, that plans are made with as with the reduced model.
 
-The linear model is a dynamic mode decomposition with control (Proctor, Brunton and Kutz, SIAM J. Appl. Dyn. Syst. 15
-(2016) 142) of delayed markers, planned with as the reduced model is. The Jacobian is measured by pressing once in every
-input, and corrected on the way by Broyden's rule, applied to means over a while: the body vibrates.
+It is a dynamic mode decomposition with control (Proctor, Brunton and Kutz, SIAM J. Appl. Dyn. Syst. 15 (2016) 142) of
+delayed markers.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .plan import Limits
-from .reduced import Response
+from .plan import Response
 
 FloatArray = NDArray[np.float64]
 
@@ -21,10 +19,6 @@ _RANKS = (8, 12, 18, 24, 36)  # of which validation chooses
 DELAYS: Final = 4  # markers that tell the state
 _RIDGE = 1e-8
 _AHEAD = 0.3  # s, that validation foretells
-_AVERAGED = 0.25  # s, over which the means of points and inputs are compared, without what vibrates
-_LEARNING = 0.05  # share of Broyden's correction that is taken in a step
-_LITTLE = 1e-3  # of the squared changes of the inputs, as shares of their ranges, that tell little
-_DAMPING = 0.05  # of the largest singular value
 
 
 @dataclass(frozen=True)
@@ -74,24 +68,7 @@ class LinearModel:
                 ds = self.a @ ds + self.b @ (basis[k] / self.scale[:, None])
                 sloped.append(ds)
         y = self.rest + np.array(states) @ self.c.T
-        return Response(y, None if basis is None else self.c @ np.array(sloped), [])
-
-    def arrays(self) -> dict[str, FloatArray]:
-        """Its arrays, for a file."""
-        return {name: getattr(self, name) for name in ("scale", "rest", "basis", "a", "b", "c")}
-
-    def plain(self) -> dict[str, float]:
-        """What `restored` needs beside the arrays."""
-        return {"time_step": self.time_step, "validation_mm": self.validation_mm}
-
-    @classmethod
-    def restored(cls, arrays: Mapping[str, FloatArray], plain: Mapping[str, float]) -> "LinearModel":
-        """From `arrays` and `plain`."""
-        return cls(
-            **{name: arrays[name] for name in ("scale", "rest", "basis", "a", "b", "c")},
-            time_step=float(plain["time_step"]),
-            validation_mm=float(plain["validation_mm"]),
-        )
+        return Response(y, None if basis is None else self.c @ np.array(sloped))
 
 
 def fit_linear(
@@ -137,7 +114,7 @@ def fit_linear(
         )
         error = _foretold(made, validation, delayed)
         if best is None or error < best.validation_mm:
-            best = LinearModel(**{**made.__dict__, "validation_mm": error})
+            best = replace(made, validation_mm=error)
     assert best is not None
     return best
 
@@ -152,49 +129,3 @@ def _foretold(model: LinearModel, trials: Sequence[tuple[FloatArray, FloatArray]
             off = (found - markers[at + 1 : at + 1 + steps]).reshape(steps, -1, 3)
             errors.append(np.linalg.norm(off, axis=2).mean())
     return 1e3 * float(np.mean(errors)) if errors else np.inf
-
-
-class JacobianFeedback:
-    """Follows a path by how the points moved when the inputs were pressed.
-
-    Args:
-        jacobian: (d, n) of the points by the inputs, measured [m per unit].
-        limits: of the inputs.
-        gain: of the error [1/s].
-        time_step: h [s].
-    """
-
-    def __init__(self, jacobian: FloatArray, limits: Limits, gain: float, time_step: float) -> None:
-        self._jacobian, self._limits, self._gain, self._step = jacobian * limits.range, limits, gain, time_step
-        self._command = np.zeros(len(limits.range))
-        self._size = float(np.linalg.norm(self._jacobian, 2))
-        self._window = max(round(_AVERAGED / time_step), 1)
-        self._past = np.zeros((0, len(jacobian) + len(limits.range)))  # points and shares of the inputs, the last last
-
-    def command(self, point: FloatArray, goal: FloatArray, next_goal: FloatArray) -> FloatArray:
-        """(n,) what to command, of a point (d,), where it should be, and where it should be a step on [m]."""
-        u, h, d = self._command, self._step, len(point)
-        self._past = np.concatenate([self._past, [np.concatenate([point, u])]])[-2 * self._window :]
-        if len(self._past) == 2 * self._window:
-            before, now = (each.mean(0) for each in np.split(self._past, 2))
-            moved, changed = (now - before)[:d], (now - before)[d:]
-            missed = moved - self._jacobian @ changed
-            self._jacobian = self._jacobian + _LEARNING / (changed @ changed + _LITTLE) * np.outer(missed, changed)
-        wanted = next_goal - goal + self._gain * h * (goal - point)
-        j, damping = self._jacobian, _DAMPING * self._size
-        inverse = j.T @ np.linalg.inv(j @ j.T + damping**2 * np.eye(d))
-        change = inverse @ wanted
-        # What moves no point brings the inputs together, away from their bounds.
-        change = change - 0.5 * h * (np.eye(len(u)) - inverse @ j) @ (u - u.mean())
-        most = self._limits.rate * h / self._limits.range
-        self._command = np.clip(u + np.clip(change, -most, most), 0.0, 1.0)
-        return np.asarray(self._limits.low + self._limits.range * self._command)
-
-    @property
-    def memory(self) -> dict[str, FloatArray]:
-        """What the next step depends on."""
-        return {"jacobian": self._jacobian, "shares": self._command, "past": self._past}
-
-    @memory.setter
-    def memory(self, values: Mapping[str, FloatArray]) -> None:
-        self._jacobian, self._command, self._past = (values[key] for key in ("jacobian", "shares", "past"))

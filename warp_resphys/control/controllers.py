@@ -1,18 +1,19 @@
-"""Who commands a robot at each step: a plan that is played, plans that begin anew at every step, or feedback.
+"""Controllers: they play a plan, plan anew at every step, or feed back the error by a Jacobian.
 
-Each has a memory of arrays, from which a run that was interrupted goes on.
+A controller has a memory of arrays, from which a run that was interrupted goes on.
 """
 
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from .baselines import DELAYS, JacobianFeedback, LinearModel
+from .baselines import DELAYS, LinearModel
 from .estimate import Estimator, Noise
 from .plan import Foretelling, Limits, Planner, Weights
 from .reduced import ReducedModel
@@ -21,22 +22,33 @@ FloatArray = NDArray[np.float64]
 Memory = dict[str, FloatArray]
 
 _SETTLES = 0.1  # share by which a linear model's constant error is corrected in a step
+_AVERAGED = 0.25  # s, over which the means of points and inputs are compared, without what vibrates
+_LEARNING = 0.05  # share of Broyden's correction that is taken in a step
+_LITTLE = 1e-3  # of the squared changes of the inputs, as shares of their ranges, that tell little
+_DAMPING = 0.05  # of the largest singular value
 
 
 class Controller(ABC):
-    """Commands inputs (n,) at each step, of what cameras saw after the last one."""
+    """Commands inputs (n,) at each step, from what cameras saw after the last one.
+
+    Attributes:
+        memory_keys: attributes that the next step depends on; None is not kept.
+    """
+
+    memory_keys: ClassVar[tuple[str, ...]] = ()
 
     @abstractmethod
     def command(self, number: int, markers: FloatArray) -> FloatArray:
-        """(n,) for a step, of markers (M, 3) before it [m], NaN where one is not seen."""
+        """(n,) inputs for a step, from markers (M, 3) before it [m], NaN where one is not seen."""
 
     def remembered(self) -> Memory:
-        """What the next step depends on."""
-        return {}
+        """The arrays that the next step depends on."""
+        return {key: value for key in self.memory_keys if (value := getattr(self, key)) is not None}
 
     def recall(self, memory: Mapping[str, FloatArray]) -> None:
-        """Goes back to what was `remembered`."""
-        del memory
+        """Continues from what another controller of the same settings `remembered`."""
+        for key in self.memory_keys:
+            setattr(self, key, memory.get(key))
 
 
 class OpenLoop(Controller):
@@ -70,14 +82,16 @@ class Horizon:
 class _Receding(Controller):
     """Plans anew at every step, from where the last plan would go on."""
 
+    memory_keys = ("last_command", "knots")
+
     def __init__(
         self, model: Foretelling, tracked: FloatArray, limits: Limits, horizon: Horizon, path: FloatArray
     ) -> None:
         self._planner = Planner(
             model, tracked, limits, horizon.steps, horizon.pieces, horizon.weights, horizon.iterations
         )
-        self._path, self._command = path, np.array(limits.low)
-        self._knots: FloatArray | None = None
+        self._path, self.last_command = path, np.array(limits.low)
+        self.knots: FloatArray | None = None
 
     def _ahead(self, number: int) -> FloatArray:
         """(H, d) of the path from a step on; at its end it stays."""
@@ -89,18 +103,9 @@ class _Receding(Controller):
         steps, pieces = planner.steps, planner.knots - 1
         line = np.concatenate([knots[:1], inputs])
         at = np.minimum(np.arange(pieces + 1) * steps / pieces + 1.0, steps)
-        self._knots = np.stack([np.interp(at, np.arange(steps + 1), column) for column in line.T], axis=1)
-        self._command = inputs[0]
-        return self._command
-
-    @override
-    def remembered(self) -> Memory:
-        kept = {"command": self._command}
-        return kept if self._knots is None else {**kept, "knots": self._knots}
-
-    @override
-    def recall(self, memory: Mapping[str, FloatArray]) -> None:
-        self._command, self._knots = memory["command"], memory.get("knots")
+        self.knots = np.stack([np.interp(at, np.arange(steps + 1), column) for column in line.T], axis=1)
+        self.last_command = inputs[0]
+        return self.last_command
 
 
 class RecedingHorizon(_Receding):
@@ -127,9 +132,8 @@ class RecedingHorizon(_Receding):
         rest: FloatArray,
     ) -> None:
         super().__init__(model, tracked, limits, horizon, path)
-        nothing = np.zeros((1, model.parts))
-        offset = rest.ravel() - model.observe(model.rest().z[None], nothing)[0]
-        self._estimator = Estimator(model, noise, nothing[0], np.where(np.isfinite(offset), offset, 0.0))
+        offset = rest.ravel() - model.observe(model.rest())[0]
+        self._estimator = Estimator(model, noise, np.zeros(model.parts), np.where(np.isfinite(offset), offset, 0.0))
         self._offset = tracked @ self._estimator.offset
 
     @override
@@ -138,7 +142,7 @@ class RecedingHorizon(_Receding):
         if number:
             known.correct(markers)
         plan = self._planner.plan(
-            known.state, self._command, self._ahead(number), self._knots, known.bias, self._offset
+            known.state, self.last_command, self._ahead(number), self.knots, known.bias, self._offset
         )
         found = self._keep(plan.inputs, plan.knots)
         known.predict(found)
@@ -162,6 +166,8 @@ class LinearRecedingHorizon(_Receding):
         tracked, limits, horizon, path, rest: see `RecedingHorizon`.
     """
 
+    memory_keys = (*_Receding.memory_keys, "seen", "expected", "missed")
+
     def __init__(
         self,
         model: LinearModel,
@@ -173,62 +179,79 @@ class LinearRecedingHorizon(_Receding):
     ) -> None:
         super().__init__(model, tracked, limits, horizon, path)
         self._model, self._tracked = model, tracked
-        self._seen = np.tile(np.where(np.isfinite(rest), rest, model.rest.reshape(-1, 3)).ravel(), (DELAYS, 1))
-        self._expected = self._seen[0]
-        self._missed = np.zeros_like(self._expected)
+        self.seen = np.tile(np.where(np.isfinite(rest), rest, model.rest.reshape(-1, 3)).ravel(), (DELAYS, 1))
+        self.expected = self.seen[0]
+        self.missed = np.zeros_like(self.expected)
 
     @override
     def command(self, number: int, markers: FloatArray) -> FloatArray:
         if number:
-            now = np.where(np.isfinite(markers.ravel()), markers.ravel(), self._expected)
-            self._missed = self._missed + _SETTLES * (now - self._expected - self._missed)
-            self._seen = np.concatenate([now[None], self._seen[:-1]])
-        state = self._model.state(list(self._seen))
+            now = np.where(np.isfinite(markers.ravel()), markers.ravel(), self.expected)
+            self.missed = self.missed + _SETTLES * (now - self.expected - self.missed)
+            self.seen = np.concatenate([now[None], self.seen[:-1]])
+        state = self._model.state(list(self.seen))
         plan = self._planner.plan(
-            state, self._command, self._ahead(number), self._knots, offset=self._tracked @ self._missed
+            state, self.last_command, self._ahead(number), self.knots, offset=self._tracked @ self.missed
         )
         found = self._keep(plan.inputs, plan.knots)
-        self._expected = self._model.respond(state, found[None]).y[0]
+        self.expected = self._model.respond(state, found[None]).y[0]
         return found
 
-    @override
-    def remembered(self) -> Memory:
-        return super().remembered() | {"seen": self._seen, "expected": self._expected, "missed": self._missed}
 
-    @override
-    def recall(self, memory: Mapping[str, FloatArray]) -> None:
-        super().recall(memory)
-        self._seen, self._expected, self._missed = (memory[key] for key in ("seen", "expected", "missed"))
+class JacobianFeedback(Controller):
+    """Follows a path by how the points moved when the inputs were pressed, corrected on the way by Broyden's rule.
 
-
-class Feedback(Controller):
-    """Follows a path by a measured Jacobian.
+    The rule is applied to means over a while, as the body vibrates.
 
     Args:
-        feedback: how.
+        jacobian: (d, n) of the points by the inputs, measured [m per unit].
+        limits: of the inputs.
+        gain: of the error [1/s].
+        time_step: h [s].
         tracked: see `Planner`.
         path: (T, d) where the points are to be after each step [m].
         rest: (M, 3) markers at the beginning [m].
     """
 
-    def __init__(self, feedback: JacobianFeedback, tracked: FloatArray, path: FloatArray, rest: FloatArray) -> None:
-        self._feedback, self._tracked, self._path = feedback, tracked, path
-        self._last = rest.ravel()
+    memory_keys = ("jacobian", "shares", "past", "last_seen")
+
+    def __init__(
+        self,
+        jacobian: FloatArray,
+        limits: Limits,
+        gain: float,
+        time_step: float,
+        tracked: FloatArray,
+        path: FloatArray,
+        rest: FloatArray,
+    ) -> None:
+        self.jacobian, self._limits, self._gain, self._step = jacobian * limits.range, limits, gain, time_step
+        self._tracked, self._path, self.last_seen = tracked, path, rest.ravel()
+        self.shares = np.zeros(len(limits.range))
+        self._damping = _DAMPING * float(np.linalg.norm(self.jacobian, 2))
+        self._window = max(round(_AVERAGED / time_step), 1)
+        self.past = np.zeros((0, len(jacobian) + len(limits.range)))  # points and shares of the inputs, the last last
 
     @override
     def command(self, number: int, markers: FloatArray) -> FloatArray:
-        now = np.where(np.isfinite(markers.ravel()), markers.ravel(), self._last)
-        self._last = now
-        goal = self._path[max(number - 1, 0)]
-        return self._feedback.command(self._tracked @ now, goal, self._path[number])
-
-    @override
-    def remembered(self) -> Memory:
-        return {"last_seen": self._last, **self._feedback.memory}
-
-    @override
-    def recall(self, memory: Mapping[str, FloatArray]) -> None:
-        self._last, self._feedback.memory = memory["last_seen"], memory
+        self.last_seen = np.where(np.isfinite(markers.ravel()), markers.ravel(), self.last_seen)
+        point, goal, next_goal = self._tracked @ self.last_seen, self._path[max(number - 1, 0)], self._path[number]
+        u, h, d = self.shares, self._step, len(point)
+        self.past = np.concatenate([self.past, [np.concatenate([point, u])]])[-2 * self._window :]
+        if len(self.past) == 2 * self._window:
+            before, now = (each.mean(0) for each in np.split(self.past, 2))
+            moved, changed = (now - before)[:d], (now - before)[d:]
+            missed = moved - self.jacobian @ changed
+            self.jacobian = self.jacobian + _LEARNING / (changed @ changed + _LITTLE) * np.outer(missed, changed)
+        wanted = next_goal - goal + self._gain * h * (goal - point)
+        j = self.jacobian
+        inverse = j.T @ np.linalg.inv(j @ j.T + self._damping**2 * np.eye(d))
+        change = inverse @ wanted
+        # What moves no point brings the inputs together, away from their bounds.
+        change = change - 0.5 * h * (np.eye(len(u)) - inverse @ j) @ (u - u.mean())
+        most = self._limits.rate * h / self._limits.range
+        self.shares = np.clip(u + np.clip(change, -most, most), 0.0, 1.0)
+        return np.asarray(self._limits.low + self._limits.range * self.shares)
 
 
 def timed_command(controller: Controller, number: int, markers: FloatArray) -> tuple[FloatArray, float]:

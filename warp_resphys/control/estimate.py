@@ -6,11 +6,12 @@ constant error the model has (offset-free control: Pannocchia and Rawlings, AICh
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .polynomials import Monomials
 from .reduced import ReducedModel, ReducedState
 
 FloatArray = NDArray[np.float64]
@@ -43,15 +44,16 @@ class Estimator:
 
     def __init__(self, model: ReducedModel, noise: Noise, inputs: FloatArray, offset: FloatArray | None = None) -> None:
         self.model, self._noise = model, noise
-        self.state, self._inputs = model.rest(inputs), inputs
+        self.state = model.rest(inputs)
         r = model.modes
         self.bias = np.zeros(r)
         self.offset = np.zeros(model.curved.shape[2]) if offset is None else offset
-        seen = model.observed_slopes(self.state.z[None], inputs[None])[0]
+        u = Monomials(self.state.acting)
+        seen = model.point_slopes(self.state.z, u)[0][0]
         # How far a coordinate moves the markers, on average [m].
         size = np.linalg.norm(seen, axis=0) / np.sqrt(len(self.offset) / 3.0)
         one = 1e-3 / size
-        stiffness = np.abs(np.diag(model.stiffness((inputs / model.scale)[None])[0]))
+        stiffness = np.abs(np.diag(model.stiffness(u)[0]))
         self._wander = np.concatenate(
             [np.zeros(r), (noise.rate * one * np.sqrt(stiffness)) ** 2, (noise.bias / size) ** 2 * model.time_step]
         )
@@ -60,23 +62,19 @@ class Estimator:
     def predict(self, inputs: FloatArray) -> None:
         """One step under inputs (n,)."""
         r = self.model.modes
-        self.state, by_z, by_v, by_bias = self.model.transition(self.state, inputs, self.bias)
-        transition = np.zeros((3 * r, 3 * r))
-        transition[: 2 * r] = np.concatenate([by_z, by_v, by_bias], axis=1)
-        transition[2 * r :, 2 * r :] = np.eye(r)
+        transition = np.eye(3 * r)
+        self.state, transition[: 2 * r] = self.model.transition(self.state, inputs, self.bias)
         self._covariance = transition @ self._covariance @ transition.T + np.diag(self._wander)
-        self._inputs = inputs
 
     @property
     def memory(self) -> dict[str, FloatArray]:
         """What the next step depends on."""
-        state = {key: value for key, value in vars(self.state).items() if value is not None}
-        return {**state, "bias": self.bias, "covariance": self._covariance, "inputs": self._inputs}
+        return {**self.state.arrays(), "bias": self.bias, "covariance": self._covariance}
 
     @memory.setter
     def memory(self, values: Mapping[str, FloatArray]) -> None:
-        self.state = ReducedState(**{each.name: values.get(each.name) for each in fields(ReducedState)})  # type: ignore[arg-type]
-        self.bias, self._covariance, self._inputs = (values[key] for key in ("bias", "covariance", "inputs"))
+        self.state = ReducedState.from_arrays({key: values[key] for key in self.state.arrays()})
+        self.bias, self._covariance = values["bias"], values["covariance"]
 
     def correct(self, markers: FloatArray) -> None:
         """Takes in markers (M, 3) after the step [m]; NaN where one is not seen."""
@@ -85,8 +83,8 @@ class Estimator:
         if not seen.any():
             return
         slopes = np.zeros((int(seen.sum()), 3 * r))
-        slopes[:, :r] = model.observed_slopes(self.state.z[None], self._inputs[None])[0][seen]
-        expected = (model.observe(self.state.z[None], self._inputs[None])[0] + self.offset)[seen]
+        slopes[:, :r] = model.point_slopes(self.state.z, Monomials(self.state.acting))[0][0, seen]
+        expected = (model.observe(self.state)[0] + self.offset)[seen]
         spread = slopes @ self._covariance @ slopes.T + self._noise.observed**2 * np.eye(len(slopes))
         gain = np.linalg.solve(spread, slopes @ self._covariance).T
         change = gain @ (markers.ravel()[seen] - expected)

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import torch
@@ -21,6 +21,9 @@ BASELINES: Final = "baselines.safetensors"
 _REDUCED: Final = "reduced model"
 _BASELINES: Final = "baselines"
 _PLANS: Final = "plans"
+_DRIVEN: Final = DRIVEN.removesuffix(".h5")
+_UNITS: Final = {"path": "m", "points": "m", "markers": "m", "errors_mm": "mm", "seconds": "s"}
+_PLAIN: Final = ("time_step", "validation_mm")  # of a linear model
 
 
 def reduced_file(model: str) -> str:
@@ -40,8 +43,9 @@ def plan_table(model: str, motion: str) -> str:
 
 def write_reduced(path: Path, model: ReducedModel) -> None:
     """Writes a reduced model without its network, for `read_reduced`."""
-    tensors = {name: torch.from_numpy(np.ascontiguousarray(each)) for name, each in model.arrays().items()}
-    write_checkpoint(path, _REDUCED, tensors, model.plain())
+    arrays, plain = model.checkpoint()
+    tensors = {name: torch.from_numpy(np.ascontiguousarray(each)) for name, each in arrays.items()}
+    write_checkpoint(path, _REDUCED, tensors, plain)
 
 
 def read_reduced(path: Path, learned: Learned | None) -> ReducedModel:
@@ -50,10 +54,10 @@ def read_reduced(path: Path, learned: Learned | None) -> ReducedModel:
     return ReducedModel.restored({name: each.numpy() for name, each in tensors.items()}, plain, learned)
 
 
-def read_told(path: Path) -> Mapping[str, Any]:
-    """What was found when a reduced model was made."""
-    told: Mapping[str, Any] = read_checkpoint(path, _REDUCED)[1]["told"]
-    return told
+def read_quality(path: Path) -> Mapping[str, Any]:
+    """Errors of a reduced model, and counts of the samples from which it was made."""
+    quality: Mapping[str, Any] = read_checkpoint(path, _REDUCED)[1]["quality"]
+    return quality
 
 
 @dataclass(frozen=True)
@@ -75,56 +79,6 @@ class PlannedMotion:
     errors_mm: FloatArray
 
 
-_PLANNED: Final = tuple(each.name for each in fields(PlannedMotion))
-
-
-def write_plans(path: Path, motions: Mapping[str, PlannedMotion]) -> None:
-    """Writes planned motions by name, for `read_plan`."""
-    with atomic_hdf5(path, _PLANS, {"names": list(motions)}) as file:
-        for name, each in motions.items():
-            group = file.create_group(name)
-            create(group, "path", each.path, "m")
-            create(group, "inputs", each.inputs)
-            create(group, "points", each.points, "m")
-            create(group, "markers", each.markers, "m")
-            create(group, "errors_mm", each.errors_mm, "mm")
-
-
-def read_plan(path: Path, motion: str) -> PlannedMotion:
-    """One of the motions."""
-    with read_hdf5(path, _PLANS) as file:
-        return PlannedMotion(*(read_array(file, f"{motion}/{name}").astype(np.float64) for name in _PLANNED))
-
-
-def plain_plans(motions: Mapping[str, PlannedMotion]) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-    """Tensors and plain data of planned motions, for a checkpoint; see `plans_from_plain`."""
-    tensors = {
-        f"{name}/{key}": torch.from_numpy(np.ascontiguousarray(getattr(each, key)))
-        for name, each in motions.items()
-        for key in _PLANNED
-    }
-    return tensors, {"names": list(motions)}
-
-
-def plans_from_plain(tensors: Mapping[str, torch.Tensor], plain: Mapping[str, Any]) -> dict[str, PlannedMotion]:
-    """From `plain_plans`."""
-    return {name: PlannedMotion(*(tensors[f"{name}/{key}"].numpy() for key in _PLANNED)) for name in plain["names"]}
-
-
-def write_baselines(path: Path, linear: LinearModel, jacobian: FloatArray) -> None:
-    """Writes the linear model and the measured Jacobian (d, n)."""
-    arrays = {**linear.arrays(), "jacobian": jacobian}
-    tensors = {name: torch.from_numpy(np.ascontiguousarray(each)) for name, each in arrays.items()}
-    write_checkpoint(path, _BASELINES, tensors, linear.plain())
-
-
-def read_baselines(path: Path) -> tuple[LinearModel, FloatArray]:
-    """From the file of `write_baselines`."""
-    tensors, plain = read_checkpoint(path, _BASELINES)
-    arrays = {name: each.numpy() for name, each in tensors.items()}
-    return LinearModel.restored(arrays, plain), arrays["jacobian"]
-
-
 @dataclass(frozen=True)
 class DrivenMotion:
     """A motion as C controllers drove it.
@@ -142,22 +96,66 @@ class DrivenMotion:
     seconds: FloatArray
 
 
-_DRIVEN: Final = tuple(each.name for each in fields(DrivenMotion))
+AnyMotion = TypeVar("AnyMotion", PlannedMotion, DrivenMotion)
+
+
+def write_plans(path: Path, motions: Mapping[str, PlannedMotion]) -> None:
+    """Writes planned motions by name, for `read_plan`."""
+    _write_motions(path, _PLANS, {}, motions)
+
+
+def read_plan(path: Path, motion: str) -> PlannedMotion:
+    """One of the planned motions."""
+    return _read_motion(path, _PLANS, motion, PlannedMotion)
 
 
 def write_driven(path: Path, controllers: Sequence[str], time_step: float, motions: Mapping[str, DrivenMotion]) -> None:
-    """Writes driven motions by name, for `read_driven`; the report reads it, too."""
-    attributes: dict[str, Any] = {"names": list(motions), "controllers": list(controllers), "time_step": time_step}
-    with atomic_hdf5(path, DRIVEN.removesuffix(".h5"), attributes) as file:
-        for name, each in motions.items():
-            group = file.create_group(name)
-            create(group, "path", each.path, "m")
-            create(group, "points", each.points, "m", time_axis=1)
-            create(group, "inputs", each.inputs, time_axis=1)
-            create(group, "seconds", each.seconds, "s", time_axis=1)
+    """Writes driven motions by name, for `read_driven` and for the report."""
+    _write_motions(path, _DRIVEN, {"controllers": list(controllers), "time_step": time_step}, motions)
 
 
 def read_driven(path: Path, motion: str) -> DrivenMotion:
-    """One of the motions."""
-    with read_hdf5(path, DRIVEN.removesuffix(".h5")) as file:
-        return DrivenMotion(*(read_array(file, f"{motion}/{name}").astype(np.float64) for name in _DRIVEN))
+    """One of the driven motions."""
+    return _read_motion(path, _DRIVEN, motion, DrivenMotion)
+
+
+def _write_motions(path: Path, kind: str, more: Mapping[str, Any], motions: Mapping[str, AnyMotion]) -> None:
+    with atomic_hdf5(path, kind, {"names": list(motions), **more}) as file:
+        for name, motion in motions.items():
+            group = file.create_group(name)
+            for each in fields(motion):
+                time_axis = int(isinstance(motion, DrivenMotion) and each.name != "path")
+                create(group, each.name, getattr(motion, each.name), _UNITS.get(each.name, "1"), time_axis)
+
+
+def _read_motion(path: Path, kind: str, motion: str, made: type[AnyMotion]) -> AnyMotion:
+    with read_hdf5(path, kind) as file:
+        return made(*(read_array(file, f"{motion}/{each.name}").astype(np.float64) for each in fields(made)))
+
+
+def plain_plans(motions: Mapping[str, PlannedMotion]) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    """Tensors and plain data of planned motions, for a checkpoint; see `plans_from_plain`."""
+    pairs = ((f"{name}/{key}", each) for name, motion in motions.items() for key, each in vars(motion).items())
+    return {key: torch.from_numpy(np.ascontiguousarray(each)) for key, each in pairs}, {"names": list(motions)}
+
+
+def plans_from_plain(tensors: Mapping[str, torch.Tensor], plain: Mapping[str, Any]) -> dict[str, PlannedMotion]:
+    """The planned motions of `plain_plans`."""
+    keys = [each.name for each in fields(PlannedMotion)]
+    return {name: PlannedMotion(*(tensors[f"{name}/{key}"].numpy() for key in keys)) for name in plain["names"]}
+
+
+def write_baselines(path: Path, linear: LinearModel, jacobian: FloatArray) -> None:
+    """Writes the linear model and the measured Jacobian (d, n)."""
+    known = {**vars(linear), "jacobian": jacobian}
+    plain = {key: known.pop(key) for key in _PLAIN}
+    tensors = {name: torch.from_numpy(np.ascontiguousarray(each)) for name, each in known.items()}
+    write_checkpoint(path, _BASELINES, tensors, plain)
+
+
+def read_baselines(path: Path) -> tuple[LinearModel, FloatArray]:
+    """The linear model and the Jacobian from the file of `write_baselines`."""
+    tensors, plain = read_checkpoint(path, _BASELINES)
+    known: dict[str, Any] = {name: each.numpy() for name, each in tensors.items()} | plain
+    jacobian = known.pop("jacobian")
+    return LinearModel(**known), jacobian

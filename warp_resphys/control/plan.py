@@ -14,12 +14,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..io.errors import InputError
-from .reduced import Response
 
 FloatArray = NDArray[np.float64]
 
 _TOLERANCE: Final = 1e-5  # of a quadratic program
 _ENOUGH: Final = 1e-3  # of the range of an input, that a plan must change by to be improved further
+
+
+@dataclass(frozen=True)
+class Response:
+    """The motion of observed points over T steps.
+
+    Attributes:
+        y: (T, 3 M) observed points after each step [m].
+        slopes: (T, 3 M, P) their derivatives by P parameters of the inputs; None if not asked for.
+    """
+
+    y: FloatArray
+    slopes: FloatArray | None
 
 
 class Foretelling(Protocol):

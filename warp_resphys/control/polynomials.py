@@ -14,17 +14,20 @@ _RIDGE: Final = 1e-9  # of the mean square of the features
 
 
 class Monomials:
-    """Monomials of points (T, n), each order computed once however many polynomials ask for it."""
+    """Monomials of points (T, n), computed once however many polynomials ask for them."""
 
     def __init__(self, points: FloatArray) -> None:
         self.points = points
-        self._values: dict[int, FloatArray] = {}
+        self._values, self._order = np.ones((len(points), 1)), 0
 
     def values(self, order: int) -> FloatArray:
-        """(T, F) up to an order."""
-        if order not in self._values:
-            self._values[order] = features(self.points, powers(self.points.shape[1], order))
-        return self._values[order]
+        """(T, F) up to an order, in the order of `powers`."""
+        variables = self.points.shape[1]
+        while self._order < order:
+            self._order += 1
+            factors, before = _products(variables, self._order)
+            self._values = np.concatenate([self._values, self.points[:, factors] * self._values[:, before]], axis=1)
+        return self._values[:, : len(powers(variables, order))]
 
 
 class Polynomial:
@@ -45,8 +48,7 @@ class Polynomial:
     def fitted(cls, points: FloatArray, values: FloatArray, order: int) -> "Polynomial":
         """By least squares, from values (S, *shape) at points (S, n), of this order or what so many points tell."""
         order = told_order(points, order)
-        known = features(points, powers(points.shape[1], order))
-        found = solve_ridge(known, values.reshape(len(values), -1))
+        found = solve_ridge(Monomials(points).values(order), values.reshape(len(values), -1))
         return cls(found.reshape(-1, *values.shape[1:]), order)
 
     def __call__(self, at: FloatArray | Monomials) -> FloatArray:
@@ -95,14 +97,15 @@ def derivatives(variables: int, order: int) -> FloatArray:
     return found
 
 
-def features(points: FloatArray, exponents: NDArray[np.int64]) -> FloatArray:
-    """(T, F) monomials of points (T, n)."""
-    most = int(exponents.max(initial=0))
-    ladder = np.stack([points**degree for degree in range(most + 1)])  # (P, T, n)
-    found = np.ones((len(points), len(exponents)))
-    for variable in range(points.shape[1]):
-        found *= ladder[exponents[:, variable], :, variable].T
-    return found
+@cache
+def _products(variables: int, order: int) -> tuple[list[int], list[int]]:
+    """The variable and the monomial of lower order whose product each monomial of this order is, by number."""
+    known = powers(variables, order)
+    place = {tuple(row): number for number, row in enumerate(known.tolist())}
+    rows = known[known.sum(1) == order]
+    factors = [int(row.argmax()) for row in rows > 0]
+    lower = rows - np.eye(variables, dtype=np.int64)[factors]
+    return factors, [place[tuple(row)] for row in lower.tolist()]
 
 
 def solve_ridge(known: FloatArray, values: FloatArray) -> FloatArray:

@@ -1,113 +1,123 @@
-r"""A robot in a few coordinates: where it rests, the slowest vibrations about there, and its network as it is.
+r"""A robot in a few coordinates: its equilibria, the slowest vibrations about them, and its network as it is.
 
 In coordinates z = Psi^T M x of r modes,
 
     z'' + D(u) z' + A(u) (z - z_0(u)) = G(u) (c - c_0(u)),
 
-with u the inputs and c the outputs of the network of the learned force, which sees no more of the body than z and z'
-tell (hyper-reduction: no unknown of the full model is left). z_0(u) is where the robot rests under u and the force of
-fixed outputs c_0(u), affine in u, which the network has on average. With Phi(u) the vibrations about there,
+with u the inputs and c the outputs of the network of the learned force, which sees of the body only what z and z' tell
+(hyper-reduction: no unknown of the full model is left). z_0(u) is the equilibrium under u and the force of fixed
+outputs c_0(u), affine in u, which the network has on average. With Phi(u) the vibrations about it,
 K phi = omega^2 M phi, and T = Psi^T M Phi,
 
     A = T (omega^2 - Phi^T dF/dx Phi) T^-1,   D = T (alpha + beta omega^2) T^-1,   G = T Phi^T dF/dc,
 
-F being the learned force of fixed outputs, which turns with the body, and alpha and beta the Rayleigh damping. What is
-observed is y = y_0(u) + C(u) dz + H dz dz with dz = z - z_0(u), C being exact for small dz. z_0 and y_0 are cubic
+F being the learned force of fixed outputs, which turns with the body, and alpha and beta the Rayleigh damping. Observed
+points are y = y_0(u) + C(u) dz + H dz dz with dz = z - z_0(u), C being exact for small dz. z_0 and y_0 are cubic
 polynomials of the inputs, A, D, G and C quadratic, fitted to equilibria and the vibrations about them (interpolation of
 reduced operators: Amsallem and Farhat, AIAA J. 46 (2008) 1803, in coordinates that are common from the beginning), and
 H is constant, fitted to motions. The network acts on the state before a step, as in the robot, so that a step is linear
-in z; the integrator is the robot's own.
+in z. With s = (z, z') and the integrator's g (1/3 where BDF2 has a state before the last, else 0) and step length h',
+
+    s_{k+1} = L ((1 + g) s_k - g s_{k-1}) + J (A z_0 + force(s_k)),   J = [N; N / h'],   N = (1 / h'^2 + D / h' + A)^-1,
+
+of which `ReducedMotion` has the derivatives. B models take a step at once. Inputs are in units of `ReducedModel.scale`.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Final, NamedTuple
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..data.input_response import InputResponse
 from ..experiment.models import Learned
 from ..io.errors import ConvergenceError, InputError
-from .input_response import InputResponse
+from .plan import Response
 from .polynomials import Monomials, Polynomial
-from .reduced_force import ForceAt, ReducedForce
+from .reduced_force import ForceAlong, ReducedForce
 
 FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 
 STATIC_ORDER: Final = 3
 TANGENT_ORDER: Final = 2
 USUAL_ORDER: Final = 1
-ORDERS: Final[Mapping[str, int]] = {"static": STATIC_ORDER, "observed": STATIC_ORDER, "places": STATIC_ORDER}
-_RESTS: Final = 1e-6  # of the coordinates' size, within which an equilibrium is found; networks are in float32
+_REST_TOLERANCE: Final = 1e-6  # of the coordinates' size, for an equilibrium; networks are in float32
 _ITERATIONS: Final = 50
 _HALVINGS: Final = 8
+_POLYNOMIALS: Final = ("static", "observed", "stiffness", "damping", "shown")
+_PLAIN: Final = ("time_step", "integrator", "labels", "name", "delay", "rise", "filters", "quality")
 
 
 @dataclass(frozen=True)
 class ReducedState:
-    """Where a reduced model is.
+    """The state of B reduced models.
 
     Attributes:
-        z: (r,) coordinates.
-        v: (r,) their rates [1/s].
-        means: (f, n) of the inputs that the learned force is told of.
-        commands: (L + 1, n) the last commands, and what the input has risen to, see `InputResponse`.
-        previous: (2, r) coordinates and rates a step ago, where the integrator looks back.
+        z: (B, r) coordinates.
+        v: (B, r) their rates [1/s].
+        acting: (B, n) inputs that act, in units of the model's scale.
+        memory: of the inputs' response, entries (..., B, n).
+        previous: (2, B, r) coordinates and rates one step earlier.
+        looks_back: (B,) whether the integrator may use these; a model that has just begun has none.
     """
 
     z: FloatArray
     v: FloatArray
-    means: FloatArray
-    commands: FloatArray
-    previous: FloatArray | None = None
+    acting: FloatArray
+    memory: Mapping[str, FloatArray]
+    previous: FloatArray
+    looks_back: BoolArray
 
+    def where(self, chosen: BoolArray, other: "ReducedState") -> "ReducedState":
+        """The models of this state where chosen (B,), those of the other one elsewhere."""
+        theirs = other.arrays()
+        return self.from_arrays(
+            {
+                key: np.where(chosen[:, None] if each.ndim > 1 else chosen, each, theirs[key])
+                for key, each in self.arrays().items()
+            }
+        )
 
-@dataclass(frozen=True)
-class Response:
-    """What a reduced model does over T steps.
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Everything by name, for a checkpoint."""
+        own = {key: each for key, each in vars(self).items() if key != "memory"}
+        return own | {f"memory.{key}": each for key, each in self.memory.items()}
 
-    Attributes:
-        y: (T, 3 M) observed points after each step [m].
-        slopes: (T, 3 M, P) their derivatives by P parameters of the inputs; None if not asked for.
-        states: T states.
-    """
-
-    y: FloatArray
-    slopes: FloatArray | None
-    states: list[ReducedState]
-
-
-class _Steps(NamedTuple):
-    """T steps that were made: what their derivatives need."""
-
-    u: Monomials  # of (T, n) acting inputs
-    length: list[float]  # of the step, as the integrator has it [s]
-    backs: list[bool]  # whether it looked back
-    inverse: FloatArray  # (T, r, r)
-    states: list[ReducedState]
-    force: ForceAt | None
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> "ReducedState":
+        """The state of `arrays`."""
+        own = {key: each for key, each in arrays.items() if not key.startswith("memory.")}
+        memory = {key.removeprefix("memory."): each for key, each in arrays.items() if key.startswith("memory.")}
+        return cls(memory=memory, **own)
 
 
 @dataclass(frozen=True)
 class ReducedModel:
-    """See the module; inputs are in units of `scale`.
+    """The reduced model of a robot; see the module for the equations.
 
     Attributes:
         time_step: h [s].
         integrator: ``implicit_euler`` or ``bdf2``.
-        labels: of the M points that are observed.
+        labels: of the M observed points.
         name: of the input.
         scale: (n,) of the inputs.
-        response: how they follow their commands.
-        filters: f time constants of the means [s].
+        delay: of the inputs behind their commands [s].
+        rise: time constant with which they follow these [s].
+        filters: F time constants of the means of the inputs that the network takes [s].
         static: z_0, (r,).
         observed: y_0, (3 M,) [m].
         stiffness: A, (r, r) [1/s^2].
         damping: D, (r, r) [1/s].
         shown: C, (3 M, r) [m].
         curved: H, (r, r, 3 M), symmetric [m].
-        force: the learned one; None for a simulator alone.
-        told: what was found when it was made: errors and counts.
+        force: the learned force; None for a simulator alone.
+        quality: errors, and counts of the samples from which it was made.
+
+    Raises:
+        InputError: another integrator.
     """
 
     time_step: float
@@ -115,7 +125,8 @@ class ReducedModel:
     labels: tuple[str, ...]
     name: str
     scale: FloatArray
-    response: InputResponse
+    delay: float
+    rise: float
     filters: tuple[float, ...]
     static: Polynomial
     observed: Polynomial
@@ -124,14 +135,9 @@ class ReducedModel:
     shown: Polynomial
     curved: FloatArray
     force: ReducedForce | None = None
-    told: Mapping[str, Any] = field(default_factory=dict)
+    quality: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuses an integrator that it cannot follow.
-
-        Raises:
-            InputError: another one.
-        """
         if self.integrator not in ("implicit_euler", "bdf2"):
             raise InputError(
                 f"a robot that is stepped by {self.integrator} cannot be reduced: set identify.integrator to "
@@ -148,83 +154,125 @@ class ReducedModel:
         """The number n of inputs."""
         return len(self.scale)
 
-    def rest(self, inputs: FloatArray | None = None) -> ReducedState:
-        """In equilibrium with inputs (n,); with none, if left out.
+    @cached_property
+    def response(self) -> InputResponse:
+        """How inputs follow their commands, with the means that the network takes."""
+        return InputResponse(self.time_step, None, self.delay or None, self.rise or None, self.filters)
+
+    def rest(self, inputs: FloatArray | None = None, count: int = 1) -> ReducedState:
+        """The equilibrium under inputs (n,), none if left out; of B models.
 
         Raises:
-            ConvergenceError: the learned force lets it come to rest nowhere.
+            ConvergenceError: no equilibrium is found, as the learned force is too large.
         """
         u = np.zeros((1, self.parts)) if inputs is None else (inputs / self.scale)[None]
-        z = self.static(u)[0]
-        means = np.repeat(u, len(self.filters), axis=0)
-        if self.force is not None:
-            z = self._balanced(z, u, means)
-        return ReducedState(z, np.zeros_like(z), means, self.response.still(u[0]))
+        z = self._equilibrium(Monomials(u))[0]
+        z, u = np.repeat(z, count, axis=0), np.repeat(u, count, axis=0)
+        still = np.stack([z, np.zeros_like(z)])
+        return ReducedState(still[0], still[1], u, self.response.still(u), still, np.zeros(count, dtype=np.bool_))
 
-    def _balanced(self, z: FloatArray, u: FloatArray, means: FloatArray) -> FloatArray:
-        """(r,) where A (z - z_0) is the learned force, by Newton's method with halved steps."""
-        assert self.force is not None
-        a, base, size = self.stiffness(u)[0], self.static(u)[0], np.abs(self.static.coefficients).max()
-        force, still = self.force.at(Monomials(u), self.static), np.zeros_like(z)
+    def _equilibrium(self, u: Monomials) -> tuple[FloatArray, ForceAlong | None]:
+        """(1, r) where A (z - z_0) is the learned force, by Newton's method with halved steps; and that force."""
+        a, base = self.stiffness(u)[0], self.static(u)
+        force = self._force(u, np.repeat(u.points[None], len(self.filters), axis=0))
+        if force is None:
+            return base, None
+        size = np.abs(self.static.coefficients).max()
 
-        def missing(z: FloatArray) -> tuple[FloatArray, float]:
-            """By which force it is not at rest, and how far that would move it."""
-            found = a @ (z - base) - force(0, z, still, means)
+        def imbalance(z: FloatArray) -> tuple[FloatArray, float]:
+            """(r,) by which the forces differ, and how far that would move the model."""
+            found = a @ (z - base)[0] - force(slice(1), np.stack([z, np.zeros_like(z)]))[0]
             return found, float(np.abs(np.linalg.solve(a, found)).max())
 
-        found, left = missing(z)
+        z = base
+        found, left = imbalance(z)
         for _ in range(_ITERATIONS):
-            if left < _RESTS * size:
-                return z
-            step = np.linalg.solve(a - force.last_slope(0), found)
+            if left < _REST_TOLERANCE * size:
+                return z, force
+            step = np.linalg.solve(a - force.last_slope(), found)
             for share in 0.5 ** np.arange(_HALVINGS):
                 tried = z - share * step
-                found, now = missing(tried)
+                found, now = imbalance(tried)
                 if now < left:
                     break
             z, left = tried, now
-        raise ConvergenceError("the reduced model comes to rest nowhere: its learned force is too large.", z, None)
+        raise ConvergenceError("the reduced model has no equilibrium: its learned force is too large.", z, None)
+
+    def _force(self, u: Monomials, means: FloatArray) -> ForceAlong | None:
+        return None if self.force is None else ForceAlong(self.force, u, self.static, means)
 
     def rest_observed(self, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(3 M,) what is observed in equilibrium with inputs (n,) [m], and (3 M, n) its derivatives by them.
+        """(3 M,) observed points in equilibrium under inputs (n,) [m], and (3 M, n) their derivatives by the inputs.
 
         Raises:
             ConvergenceError: see `rest`.
         """
-        state, u = self.rest(inputs), Monomials((inputs / self.scale)[None])
-        z, a = state.z, self.stiffness(u)[0]
-        slope = self.static.slopes(u)[0].T
-        by_u = a @ slope - np.einsum("nrs,s->rn", self.stiffness.slopes(u)[0], z - self.static(u)[0])
-        if self.force is not None:
-            force = self.force.at(u, self.static)
-            force(0, z, np.zeros_like(z), state.means)
-            by_z, _, more, by_means = (each[0] for each in force.slopes)
-            a, by_u = a - by_z, by_u + more + by_means.sum(1)
-        seen, direct = (each[0] for each in self._slopes(z[None], u))
-        return self._observed(z[None], u)[0], (direct + seen @ np.linalg.solve(a, by_u)) / self.scale
+        u = Monomials((inputs / self.scale)[None])
+        z, force = self._equilibrium(u)
+        a, slope = self.stiffness(u)[0], self.static.slopes(u)[0].T
+        by_u = a @ slope - np.einsum("nrs,s->rn", self.stiffness.slopes(u)[0], (z - self.static(u))[0])
+        if force is not None:
+            force.restart()
+            force(slice(1), np.stack([z, np.zeros_like(z)]))
+            by_state, more, by_means = (each[0] for each in force.slopes())
+            a, by_u = a - by_state[:, : self.modes], by_u + more + by_means.sum(1)
+        seen, direct = (each[0] for each in self.point_slopes(z, u))
+        return self.points(z, u)[0], (direct + seen @ np.linalg.solve(a, by_u)) / self.scale
 
-    def observe(self, z: FloatArray, inputs: FloatArray) -> FloatArray:
-        """(T, 3 M) what is observed at coordinates (T, r) under inputs (T, n) [m]."""
-        return self._observed(z, Monomials(inputs / self.scale))
+    def observe(self, state: ReducedState) -> FloatArray:
+        """(B, 3 M) observed points [m]."""
+        return self.points(state.z, Monomials(state.acting))
 
-    def _observed(self, z: FloatArray, u: Monomials) -> FloatArray:
+    def points(self, z: FloatArray, u: Monomials) -> FloatArray:
+        """(S, 3 M) observed points at coordinates (S, r) under S inputs [m]."""
         off = z - self.static(u)
         squares = (off[:, :, None] * off[:, None, :]).reshape(len(z), -1)
         linear = (self.shown(u) @ off[..., None])[..., 0]
         return self.observed(u) + linear + squares @ self.curved.reshape(squares.shape[1], -1)
 
-    def observed_slopes(self, z: FloatArray, inputs: FloatArray) -> FloatArray:
-        """(T, 3 M, r) derivatives of `observe` by the coordinates."""
-        return self._slopes(z, Monomials(inputs / self.scale))[0]
-
-    def _slopes(self, z: FloatArray, u: Monomials) -> tuple[FloatArray, FloatArray]:
-        """(T, 3 M, r) derivatives of `_observed` by z, and (T, 3 M, n) by u."""
+    def point_slopes(self, z: FloatArray, u: Monomials) -> tuple[FloatArray, FloatArray]:
+        """(S, 3 M, r) derivatives of `points` by the coordinates, and (S, 3 M, n) by the inputs."""
         off, r = z - self.static(u), self.modes
         bent = (off @ self.curved.reshape(r, -1)).reshape(len(z), r, -1)
         by_z = self.shown(u) + 2.0 * bent.swapaxes(1, 2)
-        turned = (self.shown.slopes(u) @ off[:, None, :, None])[..., 0]  # (T, n, 3 M)
+        turned = (self.shown.slopes(u) @ off[:, None, :, None])[..., 0]  # (S, n, 3 M)
         direct = (self.observed.slopes(u) + turned).swapaxes(1, 2)
         return by_z, direct - by_z @ self.static.slopes(u).swapaxes(1, 2)
+
+    def move(self, start: ReducedState, inputs: FloatArray, bias: FloatArray | None = None) -> "ReducedMotion":
+        """T steps of B models.
+
+        Args:
+            start: their state.
+            inputs: (T, B, n) commanded during each step, in their unit.
+            bias: (r,) added to the equilibria z_0.
+        """
+        acting, means, memory = self.response(start.memory, inputs / self.scale)
+        steps, batch, n = acting.shape
+        u, r, h = Monomials(acting.reshape(-1, n)), self.modes, self.time_step
+        back = np.repeat(start.looks_back[None] & (self.integrator == "bdf2"), steps, axis=0)
+        back[1:] = self.integrator == "bdf2"
+        share = np.where(back, 1.0 / 3.0, 0.0).reshape(-1, 1)  # g
+        step = np.where(back, 2.0 / 3.0 * h, h).reshape(-1, 1)
+        base = self.static(u)
+        a, damping = self.stiffness(u), self.damping(u)
+        inertia = np.eye(r) / step[..., None] ** 2 + damping / step[..., None]
+        inverse = np.linalg.inv(inertia + a)
+        pull = (a @ (base if bias is None else base + bias)[..., None])[..., 0]
+        force = self._force(u, means.reshape(len(means), len(u.points), n))
+        now, before, states = np.stack([start.z, start.v]), start.previous, []
+        for k in range(steps):
+            rows = slice(k * batch, (k + 1) * batch)
+            at, rate = (1.0 + share[rows]) * now - share[rows] * before
+            right = (inertia[rows] @ at[..., None])[..., 0] + rate / step[rows] + pull[rows]
+            if force is not None:
+                right += force(rows, now)
+            z = (inverse[rows] @ right[..., None])[..., 0]
+            now, before = np.stack([z, (z - at) / step[rows]]), now
+            states.append(now)
+        end = ReducedState(now[0], now[1], acting[-1], memory, before, np.ones(batch, dtype=np.bool_))
+        series = np.stack(states, axis=1).reshape(2, -1, r)
+        return ReducedMotion(self, u, bias, share, step, inertia, inverse, force, series[0], series[1], end)
 
     def respond(
         self,
@@ -233,166 +281,137 @@ class ReducedModel:
         basis: FloatArray | None = None,
         bias: FloatArray | None = None,
     ) -> Response:
-        """T steps under inputs.
+        """T steps of one model under commanded inputs (T, n), in their unit.
 
         Args:
-            start: the state.
-            inputs: (T, n) that are commanded during each step, in their unit.
-            basis: (T, n, P) derivatives of the inputs by parameters, by which slopes are wanted.
-            bias: (r,) added to where the equilibria are.
+            start: the state, of B = 1.
+            inputs: during each step.
+            basis: (T, n, P) derivatives of the inputs by parameters, for `Response.slopes`.
+            bias: see `move`.
         """
-        steps = self._march(start, inputs, bias)
-        series = np.array([each.z for each in steps.states])
-        y = self._observed(series, steps.u)
-        if basis is None:
-            return Response(y, None, steps.states)
-        still = self.response.still(np.zeros(basis.shape[1:]))
-        by_parameters = self.response(still, basis / self.scale[:, None])[0]
-        by_z, direct = self._slopes(series, steps.u)
-        return Response(
-            y, by_z @ self._sensitivities(steps, by_parameters, bias) + direct @ by_parameters, steps.states
-        )
+        motion = self.move(start, inputs[:, None], bias)
+        slopes = None if basis is None else motion.slopes(basis / self.scale[:, None])
+        return Response(motion.y, slopes)
 
-    def transition(
-        self, start: ReducedState, inputs: FloatArray, bias: FloatArray
-    ) -> tuple[ReducedState, FloatArray, FloatArray, FloatArray]:
-        """The state after a step under inputs (n,), and (2 r, r) its derivatives by z, by v and by the bias."""
-        steps = self._march(start, inputs[None], bias)
-        by_z, by_v = self._by_state(steps)
-        return (
-            steps.states[0],
-            by_z[0],
-            by_v[0],
-            self._with_rate(steps, 0, steps.inverse[0] @ self.stiffness(steps.u)[0]),
-        )
+    def transition(self, start: ReducedState, inputs: FloatArray, bias: FloatArray) -> tuple[ReducedState, FloatArray]:
+        """The state of one model after a step under inputs (n,), and (2 r, 3 r) its derivatives by z, v and bias."""
+        motion = self.move(start, inputs[None, None], bias)
+        by_bias = motion.impulse @ self.stiffness(motion.u)
+        return motion.end, np.concatenate([motion.by_state, by_bias], axis=2)[0]
 
-    def _march(self, start: ReducedState, inputs: FloatArray, bias: FloatArray | None) -> _Steps:
-        acting, remembered = self.response(start.commands, inputs / self.scale)
-        u = Monomials(acting)
-        a, d, rest = self.stiffness(u), self.damping(u), self.static(u) + (0.0 if bias is None else bias)
-        force = None if self.force is None else self.force.at(u, self.static)
-        h, identity = self.time_step, np.eye(self.modes)
-        keep = np.exp(-h / np.asarray(self.filters))[:, None] if self.filters else np.zeros((0, 1))
-        z, v, means, before = start.z, start.v, start.means, start.previous
-        looks_back = self.integrator == "bdf2"
-        backs = [looks_back and (before is not None or k > 0) for k in range(len(acting))]
-        length = [2.0 / 3.0 * h if back else h for back in backs]
-        short = np.array(length)[:, None, None]
-        inverses = np.linalg.inv(identity / short**2 + d / short + a)
-        pull = (a @ rest[..., None])[..., 0]
-        steps = _Steps(u, length, backs, inverses, [], force)
-        for k, now in enumerate(acting):
-            step = length[k]
-            at, rate = (4.0 * np.stack([z, v]) - before) / 3.0 if backs[k] and before is not None else (z, v)
-            means = now + keep * (means - now)
-            right = (at + step * rate) / step**2 + d[k] @ at / step + pull[k]
-            if force is not None:
-                right = right + force(k, z, v, means)
-            before = np.stack([z, v]) if looks_back else None
-            z = inverses[k] @ right
-            v = (z - at) / step
-            steps.states.append(ReducedState(z, v, means, remembered[k], before))
-        return steps
-
-    def _by_state(self, steps: _Steps) -> tuple[FloatArray, FloatArray]:
-        """(T, 2 r, r) derivatives of the state after each step by z and by v before it."""
-        identity, step = np.eye(self.modes), np.array(steps.length)[:, None, None]
-        gain = np.where(np.array(steps.backs)[:, None, None], 4.0 / 3.0, 1.0)
-        by_z, by_v = gain * (identity / step**2 + self.damping(steps.u) / step), gain / step * identity
-        if steps.force is not None:
-            by_z, by_v = by_z + steps.force.slopes[0], by_v + steps.force.slopes[1]
-        by_z, by_v = (steps.inverse @ each for each in (by_z, by_v))
-        return (
-            np.concatenate([by_z, by_z / step - gain / step * identity], axis=1),
-            np.concatenate([by_v, by_v / step], axis=1),
-        )
-
-    @staticmethod
-    def _with_rate(steps: _Steps, k: int, by: FloatArray) -> FloatArray:
-        """Derivatives (2 r, P) of z and of z' after step k, of (r, P) those of z where the state before stays."""
-        return np.concatenate([by, by / steps.length[k]])
-
-    def _sensitivities(self, steps: _Steps, by_parameters: FloatArray, bias: FloatArray | None) -> FloatArray:
-        """(T, r, P) derivatives of z after each step by the parameters, of those of the inputs (T, n, P)."""
-        u, r, h = steps.u, self.modes, self.time_step
-        z, v = (np.array([getattr(each, name) for each in steps.states]) for name in ("z", "v"))
-        rest = self.static(u) + (0.0 if bias is None else bias)
-        by_u = self.stiffness(u) @ self.static.slopes(u).swapaxes(1, 2)
-        by_u = by_u - np.einsum("tnrs,ts->trn", self.stiffness.slopes(u), z - rest)
-        by_u = by_u - np.einsum("tnrs,ts->trn", self.damping.slopes(u), v)
-        keep = np.exp(-h / np.asarray(self.filters)) if self.filters else np.zeros(0)
-        by_means = None
-        if steps.force is not None:
-            more, by_means = steps.force.slopes[2:]
-            by_u = by_u + more
-        by_z, by_v, damping = *self._by_state(steps), self.damping(u)
-        pushed = by_u @ by_parameters  # (T, r, P)
-        if by_means is not None and len(keep):
-            means = np.zeros((len(keep), *by_parameters.shape[1:]))
-            for k, du in enumerate(by_parameters):
-                means = du + keep[:, None, None] * (means - du)
-                pushed[k] += np.einsum("rfn,fnp->rp", by_means[k], means)
-        now, past, found = np.zeros((2 * r, by_parameters.shape[2])), None, []
-        own = np.concatenate([by_z, by_v], axis=2)
-        for k, (step, back, inverse) in enumerate(zip(steps.length, steps.backs, steps.inverse, strict=True)):
-            direct = pushed[k]
-            if back and past is not None:
-                at, rate = -past[:r] / 3.0, -past[r:] / 3.0
-                direct = direct + (at + step * rate) / step**2 + damping[k] @ at / step
-            after = own[k] @ now + self._with_rate(steps, k, inverse @ direct)
-            if back and past is not None:
-                after[r:] += past[:r] / 3.0 / step
-            past, now = now, after
-            found.append(now[:r])
-        return np.array(found)
-
-    def arrays(self) -> dict[str, FloatArray]:
-        """Its arrays, for a file."""
-        found = {"scale": self.scale, "curved": self.curved}
+    def checkpoint(self) -> tuple[dict[str, FloatArray], dict[str, Any]]:
+        """Arrays and plain data for `restored`; without the network."""
+        made = {name: getattr(self, name) for name in _POLYNOMIALS}
+        arrays = {"scale": self.scale, "curved": self.curved}
         if self.force is not None:
-            found |= {"told": self.force.told, "told_by": self.force.told_by}
-        return found | {name: each.coefficients for name, each in self._polynomials().items()}
-
-    def _polynomials(self) -> dict[str, Polynomial]:
-        names = ("static", "observed", "stiffness", "damping", "shown")
-        own: dict[str, Polynomial] = {name: getattr(self, name) for name in names}
-        return own if self.force is None else {**own, **self.force.polynomials()}
-
-    def plain(self) -> dict[str, Any]:
-        """What `restored` needs beside the arrays."""
-        keys = ("time_step", "integrator", "labels", "name", "filters", "told")
-        orders = {name: each.order for name, each in self._polynomials().items()}
-        return {
-            **{key: getattr(self, key) for key in keys},
-            **{"delay": self.response.delay, "rise": self.response.rise, "orders": orders},
-        }
+            made |= self.force.polynomials()
+            arrays |= {"told": self.force.told, "told_by": self.force.told_by}
+        plain = {key: getattr(self, key) for key in _PLAIN}
+        plain["orders"] = {name: each.order for name, each in made.items()}
+        return arrays | {name: each.coefficients for name, each in made.items()}, plain
 
     @classmethod
     def restored(
         cls, arrays: Mapping[str, FloatArray], plain: Mapping[str, Any], learned: Learned | None = None
     ) -> "ReducedModel":
-        """From `arrays` and `plain`, and what its robot has learned (`Description.learned`), if it has a force."""
+        """The model of a `checkpoint`.
+
+        Args:
+            arrays: of the checkpoint.
+            plain: likewise.
+            learned: of its robot (`Description.learned`), if the model has a learned force.
+
+        Raises:
+            InputError: it has one, and `learned` is None.
+        """
         made = {name: Polynomial(arrays[name], order) for name, order in plain["orders"].items()}
-        words: Sequence[str] = plain["labels"]
-        force = None
-        if "push" in made:
-            if learned is None:
-                raise InputError("the reduced model has a learned force: give what its robot has learned.")
-            force = ReducedForce.restored(learned.network, learned.range_, made, arrays)
-        return cls(
-            float(plain["time_step"]),
-            plain["integrator"],
-            tuple(words),
-            plain["name"],
-            arrays["scale"],
-            InputResponse(float(plain["time_step"]), float(plain["delay"]), float(plain["rise"])),
-            tuple(plain["filters"]),
-            made["static"],
-            made["observed"],
-            made["stiffness"],
-            made["damping"],
-            made["shown"],
-            arrays["curved"],
-            force,
-            plain["told"],
-        )
+        own: dict[str, Any] = {key: plain[key] for key in _PLAIN} | {name: made.pop(name) for name in _POLYNOMIALS}
+        own |= {key: tuple(own[key]) for key in ("labels", "filters")}
+        model = cls(**own, scale=arrays["scale"], curved=arrays["curved"])
+        if not made:
+            return model
+        if learned is None:
+            raise InputError("the reduced model has a learned force: give what its robot has learned.")
+        force = ReducedForce(learned.network, learned.range_, told=arrays["told"], told_by=arrays["told_by"], **made)
+        return replace(model, force=force)
+
+
+@dataclass(frozen=True)
+class ReducedMotion:
+    """T steps of B models, S = T B in all, the models running fastest; with what their derivatives need.
+
+    Attributes:
+        model: that moved.
+        u: of the (S, n) inputs that acted.
+        bias: see `ReducedModel.move`.
+        share: (S, 1) g, of the state before the last.
+        step: (S, 1) h' [s].
+        inertia: (S, r, r) 1 / h'^2 + D / h'.
+        inverse: (S, r, r) N.
+        force: the learned force along the motion; None where there is none.
+        z: (S, r) after each step.
+        v: (S, r) after each step [1/s].
+        end: the last state.
+    """
+
+    model: ReducedModel
+    u: Monomials
+    bias: FloatArray | None
+    share: FloatArray
+    step: FloatArray
+    inertia: FloatArray
+    inverse: FloatArray
+    force: ForceAlong | None
+    z: FloatArray
+    v: FloatArray
+    end: ReducedState
+
+    @property
+    def y(self) -> FloatArray:
+        """(S, 3 M) observed points after each step [m]."""
+        return self.model.points(self.z, self.u)
+
+    @cached_property
+    def impulse(self) -> FloatArray:
+        """(S, 2 r, r) J, derivatives of the state after a step by a force."""
+        return np.concatenate([self.inverse, self.inverse / self.step[..., None]], axis=1)
+
+    @cached_property
+    def _carried(self) -> FloatArray:
+        """(S, 2 r, 2 r) L, derivatives of the state after a step by the state that the integrator starts it from."""
+        step, identity = self.step[..., None], np.eye(self.model.modes)
+        by_z, by_v = self.inverse @ self.inertia, self.inverse / step
+        upper = np.concatenate([by_z, by_v], axis=2)
+        return np.concatenate([upper, np.concatenate([by_z - identity, by_v], axis=2) / step], axis=1)
+
+    @cached_property
+    def _force_slopes(self) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+        return None if self.force is None else self.force.slopes()
+
+    @cached_property
+    def by_state(self) -> FloatArray:
+        """(S, 2 r, 2 r) derivatives of the state after each step by the state before it."""
+        found = (1.0 + self.share[..., None]) * self._carried
+        return found if self._force_slopes is None else found + self.impulse @ self._force_slopes[0]
+
+    def slopes(self, basis: FloatArray) -> FloatArray:
+        """(T, 3 M, P) derivatives of `y` of one model by parameters, of the commands' (T, n, P)."""
+        model, u = self.model, self.u
+        by_parameters, by_means = model.response.from_rest(basis)
+        base = model.static(u)
+        off = self.z - (base if self.bias is None else base + self.bias)
+        by_u = model.stiffness(u) @ model.static.slopes(u).swapaxes(1, 2)
+        by_u = by_u - np.einsum("tnrs,ts->trn", model.stiffness.slopes(u), off)
+        by_u = by_u - np.einsum("tnrs,ts->trn", model.damping.slopes(u), self.v)
+        pushed = by_u @ by_parameters
+        if self._force_slopes is not None:
+            _, more, means = self._force_slopes
+            pushed = pushed + more @ by_parameters + np.einsum("trfn,ftnp->trp", means, by_means)
+        direct, before = self.impulse @ pushed, self.share[..., None] * self._carried
+        now = past = np.zeros(direct.shape[1:])
+        found = []
+        for k in range(len(direct)):
+            now, past = self.by_state[k] @ now - before[k] @ past + direct[k], now
+            found.append(now[: model.modes])
+        by_z, own = model.point_slopes(self.z, u)
+        return by_z @ np.array(found) + own @ by_parameters

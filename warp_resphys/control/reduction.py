@@ -1,10 +1,11 @@
 """Makes a reduced model of a robot: equilibria, vibrations about them and motions, sampled within its inputs' range."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+import scipy.linalg
 import torch
 from numpy.typing import NDArray
 from scipy.stats import qmc
@@ -65,13 +66,13 @@ def reduce(robot: Robot, sampling: Sampling, on_progress: OnProgress = lambda st
         except ConvergenceError as error:
             failure = error
             continue
-        tried[str(modes)] = made.told["window_relative"]
-        if best is None or made.told["window_error_mm"] < best.told["window_error_mm"]:
+        tried[str(modes)] = made.quality["window_relative"]
+        if best is None or made.quality["window_error_mm"] < best.quality["window_error_mm"]:
             best = made
     if best is None:
         assert failure is not None
         raise failure
-    return replace(best, told={**best.told, **counts, "motions": sampling.motions, "tried": tried})
+    return replace(best, quality={**best.quality, **counts, "motions": sampling.motions, "tried": tried})
 
 
 def _fitted(
@@ -93,10 +94,10 @@ def _fitted(
         ),
     )
     frequency = np.sqrt(np.abs(np.linalg.eigvals(made.stiffness(statics.u[:1])[0]))) / (2.0 * np.pi)
-    told: dict[str, Any] = _errors(made, motions, z, rates, first)
-    if not np.isfinite(told["window_error_mm"]):
+    quality: dict[str, Any] = _errors(made, motions, z, rates, first)
+    if not np.isfinite(quality["window_error_mm"]):
         raise ConvergenceError(f"the reduced model of {made.modes} modes diverges.", statics.q, None)
-    return replace(made, told={**told, "modes": made.modes, "frequencies_hz": np.sort(frequency).tolist()})
+    return replace(made, quality={**quality, "modes": made.modes, "frequencies_hz": np.sort(frequency).tolist()})
 
 
 def _equilibria(source: Source, sampling: Sampling, on_progress: OnProgress) -> _Statics:
@@ -157,19 +158,13 @@ def _assembled(
         usual = Polynomial.fitted(unit, statics.outputs, USUAL_ORDER)
         moved = np.linalg.solve(stiffness(unit), push(unit) @ (statics.outputs - usual(unit))[..., None])[..., 0]
         z_usual = z_statics - moved
-        seen, seen_rates = (_seen(coder, shapes, back, tangent) for coder in (network.position, network.velocity))
+        both = [_modes_seen(coder, shapes, back) for coder in (network.position, network.velocity)]
+        seen = tangent(np.stack([scipy.linalg.block_diag(*pair) for pair in zip(*both, strict=True)]))
         places = network.position.encode((statics.q - network.rest.to(statics.q)).double()).cpu().numpy()
-        places = places - (np.zeros_like(places) if seen is None else (seen(unit) @ moved[..., None])[..., 0])
-        force = ReducedForce(
-            network,
-            source.learned.range_,
-            Polynomial.fitted(unit, places, STATIC_ORDER),
-            seen,
-            seen_rates,
-            *source.told(),
-            usual,
-            push,
-        )
+        places = np.pad(places, ((0, 0), (0, both[1].shape[1])))  # The rates are zero.
+        places = places - (seen(unit)[..., : shapes.shape[2]] @ moved[..., None])[..., 0]
+        at_rest = Polynomial.fitted(unit, places, STATIC_ORDER)
+        force = ReducedForce(network, source.learned.range_, at_rest, seen, *source.told(), usual, push)
     modes, labels = shapes.shape[2], source.robot.labels
     model = ReducedModel(
         source.robot.time_step,
@@ -177,7 +172,8 @@ def _assembled(
         labels,
         source.input.name,
         source.scale,
-        source.response,
+        source.delay,
+        source.rise,
         source.filters,
         Polynomial.fitted(unit, z_usual, STATIC_ORDER),
         Polynomial(np.zeros((1, 3 * len(labels))), 0),
@@ -190,14 +186,12 @@ def _assembled(
     return model, z_statics, z, rates
 
 
-def _seen(
-    coder: Coder, shapes: torch.Tensor, back: FloatArray, tangent: Callable[[FloatArray], Polynomial]
-) -> Polynomial | None:
-    """(a, r) standardised modes of a coder by the coordinates; None for a network that sees none."""
+def _modes_seen(coder: Coder, shapes: torch.Tensor, back: FloatArray) -> FloatArray:
+    """(S, m, r) the standardised modes of a coder by the coordinates; m is 0 for a network that sees none."""
     if coder.basis is None or not coder.size:
-        return None
+        return np.zeros((len(back), 0, back.shape[1]))
     basis = (coder.basis / coder.scale).to(shapes)
-    return tangent(torch.einsum("dm,sdk->smk", basis, shapes).cpu().numpy() @ back)
+    return np.asarray(torch.einsum("dm,sdk->smk", basis, shapes).cpu().numpy() @ back)
 
 
 def _common(shapes: torch.Tensor, mass: torch.Tensor) -> torch.Tensor:
@@ -229,31 +223,29 @@ def _with_output(model: ReducedModel, rests: tuple[FloatArray, ...], motions: tu
 
 def _errors(model: ReducedModel, motions: Motions, z: FloatArray, rates: FloatArray, first: int) -> dict[str, float]:
     """How far the model is from the robot, over windows and over whole motions, from one on [mm]."""
-    steps, h = round(_WINDOW / model.time_step), model.time_step
-    keep = np.exp(-h / np.asarray(model.filters)) if model.filters else np.zeros(0)
-    off, moved, whole = [], [], []
-    for b in range(first, z.shape[1]):
-        commands, y = motions.commands[:, b], motions.y[:, b]
-        remembered = model.response(model.response.still(np.zeros(model.parts)), commands)[1]
-        means = [np.zeros((len(keep), model.parts))]
-        for now in motions.acting[:, b]:
-            means.append(now + keep[:, None] * (means[-1] - now))
-        for at in range(2, len(commands) - steps, max(steps // 3, 1)):
-            before = np.stack([z[at - 1, b], rates[at - 1, b]]) if model.integrator == "bdf2" else None
-            start = ReducedState(z[at, b], rates[at, b], means[at], remembered[at - 1], before)
-            found, true = model.respond(start, commands[at : at + steps] * model.scale).y, y[at + 1 : at + steps + 1]
-            off.append(_distances(found, true).mean())
-            moved.append(_distances(np.broadcast_to(y[at], found.shape), true).mean())
-        whole.append(_distances(model.respond(model.rest(), commands * model.scale).y, y[1:]).mean())
+    steps, chosen = round(_WINDOW / model.time_step), slice(first, None)
+    z, rates, y, acting = (each[:, chosen] for each in (z, rates, motions.y, motions.acting))
+    commands = motions.commands[:, chosen]
+    memories = [model.response.still(np.zeros(commands.shape[1:]))]
+    for now in commands:
+        memories.append(model.response(memories[-1], now[None])[2])
+    off, moved, looks = [], [], np.ones(z.shape[1], dtype=np.bool_)
+    for at in range(2, len(commands) - steps, max(steps // 3, 1)):
+        before = np.stack([z[at - 1], rates[at - 1]])
+        start = ReducedState(z[at], rates[at], acting[at - 1], memories[at], before, looks)
+        found, true = model.move(start, commands[at : at + steps] * model.scale).y, y[at + 1 : at + steps + 1]
+        off.append(_distances(found, true).mean())
+        moved.append(_distances(np.broadcast_to(y[at], true.shape), true).mean())
+    whole = model.move(model.rest(count=z.shape[1]), commands * model.scale).y
     return {
         "window_s": _WINDOW,
         "window_error_mm": float(np.mean(off)),
         "window_motion_mm": float(np.mean(moved)),
         "window_relative": float(np.mean(off) / np.mean(moved)),
-        "whole_error_mm": float(np.mean(whole)),
+        "whole_error_mm": float(_distances(whole, y[1:]).mean()),
     }
 
 
 def _distances(left: FloatArray, right: FloatArray) -> FloatArray:
-    """(T, M) of points (T, 3 M) [mm]."""
-    return np.asarray(1e3 * np.linalg.norm((left - right).reshape(len(left), -1, 3), axis=2))
+    """(P, M) distances of points (P, 3 M), or with more axes [mm]."""
+    return np.asarray(1e3 * np.linalg.norm(left.reshape(-1, 3) - right.reshape(-1, 3), axis=1))

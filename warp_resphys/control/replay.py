@@ -39,7 +39,7 @@ def driven_settings(folder: Path) -> Mapping[str, Any]:
 
 
 @dataclass(frozen=True)
-class Replay:
+class DrivenReplay:
     """A motion as C controllers drove it.
 
     Attributes:
@@ -59,7 +59,7 @@ class Replay:
     gravity: FloatArray
 
 
-def replay(folder: Path, motion: str, controllers: Sequence[str], seconds: float = np.inf) -> Replay:
+def replay(folder: Path, motion: str, controllers: Sequence[str], seconds: float = np.inf) -> DrivenReplay:
     """Gives the laboratory the inputs that it was given, for the first seconds of a motion.
 
     Args:
@@ -83,15 +83,15 @@ def replay(folder: Path, motion: str, controllers: Sequence[str], seconds: float
     steps = max(int(min(len(driven.path), seconds / robot.time_step)), 1)
     laboratory = Laboratory(settings, folder, driven_input(robot).name, len(rows), 0)
     tracked = tracked_of(robot.labels, control["tracked"])
-    bodies, points = [laboratory.bodies()[1]], [laboratory.truth()]
+    bodies, points = [laboratory.bodies()[1]], [laboratory.markers()]
     with Progress("laboratory", steps, "steps") as progress:
         for number in range(steps):
             laboratory.step(driven.inputs[rows, number])
             bodies.append(laboratory.bodies()[1])
-            points.append(laboratory.truth())
+            points.append(laboratory.markers())
             progress.advance()
     places = np.stack(points, 1)  # (C, T + 1, M, 3)
-    return Replay(
+    return DrivenReplay(
         robot.time_step * np.arange(steps + 1, dtype=np.float64),
         laboratory.bodies()[0],
         np.stack(bodies, 1),

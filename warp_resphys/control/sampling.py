@@ -11,13 +11,13 @@ import torch
 from numpy.typing import NDArray
 
 from ..data.actuation import InputSequences
+from ..data.input_response import InputResponse, response_of
 from ..experiment.models import Learned
 from ..io.errors import InputError
 from ..robot.inputs import RobotInput
 from ..robot.robot import Robot
 from ..robot.state import RobotState
 from ..stepping.state import State
-from .input_response import InputResponse
 
 FloatArray = NDArray[np.float64]
 OnProgress = Callable[[int], None]
@@ -164,9 +164,13 @@ class Source:
         self.parts, self.rest = len(known.parts), simulator.rest_positions
         self.learned: Learned | None = robot.description.learned
         self.filters = robot.description.filters if self.learned is not None else ()
-        words = {word: robot.parameters.get(f"{known.name}_{word}") for word in ("factor", "delay", "rise")}
-        self._factor, delay, rise = (None if each is None else float(each[0]) for each in words.values())
-        self.response = InputResponse(robot.time_step, delay or 0.0, rise or 0.0)
+        values = {name: each[0] for name, each in robot.parameters.items()}
+        factor, delay, rise = response_of(known.name, values)
+        self._factor, self.delay, self.rise = (
+            float(1.0 if factor is None else factor),
+            float(delay or 0.0),
+            float(rise or 0.0),
+        )
         self._elastic = robot.with_parameters(stiffness_damping=0.0, mass_damping=0.0)
         free = np.ones(simulator.body.n_vertices)
         free[simulator.body.fixed_vertices] = 0.0
@@ -178,13 +182,13 @@ class Source:
         return {self.input.name: self.robot.simulator.tensor(shares * self.scale)}
 
     def told(self) -> tuple[FloatArray, FloatArray]:
-        """(k,) the standardised inputs of the network that no state tells, without inputs; (1 + f, k, n) what they add.
+        """(k,) standardised inputs of the network beside the state, without inputs; (k, n (1 + F)) their derivatives.
 
-        These are the inputs, and their means; none where the network is told of none.
+        The derivatives are by the inputs and their means; both are empty where the network takes no inputs.
         """
         network = None if self.learned is None else self.learned.network
         if network is None or network.actuation is None:
-            return np.zeros(0), np.zeros((0, 0, self.parts))
+            return np.zeros(0), np.zeros((0, 0))
         nothing = self.given(np.zeros((1, self.parts)))
         still = RobotState(self.robot.simulator.rest_state(1), self.robot.begin_memory(nothing))
         told = self.robot.told(still, **nothing)
@@ -192,12 +196,11 @@ class Source:
         width, blocks, n = told.shape[1], 1 + len(self.filters), self.parts
         changed = torch.zeros(blocks * n, width, dtype=told.dtype, device=told.device)
         at = torch.arange(blocks * n, device=told.device)
-        acting = self.scale * (1.0 if self._factor is None else self._factor)
-        changed[at, width - blocks * n + at] = torch.as_tensor(np.tile(acting, blocks)).to(told)
+        changed[at, width - blocks * n + at] = torch.as_tensor(np.tile(self._factor * self.scale, blocks)).to(told)
         encode = network.actuation.encode
         base = encode(told.double())
-        by = (encode(told.double() + changed.double()) - base).reshape(blocks, n, -1).swapaxes(1, 2)
-        return base[0].cpu().numpy(), by.cpu().numpy()
+        by = encode(told.double() + changed.double()) - base
+        return base[0].cpu().numpy(), by.mT.cpu().numpy()
 
     def motions(self, sampling: Sampling, on_progress: OnProgress) -> Motions:
         """Motions under smooth random inputs: the first half, to fit to, some of them faster than the others."""
@@ -221,9 +224,9 @@ class Source:
                     told += 1
                     on_progress(1)
         on_progress(sampling.tenths - told)
-        acting = [self.response(self.response.still(np.zeros(self.parts)), each)[0] for each in commands.swapaxes(0, 1)]
+        acting, _ = InputResponse(robot.time_step, None, self.delay or None, self.rise or None).from_rest(commands)
         q, v = (torch.stack([getattr(each, name).float() for each in states]) for name in ("q", "v"))
-        return Motions(q, v, torch.stack(y).flatten(2).double().cpu().numpy(), commands, np.stack(acting, axis=1))
+        return Motions(q, v, torch.stack(y).flatten(2).double().cpu().numpy(), commands, acting)
 
     def _outputs(self, state: RobotState, given: dict[str, torch.Tensor]) -> FloatArray:
         """(B, c) of the network, for a step from a state."""

@@ -21,10 +21,10 @@ from ..robot.export import Track, input_columns, write_csv
 from ..robot.loading import load
 from ..robot.robot import Robot
 from ..stepping.state import State
-from .baselines import JacobianFeedback, fit_linear
+from .baselines import fit_linear
 from .controllers import (
     Controller,
-    Feedback,
+    JacobianFeedback,
     LinearRecedingHorizon,
     OpenLoop,
     RecedingHorizon,
@@ -40,8 +40,8 @@ from .files import (
     plans_from_plain,
     read_baselines,
     read_plan,
+    read_quality,
     read_reduced,
-    read_told,
     reduced_file,
     write_baselines,
     write_driven,
@@ -257,8 +257,8 @@ class _Drive(ResumableRollout):
         found += receding_controllers(self._settings, folder, robot, path, rest[len(found) :])
         limits, jacobian = task.limits, read_baselines(folder / BASELINES)[1]
         for gain in control["feedback"]["gains"]:
-            feedback = JacobianFeedback(jacobian, limits, gain, task.time_step)
-            found.append(Feedback(feedback, task.tracked, path, rest[len(found)]))
+            own = rest[len(found)]
+            found.append(JacobianFeedback(jacobian, limits, gain, task.time_step, task.tracked, path, own))
         return found
 
     @override
@@ -277,7 +277,7 @@ class _Drive(ResumableRollout):
 
     @override
     def kept(self, number: int) -> dict[str, ArrayLike]:
-        points = self._laboratory.truth().reshape(len(self._controllers), -1) @ self._task.tracked.T
+        points = self._laboratory.markers().reshape(len(self._controllers), -1) @ self._task.tracked.T
         return {"points": points, "inputs": self._inputs, "seconds": self._seconds}
 
     @override
@@ -319,7 +319,7 @@ def _summary(
         model: {name: read_plan(folder / plans_file(model), name).errors_mm.tolist() for name in motions}
         for model in control["models"]
     }
-    models = {model: read_told(folder / reduced_file(model)) for model in control["models"]}
+    models = {model: read_quality(folder / reduced_file(model)) for model in control["models"]}
     return {
         "tracking": by_speed,
         "command_ms": {

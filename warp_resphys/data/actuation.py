@@ -1,11 +1,10 @@
-"""Inputs that drive a body, such as pressures: random smooth sequences, the lag of a valve, a memory of what was."""
+"""Inputs that drive a body, such as pressures: smooth random sequences, and a check of recorded ones."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from ..io.errors import DataFileError, InputError
@@ -119,76 +118,3 @@ def check_inputs(values: FloatArray, quantity: Quantity, parts: int, limit: floa
             f"it must be {quantity.wanted}, so check the zero of the gauge."
         )
     return np.maximum(values, quantity.lower)
-
-
-def lagged(commands: torch.Tensor, rise: torch.Tensor, step: float) -> torch.Tensor:
-    """(K, B, C) inputs, such as pressures behind a valve, which follow the commanded ones with a time constant.
-
-    Exact for commands that are constant during steps: a first-order lag, from zero.
-
-    Args:
-        commands: (K, B, C) during each step, or (B, C) throughout, which is taken as it is.
-        rise: (B,) time constant [s], differentiable.
-        step: h [s].
-    """
-    if commands.ndim == 2:
-        return commands
-    behind, series = torch.zeros_like(commands[0]), []
-    for command in commands.unbind():
-        behind = followed(command, behind, rise, step)
-        series.append(behind)
-    return torch.stack(series)
-
-
-def followed(command: torch.Tensor, behind: torch.Tensor, rise: torch.Tensor, step: float) -> torch.Tensor:
-    """(B, C) what `lagged` makes of a command (B, C) in one step, from what it was behind.
-
-    Args:
-        command: during the step.
-        behind: (B, C) at the end of the step before.
-        rise: (B,) time constant [s].
-        step: h [s].
-    """
-    keep = torch.exp(-step / rise.clamp_min(1e-2 * step))[:, None]
-    return command + keep * (behind - command)
-
-
-def delayed(commands: torch.Tensor, delay: torch.Tensor, step: float) -> torch.Tensor:
-    """(K, B, C) inputs that come later than the commanded ones; none before these.
-
-    A step during which one command follows another has the mean of both over its time, differentiable in the delay but
-    where that is a whole number of steps.
-
-    Args:
-        commands: (K, B, C) during each step, or (B, C) throughout, which is taken as it is.
-        delay: (B,) [s], zero or more, differentiable.
-        step: h [s].
-    """
-    if commands.ndim == 2:
-        return commands
-    late = delay / step
-    whole = late.detach().floor().clamp_min(0.0)
-    share, number = (late - whole)[:, None], whole.long()
-    steps, environments = torch.arange(len(commands), device=commands.device), torch.arange(len(delay))
-
-    def before(count: torch.Tensor) -> torch.Tensor:
-        at = steps[:, None] - count
-        found = commands[at.clamp_min(0), environments.to(commands.device)]
-        return torch.where((at >= 0)[..., None], found, 0.0)
-
-    return (1.0 - share) * before(number) + share * before(number + 1)
-
-
-def remembered(inputs: torch.Tensor, time_constants: Sequence[float], step: float) -> torch.Tensor:
-    """(K, B, C (1 + n)) inputs, and the exponential means of each time constant of what they were.
-
-    A viscoelastic body creeps under a constant pressure: where it goes next depends on how long that has lasted, which
-    its state tells badly. These are the internal variables of n Maxwell elements that the inputs drive.
-
-    Args:
-        inputs: (K, B, C).
-        time_constants: n [s].
-        step: h [s].
-    """
-    batch = inputs.shape[1]
-    return torch.cat([inputs, *(lagged(inputs, inputs.new_full((batch,), s), step) for s in time_constants)], -1)

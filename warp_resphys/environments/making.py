@@ -7,23 +7,26 @@ from typing import Any, Final
 
 import gymnasium as gym
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from typing_extensions import override
 
 from ..control.files import read_reduced, reduced_file
+from ..control.laboratory import Laboratory
 from ..control.plan import tracked_of
 from ..control.reduced import ReducedModel
 from ..control.reduction import reduce
 from ..control.sampling import Sampling, driven_input
+from ..control.world import World
 from ..io.errors import InputError
 from ..io.progress import Progress
 from ..io.stages import finished_record
 from ..robot.inputs import BASE
 from ..robot.loading import load
 from ..robot.robot import Robot
-from .tasks import FollowTask, Reach, ReachTask, SwingTask, Task
-from .vector import Drive, RobotVectorEnv
-from .worlds import LaboratoryWorld, ReducedWorld, RobotWorld, World, rests
+from .tasks import FollowTask, Reach, ReachTask, RobotTask, SwingTask
+from .vector import ActionMapping, RobotVectorEnv
+from .worlds import ReducedWorld, RobotWorld
 
 FloatArray = NDArray[np.float64]
 
@@ -91,50 +94,52 @@ def make_vector(
         raise InputError(
             f"action_time is {action_time:g} s: it must be a multiple of the step of {robot.time_step:g} s."
         )
-    actions = max(round(seconds / action_time), 1)
-    shown = None if robot.labels else _spread_vertices(robot)
-    made = _World(robot, run, num_envs, world, spread, seed, shown)
-    asked: Task
-    if task == "swing_up":
-        if BASE not in robot.inputs or world != "simulator":
-            raise InputError("swing_up moves the base of a simulated robot: take one that is fixed to something.")
-        along = np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
-        place = made.of_base(along)
-        point = _tip(robot, place.markers()[0], tracked, shown)
-        rest = point @ place.markers()[0].ravel()
-        length = float(np.linalg.norm(rest - _fixed(robot)))
-        asked = SwingTask(num_envs, _up(robot), rest, length)
-        drive = Drive(np.full(1, -_BASE), np.full(1, _BASE), np.full(1, _BASE_SPEED), np.zeros(1), frames)
+    swings = task == "swing_up"
+    if swings and (BASE not in robot.inputs or world != "simulator"):
+        raise InputError("swing_up moves the base of a simulated robot: take one that is fixed to something.")
+    actions, shown = max(round(seconds / action_time), 1), None if robot.labels else _spread_vertices(robot)
+    place: World
+    if world == "simulator":
+        along = np.concatenate([np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis), np.zeros(3)])[None]
+        name, mixed = (BASE, along) if swings else (driven_input(robot).name, None)
+        place = RobotWorld(robot, name, num_envs, spread, mixed, shown)
+    elif world == "reduced":
+        place = ReducedWorld(_reduced(robot, Path(run).expanduser(), seed), num_envs)
+    else:
+        folder = Path(run).expanduser()
+        settings = finished_record(folder, "laboratory")["settings"]
+        place = Laboratory({**settings, "device": "cpu"}, folder, driven_input(robot).name, num_envs, seed, "count")
+    markers = place.markers()[0]
+    point = _tip(robot, markers, tracked, shown)
+    asked: RobotTask
+    if swings:
+        rest = point @ markers.ravel()
+        asked = SwingTask(num_envs, _up(robot), rest, float(np.linalg.norm(rest - _fixed(robot))))
+        mapping = ActionMapping(np.full(1, -_BASE), np.full(1, _BASE), np.full(1, _BASE_SPEED), np.zeros(1), frames)
     else:
         known = driven_input(robot)
-        assert known.low is not None
-        assert known.high is not None
         low, high = np.array(known.low), np.array(known.high)
-        place = made.of_input(known.name)
-        point = _tip(robot, place.markers()[0], tracked, shown)
-        if reach is None:
-            shares = np.random.default_rng(seed).random((_PLACES, len(low)))
-            shares[0] = 0.0
-            found, shares = rests(robot, known.name, shares)
-            found = found if shown is None else found[:, list(shown)]
-            reach = Reach(found.reshape(len(found), -1) @ point.T, 2.0 * shares - 1.0)
-        asked = (
-            ReachTask(num_envs, actions, reach)
-            if task == "reach"
-            else FollowTask(num_envs, actions, reach, action_time)
-        )
-        drive = Drive(low, high, (high - low) / _RISE, np.zeros(len(low)), frames)  # Worlds begin without inputs.
-    return RobotVectorEnv(
-        place,
-        asked,
-        drive,
-        point,
-        actions,
-        place.noise if isinstance(place, LaboratoryWorld) else noise,
-        autoreset_mode,
-        render_mode,
-        _up(robot),
-    )
+        goals = _reach(robot, known.name, low, high, point, shown, seed) if reach is None else reach
+        asked = ReachTask(num_envs, actions, goals)
+        if task == "follow":
+            asked = FollowTask(num_envs, actions, goals, action_time)
+        # Worlds begin without inputs.
+        mapping = ActionMapping(low, high, (high - low) / _RISE, np.zeros(len(low)), frames)
+    seen_noise = noise if place.noise is None else place.noise
+    return RobotVectorEnv(place, asked, mapping, point, actions, seen_noise, autoreset_mode, render_mode, _up(robot))
+
+
+def _reach(
+    robot: Robot, name: str, low: FloatArray, high: FloatArray, point: FloatArray, shown: list[int] | None, seed: int
+) -> Reach:
+    """Where the point is in equilibria of the robot under random inputs within their range."""
+    shares = np.random.default_rng(seed).random((_PLACES, len(low)))
+    shares[0] = 0.0
+    with torch.no_grad():
+        q, settled = robot.settle_some(len(shares), **{name: low + shares * (high - low)})
+        found = robot.observe(robot.state(q[settled])).double().cpu().numpy()
+    found = found if shown is None else found[:, shown]
+    return Reach(found.reshape(len(found), -1) @ point.T, 2.0 * shares[settled.cpu().numpy()] - 1.0)
 
 
 def _up(robot: Robot) -> FloatArray:
@@ -143,35 +148,14 @@ def _up(robot: Robot) -> FloatArray:
     return up if up.any() else np.array([0.0, 0.0, 1.0])
 
 
-class _World:
-    """Makes the world that was asked for."""
-
-    def __init__(
-        self, robot: Robot, run: str | Path, count: int, world: str, spread: float, seed: int, shown: list[int] | None
-    ) -> None:
-        self._robot, self._run, self._count, self._world = robot, Path(run).expanduser(), count, world
-        self._spread, self._seed, self._shown = spread, seed, shown
-
-    def of_base(self, along: FloatArray) -> World:
-        mixed = np.concatenate([along, np.zeros(3)])[None]
-        return RobotWorld(self._robot, BASE, self._count, self._spread, mixed, self._shown)
-
-    def of_input(self, name: str) -> World:
-        if self._world == "simulator":
-            return RobotWorld(self._robot, name, self._count, self._spread, None, self._shown)
-        if self._world == "reduced":
-            return ReducedWorld(self._reduced(), self._count)
-        settings = finished_record(self._run, "laboratory")["settings"]
-        return LaboratoryWorld({**settings, "device": "cpu"}, self._run, name, self._count, self._seed)
-
-    def _reduced(self) -> ReducedModel:
-        """That of the run, or a new one."""
-        known = self._robot.description
-        path = self._run / reduced_file(known.model)
-        if path.is_file():
-            finished_record(self._run, f"reduce_{known.model}")
-            return read_reduced(path, known.learned)
-        return _made(str(self._run), _changed(self._run), known.model, self._seed)
+def _reduced(robot: Robot, run: Path, seed: int) -> ReducedModel:
+    """The reduced model of the run, or a new one."""
+    known = robot.description
+    path = run / reduced_file(known.model)
+    if path.is_file():
+        finished_record(run, f"reduce_{known.model}")
+        return read_reduced(path, known.learned)
+    return _made(str(run), _changed(run), known.model, seed)
 
 
 def _changed(run: Path) -> float:

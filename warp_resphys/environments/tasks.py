@@ -49,7 +49,7 @@ class Reach:
         return np.asarray(directions * np.sign(directions[[0, 1], largest])[:, None])
 
 
-class Task(ABC):
+class RobotTask(ABC):
     """What is asked of B robots, of each by itself.
 
     Attributes:
@@ -81,7 +81,7 @@ class Task(ABC):
         """(K, 3) places to be at after so many actions, and later [m]."""
 
 
-class GoalTask(Task):
+class GoalTask(RobotTask):
     """Places (B, A + 1, 3) where the points are to be after each of A actions [m]."""
 
     def __init__(self, count: int, actions: int, reach: Reach) -> None:
@@ -89,7 +89,7 @@ class GoalTask(Task):
         self.size, self.width, self.reach = reach.size, 3 * len(PREVIEW), reach
 
     def observed(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
-        """See `Task.observed`: how far the next places are."""
+        """See `RobotTask.observed`: how far the next places are."""
         ahead = np.minimum(number[:, None] + np.array(PREVIEW) + 1, self.goals.shape[1] - 1)
         wanted = self.goals[np.arange(len(points))[:, None], ahead]
         return np.asarray(((wanted - points[:, None]) / self.size).reshape(len(points), -1))
@@ -98,15 +98,15 @@ class GoalTask(Task):
         return np.asarray(self.goals[np.arange(len(number)), np.minimum(number, self.goals.shape[1] - 1)])
 
     def errors_mm(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
-        """See `Task.errors_mm`."""
+        """See `RobotTask.errors_mm`."""
         return np.asarray(1e3 * np.linalg.norm(points - self._now(number), axis=1))
 
     def wanted(self, row: int, number: int) -> FloatArray:
-        """See `Task.wanted`."""
+        """See `RobotTask.wanted`."""
         return self.goals[row, min(number, self.goals.shape[1] - 1) :]
 
     def reward(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
-        """See `Task.reward`: one where they are, and less by their distance over the size of the reach."""
+        """See `RobotTask.reward`: one where they are, and less by their distance over the size of the reach."""
         return np.asarray(1.0 - 1e-3 * self.errors_mm(points, number) / self.size)
 
 
@@ -114,7 +114,7 @@ class ReachTask(GoalTask):
     """Be at a place, soon, and stay there."""
 
     def begin(self, row: int, random: np.random.Generator) -> None:
-        """See `Task.begin`: one of the places at which the robot can be at rest."""
+        """See `RobotTask.begin`: one of the places at which the robot can be at rest."""
         self.goals[row] = self.reach.places[random.integers(len(self.reach.places))]
 
 
@@ -136,7 +136,7 @@ class FollowTask(GoalTask):
         self._time, self._figures = action_time, tuple(figures)
 
     def begin(self, row: int, random: np.random.Generator) -> None:
-        """See `Task.begin`: a figure at a speed, from anywhere in it on."""
+        """See `RobotTask.begin`: a figure at a speed, from anywhere in it on."""
         reach = self.reach
         name = self._figures[random.integers(len(self._figures))]
         first, second = reach.plane
@@ -149,7 +149,7 @@ class FollowTask(GoalTask):
         self.goals[row] = np.stack([np.interp(at, np.arange(len(curve)), column) for column in curve.T], axis=1)
 
 
-class SwingTask(Task):
+class SwingTask(RobotTask):
     """Swing a point up, as far above its rest as its base can make it.
 
     Args:
@@ -166,23 +166,23 @@ class SwingTask(Task):
         self.size, self.width = length, 1
 
     def begin(self, row: int, random: np.random.Generator) -> None:
-        """See `Task.begin`: nothing differs between episodes but the world."""
+        """See `RobotTask.begin`: nothing differs between episodes but the world."""
 
     def _height(self, points: FloatArray) -> FloatArray:
         return np.asarray((points - self._rest) @ self._up / self.size)
 
     def observed(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
-        """See `Task.observed`: the height."""
+        """See `RobotTask.observed`: the height."""
         return self._height(points)[:, None]
 
     def reward(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
-        """See `Task.reward`: the height over the length, where it is above the rest."""
+        """See `RobotTask.reward`: the height over the length, where it is above the rest."""
         return np.clip(self._height(points), 0.0, 1.0)
 
     def errors_mm(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
-        """See `Task.errors_mm`: what is missing to a length above the rest."""
+        """See `RobotTask.errors_mm`: what is missing to a length above the rest."""
         return np.asarray(1e3 * self.size * (1.0 - self._height(points)))
 
     def wanted(self, row: int, number: int) -> FloatArray:
-        """See `Task.wanted`: a length above the rest."""
+        """See `RobotTask.wanted`: a length above the rest."""
         return np.asarray(self._rest + self.size * self._up)[None]

@@ -10,10 +10,10 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
+from ..control.world import World
 from ..io.errors import InputError
 from .picture import Camera
-from .tasks import Task
-from .worlds import World
+from .tasks import RobotTask
 
 FloatArray = NDArray[np.float64]
 Observation = NDArray[np.float32]
@@ -24,7 +24,7 @@ _SMOOTH: Final = 0.05  # of the mean square change of an action, taken from the 
 
 
 @dataclass(frozen=True)
-class Drive:
+class ActionMapping:
     """What actions do.
 
     Attributes:
@@ -52,7 +52,7 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
     Args:
         world: that is stepped.
         task: that is to be done.
-        drive: what actions do to the input of the world.
+        mapping: what actions do to the input of the world.
         tracked: (3, 3 M) from the markers to the point of the task.
         actions: A of an episode, after which it is cut off.
         noise: standard deviation of each coordinate that is seen [m].
@@ -75,8 +75,8 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
     def __init__(
         self,
         world: World,
-        task: Task,
-        drive: Drive,
+        task: RobotTask,
+        mapping: ActionMapping,
         tracked: FloatArray,
         actions: int,
         noise: float = 0.0,
@@ -86,11 +86,11 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
     ) -> None:
         if render_mode not in (None, *RENDER_MODES):
             raise InputError(f"render_mode is {render_mode!r}: choose rgb_array, for pictures as arrays.")
-        self.world, self.task, self._drive, self.tracked = world, task, drive, tracked
-        self.actions, self.frames, self._noise = actions, drive.frames, noise
+        self.world, self.task, self._mapping, self.tracked = world, task, mapping, tracked
+        self.actions, self.frames, self._noise = actions, mapping.frames, noise
         self.num_envs, self.render_mode = world.count, render_mode
         mode = AutoresetMode(autoreset_mode)
-        rate = round(1.0 / (world.time_step * drive.frames))
+        rate = round(1.0 / (world.time_step * mapping.frames))
         self.metadata = {"render_modes": [*RENDER_MODES], "render_fps": rate, "autoreset_mode": mode}
         self._up = np.asarray(up, dtype=np.float64)
         self._camera: Camera | None = None
@@ -103,7 +103,7 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, world.count)
         self.action_space = gym.vector.utils.batch_space(self.single_action_space, world.count)
         self._random: list[np.random.Generator] | None = None
-        self._commands = np.tile(drive.start, (world.count, 1))
+        self._commands = np.tile(mapping.start, (world.count, 1))
         self._number = np.zeros(world.count, dtype=np.int64)
         self._over = np.zeros(world.count, dtype=np.bool_)
         self._seen = self._before = self.rests
@@ -141,7 +141,7 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         self.world.begin(chosen)
         for row in np.flatnonzero(chosen):
             self.task.begin(int(row), self._random[row])
-        self._commands[chosen] = self._drive.start
+        self._commands[chosen] = self._mapping.start
         self._number[chosen], self._over[chosen] = 0, False
         rows = chosen[:, None, None]
         self.rests = np.where(rows, self.world.markers(), self.rests)
@@ -187,7 +187,7 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
             around = np.concatenate([-np.eye(3), np.eye(3)]) * self.task.size
             self._camera = Camera(self._up, np.concatenate([self.rests[0], vertices[0], *wanted, middle + around]))
         errors = self._errors()
-        seconds = number * self.world.time_step * self._drive.frames
+        seconds = number * self.world.time_step * self._mapping.frames
         texts = [f"{at:.2f} s, {error:.1f} mm" for at, error in zip(seconds, errors, strict=True)]
         return tuple(self._camera.pictures(triangles, vertices, markers, wanted, texts))
 
@@ -200,8 +200,8 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
     def _observed(self) -> Observation:
         count, size = self.num_envs, self.task.size
         off, moved = ((each / size).reshape(count, -1) for each in (self._seen - self.rests, self._seen - self._before))
-        drive = self._drive
-        told = 2.0 * (self._commands - drive.low) / (drive.high - drive.low) - 1.0
+        mapping = self._mapping
+        told = 2.0 * (self._commands - mapping.low) / (mapping.high - mapping.low) - 1.0
         seen_points = self._seen.reshape(count, -1) @ self.tracked.T
         task = self.task.observed(seen_points, self._number)
         return np.concatenate([off, 5.0 * moved, told, task], axis=1).astype(np.float32)
@@ -220,7 +220,7 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         """
         if self._random is None:
             raise InputError("the environment was not reset: call env.reset(seed=...) before env.step(...).")
-        given, drive = np.asarray(actions, dtype=np.float64), self._drive
+        given, mapping = np.asarray(actions, dtype=np.float64), self._mapping
         if given.shape != (self.num_envs, self.world.parts) or not np.isfinite(given).all():
             raise InputError(
                 f"actions have shape {given.shape}: give finite ones of {(self.num_envs, self.world.parts)}, from -1 "
@@ -229,17 +229,17 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         beginning = self._over.copy() if self._mode is AutoresetMode.NEXT_STEP else np.zeros_like(self._over)
         if self._mode is AutoresetMode.DISABLED and self._over.any():
             raise InputError("an episode is over: reset it with options={'reset_mask': ...} before the next step.")
-        wanted = drive.low + 0.5 * (np.clip(given, -1.0, 1.0) + 1.0) * (drive.high - drive.low)
-        most, last = drive.rate * self.world.time_step, self._commands.copy()
+        wanted = mapping.low + 0.5 * (np.clip(given, -1.0, 1.0) + 1.0) * (mapping.high - mapping.low)
+        most, last = mapping.rate * self.world.time_step, self._commands.copy()
         lost = np.zeros(self.num_envs, dtype=np.bool_)
-        for _ in range(drive.frames):
+        for _ in range(mapping.frames):
             self._commands = self._commands + np.clip(wanted - self._commands, -most, most)
             lost |= self.world.step(self._commands)
         self._number += 1
         self._before, self._seen = self._seen, self._cameras(np.ones_like(lost))
         points = self._points
         rewards = self.task.reward(points, self._number)
-        changed = (self._commands - last) / (drive.high - drive.low)
+        changed = (self._commands - last) / (mapping.high - mapping.low)
         rewards = rewards - _SMOOTH * np.square(changed).mean(axis=1)
         rewards = np.where(lost, _LOST, rewards)
         terminated, truncated = lost.copy(), (self._number >= self.actions) & ~lost

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from ..data.actuation import remembered
+from ..data.input_response import InputResponse, told_of
 from ..data.markers import Markers
 from ..data.sight import SeenMarkers
 from ..data.trials import Trials
@@ -250,7 +250,8 @@ class Scene:
             told += [each.repeat(1, 1 + len(constants)) for each in driven]
             told += [] if moving is None else [moving[0]]
             return torch.cat(told, -1) if told else None
-        series = [remembered(each, constants, replay.simulator.time_step) for each in driven]
+        response = InputResponse(replay.simulator.time_step, filters=constants)
+        series = [told_of(*response.from_rest(each)) for each in driven]
         series += [] if moving is None else [moving]
         if not series:
             return told[0] if told else None

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from ..data.actuation import delayed, lagged
+from ..data.input_response import InputResponse, response_of
 from ..data.trials import Trials
 from ..dynamics.simulator import Constants, Simulator
 from ..io.errors import ConvergenceError
@@ -122,17 +122,12 @@ class Replay:
 
     def _acting(self, inputs: Inputs, spread: Parameters) -> dict[str, torch.Tensor]:
         """What commanded inputs come to, of values (E R,) of their parameters."""
-        found, step = {}, self.simulator.time_step
-        for name, command in inputs.actuation.items():
-            if name in HUNG:
-                continue
-            if (factor := spread.get(f"{name}_factor")) is not None:
-                command = command * factor[:, None]
-            if (delay := spread.get(f"{name}_delay")) is not None:
-                command = delayed(command, delay, step)
-            if (rise := spread.get(f"{name}_rise")) is not None:
-                command = lagged(command, rise, step)
-            found[name] = command
+        found = {}
+        for name, commands in inputs.actuation.items():
+            if name not in HUNG:
+                response = InputResponse(self.simulator.time_step, *response_of(name, spread))
+                throughout = commands.ndim == 2
+                found[name] = response.scaled(commands) if throughout else response.from_rest(commands)[0]
         return found
 
     def begin(

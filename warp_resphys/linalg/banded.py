@@ -1,19 +1,67 @@
-"""LAPACK's banded Cholesky: the cheapest for slender bodies on a CPU, up to tens of thousands of unknowns."""
+"""LAPACK's banded Cholesky: the cheapest for slender bodies on a CPU, up to tens of thousands of unknowns.
 
-from abc import abstractmethod
+Its routines are called as SciPy offers them to compiled code (``scipy.linalg.cython_lapack``), so that other threads
+may run meanwhile: SciPy's own wrappers keep Python's lock.
+"""
+
+import ctypes
+from functools import cache
 from typing import Any
 
 import numpy as np
 import scipy.linalg
 import torch
+from scipy.linalg import cython_lapack
 from typing_extensions import override
 
-from .lapack import BandedCholesky, general_band
-from .linear_solver import Factor, Indices, LinearSolver, bandwidth_reducing_order
+from .linear_solver import Factor, Indices, LinearSolver, SeparateFactors, bandwidth_reducing_order
+
+_LETTERS = {torch.float64: "d", torch.float32: "s"}
+
+
+@cache
+def _routine(name: str, arguments: int) -> Any:
+    capsule = cython_lapack.__pyx_capi__[name]
+    api = ctypes.pythonapi
+    api.PyCapsule_GetName.restype, api.PyCapsule_GetName.argtypes = ctypes.c_char_p, [ctypes.py_object]
+    api.PyCapsule_GetPointer.restype = ctypes.c_void_p
+    api.PyCapsule_GetPointer.argtypes = [ctypes.py_object, ctypes.c_char_p]
+    pointer = api.PyCapsule_GetPointer(capsule, api.PyCapsule_GetName(capsule))
+    return ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * arguments)(pointer)
+
+
+class _Routines:
+    """Factors and solutions in place, of matrices (n, w + 1) by columns: row j has the entries (j, j) to (j + w, j).
+
+    Args:
+        n: unknowns.
+        width: w, entries below the diagonal.
+        dtype: of matrices and right-hand sides.
+    """
+
+    def __init__(self, n: int, width: int, dtype: torch.dtype) -> None:
+        letter = _LETTERS[dtype]
+        self._factor, self._solve = _routine(f"{letter}pbtrf", 6), _routine(f"{letter}pbtrs", 9)
+        self._lower, self._numbers = ctypes.c_char(b"L"), [ctypes.c_int(k) for k in (n, width, width + 1)]
+        self._where = [ctypes.addressof(self._lower), *map(ctypes.addressof, self._numbers)]
+
+    def factor(self, matrix: torch.Tensor) -> bool:
+        """Overwrites a contiguous matrix by its factor; False where it is not positive definite."""
+        lower, n, width, rows = self._where
+        info = ctypes.c_int()
+        self._factor(lower, n, width, matrix.data_ptr(), rows, ctypes.addressof(info))
+        return info.value == 0
+
+    def solve(self, factor: torch.Tensor, columns: torch.Tensor) -> None:
+        """Overwrites contiguous right-hand sides, (n,) or (m, n), by the solutions."""
+        lower, n, width, rows = self._where
+        count, info = ctypes.c_int(1 if columns.ndim == 1 else len(columns)), ctypes.c_int()
+        place = columns.data_ptr()
+        self._solve(lower, n, width, ctypes.addressof(count), factor.data_ptr(), rows, place, n, ctypes.addressof(info))
 
 
 class BandedSolver(LinearSolver):
-    """LAPACK's banded Cholesky in reverse Cuthill-McKee order, on the CPU, one environment after another."""
+    """Banded Cholesky in reverse Cuthill-McKee order, on the CPU, one environment after another."""
 
     overwrites = True
 
@@ -29,95 +77,50 @@ class BandedSolver(LinearSolver):
         self.n_values = self.n * (self.bandwidth + 1)
         self.address = np.where(diagonal_upper, -1, j * (self.bandwidth + 1) + (i - j)).astype(np.int32)
         self.order = order
-        self.dofs = self.unknowns
-        self.places = torch.argsort(self.dofs)
-        self.lapack = BandedCholesky(self.n, self.bandwidth, self.dtype)
+        self.lapack = _Routines(self.n, self.bandwidth, self.dtype)
 
     @override
     def _factorise(
         self, values: torch.Tensor, definite: bool, idle: torch.Tensor | None, before: Factor | None
     ) -> Factor:
         bands = values.reshape(-1, self.n, self.bandwidth + 1)
-        left_out = [False] * len(bands) if idle is None else idle.tolist()
-        kind = _BandedCholesky if definite else _BandedLU
-        return kind(self, bands, left_out, before if isinstance(before, kind) else None)
+        kind, factorise = (_Cholesky, self._cholesky) if definite else (_LU, self._lu)
+        return kind(self, bands, factorise, idle, before)
 
+    def _cholesky(self, number: int, band: torch.Tensor) -> torch.Tensor | None:
+        return band if self.lapack.factor(band) else None
 
-class _BandedFactor(Factor):
-    """One factor an environment, or None.
-
-    Args:
-        solver: with the order.
-        bands: (B or 1, n, w + 1) matrices.
-        idle: those that keep a factor, or have none.
-        before: the factor they keep.
-    """
-
-    def __init__(
-        self, solver: BandedSolver, bands: torch.Tensor, idle: list[bool], before: "_BandedFactor | None"
-    ) -> None:
-        self._solver, self._shared = solver, len(bands) == 1
-        self.failed = np.zeros(len(bands), dtype=bool)
-        self._factors: list[Any] = [None] * len(bands)
-        for i, band in enumerate(bands):
-            if not idle[i]:
-                self._factors[i], self.failed[i] = self._factorise(band)
-            elif before is not None:
-                self._factors[i], self.failed[i] = before._factors[i], before.failed[i]
-
-    @abstractmethod
-    def _factorise(self, band: torch.Tensor) -> tuple[Any, bool]:
-        """The factor of a matrix, which it may overwrite, and whether there is none: it is not a number then."""
-
-    @abstractmethod
-    def _overwrite(self, factor: Any, columns: torch.Tensor) -> None:
-        """Solves for contiguous (m, n) right-hand sides."""
-
-    @override
-    def solve(self, rhs: torch.Tensor) -> torch.Tensor:
-        b, n, m = rhs.shape
-        ordered = rhs[:, self._solver.dofs].mT
-        # Solved for one environment at a time, or for all of them at once.
-        columns = ordered.reshape((1, b * m, n) if self._shared else (b, m, n)).contiguous()
-        self._solve_each(columns)
-        return columns.view(b, m, n).mT[:, self._solver.places]
-
-    @override
-    def solve_in_place(self, columns: torch.Tensor) -> None:
-        self._solve_each(columns[None] if self._shared else columns[:, None])
-
-    def _solve_each(self, columns: torch.Tensor) -> None:
-        for factor, block in zip(self._factors, columns, strict=True):
-            if factor is not None:
-                self._overwrite(factor, block)
-
-
-class _BandedCholesky(_BandedFactor):
-    @override
-    def _factorise(self, band: torch.Tensor) -> tuple[Any, bool]:
-        definite = self._solver.lapack.factor(band)
-        if not definite:
-            band.fill_(torch.nan)
-        return band, not definite
-
-    @override
-    def _overwrite(self, factor: torch.Tensor, columns: torch.Tensor) -> None:
-        self._solver.lapack.solve(factor, columns)
-
-
-class _BandedLU(_BandedFactor):
-    @override
-    def _factorise(self, band: torch.Tensor) -> tuple[Any, bool]:
-        matrix, w = general_band(band.numpy()), self._solver.bandwidth
+    def _lu(self, number: int, band: torch.Tensor) -> tuple[Any, Any] | None:
+        matrix, w = general_band(band.numpy()), self.bandwidth
         (factorise,) = scipy.linalg.get_lapack_funcs(("gbtrf",), (matrix,))
         lu, pivots, info = factorise(matrix, w, w, overwrite_ab=1)
-        if info != 0:
-            lu.fill(np.nan)
-        return (lu, pivots), info != 0
+        return (lu, pivots) if info == 0 else None
+
+
+class _Cholesky(SeparateFactors):
+    _solver: BandedSolver
 
     @override
-    def _overwrite(self, factor: tuple[Any, Any], columns: torch.Tensor) -> None:
+    def _overwrite(self, factor: torch.Tensor, rows: torch.Tensor, exact: bool) -> None:
+        self._solver.lapack.solve(factor, rows)
+
+
+class _LU(SeparateFactors):
+    _solver: BandedSolver
+
+    @override
+    def _overwrite(self, factor: tuple[Any, Any], rows: torch.Tensor, exact: bool) -> None:
         (lu, pivots), w = factor, self._solver.bandwidth
         (solve,) = scipy.linalg.get_lapack_funcs(("gbtrs",), (lu,))
-        solved, _ = solve(lu, w, w, columns.numpy().T, pivots)
-        columns.copy_(torch.from_numpy(solved.T))
+        solved, _ = solve(lu, w, w, rows.numpy().T, pivots)
+        rows.copy_(torch.from_numpy(solved.T))
+
+
+def general_band(band: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """LAPACK's general band storage with room for pivoting, from (n, w + 1) lower symmetric storage."""
+    n, w = band.shape[0], band.shape[1] - 1
+    general = np.zeros((3 * w + 1, n), dtype=band.dtype, order="F")
+    general[2 * w :, :] = band.T
+    for k in range(1, w + 1):
+        general[2 * w - k, k:] = band[: n - k, k]
+    return general

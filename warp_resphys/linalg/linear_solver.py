@@ -5,6 +5,9 @@ belongs, so that one Warp kernel assembles for every layout. ``factor`` turns a 
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -68,6 +71,64 @@ class CorrectedFactor(Factor):
         self.factor.solve_in_place(columns)
         along = self.columns[:, self._order].mT @ columns[:, :, None]
         columns -= (self._solved[:, self._order] @ torch.linalg.lu_solve(*self._small, along))[:, :, 0]
+
+
+class SeparateFactors(Factor):
+    """A factor for each matrix of a batch, made one after another; None for a matrix that has none.
+
+    Args:
+        solver: whose order right-hand sides in place have.
+        matrices: B, or one for all environments.
+        factorise: the factor of matrix i; None where it is not positive definite.
+        idle: (B,) matrices that keep the factor they have, if any.
+        before: the factors they have.
+
+    Attributes:
+        factors: of the B matrices.
+    """
+
+    def __init__(
+        self,
+        solver: "LinearSolver",
+        matrices: torch.Tensor,
+        factorise: Callable[[int, torch.Tensor], Any],
+        idle: torch.Tensor | None,
+        before: Factor | None,
+    ) -> None:
+        kept = before if isinstance(before, type(self)) else None
+        self._solver, left_out = solver, [False] * len(matrices) if idle is None else idle.tolist()
+        self.failed = np.zeros(len(matrices), dtype=bool)
+        self.factors: list[Any] = []
+        for i, matrix in enumerate(matrices):
+            if left_out[i]:
+                self.factors.append(None if kept is None else kept.factors[i])
+                self.failed[i] = kept is not None and kept.failed[i]
+            else:
+                self.factors.append(factorise(i, matrix))
+                self.failed[i] = self.factors[i] is None
+
+    @abstractmethod
+    def _overwrite(self, factor: Any, rows: torch.Tensor, exact: bool) -> None:
+        """Overwrites contiguous right-hand sides (m, n) by the solutions, or where not `exact` by rough ones."""
+
+    def _overwrite_all(self, blocks: torch.Tensor, exact: bool) -> None:
+        for factor, failed, rows in zip(self.factors, self.failed, blocks, strict=True):
+            if failed:
+                rows.fill_(torch.nan)
+            elif factor is not None:
+                self._overwrite(factor, rows, exact)
+
+    @override
+    def solve(self, rhs: torch.Tensor) -> torch.Tensor:
+        b, n, m = rhs.shape
+        rows = rhs[:, self._solver.dofs].mT.reshape((1, b * m, n) if len(self.factors) == 1 else (b, m, n))
+        rows = rows.contiguous()
+        self._overwrite_all(rows, exact=True)
+        return rows.view(b, m, n).mT[:, self._solver.places]
+
+    @override
+    def solve_in_place(self, columns: torch.Tensor) -> None:
+        self._overwrite_all(columns[None] if len(self.factors) == 1 else columns[:, None], exact=False)
 
 
 class LinearSolver(ABC):
@@ -150,7 +211,7 @@ class LinearSolver(ABC):
                 columns = torch.where(idle[:, None, None], kept.columns, columns)
             kept = kept.factor
         factor = self._factorise(values, definite, idle, kept)
-        return factor if columns is None else CorrectedFactor(factor, columns, self.unknowns)
+        return factor if columns is None else CorrectedFactor(factor, columns, self.dofs)
 
     @abstractmethod
     def _factorise(
@@ -158,11 +219,16 @@ class LinearSolver(ABC):
     ) -> Factor:
         """See `factor`; there is no factor before unless a matrix is idle."""
 
-    @property
-    def unknowns(self) -> torch.Tensor:
+    @cached_property
+    def dofs(self) -> torch.Tensor:
         """(n,) unknown at each place of the right-hand sides in place."""
         dofs = (self.order[:, None] * self.block + np.arange(self.block)).ravel()
         return torch.as_tensor(dofs, device=self.device)
+
+    @cached_property
+    def places(self) -> torch.Tensor:
+        """(n,) place of each unknown there."""
+        return torch.argsort(self.dofs)
 
     def _entries(self, rows: Indices, cols: Indices) -> tuple[Indices, Indices]:
         """Scalar row and column (E, block^2) of every entry of every block, in the order of the nodes given."""

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from .conjugate_gradients import Iterate, conjugate_gradients
-from .linear_solver import Factor, Indices
+from .linear_solver import Factor, Indices, SeparateFactors
 from .sparse import SparseSolver, sparse_lu
 
 FloatArray = NDArray[np.float64]
@@ -58,21 +59,12 @@ class MultigridSolver(SparseSolver):
     ) -> Factor:
         if not definite:
             return super()._factorise(values, definite, idle, before)
-        kept = before if isinstance(before, _Preconditioned) else None
-        left_out = [False] * len(values) if idle is None else idle.tolist()
-        systems: list[_System | None] = []
-        failed = np.zeros(len(values), dtype=bool)
-        for i, entries in enumerate(self.mirrored(values)):
-            if left_out[i]:
-                systems.append(None if kept is None else kept.systems[i])
-                failed[i] = kept is not None and kept.failed[i]
-            else:
-                systems.append(self._system((len(values), i), entries.to(torch.float64)))
-                failed[i] = systems[i] is None
-        return _Preconditioned(systems, failed)
+        entries = self.mirrored(values).double()
+        return _Preconditioned(self, entries, partial(self._system, len(values)), idle, before)
 
-    def _system(self, environment: tuple[int, int], entries: torch.Tensor) -> "_System | None":
-        """Of an environment's `mirrored` entries; None where the matrix is found not to be positive definite."""
+    def _system(self, batch: int, number: int, entries: torch.Tensor) -> "_System | None":
+        """An environment's matrix, from its `mirrored` entries; None where it is found not to be positive definite."""
+        environment = (batch, number)
         if not bool(torch.isfinite(entries).all()):
             return None
         cycle = self._cycles.get(environment)
@@ -97,39 +89,22 @@ class _Layout:
         self.indices = [torch.as_tensor(each.astype(np.int32), device=device) for each in (self.starts, self.columns)]
 
 
-class _Preconditioned(Factor):
-    """Matrices with a V-cycle each; None for those that failed or were never made."""
+class _Preconditioned(SeparateFactors):
+    """Matrices with a V-cycle each."""
 
     approximate = True
 
-    def __init__(self, systems: "list[_System | None]", failed: NDArray[np.bool_]) -> None:
-        self.systems, self.failed = systems, failed
-
     @override
-    def solve(self, rhs: torch.Tensor) -> torch.Tensor:
-        b, n, m = rhs.shape
-        shared = len(self.systems) == 1
-        columns = rhs.permute(1, 0, 2).reshape(1, n, b * m) if shared else rhs
-        found = torch.stack([_solved(each, right.mT).mT for each, right in zip(self.systems, columns, strict=True)])
-        return found.reshape(n, b, m).permute(1, 0, 2) if shared else found
-
-    @override
-    def solve_in_place(self, columns: torch.Tensor) -> None:
-        rows = columns[None] if len(self.systems) == 1 else columns[:, None]
-        for system, right in zip(self.systems, rows, strict=True):
-            right.copy_(torch.full_like(right, torch.nan) if system is None else system.direction(right.double()))
-
-
-def _solved(system: "_System | None", right: torch.Tensor) -> torch.Tensor:
-    """(m, n) for right-hand sides (m, n)."""
-    return torch.full_like(right, torch.nan) if system is None else system.solve(right.double()).to(right.dtype)
+    def _overwrite(self, factor: "_System", rows: torch.Tensor, exact: bool) -> None:
+        right = rows.double()
+        rows.copy_(factor.solve(right) if exact else factor.direction(right))
 
 
 class _System:
     """A matrix, and a V-cycle of it or of one before."""
 
     def __init__(self, matrix: torch.Tensor, cycle: "_Cycle") -> None:
-        self._matrix, self._cycle = matrix, cycle
+        self._matrix, self.cycle = matrix, cycle
         self._lu: Any = None
 
     def direction(self, right: torch.Tensor) -> torch.Tensor:
@@ -155,7 +130,7 @@ class _System:
         return torch.as_tensor(found.T, device=right.device)
 
     def _iterate(self, right: torch.Tensor, tolerance: float) -> Iterate:
-        matrix, cycle = self._matrix, self._cycle
+        matrix, cycle = self._matrix, self.cycle
         found = conjugate_gradients(
             lambda x: _times(matrix, x), cycle.apply, right, tolerance, max_iterations=_MOST_ITERATIONS
         )

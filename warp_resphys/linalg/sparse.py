@@ -1,5 +1,6 @@
 """Sparse Cholesky through CHOLMOD or SuperLU: for wide bodies, one environment after another."""
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,9 @@ import scipy.sparse.linalg
 import torch
 from typing_extensions import override
 
-from .linear_solver import Factor, Indices, LinearSolver
+from .linear_solver import Factor, Indices, LinearSolver, SeparateFactors
+
+_COLUMNS = 128  # that CHOLMOD solves at once on a GPU
 
 
 class SparseSolver(LinearSolver):
@@ -37,61 +40,40 @@ class SparseSolver(LinearSolver):
     def _factorise(
         self, values: torch.Tensor, definite: bool, idle: torch.Tensor | None, before: Factor | None
     ) -> Factor:
-        left_out = [False] * len(values) if idle is None else idle.tolist()
-        return _SparseFactor(self, values, definite, left_out, before if isinstance(before, _SparseFactor) else None)
+        entries = self.mirrored(values)
+        cholespy = _cholespy() if definite else None
+        if cholespy is not None:
+            return _Cholmod(self, entries, partial(self._cholmod, cholespy), idle, before)
+        return _SuperLU(self, entries, partial(self._lu, definite), idle, before)
+
+    def _lu(self, definite: bool, number: int, entries: torch.Tensor) -> Any:
+        try:
+            return sparse_lu(self.matrix(entries), definite)
+        except (ValueError, RuntimeError):
+            return None
+
+    def _cholmod(self, cholespy: Any, number: int, entries: torch.Tensor) -> Any:
+        i, j = (torch.as_tensor(x, dtype=torch.int32, device=self.device) for x in (self._rows, self._cols))
+        try:
+            return cholespy.CholeskySolverD(self.n, i, j, entries.detach().double(), cholespy.MatrixType.COO)
+        except (ValueError, RuntimeError):
+            return None
 
 
-class _SparseFactor(Factor):
-    def __init__(
-        self,
-        solver: SparseSolver,
-        values: torch.Tensor,
-        definite: bool,
-        idle: list[bool],
-        before: "_SparseFactor | None",
-    ) -> None:
-        self._device, self._dtype = solver.device, solver.dtype
-        self.failed = np.zeros(len(values), dtype=bool)
-        cholmod = _cholespy() if definite else None
-        self._factors: list[Any] = []
-        self._cholmod = cholmod is not None
-        for i, entries in enumerate(solver.mirrored(values)):
-            if idle[i]:
-                self._factors.append(None if before is None else before._factors[i])
-                self.failed[i] = before is not None and before.failed[i]
-                continue
-            try:
-                if cholmod is not None:
-                    self._factors.append(_cholmod_factor(cholmod, solver, entries))
-                    continue
-                self._factors.append(sparse_lu(solver.matrix(entries), definite))
-            except (ValueError, RuntimeError):
-                self.failed[i] = True
-                self._factors.append(None)
-
+class _SuperLU(SeparateFactors):
     @override
-    def solve(self, rhs: torch.Tensor) -> torch.Tensor:
-        b, n, m = rhs.shape
-        shared = len(self._factors) == 1
-        columns = rhs.permute(1, 0, 2).reshape(1, n, b * m) if shared else rhs
-        solutions = []
-        for factor, right in zip(self._factors, columns, strict=True):
-            if factor is None:
-                solution = torch.full_like(right, torch.nan)
-            elif self._cholmod:
-                right = right.to(torch.float64).contiguous()
-                solution = torch.empty_like(right)
-                # CHOLMOD's GPU solve takes at most 128 columns at once.
-                for first in range(0, right.shape[1], 128):
-                    part = right[:, first : first + 128].contiguous()
-                    out = torch.empty_like(part)
-                    factor.solve(part, out)
-                    solution[:, first : first + 128] = out
-            else:
-                solution = torch.from_numpy(factor.solve(right.detach().cpu().numpy().astype(np.float64)))
-            solutions.append(solution.to(self._device, self._dtype))
-        stacked = torch.stack(solutions)
-        return stacked.reshape(n, b, m).permute(1, 0, 2) if shared else stacked
+    def _overwrite(self, factor: Any, rows: torch.Tensor, exact: bool) -> None:
+        rows.copy_(torch.from_numpy(factor.solve(rows.detach().cpu().double().numpy().T).T))
+
+
+class _Cholmod(SeparateFactors):
+    @override
+    def _overwrite(self, factor: Any, rows: torch.Tensor, exact: bool) -> None:
+        for part in rows.split(_COLUMNS):
+            right = part.double().mT.contiguous()
+            found = torch.empty_like(right)
+            factor.solve(right, found)
+            part.copy_(found.mT)
 
 
 def sparse_lu(matrix: scipy.sparse.csc_array, definite: bool) -> Any:
@@ -120,8 +102,3 @@ def _cholespy() -> Any:
     except ModuleNotFoundError:
         return None
     return cholespy
-
-
-def _cholmod_factor(cholmod: Any, solver: SparseSolver, entries: torch.Tensor) -> Any:
-    i, j = (torch.as_tensor(x, dtype=torch.int32, device=solver.device) for x in (solver._rows, solver._cols))
-    return cholmod.CholeskySolverD(solver.n, i, j, entries.detach().to(torch.float64), cholmod.MatrixType.COO)

@@ -41,8 +41,6 @@ class TiledSolver(LinearSolver):
         self._diagonal = torch.as_tensor(
             np.arange(self.n) * columns + self.width * TILE + np.arange(self.n) % TILE, device=self.device
         )
-        self.dofs = self.unknowns
-        self.places = torch.argsort(self.dofs)
         self.scalar = wp.float64 if self.dtype == torch.float64 else wp.float32
         self.kernels = tiled_kernels(self.scalar)
 

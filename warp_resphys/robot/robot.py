@@ -11,6 +11,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csc_array
 
+from ..data.input_response import InputResponse, response_of, told_of
 from ..dynamics.frames import BaseFrame, VertexFrames, base_movement, rotations
 from ..energies.strings import PAYLOAD, Strings
 from ..experiment.files import payload_inputs
@@ -24,7 +25,6 @@ from ..learning.replay import settled
 from ..learning.rollout import FURTHEST, Rollout
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
-from .commands import Commands
 from .description import Description
 from .inputs import BASE, FORCE, Given, InputReader, inputs_of
 from .motion import Motion
@@ -90,7 +90,9 @@ class Robot:
         spread = {name: value.expand(count) for name, value in values.items()}
         self.constants = self.simulator.prepare(constants_of(self.simulator, spread))
         filters = self.description.filters if self._learned is not None else ()
-        self._commands = {name: Commands(name, values, filters, self.time_step) for name in self.driven}
+        self._responses = {
+            name: InputResponse(self.time_step, *response_of(name, values), filters) for name in self.driven
+        }
 
     def with_parameters(self, **parameters: torch.Tensor | float) -> "Robot":
         """The same robot with other values of what was, or could have been, identified; on the same memory.
@@ -346,10 +348,11 @@ class Robot:
     def _new(self, body: State, given: Mapping[str, torch.Tensor] | None = None) -> RobotState:
         """A state before which constant inputs (B, C) have acted for long; none, if left out."""
         memory: dict[str, torch.Tensor] = {}
-        for name, commands in self._commands.items():
+        for name, response in self._responses.items():
             value = (given or {}).get(name)
             nothing = body.q.new_zeros(body.batch, len(self.inputs[name].parts))
-            memory |= commands.still(nothing if value is None else value)
+            still = response.still(nothing if value is None else value)
+            memory |= {f"{name}.{key}": each for key, each in still.items()}
         base = (given or {}).get(BASE)
         moved = self.description.told_of_base is not None or base is not None
         at = body.q.new_zeros(body.batch, len(self.inputs[BASE].parts)) if base is None else base
@@ -371,12 +374,14 @@ class Robot:
         payload = given.get(PAYLOAD.name)
         if self.description.payload_at is not None and self.description.sees_payload:
             told.append(state.q.new_zeros(state.batch, 1) if payload is None else payload)
-        for name, commands in self._commands.items():
-            value = given.get(name)
+        for name, response in self._responses.items():
+            value, own = given.get(name), f"{name}."
             nothing = state.q.new_zeros(state.batch, len(self.inputs[name].parts))
-            fields[name], series, later = commands.step(state.memory, nothing if value is None else value)
-            told += [series] if name in self.description.seen else []
-            memory |= later
+            remembered = {key.removeprefix(own): each for key, each in state.memory.items() if key.startswith(own)}
+            acting, means, later = response(remembered, (nothing if value is None else value)[None])
+            fields[name] = acting[0]
+            told += [told_of(acting[0], means[:, 0])] if name in self.description.seen else []
+            memory |= {f"{own}{key}": each for key, each in later.items()}
         if payload is not None:
             fields |= self._hung(payload)
         base = state.base

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 
 import torch
 
+from ..data.input_response import Memory
 from ..stepping.state import State
-from .commands import Memory
 
 
 @dataclass(frozen=True)
@@ -15,7 +15,7 @@ class RobotState:
 
     Attributes:
         body: positions (B, N, 3) [m] and velocities [m/s] of the vertices, and what its material remembers.
-        memory: of the commands, see `Commands`.
+        memory: of the inputs, such as ``pressure.queue``, see `InputResponse`.
         hidden: (B, H) of a recurrent network; None for others, and at the start.
         base: (2, B, 6) how the base had moved a step ago and has now [m, rad]; None where it never did.
         left: (B,) bool, whether the learned force was ever asked outside of the range of its training.
@@ -70,6 +70,8 @@ class RobotState:
 
     def where(self, chosen: torch.Tensor, other: "RobotState") -> "RobotState":
         """These environments where chosen (B,) bool, those of another state of the same robot elsewhere."""
+        if bool(chosen.all()):
+            return self
         theirs = iter(other._like(self)._tensors())
 
         def pick(value: torch.Tensor, axis: int) -> torch.Tensor:

@@ -1,0 +1,73 @@
+"""Valves that lag, commands that are late, and means of what an input was."""
+
+import numpy as np
+import pytest
+import torch
+
+from warp_resphys.data.input_response import InputResponse, told_of
+
+STEP = 0.01
+
+
+def test_a_lag_follows_a_step_exponentially_and_has_a_derivative():
+    command = torch.full((50, 1, 1), 2e4, dtype=torch.float64)
+    rise = torch.tensor([0.07], dtype=torch.float64, requires_grad=True)
+    found, _ = InputResponse(STEP, rise=rise).from_rest(command)
+    times = STEP * torch.arange(1, 51, dtype=torch.float64)
+    torch.testing.assert_close(found[:, 0, 0], 2e4 * (1 - torch.exp(-times / rise)))
+    found.sum().backward()
+    expected = -(2e4 * torch.exp(-times / 0.07) * times / 0.07**2).sum()
+    torch.testing.assert_close(rise.grad[0], expected)
+
+
+def test_a_delay_moves_commands_and_shares_a_step():
+    command = torch.arange(1.0, 6.0, dtype=torch.float64)[:, None, None].expand(-1, 3, 2)
+    late = torch.tensor([0.0, 2.0, 1.25], dtype=torch.float64) * STEP
+    found = InputResponse(STEP, delay=late).from_rest(command)[0][..., 0]
+    assert found[:, 0].tolist() == [1.0, 2.0, 3.0, 4.0, 5.0]
+    assert found[:, 1].tolist() == [0.0, 0.0, 1.0, 2.0, 3.0]
+    torch.testing.assert_close(found[:, 2], torch.tensor([0.0, 0.75, 1.75, 2.75, 3.75], dtype=torch.float64))
+
+
+def test_a_delay_is_differentiable():
+    command = torch.rand(6, 2, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    late = (torch.tensor([0.3, 1.6], dtype=torch.float64) * STEP).requires_grad_()
+    delayed = lambda x: InputResponse(STEP, delay=x).from_rest(command)[0]  # noqa: E731
+    assert torch.autograd.gradcheck(delayed, (late,), eps=1e-4 * STEP, atol=1e-6)
+
+
+def test_means_remember_what_the_pressure_was():
+    pressure = torch.zeros(100, 1, 2, dtype=torch.float64)
+    pressure[20:, :, 0] = 1e4
+    told = told_of(*InputResponse(STEP, filters=[0.1, 1.0]).from_rest(pressure))
+    assert told.shape == (100, 1, 6)
+    torch.testing.assert_close(told[..., :2], pressure)
+    assert not told[:20].any()
+    fast, slow = told[-1, 0, 2], told[-1, 0, 4]
+    assert float(fast) == pytest.approx(1e4, rel=1e-3)
+    assert float(slow) == pytest.approx(1e4 * (1 - np.exp(-0.8)), rel=1e-9)
+    torch.testing.assert_close(told_of(*InputResponse(STEP).from_rest(pressure)), pressure)
+
+
+@pytest.mark.parametrize(("delay", "rise"), [(0.0, 0.001), (0.02, 0.03), (0.025, 0.04), (0.07, 0.05)])
+def test_steps_are_the_series_for_arrays_and_for_tensors_with_parameters_of_their_own(delay, rise):
+    commands = np.random.default_rng(1).random((20, 3, 2))
+    response = InputResponse(STEP, 0.8, delay, rise, [0.1, 0.5])
+    acting, means = response.from_rest(commands)
+    memory = response.still(np.zeros((3, 2)))
+    for number, now in enumerate(commands):
+        one, mean, memory = response(memory, now[None])
+        np.testing.assert_allclose(one[0], acting[number], atol=1e-12)
+        np.testing.assert_allclose(mean[:, 0], means[:, number], atol=1e-12)
+    of_each = [torch.tensor([1.0, each, 0.5 * each], dtype=torch.float64) for each in (0.8, delay, rise)]
+    found, told = InputResponse(STEP, *of_each, [0.1, 0.5]).from_rest(torch.as_tensor(commands))
+    np.testing.assert_allclose(found[:, 1], acting[:, 1], atol=1e-12)
+    np.testing.assert_allclose(told[:, :, 1], means[:, :, 1], atol=1e-12)
+    assert float((found[:, 0] - torch.as_tensor(acting[:, 0])).abs().max()) > 1e-3
+
+
+def test_constant_commands_are_remembered_as_if_they_had_always_been_given():
+    commands = np.array([[1.0, 2.0]])
+    response = InputResponse(STEP, 0.8, 0.013, 0.02, [0.3])
+    acting, means, _ = response(response.still(commands), commands[None])
+    np.testing.assert_allclose(told_of(acting[0], means[:, 0]), 0.8 * np.tile(commands, 2))

@@ -279,7 +279,7 @@ class TestPlans:
         plan = read_plan(folder / plans_file("resphys"), "circle_0.4s")
         task = Task(settings(folder, "drive")["control"], robot.labels, robot.time_step, 3)
         follower = Follower(robot, model, task.planner(model, 0.4), 4, "adjoint")
-        errors = follower.follow(plan.path[None]).errors_mm[:, 0]
+        errors = follower.follow(plan.path[None])[0].errors_mm
         assert errors.min() < 0.8 * errors[0]
 
 

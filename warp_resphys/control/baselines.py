@@ -57,7 +57,7 @@ class LinearModel:
     def respond(
         self, start: FloatArray, inputs: FloatArray, basis: FloatArray | None = None, bias: FloatArray | None = None
     ) -> Response:
-        """See `ReducedModel.respond`; it has no bias."""
+        """The motion of the markers over T steps, see `plan.PredictionModel`; `bias` has no effect."""
         del bias
         s, states, sloped = start, [], []
         ds = None if basis is None else np.zeros((len(s), basis.shape[2]))

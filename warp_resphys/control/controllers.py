@@ -15,7 +15,7 @@ from typing_extensions import override
 
 from .baselines import DELAYS, LinearModel
 from .estimate import Estimator, Noise
-from .plan import Foretelling, Limits, Planner, Weights
+from .plan import Limits, Planner, PredictionModel, Weights
 from .reduced import ReducedModel
 
 FloatArray = NDArray[np.float64]
@@ -82,10 +82,10 @@ class Horizon:
 class _Receding(Controller):
     """Plans anew at every step, from where the last plan would go on."""
 
-    memory_keys = ("last_command", "knots")
+    memory_keys: ClassVar[tuple[str, ...]] = ("last_command", "knots")
 
     def __init__(
-        self, model: Foretelling, tracked: FloatArray, limits: Limits, horizon: Horizon, path: FloatArray
+        self, model: PredictionModel, tracked: FloatArray, limits: Limits, horizon: Horizon, path: FloatArray
     ) -> None:
         self._planner = Planner(
             model, tracked, limits, horizon.steps, horizon.pieces, horizon.weights, horizon.iterations
@@ -166,7 +166,7 @@ class LinearRecedingHorizon(_Receding):
         tracked, limits, horizon, path, rest: see `RecedingHorizon`.
     """
 
-    memory_keys = (*_Receding.memory_keys, "seen", "expected", "missed")
+    memory_keys: ClassVar[tuple[str, ...]] = (*_Receding.memory_keys, "seen", "expected", "missed")
 
     def __init__(
         self,
@@ -213,7 +213,7 @@ class JacobianFeedback(Controller):
         rest: (M, 3) markers at the beginning [m].
     """
 
-    memory_keys = ("jacobian", "shares", "past", "last_seen")
+    memory_keys: ClassVar[tuple[str, ...]] = ("jacobian", "shares", "past", "last_seen")
 
     def __init__(
         self,

@@ -6,14 +6,14 @@ own adjoint, which holds where the reduced model is wrong.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from ..robot.robot import Robot
+from .files import PlannedMotion
 from .plan import Planner
 from .reduced import ReducedModel
 
@@ -21,23 +21,6 @@ FloatArray = NDArray[np.float64]
 OnProgress = Callable[[int], None]
 
 _SHORTER: Final = 0.25  # share of a step that is tried where all of it was worse
-
-
-@dataclass(frozen=True)
-class Followed:
-    """B paths of T steps, as a robot follows them.
-
-    Attributes:
-        inputs: (B, T, n) that were found.
-        points: (B, T, d) of the robot after each step [m].
-        markers: (B, T + 1, 3 M) of the robot, at the beginning and after each step [m].
-        errors_mm: mean distance from the paths (corrections + 1, B), of the first plan and after each correction.
-    """
-
-    inputs: FloatArray
-    points: FloatArray
-    markers: FloatArray
-    errors_mm: FloatArray
 
 
 class Follower:
@@ -62,8 +45,8 @@ class Follower:
         """How often the robot plays."""
         return self._corrections + 1
 
-    def follow(self, paths: FloatArray, on_progress: OnProgress = lambda steps: None) -> Followed:
-        """The best inputs that were found for paths (B, T, d) [m]; tells of steps of the robot that are done.
+    def follow(self, paths: FloatArray, on_progress: OnProgress = lambda steps: None) -> list[PlannedMotion]:
+        """The best plans that were found for paths (B, T, d) [m]; reports the steps of the robot that are done.
 
         Raises:
             InputError: no inputs are within their bounds.
@@ -89,9 +72,11 @@ class Follower:
                 else:
                     shares[row] *= _SHORTER
                 knots[row] = kept[row] + shares[row] * steps[row]
-        shown = np.stack(kept_markers)
-        inputs = np.stack([planner.inputs(each) for each in kept])
-        return Followed(inputs, shown[:, 1:] @ planner.tracked.T, shown, np.array(errors))
+        rows = zip(paths, kept, kept_markers, np.array(errors).T, strict=True)
+        return [
+            PlannedMotion(path, planner.inputs(knots), markers[1:] @ planner.tracked.T, markers, mm)
+            for path, knots, markers, mm in rows
+        ]
 
     def _play(
         self, knots: FloatArray, paths: FloatArray, adjoint: bool, on_progress: OnProgress
@@ -103,15 +88,12 @@ class Follower:
         chosen = torch.as_tensor(knots).to(like).requires_grad_(adjoint)
         lines = torch.as_tensor(planner.lines).to(like)
         series = torch.einsum("tk,bkn->tbn", lines, chosen)
-        found = list[torch.Tensor]()
+        name = self._model.name
+        given: dict[str, Any] = {name: series}
         with torch.set_grad_enabled(adjoint):
-            state = robot.begin(len(knots), **{self._model.name: torch.as_tensor(planner.limits.low).to(like)})
-            found.append(robot.observe(state).flatten(1))
-            for now in series:
-                state = robot.step(state, **{self._model.name: now})
-                found.append(robot.observe(state).flatten(1))
-                on_progress(1)
-            markers = torch.stack(found, 1)
+            start = robot.begin(len(knots), **{name: torch.as_tensor(planner.limits.low).to(like)})
+            motion = robot.rollout(start, on_step=lambda number: on_progress(1), **given)
+            markers = motion.markers.flatten(2).swapaxes(0, 1)
             if not adjoint:
                 return markers.double().cpu().numpy(), None
             points = markers[:, 1:] @ tracked.mT

@@ -34,8 +34,8 @@ class Response:
     slopes: FloatArray | None
 
 
-class Foretelling(Protocol):
-    """A model that says what inputs do, and how that changes with them, such as a `ReducedModel`."""
+class PredictionModel(Protocol):
+    """A model that predicts observed points under inputs, with derivatives: a `ReducedModel` or a `LinearModel`."""
 
     @property
     def time_step(self) -> float:
@@ -50,7 +50,14 @@ class Foretelling(Protocol):
     def respond(
         self, start: Any, inputs: FloatArray, basis: FloatArray | None = None, bias: FloatArray | None = None
     ) -> Response:
-        """See `ReducedModel.respond`."""
+        """The motion of the observed points over T steps.
+
+        Args:
+            start: the state.
+            inputs: (T, n) commanded during each step, in their unit.
+            basis: (T, n, P) derivatives of the inputs by parameters, for `Response.slopes`.
+            bias: (r,) added to the coordinates of the equilibria, where the model has some.
+        """
         ...
 
 
@@ -117,7 +124,7 @@ class Planner:
 
     def __init__(
         self,
-        model: Foretelling,
+        model: PredictionModel,
         tracked: FloatArray,
         limits: Limits,
         steps: int,

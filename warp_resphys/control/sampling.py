@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import scipy.sparse
@@ -177,8 +177,8 @@ class Source:
         mass = robot.constants.mass[0].double() * torch.as_tensor(free, device=self.rest.device)
         self.mass = mass.repeat_interleave(3)  # (3 N,) [kg]
 
-    def given(self, shares: FloatArray) -> dict[str, torch.Tensor]:
-        """Inputs of shares (B, n) of the scale."""
+    def given(self, shares: FloatArray) -> dict[str, Any]:
+        """The input of shares (B, n) of the scale, by its name."""
         return {self.input.name: self.robot.simulator.tensor(shares * self.scale)}
 
     def told(self) -> tuple[FloatArray, FloatArray]:
@@ -213,20 +213,18 @@ class Source:
             source = InputSequences(_MEAN, _DEVIATION, time, limit=1.0, rest=2.0 * robot.time_step)
             drawn.append(source.draw(steps, robot.time_step, self.parts, random)[1:])
         commands = np.stack(drawn, axis=1)
-        state, every, told = robot.begin(batch), max(steps // sampling.tenths, 1), 0
-        states, y = [state.body], [robot.observe(state)]
+        every = max(steps // sampling.tenths, 1)
+
+        def on_step(number: int) -> None:
+            if number % every == 0 and number <= every * sampling.tenths:
+                on_progress(1)
+
         with torch.no_grad():
-            for number, shares in enumerate(commands, start=1):
-                state = robot.step(state, **self.given(shares))
-                states.append(state.body)
-                y.append(robot.observe(state))
-                if number % every == 0 and told < sampling.tenths:
-                    told += 1
-                    on_progress(1)
-        on_progress(sampling.tenths - told)
+            motion = robot.rollout(robot.begin(batch), on_step=on_step, **self.given(commands))
+        on_progress(max(sampling.tenths - steps // every, 0))
         acting, _ = InputResponse(robot.time_step, None, self.delay or None, self.rise or None).from_rest(commands)
-        q, v = (torch.stack([getattr(each, name).float() for each in states]) for name in ("q", "v"))
-        return Motions(q, v, torch.stack(y).flatten(2).double().cpu().numpy(), commands, acting)
+        y = motion.markers.flatten(2).double().cpu().numpy()
+        return Motions(motion.q.float(), motion.v.float(), y, commands, acting)
 
     def _outputs(self, state: RobotState, given: dict[str, torch.Tensor]) -> FloatArray:
         """(B, c) of the network, for a step from a state."""

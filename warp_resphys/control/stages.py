@@ -17,7 +17,7 @@ from ..io.files import write_json
 from ..io.progress import Progress
 from ..io.resumable import Field, forget_checkpoint, keep_checkpoint, resume_checkpoint
 from ..io.stages import StageContext
-from ..robot.export import Track, input_columns, write_csv
+from ..robot.export import input_columns, write_csv
 from ..robot.loading import load
 from ..robot.robot import Robot
 from ..stepping.state import State
@@ -33,7 +33,6 @@ from .controllers import (
 from .files import (
     BASELINES,
     DrivenMotion,
-    PlannedMotion,
     plain_plans,
     plan_table,
     plans_file,
@@ -103,26 +102,17 @@ def plan_motions(context: StageContext) -> None:
             if names[0] in found:
                 continue
             paths = np.stack([task.timed(path, each, start) for path in task.paths])
-            made = follower.follow(paths, progress.advance)
-            for row, name in enumerate(names):
-                found[name] = PlannedMotion(
-                    paths[row], made.inputs[row], made.points[row], made.markers[row], made.errors_mm[:, row]
-                )
+            found |= dict(zip(names, follower.follow(paths, progress.advance), strict=True))
             tensors, plain = plain_plans(found)
             keep_checkpoint(checkpoint, "plans", tensors, {**plain, "fingerprint": context.fingerprint})
     write_plans(context.run_dir / plans_file(model), found)
+    given = driven_input(robot)
     for name, motion in found.items():
-        write_csv(context.run_dir / plan_table(model, name), _track(robot, motion))
+        columns = input_columns(given.name, given.parts, given.unit, motion.inputs)
+        markers = motion.markers.reshape(len(motion.markers), -1, 3)
+        times = robot.time_step * np.arange(len(markers), dtype=np.float64)
+        write_csv(context.run_dir / plan_table(model, name), times, robot.labels, markers, columns)
     forget_checkpoint(checkpoint)
-
-
-def _track(robot: Robot, motion: PlannedMotion) -> Track:
-    """What a table shows of a planned motion: the markers and the inputs."""
-    known, count = driven_input(robot), len(motion.markers)
-    markers, none = motion.markers.reshape(count, -1, 3), np.zeros((count, 0, 3))
-    columns = input_columns(known.name, known.parts, known.unit, motion.inputs)
-    times = robot.time_step * np.arange(count, dtype=np.float64)
-    return Track(robot.description.mesh, times, none, none, robot.labels, markers, columns)
 
 
 def _start(folder: Path, task: Task) -> FloatArray:

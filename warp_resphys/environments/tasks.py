@@ -7,6 +7,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from ..control.reference import Path
 from ..io.errors import InputError
@@ -82,14 +83,17 @@ class RobotTask(ABC):
 
 
 class GoalTask(RobotTask):
-    """Places (B, A + 1, 3) where the points are to be after each of A actions [m]."""
+    """Places (B, A + 1, 3) where the points are to be after each of A actions [m].
+
+    Observed are the vectors to the next places; the reward is one, less the distance over the size of the reach.
+    """
 
     def __init__(self, count: int, actions: int, reach: Reach) -> None:
         self.goals = np.tile(reach.middle, (count, actions + 1, 1))
         self.size, self.width, self.reach = reach.size, 3 * len(PREVIEW), reach
 
+    @override
     def observed(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
-        """See `RobotTask.observed`: how far the next places are."""
         ahead = np.minimum(number[:, None] + np.array(PREVIEW) + 1, self.goals.shape[1] - 1)
         wanted = self.goals[np.arange(len(points))[:, None], ahead]
         return np.asarray(((wanted - points[:, None]) / self.size).reshape(len(points), -1))
@@ -97,29 +101,29 @@ class GoalTask(RobotTask):
     def _now(self, number: NDArray[np.int64]) -> FloatArray:
         return np.asarray(self.goals[np.arange(len(number)), np.minimum(number, self.goals.shape[1] - 1)])
 
+    @override
     def errors_mm(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
-        """See `RobotTask.errors_mm`."""
         return np.asarray(1e3 * np.linalg.norm(points - self._now(number), axis=1))
 
+    @override
     def wanted(self, row: int, number: int) -> FloatArray:
-        """See `RobotTask.wanted`."""
         return self.goals[row, min(number, self.goals.shape[1] - 1) :]
 
+    @override
     def reward(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
-        """See `RobotTask.reward`: one where they are, and less by their distance over the size of the reach."""
         return np.asarray(1.0 - 1e-3 * self.errors_mm(points, number) / self.size)
 
 
 class ReachTask(GoalTask):
-    """Be at a place, soon, and stay there."""
+    """Be at one of the places where the robot can rest, soon, and stay there."""
 
+    @override
     def begin(self, row: int, random: np.random.Generator) -> None:
-        """See `RobotTask.begin`: one of the places at which the robot can be at rest."""
         self.goals[row] = self.reach.places[random.integers(len(self.reach.places))]
 
 
 class FollowTask(GoalTask):
-    """Follow a figure in the plane in which the robot reaches furthest.
+    """Follow a figure at a random speed, from a random point of it, in the plane in which the robot reaches furthest.
 
     Args:
         count: B.
@@ -135,8 +139,8 @@ class FollowTask(GoalTask):
         super().__init__(count, actions, reach)
         self._time, self._figures = action_time, tuple(figures)
 
+    @override
     def begin(self, row: int, random: np.random.Generator) -> None:
-        """See `RobotTask.begin`: a figure at a speed, from anywhere in it on."""
         reach = self.reach
         name = self._figures[random.integers(len(self._figures))]
         first, second = reach.plane
@@ -150,7 +154,7 @@ class FollowTask(GoalTask):
 
 
 class SwingTask(RobotTask):
-    """Swing a point up, as far above its rest as its base can make it.
+    """Swing a point up by the base: one body length above its rest is the goal, and the reward the share of it.
 
     Args:
         count: B.
@@ -165,24 +169,25 @@ class SwingTask(RobotTask):
         self._up, self._rest, self._count = up / np.linalg.norm(up), rest, count
         self.size, self.width = length, 1
 
+    @override
     def begin(self, row: int, random: np.random.Generator) -> None:
-        """See `RobotTask.begin`: nothing differs between episodes but the world."""
+        pass  # Episodes differ by the world alone.
 
     def _height(self, points: FloatArray) -> FloatArray:
         return np.asarray((points - self._rest) @ self._up / self.size)
 
+    @override
     def observed(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
-        """See `RobotTask.observed`: the height."""
         return self._height(points)[:, None]
 
+    @override
     def reward(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
-        """See `RobotTask.reward`: the height over the length, where it is above the rest."""
         return np.clip(self._height(points), 0.0, 1.0)
 
+    @override
     def errors_mm(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
-        """See `RobotTask.errors_mm`: what is missing to a length above the rest."""
         return np.asarray(1e3 * self.size * (1.0 - self._height(points)))
 
+    @override
     def wanted(self, row: int, number: int) -> FloatArray:
-        """See `RobotTask.wanted`: a length above the rest."""
         return np.asarray(self._rest + self.size * self._up)[None]

@@ -217,7 +217,7 @@ class LinearSolver(ABC):
     def _factorise(
         self, values: torch.Tensor, definite: bool, idle: torch.Tensor | None, before: Factor | None
     ) -> Factor:
-        """See `factor`; there is no factor before unless a matrix is idle."""
+        """The factor of matrices A; `before` is None unless a matrix is idle."""
 
     @cached_property
     def dofs(self) -> torch.Tensor:

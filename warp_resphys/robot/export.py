@@ -2,8 +2,7 @@
 
 import csv
 import io
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -22,41 +21,23 @@ _USD = (".usd", ".usda", ".usdc")
 _MARKER_SHARE = 0.02  # of the body's size, that a marker's ball is wide
 
 
-@dataclass(frozen=True)
-class Track:
-    """The motion of one body.
-
-    Attributes:
-        mesh: its rest shape.
-        times: (T + 1,) [s].
-        q: (T + 1, N, 3) positions of its vertices [m].
-        v: (T + 1, N, 3) velocities [m/s].
-        labels: of its markers; none where every vertex is observed.
-        markers: (T + 1, M, 3) [m].
-        columns: what else a table has, by header: (T + 1,) each.
-    """
-
-    mesh: Mesh
-    times: FloatArray
-    q: FloatArray
-    v: FloatArray
-    labels: Sequence[str]
-    markers: FloatArray
-    columns: dict[str, FloatArray]
-
-
 def input_columns(name: str, parts: Sequence[str], unit: str, values: FloatArray) -> dict[str, FloatArray]:
     """(T + 1,) each: columns of what an input was during the step that led there, of values (T, C)."""
     headers = [f"{name}.{part} [{unit}]" for part in parts]
     return dict(zip(headers, np.concatenate([values[:1], values]).T, strict=True))
 
 
-def write_csv(path: Path, track: Track) -> Path:
-    """See `Motion.write_csv`."""
-    labels = track.labels or [f"vertex_{number}" for number in range(track.markers.shape[1])]
-    header = ["time [s]", *(f"{label}.{axis} [m]" for label in labels for axis in "xyz"), *track.columns]
-    more = [values[:, None] for values in track.columns.values()]
-    rows = np.concatenate([track.times[:, None], track.markers.reshape(len(track.times), -1), *more], axis=1)
+def write_csv(
+    path: Path, times: FloatArray, labels: Sequence[str], markers: FloatArray, columns: Mapping[str, FloatArray]
+) -> Path:
+    """Writes a table of markers (T + 1, M, 3) [m] at times (T + 1,) [s], and further columns (T + 1,) by header.
+
+    Without labels, the markers are all vertices.
+    """
+    labels = labels or [f"vertex_{number}" for number in range(markers.shape[1])]
+    header = ["time [s]", *(f"{label}.{axis} [m]" for label in labels for axis in "xyz"), *columns]
+    more = [values[:, None] for values in columns.values()]
+    rows = np.concatenate([times[:, None], markers.reshape(len(times), -1), *more], axis=1)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(header)
@@ -65,17 +46,25 @@ def write_csv(path: Path, track: Track) -> Path:
     return path
 
 
-def write_vtk(path: Path, track: Track) -> Path:
-    """See `Motion.write_vtk`."""
+def write_vtk(path: Path, mesh: Mesh, times: FloatArray, q: FloatArray, v: FloatArray, markers: FloatArray) -> Path:
+    """Writes a time series for ParaView: a ``.pvd`` file, and a folder of the same name with a file for each step.
+
+    Args:
+        path: of the ``.pvd`` file.
+        mesh: the rest shape.
+        times: (T + 1,) [s].
+        q: (T + 1, N, 3) positions of the vertices [m].
+        v: (T + 1, N, 3) velocities [m/s].
+        markers: (T + 1, M, 3), to ``NAME_markers.pvd`` unless M is 0 [m].
+    """
     if path.suffix != ".pvd":
         raise InputError(f"{path} does not end in .pvd: give such a name, which ParaView opens as a time series.")
-    mesh, dots = track.mesh, np.arange(len(track.labels))
-    fields = ({"displacement": x - mesh.vertices, "velocity": w} for x, w in zip(track.q, track.v, strict=True))
-    _write_series(path, track.times, track.q, (mesh.element.file_type, mesh.cells), fields)
+    fields = ({"displacement": x - mesh.vertices, "velocity": w} for x, w in zip(q, v, strict=True))
+    _write_series(path, times, q, (mesh.element.file_type, mesh.cells), fields)
+    dots = np.arange(markers.shape[1])
     if len(dots):
-        numbers = ({"marker": dots} for _ in track.times)
         place = path.with_name(f"{path.stem}_markers.pvd")
-        _write_series(place, track.times, track.markers, ("vertex", dots[:, None]), numbers)
+        _write_series(place, times, markers, ("vertex", dots[:, None]), ({"marker": dots} for _ in times))
     return path
 
 
@@ -99,15 +88,14 @@ def _write_series(
     write_text(path, "\n".join([*lines, "  </Collection>", "</VTKFile>", ""]))
 
 
-def write_usd(path: Path, track: Track) -> Path:
-    """See `Motion.write_usd`."""
+def write_usd(path: Path, mesh: Mesh, times: FloatArray, q: FloatArray, markers: FloatArray) -> Path:
+    """Writes the surface of a body and its markers with their motion to a USD file; arrays as in `write_vtk`."""
     if path.suffix not in _USD:
         raise InputError(f"{path} does not end in {', '.join(_USD)}: give such a name.")
     try:
         from pxr import Usd, UsdGeom, Vt
     except ImportError:
         raise InputError("USD files need a package that is not installed: pip install 'warp-resphys[usd]'.") from None
-    mesh, q, times = track.mesh, track.q, track.times
     kept = surface_vertices(mesh)
     triangles = np.searchsorted(kept, boundary_triangles(mesh))
     stage = Usd.Stage.CreateInMemory()
@@ -125,11 +113,11 @@ def write_usd(path: Path, track: Track) -> Path:
     body.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(triangles), 3, dtype=np.int32)))
     body.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(triangles.astype(np.int32).ravel()))
     surfaces = [(body, q[:, kept])]
-    if track.labels:
+    if markers.shape[1]:
         dots = UsdGeom.Points.Define(stage, "/robot/markers")
         size = _MARKER_SHARE * float(np.ptp(mesh.vertices, axis=0).max())
-        dots.CreateWidthsAttr(Vt.FloatArray.FromNumpy(np.full(len(track.labels), size, dtype=np.float32)))
-        surfaces.append((dots, track.markers))
+        dots.CreateWidthsAttr(Vt.FloatArray.FromNumpy(np.full(markers.shape[1], size, dtype=np.float32)))
+        surfaces.append((dots, markers))
     for shape, series in surfaces:
         points, extent = shape.CreatePointsAttr(), shape.CreateExtentAttr()
         for number, at in enumerate(series.astype(np.float32)):

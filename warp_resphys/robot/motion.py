@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..io.errors import InputError
 from ..learning.replay import sample
 from .description import Description
-from .export import Track, input_columns, write_csv, write_usd, write_vtk
+from .export import input_columns, write_csv, write_usd, write_vtk
 from .inputs import RobotInput
 from .state import RobotState
 
@@ -72,7 +72,15 @@ class Motion:
             InputError: there is no such environment.
             DataFileError: it cannot be written.
         """
-        return write_csv(Path(path), self._track(environment, half_widths))
+        self._check(environment)
+        columns: dict[str, FloatArray] = {}
+        if half_widths and self.half_widths is not None:
+            widths = self.half_widths[:, environment].T
+            columns |= {f"{name} half-width [m]": each for name, each in zip(self.robot.labels, widths, strict=True)}
+        for known in (each for name, each in self.known_inputs.items() if name in self.inputs and each.is_driven):
+            values = _array(self.inputs[known.name], environment)
+            columns |= input_columns(known.name, known.parts, known.unit, values)
+        return write_csv(Path(path), self.times, self.robot.labels, _array(self.markers, environment), columns)
 
     def write_vtk(self, path: str | Path, environment: int = 0) -> Path:
         """Writes a time series for ParaView: a ``.pvd`` file, and a folder of the same name with a file for each step.
@@ -87,7 +95,9 @@ class Motion:
             InputError: there is no such environment, or another extension.
             DataFileError: it cannot be written.
         """
-        return write_vtk(Path(path), self._track(environment))
+        self._check(environment)
+        series = (_array(each, environment) for each in (self.q, self.v, self._labelled))
+        return write_vtk(Path(path), self.robot.mesh, self.times, *series)
 
     def write_usd(self, path: str | Path, environment: int = 0) -> Path:
         """Writes the body's surface and its markers with their motion to a USD file; needs the extra ``usd``.
@@ -100,22 +110,20 @@ class Motion:
             InputError: there is no such environment, another extension, or the extra is missing.
             DataFileError: it cannot be written.
         """
-        return write_usd(Path(path), self._track(environment))
+        self._check(environment)
+        series = (_array(each, environment) for each in (self.q, self._labelled))
+        return write_usd(Path(path), self.robot.mesh, self.times, *series)
 
-    def _track(self, environment: int, half_widths: bool = False) -> Track:
+    @property
+    def _labelled(self) -> torch.Tensor:
+        """(T + 1, B, M, 3) the markers; none where every vertex is observed."""
+        return self.markers if self.robot.labels else self.markers[:, :, :0]
+
+    def _check(self, environment: int) -> None:
         count = self.q.shape[1]
         if not 0 <= environment < count:
             raise InputError(f"environment is {environment}: the motion has {count}, numbered from 0.")
-        columns: dict[str, FloatArray] = {}
-        if half_widths and self.half_widths is not None:
-            widths = self.half_widths[:, environment].T
-            columns |= {f"{name} half-width [m]": each for name, each in zip(self.robot.labels, widths, strict=True)}
-        for known in (each for name, each in self.known_inputs.items() if name in self.inputs and each.is_driven):
-            own = _array(self.inputs[known.name][:, environment])
-            columns |= input_columns(known.name, known.parts, known.unit, own)
-        q, v, markers = (_array(each[:, environment]) for each in (self.q, self.v, self.markers))
-        return Track(self.robot.mesh, self.times, q, v, self.robot.labels, markers, columns)
 
 
-def _array(values: torch.Tensor) -> FloatArray:
-    return np.asarray(values.detach().cpu().numpy(), dtype=np.float64)
+def _array(values: torch.Tensor, environment: int) -> FloatArray:
+    return np.asarray(values[:, environment].detach().cpu().numpy(), dtype=np.float64)

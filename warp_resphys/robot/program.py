@@ -30,7 +30,7 @@ class _Program(nn.Module):
     def forward(
         self, q: torch.Tensor, v: torch.Tensor, told: torch.Tensor | None = None, hidden: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, ...]:
-        """See `export_network`."""
+        """Force, or the next state, and the next hidden state; the arguments are those that `export_network` names."""
         inputs = self.network.encode(q, v, told)
         if self._range is not None:
             inputs = self._range.hold(inputs)

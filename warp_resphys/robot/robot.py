@@ -1,6 +1,6 @@
 """A robot: its identified simulator and its learned force, stepped by the names of its inputs."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -258,29 +258,35 @@ class Robot:
             predictor = self._predictor(told, self._frame(base))
             predictor.hidden = state.hidden
         rollout = Rollout(self.simulator, predictor, acting, self.constants)
-        lost = self._flags(state) if state.lost is None else state.lost
-        rollout.resume(lost, 0)
+        rollout.resume(state.lost, 0)
         body = rollout.differentiable_step(state.body)
         now = rollout.lost(body)
-        if self.simulator.settings.on_failure == "raise" and bool((now & ~lost).any()):
+        if self.simulator.settings.on_failure == "raise" and bool((now & ~state.lost).any()):
             raise ConvergenceError(
                 f"the robot has diverged: a vertex went further than {FURTHEST:g} of its lengths; take shorter steps, "
                 "lower inputs, or a force that was trained longer.",
                 state.q.detach(),
                 None,
             )
-        left = self._flags(state) if state.left is None else state.left
+        left = state.left
         if predictor is not None and predictor.left_at is not None:
             left = left | (predictor.left_at >= 0)
         hidden = None if predictor is None else predictor.hidden
         return RobotState(body, memory, hidden, None if base is None else base[1:], left, now)
 
-    def rollout(self, state: RobotState, steps: int | None = None, **inputs: Given) -> Motion:
+    def rollout(
+        self,
+        state: RobotState,
+        steps: int | None = None,
+        on_step: Callable[[int], None] = lambda number: None,
+        **inputs: Given,
+    ) -> Motion:
         """Steps many times.
 
         Args:
             state: the start.
             steps: T; as many as the longest input has, if left out.
+            on_step: called with the number of steps that are done.
             inputs: as `step` takes them, (C,) throughout, or (T, C) or (T, B, C) during each step; past the end of a
                 series, its last.
 
@@ -299,6 +305,7 @@ class Robot:
             state = self.step(state, **now)
             states.append(state)
             acting.append(now)
+            on_step(number + 1)
         markers = torch.stack([self.observe(each) for each in states])
         return Motion(
             robot=self.description,
@@ -307,8 +314,8 @@ class Robot:
             v=torch.stack([each.v for each in states]),
             markers=markers,
             half_widths=self.half_widths(markers),
-            left=torch.stack([self._flags(each) if each.left is None else each.left for each in states]),
-            lost=torch.stack([self._flags(each) if each.lost is None else each.lost for each in states]),
+            left=torch.stack([each.left for each in states]),
+            lost=torch.stack([each.lost for each in states]),
             inputs={name: torch.stack([each[name] for each in acting]) for name in series if acting},
             known_inputs=self.inputs,
             final=state,
@@ -342,9 +349,6 @@ class Robot:
     def _read(self, inputs: Mapping[str, Given], batch: int) -> dict[str, torch.Tensor]:
         return {name: self._reader.read(name, value, batch) for name, value in inputs.items()}
 
-    def _flags(self, state: RobotState) -> torch.Tensor:
-        return torch.zeros(state.batch, dtype=torch.bool, device=state.q.device)
-
     def _new(self, body: State, given: Mapping[str, torch.Tensor] | None = None) -> RobotState:
         """A state before which constant inputs (B, C) have acted for long; none, if left out."""
         memory: dict[str, torch.Tensor] = {}
@@ -356,8 +360,7 @@ class Robot:
         base = (given or {}).get(BASE)
         moved = self.description.told_of_base is not None or base is not None
         at = body.q.new_zeros(body.batch, len(self.inputs[BASE].parts)) if base is None else base
-        flags = torch.zeros(body.batch, dtype=torch.bool, device=body.q.device)
-        return RobotState(body, memory, base=torch.stack([at, at]) if moved else None, left=flags, lost=flags)
+        return RobotState(body, memory, base=torch.stack([at, at]) if moved else None)
 
     @cached_property
     def _payload_share(self) -> torch.Tensor:

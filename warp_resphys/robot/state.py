@@ -1,7 +1,7 @@
-"""The state of a robot: all that its next step depends on."""
+"""States of a robot: they go into a step and come out of it, and can be chosen and joined by environment."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 
@@ -11,14 +11,14 @@ from ..stepping.state import State
 
 @dataclass(frozen=True)
 class RobotState:
-    """All that the next step depends on, of B environments.
+    """The state of B environments of a robot: all that their next step depends on.
 
     Attributes:
-        body: positions (B, N, 3) [m] and velocities [m/s] of the vertices, and what its material remembers.
+        body: positions (B, N, 3) [m] and velocities [m/s] of the vertices, and the memory of the material.
         memory: of the inputs, such as ``pressure.queue``, see `InputResponse`.
         hidden: (B, H) of a recurrent network; None for others, and at the start.
-        base: (2, B, 6) how the base had moved a step ago and has now [m, rad]; None where it never did.
-        left: (B,) bool, whether the learned force was ever asked outside of the range of its training.
+        base: (2, B, 6) displacement of the base one step ago and now [m, rad]; None where it never moved.
+        left: (B,) bool, whether the learned force was ever evaluated outside the range of its training.
         lost: (B,) bool, whether the simulation diverged; the body stands at rest then.
     """
 
@@ -26,8 +26,13 @@ class RobotState:
     memory: Memory = field(default_factory=dict)
     hidden: torch.Tensor | None = None
     base: torch.Tensor | None = None
-    left: torch.Tensor | None = None
-    lost: torch.Tensor | None = None
+    left: torch.Tensor = field(default=None)  # type: ignore[assignment]
+    lost: torch.Tensor = field(default=None)  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        for name in ("left", "lost"):
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, torch.zeros(self.batch, dtype=torch.bool, device=self.q.device))
 
     @property
     def q(self) -> torch.Tensor:
@@ -46,20 +51,18 @@ class RobotState:
 
     def each(self, change: Callable[[torch.Tensor, int], torch.Tensor]) -> "RobotState":
         """The state with every tensor changed by a function of it and of the number of its axis of environments."""
-
-        def one(value: torch.Tensor | None, axis: int = 0) -> torch.Tensor | None:
-            return None if value is None else change(value, axis)
-
         memory = {name: change(value, value.ndim - 2) for name, value in self.memory.items()}
         body = self.body.map(lambda value: change(value, 0))
-        return RobotState(body, memory, one(self.hidden), one(self.base, 1), one(self.left), one(self.lost))
+        hidden = None if self.hidden is None else change(self.hidden, 0)
+        base = None if self.base is None else change(self.base, 1)
+        return RobotState(body, memory, hidden, base, change(self.left, 0), change(self.lost, 0))
 
     def detach(self) -> "RobotState":
         """The same, cut off from the autograd graph."""
         return self.each(lambda value, _: value.detach())
 
     def select(self, environments: Sequence[int]) -> "RobotState":
-        """That of some environments, by number."""
+        """The state of some environments, by number."""
         return self.each(
             lambda value, axis: value.index_select(axis, torch.as_tensor(environments, device=value.device))
         )
@@ -72,33 +75,21 @@ class RobotState:
         """These environments where chosen (B,) bool, those of another state of the same robot elsewhere."""
         if bool(chosen.all()):
             return self
-        theirs = iter(other._like(self)._tensors())
+        theirs = list[torch.Tensor]()
+        other._like(self).each(lambda value, _: theirs.append(value) or value)  # type: ignore[func-returns-value]
+        remaining = iter(theirs)
 
         def pick(value: torch.Tensor, axis: int) -> torch.Tensor:
             shape = [len(chosen) if at == axis else 1 for at in range(value.ndim)]
-            return torch.where(chosen.view(shape), value, next(theirs))
+            return torch.where(chosen.view(shape), value, next(remaining))
 
         return self._like(other).each(pick)
 
-    def _tensors(self) -> list[torch.Tensor]:
-        found: list[torch.Tensor] = []
-        self.each(lambda value, _: found.append(value) or value)  # type: ignore[func-returns-value]
-        return found
-
     def _like(self, other: "RobotState") -> "RobotState":
-        """With what the other one remembers and this one does not, as it is where nothing has been."""
-
-        def zeros(mine: torch.Tensor | None, theirs: torch.Tensor | None) -> torch.Tensor | None:
-            return torch.zeros_like(theirs) if mine is None and theirs is not None else mine
-
+        """With what the other state has and this one does not, as it is before anything has happened."""
         own, more = self.body.tensors(), other.body.tensors()
         rest = {"previous_q": self.q, "previous_v": self.v}
         own |= {name: rest.get(name, torch.zeros_like(x)) for name, x in more.items() if name not in own}
-        return RobotState(
-            State.from_tensors(own),
-            self.memory,
-            zeros(self.hidden, other.hidden),
-            zeros(self.base, other.base),
-            zeros(self.left, other.left),
-            zeros(self.lost, other.lost),
-        )
+        hidden = torch.zeros_like(other.hidden) if self.hidden is None and other.hidden is not None else self.hidden
+        base = torch.zeros_like(other.base) if self.base is None and other.base is not None else self.base
+        return replace(self, body=State.from_tensors(own), hidden=hidden, base=base)

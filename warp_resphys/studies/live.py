@@ -122,7 +122,7 @@ class LiveRobot:
     @property
     def has_left(self) -> bool:
         """Whether it has left the states that the learned force was trained on."""
-        return self.state.left is not None and bool(self.state.left[0])
+        return bool(self.state.left[0])
 
     @property
     def is_pulled(self) -> bool:

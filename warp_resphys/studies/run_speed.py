@@ -128,9 +128,9 @@ def _command_seconds(controller: Controller, plan: PlannedMotion) -> list[float]
 @torch.no_grad()
 def _rollout_seconds(robot: Robot, inputs: NDArray[np.float64]) -> float:
     """Seconds that the full simulator takes for a motion under inputs (T, n)."""
-    state = robot.begin()
+    state, given = robot.begin(), dict[str, Any]({driven_input(robot).name: inputs})
     began = time.perf_counter()
-    robot.rollout(state, len(inputs), **{driven_input(robot).name: inputs})
+    robot.rollout(state, len(inputs), **given)
     return time.perf_counter() - began
 
 

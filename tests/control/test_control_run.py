@@ -17,6 +17,7 @@ from warp_resphys.control import reduction, stages
 from warp_resphys.control.controllers import Horizon, LinearRecedingHorizon, OpenLoop, RecedingHorizon
 from warp_resphys.control.estimate import Estimator, Noise
 from warp_resphys.control.files import plans_file, read_baselines, read_plan, read_reduced, reduced_file
+from warp_resphys.control.laboratory import Laboratory
 from warp_resphys.control.open_loop import Follower
 from warp_resphys.control.plan import Limits, Planner, Weights
 from warp_resphys.control.reduction import reduce
@@ -77,6 +78,22 @@ def settings(folder, stage):
     return json.loads((folder / "stages" / f"{stage}.json").read_text())["settings"]
 
 
+class TestLaboratory:
+    def test_a_body_that_fails_or_begins_again_rests_and_the_other_goes_on(self, folder):
+        laboratory = Laboratory(settings(folder, "drive"), folder, "tendon_tension", 2, seed=0, on_failure="count")
+        rest, commands = laboratory.markers(), np.tile([1.0, 0.0, 0.0], (2, 1))
+        assert not laboratory.step(commands).any()
+        laboratory.begin(np.array([True, False]))
+        np.testing.assert_array_equal(laboratory.markers()[0], rest[0])
+        assert np.abs(laboratory.markers()[1] - rest[1]).max() > 1e-5
+        assert not laboratory.step(commands).any()
+        moved = np.abs(laboratory.markers() - rest).max((1, 2))
+        assert 0.0 < moved[0] < moved[1]
+        seen = laboratory.seen(3)
+        np.testing.assert_array_equal(laboratory.seen(3), seen)
+        assert 0.0 < np.abs(seen - laboratory.markers()).max() < 10.0 * laboratory.noise
+
+
 class TestReducedWorld:
     def test_it_moves_as_the_model_does_and_a_failure_lasts_until_it_begins(self, model):
         world = ReducedWorld(model, 2)
@@ -134,65 +151,6 @@ class TestReducedModel:
         found = model.observe(model.rest(inputs))[0]
         assert np.linalg.norm(settled - hangs) > 5e-3
         assert np.linalg.norm(found - settled) < 0.05 * np.linalg.norm(settled - hangs)
-
-    @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
-    def test_slopes_are_differences(self, model, integrator):
-        random, known = np.random.default_rng(0), replace(model, integrator=integrator)
-        inputs, basis = 0.3 + 0.8 * random.random((9, 3)), random.standard_normal((9, 3, 2))
-        bias, start = np.full(4, 1e-4), model.rest(np.full(3, 0.4))
-        found = known.respond(start, inputs, basis, bias).slopes
-        for number in range(2):
-            weights = random.standard_normal(found.shape[:2])
-            difference, doubt = central_difference(
-                lambda x, way=basis[..., number], by=weights: float(
-                    (by * known.respond(start, inputs + 0.1 * x * way, None, bias).y).sum()
-                )
-            )
-            slope = 0.1 * (weights * found[..., number]).sum()
-            assert abs(slope - difference) < 1e-6 * abs(difference) + 10.0 * doubt
-
-    def test_the_slopes_of_equilibria_are_differences(self, model):
-        random, inputs = np.random.default_rng(1), np.array([0.6, 0.3, 0.9])
-        weights, way = random.standard_normal(18), random.standard_normal(3)
-        slope = 0.1 * weights @ model.rest_observed(inputs)[1] @ way
-        difference, doubt = central_difference(
-            lambda x: float(weights @ model.rest_observed(inputs + 0.1 * x * way)[0])
-        )
-        assert abs(slope - difference) < 1e-4 * abs(difference) + 10.0 * doubt
-
-    @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
-    def test_a_transition_is_linearised(self, model, integrator):
-        known, inputs, bias = replace(model, integrator=integrator), np.array([0.5, 0.2, 0.9]), np.full(4, 1e-4)
-        start = known.move(model.rest(np.full(3, 0.4)), np.tile(inputs, (4, 1, 1))).end
-        slopes = np.split(known.transition(start, inputs, bias)[1], 3, axis=1)
-
-        random = np.random.default_rng(1)
-        weights, way = random.standard_normal(8), random.standard_normal(4)
-        sizes = (1e-3 * np.abs(start.z).max(), 0.1, 1e-3 * np.abs(start.z).max())
-        for number, (slope, size) in enumerate(zip(slopes, sizes, strict=True)):
-
-            def after(x, number=number, size=size):
-                z, v, b = (x * size * way * (number == each) for each in range(3))
-                state = known.transition(replace(start, z=start.z + z, v=start.v + v), inputs, bias + b)[0]
-                return float(weights @ np.concatenate([state.z[0], 0.01 * state.v[0]]))
-
-            difference, doubt = central_difference(after)
-            wanted = size * weights @ np.concatenate([slope[:4], 0.01 * slope[4:]]) @ way
-            assert abs(wanted - difference) < 1e-6 * abs(difference) + 10.0 * doubt
-
-    @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
-    def test_many_at_once_are_each_by_itself(self, model, integrator):
-        """Of which one begins anew on the way."""
-        known, random = replace(model, integrator=integrator), np.random.default_rng(4)
-        rest, inputs = np.full(3, 0.2), 0.2 + 0.8 * random.random((8, 3, 3))
-        first = batch = known.rest(rest, 3)
-        for number, each in enumerate(inputs):
-            if number == 4:
-                batch = first.where(np.array([False, True, False]), batch)
-            batch = known.move(batch, each[None]).end
-        for row, since in enumerate((0, 4, 0)):
-            wanted = known.respond(known.rest(rest), inputs[since:, row]).y[-1]
-            np.testing.assert_allclose(known.observe(batch)[row], wanted, atol=1e-12)
 
     def test_the_estimate_finds_what_markers_tell(self, model):
         """A model whose equilibria are elsewhere, seen without noise: what it is off by becomes the bias."""

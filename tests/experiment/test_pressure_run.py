@@ -34,7 +34,8 @@ from warp_resphys.experiment.scene import Scene
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_array, read_checkpoint, read_hdf5
 from warp_resphys.io.stages import StageContext
-from warp_resphys.learning.identification import Bounds, Identifier
+from warp_resphys.learning.bounds import Bounds
+from warp_resphys.learning.identification import Identifier
 from warp_resphys.learning.predictors import Range
 from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.mesh.mesh import select_vertices

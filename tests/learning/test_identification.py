@@ -13,7 +13,8 @@ from warp_resphys.data.markers import bind_markers
 from warp_resphys.data.trials import Trials
 from warp_resphys.dynamics.nonlinear_solver import SolverSettings
 from warp_resphys.io.errors import ConvergenceError, InputError
-from warp_resphys.learning.identification import Bounds, Identifier
+from warp_resphys.learning.bounds import Bounds
+from warp_resphys.learning.identification import Identifier
 from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
 from warp_resphys.stepping.inputs import Inputs

@@ -12,7 +12,8 @@ from warp_resphys import Body, Simulator
 from warp_resphys.data.markers import KINDS, MarkerMap, bind_markers
 from warp_resphys.data.trials import Trials
 from warp_resphys.io.errors import InputError
-from warp_resphys.learning.identification import Bounds, Identifier, Prior
+from warp_resphys.learning.bounds import Bounds, Prior
+from warp_resphys.learning.identification import Identifier
 from warp_resphys.learning.placement import Accuracy, PlacedMarkers, Placement, Stems, estimate
 from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.mesh.mesh import box_hexahedra, select_vertices

@@ -279,7 +279,7 @@ class _Drive(ResumableRollout):
 
     @override
     def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
-        super().restore({key: each for key, each in tensors.items() if "." not in key})
+        super().restore({key: each for key, each in tensors.items() if not key.split(".")[0].isdecimal()})
         self._laboratory.state = self.state
         for number, controller in enumerate(self._controllers):
             own = f"{number}."

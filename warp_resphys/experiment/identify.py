@@ -11,7 +11,8 @@ from ..io.files import write_json
 from ..io.progress import Progress
 from ..io.resumable import forget_checkpoint, keep_checkpoint, resume_checkpoint
 from ..io.stages import StageContext
-from ..learning.identification import Bounds, Identifier, Prior
+from ..learning.bounds import Bounds, Prior
+from ..learning.identification import Identifier
 from ..learning.parameters import first_guesses
 from ..learning.placement import Accuracy
 from ..learning.replay import Replay, Start

@@ -12,7 +12,7 @@ number of frames that tell the same. That number is found at the start and again
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import product, takewhile
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -24,8 +24,10 @@ from ..data.markers import Markers
 from ..data.trials import Trials
 from ..io.errors import ConvergenceError, InputError
 from ..linalg.least_squares import UnitBox, minimise
+from .bounds import Bounds
 from .placement import Accuracy, Placement, Stems, estimate
 from .replay import Replay, Start
+from .uncertainty import Linearised, Uncertainty, redundancy, uncertainty_of
 
 Report = Callable[[int, float, Mapping[str, float]], None]
 Attempt = dict[str, Any]
@@ -34,75 +36,6 @@ _MOST_ITERATIONS = 200  # of a solve; steps take a handful, and parameters that 
 _DIFFERENCE = 1e-3  # of a range, for derivatives by differences
 _LEAST_WEIGHT = 1e-18  # of the priors, where the residuals are rounding
 _ALIKE = 0.7  # weights of the priors that differ by less are not worth another descent
-
-
-@dataclass(frozen=True)
-class Prior:
-    """What is known of a parameter beforehand: a normal distribution, of its logarithm where that is searched."""
-
-    mean: float  # in the parameter's unit
-    deviation: float  # standard deviation, the same
-
-
-@dataclass(frozen=True)
-class Bounds:
-    """The range of a parameter."""
-
-    lower: float  # in the parameter's unit
-    upper: float  # the same
-    logarithmic: bool = False  # whether it is searched on a logarithmic scale
-    prior: Prior | None = None  # known beforehand
-
-    def __post_init__(self) -> None:
-        """Checks the range.
-
-        Raises:
-            InputError: an empty or infinite range, or a logarithmic one that is not positive.
-        """
-        if not (math.isfinite(self.lower) and math.isfinite(self.upper) and self.lower < self.upper):
-            raise InputError(f"the bounds {self.lower:g} and {self.upper:g} leave no range: the first must be smaller.")
-        if self.logarithmic and not self.lower > 0.0:
-            raise InputError(f"a logarithmic range from {self.lower:g}: its lower bound must be positive.")
-        if self.prior is not None and not self.lower <= self.prior.mean <= self.upper:
-            raise InputError(
-                f"{self.prior.mean:g} is expected beforehand, outside of the range from {self.lower:g} to "
-                f"{self.upper:g}: widen the range, or correct the prior."
-            )
-
-    def expected(self) -> tuple[float, float] | None:
-        """Mean and standard deviation of the prior, as fractions of the range."""
-        if self.prior is None:
-            return None
-        mean = self.to_unit(self.prior.mean)
-        return mean, self.prior.deviation / self.slope(mean)
-
-    def to_unit(self, value: float) -> float:
-        """A value as a fraction of the range, 0 to 1."""
-        low, high, x = (math.log(v) if self.logarithmic else v for v in (self.lower, self.upper, value))
-        return (x - low) / (high - low)
-
-    def from_unit(self, unit: torch.Tensor) -> torch.Tensor:
-        """Values of fractions, differentiable."""
-        if self.logarithmic:
-            return self.lower * torch.exp(unit * math.log(self.upper / self.lower))
-        return self.lower + unit * (self.upper - self.lower)
-
-    def slope(self, unit: float) -> float:
-        """Derivative of a value by its fraction."""
-        if self.logarithmic:
-            return self.lower * (self.upper / self.lower) ** unit * math.log(self.upper / self.lower)
-        return self.upper - self.lower
-
-
-@dataclass(frozen=True)
-class Uncertainty:
-    """What the data say about the parameters near the minimum (Gauss-Newton approximation)."""
-
-    deviation: dict[str, float]  # standard deviation of each parameter, in its unit
-    correlation: list[list[float]]  # (P, P) of the parameters, in their order
-    # the direction that the data tell least about: weights of the parameters, in fractions of their ranges
-    poorest: dict[str, float]
-    poorest_deviation: float  # standard deviation along it, as a fraction of the ranges
 
 
 @dataclass
@@ -270,7 +203,7 @@ class Identifier:
             return 1.0
         trials = found[0]
         seen = sum(count for *_, count in trials)
-        squares = [np.square(rows).sum() * _redundancy(rows) for rows, _, _ in trials]
+        squares = [np.square(rows).sum() * redundancy(rows) for rows, _, _ in trials]
         self._prior_weight = max(float(sum(squares)) / max(seen, 1), _LEAST_WEIGHT)
         return self._prior_weight / before if before else math.inf
 
@@ -467,7 +400,7 @@ class Identifier:
 
     def _linearise(
         self, unit: NDArray[np.float64], central: bool = False, derivatives: bool = True
-    ) -> tuple[list[tuple[NDArray[np.float64], NDArray[np.float64], int]], NDArray[np.float64]] | None:
+    ) -> tuple[list[Linearised], NDArray[np.float64]] | None:
         """Weighted residuals of every trial, their derivatives by the fractions from differences, and how many count.
 
         One-sided differences lead into the range; central ones are taken a step inside of it. None where a simulation
@@ -510,32 +443,9 @@ class Identifier:
         return found, slopes(prior.double().cpu().numpy())
 
     def uncertainty(self, unit: NDArray[np.float64]) -> Uncertainty | None:
-        """Covariance (J^T J)^-1 (sum_r S_r) (J^T J)^-1 at fractions of the ranges; None if a simulation close by fails.
-
-        S_r is that of the gradient J_r^T e of a trial whose errors e are as large as its residuals, and as correlated
-        in time, up to the first zero of their autocorrelation (Newey and West 1987, with the same correlation for all
-        coordinates). What the priors add counts as one more trial, whose errors are independent and of their weight.
-        """
-        linear = self._linearise(unit, central=True)
-        if linear is None:
-            return None
-        found, prior = linear
-        free = 1.0 - min(len(unit) / sum(seen for _, _, seen in found), 0.5)
-        told = [np.square(rows).sum() / (seen * free) * _scatter(rows, jacobian) for rows, jacobian, seen in found]
-        told.append(self._prior_weight * prior.T @ prior)
-        curvature = np.sum([jacobian.T @ jacobian for _, jacobian, _ in found], axis=0) + prior.T @ prior
-        values, vectors = np.linalg.eigh(curvature)
-        inverse = (vectors / np.maximum(values, 1e-12 * max(values[-1], 1e-300))) @ vectors.T
-        covariance = inverse @ np.sum(told, axis=0) @ inverse
-        deviation = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-        slopes = [bounds.slope(u) for bounds, u in zip(self.bounds.values(), unit, strict=True)]
-        poorest = vectors[:, 0] * np.sign(vectors[np.abs(vectors[:, 0]).argmax(), 0])
-        return Uncertainty(
-            deviation=dict(zip(self.bounds, (deviation * slopes).tolist(), strict=True)),
-            correlation=(covariance / np.outer(deviation, deviation)).tolist(),
-            poorest=dict(zip(self.bounds, poorest.tolist(), strict=True)),
-            poorest_deviation=float(np.sqrt(max(vectors[:, 0] @ covariance @ vectors[:, 0], 0.0))),
-        )
+        """The uncertainty of parameters at fractions of their ranges; None if a simulation close by fails."""
+        found = self._linearise(unit, central=True)
+        return None if found is None else uncertainty_of(*found, self._prior_weight, self.bounds, unit)
 
 
 @dataclass(frozen=True)
@@ -552,32 +462,3 @@ class _Equilibria:
         if self.slopes is None:
             return self.q.repeat(len(unit), 1, 1)
         return (self.q + torch.einsum("ep,prni->erni", away, self.slopes)).flatten(0, 1)
-
-
-def _autocorrelation(series: NDArray[np.float64]) -> list[float]:
-    """That of (T, C) values at the lags of 1, 2, ... frames, up to its first zero."""
-    products = [float((series[lag:] * series[: len(series) - lag]).sum()) for lag in range(len(series) // 2)]
-    if not products or products[0] <= 0.0:
-        return []
-    return [value / products[0] for value in takewhile(lambda value: value > 0.0, products[1:])]
-
-
-def _redundancy(series: NDArray[np.float64]) -> float:
-    """How many frames (T, C) weigh as much as one."""
-    return 1.0 + 2.0 * sum(_autocorrelation(series))
-
-
-def _scatter(rows: NDArray[np.float64], jacobian: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(P, P) the covariance of J^T e for errors e of unit size that are as correlated in time as the residuals.
-
-    Args:
-        rows: (T, C) the residuals.
-        jacobian: (T C, P) J.
-    """
-    slopes = jacobian.reshape(*rows.shape, -1)
-    found = np.einsum("tcp,tcq->pq", slopes, slopes)
-    for lag, share in enumerate(_autocorrelation(rows), 1):
-        across = share * np.einsum("tcp,tcq->pq", slopes[lag:], slopes[:-lag])
-        found += across + across.T
-    values, vectors = np.linalg.eigh(found)  # Cut off at a zero, a correlation may leave something negative.
-    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)

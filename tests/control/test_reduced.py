@@ -1,0 +1,133 @@
+"""A reduced model of random polynomials with a random network: its derivatives, and many models at once."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from warp_resphys.control.polynomials import Polynomial, powers
+from warp_resphys.control.reduced import ReducedModel
+from warp_resphys.control.reduced_force import ReducedForce
+from warp_resphys.learning.networks import build_model
+from warp_resphys.learning.predictors import Range
+from warp_resphys.studies.gradient_check import central_difference
+
+MODES, PARTS, POINTS, FILTERS = 3, 2, 2, (0.1, 0.5)
+NETWORK = {"kind": "reduced", "position_modes": 4, "velocity_modes": 2, "force_modes": 3, "blocks": 1, "layers": 1,
+           "width": 8, "activation": "silu"}  # fmt: skip
+
+
+@pytest.fixture(scope="module", params=["implicit_euler", "bdf2"])
+def model(request):
+    random = np.random.default_rng(0)
+    torch.manual_seed(0)
+
+    def polynomial(order, middle, spread):
+        coefficients = spread * random.standard_normal((len(powers(PARTS, order)), *np.shape(middle)))
+        coefficients[0] += middle
+        return Polynomial(coefficients, order)
+
+    told = torch.randn(20, PARTS * (1 + len(FILTERS)), dtype=torch.float64)
+    samples = torch.randn(20, 6, 3, dtype=torch.float64)
+    network = build_model(NETWORK, samples[0], samples, samples, samples, told).double().requires_grad_(False)
+    seen = np.zeros((6, 2 * MODES))
+    seen[:4, :MODES], seen[4:, MODES:] = random.standard_normal((4, MODES)), random.standard_normal((2, MODES))
+    force = ReducedForce(
+        network,
+        Range.of(torch.randn(30, 6 + told.shape[1], dtype=torch.float64)),
+        polynomial(3, np.zeros(6), 0.1),
+        polynomial(2, seen, 0.1),
+        0.1 * random.standard_normal(told.shape[1]),
+        0.3 * random.standard_normal((told.shape[1], told.shape[1])),
+        polynomial(1, np.zeros(3), 0.1),
+        polynomial(2, random.standard_normal((MODES, 3)), 0.1),
+    )
+    curved = random.standard_normal((MODES, MODES, 3 * POINTS))
+    return ReducedModel(
+        0.01,
+        request.param,
+        ("a", "b"),
+        "pressure",
+        np.full(PARTS, 5.0),
+        0.013,
+        0.03,
+        FILTERS,
+        polynomial(3, np.zeros(MODES), 0.1),
+        polynomial(3, np.zeros(3 * POINTS), 0.1),
+        polynomial(2, np.diag([400.0, 900.0, 2500.0]), 5.0),
+        polynomial(2, np.eye(MODES), 0.1),
+        polynomial(2, random.standard_normal((3 * POINTS, MODES)), 0.1),
+        curved + curved.swapaxes(0, 1),
+        force,
+    )
+
+
+def assert_slope(function, slope):
+    difference, doubt = central_difference(function)
+    assert abs(slope - difference) < 1e-6 * abs(difference) + 10.0 * doubt
+
+
+def test_slopes_of_a_motion_by_parameters_of_its_inputs(model):
+    random = np.random.default_rng(1)
+    inputs, basis = 5.0 * random.random((9, PARTS)), random.standard_normal((9, PARTS, 2))
+    bias, start = np.full(MODES, 1e-2), model.rest(np.full(PARTS, 2.0))
+    slopes = model.respond(start, inputs, basis, bias).slopes
+    weights = random.standard_normal(slopes.shape[:2])
+    for number in range(2):
+        way = basis[..., number]
+        assert_slope(
+            lambda x, way=way: float((weights * model.respond(start, inputs + x * way, None, bias).y).sum()),
+            (weights * slopes[..., number]).sum(),
+        )
+
+
+def test_slopes_of_equilibria_by_the_inputs(model):
+    random, inputs = np.random.default_rng(2), np.array([3.0, 1.5])
+    weights, way = random.standard_normal(3 * POINTS), random.standard_normal(PARTS)
+    slope = weights @ model.rest_observed(inputs)[1] @ way
+    difference, doubt = central_difference(lambda x: float(weights @ model.rest_observed(inputs + x * way)[0]))
+    assert abs(slope - difference) < 1e-4 * abs(difference) + 10.0 * doubt
+
+
+def test_an_equilibrium_lasts(model):
+    state = model.rest(np.array([3.0, 1.5]), count=2)
+    motion = model.move(state, np.tile([3.0, 1.5], (20, 2, 1)))
+    np.testing.assert_allclose(motion.end.z, state.z, atol=1e-6)
+    np.testing.assert_allclose(model.observe(motion.end)[0], model.rest_observed(np.array([3.0, 1.5]))[0], atol=1e-5)
+
+
+def test_a_transition_is_linearised(model):
+    random, inputs = np.random.default_rng(3), np.array([2.5, 1.0])
+    start = model.move(model.rest(np.full(PARTS, 2.0)), np.tile(inputs, (4, 1, 1))).end
+    weights, way = random.standard_normal(2 * MODES), random.standard_normal((3, MODES))
+    slopes = np.split(model.transition(start, inputs, np.zeros(MODES))[1], 3, axis=1)
+    for number, slope in enumerate(slopes):
+
+        def after(x, number=number):
+            z, v, b = (x * way[each] * (each == number) for each in range(3))
+            state = model.transition(replace(start, z=start.z + z, v=start.v + v), inputs, b)[0]
+            return float(weights @ np.concatenate([state.z[0], state.v[0]]))
+
+        assert_slope(after, weights @ slope @ way[number])
+
+
+def test_models_at_once_do_not_see_each_other_and_begin_again_by_themselves(model):
+    random, rest = np.random.default_rng(4), np.full(PARTS, 1.0)
+    inputs = 1.0 + 4.0 * random.random((8, 3, PARTS))
+    first = batch = model.rest(rest, 3)
+    for number, now in enumerate(inputs):
+        if number == 4:
+            batch = first.where(np.array([False, True, False]), batch)
+        batch = model.move(batch, now[None]).end
+    for row, since in enumerate((0, 4, 0)):
+        wanted = model.respond(model.rest(rest), inputs[since:, row]).y[-1]
+        np.testing.assert_allclose(model.observe(batch)[row], wanted, atol=1e-12)
+
+
+def test_a_state_goes_on_from_its_arrays(model):
+    inputs = 5.0 * np.random.default_rng(5).random((6, 2, PARTS))
+    half = model.move(model.rest(count=2), inputs[:3]).end
+    again = model.move(type(half).from_arrays(half.arrays()), inputs[3:]).end
+    np.testing.assert_array_equal(again.z, model.move(half, inputs[3:]).end.z)
+    np.testing.assert_allclose(again.z, model.move(model.rest(count=2), inputs).end.z, atol=1e-12)

@@ -30,7 +30,7 @@ def _routine(name: str, arguments: int) -> Any:
     return ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * arguments)(pointer)
 
 
-class _Routines:
+class BandedCholesky:
     """Factors and solutions in place, of matrices (n, w + 1) by columns: row j has the entries (j, j) to (j + w, j).
 
     Args:
@@ -77,7 +77,7 @@ class BandedSolver(LinearSolver):
         self.n_values = self.n * (self.bandwidth + 1)
         self.address = np.where(diagonal_upper, -1, j * (self.bandwidth + 1) + (i - j)).astype(np.int32)
         self.order = order
-        self.lapack = _Routines(self.n, self.bandwidth, self.dtype)
+        self.lapack = BandedCholesky(self.n, self.bandwidth, self.dtype)
 
     @override
     def _factorise(

@@ -23,9 +23,9 @@ from .tiled import TiledSolver
 
 LinearSolverName = Literal["auto", "banded", "tiled", "dense", "sparse", "multigrid"]
 LINEAR_SOLVERS: tuple[LinearSolverName, ...] = get_args(LinearSolverName)
-DEAREST_BAND = 4e10  # multiplications of a banded factor on a CPU, beyond which multigrid is the cheaper one
-WIDEST_BAND = 600  # unknowns, beyond which tiles of a band hold mostly fill on a GPU
-MOST_DENSE = 4000  # unknowns
+MAX_BANDED_FLOPS = 4e10  # multiplications of a banded factor on a CPU, beyond which multigrid is the cheaper one
+MAX_TILED_BANDWIDTH = 600  # unknowns, beyond which tiles of a band hold mostly fill on a GPU
+MAX_DENSE_UNKNOWNS = 4000  # unknowns
 
 
 def make_linear_solver(
@@ -71,7 +71,7 @@ def _cheapest(rows: Indices, cols: Indices, n_nodes: int, block: int, device: to
     bandwidth = block * int(np.abs(place[rows] - place[cols]).max(initial=0) + 1)
     unknowns = n_nodes * block
     if device.type == "cpu":
-        return "banded" if unknowns * bandwidth**2 <= DEAREST_BAND else "multigrid"
-    if bandwidth + 2 * TILE <= min(unknowns // 2, WIDEST_BAND):
+        return "banded" if unknowns * bandwidth**2 <= MAX_BANDED_FLOPS else "multigrid"
+    if bandwidth + 2 * TILE <= min(unknowns // 2, MAX_TILED_BANDWIDTH):
         return "tiled"
-    return "dense" if unknowns <= MOST_DENSE else "sparse"
+    return "dense" if unknowns <= MAX_DENSE_UNKNOWNS else "sparse"

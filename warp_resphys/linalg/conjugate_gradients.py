@@ -1,4 +1,4 @@
-"""Conjugate gradients for a batch of systems that are known by their products alone."""
+"""Preconditioned conjugate gradients for a batch of systems that are given by products with vectors."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -9,7 +9,7 @@ LinearMap = Callable[[torch.Tensor], torch.Tensor]
 
 
 class Iterate(NamedTuple):
-    """Where the iterations of a batch ended."""
+    """Result of the iterations of a batch."""
 
     x: torch.Tensor  # (B, ...)
     converged: torch.Tensor  # (B,) bool

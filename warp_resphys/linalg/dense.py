@@ -28,7 +28,7 @@ class DenseSolver(LinearSolver):
 
 
 class DenseFactor(Factor):
-    """Of lower triangles (B, n, n), which it may overwrite."""
+    """Factors of symmetric matrices, from their lower triangles (B, n, n), which may be overwritten."""
 
     def __init__(self, lower: torch.Tensor, definite: bool) -> None:
         self._definite = definite
@@ -42,7 +42,7 @@ class DenseFactor(Factor):
             (self._cholesky if definite else self._lu)[info != 0] = torch.nan
 
     def keep(self, before: "DenseFactor", idle: torch.Tensor) -> None:
-        """Takes the Cholesky factors of some matrices (B,) from another one."""
+        """Takes over the Cholesky factors of idle matrices (B,) from an earlier factor."""
         self._cholesky = torch.where(idle[:, None, None], before._cholesky, self._cholesky)
         self.failed = np.where(idle.cpu().numpy(), before.failed, self.failed)
 

@@ -29,10 +29,10 @@ _SMALL = 1e-4
 
 @dataclass(frozen=True)
 class Point:
-    """Where a batch of problems is."""
+    """Current iterate of a batch of problems."""
 
     x: torch.Tensor  # (B, ...) unknowns
-    value: torch.Tensor  # (B,) objective; infinite where there is none, as where a simulation fails
+    value: torch.Tensor  # (B,) objective; infinite where it cannot be evaluated, as where a simulation fails
     kept: tuple[torch.Tensor, ...] = ()  # what the problem keeps of its evaluation, each (B, ...)
 
 
@@ -45,26 +45,26 @@ class Problem(ABC):
 
     @abstractmethod
     def linearise(self, point: Point) -> Move:
-        """Of a damping (B,), zero or more, to the unknowns that minimise the damped linearisation about the point."""
+        """The function of a damping (B,), zero or more, that gives the minimiser of the damped linearisation there."""
 
     @abstractmethod
     def distance(self, old: Point, new: Point) -> torch.Tensor:
-        """(B,) how far a step led, in the unit of the tolerance."""
+        """(B,) length of a step, in the unit of the tolerance."""
 
 
 @dataclass(frozen=True)
 class Solution:
-    """What `minimise` found."""
+    """Result of `minimise`."""
 
-    point: Point  # the last one that was taken
-    iterations: int  # steps that were tried
-    settled: bool  # whether every problem of the batch has
-    moved: float  # the furthest distance of the last step
+    point: Point  # the last accepted iterate
+    iterations: int  # trial steps
+    settled: bool  # whether every problem of the batch has converged
+    moved: float  # largest distance of the last step
 
 
 @torch.no_grad()
 def minimise(problem: Problem, start: Point, tolerance: float, max_iterations: int) -> Solution:
-    """The minimum that is downhill from a start.
+    """The local minimum reached from a start.
 
     A problem of the batch has settled, and is left alone, when a step leads no further than the tolerance and either is
     hardly damped or leads nowhere better.
@@ -98,7 +98,7 @@ def minimise(problem: Problem, start: Point, tolerance: float, max_iterations: i
 
 
 def _where(mask: torch.Tensor, new: torch.Tensor, old: torch.Tensor) -> torch.Tensor:
-    """Of (B, ...) the new rows where the mask (B,) is set."""
+    """(B, ...) the new rows where the mask (B,) is set, the old ones elsewhere."""
     return torch.where(mask.view(-1, *[1] * (new.ndim - 1)), new, old)
 
 

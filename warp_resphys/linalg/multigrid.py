@@ -81,7 +81,7 @@ class MultigridSolver(SparseSolver):
 
 
 class _Layout:
-    """Where the entries of a sparse matrix come from: one whose entries are the places of these, counted from one."""
+    """Source of the entries of a sparse matrix, from a matrix whose entries are their places, counted from one."""
 
     def __init__(self, places: Any, device: torch.device) -> None:
         self.starts, self.columns = places.indptr, places.indices
@@ -101,14 +101,14 @@ class _Preconditioned(SeparateFactors):
 
 
 class _System:
-    """A matrix, and a V-cycle of it or of one before."""
+    """A matrix with a V-cycle, made for it or for an earlier matrix."""
 
     def __init__(self, matrix: torch.Tensor, cycle: "_Cycle") -> None:
         self._matrix, self.cycle = matrix, cycle
         self._lu: Any = None
 
     def direction(self, right: torch.Tensor) -> torch.Tensor:
-        """(m, n) roughly the solutions for (m, n) right-hand sides, and never uphill of them."""
+        """(m, n) rough solutions for right-hand sides (m, n), each a direction of descent."""
         return self._iterate(right, DIRECTION).x
 
     def solve(self, right: torch.Tensor) -> torch.Tensor:
@@ -139,7 +139,7 @@ class _System:
 
 
 class _Level(NamedTuple):
-    """One of the matrices of a hierarchy, with what its smoother needs and the way to the next one."""
+    """A level of the hierarchy: its matrix, its smoother, and the transfer to the next level."""
 
     matrix: torch.Tensor  # (n, n) sparse
     inverse: torch.Tensor  # (n / k, k, k) of its diagonal blocks
@@ -166,7 +166,7 @@ class _Cycle:
         self.worn = not finer  # The factor of a small matrix costs nothing, and serves no other.
 
     def note(self, iterations: int, tolerance: float) -> None:
-        """Notes how many iterations it took."""
+        """Records the iterations of a solve, to find out when the cycle is worn."""
         self.worn |= iterations > _WEAR * self._fresh.setdefault(tolerance, max(iterations, _FEW))
 
     def apply(self, right: torch.Tensor, k: int = 0) -> torch.Tensor:
@@ -208,7 +208,7 @@ def _block_diagonal(blocks: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
 
 
 def _level(level: Any, device: torch.device) -> _Level:
-    """Of one of PyAMG's."""
+    """Our form of a level of PyAMG."""
     a = level.A
     row = np.repeat(np.arange(len(a.indptr) - 1), np.diff(a.indptr))
     blocks = torch.as_tensor(a.data[row == a.indices], device=device)
@@ -222,7 +222,7 @@ def _level(level: Any, device: torch.device) -> _Level:
 
 
 def _sparse(matrix: Any, device: torch.device) -> torch.Tensor:
-    """On the device, with indices of 32 bits, which its libraries take as they are."""
+    """A SciPy matrix as a torch matrix on the device, with the 32-bit indices that its libraries need."""
     rows = scipy.sparse.csr_array(matrix)
     indices = [torch.as_tensor(each.astype(np.int32), device=device) for each in (rows.indptr, rows.indices)]
     return _of_rows(indices, torch.as_tensor(rows.data, device=device), rows.shape)

@@ -1,4 +1,4 @@
-"""Threads: one for small linear algebra, several for the shards of a batch."""
+"""Numbers of threads: one for small linear algebra, several for the shards of a batch."""
 
 import os
 from collections.abc import Callable, Iterator, Sequence

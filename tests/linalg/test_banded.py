@@ -5,7 +5,7 @@ import pytest
 import scipy.linalg
 import torch
 
-from warp_resphys.linalg.lapack import BandedCholesky, general_band
+from warp_resphys.linalg.banded import BandedCholesky, general_band
 
 SIZE, WIDTH = 11, 3
 

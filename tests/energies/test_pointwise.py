@@ -83,6 +83,25 @@ class Spring(PointwiseEnergy):
         return (between(self.pairs, np.arange(self.count)),)
 
 
+@wp.func
+def polynomial(x: wp.vec3d, v: wp.vec3d) -> wp.float64:
+    height = x[2]
+    return height * (v[0] + height * (v[1] + height * v[2]))
+
+
+@dataclass(frozen=True)
+class Hills(PointwiseEnergy):
+    """A potential of the height of the tip, by an array of coefficients."""
+
+    parameters: ClassVar = (Quantity("coefficients", "J", shape=(3,)),)
+    density: ClassVar = polynomial
+    size: ClassVar[float] = 0.02
+    coefficients: tuple = (0.1, 2.0, 30.0)
+
+    def points(self, mesh):
+        return (at_vertices(TIP),)
+
+
 def simulator(energy, **options):
     return Simulator(Body(MESH, fixed=CLAMP, energies=[energy]), MATERIAL, solver=TIGHT, **options)
 
@@ -160,3 +179,22 @@ def test_another_number_of_values_is_refused():
 
     with pytest.raises(InputError, match="Wrong takes 2 values"):
         simulator(Wrong()).workspace(1)
+
+
+def test_a_parameter_may_be_an_array():
+    s, weights = simulator(Hills()), torch.tensor([1.0, -2.0, 0.5]).double()
+
+    def loss(coefficients):
+        end = s.rollout(s.rest_state(2), 2, parameters={"coefficients": coefficients}).q[-1]
+        return 1e3 * (end[0] * weights).sum() + 2e3 * (end[1] * weights).sum()
+
+    for values in (torch.tensor([0.1, 2.0, 30.0]), torch.tensor([[0.1, 2.0, 30.0], [0.3, 1.0, -20.0]])):
+        given = values.double().requires_grad_()
+        (gradient,) = torch.autograd.grad(loss(given), given)
+        assert gradient.shape == given.shape
+        step = 1e-3 * torch.ones_like(given).detach() * torch.tensor([1.0, 10.0, 100.0])
+        with torch.no_grad():
+            difference = (loss(given + step) - loss(given - step)) / 2.0
+        torch.testing.assert_close((gradient * step).sum(), difference, rtol=1e-6, atol=0.0)
+    with pytest.raises(InputError, match="coefficients has shape"):
+        s.prepare({"coefficients": torch.zeros(4)})

@@ -220,11 +220,13 @@ class Energy(ABC):
         return {quantity.name: self.per_part(quantity, constants[quantity.name]) for quantity in self.parameters}
 
     def per_part(self, quantity: Quantity, values: torch.Tensor) -> torch.Tensor:
-        """(1 or B, `count`) values of a parameter.
+        """Returns (1 or B, `count`) values of a parameter, or an array (1 or B, *shape) as it is.
 
         Raises:
             InputError: another number of them.
         """
+        if quantity.shape:
+            return values
         if values.shape[1] not in (1, self.count):
             raise InputError(
                 f"{quantity.name} has {values.shape[1]} values for {self.count} {quantity.per}s: give one value, or "
@@ -404,6 +406,7 @@ class ReadingTerm(Term):
             values that are a point's own.
         count: of the parts.
         own: names of the values that are a point's own.
+        arrays: names of arrays, of any shape, that every point reads as a whole.
         extra: arguments of the kernels after the values.
     """
 
@@ -415,12 +418,14 @@ class ReadingTerm(Term):
         shapes: Mapping[str, tuple[int, ...]],
         count: int,
         own: Sequence[str] = (),
+        arrays: Sequence[str] = (),
         extra: Sequence[Any] = (),
     ) -> None:
         super().__init__(launcher, sets)
         (s,) = sets
         assert isinstance(s.source, PartPoints)
-        self._kernels, self._shapes, self._point_values, self._extra = kernels, dict(shapes), frozenset(own), extra
+        self._kernels, self._shapes, self._extra = kernels, dict(shapes), extra
+        self._point_values, self._arrays = frozenset(own), frozenset(arrays)
         self.part_of = torch.as_tensor(s.source.part, device=launcher.device)
         self.weight = torch.as_tensor(s.source.weights, device=launcher.device)
         self._own = torch.as_tensor(np.eye(count)[s.source.part], device=launcher.device)  # (P, count) one in its part
@@ -432,6 +437,8 @@ class ReadingTerm(Term):
 
     def _places_of(self, name: str, part: NDArray[np.int64]) -> NDArray[np.int64]:
         """(n, P) where in a row of its array the values of each point are."""
+        if name in self._arrays:
+            return np.tile(np.arange(int(np.prod(self._shapes[name])))[:, None], len(part))
         columns = int(np.prod(self._shapes[name][1:]))
         first = np.arange(len(part)) if name in self._point_values else part
         return np.stack([first * columns + k for k in range(columns)])
@@ -470,7 +477,9 @@ class ReadingTerm(Term):
             found, first = {}, 0
             for name, shape in self._shapes.items():
                 slope = out[..., first : first + len(self._places[name])]
-                if name not in self._point_values:
+                if name in self._arrays:
+                    slope = slope.sum(1)
+                elif name not in self._point_values:
                     slope = torch.einsum("bpn,pc->bcn", slope, self._own)
                 found[name] = slope.reshape(own.batch, *shape).clone()
                 first += len(self._places[name])

@@ -127,7 +127,8 @@ class BoundPointwise(BoundEnergy):
     def _values(self, step: Step) -> dict[str, torch.Tensor]:
         """Returns parameters, inputs and memory at the points, by name."""
         energy, zeros = self._pointwise, self._zeros(step.state.batch)
-        values = {q.name: step.constants.value(q.name)[:, self._part] for q in energy.parameters}
+        constants = {q: step.constants.value(q.name) for q in energy.parameters}
+        values = {q.name: value if q.shape else value[:, self._part] for q, value in constants.items()}
         for quantity in energy.inputs:
             given = step.inputs.actuation.get(quantity.name)
             values[quantity.name] = zeros if given is None else given[:, self._part]
@@ -161,15 +162,18 @@ class PointwiseTerm(ReadingTerm):
 
     def __init__(self, launcher: Launcher, sets: Sequence[PointSet], energy: PointwiseEnergy) -> None:
         kernels, names = pointwise_kernels(energy.density), energy.value_names
-        if kernels.values._length_ != len(names):
+        arrays = {q.name: q.shape for q in energy.parameters if q.shape}
+        values = len(names) - len(arrays) + sum(int(np.prod(shape)) for shape in arrays.values())
+        if kernels.values._length_ != values:
             raise InputError(
                 f"the density of {type(energy).__name__} takes {kernels.values._length_} values, but the energy has "
-                f"{len(names)}: {', '.join(names)}."
+                f"{values}: {', '.join(names)}."
             )
         acting = len(energy.parameters) + len(energy.inputs)
         own, count = names[acting:], energy.count
-        shapes = dict.fromkeys(names[:acting], (count,)) | dict.fromkeys(own, (sets[0].n_points,))
-        super().__init__(launcher, sets, kernels, shapes, count, own, [wp.float64(energy.size)])
+        shapes: dict[str, tuple[int, ...]] = {name: arrays.get(name, (count,)) for name in names[:acting]}
+        shapes |= dict.fromkeys(own, (sets[0].n_points,))
+        super().__init__(launcher, sets, kernels, shapes, count, own, list(arrays), [wp.float64(energy.size)])
 
     @override
     def curvature(self, values: Values) -> torch.Tensor:

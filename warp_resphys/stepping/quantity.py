@@ -24,6 +24,7 @@ class Quantity:
     closed: bool = False  # whether `lower` itself is allowed
     # what there may be a value each of, such as ``element`` or ``chamber``; without it, only environments
     per: str = ""
+    shape: tuple[int, ...] = ()  # of one value that is an array, such as a network's weights; then without `per`
     typical: float = 1.0  # about how large it is: an input, or a parameter that may be anything
     words: str = ""  # what an input is called in a sentence, and
     shown_unit: str = ""  # the unit in which people read it,
@@ -72,7 +73,12 @@ class Quantity:
             raise InputError(f"{self.name} is {value!r}: it must be a number, {self.wanted}.") from None
         inside = (values >= self.lower if self.closed else values > self.lower) & (values < self.upper)
         inside &= torch.isfinite(values)
-        if values.numel() == 0 or values.ndim > 2:
+        if self.shape and tuple(values.shape) != self.shape and tuple(values.shape[1:]) != self.shape:
+            raise InputError(
+                f"{self.name} has shape {tuple(values.shape)}: it must be {self.shape}, or (B, *{self.shape}) with one "
+                "for each environment."
+            )
+        if not self.shape and (values.numel() == 0 or values.ndim > 2):
             raise InputError(
                 f"{self.name} has shape {tuple(values.shape)}: give a number, (M,), (B, 1) or (B, M) values."
             )
@@ -81,7 +87,12 @@ class Quantity:
             raise InputError(f"{self.name} is {wrong:g}: it must be {self.wanted}.")
 
     def shaped(self, values: torch.Tensor) -> torch.Tensor:
-        """A number, (n,), (B, 1) or (B, n) values as (1 or B, 1 or n); keeps the autograd graph."""
+        """Returns a number, (n,), (B, 1) or (B, n) values as (1 or B, 1 or n), an array as (1 or B, *shape).
+
+        Keeps the autograd graph.
+        """
+        if self.shape:
+            return values if values.ndim > len(self.shape) else values[None]
         if not self.per:
             return values.reshape(-1, 1)
         return values.reshape(1, -1) if values.ndim < 2 else values

@@ -177,15 +177,16 @@ class _Problem:
                 yield name, partial(self.loss, name), value, sizes[name]
         for name, quantity in simulator.parameters.items():
             base = simulator.tensor(simulator.constants[name])
-            shapes: dict[str, tuple[int, ...]] = {"environment": (self.batch, 3)}
-            if name != "gravity":
+            shapes: dict[str, tuple[int, ...]] = {"environment": (self.batch, *(quantity.shape or (3,)))}
+            if name != "gravity" and not quantity.shape:
                 base, shapes = base.mean(), {"environment": (self.batch, 1)}
                 if quantity.per:
                     shapes = {"one": (1,), quantity.per: (simulator.counts[name],), **shapes}
             for kind, shape in shapes.items():
                 vary = partial(self._varied, quantity, base)
                 title = f"{name}, each {kind}" if kind != "one" else name
-                yield title, vary, torch.zeros(shape, device=base.device, dtype=base.dtype), 0.7
+                size = 0.01 if quantity.shape else 0.7
+                yield title, vary, torch.zeros(shape, device=base.device, dtype=base.dtype), size
 
     def _varied(self, quantity: Quantity, base: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
         """The loss by how a parameter varies in its range."""

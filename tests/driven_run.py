@@ -3,12 +3,15 @@
 from pathlib import Path
 
 import numpy as np
-from measured_run import describe_recordings, reported
+from configured import composed
+from measured_run import describe_recordings
 
 from warp_resphys.experiment.build import build_mesh
 from warp_resphys.io.files import atomic_hdf5, create, read_json, write_json
+from warp_resphys.io.settings import parse
 from warp_resphys.learning.metrics import median_filter, summarise, summarise_each
 from warp_resphys.report.data import mean_distance
+from warp_resphys.settings.run import RunSettings
 
 MODELS = ("simulation", "sysid", "simfree", "resphys")
 STEP, LIMIT = 0.02, 20e3
@@ -22,9 +25,21 @@ _OFF = {
 }
 
 
+LABORATORY = {
+    "mesh": {"kind": "arm_generated"},
+    "time_step": 0.01,
+    "integrator": "bdf2",
+    "material": {},
+    "fibres": {"angles": [8.0], "stiffness": 1e4},
+    "noise": 0.0,
+    "placement_noise": 0.0,
+}
+
+
 def data(**changes):
     """The group of that name."""
     return {
+        "kind": "recorded",
         "folder": None,
         "input_limit": LIMIT,
         "train_fraction": 1.0,
@@ -41,18 +56,18 @@ def arm_settings(name="sopra", chambers=6, **changes):
         label: [radii[k] * np.cos(0.3 + 1.6 * at), radii[k] * np.sin(0.3 + 1.6 * at), heights[k]]
         for label, (k, at) in ring.items()
     }
-    plain = reported("mesh=arm_coarse")
+    plain = composed("mesh=arm_coarse")
     plain |= {
         "name": name,
         "title": "Pneumatic arm",
         "fixed": {"z": 0.0},
         "markers": {"tracked": tracked, "reference": BASE},
-        "laboratory": {"fibres": {"angles": [8.0]}},
+        "laboratory": LABORATORY,
         "chambers": {"count": chambers, "axis": [0.0, 0.0, -1.0]},
         "data": data(),
         "time_step": STEP,
     }
-    return {**plain, **changes}
+    return parse(RunSettings, {**plain, **changes})
 
 
 def pressures(trials, steps, chambers, factor=1.0):
@@ -101,9 +116,9 @@ def write_run(
     sag=0.0,
 ):
     """All files of a run; bodies hang longer by the sag [m]."""
-    mesh = build_mesh(settings["mesh"])
-    labels = list(settings["markers"]["tracked"])
-    bound = np.array(list(settings["markers"]["tracked"].values())) + 1e-4
+    mesh = build_mesh(settings.mesh)
+    labels = list(settings.markers.tracked)
+    bound = np.array(list(settings.markers.tracked.values())) + 1e-4
     nominal = [f"test_{number:02d}" for number in range(test)]
     driven = pressures([*(f"train_{n:02d}" for n in range(train)), *nominal], steps, chambers)
     for scale in scales:
@@ -197,7 +212,7 @@ def _errors(simulated, measured, names, test, labels, scales, horizons):
 
 def _write_rest(folder, settings, tracked, registered, rng, models, simulated):
     """Everything but motions, roll-outs and errors."""
-    quality, registration = describe_recordings(registered, tracked, settings["markers"]["reference"], rng, None)
+    quality, registration = describe_recordings(registered, tracked, settings.markers.reference, rng, None)
     write_json(folder / "quality.json", quality)
     write_json(folder / "registration.json", registration)
     if simulated:

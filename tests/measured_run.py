@@ -1,18 +1,17 @@
 """A made-up run of an experiment with measured motions: every file that its report reads."""
 
-import copy
-import functools
 import json
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from hydra import compose, initialize_config_module
-from omegaconf import OmegaConf
+from configured import composed
 
 from warp_resphys.io.files import atomic_hdf5, create, write_json
+from warp_resphys.io.settings import parse
 from warp_resphys.learning.metrics import summarise
 from warp_resphys.mesh.mesh import box_hexahedra
+from warp_resphys.settings.run import RunSettings
 
 MODELS = ("published", "simulation", "sysid_elastic", "sysid", "simfree", "resphys_uncorrected", "resphys")
 LEARNED = ("simfree", "resphys_uncorrected", "resphys")
@@ -31,38 +30,21 @@ _OFF = {  # Period, damping and level of a model, over those of the reality.
 }
 
 
-@functools.cache
-def composed(*overrides):
-    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        return OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
-
-
-def configuration(*overrides, experiment="beam_real"):
-    """Settings of an experiment as the command line would compose them."""
-    return copy.deepcopy(composed(f"experiment={experiment}", *overrides))
-
-
-def reported(*overrides, experiment="beam_oscillation"):
-    """The same, with the names that the report reads."""
-    plain = configuration(*overrides, experiment=experiment)
-    names = {"reality": "target", "synthetic": "laboratory"}
-    return {names.get(key, key): value for key, value in plain.items()}
-
-
 def config(**data):
-    """Settings of the experiment, as its stages get them."""
-    plain = reported("mesh.divisions=[6,2,2]")
+    """Settings of an experiment on recordings."""
+    plain = composed("mesh.divisions=[6,2,2]")
+    published = {**plain["simulation"], "youngs_modulus": 215e3, "poissons_ratio": 0.45}
     plain |= {
         "name": "beam_real",
         "title": "Real beam",
         "simulation": {**plain["simulation"], "youngs_modulus": 264e3, "poissons_ratio": 0.499},
-        "published": {"simulation": {**plain["simulation"], "youngs_modulus": 215e3, "poissons_ratio": 0.45}},
+        "published": {"simulation": published, "physics": {}, "integrator": "implicit_euler"},
         "markers": {"tracked": TRACKED, "reference": REFERENCE},
         "in_the_loop": {"epochs": 5},
-        "data": {"folder": "recordings", "seconds": SECONDS, "folds": None, **data},
+        "data": {"kind": "recorded", "folder": "recordings", "seconds": SECONDS, "folds": None, **data},
         "time_step": STEP,
     }
-    return plain
+    return parse(RunSettings, plain)
 
 
 def sag(rest, times, payload, model=None):

@@ -14,11 +14,14 @@ from typing import Any
 import pytest
 from hydra import compose, initialize_config_module
 from hydra._internal.utils import get_args_parser
+from omegaconf import OmegaConf
 
-from warp_resphys import __version__, cli, commands
+from warp_resphys import __version__, cli, commands, launch
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.labels import run_label
+from warp_resphys.io.setting_errors import keys
 from warp_resphys.io.stages import StageInterrupted
+from warp_resphys.settings.run import RunSettings
 
 REPOSITORY = Path(__file__).parents[1]
 EXPERIMENT = "warp_resphys.pipeline"
@@ -370,7 +373,45 @@ def test_every_documented_line_has_keys_that_exist():
             command, arguments = commands.parse([word for word in shlex.split(line) if word != "--multirun"])
             elsewhere = ("tuned=", "hydra/launcher=")  # what a search leaves, what is to be installed
             known = [re.sub(r"^seed=0,.*", "seed=0", each) for each in arguments if not each.startswith(elsewhere)]
-            compose(commands.configuration(command), known)
+            compose(commands.configuration(command), launch.freed(known, command in launch.TYPED))
+            if command in ("run", "tune"):
+                names = [each.partition("=")[0].lstrip("+~") for each in known]
+                assert all("." not in name or _is_key(name) for name in names), line
+
+
+def _is_key(name):
+    """Whether a run has a key of a dotted name."""
+    patterns = [key.replace(".", r"\.").replace("NAME", "[^.]+") for key in keys(RunSettings.model_json_schema())]
+    free = ("hydra.", "tune.", "simulation.", "target.", "laboratory.material.")  # what others check
+    return name.startswith(free) or any(re.fullmatch(pattern, name) for pattern in patterns)
+
+
+class TestSettingsOfARun:
+    @pytest.fixture(autouse=True)
+    def _elsewhere(self, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+
+    def test_all_keys_are_shown_with_their_defaults_and_nothing_is_written(self, capsys, monkeypatch, tmp_path):
+        monkeypatch.setattr(sys, "argv", ["warp-resphys", "--cfg", "job", "seed=3", "mesh=rod"])
+        cli.main()
+        shown = OmegaConf.create(capsys.readouterr().out)
+        assert (shown.seed, shown.mesh.kind, shown.mesh.grading, shown.parallel.backend) == (3, "rod", 0.0, "local")
+        assert list(tmp_path.iterdir()) == []
+
+    @pytest.mark.parametrize(
+        ("argument", "sentence"),
+        [
+            ("sed=1", "unknown key 'sed', did you mean 'seed'?"),
+            ("trainer.epoch=1", "unknown key 'trainer.epoch', did you mean 'epochs'"),
+            ("trainer.epochs=1.5", "trainer.epochs is 1.5: it must be a whole number, one or more."),
+            ("seed=[1", "cannot read the override 'seed=[1'"),
+        ],
+    )
+    def test_a_wrong_key_or_value_is_one_sentence(self, capsys, monkeypatch, argument, sentence):
+        monkeypatch.setattr(sys, "argv", ["warp-resphys", argument])
+        with pytest.raises(SystemExit):
+            cli.main()
+        assert capsys.readouterr().err.startswith(f"error: {sentence}")
 
 
 class TestProcess:

@@ -3,11 +3,13 @@
 from pathlib import Path
 
 import numpy as np
-from measured_run import reported
+from configured import composed
 
 from warp_resphys.experiment.build import build_mesh
 from warp_resphys.io.files import atomic_hdf5, create, write_json
+from warp_resphys.io.settings import parse
 from warp_resphys.learning.metrics import marker_errors, summarise, summarise_each
+from warp_resphys.settings.run import RunSettings
 
 STEPS, STEP = 40, 0.01
 TRIALS = {"0.05 kg": 0.008, "0.07 kg": 0.01, "0.12 <kg>": 0.02}  # The first one is of the training.
@@ -17,7 +19,7 @@ OFFSETS = {"reconstruction": 1e-9, "resphys": 2e-6}
 
 def settings(**changes):
     """Of an experiment whose simulated trials are known at every vertex."""
-    return {**reported("mesh.divisions=[4,1,1]"), "time_step": STEP, **changes}
+    return parse(RunSettings, {**composed("mesh.divisions=[4,1,1]"), "time_step": STEP, **changes})
 
 
 def bending(vertices, amplitude, period=0.14, offset=0.0, steps=STEPS):
@@ -31,7 +33,7 @@ def bending(vertices, amplitude, period=0.14, offset=0.0, steps=STEPS):
 
 def write_run(folder: Path, config, *, models=tuple(PERIODS), diverged=(), steps=STEPS, begins="given", refined=False):
     """Every file that the report reads; one step more or less makes poses of the roll-outs."""
-    vertices = build_mesh(config["mesh"]).vertices
+    vertices = build_mesh(config.mesh).vertices
     names, test = list(TRIALS), list(TRIALS)[1:]
     target = np.stack([bending(vertices, size, steps=steps) for size in TRIALS.values()])
     attributes = {"names": names, "labels": [], "gravity": np.array([0.0, 0.0, -9.8]), "begins": [begins] * 3}

@@ -6,8 +6,9 @@ import logging
 import os
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from importlib import import_module, resources
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
@@ -31,6 +32,11 @@ from .io.labels import OWN_OPTIONS, run_label
 from .io.pipes import ends_where_nobody_reads
 
 INTERRUPTED: Final = 130
+# Commands that have the keys of `settings.run.RunSettings`, perhaps beside others.
+TYPED: Final = ("run", "tune", "benchmark", "verify gradients", "verify device")
+_FOREIGN: Final = {"--config-path", "-cp", "--config-name", "-cn"}  # options that take another configuration than ours
+# Options of Hydra for a job that only prints.
+_SILENT: Final = ("hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=disabled")
 _PLAIN: Final = re.compile(r"[\w./~=+%@:,-]+")  # A value that means nothing but itself.
 
 
@@ -44,11 +50,16 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
     """
     reported: list[BaseException] = []
     started = False
+    shown: str | None
 
     def job(config: DictConfig) -> Any:
         nonlocal started
         started = True
         try:
+            if shown is not None:
+                with ends_where_nobody_reads():
+                    _show(config, shown)
+                return None
             module, _, name = function.partition(":")
             settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
             folder = Path(HydraConfig.get().runtime.output_dir)
@@ -73,7 +84,13 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
     try:
         if any(argument.startswith("--experimental-rerun") for argument in arguments):
             raise HydraException("--experimental-rerun reads a pickle, which can run code: use overrides")
-        sys.argv = [before[0], *_own_options(), *map(_quoted, arguments)]
+        rest, shown = [*_own_options(), *map(_quoted, arguments)], None
+        if command in TYPED and not _FOREIGN & {*rest}:
+            rest, shown = _without_shown(rest)
+            rest = [*freed(rest), *(_SILENT if shown is not None else ())]
+        else:
+            rest = freed(rest, typed=False)
+        sys.argv = [before[0], *rest]
         hydra.main(version_base="1.3", config_path=f"pkg://{CONFIG_PACKAGE}", config_name=configuration(command))(job)()
     except KeyboardInterrupt as error:
         print(f"\n{error}" if str(error) else "\ninterrupted", file=sys.stderr, flush=True)
@@ -105,6 +122,59 @@ def _own_options() -> list[str]:
     return ["--config-dir", str(folder)]
 
 
+def _groups(arguments: Sequence[str]) -> set[str]:
+    """Names of the groups that have options, in the package and in the folders of the user."""
+    pairs = pairwise(arguments)
+    added = [Path(value) for option, value in pairs if option in ("--config-dir", "-cd")]
+    places = [resources.files(CONFIG_PACKAGE), *(folder for folder in added if folder.is_dir())]
+    return {entry.name for place in places for entry in place.iterdir() if entry.is_dir()}
+
+
+def freed(arguments: Sequence[str], typed: bool = True) -> list[str]:
+    """Arguments for Hydra that may set keys which no option mentions: the classes of the settings have all keys.
+
+    Args:
+        arguments: as a user writes them.
+        typed: whether the classes have all keys of the command, or those in groups alone.
+    """
+    groups = _groups(arguments)
+    return [_free(argument, groups, typed) for argument in arguments]
+
+
+def _free(argument: str, groups: Container[str], typed: bool) -> str:
+    key, equals, value = argument.partition("=")
+    first, dot, _ = key.partition("@")[0].partition(".")
+    chooses = first in groups and not dot and not value.startswith("{")
+    if not equals or key[:1] in ("-", "+", "~") or "/" in first or first == "hydra" or chooses:
+        return argument
+    return f"++{argument}" if typed or first in groups else argument
+
+
+def _without_shown(arguments: Sequence[str]) -> tuple[list[str], str | None]:
+    """Arguments without ``--cfg job``, and the key whose settings it asks for: empty for all, None without it."""
+    rest, asked = list(arguments), dict[str, str]()
+    for short, long in (("-c", "--cfg"), ("-p", "--package")):
+        for at, argument in enumerate(rest):
+            if argument in (short, long) and at + 1 < len(rest):
+                asked[long] = rest[at + 1]
+                del rest[at : at + 2]
+                break
+            if argument.startswith(f"{long}="):
+                asked[long] = rest.pop(at).partition("=")[2]
+                break
+    return (rest, asked.get("--package", "")) if asked.get("--cfg") == "job" else (list(arguments), None)
+
+
+def _show(config: DictConfig, key: str) -> None:
+    """Prints the settings of a run, with the defaults of all keys that no option mentions."""
+    from .io.setting_errors import completed
+    from .settings.run import RunSettings, with_baseline
+
+    values = with_baseline(OmegaConf.to_container(config, resolve=True))
+    whole = OmegaConf.create(completed(RunSettings.model_json_schema(), values))
+    print(OmegaConf.to_yaml(OmegaConf.select(whole, key) if key else whole), end="")
+
+
 def _quoted(argument: str) -> str:
     """The same argument; a value with an equals sign, as run folders are called, in the quotes that Hydra wants."""
     key, _, value = argument.partition("=")
@@ -131,7 +201,7 @@ def _explain(error: BaseException, started: bool) -> str | None:
     if isinstance(error, HydraException) and isinstance(cause, (ConfigAttributeError, ConfigKeyError)):
         return _explain_key(error, cause)
     if isinstance(error, OverrideParseException):
-        return f"cannot read the override {error.override!r} ({_sentence(error)}): write key=value"
+        return f"cannot read the override {error.override.removeprefix('++')!r} ({_sentence(error)}): write key=value"
     if isinstance(error, (HydraException, OmegaConfBaseException)):
         return _sentence(error)
     if is_disk_full(error):

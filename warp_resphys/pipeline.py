@@ -18,7 +18,7 @@ from .control.stages import drive, fit_baselines, plan_motions, reduce_robot
 from .control.task import motions_of
 from .experiment.ablation import ablation_stages, print_ablation
 from .experiment.build import choose_device
-from .experiment.checks import check_configuration, training_settings
+from .experiment.checks import check_run
 from .experiment.evaluate import check_mesh, evaluate, intervals_of_folds, time_models
 from .experiment.files import (
     CONTROL,
@@ -48,295 +48,277 @@ from .experiment.models import SIMFREE
 from .experiment.parts import workers_for
 from .experiment.reconstruct import reconstruct
 from .experiment.report import collect_metrics, make_folds_report, make_report
-from .experiment.scene import LEARNED, models_of
+from .experiment.scene import LEARNED
 from .experiment.simulate import run_laboratory, simulate
-from .experiment.trials import (
-    Split,
-    folds_of,
-    is_laboratory,
-    scaled_trials_of,
-    sees_markers,
-    split_of,
-    test_groups,
-    trials_of,
-)
+from .experiment.trials import folds_of, scaled_trials_of, split_of, test_groups, trials_of
 from .io.atomic import digest
 from .io.errors import DataFileError
 from .io.fan_out import ALONE, Workers
 from .io.files import read_json, write_json
+from .io.settings import parse
 from .io.stages import Stage, StageContext, package_versions, resources_used, run_stages
 from .learning.metrics import summarise_folds
 from .report.conclusions import conclusions
 from .report.control_section import controller_name
 from .report.page import number_text
-
-_SIMULATED = (
-    *("mesh", "physics", "fixed", "gravity", "time_step", "integrator", "solver", "device", "dtype"),
-    *("chambers", "fibres", "tendons", "muscles", "coupling"),
+from .settings.body import MeshSettings
+from .settings.control import ControlSettings, FigureSettings
+from .settings.run import RunSettings
+from .settings.stages import (
+    BaselinesStage,
+    DriveStage,
+    EvaluateStage,
+    FoldsReportStage,
+    IdentifyStage,
+    ImportStage,
+    LaboratoryStage,
+    LearningStage,
+    MeshCheckStage,
+    PlanStage,
+    PlayedSettings,
+    ReconstructStage,
+    ReduceStage,
+    RefineStage,
+    SimulateStage,
+    SplitReportStage,
+    TimeStage,
+    TrainStage,
 )
-_DRAWN = (
-    *("laboratory", "fixed", "chambers", "tendons", "muscles", "gravity"),
-    *("time_step", "solver", "device", "dtype", "seed", "tip"),
-)
-_DRAWN_DATA = (
-    *("folder", "trials", "sequences", "begins", "train", "validation", "test", "folds", "limit"),
-    *("payload_at", "up", "rest", "steps", "input_limit", "base_motion"),
-)
-_DRAWN_MARKERS = ("tracked", "reference", "bind", "bind_to", "patch", "largest_distance")
-_LATER_DATA = ("horizons", "train_fraction", "input_scales")
-_LEARNED_FROM = ("simulation", "markers", "release", "force_frame")
-_OF_NETWORKS = ("actuation", "range_guard")
-_LEARNED_DATA = ("payload_at", "train_fraction", "seconds")
-_PLANNED = ("tracked", "shapes", "seconds", "centre", "size", "right", "up", "limits", "plan")
-_OF_HORIZONS = ("receding", "horizon", "estimate", "plan", "reduction")
+from .settings.trials import Split, Trial
 
 _MOST_COLUMNS = 5  # folds that stand beside each other in a terminal
 
 Work = Callable[[StageContext], None]
 
 
-def simulated(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings that every simulation of an experiment depends on."""
-    base = _pick(config, *_SIMULATED, *_around(config))
-    if "path" in config["mesh"]:
-        base["mesh_digest"] = digest(config["mesh"]["path"])
-    trials = config["data"].get("trials") or {}
-    motions = [each.get("base_motion") for each in (config["data"], *trials.values()) if isinstance(each, Mapping)]
-    files = [each["file"] for each in motions if isinstance(each, Mapping) and "file" in each]
-    if files:
-        folder = Path(config["data"].get("folder") or ".").expanduser()
-        base["base_motions"] = {name: _digest(folder / name, "the file of base_motion") for name in files}
-    return base
-
-
-def _around(config: Mapping[str, Any]) -> tuple[str, ...]:
-    """The keys of what is around a body and hangs on it, where there is any."""
-    return tuple(key for key in ("medium", "payload_string") if config.get(key) is not None)
-
-
-def shown(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The configuration without what has no bearing on a run."""
-    return {key: value for key, value in config.items() if key != "tune"}
-
-
-def _pick(config: Mapping[str, Any], *keys: str) -> dict[str, Any]:
-    return {key: config[key] for key in keys if key in config}
-
-
-def acquisition_stages(config: Mapping[str, Any]) -> list[Stage]:
-    """The stages that lead to dataset.h5: a simulation of the trials, or their import, perhaps from a laboratory.
+def files_read(run: RunSettings, mesh: MeshSettings) -> dict[str, str]:
+    """SHA-256 of the files that bodies and the motions of their bases are read from, by path.
 
     Args:
-        config: that `check_configuration` accepts.
+        run: its settings.
+        mesh: of the simulator, or of the laboratory.
 
     Raises:
-        DataFileError: a recording that is not there.
+        DataFileError: a file that is not there.
     """
-    base, data = simulated(config), config["data"]
-    if not sees_markers(config):
-        return [Stage("simulate", simulate, (DATASET,), {**base, **_pick(config, "target", "data")})]
-    stages, workers = [], workers_for(config, config["parallel"]["processes"])
-    imported = {**base, **_pick(config, "simulation", "markers")}
-    imported["data"] = {key: value for key, value in data.items() if key not in _LATER_DATA} | {"input_scales": []}
-    trials = trials_of(config)
-    if folds_of(config) is None:
-        imported["split"] = {name: each for name, each in split_of(config).plain().items() if name != "test"}
-    imported |= {"laboratory": config["laboratory"], "in_the_loop": config["in_the_loop"] is not None}
-    if is_laboratory(config):
-        files = (*(trial.recording for trial in trials), TRUTH)
-        play = partial(run_laboratory, workers=workers)
-        stages.append(Stage("laboratory", play, files, _laboratory_settings(config, ())))
-    else:
-        imported["recordings"] = {trial.name: _digest(trial.file, f"data.trials.{trial.name}.file") for trial in trials}
-    needs = tuple(stage.name for stage in stages)
-    stages.append(Stage("import", import_recordings, (DATASET, QUALITY, REGISTRATION), imported, needs))
-    scales = data["input_scales"]
-    if scales:
-        files = tuple(trial.recording for trial in scaled_trials_of(config))
-        play = partial(run_laboratory, workers=workers, scaled=True)
-        stages.append(Stage("laboratory_scaled", play, files, _laboratory_settings(config, scales), needs))
-        more = {**imported, "data": {**imported["data"], "input_scales": scales}}
-        needs = ("import", "laboratory_scaled")
-        stages.append(Stage("import_scaled", import_scaled, (SCALED_DATASET,), more, needs))
-    return stages
+    folder = Path((run.recorded.folder if run.recorded is not None else None) or ".").expanduser()
+    moved = {motion.file for motion in run.motions().values() if motion.file is not None}
+    found = {name: _digest(folder / name, "the file of base_motion") for name in sorted(moved)}
+    path: str | None = getattr(mesh, "path", None)
+    return found if path is None else {**found, path: digest(path)}
 
 
-def _laboratory_settings(config: Mapping[str, Any], scales: Sequence[float]) -> dict[str, Any]:
-    """What the recordings of a simulated laboratory depend on."""
-    own: dict[str, Any] = {
-        **_pick(config, *_DRAWN, *_around(config)),
-        "data": {**_pick(config["data"], *_DRAWN_DATA), "input_scales": list(scales)},
-        "markers": _pick(config["markers"], *_DRAWN_MARKERS),
-        "batch": config["parallel"]["batch"],
-        "in_the_loop": config["in_the_loop"] is not None,
-    }
-    if "path" in config["laboratory"]["mesh"]:
-        own["mesh_digest"] = digest(config["laboratory"]["mesh"]["path"])
-    return own
-
-
-def _digest(path: Path | None, key: str) -> str:
+def _digest(path: Path, key: str) -> str:
     try:
         return digest(str(path))
     except OSError as error:
         raise DataFileError(f"cannot read {path} ({error.strerror}): check data.folder and {key}.") from error
 
 
+def acquisition_stages(run: RunSettings) -> list[Stage]:
+    """The stages that lead to dataset.h5: a simulation of the trials, or their import, perhaps from a laboratory.
+
+    Args:
+        run: that `check_run` accepts.
+
+    Raises:
+        DataFileError: a recording that is not there.
+    """
+    files, trials, data = files_read(run, run.mesh), trials_of(run), run.recorded
+    if data is None:
+        return [Stage("simulate", simulate, (DATASET,), SimulateStage.of(run, files=files, trials=trials))]
+    stages, upstream = list[Stage](), tuple[str, ...]()
+    learned = None if folds_of(run) is not None else split_of(run).train + split_of(run).validation
+    imported = ImportStage.of(run, files=files, trials=trials, learned=learned)
+    if run.is_laboratory:
+        stages.append(_laboratory_stage("laboratory", run, trials))
+        upstream = ("laboratory",)
+    else:
+        recordings = {str(each.file): _digest(Path(str(each.file)), f"data.trials.{each.name}.file") for each in trials}
+        imported = imported.model_copy(update={"files": {**files, **recordings}})
+    stages.append(Stage("import", import_recordings, (DATASET, QUALITY, REGISTRATION), imported, upstream))
+    scaled = scaled_trials_of(run)
+    if scaled:
+        stages.append(_laboratory_stage("laboratory_scaled", run, scaled, "laboratory"))
+        upstream, imported = ("import", "laboratory_scaled"), imported.model_copy(update={"trials": scaled})
+        stages.append(Stage("import_scaled", import_scaled, (SCALED_DATASET,), imported, upstream))
+    return stages
+
+
+def _played(run: RunSettings) -> PlayedSettings:
+    """What the recordings of a simulated laboratory depend on, but for the trials."""
+    assert run.laboratory is not None
+    return PlayedSettings.of(run, files=files_read(run, run.laboratory.mesh))
+
+
+def _laboratory_stage(name: str, run: RunSettings, trials: Sequence[Trial], *upstream: str) -> Stage:
+    work = partial(run_laboratory, workers=workers_of(run))
+    scaled = any(trial.scale != 1.0 for trial in trials)
+    outputs = (*(trial.recording for trial in trials), *(() if scaled else (TRUTH,)))
+    return Stage(name, work, outputs, LaboratoryStage.of(_played(run), trials=trials, batch=run.batch), upstream)
+
+
+def workers_of(run: RunSettings) -> Workers:
+    """The workers that share a run."""
+    return workers_for(run.parallel, run.parallel.processes, run.device)
+
+
 def learning_stages(
-    config: Mapping[str, Any], split: Split, shared: str, acquired: str, workers: Workers | None = None
+    run: RunSettings, split: Split, shared: str, acquired: str, workers: Workers | None = None
 ) -> list[Stage]:
     """The stages of one split, from the identification to the report.
 
     Args:
-        config: that `check_configuration` accepts.
+        run: that `check_run` accepts.
         split: names of trials.
         shared: the folder of dataset.h5, relative to that of the split.
         acquired: fingerprint of the stage that wrote it.
         workers: that share the work; as the configuration says, if left out.
     """
-    workers = workers_for(config, config["parallel"]["processes"]) if workers is None else workers
-    markers = sees_markers(config)
-    needs = ("identify",) if config["identify"] is not None else ()
-    base: dict[str, Any] = {
-        **simulated(config),
-        **_pick(config, *_LEARNED_FROM),
-        "data": _pick(config["data"], *_LEARNED_DATA),
-        "identify": _pick(config["identify"], "integrator", "substeps", "elastic") if needs else None,
-        "batch": config["parallel"]["batch"],
-        "shared": shared,
-        "acquired": acquired,
-        "split": split.plain(),
-    }
+    workers = workers_of(run) if workers is None else workers
+    needs = () if run.identify is None else ("identify",)
+    common = {"files": files_read(run, run.mesh), "shared": shared, "acquired": acquired, "split": split}
     stages: list[Stage] = []
 
-    def add(name: str, work: Work, outputs: tuple[str, ...], settings: Mapping[str, Any], *upstream: str) -> None:
-        stages.append(Stage(name, work, outputs, {**base, **settings}, (*needs, *upstream)))
+    def add(name: str, work: Work, outputs: tuple[str, ...], settings: LearningStage, *upstream: str) -> None:
+        stages.append(Stage(name, work, outputs, settings, (*needs, *upstream)))
 
-    if needs:
-        stages.append(Stage("identify", identify, (IDENTIFICATION,), {**base, **_pick(config, "identify", "seed")}))
-    reconstructed = [*split.train, *split.validation, *(() if markers else split.test)]
-    networks, learned = _pick(config, *_OF_NETWORKS), []
-    for model in (each for each in models_of(config) if each in LEARNED and each != SIMFREE):
-        own, first, second = {"model": model}, f"reconstruct_{model}", f"train_{model}"
-        settings = {**own, **_pick(config, "reconstruction"), "reconstructed": reconstructed}
-        add(first, partial(reconstruct, workers=workers), (reconstruction_file(model),), settings)
-        settings = {**own, **networks, **training_settings(config, model)}
-        add(second, train, (weights_file(model), training_file(model)), settings, first)
-        if config["refinement"]["kind"] != "none":
+    if run.identify is not None:
+        stages.append(Stage("identify", identify, (IDENTIFICATION,), IdentifyStage.of(run, **common)))
+    reconstructed = split.train + split.validation + (() if run.markers is not None else split.test)
+    learned = []
+    for model in (each for each in run.models if each in LEARNED and each != SIMFREE):
+        first, second = f"reconstruct_{model}", f"train_{model}"
+        forces = ReconstructStage.of(run, **common, model=model, reconstructed=reconstructed)
+        add(first, partial(reconstruct, workers=workers), (reconstruction_file(model),), forces)
+        trained = TrainStage.of(run, **common, model=model, training=run.training(model))
+        add(second, train, (weights_file(model), training_file(model)), trained, first)
+        if run.refinement is not None:
             outputs = (weights_file(model, True), training_file(model, True))
-            settings = {**own, **networks, **_pick(config, "refinement", "seed")}
-            add(f"refine_{model}", refine, outputs, settings, first, second)
+            add(f"refine_{model}", refine, outputs, RefineStage.of(run, **common, model=model), first, second)
         learned.append(stages[-1].name)
-    settings = {"model": SIMFREE, **networks, **training_settings(config, SIMFREE)}
-    if not markers:  # What replaces a simulator depends on none, where states are known without.
-        settings["simulation"] = config["target"]
+    trained = TrainStage.of(run, **common, model=SIMFREE, training=run.training(SIMFREE))
+    if (
+        run.markers is None and run.target is not None
+    ):  # What replaces a simulator depends on none, where states are known without.
+        trained = trained.model_copy(update={"simulation": run.target})
     outputs = (weights_file(SIMFREE), training_file(SIMFREE))
-    add("train_simfree", train, outputs, settings, *(("reconstruct_resphys",) if markers else ()))
+    add("train_simfree", train, outputs, trained, *(() if run.markers is None else ("reconstruct_resphys",)))
     learned.append("train_simfree")
-    tested = {"groups": test_groups(config, split), **networks, "refinement": config["refinement"]["kind"]}
-    calibration = [*(split.validation or split.train)] if markers and folds_of(config) is None else []
-    settings = {**tested, "calibration": calibration, **_pick(config, "published", "correct_uncorrected")}
-    settings["data"] = {**base["data"], **_pick(config["data"], "horizons")}
-    work = partial(evaluate, workers=workers)
-    add("evaluate", work, (ROLLOUTS, ERRORS), settings, *learned, "reconstruct_resphys")
-    if config["timing"]:
-        add("time", time_models, (TIMES,), {**tested, **_pick(config, "target")}, *learned)
-    if config["mesh_check"] is not None:
-        add("mesh_check", check_mesh, (MESH_CHECK,), {**tested, **_pick(config, "mesh_check")})
-    if config["control"] is not None:
-        stages += control_stages(config, base, acquired, workers)
+    tested = {**common, "groups": test_groups(run, split), "refined": run.refinement is not None}
+    calibration = (split.validation or split.train) if run.markers is not None and folds_of(run) is None else ()
+    work, evaluated = partial(evaluate, workers=workers), EvaluateStage.of(run, **tested, calibration=calibration)
+    add("evaluate", work, (ROLLOUTS, ERRORS), evaluated, *learned, "reconstruct_resphys")
+    if run.timing:
+        add("time", time_models, (TIMES,), TimeStage.of(run, **tested), *learned)
+    if run.mesh_check is not None:
+        add("mesh_check", check_mesh, (MESH_CHECK,), MeshCheckStage.of(run, **tested))
+    if run.control is not None:
+        stages += control_stages(run, run.control, common, workers)
     last = tuple(stage.name for stage in stages if stage.name in ("evaluate", "time", "mesh_check", "drive"))
-    stages.append(Stage("report", make_report, (REPORT,), {"config": shown(config), "acquired": acquired}, last))
+    shown = SplitReportStage(config=shown_of(run), acquired=acquired)
+    stages.append(Stage("report", make_report, (REPORT,), shown, last))
     return stages
 
 
-def control_stages(config: Mapping[str, Any], base: Mapping[str, Any], acquired: str, workers: Workers) -> list[Stage]:
+def shown_of(run: RunSettings) -> RunSettings:
+    """The settings without what has no bearing on a run."""
+    return run.model_copy(update={"tune": {}})
+
+
+def control_stages(
+    run: RunSettings, control: ControlSettings, common: Mapping[str, Any], workers: Workers
+) -> list[Stage]:
     """The stages of a run that plan on its models, and where a simulation plays the robot, drive it.
 
     Args:
-        config: that `check_configuration` accepts.
-        base: the settings that all stages of the split depend on.
-        acquired: see `learning_stages`.
+        run: that `check_run` accepts.
+        control: its group.
+        common: what all stages of the split depend on beside its settings.
         workers: that share the motions.
     """
-    control, stages = config["control"], list[Stage]()
-    for model in reversed(control["models"]):  # The last is to reach the paths, which is seen first.
-        first, own = f"reduce_{model}", {**base, "model": model, "seed": config["seed"], "device": config["device"]}
-        known = {"control": _pick(control, "reduction")}
-        stages.append(Stage(first, reduce_robot, (reduced_file(model),), {**own, **known}, ("evaluate",)))
-        known = {"control": _pick(control, *_PLANNED), "must_reach": model == control["models"][-1]}
+    stages, last = list[Stage](), control.models[-1]
+    figures = FigureSettings.of(control)
+    for model in reversed(control.models):  # The last is to reach the paths, which is seen first.
+        first = f"reduce_{model}"
+        reduced = ReduceStage.of(run, **common, model=model, reduction=control.reduction)
+        stages.append(Stage(first, reduce_robot, (reduced_file(model),), reduced, ("evaluate",)))
         tables = [plan_table(model, motion) for motion in motions_of(control)]
-        stages.append(Stage(f"plan_{model}", plan_motions, (plans_file(model), *tables), {**own, **known}, (first,)))
-    if config["laboratory"] is None:
+        planned = PlanStage.of(run, **common, model=model, figures=figures, plan=control.plan, must_reach=model == last)
+        stages.append(Stage(f"plan_{model}", plan_motions, (plans_file(model), *tables), planned, (first,)))
+    if run.laboratory is None:
         return stages
-    played = {**base, **_laboratory_settings(config, ()), "device": config["device"]}
-    needs = tuple(stage.name for stage in stages)
-    settings = {**played, "control": {key: value for key, value in control.items() if key not in _OF_HORIZONS}}
-    stages.append(Stage("baselines", fit_baselines, (BASELINES,), settings, ("evaluate",)))
+    played, needs = _played(run), tuple(stage.name for stage in stages)
+    known = {"model": last, "figures": figures, "feedback": control.feedback, "played": played}
+    stages.append(
+        Stage("baselines", fit_baselines, (BASELINES,), BaselinesStage.of(run, **common, **known), ("evaluate",))
+    )
+    driven = DriveStage.of(run, **common, played=played)
     work = partial(drive, workers=workers)
-    stages.append(Stage("drive", work, (DRIVEN, CONTROL), {**played, "control": control}, (*needs, "baselines")))
+    stages.append(Stage("drive", work, (DRIVEN, CONTROL), driven, (*needs, "baselines")))
     return stages
 
 
-def prepare(config: Mapping[str, Any]) -> None:
-    """Checks a configuration, and sets up libraries for it.
+def prepare(run: RunSettings) -> None:
+    """Checks a run, and sets up libraries for it.
 
     Raises:
-        InputError: a value of the wrong kind or out of range, or an unknown key.
+        InputError: values that do not fit the mesh or the trials.
     """
     wp.config.log_level = wp.LOG_WARNING
-    if config["device"] == "cpu" or not torch.cuda.is_available():
+    if run.device == "cpu" or not torch.cuda.is_available():
         torch.set_num_threads(1)  # The networks are small: see threads.py.
-    check_configuration(config)
+    check_run(run)
 
 
-def acquire(config: Mapping[str, Any], folder: Path, wait: bool = False) -> tuple[list[Stage], str]:
+def acquire(run: RunSettings, folder: Path, wait: bool = False) -> tuple[list[Stage], str]:
     """Runs the stages that lead to the trials; returns them, and the fingerprint of the one that writes dataset.h5."""
-    stages = acquisition_stages(config)
+    stages = acquisition_stages(run)
     run_stages(stages, folder, wait)
     (written,) = (stage.name for stage in stages if DATASET in stage.outputs)
     return stages, str(read_json(folder / "stages" / f"{written}.json")["fingerprint"])
 
 
-def run_experiment(plain: dict[str, Any], folder: Path) -> None:
+def run_experiment(config: Mapping[str, Any], folder: Path) -> None:
     """Runs what has changed, writes metrics.json into the run folder and prints the errors.
 
     Raises:
         InputError: a value that cannot be used.
     """
-    prepare(plain)
-    if "ablation" in plain:
-        run_stages(ablation_stages(plain, simulated(plain), shown(plain)), folder)
-        print_ablation(plain, folder)
+    run = parse(RunSettings, config)
+    prepare(run)
+    if run.ablation is not None:
+        run_stages(ablation_stages(run, files_read(run, run.mesh)), folder)
+        print_ablation(run, folder)
         return
-    first, acquired = acquire(plain, folder)
-    folds = folds_of(plain)
+    first, acquired = acquire(run, folder)
+    folds = folds_of(run)
     if folds is None:
-        stages = learning_stages(plain, split_of(plain), ".", acquired)
+        stages = learning_stages(run, split_of(run), ".", acquired)
         run_stages(stages, folder)
-        metrics = collect_metrics(folder, plain, [stage.name for stage in (*first, *stages)])
+        metrics = collect_metrics(folder, run, [stage.name for stage in (*first, *stages)])
     else:
-        metrics = _run_folds(plain, folder, folds, first, acquired)
+        metrics = _run_folds(run, folder, folds, first, acquired)
     write_json(folder / METRICS, metrics)
     if folds is not None:
-        each = {trial: fold["errors_mm"] for trial, fold in metrics["folds"].items()}
-        reported = {"config": shown(plain), "folds": each}
+        errors = {trial: fold["errors_mm"] for trial, fold in metrics["folds"].items()}
+        reported = FoldsReportStage(config=shown_of(run), folds=errors)
         run_stages([*first, Stage("report", make_folds_report, (REPORT,), reported, (first[-1].name,))], folder)
-    _print(metrics, folder, plain)
+    _print(metrics, folder, run)
 
 
 def _run_folds(
-    config: dict[str, Any], folder: Path, splits: Mapping[str, Split], first: Sequence[Stage], acquired: str
+    run: RunSettings, folder: Path, splits: Mapping[str, Split], first: Sequence[Stage], acquired: str
 ) -> dict[str, Any]:
     """What metrics.json says of a cross-validation, each fold of which has a folder of its own."""
     folds = {
-        name: Fold(name, folder / fold_folder(name), partial(learning_stages, config, split, "..", acquired))
+        name: Fold(name, folder / fold_folder(name), partial(learning_stages, run, split, "..", acquired))
         for name, split in splits.items()
     }
-    run_folds(folds, workers_for(config, config["parallel"]["processes"]))
+    run_folds(folds, workers_of(run))
     found = {}
     for name, fold in folds.items():
-        found[name] = collect_metrics(fold.folder, config, [stage.name for stage in fold.stages(ALONE)])
+        found[name] = collect_metrics(fold.folder, run, [stage.name for stage in fold.stages(ALONE)])
         write_json(fold.folder / METRICS, found[name])
     return {
         "errors_mm": summarise_folds([each["errors_mm"] for each in found.values()]),
@@ -344,11 +326,11 @@ def _run_folds(
         **intervals_of_folds(folder / DATASET, {name: fold.folder for name, fold in folds.items()}),
         **resources_used(folder, [stage.name for stage in first]),
         "versions": package_versions(),
-        "device": str(choose_device(config["device"])),
+        "device": str(choose_device(run.device)),
     }
 
 
-def _print(metrics: Mapping[str, Any], folder: Path, config: Mapping[str, Any]) -> None:
+def _print(metrics: Mapping[str, Any], folder: Path, run: RunSettings) -> None:
     """Errors as a table, a column for every fold, horizon and pressure scale that tells more, and what they say."""
     whole = metrics["errors_mm"]
     folds = {trial: fold["errors_mm"] for trial, fold in metrics.get("folds", {}).items()}
@@ -356,7 +338,7 @@ def _print(metrics: Mapping[str, Any], folder: Path, config: Mapping[str, Any]) 
     columns |= {f"first {seconds} s": found for seconds, found in metrics.get("horizons", {}).items()}
     columns |= {f"{scale} x": found for scale, found in metrics.get("scales", {}).items()}
     columns = {name: found for name, found in columns.items() if found != whole}
-    what = "markers" if sees_markers(config) else "vertices"
+    what = "vertices" if run.markers is None else "markers"
     title = f"Error of the {what} in what no training saw" + "; x: times the inputs" * ("scales" in metrics)
     table = Table("model", "mean [mm]", "std [mm]", *columns, "diverged", title=title)
     for model, summary in whole.items():
@@ -380,7 +362,7 @@ def _print(metrics: Mapping[str, Any], folder: Path, config: Mapping[str, Any]) 
         console.print(_driven(metrics["control"]["tracking"]))
     if "noise_mm" in metrics:
         console.print(f"The noise of the markers alone is {number_text(metrics['noise_mm'])} mm.")
-    for said in conclusions(metrics, config):
+    for said in conclusions(metrics, run.plain()):
         console.print(said, soft_wrap=True)
     console.print(f"Report: {folder / REPORT}", soft_wrap=True)
 

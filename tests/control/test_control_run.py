@@ -7,9 +7,8 @@ from dataclasses import replace
 import imageio_ffmpeg
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_module
+from configured import check, composed
 from main_job import IN_RUN, run, run_without_report
-from omegaconf import OmegaConf
 
 import warp_resphys
 from warp_resphys import pipeline
@@ -21,11 +20,10 @@ from warp_resphys.control.laboratory import Laboratory
 from warp_resphys.control.open_loop import Follower
 from warp_resphys.control.plan import Limits, Planner, Weights
 from warp_resphys.control.reduction import reduce
-from warp_resphys.control.replay import replay
+from warp_resphys.control.replay import driven_settings, replay
 from warp_resphys.control.sampling import Sampling
 from warp_resphys.control.task import Task
 from warp_resphys.environments.worlds import ReducedWorld
-from warp_resphys.experiment.checks import check_configuration
 from warp_resphys.io.errors import ConvergenceError, DataFileError, InputError
 from warp_resphys.io.files import read_array, read_hdf5
 from warp_resphys.studies.gradient_check import central_difference
@@ -74,13 +72,14 @@ def model(folder, robot):
     learned.network.float()
 
 
-def settings(folder, stage):
-    return json.loads((folder / "stages" / f"{stage}.json").read_text())["settings"]
+def control_of(folder):
+    """What controllers have followed."""
+    return driven_settings(folder).control
 
 
 class TestLaboratory:
     def test_a_body_that_fails_or_begins_again_rests_and_the_other_goes_on(self, folder):
-        laboratory = Laboratory(settings(folder, "drive"), folder, "tendon_tension", 2, seed=0, on_failure="count")
+        laboratory = Laboratory(driven_settings(folder).played, folder, "tendon_tension", 2, seed=0, on_failure="count")
         rest, commands = laboratory.markers(), np.tile([1.0, 0.0, 0.0], (2, 1))
         assert not laboratory.step(commands).any()
         laboratory.begin(np.array([True, False]))
@@ -183,22 +182,20 @@ class TestReducedModel:
             read_reduced(folder / reduced_file("resphys"), None)
 
     def test_a_path_out_of_reach_is_named_with_the_nearest_point(self, folder, model, robot):
-        control = settings(folder, "drive")["control"]
-        far = {**control, "centre": [0.0, 0.0, -0.35], "plan": {**control["plan"], "reach": 1e-3}}
+        far = control_of(folder).changed(centre=[0.0, 0.0, -0.35])
         task = Task(far, robot.labels, robot.time_step, 3)
         with pytest.raises(InputError, match=r"path circle leaves what .*-350.0\) mm, the nearest point .* mm away"):
-            task.check_reach(model)
+            task.check_reach(model, 1e-3)
 
 
 class TestPlans:
     def test_plans_stay_within_bounds_and_rates(self, folder):
-        plan, limits = read_plan(folder / plans_file("resphys"), "circle_0.4s"), settings(folder, "plan_resphys")
-        limits = limits["control"]["limits"]
-        assert plan.inputs.min() > limits["low"] - 1e-3
-        assert plan.inputs.max() < limits["high"] + 1e-3
+        plan, limits = read_plan(folder / plans_file("resphys"), "circle_0.4s"), control_of(folder).limits
+        assert plan.inputs.min() > limits.low - 1e-3
+        assert plan.inputs.max() < limits.high + 1e-3
         assert plan.inputs.max() > 0.1
         steps = np.abs(np.diff(plan.inputs, axis=0, prepend=0.0))
-        assert steps.max() < 1.01 * limits["rate"] * 0.01
+        assert steps.max() < 1.01 * limits.rate * 0.01
 
     def test_corrections_by_the_simulator_bring_it_closer(self, folder):
         errors = read_plan(folder / plans_file("resphys"), "circle_0.4s").errors_mm
@@ -235,8 +232,8 @@ class TestPlans:
 
     def test_the_adjoint_improves_a_plan_too(self, robot, model, folder):
         plan = read_plan(folder / plans_file("resphys"), "circle_0.4s")
-        task = Task(settings(folder, "drive")["control"], robot.labels, robot.time_step, 3)
-        follower = Follower(robot, model, task.planner(model, 0.4), 4, "adjoint")
+        task = Task(control_of(folder), robot.labels, robot.time_step, 3)
+        follower = Follower(robot, model, task.planner(model, 0.4, control_of(folder).plan), 4, "adjoint")
         errors = follower.follow(plan.path[None])[0].errors_mm
         assert errors.min() < 0.8 * errors[0]
 
@@ -308,7 +305,7 @@ class TestDriving:
         assert _MARKS == ["drive"]
 
     def test_a_memory_goes_on_where_it_was(self, folder, robot, model):
-        task = Task(settings(folder, "drive")["control"], robot.labels, robot.time_step, 3)
+        task = Task(control_of(folder), robot.labels, robot.time_step, 3)
         path = read_plan(folder / plans_file("resphys"), "circle_0.4s").path
         rest = robot.observe(robot.begin())[0].numpy()
         linear = read_baselines(folder / "baselines.safetensors")[0]
@@ -342,20 +339,14 @@ def _marked(context, workers=None):
     raise InputError("no more than that.")
 
 
-def configuration(*overrides):
-    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        found = compose("config", ["experiment=tendon_rod_control", "mesh.layers=3", "mesh.nodes=20", *overrides])
-    return OmegaConf.to_container(found, resolve=True)
-
-
 @pytest.mark.parametrize(
     ("override", "said"),
     [
-        ("control.tracked=[Tip]", "control.tracked names 'Tip': markers.tracked has 'Middle - 1'"),
-        ("control.models=[simfree]", "control.models has simfree: this experiment has 'simulation', 'sysid'"),
-        ("control.models=[sysid]", "control.receding must be among control.models, which are 'sysid'"),
+        ("control.tracked=[Tip]", "control.tracked names 'Tip': markers.tracked has Middle - 1"),
+        ("control.models=[simfree]", "control.models has simfree: this experiment has simulation, sysid"),
+        ("control.models=[sysid]", "control.receding must be among control.models, which are sysid"),
         ("control.limits.high=9", "control.limits are from 0 to 9: they must rise, to data.input_limit of 1.5"),
-        ("control.shapes=[square]", "control.shapes is .*circle, eight and capital letters"),
+        ("control.shapes=[square]", "control.shapes is .*circle, eight or a capital letter"),
         ("control.seconds=[0.1]", "control.seconds has 0.1: a figure takes 20 steps at least"),
         ("control.plan.gradient=none", "control.plan.gradient is 'none': it must be one of reduced, adjoint"),
         ("data.folds=leave_one_out", "control is for a robot with markers, .* of one split of its trials"),
@@ -363,17 +354,17 @@ def configuration(*overrides):
             "+laboratory.trials.t000={payload: 0.01};data.payload_at={z: -0.2}",
             "control drives a robot without payloads: leave them out of laboratory.trials",
         ),
-        ("control.seconds=[]", "control.seconds is .*: it must be a list of different positive numbers"),
+        ("control.seconds=[]", "control.seconds is .*: it must be a list of one or more positive numbers"),
         (
             "control.reduction.modes=[4,4]",
-            "control.reduction.modes is .*: it must be a list of different whole numbers",
+            "control.reduction.modes is .*: a value occurs twice",
         ),
         ("+control.colour=red", "unknown key 'control.colour'"),
     ],
 )
 def test_what_no_control_can_be_made_of(override, said):
     with pytest.raises(InputError, match=said):
-        check_configuration(configuration(*override.split(";")))
+        check(composed("experiment=tendon_rod_control", "mesh.layers=3", "mesh.nodes=20", *override.split(";")))
 
 
 def test_the_benchmark_times_the_commands_of_all_that_plan_anew(folder):

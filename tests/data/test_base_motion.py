@@ -16,17 +16,22 @@ from warp_resphys.data.base_motion import (
 )
 from warp_resphys.data.rigid import RigidTransform
 from warp_resphys.io.errors import DataFileError
+from warp_resphys.io.settings import parse
+from warp_resphys.settings.trials import MotionSettings
 
 TIMES = np.linspace(0.0, 2.0, 201)
-SWING = {
-    "swings": {
-        "across": {"frequency": 1.5, "translation": (0.02, 0.0, -0.01)},
-        "about": {"frequency": 0.7, "rotation": (0.1, 0.3, -0.2), "phase": 0.4},
+SWING = parse(
+    MotionSettings,
+    {
+        "swings": {
+            "across": {"frequency": 1.5, "translation": (0.02, 0.0, -0.01)},
+            "about": {"frequency": 0.7, "rotation": (0.1, 0.3, -0.2), "phase": 0.4},
+        },
+        "about": (0.05, -0.02, 0.01),
+        "start": 0.3,
+        "ramp": 0.2,
     },
-    "about": (0.05, -0.02, 0.01),
-    "start": 0.3,
-    "ramp": 0.2,
-}
+)
 POINTS = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.08, 0.0], [0.0, 0.02, 0.05]])
 
 
@@ -42,7 +47,7 @@ class TestFunctions:
         since = TIMES[after] - 0.3
         turned = np.sin(2 * np.pi * 0.7 * since + 0.4) - np.sin(0.4)
         np.testing.assert_allclose(poses[after, 3:], turned[:, None] * [0.1, 0.3, -0.2], atol=1e-12)
-        centre = moved(poses, np.array([SWING["about"]]))[:, 0] - SWING["about"]
+        centre = moved(poses, np.array([SWING.about]))[:, 0] - SWING.about
         expected = np.sin(2 * np.pi * 1.5 * since)[:, None] * [0.02, 0.0, -0.01]
         np.testing.assert_allclose(centre[after], expected, atol=1e-12)
 
@@ -62,7 +67,7 @@ class TestTables:
         quaternions = Rotation.from_rotvec(known[:, 3:]).as_quat()[:, [3, 0, 1, 2]]
         table = np.column_stack([TIMES, moved(known, place[None])[:, 0] + offset, quaternions])
         np.savetxt(tmp_path / "shaker.csv", table, delimiter=",", header="t, x, y, z, w, i, j, k")
-        found = prescribed({"file": "shaker.csv", "about": place}, TIMES[3:-3] + 0.004, tmp_path)
+        found = prescribed(MotionSettings(**{"file": "shaker.csv", "about": place}), TIMES[3:-3] + 0.004, tmp_path)
         np.testing.assert_allclose(moved(found), moved(prescribed(SWING, TIMES[3:-3] + 0.004)), atol=2e-5)
 
     @pytest.mark.parametrize(
@@ -71,11 +76,11 @@ class TestTables:
     def test_what_is_no_table_of_poses_is_one_sentence(self, tmp_path, text):
         (tmp_path / "bad.csv").write_text(text)
         with pytest.raises(DataFileError, match=r"bad\.csv.*(\.$|to be)"):
-            prescribed({"file": "bad.csv"}, TIMES, tmp_path)
+            prescribed(MotionSettings(**{"file": "bad.csv"}), TIMES, tmp_path)
 
     def test_a_table_that_is_not_there(self, tmp_path):
         with pytest.raises(DataFileError, match="cannot be read"):
-            prescribed({"file": "none.csv"}, TIMES, tmp_path)
+            prescribed(MotionSettings(**{"file": "none.csv"}), TIMES, tmp_path)
 
 
 class TestRecorded:

@@ -9,7 +9,9 @@ from scipy.spatial.transform import Rotation
 from warp_resphys import Body, Corotated, Simulator, box_hexahedra, select_vertices
 from warp_resphys.data.base_motion import prescribed, rigid
 from warp_resphys.dynamics.frames import BaseFrame, VertexFrames, base_movement
+from warp_resphys.io.settings import parse
 from warp_resphys.learning.predictors import LearnedPredictor, Range
+from warp_resphys.settings.trials import MotionSettings
 from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.stepping.state import State
 
@@ -107,7 +109,9 @@ SWINGS = [
 
 def poses_of_two(steps=20):
     """(K + 1, 2, 6)."""
-    return torch.from_numpy(np.stack([prescribed(each, STEP * np.arange(steps + 1)) for each in SWINGS], 1))
+    return torch.from_numpy(
+        np.stack([prescribed(parse(MotionSettings, each), STEP * np.arange(steps + 1)) for each in SWINGS], 1)
+    )
 
 
 class TestBaseFrame:

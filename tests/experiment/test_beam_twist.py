@@ -6,7 +6,7 @@ import sys
 
 import numpy as np
 import pytest
-from measured_run import configuration
+from configured import settings
 from scipy.spatial.transform import Rotation
 
 from warp_resphys import box_hexahedra, cli
@@ -76,20 +76,20 @@ def test_the_beam_is_let_go_from_cross_sections_turned_rigidly_by_the_configured
 
 
 @pytest.mark.parametrize(
-    ("experiment", "key", "unit", "factor"),
-    [("beam_twist", "angles_deg", "°", np.pi / 180.0), ("beam_oscillation", "weights_g", " g", 1e-3)],
+    ("experiment", "unit", "factor"),
+    [("beam_twist", "°", np.pi / 180.0), ("beam_oscillation", " g", 1e-3)],
 )
-def test_the_quick_budget_picks_evenly(experiment, key, unit, factor):
-    configs = [configuration(f"budget={budget}", experiment=experiment) for budget in ("full", "quick")]
-    full, quick = (config["data"] for config in configs)
-    assert full["limit"] is None
-    assert quick[key] == full[key]
-    assert quick["steps"] < full["steps"]
-    whole, split = map(split_of, configs)
-    amounts = {trial.name: trial.amount for trial in trials_of(configs[1])}
+def test_the_quick_budget_picks_evenly(experiment, unit, factor):
+    runs = [settings(f"experiment={experiment}", f"budget={budget}") for budget in ("full", "quick")]
+    full, quick = (run.data for run in runs)
+    assert full.limit is None
+    assert quick.amounts == full.amounts
+    assert quick.steps < full.steps
+    whole, split = map(split_of, runs)
+    amounts = {trial.name: trial.amount for trial in trials_of(runs[1])}
     assert tuple(amounts) == split.names
-    for name, limit in quick["limit"].items():
-        row, picked = [f"{x:g}{unit}" for x in full[key][name]], list(getattr(split, name))
+    for name, limit in dict(quick.limit).items():
+        row, picked = [f"{x:g}{unit}" for x in getattr(full.amounts, name)], list(getattr(split, name))
         assert list(getattr(whole, name)) == row
         places = [row.index(each) for each in picked]
         assert len(picked) == limit < len(row)
@@ -97,7 +97,7 @@ def test_the_quick_budget_picks_evenly(experiment, key, unit, factor):
             assert (places[0], places[-1]) == (0, len(row) - 1)
             assert np.ptp(np.diff(places)) <= 1  # strides differ by one at most
             assert np.diff(places).min() >= 1
-        chosen = np.array([full[key][name][place] for place in places])
+        chosen = np.array([getattr(full.amounts, name)[place] for place in places])
         np.testing.assert_allclose([amounts[each] for each in picked], factor * chosen)
 
 
@@ -106,7 +106,8 @@ def test_the_quick_budget_picks_evenly(experiment, key, unit, factor):
 )
 def test_limits(limit, picked):
     row = [10, 20, 30, 40, 50]
-    angles = {"train": row, "validation": [60], "test": [70]}
-    data = {"kind": "release_from_twist", "angles_deg": angles, "limit": {"train": limit, "validation": 1, "test": 1}}
-    split = split_of({"data": data})
+    angles = f"data.angles_deg={{train: {row}, validation: [60], test: [70]}}"
+    split = split_of(
+        settings("experiment=beam_twist", angles, f"data.limit={{train: {limit}, validation: 1, test: 1}}")
+    )
     assert split.train == tuple(f"{angle}°" for angle in (picked if limit <= len(row) else row))

@@ -11,6 +11,8 @@ from played_run import check_robots
 from warp_resphys import pipeline
 from warp_resphys.data.base_motion import prescribed, rigid
 from warp_resphys.io.files import read_array, read_checkpoint, read_hdf5
+from warp_resphys.io.settings import parse
+from warp_resphys.settings.trials import MotionSettings
 
 # A short segment with two chambers of some 70 vertices, on which everything takes seconds.
 SEGMENT = """# @package _global_
@@ -271,7 +273,8 @@ def test_a_base_that_moves_is_told_by_markers_or_by_a_record(known):
     assert errors["resphys"] < 1.05 * errors["sysid"]
     _, (base, times) = dataset("base", "times")
     swing = {"frequency": 3.0, "rotation": [0.2, 0.2, 0.0]}
-    truth = prescribed({"start": 0.05, "ramp": 0.05, "swings": {"a": swing}}, times[1])
+    motion = parse(MotionSettings, {"start": 0.05, "ramp": 0.05, "swings": {"a": swing}})
+    truth = prescribed(motion, times[1])
     # Markers that are placed to 0.3 mm over 40 mm turn the frame by some 10 mrad, and its rotations by 0.3 of that.
     assert np.abs(base[1, : len(truth), 3:] - truth[:, 3:]).max() < 0.01
     assert np.abs(truth[:, 3:]).max() > 0.19

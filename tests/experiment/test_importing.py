@@ -1,6 +1,5 @@
 """Recordings of a body, real or simulated, become markers in its frame; what cannot is refused by file and marker."""
 
-import copy
 import json
 import logging
 import re
@@ -10,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from measured_run import configuration
+from configured import check, settings
 from scipy.spatial.transform import Rotation
 
 from warp_resphys import cli
@@ -19,16 +18,19 @@ from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.recordings.recording import Recording
 from warp_resphys.data.trials import Trials
 from warp_resphys.experiment.build import bound_markers, build_body
-from warp_resphys.experiment.checks import check_configuration
+from warp_resphys.experiment.checks import check_run
 from warp_resphys.experiment.files import DATASET, QUALITY, REGISTRATION, TRUTH, Dataset, payload_inputs, read_dataset
 from warp_resphys.experiment.importing import import_recordings
 from warp_resphys.experiment.simulate import laboratory_simulator, make_setup
 from warp_resphys.experiment.trials import trials_of
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.files import read_hdf5
+from warp_resphys.io.settings import parse
 from warp_resphys.io.stages import StageContext, fingerprint, run_stages
 from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.pipeline import acquisition_stages
+from warp_resphys.settings.run import RunSettings
+from warp_resphys.settings.stages import ImportStage, PlayedSettings
 from warp_resphys.stepping.inputs import Inputs
 
 ROOT = Path(__file__).parents[2]
@@ -53,17 +55,17 @@ def read_json(path):
 def laboratory(tmp_path_factory):
     """A run of the first stages without recordings."""
     folder = tmp_path_factory.mktemp("laboratory")
-    config = configuration(*SMALL)
-    check_configuration(config)
-    run_stages(acquisition_stages(config), folder)
-    return folder, config
+    run = settings("experiment=beam_real", *SMALL)
+    check_run(run)
+    run_stages(acquisition_stages(run), folder)
+    return folder, run
 
 
-def true_markers(config, setup, trials, times):
+def true_markers(played, setup, trials, times):
     """(R, T, M, 3) tracked markers in the frame of the body at times (R, T) since the release, as simulated [m]."""
-    simulator = laboratory_simulator(config, setup.gravity)
-    read = bound_markers(config["markers"], simulator.body.mesh, setup.tracked, TIPS).to(simulator.rest_positions)
-    masses = payload_inputs(simulator.body, config["data"]["payload_at"], np.array([each.payload for each in trials]))
+    simulator = laboratory_simulator(played, setup.gravity)
+    read = bound_markers(played.binding, simulator.body.mesh, setup.tracked, TIPS).to(simulator.rest_positions)
+    masses = payload_inputs(simulator.body, played.payload_at, np.array([each.payload for each in trials]))
     held = torch.as_tensor(setup.tracked).expand(len(trials), -1, -1)
     blank = held[:, None].expand(-1, times.shape[1], -1, -1)
     inputs = Inputs(attached_mass=torch.as_tensor(masses["attached_mass"]))
@@ -73,15 +75,15 @@ def true_markers(config, setup, trials, times):
         return Replay(simulator, read, motions)(start)[0].numpy()
 
 
-def read_motions(folder, config):
+def read_motions(folder, run):
     """The dataset of a run, and its trials as a simulator takes them."""
     dataset = read_dataset(folder / DATASET)
-    return dataset, dataset.trials(dataset.names, build_body(config), config["data"]["payload_at"])
+    return dataset, dataset.trials(dataset.names, build_body(run), run.payload_at)
 
 
 def test_simulated_markers_come_back_within_noise(laboratory):
-    folder, config = laboratory
-    dataset, motions = read_motions(folder, config)
+    folder, run = laboratory
+    dataset, motions = read_motions(folder, run)
     bound = dataset.bound
     assert motions.names == ("m0", "m50", "m90")
     assert dataset.labels == TIPS
@@ -89,18 +91,19 @@ def test_simulated_markers_come_back_within_noise(laboratory):
     assert dataset.inputs == dataset.channels == {}
     np.testing.assert_allclose(dataset.payload, [0.0, 0.05, 0.09])
     np.testing.assert_allclose(motions.inputs.attached_mass.sum(1), [0.0, 0.05, 0.09], atol=1e-12)
-    setup = make_setup(config)
+    played = PlayedSettings.of(run, files={})
+    setup = make_setup(played)
     released = np.array(list(read_json(folder / TRUTH)["released_s"].values()))
     found = np.array([each["release_frame"] for each in read_json(folder / QUALITY).values()]) / RATE
     times = motions.times.numpy() + (found - released)[:, None]
-    true = true_markers(config, setup, trials_of(config), times)
+    true = true_markers(played, setup, trials_of(run), times)
     # The nominal places turn the frame by a little; what has to come back is the motion in it.
     turn, _ = Rotation.align_vectors(bound - bound.mean(0), setup.tracked - setup.tracked.mean(0))
     assert np.degrees(turn.magnitude()) < 1.0
     moved = turn.apply((true - setup.tracked).reshape(-1, 3)).reshape(true.shape)
     off = (motions.observed.numpy() - bound - moved)[motions.seen.numpy()]
     assert float(motions.amplitude[2]) > 0.01
-    assert np.sqrt(np.mean(off**2)) < 2.5 * config["laboratory"]["noise"]
+    assert np.sqrt(np.mean(off**2)) < 2.5 * run.laboratory.noise
     torch.testing.assert_close(motions.held, torch.as_tensor(bound).expand(3, -1, -1), rtol=0.0, atol=1e-12)
     registration = read_json(folder / REGISTRATION)["m50"]
     assert 0.2 < registration["rms_mm"] < 0.6  # misplaced by 0.3 mm a coordinate, less what the motion takes up
@@ -110,26 +113,26 @@ def test_simulated_markers_come_back_within_noise(laboratory):
 def test_a_laboratory_binds_its_markers_as_they_are_configured():
     """Whatever changes where markers go makes its recordings anew."""
     changes = ("markers.bind=patch", "markers.patch=0.05", "markers.largest_distance=0.03")
-    made = [acquisition_stages(configuration(*SMALL, *changes[:count]))[0] for count in range(4)]
+    made = [acquisition_stages(settings("experiment=beam_real", *SMALL, *changes[:count]))[0] for count in range(4)]
     assert len({fingerprint(each, {}) for each in made}) == 4
-    assert made[2].settings["markers"]["patch"] == 0.05
+    assert made[2].settings.binding.patch == 0.05
 
 
 def test_frames_end_with_what_counts(laboratory):
-    folder, config = laboratory
+    folder, run = laboratory
     with read_hdf5(folder / DATASET, "dataset") as file:
         times, markers = file["times"][()], file["observed"][()]
     assert (np.diff(times, axis=1) >= 0.0).all()
     assert (times[:, 0] >= 0.0).all()
     assert (times[:, 0] < 1.0 / RATE).all()
-    assert times.max() <= config["data"]["seconds"]
-    assert times[:, -1].min() > config["data"]["seconds"] - 1.0 / RATE
+    assert times.max() <= run.data.seconds
+    assert times[:, -1].min() > run.data.seconds - 1.0 / RATE
     ended = np.concatenate([np.zeros((len(times), 1), bool), np.diff(times, axis=1) == 0.0], axis=1)
     np.testing.assert_array_equal(np.isnan(markers).all((2, 3)), ended)
 
 
 def test_gravity_and_release_are_recovered(laboratory):
-    folder, config = laboratory
+    folder, run = laboratory
     truth, quality = read_json(folder / TRUTH), read_json(folder / QUALITY)
     with read_hdf5(folder / DATASET, "dataset") as file:
         gravity = np.asarray(file.attrs["gravity"])
@@ -138,42 +141,40 @@ def test_gravity_and_release_are_recovered(laboratory):
     assert lean < 0.5
     assert np.linalg.norm(gravity) == pytest.approx(9.80709)
     tilt = np.degrees(np.arccos(-true[2] / np.linalg.norm(true)))
-    assert tilt == pytest.approx(config["laboratory"]["tilt"])
+    assert tilt == pytest.approx(run.laboratory.tilt)
     for name, at in truth["released_s"].items():
         assert quality[name]["release_frame"] == pytest.approx(RATE * at, abs=0.3)
         assert 40.0 < RATE * at < 41.0
 
 
 def test_the_recordings_are_in_a_frame_of_their_own(laboratory):
-    folder, config = laboratory
+    folder, run = laboratory
     recording = read_recording(folder / "recordings/m0.h5")
     assert recording.labels == (*TIPS, *BASES)
-    nominal = np.array([*config["markers"]["tracked"].values(), *config["markers"]["reference"].values()])
+    nominal = np.array([*run.markers.tracked.values(), *run.markers.reference.values()])
     assert np.linalg.norm(recording.positions[0] - nominal, axis=1).min() > 0.05
     sag = recording.positions[-1, :3].mean(0) - recording.positions[0, :3].mean(0)
     assert -sag[0] > 0.99 * np.linalg.norm(sag) - 2e-3  # up is x
 
 
 def test_a_trial_does_not_depend_on_the_others(tmp_path, laboratory):
-    folder, config = laboratory
-    alone = copy.deepcopy(config)
-    alone["laboratory"] |= {"train": ["m90"], "test": ["m50"]}
+    folder, run = laboratory
+    alone = run.changed(laboratory=run.laboratory.changed(train=["m90"], test=["m50"]))
     run_stages(acquisition_stages(alone)[:1], tmp_path)
     one, other = (read_recording(place / "recordings/m90.h5") for place in (folder, tmp_path))
     np.testing.assert_allclose(one.positions, other.positions, rtol=0.0, atol=1e-7)
-    again = configuration(*SMALL, "seed=1")
-    assert fingerprint(acquisition_stages(again)[0], {}) != fingerprint(acquisition_stages(config)[0], {})
-    assert np.abs(make_setup(again).translation - make_setup(config).translation).min() > 1e-3
+    again = settings("experiment=beam_real", *SMALL, "seed=1")
+    assert fingerprint(acquisition_stages(again)[0], {}) != fingerprint(acquisition_stages(run)[0], {})
+    one, other = (make_setup(PlayedSettings.of(each, files={})) for each in (again, run))
+    assert np.abs(one.translation - other.translation).min() > 1e-3
 
 
 def test_without_a_known_vertical_gravity_is_as_configured(tmp_path):
-    config = configuration(
-        *SMALL, "data.up=null", "laboratory.train=[m90]", "laboratory.test=[m50]", "data.seconds=0.1"
-    )
-    config["laboratory"]["seconds"] = 0.1
-    run_stages(acquisition_stages(config), tmp_path)
+    short = ("data.up=null", "laboratory.train=[m90]", "laboratory.test=[m50]", "data.seconds=0.1")
+    run = settings("experiment=beam_real", *SMALL, *short, "laboratory.seconds=0.1")
+    run_stages(acquisition_stages(run), tmp_path)
     with read_hdf5(tmp_path / DATASET, "dataset") as file:
-        np.testing.assert_allclose(file.attrs["gravity"], config["gravity"])
+        np.testing.assert_allclose(file.attrs["gravity"], run.gravity)
     assert "vertical_deg" not in read_json(tmp_path / REGISTRATION)["m90"]
 
 
@@ -181,10 +182,10 @@ class Shelf:
     """Recordings in a folder, made of the simulated ones, and the configuration that names them."""
 
     def __init__(self, folder, laboratory):
-        made, config = laboratory
-        self.folder, self.config = folder, copy.deepcopy(config)
+        made, run = laboratory
+        self.folder, self.config, self.learned = folder, run.plain(), None
         names = {"bare": "m0", "load52": "m50", "load101": "m90"}
-        hung = config["laboratory"]["trials"]
+        hung = self.config["laboratory"]["trials"]
         self.config["data"] |= {
             "folder": str(folder),
             "trials": {name: {"file": f"{name}.h5", "payload": hung[of]["payload"]} for name, of in names.items()},
@@ -206,7 +207,9 @@ class Shelf:
         self.write(name, positions=positions)
 
     def bring_in(self):
-        import_recordings(StageContext("import", self.folder, "", self.config))
+        run = parse(RunSettings, self.config)
+        stage = ImportStage.of(run, files={}, trials=trials_of(run), learned=self.learned)
+        import_recordings(StageContext("import", self.folder, "", stage))
         with read_hdf5(self.folder / DATASET, "dataset") as file:
             return {name: file[name][()] for name in file} | dict(file.attrs)
 
@@ -217,7 +220,7 @@ def shelf(tmp_path, laboratory):
 
 
 def test_recordings_of_a_folder_give_what_the_run_folder_gave(shelf, laboratory):
-    shelf.config["split"] = {"train": ["bare", "load52"], "validation": []}
+    shelf.learned = ["bare", "load52"]
     found = shelf.bring_in()
     with read_hdf5(laboratory[0] / DATASET, "dataset") as file:
         np.testing.assert_array_equal(found["observed"], file["observed"][()])
@@ -227,7 +230,7 @@ def test_recordings_of_a_folder_give_what_the_run_folder_gave(shelf, laboratory)
 
 
 def test_a_trial_that_is_tested_does_not_say_where_markers_sit(shelf):
-    shelf.config["split"] = {"train": ["bare"], "validation": ["load52"]}
+    shelf.learned = ["bare"] + ["load52"]
     first = shelf.bring_in()["bound"]
     shelf.move("load101", "Tip - 2", [0.0, 0.001, 0.0])
     np.testing.assert_array_equal(shelf.bring_in()["bound"], first)
@@ -285,15 +288,15 @@ def test_a_trial_with_markers_of_its_own(shelf):
     ).tolist()
     for name, own in {"bare": "Tip - 2", "load52": "Tip - 2", "load101": "Tip - 4"}.items():
         shelf.config["data"]["trials"][name]["labels"] = ["Tip - 1", own, "Tip - 3", *BASES]
-    check_configuration(shelf.config)
-    shelf.config["split"] = {"train": ["bare", "load52"], "validation": []}
+    check(shelf.config)
+    shelf.learned = ["bare", "load52"]
     found = shelf.bring_in()
     assert list(found["labels"]) == [*TIPS, "Tip - 4"]
     np.testing.assert_array_equal(np.isfinite(found["held"]).all(2), [[1, 1, 1, 0], [1, 1, 1, 0], [1, 0, 1, 1]])
     hidden = np.isnan(found["observed"]).all((1, 3))
     np.testing.assert_array_equal(hidden, ~np.isfinite(found["held"]).all(2))
     np.testing.assert_allclose(found["bound"][:3], whole["bound"], rtol=0.0, atol=2e-4)
-    shelf.config["split"] = {"train": ["bare", "load52", "load101"], "validation": []}
+    shelf.learned = ["bare", "load52", "load101"]
     mean = shelf.bring_in()["bound"]
     assert (
         np.abs(mean[[0, 2]] - found["bound"][[0, 2]]).max() > 1e-5
@@ -312,7 +315,7 @@ def test_a_trial_whose_labels_are_all_wrong_is_named(shelf):
     with pytest.raises(
         InputError, match=r"data\.trials\.load52\.labels names 'a', .* none of which is in markers\.trac"
     ):
-        check_configuration(shelf.config)
+        check(shelf.config)
 
 
 def published_layout(shelf, name, first):
@@ -353,7 +356,7 @@ def test_a_missing_file_is_named(shelf):
     (shelf.folder / "load52.h5").unlink()
     refuse(shelf, r"load52\.h5 does not exist")
     with pytest.raises(DataFileError, match=r"cannot read .*load52\.h5 .*data\.trials\.load52\.file"):
-        acquisition_stages(shelf.config)
+        acquisition_stages(parse(RunSettings, shelf.config))
 
 
 @pytest.mark.parametrize("share", [0.3, 0.9])
@@ -460,25 +463,25 @@ def test_a_marker_far_from_the_body_is_named(shelf):
 
 
 def test_a_changed_recording_is_imported_again(shelf):
-    before = fingerprint(acquisition_stages(shelf.config)[0], {})
-    assert fingerprint(acquisition_stages(shelf.config)[0], {}) == before
+    before = fingerprint(acquisition_stages(parse(RunSettings, shelf.config))[0], {})
+    assert fingerprint(acquisition_stages(parse(RunSettings, shelf.config))[0], {}) == before
     shelf.move("load52", "Tip - 1", 1e-6)
-    assert fingerprint(acquisition_stages(shelf.config)[0], {}) != before
+    assert fingerprint(acquisition_stages(parse(RunSettings, shelf.config))[0], {}) != before
 
 
 def test_the_three_beams(shared_data, tmp_path):
-    config = configuration(f"data.folder={shared_data / 'beam_mocap'}")
-    check_configuration(config)
-    run_stages(acquisition_stages(config), tmp_path)
+    run = settings("experiment=beam_real", f"data.folder={shared_data / 'beam_mocap'}")
+    check_run(run)
+    run_stages(acquisition_stages(run), tmp_path)
     registration = read_json(tmp_path / REGISTRATION)
     rms = {name: round(each["rms_mm"], 2) for name, each in registration.items()}
     assert rms == {"bare": 0.81, "load52": 0.83, "load101": 1.13}  # docs/registration.md
-    dataset, motions = read_motions(tmp_path, config)
+    dataset, motions = read_motions(tmp_path, run)
     bound, gravity = dataset.bound, dataset.gravity
     assert bool(motions.seen[motions.times < 1.38].all())
     np.testing.assert_allclose(motions.inputs.attached_mass.sum(1) * 9.80709, [0.0, 0.51012, 1.00062], atol=1e-4)
     assert int((motions.inputs.attached_mass[1] > 0.0).sum()) == 4
-    nominal = np.array(list(config["markers"]["tracked"].values()))
+    nominal = np.array(list(run.markers.tracked.values()))
     assert np.linalg.norm(bound - nominal, axis=1).max() < 2e-3
     assert np.degrees(np.arccos(-gravity[2] / np.linalg.norm(gravity))) < 10.0
     for row, name in enumerate(("gravity", "load52", "load101")):  # a rigid motion keeps every distance
@@ -493,9 +496,9 @@ def test_the_three_beams(shared_data, tmp_path):
 
 def test_the_fish_tail(shared_data, tmp_path):
     """A table without a header, with semicolons, in millimetres; a step that nobody has recorded."""
-    config = configuration("experiment=fish_tail", f"data.folder={shared_data / 'fish_tail'}")
-    check_configuration(config)
-    run_stages(acquisition_stages(config), tmp_path)
+    run = settings("experiment=fish_tail", f"data.folder={shared_data / 'fish_tail'}")
+    check_run(run)
+    run_stages(acquisition_stages(run), tmp_path)
     dataset = read_dataset(tmp_path / DATASET)
     (tip,) = dataset.observed.transpose(2, 0, 1, 3)
     travel = np.linalg.norm(tip[0] - tip[0, 0], axis=1)
@@ -562,9 +565,9 @@ def test_the_tutorial(shared_data, tmp_path, monkeypatch):
     place.parent.mkdir(parents=True)
     place.write_text(written)
     assert len(written.splitlines()) < 36
-    config = configuration(f"hydra.searchpath=[file://{tmp_path / 'configs'}]", experiment="my_robot")
-    check_configuration(config)
-    run_stages(acquisition_stages(config), tmp_path)
+    run = settings(f"hydra.searchpath=[file://{tmp_path}/configs]", "experiment=my_robot")
+    check_run(run)
+    run_stages(acquisition_stages(run), tmp_path)
     quality, registration = read_json(tmp_path / QUALITY), read_json(tmp_path / REGISTRATION)
     for line, (name, each) in zip(log, quality.items(), strict=True):
         rms = registration[name]["rms_mm"]
@@ -580,10 +583,10 @@ def test_the_second_robot_of_the_tutorial(shared_data, tmp_path, monkeypatch, ca
     place = tmp_path / "configs" / "experiment" / "my_tentacle.yaml"
     place.parent.mkdir(parents=True)
     place.write_text(written)
-    config = configuration(f"hydra.searchpath=[file://{tmp_path / 'configs'}]", experiment="my_tentacle")
-    check_configuration(config)
+    run = settings(f"hydra.searchpath=[file://{tmp_path}/configs]", "experiment=my_tentacle")
+    check_run(run)
     with caplog.at_level("INFO"):
-        run_stages(acquisition_stages(config), tmp_path)
+        run_stages(acquisition_stages(run), tmp_path)
     assert [each for each in caplog.messages if "are told by where they are" in each] == log
 
 
@@ -591,10 +594,9 @@ def test_an_experiment_may_set_gravity(tmp_path):
     place = tmp_path / "experiment" / "hanging.yaml"
     place.parent.mkdir()
     place.write_text("# @package _global_\ndefaults: [beam_real, _self_]\nname: hanging\ngravity: [9.81, 0.0, 0.0]\n")
-    config = configuration(f"hydra.searchpath=[file://{tmp_path}]", experiment="hanging")
-    assert config["gravity"] == [9.81, 0.0, 0.0]
-    given = configuration(f"hydra.searchpath=[file://{tmp_path}]", "gravity=[0,0,-1]", experiment="hanging")
-    assert given["gravity"] == [0, 0, -1]
+    own = (f"hydra.searchpath=[file://{tmp_path}]", "experiment=hanging")
+    assert settings(*own).gravity == (9.81, 0.0, 0.0)
+    assert settings(*own, "gravity=[0,0,-1]").gravity == (0.0, 0.0, -1.0)
 
 
 @pytest.mark.parametrize(("ratio", "count"), [(0.25, 24), (0.5, 12), (1.0, 6)])
@@ -606,7 +608,7 @@ def test_inputs_keep_their_time_at_steps_of_another_length(ratio, count):
     inputs = {"pressure": np.arange(6.0)[None, :, None]}
     words = (("a",), ("m",), ("rest",))
     dataset = Dataset(*words, times, seen, seen[:, 0], weight, np.zeros(3), 0.01, inputs=inputs, base=base)
-    body = build_body(configuration("experiment=beam_real"))
+    body = build_body(settings("experiment=beam_real"))
     given = dataset.trials(["a"], body, None, 0.01 * ratio).inputs.fields
     times = 0.01 * ratio * (np.arange(count) + 1.0)
     np.testing.assert_allclose(given["pressure"][:, 0, 0], ((times - 0.005 * ratio) / 0.01).astype(int))

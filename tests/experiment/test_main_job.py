@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from hydra import compose, initialize_config_module
+from configured import check, composed, settings
 from main_job import (
     CORRECTED,
     IN_RUN,
@@ -33,7 +33,7 @@ from omegaconf import OmegaConf
 from warp_resphys import box_hexahedra, pipeline
 from warp_resphys.experiment import learn, models
 from warp_resphys.experiment.build import build_simulator
-from warp_resphys.experiment.checks import check_configuration
+from warp_resphys.experiment.checks import check_run
 from warp_resphys.experiment.trials import split_of
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_checkpoint, read_hdf5
@@ -108,8 +108,8 @@ class TestCompleteRun:
 
     def test_settings_and_seeds_are_saved(self, finished):
         record = json.loads((finished[0] / "stages" / "train_resphys.json").read_text())
-        assert record["settings"]["seed"] == 0
-        assert record["settings"]["trainer"]["epochs"] == 40
+        assert record["settings"]["training"]["seed"] == 0
+        assert record["settings"]["training"]["trainer"]["epochs"] == 40
         saved = OmegaConf.load(finished[0] / ".hydra" / "config.yaml")
         assert saved.network.width == 32
         training = json.loads((finished[0] / "training_resphys.json").read_text())
@@ -274,13 +274,13 @@ class TestChanges:
         assert np.isfinite(found[1, :5]).all()
 
 
-def stages_of(config):
+def stages_of(wanted):
     """All stages of an experiment without folds."""
-    if "ablation" in config:
-        return pipeline.ablation_stages(config, pipeline.simulated(config), config)
+    if wanted.ablation is not None:
+        return pipeline.ablation_stages(wanted, {})
     return [
-        *pipeline.acquisition_stages(config),
-        *pipeline.learning_stages(config, split_of(config), ".", "fingerprint"),
+        *pipeline.acquisition_stages(wanted),
+        *pipeline.learning_stages(wanted, split_of(wanted), ".", "fingerprint"),
     ]
 
 
@@ -303,11 +303,6 @@ CHOICES = [
 
 
 class TestConfiguration:
-    def composed(self, *overrides):
-        with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-            config = compose("config", overrides=list(overrides))
-        return OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-
     @pytest.mark.parametrize(("name", "group", "option"), CHOICES, ids=map("-".join, CHOICES))
     def test_every_option_of_every_experiment_is_accepted_and_built(self, folder, name, group, option):
         overrides = [f"experiment={name}", f"{group}={option}"]
@@ -321,7 +316,7 @@ class TestConfiguration:
             overrides += ["mesh.path=box.obj", "mesh.units=m"]
         if option == "recurrent":
             overrides.append("trainer=sequences")
-        config = self.composed(*overrides)
+        wanted = settings(*overrides)
         refused = ""
         if group == "mesh" and option.startswith(("arm", "rod", "segment")) and option != "arm_published":
             refused = r"no vertex lies within .* of x = 0\.1"
@@ -329,28 +324,29 @@ class TestConfiguration:
             refused = "ablation.counts asks for 128 markers, but the mesh has 42 surface vertices"
         if refused:
             with pytest.raises(InputError, match=refused):
-                check_configuration(config)
+                check_run(wanted)
             return
-        check_configuration(config)
-        real, wrong = (build_simulator(config, which) for which in ("target", "simulation"))
+        check_run(wanted)
+        real, wrong = (build_simulator(wanted, material) for material in (wanted.target, wanted.simulation))
         assert real.material != wrong.material
-        wanted = REFINED if option == "solver_in_the_loop" else STAGES
-        wanted = ["generate", "ablation", "report"] if name == "marker_ablation" else wanted
-        assert [stage.name for stage in stages_of(config)] == wanted
+        stages = REFINED if option == "solver_in_the_loop" else STAGES
+        stages = ["generate", "ablation", "report"] if name == "marker_ablation" else stages
+        assert [stage.name for stage in stages_of(wanted)] == stages
 
     @pytest.mark.parametrize("option", FROM_MARKERS)
     def test_reconstructions_from_markers_are_refused_where_whole_states_are_known(self, option):
         with pytest.raises(InputError, match=r"reconstruction.(method is 'levenberg_marquardt': choose one of|modes)"):
-            check_configuration(self.composed(f"reconstruction={option}"))
+            check(composed(f"reconstruction={option}"))
 
     def test_published_sizes_and_settings(self):
-        config = self.composed("physics=published", "network=published", "trainer=published")
-        assert build_simulator(config).body.n_vertices * 3 == 528
-        assert {k: len(v) for k, v in config["data"]["weights_g"].items()} == {"train": 9, "validation": 2, "test": 5}
-        assert config["data"]["steps"] == 150
-        assert [config["network"][k] for k in ("blocks", "layers", "width")] == [5, 3, 512]
-        keys = ("epochs", "batch_size", "learning_rate", "weight_decay")
-        assert [config["trainer"][k] for k in keys] == [1000, 256, 1e-3, 1e-5]
-        keys = ("schedule", "gamma", "step_epochs", "selection")
-        assert [config["trainer"][k] for k in keys] == ["step", 0.83, 100, "validation_loss"]
-        assert config["physics"] == {"mass": "per_vertex", "volume_integration": "full"}
+        run = settings("physics=published", "network=published", "trainer=published")
+        assert build_simulator(run, run.simulation).body.n_vertices * 3 == 528
+        assert [len(getattr(run.data.weights_g, name)) for name in ("train", "validation", "test")] == [9, 2, 5]
+        assert run.data.steps == 150
+        assert (run.network.blocks, run.network.layers, run.network.width) == (5, 3, 512)
+        trainer = run.trainer
+        assert (trainer.epochs, trainer.batch_size) == (1000, 256)
+        assert (trainer.learning_rate, trainer.weight_decay) == (1e-3, 1e-5)
+        assert (trainer.schedule, trainer.gamma, trainer.step_epochs) == ("step", 0.83, 100)
+        assert trainer.selection == "validation_loss"
+        assert dict(run.physics) == {"mass": "per_vertex", "volume_integration": "full"}

@@ -13,9 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_module
+from configured import check, composed, settings
 from main_job import IN_RUN, run
-from omegaconf import OmegaConf
 
 from warp_resphys import pipeline
 from warp_resphys.data.actuation import InputSequences
@@ -25,7 +24,6 @@ from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.trials import Trials
 from warp_resphys.experiment import learn, reconstruct
 from warp_resphys.experiment.build import build_simulator
-from warp_resphys.experiment.checks import check_configuration
 from warp_resphys.experiment.evaluate import summary
 from warp_resphys.experiment.files import Dataset
 from warp_resphys.experiment.importing import import_recordings
@@ -33,12 +31,15 @@ from warp_resphys.experiment.reconstruct import replayed_errors
 from warp_resphys.experiment.scene import Scene
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_array, read_checkpoint, read_hdf5
+from warp_resphys.io.settings import parse
 from warp_resphys.io.stages import StageContext
 from warp_resphys.learning.bounds import Bounds
 from warp_resphys.learning.identification import Identifier
 from warp_resphys.learning.predictors import Range
 from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.mesh.mesh import select_vertices
+from warp_resphys.settings.body import MaterialSettings
+from warp_resphys.settings.stages import EvaluateStage, ReconstructStage, TrainStage
 from warp_resphys.stepping.inputs import Inputs
 
 # A short segment with two chambers of some 70 vertices, on which everything takes seconds.
@@ -85,11 +86,6 @@ def place_experiment(folder):
     place = Path(folder) / "configs" / "experiment" / "tiny.yaml"
     place.parent.mkdir(parents=True, exist_ok=True)
     place.write_text(SEGMENT)
-
-
-def configuration(*overrides, experiment="sopra"):
-    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        return OmegaConf.to_container(compose("config", [f"experiment={experiment}", *overrides]), resolve=True)
 
 
 @pytest.fixture(scope="module")
@@ -173,8 +169,9 @@ def test_forces_that_do_not_hold_the_body_are_named(finished, monkeypatch, tmp_p
     summary = json.loads((finished / "run" / "reconstruction.json").read_text())["resphys"]
     with read_hdf5(finished / "run" / "reconstruction_resphys.h5", "reconstruction") as file:
         states = {name: read_array(file, name)[2:] for name in ("q", "v", "force")}
-    settings = json.loads((finished / "run" / "stages" / "reconstruct_resphys.json").read_text())["settings"]
-    replay = partial(replayed_errors, settings, finished / "run", ("t002",))
+    record = json.loads((finished / "run" / "stages" / "reconstruct_resphys.json").read_text())
+    stage = parse(ReconstructStage, record["settings"])
+    replay = partial(replayed_errors, stage, finished / "run", ("t002",))
     found = replay(states)
     assert found.mean() == pytest.approx(summary["replayed_mm"], rel=1e-3)
     assert found.mean() < 0.2
@@ -186,21 +183,22 @@ def test_forces_that_do_not_hold_the_body_are_named(finished, monkeypatch, tmp_p
     for name in ("dataset.h5", "identification.json"):
         shutil.copy(finished / "run" / name, tmp_path)
     monkeypatch.setattr(reconstruct, "replayed_errors", lambda *rest: np.full(rest[3]["force"].shape[:2], np.inf))
-    reconstruct.reconstruct(StageContext("reconstruct_resphys", tmp_path, "", settings))
+    reconstruct.reconstruct(StageContext("reconstruct_resphys", tmp_path, "", stage))
     assert "the forces lead inf mm away from the markers" in caplog.text
     assert json.loads((tmp_path / "reconstruction.json").read_text())["resphys"]["replayed_mm"] is None
 
 
 def test_forces_are_learned_as_they_are_in_the_rest_shape(finished, monkeypatch):
-    settings = json.loads((finished / "run" / "stages" / "train_resphys.json").read_text())["settings"]
-    assert settings["force_frame"] == "corotated"
+    record = json.loads((finished / "run" / "stages" / "train_resphys.json").read_text())
+    stage = parse(TrainStage, record["settings"])
+    assert stage.force_frame == "corotated"
     assert read_checkpoint(finished / "run" / "resphys.safetensors", "residual force")[1]["force_frame"] == "corotated"
     learned = {}
     for frame in ("corotated", "world"):
         keep = lambda network, train, *rest, frame=frame: learned.update({frame: train})  # noqa: E731
         monkeypatch.setattr(learn, "Trainer", keep)
-        scene = Scene({**settings, "force_frame": frame}, finished / "run")
-        assert learn.Learning(scene, "resphys").trainer(settings).learned.force_frame == frame
+        scene = Scene(stage.changed(force_frame=frame), finished / "run")
+        assert learn.Learning(scene, "resphys").trainer(stage.training).learned.force_frame == frame
     turned, kept = (learned[frame] for frame in ("corotated", "world"))
     back = scene.frames(scene.model_simulator("resphys"), "corotated").to_world(turned.q, turned.v, turned.outputs[0])
     size = float(kept.outputs[0].abs().max())
@@ -340,7 +338,7 @@ def test_pressures_in_another_unit_and_two_files_of_one_name_cost_one_sentence(f
 
 def test_another_method_of_reconstruction_is_taken_as_a_whole():
     for name in ("sopra", "segment_real", "beam_real"):
-        chosen = configuration("reconstruction=lbfgsb", experiment=name)["reconstruction"]
+        chosen = composed(f"experiment={name}", "reconstruction=lbfgsb")["reconstruction"]
         assert (chosen["method"], chosen["regularisation"]) == ("lbfgsb", 1e-4)
 
 
@@ -350,8 +348,8 @@ def test_a_short_recording_is_named_and_its_rest_counts_as_not_seen(finished, mo
 
     monkeypatch.chdir(finished)
     path = f"hydra.searchpath=[file://{finished / 'configs'}]"
-    config = configuration(path, TRACKED, *recorded(tmp_path, finished, shortened), experiment="tiny")
-    stages = {stage.name: stage for stage in pipeline.acquisition_stages(config)}
+    wanted = settings(path, "experiment=tiny", TRACKED, *recorded(tmp_path, finished, shortened))
+    stages = {stage.name: stage for stage in pipeline.acquisition_stages(wanted)}
     import_recordings(StageContext("import", tmp_path, "", stages["import"].settings))
     with read_hdf5(tmp_path / "dataset.h5", "dataset") as file:
         seen = np.isfinite(read_array(file, "observed")).all(axis=(2, 3))
@@ -373,9 +371,9 @@ def test_the_number_of_processes_is_no_setting_of_the_results(finished, monkeypa
 def test_the_configurations_of_every_experiment_with_pressures_are_accepted(tmp_path, monkeypatch):
     for name in ("sopra", "sopra_extrapolation", "sopra_overpressure"):
         for overrides in ([], ["budget=quick"]):
-            check_configuration(configuration(*overrides, experiment=name))
+            check(composed(f"experiment={name}", *overrides))
     recording = read_published(tmp_path)
-    check_configuration(configuration(f"data.folder={recording}", experiment="segment_real"))
+    check(composed("experiment=segment_real", f"data.folder={recording}"))
 
 
 @pytest.mark.parametrize(
@@ -391,7 +389,7 @@ def test_the_configurations_of_every_experiment_with_pressures_are_accepted(tmp_
     ],
 )
 def test_what_the_pipeline_has_for_others_goes_with_pressures(overrides):
-    check_configuration(configuration(*overrides))
+    check(composed("experiment=sopra", *overrides))
 
 
 def read_published(folder):
@@ -424,9 +422,8 @@ def at_rest(simulator, motions):
 
 
 def tiny_simulator(**material):
-    config = configuration("mesh=segment", "mesh.size=0.03", "mesh.layers=0.05", "chambers.count=3")
-    config["simulation"] |= material
-    return build_simulator(config)
+    small = settings("experiment=sopra", "mesh=segment", "mesh.size=0.03", "mesh.layers=0.05", "chambers.count=3")
+    return build_simulator(small, MaterialSettings(**{**small.simulation.plain(), **material}))
 
 
 def test_identification_finds_the_stiffness_that_made_motions_and_the_valves_lag():
@@ -470,14 +467,16 @@ def test_a_diverged_roll_out_and_one_that_left_the_range_are_reported(tmp_path):
     observed = np.zeros((2, 5, 1, 3))
     good, lost = observed + np.array([3e-3, 0.0, 4e-3]), observed.copy()
     lost[1, 3:] = np.nan
-    settings = {"data": {"horizons": [0.02, 0.04]}, "time_step": 0.01, "split": {"train": []}}
     left = {"resphys": np.array([-1, 3])}
     markers = {"sysid": good, "resphys": lost}
-    scene = Scene(settings, tmp_path)
+    own = {"horizons": (0.02, 0.04), "split": {"train": [], "validation": [], "test": ["a", "b"]}, "refined": False}
+    own |= {"files": {}, "shared": ".", "acquired": "", "groups": {"1": ["a", "b"]}, "calibration": []}
+    stage = EvaluateStage.of(settings("experiment=sopra"), **own)
+    scene = Scene(stage, tmp_path)
     times = np.tile(0.01 * np.arange(5), (2, 1))
     about = (times, observed, observed[:, 0], np.zeros(2), np.zeros(3), 0.01)
     scene.__dict__["dataset"] = Dataset(("a", "b"), ("m",), ("rest", "rest"), *about, bound=np.zeros((1, 3)))
-    found = summary(StageContext("evaluate", tmp_path, "", settings), scene, {"1": ("a", "b")}, markers, left)
+    found = summary(StageContext("evaluate", tmp_path, "", stage), scene, {"1": ("a", "b")}, markers, left)
     assert found["errors_mm"]["sysid"]["mean"] == pytest.approx(5.0)
     assert found["errors_mm"]["resphys"]["diverged"] == 1
     assert found["range"]["resphys"] == {"left": 1, "first_s": {"b": pytest.approx(0.03)}}

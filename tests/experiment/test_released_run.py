@@ -12,9 +12,8 @@ from functools import partial
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_module
+from configured import settings
 from main_job import run
-from omegaconf import OmegaConf
 
 from warp_resphys.experiment import identify, report
 from warp_resphys.experiment.folds import Fold, run_folds
@@ -74,11 +73,6 @@ STAGES = [
     "evaluate",
     "report",
 ]
-
-
-def configuration(*overrides):
-    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        return OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
 
 
 def records(folder):
@@ -195,10 +189,10 @@ class TestCompleteRun:
         assert len(shown.identification["sysid"]["history"]) == 1
 
     def test_the_report_depends_on_the_configuration_and_the_trials(self, finished):
-        settings = records(finished)["report"]["settings"]
-        assert settings["config"]["name"] == "beam_real"
-        assert "tune" not in settings["config"]
-        assert settings["acquired"] == records(finished)["import"]["fingerprint"]
+        shown = records(finished)["report"]["settings"]
+        assert shown["config"]["name"] == "beam_real"
+        assert shown["config"]["tune"] == {}
+        assert shown["acquired"] == records(finished)["import"]["fingerprint"]
 
     def test_the_reconstruction_says_how_close_it_came_and_where_its_forces_lead(self, finished):
         found = read(finished / "reconstruction.json")
@@ -249,18 +243,18 @@ def test_folds(finished, tmp_path, monkeypatch, pages):
         folder = tmp_path / "run" / f"fold_{trial}"
         assert [each["name"] for each in fold["per_trajectory"]] == [trial]
         assert read(folder / "metrics.json") == fold
-        settings = records(folder)["train_resphys"]["settings"]["split"]
-        assert trial not in settings["train"] + settings["validation"]
+        split = records(folder)["train_resphys"]["settings"]["split"]
+        assert trial not in split["train"] + split["validation"]
     assert (tmp_path / "run" / "report.html").is_file()
     assert pages["run"].pages == {trial: f"fold_{trial}/report.html" for trial in found["folds"]}
-    settings = records(tmp_path / "run")["report"]["settings"]
-    assert settings["folds"] == {trial: fold["errors_mm"] for trial, fold in found["folds"].items()}
+    shown = records(tmp_path / "run")["report"]["settings"]
+    assert shown["folds"] == {trial: fold["errors_mm"] for trial, fold in found["folds"].items()}
     assert {f"fold_{trial}" for trial in found["folds"]} <= set(pages)
     assert all((tmp_path / "run" / f"fold_{trial}" / "report.html").is_file() for trial in found["folds"])
     at_once = tmp_path / "at_once"
     at_once.mkdir()
     shutil.copy(tmp_path / "run" / "dataset.h5", at_once)
-    splits = folds_of(configuration(*(each for each in FOLDS if not each.startswith("hydra"))))
+    splits = folds_of(settings(*FOLDS))
     folds = {name: Fold(name, at_once / name, partial(_unreported, split)) for name, split in splits.items()}
     run_folds(folds, Workers(2))
     for trial, fold in found["folds"].items():
@@ -269,15 +263,15 @@ def test_folds(finished, tmp_path, monkeypatch, pages):
 
 def _unreported(split, processes):
     """The stages of a fold but its report."""
-    config = configuration(*(each for each in FOLDS if not each.startswith("hydra")))
-    return learning_stages(config, split, "..", "imported", processes)[:-1]
+    wanted = settings(*FOLDS)
+    return learning_stages(wanted, split, "..", "imported", processes)[:-1]
 
 
 def test_an_interrupted_identification_goes_on_with_the_next_start(finished, tmp_path, monkeypatch):
     """The descents themselves are left out: each start stays where it is."""
     shutil.copy(finished / "dataset.h5", tmp_path)
-    config = configuration(*[each for each in SYNTHETIC if "hydra" not in each], "identify.starts=2")
-    (stage, *_) = learning_stages(config, split_of(config), ".", "imported")
+    wanted = settings(*SYNTHETIC, "identify.starts=2")
+    (stage, *_) = learning_stages(wanted, split_of(wanted), ".", "imported")
     descents, at = [], 2
 
     def descend(self, number, start, max_evaluations, tolerance, report):
@@ -301,8 +295,8 @@ def test_an_interrupted_landscape_goes_on_and_loses_no_identification(finished, 
     """The searches are left out; the losses of the landscape count its points, and the second is a failure."""
     shutil.copy(finished / "dataset.h5", tmp_path)
     grid = ["identify.starts=2", "identify.grid.youngs_modulus.points=5", "identify.grid.poissons_ratio.points=2"]
-    config = configuration(*[each for each in SYNTHETIC if "hydra" not in each], *grid)
-    (stage, *_) = learning_stages(config, split_of(config), ".", "imported")
+    wanted = settings(*SYNTHETIC, *grid)
+    (stage, *_) = learning_stages(wanted, split_of(wanted), ".", "imported")
     calls, moduli, interrupt_at = [], [], [6]
 
     def starts(self, first, count, candidates, seed):

@@ -6,14 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_module
+from configured import check, composed, settings
 from main_job import IN_RUN, run
-from omegaconf import OmegaConf
 from played_run import check_robots
 
 from warp_resphys.data.sight import Sight
 from warp_resphys.experiment.build import bound_markers, build_simulator
-from warp_resphys.experiment.checks import check_configuration
 from warp_resphys.experiment.files import read_dataset
 from warp_resphys.io.errors import InputError
 from warp_resphys.stepping.inputs import Inputs
@@ -46,29 +44,20 @@ HIDDEN = {"slow": [0], "fast": []}  # frames in which the second marker is, and 
 PERIODS = {"slow": 16.0, "fast": 9.0}  # steps
 
 
-def configuration(*overrides):
-    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        shown = [each for each in (*TINY, *TRIALS, *SPLIT) if not each.startswith("hydra")]
-        return OmegaConf.to_container(compose("config", [*shown, *overrides]), resolve=True)
-
-
-def tracked(config, trial):
+def tracked(run, trial):
     """The places of the markers that a trial has, by name."""
-    places = config["markers"]["tracked"]
-    return {label: places[label] for label in config["data"]["trials"][trial]["labels"]}
+    return {label: run.markers.tracked[label] for label in run.data.trials[trial].labels}
 
 
 @pytest.fixture(scope="module")
 def swum():
     """By trial, what the winch is told (T,) and where the markers are in the frame of the body (T, 4, 3), both [m]."""
-    config = configuration()
-    simulator = build_simulator(config)
-    markers = config["markers"]
+    run = settings(*TINY, *TRIALS, *SPLIT)
+    simulator = build_simulator(run, run.simulation)
+    markers = run.markers
     found = {}
     for name, period in PERIODS.items():
-        read = bound_markers(
-            markers, simulator.body.mesh, [*tracked(config, name).values()], tuple(tracked(config, name))
-        )
+        read = bound_markers(markers, simulator.body.mesh, [*tracked(run, name).values()], tuple(tracked(run, name)))
         steps = np.arange(STEPS + 4)
         told = 0.008 * np.sin(np.pi * np.clip(steps - 3, 0, None) / period) ** 2
         pulled = torch.as_tensor(FACTOR * told[1:, None, None])
@@ -100,14 +89,14 @@ def test_limbs_are_identified_by_their_shape(swum, tmp_path, monkeypatch):
     write(Path("recordings"), swum)
     code, err = run(*TINY, *TRIALS, *SPLIT)
     assert (code, err[-500:] if code else "") == (0, "")
-    config, dataset = configuration(), read_dataset(Path("run/dataset.h5"))
+    wanted, dataset = settings(*TINY, *TRIALS, *SPLIT), read_dataset(Path("run/dataset.h5"))
     assert dataset.sets == ((4, 5, 6, 7), (0, 1, 2, 3))
     for name, (told, markers) in swum.items():
         pulled = dataset.inputs["tendon_contraction"][dataset.names.index(name), :, 0]
         np.testing.assert_allclose(pulled, told[1 : STEPS + 1], atol=1e-6)
-        sight = Sight.of([*tracked(config, name).values()], ["x", "z"], "own")
+        sight = Sight.of([*tracked(wanted, name).values()], ["x", "z"], "own")
         shapes = sight.of_arrays(markers[: STEPS + 1])
-        columns = [dataset.labels.index(label) for label in tracked(config, name)]
+        columns = [dataset.labels.index(label) for label in tracked(wanted, name)]
         shapes[HIDDEN[name]] = np.nan
         np.testing.assert_allclose(dataset.observed[dataset.names.index(name)][:, columns], shapes, atol=3e-4)
         assert np.nanmax(np.abs(shapes - shapes[1])) > 3e-3
@@ -116,7 +105,7 @@ def test_limbs_are_identified_by_their_shape(swum, tmp_path, monkeypatch):
     metrics = json.loads(Path("run/metrics.json").read_text())
     errors = {name: each["mean"] for name, each in metrics["errors_mm"].items()}
     assert {label: value is None for label, value in metrics["per_marker"]["sysid"].items()} == dict.fromkeys(
-        tracked(config, "fast"), False
+        tracked(wanted, "fast"), False
     )
     drawn = {path.stem for path in Path("run/figures").glob("*.png")}
     assert {"markers", "motion"} <= drawn
@@ -129,16 +118,16 @@ def test_limbs_are_identified_by_their_shape(swum, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
-        (["markers.plane=[x,x]"], "markers.plane is .*two different ones"),
+        (["markers.plane=[x,x]"], "markers.plane is .* twice"),
         (["data.trials.fast.labels=[N1,N2,N3,N4,M3]"], "'slow' and 'fast' both have 'M3', but only one has 'M1'"),
         (["data.trials.fast.labels=[N1,N2,N4]"], "markers.tracked names 'N3', which no trial has"),
         (["data.axes=null"], "markers.plane is set, but data.axes is not"),
         (["markers.frame=free"], "markers.frame is 'free': .* body, own"),
         (["data.base_motion=recorded"], "markers.frame is own, but a base_motion tells"),
         (["identify.placement={markers: 0.001}"], "identify.placement is set, but with markers.plane"),
-        (["+data.trials.slow.base_motion=recorded"], "markers.frame is own, but a base_motion tells"),
+        (["+data.trials.slow.base_motion=recorded"], "data.trials.slow.base_motion is 'recorded'"),
         (["markers.frame=body", "identify.placement={turn: 1.0}"], "identify.placement is set, but with markers.plane"),
-        (["fixed.z=[0.02,-0.02]"], "fixed.z is .*two rising ones"),
+        (["fixed.z=[0.02,-0.02]"], "fixed.z is .*two rising"),
         (["fixed.z=[0.2,0.3]"], r"no vertex lies within 1e-09 m of z = 0\.2 to 0\.3 m"),
     ],
 )
@@ -146,4 +135,4 @@ def test_what_a_camera_cannot_tell_is_refused(overrides, said, tmp_path, swum, m
     monkeypatch.chdir(tmp_path)
     write(Path("recordings"), swum)
     with pytest.raises(InputError, match=said):
-        check_configuration(configuration(*overrides))
+        check(composed(*TINY, *TRIALS, *SPLIT, *overrides))

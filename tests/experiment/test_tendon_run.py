@@ -5,13 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_module
+from configured import check, composed
 from main_job import IN_RUN, run
-from omegaconf import OmegaConf
 from played_run import check_robots
 
 from warp_resphys.data.recordings.reading import read_recording
-from warp_resphys.experiment.checks import check_configuration
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_array, read_hdf5
 
@@ -67,28 +65,22 @@ def test_a_body_whose_muscles_contract_goes_through_every_stage(tmp_path, monkey
         assert said in page
 
 
-def configuration(*overrides):
-    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        return OmegaConf.to_container(compose("config", ["experiment=tendon_rod", *overrides]), resolve=True)
-
-
 @pytest.mark.parametrize(
     ("override", "said"),
     [
-        ("tendons.routes.left.guides=[[0,0,0]]", "tendons.routes.left.guides is .*two or more places"),
+        ("tendons.routes.left.guides=[[0,0,0]]", "tendons.routes.left.guides is .*two or more"),
         ("tendons.routes.left.guides=[[0.02,0,0],[0,0,-0.2]]", "guide 1 of tendon 2.* lies .* mm outside of the body"),
-        ("tendons.commanded=contraction", "tendons.stiffness is 0, but their contraction is commanded"),
+        ("tendons.commanded=contraction", "tendons.stiffness is 0, but contractions are commanded"),
         ("tendons.commanded=angle", "tendons.commanded is 'angle'"),
         ("tendons.stiffness=-1", "tendons.stiffness is -1"),
         ("tendons.routes.left.pieces=0", "tendons.routes.left.pieces is 0"),
-        ("+tendons.routes.left.offsets=[]", "tendons.routes.left.offsets is .*one or two directions"),
-        ("+tendons.routes.left.offsets=[[[1,0,0],[0,1,0],[0,0,1]]]", "left.offsets has a direction of shape"),
+        ("+tendons.routes.left.offsets=[[[1,0,0],[0,1,0],[0,0,1]]]", "left.offsets has a direction for 3 guides"),
         ("+tendons.routes.left.offsets=[[1,0,0]]", "3 tendons|the tendons have"),
         ("+identify.parameters.tendon_offset_1_left={lower:-1,upper:1}", "'tendon_offset_1_left': choose from"),
         ("data.input_limit=null", "data.input_limit is not set: say what the tendons take, in N"),
         ("data.parts=[1,2,4]", "data.parts names tendon 4, but the body has 3"),
-        (MUSCLES, "a body with tendons and muscles has two inputs, but recordings drive one: take one out"),
-        ("chambers={count:1,axis:[0,0,1]}", "a body with chambers and tendons has two inputs"),
+        (MUSCLES, "tendons and muscles are two inputs of the body, and recordings drive one: take one out"),
+        ("chambers={count:1,axis:[0,0,1]}", "chambers and tendons are two inputs"),
         (
             "muscles={commanded:null,stiffness:0,bundles:{a:{direction:[0,0,1]}}}",
             "muscles.stiffness is 0, but nothing is commanded: set it, in Pa",
@@ -105,4 +97,4 @@ def configuration(*overrides):
 )
 def test_wrong_tendons_are_refused_before_anything_runs(override, said):
     with pytest.raises(InputError, match=said):
-        check_configuration(configuration(override))
+        check(composed("experiment=tendon_rod", override))

@@ -8,8 +8,7 @@ from warp_resphys import Body, Simulator, State, box_hexahedra, select_vertices
 from warp_resphys.data.markers import bind_markers
 from warp_resphys.data.trials import Trials
 from warp_resphys.experiment.scene import at_steps
-from warp_resphys.experiment.schema import IN_THE_LOOP, check
-from warp_resphys.io.errors import ConvergenceError, InputError
+from warp_resphys.io.errors import ConvergenceError
 from warp_resphys.io.files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.markers_in_the_loop import MarkersInTheLoop, MotionLoss, Watched, cross_validated_epochs
 from warp_resphys.learning.metrics import marker_errors
@@ -272,12 +271,6 @@ class TestMarkersInTheLoop:
         trainer.begin()
         assert trainer.finished
         assert loss.error_mm(trainer.use_best()) == pytest.approx(loss.error_mm(None), rel=1e-9)
-
-    @pytest.mark.parametrize(("key", "value"), [("epochs", 0), ("memory", 0), ("patience", 0), ("penalty", -1.0)])
-    def test_bad_settings(self, key, value):
-        check("in_the_loop", CONFIG, IN_THE_LOOP)
-        with pytest.raises(InputError, match=rf"in_the_loop\.{key} is {value}: it must be"):
-            check("in_the_loop", {**CONFIG, key: value}, IN_THE_LOOP)
 
     def test_groups_weigh_what_their_trials_do(self, loss):
         """Motions in groups of their own, as those that begin otherwise are, give the loss and error of one group."""

@@ -8,7 +8,6 @@ from torch import nn
 from warp_resphys import Body, Corotated, Simulator, State, box_hexahedra, select_vertices
 from warp_resphys.dynamics import modes
 from warp_resphys.dynamics.modes import RestStiffness, vibration_modes
-from warp_resphys.experiment.schema import NETWORK, check
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.networks import (
@@ -198,25 +197,6 @@ class TestResidualForce:
         rest = model.rest.clone()
         shifted = build_model(KINDS["nodal"], rest + 1.0, q + 1.0, v, field(40, seed=3))
         np.testing.assert_allclose(shifted.encode(q + 1.0, v), model.encode(q, v), atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("settings", "sentence"),
-    [
-        ({"kind": "graph"}, "network.kind is 'graph': it must be one of reduced, nodal."),
-        ({"activation": "relu"}, "network.activation is 'relu': it must be one of normalised_elu, silu."),
-        ({"blocks": 0}, "network.blocks is 0: it must be a whole number from 1 to 100."),
-        ({"layers": -1}, "network.layers is -1: it must be a whole number from 0 to 100."),
-        ({"width": 0}, "network.width is 0: it must be a whole number from 1 to 16,384."),
-        ({"width": -1}, "network.width is -1: it must be a whole number from 1 to 16,384."),
-        ({"force_modes": 0}, "network.force_modes is 0: it must be a whole number, one or more."),
-    ],
-)
-def test_bad_settings(settings, sentence):
-    check("network", KINDS["reduced"], NETWORK)
-    with pytest.raises(InputError) as error:
-        check("network", {**KINDS["reduced"], **settings}, NETWORK)
-    assert str(error.value) == sentence
 
 
 class TestActuation:

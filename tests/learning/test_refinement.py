@@ -5,13 +5,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from measured_run import configuration
+from configured import settings
 
 from warp_resphys import Body, Corotated, Simulator, box_hexahedra, select_vertices
 from warp_resphys.data.trials import Trials
 from warp_resphys.dynamics.nonlinear_solver import SolverSettings
-from warp_resphys.experiment.checks import check_configuration
-from warp_resphys.experiment.schema import check, refinement_group
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.networks import build_model
@@ -27,8 +25,8 @@ FRAMES = 11
 
 
 def simulator(material=WRONG, integrator="implicit_euler"):
-    settings = SolverSettings(relative_tolerance=1e-11, on_failure="count")
-    return Simulator(BODY, material, integrator=integrator, solver=settings)
+    solver = SolverSettings(relative_tolerance=1e-11, on_failure="count")
+    return Simulator(BODY, material, integrator=integrator, solver=solver)
 
 
 def motion(integrator="implicit_euler", seed=0):
@@ -86,9 +84,9 @@ def window_loss(model, window=3, batch_size=4, integrator="implicit_euler"):
     return WindowLoss(model, lambda: simulator(integrator=integrator), window, batch_size)
 
 
-def trainer(model=None, error=None, **settings):
+def trainer(model=None, error=None, **changes):
     model = network() if model is None else model
-    config = {**CONFIG, **settings}
+    config = {**CONFIG, **changes}
     loss = window_loss(model, config["window"], config["batch_size"])
 
     def drift(model):
@@ -281,32 +279,10 @@ class TestTraining:
             run.run_epoch()
 
 
-NATURAL = "it must be a whole number, one or more."
-
-
-@pytest.mark.parametrize(
-    ("settings", "sentence"),
-    [
-        ({"kind": "adjoint"}, "refinement.kind is 'adjoint': it must be one of none, solver_in_the_loop."),
-        ({"window": 0}, f"refinement.window is 0: {NATURAL}"),
-        ({"epochs": 0}, f"refinement.epochs is 0: {NATURAL}"),
-        ({"batch_size": -1}, f"refinement.batch_size is -1: {NATURAL}"),
-        ({"memory": 0}, f"refinement.memory is 0: {NATURAL}"),
-        ({"rollout_every": 0}, f"refinement.rollout_every is 0: {NATURAL}"),
-    ],
-)
-def test_bad_settings(settings, sentence):
-    check("refinement", CONFIG, refinement_group(CONFIG))
-    with pytest.raises(InputError) as error:
-        check("refinement", {**CONFIG, **settings}, refinement_group({**CONFIG, **settings}))
-    assert str(error.value) == sentence
-
-
 @pytest.mark.parametrize("experiment", ["beam_oscillation", "sopra"])
 def test_a_window_is_shorter_than_the_trials(experiment):
-    config = configuration("refinement=solver_in_the_loop", "data.steps=50", experiment=experiment)
-    config["data"] |= {"horizons": []} if experiment == "sopra" else {}
-    check_configuration(config | {"refinement": {**CONFIG, "window": 49}})
-    with pytest.raises(InputError) as error:
-        check_configuration(config | {"refinement": {**CONFIG, "window": 50}})
-    assert str(error.value) == "refinement.window is 50: it must be less than the data's 50 steps."
+    shorter = ["data.horizons=[]"] if experiment == "sopra" else []
+    refined = (f"experiment={experiment}", "refinement=solver_in_the_loop", "data.steps=50", *shorter)
+    settings(*refined, "refinement.window=49")
+    with pytest.raises(InputError, match=r"refinement\.window is 50"):
+        settings(*refined, "refinement.window=50")

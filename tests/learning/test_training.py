@@ -5,7 +5,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from warp_resphys.experiment.schema import TRAINER, check
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.networks import build_model
@@ -220,31 +219,3 @@ def test_outputs_weigh_by_their_deviation(exponent, smallest):
     unit = coder.scale.square().mean() if exponent else 1.0
     assert loss == pytest.approx(float(weighed.square().mean() / unit), rel=1e-4)
     assert float(coder.scale.min() / coder.scale.max()) ** exponent == pytest.approx(smallest, rel=0.5)
-
-
-@pytest.mark.parametrize(
-    ("settings", "sentence"),
-    [
-        ({"epochs": 0}, "trainer.epochs is 0: it must be a whole number, one or more."),
-        ({"batch_size": 0}, "trainer.batch_size is 0: it must be a whole number, one or more."),
-        ({"learning_rate": 0.0}, "trainer.learning_rate is 0.0: it must be a positive number."),
-        ({"learning_rate": math.nan}, "trainer.learning_rate is nan: it must be a positive number."),
-        ({"final_learning_rate": -1.0}, "trainer.final_learning_rate is -1.0: it must be a positive number."),
-        ({"rollout_every": 0}, "trainer.rollout_every is 0: it must be a whole number, one or more."),
-        ({"weight_decay": -1.0}, "trainer.weight_decay is -1.0: it must be a number, zero or more."),
-        ({"noise": -1.0}, "trainer.noise is -1.0: it must be a number, zero or more."),
-        ({"scale_weight": -1.0}, "trainer.scale_weight is -1.0: it must be a number, zero or more."),
-        ({"schedule": "linear"}, "trainer.schedule is 'linear': it must be one of cosine, step."),
-        ({"selection": "test"}, "trainer.selection is 'test': it must be one of rollout, validation_loss."),
-        ({"gamma": 0.0}, "trainer.gamma is 0.0: it must be more than 0 and at most 1."),
-        ({"gamma": 1.1}, "trainer.gamma is 1.1: it must be more than 0 and at most 1."),
-        ({"step_epochs": 0}, "trainer.step_epochs is 0: it must be a whole number, one or more."),
-        ({"linear_noise": 0.0}, "trainer.linear_noise is 0.0: it must be a positive number, or null."),
-    ],
-)
-def test_bad_settings(settings, sentence):
-    check("trainer", CONFIG, TRAINER)
-    check("trainer", {**CONFIG, "linear_noise": None}, TRAINER)
-    with pytest.raises(InputError) as error:
-        check("trainer", {**CONFIG, **settings}, TRAINER)
-    assert str(error.value) == sentence

@@ -1,21 +1,23 @@
 import re
 import sys
+from dataclasses import fields
 from importlib import resources
 from math import pi
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_module
-from omegaconf import OmegaConf
+from configured import composed
 
 from warp_resphys.experiment.build import build_mesh
 from warp_resphys.io.errors import InputError, MeshError
+from warp_resphys.io.settings import parse
 from warp_resphys.mesh.arm import mesh_arm
-from warp_resphys.mesh.arm_geometry import ArmGeometry, arm_geometry
+from warp_resphys.mesh.arm_geometry import ArmGeometry
 from warp_resphys.mesh.chambers import check_chambers, find_chambers
 from warp_resphys.mesh.mesh import boundary_faces, check_mesh, face_triangles, quadratic
 from warp_resphys.mesh.quality import cell_volumes, scaled_jacobian
 from warp_resphys.mesh.readers import read_mesh, read_surfaces, write_mesh
+from warp_resphys.settings.body import MeshGroup
 
 SHIPPED = resources.files("warp_resphys") / "meshes"
 SHAPES = [
@@ -85,8 +87,7 @@ def quad_areas(mesh, faces):
 
 
 def configured(*overrides):
-    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        return OmegaConf.to_container(compose("config", list(overrides)), resolve=True)["mesh"]
+    return parse(MeshGroup, {"mesh": composed(*overrides)["mesh"]}).mesh
 
 
 @pytest.mark.parametrize(("cells", "size"), [("hexahedra", 0.01), ("hexahedra", 0.002), ("tetrahedra", 0.03)])
@@ -286,9 +287,11 @@ def test_unknown_shipped_arm():
 
 
 def test_generated_arm_is_configured():
-    config = configured("mesh=arm_generated", "mesh.chambers=4", "mesh.size=0.012")
-    assert arm_geometry(config) == ArmGeometry(chambers=4)
-    assert len(find_chambers(build_mesh(config))) == 8
+    arm = configured("mesh=arm_generated", "mesh.chambers=4", "mesh.size=0.012")
+    assert ArmGeometry(**{each.name: getattr(arm, each.name) for each in fields(ArmGeometry)}) == ArmGeometry(
+        chambers=4
+    )
+    assert len(find_chambers(build_mesh(arm))) == 8
 
 
 def test_named_surfaces_survive_a_file(tmp_path):

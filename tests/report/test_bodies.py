@@ -64,7 +64,7 @@ def test_one_marker_alone_is_seen_from_a_distance_that_shows_its_body():
 @pytest.mark.usefixtures("can_draw")
 def test_second_view_is_from_below():
     arm = shipped_arm("arm_hexahedra_500")
-    places = np.array(list(arm_settings()["markers"]["tracked"].values()))
+    places = np.array(list(arm_settings().markers.tracked.values()))
     push = np.array([[LIMIT, 0.0, 0.0, 0.0, 0.0, 0.0]] * 30)  # Along x.
     body, markers = (
         np.concatenate([bent(points, np.zeros((1, 6)))[:1], bent(points, push)[-1:]])

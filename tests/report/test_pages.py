@@ -8,7 +8,7 @@ import measured_run as beam
 import numpy as np
 import pytest
 from chambered import hollow_box
-from driven_run import BASE, MODELS, arm_settings, data, errors_of, write_run
+from driven_run import BASE, LABORATORY, MODELS, arm_settings, data, errors_of, write_run
 from measured_run import FRAMES, SECONDS, STEP, TRACKED, TRIALS, write_folds, write_recordings, write_split
 from report_page import report
 
@@ -23,6 +23,7 @@ from warp_resphys.mesh.readers import write_mesh
 from warp_resphys.report.data import best_and_worst
 from warp_resphys.report.marker_section import paths_section
 from warp_resphys.report.page import NONE, Canvas, Drawn, Picture
+from warp_resphys.settings.stages import ReportStage
 
 BEAM = beam.config()
 FIGURES_OF_AN_ARM = {
@@ -106,11 +107,12 @@ class TestArms:
         box = hollow_box("hexahedron")
         turned = box.vertices[:, [2, 1, 0]] * [1.0, 1.0, -1.0] - [0.01, 0.015, 0.0]
         write_mesh(tmp_path / "box.vtk", Mesh(turned, box.cells))
-        settings = arm_settings("segment_real", 2)
-        settings["mesh"] = {"kind": "file", "path": str(tmp_path / "box.vtk"), "units": "m", "order": 1}
-        settings["mesh"]["drop_unreferenced"] = True
-        settings["markers"] = {"tracked": {"Tip": [0.0, 0.01, -0.06]}, "reference": BASE}
-        settings["data"] = data(folder="recordings", input_limit=None)
+        own = {
+            "mesh": {"kind": "file", "path": str(tmp_path / "box.vtk"), "drop_unreferenced": True},
+            "markers": {"tracked": {"Tip": [0.0, 0.01, -0.06]}, "reference": BASE},
+            "data": data(folder="recordings", input_limit=None),
+        }
+        settings = arm_settings("segment_real", 2, **own)
         write_run(tmp_path, settings, train=0, test=1, chambers=1, models=("simulation", "resphys"), simulated=False)
         page = report(tmp_path, settings)
         for said in ("On trial test_00, which", "1 test trial of 2 s and 1 marker, ±", "Pressures of the trial."):
@@ -157,7 +159,7 @@ class TestArms:
     def test_what_is_read(self, tmp_path):
         settings = arm_settings()
         write_run(tmp_path, settings, diverged=("simfree",))
-        trials, film = read_trials(tmp_path, settings), read_film(tmp_path, settings, build_mesh(settings["mesh"]))
+        trials, film = read_trials(tmp_path, settings), read_film(tmp_path, settings, build_mesh(settings.mesh))
         pressures = read_driven(tmp_path, settings)
         assert pressures.scaled == ()
         assert trials.times[0, [0, -1]].tolist() == [0.0, pytest.approx(2.0)]
@@ -191,14 +193,14 @@ class TestArms:
         settings, shown = arm_settings(), []
         write_run(tmp_path, settings, test=1, steps=40, models=("simulation",), sag=0.004)
         monkeypatch.setattr(stage, "write_report", lambda _, data: shown.append(data))
-        stage.make_report(StageContext("report", tmp_path, "", {"config": settings}))
+        stage.make_report(StageContext("report", tmp_path, "", ReportStage(config=settings)))
         (found,) = shown
         sagged = found.mesh.vertices[:, 2].min() - found.recordings.mesh.vertices[:, 2].min()
         assert sagged == pytest.approx(0.004, abs=1e-6)
         nominal = dict(zip(found.recordings.labels, found.recordings.nominal[:, 2], strict=True))
         assert nominal["Base - 1"] == BASE["Base - 1"][2]
         for label, moved in (("Ring 3 - 1", -0.004), ("Ring 1 - 1", -0.001)):
-            assert nominal[label] - settings["markers"]["tracked"][label][2] == pytest.approx(moved, abs=3e-4)
+            assert nominal[label] - settings.markers.tracked[label][2] == pytest.approx(moved, abs=3e-4)
 
 
 class TestBeams:
@@ -233,7 +235,10 @@ class TestBeams:
         write_split(tmp_path, ["bare", "load52"], models=("simulation", "resphys"), diverged=("resphys",))
         for name in ("identification.json", "training_resphys.json", "truth.json"):
             (tmp_path / name).unlink()
-        page = report(tmp_path, {**BEAM, "name": "my_robot", "data": {**BEAM["data"], "folder": None}})
+        page = report(
+            tmp_path,
+            BEAM.changed(name="my_robot", data=BEAM.data.changed(folder=None), laboratory=LABORATORY),
+        )
         assert "ResPhys diverged in 1 of 2 roll-outs" in page.text
         assert page.text.count("1 of 2 diverged") == 1
         for said in ("No recordings are configured", "A line ends where the first roll-out has diverged."):
@@ -256,7 +261,7 @@ class TestBeams:
         identified["sysid"]["parameters"]["youngs_modulus"] = 2e6
         write_json(tmp_path / "identification.json", identified)
         ranges = {"parameters": {"youngs_modulus": {"lower": 5e4, "upper": 2e6}}}
-        page = report(tmp_path, BEAM | {"identify": ranges})
+        page = report(tmp_path, BEAM.changed(identify=ranges))
         head = page.text[: page.text.index("Error of the markers")]
         mean = f"{errors['errors_mm']['sysid']['mean']:.3f}"
         assert re.search(f"{mean} mm from the measured ones over the first [0-9.]+ s with SysID;", head)
@@ -291,7 +296,7 @@ class TestBeams:
         assert trials.positions["resphys"].shape == trials.target.shape
         assert trials.times[0, -1] <= SECONDS < trials.times[0, -1] + STEP
         assert np.isfinite(trials.target).all()
-        whole = read_trials(tmp_path / "fold_load101", {**BEAM, "data": {**BEAM["data"], "seconds": None}})
+        whole = read_trials(tmp_path / "fold_load101", BEAM.changed(data=BEAM.data.changed(seconds=None)))
         assert whole.target.shape[1] == FRAMES
         assert np.isnan(whole.target[0, -3:]).all()
         expected = read_json(tmp_path / "fold_load101" / "errors.json")["errors_mm"]

@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_module
-from omegaconf import OmegaConf
+from configured import composed
 
 from warp_resphys.learning.metrics import (
     PUBLISHED_MM,
@@ -262,10 +261,8 @@ def test_trials_out_of_range_are_counted_where_they_belong():
     ],
 )
 def test_it_is_said_whose_network_it_is(options, said):
-    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        config = OmegaConf.to_container(compose("config", options), resolve=True)
-        refined = OmegaConf.to_container(compose("config", [*options, "refinement=solver_in_the_loop"]), resolve=True)
-    note = network_note(config["network"], config["trainer"], config["refinement"])
+    config, refined = composed(*options), composed(*options, "refinement=solver_in_the_loop")
+    note = network_note(config["network"], config["trainer"], {})
     assert all(words in note for words in said)
     assert network_note(config["network"], config["trainer"], refined["refinement"]).startswith(note)
 

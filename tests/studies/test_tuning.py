@@ -12,14 +12,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from configured import check, composed
 from main_job import IN_RUN, TINY, files, run
-from measured_run import configuration
 from omegaconf import OmegaConf
 from optuna.trial import TrialState
 
 from warp_resphys import pipeline
 from warp_resphys.experiment import learn
-from warp_resphys.experiment.checks import check_configuration
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_checkpoint
 from warp_resphys.learning.training import Trainer
@@ -460,9 +459,8 @@ class TestBadInput:
         ],
     )
     def test_other_experiments_are_searched(self, overrides, groups):
-        experiment, *others = overrides
-        config = configuration(*others, experiment=experiment.partition("=")[2])
-        check_configuration(config)
+        config = composed(*overrides)
+        check(config)
         _, space, _ = tune.check_tuning(config)
         assert {key.partition(".")[0] for key in space} == groups
 

@@ -1,9 +1,8 @@
 """The simulated laboratory, driven by hand: commands go in, and what its cameras see comes out."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import torch
@@ -13,10 +12,10 @@ from ..data.rigid import RigidTransform, kabsch
 from ..experiment.build import bound_markers
 from ..experiment.files import REGISTRATION
 from ..experiment.simulate import laboratory_simulator, make_setup, substeps_of
-from ..io.errors import InputError
 from ..io.files import read_json
 from ..mesh.mesh import boundary_triangles
 from ..robot.state import RobotState
+from ..settings.stages import PlayedSettings
 from ..stepping.inputs import Inputs
 from .world import BoolArray, FloatArray, IntArray, World
 
@@ -28,7 +27,7 @@ class Laboratory(World):
     """B bodies that play the real one, from rest.
 
     Args:
-        settings: of the experiment, with a laboratory.
+        settings: of the laboratory.
         run_dir: of its run, whose registration says where cameras have the body.
         name: of the input.
         count: B.
@@ -37,35 +36,30 @@ class Laboratory(World):
 
     Attributes:
         state: of the bodies.
-
-    Raises:
-        InputError: the experiment has recordings in place of a laboratory.
     """
 
     noise: float
 
     def __init__(
         self,
-        settings: Mapping[str, Any],
+        settings: PlayedSettings,
         run_dir: Path,
         name: str,
         count: int,
         seed: int,
         on_failure: str = "raise",
     ) -> None:
-        if settings.get("laboratory") is None:
-            raise InputError("the experiment has no laboratory: control is tried on a simulated one.")
         setup = make_setup(settings)
         simulator = laboratory_simulator(settings, setup.gravity)
         self._simulator = replace(simulator, solver=replace(simulator.settings, on_failure=on_failure))
         self._constants, self.input, self.count = self._simulator.prepare(), name, count
-        self.time_step, self.parts = float(settings["time_step"]), self._simulator.counts[name]
-        labels = tuple(settings["markers"]["tracked"])
-        found = bound_markers(settings["markers"], self._simulator.body.mesh, setup.tracked, labels)
+        self.time_step, self.parts = settings.time_step, self._simulator.counts[name]
+        binding = settings.binding
+        found = bound_markers(binding, self._simulator.body.mesh, setup.tracked, tuple(binding.tracked))
         self._read = found.to(self._simulator.rest_positions)
-        self._substeps, self.noise = substeps_of(settings), float(settings["laboratory"]["noise"])
-        self._seeds = (int(settings["seed"]), _STREAM, seed)
-        self._frame = _registered(run_dir, setup.reference, tuple(settings["markers"]["reference"]))
+        self._substeps, self.noise = substeps_of(settings), settings.laboratory.noise
+        self._seeds = (settings.seed, _STREAM, seed)
+        self._frame = _registered(run_dir, setup.reference, tuple(binding.reference))
         with torch.no_grad():
             inputs = self._inputs(np.zeros((count, self.parts)))
             self.state = self._simulator.static_equilibrium(inputs, self._constants, batch=count)

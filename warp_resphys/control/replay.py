@@ -1,9 +1,8 @@
 """What controllers did on the simulated laboratory, done again to be looked at."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +10,10 @@ from numpy.typing import NDArray
 from ..experiment.files import DRIVEN
 from ..io.errors import InputError
 from ..io.progress import Progress
+from ..io.settings import parse
 from ..io.stages import finished_record
 from ..robot.loading import load
+from ..settings.stages import DriveStage
 from .files import DrivenMotion, read_driven
 from .laboratory import Laboratory
 from .plan import tracked_of
@@ -23,7 +24,7 @@ from .task import motions_of
 FloatArray = NDArray[np.float64]
 
 
-def driven_settings(folder: Path) -> Mapping[str, Any]:
+def driven_settings(folder: Path) -> DriveStage:
     """Settings of a run whose laboratory controllers have driven.
 
     Raises:
@@ -34,8 +35,7 @@ def driven_settings(folder: Path) -> Mapping[str, Any]:
         raise InputError(
             f"no motion was driven in {folder}: name a finished run of an experiment with control, as sopra_control."
         )
-    settings: Mapping[str, Any] = finished_record(folder, "drive")["settings"]
-    return settings
+    return parse(DriveStage, finished_record(folder, "drive")["settings"])
 
 
 @dataclass(frozen=True)
@@ -74,15 +74,15 @@ def replay(folder: Path, motion: str, controllers: Sequence[str], seconds: float
         ConvergenceError: the simulation diverges.
     """
     settings = driven_settings(folder)
-    control = settings["control"]
+    control = settings.control
     known = controllers_of(control)
     _check("motion", [motion], motions_of(control))
     _check("controllers", controllers, known)
-    robot = load(folder, control["models"][-1], settings["device"])
+    robot = load(folder, control.models[-1], settings.device)
     driven, rows = read_driven(folder / DRIVEN, motion), [known.index(each) for each in controllers]
     steps = max(int(min(len(driven.path), seconds / robot.time_step)), 1)
-    laboratory = Laboratory(settings, folder, driven_input(robot).name, len(rows), 0)
-    tracked = tracked_of(robot.labels, control["tracked"])
+    laboratory = Laboratory(settings.played, folder, driven_input(robot).name, len(rows), 0)
+    tracked = tracked_of(robot.labels, control.tracked)
     bodies, points = [laboratory.bodies()[1]], [laboratory.markers()]
     with Progress("laboratory", steps, "steps") as progress:
         for number in range(steps):

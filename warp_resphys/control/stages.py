@@ -20,6 +20,8 @@ from ..io.stages import StageContext
 from ..robot.export import input_columns, write_csv
 from ..robot.loading import load
 from ..robot.robot import Robot
+from ..settings.control import ControlSettings, FigureSettings
+from ..settings.stages import BaselinesStage, DriveStage, PlanStage, ReduceStage
 from ..stepping.state import State
 from .baselines import fit_linear
 from .controllers import (
@@ -30,6 +32,7 @@ from .controllers import (
     RecedingHorizon,
     timed_command,
 )
+from .estimate import Noise
 from .files import (
     BASELINES,
     DrivenMotion,
@@ -51,7 +54,7 @@ from .laboratory import Laboratory
 from .open_loop import Follower
 from .reduced import ReducedModel
 from .reduction import reduce
-from .sampling import driven_input
+from .sampling import Sampling, driven_input
 from .task import Task, motion_name
 
 FloatArray = NDArray[np.float64]
@@ -65,12 +68,12 @@ def reduce_robot(context: StageContext) -> None:
     Raises:
         InputError, ConvergenceError: it cannot be reduced, see `reduction.reduce`.
     """
-    settings = context.settings
-    robot = load(context.run_dir, settings["model"], settings["device"])
-    sampling = _task(settings, robot).sampling(settings["seed"])
+    settings: ReduceStage = context.settings
+    robot = load(context.run_dir, settings.model, settings.device)
+    sampling = Sampling(**dict(settings.reduction), seed=settings.seed)
     with Progress(context.name, sampling.total, "samples") as progress:
         found = reduce(robot, sampling, progress.advance)
-    write_reduced(context.run_dir / reduced_file(settings["model"]), found)
+    write_reduced(context.run_dir / reduced_file(settings.model), found)
 
 
 def plan_motions(context: StageContext) -> None:
@@ -80,18 +83,19 @@ def plan_motions(context: StageContext) -> None:
         InputError: the robot cannot reach a path, and is the one that must.
         ConvergenceError: the robot diverges on a plan.
     """
-    settings, model = context.settings, context.settings["model"]
-    robot = load(context.run_dir, model, settings["device"])
-    task, known = _task(settings, robot), settings["control"]["plan"]
+    settings: PlanStage = context.settings
+    model, plan = settings.model, settings.plan
+    robot = load(context.run_dir, model, settings.device)
+    task = task_of(settings.figures, robot)
     reduced = read_reduced(context.run_dir / reduced_file(model), robot.description.learned)
-    if settings["must_reach"]:
-        task.check_reach(reduced)
-    start, seconds = _start(context.run_dir, task), settings["control"]["seconds"]
+    if settings.must_reach:
+        task.check_reach(reduced, plan.reach)
+    start, seconds = _start(context.run_dir, task), settings.figures.seconds
     checkpoint = context.run_dir / f"{context.name}.state.safetensors"
     kept = resume_checkpoint(checkpoint, "plans", context.fingerprint)
     found = {} if kept is None else plans_from_plain(*kept)
     followers = {
-        each: Follower(robot, reduced, task.planner(reduced, each), known["corrections"], known["gradient"])
+        each: Follower(robot, reduced, task.planner(reduced, each, plan), plan.corrections, plan.gradient)
         for each in seconds
     }
     total = sum(each.rollouts * task.steps(time) for time, each in followers.items())
@@ -127,19 +131,19 @@ def fit_baselines(context: StageContext) -> None:
     Raises:
         InputError: too few frames of the trials show all markers.
     """
-    settings = context.settings
-    robot = load(context.run_dir, settings["control"]["models"][-1], settings["device"])
-    task, known, data = _task(settings, robot), driven_input(robot), read_dataset(context.run_dir / DATASET)
+    settings: BaselinesStage = context.settings
+    robot = load(context.run_dir, settings.model, settings.device)
+    task, known, data = task_of(settings.figures, robot), driven_input(robot), read_dataset(context.run_dir / DATASET)
     assert known.high is not None
     train, validation = (
-        [_series(data, name, known.name, robot.time_step) for name in settings["split"][part]]
-        for part in ("train", "validation")
+        [_series(data, name, known.name, robot.time_step) for name in names]
+        for names in (settings.split.train, settings.split.validation)
     )
     linear = fit_linear(train, validation or train, np.asarray(known.high), robot.time_step)
-    feedback, limits = settings["control"]["feedback"], task.limits
-    parts, steps = task.parts, max(round(feedback["settles"] / robot.time_step), 2)
-    pressed = feedback["pressed"] * np.diag(limits.range)
-    laboratory = Laboratory(settings, context.run_dir, known.name, parts, len(task.motions))
+    feedback, limits = settings.feedback, task.limits
+    parts, steps = task.parts, max(round(feedback.settles / robot.time_step), 2)
+    pressed = feedback.pressed * np.diag(limits.range)
+    laboratory = Laboratory(settings.played, context.run_dir, known.name, parts, len(task.motions))
     rest, seen = laboratory.rest(), []
     with Progress(context.name, steps, "steps") as progress:
         for number in range(steps):
@@ -169,37 +173,38 @@ def _series(data: Dataset, name: str, given: str, time_step: float) -> tuple[Flo
 
 def drive(context: StageContext, workers: Workers = ALONE) -> None:
     """Writes how all controllers drive all motions on the simulated laboratory."""
-    settings = context.settings
-    controllers = controllers_of(settings["control"])
-    robot = load(context.run_dir, settings["control"]["models"][-1], settings["device"])
-    task, parts = _task(settings, robot), list[TrialPart]()
-    for seconds in settings["control"]["seconds"]:
+    settings: DriveStage = context.settings
+    control = settings.control
+    controllers = controllers_of(control)
+    robot = load(context.run_dir, control.models[-1], settings.device)
+    task, parts = task_of(control, robot), list[TrialPart]()
+    for seconds in control.seconds:
         for name in _names(task, seconds):
             parts += split_into_parts(context, (name,), task.steps(seconds) + 1, name)
     work_on(parts, _Drive, workers)
     motions = {}
     for part in parts:
         (name,) = part.names
-        points, inputs, seconds = (read_parts([part], key).swapaxes(0, 1) for key in ("points", "inputs", "seconds"))
-        path = read_plan(context.run_dir / plans_file(settings["control"]["models"][-1]), name).path
-        motions[name] = DrivenMotion(path, points[:, 1:], inputs[:, 1:], seconds[:, 1:])
+        points, inputs, took = (read_parts([part], key).swapaxes(0, 1) for key in ("points", "inputs", "seconds"))
+        path = read_plan(context.run_dir / plans_file(control.models[-1]), name).path
+        motions[name] = DrivenMotion(path, points[:, 1:], inputs[:, 1:], took[:, 1:])
     write_driven(context.run_dir / DRIVEN, controllers, robot.time_step, motions)
-    write_json(context.run_dir / CONTROL, _summary(context.run_dir, settings, controllers, motions))
+    write_json(context.run_dir / CONTROL, _summary(context.run_dir, control, controllers, motions))
     remove_parts(context)
 
 
-def controllers_of(control: Mapping[str, Any]) -> list[str]:
+def controllers_of(control: ControlSettings) -> list[str]:
     """What drives, in the order of the tables."""
     return [
-        *(f"{OPEN}{model}" for model in control["models"]),
-        *(f"{RECEDING}{model}" for model in control["receding"]),
+        *(f"{OPEN}{model}" for model in control.models),
+        *(f"{RECEDING}{model}" for model in control.receding),
         f"{RECEDING}{LINEAR}",
-        *(f"{FEEDBACK}{gain:g}" for gain in control["feedback"]["gains"]),
+        *(f"{FEEDBACK}{gain:g}" for gain in control.feedback.gains),
     ]
 
 
 def receding_controllers(
-    settings: Mapping[str, Any], folder: Path, robot: Robot, path: FloatArray, rests: FloatArray
+    settings: DriveStage, folder: Path, robot: Robot, path: FloatArray, rests: FloatArray
 ) -> list[Controller]:
     """Those that plan anew at each step, on the reduced models and at last on the linear one.
 
@@ -210,12 +215,13 @@ def receding_controllers(
         path: (T, d) where the point is to be after each step [m].
         rests: (>= C, M, 3) the markers that each of them sees as the robot hangs without inputs [m].
     """
-    task, control = _task(settings, robot), settings["control"]
-    limits, horizon, found = task.limits, task.horizon, list[Controller]()
-    for model in control["receding"]:
-        learned = robot if model == robot.description.model else load(folder, model, settings["device"])
+    control = settings.control
+    task, noise, found = task_of(control, robot), Noise(**dict(control.estimate)), list[Controller]()
+    limits, horizon = task.limits, task.horizon(control.horizon)
+    for model in control.receding:
+        learned = robot if model == robot.description.model else load(folder, model, settings.device)
         reduced: ReducedModel = read_reduced(folder / reduced_file(model), learned.description.learned)
-        found.append(RecedingHorizon(reduced, task.tracked, limits, horizon, task.noise, path, rests[len(found)]))
+        found.append(RecedingHorizon(reduced, task.tracked, limits, horizon, noise, path, rests[len(found)]))
     linear = read_baselines(folder / BASELINES)[0]
     return [*found, LinearRecedingHorizon(linear, task.tracked, limits, horizon, path, rests[len(found)])]
 
@@ -224,12 +230,14 @@ class _Drive(ResumableRollout):
     """One motion, driven by all controllers at once."""
 
     def __init__(self, part: TrialPart) -> None:
-        self._settings, self._folder, (self._name,) = part.context.settings, part.context.run_dir, part.names
-        names = controllers_of(self._settings["control"])
-        robot = load(self._folder, self._settings["control"]["models"][-1], self._settings["device"])
-        self._task, known = _task(self._settings, robot), driven_input(robot)
+        settings: DriveStage = part.context.settings
+        self._settings, self._folder, (self._name,) = settings, part.context.run_dir, part.names
+        control = settings.control
+        names = controllers_of(control)
+        robot = load(self._folder, control.models[-1], settings.device)
+        self._task, known = task_of(control, robot), driven_input(robot)
         number = self._task.motions.index(self._name)
-        self._laboratory = Laboratory(self._settings, self._folder, known.name, len(names), number)
+        self._laboratory = Laboratory(settings.played, self._folder, known.name, len(names), number)
         self._controllers = self._made(robot)
         self.like, self.frames, count = self._laboratory.state.q, part.frames, len(names)
         self.fields = {
@@ -240,13 +248,13 @@ class _Drive(ResumableRollout):
         self._inputs, self._seconds = np.zeros((count, self._task.parts)), np.zeros(count)
 
     def _made(self, robot: Robot) -> list[Controller]:
-        control, task, folder = self._settings["control"], self._task, self._folder
-        plans = {model: read_plan(folder / plans_file(model), self._name) for model in control["models"]}
-        rest, path = self._laboratory.rest(), plans[control["models"][-1]].path
+        control, task, folder = self._settings.control, self._task, self._folder
+        plans = {model: read_plan(folder / plans_file(model), self._name) for model in control.models}
+        rest, path = self._laboratory.rest(), plans[control.models[-1]].path
         found: list[Controller] = [OpenLoop(plan.inputs) for plan in plans.values()]
         found += receding_controllers(self._settings, folder, robot, path, rest[len(found) :])
         limits, jacobian = task.limits, read_baselines(folder / BASELINES)[1]
-        for gain in control["feedback"]["gains"]:
+        for gain in control.feedback.gains:
             own = rest[len(found)]
             found.append(JacobianFeedback(jacobian, limits, gain, task.time_step, task.tracked, path, own))
         return found
@@ -288,13 +296,12 @@ class _Drive(ResumableRollout):
 
 
 def _summary(
-    folder: Path, settings: Mapping[str, Any], controllers: Sequence[str], motions: Mapping[str, DrivenMotion]
+    folder: Path, control: ControlSettings, controllers: Sequence[str], motions: Mapping[str, DrivenMotion]
 ) -> dict[str, Any]:
     """What control.json says: errors [mm] by speed and controller, and of each motion; times; the reduced models."""
-    control = settings["control"]
     by_speed: dict[str, Any] = {}
-    for seconds in control["seconds"]:
-        names = [motion_name(shape, seconds) for shape in control["shapes"]]
+    for seconds in control.seconds:
+        names = [motion_name(shape, seconds) for shape in control.shapes]
         each = {name: 1e3 * np.linalg.norm(motions[name].points - motions[name].path, axis=2) for name in names}
         by_speed[f"{seconds:g}"] = {
             controller: {
@@ -307,9 +314,9 @@ def _summary(
     times = np.concatenate([motion.seconds for motion in motions.values()], axis=1)
     planned = {
         model: {name: read_plan(folder / plans_file(model), name).errors_mm.tolist() for name in motions}
-        for model in control["models"]
+        for model in control.models
     }
-    models = {model: read_quality(folder / reduced_file(model)) for model in control["models"]}
+    models = {model: read_quality(folder / reduced_file(model)) for model in control.models}
     return {
         "tracking": by_speed,
         "command_ms": {
@@ -322,8 +329,9 @@ def _summary(
     }
 
 
-def _task(settings: Mapping[str, Any], robot: Robot) -> Task:
-    return Task(settings["control"], robot.labels, robot.time_step, len(driven_input(robot).parts))
+def task_of(figures: FigureSettings, robot: Robot) -> Task:
+    """The figures that a robot is to follow."""
+    return Task(figures, robot.labels, robot.time_step, len(driven_input(robot).parts))
 
 
 def _names(task: Task, seconds: float) -> list[str]:

@@ -1,21 +1,19 @@
 """What is to be followed, by what, within which limits: the group ``control`` of a configuration."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from ..io.errors import InputError
+from ..settings.control import FigureSettings, HorizonSettings, PlanSettings
 from .controllers import Horizon
-from .estimate import Noise
 from .plan import Limits, Planner, Weights, tracked_of
 from .reduced import ReducedModel
 from .reference import Path
-from .sampling import Sampling
 
 FloatArray = NDArray[np.float64]
 
@@ -27,13 +25,13 @@ class Task:
     """See the module.
 
     Attributes:
-        settings: the group ``control``.
+        figures: that are followed.
         labels: of the M markers.
         time_step: h [s].
         parts: n inputs.
     """
 
-    settings: Mapping[str, Any]
+    figures: FigureSettings
     labels: Sequence[str]
     time_step: float
     parts: int
@@ -41,23 +39,24 @@ class Task:
     @cached_property
     def tracked(self) -> FloatArray:
         """(3, 3 M) from the markers to the point that is to follow, which is the mean of some."""
-        return tracked_of(self.labels, self.settings["tracked"])
+        return tracked_of(self.labels, self.figures.tracked)
 
     @property
     def limits(self) -> Limits:
         """Of the inputs."""
-        return Limits(*(np.full(self.parts, float(self.settings["limits"][key])) for key in ("low", "high", "rate")))
+        limits = self.figures.limits
+        return Limits(*(np.full(self.parts, each) for each in (limits.low, limits.high, limits.rate)))
 
     @property
     def paths(self) -> list[Path]:
         """The curves."""
-        places = {key: self.settings[key] for key in ("size", "centre", "right", "up")}
-        return [Path(name, **places) for name in self.settings["shapes"]]
+        own = self.figures
+        return [Path(name, size=own.size, centre=own.centre, right=own.right, up=own.up) for name in own.shapes]
 
     @property
     def motions(self) -> list[str]:
         """Their names: each curve at each speed, such as ``eight_4s``."""
-        return motions_of(self.settings)
+        return motions_of(self.figures)
 
     def steps(self, seconds: float) -> int:
         """T of a motion whose curve takes so long."""
@@ -67,35 +66,25 @@ class Task:
         """(T, 3) where the point is to be after each step of a motion that begins at (3,) [m]."""
         return path.timed(seconds, self.time_step, lead=start)[1:]
 
-    def planner(self, model: ReducedModel, seconds: float) -> Planner:
+    def planner(self, model: ReducedModel, seconds: float, plan: PlanSettings) -> Planner:
         """Of whole motions."""
-        known, steps = self.settings["plan"], self.steps(seconds)
-        pieces = max(round(steps * self.time_step / known["spacing"]), 1)
-        weights = Weights(known["effort"], known["change"])
-        return Planner(
-            model, self.tracked, self.limits, steps, min(pieces, steps), weights, iterations=known["iterations"]
-        )
+        steps = self.steps(seconds)
+        pieces = max(round(steps * self.time_step / plan.spacing), 1)
+        weights = Weights(plan.effort, plan.change)
+        return Planner(model, self.tracked, self.limits, steps, min(pieces, steps), weights, iterations=plan.iterations)
 
-    @property
-    def horizon(self) -> Horizon:
+    def horizon(self, settings: HorizonSettings) -> Horizon:
         """Of receding plans."""
-        known = self.settings["horizon"]
-        steps = max(round(known["seconds"] / self.time_step), 1)
-        weights = Weights(known["effort"], known["change"])
-        return Horizon(steps, min(known["pieces"], steps), weights, known["iterations"])
+        steps = max(round(settings.seconds / self.time_step), 1)
+        weights = Weights(settings.effort, settings.change)
+        return Horizon(steps, min(settings.pieces, steps), weights, settings.iterations)
 
-    @property
-    def noise(self) -> Noise:
-        """What the estimator is to expect."""
-        return Noise(**self.settings["estimate"])
-
-    def sampling(self, seed: int) -> Sampling:
-        """For reduced models."""
-        known = self.settings["reduction"]
-        return Sampling(**{**known, "modes": tuple(known["modes"])}, seed=seed)
-
-    def check_reach(self, model: ReducedModel) -> None:
+    def check_reach(self, model: ReducedModel, reach: float) -> None:
         """Sees to it that the robot can come to rest at every point of the paths.
+
+        Args:
+            model: of the robot.
+            reach: distance that a point may be out of reach [m].
 
         Raises:
             InputError: it cannot; the nearest point that it reaches is named.
@@ -108,7 +97,7 @@ class Task:
                 distance = float(np.linalg.norm(near - point))
                 if distance > worst:
                     worst, shown = distance, (point, near)
-            if worst > self.settings["plan"]["reach"]:
+            if worst > reach:
                 wanted, reached = (_millimetres(each) for each in shown)
                 raise InputError(
                     f"the path {path.name} leaves what the robot reaches: of {wanted} mm, the nearest point that it "
@@ -136,9 +125,9 @@ class Task:
         return best.x, place(best.x)[0]
 
 
-def motions_of(control: Mapping[str, Any]) -> list[str]:
-    """The names of the motions that the group ``control`` asks for."""
-    return [motion_name(shape, seconds) for seconds in control["seconds"] for shape in control["shapes"]]
+def motions_of(figures: FigureSettings) -> list[str]:
+    """The names of the motions that are asked for."""
+    return [motion_name(shape, seconds) for seconds in figures.seconds for shape in figures.shapes]
 
 
 def motion_name(shape: str, seconds: float) -> str:

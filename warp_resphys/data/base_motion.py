@@ -4,7 +4,6 @@ A pose is a translation t [m] and a rotation vector [rad] of R, side by side: wh
 R x + t.
 """
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +13,9 @@ from scipy.interpolate import CubicSpline, make_smoothing_spline
 from scipy.spatial.transform import Rotation, Slerp
 
 from ..io.errors import DataFileError
+from ..settings.trials import MotionSettings
 from .rigid import FloatArray, RigidTransform, kabsch
 
-OBSERVED = ("recorded", "reference")  # the array `base` of a recording, or its reference markers, tell it
 _LARGEST_STEP = 0.2  # of the size of a body
 _MILLI = 1e3
 
@@ -31,12 +30,12 @@ def rigid(poses: FloatArray) -> RigidTransform:
     return RigidTransform(Rotation.from_rotvec(poses[:, 3:]).as_matrix(), poses[:, :3])
 
 
-def prescribed(motion: Mapping[str, Any], times: ArrayLike, folder: str | Path = ".", scale: float = 1.0) -> FloatArray:
+def prescribed(motion: MotionSettings, times: ArrayLike, folder: str | Path = ".", scale: float = 1.0) -> FloatArray:
     """(T, 6) poses at (T,) times [s] of a motion that is known beforehand.
 
     Args:
-        motion: ``file``, see `_table`, or ``swings``, see `_swinging`; and ``about``, the point of the base, in the
-            frame of the mesh, whose translation is given, and which rotations leave where it is [m].
+        motion: a table of poses, see `_table`, or sinusoids, see `_swinging`; ``about`` is the point of the base, in
+            the frame of the mesh, whose translation is given, and which rotations leave where it is [m].
         times: (T,) [s].
         folder: that a path in ``file`` begins in.
         scale: of the whole motion.
@@ -45,30 +44,26 @@ def prescribed(motion: Mapping[str, Any], times: ArrayLike, folder: str | Path =
         DataFileError: the file cannot be read.
     """
     at = np.asarray(times, dtype=np.float64)
-    poses = scale * (
-        _table(Path(folder).expanduser() / motion["file"], at) if "file" in motion else _swinging(motion, at)
-    )
-    about = np.asarray(motion.get("about", (0.0, 0.0, 0.0)), dtype=np.float64)
+    moved = _swinging(motion, at) if motion.file is None else _table(Path(folder).expanduser() / motion.file, at)
+    poses, about = scale * moved, np.asarray(motion.about, dtype=np.float64)
     poses[:, :3] += about - Rotation.from_rotvec(poses[:, 3:]).apply(about)
     return np.asarray(poses)
 
 
-def _swinging(motion: Mapping[str, Any], times: FloatArray) -> FloatArray:
+def _swinging(motion: MotionSettings, times: FloatArray) -> FloatArray:
     """(T, 6) a sum of sinusoids, which begins where the body was.
 
     ``swings``, by any names, have each a ``frequency`` [Hz], amplitudes ``translation`` [m] and ``rotation`` [rad]
     along and about x, y and z, and a ``phase`` [rad]; before ``start`` nothing moves, and during ``ramp`` after it the
     amplitudes grow from nothing [s].
     """
-    since = np.maximum(times - motion.get("start", 0.0), 0.0)
-    ramp = float(motion.get("ramp", 0.0))
-    share = np.clip(since / ramp, 0.0, 1.0) if ramp else np.ones_like(since)
+    since = np.maximum(times - motion.start, 0.0)
+    share = np.clip(since / motion.ramp, 0.0, 1.0) if motion.ramp else np.ones_like(since)
     grown = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
     poses = np.zeros((len(since), 6))
-    for swing in motion["swings"].values():
-        phase = float(swing.get("phase", 0.0))
-        wave = grown * (np.sin(2.0 * np.pi * swing["frequency"] * since + phase) - np.sin(phase))
-        poses += wave[:, None] * np.concatenate([swing.get(x, (0.0, 0.0, 0.0)) for x in ("translation", "rotation")])
+    for swing in (motion.swings or {}).values():
+        wave = grown * (np.sin(2.0 * np.pi * swing.frequency * since + swing.phase) - np.sin(swing.phase))
+        poses += wave[:, None] * np.concatenate([swing.translation, swing.rotation])
     return poses
 
 

@@ -20,10 +20,12 @@ from ..control.sampling import Sampling, driven_input
 from ..control.world import World
 from ..io.errors import InputError
 from ..io.progress import Progress
+from ..io.settings import parse
 from ..io.stages import finished_record
 from ..robot.inputs import BASE
 from ..robot.loading import load
 from ..robot.robot import Robot
+from ..settings.stages import LaboratoryStage
 from .tasks import FollowTask, Reach, ReachTask, RobotTask, SwingTask
 from .vector import ActionMapping, RobotVectorEnv
 from .worlds import ReducedWorld, RobotWorld
@@ -107,8 +109,8 @@ def make_vector(
         place = ReducedWorld(_reduced(robot, Path(run).expanduser(), seed), num_envs)
     else:
         folder = Path(run).expanduser()
-        settings = finished_record(folder, "laboratory")["settings"]
-        place = Laboratory({**settings, "device": "cpu"}, folder, driven_input(robot).name, num_envs, seed, "count")
+        settings = parse(LaboratoryStage, finished_record(folder, "laboratory")["settings"]).changed(device="cpu")
+        place = Laboratory(settings, folder, driven_input(robot).name, num_envs, seed, "count")
     markers = place.markers()[0]
     point = _tip(robot, markers, tracked, shown)
     asked: RobotTask

@@ -25,8 +25,10 @@ from ..learning.reconstruction import make_reconstructor
 from ..mesh.mesh import surface_vertices
 from ..report.ablation_page import write_ablation_report
 from ..report.page import number_text
+from ..settings.run import RunSettings
+from ..settings.stages import AblationStage, DrawSettings, MotionStage, ReportStage
 from ..stepping.state import State
-from .build import build_mesh, build_simulator, simulation_device
+from .build import build_body, build_simulator, simulation_device
 from .files import METRICS, REPORT
 from .parts import TrialPart, remove_parts, split_into_parts, work_on, workers_for
 from .reconstruct import Reconstructing
@@ -40,23 +42,27 @@ _STAGES = ("generate", "ablation", "report")
 _MM = 1e3
 
 
-def ablation_stages(config: Mapping[str, Any], base: Mapping[str, Any], shown: Mapping[str, Any]) -> list[Stage]:
-    """The stages of the study; ``base`` has what every simulation depends on, ``shown`` goes into the report."""
-    own = dict(config["ablation"])
-    workers = workers_for(config, own.pop("processes")).at_most(len(own["counts"]))
-    moved = {**base, **{key: config[key] for key in ("target", "simulation", "data")}}
-    reconstructed = {**base, **{key: config[key] for key in ("simulation", "reconstruction", "seed")}, "ablation": own}
-    work = partial(ablate, workers=workers)
+def ablation_stages(run: RunSettings, files: Mapping[str, str]) -> list[Stage]:
+    """The stages of the study.
+
+    Args:
+        run: with the group ``ablation``.
+        files: see `SimulationStage`.
+    """
+    assert run.ablation is not None
+    own = run.ablation
+    workers = workers_for(run.parallel, own.processes, run.device).at_most(len(own.counts))
+    work, known = partial(ablate, workers=workers), AblationStage.of(run, files=files, drawn=DrawSettings.of(own))
     return [
-        Stage("generate", generate_motion, (MOTION,), moved),
-        Stage("ablation", work, (DRAWS, SUMMARY, TABLE), reconstructed, ("generate",)),
-        Stage("report", report_ablation, (REPORT,), {"config": shown}, ("ablation",)),
+        Stage("generate", generate_motion, (MOTION,), MotionStage.of(run, files=files)),
+        Stage("ablation", work, (DRAWS, SUMMARY, TABLE), known, ("generate",)),
+        Stage("report", report_ablation, (REPORT,), ReportStage(config=run), ("ablation",)),
     ]
 
 
-def print_ablation(config: Mapping[str, Any], folder: Path) -> None:
+def print_ablation(run: RunSettings, folder: Path) -> None:
     """Writes metrics.json and prints the errors."""
-    metrics = _metrics(folder, config)
+    metrics = _metrics(folder, run)
     write_json(folder / METRICS, metrics)
     table = Table("markers", "median [mm]", "quartiles [mm]", title="Error of the reconstructed motion, all vertices")
     for row in metrics["by_markers"]:
@@ -69,14 +75,14 @@ def print_ablation(config: Mapping[str, Any], folder: Path) -> None:
 
 def generate_motion(context: StageContext) -> None:
     """Writes motion.h5: q (T + 1, N, 3) from the held state on, and what the uncorrected simulator makes of it."""
-    settings = context.settings
-    data = settings["data"]
-    target, simulation = (build_simulator(settings, name) for name in ("target", "simulation"))
+    settings: MotionStage = context.settings
+    data = settings.data
+    target, simulation = (build_simulator(settings, each) for each in (settings.target, settings.simulation))
     with torch.no_grad():
-        start = held_state(target, data["load"], 1e-3 * np.array(data["weights_g"]["observed"]))
-        motion = {"q": target.rollout(start, data["steps"]).q[:, 0]}
-        motion["uncorrected_q"] = simulation.rollout(start, data["steps"]).q[:, 0]
-    attributes = {"fingerprint": context.fingerprint, "time_step": settings["time_step"]}
+        start = held_state(target, data.load, 1e-3 * np.array(data.weights_g.observed))
+        motion = {"q": target.rollout(start, data.steps).q[:, 0]}
+        motion["uncorrected_q"] = simulation.rollout(start, data.steps).q[:, 0]
+    attributes = {"fingerprint": context.fingerprint, "time_step": settings.time_step}
     with atomic_hdf5(context.run_dir / MOTION, "motion", attributes) as file:
         for name, q in motion.items():
             create(file, name, q.cpu().numpy(), "m")
@@ -88,7 +94,7 @@ def ablate(context: StageContext, workers: Workers = ALONE) -> None:
     Raises:
         ConvergenceError, WorkerError: a step could not be reconstructed.
     """
-    counts = context.settings["ablation"]["counts"]
+    counts = list(context.settings.drawn.counts)
     motion, uncorrected = read_motion(context.run_dir)
     parts = {}
     for count in sorted(counts, reverse=True):  # The longest first, so that no process is left with it.
@@ -124,16 +130,17 @@ class _FromMarkers(Reconstructing):
     """
 
     def __init__(self, part: TrialPart) -> None:
-        settings, self._count = part.context.settings, part.more
-        simulator = build_simulator(settings, "simulation")
-        self.like, draws = simulator.rest_positions, settings["ablation"]["draws"]
+        settings: AblationStage = part.context.settings
+        self._count, draws = part.more, settings.drawn.draws
+        simulator = build_simulator(settings, settings.simulation)
+        self.like = simulator.rest_positions
         self._motion = simulator.tensor(read_motion(part.context.run_dir)[0])
-        self._vertices = draw_markers(simulator, self._count, draws, settings["seed"])
+        self._vertices = draw_markers(simulator, self._count, draws, settings.seed)
         self._markers = MarkerMap.at_vertices(torch.as_tensor(self._vertices, device=self.like.device), self.like.dtype)
-        more = {**settings["reconstruction"], "modes": settings["ablation"]["modes"]}
+        more = dict(settings.reconstruction) | {"modes": settings.drawn.modes}
         self.method = make_reconstructor(simulator, **more, markers=self._markers)
         self.force = self.like.new_zeros(draws, *self.like.shape)
-        self._padding = max(settings["ablation"]["counts"]) - self._count
+        self._padding = max(settings.drawn.counts) - self._count
         self.fields = {name: Field((draws,), "m", batch_axes=1) for name in ("error", "misfit")}
         self.frames = len(self._motion)
 
@@ -190,19 +197,19 @@ def summarise_draws(count: int, errors_mm: NDArray[np.float64], misfits_mm: NDAr
 
 def report_ablation(context: StageContext) -> None:
     """Writes report.html and its figure."""
-    config = context.settings["config"]
-    mesh = build_mesh(config["mesh"])
+    run: RunSettings = context.settings.config
+    body = build_body(run)
+    mesh, fixed = body.mesh, body.fixed_vertices
     surface = surface_vertices(mesh)
-    fixed = build_simulator(config).body.fixed_vertices
     counts = {"vertices": len(mesh.vertices), "surface": len(surface), "free": len(np.setdiff1d(surface, fixed))}
-    write_ablation_report(context.run_dir / REPORT, _metrics(context.run_dir, config), config, **counts)
+    write_ablation_report(context.run_dir / REPORT, _metrics(context.run_dir, run), run.plain(), **counts)
 
 
-def _metrics(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
+def _metrics(folder: Path, run: RunSettings) -> dict[str, Any]:
     """Errors, time and memory of the stages that are done, versions and device."""
     return {
         **read_json(folder / SUMMARY),
         **resources_used(folder, _STAGES),
         "versions": package_versions(),
-        "device": str(simulation_device(config)),
+        "device": str(simulation_device(run.device)),
     }

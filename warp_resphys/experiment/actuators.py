@@ -20,7 +20,11 @@ from ..fem.body import Body
 from ..io.errors import InputError
 from ..mesh.chambers import Chamber, find_chambers
 from ..mesh.mesh import Mesh, select_cells, select_vertices
+from ..settings.body import BodySettings, ChamberSettings, MuscleSettings, PlaceSettings, TendonSettings
+from ..settings.stages import PlayedSettings
 from ..stepping.quantity import Quantity
+
+Actuated = BodySettings | PlayedSettings  # settings with the groups of what drives a body
 
 # By group, and the word of its key ``commanded``: the input.
 _COMMANDED: Final[Mapping[str, Mapping[str, Quantity]]] = {
@@ -32,47 +36,48 @@ DRIVING_QUANTITIES: Final[Mapping[str, Quantity]] = {
 }
 
 
-def build_actuators(config: Mapping[str, Any], mesh: Mesh) -> list[Energy]:
+def build_actuators(settings: BodySettings, mesh: Mesh, payload_at: PlaceSettings | None) -> list[Energy]:
     """The energies of ``chambers``, ``fibres``, ``tendons``, ``muscles``, ``medium`` and ``payload_string``.
 
+    Args:
+        settings: of the body.
+        mesh: of the body.
+        payload_at: vertices that the string is tied to.
+
     Raises:
-        InputError: fibres without chambers, another number of chambers than the mesh has, tendons or muscles that do
-            not fit, two inputs, or a string that is tied to nothing.
+        InputError: another number of chambers than the mesh has, or tendons or muscles that do not fit.
     """
-    driving_quantity(config)
-    chambers, fibres = build_chambers(config.get("chambers"), mesh), config.get("fibres")
-    if fibres is not None and not chambers:
-        raise InputError("fibres are wound around chambers, but there is no group chambers: leave the fibres out.")
+    chambers = build_chambers(settings.chambers, mesh)
     energies: list[Energy] = [Pressure(chambers)] if chambers else []
-    if fibres is not None:
-        energies.append(Fibres(chambers, axis=config["chambers"]["axis"], **fibres))
-    if config.get("tendons") is not None:
-        energies.append(build_tendons(config["tendons"]))
-    if config.get("muscles") is not None:
-        energies.append(build_muscles(config["muscles"], mesh))
-    if config.get("medium") is not None:
-        energies.append(Medium(**{str(key): value for key, value in config["medium"].items()}))
-    if config.get("payload_string") is not None:
-        place = config["data"].get("payload_at")
-        if place is None:
+    if settings.fibres is not None:
+        if settings.chambers is None:
+            raise InputError("fibres are wound around chambers, but chambers is null: leave the fibres out.")
+        energies.append(Fibres(chambers, axis=settings.chambers.axis, **dict(settings.fibres)))
+    if settings.tendons is not None:
+        energies.append(build_tendons(settings.tendons))
+    if settings.muscles is not None:
+        energies.append(build_muscles(settings.muscles, mesh))
+    if settings.medium is not None:
+        energies.append(Medium(**dict(settings.medium)))
+    if settings.payload_string is not None:
+        if payload_at is None:
             raise InputError("payload_string is set, but data.payload_at is not: name the vertices that carry it.")
-        string = {str(key): value for key, value in config["payload_string"].items()}
-        energies.append(Strings([select_vertices(mesh, **place)], **string))
+        energies.append(Strings([select_vertices(mesh, **payload_at.arguments())], **dict(settings.payload_string)))
     return energies
 
 
-def build_chambers(config: Mapping[str, Any] | None, mesh: Mesh) -> tuple[Chamber, ...]:
+def build_chambers(settings: ChamberSettings | None, mesh: Mesh) -> tuple[Chamber, ...]:
     """The closed chambers of a mesh, from the group ``chambers``; none without the group.
 
     Raises:
         InputError: the mesh has another number of them.
     """
-    if config is None:
+    if settings is None:
         return ()
-    found = find_chambers(mesh, config["axis"])
-    if len(found) != config["count"]:
+    found = find_chambers(mesh, settings.axis)
+    if len(found) != settings.count:
         raise InputError(
-            f"the mesh has {len(found)} closed chambers, but chambers.count is {config['count']}: a chamber that is "
+            f"the mesh has {len(found)} closed chambers, but chambers.count is {settings.count}: a chamber that is "
             "open to the outside is none, so close it in the mesh, or set chambers.count."
         )
     return found
@@ -91,66 +96,51 @@ class Drive:
         return self.quantity.per
 
 
-def driving_quantity(config: Mapping[str, Any]) -> Quantity | None:
-    """Which input of the body is driven; None for a body without actuators.
-
-    Raises:
-        InputError: there are two.
-    """
-    found = {"chambers": PRESSURE} if config.get("chambers") is not None else {}
+def driving_quantity(settings: Actuated) -> Quantity | None:
+    """The input of the body that is driven; None for a body without actuators."""
+    if settings.chambers is not None:
+        return PRESSURE
     for group, quantities in _COMMANDED.items():
-        commanded = (config.get(group) or {}).get("commanded")
-        if commanded is not None:
-            found[group] = quantities[commanded]
-    if len(found) > 1:
-        first, second, *_ = found
-        raise InputError(f"a body with {first} and {second} has two inputs, but recordings drive one: take one out.")
-    return next(iter(found.values()), None)
+        own = getattr(settings, group)
+        if own is not None and own.commanded is not None:
+            return quantities[own.commanded]
+    return None
 
 
-def driven_parts(config: Mapping[str, Any]) -> int:
-    """How many values the driven input has."""
-    if config.get("chambers") is not None:
-        return int(config["chambers"]["count"])
-    (group,) = (group for group in _COMMANDED if (config.get(group) or {}).get("commanded") is not None)
-    return len(config[group]["routes" if group == "tendons" else "bundles"])
+def driven_parts(settings: Actuated) -> int:
+    """Number of values of the driven input."""
+    if settings.chambers is not None:
+        return settings.chambers.count
+    if settings.tendons is not None:
+        return len(settings.tendons.routes)
+    assert settings.muscles is not None
+    return len(settings.muscles.bundles)
 
 
-def drive_of(config: Mapping[str, Any], body: Body) -> Drive | None:
+def drive_of(settings: Actuated, body: Body) -> Drive | None:
     """The input that drives a body; None for one without actuators."""
-    quantity = driving_quantity(config)
+    quantity = driving_quantity(settings)
     if quantity is None:
         return None
     (energy,) = (each for each in cast(Sequence[Energy], body.energies) if quantity in each.inputs)
     return Drive(quantity, energy.names)
 
 
-def build_tendons(config: Mapping[str, Any]) -> Tendons:
+def build_tendons(settings: TendonSettings) -> Tendons:
     """The tendons of a group: every straight piece of a route is divided into as many as asked for, and its offsets.
 
     Raises:
-        InputError: see `Tendons`; or a contraction that nothing would pull.
+        InputError: see `Tendons`.
     """
-    if config["commanded"] == "contraction" and not config["stiffness"] > 0.0:
-        raise InputError(
-            "tendons.stiffness is 0, but their contraction is commanded, which acts through it: set it, in N/m."
-        )
-    more: dict[str, Any] = {key: config[key] for key in ("toe", "reach") if key in config}
     routes, directions = [], []
-    for name, route in config["routes"].items():
-        guides, pieces = np.asarray(route["guides"], dtype=np.float64), route.get("pieces", 1)
-        routes.append(_divided(guides, pieces))
-        own = [np.asarray(each, dtype=np.float64) for each in route.get("offsets", ())]
-        for each in own:
-            if each.shape not in ((3,), guides.shape):
-                raise InputError(
-                    f"tendons.routes.{name}.offsets has a direction of shape {each.shape}: give three numbers, or "
-                    f"three for each of its {len(guides)} guides."
-                )
-        directions.append([_divided(np.broadcast_to(each, guides.shape), pieces) for each in own])
-    if any(directions):
-        more["directions"] = directions
-    return Tendons(routes, config["stiffness"], labels=tuple(config["routes"]), **more)
+    for route in settings.routes.values():
+        guides = np.asarray(route.guides, dtype=np.float64)
+        routes.append(_divided(guides, route.pieces))
+        own = [np.broadcast_to(np.asarray(each, dtype=np.float64), guides.shape) for each in route.offsets]
+        directions.append([_divided(each, route.pieces) for each in own])
+    more: dict[str, Any] = {"directions": directions} if any(directions) else {}
+    labels = tuple(settings.routes)
+    return Tendons(routes, settings.stiffness, labels=labels, toe=settings.toe, reach=settings.reach, **more)
 
 
 def _divided(values: NDArray[np.float64], pieces: int) -> NDArray[np.float64]:
@@ -159,18 +149,15 @@ def _divided(values: NDArray[np.float64], pieces: int) -> NDArray[np.float64]:
     return np.concatenate([*(first + share * (last - first) for first, last in pairwise(values)), values[-1:]])
 
 
-def build_muscles(config: Mapping[str, Any], mesh: Mesh) -> Muscles:
+def build_muscles(settings: MuscleSettings, mesh: Mesh) -> Muscles:
     """The muscles of a group, through the cells whose centres lie within their boxes.
 
     Raises:
-        InputError: see `Muscles`; a contraction that nothing would pull, or fibres that do nothing.
+        InputError: see `Muscles`.
         MeshError: no cell lies within a box.
     """
-    if config["commanded"] != "stress" and not config["stiffness"] > 0.0:
-        why = "their contraction is commanded" if config["commanded"] else "nothing is commanded"
-        raise InputError(f"muscles.stiffness is 0, but {why}: set it, in Pa.")
     found = [
-        Muscle(select_cells(mesh, **each.get("within", {})), each["direction"], name)
-        for name, each in config["bundles"].items()
+        Muscle(select_cells(mesh, **each.within.arguments()), each.direction, name)
+        for name, each in settings.bundles.items()
     ]
-    return Muscles(found, config["stiffness"], **{key: config[key] for key in ("toe",) if key in config})
+    return Muscles(found, settings.stiffness, toe=settings.toe)

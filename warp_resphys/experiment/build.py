@@ -1,10 +1,15 @@
-"""Builds meshes, bodies, materials and simulators from configurations."""
+"""Builds meshes, bodies, materials and simulators from settings.
 
+A mesh and a body are built once a process for the same settings, as checks, stages and reports ask for the same ones.
+"""
+
+import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import fields
+from functools import lru_cache
 from importlib import resources
-from typing import Any
 
 import torch
 from numpy.typing import ArrayLike
@@ -15,14 +20,33 @@ from ..dynamics.nonlinear_solver import SolverSettings
 from ..dynamics.simulator import Simulator
 from ..energies.materials import Material, make_material
 from ..fem.body import Body
+from ..io.atomic import digest
 from ..io.errors import InputError
+from ..io.settings import parse
 from ..mesh.arm import mesh_arm
-from ..mesh.arm_geometry import arm_geometry
+from ..mesh.arm_geometry import ArmGeometry
 from ..mesh.boxes import boxes_hexahedra
 from ..mesh.mesh import Mesh, box_hexahedra, box_tetrahedra, check_mesh, quadratic, select_vertices
 from ..mesh.readers import read_mesh
 from ..mesh.rod import rod
 from ..mesh.tetrahedra import fill_surface
+from ..settings.body import (
+    BodySettings,
+    BoxesMesh,
+    FileMesh,
+    GeneratedArm,
+    HexahedralBox,
+    MaterialSettings,
+    MeshGroup,
+    MeshSettings,
+    PlaceSettings,
+    RodMesh,
+    ShippedArm,
+    SimulatorSettings,
+    SurfaceMesh,
+    TetrahedralBox,
+)
+from ..settings.trials import BindingSettings, MarkerSettings
 from .actuators import build_actuators
 
 _DTYPES = {"float64": torch.float64, "float32": torch.float32}
@@ -47,60 +71,70 @@ def choose_device(name: str) -> torch.device:
     return device
 
 
-def simulation_device(config: Mapping[str, Any]) -> torch.device:
+def simulation_device(name: str) -> torch.device:
     """Where bodies are simulated: ``auto`` is the CPU."""
-    return choose_device("cpu" if config["device"] == "auto" else config["device"])
+    return choose_device("cpu" if name == "auto" else name)
 
 
-def build_mesh(config: Mapping[str, Any]) -> Mesh:
-    """A mesh from the group ``mesh``; `schema` has what each kind takes.
+def build_mesh(settings: MeshSettings) -> Mesh:
+    """The mesh of the group ``mesh``.
 
     Raises:
-        InputError: an unknown kind, or shipped arm.
+        InputError: an unknown arm.
         MeshError: a mesh that cannot be read or simulated.
     """
-    kind = config["kind"]
-    if kind == "box_hexahedra":
-        mesh = box_hexahedra(config["size"], config["divisions"], config.get("nodes", 8))
-    elif kind == "box_tetrahedra":
-        mesh = box_tetrahedra(config["size"], config["divisions"], config.get("order", 1))
-    elif kind == "boxes":
-        mesh = boxes_hexahedra([(low, high) for low, high in config["boxes"]], config["size"], config["nodes"])
-    elif kind == "file":
-        mesh = read_mesh(config["path"], config["units"], config["order"], config["drop_unreferenced"])
-    elif kind == "surface":
-        mesh = fill_surface(config["path"], config["size"], config["units"], config["order"])
-    elif kind == "arm":
-        mesh = shipped_arm(config["name"])
-    elif kind == "arm_generated":
-        mesh, _ = mesh_arm(arm_geometry(config), config["size"], config["cells"], config["layers"])
-        mesh = quadratic(mesh) if config["order"] == 2 else mesh
-    elif kind == "rod":
-        mesh = rod(**{str(key): value for key, value in config.items() if key != "kind"})
-    else:
-        raise InputError(f"mesh.kind is {kind!r}: choose one of those in conf/mesh.")
+    path = getattr(settings, "path", None)
+    return _built_mesh(settings.model_dump_json(), None if path is None else digest(path))
+
+
+@lru_cache(maxsize=8)
+def _built_mesh(content: str, file: str | None) -> Mesh:
+    """The mesh of settings as JSON; ``file`` is the digest of the file that it is read from."""
+    mesh = _read_or_made(parse(MeshGroup, {"mesh": json.loads(content)}).mesh)
     check_mesh(mesh)
     return mesh
 
 
-def finer(config: Mapping[str, Any], times: float) -> dict[str, Any]:
+def _read_or_made(settings: MeshSettings) -> Mesh:
+    match settings:
+        case HexahedralBox():
+            return box_hexahedra(settings.size, settings.divisions, settings.nodes)
+        case TetrahedralBox():
+            return box_tetrahedra(settings.size, settings.divisions, settings.order)
+        case BoxesMesh():
+            return boxes_hexahedra(settings.boxes, settings.size, settings.nodes)
+        case FileMesh():
+            return read_mesh(settings.path, settings.units, settings.order, settings.drop_unreferenced)
+        case SurfaceMesh():
+            return fill_surface(settings.path, settings.size, settings.units, settings.order)
+        case ShippedArm():
+            return shipped_arm(settings.name)
+        case RodMesh():
+            return rod(**{key: value for key, value in dict(settings).items() if key != "kind"})
+        case GeneratedArm():
+            geometry = ArmGeometry(**{each.name: getattr(settings, each.name) for each in fields(ArmGeometry)})
+            mesh, _ = mesh_arm(geometry, settings.size, settings.cells, settings.layers)
+            return quadratic(mesh) if settings.order == 2 else mesh
+
+
+def finer(settings: MeshSettings, times: float) -> MeshSettings:
     """The group ``mesh`` with so many times as many cells along the edges of a box, along a rod's axis, or everywhere.
 
     Raises:
         InputError: a mesh whose cells are given.
     """
-    kind = config["kind"]
-    if kind in ("box_hexahedra", "box_tetrahedra"):
-        return {**config, "divisions": [math.ceil(times * each) for each in config["divisions"]]}
-    if kind in ("boxes", "surface"):
-        return {**config, "size": config["size"] / times}
-    if kind == "rod":
-        return {**config, "layers": math.ceil(times * config["layers"])}
-    if kind == "arm_generated":
-        layers = None if config["layers"] is None else config["layers"] / times
-        return {**config, "size": config["size"] / times, "layers": layers}
+    match settings:
+        case HexahedralBox() | TetrahedralBox():
+            return settings.changed(divisions=[math.ceil(times * each) for each in settings.divisions])
+        case BoxesMesh() | SurfaceMesh():
+            return settings.changed(size=settings.size / times)
+        case RodMesh():
+            return settings.changed(layers=math.ceil(times * settings.layers))
+        case GeneratedArm():
+            layers = None if settings.layers is None else settings.layers / times
+            return settings.changed(size=settings.size / times, layers=layers)
     raise InputError(
-        f"mesh_check: the cells of a mesh of the kind {kind!r} are given and cannot be made finer: take null."
+        f"mesh_check: the cells of a mesh of the kind {settings.kind!r} are given and cannot be made finer: take null."
     )
 
 
@@ -118,48 +152,72 @@ def shipped_arm(name: str) -> Mesh:
         return read_mesh(path)
 
 
-def build_material(config: Mapping[str, Any], key: str) -> Material:
-    """The material of a group.
+def build_material(settings: MaterialSettings, key: str) -> Material:
+    """The material of a group, whose dotted key errors begin with.
 
     Raises:
         InputError: an unknown constant, or one out of range.
     """
     try:
-        return make_material(**{str(name): value for name, value in config[key].items()})
+        return make_material(settings.model, **settings.constants)
     except InputError as error:
         raise InputError(f"{key}: {error}") from error
 
 
-def build_body(config: Mapping[str, Any], mesh: Mesh | None = None) -> Body:
-    """A body from the groups ``mesh``, ``physics``, ``fixed``, and any of its actuators' groups and ``fibres``.
+def build_body(settings: BodySettings, payload_at: PlaceSettings | None = None, mesh: Mesh | None = None) -> Body:
+    """The body of a configuration.
 
     Args:
-        config: these groups.
-        mesh: where it is there already, in place of the group ``mesh``.
+        settings: its mesh, masses, fixed vertices, and what acts on it.
+        payload_at: vertices that carry the payloads of a string.
+        mesh: in place of that of the settings.
 
     Raises:
-        InputError: fibres without chambers, another number of chambers than the mesh has, tendons or muscles that do
-            not fit, or two inputs.
+        InputError: another number of chambers than the mesh has, or tendons or muscles that do not fit.
         MeshError: a mesh that cannot be read or simulated, or no vertex where the body is fixed.
     """
-    mesh = build_mesh(config["mesh"]) if mesh is None else mesh
-    energies = build_actuators(config, mesh)
-    return Body(mesh, energies=tuple(energies), fixed=select_vertices(mesh, **config["fixed"]), **config["physics"])
+    if mesh is not None:
+        return _body(settings, payload_at, mesh)
+    of_body = BodySettings.of(settings)
+    path = getattr(settings.mesh, "path", None)
+    place = None if payload_at is None else payload_at.model_dump_json()
+    return _built_body(of_body.model_dump_json(), place, None if path is None else digest(path))
 
 
-def bound_markers(settings: Mapping[str, Any], mesh: Mesh, places: ArrayLike, labels: Sequence[str]) -> Markers:
+@lru_cache(maxsize=8)
+def _built_body(content: str, place: str | None, file: str | None) -> Body:
+    """The body of settings as JSON; ``file`` is the digest of the file of its mesh."""
+    settings = parse(BodySettings, json.loads(content))
+    payload_at = None if place is None else parse(PlaceSettings, json.loads(place))
+    return _body(settings, payload_at, build_mesh(settings.mesh))
+
+
+def _body(settings: BodySettings, payload_at: PlaceSettings | None, mesh: Mesh) -> Body:
+    energies = build_actuators(settings, mesh, payload_at)
+    fixed = select_vertices(mesh, **settings.fixed.arguments())
+    return Body(mesh, energies=tuple(energies), fixed=fixed, **dict(settings.physics))
+
+
+def bound_markers(settings: BindingSettings, mesh: Mesh, places: ArrayLike, labels: Sequence[str]) -> Markers:
     """Markers at places (M, 3) on the undeformed body [m], in float64 on the CPU, from the group ``markers``.
 
     Raises:
         InputError: see `bind_markers`.
         MeshError: no vertex lies where ``markers.bind_to`` says.
     """
-    vertices = None if settings["bind_to"] is None else select_vertices(mesh, **settings["bind_to"])
-    more = {key: settings[key] for key in ("largest_distance", "patch") if key in settings}
-    return bind_markers(mesh, places, labels, kind=settings["bind"], vertices=vertices, **more)
+    to = settings.bind_to
+    return bind_markers(
+        mesh,
+        places,
+        labels,
+        kind=settings.bind,
+        vertices=None if to is None else select_vertices(mesh, **to.arguments()),
+        largest_distance=settings.largest_distance,
+        patch=settings.patch,
+    )
 
 
-def sight_of(settings: Mapping[str, Any], labels: Sequence[str], sets: tuple[tuple[int, ...], ...] = ()) -> Sight:
+def sight_of(settings: MarkerSettings, labels: Sequence[str], sets: tuple[tuple[int, ...], ...] = ()) -> Sight:
     """How much recordings tell of where these tracked markers are, from the group ``markers``.
 
     Args:
@@ -170,38 +228,37 @@ def sight_of(settings: Mapping[str, Any], labels: Sequence[str], sets: tuple[tup
     Raises:
         InputError: see `Sight`.
     """
-    nominal = [settings["tracked"][label] for label in labels]
-    return Sight.of(nominal, settings.get("plane"), settings.get("frame", "body"), sets)
+    return Sight.of([settings.tracked[label] for label in labels], settings.plane, settings.frame, sets)
 
 
 def build_simulator(
-    config: Mapping[str, Any],
-    material: str = "simulation",
+    settings: SimulatorSettings,
+    material: MaterialSettings,
     body: Body | None = None,
+    payload_at: PlaceSettings | None = None,
     on_failure: str | None = None,
 ) -> Simulator:
-    """A simulator from a whole configuration.
+    """The simulator of a configuration.
 
     Args:
-        config: with the keys of ``conf/config.yaml``.
-        material: the key of its material, such as ``simulation`` or ``target``.
-        body: the body, where it was built already.
+        settings: of the simulator and its body.
+        material: of the body.
+        body: in place of that of the settings.
+        payload_at: vertices that carry the payloads of a string.
         on_failure: in place of the configured one.
 
     Raises:
         InputError: a value that cannot be simulated.
     """
-    if config["dtype"] not in _DTYPES:
-        raise InputError(f"dtype is {config['dtype']!r}: choose float64 or float32.")
-    solver = {**config["solver"], **({} if on_failure is None else {"on_failure": on_failure})}
+    solver = dict(settings.solver) | ({} if on_failure is None else {"on_failure": on_failure})
     return Simulator(
-        build_body(config) if body is None else body,
-        build_material(config, material),
-        time_step=config["time_step"],
-        gravity=config["gravity"],
-        integrator=config["integrator"],
+        build_body(settings, payload_at) if body is None else body,
+        build_material(material, "material"),
+        time_step=settings.time_step,
+        gravity=settings.gravity,
+        integrator=settings.integrator,
         solver=SolverSettings(**solver),
-        device=simulation_device(config),
-        dtype=_DTYPES[config["dtype"]],
-        coupling=config.get("coupling", "implicit"),
+        device=simulation_device(settings.device),
+        dtype=_DTYPES[settings.dtype],
+        coupling=settings.coupling,
     )

@@ -19,12 +19,14 @@ from ..io.stages import StageContext
 from ..learning.intervals import LEVEL, Intervals
 from ..learning.metrics import errors_per_marker, marker_errors, median_filter, summarise, summarise_each
 from ..learning.replay import Start
+from ..settings.run import models_of
+from ..settings.stages import EvaluateStage, MeshCheckStage, TimeStage
 from ..stepping.state import State
 from .build import finer
 from .files import ERRORS, MESH_CHECK, ROLLOUTS, STATIC, TIMES, read_dataset, reconstruction_file
 from .models import POSE_STEPS, SIMFREE, ModelRollout, first_frame, learned_of
 from .parts import TrialPart, padded, remove_parts, split_into_parts, work_on
-from .scene import LEARNED, Scene, models_of
+from .scene import LEARNED, Scene
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -36,47 +38,55 @@ _FILTERED_SECONDS = 4.0  # that trials must last for the median filter over a se
 
 def evaluate(context: StageContext, workers: Workers = ALONE) -> None:
     """Writes rollouts.h5, what is observed of every model's roll-outs of the test trials, and errors.json."""
-    settings = context.settings
-    scene = Scene(settings, context.run_dir, "count")
-    names = [name for group in settings["groups"].values() for name in group]
-    filmed = _film_trial(scene, settings["groups"]["1"])
-    parts = _parts(context, scene, names, models_of(settings), filmed)
-    calibrating = _parts(context, scene, settings["calibration"], INTERVAL_MODELS, filmed, "calibration_")
+    settings: EvaluateStage = context.settings
+    scene, compared = Scene(settings, context.run_dir, "count"), _models(settings)
+    names = [name for group in settings.groups.values() for name in group]
+    filmed = _film_trial(scene, settings.groups["1"])
+    parts = _parts(context, scene, names, compared, filmed)
+    with_intervals = [model for model in INTERVAL_MODELS if model in compared]
+    calibrating = _parts(context, scene, settings.calibration, with_intervals, filmed, "calibration_")
     work_on([part for each in (parts, calibrating) for some in each.values() for part in some], _rolled_out, workers)
     order = [name for some in scene.alike(names) for name in some]
     rows = [order.index(name) for name in names]
     observed = {model: _all_observed(scene, model, some)[rows] for model, some in parts.items()}
-    shown = _film_steps(int(float(scene.trials([filmed]).times.max()) / settings["time_step"] + 1e-6))
-    attributes = {"names": names, "time_step": settings["time_step"], "film_trial": filmed}
+    shown = _film_steps(int(float(scene.trials([filmed]).times.max()) / settings.time_step + 1e-6))
+    attributes = {"names": names, "time_step": settings.time_step, "film_trial": filmed}
     with atomic_hdf5(context.run_dir / ROLLOUTS, "rollouts", attributes) as file:
         for model, values in observed.items():
             create(file, f"{model}_observed", values, "m", time_axis=1)
             bodies = next(part.read("film") for part in parts[model] if filmed in part.names)
-            substeps = round(settings["time_step"] / scene.model_simulator(model).time_step)
+            substeps = round(settings.time_step / scene.model_simulator(model).time_step)
             create(file, f"{model}_film", bodies[np.minimum(substeps * shown, len(bodies) - 1)], "m")
         create(file, "film_steps", shown)
     left = {
         model: np.concatenate([part.read("left")[:, -1] for part in some])[rows]
         for model, some in parts.items()
-        if model in LEARNED and settings["range_guard"]
+        if model in LEARNED and settings.range_guard
     }
-    found = summary(context, scene, settings["groups"], observed, left)
-    if settings["calibration"]:
+    found = summary(context, scene, settings.groups, observed, left)
+    if settings.calibration:
         found |= _intervals(scene, calibrating, observed)
     write_json(context.run_dir / ERRORS, found)
     remove_parts(context)
+
+
+def _models(settings: EvaluateStage) -> list[str]:
+    """The models that are compared."""
+    return models_of(settings.published, settings.identified, settings.correct_uncorrected)
 
 
 def _parts(
     context: StageContext, scene: Scene, names: Sequence[str], models: Sequence[str], filmed: str, label: str = ""
 ) -> dict[str, list[TrialPart]]:
     """The roll-outs of some trials, by model."""
-    found: dict[str, list[TrialPart]] = {model: [] for model in models if model in models_of(context.settings)}
+    found: dict[str, list[TrialPart]] = {model: [] for model in models}
     for number, some in enumerate(scene.alike(names)):
         for model, parts in found.items():
             rests = POSE_STEPS if model == SIMFREE and scene.begins(some[0]) == STATIC else 0
             frames = 1 + (rests or int(float(scene.trials(some).times.max()) / scene.model_simulator(model).time_step))
-            parts += split_into_parts(context, some, frames, f"{label}{model}{number}", (model, filmed))
+            parts += split_into_parts(
+                context, some, frames, f"{label}{model}{number}", (model, filmed), scene.settings.batch
+            )
     return found
 
 
@@ -89,11 +99,12 @@ def _intervals(
     scene: Scene, calibrating: Mapping[str, Sequence[TrialPart]], tested: Mapping[str, FloatArray]
 ) -> dict[str, Any]:
     """Prediction intervals by model, and how often they hold in the test trials; see `learning.intervals`."""
-    settings, rest = scene.config, scene.dataset.bound
+    settings, rest = scene.settings, scene.dataset.bound
+    assert isinstance(settings, EvaluateStage)
     assert rest is not None
-    names = [name for some in scene.alike(settings["calibration"]) for name in some]
-    known, target = scene.dataset.observed[scene.dataset.rows(names)], _counted(scene, settings["groups"]["1"])
-    learned = [row for row, name in enumerate(names) if name in settings["split"]["train"]]
+    names = [name for some in scene.alike(settings.calibration) for name in some]
+    known, target = scene.dataset.observed[scene.dataset.rows(names)], _counted(scene, settings.groups["1"])
+    learned = [row for row, name in enumerate(names) if name in settings.split.train]
     known[learned, scene.learned_steps(known.shape[1] - 1) + 1 :] = np.nan  # The rest may be the test.
     found: dict[str, Any] = {}
     for model, parts in calibrating.items():
@@ -109,7 +120,7 @@ def _counted(scene: Scene, names: Sequence[str]) -> FloatArray:
     """(R, T, M, 3) what was observed in some trials [m], NaN where that was learned from."""
     observed = scene.dataset.observed[scene.dataset.rows(names)]
     for row, name in enumerate(names):
-        if name in scene.config["split"]["train"]:
+        if name in scene.settings.split.train:
             observed[row, : scene.learned_steps(observed.shape[1] - 1) + 1] = np.nan
     return observed
 
@@ -188,9 +199,10 @@ def summary(
         simulated: by model, (R, T, M, 3) what is observed of its roll-outs [m], NaN where one diverged.
         left: by model, (R,) the step at which a trial left the range of the training, or -1.
     """
-    settings, dataset = context.settings, scene.dataset
+    settings, dataset = scene.settings, scene.dataset
+    assert isinstance(settings, EvaluateStage)
     names, every = groups["1"], [name for group in groups.values() for name in group]
-    count, step = len(names), settings["time_step"]
+    count, step = len(names), settings.time_step
     observed = _counted(scene, every)
     first = [first_frame(scene, [name]) for name in every]
     models = dict(simulated)
@@ -240,13 +252,13 @@ def _reconstructed(context: StageContext, names: Sequence[str]) -> FloatArray:
 
 
 def _over_time(
-    settings: Mapping[str, Any],
+    settings: EvaluateStage,
     test: Mapping[str, FloatArray],
     observed: FloatArray,
     errors: Mapping[str, Sequence[FloatArray]],
 ) -> dict[str, Any]:
     """Errors up to horizons, how they grow, and the largest of long trials without what is short."""
-    step, horizons = settings["time_step"], settings["data"].get("horizons") or []
+    step, horizons = settings.time_step, settings.horizons
     found: dict[str, Any] = {}
     if horizons:
         first = [0] * len(observed)
@@ -281,7 +293,7 @@ def _range(left: IntArray, names: Sequence[str], step: float) -> dict[str, Any]:
 
 def _sideways(scene: Scene, names: Sequence[str]) -> dict[str, float]:
     """How far sideways bodies were held [mm], as the identified simulator has it, where that was estimated."""
-    if scene.config.get("release", {}).get("sideways", 0.0) <= 0.0:
+    if scene.settings.release.sideways <= 0.0:
         return {}
     simulator = scene.model_simulator("resphys")
     found: dict[str, float] = {}
@@ -301,13 +313,14 @@ def time_models(context: StageContext) -> None:
     the simulator with the learned force, and the network alone. One trial at a time, each once, after a run of the
     first to warm up.
     """
-    scene = Scene(context.settings, context.run_dir, "count")
-    names = scene.moving(context.settings["groups"]["1"])
+    settings: TimeStage = context.settings
+    scene = Scene(settings, context.run_dir, "count")
+    names = scene.moving(settings.groups["1"])
     simulator = scene.model_simulator("resphys")
     learned = learned_of(scene, "resphys")
     starts = {name: scene.start(scene.replay(simulator, [name], "resphys")) for name in names}
     rows: dict[str, tuple[str, Any, Any]] = {"simulation": ("simulation", None, scene.simulator("simulation"))}
-    if scene.config.get("target") is not None:
+    if settings.target is not None:
         rows["target"] = ("simulation", None, scene.simulator("target"))
     rows |= {"resphys": ("resphys", learned, simulator), "inference": ("resphys", learned, simulator)}
     times: dict[str, dict[str, float]] = {}
@@ -335,11 +348,11 @@ def check_mesh(context: StageContext) -> None:
 
     Its constants stay those that were identified on the mesh as it is.
     """
-    settings = context.settings
-    other = {**settings, "mesh": finer(settings["mesh"], settings["mesh_check"])}
+    settings: MeshCheckStage = context.settings
+    other = settings.model_copy(update={"mesh": finer(settings.mesh, settings.mesh_check)})
     scenes = [Scene(each, context.run_dir) for each in (settings, other)]
-    model = "simulation" if settings["identify"] is None else "sysid"
-    groups = scenes[0].alike(settings["groups"]["1"])
+    model = "simulation" if settings.identified is None else "sysid"
+    groups = scenes[0].alike(settings.groups["1"])
     found: dict[str, Any] = {"cells": [len(each.body.mesh.cells) for each in scenes], "model": model}
     errors: list[list[FloatArray]] = [[], []]
     moved: list[FloatArray] = []

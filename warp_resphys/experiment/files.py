@@ -17,6 +17,7 @@ from ..fem.body import Body
 from ..io.errors import InputError
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5, read_json
 from ..mesh.mesh import select_vertices
+from ..settings.body import PlaceSettings
 from ..stepping.inputs import Inputs
 from .actuators import DRIVING_QUANTITIES
 
@@ -85,7 +86,7 @@ class Dataset:
     Attributes:
         names: of the trials.
         labels: of the M tracked markers; none where every vertex is observed.
-        begins: how each trial begins, see `trials.BEGINNINGS`; held bodies are ``released`` here.
+        begins: how each trial begins, see `settings.trials.Begins`; held bodies are ``released`` here.
         times: (R, T) of the frames [s]; trials that end early repeat their last time.
         observed: (R, T, M, 3) [m], NaN where nothing was seen.
         held: (R, M, 3) the same before time zero [m], NaN for markers that a trial does not have.
@@ -180,7 +181,7 @@ class Dataset:
         return torch.from_numpy(np.stack(rows, axis=1))
 
     def trials(
-        self, names: Sequence[str], body: Body, payload_at: Mapping[str, Any] | None, time_step: float | None = None
+        self, names: Sequence[str], body: Body, payload_at: PlaceSettings | None, time_step: float | None = None
     ) -> Trials:
         """Some of the trials, which begin alike, in float64 on the CPU.
 
@@ -243,7 +244,7 @@ def read_dataset(path: Path) -> Dataset:
         )
 
 
-def payload_inputs(body: Body, payload_at: Mapping[str, Any] | None, loads: FloatArray) -> dict[str, FloatArray]:
+def payload_inputs(body: Body, payload_at: PlaceSettings | None, loads: FloatArray) -> dict[str, FloatArray]:
     """What payloads are for a simulation, as arguments of `Inputs` [kg].
 
     On a body with strings they are (R, 1) `energies.strings.PAYLOAD`; on others an (R, N) ``attached_mass`` in equal
@@ -251,7 +252,7 @@ def payload_inputs(body: Body, payload_at: Mapping[str, Any] | None, loads: Floa
 
     Args:
         body: that they hang on.
-        payload_at: its vertices, such as ``{"x": 0.1, "z": 0.03}`` [m]; None where nothing ever hangs.
+        payload_at: its vertices; None where nothing ever hangs.
         loads: (R,) [kg].
 
     Raises:
@@ -265,7 +266,7 @@ def payload_inputs(body: Body, payload_at: Mapping[str, Any] | None, loads: Floa
         return {"attached_mass": masses}
     if payload_at is None:
         raise InputError("a trial has a payload, but data.payload_at is not set: name the vertices that carry it.")
-    carrying = select_vertices(body.mesh, **payload_at)
+    carrying = select_vertices(body.mesh, **payload_at.arguments())
     if np.isin(carrying, body.fixed_vertices).all():
         raise InputError("data.payload_at names fixed vertices alone: hang the payload on vertices that can move.")
     masses[:, carrying] = loads[:, None] / len(carrying)

@@ -16,13 +16,14 @@ from ..learning.identification import Identifier
 from ..learning.parameters import first_guesses
 from ..learning.placement import Accuracy
 from ..learning.replay import Replay, Start
+from ..settings.learning import RangeSettings
+from ..settings.stages import IdentifyStage
 from .files import IDENTIFICATION
 from .scene import MODELS, Scene
 from .trials import evenly
 
 ELASTIC = ("youngs_modulus", "poissons_ratio")
 _LANDSCAPE = "landscape"
-_RANGE = ("lower", "upper", "logarithmic")
 _AT_ONCE = 4  # points of the landscape
 
 Replays = Sequence[tuple[Replay, Start]]
@@ -35,15 +36,14 @@ def identify(context: StageContext) -> None:
     identified one. A few of the training trials, and the beginning of each, may tell enough: ``identify.trials`` and
     ``identify.seconds``. What an interrupted run has finished is not done again: starts, searches, points.
     """
-    settings = context.settings
-    config = settings["identify"]
+    settings: IdentifyStage = context.settings
+    wanted, names = settings.identify, settings.split.train
     scene = Scene(settings, context.run_dir)
-    names = settings["split"]["train"]
-    names = evenly(names, config["trials"]) if config["trials"] is not None else names
-    searches = {"sysid": config["parameters"], "sysid_elastic": config.get("elastic") or {}}
-    ranges = {model: {k: bounds_of(b) for k, b in each.items() if b} for model, each in searches.items() if each}
+    names = names if wanted.trials is None else tuple(evenly(names, wanted.trials))
+    searches = {"sysid": wanted.parameters, "sysid_elastic": wanted.elastic or {}}
+    ranges = {model: {name: bounds_of(each) for name, each in some.items()} for model, some in searches.items() if some}
     kinds = {model: MODELS[model][0] for model in ranges}
-    evaluations = len(ranges) * config["starts"] * config["max_evaluations"]
+    evaluations = len(ranges) * wanted.starts * wanted.max_evaluations
     kept = {part: _Kept(context, part) for part in (*ranges, _LANDSCAPE)}
     done = sum(kept[model].evaluations for model in ranges)
     found, replays = {}, {}
@@ -53,38 +53,35 @@ def identify(context: StageContext) -> None:
             placed = _placement(scene) if model == "sysid" else {}
             identifier = Identifier(replays[model], bounds, _seconds(settings, replays[model]), **placed)
             found[model] = _search(settings, identifier, kept[model], progress)
-    if config["grid"]:
-        seconds = _seconds(settings, replays["sysid"]) if config["seconds"] is not None else None
-        axes = {name: Bounds(*(grid[key] for key in _RANGE)) for name, grid in config["grid"].items()}
+    if wanted.grid is not None:
+        seconds = _seconds(settings, replays["sysid"]) if wanted.seconds is not None else None
+        grid = {name: each for name, each in dict(wanted.grid).items() if each is not None}
+        axes = {name: Bounds(each.lower, each.upper, each.logarithmic) for name, each in grid.items()}
         others = {name: bounds for name, bounds in ranges["sysid"].items() if name not in axes}
         identifier = Identifier(replays["sysid"], {**axes, **others}, seconds, **_placement(scene))
-        counts = {name: int(grid["points"]) for name, grid in config["grid"].items()}
+        counts = {name: each.points for name, each in grid.items()}
         found[_LANDSCAPE] = _landscape(identifier, counts, found["sysid"]["parameters"], kept[_LANDSCAPE])
     write_json(context.run_dir / IDENTIFICATION, found)
     for each in kept.values():
         forget_checkpoint(each.path)
 
 
-def bounds_of(settings: Mapping[str, Any]) -> Bounds:
-    """A range as it is configured.
-
-    Raises:
-        InputError: an empty range, or a prior outside of it.
-    """
-    prior = settings.get("prior")
-    own = {key: settings[key] for key in _RANGE if key in settings}
-    return Bounds(**own, prior=None if prior is None else Prior(**prior))
+def bounds_of(settings: RangeSettings) -> Bounds:
+    """A range as it is configured."""
+    prior = None if settings.prior is None else Prior(**dict(settings.prior))
+    return Bounds(settings.lower, settings.upper, settings.logarithmic, prior)
 
 
 def _placement(scene: Scene) -> dict[str, Any]:
     """What an `Identifier` is told of how well it is known where markers sit; nothing where that is not asked."""
-    wanted = scene.config["identify"].get("placement")
-    if wanted is None:
+    settings = scene.settings
+    assert isinstance(settings, IdentifyStage)
+    wanted, markers = settings.identify.placement, settings.markers
+    if wanted is None or markers is None:
         return {}
-    turn = wanted.get("turn")
-    accuracy = Accuracy(wanted.get("markers"), wanted.get("shift"), None if turn is None else math.radians(turn))
-    markers = scene.config["markers"]
-    standing = [*markers["reference"].values()] or [*markers["tracked"].values()]
+    turn = None if wanted.turn is None else math.radians(wanted.turn)
+    standing = [*markers.reference.values()] or [*markers.tracked.values()]
+    accuracy = Accuracy(wanted.markers, wanted.shift, turn)
     return {"accuracy": accuracy, "labels": scene.dataset.labels, "centre": np.mean(standing, axis=0).tolist()}
 
 
@@ -107,23 +104,22 @@ class _Kept:
         return sum(len(attempt["history"]) for attempt in self.content.get("attempts", ()))
 
 
-def _seconds(settings: Mapping[str, Any], replays: Replays) -> float | None:
+def _seconds(settings: IdentifyStage, replays: Replays) -> float | None:
     """How much of each trial counts [s]; None for all of it."""
-    limits = [settings["data"].get("seconds"), settings["identify"]["seconds"]]
-    fraction = settings["data"].get("train_fraction", 1.0)
+    limits, fraction = [settings.trial_seconds, settings.identify.seconds], settings.train_fraction
     if fraction < 1.0:
         limits.append(fraction * max(float(replay.trials.times.max()) for replay, _ in replays))
     return min((each for each in limits if each is not None), default=None)
 
 
-def _search(settings: Mapping[str, Any], identifier: Identifier, kept: _Kept, progress: Progress) -> dict[str, Any]:
+def _search(settings: IdentifyStage, identifier: Identifier, kept: _Kept, progress: Progress) -> dict[str, Any]:
     """The `Identification` of a model, as plain data; goes on from where an interrupted one ended."""
     if "found" in kept.content:
         return dict(kept.content["found"])
-    config, bounds = settings["identify"], identifier.bounds
+    wanted, bounds = settings.identify, identifier.bounds
     if "starts" not in kept.content:
-        guess = first_guesses(settings, bounds)
-        starts = identifier.starts(guess, config["starts"], config["candidates"], settings["seed"])
+        guess = first_guesses(settings.plain(), bounds)
+        starts = identifier.starts(guess, wanted.starts, wanted.candidates, settings.seed)
         kept.keep(starts=starts, attempts=[])
 
     def report(start: int, loss: float, values: Mapping[str, float]) -> None:
@@ -132,8 +128,8 @@ def _search(settings: Mapping[str, Any], identifier: Identifier, kept: _Kept, pr
     def keep(attempts: list[Any]) -> None:
         kept.keep(attempts=attempts)
 
-    starts, finished, most = kept.content["starts"], kept.content["attempts"], config["max_evaluations"]
-    found = identifier.run(starts, most, report, finished, keep, config["tolerance"])
+    starts, finished, most = kept.content["starts"], kept.content["attempts"], wanted.max_evaluations
+    found = identifier.run(starts, most, report, finished, keep, wanted.tolerance)
     kept.keep(found=asdict(found))
     return dict(kept.content["found"])
 

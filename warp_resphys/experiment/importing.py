@@ -6,7 +6,7 @@ that the frame rate need not fit the time step. Driven ones are brought to the s
 """
 
 import logging
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,12 +20,14 @@ from ..data.registration import Registration
 from ..io.errors import DataFileError, InputError
 from ..io.files import write_json
 from ..io.stages import StageContext
+from ..settings.stages import ImportStage
+from ..settings.trials import ReadingSettings
 from .actuators import Drive
 from .build import bound_markers
 from .files import DATASET, QUALITY, REGISTRATION, SCALED_DATASET, Dataset, read_dataset
 from .observing import Observed, Observer
 from .simulate import vertical
-from .trials import evenly, scaled_trials_of, trials_of
+from .trials import evenly
 
 log = logging.getLogger(__name__)
 
@@ -44,17 +46,16 @@ def import_recordings(context: StageContext) -> None:
         InputError: a configured value that does not fit.
     """
     observer = Observer(context)
-    settings, tracked = context.settings, observer.tracked
-    observed = observer.observe(trials_of(settings))
+    settings, tracked = observer.settings, observer.tracked
+    observed = observer.observe(settings.trials)
     if observer.drive is not None:
-        _check_unit([each.driven for each in observed if each.driven is not None], settings["data"], observer.drive)
-    split = settings.get("split")
-    known = set(split["train"]) | set(split["validation"]) if split else {each.trial.name for each in observed}
+        _check_unit([each.driven for each in observed if each.driven is not None], settings.data, observer.drive)
+    known = [each.trial.name for each in observed] if settings.learned is None else settings.learned
     offsets = np.stack([_offset(observer, each) for each in observed])  # (R, M, 3) [m]
     mean = _mean_offset(offsets, observed, known)
     mesh, bound = observer.simulator.body.mesh, observer.nominal + mean
-    bound_markers(settings["markers"], mesh, bound, tracked)  # Refuses a marker that is far off.
-    shifts = _shifts(settings["data"], observed, mean, offsets)
+    bound_markers(settings.markers, mesh, bound, tracked)  # Refuses a marker that is far off.
+    shifts = _shifts(settings.data, observed, mean, offsets)
     verticals = _verticals(observed, settings)
     gravity = _gravity(verticals, settings)
     _dataset(observer, observed, bound, shifts, gravity).write(context.run_dir / DATASET)
@@ -70,9 +71,9 @@ def import_scaled(context: StageContext) -> None:
     observer = Observer(context)
     known = read_dataset(context.run_dir / DATASET)
     assert known.bound is not None
-    observed = observer.observe(scaled_trials_of(context.settings))
+    observed = observer.observe(observer.settings.trials)
     offsets = np.stack([_offset(observer, each) for each in observed])
-    shifts = _shifts(context.settings["data"], observed, known.bound - observer.nominal, offsets)
+    shifts = _shifts(observer.settings.data, observed, known.bound - observer.nominal, offsets)
     _dataset(observer, observed, known.bound, shifts, known.gravity).write(context.run_dir / SCALED_DATASET)
 
 
@@ -97,19 +98,20 @@ def _mean_offset(offsets: FloatArray, observed: Sequence[Observed], known: Conta
     return mean
 
 
-def _shifts(data: Mapping[str, Any], observed: Sequence[Observed], mean: FloatArray, offsets: FloatArray) -> FloatArray:
+def _shifts(data: ReadingSettings, observed: Sequence[Observed], mean: FloatArray, offsets: FloatArray) -> FloatArray:
     """(R, M, 3) by which each trial's markers are moved [m]: to where they sit on the whole, if they drift."""
-    if data["alignment"] == "shared":
+    if data.alignment == "shared":
         return np.zeros_like(offsets)
     own = np.array([each.tells_places for each in observed])
     return np.where(own[:, None, None], mean - offsets, 0.0)
 
 
-def _check_unit(driven: Sequence[FloatArray], data: Mapping[str, Any], drive: Drive) -> None:
+def _check_unit(driven: Sequence[FloatArray], data: ReadingSettings, drive: Drive) -> None:
     """Refuses recordings under which the body would hardly move, as those do whose unit was mistaken."""
     if not driven or all(len(each) == 1 for each in driven):
         return
-    highest, limit = max(float(np.abs(each).max()) for each in driven), data["input_limit"]
+    assert data.input_limit is not None
+    highest, limit = max(float(np.abs(each).max()) for each in driven), data.input_limit
     words, unit = drive.quantity.plural, drive.quantity.unit
     if highest < NO_INPUT * limit:
         raise DataFileError(
@@ -124,10 +126,10 @@ def _dataset(
 ) -> Dataset:
     """The trials in the frame of the body; those that end early are padded."""
     settings, drive = observer.settings, observer.drive
-    data, cutoff = settings["data"], settings["data"].get("cutoff")
-    steps = data.get("steps")
+    cutoff, steps = settings.data.cutoff, settings.data.steps
     frames = max(len(each.moving.positions) if each.trial.is_released else 1 for each in observed)
     if any(each.trial.begins == "rest" for each in observed):
+        assert steps is not None
         frames = max(frames, steps + 1)
     shape = (len(observed), frames, len(observer.tracked), 3)
     markers, smoothed = np.full(shape, np.nan), np.full(shape, np.nan)
@@ -146,14 +148,14 @@ def _dataset(
         if each.trial.is_released:
             times[row] = np.pad(each.moving.time, (0, frames - len(seen)), mode="edge")
         elif each.trial.begins == "rest":
-            times[row] = np.minimum(np.arange(frames), steps) * settings["time_step"]
+            times[row] = np.minimum(np.arange(frames), steps or 0) * settings.time_step
             held[row] = np.where(np.isfinite(markers[row, 0]), markers[row, 0], held[row])
         else:
             held[row, has] = bound[has]  # A pose is as large as it is far from the undeformed body.
         if each.driven is not None:
             for series in inputs.values():
                 _fill_inputs(series[row], each.driven, each)
-    base = _bases(observed, times, settings["time_step"], observer.simulator.body.mesh.vertices)
+    base = _bases(observed, times, settings.time_step, observer.simulator.body.mesh.vertices)
     return Dataset(
         names=tuple(each.trial.name for each in observed),
         labels=tuple(observer.tracked),
@@ -163,7 +165,7 @@ def _dataset(
         held=held,
         payload=np.array([each.trial.payload for each in observed]),
         gravity=gravity,
-        time_step=settings["time_step"],
+        time_step=settings.time_step,
         bound=bound,
         smoothed=smoothed if cutoff is not None or all(each.trial.begins == "rest" for each in observed) else None,
         inputs=inputs,
@@ -197,27 +199,27 @@ def _fill_inputs(row: FloatArray, driven: FloatArray, each: Observed) -> None:
         )
 
 
-def _verticals(observed: Sequence[Observed], settings: Mapping[str, Any]) -> FloatArray | None:
+def _verticals(observed: Sequence[Observed], settings: ImportStage) -> FloatArray | None:
     """(R, 3) the vertical of each recording in the frame of the body, near the configured one; None if not known."""
-    up = vertical(settings["data"].get("up"))
+    up = vertical(settings.data.up)
     if up is None:
         return None
     verticals = np.stack([each.registration.transform.rotation @ up for each in observed])
-    configured = np.asarray(settings["gravity"], dtype=np.float64)
+    configured = np.asarray(settings.gravity, dtype=np.float64)
     for each, found in zip(observed, verticals, strict=True):
         if configured.any() and _angle(found, -configured) > _LARGEST_LEAN:
             down = ", ".join(f"{-each:.2f}" for each in found)
             raise InputError(
-                f"{each.raw.source}: with data.up {settings['data']['up']}, gravity points along ({down}) in the "
+                f"{each.raw.source}: with data.up {settings.data.up}, gravity points along ({down}) in the "
                 f"frame of the body, {_angle(found, -configured):.0f} degrees from the configured one: set data.up to "
                 "the vertical of the recordings, or gravity to its direction in the frame of markers and mesh."
             )
     return verticals
 
 
-def _gravity(verticals: FloatArray | None, settings: Mapping[str, Any]) -> FloatArray:
+def _gravity(verticals: FloatArray | None, settings: ImportStage) -> FloatArray:
     """(3,) gravity in the frame of the body, as strong as configured [m/s^2]."""
-    configured = np.asarray(settings["gravity"], dtype=np.float64)
+    configured = np.asarray(settings.gravity, dtype=np.float64)
     if verticals is None:
         return configured
     mean = verticals.mean(axis=0)
@@ -238,7 +240,8 @@ def _write_quality(
     gravity: FloatArray,
 ) -> None:
     """quality.json and registration.json: of all released trials, and of a few driven ones."""
-    reference, gap = list(context.settings["markers"]["reference"]), context.settings["data"]["longest_gap"]
+    settings: ImportStage = context.settings
+    reference, gap = list(settings.markers.reference), settings.data.longest_gap
     driven = [row for row, each in enumerate(observed) if not each.trial.is_released]
     shown = evenly(driven, _SHOWN) if driven else []
     qualities, registrations = {}, {}

@@ -23,6 +23,8 @@ from ..learning.predictors import Range
 from ..learning.refinement import Motion, SolverInTheLoop, WindowLoss
 from ..learning.replay import Replay
 from ..learning.training import EpochTrainer, Samples, SequenceTrainer, Trainer
+from ..settings.learning import InTheLoopSettings, NetworkSettings, TrainingSettings
+from ..settings.stages import NetworkStage, RefineStage, TrainStage
 from .build import choose_device
 from .files import STATIC, reconstruction_file, training_file, weights_file
 from .models import SIMFREE, Learned, kind_of, load, rollout_error
@@ -116,34 +118,25 @@ class Learning:
     Attributes:
         scene: of the experiment.
         model: name of what is learned.
-        in_the_loop: whether weights come out of whole motions through the simulator.
     """
 
     scene: Scene
     model: str
 
-    @property
-    def in_the_loop(self) -> bool:
-        """Whether the weights come out of whole trials through the simulator, not out of reconstructed steps."""
-        return self.model != SIMFREE and self.scene.config.get("in_the_loop") is not None
-
-    def trainer(self, groups: Mapping[str, Any]) -> "Prepared":
-        """A trainer of a new model; the same settings and seed give the same model.
-
-        Args:
-            groups: ``network``, ``trainer``, ``in_the_loop`` and ``seed``, of the weights, the batches and the noise.
+    def trainer(self, settings: TrainingSettings) -> "Prepared":
+        """A trainer of a new model; the same settings give the same model.
 
         Raises:
             InputError: a setting out of range, or an empty split.
         """
-        split = self.scene.config["split"]
-        device = choose_device(self.scene.config["device"])
-        train = samples_of(self.scene, self.model, split["train"], device)
-        if self.in_the_loop:
-            return _in_the_loop(self.scene, self.model, train, groups)
-        judged = split["validation"] or split["train"]
-        validation = samples_of(self.scene, self.model, judged, device) if split["validation"] else train
-        return _supervised(self.scene, self.model, train, validation, judged, groups)
+        split = self.scene.settings.split
+        device = choose_device(self.scene.settings.device)
+        train = samples_of(self.scene, self.model, split.train, device)
+        if settings.in_the_loop is not None:
+            return _in_the_loop(self.scene, self.model, train, settings, settings.in_the_loop)
+        judged = split.validation or split.train
+        validation = samples_of(self.scene, self.model, judged, device) if split.validation else train
+        return _supervised(self.scene, self.model, train, validation, judged, settings)
 
 
 @dataclass(frozen=True)
@@ -159,61 +152,65 @@ class Prepared:
     learned: Learned
 
 
-def _new_network(scene: Scene, model: str, train: Samples, groups: Mapping[str, Any]) -> StateMap:
+def _new_network(scene: Scene, model: str, train: Samples, settings: TrainingSettings) -> StateMap:
     """An untrained network, with coders from the training steps; the same for the same seed."""
-    rest, config = scene.like.to(train.q.device), groups["network"]
-    if not scene.moving(scene.config["split"]["train"]):
-        config = _told_by(config, len(train.q), model)
-    torch.manual_seed(groups["seed"])
+    rest, network = scene.like.to(train.q.device), settings.network
+    if not scene.moving(scene.settings.split.train):
+        network = _limited(network, len(train.q), model)
+    torch.manual_seed(settings.seed)
+    config = dict(network)
     if model == SIMFREE:
         return build_next_state(config, rest, train.q, train.v, train.actuation)
-    by_displacement = config["kind"] == "reduced" and config["force_basis"] == "displacement"
+    by_displacement = network.kind == "reduced" and network.force_basis == "displacement"
     stiffness = RestStiffness(scene.model_simulator(model)) if by_displacement else None
     return build_model(config, rest, train.q, train.v, train.outputs[0], train.actuation, stiffness)
 
 
-def _told_by(config: Mapping[str, Any], poses: int, model: str) -> Mapping[str, Any]:
+def _limited(network: NetworkSettings, poses: int, model: str) -> NetworkSettings:
     """The group ``network`` with no more modes than there are poses, each of which tells one at most."""
-    known = ("position_modes",) if model == SIMFREE else ("position_modes", "force_modes")
-    many = {key: poses for key in known if config.get(key, 0) > poses}
+    names = ("position_modes",) if model == SIMFREE else ("position_modes", "force_modes")
+    many = {name: getattr(network, name) for name in names if getattr(network, name) > poses}
     if many:
-        said = " and ".join(f"network.{key} of {config[key]}" for key in many)
+        said = " and ".join(f"network.{name} of {count}" for name, count in many.items())
         log.info("%s: %d poses tell %d modes, which %s comes down to", model, poses, poses, said)
-    return {**config, **many}
+    return network.changed(**dict.fromkeys(many, poses))
 
 
 def _supervised(
-    scene: Scene, model: str, train: Samples, validation: Samples, judged: Sequence[str], groups: Mapping[str, Any]
+    scene: Scene, model: str, train: Samples, validation: Samples, judged: Sequence[str], settings: TrainingSettings
 ) -> Prepared:
     """Training on single steps, judged by roll-outs."""
-    network = _new_network(scene, model, train, groups)
-    learned = Learned(network, _range_of(scene, network, train), scene.config["force_frame"])
+    network = _new_network(scene, model, train, settings)
+    learned = Learned(network, _range_of(scene, network, train), scene.settings.force_frame)
     error = rollout_error(dataclasses.replace(scene, on_failure="count"), model, judged)
     kind: type[Trainer[Any]] = Trainer if network.recurrent is None else SequenceTrainer
 
     def judge(weights: StateMap) -> float:
         return error(dataclasses.replace(learned, network=weights))
 
-    return Prepared(kind(network, train, validation, judge, groups["trainer"], groups["seed"]), learned)
+    return Prepared(kind(network, train, validation, judge, dict(settings.trainer), settings.seed), learned)
 
 
 def _range_of(scene: Scene, network: StateMap, train: Samples) -> Range | None:
     """The range of a network's inputs in training, in which roll-outs hold it, if that is asked for."""
-    if not scene.config["range_guard"]:
+    assert isinstance(scene.settings, NetworkStage)
+    if not scene.settings.range_guard:
         return None
     with torch.no_grad():
         return Range.of(network.encode(train.q, train.v, train.actuation))
 
 
-def _in_the_loop(scene: Scene, model: str, samples: Samples, groups: Mapping[str, Any]) -> Prepared:
+def _in_the_loop(
+    scene: Scene, model: str, samples: Samples, settings: TrainingSettings, loop: InTheLoopSettings
+) -> Prepared:
     """Training on whole trials through the simulator.
 
     The reconstruction says in which modes bodies move and forces act. Without validation trials, each training trial is
     held out once to find how long training serves others; no epoch at all is one of the choices.
     """
-    config, split = groups["in_the_loop"], scene.config["split"]
+    config, split = dict(loop), scene.settings.split
     parameters, simulator = scene.parameters(model), scene.model_simulator(model)
-    everyone, frames = scene.replays(simulator, [*split["train"], *split["validation"]], model), scene.frames(simulator)
+    everyone, frames = scene.replays(simulator, split.train + split.validation, model), scene.frames(simulator)
 
     def loss(names: Sequence[str]) -> MotionLoss:
         watched = []
@@ -228,53 +225,53 @@ def _in_the_loop(scene: Scene, model: str, samples: Samples, groups: Mapping[str
         return MotionLoss(watched, parameters)
 
     def make_network() -> ResidualForce:
-        found = _new_network(scene, model, samples, groups)
+        found = _new_network(scene, model, samples, settings)
         assert isinstance(found, ResidualForce)
         return found.double()
 
-    epochs, train, validation = None, split["train"], split["validation"]
-    if config["hold_out"] and not validation and len(train) > 1:
+    epochs, train, validation = None, split.train, split.validation
+    if loop.hold_out and not validation and len(train) > 1:
         parts = [(loss([name for name in train if name != out]), loss([out])) for out in train]
-        with Progress(f"{model}: held out", len(train) * config["epochs"], "epochs at most") as progress:
+        with Progress(f"{model}: held out", len(train) * loop.epochs, "epochs at most") as progress:
             epochs = cross_validated_epochs(make_network, parts, config, progress.advance)
         log.info("%s: %d epochs serve trials that are held out best", model, epochs)
     judged = loss(validation) if validation else None
     trainer = MarkersInTheLoop(make_network(), loss(train), judged, config, epochs)
     trainer.begin()
-    learned = Learned(trainer.model, _range_of(scene, trainer.model, samples), scene.config["force_frame"])
+    learned = Learned(trainer.model, _range_of(scene, trainer.model, samples), scene.settings.force_frame)
     return Prepared(trainer, learned)
 
 
 def train(context: StageContext) -> None:
     """Trains a model: <model>.safetensors, with the weights that are selected, and training_<model>.json."""
-    settings, model = context.settings, context.settings["model"]
-    fit(context, Learning(Scene(settings, context.run_dir), model).trainer(settings))
+    settings: TrainStage = context.settings
+    learning = Learning(Scene(settings, context.run_dir), settings.model)
+    fit(context, settings.model, learning.trainer(settings.training))
 
 
 def refine(context: StageContext) -> None:
     """Trains a residual force on through the simulator: <model>_refined.safetensors and refinement_<model>.json."""
-    settings, model = context.settings, context.settings["model"]
-    scene = Scene(settings, context.run_dir, "count")
+    settings: RefineStage = context.settings
+    model, scene = settings.model, Scene(settings, context.run_dir, "count")
     simulator = scene.model_simulator(model)
-    learned = load(context.run_dir, model, choose_device(settings["device"]))
-    network, config = learned.network, settings["refinement"]
+    learned = load(context.run_dir, model, choose_device(settings.device))
+    network, refinement = learned.network, settings.refinement
     assert isinstance(network, ResidualForce)
-    split = settings["split"]
-    judged = split["validation"] or split["train"]
-    motions = {name: _motions(scene, model, split[name] or judged) for name in ("train", "validation")}
+    judged = settings.split.validation or settings.split.train
+    train_on, validate_on = (_motions(scene, model, names) for names in (settings.split.train, judged))
     error = rollout_error(scene, model, judged)
     loss = WindowLoss(
         network,
         partial(dataclasses.replace, simulator),  # One whose solver has seen nothing yet.
-        config["window"],
-        config["batch_size"],
+        refinement.window,
+        refinement.batch_size,
         observe=scene.observe_by(model),
         parameters=scene.parameters(model),
         frames=scene.frames(simulator, learned.force_frame),
         range_=learned.range_,
     )
-    trainer = SolverInTheLoop(network, loss, motions["train"], motions["validation"], lambda _: error(learned), config)
-    fit(context, Prepared(trainer, learned), refined=True)
+    trainer = SolverInTheLoop(network, loss, train_on, validate_on, lambda _: error(learned), dict(refinement))
+    fit(context, model, Prepared(trainer, learned), refined=True)
     left_out = trainer.state.history[0]["left_out"]
     if left_out:
         log.warning("%s: %d windows could not be simulated and were left out", context.name, left_out)
@@ -294,15 +291,16 @@ def _motions(scene: Scene, model: str, names: Sequence[str]) -> list[Motion]:
     return found
 
 
-def fit(context: StageContext, prepared: Prepared, refined: bool = False) -> None:
+def fit(context: StageContext, model: str, prepared: Prepared, refined: bool = False) -> None:
     """Trains, going on from an interrupted run, and writes the selected weights and the history.
 
     Args:
-        context: of the stage, whose settings name the model.
+        context: of the stage.
+        model: name of what is trained.
         prepared: the trainer, and what goes with the weights.
         refined: whether this is the refinement of a model that was trained before.
     """
-    model, trainer = context.settings["model"], prepared.trainer
+    trainer = prepared.trainer
     checkpoint = context.run_dir / f"{context.name}.safetensors"
     if (found := resume_checkpoint(checkpoint, "training", context.fingerprint)) is not None:
         trainer.resume(*found)

@@ -21,6 +21,7 @@ from ..learning.networks import NextState, ResidualForce, StateMap, restore
 from ..learning.predictors import LearnedPredictor, Range
 from ..learning.replay import Start
 from ..learning.rollout import Rollout
+from ..settings.stages import TestStage
 from ..stepping.state import State
 from .files import GIVEN, weights_file
 from .parts import ResumableRollout
@@ -139,7 +140,7 @@ class ModelRollout(ResumableRollout):
         """Steps that reach past all frames; of whole time steps of the experiment."""
         if self.replay.is_static:
             return POSE_STEPS if self.model == SIMFREE else 0
-        substeps = round(self.scene.config["time_step"] / self.simulator.time_step)
+        substeps = round(self.scene.settings.time_step / self.simulator.time_step)
         return -(-self.replay.steps(self.start) // substeps) * substeps
 
     @torch.no_grad()
@@ -216,7 +217,7 @@ class ModelRollout(ResumableRollout):
         """Mean distances [mm] at those frames of each trial that are learned from; NaN where the roll-out diverged."""
         observed, steps = self.replay.trials.observed, self.frames - 1
         observed = observed[:, : self.scene.learned_steps(observed.shape[1] - 1) + 1]
-        if self.scene.config["data"].get("train_fraction", 1.0) < 1.0:
+        if self.scene.settings.train_fraction < 1.0:
             steps = min(steps, self.scene.learned_steps(steps))
         series: list[torch.Tensor] = []
         with contextlib.suppress(ConvergenceError):
@@ -260,5 +261,6 @@ def rollout_error(scene: Scene, model: str, names: Sequence[str]) -> Callable[[L
 
 def learned_of(scene: Scene, model: str) -> Learned | None:
     """What a model has learned in this run; None for those that are simulators alone."""
-    refined = model != SIMFREE and scene.config["refinement"] != "none"
+    assert isinstance(scene.settings, TestStage)
+    refined = model != SIMFREE and scene.settings.refined
     return load(scene.folder, model, scene.like.device, refined) if model in LEARNED else None

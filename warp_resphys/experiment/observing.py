@@ -1,7 +1,7 @@
 """Trials as they were recorded: when each begins, where its markers are in the frame of the body, and what drove it."""
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,11 +20,12 @@ from ..data.sight import Sight
 from ..dynamics.simulator import Simulator
 from ..io.errors import DataFileError, listed
 from ..io.stages import StageContext
+from ..settings.stages import ImportStage
+from ..settings.trials import BaseMotion, MotionSettings, Trial
 from .actuators import Drive, drive_of
 from .build import build_simulator
 from .files import STATIC
 from .reading import POSE_SECONDS, Reader, central_places
-from .trials import Trial
 
 log = logging.getLogger(__name__)
 
@@ -81,13 +82,15 @@ class Observer:
     """Reads and registers trials.
 
     Args:
-        context: of the stage, with the groups data, markers, laboratory, mesh and what a simulator needs.
+        context: of the stage.
     """
 
     def __init__(self, context: StageContext) -> None:
-        self.context, self.settings = context, context.settings
-        self.data, self.markers = self.settings["data"], self.settings["markers"]
-        self.simulator: Simulator = build_simulator(self.settings)
+        settings: ImportStage = context.settings
+        self.context, self.settings = context, settings
+        self.data, self.markers = settings.data, settings.markers
+        self.simulator: Simulator = build_simulator(settings, settings.simulation, payload_at=settings.payload_at)
+        self._limit = settings.data.input_limit or np.inf
         self.drive = drive_of(self.settings, self.simulator.body)
         self.reader = Reader(self.settings, context.run_dir, self.simulator, self.drive)
         self.tracked, self.nominal = self.reader.tracked, self.reader.nominal
@@ -114,7 +117,7 @@ class Observer:
         a body by a millimetre at its tip, otherwise than in the trials that are registered by all markers.
         """
         known = [each.registration.positions[len(each.columns) :] for each in observed if each.tells_places]
-        if not known or len(known) == len(observed) or len(self.markers["reference"]) < self.reader.enough:
+        if not known or len(known) == len(observed) or len(self.markers.reference) < self.reader.enough:
             return observed
         seen = np.isfinite(np.stack(known)).all(-1).any(0)
         mean = np.nanmean(np.stack(known)[:, seen], axis=0)
@@ -130,11 +133,11 @@ class Observer:
     def _timed(self, trial: Trial, recording: Recording) -> tuple[Recording, Release | None]:
         """A recording, at the steps of the simulation if the body is driven, and when the body is let go if it is."""
         if not trial.is_released:
-            return resample(recording, 1.0 / self.settings["time_step"]), None
+            return resample(recording, 1.0 / self.settings.time_step), None
         self._check_rate(recording)
         if trial.begins == "released":
             return recording, _START
-        return recording, release_of(recording, self.reader.tracked_in(trial), self.data["longest_gap"])
+        return recording, release_of(recording, self.reader.tracked_in(trial), self.data.longest_gap)
 
     def _check_rate(self, recording: Recording) -> None:
         """Refuses a recording that is too slow, and says whether frames fall between the steps of the simulation."""
@@ -143,17 +146,17 @@ class Observer:
                 f"{recording.source} has {recording.rate:g} frames a second, too few to tell how the body was let "
                 f"go: record {_LEAST_RATE:g} or more, or set data.rate if the file is wrong."
             )
-        ratio = recording.rate * self.settings["time_step"]
+        ratio = recording.rate * self.settings.time_step
         if abs(max(ratio, 1.0 / ratio) - round(max(ratio, 1.0 / ratio))) > 1e-6:
             log.info(
                 "import: %s has %g frames a second and the simulation %g steps: it is read off at the times of the "
                 "frames, between its steps",
-                *(recording.source.name, recording.rate, 1.0 / self.settings["time_step"]),
+                *(recording.source.name, recording.rate, 1.0 / self.settings.time_step),
             )
 
     def _check_reference(self, trials: Sequence[Trial], ready: Sequence[tuple[Recording, Release | None]]) -> None:
         """Refuses recordings whose reference markers moved against each other between trials."""
-        reference, still = list(self.markers["reference"]), []
+        reference, still = list(self.markers.reference), []
         for trial, (recording, release) in zip(trials, ready, strict=True):
             if release is not None:
                 still.append(_frames(recording, *release.rest))
@@ -161,15 +164,15 @@ class Observer:
                 stands = self._base_motion(trial) is None
                 still.append(recording if stands else _frames(recording, 0, self._rest_frames(recording)))
         if len(reference) > 1:
-            limits = {key: self.markers[key] for key in ("largest_distortion", "largest_shift")}
-            check_base(still, reference, **limits)
+            limits = {"largest_distortion": self.markers.largest_distortion}
+            check_base(still, reference, **limits, largest_shift=self.markers.largest_shift)
 
     def _rest_frames(self, recording: Recording) -> int:
-        return max(round(self.data["rest_seconds"] * recording.rate), 1)
+        return max(round(self.data.rest_seconds * recording.rate), 1)
 
-    def _base_motion(self, trial: Trial) -> Mapping[str, Any] | str | None:
+    def _base_motion(self, trial: Trial) -> BaseMotion:
         """How the base of a trial moves; that of a laboratory's trial may have to be found out."""
-        common: Mapping[str, Any] | str | None = self.data.get("base_motion")
+        common = self.data.base_motion
         return common if trial.base_motion is None or isinstance(common, str) else trial.base_motion
 
     def _base(
@@ -179,8 +182,8 @@ class Observer:
         motion = self._base_motion(trial)
         if motion is None:
             return None
-        if isinstance(motion, Mapping):
-            poses = prescribed(motion, moving.time, self.data["folder"] or ".")
+        if isinstance(motion, MotionSettings):
+            poses = prescribed(motion, moving.time, self.data.folder or ".")
         elif motion == "reference":
             count = len(self.reader.tracked_in(trial))
             poses = in_frame(followed(whole.positions[:, count:], still[count:], whole.source), transform)
@@ -193,7 +196,7 @@ class Observer:
             )
         early = poses[: 1 if trial.is_released else self._rest_frames(whole)]
         moved = rigid(early).apply(np.broadcast_to(self.nominal, (len(early), *self.nominal.shape))) - self.nominal
-        if (furthest := float(np.linalg.norm(moved, axis=-1).max())) > self.markers["largest_residual"]:
+        if (furthest := float(np.linalg.norm(moved, axis=-1).max())) > self.markers.largest_residual:
             raise DataFileError(
                 f"{whole.source}: the base has moved the body by {_MILLI * furthest:.1f} mm while that is registered: "
                 "let it stand still until the release, or in the first data.rest_seconds."
@@ -218,11 +221,11 @@ class Observer:
         expected: FloatArray,
         only_reference: bool = False,
     ) -> Registration:
-        use = list(self.markers["reference"]) if only_reference else None
+        use = list(self.markers.reference) if only_reference else None
         return register_markers(
             *(self._turned_back(places, self.reader.sight(trial)), expected, recording.labels),
             source=recording.source,
-            largest_residual=self.markers["largest_residual"],
+            largest_residual=self.markers.largest_residual,
             use=use,
             rotation=self.reader.rotation,
             vertical=self.reader.vertical,
@@ -232,19 +235,19 @@ class Observer:
         """A body that was held, undeformed or as the file says, and let go."""
         tracked = self.reader.tracked_in(trial)
         still = _median(_frames(recording, *release.rest), tracked)
-        places = _rest_of(recording, tracked) if self.data["rest"] == "file" else still
+        places = _rest_of(recording, tracked) if self.data.rest == "file" else still
         registration = self._register(trial, places, recording, self.reader.expected(trial))
         off = f"; left out: {listed(registration.outliers)}" if registration.outliers else ""
         log.info(
             "import: %s is let go in frame %.1f, registered to %.2f mm%s",
             *(trial.name, release.frame, _MILLI * registration.rms, off),
         )
-        filled = fill_gaps(recording.select(tracked), self.data["longest_gap"], mask_long=True)
-        moving = trim_to_release(filled, release, seconds=self.data["seconds"])
+        filled = fill_gaps(recording.select(tracked), self.data.longest_gap, mask_long=True)
+        moving = trim_to_release(filled, release, seconds=self.data.seconds)
         lost = [label for label, seen in zip(moving.labels, moving.seen.T, strict=True) if not seen.any()]
         if lost:
             raise DataFileError(
-                f"{moving.source}: {listed(lost)} cannot be seen in the {self.data['seconds']:g} s after the release; "
+                f"{moving.source}: {listed(lost)} cannot be seen in the {self.data.seconds:g} s after the release; "
                 "leave it out of markers.tracked."
             )
         check_motion(moving, tracked)
@@ -260,14 +263,15 @@ class Observer:
         """A body that rests until its inputs come, or one in a pose."""
         static, tracked = trial.begins == STATIC, self.reader.tracked_in(trial)
         if not static:
-            check_motion(_frames(recording, 0, self.data["steps"] + 1), tracked)
+            assert self.data.steps is not None
+            check_motion(_frames(recording, 0, self.data.steps + 1), tracked)
         driven = None if self.drive is None else self._inputs(recording, trial, self.drive)
         loaded = driven is not None and not self._is_at_rest(driven[:1])[0]
         tells = trial.payload == 0.0 and not loaded
-        filled = fill_gaps(recording, self.data["longest_gap"], mask_long=True)
+        filled = fill_gaps(recording, self.data.longest_gap, mask_long=True)
         still = _median(filled, tracked) if static and loaded else self._resting(trial, filled, driven)
         # Where the body is without what hangs on it, the other trials tell.
-        only_reference = not tells and len(self.markers["reference"]) >= self.reader.enough
+        only_reference = not tells and len(self.markers.reference) >= self.reader.enough
         registration = self._register(trial, still, recording, self.reader.expected(trial), only_reference)
         moving = filled.select(tracked)
         if static:
@@ -282,7 +286,7 @@ class Observer:
 
     def _is_at_rest(self, driven: FloatArray) -> NDArray[np.bool_]:
         """(T,) whether (T, C) inputs are what a gauge shows of none."""
-        return np.asarray(np.abs(driven).max(axis=1) <= NO_INPUT * self.data["input_limit"])
+        return np.asarray(np.abs(driven).max(axis=1) <= NO_INPUT * self._limit)
 
     def _resting(self, trial: Trial, recording: Recording, driven: FloatArray | None) -> FloatArray:
         """(M', 3) mean positions of the markers before the inputs come [m], NaN for one that is not seen."""
@@ -299,7 +303,7 @@ class Observer:
 
     def _inputs(self, recording: Recording, trial: Trial, drive: Drive) -> FloatArray:
         """(T, C) of the body's parts; refuses those of another number of parts, or beyond the limit."""
-        data, count = self.data, len(drive.parts)
+        count = len(drive.parts)
         found = recording.actuation
         if found is None:
             if trial.is_released:
@@ -308,8 +312,8 @@ class Observer:
                 f"{recording.source} has no array 'actuation' with the {drive.quantity.plural} of the {drive.per}s: "
                 "add it (docs/recordings.md)."
             )
-        values = check_inputs(found, drive.quantity, count, trial.scale * data["input_limit"], recording.source)
-        if data["valve"] == "detected" and not trial.is_released:
+        values = check_inputs(found, drive.quantity, count, trial.scale * self._limit, recording.source)
+        if self.data.valve == "detected" and not trial.is_released:
             opening = valve_opening(recording, self.reader.tracked_in(trial))
             # Commanded inputs from that moment on; the step in which the valve opens has its share.
             frame = (opening - recording.start) * recording.rate

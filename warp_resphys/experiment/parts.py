@@ -24,6 +24,7 @@ from ..io.machine import available_cores
 from ..io.progress import Progress
 from ..io.resumable import Field, ResumableHDF5, is_final
 from ..io.stages import StageContext
+from ..settings.run import ParallelSettings
 from ..stepping.state import State
 from .build import simulation_device
 
@@ -128,9 +129,14 @@ class TrialPart:
 
 
 def split_into_parts(
-    context: StageContext, names: Sequence[str], frames: int, label: str = "part", more: Any = None
+    context: StageContext,
+    names: Sequence[str],
+    frames: int,
+    label: str = "part",
+    more: Any = None,
+    batch: int | None = None,
 ) -> list[TrialPart]:
-    """Parts of at most ``batch`` trials, a setting of the stage; one part of all trials, if that is not set.
+    """Parts of some trials of a stage.
 
     Args:
         context: of the stage.
@@ -138,8 +144,9 @@ def split_into_parts(
         frames: of a trial.
         label: that the files' names begin with.
         more: see `TrialPart`.
+        batch: trials of a part, at most; all of them, if left out.
     """
-    folder, size = _folder(context), context.settings.get("batch") or len(names)
+    folder, size = _folder(context), batch or len(names)
     return [
         TrialPart(context, tuple(names[first : first + size]), folder / f"{label}_{first:03d}.h5", frames, more)
         for first in range(0, len(names), size)
@@ -151,22 +158,29 @@ def _folder(context: StageContext) -> Path:
     return context.run_dir / f"{context.name}_parts"
 
 
-def workers_for(config: Mapping[str, Any], wanted: int | None) -> Workers:
+def workers_for(parallel: ParallelSettings, wanted: int | None, device: str) -> Workers:
     """As many as wanted; if that is not said, one a core, but one for all where a GPU simulates.
+
+    Args:
+        parallel: of the run.
+        wanted: number of processes.
+        device: of the simulation.
 
     Raises:
         InputError: a cluster without a number of workers, or that cannot simulate on the device.
     """
-    backend = config["parallel"]["backend"]
-    if backend != "local" and wanted is None:
-        raise InputError(f"parallel.processes is null: say how many workers of the {backend} cluster are to be used.")
-    if backend == "ray" and simulation_device(config).type != "cpu":
+    on_cpu = simulation_device(device).type == "cpu"
+    if parallel.backend != "local" and wanted is None:
+        raise InputError(
+            f"parallel.processes is null: say how many workers of the {parallel.backend} cluster are to be used."
+        )
+    if parallel.backend == "ray" and not on_cpu:
         raise InputError(
             "parallel.backend is ray, which hands out CPUs here: choose device=cpu, or parallel.backend=dask."
         )
     if wanted is None:
-        wanted = available_cores() if simulation_device(config).type == "cpu" else 1
-    return Workers(wanted, backend, config["parallel"]["address"])
+        wanted = available_cores() if on_cpu else 1
+    return Workers(wanted, parallel.backend, parallel.address)
 
 
 def work_on(parts: Sequence[TrialPart], make: Callable[[TrialPart], ResumableRollout], workers: Workers) -> None:

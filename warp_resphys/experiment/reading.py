@@ -18,12 +18,13 @@ from ..data.registration import axes_rotation
 from ..data.sight import Sight
 from ..dynamics.simulator import Simulator
 from ..io.errors import DataFileError, InputError, listed
+from ..settings.stages import ImportStage
+from ..settings.trials import ReadingSettings, Trial
 from ..stepping.inputs import Inputs
 from .actuators import Drive
 from .build import bound_markers, sight_of
 from .files import STATIC, payload_inputs
 from .simulate import vertical
-from .trials import Trial, is_laboratory
 
 log = logging.getLogger(__name__)
 
@@ -38,7 +39,7 @@ class Reader:
     """Reads recordings, and knows where their markers should be.
 
     Args:
-        settings: the groups data, markers, laboratory and what a simulator needs.
+        settings: of the import.
         run_dir: where the recordings of a laboratory are.
         simulator: of the body.
         drive: what drives it; None if nothing does.
@@ -51,18 +52,17 @@ class Reader:
         enough: how many markers that stand still register a recording.
     """
 
-    def __init__(self, settings: Mapping[str, Any], run_dir: Path, simulator: Simulator, drive: Drive | None) -> None:
-        self.data, self.markers = settings["data"], settings["markers"]
-        self.tracked = list(self.markers["tracked"])
-        self.nominal, self._reference = (_places(self.markers[key]) for key in ("tracked", "reference"))
-        axes = self.data.get("axes")
+    def __init__(self, settings: ImportStage, run_dir: Path, simulator: Simulator, drive: Drive | None) -> None:
+        self.data, self.markers, self._payload_at = settings.data, settings.markers, settings.payload_at
+        self.tracked = list(self.markers.tracked)
+        self.nominal, self._reference = _places(self.markers.tracked), _places(self.markers.reference)
+        axes, table = self.data.axes, self.data.table
         self.rotation = None if axes is None else axes_rotation(axes)
-        self.vertical = vertical_of(settings)
-        self.enough = standing_enough(settings)
+        self.vertical = vertical_of(self.data.up, settings.gravity)
+        self.enough = standing_enough(self.data, settings.gravity)
         self._simulator, self._drive = simulator, drive
-        self._folder = run_dir if is_laboratory(settings) else None
-        table = self.data.get("table")
-        self._table = None if table is None else Table(table["columns"], table.get("header_lines", 0))
+        self._folder = run_dir if self.data.folder is None else None
+        self._table = None if table is None else Table(table.columns, table.header_lines)
         self._hanging: FloatArray | None = None
 
     def tracked_in(self, trial: Trial) -> list[str]:
@@ -71,7 +71,7 @@ class Reader:
 
     def labels(self, trial: Trial) -> list[str]:
         """Of the configured markers that a trial has, the tracked ones first."""
-        return [*self.tracked_in(trial), *self.markers["reference"]]
+        return [*self.tracked_in(trial), *self.markers.reference]
 
     def sight(self, trial: Trial) -> Sight:
         """How much the recording of a trial tells of where its tracked markers are."""
@@ -100,7 +100,7 @@ class Reader:
             DataFileError: a recording that cannot be read or used; the sentence names the file and the marker.
         """
         found = [self._read(trial) for trial in trials]
-        if self.markers.get("labels") == "assigned":
+        if self.markers.labels == "assigned":
             found = self._assigned(trials, found)
         for trial in trials:
             if absent := [label for label in self.tracked if label not in self.labels(trial)]:
@@ -134,7 +134,7 @@ class Reader:
             recording = read_recording(self._folder / trial.recording)
         else:
             assert trial.file is not None
-            recording = read_recording(trial.file, self.data["units"], self.data["rate"], trial.labels, self._table)
+            recording = read_recording(Path(trial.file), self.data.units, self.data.rate, trial.labels, self._table)
         if self._drive is None:
             if trial.inputs is not None:
                 raise InputError(
@@ -162,7 +162,7 @@ class Reader:
 
     def _of_parts(self, columns: FloatArray, source: Path, drive: Drive) -> FloatArray:
         """(T, C) inputs of the parts of the body, of the columns (T, A) that a recording has of them."""
-        parts, count = self.data["parts"], len(drive.parts)
+        parts, count = self.data.parts, len(drive.parts)
         if columns.shape[1] != (count if parts is None else len(parts)):
             names = "the body has" if parts is None else "data.parts names"
             raise DataFileError(
@@ -226,7 +226,7 @@ class Reader:
                 last.append(np.median(driven[-_count(POSE_SECONDS, recording) :], axis=0))
             fields[self._drive.quantity.name] = like.new_tensor(np.stack(last))
         loads = np.array([trial.payload for trial in trials])
-        hung = payload_inputs(self._simulator.body, self.data["payload_at"], loads)
+        hung = payload_inputs(self._simulator.body, self._payload_at, loads)
         return Inputs(**fields, **{key: like.new_tensor(each) for key, each in hung.items()})
 
     def _posed(self, inputs: Inputs) -> FloatArray:
@@ -237,17 +237,27 @@ class Reader:
         return found
 
 
-def standing_enough(settings: Mapping[str, Any]) -> int:
-    """How many markers that stand still register a recording: one where its rotation is known, two where its up is."""
-    if settings["data"].get("axes") is not None:
+def standing_enough(data: ReadingSettings, gravity: Sequence[float]) -> int:
+    """How many markers that stand still register a recording: one where its rotation is known, two where its up is.
+
+    Args:
+        data: how recordings are read.
+        gravity: (3,) in the frame of the body [m/s^2].
+    """
+    if data.axes is not None:
         return 1
-    return 3 if vertical_of(settings) is None else 2
+    return 3 if vertical_of(data.up, gravity) is None else 2
 
 
-def vertical_of(settings: Mapping[str, Any]) -> tuple[FloatArray, FloatArray] | None:
-    """(3,) upwards in the frame of the recordings, and in that of the body by its gravity; None if one is not known."""
-    up, gravity = vertical(settings["data"].get("up")), np.asarray(settings["gravity"], dtype=np.float64)
-    return None if up is None or not gravity.any() else (up, -gravity)
+def vertical_of(up: str | Sequence[float] | None, gravity: Sequence[float]) -> tuple[FloatArray, FloatArray] | None:
+    """(3,) upwards in the frame of the recordings, and in that of the body by its gravity; None if one is not known.
+
+    Args:
+        up: see `simulate.vertical`.
+        gravity: (3,) in the frame of the body [m/s^2].
+    """
+    upwards, down = vertical(up), np.asarray(gravity, dtype=np.float64)
+    return None if upwards is None or not down.any() else (upwards, -down)
 
 
 def central_places(recording: Recording, centre: Callable[..., Any]) -> FloatArray:

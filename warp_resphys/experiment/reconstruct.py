@@ -19,6 +19,7 @@ from ..io.stages import StageContext
 from ..learning.metrics import marker_errors
 from ..learning.reconstruction import Reconstructor, make_reconstructor
 from ..learning.rollout import Rollout
+from ..settings.stages import ReconstructStage
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .files import RECONSTRUCTION, read_if_there, reconstruction_file
@@ -43,16 +44,16 @@ def reconstruct(context: StageContext, workers: Workers = ALONE) -> None:
     that are not stable, such as those of a chamber's wall that is about to buckle: step by step the markers are met,
     but nothing that learns these forces will go there.
     """
-    settings, model = context.settings, context.settings["model"]
-    scene = Scene(settings, context.run_dir)
+    settings: ReconstructStage = context.settings
+    scene, model = Scene(settings, context.run_dir), settings.model
     parts: list[TrialPart] = []
-    for number, names in enumerate(scene.alike(settings["reconstructed"])):
+    for number, names in enumerate(scene.alike(settings.reconstructed)):
         last = float(scene.trials(names).times.max()) / scene.model_simulator(model).time_step
         frames = max(scene.learned_steps(int(last + 1e-6)), 1) + 1
-        parts += split_into_parts(context, names, frames, f"part{number}")
+        parts += split_into_parts(context, names, frames, f"part{number}", batch=settings.batch)
     work_on(parts, _OfTrials, workers)
     order = [name for part in parts for name in part.names]
-    held = scene.moving(settings["split"]["validation"])
+    held = scene.moving(settings.split.validation)
     rows = [row for row, name in enumerate(order) if name in held]
     error, held_out = read_parts(parts, "error"), {}
     with atomic_hdf5(context.run_dir / reconstruction_file(model), "reconstruction", {"names": order}) as file:
@@ -128,19 +129,19 @@ class _OfTrials(Reconstructing):
     """
 
     def __init__(self, part: TrialPart) -> None:
-        settings = part.context.settings
+        settings: ReconstructStage = part.context.settings
         scene = Scene(settings, part.context.run_dir)
-        simulator = reconstructing_simulator(scene, settings["model"])
-        replay = self._replay = scene.replay(simulator, part.names, settings["model"])
-        self._start, self.like = scene.start(replay, settings["model"]), simulator.rest_positions
-        self._constants, self._inputs, self._resting = replay.setting(scene.parameters(settings["model"]))
+        simulator = reconstructing_simulator(scene, settings.model)
+        replay = self._replay = scene.replay(simulator, part.names, settings.model)
+        self._start, self.like = scene.start(replay, settings.model), simulator.rest_positions
+        self._constants, self._inputs, self._resting = replay.setting(scene.parameters(settings.model))
         self._observed = scene.explained(replay, self._start)
         if replay.is_static:  # A pose is where one step leads that lasts so long that inertia has no say.
             simulator = dataclasses.replace(simulator, time_step=_FOR_EVER, integrator="implicit_euler")
             self._observed = torch.cat([torch.full_like(self._observed, torch.nan), self._observed], 1)
             self._inputs = self._resting
         markers: Any = None if scene.dataset.bound is None else replay.observe  # Full states have a faster way.
-        method = make_reconstructor(simulator, **settings["reconstruction"], markers=markers)
+        method = make_reconstructor(simulator, **dict(settings.reconstruction), markers=markers)
         self.method = method.with_constants(self._constants)
         self.force = torch.zeros_like(self._start.state.q)
         dtype = "float64" if scene.dataset.bound is None else "float32"
@@ -166,7 +167,7 @@ class _OfTrials(Reconstructing):
 
 
 def replayed_errors(
-    settings: Mapping[str, Any], run_dir: Path, names: tuple[str, ...], found: Mapping[str, FloatArray]
+    settings: ReconstructStage, run_dir: Path, names: tuple[str, ...], found: Mapping[str, FloatArray]
 ) -> FloatArray:
     """(B, K + 1) distance of the markers [mm] of simulations with reconstructed forces; infinite from where one fails.
 
@@ -179,10 +180,10 @@ def replayed_errors(
         found: q [m], v [m/s] and the force [N] that leads there, each (B, K + 1, N, 3).
     """
     scene = Scene(settings, run_dir, "count")
-    simulator = reconstructing_simulator(scene, settings["model"])
-    replay = scene.replay(simulator, names, settings["model"])
-    start = scene.start(replay, settings["model"])
-    constants, inputs, resting = replay.setting(scene.parameters(settings["model"]))
+    simulator = reconstructing_simulator(scene, settings.model)
+    replay = scene.replay(simulator, names, settings.model)
+    start = scene.start(replay, settings.model)
+    constants, inputs, resting = replay.setting(scene.parameters(settings.model))
     observed = scene.explained(replay, start)
     frames = scene.frames(simulator)
     steps = (found["q"][:, :-1], found["v"][:, :-1], found["force"][:, 1:])

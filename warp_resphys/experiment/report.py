@@ -12,6 +12,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..energies.muscles import Muscles
+from ..energies.tendons import Tendons
+from ..fem.body import Body
 from ..io.errors import DataFileError
 from ..io.files import read_array, read_hdf5, read_json
 from ..io.stages import StageContext, package_versions, resources_used
@@ -22,8 +25,9 @@ from ..mesh.surface import closest_points
 from ..report.data import MODELS, Driven, Film, FollowedPath, Recordings, RunReport, TrialResults
 from ..report.notes import error_notes, kept_note, material_note, network_note, published_note
 from ..report.run_page import write_report
-from .actuators import build_chambers, build_muscles, build_tendons, driving_quantity
-from .build import bound_markers, build_mesh, choose_device, sight_of
+from ..settings.run import RunSettings
+from .actuators import build_chambers, driving_quantity
+from .build import bound_markers, build_body, build_mesh, choose_device, sight_of
 from .files import (
     CONTROL,
     DATASET,
@@ -48,7 +52,6 @@ from .files import (
     training_file,
 )
 from .scene import LEARNED
-from .trials import sees_markers
 
 FloatArray = NDArray[np.float64]
 
@@ -59,35 +62,35 @@ def make_report(context: StageContext) -> None:
     Raises:
         DataFileError: a file of an earlier stage is missing or damaged, or one could not be written.
     """
-    folder, config = context.run_dir, context.settings["config"]
-    metrics, truth = collect_metrics(folder, config), read_if_there(common_folder(folder) / TRUTH)
-    trials, identification = read_trials(folder, config), read_if_there(folder / IDENTIFICATION)
-    mesh = build_mesh(config["mesh"])
-    film, driven = read_film(folder, config, mesh), read_driven(folder, config)
+    folder, run = context.run_dir, context.settings.config
+    metrics, truth = collect_metrics(folder, run), read_if_there(common_folder(folder) / TRUTH)
+    body = build_body(run, run.payload_at)
+    mesh = body.mesh
+    trials, identification = read_trials(folder, run), read_if_there(folder / IDENTIFICATION)
+    film, driven = read_film(folder, run, mesh), read_driven(folder, run)
     channels = () if driven is None else driven.channels
-    tip = {} if trials.labels else config.get("tip") or {}
-    learned = "resphys" in metrics["errors_mm"] and not config.get("in_the_loop")
-    network = (config["network"], config["trainer"], config.get("refinement") or {}) if learned else None
+    learned = "resphys" in metrics["errors_mm"] and run.in_the_loop is None
+    no_vertices = np.empty(0, dtype=np.int64)
     data = RunReport(
-        **_common_parts(config, metrics, mesh),
-        tip=select_vertices(mesh, **tip) if tip else np.empty(0, dtype=np.int64),
-        chambers=_driven_chambers(build_chambers(config.get("chambers"), mesh), channels),
-        tendons=_routes(config, mesh),
+        **_common_parts(run, metrics, body),
+        tip=no_vertices if trials.labels else select_vertices(mesh, **run.tip.arguments()),
+        chambers=_driven_chambers(build_chambers(run.chambers, mesh), channels),
+        tendons=_routes(body),
         trials=trials,
         film=film,
         driven=driven,
-        recordings=read_recordings(folder, config, *_at_rest(mesh, trials, film)),
+        recordings=read_recordings(folder, run, *_at_rest(mesh, trials, film)),
         notes=error_notes(metrics.get("sideways_mm", {}), truth, metrics.get("mesh_check", {})),
         identification=identification,
-        start=data_sheet(config, identification),
+        start=data_sheet(run, identification),
         truth=truth.get("material", {}),
         training=_histories(folder, False),
         refinement=_histories(folder, True),
-        network_note="" if network is None else network_note(*network),
+        network_note=_network_note(run) if learned else "",
         kept_note=kept_note(metrics["networks"]),
-        followed=read_followed(folder, config),
-        simulator=material_note(config["simulation"]),
-        target=material_note(config["target"]) if config.get("target") else "",
+        followed=read_followed(folder, run),
+        simulator=material_note(run.simulation.plain()),
+        target="" if run.target is None else material_note(run.target.plain()),
     )
     write_report(folder / REPORT, data)
 
@@ -98,32 +101,32 @@ def make_folds_report(context: StageContext) -> None:
     Raises:
         DataFileError: a file of an earlier stage is missing or damaged, or one could not be written.
     """
-    folder, config = context.run_dir, context.settings["config"]
-    metrics = {"device": str(choose_device(config["device"])), **read_json(folder / METRICS)}
+    folder, run = context.run_dir, context.settings.config
+    metrics = {"device": str(choose_device(run.device)), **read_json(folder / METRICS)}
     sideways = {trial: mm for fold in metrics["folds"].values() for trial, mm in fold.get("sideways_mm", {}).items()}
-    mesh = build_mesh(config["mesh"])
+    body = build_body(run, run.payload_at)
     data = RunReport(
-        **_common_parts(config, metrics, mesh),
+        **_common_parts(run, metrics, body),
         pages={trial: f"{fold_folder(trial)}/{REPORT}" for trial in metrics["folds"]},
-        recordings=read_recordings(folder, config, mesh, {}),
+        recordings=read_recordings(folder, run, body.mesh, {}),
         notes=error_notes(sideways, {}, {}),
     )
     write_report(folder / REPORT, data)
 
 
-def _common_parts(config: Mapping[str, Any], metrics: Mapping[str, Any], mesh: Mesh) -> dict[str, Any]:
-    """The parts of the report that all pages have."""
+def _common_parts(run: RunSettings, metrics: Mapping[str, Any], body: Body) -> dict[str, Any]:
+    """What all pages show."""
     return {
         "metrics": metrics,
-        "settings": config,
-        "mesh": mesh,
-        "fixed": select_vertices(mesh, **config["fixed"]),
-        "published_note": published_note(config),
+        "settings": run.plain(),
+        "mesh": body.mesh,
+        "fixed": body.fixed_vertices,
+        "published_note": published_note(run.plain()),
     }
 
 
 def common_folder(folder: Path) -> Path:
-    """Folder of the files that do not depend on the fold: this one, or the one that has the folds' folders."""
+    """Where the files lie that do not depend on the fold: here, or beside the folders of the folds."""
     return folder if (folder / DATASET).is_file() else folder.parent
 
 
@@ -133,15 +136,15 @@ def _histories(folder: Path, refined: bool) -> dict[str, Any]:
     return {model: read_json(path)["epochs"] for model, path in files.items() if path.is_file()}
 
 
-def collect_metrics(folder: Path, config: Mapping[str, Any], stages: Sequence[str] | None = None) -> dict[str, Any]:
-    """Content of metrics.json of a split.
+def collect_metrics(folder: Path, run: RunSettings, stages: Sequence[str] | None = None) -> dict[str, Any]:
+    """What metrics.json of a split says.
 
     Errors, the noise in them where known, which weights were kept, what was identified and reconstructed, time and
     memory of the stages (those that are done in the order of their end, if left out), versions and device.
     """
     if stages is None:
         records = sorted((folder / "stages").glob("*.json"), key=lambda path: path.stat().st_mtime_ns)
-        stages = [path.stem for path in records if not path.stem.endswith(".progress")]
+        stages = [path.stem for path in records if "." not in path.stem]  # not what interrupted stages keep
     files = {
         f"{model}_refined" if refined else model: folder / training_file(model, refined)
         for model in LEARNED
@@ -150,9 +153,9 @@ def collect_metrics(folder: Path, config: Mapping[str, Any], stages: Sequence[st
     identified, truth = (read_if_there(each) for each in (folder / IDENTIFICATION, common_folder(folder) / TRUTH))
     more = {
         "reconstruction": read_if_there(folder / RECONSTRUCTION),
-        "control": read_if_there(folder / CONTROL) if config["control"] is not None else {},
-        "mesh_check": {} if config["mesh_check"] is None else read_if_there(folder / MESH_CHECK),
-        "seconds_per_test_trajectory": read_if_there(folder / TIMES).get("seconds", {}) if config["timing"] else {},
+        "control": read_if_there(folder / CONTROL) if run.control is not None else {},
+        "mesh_check": {} if run.mesh_check is None else read_if_there(folder / MESH_CHECK),
+        "seconds_per_test_trajectory": read_if_there(folder / TIMES).get("seconds", {}) if run.timing else {},
         **({"noise_mm": truth["noise_mm"]} if "noise_mm" in truth else {}),
     }
     return {
@@ -162,18 +165,18 @@ def collect_metrics(folder: Path, config: Mapping[str, Any], stages: Sequence[st
         **{key: value for key, value in more.items() if value},
         **resources_used(folder, stages),
         "versions": package_versions(),
-        "device": str(choose_device(config["device"])),
+        "device": str(choose_device(run.device)),
     }
 
 
-def data_sheet(config: Mapping[str, Any], identification: Mapping[str, Any]) -> dict[str, float]:
-    """Values on the data sheet of the identified parameters and of those of the landscape."""
-    names = {name for identified in identification.values() for name in identified.get("parameters", {})}
-    return configured_parameters(config, (*names, "youngs_modulus", "poissons_ratio"))
+def data_sheet(run: RunSettings, identification: Mapping[str, Any]) -> dict[str, float]:
+    """What the simulator has of all that was identified, and of what the landscape is drawn over."""
+    names = {name for found in identification.values() for name in found.get("parameters", {})}
+    return configured_parameters(run.plain(), (*names, "youngs_modulus", "poissons_ratio"))
 
 
-def read_trials(folder: Path, config: Mapping[str, Any]) -> TrialResults:
-    """Reads the observations of the test trials of a split and the models' roll-outs, for the time that counts.
+def read_trials(folder: Path, run: RunSettings) -> TrialResults:
+    """What was observed in the test trials of a split and what the models made of them, as long as it counts.
 
     Roll-outs at other inputs than those of the data set are left out.
 
@@ -182,7 +185,7 @@ def read_trials(folder: Path, config: Mapping[str, Any]) -> TrialResults:
     """
     path = common_folder(folder) / DATASET
     dataset = read_dataset(path)
-    bound = build_mesh(config["mesh"]).vertices if dataset.bound is None else dataset.bound
+    bound = build_mesh(run.mesh).vertices if dataset.bound is None else dataset.bound
     with read_hdf5(folder / ROLLOUTS, "rollouts") as file:
         rolled = tuple(str(each) for each in file.attrs["names"])
         scaled = _read_scaled(folder)
@@ -197,7 +200,7 @@ def read_trials(folder: Path, config: Mapping[str, Any]) -> TrialResults:
     rows = dataset.rows(test)
     times, target = dataset.times[rows], dataset.observed[rows]
     begins = tuple(dataset.begins[row] for row in rows)
-    seconds, length = config["data"].get("seconds"), times.shape[1]
+    seconds, length = run.trial_seconds, times.shape[1]
     if seconds is not None:
         target = np.where((times <= seconds)[..., None, None], target, np.nan)
         length = max(1, int((times <= seconds).any(axis=0).sum()))
@@ -213,16 +216,16 @@ def read_trials(folder: Path, config: Mapping[str, Any]) -> TrialResults:
         bound=bound,
         gravity=dataset.gravity,
         time_step=dataset.time_step,
-        **_seen(config, dataset),
+        **_seen(run, dataset),
     )
 
 
-def _seen(config: Mapping[str, Any], dataset: Dataset) -> dict[str, Any]:
-    """Along which axes and in which frame markers are seen, for the pictures."""
+def _seen(run: RunSettings, dataset: Dataset) -> dict[str, Any]:
+    """How markers are seen, for the pictures."""
     labels = dataset.labels
-    if not labels:
+    if run.markers is None:
         return {}
-    sight = sight_of(config["markers"], labels, dataset.sets)
+    sight = sight_of(run.markers, labels, dataset.sets)
     return {"axes": tuple(axis for axis in range(3) if axis != sight.unseen), "own_frame": sight.own}
 
 
@@ -232,7 +235,7 @@ def _read_scaled(folder: Path) -> Dataset | None:
     return read_dataset(path) if path.is_file() else None
 
 
-def read_film(folder: Path, config: Mapping[str, Any], mesh: Mesh) -> Film | None:
+def read_film(folder: Path, run: RunSettings, mesh: Mesh) -> Film | None:
     """The bodies of the film, where their markers are seen; None where there is none."""
     with read_hdf5(folder / ROLLOUTS, "rollouts") as file:
         if "film_steps" not in file:
@@ -242,25 +245,28 @@ def read_film(folder: Path, config: Mapping[str, Any], mesh: Mesh) -> Film | Non
         shape = (len(steps), None, 3)
         bodies = {model: read_array(file, f"{model}_film", shape).astype(np.float64) for model in models}
         film = Film(str(file.attrs["film_trial"]), float(file.attrs["time_step"]) * steps, bodies)
-    return _as_seen(film, read_dataset(common_folder(folder) / DATASET), config, mesh)
+    return _as_seen(film, read_dataset(common_folder(folder) / DATASET), run, mesh)
 
 
-def _as_seen(film: Film, dataset: Dataset, config: Mapping[str, Any], mesh: Mesh) -> Film:
+def _as_seen(film: Film, dataset: Dataset, run: RunSettings, mesh: Mesh) -> Film:
     """The same, with the bodies carried to where their markers are seen."""
-    if dataset.bound is None or not (sight := sight_of(config["markers"], dataset.labels, dataset.sets)).own:
+    if dataset.bound is None or run.markers is None:
+        return film
+    sight = sight_of(run.markers, dataset.labels, dataset.sets)
+    if not sight.own:
         return film
     has = np.flatnonzero(dataset.present[dataset.names.index(film.trial)]).tolist()
-    markers = bound_markers(config["markers"], mesh, dataset.bound, dataset.labels)
+    markers = bound_markers(run.markers, mesh, dataset.bound, dataset.labels)
     sight = sight.select(has)
     at = {model: torch.from_numpy(each) for model, each in film.positions.items()}
     return replace(film, positions={model: sight.carried(q, markers(q)[:, has]).numpy() for model, q in at.items()})
 
 
-def read_followed(folder: Path, config: Mapping[str, Any]) -> list[FollowedPath]:
-    """Reads the paths that controllers followed on a simulated laboratory; empty without control."""
-    if config["control"] is None or config["laboratory"] is None:
+def read_followed(folder: Path, run: RunSettings) -> list[FollowedPath]:
+    """How controllers have driven a simulated laboratory; nothing where they have not."""
+    if run.control is None or not run.is_laboratory:
         return []
-    followed = []
+    found = []
     with read_hdf5(folder / DRIVEN, "driven") as file:
         controllers = [str(each) for each in file.attrs["controllers"]]
         for name in map(str, file.attrs["names"]):
@@ -268,14 +274,14 @@ def read_followed(folder: Path, config: Mapping[str, Any]) -> list[FollowedPath]
             path = read_array(file, f"{name}/path", (None, 3)).astype(np.float64)
             points = read_array(file, f"{name}/points", (len(controllers), len(path), 3)).astype(np.float64)
             by_name = dict(zip(controllers, points, strict=True))
-            followed.append(FollowedPath(name=shape, seconds=float(seconds), path=path, points=by_name))
-    return followed
+            found.append(FollowedPath(name=shape, seconds=float(seconds), path=path, points=by_name))
+    return found
 
 
-def read_driven(folder: Path, config: Mapping[str, Any]) -> Driven | None:
-    """Reads the inputs of all trials of a split; None without inputs."""
+def read_driven(folder: Path, run: RunSettings) -> Driven | None:
+    """What drives all trials of a split; None where nothing does."""
     dataset, scaled = read_dataset(common_folder(folder) / DATASET), _read_scaled(folder)
-    quantity = driving_quantity(config)
+    quantity = driving_quantity(run)
     if quantity is None or quantity.name not in dataset.inputs:
         return None
     values: dict[str, Any] = {}
@@ -285,32 +291,35 @@ def read_driven(folder: Path, config: Mapping[str, Any]) -> Driven | None:
         quantity,
         dataset.channels[quantity.name],
         values,
-        config["data"].get("input_limit"),
+        run.input_limit,
         scaled=() if scaled is None else scaled.names,
         poses=tuple(n for n, begins in zip(dataset.names, dataset.begins, strict=True) if begins == STATIC),
     )
 
 
-def _routes(config: Mapping[str, Any], mesh: Mesh) -> dict[str, FloatArray]:
+def _routes(body: Body) -> dict[str, FloatArray]:
     """(G, 3) guides of the body's tendons, or a line through each of its muscles [m], by name."""
-    if config.get("tendons"):
-        tendons = build_tendons(config["tendons"])
-        return dict(zip(tendons.names, tendons.guides, strict=True))
-    return build_muscles(config["muscles"], mesh).lines(mesh) if config.get("muscles") else {}
+    found: dict[str, FloatArray] = {}
+    for energy in body.energies:
+        if isinstance(energy, Tendons):
+            found |= dict(zip(energy.names, energy.guides, strict=True))
+        elif isinstance(energy, Muscles):
+            found |= energy.lines(body.mesh)
+    return found
 
 
 def _driven_chambers(chambers: tuple[Chamber, ...], names: tuple[str, ...]) -> tuple[Chamber, ...]:
-    """The chambers of a body that are under pressure, in the order of the pressures."""
+    """Those of a body's chambers that are under pressure, in the order of the pressures."""
     if not chambers:
         return ()
-    by_name = {chamber.name: chamber for chamber in chambers}
-    unknown = [name for name in names if name not in by_name]
+    found = {chamber.name: chamber for chamber in chambers}
+    unknown = [name for name in names if name not in found]
     if unknown:
         raise DataFileError(
             f"{DATASET} has pressures of {', '.join(unknown)}, but the body's chambers are "
-            f"{', '.join(by_name) or 'none'}: take the mesh that the trials were imported for."
+            f"{', '.join(found) or 'none'}: take the mesh that the trials were imported for."
         )
-    return tuple(by_name[name] for name in names)
+    return tuple(found[name] for name in names)
 
 
 def _at_rest(mesh: Mesh, trials: TrialResults, film: Film | None) -> tuple[Mesh, dict[str, FloatArray]]:
@@ -329,18 +338,16 @@ def _at_rest(mesh: Mesh, trials: TrialResults, film: Film | None) -> tuple[Mesh,
     return Mesh(film.positions[model][0], mesh.cells), dict(zip(trials.labels, moved, strict=True))
 
 
-def read_recordings(
-    folder: Path, config: Mapping[str, Any], mesh: Mesh, moved: Mapping[str, FloatArray]
-) -> Recordings | None:
+def read_recordings(folder: Path, run: RunSettings, mesh: Mesh, moved: Mapping[str, FloatArray]) -> Recordings | None:
     """Quality and registration of all trials, and the trial that fits worst; None where there are no recordings.
 
     Args:
         folder: of the split.
-        config: with the group ``markers``, where markers are observed.
+        run: its settings.
         mesh: the body as it is at rest.
         moved: (3,) how far nominal places, which are on the undeformed body, move until it is at rest, by label [m].
     """
-    if not sees_markers(config):
+    if run.markers is None:
         return None
     path = common_folder(folder) / REGISTRATION
     residuals = read_json(path)
@@ -348,7 +355,7 @@ def read_recordings(
     each = residuals[worst]
     if "positions" not in each:
         raise DataFileError(f"{path} has no positions: delete it and run the same command again.")
-    nominal: dict[str, Any] = {**config["markers"]["tracked"], **(config["markers"]["reference"] or {})}
+    nominal: dict[str, Any] = {**run.markers.tracked, **run.markers.reference}
     labels = [label for label in each["positions"] if label in nominal]
     # What JSON has as null was not seen.
     places = np.array([each["positions"][label] or (None,) * 3 for label in labels], dtype=np.float64)
@@ -367,3 +374,9 @@ def read_recordings(
         feet=feet,
         mesh=mesh,
     )
+
+
+def _network_note(run: RunSettings) -> str:
+    """Which network predicts the residual force, and how it is trained."""
+    refinement = {} if run.refinement is None else run.refinement.plain()
+    return network_note(run.network.plain(), run.trainer.plain(), refinement)

@@ -23,14 +23,16 @@ from ..fem.body import Body
 from ..io.errors import ConvergenceError
 from ..io.files import read_json
 from ..learning.placement import PlacedMarkers, Placement
-from ..learning.release import ReleaseSettings, estimate_release
+from ..learning.release import estimate_release
 from ..learning.replay import Replay, Start
+from ..settings.body import MaterialSettings, SimulatorSettings
+from ..settings.run import PublishedSettings
+from ..settings.stages import EvaluateStage, LearningStage, NetworkStage, TestStage, TimeStage
 from ..stepping.state import State
 from .build import bound_markers, build_body, build_simulator, sight_of
 from .files import DATASET, GIVEN, IDENTIFICATION, SCALED_DATASET, STATIC, Dataset, read_dataset
 
 COROTATED: Final = "corotated"
-FORCE_FRAMES: Final = (COROTATED, "world")
 LEARNED: Final = ("simfree", "resphys_uncorrected", "resphys")
 # By model: the simulator that it is, or corrects, and the identification whose parameters that has.
 MODELS: Final[Mapping[str, tuple[str, str | None]]] = {
@@ -46,45 +48,33 @@ _STANDS_STILL = 1e-9  # m/s, rad/s
 Observe = Callable[[torch.Tensor], torch.Tensor]
 
 
-def models_of(config: Mapping[str, Any]) -> list[str]:
-    """The models that an experiment compares, as its configuration asks for them."""
-    identify = config.get("identify")
-    absent = {
-        "published": config.get("published") is None,
-        "sysid": identify is None,
-        "sysid_elastic": identify is None or not identify.get("elastic"),
-        "resphys_uncorrected": identify is None or not config.get("correct_uncorrected"),
-    }
-    return [model for model in MODELS if not absent.get(model)]
-
-
 @dataclass(frozen=True)
 class Scene:
     """The trials and the simulators of an experiment.
 
     Attributes:
-        config: the settings of the stage.
+        settings: of the stage.
         folder: of the split.
         on_failure: whether a step that fails raises, or is counted.
     """
 
-    config: Mapping[str, Any]
+    settings: LearningStage
     folder: Path
     on_failure: str = "raise"
 
     @cached_property
     def dataset(self) -> Dataset:
         """The trials, and those at scaled inputs where the stage tests them."""
-        shared = self.folder / self.config["shared"]
+        shared = self.folder / self.settings.shared
         found = read_dataset(shared / DATASET)
-        if len(self.config.get("groups", ())) > 1:
+        if isinstance(self.settings, TestStage) and len(self.settings.groups) > 1:
             found = found.joined(read_dataset(shared / SCALED_DATASET))
         return found
 
     @cached_property
     def body(self) -> Body:
         """That is simulated."""
-        return build_body(self.config)
+        return build_body(self.settings, self.settings.payload_at)
 
     @cached_property
     def _simulators(self) -> dict[str, Simulator]:
@@ -99,19 +89,36 @@ class Scene:
         """
         if kind not in self._simulators:
             body = None if kind == "published" else self.body
-            material = "target" if kind == "target" else "simulation"
-            self._simulators[kind] = build_simulator(self.settings_of(kind), material, body, self.on_failure)
+            made_of, material = self.settings_of(kind), self.material_of(kind)
+            self._simulators[kind] = build_simulator(made_of, material, body, on_failure=self.on_failure)
         return self._simulators[kind]
 
-    def settings_of(self, kind: str) -> dict[str, Any]:
-        """The configuration that `build_simulator` makes a simulator of; for its kinds see there."""
-        config = {**self.config, "gravity": self.dataset.gravity.tolist()}
-        identify = config.get("identify") or {}
+    def settings_of(self, kind: str) -> SimulatorSettings:
+        """What `build_simulator` makes a simulator of; for its kinds see there."""
+        settings, identified = self.settings, self.settings.identified
+        own: dict[str, Any] = {"gravity": tuple(self.dataset.gravity.tolist())}
         if kind == "published":
-            config |= {**config["published"], "payload_string": None}
-        elif kind == "identified" and identify.get("integrator") is not None:
-            config |= {"integrator": identify["integrator"], "time_step": config["time_step"] / identify["substeps"]}
-        return config
+            published = self._published
+            own |= {"physics": published.physics, "integrator": published.integrator, "payload_string": None}
+        elif kind == "identified" and identified is not None and identified.integrator is not None:
+            own |= {"integrator": identified.integrator, "time_step": settings.time_step / identified.substeps}
+        return SimulatorSettings.of(settings).model_copy(update=own)
+
+    def material_of(self, kind: str) -> MaterialSettings:
+        """Material of a simulator; for its kinds see `simulator`."""
+        if kind == "published":
+            return self._published.simulation
+        if kind != "target":
+            return self.settings.simulation
+        assert isinstance(self.settings, TimeStage)
+        assert self.settings.target is not None
+        return self.settings.target
+
+    @property
+    def _published(self) -> PublishedSettings:
+        assert isinstance(self.settings, EvaluateStage)
+        assert self.settings.published is not None
+        return self.settings.published
 
     @property
     def like(self) -> torch.Tensor:
@@ -123,14 +130,15 @@ class Scene:
         """(B, N, 3) positions to what is observed of them: (B, M, 3) markers, or all of them."""
         if self.dataset.bound is None:
             return lambda positions: positions
-        markers, labels = self.config["markers"], self.dataset.labels
+        markers, labels = self.settings.markers, self.dataset.labels
+        assert markers is not None
         found = bound_markers(markers, self.body.mesh, self.dataset.bound, labels)
         return SeenMarkers.of(found, sight_of(markers, labels, self.dataset.sets)).to(self.like)
 
     def observe_by(self, model: str) -> Observe:
         """The same, with the markers where the identification of a model found that they sit."""
         key = MODELS[model][1]
-        if key is None or self.config.get("identify") is None:
+        if key is None or self.settings.identified is None:
             return self.observe
         found = read_json(self.folder / IDENTIFICATION)[key].get("placement")
         if found is None:
@@ -140,9 +148,8 @@ class Scene:
 
     def trials(self, names: Sequence[str], simulator: Simulator | None = None) -> Trials:
         """Some of the trials, which begin alike, on the simulators' device, with inputs for a simulator's steps."""
-        payload_at = self.config["data"].get("payload_at")
         body, step = (self.body, None) if simulator is None else (simulator.body, simulator.time_step)
-        found = self.dataset.trials(names, body, payload_at, step)
+        found = self.dataset.trials(names, body, self.settings.payload_at, step)
         return found.to(self.like)
 
     def base(self, names: Sequence[str], simulator: Simulator) -> BaseFrame | None:
@@ -191,7 +198,7 @@ class Scene:
             v = torch.zeros_like(q) if velocity is None else q.new_tensor(velocity[self.dataset.rows(trials.names), 0])
             return Start(State(q, v), q.new_zeros(len(q)))
         if begins == "released":
-            return estimate_release(simulator, replay.observe, trials, ReleaseSettings(**self.config["release"]))
+            return estimate_release(simulator, replay.observe, trials, self.settings.release)
         guess = simulator.rest_positions.expand(len(trials.names), -1, -1)
         if begins == STATIC:  # Far from rest, where whoever changes a parameter a little need not begin again.
             with contextlib.suppress(ConvergenceError), torch.no_grad():
@@ -213,7 +220,7 @@ class Scene:
     def parameters(self, model: str) -> dict[str, torch.Tensor]:
         """(1,) identified parameters of a model's simulator; none for one that is not identified."""
         key = MODELS[model][1]
-        if key is None or self.config.get("identify") is None:
+        if key is None or self.settings.identified is None:
             return {}
         values = read_json(self.folder / IDENTIFICATION)[key]["parameters"]
         return {name: torch.tensor([x]).to(self.like) for name, x in values.items()}
@@ -221,7 +228,7 @@ class Scene:
     def model_simulator(self, model: str) -> Simulator:
         """The one that a model is, or corrects."""
         kind = MODELS[model][0]
-        return self.simulator("simulation" if kind == "identified" and self.config.get("identify") is None else kind)
+        return self.simulator("simulation" if kind == "identified" and self.settings.identified is None else kind)
 
     def conditions(
         self, replay: Replay, parameters: Mapping[str, torch.Tensor], payload: bool = False
@@ -238,11 +245,12 @@ class Scene:
             how the base moves (`base_movement`). Of poses (R, A), whose inputs have lasted.
         """
         _, inputs, resting = replay.setting(parameters)
-        actuation, told = self.config["actuation"], []
-        if self.config["data"].get("payload_at") is not None and (payload or actuation["sees_payload"]):
+        assert isinstance(self.settings, NetworkStage)
+        actuation, told = self.settings.actuation, list[torch.Tensor]()
+        if self.settings.payload_at is not None and (payload or actuation.sees_payload):
             rows = self.dataset.rows(replay.trials.names)
             told.append(replay.trials.times.new_tensor(self.dataset.payload[rows])[:, None])
-        constants = actuation["filter_time_constants"]
+        constants = actuation.filter_time_constants
         acting = resting if replay.is_static else inputs
         driven = [each for name, each in acting.actuation.items() if name != PAYLOAD.name]
         moving = self._base_movement(replay.trials.names, replay.simulator)
@@ -261,7 +269,7 @@ class Scene:
 
     def frames(self, simulator: Simulator, kind: str | None = None) -> VertexFrames | None:
         """With which residual forces turn; None where they keep their directions (``force_frame: world``)."""
-        if (self.config["force_frame"] if kind is None else kind) != COROTATED:
+        if (self.settings.force_frame if kind is None else kind) != COROTATED:
             return None
         return VertexFrames(simulator.body, simulator.time_step, simulator.rest_positions)
 
@@ -281,7 +289,7 @@ class Scene:
 
     def learned_steps(self, steps: int) -> int:
         """Steps of a trial that are learned from."""
-        return max(round(self.config["data"].get("train_fraction", 1.0) * steps), 1)
+        return max(round(self.settings.train_fraction * steps), 1)
 
 
 def at_steps(trials: Trials, step: float, delay: torch.Tensor | None = None) -> NDArray[np.float64]:

@@ -1,94 +1,21 @@
 """Which trials an experiment has, how each begins, and how they are split."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Final, TypeVar
 
 import numpy as np
 
 from ..io.errors import DataFileError, InputError
+from ..settings.run import RunSettings
+from ..settings.trials import LaboratorySettings, RecordedData, SimulatedData, Split, Trial, TrialSettings
 
 T = TypeVar("T")
 
 SPLITS: Final = ("train", "validation", "test")
-FOLDS: Final = ("leave_one_out",)
-# Held at rest until it is let go; let go with the first frame; at rest until its inputs come; a pose without time.
-BEGINNINGS: Final = ("held", "released", "rest", "static")
 _SUFFIXES = (".h5", ".hdf5", ".npz", ".c3d", ".tsv", ".csv")
-_SCALED_RECORDINGS = "recordings_scaled"  # not beside the others: that folder may become another experiment's data
-
-
-@dataclass(frozen=True)
-class Trial:
-    """One motion of the body, or one pose.
-
-    Attributes:
-        name: also names its files.
-        begins: one of `BEGINNINGS`; ``given`` where a simulation knows the state.
-        file: its recording; None where it is simulated.
-        payload: mass that hangs on the body [kg].
-        pull: force that holds the body before the release, where the laboratory is simulated [N].
-        sequence: number of its pressures, where they are drawn; None without any.
-        scale: by which these are multiplied.
-        amount: what sets simulated trajectories apart: a weight [kg], an angle [rad], or a factor of `base_motion`.
-        inputs: what drives it all the time, one number for each part of the body; None where the recording tells.
-        onset: when these come, on the clock of the recording [s]; with its first frame, if left out.
-        input_delay: how much later than its log says what drives it came, as clocks differ; negative for earlier [s].
-        labels: of the markers of its recording, in their order; None where that tells. It has no others.
-        base_motion: how what it is fixed to moves, if otherwise than ``data.base_motion`` says; see
-            `data.base_motion.prescribed`.
-    """
-
-    name: str
-    begins: str
-    file: Path | None = None
-    payload: float = 0.0
-    pull: tuple[float, ...] | None = None
-    sequence: int | None = None
-    scale: float = 1.0
-    amount: float = 0.0
-    inputs: Sequence[float] | None = None
-    onset: float | None = None
-    input_delay: float = 0.0
-    labels: Sequence[str] | None = None
-    base_motion: Mapping[str, Any] | None = None
-
-    @property
-    def is_released(self) -> bool:
-        """Whether it is let go at time zero."""
-        return self.begins in ("held", "released")
-
-    def tracked(self, known: Sequence[str]) -> list[int]:
-        """Which of the tracked markers it has, by their numbers."""
-        return [number for number, label in enumerate(known) if self.labels is None or label in self.labels]
-
-    @property
-    def recording(self) -> str:
-        """Where its recording is in the run folder, if the laboratory is simulated."""
-        return f"{'recordings' if self.scale == 1.0 else _SCALED_RECORDINGS}/{self.name}.h5"
-
-
-@dataclass(frozen=True)
-class Split:
-    """Names of the trials of each split; their order is that of the files.
-
-    A trial of which a part is learned from (``data.train_fraction``) may be tested on the rest of it.
-    """
-
-    train: tuple[str, ...]
-    validation: tuple[str, ...]
-    test: tuple[str, ...]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """All of them."""
-        return tuple(dict.fromkeys(self.train + self.validation + self.test))
-
-    def plain(self) -> dict[str, list[str]]:
-        """As settings of a stage."""
-        return {name: list(getattr(self, name)) for name in SPLITS}
 
 
 @dataclass(frozen=True)
@@ -117,77 +44,64 @@ VARIATIONS: Final = {
 }
 
 
-def sees_markers(config: Mapping[str, Any]) -> bool:
-    """Whether bodies are observed through markers; else every vertex is."""
-    return config.get("markers") is not None
-
-
-def is_laboratory(config: Mapping[str, Any]) -> bool:
-    """Whether there are no recordings, so that a simulated laboratory makes them."""
-    return sees_markers(config) and config["data"]["folder"] is None
-
-
-def variation_of(data: Mapping[str, Any]) -> Variation:
-    """What sets simulated trajectories apart.
-
-    Raises:
-        InputError: an unknown kind.
-    """
-    if data.get("kind") not in VARIATIONS:
-        raise InputError(f"data.kind is {data.get('kind')!r}: choose one of {', '.join(VARIATIONS)}.")
-    found = VARIATIONS[data["kind"]]
-    if found.key not in data:
-        raise InputError(
-            f"data.{found.key} is missing: data.kind {data['kind']} needs it, as "
-            f"{{train: [..], validation: [..], test: [..]}} in {found.unit}."
-        )
-    return found
-
-
-def known_trials(config: Mapping[str, Any]) -> dict[str, Trial]:
+def known_trials(run: RunSettings) -> dict[str, Trial]:
     """All trials there are, by name.
 
     Raises:
         DataFileError: there is no folder of recordings, or none in it.
     """
-    data = config["data"]
-    if not sees_markers(config):
-        variation = variation_of(data)
-        amounts = {variation.name(x): variation.factor * x for name in SPLITS for x in data[variation.key][name]}
-        return {name: Trial(name, "given", amount=amount) for name, amount in amounts.items()}
-    if not is_laboratory(config):
-        return {name: replace(Trial(name, data["begins"]), **own) for name, own in _recordings(data).items()}
-    found = {f"t{n:03d}": Trial(f"t{n:03d}", data["begins"], sequence=n) for n in range(data["sequences"])}
-    for name, own in config["laboratory"]["trials"].items():
-        new = Trial(str(name), data["begins"], sequence=len(found) if data["sequences"] else None)
-        found[new.name] = replace(found.get(new.name, new), **own)
+    data = run.data
+    if not isinstance(data, RecordedData):
+        variation = VARIATIONS[data.kind]
+        values = (*data.amounts.train, *data.amounts.validation, *data.amounts.test)
+        amounts = {variation.name(value): variation.factor * value for value in values}
+        return {name: Trial(name=name, begins="given", amount=amount) for name, amount in amounts.items()}
+    if data.folder is not None:
+        folder = Path(data.folder).expanduser()
+        entries = data.trials or _recordings(folder)
+        return {
+            name: _trial(name, each, data.begins, file=_in_folder(folder, name, each)) for name, each in entries.items()
+        }
+    assert run.laboratory is not None
+    drawn = {f"t{number:03d}": number for number in range(data.sequences)}
+    found = {name: Trial(name=name, begins=data.begins, sequence=number) for name, number in drawn.items()}
+    for name, own in run.laboratory.trials.items():
+        new = len(found) if data.sequences else None
+        sequence = found[name].sequence if name in found else new
+        found[name] = _trial(name, own, data.begins, sequence=sequence)
     return found
 
 
-def _recordings(data: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """The entries of the recordings in the folder, with their paths: those that are named, or all."""
-    folder = Path(data["folder"]).expanduser()
-    if data["trials"]:
-        entries = {str(k): {"file": v} if isinstance(v, str) else dict(v) for k, v in data["trials"].items()}
-        return {name: {**each, "file": folder / each["file"]} for name, each in entries.items()}
+def _trial(name: str, own: TrialSettings, begins: str, file: str | None = None, sequence: int | None = None) -> Trial:
+    """A trial from its entry in a table of trials."""
+    return Trial(**{**dict(own), "name": name, "begins": own.begins or begins, "file": file, "sequence": sequence})
+
+
+def _in_folder(folder: Path, name: str, own: TrialSettings) -> str:
+    if own.file is None:
+        raise InputError(f"data.trials.{name}.file is missing: give the name of a file in data.folder.")
+    return str(folder / own.file)
+
+
+def _recordings(folder: Path) -> dict[str, TrialSettings]:
+    """The entries of all recordings in a folder."""
     if not folder.is_dir():
         raise DataFileError(f"{folder} is no folder: set data.folder to that of the recordings.")
-    found: dict[str, dict[str, Any]] = {}
+    found: dict[str, str] = {}
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() not in _SUFFIXES:
             continue
-        other = found.setdefault(path.stem, {"file": path})["file"]
-        if other != path:
+        other = found.setdefault(path.stem, path.name)
+        if other != path.name:
             raise DataFileError(
-                f"{folder} has {other.name} and {path.name}, two recordings of one name: list the trials in "
-                "data.trials."
+                f"{folder} has {other} and {path.name}, two recordings of one name: list the trials in data.trials."
             )
     if not found:
         raise DataFileError(f"{folder} holds no recording ({', '.join(_SUFFIXES)}): set data.folder to that of yours.")
-    return found
+    return {name: TrialSettings(file=file) for name, file in found.items()}
 
 
-def split_of(config: Mapping[str, Any]) -> Split:
+def split_of(run: RunSettings) -> Split:
     """The trials of training, validation and test.
 
     A split is a list of names, or a number of trials: these are taken in order, of training first. A laboratory that
@@ -197,26 +111,20 @@ def split_of(config: Mapping[str, Any]) -> Split:
         InputError: an unknown trial, one in two splits, more than there are, or none to train or to test.
         DataFileError: see `known_trials`.
     """
-    data = config["data"]
-    if not sees_markers(config):
-        lists = _valued(data)
-    else:
-        group = "laboratory" if is_laboratory(config) and "train" in config["laboratory"] else "data"
-        lists = _named(config, group)
-    if data.get("limit") is not None:
-        lists = {name: evenly(row, data["limit"][name]) if row else [] for name, row in lists.items()}
-    return Split(*(tuple(lists[name]) for name in SPLITS))
+    data = run.data
+    lists = _named(run) if isinstance(data, RecordedData) else _valued(data)
+    if data.limit is not None:
+        lists = {name: evenly(row, getattr(data.limit, name)) if row else [] for name, row in lists.items()}
+    return Split(train=tuple(lists["train"]), validation=tuple(lists["validation"]), test=tuple(lists["test"]))
 
 
-def _valued(data: Mapping[str, Any]) -> dict[str, list[str]]:
+def _valued(data: SimulatedData) -> dict[str, list[str]]:
     """The names of the trials that the splits of a simulated experiment list by their values."""
-    kind = variation_of(data)
-    values = {name: [float(x) for x in data[kind.key][name]] for name in SPLITS}
+    kind = VARIATIONS[data.kind]
+    values = {name: getattr(data.amounts, name) for name in SPLITS}
     for name, row in values.items():
         if not row:
-            raise InputError(f"data.{kind.key}.{name} is empty: give the split at least one value.")
-        if not all(np.isfinite(x) and x > 0.0 for x in row):
-            raise InputError(f"data.{kind.key}.{name} holds a value that is not positive: {row}.")
+            raise InputError(f"data.{kind.key}.{name} is empty: give the split at least one value, in {kind.unit}.")
     everything = [x for row in values.values() for x in row]
     twice = sorted({x for x in everything if everything.count(x) > 1})
     if twice:
@@ -224,28 +132,41 @@ def _valued(data: Mapping[str, Any]) -> dict[str, list[str]]:
     return {name: [kind.name(x) for x in row] for name, row in values.items()}
 
 
-def _named(config: Mapping[str, Any], group: str) -> dict[str, list[str]]:
+def _splits(run: RunSettings) -> tuple[str, RecordedData | LaboratorySettings]:
+    """The group whose split counts, and its name."""
+    assert isinstance(run.data, RecordedData)
+    if run.is_laboratory and run.laboratory is not None and run.laboratory.train is not None:
+        return "laboratory", run.laboratory
+    return "data", run.data
+
+
+def _named(run: RunSettings) -> dict[str, list[str]]:
     """The names that the splits of a group list or count."""
-    known, settings = list(known_trials(config)), config[group]
-    asked = sum(settings[name] for name in SPLITS if isinstance(settings[name], int))
+    known, (group, settings) = list(known_trials(run)), _splits(run)
+    wanted = {name: getattr(settings, name) for name in SPLITS}
+    asked = sum(each for each in wanted.values() if isinstance(each, int))
     if asked > len(known):
         raise InputError(
             f"{group}.train, {group}.validation and {group}.test ask for {asked} trials, but there are {len(known)}."
         )
-    rest, lists = iter(known), {}
-    for name in SPLITS:
-        wanted = settings[name]
-        lists[name] = [*islice(rest, wanted)] if isinstance(wanted, int) else [str(each) for each in wanted]
-        unknown = [each for each in lists[name] if each not in known]
+    rest, lists = iter(known), dict[str, list[str]]()
+    for name, each in wanted.items():
+        lists[name] = [*islice(rest, each)] if isinstance(each, int) else list(each)
+        unknown = [trial for trial in lists[name] if trial not in known]
         if unknown:
             raise InputError(
                 f"{group}.{name} names the trial '{unknown[0]}', which is not in {group}.trials: {', '.join(known)}."
             )
-        if not lists[name] and not (name == "validation" and config["in_the_loop"]):
+        if not lists[name] and not (name == "validation" and run.in_the_loop is not None):
             more = ", or set data.folds to leave_one_out" if group == "data" else ""
             raise InputError(f"{group}.{name} is empty: name one of {group}.trials there{more}.")
+    _check_once(group, lists, run.train_fraction < 1.0)
+    return lists
+
+
+def _check_once(group: str, lists: Mapping[str, Sequence[str]], parted: bool) -> None:
+    """Refuses a trial in two splits, but for one of training whose rest is a test."""
     seen: dict[str, str] = {}
-    parted = config["data"].get("train_fraction", 0.0) < 1.0  # A stage that is not told it is told checked splits.
     for name, trial in ((name, trial) for name, members in lists.items() for trial in members):
         if trial in seen:
             if parted and (seen[trial], name) == ("train", "test"):
@@ -254,10 +175,9 @@ def _named(config: Mapping[str, Any], group: str) -> dict[str, list[str]]:
             where = f"twice in {group}.{name}" if other == name else f"in {group}.{other} and {group}.{name}"
             raise InputError(f"the trial '{trial}' is {where}: every trial is in one split, once.")
         seen[trial] = name
-    return lists
 
 
-def folds_of(config: Mapping[str, Any]) -> dict[str, Split] | None:
+def folds_of(run: RunSettings) -> dict[str, Split] | None:
     """By the name of the trial that is tested: the splits of a cross-validation; None where there is one split.
 
     A fold trains on all other trials and has none to validate with. With ``data.limit`` there are fewer folds, and each
@@ -266,21 +186,21 @@ def folds_of(config: Mapping[str, Any]) -> dict[str, Split] | None:
     Raises:
         InputError: fewer than two trials.
     """
-    data = config["data"]
-    if not data.get("folds") or (is_laboratory(config) and "train" in config["laboratory"]):
+    data = run.data
+    if data.folds is None or (isinstance(data, RecordedData) and _splits(run)[0] == "laboratory"):
         return None
-    names = list(known_trials(config))
+    names = list(known_trials(run))
     if len(names) < 2:
         raise InputError("data.folds is leave_one_out, which needs two trials or more in data.trials.")
-    limit = data.get("limit") or {"train": len(names), "test": len(names)}
-    others = {name: [each for each in names if each != name] for name in evenly(names, limit["test"])}
-    return {name: Split(tuple(evenly(row, limit["train"])), (), (name,)) for name, row in others.items()}
+    folds, members = (len(names), len(names)) if data.limit is None else (data.limit.test, data.limit.train)
+    others = {name: [each for each in names if each != name] for name in evenly(names, folds)}
+    return {name: Split(train=tuple(evenly(row, members)), validation=(), test=(name,)) for name, row in others.items()}
 
 
-def trials_of(config: Mapping[str, Any]) -> tuple[Trial, ...]:
+def trials_of(run: RunSettings) -> tuple[Trial, ...]:
     """The trials of an experiment, in the order of the files: that of the split, or, with folds, as configured."""
-    known = known_trials(config)
-    return tuple(known[name] for name in (known if folds_of(config) else split_of(config).names))
+    known = known_trials(run)
+    return tuple(known[name] for name in (known if folds_of(run) else split_of(run).names))
 
 
 def scaled_name(name: str, scale: float) -> str:
@@ -288,20 +208,23 @@ def scaled_name(name: str, scale: float) -> str:
     return f"{name}_x{scale:g}"
 
 
-def scaled_trials_of(config: Mapping[str, Any]) -> tuple[Trial, ...]:
+def scaled_trials_of(run: RunSettings) -> tuple[Trial, ...]:
     """The test trials at ``data.input_scales``, scale by scale."""
-    scales = [float(scale) for scale in config["data"].get("input_scales") or ()]
-    if not scales:
+    if not run.input_scales:
         return ()
-    known = known_trials(config)
-    test = [known[name] for name in split_of(config).test]
-    return tuple(replace(each, name=scaled_name(each.name, scale), scale=scale) for scale in scales for each in test)
+    known = known_trials(run)
+    test = [known[name] for name in split_of(run).test]
+    return tuple(
+        each.model_copy(update={"name": scaled_name(each.name, scale), "scale": scale})
+        for scale in run.input_scales
+        for each in test
+    )
 
 
-def test_groups(config: Mapping[str, Any], split: Split) -> dict[str, list[str]]:
+def test_groups(run: RunSettings, split: Split) -> dict[str, tuple[str, ...]]:
     """By scale of the inputs, the trials that are tested; the first is that of the training, ``1``."""
-    scales = [float(scale) for scale in config["data"].get("input_scales") or ()]
-    return {"1": list(split.test)} | {f"{s:g}": [scaled_name(name, s) for name in split.test] for s in scales}
+    scaled = {f"{scale:g}": tuple(scaled_name(name, scale) for name in split.test) for scale in run.input_scales}
+    return {"1": split.test} | scaled
 
 
 def evenly(row: Sequence[T], limit: int) -> list[T]:

@@ -24,7 +24,7 @@ def run_label(overrides: Sequence[str], excluded: Sequence[str] = ()) -> str:
     """
     settings = {}
     for override in overrides:
-        key, _, value = override.partition("=")
+        key, _, value = override.removeprefix("++").partition("=")
         bare = key.lstrip("+~")
         if not any(bare == name or bare.startswith(f"{name}.") for name in excluded):
             settings[key] = f"{key}={value}" if value else key

@@ -123,6 +123,7 @@ def _array(node: Schema, schema: Schema) -> str:
     items = node.get("prefixItems", [node.get("items", {})])
     each = in_words(items[0], schema).removeprefix("a ")
     each = re.sub(r"\b(number|word|list|group)\b", r"\1s", each, count=1)
+    each = f"lists of {each}" if each.partition(" ")[0] in _NUMBERS else each
     least, most = node.get("minItems", 0), node.get("maxItems")
     if least == most and least < len(_NUMBERS):
         return f"{_NUMBERS[least]} {each}"
@@ -142,6 +143,27 @@ def _range(node: Schema) -> str:
     limits = {"at least": low, "above": above, "at most": high, "below": below}
     words = " and ".join(f"{name} {limit:,g}" for name, limit in limits.items() if limit is not None)
     return f"a {noun}{f' {words}' if words else ''}"
+
+
+def completed(schema: Schema, values: Any, node: Schema | None = None) -> Any:
+    """Values with the defaults of all keys that are left out; values that a class would refuse stay as they are.
+
+    Args:
+        schema: JSON Schema of the class.
+        values: nested plain data.
+        node: JSON Schema of the values; that of the class, if left out.
+    """
+    if not isinstance(values, Mapping):
+        return values
+    choices = [each for each in options(schema, schema if node is None else node) if each.get("type") == "object"]
+    option: Schema = next((each for each in choices if _fits(each, values)), {})
+    named, other = option.get("properties", {}), option.get("additionalProperties")
+    defaults = {key: each["default"] for key, each in named.items() if "default" in each and key not in values}
+    found = {**values, **defaults}
+    return {
+        key: completed(schema, each, named.get(key, other)) if isinstance(named.get(key, other), Mapping) else each
+        for key, each in found.items()
+    }
 
 
 def _path(values: Any, error: ErrorDetails) -> Path:

@@ -15,6 +15,7 @@ the class, which `parse` completes to the dotted key.
 
 import hashlib
 import json
+from collections.abc import Mapping
 from typing import Annotated, Any, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError
@@ -78,7 +79,8 @@ def setting(default: Any = PydanticUndefined, description: str = "", unit: str =
         unit: such as ``m/s^2``; it stands in error messages, too.
         limits: other arguments of `pydantic.Field`, such as ``gt`` or ``le``.
     """
-    return Field(default, description=description or None, json_schema_extra={"unit": unit} if unit else None, **limits)
+    more: dict[str, Any] = {"json_schema_extra": {"unit": unit}} if unit else {}
+    return Field(default, description=description or None, **more, **limits)
 
 
 def parse(settings: type[S], values: Any, where: str = "") -> S:
@@ -98,3 +100,8 @@ def parse(settings: type[S], values: Any, where: str = "") -> S:
     except ValidationError as error:
         schema = settings.model_json_schema()
         raise InputError(sentence(schema, values, where, error.errors(include_url=False))) from None
+
+
+def parse_part(settings: type[S], values: Mapping[str, Any], where: str = "") -> S:
+    """Makes an object of those values that its class has keys for; see `parse`."""
+    return parse(settings, {key: each for key, each in values.items() if key in settings.model_fields}, where)

@@ -37,7 +37,7 @@ class StageContext:
     name: str  # of the stage
     run_dir: Path  # the run folder, where outputs are written
     fingerprint: str  # identifies all that the outputs depend on; resumable files are marked with it
-    settings: Mapping[str, Any]  # of the stage
+    settings: Any  # of the stage
     memory: WorkersMemory = field(default_factory=WorkersMemory)  # of its worker processes
     upstream: Mapping[str, str] = field(default_factory=dict)  # fingerprints of the stages that it reads from, by name
 
@@ -49,7 +49,7 @@ class Stage:
     name: str  # also of its record
     function: Callable[[StageContext], None]  # does the work; writes each output whole or not at all
     outputs: tuple[str, ...]  # names of the files that it writes, relative to the run folder
-    settings: Mapping[str, Any]  # all settings that the outputs depend on, and no others
+    settings: Any  # all that the outputs depend on, and no more: an object of `Settings`, or plain nested data
     upstream: tuple[str, ...] = ()  # names of the stages whose outputs it reads
 
 

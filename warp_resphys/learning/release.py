@@ -6,8 +6,6 @@ go between two frames, and not without a push, of a body that it may have bent s
 slow modes, and a sideways displacement are what best explains the first frames.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from typing_extensions import override
@@ -15,8 +13,9 @@ from typing_extensions import override
 from ..data.trials import Trials
 from ..dynamics.modes import resolved, vibration_modes, with_signs
 from ..dynamics.simulator import Simulator
-from ..io.errors import ConvergenceError, InputError
+from ..io.errors import ConvergenceError
 from ..linalg.least_squares import Move, Point, Problem, damped, minimise
+from ..settings.learning import ReleaseSettings
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .replay import Observe, Replay, Start
@@ -27,34 +26,6 @@ _SIDEWAYS_STRAIN = 1e-3  # of the body's extent: how far it is bent to find how 
 _DELAYS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # that the search begins at, in expected deviations
 _HOLD_WEIGHT = 1e-6  # w, in units of the largest diagonal entry of the first J^T J
 _RELEASE_TOLERANCE, _DIFFERENCE, _LONGEST_STEP = 1e-4, 0.05, 3.0  # in expected deviations
-
-
-@dataclass(frozen=True)
-class ReleaseSettings:
-    """How the beginning of a motion is estimated."""
-
-    # vibration modes whose inertial forces hold the body; 0 lets it go from where gravity leaves it
-    hold_modes: int = 6
-    velocity_modes: int = 0  # vibration modes that the velocity at the release is made of; 0 for none
-    window: float = 0.13  # how much of the motion after the release is used [s]
-    noise: float = 3e-4  # what a marker may be off for reasons that no release explains [m]
-    # expected deviation of the moment of release from the one found in the frames [s]; 0 keeps that one
-    delay: float = 0.0
-    speed: float = 0.05  # expected size of the velocity of the fastest vertex [m/s]
-    # expected displacement, across gravity, of a body that seems to be held undeformed [m]: as a sideways
-    # acceleration bends it, at the vertex that moves furthest; 0 for none. Along gravity it would be mistaken for
-    # a weight or a stiffness
-    sideways: float = 0.0
-    iterations: int = 4  # Levenberg-Marquardt steps
-
-    def __post_init__(self) -> None:
-        """Checks the ranges; raises InputError for a number out of range."""
-        for name in ("window", "noise", "speed", "iterations"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"release.{name} is {getattr(self, name)}: it must be positive.")
-        for name in ("hold_modes", "velocity_modes", "delay", "sideways"):
-            if not getattr(self, name) >= 0:
-                raise InputError(f"release.{name} is {getattr(self, name)}: it must be zero or more.")
 
 
 def estimate_release(simulator: Simulator, markers: Observe, motions: Trials, settings: ReleaseSettings) -> Start:

@@ -13,28 +13,35 @@ from ..dynamics.simulator import Simulator
 from ..experiment.build import bound_markers, build_body, build_simulator, sight_of
 from ..experiment.files import ERRORS, IDENTIFICATION, fold_folder, read_if_there
 from ..experiment.models import SIMFREE, Learned, kind_of, learned_of
-from ..experiment.scene import LEARNED, MODELS, Scene, models_of
+from ..experiment.scene import LEARNED, MODELS, Scene
 from ..io.errors import DataFileError, InputError, listed
 from ..io.files import read_checkpoint, write_checkpoint
+from ..io.settings import Settings, parse
 from ..io.stages import finished_record
 from ..learning.intervals import LEVEL, Intervals
 from ..learning.networks import restore
 from ..learning.placement import PlacedMarkers, Placement
 from ..learning.predictors import Range
 from ..mesh.mesh import Mesh
+from ..settings.body import MaterialSettings, PlaceSettings, SimulatorSettings
+from ..settings.run import models_of
+from ..settings.stages import EvaluateStage
+from ..settings.trials import MarkerSettings
 
 _KIND: Final = "robot"
 _EVALUATE: Final = "evaluate"
 _NETWORK: Final = "network."
-_MADE_OF: Final = (  # the groups and keys of a configuration that a simulator is made of
-    *("physics", "fixed", "gravity", "time_step", "integrator", "solver", "dtype", "coupling", "simulation"),
-    *("chambers", "fibres", "tendons", "muscles", "medium", "payload_string"),
-)
-
 _PLAIN: Final = (  # fields that are written as they are
-    *("name", "model", "settings", "parameters", "uncertainty", "payload_at", "markers", "labels", "sets"),
+    *("name", "model", "settings", "material", "parameters", "uncertainty", "payload_at", "markers", "labels", "sets"),
     *("placement", "filters", "sees_payload", "told_of_base", "seen", "level", "errors_mm"),
 )
+
+_SETTINGS: Final[Mapping[str, type[Settings]]] = {
+    "settings": SimulatorSettings,
+    "material": MaterialSettings,
+    "payload_at": PlaceSettings,
+    "markers": MarkerSettings,
+}
 
 
 @dataclass(frozen=True)
@@ -44,12 +51,13 @@ class Description:
     Attributes:
         name: of the experiment and the run.
         model: which of the experiment's models, such as ``resphys``.
-        settings: groups and keys of the configuration that its simulator is made of, without the mesh.
+        settings: that its simulator is made of, but for the mesh and the device.
+        material: of its body, before identification.
         mesh: its rest shape.
         parameters: identified values by name, see `learning.parameters`.
         uncertainty: their standard deviations and correlations, where the identification has them.
-        payload_at: the vertices that a payload hangs on, as `mesh.select_vertices` takes them; None for none.
-        markers: the group of the configuration; None where every vertex is observed.
+        payload_at: the vertices that a payload hangs on; None for none.
+        markers: their settings; None where every vertex is observed.
         labels: of the M markers.
         bound: (M, 3) where they are bound on the undeformed body [m].
         placement: where identification found that they sit, as `Placement.plain` has it.
@@ -65,12 +73,13 @@ class Description:
 
     name: str
     model: str
-    settings: Mapping[str, Any]
+    settings: SimulatorSettings
+    material: MaterialSettings
     mesh: Mesh
     parameters: Mapping[str, float] = field(default_factory=dict)
     uncertainty: Mapping[str, Any] | None = None
-    payload_at: Mapping[str, Any] | None = None
-    markers: Mapping[str, Any] | None = None
+    payload_at: PlaceSettings | None = None
+    markers: MarkerSettings | None = None
     labels: tuple[str, ...] = ()
     sets: tuple[tuple[int, ...], ...] = ()
     bound: torch.Tensor | None = None
@@ -86,8 +95,9 @@ class Description:
 
     def simulator(self, device: torch.device, on_failure: str) -> Simulator:
         """The simulator of its model."""
-        config = {**self.settings, "device": str(device), "data": {"payload_at": self.payload_at}}
-        return build_simulator(config, "simulation", build_body(config, self.mesh), on_failure)
+        settings = self.settings.model_copy(update={"device": str(device)})
+        body = build_body(settings, self.payload_at, self.mesh)
+        return build_simulator(settings, self.material, body, on_failure=on_failure)
 
     def observe(self) -> Markers | None:
         """What markers a body shows, in float64 on the CPU; None where every vertex is observed."""
@@ -129,6 +139,8 @@ class Description:
             range_ = None if known["range"] is None else Range.restore(known["range"], network.linear)
             learned = Learned(network, range_, known["force_frame"])
         intervals = found.pop("intervals")
+        for key, kind in _SETTINGS.items():
+            found[key] = None if found[key] is None else parse(kind, found[key], key)
         for key in ("labels", "filters"):
             found[key] = tuple(found[key])
         found["sets"] = tuple(tuple(some) for some in found["sets"])
@@ -157,7 +169,7 @@ def finished_scene(folder: Path) -> Scene:
             raise DataFileError(
                 f"{folder} is a cross-validation, which has a robot for each fold: name one of {names}."
             )
-    return Scene(finished_record(folder, _EVALUATE)["settings"], folder)
+    return Scene(parse(EvaluateStage, finished_record(folder, _EVALUATE)["settings"]), folder)
 
 
 def describe(folder: Path, model: str) -> Description:
@@ -173,34 +185,36 @@ def describe(folder: Path, model: str) -> Description:
         MeshError: the file with its mesh is not there any more.
     """
     scene = finished_scene(folder)
-    known = models_of(scene.config)
+    made = scene.settings
+    assert isinstance(made, EvaluateStage)
+    known = models_of(made.published, made.identified, made.correct_uncorrected)
     if model not in known:
         raise InputError(f"the model is {model!r}: {folder} has {listed(known)}.")
     kind, key = MODELS[model]
-    identified = scene.config.get("identify") is not None
-    kind = "simulation" if kind == "identified" and not identified else kind
-    settings, simulator, dataset = scene.settings_of(kind), scene.simulator(kind), scene.dataset
+    kind = "simulation" if kind == "identified" and made.identified is None else kind
+    simulator, dataset = scene.simulator(kind), scene.dataset
     found = read_if_there(folder / IDENTIFICATION).get(key or "", {})
     errors = read_if_there(folder / ERRORS)
     intervals = errors.get("intervals", {"level": LEVEL, "models": {}})
-    learned, actuation = learned_of(scene, model), settings["actuation"]
+    learned, actuation = learned_of(scene, model), made.actuation
     told = None if learned is None else scene.told_of_base(simulator)
     return Description(
         name="/".join(folder.resolve().parts[-2:]),
         model=model,
-        settings={name: settings[name] for name in _MADE_OF if name in settings},
+        settings=scene.settings_of(kind),
+        material=scene.material_of(kind),
         mesh=simulator.body.mesh,
         parameters=found.get("parameters", {}),
         uncertainty=found.get("uncertainty"),
-        payload_at=settings["data"].get("payload_at"),
-        markers=settings.get("markers"),
+        payload_at=made.payload_at,
+        markers=made.markers,
         labels=dataset.labels,
         sets=dataset.sets,
         bound=None if dataset.bound is None else torch.from_numpy(dataset.bound),
         placement=found.get("placement"),
         learned=learned,
-        filters=tuple(actuation["filter_time_constants"]),
-        sees_payload=model in LEARNED and (actuation["sees_payload"] or model == SIMFREE),
+        filters=actuation.filter_time_constants,
+        sees_payload=model in LEARNED and (actuation.sees_payload or model == SIMFREE),
         told_of_base=None if told is None else tuple(told.tolist()),
         seen={n: (tuple(x.min((0, 1)).tolist()), tuple(x.max((0, 1)).tolist())) for n, x in dataset.inputs.items()},
         intervals=Intervals.from_plain(intervals["models"][model]) if model in intervals["models"] else None,

@@ -24,9 +24,10 @@ from ..io.errors import InputError
 from ..io.files import write_json
 from ..io.machine import hardware
 from ..io.progress import Progress
-from ..io.settings import Many, Natural, NotNegative, Positive, Settings, Some, Word, parse, setting
+from ..io.settings import Many, Natural, NotNegative, Positive, Settings, Some, Word, parse, parse_part, setting
 from ..io.stages import package_versions
 from ..linalg.threads import threads_for
+from ..settings.body import BodySettings, MaterialSettings, SimulatorSettings
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .command import show
@@ -175,7 +176,8 @@ def run_benchmark(config: Mapping[str, Any]) -> dict[str, Any]:
     """
     settings = parse(BenchmarkSettings, config["benchmark"], "benchmark")
     settings = settings.changed(**_QUICK) if settings.quick else settings
-    config = {**config, "device": str(choose_device(config["device"]))}  # the device that auto stands for
+    config = {**config, **parse_part(SimulatorSettings, config).plain()}  # with the defaults of all keys
+    config["device"] = str(choose_device(config["device"]))  # the device that auto stands for
     environments, control = _time_runs(settings, config["device"])  # first, since their folders may hold no run
     yardstick: list[float] = []
     steps: list[dict[str, Any]] = []
@@ -209,20 +211,18 @@ def _time_runs(settings: BenchmarkSettings, device: str) -> tuple[list[dict[str,
 
 def _cases(config: Mapping[str, Any], settings: BenchmarkSettings, refinement: int) -> list[Case]:
     """Every combination of solver, material and batch, at its start and warmed up."""
-    body = build_body({**config, "mesh": _refined(config, refinement)})
+    body = build_body(parse_part(BodySettings, {**config, "mesh": _refined(config, refinement)}))
     tolerances = {"relative_tolerance": settings.relative_tolerance, "max_iterations": settings.max_iterations}
     cases = []
     for solver in settings.solvers:
         steps = settings.steps_of(solver, refinement)
         batches = settings.batches_of(solver, refinement, config["device"])
         for material in settings.materials:
-            changed = {
-                **config,
-                "simulation": {**config["simulation"], **material.plain()},
-                "solver": {**config["solver"], "name": solver, **tolerances},
-            }
+            changed = {**config, "solver": {**config["solver"], "name": solver, **tolerances}}
+            made_of = parse_part(SimulatorSettings, changed)
+            constants = parse(MaterialSettings, {**config["simulation"], **material.plain()}, "simulation")
             for batch in batches:
-                simulator = build_simulator(changed, body=body)
+                simulator = build_simulator(made_of, constants, body)
                 start, inputs = _start(simulator, settings, batch, steps)
                 simulator.rollout(start, 2, Inputs(**{name: value[:2] for name, value in inputs.fields.items()}))
                 timed = TimedRollout(simulator, start, steps, inputs)
@@ -326,7 +326,8 @@ def cold_start(config: Mapping[str, Any]) -> dict[str, dict[str, float]]:
 def first_step(config: Mapping[str, Any]) -> dict[str, float]:
     """Seconds that a process takes for its first step of a configuration."""
     began = time.perf_counter()
-    simulator = build_simulator(config)
+    material = parse(MaterialSettings, config["simulation"], "simulation")
+    simulator = build_simulator(parse_part(SimulatorSettings, config), material)
     state = simulator.rest_state()
     built = time.perf_counter()
     potential = simulator.workspace(1).potential

@@ -7,7 +7,8 @@ from typing import Any
 
 from ..experiment.build import build_mesh
 from ..experiment.report import read_trials
-from ..experiment.trials import variation_of
+from ..experiment.trials import VARIATIONS
+from ..io.settings import parse
 from ..learning import metrics as paper
 from ..mesh.mesh import select_vertices, surface_vertices
 from ..report import ablation_page, figures, motion_figures
@@ -28,6 +29,7 @@ from ..report.page import (
     number_text,
     published_parts,
 )
+from ..settings.run import RunSettings
 from .rows import Reproduction
 from .runs import Run
 
@@ -121,10 +123,10 @@ def setup_section(reproduction: Reproduction, studies: Mapping[str, Runs]) -> Pa
 def _setup(settings: Mapping[str, Any]) -> dict[str, float]:
     """What the published tables of parameters list, of one run."""
     data = settings["data"]
-    values = data[variation_of(data).key]
+    values = data[VARIATIONS[data["kind"]].key]
     limits = data["limit"] or {}
     return {
-        "degrees of freedom": 3 * len(build_mesh(settings["mesh"]).vertices),
+        "degrees of freedom": 3 * len(build_mesh(parse(RunSettings, settings).mesh).vertices),
         **{
             f"{key}, {which} beam": settings[source][constant]
             for key, constant in (("Poisson's ratio", "poissons_ratio"), ("Young's modulus", "youngs_modulus"))
@@ -174,11 +176,12 @@ def study_section(reproduction: Reproduction, name: str, runs: Runs, canvas: Can
 
 def _study_figures(reproduction: Reproduction, name: str, drawn: Mapping[str, Run], canvas: Canvas) -> list[Drawn]:
     settings = drawn["models"].settings
-    test = read_trials(drawn["models"].folder, settings)
+    test = read_trials(drawn["models"].folder, parse(RunSettings, settings))
     paths = {model: test.positions[model][test.worst] for model in ("simulation", "resphys")}
     errors = {model: test.errors_mm[model] for model in ("simulation", "simfree", "resphys")}
     if "published_network" in drawn:
-        other = read_trials(drawn["published_network"].folder, drawn["published_network"].settings)
+        run = drawn["published_network"]
+        other = read_trials(run.folder, parse(RunSettings, run.settings))
         paths["published_network"] = other.positions["resphys"][test.worst]
         errors["published_network"] = other.errors_mm["resphys"]
     published = {model: each.mean for model, each in paper.PUBLISHED_MM.get(name, {}).items() if model in errors}
@@ -205,8 +208,9 @@ def _study_figures(reproduction: Reproduction, name: str, drawn: Mapping[str, Ru
 
 def _tip_motion(settings: Mapping[str, Any], test: TrialResults, paths: Mapping[str, Any]) -> dict[str, Any]:
     """(T + 1, 3) displacement of the tip [m] of the target and the models."""
-    mesh = build_mesh(settings["mesh"])
-    tip = select_vertices(mesh, **settings["tip"])
+    run = parse(RunSettings, settings)
+    mesh = build_mesh(run.mesh)
+    tip = select_vertices(mesh, **run.tip.arguments())
     rest = mesh.vertices[tip].mean(axis=0)
     whole = {"target": test.target[test.worst], **paths}
     return {name: q[:, tip].mean(axis=1) - rest for name, q in whole.items()}
@@ -246,7 +250,7 @@ def ablation_section(reproduction: Reproduction, name: str, runs: Runs, canvas: 
         spread = "small" if count >= paper.PUBLISHED_MARKERS_OF_SMALL_SPREAD else "high"
         ours = (number_text(row[key]) for key in ("median_mm", "interquartile_range_mm", "largest_mm"))
         rows.append(Row(str(count), [Cell(text) for text in (median, spread, *ours)]))
-    vertices = len(surface_vertices(build_mesh(settings["mesh"])))
+    vertices = len(surface_vertices(build_mesh(parse(RunSettings, settings).mesh)))
     note = (
         f"Error over all vertices and {settings['data']['steps']} steps, in mm, of {settings['ablation']['draws']} "
         f"random sets of markers among the {vertices} vertices of the surface. "

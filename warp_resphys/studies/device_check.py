@@ -18,10 +18,11 @@ from ..experiment.build import choose_device
 from ..experiment.files import METRICS
 from ..io.errors import ResphysError
 from ..io.files import write_json
-from ..io.settings import Many, Natural, Positive, Settings, Word, parse
+from ..io.settings import Many, Natural, Positive, Settings, Word, parse, parse_part
 from ..io.stages import run_lock
 from ..linalg.choice import LINEAR_SOLVERS
 from ..mesh.mesh import Mesh
+from ..settings.body import SimulatorSettings
 from ..stepping.inputs import Inputs
 from .beam import ELEMENT_NAMES, Divisions, Element, beam_mesh, clamped
 from .benchmark import benchmark_sheets, machine, run_benchmark
@@ -97,7 +98,7 @@ def check_device(config: Mapping[str, Any], folder: Path) -> None:
     """
     settings = parse(CheckSettings, config["check"], "check")
     wp.config.log_level = wp.LOG_WARNING
-    device = choose_device(config["device"])
+    device = choose_device(parse_part(SimulatorSettings, config).device)
     work = {
         "Trajectories beside the CPU's": lambda: trajectory_checks(device, settings.steps),
         "Gradients beside differences": lambda: gradient_checks(device),

@@ -75,9 +75,9 @@ def _film_of_motion(run: Path, config: Mapping[str, Any]) -> tuple[str, Scene]:
         if config[key] is not None:
             raise InputError(f"{key} is of films of trials, and motion of one of control: leave one of them out.")
     name, seconds = config["motion"], config["seconds"]
-    control, controllers = driven_settings(run)["control"], config["controllers"]
+    control, controllers = driven_settings(run).control, config["controllers"]
     if controllers is None:
-        controllers = [each for each in compared_controllers(control) if each.startswith(OPEN)]
+        controllers = [each for each in compared_controllers(control.plain()) if each.startswith(OPEN)]
     if len(controllers) > _MOST_VIEWS:
         raise InputError(f"controllers names {len(controllers)}: a film shows at most {_MOST_VIEWS} side by side.")
     played = replay(run, name, controllers, np.inf if seconds is None else seconds)
@@ -87,7 +87,7 @@ def _film_of_motion(run: Path, config: Mapping[str, Any]) -> tuple[str, Scene]:
         dict(zip(controllers, played.bodies, strict=True)),
         dict(zip(controllers, played.points, strict=True)),
         played.driven.path,
-        np.array([control["right"], control["up"]], dtype=np.float64),
+        np.array([control.right, control.up], dtype=np.float64),
         played.gravity,
     )
     return name, shown.film(1.0 if config["slower"] is None else config["slower"])

@@ -13,8 +13,9 @@ import warp as wp
 from ..dynamics.simulator import Simulator
 from ..experiment.build import build_simulator
 from ..io.errors import InputError
-from ..io.settings import Count, Natural, Positive, Settings, Some, parse, setting
+from ..io.settings import Count, Natural, Positive, Settings, Some, parse, parse_part, setting
 from ..mesh.poses import twisted
+from ..settings.body import MaterialSettings, SimulatorSettings
 from ..stepping.inputs import Inputs
 from ..stepping.quantity import Quantity
 from ..stepping.state import State
@@ -226,10 +227,12 @@ def check_configured(
     Raises:
         ResphysError: a value that cannot be simulated, float32, whose rounding drowns differences, or no convergence.
     """
-    if config["dtype"] != "float64":
-        raise InputError(f"dtype is {config['dtype']!r}: gradients are checked in float64.")
-    solver = {**config["solver"], "relative_tolerance": settings.relative_tolerance}
-    simulator = build_simulator({**config, "solver": solver})
+    made_of = parse_part(SimulatorSettings, config)
+    if made_of.dtype != "float64":
+        raise InputError(f"dtype is {made_of.dtype!r}: gradients are checked in float64.")
+    solver = made_of.solver.changed(relative_tolerance=settings.relative_tolerance)
+    material = parse(MaterialSettings, config["simulation"], "simulation")
+    simulator = build_simulator(made_of.changed(solver=solver), material)
     damping = {"mass_damping": settings.mass_damping, "stiffness_damping": settings.stiffness_damping}
     for poissons_ratio in settings.poissons_ratios:
         changed: dict[str, Any] = {"poissons_ratio": poissons_ratio, **damping}

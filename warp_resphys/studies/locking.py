@@ -33,6 +33,7 @@ from ..mesh.chambers import find_chambers
 from ..mesh.mesh import Mesh, quadratic
 from ..mesh.readers import read_mesh
 from ..report.figures import STYLE, TONES, new_figure, save_png
+from ..settings.body import GeneratedArm
 from ..stepping.inputs import Inputs
 from .beam import ELEMENT_NAMES, Element
 from .command import show, write_csv
@@ -232,7 +233,7 @@ def locking_study(config: Mapping[str, Any], folder: Path) -> None:
         ResphysError: a value that cannot be used, a mesh that cannot be made, or an equilibrium that was not found.
     """
     study = parse(LockingStudy, config["study"], "study")
-    rows = _measured(study, config["mesh"], folder)
+    rows = _measured(study, parse(GeneratedArm, config["mesh"], "mesh").plain(), folder)
     limits = {load: converged(rows, load) for load in LOADS}
     for row in rows:
         for load, limit in limits.items():

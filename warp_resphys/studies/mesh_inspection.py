@@ -7,6 +7,7 @@ import numpy as np
 
 from ..experiment.build import build_mesh
 from ..io.errors import MeshError
+from ..io.settings import parse
 from ..mesh.arm import mesh_arm, name_surfaces
 from ..mesh.arm_geometry import arm_geometry
 from ..mesh.cavities import MOST_TRIANGLES, open_cavities
@@ -15,6 +16,7 @@ from ..mesh.mesh import FloatArray, Mesh, Place, boundary_triangles, connected_p
 from ..mesh.quality import scaled_jacobian
 from ..mesh.readers import read_mesh, read_surfaces, read_vertices, write_mesh
 from ..report.body_picture import MeshSummary, draw_mesh
+from ..settings.body import FileMesh, GeneratedArm, MeshGroup
 from .command import aligned
 from .inspection import Arm, Inspection
 
@@ -28,7 +30,7 @@ def make_arm(arm: Arm, folder: Path) -> str:
     Raises:
         ResphysError: A setting of the wrong kind, or an arm that cannot be made.
     """
-    settings = arm.mesh
+    settings = parse(GeneratedArm, arm.mesh, "mesh").plain()
     if settings["order"] not in (1, 2) or (settings["order"] == 2 and settings["cells"] != "tetrahedra"):
         raise MeshError(f"mesh.order is {settings['order']!r}: choose 1, or 2 for tetrahedra with edge midpoints.")
     mesh, surfaces = mesh_arm(arm_geometry(settings), settings["size"], settings["cells"], settings["layers"])
@@ -51,7 +53,8 @@ def inspect_mesh(settings: Inspection, folder: Path) -> str:
     rows: list[tuple[str, str]] = []
     read = settings.mesh["kind"] == "file"
     if read:
-        path, units, order = (settings.mesh[key] for key in ("path", "units", "order"))
+        own = parse(FileMesh, settings.mesh, "mesh")
+        path, units, order = own.path, own.units, own.order
         points = read_vertices(path, units)
         mesh = read_mesh(path, units, order, drop_unreferenced=True)
         unused = len(points) - len(read_mesh(path, units, drop_unreferenced=True).vertices)
@@ -61,7 +64,8 @@ def inspect_mesh(settings: Inspection, folder: Path) -> str:
         surfaces = read_surfaces(path, units, order, True)
         names = ", ".join(f"{name} ({len(faces)})" for name, faces in surfaces.items())
     else:
-        mesh = build_mesh({key: each for key, each in settings.mesh.items() if (key, each) != ("path", None)})
+        given = {key: each for key, each in settings.mesh.items() if (key, each) != ("path", None)}
+        mesh = build_mesh(parse(MeshGroup, {"mesh": given}).mesh)
         points = mesh.vertices
     chosen = {axis: at for axis, at in settings.fixed.items() if at is not None and axis != "tolerance"}
     place = Place(**settings.fixed) if chosen else None

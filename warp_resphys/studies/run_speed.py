@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from ..control.controllers import Controller, timed_command
 from ..control.files import PlannedMotion, plans_file, read_plan, reduced_file
+from ..control.replay import driven_settings
 from ..control.sampling import driven_input
 from ..control.stages import receding_controllers
 from ..control.task import motions_of
 from ..experiment.files import LINEAR
 from ..io.errors import InputError
 from ..io.progress import Progress
-from ..io.stages import finished_record
 from ..linalg.threads import threads_for
 from ..robot.loading import load
 from ..robot.robot import Robot
@@ -91,13 +91,13 @@ def time_commands(run: Path, repeats: int) -> list[dict[str, Any]]:
     Raises:
         DataFileError: the folder has no run whose stage drive is done.
     """
-    settings = finished_record(run, "drive")["settings"]
-    control = settings["control"]
-    model = control["models"][-1]
-    robot = load(run, model, settings["device"])
-    names = [*control["receding"], LINEAR]
+    settings = driven_settings(run)
+    control = settings.control
+    model = control.models[-1]
+    robot = load(run, model, settings.device)
+    names = [*control.receding, LINEAR]
     seconds: dict[str, list[float]] = {name: [] for name in [*names, "full simulator"]}
-    motions, horizon = motions_of(control), float(control["horizon"]["seconds"])
+    motions, horizon = motions_of(control), control.horizon.seconds
     with threads_for(1):
         for number in range(repeats):
             plan = read_plan(run / plans_file(model), motions[number % len(motions)])

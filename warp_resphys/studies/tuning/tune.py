@@ -13,11 +13,9 @@ from typing import Any
 from optuna import TrialPruned
 from optuna.trial import TrialState
 
-from ...experiment.checks import check_training, training_settings
 from ...experiment.files import training_file
 from ...experiment.learn import Learning, Snapshot, run_epochs
-from ...experiment.parts import workers_for
-from ...experiment.scene import LEARNED, Scene, models_of
+from ...experiment.scene import LEARNED, Scene
 from ...experiment.trials import folds_of, split_of
 from ...io.errors import DataFileError, InputError
 from ...io.fan_out import Advance, WorkerError, Workers, fan_out
@@ -26,7 +24,9 @@ from ...io.progress import Progress, clock
 from ...io.resumable import forget_checkpoint, keep_checkpoint, resume_checkpoint
 from ...io.settings import parse
 from ...io.stages import Stage, StageInterrupted, run_stages
-from ...pipeline import acquire, acquisition_stages, learning_stages, prepare
+from ...pipeline import acquire, acquisition_stages, learning_stages, prepare, workers_of
+from ...settings.learning import TrainingSettings
+from ...settings.run import RunSettings
 from .results import Results, print_best, ranked, short_text, write_results
 from .space import Dimension, Tune, with_settings
 from .study import Claim, Study
@@ -46,15 +46,14 @@ def run_tuning(config: Mapping[str, Any], run_dir: Path) -> None:
         DataFileError: a file cannot be read or written.
         StageInterrupted: the user pressed Ctrl-C; what is done so far is kept.
     """
-    prepare(config)
+    run = parse(RunSettings, config)
+    prepare(run)
     search = Search.of(config, run_dir.absolute())  # Refuses a study of something else before anything is computed.
-    _, acquired = acquire(config, run_dir, wait=True)
-    run_stages(stages_before(config, search.tune.model, acquired), run_dir, wait=True)
+    _, acquired = acquire(run, run_dir, wait=True)
+    run_stages(stages_before(run, search.tune.model, acquired), run_dir, wait=True)
     kept = read_json(run_dir / training_file(search.tune.model))["kept"]
     results = Results(config, search.tune, search.groups, search.study, kept["validation_rollout_error_mm"])
-    workers = workers_for(config, config["parallel"]["processes"]).at_most(
-        search.study.trials - search.study.finished()
-    )
+    workers = workers_of(run).at_most(search.study.trials - search.study.finished())
     if not workers.alone:
         _share(search, acquired, workers, results)
     _work(search, acquired, lambda count=1, **shown: write_results(results) if count else None)
@@ -88,7 +87,8 @@ class Search:
             InputError, DataFileError: see `check_tuning` and `Study`.
         """
         tune, space, groups = check_tuning(config)
-        stages = [*acquisition_stages(config), *stages_before(config, tune.model, "")]
+        run = parse(RunSettings, config)
+        stages = [*acquisition_stages(run), *stages_before(run, tune.model, "")]
         conditions = {"model": tune.model, **_settings_of(stages), **groups}
         for group in _trained_with(groups):
             conditions[group] = {name: v for name, v in groups[group].items() if f"{group}.{name}" not in space}
@@ -105,21 +105,21 @@ def check_tuning(config: Mapping[str, Any]) -> tuple[Tune, dict[str, Dimension],
     Raises:
         InputError: a value of the wrong kind or out of range.
     """
-    tune = parse(Tune, config["tune"], "tune")
-    if "ablation" in config:
-        raise InputError(f"the experiment {config['name']} trains no network: tune another one.")
-    if folds_of(config) is not None:
+    run, tune = parse(RunSettings, config), parse(Tune, config["tune"], "tune")
+    if run.ablation is not None:
+        raise InputError(f"the experiment {run.name} trains no network: tune another one.")
+    if folds_of(run) is not None:
         raise InputError(
             "a search needs one split, and data.folds makes several: set data.folds to null, and data.train, "
             "data.validation and data.test."
         )
-    known = [model for model in models_of(config) if model in LEARNED]
+    known = [model for model in run.models if model in LEARNED]
     if tune.model not in known:
         raise InputError(f"tune.model is {tune.model!r}: choose one of {', '.join(known)}.")
     space, fixed = tune.dimensions, tune.settings.dotted()
     if both := fixed.keys() & space.keys():
         raise InputError(f"tune.settings.{min(both)} and tune.space.{min(both)} exclude each other: take one out.")
-    groups = training_settings(config, tune.model)
+    groups: dict[str, Any] = run.training(tune.model).plain()
     for key in (*fixed, *space):
         group, _, name = key.partition(".")
         if group not in _trained_with(groups) or name not in groups[group]:
@@ -128,7 +128,7 @@ def check_tuning(config: Mapping[str, Any]) -> tuple[Tune, dict[str, Dimension],
     groups = with_settings(groups, fixed)
     for key, value in [("", None), *((key, value) for key, each in space.items() for value in each.ends)]:
         try:
-            check_training(with_settings(groups, {key: value} if key else {}))
+            parse(TrainingSettings, with_settings(groups, {key: value} if key else {}))
         except InputError as error:
             raise InputError(f"tune: {error}") from error
     return tune, space, groups
@@ -139,9 +139,9 @@ def _trained_with(groups: Mapping[str, Any]) -> list[str]:
     return ["network", "in_the_loop" if groups["in_the_loop"] else "trainer"]
 
 
-def stages_before(config: Mapping[str, Any], model: str, acquired: str) -> list[Stage]:
+def stages_before(run: RunSettings, model: str, acquired: str) -> list[Stage]:
     """The stages of a run from the dataset of a fingerprint up to the training of a model."""
-    stages = {stage.name: stage for stage in learning_stages(config, split_of(config), ".", acquired)}
+    stages = {stage.name: stage for stage in learning_stages(run, split_of(run), ".", acquired)}
 
     def before(name: str) -> list[str]:
         return [*(each for needed in stages[name].upstream for each in before(needed)), name]
@@ -153,7 +153,7 @@ def stages_before(config: Mapping[str, Any], model: str, acquired: str) -> list[
 def _settings_of(stages: Sequence[Stage]) -> dict[str, Any]:
     """The settings of some stages, in place of the fingerprint of the dataset that they lead to."""
     found: dict[str, Any] = {}
-    for key, value in (item for stage in stages for item in stage.settings.items() if item[0] != "acquired"):
+    for key, value in (item for stage in stages for item in stage.settings.plain().items() if item[0] != "acquired"):
         known = found.get(key)
         found[key] = {**known, **value} if isinstance(known, dict) and isinstance(value, dict) else value
     return found
@@ -194,9 +194,9 @@ def _work(search: Search, acquired: str, tell: Advance) -> None:
         acquired: fingerprint of the dataset.
         tell: is called after each epoch and trial with how many trials that makes, and the best one; may raise.
     """
-    training = stages_before(search.config, search.tune.model, acquired)[-1]
+    training = stages_before(parse(RunSettings, search.config), search.tune.model, acquired)[-1]
     learning = Learning(Scene(training.settings, search.run_dir), search.tune.model)
-    fingerprint = _digest({**training.settings, **search.groups})
+    fingerprint = _digest({**training.settings.plain(), **search.groups})
     waiting = False
     while (claim := search.study.claim()) is not None or (others := search.study.running()):
         if claim is not None:
@@ -237,7 +237,7 @@ def _run_trial(search: Search, learning: Learning, claim: Claim, fingerprint: st
             claim.trial.report(record["rollout_error_mm"], int(record["epoch"]))
 
     try:
-        trainer = learning.trainer(with_settings(search.groups, claim.settings)).trainer
+        trainer = learning.trainer(parse(TrainingSettings, with_settings(search.groups, claim.settings))).trainer
         if found := resume_checkpoint(path, "training", fingerprint):
             trainer.resume(*found)
             spent = float(found[1]["seconds"])

@@ -1,0 +1,37 @@
+"""Configurations of runs, as the command line composes them."""
+
+import copy
+import functools
+
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+
+from warp_resphys.experiment.checks import check_run
+from warp_resphys.io.setting_errors import completed
+from warp_resphys.io.settings import parse
+from warp_resphys.launch import freed
+from warp_resphys.settings.run import RunSettings, with_baseline
+
+
+@functools.cache
+def _composed(*overrides):
+    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
+        plain = OmegaConf.to_container(compose("config", freed(overrides)), resolve=True)
+    return completed(RunSettings.model_json_schema(), with_baseline(plain))
+
+
+def composed(*overrides):
+    """Nested plain settings with all defaults, as a user might have written them."""
+    return copy.deepcopy(
+        _composed(*(each for each in overrides if not each.startswith("hydra") or each.startswith("hydra.searchpath")))
+    )
+
+
+def settings(*overrides):
+    """Settings of a run."""
+    return parse(RunSettings, composed(*overrides))
+
+
+def check(config):
+    """Checks a configuration as a run would."""
+    check_run(parse(RunSettings, config))

@@ -1,0 +1,60 @@
+"""The page of all keys, and the JSON Schema for editors."""
+
+from pathlib import Path
+from typing import get_args
+
+import jsonschema
+import pytest
+from omegaconf import OmegaConf
+
+from warp_resphys.data.markers import KINDS
+from warp_resphys.data.sight import FRAMES
+from warp_resphys.dynamics.simulator import COUPLINGS
+from warp_resphys.experiment.scene import MODELS
+from warp_resphys.fem.body import MASS_MODES
+from warp_resphys.fem.elements import VOLUME_INTEGRATIONS
+from warp_resphys.learning.networks import ACTIVATIONS, FORCE_BASES, NETWORK_KINDS
+from warp_resphys.learning.training import SCHEDULES, SELECTIONS
+from warp_resphys.settings.body import PhysicsSettings, SimulatorSettings
+from warp_resphys.settings.control import Model
+from warp_resphys.settings.learning import NetworkSettings, TrainerSettings
+from warp_resphys.settings.reference import editor_schema, page
+from warp_resphys.settings.trials import MarkerSettings
+from warp_resphys.stepping.integrators import INTEGRATORS
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_the_page_of_all_keys_is_current():
+    assert (ROOT / "docs" / "settings.md").read_text(encoding="utf-8").rstrip() == page().rstrip()
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "conf" / "experiment").glob("*.yaml")), ids=lambda path: path.stem)
+def test_experiments_are_what_editors_expect(path):
+    content = OmegaConf.to_container(OmegaConf.load(path))
+    content = {key: each for key, each in content.items() if key not in ("mesh", "data")}  # of a kind that others name
+    jsonschema.validate(content, editor_schema())
+
+
+def test_an_editor_marks_a_wrong_key():
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate({"trainer": {"epoch": 3}}, editor_schema())
+
+
+def test_words_of_the_settings_are_those_that_the_code_knows():
+    pairs = [
+        (SimulatorSettings, "integrator", INTEGRATORS),
+        (SimulatorSettings, "coupling", COUPLINGS),
+        (PhysicsSettings, "mass", MASS_MODES),
+        (PhysicsSettings, "volume_integration", VOLUME_INTEGRATIONS),
+        (MarkerSettings, "bind", KINDS),
+        (MarkerSettings, "frame", FRAMES),
+        (NetworkSettings, "kind", NETWORK_KINDS),
+        (NetworkSettings, "activation", ACTIVATIONS),
+        (NetworkSettings, "force_basis", FORCE_BASES),
+        (TrainerSettings, "schedule", SCHEDULES),
+        (TrainerSettings, "selection", SELECTIONS),
+    ]
+    for settings, key, words in pairs:
+        assert {*get_args(settings.model_fields[key].annotation)} == {*words}
+    assert get_args(Model) == tuple(MODELS)

@@ -1,0 +1,330 @@
+"""Settings of a body: its mesh, where it is held, what acts on it, and of the simulator that steps it."""
+
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import AfterValidator, ConfigDict, Field, model_validator
+
+from ..io.settings import Many, Natural, NotNegative, Pair, Positive, Settings, Some, Vector, Word, setting
+
+Divisions = Annotated[int, Field(ge=1, le=10_000)]
+LengthUnit = Literal["m", "cm", "mm"]
+Order = Literal[1, 2]
+Nodes = Literal[8, 20, 27]
+Integrator = Literal["implicit_euler", "bdf2", "midpoint"]
+TimeStep = Annotated[float, Field(gt=0.0, le=10.0)]
+
+
+def _nonzero(vector: tuple[float, float, float]) -> tuple[float, float, float]:
+    if not any(vector):
+        raise ValueError("it must be three numbers, not all zero.")
+    return vector
+
+
+def _rising(pair: tuple[float, float]) -> tuple[float, float]:
+    if pair[0] > pair[1]:
+        raise ValueError("it must be two rising numbers, in m.")
+    return pair
+
+
+Direction = Annotated[Vector, AfterValidator(_nonzero)]
+Span = Annotated[Pair[float], AfterValidator(_rising)]
+Curve = Annotated[Many[Vector], Field(min_length=2)]
+
+
+class _Given(Settings):
+    def arguments(self) -> dict[str, Any]:
+        """The keys that are not null, as arguments of a function."""
+        return {key: value for key, value in dict(self).items() if value is not None}
+
+
+class PlaceSettings(_Given):
+    """Vertices, by where they lie: on a plane, or between two."""
+
+    x: float | Span | None = setting(None, "coordinate, or two between which the vertices lie", "m")
+    y: float | Span | None = setting(None, "coordinate along y, or two", "m")
+    z: float | Span | None = setting(None, "coordinate along z, or two", "m")
+    tolerance: Positive | None = setting(None, "distance from the plane that still counts; null: 1e-9", "m")
+
+
+class BoxSettings(_Given):
+    """Cells, by the box in which their centres lie."""
+
+    x: Span | None = setting(None, "from where to where along x; null: anywhere", "m")
+    y: Span | None = setting(None, "from where to where along y", "m")
+    z: Span | None = setting(None, "from where to where along z", "m")
+
+
+class HexahedralBox(Settings):
+    """A box of hexahedra."""
+
+    kind: Literal["box_hexahedra"]
+    size: Annotated[Many[Positive], Field(min_length=3, max_length=3)] = setting(description="of its edges", unit="m")
+    divisions: Annotated[Many[Divisions], Field(min_length=3, max_length=3)] = setting(description="cells along each")
+    nodes: Nodes = setting(8, "nodes of a cell: 8, or quadratic with 20 or 27")
+
+
+class TetrahedralBox(Settings):
+    """A box of tetrahedra, six in each of its cells."""
+
+    kind: Literal["box_tetrahedra"]
+    size: Annotated[Many[Positive], Field(min_length=3, max_length=3)] = setting(description="of its edges", unit="m")
+    divisions: Annotated[Many[Divisions], Field(min_length=3, max_length=3)] = setting(description="cells along each")
+    order: Order = setting(1, "2 adds edge midpoints, without which tetrahedra bend far too stiffly")
+
+
+class BoxesMesh(Settings):
+    """A body of boxes along the axes, of hexahedra; they touch or overlap."""
+
+    kind: Literal["boxes"]
+    boxes: Some[Pair[Vector]] = setting(description="lowest and highest corner of each", unit="m")
+    size: Positive = setting(0.01, "longest edge of a cell", "m")
+    nodes: Nodes = setting(8, "nodes of a cell")
+
+
+class FileMesh(Settings):
+    """A tetrahedral or hexahedral mesh of a file that meshio reads."""
+
+    kind: Literal["file"]
+    path: Word = setting(description="of the file")
+    units: LengthUnit = setting("m", "of the file")
+    order: Order = setting(1, "2 adds edge midpoints to linear tetrahedra")
+    drop_unreferenced: bool = setting(False, "leave out vertices that no cell has")
+
+
+class SurfaceMesh(Settings):
+    """The inside of a closed surface of triangles, filled with tetrahedra; closed surfaces within it are cavities."""
+
+    kind: Literal["surface"]
+    path: Word = setting(description="of an STL, OBJ or PLY file")
+    units: LengthUnit = setting("mm", "of the file")
+    size: Positive = setting(0.01, "of the tetrahedra's edges", "m")
+    order: Order = setting(2, "1: linear tetrahedra, which bend far too stiffly")
+
+
+class RodMesh(Settings):
+    """A round or elliptic rod of hexahedra."""
+
+    kind: Literal["rod"]
+    centreline: Curve = setting(description="points of its axis", unit="m")
+    radii: Positive | Some[Annotated[Many[float], Field(min_length=2, max_length=3)]] = setting(
+        description="one radius, or arc lengths with the radius there, linear in between; two radii for an ellipse: "
+        "along the axis that the rod crosses most squarely where it begins (the first of x, y and z), and across it",
+        unit="m",
+    )
+    layers: Divisions = setting(10, "cells along the axis")
+    core: Divisions = setting(1, "cells along a side of the middle of the section")
+    rings: Divisions = setting(1, "cells around it")
+    nodes: Nodes = setting(27, "nodes of a cell")
+    grading: Annotated[float, Field(ge=0.0, le=1.0)] = setting(
+        0.0, "from 0, layers of one length, to 1, layers shorter where the rod is thinner, in proportion"
+    )
+
+
+class ShippedArm(Settings):
+    """One of the arms with six chambers that come with the package."""
+
+    kind: Literal["arm"]
+    name: Word = setting(description="of the arm, such as arm_hexahedra_1400")
+
+
+class GeneratedArm(Settings):
+    """A pneumatic arm of given measures; the defaults are those of SoPrA."""
+
+    kind: Literal["arm_generated"]
+    size: Positive = setting(0.01, "of the cells", "m")
+    cells: Word = setting("hexahedra", "hexahedra or tetrahedra")
+    layers: Positive | None = setting(None, "length of hexahedra along the arm; null: 2.5 times the size", "m")
+    order: Order = setting(1, "2 adds edge midpoints to tetrahedra")
+    chamber_lengths: Some[Positive] = setting((0.120, 0.120), "of the chambers of each segment", "m")
+    caps: Some[Positive] = setting((0.010, 0.021, 0.005), "solid parts before, between and after the chambers", "m")
+    radii: Some[Positive] = setting(
+        (0.0283923, 0.0212942, 0.0165622), "before the first chambers and after those of each segment", "m"
+    )
+    chambers: Natural = setting(3, "of each segment")
+    profile: Word = setting("half_disc", "half_disc, disc or sector")
+    outline: Word = setting("lobed", "lobed, around the chambers, or round")
+    wall: Positive = setting(0.004, "thickness of the wall", "m")
+    web: Positive = setting(0.004, "thickness between neighbouring chambers", "m")
+    core: Positive | None = setting(
+        None, "distance of the chambers from the axis, at the base; null: the least that the webs allow", "m"
+    )
+    rotations: Many[float] = setting(
+        (), "of the chambers of each segment about the axis; for tetrahedra and a round outline", "degrees"
+    )
+
+
+MeshSettings = Annotated[
+    HexahedralBox | TetrahedralBox | BoxesMesh | FileMesh | SurfaceMesh | RodMesh | ShippedArm | GeneratedArm,
+    Field(discriminator="kind"),
+]
+
+
+class MeshGroup(Settings):
+    """A mesh alone."""
+
+    mesh: MeshSettings
+
+
+class PhysicsSettings(Settings):
+    """How masses and volumes are computed."""
+
+    mass: Literal["row_sum", "per_vertex"] = setting(
+        "row_sum", "row_sum; per_vertex: every vertex has the mean element mass, as in the published code"
+    )
+    volume_integration: Literal["centre", "full"] = setting(
+        "centre", "volume points of an element: one, against locking, or all, as in the published code"
+    )
+
+
+class MaterialSettings(Settings):
+    """A material and its constants, in SI units; `energies.materials` has those of each model."""
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, float]
+
+    model: Word = setting("corotated", "constitutive model")
+
+    @property
+    def constants(self) -> dict[str, float]:
+        """By name, such as ``youngs_modulus`` [Pa]."""
+        return dict(self.__pydantic_extra__)
+
+
+class ChamberSettings(Settings):
+    """Closed chambers of the mesh, each of which has a pressure."""
+
+    count: Natural = setting(description="number that the mesh is expected to have")
+    axis: Direction = setting(description="along which chambers are numbered")
+
+
+class FibreSettings(Settings):
+    """Fibres wound around the chambers."""
+
+    angles: Many[float] = setting(description="from the circumference, one of each family", unit="degrees")
+    toe: Positive = setting(1.0e-3, "strain over which fibres become taut")
+    stiffness: NotNegative = setting(description="of a family, per length", unit="N/m")
+
+
+class RouteSettings(Settings):
+    """Where a tendon runs."""
+
+    guides: Curve = setting(description="points that it is led through", unit="m")
+    pieces: Divisions = setting(1, "pieces into which each straight part is divided")
+    offsets: Annotated[Many[Direction | Curve], Field(max_length=2)] = setting(
+        (), "directions in which it may lie elsewhere: each three numbers, or three for each guide"
+    )
+
+
+class TendonSettings(Settings):
+    """Tendons that pull on the body."""
+
+    routes: dict[str, RouteSettings] = setting(description="by name")
+    commanded: Literal["tension", "contraction"] = setting(description="input of the tendons")
+    stiffness: NotNegative = setting(description="needed where contractions are commanded", unit="N/m")
+    toe: Positive = setting(1.0e-4, "contraction over which a tendon becomes taut", "m")
+    reach: Positive = setting(1.0e-3, "largest distance of a guide from the body", "m")
+
+    @model_validator(mode="after")
+    def _pulls(self) -> Self:
+        if self.commanded == "contraction" and not self.stiffness > 0.0:
+            raise ValueError("stiffness is 0, but contractions are commanded, which act through it: set it, in N/m.")
+        for name, route in self.routes.items():
+            for each in route.offsets:
+                if isinstance(each[0], tuple) and len(each) != len(route.guides):
+                    raise ValueError(
+                        f"routes.{name}.offsets has a direction for {len(each)} guides: give three numbers, or three "
+                        f"for each of its {len(route.guides)} guides."
+                    )
+        return self
+
+
+class BundleSettings(Settings):
+    """A muscle: the cells that it runs through, and its direction there."""
+
+    direction: Direction = setting(description="of its fibres")
+    within: BoxSettings = setting(BoxSettings(), "cells that it runs through")
+
+
+class MuscleSettings(Settings):
+    """Contractile fibres in the body."""
+
+    bundles: dict[str, BundleSettings] = setting(description="by name")
+    commanded: Literal["stress", "contraction"] | None = setting(description="input of the muscles")
+    stiffness: NotNegative = setting(description="needed where contractions are commanded", unit="Pa")
+    toe: Positive = setting(1.0e-3, "strain over which fibres become taut")
+
+    @model_validator(mode="after")
+    def _pulls(self) -> Self:
+        if self.commanded != "stress" and not self.stiffness > 0.0:
+            why = "contractions are commanded" if self.commanded else "nothing is commanded"
+            raise ValueError(f"stiffness is 0, but {why}: set it, in Pa.")
+        return self
+
+
+class MediumSettings(Settings):
+    """A fluid around the body."""
+
+    density: NotNegative = setting(description="of the fluid", unit="kg/m^3")
+    linear: NotNegative = setting(0.0, "viscous drag of the surface", "N s/m^3")
+    normal: NotNegative = setting(0.0, "coefficient of the drag normal to the surface")
+    tangential: NotNegative = setting(0.0, "coefficient of the drag along the surface")
+    layer: NotNegative = setting(0.0, "thickness of the fluid that moves with the surface", "m")
+    buoyancy: bool = setting(True, "whether the fluid carries the body")
+
+
+class StringSettings(Settings):
+    """A string on which payloads hang."""
+
+    length: Positive = setting(description="without a payload", unit="m")
+    compliance: NotNegative = setting(0.0, "stretch for each newton", "m/N")
+    toe: Positive = setting(1.0e-5, "stretch over which it becomes taut", "m")
+
+
+class SolveSettings(Settings):
+    """How a step is solved; see `dynamics.nonlinear_solver`."""
+
+    name: Literal["quasi_newton", "newton", "projective_dynamics"] = setting("quasi_newton", "method")
+    relative_tolerance: Annotated[float, Field(gt=0.0, le=0.1)] = setting(
+        1.0e-8, "residual over the forces that balance, at which a step is solved"
+    )
+    absolute_tolerance: NotNegative = setting(1.0e-12, "residual at which a step is solved in any case", "N")
+    max_iterations: Natural = setting(500, "after which the step has failed")
+    memory: Natural = setting(12, "pairs that L-BFGS keeps")
+    refactor_after: Natural = setting(
+        4, "iterations of a step above which quasi_newton factorises an environment anew before its next"
+    )
+    linear_solver: Literal["auto", "banded", "tiled", "dense", "sparse", "multigrid"] = setting(
+        "auto", "of Newton's equation; banded runs on the CPU alone"
+    )
+    factors: Literal["double", "single"] = setting(
+        "double", "precision of factors and L-BFGS pairs; residuals, states and gradients stay accurate"
+    )
+    on_failure: Literal["raise", "count"] = setting("raise", "what a step that fails does: count goes on")
+
+
+class BodySettings(Settings):
+    """What a body is made of."""
+
+    mesh: MeshSettings
+    physics: PhysicsSettings = PhysicsSettings()
+    fixed: PlaceSettings = setting(description="vertices that are held")
+    chambers: ChamberSettings | None = setting(None, "chambers under pressure")
+    fibres: FibreSettings | None = setting(None, "fibres around the chambers")
+    tendons: TendonSettings | None = setting(None, "tendons that pull")
+    muscles: MuscleSettings | None = setting(None, "contractile fibres")
+    medium: MediumSettings | None = setting(None, "fluid around the body")
+    payload_string: StringSettings | None = setting(None, "string on which payloads hang; null: they are on the body")
+
+
+class SimulatorSettings(BodySettings):
+    """What a simulator is made of, but for the material."""
+
+    gravity: Vector = setting((0.0, 0.0, -9.80709), unit="m/s^2")
+    time_step: TimeStep = setting(0.01, "of the simulator", "s")
+    integrator: Integrator = setting("implicit_euler", "how states go from step to step")
+    solver: SolveSettings = SolveSettings()
+    device: Word = setting("auto", "cpu, cuda or auto, which takes CUDA for training where there is one")
+    dtype: Literal["float64", "float32"] = setting("float64", "of the simulation; experiments need float64")
+    coupling: Literal["implicit", "explicit"] = setting(
+        "implicit", "pressure acts on the chambers as they move, or as they are at the start of a step"
+    )

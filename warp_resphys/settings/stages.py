@@ -1,0 +1,256 @@
+"""What each stage of a run depends on: a class with a field for every group or key that it may read.
+
+A stage is given an object of its class, whose content is its fingerprint. What the class does not have, the stage
+cannot read, so that nothing a file depends on can be forgotten. `Settings.of` fills the fields that a `RunSettings` has
+by the same name; the pipeline adds the others.
+"""
+
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from ..io.settings import Many, Settings, Vector
+from .body import (
+    ChamberSettings,
+    MaterialSettings,
+    MediumSettings,
+    MuscleSettings,
+    PlaceSettings,
+    SimulatorSettings,
+    SolveSettings,
+    StringSettings,
+    TendonSettings,
+)
+from .control import ControlSettings, FeedbackSettings, FigureSettings, PlanSettings, ReductionSettings
+from .learning import (
+    ActuationSettings,
+    IdentifiedSettings,
+    IdentifySettings,
+    ReconstructionSettings,
+    RefinementSettings,
+    ReleaseSettings,
+    TrainingSettings,
+)
+from .run import PublishedSettings, RunSettings
+from .trials import (
+    BindingSettings,
+    MarkerSettings,
+    PlaySettings,
+    ReadingSettings,
+    ReleaseFromLoad,
+    SimulatedData,
+    Split,
+    Trial,
+)
+
+
+class SimulationStage(SimulatorSettings):
+    """What every simulation of a run depends on."""
+
+    payload_at: PlaceSettings | None
+    files: dict[str, str]  # SHA-256 of the files that bodies and their motions are read from, by path
+
+
+class SimulateStage(SimulationStage):
+    """Trials of a simulation that plays the real body, whose vertices are all known."""
+
+    target: MaterialSettings
+    data: Annotated[SimulatedData, Field(discriminator="kind")]
+    trials: Many[Trial]
+
+
+class PlayedSettings(Settings):
+    """A simulated laboratory."""
+
+    laboratory: PlaySettings
+    fixed: PlaceSettings
+    tip: PlaceSettings
+    chambers: ChamberSettings | None
+    tendons: TendonSettings | None
+    muscles: MuscleSettings | None
+    medium: MediumSettings | None
+    payload_string: StringSettings | None
+    payload_at: PlaceSettings | None
+    gravity: Vector
+    time_step: float
+    solver: SolveSettings
+    device: str
+    dtype: str
+    seed: int
+    binding: BindingSettings
+    data: ReadingSettings
+    files: dict[str, str]
+
+
+class LaboratoryStage(PlayedSettings):
+    """Recordings of the laboratory."""
+
+    trials: Many[Trial]
+    batch: int | None
+
+
+class ImportStage(SimulationStage):
+    """Recordings that are brought into the frame of the body."""
+
+    simulation: MaterialSettings
+    markers: MarkerSettings
+    data: ReadingSettings
+    trials: Many[Trial]
+    learned: Many[str] | None  # names of the trials of training and validation; None for a cross-validation
+
+
+class LearningStage(SimulationStage):
+    """What all stages of a split depend on."""
+
+    simulation: MaterialSettings
+    markers: MarkerSettings | None
+    release: ReleaseSettings
+    force_frame: str
+    train_fraction: float
+    trial_seconds: float | None
+    identified: IdentifiedSettings | None
+    batch: int | None
+    shared: str  # folder of the dataset, from that of the split
+    acquired: str  # fingerprint of the stage that wrote the dataset
+    split: Split
+
+
+class IdentifyStage(LearningStage):
+    """Identification."""
+
+    identify: IdentifySettings
+    seed: int
+
+
+class ReconstructStage(LearningStage):
+    """Reconstruction of the forces on a model's simulator."""
+
+    model: str
+    reconstruction: ReconstructionSettings
+    reconstructed: Many[str]  # names of the trials
+
+
+class NetworkStage(LearningStage):
+    """What all stages with networks depend on."""
+
+    actuation: ActuationSettings
+    range_guard: bool
+
+
+class TrainStage(NetworkStage):
+    """Training of a model."""
+
+    model: str
+    training: TrainingSettings
+
+
+class RefineStage(NetworkStage):
+    """Further training of a model through its simulator."""
+
+    model: str
+    refinement: RefinementSettings
+    seed: int
+
+
+class TestStage(NetworkStage):
+    """What all stages that roll models out depend on."""
+
+    groups: dict[str, Many[str]]  # names of the test trials by scale of the inputs, ``1`` first
+    refined: bool  # whether networks were trained further through the simulator
+
+
+class EvaluateStage(TestStage):
+    """Roll-outs of the test trials by all models."""
+
+    calibration: Many[str]  # names of the trials that prediction intervals come from
+    published: PublishedSettings | None
+    correct_uncorrected: bool
+    horizons: Many[float]
+
+
+class TimeStage(TestStage):
+    """Times of the models."""
+
+    target: MaterialSettings | None
+
+
+class MeshCheckStage(TestStage):
+    """What a finer mesh changes."""
+
+    mesh_check: float
+
+
+class ReduceStage(LearningStage):
+    """A reduced model of a robot."""
+
+    model: str
+    reduction: ReductionSettings
+    seed: int
+
+
+class PlanStage(LearningStage):
+    """Plans of all motions on the reduced model of a robot."""
+
+    model: str
+    figures: FigureSettings
+    plan: PlanSettings
+    must_reach: bool  # whether the robot must be able to reach all figures
+
+
+class BaselinesStage(LearningStage):
+    """Controllers that know no simulator."""
+
+    model: str  # of the robot
+    figures: FigureSettings
+    feedback: FeedbackSettings
+    played: PlayedSettings
+
+
+class DriveStage(LearningStage):
+    """Motions of the laboratory under all controllers."""
+
+    control: ControlSettings
+    played: PlayedSettings
+
+
+class MotionStage(SimulationStage):
+    """The motion of a marker ablation."""
+
+    target: MaterialSettings
+    simulation: MaterialSettings
+    data: ReleaseFromLoad
+
+
+class DrawSettings(Settings):
+    """Sets of markers that are drawn."""
+
+    counts: Many[int]
+    draws: int
+    modes: int | None
+
+
+class AblationStage(SimulationStage):
+    """Reconstructions of the motion from sets of markers."""
+
+    simulation: MaterialSettings
+    reconstruction: ReconstructionSettings
+    seed: int
+    drawn: DrawSettings
+
+
+class ReportStage(Settings):
+    """A report; it shows the whole configuration."""
+
+    config: RunSettings
+
+
+class SplitReportStage(ReportStage):
+    """The report of a split."""
+
+    acquired: str  # fingerprint of the stage that wrote the dataset
+
+
+class FoldsReportStage(ReportStage):
+    """The report over the folds of a cross-validation."""
+
+    folds: dict[str, Any]  # errors of the models, by the trial that is left out

@@ -172,7 +172,8 @@ def _show(config: DictConfig, key: str) -> None:
 
     values = with_baseline(OmegaConf.to_container(config, resolve=True))
     whole = OmegaConf.create(completed(RunSettings.model_json_schema(), values))
-    print(OmegaConf.to_yaml(OmegaConf.select(whole, key) if key else whole), end="")
+    chosen = OmegaConf.select(whole, key) if key else whole
+    print(OmegaConf.to_yaml(chosen).rstrip() if OmegaConf.is_config(chosen) else chosen)
 
 
 def _quoted(argument: str) -> str:

@@ -253,7 +253,7 @@ def build_simulator(
     solver = dict(settings.solver) | ({} if on_failure is None else {"on_failure": on_failure})
     return Simulator(
         build_body(settings, payload_at) if body is None else body,
-        build_material(material, "material"),
+        build_material(material, "simulation"),
         time_step=settings.time_step,
         gravity=settings.gravity,
         integrator=settings.integrator,

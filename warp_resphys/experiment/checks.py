@@ -54,8 +54,7 @@ def check_run(run: RunSettings) -> None:
     _check_memory(run)
     body = build_body(run, run.payload_at)
     select_vertices(body.mesh, **run.tip.arguments())
-    with _naming("simulation: "):
-        simulator = build_simulator(run, run.simulation, body)
+    simulator = build_simulator(run, run.simulation, body)
     for each in simulator.materials.values():
         _check_size(body, each, run.gravity)
     if isinstance(run.data, RecordedData) and run.markers is not None:

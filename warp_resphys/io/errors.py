@@ -58,5 +58,6 @@ def did_you_mean(wanted: str, known: Sequence[str], preferred: Sequence[str] = (
         known: names that exist.
         preferred: those that are offered whatever they look like.
     """
-    matches = list(preferred[:3]) or difflib.get_close_matches(wanted, known, n=3, cutoff=0.6)
+    offered = [name for name in dict.fromkeys(preferred) if name != wanted][:3]
+    matches = offered or difflib.get_close_matches(wanted, [name for name in known if name != wanted], n=3, cutoff=0.6)
     return f", did you mean {' or '.join(repr(match) for match in matches)}?" if matches else ""

@@ -10,6 +10,7 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from warp_resphys import cli
+from warp_resphys.launch import freed
 
 
 class Outcome(NamedTuple):
@@ -38,4 +39,4 @@ def outcome(*arguments: object) -> Outcome:
 def configuration(name: str, *overrides: str) -> dict:
     """A configuration of the package as plain data."""
     with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        return OmegaConf.to_container(compose(name, list(overrides)), resolve=True)
+        return OmegaConf.to_container(compose(name, freed(overrides)), resolve=True)

@@ -11,6 +11,7 @@ from warp_resphys.data.markers import bind_markers
 from warp_resphys.data.trials import Trials
 from warp_resphys.dynamics.modes import vibration_modes
 from warp_resphys.io.errors import ConvergenceError, InputError
+from warp_resphys.io.settings import parse
 from warp_resphys.learning.parameters import configured_parameters, first_guesses, tilted_gravity
 from warp_resphys.learning.release import ReleaseSettings, estimate_release, hold, sideways_shapes, velocity_shapes
 from warp_resphys.learning.replay import Replay, Start, sample
@@ -307,7 +308,7 @@ def test_a_body_held_sideways_shows_it_once_it_is_initial_motion():
     torch.testing.assert_close(replay(found)[0], seen, rtol=0.0, atol=1e-5)
     torch.testing.assert_close(found.select([1]).shift, found.shift[1:])
     torch.testing.assert_close(found.bound(found.shifted(seen)), seen)
-    straight = estimate_release(sim, MARKERS, replace(motions, observed=seen), replace(settings, sideways=0.0))
+    straight = estimate_release(sim, MARKERS, replace(motions, observed=seen), settings.changed(sideways=0.0))
     assert straight.shift is None
     assert float((replay(straight)[0] - seen).norm(dim=-1).mean()) > 1e-3
 
@@ -355,4 +356,4 @@ def test_a_body_that_cannot_be_held_says_so(monkeypatch):
 )
 def test_settings_out_of_range_are_refused(wrong):
     with pytest.raises(InputError, match=f"release.{next(iter(wrong))}"):
-        ReleaseSettings(**wrong)
+        parse(ReleaseSettings, wrong, "release")

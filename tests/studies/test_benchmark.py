@@ -8,6 +8,8 @@ from command_line import configuration, outcome
 from warp_resphys.experiment.build import build_simulator
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_json
+from warp_resphys.io.settings import parse, parse_part
+from warp_resphys.settings.body import MaterialSettings, SimulatorSettings
 from warp_resphys.studies.benchmark import PARTS, released, run_benchmark
 
 TINY = [
@@ -60,7 +62,10 @@ def test_quick_measures_the_coarsest_mesh_alone():
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_the_beam_hangs_under_the_weight(dtype):
-    simulator = build_simulator(configuration("benchmark", *TINY, "device=cpu", f"dtype={dtype}"))
+    config = configuration("benchmark", *TINY, "device=cpu", f"dtype={dtype}")
+    simulator = build_simulator(
+        parse_part(SimulatorSettings, config), parse(MaterialSettings, config["simulation"], "simulation")
+    )
     heavy, light = released(simulator, 0.1, 2), released(simulator, 0.0, 2)
     sag = (heavy.q - light.q)[:, :, 2].min(1).values
     assert float(sag[0]) < 1.3 * float(sag[1]) < 0.0
@@ -77,7 +82,7 @@ def test_the_beam_hangs_under_the_weight(dtype):
         ("benchmark.materials=[{E: 1.0}]", "benchmark.materials.*E"),
         ("+benchmark.colour=red", "benchmark.colour"),
         ("benchmark.batches.cpu=[300];benchmark.solvers=[newton]", "leave none of refinement 1"),
-        ("+mesh.path=arm.vtk;~mesh.divisions", "choose mesh=beam_hexahedra"),
+        ("+mesh.path=arm.vtk;~mesh.divisions", "mesh.path"),
     ],
 )
 def test_what_cannot_be_measured_is_refused_first(overrides, message):

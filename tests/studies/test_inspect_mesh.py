@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 from warp_resphys import cli
 from warp_resphys.io.errors import InputError, MeshError
 from warp_resphys.io.settings import parse
+from warp_resphys.launch import freed
 from warp_resphys.mesh.arm import mesh_arm, name_surfaces
 from warp_resphys.mesh.arm_geometry import ArmGeometry
 from warp_resphys.mesh.cavities import open_cavities
@@ -24,7 +25,7 @@ from warp_resphys.studies.mesh_inspection import inspect_mesh, make_arm
 
 def configured(name, *overrides):
     with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        config = OmegaConf.to_container(compose(name, list(overrides)), resolve=True)
+        config = OmegaConf.to_container(compose(name, freed(overrides)), resolve=True)
         return parse(Inspection if name == "inspect" else Arm, config)
 
 

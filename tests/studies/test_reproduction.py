@@ -18,6 +18,7 @@ from omegaconf import OmegaConf
 
 from warp_resphys import cli
 from warp_resphys.io.errors import InputError
+from warp_resphys.launch import freed
 from warp_resphys.report.page import error_parts, number_text
 from warp_resphys.studies.rows import Reproduction
 from warp_resphys.studies.runs import Run, _Pace, execute
@@ -151,7 +152,7 @@ class TestPlan:
         runs = plan(configured("budget=quick"))
         with initialize_config_module("warp_resphys.conf", version_base="1.3"):
             for each in runs:
-                assert compose("config", list(each.arguments)).budget == "quick"
+                assert compose("config", freed(each.arguments)).budget == "quick"
 
     def test_only(self):
         names = [each.name for each in plan(configured("only=[marker_ablation,beam_twist/default]"))]

@@ -11,6 +11,7 @@ from main_job import end_of
 from omegaconf import OmegaConf
 
 from warp_resphys import cli
+from warp_resphys.launch import freed
 from warp_resphys.report.page import error_parts
 
 SMALL = [
@@ -144,7 +145,7 @@ def configured():
 def test_every_robot_is_an_experiment_whose_files_are_known():
     for robot in configured().values():
         with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-            found = compose("config", [f"experiment={robot['experiment']}", *robot["overrides"]])
+            found = compose("config", freed([f"experiment={robot['experiment']}", *robot["overrides"]]))
         assert found.name == robot["experiment"]
         assert (robot["recordings"] is None) == ("files" not in robot)
         assert all(len(digest) == 64 for digest in robot.get("files", {}).values())

@@ -403,7 +403,7 @@ class TestBadInput:
             ("+tune.space.network.depth=[1,2]", "unknown key 'network.depth' in the group tune"),
             ("+tune.settings.network.width=8", "tune.settings.network.width and tune.space.network.width exclude"),
             ("simfree=3", "simfree is 3"),
-            ("+simfree.network.width=-1", "simfree: network.width is -1"),
+            ("+simfree.network.width=-1", "simfree.network.width is -1"),
         ],
     )
     def test_settings(self, folder, override, sentence):

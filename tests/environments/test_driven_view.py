@@ -44,7 +44,7 @@ def test_between_frames_what_was_measured_is_linear_in_time(robot):
 
 def test_markers_that_are_seen_in_a_frame_of_their_own_are_shown_on_the_body(robot):
     known = robot.description
-    own = Robot(replace(known, markers={**known.markers, "frame": "own"}))
+    own = Robot(replace(known, markers=known.markers.changed(frame="own")))
     plain, turned = LiveRobot(Robot(known)), LiveRobot(own)
     for live in (plain, turned):
         live.play_trial(None)

@@ -175,7 +175,7 @@ class TestArms:
     def test_the_tip_is_shown_where_its_place_in_space_is_known(self, tmp_path):
         settings = arm_settings()
         write_run(tmp_path, settings, steps=40)
-        trials, mesh = read_trials(tmp_path, settings), build_mesh(settings["mesh"])
+        trials, mesh = read_trials(tmp_path, settings), build_mesh(settings.mesh)
         canvas = SimpleNamespace(figure=lambda name, *_: name)
 
         def drawn(shown, driven):

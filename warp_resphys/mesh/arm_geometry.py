@@ -92,12 +92,12 @@ class ArmGeometry:
 
 
 def arm_geometry(config: Mapping[str, Any]) -> ArmGeometry:
-    """The measures of an arm from a group that has the keys of `ArmGeometry`, and perhaps others.
+    """The measures of an arm from a group with keys of `ArmGeometry`, and perhaps others; what it lacks has its default.
 
     Raises:
         MeshError: measures of which no arm can be made.
     """
-    return ArmGeometry(**{field.name: config[field.name] for field in fields(ArmGeometry)})
+    return ArmGeometry(**{field.name: config[field.name] for field in fields(ArmGeometry) if field.name in config})
 
 
 def numbers(name: str, given: Sequence[Any], positive: bool = True) -> tuple[float, ...]:

@@ -92,7 +92,7 @@ class ArmGeometry:
 
 
 def arm_geometry(config: Mapping[str, Any]) -> ArmGeometry:
-    """The measures of an arm from a group with keys of `ArmGeometry`, and perhaps others; what it lacks has its default.
+    """Returns the measures of an arm from a group with keys of `ArmGeometry`; missing ones have their defaults.
 
     Raises:
         MeshError: measures of which no arm can be made.

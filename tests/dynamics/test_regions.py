@@ -10,6 +10,7 @@ from warp_resphys import (
     Corotated,
     Inputs,
     Mesh,
+    Scene,
     Simulator,
     SolverSettings,
     StableNeoHookean,
@@ -62,6 +63,20 @@ def test_regions_with_a_material_cover_every_cell_once():
         Simulator(body, {"cap": SILICONE})
     with pytest.raises(InputError, match="cap"):
         Simulator(clamped(rigid={"cap": Rigid()}), {"beam": SILICONE, "cap": SILICONE})
+
+
+def test_midpoint_is_refused_with_rigid_parts():
+    with pytest.raises(InputError, match="midpoint"):
+        Simulator(clamped(rigid={"cap": Rigid()}), SILICONE, integrator="midpoint")
+
+
+def test_names_that_two_energies_would_share_are_refused():
+    mesh = beam((6, 2, 2))
+    cap = {"cap": mesh.region("cap"), "a_cap": mesh.region("beam")}
+    one = Body(Mesh(mesh.vertices, mesh.cells, cap))
+    scene = Scene({"a": one, "a_a": clamped()})
+    with pytest.raises(InputError, match="two energies depend on a_a_cap"):
+        Simulator(scene, {"a": {"cap": SILICONE, "a_cap": SILICONE}, "a_a": {"beam": SILICONE, "cap": SILICONE}})
 
 
 def deviation(mesh, cells, q):

@@ -354,6 +354,7 @@ def test_bad_input_is_one_sentence(tmp_path, monkeypatch, overrides, sentence):
     code, err = run(*SYNTHETIC, *overrides)
     (last,) = err.strip().splitlines()[-1:]
     assert (code, "Traceback" in err) == (2, False)
+    assert last.startswith("error: ")
     assert offending(sentence) in last
 
 

@@ -67,6 +67,8 @@ class EnergySet:
             self._bound.append(bound)
             own = named({q.name: replace(q, name=f"{each.prefix}{q.name}") for q in energy.parameters})
             acting = named({q.name: replace(q, name=f"{each.prefix}{q.name}") for q in energy.inputs})
+            if twice := {*own, *acting} & {*self.parameters, *self.inputs}:
+                raise InputError(f"two energies depend on {min(twice)}: rename one of their bodies or regions.")
             self.parameters |= own
             self.inputs |= acting
             self.constants |= named(energy.constants)

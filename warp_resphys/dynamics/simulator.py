@@ -164,6 +164,8 @@ class Simulator:
         body = self.body
         self.rest_positions = self.tensor(body.vertices)  # (N, 3) [m]
         self.fixed = torch.as_tensor(body.fixed_vertices, device=self.device)
+        if self.integrator == "midpoint" and any(own.controls for _, own, _ in body.members):
+            raise InputError("integrator is midpoint, by which rigid parts ring: choose implicit_euler or bdf2.")
         self._coordinates = body.coordinates.on(self.rest_positions)
         placed = self._place_energies()
         self._set = EnergySet(placed, body, self.rest_positions, self.method, self.time_step)

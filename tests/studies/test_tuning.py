@@ -283,11 +283,12 @@ from warp_resphys.studies.tuning.space import Dimension
 from warp_resphys.studies.tuning.study import Study
 folder = Path({str(tmp_path)!r})
 space = {{"trainer.gamma": Dimension.of("gamma", {{"low": 0.8, "high": 1.0}})}}
+study = Study(folder, space, {{}}, 21, 0)
 print("ready", flush=True)
 while not (folder / "go").exists():
     time.sleep(1e-4)
-study = Study(folder, space, {{}}, 21, 0)
 while (claim := study.claim()) is not None:
+    time.sleep(0.1)  # a trial takes longer than a process waits for the lock
     study.end(claim, claim.settings["trainer.gamma"], 1.0)
     print(claim.number, claim.settings["trainer.gamma"], flush=True)
 """

@@ -180,13 +180,17 @@ def memory_checks(device: torch.device, steps: int) -> Iterator[Check]:
     """Whether kernels write to torch's memory, where it was from the start, and nothing leaves the device."""
     simulator = _beam(_meshes()["8-node hexahedra"], 0.45, device=device)
     potential = simulator.workspace(2).parts[0][1].potential
-    names = ("residual", "tangent", "energy")  # zero until a kernel has written them
-    before = {name: getattr(potential, name) for name in names}
+    written: dict[str, Callable[[], torch.Tensor]] = {  # zero until a kernel has written them
+        "residual": lambda: potential.residual,
+        "tangent": lambda: potential.tangents[0],
+        "energy": lambda: potential.energy,
+    }
+    before = {name: tensor() for name, tensor in written.items()}
     addresses = {name: tensor.data_ptr() for name, tensor in before.items()}
     empty = {name: not bool(tensor.any()) for name, tensor in before.items()}
     end = simulator.rollout(simulator.rest_state(2), steps, Inputs())
-    for name in names:
-        tensor = getattr(potential, name)
+    for name, read in written.items():
+        tensor = read()
         same = empty[name] and bool(tensor.any()) and tensor.data_ptr() == addresses[name]
         yield Check(f"{name}, written by kernels", "shared" if same else "copied", "shared", same)
     for name, tensor in {"positions": end.q, "velocities": end.v}.items():

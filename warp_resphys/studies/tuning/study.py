@@ -84,7 +84,8 @@ class Study:
                 content = journal.read_bytes()
                 os.truncate(journal, content.rfind(b"\n") + 1)  # a line that a full disk left half written
                 storage = JournalStorage(JournalFileBackend(str(journal)))
-                self._study = optuna.create_study(study_name=_NAME, storage=storage, load_if_exists=True)
+                there = _NAME in optuna.get_all_study_names(storage)  # To create it again would write to the journal.
+                self._study = (optuna.load_study if there else optuna.create_study)(study_name=_NAME, storage=storage)
         except OSError as error:
             raise DataFileError(f"cannot write {folder} ({error.strerror}): make it writable") from error
         except (ValueError, KeyError, AssertionError) as error:

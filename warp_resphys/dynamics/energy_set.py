@@ -7,7 +7,7 @@ and takes it away.
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 
@@ -20,8 +20,6 @@ from ..stepping.inputs import Inputs
 from ..stepping.integrators import Integrator
 from ..stepping.quantity import Quantity
 from ..stepping.state import ImplicitStage, State
-
-T = TypeVar("T")
 
 
 class EnergySet:

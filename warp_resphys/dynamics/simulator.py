@@ -96,7 +96,7 @@ def _material_of(material: Material | Materials, name: str) -> Material | Materi
         return material
     if name not in material:
         raise InputError(f"The body {name!r} has no material. Give one: there are {', '.join(material) or 'none'}.")
-    own = material[name]
+    own: Material | Materials = material[name]
     return own
 
 

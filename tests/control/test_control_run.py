@@ -349,7 +349,7 @@ def _marked(context, workers=None):
         ("control.shapes=[square]", "control.shapes is .*circle, eight or a capital letter"),
         ("control.seconds=[0.1]", "control.seconds has 0.1: a figure takes 20 steps at least"),
         ("control.plan.gradient=none", "control.plan.gradient is 'none': it must be one of reduced, adjoint"),
-        ("data.folds=leave_one_out", "control is for a robot with markers, .* of one split of its trials"),
+        ("data.folds=leave_one_out", "control is for a robot with markers.* of one split of its trials"),
         (
             "+laboratory.trials.t000={payload: 0.01};data.payload_at={z: -0.2}",
             "control drives a robot without payloads: leave them out of laboratory.trials",

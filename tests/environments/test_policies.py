@@ -136,9 +136,9 @@ def test_policies_of_several_seeds_are_told_in_one_row():
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ("seeds=[]", r"seeds is empty: name those with which policies are to learn, as in seeds=\[0,1,2\]"),
-        ("seeds=[0,0]", "different whole numbers"),
-        ("models=[]", "models is empty"),
+        ("seeds=[]", r"seeds is \[\]: it must be a list of one or more"),
+        ("seeds=[0,0]", "seeds is .*twice"),
+        ("models=[]", r"models is \[\]: it must be a list of one or more"),
     ],
 )
 def test_wrong_settings_are_refused(folder, tmp_path, monkeypatch, wrong, said):

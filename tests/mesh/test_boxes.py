@@ -10,6 +10,7 @@ from warp_resphys.io.errors import MeshError
 from warp_resphys.mesh.boxes import boxes_hexahedra
 from warp_resphys.mesh.mesh import boundary_triangles, box_hexahedra, check_mesh
 from warp_resphys.mesh.quality import cell_volumes
+from warp_resphys.settings.body import BoxesMesh
 
 PLATE, SIDES, FIN = (
     ((-0.005, -0.025, 0.0), (0.005, 0.025, 0.06)),
@@ -44,7 +45,7 @@ def test_one_box_is_a_box():
 
 
 def test_of_a_configuration():
-    config = {"kind": "boxes", "boxes": [[[0, 0, 0], [0.1, 0.03, 0.03]]], "size": 0.01, "nodes": 8}
+    config = BoxesMesh(kind="boxes", boxes=[[[0, 0, 0], [0.1, 0.03, 0.03]]], size=0.01)
     assert len(build_mesh(config).cells) == 90
     assert len(build_mesh(finer(config, 2.0)).cells) == 720
 

@@ -31,7 +31,7 @@ def driven_settings(folder: Path) -> DriveStage:
         InputError: none have.
         DataFileError: there is no such run, or it has changed since.
     """
-    if folder.is_dir() and not (folder / DRIVEN).is_file():
+    if (folder / "stages").is_dir() and not (folder / DRIVEN).is_file():
         raise InputError(
             f"no motion was driven in {folder}: name a finished run of an experiment with control, as sopra_control."
         )

@@ -76,8 +76,8 @@ class InputSequences:
             matrix = same + (1.0 - same) * matrix
         if matrix.shape != (parts, parts):
             raise InputError(
-                f"the correlations of the inputs have the shape {matrix.shape}: give one number, or a matrix for "
-                f"{parts} parts."
+                f"correlation is {np.asarray(self.correlation).tolist()}: give one number, or a matrix of "
+                f"{parts} rows and {parts} columns, one for each part that is driven."
             )
         try:
             return np.asarray(np.linalg.cholesky(matrix))

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import fields
 from functools import lru_cache
 from importlib import resources
+from pathlib import Path
 
 import torch
 from numpy.typing import ArrayLike
@@ -83,8 +84,13 @@ def build_mesh(settings: MeshSettings) -> Mesh:
         InputError: an unknown arm.
         MeshError: a mesh that cannot be read or simulated.
     """
+    return _built_mesh(settings.model_dump_json(), _file_of(settings))
+
+
+def _file_of(settings: MeshSettings) -> str | None:
+    """Digest of the file that a mesh is read from, if there is one: what is built is built anew where it changes."""
     path = getattr(settings, "path", None)
-    return _built_mesh(settings.model_dump_json(), None if path is None else digest(path))
+    return digest(path) if path is not None and Path(path).is_file() else None
 
 
 @lru_cache(maxsize=8)
@@ -179,9 +185,8 @@ def build_body(settings: BodySettings, payload_at: PlaceSettings | None = None, 
     if mesh is not None:
         return _body(settings, payload_at, mesh)
     of_body = BodySettings.of(settings)
-    path = getattr(settings.mesh, "path", None)
     place = None if payload_at is None else payload_at.model_dump_json()
-    return _built_body(of_body.model_dump_json(), place, None if path is None else digest(path))
+    return _built_body(of_body.model_dump_json(), place, _file_of(settings.mesh))
 
 
 @lru_cache(maxsize=8)

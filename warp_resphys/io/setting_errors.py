@@ -28,7 +28,10 @@ def sentence(schema: Schema, values: Any, where: str, errors: Sequence[ErrorDeta
         errors: of pydantic.
     """
     located = [(error, _path(values, error)) for error in errors]
-    error, path = max(located, key=lambda each: (each[0]["type"] == "extra_forbidden", len(each[1])))
+    error, path = max(
+        located,
+        key=lambda each: (each[0]["type"] == "extra_forbidden", len(each[1]), each[0]["type"] == "value_error"),
+    )
     key, kind, context = _dotted(path, where), error["type"], error.get("ctx", {})
     if kind == "extra_forbidden":
         return _unknown(schema, values, where, path)
@@ -55,11 +58,19 @@ def _unknown(schema: Schema, values: Any, where: str, path: Path) -> str:
     inside = _value(values, group)
     choices = sorted(options(schema, _node(schema, group, values)), key=lambda each: not _fits(each, inside))
     own = list(next((each["properties"] for each in choices if "properties" in each), {}))
-    known = list(keys(schema))
+    known, key = list(keys(schema)), _dotted(path, where)
+    if kind := _kind_with(choices, name):
+        return f"{key} is a setting of kind {kind}, not of {inside['kind']}: leave it out, as ~{key}."
     same = [each for each in known if each.rpartition(".")[2] == name]
     hint = did_you_mean(name, same, preferred=same) or did_you_mean(name, own) or did_you_mean(_dotted(path), known)
     at = _dotted(group, where)
-    return f"unknown key '{_dotted(path, where)}'" + (hint or f": {at or 'a configuration'} has {', '.join(own)}.")
+    return f"unknown key '{key}'" + (hint or f": {at or 'a configuration'} has {', '.join(own)}.")
+
+
+def _kind_with(choices: Sequence[Schema], name: str) -> str:
+    """The kind among those that a group may have whose key a name is; empty where there is none."""
+    kinds = [each["properties"] for each in choices if "kind" in each.get("properties", {})]
+    return next((str(_words_of(each["kind"])[0]) for each in kinds[1:] if name in each), "")
 
 
 def keys(schema: Schema, node: Schema | None = None, prefix: str = "") -> Iterator[str]:

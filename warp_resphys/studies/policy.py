@@ -4,17 +4,19 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
+from pydantic import AfterValidator
 
 from ..io.errors import InputError
 from ..io.files import read_json, write_json
 from ..io.progress import Progress
 from ..io.settings import Count, Natural, Settings, Some, Word, parse, setting
 from ..io.stages import finished_record
+from ..settings.trials import Labels, different
 from .command import show, table_of
 
 _SEED: Final = 1000  # of the episodes in which policies are tried
@@ -26,11 +28,11 @@ class Policies(Settings):
 
     run: Word = setting(description="folder of a run with a laboratory")
     skill: Literal["reach", "follow"]
-    models: Some[Word] = setting(description="on which policies learn, such as sysid and resphys")
+    models: Labels = setting(description="on which policies learn, such as sysid and resphys")
     steps: Natural = setting(description="actions of all robots together")
     robots: Natural = setting(description="that learn at once")
     episodes: Natural = setting(description="in which policies are tried")
-    seeds: Some[Count]
+    seeds: Annotated[Some[Count], AfterValidator(different)] = setting(description="of the policies")
 
 
 def train_policy(config: Mapping[str, Any], folder: Path) -> None:

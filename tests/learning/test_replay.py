@@ -12,7 +12,7 @@ from warp_resphys.data.trials import Trials
 from warp_resphys.dynamics.modes import vibration_modes
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.io.settings import parse
-from warp_resphys.learning.parameters import configured_parameters, first_guesses, tilted_gravity
+from warp_resphys.learning.parameters import configured_parameters, tilted_gravity
 from warp_resphys.learning.release import ReleaseSettings, estimate_release, hold, sideways_shapes, velocity_shapes
 from warp_resphys.learning.replay import Replay, Start, sample
 from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
@@ -140,22 +140,18 @@ def test_parts_have_parameters_of_their_own():
         torch.testing.assert_close(found, double(wanted).repeat_interleave(2, 0))
 
 
-def test_first_guesses_are_those_of_the_simulation_unless_they_are_given():
-    """A part's is that of all; what is called like a command of an input need not be one."""
-    settings = {
-        "simulation": {"youngs_modulus": 2e5, "model": "corotated"},
-        "tendons": {"stiffness": 300.0},
-        "medium": {"density": 1000.0, "normal": 1.1},
-        "identify": {"first_guess": {"fibre_stiffness": 2000.0, "tendon_stiffness_rise": 50.0}},
-    }
+def test_configured_parameters_are_those_of_the_simulator():
+    """A part's is its own; what is called like a command of an input need not be one."""
+    mesh = box_hexahedra((0.1, 0.03, 0.03), (2, 1, 1))
+    routes = {name: [(0.0, y, 0.015), (0.1, y, 0.015)] for name, y in (("low", 0.01), ("rise", 0.02))}
+    tendons = Tendons([*routes.values()], stiffness=[300.0, 400.0], labels=[*routes])
+    sim = Simulator(Body(mesh, fixed=[0, 1, 2, 3], energies=(tendons,)), Corotated(2e5, 0.45))
     wanted = {
-        **{"youngs_modulus": 2e5, "tendon_stiffness": 300.0, "tendon_stiffness_left": 300.0, "drag_normal": 1.1},
-        **{"tendon_stiffness_rise": 50.0, "fibre_stiffness_2": 2000.0, "medium_density": 1000.0, "drag_linear": 0.0},
-        **{"pressure_factor": 1.0, "pressure_rise": 0.0, "attached_mass_factor": 1.0, "tendon_offset_1_factor": 0.0},
+        **{"youngs_modulus": 2e5, "tendon_stiffness_low": 300.0, "tendon_stiffness_rise": 400.0},
+        **{"tendon_contraction_factor": 1.0, "tendon_contraction_rise": 0.0, "attached_mass_factor": 1.0},
+        **{"gravity_tilt_1": 0.0},
     }
-    assert first_guesses(settings, wanted) == wanted
-    configured = configured_parameters(settings, ["fibre_stiffness", "tendon_stiffness_rise"])
-    assert configured == {"fibre_stiffness": 0.0, "tendon_stiffness_rise": 300.0}
+    assert configured_parameters(sim, wanted) == wanted
 
 
 def test_before_its_release_a_body_holds_still_and_frames_lie_between_steps():

@@ -6,8 +6,8 @@ A mesh and a body are built once a process for the same settings, as checks, sta
 import json
 import math
 import re
-from collections.abc import Sequence
-from dataclasses import fields
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
@@ -21,19 +21,21 @@ from ..dynamics.nonlinear_solver import SolverSettings
 from ..dynamics.simulator import Simulator
 from ..energies.materials import Material, make_material
 from ..fem.body import Body
+from ..fem.rigid import Rigid
 from ..io.atomic import digest
-from ..io.errors import InputError
+from ..io.errors import InputError, MeshError
 from ..io.settings import parse
 from ..mesh.arm import mesh_arm
 from ..mesh.arm_geometry import ArmGeometry
 from ..mesh.boxes import boxes_hexahedra
-from ..mesh.mesh import Mesh, box_hexahedra, box_tetrahedra, check_mesh, quadratic, select_vertices
+from ..mesh.mesh import Mesh, box_hexahedra, box_tetrahedra, check_mesh, quadratic, select_cells, select_vertices
 from ..mesh.readers import read_mesh
 from ..mesh.rod import rod
 from ..mesh.tetrahedra import fill_surface
 from ..settings.body import (
     BodySettings,
     BoxesMesh,
+    BoxSettings,
     FileMesh,
     GeneratedArm,
     HexahedralBox,
@@ -158,16 +160,19 @@ def shipped_arm(name: str) -> Mesh:
         return read_mesh(path)
 
 
-def build_material(settings: MaterialSettings, key: str) -> Material:
-    """The material of a group, whose dotted key errors begin with.
+def build_material(settings: MaterialSettings, key: str) -> Material | dict[str, Material]:
+    """The material of a group, or those of its regions by name; errors begin with the group's dotted key.
 
     Raises:
         InputError: an unknown constant, or one out of range.
     """
-    try:
-        return make_material(settings.model, **settings.constants)
-    except InputError as error:
-        raise InputError(f"{key}: {error}") from error
+    found = {}
+    for region, own in settings.by_region.items():
+        try:
+            found[region] = make_material(own.model, **own.constants)
+        except InputError as error:
+            raise InputError(f"{key}.regions.{region}: {error}" if region else f"{key}: {error}") from error
+    return found.get("", found)
 
 
 def build_body(settings: BodySettings, payload_at: PlaceSettings | None = None, mesh: Mesh | None = None) -> Body:
@@ -198,9 +203,22 @@ def _built_body(content: str, place: str | None, file: str | None) -> Body:
 
 
 def _body(settings: BodySettings, payload_at: PlaceSettings | None, mesh: Mesh) -> Body:
+    mesh = _with_regions(mesh, settings.regions)
     energies = build_actuators(settings, mesh, payload_at)
     fixed = select_vertices(mesh, **settings.fixed.arguments())
-    return Body(mesh, energies=tuple(energies), fixed=fixed, **dict(settings.physics))
+    rigid = {name: Rigid(**dict(part)) for name, part in settings.rigid.items()}
+    return Body(mesh, energies=tuple(energies), fixed=fixed, rigid=rigid, **dict(settings.physics))
+
+
+def _with_regions(mesh: Mesh, boxes: Mapping[str, BoxSettings]) -> Mesh:
+    """A mesh with the regions of the group ``regions`` beside its own."""
+    regions = dict(mesh.regions)
+    for name, box in boxes.items():
+        try:
+            regions[name] = select_cells(mesh, **box.arguments())
+        except MeshError as error:
+            raise MeshError(f"regions.{name}: {error}") from None
+    return replace(mesh, regions=regions)
 
 
 def bound_markers(settings: BindingSettings, mesh: Mesh, places: ArrayLike, labels: Sequence[str]) -> Markers:

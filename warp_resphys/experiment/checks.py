@@ -70,7 +70,7 @@ def check_run(run: RunSettings) -> None:
         _check_control(run, body)
     if run.identify is not None:
         known = [name for name in known_parameters(simulator) if run.payload_at is not None or name != MASS_FACTOR]
-        _check_identification(run.identify, known)
+        _check_identification(run.identify, known, simulator)
         _check_parts(run.identify, simulator)
 
 
@@ -278,7 +278,8 @@ def _check_laboratory(run: RunSettings, data: RecordedData, trials: Sequence[Tri
             input_sequences(played).draw(data.steps, run.time_step, len(drive.parts), random)
     with _naming("laboratory: "):
         body = build_body(laboratory_settings(played), played.payload_at)
-    _check_size(body, material, run.gravity)
+    for each in (material,) if isinstance(material, Material) else material.values():
+        _check_size(body, each, run.gravity)
 
 
 def _check_size(body: Body, material: Material, gravity: Sequence[float]) -> None:
@@ -301,7 +302,7 @@ def _check_size(body: Body, material: Material, gravity: Sequence[float]) -> Non
         )
 
 
-def _check_identification(identify: IdentifySettings, known: Sequence[str]) -> None:
+def _check_identification(identify: IdentifySettings, known: Sequence[str], simulator: Simulator) -> None:
     """Checks the names in the group ``identify``, given the parameters that may be identified."""
     if not identify.parameters:
         raise InputError(f"identify.parameters is empty: give a range of one or more of {', '.join(known)}.")
@@ -318,7 +319,7 @@ def _check_identification(identify: IdentifySettings, known: Sequence[str]) -> N
                 instead = f"choose from {', '.join(choice)}" if choice else f"set identify.{group} to null"
                 raise InputError(f"identify.{group} names '{name}': {instead}.")
     for name, each in identify.parameters.items():
-        if command_of(name)[1] in ("delay", "rise") and each.lower < 0.0:
+        if command_of(simulator, name)[1] in ("delay", "rise") and each.lower < 0.0:
             raise InputError(
                 f"identify.parameters.{name}.lower is {each.lower:g}: nothing comes before its command, so it must be "
                 "zero or more, in s; data.trials.NAME.onset says when a command comes."

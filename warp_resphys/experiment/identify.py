@@ -13,7 +13,7 @@ from ..io.resumable import forget_checkpoint, keep_checkpoint, resume_checkpoint
 from ..io.stages import StageContext
 from ..learning.bounds import Bounds, Prior
 from ..learning.identification import Identifier
-from ..learning.parameters import first_guesses
+from ..learning.parameters import configured_parameters
 from ..learning.placement import Accuracy
 from ..learning.replay import Replay, Start
 from ..settings.learning import RangeSettings
@@ -52,7 +52,9 @@ def identify(context: StageContext) -> None:
             replays[model] = scene.replays(scene.simulator(kinds[model]), names)
             placed = _placement(scene) if model == "sysid" else {}
             identifier = Identifier(replays[model], bounds, _seconds(settings, replays[model]), **placed)
-            found[model] = _search(settings, identifier, kept[model], progress)
+            guess = {**configured_parameters(scene.simulator(kinds[model]), bounds), **wanted.first_guess}
+            guess = {name: guess[name] for name in bounds}
+            found[model] = _search(settings, identifier, guess, kept[model], progress) | {"first_guess": guess}
     if wanted.grid is not None:
         seconds = _seconds(settings, replays["sysid"]) if wanted.seconds is not None else None
         grid = {name: each for name, each in dict(wanted.grid).items() if each is not None}
@@ -112,18 +114,20 @@ def _seconds(settings: IdentifyStage, replays: Replays) -> float | None:
     return min((each for each in limits if each is not None), default=None)
 
 
-def _search(settings: IdentifyStage, identifier: Identifier, kept: _Kept, progress: Progress) -> dict[str, Any]:
-    """The `Identification` of a model, as plain data; goes on from where an interrupted one ended."""
+def _search(
+    settings: IdentifyStage, identifier: Identifier, guess: Mapping[str, float], kept: _Kept, progress: Progress
+) -> dict[str, Any]:
+    """The `Identification` of a model from a first guess, as plain data; goes on where an interrupted one ended."""
     if "found" in kept.content:
         return dict(kept.content["found"])
-    wanted, bounds = settings.identify, identifier.bounds
+    wanted = settings.identify
     if "starts" not in kept.content:
-        guess = first_guesses(settings.plain(), bounds)
         starts = identifier.starts(guess, wanted.starts, wanted.candidates, settings.seed)
         kept.keep(starts=starts, attempts=[])
 
     def report(start: int, loss: float, values: Mapping[str, float]) -> None:
-        progress.advance(1, start=start, loss=f"{loss:.3g}", E=f"{values.get('youngs_modulus', 0.0) / 1e3:.4g} kPa")
+        name, value = next(iter(values.items()))
+        progress.advance(1, start=start, loss=f"{loss:.3g}", **{name: f"{value:.4g}"})
 
     def keep(attempts: list[Any]) -> None:
         kept.keep(attempts=attempts)

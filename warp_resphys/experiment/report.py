@@ -27,7 +27,7 @@ from ..report.notes import error_notes, kept_note, material_note, network_note, 
 from ..report.run_page import write_report
 from ..settings.run import RunSettings
 from .actuators import build_chambers, driving_quantity
-from .build import bound_markers, build_body, build_mesh, choose_device, sight_of
+from .build import bound_markers, build_body, build_mesh, build_simulator, choose_device, sight_of
 from .files import (
     CONTROL,
     DATASET,
@@ -89,8 +89,8 @@ def make_report(context: StageContext) -> None:
         network_note=_network_note(run) if learned else "",
         kept_note=kept_note(metrics["networks"]),
         followed=read_followed(folder, run),
-        simulator=material_note(run.simulation.plain()),
-        target="" if run.target is None else material_note(run.target.plain()),
+        simulator=material_note(run.simulation),
+        target="" if run.target is None else material_note(run.target),
     )
     write_report(folder / REPORT, data)
 
@@ -162,6 +162,7 @@ def collect_metrics(folder: Path, run: RunSettings, stages: Sequence[str] | None
         **read_json(folder / ERRORS),
         "networks": {name: read_json(path)["kept"] for name, path in files.items() if path.is_file()},
         "parameters": {name: each["parameters"] for name, each in identified.items() if "parameters" in each},
+        "first_guesses": {name: each["first_guess"] for name, each in identified.items() if "first_guess" in each},
         **{key: value for key, value in more.items() if value},
         **resources_used(folder, stages),
         "versions": package_versions(),
@@ -172,7 +173,8 @@ def collect_metrics(folder: Path, run: RunSettings, stages: Sequence[str] | None
 def data_sheet(run: RunSettings, identification: Mapping[str, Any]) -> dict[str, float]:
     """What the simulator has of all that was identified, and of what the landscape is drawn over."""
     names = {name for found in identification.values() for name in found.get("parameters", {})}
-    return configured_parameters(run.plain(), (*names, "youngs_modulus", "poissons_ratio"))
+    simulator = build_simulator(run, run.simulation, payload_at=run.payload_at)
+    return configured_parameters(simulator, (*names, "youngs_modulus", "poissons_ratio"))
 
 
 def read_trials(folder: Path, run: RunSettings) -> TrialResults:

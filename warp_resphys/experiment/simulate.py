@@ -279,7 +279,7 @@ def _truth(settings: PlayedSettings, setup: Setup, trials: Sequence[Trial], nois
     wound = {} if fibres is None else {"fibre_stiffness": fibres.stiffness}
     released = {trial.name: _released_at(settings, trial, _draw_of(settings, trial)) for trial in trials}
     return {
-        "material": {**material.plain(), **wound},
+        "material": {"model": material.model, **material.parameters, **wound},
         "fibre_angles": [] if fibres is None else fibres.angles,
         "gravity": setup.gravity,
         "rotation": setup.rotation.as_matrix(),

@@ -5,37 +5,18 @@ A name is that of a simulator's parameter (``youngs_modulus``), the same of one 
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Final
+from typing import Final
 
 import torch
 
 from ..dynamics.simulator import Simulator
-from ..energies.muscles import CONTRACTION as MUSCLE_CONTRACTION
-from ..energies.muscles import STRESS
-from ..energies.pressure import PRESSURE
 from ..energies.strings import PAYLOAD
-from ..energies.tendons import CONTRACTION, TENSION
 from ..io.errors import InputError
 
 MASS_FACTOR: Final = "attached_mass_factor"
 TILTS: Final = ("gravity_tilt_1", "gravity_tilt_2")
 HUNG: Final = ("attached_mass", PAYLOAD.name)
 _COMMANDS: Final = ("factor", "delay", "rise")  # that may be unknown of an input, in the order in which they act
-_DRIVES: Final = tuple(each.name for each in (PRESSURE, TENSION, CONTRACTION, STRESS, MUSCLE_CONTRACTION))
-# By group of a configuration: its keys, and the parameters that they are.
-_CONFIGURED: Final[Mapping[str, Mapping[str, str]]] = {
-    "fibres": {"stiffness": "fibre_stiffness"},
-    "tendons": {"stiffness": "tendon_stiffness"},
-    "muscles": {"stiffness": "muscle_stiffness"},
-    "payload_string": {"length": "string_length", "compliance": "string_compliance"},
-    "medium": {
-        "density": "medium_density",
-        "linear": "drag_linear",
-        "normal": "drag_normal",
-        "tangential": "drag_tangential",
-        "layer": "added_layer",
-    },
-}
 
 
 def known_parameters(simulator: Simulator) -> tuple[str, ...]:
@@ -126,40 +107,22 @@ def tilted_gravity(simulator: Simulator, first: torch.Tensor | None, second: tor
     return strength * direction / direction.norm(dim=1, keepdim=True)
 
 
-def command_of(name: str) -> tuple[str, str]:
+def command_of(simulator: Simulator, name: str) -> tuple[str, str]:
     """The input, and which of factor, delay and rise a name is of its commands; both empty for another name."""
     driven, _, what = name.rpartition("_")
-    return (driven, what) if driven in _DRIVES and what in _COMMANDS else ("", "")
+    return (driven, what) if driven in simulator.inputs and driven not in HUNG and what in _COMMANDS else ("", "")
 
 
-def configured_parameters(settings: Mapping[str, Any], names: Iterable[str]) -> dict[str, float]:
-    """Those of the uncorrected simulation of a configuration; a part has that of all parts."""
-    return _of(_configured(settings), names)
-
-
-def first_guesses(settings: Mapping[str, Any], names: Iterable[str]) -> dict[str, float]:
-    """What a search begins with: the configured first guesses, else `configured_parameters`."""
-    return _of({**_configured(settings), **((settings.get("identify") or {}).get("first_guess") or {})}, names)
-
-
-def _configured(settings: Mapping[str, Any]) -> dict[str, float]:
-    values = {key: value for key, value in settings.get("simulation", {}).items() if key != "model"}
-    for group, keys in _CONFIGURED.items():
-        given = settings.get(group) or {}
-        values |= {parameter: given[key] for key, parameter in keys.items() if key in given}
-    return values
-
-
-def _of(values: Mapping[str, float], names: Iterable[str]) -> dict[str, float]:
-    """The values by name, of parts those of the whole; where there are none, what changes nothing."""
+def configured_parameters(simulator: Simulator, names: Iterable[str]) -> dict[str, float]:
+    """What a simulator has of parameters: its own constants, a part that of all parts; else what changes nothing."""
+    of_parts = parameters_of_parts(simulator)
 
     def find(name: str) -> float:
-        if name in values:
-            return float(values[name])
-        driven, what = command_of(name)
-        if driven or name == MASS_FACTOR:
-            return 1.0 if not driven or what == "factor" else 0.0
-        wholes = [each for each in values if name.startswith(f"{each}_")]
-        return float(values[max(wholes, key=len)]) if wholes else 0.0
+        constant, part = of_parts.get(name, (name, None))
+        if constant in simulator.parameters:
+            value = simulator.tensor(simulator.constants[constant]).flatten()
+            return float(value[0 if part is None or len(value) == 1 else part])
+        driven, what = command_of(simulator, name)
+        return 1.0 if name == MASS_FACTOR or (driven and what == "factor") else 0.0
 
     return {name: find(name) for name in names}

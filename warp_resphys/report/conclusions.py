@@ -1,5 +1,6 @@
 """Conclusions of a run: which step helped, by more than chance, how far its intervals hold, and what to try next."""
 
+import math
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -7,7 +8,6 @@ from statistics import fmean
 from typing import Any, Final
 
 from ..learning.metrics import Gain, PublishedError, paired_gain, published_errors
-from ..learning.parameters import first_guesses
 from .page import MINUS
 
 # By model: what it is called, and what it adds to the first of these models that there is.
@@ -179,7 +179,7 @@ def _advice(identified: Identified) -> str:
                 f"{name} was identified at its {end} bound, {bound:g}: {widen}, or look for what it makes up for, "
                 "such as a wrong weight, mesh or registration."
             )
-    if identified.has_prior or abs(identified.value - identified.start) > close:
+    if identified.has_prior or not abs(identified.value - identified.start) <= close:
         return ""
     return (
         f"{name} stayed at its first guess, {identified.start:g}: raise identify.max_evaluations or identify.starts, "
@@ -195,7 +195,7 @@ def _identified(metrics: Mapping[str, Any], settings: Mapping[str, Any]) -> list
         ranges = config.get(place) or {}
         for name, value in metrics.get("parameters", {}).get(model, {}).items():
             if own := ranges.get(name):
-                start = first_guesses(settings, [name])[name]
+                start = metrics.get("first_guesses", {}).get(model, {}).get(name, math.nan)
                 key, has_prior = f"identify.{place}.{name}", own.get("prior") is not None
                 identified.append(Identified(key, value, own["lower"], own["upper"], start, has_prior))
     return identified

@@ -8,7 +8,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from ..learning.parameters import command_of
 from .data import MODELS, FloatArray, RunReport
 from .page import MINUS, NO_BREAK_SPACE, NONE, Canvas, Cell, Drawn, Part, Row, Table, Text
 
@@ -26,6 +25,7 @@ _PARAMETERS: Final[Mapping[str, Wording]] = {
     "tendon_offset_1": ("First offset of the tendons", "mm", 1e3),
     "tendon_offset_2": ("Second offset of the tendons", "mm", 1e3),
 }
+_MATERIAL: Final = tuple(_PARAMETERS)[:5]  # Of which a region may have its own.
 _COMMANDS: Final[Mapping[str, Wording]] = {
     "factor": ("Factor", "", 1.0),
     "delay": ("Delay", "ms", 1e3),
@@ -129,9 +129,8 @@ def parameter_rows(identified: Mapping[str, Any], start: Mapping[str, float], tr
 
 def _wording(parameter: str) -> Wording:
     """Name, unit and factor of a parameter, also of one of a tendon, of a branch or of the commands of an input."""
-    driven, command = command_of(parameter)
-    if driven:
-        (kind, unit, factor), words = _COMMANDS[command], driven.rpartition("_")[2]
+    if command := re.fullmatch(r"(?:.+_)?(pressure|tension|contraction|stress)_(factor|delay|rise)", parameter):
+        (kind, unit, factor), words = _COMMANDS[command[2]], command[1]
         return f"{kind} of the {words}{'es' if words.endswith('s') else 's'}", unit, factor
     if offset := re.fullmatch(r"(tendon_offset_[12])_(.+)", parameter):
         kind, unit, factor = _PARAMETERS[offset[1]]
@@ -139,6 +138,10 @@ def _wording(parameter: str) -> Wording:
     if branch := re.fullmatch(r"prony_(ratio|time)_(\d+)", parameter):
         kind, number = branch.groups()
         return (f"Relaxation time {number}", "s", 1.0) if kind == "time" else (f"Prony ratio {number}", "", 1.0)
+    region = next((parameter.removesuffix(f"_{name}") for name in _MATERIAL if parameter.endswith(f"_{name}")), "")
+    if region:
+        kind, unit, factor = _PARAMETERS[parameter.removeprefix(f"{region}_")]
+        return f"{kind} of {region}", unit, factor
     return _PARAMETERS.get(parameter, (parameter, "", 1.0))
 
 

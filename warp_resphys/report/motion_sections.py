@@ -4,11 +4,14 @@ from concurrent.futures import Executor, Future
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from statistics import fmean
 from typing import Any, Final
 
 import numpy as np
 from markupsafe import Markup
 
+from ..io.settings import parse
+from ..settings.body import MaterialSettings
 from .bodies import ComparedMotion, distance_scene, largest_distances
 from .camera import hangs
 from .data import (
@@ -229,7 +232,8 @@ def body_section(data: RunReport, canvas: Canvas) -> Part | None:
     def body(path: Path) -> Drawn:
         from .body_picture import MeshSummary, draw_mesh
 
-        density = float(data.settings["simulation"]["density"])
+        constants = parse(MaterialSettings, data.settings["simulation"]).parameters
+        density = fmean(value for name, value in constants.items() if name.endswith("density"))
         coloured = f"{quantity.per}s".capitalize()
         summary = MeshSummary(data.mesh, density, data.fixed, data.chambers, data.tendons, coloured)
         draw_mesh(path, summary, trials.bound if trials.labels else None)

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from ..energies.materials import make_material
+from ..settings.body import MaterialSettings
 from .page import number_text
 
 _SELECTED_BY: Final = {"rollout": "roll-out error", "validation_loss": "validation loss"}
@@ -116,10 +117,12 @@ def _validated(kept: Mapping[str, Any]) -> str:
     return f"its mean roll-out error on the validation split is {number_text(error)} mm"
 
 
-def material_note(material: Mapping[str, Any]) -> str:
-    """Return the constants of a material, and its model where it is not the usual one."""
-    constants: dict[str, Any] = dict(make_material(**material).constants)
-    model = material.get("model", "corotated")
+def material_note(material: MaterialSettings) -> str:
+    """Return the constants of a material, and its model where it is not the usual one; a region at a time."""
+    if material.regions:
+        return "; ".join(f"{region}: {material_note(own)}" for region, own in material.by_region.items())
+    model = material.model
+    constants: dict[str, Any] = dict(make_material(model, **material.constants).constants)
     if "youngs_modulus" in constants:
         words = f"E {constants['youngs_modulus'] / 1e3:g} kPa, ν {constants['poissons_ratio']:g}"  # noqa: RUF001
     else:

@@ -31,6 +31,7 @@ from ..settings.trials import MarkerSettings
 _KIND: Final = "robot"
 _EVALUATE: Final = "evaluate"
 _NETWORK: Final = "network."
+_REGION: Final = "region."
 _PLAIN: Final = (  # fields that are written as they are
     *("name", "model", "settings", "material", "parameters", "uncertainty", "payload_at", "markers", "labels", "sets"),
     *("placement", "filters", "sees_payload", "told_of_base", "seen", "level", "errors_mm"),
@@ -117,6 +118,7 @@ class Description:
         metadata: dict[str, Any] = {key: getattr(self, key) for key in _PLAIN}
         metadata["intervals"] = None if self.intervals is None else self.intervals.plain()
         tensors = {"vertices": torch.from_numpy(self.mesh.vertices), "cells": torch.from_numpy(self.mesh.cells)}
+        tensors |= {f"{_REGION}{name}": torch.from_numpy(cells) for name, cells in self.mesh.regions.items()}
         tensors |= {} if self.bound is None else {"bound": self.bound}
         if self.learned is not None:
             network = self.learned.network
@@ -147,8 +149,9 @@ class Description:
         if found["told_of_base"] is not None:
             found["told_of_base"] = tuple(found["told_of_base"])
         found["seen"] = {key: (tuple(low), tuple(high)) for key, (low, high) in found["seen"].items()}
+        regions = {name.removeprefix(_REGION): x.numpy() for name, x in tensors.items() if name.startswith(_REGION)}
         return cls(
-            mesh=Mesh(tensors["vertices"].numpy(), tensors["cells"].numpy()),
+            mesh=Mesh(tensors["vertices"].numpy(), tensors["cells"].numpy(), regions),
             bound=tensors.get("bound"),
             learned=learned,
             intervals=None if intervals is None else Intervals.from_plain(intervals),

@@ -176,18 +176,61 @@ class PhysicsSettings(Settings):
     )
 
 
-class MaterialSettings(Settings):
-    """A material and its constants, in SI units; `energies.materials` has those of each model."""
+class _Constants(Settings):
+    """Constants by name, in SI units; `energies.materials` has those of each model."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, float]
-
-    model: Word = setting("corotated", "constitutive model")
 
     @property
     def constants(self) -> dict[str, float]:
         """By name, such as ``youngs_modulus`` [Pa]."""
         return dict(self.__pydantic_extra__)
+
+
+class RegionMaterialSettings(_Constants):
+    """The material of a region: what is left out is as in the group around it."""
+
+    model: Word | None = setting(None, "constitutive model; another one shares no constants but its own")
+
+
+class MaterialSettings(_Constants):
+    """A material and its constants, in SI units; `energies.materials` has those of each model."""
+
+    model: Word = setting("corotated", "constitutive model")
+    regions: dict[str, RegionMaterialSettings] = setting({}, "regions of the mesh with a material of their own")
+
+    @property
+    def by_region(self) -> "dict[str, MaterialSettings]":
+        """Materials by the name of their region; of an empty name where one is that of the whole body."""
+        if not self.regions:
+            return {"": self}
+        whole: dict[str, Any] = {"model": self.model, **self.constants}
+        return {
+            name: MaterialSettings(
+                **{
+                    **(whole if own.model in (None, self.model) else {"model": own.model}),
+                    **own.constants,
+                }
+            )
+            for name, own in self.regions.items()
+        }
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Constants by the name of the simulator's parameter, such as ``tip_youngs_modulus`` of a region ``tip``."""
+        return {
+            f"{region}_{name}" if region else name: value
+            for region, material in self.by_region.items()
+            for name, value in material.constants.items()
+        }
+
+
+class RigidSettings(Settings):
+    """A region that hardly deforms, such as an end cap or an insert; see `fem.rigid.Rigid`."""
+
+    density: Positive = setting(1200.0, unit="kg/m^3")
+    stiffness: Positive = setting(1.0e9, "of the energy that keeps it rigid", "Pa")
 
 
 class ChamberSettings(Settings):
@@ -307,6 +350,8 @@ class BodySettings(Settings):
 
     mesh: MeshSettings
     physics: PhysicsSettings = PhysicsSettings()
+    regions: dict[str, BoxSettings] = setting({}, "cells by the name of their region, beside those that a file names")
+    rigid: dict[str, RigidSettings] = setting({}, "regions that are rigid parts")
     fixed: PlaceSettings = setting(description="vertices that are held")
     chambers: ChamberSettings | None = setting(None, "chambers under pressure")
     fibres: FibreSettings | None = setting(None, "fibres around the chambers")

@@ -71,7 +71,7 @@ class PlacementSettings(Settings):
 
 
 def _without_null(values: Any) -> Any:
-    """Takes out the parameters whose range is null."""
+    """Takes out the parameters whose range or first guess is null."""
     return {key: each for key, each in values.items() if each is not None} if isinstance(values, dict) else values
 
 
@@ -79,6 +79,7 @@ Ranges = Annotated[
     dict[str, RangeSettings],
     BeforeValidator(_without_null, json_schema_input_type=dict[str, RangeSettings | None]),
 ]
+Guesses = Annotated[dict[str, float], BeforeValidator(_without_null, json_schema_input_type=dict[str, float | None])]
 
 
 class IdentifiedSettings(Settings):
@@ -98,7 +99,7 @@ class IdentifySettings(IdentifiedSettings):
         {}, "ranges by name; null, or ~identify.parameters.NAME, takes one out; docs/identification has the names"
     )
     placement: PlacementSettings | None = setting(None, "identify where markers sit and how recordings lie")
-    first_guess: dict[str, float] = setting({}, "where the data sheet says nothing")
+    first_guess: Guesses = setting({}, "where the data sheet says nothing; null takes one out")
     trials: Natural | None = setting(None, "of the training, evenly picked; null: all")
     seconds: Positive | None = setting(None, "of each; null: all that counts", "s")
     starts: Natural = setting(1, "searches: from the first guess, and the best of random candidates")

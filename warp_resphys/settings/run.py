@@ -230,6 +230,16 @@ class RunSettings(SimulatorSettings):
         return self
 
     @model_validator(mode="after")
+    def _holds_rigid_parts(self) -> Self:
+        used = {"integrator": self.integrator}
+        used |= {} if self.identify is None else {"identify.integrator": self.identify.integrator or self.integrator}
+        if self.is_laboratory and self.laboratory is not None:
+            used["laboratory.integrator"] = self.laboratory.integrator
+        for key in [key for key, each in used.items() if self.rigid and each == "midpoint"]:
+            raise ValueError(f"{key} is midpoint, by which rigid parts ring: choose implicit_euler or bdf2.")
+        return self
+
+    @model_validator(mode="after")
     def _training(self) -> Self:
         for model in ("resphys", "simfree"):
             self.training(model)

@@ -11,11 +11,13 @@ from pydantic import Field
 
 from ..io.settings import Many, Settings, Vector
 from .body import (
+    BoxSettings,
     ChamberSettings,
     MaterialSettings,
     MediumSettings,
     MuscleSettings,
     PlaceSettings,
+    RigidSettings,
     SimulatorSettings,
     SolveSettings,
     StringSettings,
@@ -63,6 +65,8 @@ class PlayedSettings(Settings):
     """A simulated laboratory."""
 
     laboratory: PlaySettings
+    regions: dict[str, BoxSettings]
+    rigid: dict[str, RigidSettings]
     fixed: PlaceSettings
     tip: PlaceSettings
     chambers: ChamberSettings | None

@@ -15,11 +15,12 @@ TINY = [
     "budget=quick",
     "mesh.divisions=[10,1,1]",
     "laboratory.mesh.divisions=[10,1,1]",
-    "laboratory.time_step=0.0025",
+    "laboratory.time_step=0.005",
     "laboratory.integrator=bdf2",
     "laboratory.material.model=corotated",
     "laboratory.material.poissons_ratio=0.499",
     "laboratory.material.mass_damping=0",
+    "laboratory.material.regions.root.youngs_modulus=350e3",
     "laboratory.seconds=0.4",
     "laboratory.noise=1e-6",
     "laboratory.placement_noise=1e-6",
@@ -29,7 +30,7 @@ TINY = [
     "laboratory.test=[m50]",
     "data.seconds=0.3",
     "data.limit=null",
-    "identify.substeps=4",
+    "identify.substeps=2",
     "identify.max_evaluations=10",
     "correct_uncorrected=false",
     "simfree.trainer.epochs=10",
@@ -38,7 +39,7 @@ TINY = [
     "hydra/hydra_logging=none",
     IN_RUN,
 ]
-TRUE = {"root_youngs_modulus": 250e3, "tip_youngs_modulus": 90e3}
+TRUE = {"root_youngs_modulus": 350e3, "tip_youngs_modulus": 90e3}
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +49,7 @@ def folder(tmp_path_factory):
 
 def test_each_silicone_is_identified(folder):
     found = json.loads((folder / "identification.json").read_text())["sysid"]
-    assert {name: found["parameters"][name] for name in TRUE} == pytest.approx(TRUE, rel=0.04)
+    assert {name: found["parameters"][name] for name in TRUE} == pytest.approx(TRUE, rel=0.08)
     assert found["first_guess"]["tip_youngs_modulus"] == 150e3
     errors = json.loads((folder / "metrics.json").read_text())["errors_mm"]
     assert errors["sysid"]["mean"] < 0.2 * errors["simulation"]["mean"]

@@ -42,7 +42,7 @@ ENERGY_ROUNDING = wp.constant(wp.float64(8.0 * 2.0**-52))
 
 
 @wp.struct
-class Progress:
+class SolverProgress:
     """Where the environments of a batch are, (B) each."""
 
     phase: wp.array[int]
@@ -151,7 +151,7 @@ def begin(
     positions: wp.array2d[wp.vec3d],  # (B, N) where inertia alone would lead; becomes the start [m]
     tolerances: Tolerances,
     origin_out: wp.array2d[wp.vec3d],
-    progress: Progress,
+    progress: SolverProgress,
     history: History,
 ):
     """Starts where the last steps foretell, and sums what does not change during this solve."""
@@ -188,7 +188,7 @@ def begin(
 
 
 @wp.kernel
-def choose(progress: Progress, active_out: wp.array[int], clamp_out: wp.array[int], pairs: wp.array[int]):
+def choose(progress: SolverProgress, active_out: wp.array[int], clamp_out: wp.array[int], pairs: wp.array[int]):
     """Which environments are factorised next, and which of these are clamped; forgets the pairs of the old factors."""
     b = wp.tid()
     wanted = progress.wanted[b]
@@ -231,7 +231,7 @@ def repeat(active: wp.array[int], clamp: wp.array[int], wanting_out: wp.array[in
 
 @wp.kernel
 def nudge(
-    progress: Progress,
+    progress: SolverProgress,
     signs: wp.array2d[wp.vec3d],  # (., N) up or down, at random: several draws
     positions: wp.array2d[wp.vec3d],  # (B, N) [m]
     positions_out: wp.array2d[wp.vec3d],  # (B, N) what they were
@@ -255,7 +255,7 @@ def nudge(
 
 @wp.kernel
 def compare(
-    progress: Progress,
+    progress: SolverProgress,
     kept: wp.array2d[wp.vec3d],  # (B, N) positions before `nudge` [m]
     gradient: wp.array2d[wp.vec3d],  # (B, N) there [N]
     residual: wp.array2d[wp.vec3d],  # (B, N) after it [N]
@@ -286,7 +286,7 @@ def compare(
 
 
 @wp.kernel
-def summarise(progress: Progress, summary_out: wp.array[int], active_out: wp.array[int]):
+def summarise(progress: SolverProgress, summary_out: wp.array[int], active_out: wp.array[int]):
     """What the host has to know, by the one block of the launch, and (B) who needs a further evaluation."""
     _, lane = wp.tid()
     active, aiming = wp.float64(0.0), wp.float64(0.0)
@@ -310,14 +310,14 @@ def summarise(progress: Progress, summary_out: wp.array[int], active_out: wp.arr
 
 
 @wp.func
-def may_be_rounding(progress: Progress, b: int, norm: wp.float64, iterations: int, stalls: int) -> bool:
+def may_be_rounding(progress: SolverProgress, b: int, norm: wp.float64, iterations: int, stalls: int) -> bool:
     """Whether to measure what rounding makes of a residual that does not fall: once, and again when that went on."""
     stuck = iterations >= STALLS and stalls >= STALLS
     return stuck and (norm <= progress.rounding[b] or stalls % ASKS_AGAIN == 0)
 
 
 @wp.func
-def give_up(progress: Progress, tolerances: Tolerances, clamped: wp.array[wp.bool], b: int):
+def give_up(progress: SolverProgress, tolerances: Tolerances, clamped: wp.array[wp.bool], b: int):
     """Stays where it was: a new factor, and a clamped one, get a try before the environment counts as stuck."""
     progress.phase[b] = AIMS
     progress.stalls[b] += 1
@@ -382,7 +382,7 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
 
     @wp.kernel(module=module)
     def project(
-        progress: Progress,
+        progress: SolverProgress,
         pairs: Pairs,
         vertex_at: wp.array[int],  # (F) the vertex at each place of the linear solver's order
         gradient: wp.array2d[wp.vec3d],  # (B, N) [N]
@@ -418,7 +418,7 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
 
     @wp.kernel(module=module)
     def aim(
-        progress: Progress,
+        progress: SolverProgress,
         pairs: Pairs,
         vertex_at: wp.array[int],
         gradient: wp.array2d[wp.vec3d],
@@ -531,7 +531,7 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
         clamped: wp.array[wp.bool],  # (B) whether the global step's matrix is positive definite by force
         positions: wp.array2d[wp.vec3d],
         gradient: wp.array2d[wp.vec3d],  # (B, N) becomes the residual, where the trial is taken
-        progress: Progress,
+        progress: SolverProgress,
         pairs: Pairs,
         history: History,
     ):

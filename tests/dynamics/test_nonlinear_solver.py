@@ -380,9 +380,9 @@ class OneVertex:
 
     def __init__(self, memory):
         self.own, self.vectors = minimisation_kernels(wp.float64), {}
-        self.progress, self.pairs, self.found = kernels.Progress(), self.own.Pairs(), kernels.Evaluation()
+        self.progress, self.pairs, self.found = kernels.SolverProgress(), self.own.Pairs(), kernels.Evaluation()
         self.tolerances, pairs = kernels.Tolerances(), self.pairs
-        for name, variable in kernels.Progress.vars.items():
+        for name, variable in kernels.SolverProgress.vars.items():
             setattr(self.progress, name, wp.full(1, 1, dtype=variable.type.dtype, device="cpu"))
         pairs.count, pairs.last = (wp.zeros(1, dtype=int, device="cpu") for _ in range(2))
         pairs.s, pairs.y = (wp.zeros((1, memory, 1), dtype=wp.vec3d, device="cpu") for _ in range(2))

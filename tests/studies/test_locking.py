@@ -11,7 +11,7 @@ from warp_resphys.io.files import read_json
 from warp_resphys.io.settings import parse
 from warp_resphys.mesh.arm import mesh_arm
 from warp_resphys.mesh.arm_geometry import ArmGeometry
-from warp_resphys.studies.locking import Case, LockingStudy, cases, cheapest, converged, measure
+from warp_resphys.studies.locking import LockingCase, LockingStudy, cases, cheapest, converged, measure
 
 
 def study(*overrides):
@@ -85,7 +85,7 @@ def test_quadratic_hexahedra_are_nearer_to_the_converged_deflection_than_linear_
     """31.63 mm under gravity, of docs/results/2026-11-20-arm-mesh.md."""
     deflection = {}
     for nodes in (8, 20, 27):
-        mesh = Case(f"hexahedron{nodes}", 0.01, 0.06).mesh(configuration("benchmark_locking")["mesh"])
+        mesh = LockingCase(f"hexahedron{nodes}", 0.01, 0.06).mesh(configuration("benchmark_locking")["mesh"])
         assert mesh.cells.shape[1] == nodes
         deflection[nodes] = measure(mesh, study(), timed=False)["gravity_mm"]
     assert deflection[8] < 0.9 * 31.63

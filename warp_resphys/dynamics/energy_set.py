@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from ..energies.base import BoundEnergy, Memory, Placement, Term
+from ..energies.base import BoundEnergy, EnergySite, Memory, Term
 from ..energies.placed import Placed
 from ..fem.body import Body
 from ..io.errors import InputError
@@ -60,7 +60,7 @@ class EnergySet:
         for each in placed:
             energy, named = each.energy, each.named
             points = each.all_points or each.points
-            place = Placement(each.body or body, each.first, points, rest_positions, method, time_step)
+            place = EnergySite(each.body or body, each.first, points, rest_positions, method, time_step)
             bound = energy.bind(place)
             self._bound.append(bound)
             own = named({q.name: replace(q, name=f"{each.prefix}{q.name}") for q in energy.parameters})

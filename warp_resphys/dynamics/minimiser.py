@@ -70,7 +70,8 @@ class Minimiser:
         double = dtype == torch.float64
         own = kernels.minimisation_kernels(wp.float64 if double else wp.float32)
         vector = wp.vec3d if double else wp.vec3f
-        progress, pairs, found, tolerances = kernels.Progress(), own.Pairs(), kernels.Evaluation(), kernels.Tolerances()
+        progress, pairs = kernels.SolverProgress(), own.Pairs()
+        found, tolerances = kernels.Evaluation(), kernels.Tolerances()
         for name, values in self._counts.items():
             setattr(progress, name, warp_view(values, wp.int32))
         for name, values in self._sums.items():

@@ -77,7 +77,7 @@ class PartPoints(Points):
 
 
 @dataclass(frozen=True)
-class Placement:
+class EnergySite:
     """What an energy needs of the simulator that it is bound to, whose vertices may be those of several bodies."""
 
     body: Body  # that the energy belongs to
@@ -109,7 +109,7 @@ class Placement:
 
 
 @dataclass(frozen=True)
-class Step:
+class EnergyStep:
     """One time step, as an energy sees it."""
 
     state: State  # where it starts
@@ -204,7 +204,7 @@ class Energy(ABC):
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "Term":
         """Returns the energy's kernels for a batch."""
 
-    def bind(self, placement: Placement) -> "BoundEnergy":
+    def bind(self, placement: EnergySite) -> "BoundEnergy":
         """Returns the energy on a simulator's device; an energy that depends on where a step starts has its own."""
         return BoundEnergy(self, placement)
 
@@ -248,7 +248,7 @@ class BoundEnergy:
 
     memory: tuple[Memory, ...] = ()
 
-    def __init__(self, energy: Energy, placement: Placement) -> None:
+    def __init__(self, energy: Energy, placement: EnergySite) -> None:
         self.energy, self.placement = energy, placement
 
     def prepare(self, parameters: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor | None]:
@@ -260,7 +260,7 @@ class BoundEnergy:
         del parameters
         return None
 
-    def begin_step(self, step: Step) -> dict[str, torch.Tensor | None]:
+    def begin_step(self, step: EnergyStep) -> dict[str, torch.Tensor | None]:
         """Returns the values of the energy's term that depend on the step."""
         del step
         return {}
@@ -282,7 +282,7 @@ class BoundEnergy:
         del inputs, constants, batch, static
         return None
 
-    def end_step(self, step: Step, x: torch.Tensor, q: torch.Tensor) -> dict[str, torch.Tensor]:
+    def end_step(self, step: EnergyStep, x: torch.Tensor, q: torch.Tensor) -> dict[str, torch.Tensor]:
         """Returns the memory (B, ...) after a step, by name.
 
         Args:

@@ -28,7 +28,7 @@ from ..mesh.mesh import Mesh, boundary_faces
 from ..stepping.constants import Constants
 from ..stepping.inputs import Inputs
 from ..stepping.quantity import Parameter, Quantity
-from .base import BoundEnergy, Energy, Placement, PointSet, Step, Term, Values
+from .base import BoundEnergy, Energy, EnergySite, EnergyStep, PointSet, Term, Values
 from .launcher import Launcher, warp_view
 
 
@@ -97,14 +97,14 @@ class Medium(Energy):
         return MediumTerm(launcher, sets)
 
     @override
-    def bind(self, placement: Placement) -> "BoundMedium":
+    def bind(self, placement: EnergySite) -> "BoundMedium":
         return BoundMedium(self, placement)
 
 
 class BoundMedium(BoundEnergy):
     """A medium over the steps of a simulator: where the surface was, where it points, and buoyancy."""
 
-    def __init__(self, medium: Medium, placement: Placement) -> None:
+    def __init__(self, medium: Medium, placement: EnergySite) -> None:
         super().__init__(medium, placement)
         (points,) = placement.points
         assert isinstance(points, FacePoints)
@@ -116,7 +116,7 @@ class BoundMedium(BoundEnergy):
         self._volume = volume if medium.buoyancy else None
 
     @override
-    def begin_step(self, step: Step) -> dict[str, torch.Tensor | None]:
+    def begin_step(self, step: EnergyStep) -> dict[str, torch.Tensor | None]:
         """Returns values with the areas and normals of the start of the step."""
         h, batch, stage = step.stage.step, step.state.batch, step.stage
         tangents = torch.einsum("qkd,bfki->bfqdi", self._slopes, step.state.q[:, self._nodes])

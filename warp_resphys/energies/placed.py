@@ -11,7 +11,7 @@ from ..fem.elements import Points
 from ..stepping.constants import Constants
 from ..stepping.inputs import Inputs
 from ..stepping.state import ImplicitStage, State
-from .base import Energy, Step, Term
+from .base import Energy, EnergyStep, Term
 
 T = TypeVar("T")
 
@@ -68,10 +68,10 @@ class Placed:
         """Returns the inputs of the energy under its names."""
         return Inputs(**self.own(inputs.actuation)) if self.prefix else inputs
 
-    def step(self, state: State, stage: ImplicitStage, inputs: Inputs, constants: Constants, term: Term) -> Step:
+    def step(self, state: State, stage: ImplicitStage, inputs: Inputs, constants: Constants, term: Term) -> EnergyStep:
         """Returns a step as the energy sees it."""
         seen = replace(state, memory=self.own(state.memory)) if self.prefix else state
-        return Step(seen, stage, self.own_inputs(inputs), self.own_constants(constants), term)
+        return EnergyStep(seen, stage, self.own_inputs(inputs), self.own_constants(constants), term)
 
     def own_values(self, values: Mapping[str, torch.Tensor | None], term: Term) -> dict[str, torch.Tensor | None]:
         """Returns the values that the energy's term has, under the energy's names."""

@@ -27,7 +27,7 @@ from ..io.errors import InputError
 from ..kernels.pointwise import pointwise_kernels
 from ..mesh.mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
-from .base import BoundEnergy, Energy, Memory, PartPoints, Placement, PointSet, ReadingTerm, Step, Values
+from .base import BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PartPoints, PointSet, ReadingTerm, Values
 from .launcher import Launcher
 
 
@@ -102,14 +102,14 @@ class PointwiseEnergy(Energy):
         return PointwiseTerm(launcher, sets, self)
 
     @override
-    def bind(self, placement: Placement) -> "BoundPointwise":
+    def bind(self, placement: EnergySite) -> "BoundPointwise":
         return BoundPointwise(self, placement)
 
 
 class BoundPointwise(BoundEnergy):
     """A pointwise energy over the steps of a simulator."""
 
-    def __init__(self, energy: PointwiseEnergy, placement: Placement) -> None:
+    def __init__(self, energy: PointwiseEnergy, placement: EnergySite) -> None:
         super().__init__(energy, placement)
         (points,) = placement.points
         assert isinstance(points, PartPoints)
@@ -124,7 +124,7 @@ class BoundPointwise(BoundEnergy):
         seen = torch.einsum("cqkw,bcki->bcqiw", self._operators, q[:, self._nodes]).flatten(1, 2)
         return seen[..., 0] if seen.shape[-1] == 1 else seen
 
-    def _values(self, step: Step) -> dict[str, torch.Tensor]:
+    def _values(self, step: EnergyStep) -> dict[str, torch.Tensor]:
         """Returns parameters, inputs and memory at the points, by name."""
         energy, zeros = self._pointwise, self._zeros(step.state.batch)
         constants = {q: step.constants.value(q.name) for q in energy.parameters}
@@ -138,7 +138,7 @@ class BoundPointwise(BoundEnergy):
         return self._operators.new_zeros(batch, len(self._part))
 
     @override
-    def begin_step(self, step: Step) -> dict[str, torch.Tensor | None]:
+    def begin_step(self, step: EnergyStep) -> dict[str, torch.Tensor | None]:
         energy = self._pointwise
         if not energy._of_step:
             return {}
@@ -151,7 +151,7 @@ class BoundPointwise(BoundEnergy):
         return {energy.own_name(name): self._zeros(batch) for name in energy._of_step}
 
     @override
-    def end_step(self, step: Step, x: torch.Tensor, q: torch.Tensor) -> dict[str, torch.Tensor]:
+    def end_step(self, step: EnergyStep, x: torch.Tensor, q: torch.Tensor) -> dict[str, torch.Tensor]:
         if not self.memory:
             return {}
         return dict(self._pointwise.end_step(self._seen(step.state.q), self._seen(q), self._values(step)))

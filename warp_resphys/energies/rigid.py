@@ -30,7 +30,7 @@ from ..mesh.elements import conical_simplex, gauss_box
 from ..mesh.mesh import Mesh
 from ..stepping.constants import Mass
 from ..stepping.quantity import Parameter, Quantity
-from .base import BoundEnergy, Energy, Placement, PointSet, Step, Term, Values
+from .base import BoundEnergy, Energy, EnergySite, EnergyStep, PointSet, Term, Values
 from .launcher import Launcher, warp_view
 from .materials import Corotated
 from .solid import VISCOUS, SolidTerm
@@ -51,7 +51,7 @@ class PointInertia(Energy):
         return PointInertiaTerm(launcher, sets)
 
     @override
-    def bind(self, placement: Placement) -> "BoundInertia":
+    def bind(self, placement: EnergySite) -> "BoundInertia":
         return BoundInertia(self, placement)
 
 
@@ -80,14 +80,14 @@ class RigidInertia(PointInertia):
         return {"density": self.density}
 
     @override
-    def bind(self, placement: Placement) -> "BoundRigidInertia":
+    def bind(self, placement: EnergySite) -> "BoundRigidInertia":
         return BoundRigidInertia(self, placement)
 
 
 class BoundRigidInertia(BoundInertia):
     """A rigid part's mass over the steps of a simulator."""
 
-    def __init__(self, part: RigidInertia, placement: Placement) -> None:
+    def __init__(self, part: RigidInertia, placement: EnergySite) -> None:
         super().__init__(part, placement)
         like = placement.rest_positions
         self._controls = torch.as_tensor(placement.points[0].nodes[0], device=like.device)
@@ -101,7 +101,7 @@ class BoundRigidInertia(BoundInertia):
         return Mass(torch.zeros_like(weight), weight, weight.new_zeros(1, 1))
 
     @override
-    def begin_step(self, step: Step) -> dict[str, torch.Tensor | None]:
+    def begin_step(self, step: EnergyStep) -> dict[str, torch.Tensor | None]:
         inertia = step.constants.value("density") / step.stage.step**2
         target = torch.einsum("pc,bci->bpi", self._factor, step.stage.target[:, self._controls])
         return {"inertia": inertia.expand(step.state.batch, len(self._factor)), "target": target}
@@ -171,7 +171,7 @@ class Rigidity(Energy):
         return SolidTerm(launcher, sets, Corotated(), np.array([[volume, 0.0]]))
 
     @override
-    def bind(self, placement: Placement) -> "BoundRigidity":
+    def bind(self, placement: EnergySite) -> "BoundRigidity":
         return BoundRigidity(self, placement)
 
 
@@ -192,7 +192,7 @@ class BoundRigidity(BoundEnergy):
         return dict(zip(VISCOUS, (still, None, None), strict=True))
 
     @override
-    def begin_step(self, step: Step) -> dict[str, torch.Tensor | None]:
+    def begin_step(self, step: EnergyStep) -> dict[str, torch.Tensor | None]:
         return self.at_rest(step.state.batch)
 
 

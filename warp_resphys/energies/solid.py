@@ -19,7 +19,7 @@ from ..kernels import solid as kernels
 from ..mesh.mesh import Mesh
 from ..stepping.constants import Constants, Mass
 from ..stepping.quantity import Parameter, Quantity
-from .base import BoundEnergy, Energy, Memory, Placement, PointSet, Step, Term, Values
+from .base import BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PointSet, Term, Values
 from .launcher import Launcher, warp_view
 from .materials import PRONY_RATIO, PRONY_TIME, Material
 from .viscosity import Viscosity
@@ -100,7 +100,7 @@ class Solid(Energy):
         return SolidTerm(launcher, sets, self.material, carried)
 
     @override
-    def bind(self, placement: Placement) -> "BoundSolid":
+    def bind(self, placement: EnergySite) -> "BoundSolid":
         return BoundSolid(self, placement)
 
 
@@ -147,7 +147,7 @@ def _shares(points: SolidPoints) -> dict[str, scipy.sparse.csr_array]:
 class BoundSolid(BoundEnergy):
     """A solid over the steps of a simulator: its stiffness, its mass, and the viscous strain that it remembers."""
 
-    def __init__(self, solid: Solid, placement: Placement) -> None:
+    def __init__(self, solid: Solid, placement: EnergySite) -> None:
         super().__init__(solid, placement)
         self._solid = solid
         like, sets = placement.rest_positions, solid.discretisation.point_sets
@@ -198,7 +198,7 @@ class BoundSolid(BoundEnergy):
         return dict(zip(VISCOUS, values, strict=True))
 
     @override
-    def begin_step(self, step: Step) -> dict[str, torch.Tensor | None]:
+    def begin_step(self, step: EnergyStep) -> dict[str, torch.Tensor | None]:
         carried = step.state.memory.get(VISCOUS_STRAIN)
         viscosity, strain = self._viscosity(step.constants), partial(GreenStrain.apply, step.term)
         return self._values(*viscosity.step_values(strain, step.state.q, carried, step.stage, self.placement.time_step))
@@ -208,7 +208,7 @@ class BoundSolid(BoundEnergy):
         return self._values(self.placement.rest_positions.new_zeros(batch, 2), None, None)
 
     @override
-    def end_step(self, step: Step, x: torch.Tensor, q: torch.Tensor) -> dict[str, torch.Tensor]:
+    def end_step(self, step: EnergyStep, x: torch.Tensor, q: torch.Tensor) -> dict[str, torch.Tensor]:
         viscosity = self._viscosity(step.constants)
         if viscosity.ratio is None:
             return {}

@@ -33,7 +33,7 @@ from ..stepping.constants import Constants
 from ..stepping.inputs import Inputs
 from ..stepping.quantity import Parameter, Quantity
 from ..stepping.state import ImplicitStage, State
-from .base import BoundEnergy, Energy, Memory, PartPoints, Placement, PointSet, ReadingTerm, Step, Values
+from .base import BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PartPoints, PointSet, ReadingTerm, Values
 from .launcher import Launcher
 
 PAYLOAD = Quantity(
@@ -109,7 +109,7 @@ class Strings(Energy):
         return StringTerm(launcher, sets, axial_kernels(law), shapes, self.count, extra=[wp.float64(self.toe)])
 
     @override
-    def bind(self, placement: Placement) -> "BoundStrings":
+    def bind(self, placement: EnergySite) -> "BoundStrings":
         return BoundStrings(self, placement)
 
 
@@ -120,7 +120,7 @@ class BoundStrings(BoundEnergy):
     the same one step earlier. Where a state has none, the weights are below where they are tied, on taut strings.
     """
 
-    def __init__(self, strings: Strings, placement: Placement) -> None:
+    def __init__(self, strings: Strings, placement: EnergySite) -> None:
         super().__init__(strings, placement)
         self._strings = strings
         (points,) = placement.points
@@ -147,7 +147,7 @@ class BoundStrings(BoundEnergy):
         return torch.einsum("bs,sn,bc->bnc", self._masses(inputs, batch), self._shares, gravity)
 
     @override
-    def begin_step(self, step: Step) -> dict[str, torch.Tensor | None]:
+    def begin_step(self, step: EnergyStep) -> dict[str, torch.Tensor | None]:
         mass, compliance = self._inertia(step), step.constants.value("string_compliance")
         free = self._free(self._stage(self._weights(step)), step.constants)
         return {"string_target": free, "string_stiffness": mass / (1.0 + compliance * mass)}
@@ -159,7 +159,7 @@ class BoundStrings(BoundEnergy):
         return {"string_target": zeros[..., None].expand(-1, -1, 3), "string_stiffness": zeros}
 
     @override
-    def end_step(self, step: Step, x: torch.Tensor, q: torch.Tensor) -> dict[str, torch.Tensor]:
+    def end_step(self, step: EnergyStep, x: torch.Tensor, q: torch.Tensor) -> dict[str, torch.Tensor]:
         weights = self._weights(step)
         free = self._free(self._stage(weights), step.constants)
         tied = torch.einsum("sn,bnc->bsc", self._shares, x)
@@ -168,11 +168,11 @@ class BoundStrings(BoundEnergy):
         values = (new.q, new.v, *(new.previous or ()))
         return {memory.name: value for memory, value in zip(self.memory, values, strict=False)}
 
-    def _inertia(self, step: Step) -> torch.Tensor:
+    def _inertia(self, step: EnergyStep) -> torch.Tensor:
         """Returns M = m / h^2 (B, S) [N/m]."""
         return self._masses(step.inputs, step.state.batch) / step.stage.step**2
 
-    def _weights(self, step: Step) -> State:
+    def _weights(self, step: EnergyStep) -> State:
         """Returns the state of the weights, (B, S, 3), at the start of a step.
 
         Without gravity nothing tightens a string, and a weight is where it is tied.

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ..report.bodies import BODIES, BODY_LIGHT, sharp_edges
 from ..report.camera import frame_of
-from ..report.render import INK, FloatArray, Layer, Pixels, Renderer, Scene, View, chain, view_axes
+from ..report.render import INK, FloatArray, Layer, Pixels, Renderer, RenderScene, View, chain, view_axes
 
 _SIZE: Final = (480, 480)  # px
 _TURN, _TILT = np.radians(-35.0), np.radians(20.0)  # of the eye, about the vertical and over the horizon
@@ -74,7 +74,7 @@ class Camera:
             layers.append(Layer("surface", vertices, triangles, BODIES[1], light=BODY_LIGHT))
             layers.append(Layer("lines", vertices, edges, INK, size=1.5, shift=before["edges"]))
         view = View(layers, self._axes, self._focus, self._half)
-        return list(self._renderer.frames(Scene([view], _SIZE, background="white", texts=texts)))
+        return list(self._renderer.frames(RenderScene([view], _SIZE, background="white", texts=texts)))
 
     def close(self) -> None:
         """Ends the process that draws."""

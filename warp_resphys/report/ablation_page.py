@@ -15,9 +15,9 @@ from .page import (
     NO_BREAK_SPACE,
     Canvas,
     Cell,
+    PageTable,
     Part,
     Row,
-    Table,
     Text,
     experiment_kicker,
     figures_beside,
@@ -76,7 +76,7 @@ def write_ablation_report(
     write_page(
         path,
         [
-            Part("", [figure, Table("Markers", [*_COLUMNS.values()], body, note)]),
+            Part("", [figure, PageTable("Markers", [*_COLUMNS.values()], body, note)]),
             Part("How it was reconstructed", [Text(_how_reconstructed(settings))]),
         ],
         title=settings["title"],

@@ -10,7 +10,7 @@ from ..mesh.mesh import Mesh, boundary_faces, boundary_triangles
 from ..mesh.surface import closest_points
 from .camera import axes_from_below, frame_of, height_of, motion_axes, picture_size
 from .data import MODELS, mean_distance
-from .render import INK, MEASURED, OUTLINE, FloatArray, IntArray, Layer, Scene, View, pace, view_axes
+from .render import INK, MEASURED, OUTLINE, FloatArray, IntArray, Layer, RenderScene, View, pace, view_axes
 
 _LONGER_SIDE: Final = 1100  # Of a picture of a body coloured by its distance [px].
 MARGIN: Final = 0.02  # Around the bodies there, as the lengths below relative to the longer side of what is seen.
@@ -47,7 +47,7 @@ def largest_distances(mesh: Mesh, positions: Mapping[str, FloatArray], target: F
     }
 
 
-def distance_scene(mesh: Mesh, positions: Mapping[str, FloatArray], target: FloatArray) -> Scene | None:
+def distance_scene(mesh: Mesh, positions: Mapping[str, FloatArray], target: FloatArray) -> RenderScene | None:
     """Return deformed bodies, coloured by the distance from the target's vertices: from zero to the largest of each.
 
     Args:
@@ -75,7 +75,7 @@ def distance_scene(mesh: Mesh, positions: Mapping[str, FloatArray], target: Floa
         surface = Layer("surface", q, triangles, paint=paint, light=(1.0 - SHADE, SHADE))
         rims = Layer("lines", q, edges, "black", size=line, opacity=0.35, shift=0.2 * nudge)
         views.append(View([surface, rims, rest], axes, focus, half[1]))
-    return Scene(views, picture_size(half, _LONGER_SIDE))
+    return RenderScene(views, picture_size(half, _LONGER_SIDE))
 
 
 def face_edges(mesh: Mesh) -> IntArray:
@@ -134,11 +134,11 @@ class ComparedMotion:
         target = None if self.target is None else self.target[chosen]
         return replace(self, times=times, measured=measured, positions=positions, markers=markers, target=target)
 
-    def scene(self) -> Scene:
+    def scene(self) -> RenderScene:
         """Return the whole body at some instants, and beside it the markers from nearby, or the body from below."""
-        return Scene(_views(self.at(self.instants), _PICTURE_VIEW), _PICTURE_VIEW)
+        return RenderScene(_views(self.at(self.instants), _PICTURE_VIEW), _PICTURE_VIEW)
 
-    def film(self, seconds: float | None = None, slower: float | None = None) -> Scene:
+    def film(self, seconds: float | None = None, slower: float | None = None) -> RenderScene:
         """Return a film of the first seconds, slowed down if the motion is fast.
 
         Args:
@@ -152,7 +152,7 @@ class ComparedMotion:
         first, second = _views(shown, FILM_VIEW, HEADROOM)
         legend = [*((name, _RINGS[0]) for name in others), (last, _RINGS[1]), ("measured", MEASURED)]
         texts = [f"{time:.2f} s" for time in shown.times]
-        return Scene([replace(first, legend=legend), second], FILM_VIEW, background="white", fps=fps, texts=texts)
+        return RenderScene([replace(first, legend=legend), second], FILM_VIEW, background="white", fps=fps, texts=texts)
 
 
 def instants(target: FloatArray, bound: FloatArray, simulated: FloatArray) -> list[int]:

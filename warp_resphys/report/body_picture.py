@@ -18,7 +18,7 @@ from ..mesh.quality import cell_volumes
 from .bodies import face_edges, sharp_edges
 from .camera import frame_of, picture_size
 from .figures import CHAMBER_COLOURS, in_style
-from .render import BODY, CLAMPED, INK, MEASURED, FloatArray, IntArray, Layer, Scene, View, chain, draw, view_axes
+from .render import BODY, CLAMPED, INK, MEASURED, FloatArray, IntArray, Layer, RenderScene, View, chain, draw, view_axes
 
 TOWARDS_VIEWER: Final = (0.32, -1.0, 0.28)
 _CUT: Final = "#d3dde7"
@@ -76,7 +76,7 @@ def draw_mesh(path: Path, summary: MeshSummary, markers: FloatArray | None = Non
     half = np.maximum(half, _NARROWEST * half.max())
     size = picture_size(half, _LONGER_SIDE)
     views = [View(layers, axes, focus, half[1]) for layers in _layers(summary, dots, max(1.0, size[1] / 900.0))]
-    ((picture,),) = draw(Scene(views, size, background="white", sorts=True))
+    ((picture,),) = draw(RenderScene(views, size, background="white", sorts=True))
     volumes = {each.name.replace("_", " "): _CUBIC_CENTI * summary.chamber_volume(each) for each in summary.chambers}
     labels = [*(f"{name}: {volume:.1f} cm³" for name, volume in volumes.items())]
     labels += [name.replace("_", " ") for name in summary.tendons]

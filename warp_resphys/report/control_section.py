@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from .data import MODELS, RunReport
-from .page import NONE, Canvas, Cell, Items, Part, Row, Table, Text, mm_text, number_text, percent_text
+from .page import NONE, Canvas, Cell, Items, PageTable, Part, Row, Text, mm_text, number_text, percent_text
 
 _KINDS: Final[Mapping[str, tuple[str, str]]] = {  # by the beginning of a controller's name: its name and its meaning
     "open_": ("{}, open loop", "planned once, on the whole path, and played"),
@@ -68,7 +68,7 @@ def _task(control: Mapping[str, Any]) -> str:
     )
 
 
-def _table(tracking: Mapping[str, Any]) -> Table:
+def _table(tracking: Mapping[str, Any]) -> PageTable:
     first = next(iter(tracking.values()))
     best = min(first, key=lambda controller: float(first[controller]["mean_mm"]))
 
@@ -81,7 +81,7 @@ def _table(tracking: Mapping[str, Any]) -> Table:
     for controller in first:
         name, meaning = _words(controller)
         rows.append(Row(name, [cell(each.get(controller)) for each in tracking.values()], controller == best, meaning))
-    return Table("Mean error of the point [mm]", [f"Paths in {float(speed):g} s" for speed in tracking], rows)
+    return PageTable("Mean error of the point [mm]", [f"Paths in {float(speed):g} s" for speed in tracking], rows)
 
 
 def compared_controllers(control: Mapping[str, Any]) -> list[str]:

@@ -10,7 +10,7 @@ from .bodies import BODIES, BODY_LIGHT, FILM_VIEW, HEADROOM, sharp_edges
 from .camera import frame_of, height_of, path_axes
 from .control_section import controller_name
 from .figures import TONES
-from .render import INK, FloatArray, IntArray, Layer, Scene, View, chain, pace
+from .render import INK, FloatArray, IntArray, Layer, RenderScene, View, chain, pace
 
 _DRAWING: Final = 0.6  # Longer side of the drawing, over that of the body;
 _GAP: Final = 0.15  # how far it is from the body, over the same.
@@ -34,7 +34,7 @@ class DrivenBodies:
     plane: FloatArray  # (2, 3) to the right and upwards in the plane of the path.
     gravity: FloatArray  # (3,) which way is down.
 
-    def film(self, slower: float = 1.0) -> Scene:
+    def film(self, slower: float = 1.0) -> RenderScene:
         """Return each body in a view of its own, with the path and a trail of where the point has been, also enlarged.
 
         Args:
@@ -53,7 +53,7 @@ class DrivenBodies:
             for name, legend in zip(self.positions, legends, strict=True)
         ]
         texts = [f"{time:.2f} s" for time in self.times[frames]]
-        return Scene(views, FILM_VIEW, background="white", fps=fps, texts=texts)
+        return RenderScene(views, FILM_VIEW, background="white", fps=fps, texts=texts)
 
     def _placed(self) -> Placement:
         """Places of points (..., 3) of the plane in a drawing beside the body, larger and seen from the front."""

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from .data import MODELS, FloatArray, RunReport
-from .page import MINUS, NO_BREAK_SPACE, NONE, Canvas, Cell, Drawn, Part, Row, Table, Text
+from .page import MINUS, NO_BREAK_SPACE, NONE, Canvas, Cell, Drawn, PageTable, Part, Row, Text
 
 # A name, the unit that it is written in, and how many of these make an SI unit.
 Wording = tuple[str, str, float]
@@ -44,7 +44,7 @@ def identification_section(data: RunReport, canvas: Canvas) -> Part | None:
         return None
     columns = ["Data sheet", "Identified", *(["True"] if data.truth else []), "At a bound"]
     blocks: list[Any] = [
-        Table(MODELS[name][0], columns, parameter_rows(each, data.start, data.truth))
+        PageTable(MODELS[name][0], columns, parameter_rows(each, data.start, data.truth))
         for name, each in identified.items()
     ]
     ranges = (data.settings.get("identify") or {}).get("parameters", {})

@@ -53,7 +53,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Table:
+class PageTable:
     """A table."""
 
     head: str  # Above the first column.
@@ -116,7 +116,7 @@ class ViewInSpace:
     observed: str  # What was observed, such as "markers".
 
 
-Block = Text | Items | Table | Drawn | ViewInSpace
+Block = Text | Items | PageTable | Drawn | ViewInSpace
 
 
 class Script(NamedTuple):
@@ -214,7 +214,7 @@ def write_page(
     conclusions: Sequence[str] = (),
     metrics: Mapping[str, Any] | None = None,
     settings: Mapping[str, Any] | None = None,
-    timed: Table | None = None,
+    timed: PageTable | None = None,
 ) -> None:
     """Write a page: its heading, what stands above and below that, its sections, and how they were computed.
 

@@ -18,7 +18,20 @@ from ..mesh.mesh import Mesh, boundary_triangles
 from .bodies import face_edges, sharp_edges, stems
 from .camera import frame_of, picture_size
 from .data import Recordings
-from .render import BODY, CLAMPED, INK, MEASURED, FloatArray, IntArray, Layer, Pixels, Scene, View, draw, view_axes
+from .render import (
+    BODY,
+    CLAMPED,
+    INK,
+    MEASURED,
+    FloatArray,
+    IntArray,
+    Layer,
+    Pixels,
+    RenderScene,
+    View,
+    draw,
+    view_axes,
+)
 
 NOMINAL: Final = "#0072b2"  # Blue of Okabe and Ito (2008).
 _GREY: Final = "#5b6570"
@@ -60,10 +73,10 @@ class Panel:
         """Return coordinates (..., 2) of points (..., 3) [m] in the picture, to the right and up."""
         return points @ self.axes[:2].T
 
-    def scene(self, layers: Sequence[Layer]) -> Scene:
+    def scene(self, layers: Sequence[Layer]) -> RenderScene:
         """Return the scene that is drawn beneath names and rings."""
         size = picture_size(self.half, _FINER * _DPI * _LONGER_SIDE)
-        return Scene([View(layers, self.axes, self.focus, self.half[1])], size, background="white", sorts=True)
+        return RenderScene([View(layers, self.axes, self.focus, self.half[1])], size, background="white", sorts=True)
 
 
 def draw_registration(path: Path, recordings: Recordings, fixed: IntArray) -> None:

@@ -79,7 +79,7 @@ class View:
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class RenderScene:
     """Views side by side, and how they are drawn."""
 
     views: Sequence[View]
@@ -132,7 +132,7 @@ class Renderer:
         """End the process; so does whatever forgets the renderer."""
         self._end()
 
-    def frames(self, scene: Scene) -> Iterator[Pixels]:
+    def frames(self, scene: RenderScene) -> Iterator[Pixels]:
         """Yield frames (H, V * W, 3 | 4): red, green, blue and, without a background, opacity, from 0 to 255.
 
         Raises:
@@ -180,7 +180,7 @@ def _end(process: subprocess.Popen[bytes], messages: IO[bytes]) -> None:
                 pipe.close()
 
 
-def draw(*scenes: Scene) -> list[Pixels]:
+def draw(*scenes: RenderScene) -> list[Pixels]:
     """Draw scenes, in one process, as its start takes longer than most pictures.
 
     Returns:
@@ -193,7 +193,7 @@ def draw(*scenes: Scene) -> list[Pixels]:
         return [np.stack(list(renderer.frames(scene))) for scene in scenes]
 
 
-def write_film(path: Path, scene: Scene) -> None:
+def write_film(path: Path, scene: RenderScene) -> None:
     """Write a film (MP4, H.264) of a scene with a background and a text for every frame; shows its progress.
 
     Raises:
@@ -232,7 +232,7 @@ def pace(times: FloatArray, slower: float) -> tuple[IntArray, float]:
     return np.arange(0, len(times), every), 1.0 / (slower * step * every)
 
 
-def packed(scene: Scene) -> bytes:
+def packed(scene: RenderScene) -> bytes:
     """Return a scene as JSON with names in place of its arrays, these once each, and before all that its length."""
     arrays: dict[str, Any] = {}
 

@@ -21,9 +21,9 @@ from .page import (
     Canvas,
     Cell,
     Items,
+    PageTable,
     Part,
     Row,
-    Table,
     Text,
     duration_text,
     error_parts,
@@ -95,7 +95,7 @@ def write_report(path: Path, data: RunReport) -> None:
         conclusions=conclusions(data.metrics, data.settings),
         metrics=data.metrics,
         settings=data.settings,
-        timed=Table("Model", ["Wall time"], timed) if timed else None,
+        timed=PageTable("Model", ["Wall time"], timed) if timed else None,
     )
     _LOG.info("report written: %s", path)
 
@@ -119,7 +119,7 @@ def results_section(data: RunReport, canvas: Canvas) -> Part:
     return Part("", blocks)
 
 
-def _errors_table(data: RunReport) -> Table:
+def _errors_table(data: RunReport) -> PageTable:
     errors, models = data.metrics["errors_mm"], data.models
     idle = untrained(epochs_kept(data.metrics))
     published = published_beside(data.published, models)
@@ -137,7 +137,7 @@ def _errors_table(data: RunReport) -> Table:
         cells += [Cell(shares.get(model, NONE))] if base else []
         cells += [_pair(published[model]) if model in published else Cell(NONE)] if published else []
         rows.append(Row(name, cells, model == best(errors, idle), meaning))
-    return Table(f"Error of the {_observed(data)} [mm]", columns, rows)
+    return PageTable(f"Error of the {_observed(data)} [mm]", columns, rows)
 
 
 def _observed(data: RunReport) -> str:
@@ -296,9 +296,8 @@ def reconstruction_section(data: RunReport, canvas: Canvas) -> Part | None:
         "The network learns from reconstructed trajectories. Their own distance from the target is in the first table; "
         "this is how far the roll-outs are from them."
     )
-    return Part(
-        "Against the reconstruction", [Text(said), Table("Error against the reconstruction [mm]", ["This run"], rows)]
-    )
+    table = PageTable("Error against the reconstruction [mm]", ["This run"], rows)
+    return Part("Against the reconstruction", [Text(said), table])
 
 
 SECTIONS: Final[tuple[Callable[[RunReport, Canvas], Part | None], ...]] = (

@@ -13,9 +13,9 @@ from .page import (
     Cell,
     Drawn,
     Items,
+    PageTable,
     Part,
     Row,
-    Table,
     Text,
     drawn_file,
     error_parts,
@@ -44,12 +44,12 @@ def against(errors: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
 
 def model_table(
     head: str, rows: Mapping[str, Mapping[str, Cell]], note: str = "", pages: Mapping[str, str] | None = None
-) -> Table:
+) -> PageTable:
     """Return cells by what a row is and model; a row may lead to a page."""
     models = [model for model in MODELS if any(model in row for row in rows.values())]
     addresses = pages or {}
     body = [Row(n, [r.get(m, Cell(NONE)) for m in models], address=addresses.get(n, "")) for n, r in rows.items()]
-    return Table(head, [MODELS[model][0] for model in models], body, note)
+    return PageTable(head, [MODELS[model][0] for model in models], body, note)
 
 
 def horizons_section(data: RunReport, canvas: Canvas) -> Part | None:
@@ -60,7 +60,7 @@ def horizons_section(data: RunReport, canvas: Canvas) -> Part | None:
     return None if table is None else Part(title, [table])
 
 
-def horizon_table(metrics: Mapping[str, Any], published: Mapping[str, Mapping[str, Any]]) -> Table | None:
+def horizon_table(metrics: Mapping[str, Any], published: Mapping[str, Mapping[str, Any]]) -> PageTable | None:
     """Return the errors over the first seconds of the roll-outs and their growth, with the published ones below them.
 
     Args:
@@ -104,7 +104,7 @@ def scales_section(data: RunReport, canvas: Canvas) -> Part | None:
     return Part("Beyond the inputs of the training", [table, figure])
 
 
-def scale_table(scales: Mapping[str, Mapping[str, Any]]) -> Table | None:
+def scale_table(scales: Mapping[str, Mapping[str, Any]]) -> PageTable | None:
     """Return the errors at multiples of the inputs (a summary by scale and model), with how they stand to SysID."""
     rows = {}
     for scale in sorted(scales, key=float):
@@ -138,7 +138,7 @@ def registration_section(data: RunReport, canvas: Canvas) -> Part | None:
     return Part("Registration", [*blocks, residual_table(recordings.residuals)])
 
 
-def residual_table(residuals: Mapping[str, Any]) -> Table:
+def residual_table(residuals: Mapping[str, Any]) -> PageTable:
     """Return the residuals of the registration [mm] by trial and marker; many markers stand below each other."""
     labels = list(dict.fromkeys(label for each in residuals.values() for label in each["residual_mm"]))
     head, last = "Residual [mm]", "Root mean square"
@@ -151,9 +151,9 @@ def residual_table(residuals: Mapping[str, Any]) -> Table:
     rms = {trial: Cell(f"{each['rms_mm']:.2f}") for trial, each in residuals.items()}
     if len(labels) <= _MOST_WIDE:
         rows = [Row(t, [*(cell(each, label) for label in labels), rms[t]]) for t, each in residuals.items()]
-        return Table(head, [*labels, last], rows, note)
+        return PageTable(head, [*labels, last], rows, note)
     rows = [Row(label, [cell(each, label) for each in residuals.values()]) for label in labels]
-    return Table(head, list(residuals), [*rows, Row(last, list(rms.values()))], note)
+    return PageTable(head, list(residuals), [*rows, Row(last, list(rms.values()))], note)
 
 
 def quality_section(data: RunReport, canvas: Canvas) -> Part | None:
@@ -173,7 +173,7 @@ def quality_section(data: RunReport, canvas: Canvas) -> Part | None:
         release = each["release_frame"]
         summary = f"{trial}: {each['frames']} frames at {each['rate_hz']:g} Hz"
         summary += "" if release is None else f", let go in frame {release:.1f}"
-        tables.append(Table("Marker", columns, quality_rows(each), "", summary, len(quality) == 1))
+        tables.append(PageTable("Marker", columns, quality_rows(each), "", summary, len(quality) == 1))
     said = Items(warnings) if warnings else Text("No warnings.")
     return Part("Quality of the recordings", [said, *tables, Text(note, note=True)])
 

@@ -41,7 +41,7 @@ PARTS: Final = ("local_step", "tangent", "assembly", "factor", "solve")
 ByRefinement = Annotated[dict[Natural, Natural], Field(min_length=1)]
 
 
-class Material(Settings):
+class ElasticConstants(Settings):
     """Elastic constants that a case takes in the place of the configured ones."""
 
     poissons_ratio: float
@@ -55,7 +55,7 @@ class Batches(Settings):
     cuda: Some[Natural]
 
 
-class Limits(Settings):
+class SolverLimits(Settings):
     """What a solver is timed for, in the place of the values for all of them."""
 
     refinements: Some[Natural] | None = None
@@ -75,14 +75,14 @@ class BenchmarkSettings(Settings):
 
     quick: bool
     solvers: Some[SolverName]
-    materials: Some[Material]
+    materials: Some[ElasticConstants]
     refinements: Some[Natural]
     batches: Batches
     largest_batch: ByRefinement
     steps: ByRefinement
-    projective_dynamics: Limits = Limits()
-    quasi_newton: Limits = Limits()
-    newton: Limits = Limits()
+    projective_dynamics: SolverLimits = SolverLimits()
+    quasi_newton: SolverLimits = SolverLimits()
+    newton: SolverLimits = SolverLimits()
     relative_tolerance: Positive
     max_iterations: Natural
     tip_mass: NotNegative = setting(unit="kg")
@@ -97,7 +97,7 @@ class BenchmarkSettings(Settings):
 
     def batches_of(self, solver: str, refinement: int, device: str) -> list[int]:
         """Numbers of environments that a solver is timed with."""
-        limits: Limits = getattr(self, solver)
+        limits: SolverLimits = getattr(self, solver)
         if refinement not in (limits.refinements or [refinement]):
             return []
         batches = limits.batches or (self.batches.cuda if device.startswith("cuda") else self.batches.cpu)
@@ -105,7 +105,7 @@ class BenchmarkSettings(Settings):
 
     def steps_of(self, solver: str, refinement: int) -> int:
         """Steps of a roll-out of a solver."""
-        limits: Limits = getattr(self, solver)
+        limits: SolverLimits = getattr(self, solver)
         return limits.steps or _at(self.steps, refinement)
 
 
@@ -114,11 +114,11 @@ _QUICK: Final = {"refinements": (1,), "batches": Batches(cpu=(1,), cuda=(1,)), "
 
 
 @dataclass
-class Case:
+class BenchmarkCase:
     """One row of the benchmark."""
 
     solver: str
-    material: Material
+    material: ElasticConstants
     refinement: int  # of the configured box
     batch: int
     timed: TimedRollout
@@ -167,9 +167,9 @@ def run_benchmark(config: Mapping[str, Any]) -> dict[str, Any]:
     """Measures everything that the group ``benchmark`` of a configuration asks for.
 
     Returns:
-        ``steps`` (a row for each `Case`), ``parts`` (milliseconds of the parts of a step), ``cold_start`` (seconds of a
-        new process without and with compiled kernels), ``environments`` and ``control`` (rows of `run_speed`),
-        ``yardstick_ms``, ``hardware``, ``versions``, ``date`` and ``settings``.
+        ``steps`` (a row for each `BenchmarkCase`), ``parts`` (milliseconds of the parts of a step), ``cold_start``
+        (seconds of a new process without and with compiled kernels), ``environments`` and ``control`` (rows of
+        `run_speed`), ``yardstick_ms``, ``hardware``, ``versions``, ``date`` and ``settings``.
 
     Raises:
         InputError: a configuration that cannot be simulated or refined.
@@ -209,7 +209,7 @@ def _time_runs(settings: BenchmarkSettings, device: str) -> tuple[list[dict[str,
     return environments, time_commands(Path(driven), repeats) if driven else []
 
 
-def _cases(config: Mapping[str, Any], settings: BenchmarkSettings, refinement: int) -> list[Case]:
+def _cases(config: Mapping[str, Any], settings: BenchmarkSettings, refinement: int) -> list[BenchmarkCase]:
     """Every combination of solver, material and batch, at its start and warmed up."""
     body = build_body(parse_part(BodySettings, {**config, "mesh": _refined(config, refinement)}))
     tolerances = {"relative_tolerance": settings.relative_tolerance, "max_iterations": settings.max_iterations}
@@ -226,7 +226,7 @@ def _cases(config: Mapping[str, Any], settings: BenchmarkSettings, refinement: i
                 start, inputs = _start(simulator, settings, batch, steps)
                 simulator.rollout(start, 2, Inputs(**{name: value[:2] for name, value in inputs.fields.items()}))
                 timed = TimedRollout(simulator, start, steps, inputs)
-                cases.append(Case(solver, material, refinement, batch, timed))
+                cases.append(BenchmarkCase(solver, material, refinement, batch, timed))
     if not cases:
         raise InputError(
             f"benchmark.batches and benchmark.largest_batch leave none of refinement {refinement}: name a smaller one."
@@ -275,7 +275,7 @@ def released(simulator: Simulator, mass: float, batch: int) -> State:
     return simulator.static_equilibrium(Inputs(force)).detach()
 
 
-def _take_turns(cases: list[Case], settings: BenchmarkSettings, yardstick: list[float]) -> None:
+def _take_turns(cases: list[BenchmarkCase], settings: BenchmarkSettings, yardstick: list[float]) -> None:
     with Progress(f"refinement {cases[0].refinement}", len(cases) * settings.repeats, "runs") as progress:
         for _ in range(settings.repeats):
             for case in cases:
@@ -285,7 +285,7 @@ def _take_turns(cases: list[Case], settings: BenchmarkSettings, yardstick: list[
             yardstick.append(yardstick_seconds())
 
 
-def _time_parts(case: Case, repeats: int) -> dict[str, Any]:
+def _time_parts(case: BenchmarkCase, repeats: int) -> dict[str, Any]:
     """Milliseconds of each part of an iteration, for the whole batch, at the end of the case's last roll-out."""
     sim = case.timed.simulator
     workspace = sim.workspace(case.batch)

@@ -10,12 +10,8 @@ from typing import Any, Final
 from rich.console import Console, RenderableType
 from rich.table import Table
 
-from ..experiment.schema import Kind
 from ..io.files import write_text
 
-WORDS: Final = Kind(
-    lambda value: isinstance(value, list) and all(isinstance(each, str) for each in value), "a list of words"
-)
 _LOG_WIDTH: Final = 140  # of tables that go to a file, in characters
 
 

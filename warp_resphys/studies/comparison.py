@@ -20,9 +20,9 @@ from ..report.page import (
     Cell,
     Drawn,
     Items,
+    PageTable,
     Part,
     Row,
-    Table,
     Text,
     duration_text,
     error_parts,
@@ -117,7 +117,7 @@ def setup_section(reproduction: Reproduction, studies: Mapping[str, Runs]) -> Pa
         for key in values[1]
     ]
     note = "The incorrect beam is the simulator to correct, the correct one is its target."
-    return Part("Set-up", [Table("", columns, rows, note)])
+    return Part("Set-up", [PageTable("", columns, rows, note)])
 
 
 def _setup(settings: Mapping[str, Any]) -> dict[str, float]:
@@ -168,7 +168,7 @@ def study_section(reproduction: Reproduction, name: str, runs: Runs, canvas: Can
         "Mean distance of the vertices over all test trajectories and steps, ± its standard deviation. A roll-out that "
         "diverged leaves no mean. Reconstruction: the simulator with forces fitted to the test trajectory itself."
     )
-    table = Table("Roll-out error [mm]", _columns(reproduction, runs), rows, note)
+    table = PageTable("Roll-out error [mm]", _columns(reproduction, runs), rows, note)
     drawn = {role: runs[variant] for role, variant in group.drawn.items() if variant in runs}
     drawn.setdefault("models", next(iter(runs.values())))
     return Part(group.title, [table, *_study_figures(reproduction, name, drawn, canvas), *_reasons(group.deviations)])
@@ -231,7 +231,7 @@ def timing_section(reproduction: Reproduction, runs: Runs) -> Part:
     ]
     counts = " and ".join(sorted({str(steps) for _, steps in measured}))
     note = f"Published: trajectories of {paper.PUBLISHED_SECONDS_STEPS} steps; here: of {counts}."
-    table = Table("Time per trajectory [s]", _columns(reproduction, runs), rows, note)
+    table = PageTable("Time per trajectory [s]", _columns(reproduction, runs), rows, note)
     return Part("Time benchmark", [table, *_reasons(reproduction.timing.deviations)])
 
 
@@ -261,7 +261,7 @@ def ablation_section(reproduction: Reproduction, name: str, runs: Runs, canvas: 
     boxes = partial(ablation_page.marker_boxes, ablation_page.box_errors(metrics), metrics["uncorrected_mm"], published)
     caption = "Box: lower quartile, median (orange), upper quartile; whiskers to the smallest and the largest error."
     figure = canvas.figure(name, boxes, ablation_page.describe_boxes(metrics), caption)
-    return Part(group.title, [Table("Markers", columns, rows, note), figure, *_reasons(group.deviations)])
+    return Part(group.title, [PageTable("Markers", columns, rows, note), figure, *_reasons(group.deviations)])
 
 
 def runs_section(reproduction: Reproduction, results: Sequence[Run]) -> Part:
@@ -280,7 +280,7 @@ def runs_section(reproduction: Reproduction, results: Sequence[Run]) -> Part:
     note = (
         "Time of each stage when it was last run, beside whatever else the machine did. Memory: with that of workers."
     )
-    table = Table("Run", ["All stages", "Peak memory [GiB]"], rows, note)
+    table = PageTable("Run", ["All stages", "Peak memory [GiB]"], rows, note)
     commands = Items([shlex.join(["warp-resphys", *run.arguments]) for run in results], code=True)
     return Part("Runs", [*failures, table, Text("Each by itself", heading=True), commands])
 
@@ -295,5 +295,5 @@ def missing_section(published: Mapping[str, Mapping[str, paper.PublishedError]])
         )
         for name, errors in published.items()
     ]
-    table = Table("Published error [mm]", [*models.values()], rows)
+    table = PageTable("Published error [mm]", [*models.values()], rows)
     return Part("Published, and not reproduced yet", [table])

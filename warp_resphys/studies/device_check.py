@@ -60,7 +60,7 @@ class Check(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Section:
+class CheckGroup:
     """Checks of one kind, and the seconds that they took."""
 
     title: str
@@ -126,11 +126,11 @@ def check_device(config: Mapping[str, Any], folder: Path) -> None:
         raise SystemExit(1)
 
 
-def _run(title: str, checks: Callable[[], Iterator[Check]]) -> Section:
+def _run(title: str, checks: Callable[[], Iterator[Check]]) -> CheckGroup:
     """Runs the checks of a section, and prints them."""
     began = time.perf_counter()
     done = list(checks())
-    section = Section(title, done, time.perf_counter() - began)
+    section = CheckGroup(title, done, time.perf_counter() - began)
     show(section.sheet(f"{title}, {section.seconds:.0f} s"))
     return section
 

@@ -10,24 +10,37 @@ import warp as wp
 
 from ..control.replay import driven_settings, replay
 from ..experiment.files import METRICS, OPEN
-from ..experiment.schema import POSITIVE, WORD, check, optional
 from ..io.errors import InputError
 from ..io.files import read_json
+from ..io.settings import Many, Positive, Settings, Word, parse, setting
 from ..io.stages import finished_record
 from ..report.bodies import ComparedMotion
 from ..report.camera import hangs
 from ..report.control_section import compared_controllers
 from ..report.data import MODELS, at_times
 from ..report.driven_film import DrivenBodies
-from ..report.render import DrawingError, Scene, write_film
+from ..report.render import DrawingError, RenderScene, write_film
 from ..robot.loading import load, recorded_trial
 from ..robot.robot import Robot
-from .command import WORDS, show
+from .command import show
 
 _USUAL: Final = ("simulation", "resphys")
 _MOST_VIEWS: Final = 3  # of controllers, side by side
 _MOST_MARKERS: Final = 6  # vertices that are shown where every one is observed
 _AT_THE_TIP: Final = 0.97  # of the largest distance from what is fixed, from which on they are
+
+
+class FilmSettings(Settings):
+    """The configuration ``view_film``, which has what the keys mean, and their values."""
+
+    run: Word
+    trial: Word | None
+    models: Many[Word] | None
+    motion: Word | None
+    controllers: Many[Word] | None
+    seconds: Positive | None = setting(unit="s")
+    slower: Positive | None
+    file: Word | None
 
 
 def film(config: Mapping[str, Any], folder: Path) -> None:
@@ -40,15 +53,14 @@ def film(config: Mapping[str, Any], folder: Path) -> None:
         DataFileError: there is no finished run, or the film cannot be written.
     """
     del folder
-    check("run", config["run"], WORD)
-    for key, kind in (("trial", WORD), ("motion", WORD), ("file", WORD), ("slower", POSITIVE), ("seconds", POSITIVE)):
-        check(key, config[key], optional(kind))
-    for key in ("models", "controllers"):
-        check(key, config[key], optional(WORDS))
+    settings = parse(FilmSettings, config)
     wp.config.log_level = wp.LOG_WARNING
-    run = Path(config["run"]).expanduser()
-    name, scene = _film_of_trial(run, config) if config["motion"] is None else _film_of_motion(run, config)
-    path = run / "films" / f"{name}.mp4" if config["file"] is None else Path(config["file"]).expanduser()
+    run = Path(settings.run).expanduser()
+    if settings.motion is None:
+        name, scene = _film_of_trial(run, settings)
+    else:
+        name, scene = _film_of_motion(run, settings.motion, settings)
+    path = run / "films" / f"{name}.mp4" if settings.file is None else Path(settings.file).expanduser()
     try:
         write_film(path, scene)
     except DrawingError as error:
@@ -56,28 +68,28 @@ def film(config: Mapping[str, Any], folder: Path) -> None:
     show(f"Written: {path}")
 
 
-def _film_of_trial(run: Path, config: Mapping[str, Any]) -> tuple[str, Scene]:
+def _film_of_trial(run: Path, settings: FilmSettings) -> tuple[str, RenderScene]:
     """Name and film of a trial."""
-    if config["controllers"] is not None:
+    if settings.controllers is not None:
         raise InputError("controllers drive motions: name one by motion=, such as motion=eight_4s.")
     finished_record(run, "evaluate")
-    metrics, models, seconds = read_json(run / METRICS), config["models"], config["seconds"]
+    metrics, models, seconds = read_json(run / METRICS), settings.models, settings.seconds
     if models is None:
-        models = [each for each in _USUAL if each in metrics["errors_mm"]] or list(metrics["errors_mm"])[:2]
-    name = metrics["per_trajectory"][0]["name"] if config["trial"] is None else config["trial"]
+        known = tuple(metrics["errors_mm"])
+        models = tuple(each for each in _USUAL if each in known) or known[:2]
+    name = metrics["per_trajectory"][0]["name"] if settings.trial is None else settings.trial
     motion = motion_of(run, name, models, np.inf if seconds is None else seconds)
-    return name, motion.film(seconds, config["slower"])
+    return name, motion.film(seconds, settings.slower)
 
 
-def _film_of_motion(run: Path, config: Mapping[str, Any]) -> tuple[str, Scene]:
+def _film_of_motion(run: Path, name: str, settings: FilmSettings) -> tuple[str, RenderScene]:
     """Name and film of a motion as controllers drove it."""
     for key in ("trial", "models"):
-        if config[key] is not None:
+        if getattr(settings, key) is not None:
             raise InputError(f"{key} is of films of trials, and motion of one of control: leave one of them out.")
-    name, seconds = config["motion"], config["seconds"]
-    control, controllers = driven_settings(run).control, config["controllers"]
+    seconds, controllers, control = settings.seconds, settings.controllers, driven_settings(run).control
     if controllers is None:
-        controllers = [each for each in compared_controllers(control.plain()) if each.startswith(OPEN)]
+        controllers = tuple(each for each in compared_controllers(control.plain()) if each.startswith(OPEN))
     if len(controllers) > _MOST_VIEWS:
         raise InputError(f"controllers names {len(controllers)}: a film shows at most {_MOST_VIEWS} side by side.")
     played = replay(run, name, controllers, np.inf if seconds is None else seconds)
@@ -90,7 +102,7 @@ def _film_of_motion(run: Path, config: Mapping[str, Any]) -> tuple[str, Scene]:
         np.array([control.right, control.up], dtype=np.float64),
         played.gravity,
     )
-    return name, shown.film(1.0 if config["slower"] is None else config["slower"])
+    return name, shown.film(1.0 if settings.slower is None else settings.slower)
 
 
 def motion_of(run: Path, trial: str, models: Sequence[str], seconds: float = np.inf) -> ComparedMotion:

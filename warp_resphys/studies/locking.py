@@ -83,7 +83,7 @@ class LockingStudy(Settings):
 
 
 @dataclass(frozen=True)
-class Case:
+class LockingCase:
     """A mesh of the study."""
 
     element: Element
@@ -113,13 +113,13 @@ class Case:
         return mesh if linear else quadratic(mesh, self.element)
 
 
-def cases(study: LockingStudy) -> list[Case]:
+def cases(study: LockingStudy) -> list[LockingCase]:
     """The meshes of a study: those of a file, then those that are made."""
     elements: tuple[Element, ...] = () if study.file is None else ("tetrahedron4", "tetrahedron10")
     return [
-        *(Case(element, file=study.file, units=study.units) for element in elements),
+        *(LockingCase(element, file=study.file, units=study.units) for element in elements),
         *(
-            Case(element, size, layers[0] if layers else None, timed=timed)
+            LockingCase(element, size, layers[0] if layers else None, timed=timed)
             for element, meshes in study.meshes.items()
             for size, *layers, timed in meshes
         ),
@@ -131,7 +131,7 @@ def measure(mesh: Mesh, study: LockingStudy, timed: bool = True) -> dict[str, An
 
     Returns:
         ``vertices``, ``chamber_cm3`` of the chamber under pressure, ``<load>_mm`` of each of `LOADS`: how far the tip
-        moves towards +x, ``step_ms`` and ``iterations`` of a step; None for what was left out, as `Case.timed` says.
+        moves towards +x, ``step_ms`` and ``iterations`` of a step; None for what `LockingCase.timed` leaves out.
 
     Raises:
         ResphysError: the mesh has no such chamber, or an equilibrium was not found.
@@ -185,7 +185,7 @@ def converged(rows: Sequence[Mapping[str, Any]], load: str) -> dict[str, float] 
     1911).
 
     Args:
-        rows: results of `measure`, with the ``element``, ``size`` and ``layers`` of their `Case`.
+        rows: results of `measure`, with the ``element``, ``size`` and ``layers`` of their `LockingCase`.
         load: one of `LOADS`.
 
     Returns:

@@ -7,7 +7,7 @@ gravity points along -z. Arrays are in metres; T frames or steps, M markers, N v
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 import torch
@@ -25,32 +25,23 @@ from ..data.recordings.reading import read_recording
 from ..data.recordings.recording import Recording
 from ..data.recordings.release import Release, find_release
 from ..data.rigid import kabsch, root_mean_square
+from ..dynamics.nonlinear_solver import SolverName
 from ..dynamics.simulator import Simulator
-from ..energies.materials import make_material
-from ..experiment.schema import ANYTHING, COUNT, FINITE, MATERIAL, NOT_NEGATIVE, POSITIVE, WORD, Group, check, optional
+from ..experiment.build import build_material
 from ..fem.body import Body, PointMass
+from ..fem.elements import VolumeIntegration
 from ..io.atomic import atomic_path
 from ..io.errors import DataFileError, InputError
 from ..io.files import write_json
+from ..io.settings import Count, NotNegative, Positive, Settings, Some, Vector, Word, parse, setting
 from ..mesh.mesh import box_hexahedra, select_vertices
 from ..report.figures import STYLE, TONES, save_png
+from ..settings.body import Integrator, MaterialSettings
+from .beam import Divisions
 from .command import aligned
 
 FloatArray = NDArray[np.float64]
 
-_KEYS: Final = Group(
-    {
-        "material": MATERIAL,
-        "registration": Group({"longest_gap": COUNT, "largest_residual": NOT_NEGATIVE}),
-        "comparison": Group(dict.fromkeys(("fit_seconds", "tail_seconds", "error_seconds"), POSITIVE)),
-        "recording": Group({"hung_weight": NOT_NEGATIVE, "release_frame": optional(FINITE)}, each=ANYTHING),
-        "simulation": Group(
-            dict.fromkeys(("time_step", "gravity", "relative_tolerance"), POSITIVE)
-            | dict.fromkeys(("integrator", "solver", "device"), WORD)
-        ),
-    },
-    each=ANYTHING,
-)
 _MILLI: Final = 1e3
 _CLOSE_UP_SECONDS: Final = 1.4
 _HELD_FRAMES: Final = 20  # that give the rest position where the release is configured
@@ -70,12 +61,75 @@ _NUMBERS: Final[Mapping[str, tuple[str, float]]] = {
 _COMPARED: Final = {"sag [mm]": "sag", "period [s]": "period", "decay [1/s]": "decay_rate"}
 
 
-@dataclasses.dataclass(frozen=True)
-class Marker:
+class NominalMarker(Settings):
     """A marker and its nominal position in the frame of the body."""
 
-    name: str
-    position: tuple[float, float, float]  # (x, y, z) [m]
+    name: Word
+    position: Vector = setting(unit="m")
+
+
+class NominalMarkers(Settings):
+    """Markers of the tip and of the clamp."""
+
+    tip: Some[NominalMarker]
+    base: Some[NominalMarker]
+
+
+class RegistrationSettings(Settings):
+    """When a recording is close enough to the nominal markers."""
+
+    longest_gap: Count = setting(description="frames of an occlusion that are interpolated")
+    largest_residual: NotNegative = setting(description="root mean square of the registration", unit="m")
+
+
+class BeamSettings(Settings):
+    """The box that is simulated."""
+
+    size: Vector = setting(unit="m")
+    divisions: Divisions
+    mass: Literal["row_sum", "per_vertex"]
+    volume_integration: VolumeIntegration
+
+
+class SwingSimulation(Settings):
+    """How the swing is simulated."""
+
+    time_step: Positive = setting(unit="s")
+    integrator: Integrator
+    solver: SolverName
+    relative_tolerance: Positive
+    gravity: Positive = setting(unit="m/s^2")
+    device: Word
+
+
+class WindowSettings(Settings):
+    """Spans of time that numbers are taken from."""
+
+    fit_seconds: Positive = setting(unit="s")
+    tail_seconds: Positive = setting(unit="s")
+    error_seconds: Positive = setting(unit="s")
+
+
+class SwingRecording(Settings):
+    """The group ``recording``: a file, and what hung on the beam."""
+
+    name: Word
+    title: Word
+    path: Word | None
+    hung_weight: NotNegative = setting(unit="N")
+    release_frame: float | None
+
+
+class ComparisonSettings(Settings):
+    """The configuration ``inspect_compare``, which has what the keys mean, and their values."""
+
+    markers: NominalMarkers
+    registration: RegistrationSettings
+    body: BeamSettings
+    material: MaterialSettings
+    simulation: SwingSimulation
+    comparison: WindowSettings
+    recording: SwingRecording
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,8 +161,8 @@ class MeasuredSwing(Swing):
 
 def measured_swing(
     recording: Recording,
-    tip: Sequence[Marker],
-    base: Sequence[Marker],
+    tip: Sequence[NominalMarker],
+    base: Sequence[NominalMarker],
     *,
     longest_gap: int,
     largest_residual: float,
@@ -173,35 +227,35 @@ def marker_error(measured: Swing, simulated: Swing, seconds: float) -> float:
     return float(np.linalg.norm(at_frames - measured.displacement[inside], axis=-1).mean())
 
 
-def simulate_swing(config: Mapping[str, Any], rest_markers: FloatArray, seconds: float) -> Swing:
+def simulate_swing(settings: ComparisonSettings, rest_markers: FloatArray, seconds: float) -> Swing:
     """Simulates the beam let go from straight and at rest for some seconds, and follows its markers (M, 3) [m].
 
     Raises:
         ResphysError: A value in the configuration cannot be simulated, or a step did not converge.
     """
-    shape, simulation = config["body"], config["simulation"]
-    length, _, height = shape["size"]
-    mesh = box_hexahedra(shape["size"], shape["divisions"])
-    mass = config["recording"]["hung_weight"] / simulation["gravity"]
+    shape, simulation = settings.body, settings.simulation
+    length, _, height = shape.size
+    mesh = box_hexahedra(shape.size, shape.divisions)
+    mass = settings.recording.hung_weight / simulation.gravity
     weights = [PointMass(mass, select_vertices(mesh, x=length, z=height).tolist())] if mass > 0.0 else []
     body = Body(
         mesh,
         fixed=select_vertices(mesh, x=0.0),
-        mass=shape["mass"],
-        volume_integration=shape["volume_integration"],
+        mass=shape.mass,
+        volume_integration=shape.volume_integration,
         point_masses=weights,
     )
     simulator = Simulator(
         body,
-        make_material(**config["material"]),
-        **{**simulation, "gravity": (0.0, 0.0, -simulation["gravity"])},
+        build_material(settings.material, "material"),
+        **{**simulation.plain(), "gravity": (0.0, 0.0, -simulation.gravity)},
     )
-    steps = int(np.ceil(seconds / simulation["time_step"]))
+    steps = int(np.ceil(seconds / simulation.time_step))
     with torch.no_grad():
         positions = simulator.rollout(simulator.rest_state(), steps).q
     tip_face = select_vertices(mesh, x=length)
     face = positions[:, 0, tip_face].cpu().numpy().astype(np.float64)
-    time = simulation["time_step"] * np.arange(steps + 1)
+    time = simulation.time_step * np.arange(steps + 1, dtype=np.float64)
     return Swing(time, follow_face(face, mesh.vertices[tip_face], rest_markers))
 
 
@@ -228,23 +282,27 @@ def compare_recording(config: Mapping[str, Any], folder: Path) -> dict[str, Any]
         ResphysError: A value in the configuration is wrong, the recording cannot be used, a step of the simulation did
             not converge, or a file cannot be written.
     """
-    check("", config, _KEYS)
-    settings, comparison = config["recording"], config["comparison"]
-    if settings["path"] is None:
+    settings = parse(ComparisonSettings, config)
+    path, markers, windows = settings.recording.path, settings.markers, settings.comparison
+    if path is None:
         raise InputError("No recording given: set recording.path to one, as in recording.path=swing.c3d.")
-    tip, base = ([Marker(**marker) for marker in config["markers"][part]] for part in ("tip", "base"))
-    recording = read_recording(settings["path"])
+    recording = read_recording(path)
     check_passive(recording)
-    check_motion(recording, [marker.name for marker in tip])
-    measured = measured_swing(recording, tip, base, **config["registration"], release_frame=settings["release_frame"])
-    simulated = simulate_swing(config, measured.rest_markers, float(measured.time[-1]))
-    window, tail = comparison["fit_seconds"], comparison["tail_seconds"]
+    check_motion(recording, [marker.name for marker in markers.tip])
+    measured = measured_swing(
+        recording,
+        markers.tip,
+        markers.base,
+        **settings.registration.plain(),
+        release_frame=settings.recording.release_frame,
+    )
+    simulated = simulate_swing(settings, measured.rest_markers, float(measured.time[-1]))
     oscillations = {
-        name: measure_oscillation(swing.deflection, swing.rate, window=window, tail=tail)
+        name: measure_oscillation(swing.deflection, swing.rate, window=windows.fit_seconds, tail=windows.tail_seconds)
         for name, swing in (("measured", measured), ("simulated", simulated))
     }
-    error = marker_error(measured, simulated, comparison["error_seconds"])
-    result = _summary(measured, oscillations, error) | {"config": dict(config)}
+    error = marker_error(measured, simulated, windows.error_seconds)
+    result = _summary(measured, oscillations, error) | {"config": settings.plain()}
     figure = draw_comparison(measured, simulated, result)
     write_json(folder / "comparison.json", result)
     with atomic_path(folder / "comparison.png") as partial:

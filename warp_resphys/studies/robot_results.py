@@ -17,9 +17,9 @@ from ..report.page import (
     Cell,
     Drawn,
     Items,
+    PageTable,
     Part,
     Row,
-    Table,
     Text,
     drawn_file,
     duration_text,
@@ -27,7 +27,7 @@ from ..report.page import (
     number_text,
 )
 from ..report.verdict import learned_in_part
-from .rows import Robot
+from .rows import RecordedRobot
 from .runs import Run
 
 _MODELS = ("simulation", "sysid", "simfree", "resphys")
@@ -136,7 +136,7 @@ def _seconds(metrics: Mapping[str, Any]) -> float:
     return float(sum(sum(each["seconds"].values()) for each in every))
 
 
-def summary(robots: Mapping[str, Robot], found: Mapping[str, Measured], failed: Container[str]) -> Part:
+def summary(robots: Mapping[str, RecordedRobot], found: Mapping[str, Measured], failed: Container[str]) -> Part:
     """One row per robot. A robot whose run failed keeps its last known result."""
     rows = []
     for name, each in found.items():
@@ -163,7 +163,7 @@ def summary(robots: Mapping[str, Robot], found: Mapping[str, Measured], failed: 
         "Coverage",
         "Time",
     ]
-    return Part("All robots", [Table("Robot", columns, rows, note)] if rows else [])
+    return Part("All robots", [PageTable("Robot", columns, rows, note)] if rows else [])
 
 
 def _gain_text(gain: Share | None) -> str:
@@ -180,7 +180,7 @@ def _coverage(intervals: Mapping[str, Any] | None) -> str:
     return f"{100.0 * intervals['coverage']:.0f} % (± {intervals['half_width_mm']:.2g} mm)"
 
 
-def details(name: str, robot: Robot, found: Measured, pictures: Path) -> Part:
+def details(name: str, robot: RecordedRobot, found: Measured, pictures: Path) -> Part:
     """A robot: its picture, where its recordings come from, what was tested, and what was published."""
     source = Text(f"{robot.actuation[:1].upper()}{robot.actuation[1:]}. {robot.source}")
     count = len(found.tested)
@@ -194,7 +194,7 @@ def details(name: str, robot: Robot, found: Measured, pictures: Path) -> Part:
     return Part(robot.title, [*blocks, Items([shlex.join(["warp-resphys", *found.arguments])], code=True)])
 
 
-def _drawn(name: str, robot: Robot, pictures: Path) -> list[Drawn]:
+def _drawn(name: str, robot: RecordedRobot, pictures: Path) -> list[Drawn]:
     """The body; none where no picture was drawn."""
     path = pictures / f"{name}.png"
     if not path.is_file():
@@ -202,7 +202,7 @@ def _drawn(name: str, robot: Robot, pictures: Path) -> list[Drawn]:
     return [drawn_file(path, f"The body of {robot.title} and its markers.", "The body as it is simulated.")]
 
 
-def machines(robots: Mapping[str, Robot], found: Mapping[str, Measured]) -> Part:
+def machines(robots: Mapping[str, RecordedRobot], found: Mapping[str, Measured]) -> Part:
     """When each robot was measured, on which machine and with which versions."""
     columns = ["Measured", *_MACHINE.values(), *_PACKAGES]
     rows = [
@@ -212,10 +212,10 @@ def machines(robots: Mapping[str, Robot], found: Mapping[str, Measured]) -> Part
         )
         for name, each in found.items()
     ]
-    return Part("Machines and versions", [Table("Robot", columns, rows)] if rows else [])
+    return Part("Machines and versions", [PageTable("Robot", columns, rows)] if rows else [])
 
 
-def verdict(robots: Mapping[str, Robot], found: Mapping[str, Measured]) -> str:
+def verdict(robots: Mapping[str, RecordedRobot], found: Mapping[str, Measured]) -> str:
     """The robots on which the learned force helps, in a sentence."""
     if not found:
         return "No run has succeeded."

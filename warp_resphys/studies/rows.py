@@ -39,7 +39,7 @@ class Beam(Settings):
     deviations: Many[Word] = setting(description="why results differ from what was published")
 
 
-class Robot(Settings):
+class RecordedRobot(Settings):
     """A robot with a frozen split; others have recorded it, or a simulation plays it."""
 
     title: Word
@@ -74,7 +74,7 @@ class Reproduction(Settings):
     variants: dict[str, Variant]
     experiments: dict[str, Beam]
     timing: Timing
-    robots: dict[str, Robot]
+    robots: dict[str, RecordedRobot]
 
     @classmethod
     def read(cls, config: Mapping[str, Any]) -> "Reproduction":

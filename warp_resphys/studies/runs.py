@@ -23,7 +23,7 @@ from ..io.files import read_json, write_text
 from ..io.machine import commit, hardware
 from ..io.progress import clock
 from ..io.stages import package_versions
-from ..report.page import Cell, Drawn, Items, Part, Row, Table, markdown, write_page
+from ..report.page import Cell, Drawn, Items, PageTable, Part, Row, markdown, write_page
 
 _UP_TO_DATE_SECONDS = 8.0  # for a run that finds nothing to do
 _LINE_SECONDS = 60.0
@@ -103,7 +103,7 @@ def made(command: str, hidden: Sequence[str] = ()) -> Part:
         hidden: keys whose values are folders of that machine.
     """
     known = {**hardware(), "commit": commit() or "not known", **package_versions()}
-    table = Table("Machine and versions", ["Here"], [Row(name, [Cell(value)]) for name, value in known.items()])
+    table = PageTable("Machine and versions", ["Here"], [Row(name, [Cell(value)]) for name, value in known.items()])
     return Part("Command, machine and versions", [*command_part(command, hidden).blocks, table])
 
 

@@ -27,7 +27,7 @@ _FITTED: Final = 3  # largest sizes that exponents are fitted to
 Element = Literal["hexahedron8", "tetrahedron10"]
 
 
-class Case(NamedTuple):
+class SizeCase(NamedTuple):
     """A beam and a linear solver."""
 
     element: Element
@@ -49,11 +49,11 @@ class SizeStudy(BeamStudy):
     longest: Positive = setting(unit="s")
     device: Word
 
-    def cases(self) -> list[Case]:
+    def cases(self) -> list[SizeCase]:
         """All cases, larger ones of their kind after smaller ones."""
         divisions = {"hexahedron8": self.hexahedron_divisions, "tetrahedron10": self.tetrahedron_divisions}
         return [
-            Case(element, ratio, own, solver)
+            SizeCase(element, ratio, own, solver)
             for element in self.elements
             for ratio in self.poissons_ratios
             for own in divisions[element]
@@ -99,9 +99,9 @@ def measure(values: Mapping[str, Any]) -> dict[str, Any]:
     Kernels and layouts are made by a first step and its gradient, which are not timed.
 
     Args:
-        values: ``study``, the settings, and ``case``, the fields of a `Case`, as plain data.
+        values: ``study``, the settings, and ``case``, the fields of a `SizeCase`, as plain data.
     """
-    study, case = parse(SizeStudy, values["study"]), Case(**values["case"])
+    study, case = parse(SizeStudy, values["study"]), SizeCase(**values["case"])
     body = clamped(beam_mesh(case.element, study.size, case.divisions))
     solver = SolverSettings(relative_tolerance=study.relative_tolerance, linear_solver=case.linear_solver)
     material = Corotated(study.youngs_modulus, case.poissons_ratio)

@@ -6,7 +6,7 @@ from typing import Any
 
 from rich.table import Table as TerminalTable
 
-from ..report.page import Cell, Part, Row, Table
+from ..report.page import Cell, PageTable, Part, Row
 from .command import table_of
 
 
@@ -36,4 +36,4 @@ class Sheet:
         """A section of a page."""
         first, *others = (heading[:1].upper() + heading[1:] for heading in self.headings)
         rows = [Row(name, [Cell(value) for value in values]) for name, *values in self.rows]
-        return Part(self.title, [Table(first, others, rows, note=self.note)])
+        return Part(self.title, [PageTable(first, others, rows, note=self.note)])

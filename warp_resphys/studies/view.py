@@ -17,8 +17,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from ..experiment.schema import COUNT, POSITIVE, WORD, check, optional
 from ..io.errors import InputError, ResphysError
+from ..io.settings import Count, Positive, Settings, Word, parse, setting
 from ..report.bodies import sharp_edges
 from ..report.camera import upwards
 from ..report.figures import TONES
@@ -44,6 +44,18 @@ Keys: **space** pauses, **R** resets."""
 _SPEEDS: Final = {"a tenth": 0.1, "a quarter": 0.25, "half": 0.5, "real time": 1.0, "double": 2.0}
 
 
+class ViewSettings(Settings):
+    """The configuration ``view``, which has what the keys mean, and their values."""
+
+    run: Word
+    model: Word
+    trial: Word | None
+    device: Word
+    host: Word
+    port: Count
+    seconds: Positive | None = setting(unit="s")
+
+
 def view(config: Mapping[str, Any], folder: Path) -> None:
     """Serves a page until it is interrupted, and says how many pictures a second it has shown.
 
@@ -52,11 +64,8 @@ def view(config: Mapping[str, Any], folder: Path) -> None:
         DataFileError: there is no finished run.
     """
     del folder
-    for key, kind in (("run", WORD), ("model", WORD), ("trial", optional(WORD)), ("device", WORD), ("host", WORD)):
-        check(key, config[key], kind)
-    check("port", config["port"], COUNT)
-    check("seconds", config["seconds"], optional(POSITIVE))
-    port = _free_port(config["host"], config["port"])
+    settings = parse(ViewSettings, config)
+    port = _free_port(settings.host, settings.port)
     try:
         import viser
     except ImportError:
@@ -64,20 +73,20 @@ def view(config: Mapping[str, Any], folder: Path) -> None:
             "the viewer needs a package that is not installed: pip install 'warp-resphys[view]'."
         ) from None
     wp.config.log_level = wp.LOG_WARNING
-    robot = load(Path(config["run"]).expanduser(), config["model"], device=config["device"])
+    robot = load(Path(settings.run).expanduser(), settings.model, device=settings.device)
     live = LiveRobot(robot)
-    if config["trial"] is not None:
-        live.play_trial(config["trial"])
+    if settings.trial is not None:
+        live.play_trial(settings.trial)
     live.step()  # Whatever is compiled at the first step is compiled before anyone looks.
     live.reset()
     logging.getLogger("websockets").setLevel(logging.WARNING)
     with redirect_stdout(io.StringIO()):  # Where it listens is said below.
-        server = viser.ViserServer(config["host"], port, label=robot.description.name, verbose=False)
+        server = viser.ViserServer(settings.host, port, label=robot.description.name, verbose=False)
     try:
         page = Page(server, live)
-        where = "localhost" if config["host"] in _EVERYWHERE else config["host"]
+        where = "localhost" if settings.host in _EVERYWHERE else settings.host
         show(f"Open http://{where}:{server.get_port()} in a browser; Ctrl-C ends it.")
-        rate = page.run(config["seconds"])
+        rate = page.run(settings.seconds)
     finally:
         with redirect_stdout(io.StringIO()):
             server.stop()

@@ -23,9 +23,9 @@ from ...report.page import (
     Canvas,
     Cell,
     Drawn,
+    PageTable,
     Part,
     Row,
-    Table,
     Text,
     duration_text,
     flatten,
@@ -45,7 +45,7 @@ _MODELS = {"resphys": "ResPhys", "simfree": "SimFree"}
 
 
 @dataclass(frozen=True)
-class Results:
+class SearchResults:
     """The results of a search.
 
     Attributes:
@@ -84,7 +84,7 @@ def short_text(value: Any) -> str:
     return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
-def write_results(results: Results, finished: bool = False) -> None:
+def write_results(results: SearchResults, finished: bool = False) -> None:
     """Writes tune.json, trials.csv and the best settings; the page too, at the end or if its last drawing is old."""
     study = results.study
     with FileLock(study.folder / "results.lock"):
@@ -114,7 +114,7 @@ def write_results(results: Results, finished: bool = False) -> None:
             _write_page(results, outcomes)
 
 
-def _option_text(results: Results, best: Outcome, trials: int) -> str:
+def _option_text(results: SearchResults, best: Outcome, trials: int) -> str:
     """An option of the group ``tuned``: all of ``network`` and ``trainer`` as the best trial had them."""
     groups = with_settings(results.groups, best.settings)
     found: dict[str, Any] = {key: groups[key] for key in ("network", "trainer")}
@@ -130,7 +130,7 @@ def _option_text(results: Results, best: Outcome, trials: int) -> str:
     return "\n".join([*head, str(OmegaConf.to_yaml({"tuned": results.tune.save_as, **found}))])
 
 
-def print_best(results: Results) -> None:
+def print_best(results: SearchResults) -> None:
     """Prints the best trials, and how to use their settings."""
     best = ranked(results.study.outcomes())
     if not best:
@@ -146,12 +146,12 @@ def print_best(results: Results) -> None:
     )
 
 
-def _values(results: Results, trial: Outcome) -> list[str]:
+def _values(results: SearchResults, trial: Outcome) -> list[str]:
     """Error and settings of a trial."""
     return [number_text(trial.error), *(short_text(trial.settings[key]) for key in results.study.space)]
 
 
-def _write_page(results: Results, outcomes: Sequence[Outcome]) -> None:
+def _write_page(results: SearchResults, outcomes: Sequence[Outcome]) -> None:
     """Writes history.png, importance.png and settings.png, and tune.html, which shows them and the trials."""
     best, space = ranked(outcomes), results.study.space
     last = [key.rpartition(".")[2] for key in space]
@@ -160,15 +160,15 @@ def _write_page(results: Results, outcomes: Sequence[Outcome]) -> None:
         Row(str(each.number), [Cell(text) for text in (*_values(results, each), duration_text(each.seconds or 0.0))])
         for each in best
     ]
-    shown: list[Drawn | Text | Table] = [*_drawn(results.study, outcomes, names, results.configured_mm)]
+    shown: list[Drawn | Text | PageTable] = [*_drawn(results.study, outcomes, names, results.configured_mm)]
     if best:
         use = f"To run with the best settings: tuned={results.tune.save_as}, which stands in {results.option}."
-        shown += [Text(use), Table("Trial", ["Error [mm]", *names.values(), "Wall time"], rows)]
+        shown += [Text(use), PageTable("Trial", ["Error [mm]", *names.values(), "Wall time"], rows)]
     fixed = flatten({key: results.groups[key] for key in ("network", "trainer", "seed")})
     common = [Row(key, [Cell(value)]) for key, value in fixed if key not in space]
     searched = [
-        Table("Setting", ["Range"], [Row(key, [Cell(str(dimension))]) for key, dimension in space.items()]),
-        Table("Setting", ["Value"], common, summary="What all trials have in common"),
+        PageTable("Setting", ["Range"], [Row(key, [Cell(str(dimension))]) for key, dimension in space.items()]),
+        PageTable("Setting", ["Value"], common, summary="What all trials have in common"),
     ]
     write_page(
         results.study.folder / PAGE,
@@ -179,7 +179,7 @@ def _write_page(results: Results, outcomes: Sequence[Outcome]) -> None:
     )
 
 
-def _verdict(results: Results, outcomes: Sequence[Outcome], best: Sequence[Outcome]) -> str:
+def _verdict(results: SearchResults, outcomes: Sequence[Outcome], best: Sequence[Outcome]) -> str:
     """The best trial, and how many there were."""
     complete, pruned = (sum(each.state == state for each in outcomes) for state in ("complete", "pruned"))
     asides = [f"{pruned} given up, as they took too long"] if pruned else []

@@ -1,5 +1,6 @@
 """The group `tune` of the configuration: what is searched, over which values, and how long."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -7,7 +8,6 @@ from typing import Annotated, Any
 from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
 from pydantic import Field
 
-from ...experiment.schema import is_finite
 from ...io.errors import InputError
 from ...io.settings import Count, Natural, Positive, Settings, Word, setting
 
@@ -69,11 +69,11 @@ class Dimension:
         """From the value of a key of the configuration."""
         try:
             if isinstance(given, list) and len(set(given)) == len(given) > 1:
-                if all(map(is_finite, given)):
+                if all(map(_is_finite, given)):
                     return cls(IntDistribution(0, len(given) - 1), tuple(sorted(given)))
-                if all(isinstance(value, (str, bool)) or is_finite(value) for value in given):
+                if all(isinstance(value, (str, bool)) or _is_finite(value) for value in given):
                     return cls(CategoricalDistribution(given), tuple(given))
-            if isinstance(given, Mapping) and is_finite(given.get("low")) and is_finite(given.get("high")):
+            if isinstance(given, Mapping) and _is_finite(given.get("low")) and _is_finite(given.get("high")):
                 whole = isinstance(given["low"], int) and isinstance(given["high"], int)
                 return cls((IntDistribution if whole else FloatDistribution)(**given))
         except (TypeError, ValueError) as error:
@@ -102,6 +102,10 @@ class Dimension:
         if self.values:
             return f"one of {', '.join(map(str, self.values))}"
         return f"{self.ends[0]:g} to {self.ends[1]:g}{' (log)' if self.log else ''}"
+
+
+def _is_finite(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def with_settings(groups: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, Any]:

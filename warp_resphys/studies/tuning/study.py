@@ -24,9 +24,9 @@ from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import FrozenTrial, Trial, TrialState
 
-from ...experiment.schema import dotted
 from ...io.errors import DataFileError, InputError
 from ...io.files import to_plain
+from ...report.page import flatten
 from .space import Dimension
 
 JOURNAL = "study.journal"
@@ -96,7 +96,7 @@ class Study:
         """Marks a new study with its conditions, and compares those of an old one."""
         if "conditions" not in self._study.user_attrs:
             self._study.set_user_attr("conditions", conditions)
-        there, here = dict(dotted(self._study.user_attrs["conditions"])), dict(dotted(conditions))
+        there, here = dict(flatten(self._study.user_attrs["conditions"])), dict(flatten(conditions))
         for key in sorted({*there, *here}, key=lambda key: (not key.startswith("space."), key)):
             if there.get(key, "absent") != here.get(key, "absent"):
                 raise InputError(

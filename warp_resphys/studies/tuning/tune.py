@@ -27,7 +27,7 @@ from ...io.stages import Stage, StageInterrupted, run_stages
 from ...pipeline import acquire, acquisition_stages, learning_stages, prepare, workers_of
 from ...settings.learning import TrainingSettings
 from ...settings.run import RunSettings
-from .results import Results, print_best, ranked, short_text, write_results
+from .results import SearchResults, print_best, ranked, short_text, write_results
 from .space import Dimension, Tune, with_settings
 from .study import Claim, Study
 
@@ -52,7 +52,7 @@ def run_tuning(config: Mapping[str, Any], run_dir: Path) -> None:
     _, acquired = acquire(run, run_dir, wait=True)
     run_stages(stages_before(run, search.tune.model, acquired), run_dir, wait=True)
     kept = read_json(run_dir / training_file(search.tune.model))["kept"]
-    results = Results(config, search.tune, search.groups, search.study, kept["validation_rollout_error_mm"])
+    results = SearchResults(config, search.tune, search.groups, search.study, kept["validation_rollout_error_mm"])
     workers = workers_of(run).at_most(search.study.trials - search.study.finished())
     if not workers.alone:
         _share(search, acquired, workers, results)
@@ -159,7 +159,7 @@ def _settings_of(stages: Sequence[Stage]) -> dict[str, Any]:
     return found
 
 
-def _share(search: Search, acquired: str, workers: Workers, results: Results) -> None:
+def _share(search: Search, acquired: str, workers: Workers, results: SearchResults) -> None:
     """Runs trials in worker processes until there are enough."""
     study, done = search.study, search.study.finished()
 

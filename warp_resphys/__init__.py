@@ -1,10 +1,12 @@
 """Differentiable soft-body simulation on NVIDIA Warp, with learned residual physics.
 
-The names below are imported when they are first used, so that importing the package costs nothing.
+Public names are imported when they are first used, so that importing the package costs nothing.
+`__init__.pyi` lists them.
 """
 
 import importlib
 import importlib.util
+import re
 from pathlib import Path
 from typing import Any
 
@@ -12,52 +14,9 @@ from typing import Any
 if importlib.util.find_spec(f"{__name__}.kernels") is None:
     __path__.append(str(Path(__file__).parents[1]))
 
-_MODULES = {
-    "ArmGeometry": "mesh.arm_geometry",
-    "Body": "fem.body",
-    "PointMass": "fem.body",
-    "Corotated": "energies.materials",
-    "Material": "energies.materials",
-    "StableNeoHookean": "energies.materials",
-    "MooneyRivlin": "energies.materials",
-    "Gent": "energies.materials",
-    "make_material": "energies.materials",
-    "Inputs": "stepping.inputs",
-    "Glue": "fem.rigid",
-    "Rigid": "fem.rigid",
-    "load": "robot.loading",
-    "Motion": "robot.motion",
-    "Robot": "robot.robot",
-    "RobotState": "robot.state",
-    "recorded_trial": "robot.loading",
-    "trial_names": "robot.loading",
-    "Pressure": "energies.pressure",
-    "Mesh": "mesh.mesh",
-    "box_hexahedra": "mesh.mesh",
-    "box_tetrahedra": "mesh.mesh",
-    "find_chambers": "mesh.chambers",
-    "Fibres": "energies.fibres",
-    "mesh_arm": "mesh.arm",
-    "quadratic": "mesh.mesh",
-    "read_mesh": "mesh.readers",
-    "read_surfaces": "mesh.readers",
-    "read_recording": "data.recordings.reading",
-    "record_rollout": "dynamics.tape",
-    "fill_surface": "mesh.tetrahedra",
-    "rod": "mesh.rod",
-    "select_vertices": "mesh.mesh",
-    "Scene": "fem.scene",
-    "Simulator": "dynamics.simulator",
-    "Medium": "energies.medium",
-    "Muscle": "energies.muscles",
-    "Muscles": "energies.muscles",
-    "SolverSettings": "dynamics.nonlinear_solver",
-    "State": "stepping.state",
-    "Strings": "energies.strings",
-    "Trajectory": "dynamics.simulator",
-    "Tendons": "energies.tendons",
-    "write_mesh": "mesh.readers",
-}
+# Module of every public name, from the stub that type checkers read: one name a line.
+_STUB = Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")
+_MODULES = {name: module for module, name in re.findall(r"^from \.([\w.]+) import \w+ as (\w+)$", _STUB, re.MULTILINE)}
 
 __all__ = sorted(_MODULES)
 __version__ = "0.1.0"

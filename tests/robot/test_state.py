@@ -5,7 +5,7 @@ import csv
 import numpy as np
 import torch
 
-from warp_resphys.robot.export import input_columns, write_csv
+from warp_resphys.mesh.motion_files import input_columns, write_csv
 from warp_resphys.robot.state import RobotState
 from warp_resphys.stepping.state import State
 

@@ -17,7 +17,7 @@ from ..io.files import write_json
 from ..io.progress import Progress
 from ..io.resumable import Field, forget_checkpoint, keep_checkpoint, resume_checkpoint
 from ..io.stages import StageContext
-from ..robot.export import input_columns, write_csv
+from ..mesh.motion_files import input_columns, write_csv
 from ..robot.loading import load
 from ..robot.robot import Robot
 from ..settings.control import ControlSettings, FigureSettings

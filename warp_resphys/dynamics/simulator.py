@@ -5,10 +5,12 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike, NDArray
 
 from ..energies.base import Energy
 from ..energies.explicit import HeldEnergy
@@ -19,7 +21,9 @@ from ..energies.rigid import PointInertia, rigid_energies
 from ..energies.solid import solids_of
 from ..fem.body import Body
 from ..io.errors import ConvergenceError, InputError
+from ..io.files import atomic_hdf5, create
 from ..linalg.threads import shards_of
+from ..mesh.motion_files import write_vtk
 from ..stepping.constants import Constants
 from ..stepping.inputs import Inputs, check_tensor
 from ..stepping.integrators import make_integrator
@@ -53,6 +57,86 @@ class Trajectory:
     v: torch.Tensor  # (T + 1, B, N, 3) velocities [m/s]
     reports: list[SolveReport]  # T outcomes of the solver
     final: State  # the last state, from which a further roll-out goes on
+    body: Body  # that moved
+    time_step: float  # [s]
+
+    @property
+    def times(self) -> NDArray[np.float64]:
+        """(T + 1,) [s], from zero."""
+        return self.time_step * np.arange(len(self.q), dtype=np.float64)
+
+    def save(self, path: str | Path) -> Path:
+        """Writes times, positions and velocities, with their units, to an HDF5 file.
+
+        Its datasets are ``times`` (T + 1,), ``q`` and ``v`` (T + 1, B, N, 3) and ``rest`` (N, 3), each with an
+        attribute ``units``.
+
+        Args:
+            path: of the file; missing folders are made.
+
+        Raises:
+            DataFileError: it cannot be written.
+        """
+        with atomic_hdf5(path, "trajectory") as file:
+            create(file, "times", self.times, "s")
+            create(file, "q", _array(self.q), "m")
+            create(file, "v", _array(self.v), "m/s")
+            create(file, "rest", self.body.vertices, "m")
+        return Path(path)
+
+    def plot(self, vertices: ArrayLike, axis: str = "z", environment: int = 0, ax: Any = None) -> Any:
+        """Draws the mean displacement of some vertices from their rest position over time.
+
+        Args:
+            vertices: numbers of the vertices, such as those of `select_vertices`; or one number.
+            axis: ``x``, ``y`` or ``z``.
+            environment: which of the B.
+            ax: axes of matplotlib to draw in; those of a new figure where left out.
+
+        Returns:
+            The axes.
+
+        Raises:
+            InputError: an unknown axis, a vertex that the body does not have, or no such environment.
+        """
+        import matplotlib.pyplot as plt
+
+        self._check(environment)
+        chosen, count = np.atleast_1d(np.asarray(vertices, dtype=np.int64)), self.body.n_vertices
+        if axis not in ("x", "y", "z"):
+            raise InputError(f"axis is {axis!r}: choose x, y or z.")
+        if not len(chosen) or chosen.min() < 0 or chosen.max() >= count:
+            raise InputError(f"the vertices to plot must be one or more of 0 to {count - 1}.")
+        moved = (_array(self.q[:, environment]) - self.body.vertices)[:, chosen, "xyz".index(axis)].mean(1)
+        ax = plt.subplots(layout="constrained")[1] if ax is None else ax
+        ax.plot(self.times, 1e3 * moved)
+        ax.set(xlabel="time [s]", ylabel=f"displacement along {axis} [mm]")
+        return ax
+
+    def write_vtk(self, path: str | Path, environment: int = 0) -> Path:
+        """Writes a time series for ParaView: a ``.pvd`` file, and a folder of the same name with a file for each step.
+
+        The vertices have ``displacement`` and ``velocity``.
+
+        Args:
+            path: of the ``.pvd`` file.
+            environment: which of the B.
+
+        Raises:
+            InputError: no such environment, or another extension.
+            DataFileError: it cannot be written.
+        """
+        self._check(environment)
+        q, v = (_array(values[:, environment]) for values in (self.q, self.v))
+        return write_vtk(Path(path), self.body.mesh, self.times, q, v, q[:, :0])
+
+    def _check(self, environment: int) -> None:
+        if not 0 <= environment < self.q.shape[1]:
+            raise InputError(f"environment is {environment}: there are {self.q.shape[1]}, numbered from 0.")
+
+
+def _array(values: torch.Tensor) -> NDArray[np.float64]:
+    return np.asarray(values.detach().cpu().numpy(), dtype=np.float64)
 
 
 def _check_count(name: str, value: object) -> None:
@@ -295,6 +379,23 @@ class Simulator:
         _check_count("batch", batch)
         q = self.rest_positions.expand(batch, -1, -1).clone()
         return State(q, torch.zeros_like(q))
+
+    def state(self, q: object, v: object = None) -> State:
+        """Builds a state, with nothing remembered, of arrays or tensors.
+
+        Args:
+            q: (B, N, 3) positions, or (N, 3) of a batch of one [m].
+            v: velocities of the same shape; at rest where left out [m/s].
+
+        Raises:
+            InputError: another shape, or values that are not finite.
+        """
+        positions = self.tensor(q)
+        velocities = torch.zeros_like(positions) if v is None else self.tensor(v)
+        fields = [x[None] if x.ndim == 2 else x for x in (positions, velocities)]
+        for name, unit, values in zip(("q", "v"), ("m", "m/s"), fields, strict=True):
+            check_tensor(name, values, (len(fields[0]), self.body.n_vertices, 3), unit, "vertex", self.rest_positions)
+        return State(fields[0], fields[1])
 
     def step(
         self, state: State, inputs: Inputs | None = None, parameters: Parameters | Constants | None = None
@@ -549,7 +650,7 @@ class Simulator:
             states.append(state)
             reports.append(report)
         q, v = (torch.stack([getattr(s, name) for s in states]) for name in ("q", "v"))
-        return Trajectory(q, v, reports, state)
+        return Trajectory(q, v, reports, state, self.body, self.time_step)
 
     def _check(self, state: State, inputs: Inputs, constants: Constants) -> None:
         """One sentence on the first argument that cannot be simulated."""

@@ -17,7 +17,7 @@ from ..io.files import atomic_hdf5, create, write_json
 from ..io.resumable import Field
 from ..io.stages import StageContext
 from ..learning.metrics import marker_errors
-from ..learning.reconstruction import Reconstructor, make_reconstructor
+from ..learning.reconstruction import Reconstructor, make_reconstructor, without_ringing
 from ..learning.rollout import Rollout
 from ..settings.stages import ReconstructStage
 from ..stepping.inputs import Inputs
@@ -85,13 +85,8 @@ def _replay(context: StageContext, names: Sequence[str], found: Mapping[str, Flo
 
 
 def reconstructing_simulator(scene: Scene, model: str) -> Simulator:
-    """The simulator of a model, with an integrator whose velocities do not ring where markers are prescribed.
-
-    The midpoint rule's do: v+ = 2 (q+ - q) / h - v keeps every deviation.
-    """
-    simulator = scene.model_simulator(model)
-    rings = simulator.integrator == "midpoint" and scene.dataset.bound is not None
-    return dataclasses.replace(simulator, integrator="bdf2") if rings else simulator
+    """The simulator of a model, see `without_ringing`."""
+    return without_ringing(scene.model_simulator(model), scene.dataset.bound is not None)
 
 
 class Reconstructing(ResumableRollout):

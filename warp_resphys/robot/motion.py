@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from ..io.errors import InputError
 from ..learning.replay import sample
+from ..mesh.motion_files import input_columns, write_csv, write_usd, write_vtk
 from .description import Description
-from .export import input_columns, write_csv, write_usd, write_vtk
 from .inputs import RobotInput
 from .state import RobotState
 

@@ -13,7 +13,7 @@ class Inputs:
     """What acts on a batch, during one step or during each of T: any subset, all differentiable.
 
     Every field may have a leading axis of time, T, if it changes: `at` gives that of one step. ``attached_mass`` is
-    constant.
+    constant. Without both axes, such as (N, 3) or (n,), a field is that of a batch of one.
 
     Args:
         external_force: (B, N, 3) or (T, B, N, 3) held during a step, gravity not included [N].
@@ -33,8 +33,13 @@ class Inputs:
         attached_mass: torch.Tensor | None = None,
         **actuation: torch.Tensor | None,
     ) -> None:
-        self.external_force, self.fixed_positions, self.attached_mass = external_force, fixed_positions, attached_mass
-        self.actuation: dict[str, torch.Tensor] = {k: v for k, v in actuation.items() if v is not None}
+        self.external_force = _batched(external_force, 2)
+        self.fixed_positions = _batched(fixed_positions, 2)
+        self.attached_mass = _batched(attached_mass, 1)
+        self.actuation: dict[str, torch.Tensor] = {}
+        for name, value in actuation.items():
+            if (values := _batched(value, 1)) is not None:
+                self.actuation[name] = values
 
     @property
     def fields(self) -> dict[str, torch.Tensor]:
@@ -151,6 +156,11 @@ class Inputs:
             check_tensor(name, values, shape, unit, place, like)
             if name in accepted:
                 accepted[name][0].check(values)
+
+
+def _batched(values: torch.Tensor | None, axes: int) -> torch.Tensor | None:
+    """A field with an axis of environments, of one that has only so many axes without it."""
+    return values[None] if isinstance(values, torch.Tensor) and values.ndim == axes else values
 
 
 def check_tensor(name: str, values: Any, shape: tuple[int, ...], unit: str, place: str, like: torch.Tensor) -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..io.atomic import atomic_path
 from ..io.errors import InputError
 from ..io.files import write_text
-from ..mesh.mesh import Mesh, boundary_triangles, surface_vertices
+from .mesh import Mesh, boundary_triangles, surface_vertices
 
 FloatArray = NDArray[np.float64]
 

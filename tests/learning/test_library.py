@@ -1,0 +1,113 @@
+"""Identification, reconstruction, training and evaluation as functions, on beams."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+import warp_resphys as wr
+from warp_resphys.settings.learning import NetworkSettings, TrainerSettings
+
+MESH = wr.box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(5, 1, 1))
+BODY = wr.Body(MESH, fixed=wr.select_vertices(MESH, x=0.0))
+TIP = wr.select_vertices(MESH, x=0.1)
+MARKERS = wr.bind_markers(
+    MESH, np.array([[0.1, 0.01, 0.022], [0.06, 0.01, 0.022], [0.1, 0.022, 0.01]]), ["a", "b", "c"]
+)
+STEPS = 25
+
+
+def beam(youngs_modulus, **options):
+    material = wr.Corotated(youngs_modulus, 0.45, density=1070.0, stiffness_damping=3e-3)
+    return wr.Simulator(BODY, material, time_step=0.01, **options)
+
+
+def pulled(*newtons):
+    force = torch.zeros(len(newtons), len(MESH.vertices), 3, dtype=torch.float64)
+    force[:, TIP, 2] = -torch.tensor(newtons, dtype=torch.float64)[:, None] / len(TIP)
+    return wr.Inputs(external_force=force)
+
+
+def let_go(robot, *newtons, markers=None, known_start=False):
+    """Motions of a robot that is pulled at its tip and let go."""
+    resting = pulled(*newtons)
+    start = robot.static_equilibrium(resting)
+    q = robot.rollout(start, STEPS).q
+    seen = q if markers is None else torch.stack([markers(each) for each in q])
+    begins = {"start": start} if known_start else {"resting": resting}
+    return wr.ObservedMotion(seen, markers=markers, **begins)
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return beam(264e3)
+
+
+@pytest.mark.parametrize("markers", [MARKERS, None], ids=["markers", "whole states"])
+def test_youngs_modulus_comes_back(robot, markers):
+    motion = let_go(robot, 0.05, 0.1, markers=markers)
+    found = wr.identify(beam(180e3), motion, {"youngs_modulus": (1e5, 1e6)})
+    assert found.parameters["youngs_modulus"] == pytest.approx(264e3, rel=1e-4)
+    assert not found.at_bounds
+    assert float(wr.evaluate(beam(180e3), motion, parameters=found.parameters).max()) < 1e-6
+    assert float(wr.evaluate(beam(180e3), motion).mean()) > 1e-4
+
+
+def test_a_learned_force_beats_the_simulator_on_a_motion_it_has_not_seen(robot):
+    wrong = beam(200e3)
+    seen = let_go(robot, 0.04, 0.07, 0.1, 0.13, known_start=True)
+    samples = wr.reconstruct(wrong, seen)
+    assert samples.q.shape == samples.outputs[0].shape == (4 * STEPS, len(MESH.vertices), 3)
+    # With its own forces, the simulator goes where the robot went.
+    forces = samples.outputs[0].unflatten(0, (4, STEPS))
+    assert float(wr.evaluate(wrong, seen, lambda state, step: forces[:, step]).max()) < 1e-6
+
+    network = NetworkSettings(position_modes=3, velocity_modes=3, force_modes=4, layers=1, width=16)
+    force = wr.fit_force(wrong, samples, network=network, trainer=TrainerSettings(epochs=60))
+    unseen = let_go(robot, 0.09, known_start=True)
+    corrected, uncorrected = wr.evaluate(wrong, unseen, force), wr.evaluate(wrong, unseen)
+    at_rest = (unseen.observed - wrong.rest_positions).norm(dim=-1).mean(-1)
+    assert corrected.shape == (STEPS + 1, 1)
+    assert float(corrected[0]) == 0.0
+    assert float(corrected.mean()) < 0.2 * float(uncorrected.mean())
+    assert float(corrected.mean()) < 0.2 * float(at_rest.mean())
+    # The same seed gives the same network, whatever torch drew before; held-out motions choose the weights.
+    again = wr.fit_force(wrong, samples, network=network, trainer=TrainerSettings(epochs=60))
+    assert torch.equal(force(samples.q, samples.v), again(samples.q, samples.v))
+    chosen = TrainerSettings(epochs=60, rollout_every=20)
+    judged = wr.fit_force(wrong, samples, unseen, network=network, trainer=chosen)
+    assert float(wr.evaluate(wrong, unseen, judged).mean()) < 0.2 * float(uncorrected.mean())
+
+
+def test_forces_from_markers_bring_the_markers_there(robot):
+    wrong = beam(200e3)
+    seen = let_go(robot, 0.1, markers=MARKERS)
+    gaps = seen.observed.clone()
+    gaps[5, 0, 1] = torch.nan
+    seen = dataclasses.replace(seen, observed=gaps)
+    samples = wr.reconstruct(wrong, seen)
+    forces = samples.outputs[0]
+    replayed = wr.evaluate(wrong, seen, lambda state, step: forces[step][None])
+    assert float(replayed[1:].max()) < 0.02 * float(wr.evaluate(wrong, seen).mean())
+
+
+def test_one_motion_needs_no_axis_of_motions(robot):
+    start = robot.state(robot.rest_positions)
+    q = robot.rollout(start, 3).q
+    one, many = wr.ObservedMotion(q[:, 0], start), wr.ObservedMotion(q, start)
+    assert torch.equal(one.observed, many.observed)
+    assert float(wr.evaluate(robot, one).max()) == 0.0
+
+
+def test_what_cannot_be_compared_is_refused(robot):
+    start = robot.rest_state()
+    with pytest.raises(wr.InputError, match="observed has shape"):
+        wr.ObservedMotion(torch.zeros(3), start)
+    with pytest.raises(wr.InputError, match="5 points were observed, but the body has"):
+        wr.evaluate(robot, wr.ObservedMotion(torch.zeros(3, 5, 3), start))
+    motion = wr.ObservedMotion(robot.rollout(start, 3).q, start)
+    with pytest.raises(wr.InputError, match="there is no parameter 'mass'"):
+        wr.identify(robot, motion, {"mass": (1.0, 2.0)})
+    with pytest.raises(wr.InputError, match="no recurrent network"):
+        wr.fit_force(robot, wr.reconstruct(robot, motion), network=NetworkSettings(recurrent=4))

@@ -1,0 +1,39 @@
+"""What type checkers know of the public names."""
+
+import importlib
+import re
+
+import pytest
+
+import warp_resphys
+
+SCRIPT = """
+import warp_resphys
+from warp_resphys import Body, box_hexahedra
+
+simulator = warp_resphys.Simulator(Body(box_hexahedra()))
+reveal_type(warp_resphys.Simulator)
+reveal_type(simulator.rollout(simulator.rest_state(), 3).q)
+reveal_type(warp_resphys.identify)
+Body(mesh="beam.msh")
+warp_resphys.Simulater
+"""
+
+
+@pytest.mark.parametrize("name", warp_resphys.__all__)
+def test_every_name_is_what_its_module_has(name):
+    value = getattr(warp_resphys, name)
+    assert value is getattr(importlib.import_module(f"warp_resphys.{warp_resphys._MODULES[name]}"), name)
+    assert value.__doc__
+
+
+def test_a_type_checker_knows_the_public_names(tmp_path):
+    api = pytest.importorskip("mypy.api")
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT, encoding="utf-8")
+    out, *_ = api.run([str(script), "--follow-imports=silent", "--ignore-missing-imports", f"--cache-dir={tmp_path}"])
+    revealed = re.findall(r'Revealed type is "(.+)"', out)
+    assert revealed[0].endswith("-> warp_resphys.dynamics.simulator.Simulator")
+    assert revealed[1].startswith("torch.")
+    assert "-> warp_resphys.learning.identification.Identification" in revealed[2].replace('"', "")
+    assert len(re.findall(r"error: .*\[(?:arg-type|attr-defined)\]", out)) == 2, out

@@ -1,0 +1,267 @@
+"""Identification, reconstruction, training and evaluation as four functions, without configuration or run folder.
+
+The commands do the same work in stages, through files. Here observations are tensors and results stay in memory:
+
+    identified = identify(simulator, motion, {"youngs_modulus": (1e5, 1e6)}).parameters
+    samples = reconstruct(simulator, motion, parameters=identified)
+    force = fit_force(simulator, samples)
+    errors = evaluate(simulator, held_out, force, parameters=identified)
+
+Every function takes whole states and markers alike. Forces are in the world's frame, and start from the simulator's
+own parameters unless others are given. `tests/learning/test_library.py` checks them on a beam.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+
+from ..data.markers import Markers
+from ..data.trials import Trials
+from ..dynamics.simulator import Simulator
+from ..io.errors import InputError
+from ..settings.learning import NetworkSettings, ReconstructionSettings, TrainerSettings
+from ..stepping.inputs import Inputs
+from ..stepping.state import State
+from .bounds import Bounds
+from .identification import Identification, Identifier
+from .networks import ResidualForce, build_model
+from .parameters import configured_parameters
+from .predictors import LearnedPredictor
+from .reconstruction import make_reconstructor, without_ringing
+from .replay import Replay, Start
+from .rollout import Predictor, Rollout, closed_loop
+from .training import Samples, Trainer
+
+
+@dataclass(frozen=True)
+class ObservedMotion:
+    """B motions of one body, observed at the start and after every time step of the simulator.
+
+    Raises:
+        InputError: observations of another shape, of other vertices than the body has, or of which nothing was seen.
+    """
+
+    # (T + 1, B, N, 3) positions of all vertices or, with `markers`, (T + 1, B, M, 3) of these; NaN where not seen. A
+    # `Trajectory.q` has this shape. (T + 1, N, 3) and (T + 1, M, 3) are one motion [m]
+    observed: torch.Tensor
+    start: State | None = None  # where the motions begin; None: at rest in equilibrium under `resting`
+    inputs: Inputs = field(default_factory=Inputs)  # that act during the motion, with or without an axis of time
+    resting: Inputs = field(default_factory=Inputs)  # that hold the body before the motion, where `start` is None
+    markers: Markers | None = None  # where the observed points sit on the body, see `bind_markers`; None: all vertices
+
+    def __post_init__(self) -> None:
+        """Adds the axis of motions where there is one motion."""
+        if self.observed.ndim == 3:
+            object.__setattr__(self, "observed", self.observed[:, None])
+        if self.observed.ndim != 4 or self.observed.shape[-1] != 3 or len(self.observed) < 2:
+            raise InputError(
+                f"observed has shape {tuple(self.observed.shape)}: it must be (time, motion, point, 3) in m, of two "
+                "times or more."
+            )
+
+    def replay(self, simulator: Simulator) -> tuple[Replay, Start]:
+        """Returns what simulates these motions, and how they begin."""
+        like = simulator.rest_positions
+        observed = self.observed.to(like).transpose(0, 1)
+        count, frames = observed.shape[:2]
+        if self.markers is None and observed.shape[2] != len(like):
+            raise InputError(f"{observed.shape[2]} points were observed, but the body has {len(like)} vertices.")
+        times = simulator.time_step * torch.arange(frames).to(like).expand(count, -1)
+        names = tuple(f"motion {number}" for number in range(count))
+        inputs, resting = self.inputs.to(like), self.resting.to(like)
+        trials = Trials(names, times, observed, observed[:, 0], inputs, resting)
+        if self.start is None:
+            start = Start.resting(like.expand(count, -1, -1).clone())
+        else:
+            start = Start(self.start.map(lambda values: values.to(like)), like.new_zeros(count))
+        observe: Callable[[torch.Tensor], torch.Tensor] = torch.clone
+        return Replay(simulator, observe if self.markers is None else self.markers.to(like), trials), start
+
+
+def identify(
+    simulator: Simulator,
+    motion: ObservedMotion,
+    parameters: Mapping[str, Bounds | tuple[float, float]],
+    first_guess: Mapping[str, float] | None = None,
+    *,
+    starts: int = 1,
+    max_evaluations: int = 30,
+    tolerance: float = 1e-6,
+    seed: int = 0,
+) -> Identification:
+    """Finds the parameters with which a simulator comes closest to observed motions.
+
+    Args:
+        simulator: gives every value that is not identified.
+        motion: from whole states or markers.
+        parameters: range of every parameter to identify, by a name of `Replay.known`, in its unit. A pair is searched
+            on a logarithmic scale where both its numbers are positive.
+        first_guess: where the search begins; the simulator's own values where left out.
+        starts: searches; those after the first begin at the best of four times as many random candidates.
+        max_evaluations: of the loss and its gradient, a start.
+        tolerance: relative decrease of the loss that is still worth a step.
+        seed: of the random candidates.
+
+    Returns:
+        The parameters, the loss, its history, parameters that ended on a bound, and the uncertainty.
+
+    Raises:
+        InputError: an unknown parameter, an empty range, or a motion in which nothing moves.
+        ConvergenceError: the simulation fails at every start.
+    """
+    ranges = {n: b if isinstance(b, Bounds) else Bounds(*b, logarithmic=min(b) > 0.0) for n, b in parameters.items()}
+    identifier = Identifier([motion.replay(simulator)], ranges)
+    guess = {**configured_parameters(simulator, ranges), **(first_guess or {})}
+    begun = identifier.starts(guess, starts, 4 * starts, seed)
+    return identifier.run(begun, max_evaluations, tolerance=tolerance)
+
+
+def reconstruct(
+    simulator: Simulator,
+    motion: ObservedMotion,
+    *,
+    parameters: Mapping[str, float] | None = None,
+    settings: ReconstructionSettings | None = None,
+) -> Samples:
+    """Finds the forces that bring a simulator, step by step, to observed motions.
+
+    Args:
+        simulator: the one to correct. One by the midpoint rule steps by BDF2 where markers are observed.
+        motion: from whole states or markers.
+        parameters: values in place of the simulator's own, such as `Identification.parameters`.
+        settings: method, regularisation [m^2/N^2], tolerance and iterations; the defaults of the class.
+
+    Returns:
+        The S = B T steps, motion after motion: where they start, q (S, N, 3) [m] and v (S, N, 3) [m/s], the force of
+        the step as the only output (S, N, 3) [N], and the inputs that act (S, A).
+
+    Raises:
+        InputError: a setting out of range, or an input that the body does not take.
+        ConvergenceError: a step without a solution.
+    """
+    used = without_ringing(simulator, motion.markers is not None)
+    replay, start = motion.replay(used)
+    with torch.no_grad():
+        constants, inputs, resting = replay.setting(_values(used, parameters))
+        state = replay.begin(start, constants, resting)
+        markers = motion.markers
+        method = make_reconstructor(used, **dict(settings or ReconstructionSettings()), markers=markers)
+        method = method.with_constants(constants)
+        force, rows = torch.zeros_like(state.q), []
+        for step in range(replay.trials.observed.shape[1] - 1):
+            with torch.enable_grad():
+                found = method.step(state, replay.trials.observed[:, step + 1], inputs.at(step), force)
+            force = found.force.detach()
+            rows.append((state.q, state.v, force))
+            state = found.state.detach()
+        q, v, f = (torch.stack(each, 1).flatten(0, 1) for each in zip(*rows, strict=True))
+        acting = _told(inputs, len(rows))
+        told = None if acting is None else acting.transpose(0, 1).flatten(0, 1)
+    return Samples(q, v, (f,), told, (len(rows),) * replay.trials.observed.shape[0])
+
+
+def fit_force(
+    simulator: Simulator,
+    samples: Samples,
+    validation: ObservedMotion | None = None,
+    *,
+    parameters: Mapping[str, float] | None = None,
+    network: NetworkSettings | None = None,
+    trainer: TrainerSettings | None = None,
+    seed: int = 0,
+) -> ResidualForce:
+    """Trains a network that predicts the force which a simulator lacks, from its state and inputs.
+
+    Args:
+        simulator: the one to correct.
+        samples: from `reconstruct`.
+        validation: motions that were held out. The weights with the smallest roll-out error on them are kept; without
+            them, those of the smallest loss on the samples.
+        parameters: as for `reconstruct`.
+        network: its kind and size; the defaults of the class.
+        trainer: epochs, rates and noise; the defaults of the class.
+        seed: of the weights, batches and noise; torch's global generator is left as it was.
+
+    Returns:
+        The network. Called with q (S, N, 3) [m], v (S, N, 3) [m/s] and the inputs (S, A), it gives forces (S, N, 3)
+        [N]; pass it to `evaluate`.
+
+    Raises:
+        InputError: sizes that do not fit the samples, or a recurrent network.
+    """
+    network = network or NetworkSettings()
+    config = dict(trainer or TrainerSettings())
+    if network.recurrent is not None:
+        raise InputError("fit_force trains no recurrent network: leave network.recurrent out.")
+    if validation is None:
+        config["selection"] = "validation_loss"
+
+    def rollout_error(model: ResidualForce) -> float:
+        if validation is None:
+            return math.nan
+        return 1e3 * float(evaluate(simulator, validation, model, parameters=parameters).nanmean())
+
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        fields = samples.q, samples.v, samples.outputs[0], samples.actuation
+        model = build_model(dict(network), simulator.rest_positions, *fields)
+    trained = Trainer(model, samples, samples, rollout_error, config, seed)
+    while not trained.finished:
+        trained.run_epoch()
+    return trained.use_best()
+
+
+def evaluate(
+    simulator: Simulator,
+    motion: ObservedMotion,
+    force: ResidualForce | Predictor | None = None,
+    *,
+    parameters: Mapping[str, float] | None = None,
+) -> torch.Tensor:
+    """Rolls a simulator out from where motions begin, and compares it with them.
+
+    Args:
+        simulator: with the integrator that it has.
+        motion: from whole states or markers.
+        force: what the simulator lacks, from `fit_force`, or a function of the state and the number of the step that
+            gives forces (B, N, 3) [N]; None for the simulator as it is.
+        parameters: as for `reconstruct`.
+
+    Returns:
+        (T + 1, B) mean distance of the observed points [m]; NaN where none was seen, infinite from where a simulation
+        diverged.
+
+    Raises:
+        InputError: an input that the body does not take.
+        ConvergenceError: no equilibrium to begin at.
+    """
+    used = replace(simulator, solver=replace(simulator.settings, on_failure="count"))
+    replay, start = motion.replay(used)
+    observed = replay.trials.observed
+    with torch.no_grad():
+        constants, inputs, resting = replay.setting(_values(used, parameters))
+        predict: Predictor | None
+        if isinstance(force, ResidualForce):
+            predict = LearnedPredictor(force, _told(inputs, observed.shape[1] - 1))
+        else:
+            predict = force
+        state = replay.begin(start, constants, resting)
+        q = closed_loop(Rollout(used, predict, inputs, constants), state, observed.shape[1] - 1)
+        points = torch.stack([replay.observe(each) for each in q.unbind(1)], 1)
+        distance = (points - observed).norm(dim=-1).nan_to_num(math.inf)
+        mean = torch.where(replay.trials.seen, distance, torch.nan).nanmean(2)
+    return mean.transpose(0, 1)
+
+
+def _values(simulator: Simulator, parameters: Mapping[str, float] | None) -> dict[str, torch.Tensor]:
+    """(1,) values of parameters."""
+    return {name: simulator.tensor([value]) for name, value in (parameters or {}).items()}
+
+
+def _told(inputs: Inputs, steps: int) -> torch.Tensor | None:
+    """(K, B, A) actuation during every step, as networks see it; None without any."""
+    series: list[Any] = [[*inputs.at(step).actuation.values()] for step in range(steps)]
+    return torch.stack([torch.cat(each, 1) for each in series]) if series and series[0] else None

@@ -80,6 +80,30 @@ def test_a_learned_force_beats_the_simulator_on_a_motion_it_has_not_seen(robot):
     assert float(wr.evaluate(wrong, unseen, judged).mean()) < 0.2 * float(uncorrected.mean())
 
 
+def test_the_network_sees_what_drives_a_body():
+    """Tendons of two tensions; the force that is missing is that of a third of the tension."""
+    cable = wr.Tendons([[[0.0, 0.01, 0.0], [0.05, 0.01, 0.0], [0.1, 0.01, 0.0]]])
+    body = wr.Body(MESH, fixed=BODY.fixed_vertices, energies=[cable])
+    simulator = wr.Simulator(body, wr.Corotated(264e3, 0.45, density=1070.0, stiffness_damping=3e-3))
+    start = simulator.rest_state(batch=3)
+    ramp = torch.linspace(0.0, 1.0, 15, dtype=torch.float64)[:, None, None]
+    tension = ramp * torch.tensor([[0.2], [0.35], [0.5]], dtype=torch.float64)
+    q = simulator.rollout(start, 15, wr.Inputs(tendon_tension=1.5 * tension)).q
+
+    def motion(*rows):
+        some = wr.Inputs(tendon_tension=tension[:, rows])
+        return wr.ObservedMotion(q[:, rows], start.map(lambda t: t[list(rows)]), some)
+
+    samples = wr.reconstruct(simulator, motion(0, 2))
+    assert torch.equal(samples.actuation[:, 0], torch.cat([tension[:, 0, 0], tension[:, 2, 0]]))
+    network = NetworkSettings(position_modes=2, velocity_modes=2, force_modes=3, layers=1, width=16)
+    force = wr.fit_force(simulator, samples, network=network, trainer=TrainerSettings(epochs=60))
+    uncorrected = wr.evaluate(simulator, motion(1))
+    assert float(wr.evaluate(simulator, motion(1), force).mean()) < 0.2 * float(uncorrected.mean())
+    factor = wr.identify(simulator, motion(0, 1, 2), {"tendon_tension_factor": (0.5, 3.0)})
+    assert factor.parameters["tendon_tension_factor"] == pytest.approx(1.5, rel=1e-3)
+
+
 def test_forces_from_markers_bring_the_markers_there(robot):
     wrong = beam(200e3)
     seen = let_go(robot, 0.1, markers=MARKERS)

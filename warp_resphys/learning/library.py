@@ -47,7 +47,8 @@ class ObservedMotion:
     # (T + 1, B, N, 3) positions of all vertices or, with `markers`, (T + 1, B, M, 3) of these; NaN where not seen. A
     # `Trajectory.q` has this shape. (T + 1, N, 3) and (T + 1, M, 3) are one motion [m]
     observed: torch.Tensor
-    start: State | None = None  # where the motions begin; None: at rest in equilibrium under `resting`
+    # positions and velocities with which the motions begin; None: at rest in equilibrium under `resting`
+    start: State | None = None
     inputs: Inputs = field(default_factory=Inputs)  # that act during the motion, with or without an axis of time
     resting: Inputs = field(default_factory=Inputs)  # that hold the body before the motion, where `start` is None
     markers: Markers | None = None  # where the observed points sit on the body, see `bind_markers`; None: all vertices

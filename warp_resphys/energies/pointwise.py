@@ -1,5 +1,7 @@
 """An energy that is one Warp function: its kernels, its values over a step and its memory follow from it.
 
+For example::
+
     class Spring(PointwiseEnergy):                       # k/2 (|x| - L)^2 between two vertices
         parameters = (Quantity("spring_stiffness", "N/m", 0.0), Quantity("spring_length", "m", 0.0))
         density = spring                                 # a Warp function of x (vec3d) and the values (vec2d)

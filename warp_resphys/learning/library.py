@@ -1,6 +1,6 @@
 """Identification, reconstruction, training and evaluation as four functions, without configuration or run folder.
 
-The commands do the same work in stages, through files. Here observations are tensors and results stay in memory:
+The commands do the same work in stages, through files. Here observations are tensors and results stay in memory::
 
     identified = identify(simulator, motion, {"youngs_modulus": (1e5, 1e6)}).parameters
     samples = reconstruct(simulator, motion, parameters=identified)

@@ -60,6 +60,7 @@ class TestCompleteRun:
         found = metrics(finished[0])
         keys = {"errors_mm", "errors_vs_reconstruction_mm", "per_trajectory", "range", "networks", "parameters"}
         keys |= {"reconstruction", "seconds_per_test_trajectory", "seconds", "peak_memory_gib", "versions", "device"}
+        keys |= {"first_guesses"}
         assert set(found) == keys
         assert set(found["seconds_per_test_trajectory"]) == {"simulation", "target", "resphys", "inference"}
         assert set(found["errors_mm"]) == {"simulation", "reconstruction", "resphys", "simfree"}

@@ -101,4 +101,4 @@ def test_one_name_is_one_class():
     trees = [ast.parse(path.read_text(encoding="utf-8")) for path in (*PACKAGE.rglob("*.py"), *KERNELS.rglob("*.py"))]
     names = Counter(node.name for tree in trees for node in tree.body if isinstance(node, ast.ClassDef))
     twice = {name for name, count in names.items() if count > 1 and not name.startswith("_")}
-    assert twice == {"Motion", "Scene"}  # of `robot` and of `learning`; of `fem` and of `experiment`: to be renamed
+    assert twice == set()

@@ -7,10 +7,10 @@ import jsonschema
 import pytest
 from omegaconf import OmegaConf
 
+from warp_resphys.data.marker_view import FRAMES
 from warp_resphys.data.markers import KINDS
-from warp_resphys.data.sight import FRAMES
 from warp_resphys.dynamics.simulator import COUPLINGS
-from warp_resphys.experiment.scene import MODELS
+from warp_resphys.experiment.experiment import MODELS
 from warp_resphys.fem.body import MASS_MODES
 from warp_resphys.fem.elements import VOLUME_INTEGRATIONS
 from warp_resphys.learning.networks import ACTIVATIONS, FORCE_BASES, NETWORK_KINDS

@@ -1,6 +1,7 @@
 # The public names of the package: `__init__.py` imports one from here when it is first used, type checkers all.
 from .data.markers import Markers as Markers
 from .data.markers import bind_markers as bind_markers
+from .data.observation import Observation as Observation
 from .data.recordings.reading import read_recording as read_recording
 from .dynamics.nonlinear_solver import SolverSettings as SolverSettings
 from .dynamics.simulator import Simulator as Simulator

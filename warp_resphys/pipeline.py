@@ -20,6 +20,7 @@ from .experiment.ablation import ablation_stages, print_ablation
 from .experiment.build import choose_device
 from .experiment.checks import check_run
 from .experiment.evaluate import check_mesh, evaluate, intervals_of_folds, time_models
+from .experiment.experiment import LEARNED
 from .experiment.files import (
     CONTROL,
     DATASET,
@@ -48,7 +49,6 @@ from .experiment.models import SIMFREE
 from .experiment.parts import workers_for
 from .experiment.reconstruct import reconstruct
 from .experiment.report import collect_metrics, make_folds_report, make_report
-from .experiment.scene import LEARNED
 from .experiment.simulate import run_laboratory, simulate
 from .experiment.trials import folds_of, scaled_trials_of, split_of, test_groups, trials_of
 from .io.atomic import digest

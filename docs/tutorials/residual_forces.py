@@ -159,7 +159,7 @@ corners = [0, 3, 12, 15]  # of the 16 vertices of a section
 seen = torch.as_tensor([*middle[corners], *tip[corners]])
 markers = MarkerMap(seen.view(1, -1, 1), torch.ones(1, len(seen), 1, dtype=torch.float64))
 from_markers = make_reconstructor(
-    simulator, "levenberg_marquardt", regularisation=1e-4, tolerance=1e-6, max_iterations=100, markers=markers
+    simulator, "levenberg_marquardt", regularisation=1e-4, tolerance=1e-6, max_iterations=100, observation=markers
 )
 state = State(motion.q[0, 7:8], motion.v[0, 7:8])
 guess, off = None, []

@@ -26,10 +26,10 @@ from warp_resphys.data.trials import Trials
 from warp_resphys.experiment import learn, reconstruct
 from warp_resphys.experiment.build import build_simulator
 from warp_resphys.experiment.evaluate import summary
+from warp_resphys.experiment.experiment import Experiment
 from warp_resphys.experiment.files import Dataset
 from warp_resphys.experiment.importing import import_recordings
 from warp_resphys.experiment.reconstruct import replayed_errors
-from warp_resphys.experiment.scene import Scene
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_array, read_checkpoint, read_hdf5
 from warp_resphys.io.settings import parse
@@ -198,10 +198,12 @@ def test_forces_are_learned_as_they_are_in_the_rest_shape(finished, monkeypatch)
     for frame in ("corotated", "world"):
         keep = lambda network, train, *rest, frame=frame: learned.update({frame: train})  # noqa: E731
         monkeypatch.setattr(learn, "Trainer", keep)
-        scene = Scene(stage.changed(force_frame=frame), finished / "run")
-        assert learn.Learning(scene, "resphys").trainer(stage.training).learned.force_frame == frame
+        experiment = Experiment(stage.changed(force_frame=frame), finished / "run")
+        assert learn.Learning(experiment, "resphys").trainer(stage.training).learned.force_frame == frame
     turned, kept = (learned[frame] for frame in ("corotated", "world"))
-    back = scene.frames(scene.model_simulator("resphys"), "corotated").to_world(turned.q, turned.v, turned.outputs[0])
+    back = experiment.frames(experiment.model_simulator("resphys"), "corotated").to_world(
+        turned.q, turned.v, turned.outputs[0]
+    )
     size = float(kept.outputs[0].abs().max())
     np.testing.assert_allclose(back, kept.outputs[0], atol=1e-5 * size)
     assert float((turned.outputs[0] - kept.outputs[0]).abs().max()) > 1e-3 * size
@@ -473,11 +475,11 @@ def test_a_diverged_roll_out_and_one_that_left_the_range_are_reported(tmp_path):
     own = {"horizons": (0.02, 0.04), "split": {"train": [], "validation": [], "test": ["a", "b"]}, "refined": False}
     own |= {"files": {}, "shared": ".", "acquired": "", "groups": {"1": ["a", "b"]}, "calibration": []}
     stage = EvaluateStage.of(settings("experiment=sopra"), **own)
-    scene = Scene(stage, tmp_path)
+    experiment = Experiment(stage, tmp_path)
     times = np.tile(0.01 * np.arange(5), (2, 1))
     about = (times, observed, observed[:, 0], np.zeros(2), np.zeros(3), 0.01)
-    scene.__dict__["dataset"] = Dataset(("a", "b"), ("m",), ("rest", "rest"), *about, bound=np.zeros((1, 3)))
-    found = summary(StageContext("evaluate", tmp_path, "", stage), scene, {"1": ("a", "b")}, markers, left)
+    experiment.__dict__["dataset"] = Dataset(("a", "b"), ("m",), ("rest", "rest"), *about, bound=np.zeros((1, 3)))
+    found = summary(StageContext("evaluate", tmp_path, "", stage), experiment, {"1": ("a", "b")}, markers, left)
     assert found["errors_mm"]["sysid"]["mean"] == pytest.approx(5.0)
     assert found["errors_mm"]["resphys"]["diverged"] == 1
     assert found["range"]["resphys"] == {"left": 1, "first_s": {"b": pytest.approx(0.03)}}

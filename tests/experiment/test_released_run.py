@@ -17,8 +17,8 @@ from main_job import run
 from sentences import offending
 
 from warp_resphys.experiment import identify, report
+from warp_resphys.experiment.experiment import LEARNED, MODELS
 from warp_resphys.experiment.folds import Fold, run_folds
-from warp_resphys.experiment.scene import LEARNED, MODELS
 from warp_resphys.experiment.trials import folds_of, split_of
 from warp_resphys.io.fan_out import Workers
 from warp_resphys.io.files import read_checkpoint, read_hdf5

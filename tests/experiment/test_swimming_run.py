@@ -10,7 +10,7 @@ from configured import check, composed, settings
 from main_job import IN_RUN, run
 from played_run import check_robots
 
-from warp_resphys.data.sight import Sight
+from warp_resphys.data.marker_view import MarkerView
 from warp_resphys.experiment.build import bound_markers, build_simulator
 from warp_resphys.experiment.files import read_dataset
 from warp_resphys.io.errors import InputError
@@ -94,8 +94,8 @@ def test_limbs_are_identified_by_their_shape(swum, tmp_path, monkeypatch):
     for name, (told, markers) in swum.items():
         pulled = dataset.inputs["tendon_contraction"][dataset.names.index(name), :, 0]
         np.testing.assert_allclose(pulled, told[1 : STEPS + 1], atol=1e-6)
-        sight = Sight.of([*tracked(wanted, name).values()], ["x", "z"], "own")
-        shapes = sight.of_arrays(markers[: STEPS + 1])
+        view = MarkerView.of([*tracked(wanted, name).values()], ["x", "z"], "own")
+        shapes = view.of_arrays(markers[: STEPS + 1])
         columns = [dataset.labels.index(label) for label in tracked(wanted, name)]
         shapes[HIDDEN[name]] = np.nan
         np.testing.assert_allclose(dataset.observed[dataset.names.index(name)][:, columns], shapes, atol=3e-4)

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import warp_resphys as wr
+from warp_resphys.data.observation import WHOLE_STATE
 from warp_resphys.settings.learning import NetworkSettings, TrainerSettings
 
 MESH = wr.box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(5, 1, 1))
@@ -29,14 +30,14 @@ def pulled(*newtons):
     return wr.Inputs(external_force=force)
 
 
-def let_go(robot, *newtons, markers=None, known_start=False):
+def let_go(robot, *newtons, markers=WHOLE_STATE, known_start=False):
     """Motions of a robot that is pulled at its tip and let go."""
     resting = pulled(*newtons)
     start = robot.static_equilibrium(resting)
     q = robot.rollout(start, STEPS).q
-    seen = q if markers is None else torch.stack([markers(each) for each in q])
+    seen = torch.stack([markers(positions) for positions in q])
     begins = {"start": start} if known_start else {"resting": resting}
-    return wr.ObservedMotion(seen, markers=markers, **begins)
+    return wr.ObservedMotion(seen, observation=markers, **begins)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +45,7 @@ def robot():
     return beam(264e3)
 
 
-@pytest.mark.parametrize("markers", [MARKERS, None], ids=["markers", "whole states"])
+@pytest.mark.parametrize("markers", [MARKERS, WHOLE_STATE], ids=["markers", "whole states"])
 def test_youngs_modulus_comes_back(robot, markers):
     motion = let_go(robot, 0.05, 0.1, markers=markers)
     found = wr.identify(beam(180e3), motion, {"youngs_modulus": (1e5, 1e6)})

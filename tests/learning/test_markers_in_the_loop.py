@@ -7,7 +7,7 @@ import torch
 from warp_resphys import Body, Simulator, State, box_hexahedra, select_vertices
 from warp_resphys.data.markers import bind_markers
 from warp_resphys.data.trials import Trials
-from warp_resphys.experiment.scene import at_steps
+from warp_resphys.experiment.experiment import at_steps
 from warp_resphys.io.errors import ConvergenceError
 from warp_resphys.io.files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.markers_in_the_loop import MarkersInTheLoop, MotionLoss, Watched, cross_validated_epochs

@@ -13,7 +13,7 @@ from warp_resphys.dynamics.nonlinear_solver import SolverSettings
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.networks import build_model
-from warp_resphys.learning.refinement import Motion, SolverInTheLoop, WindowLoss, Windows
+from warp_resphys.learning.refinement import RefinementBatch, SolverInTheLoop, WindowLoss, Windows
 from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.studies.gradient_check import central_difference
 
@@ -44,7 +44,7 @@ def motion_of(q, v, target, inputs=None, told=None):
     """Two trials at the steps of the simulator, and what should be observed of them."""
     times = real_time(target.shape[1]).expand(2, -1)
     trials = Trials(("a", "b"), times, target, target[:, 0], Inputs() if inputs is None else inputs)
-    return Motion(q, v, target, trials, told)
+    return RefinementBatch(q, v, target, trials, told)
 
 
 def real_time(frames):

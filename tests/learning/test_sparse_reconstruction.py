@@ -38,21 +38,21 @@ def markers_at(*rows):
 
 
 def make_sparse_reconstructor(sim, markers, *settings, **options):
-    return make_reconstructor(sim, *settings, markers=markers, **options)
+    return make_reconstructor(sim, *settings, observation=markers, **options)
 
 
 def gauss_newton(sim, markers, *settings, **options):
-    return make_reconstructor(sim, "gauss_newton", *settings, markers=markers, **options)
+    return make_reconstructor(sim, "gauss_newton", *settings, observation=markers, **options)
 
 
 def levenberg_marquardt(sim, markers, *settings, **options):
-    return make_reconstructor(sim, "levenberg_marquardt", *settings, markers=markers, **options)
+    return make_reconstructor(sim, "levenberg_marquardt", *settings, observation=markers, **options)
 
 
 def reconstruct(solver, start, observed):
     state, results = start, []
     for target in observed[1:]:
-        results.append(solver.step(state, solver.markers(target)))
+        results.append(solver.step(state, solver.observation(target)))
         state = results[-1].state
     return torch.stack([r.state.q for r in results]), torch.stack([r.force for r in results])
 
@@ -87,7 +87,7 @@ def test_in_single_precision(method, options):
         first = State(start.q.to(dtype), start.v.to(dtype))
         if method == "full":
             solver = make_reconstructor(sim, "gauss_newton", 1e-6, 1e-7, 40)
-            solver.markers = lambda q: q
+            solver.observation = lambda q: q
         else:
             solver = make_sparse_reconstructor(sim, markers_at([5, 10]), method, 1e-6, 1e-6, 60, **options)
         q, force = reconstruct(solver, first, observed.to(dtype))
@@ -188,7 +188,7 @@ class TestGaussNewton:
         observed, start = observation()
         solver = gauss_newton(simulator(), markers_at([8]), 1e-6, tolerance=1e-12, max_iterations=1)
         with pytest.raises(ConvergenceError, match=r"the 1th: raise reconstruction\.regularisation"):
-            solver.step(start, solver.markers(observed[1]))
+            solver.step(start, solver.observation(observed[1]))
 
 
 class TestLevenbergMarquardt:
@@ -262,7 +262,7 @@ class TestLevenbergMarquardt:
 
         monkeypatch.setattr(Simulator, "step", failing)
         with pytest.raises(ConvergenceError, match=r"the 5th: raise reconstruction\.regularisation"):
-            solver.step(start, solver.markers(observed[1]))
+            solver.step(start, solver.observation(observed[1]))
 
 
 def test_the_published_method_leaves_out_markers_that_were_not_seen():

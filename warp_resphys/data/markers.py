@@ -13,10 +13,8 @@ A marker stands on a stem. What a body does to the stem is decided by what it is
 All reproduce the markers at rest, and carry them rigidly where the body moves rigidly.
 """
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any, Self
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -26,28 +24,16 @@ from typing_extensions import override
 from ..io.errors import InputError
 from ..mesh.mesh import Mesh
 from ..mesh.surface import closest_points
+from .observation import Observation
 
 _LEAST_PATCH = 4  # vertices that tell how a patch turns
 KINDS = ("normal", "frame", "rigid", "patch")
 
 
-class Markers(ABC):
-    """A map from the vertices of a body to m markers."""
+class Markers(Observation):
+    """A map from the vertices of a body to M markers."""
 
     vertices: torch.Tensor  # all that the markers depend on, in any shape
-
-    @abstractmethod
-    def __call__(self, positions: torch.Tensor) -> torch.Tensor:
-        """(B, N, 3) positions of the vertices to (B, m, 3) positions of the markers [m]."""
-
-    def transposed_jacobian(self, positions: torch.Tensor) -> torch.Tensor:
-        """(B, 3 N, 3 m) the transposed derivative of the markers by the vertices at positions (B, N, 3)."""
-        with torch.enable_grad():
-            q = positions.detach().requires_grad_(True)
-            at = self(q)
-            seeds = torch.eye(at[0].numel(), device=q.device, dtype=q.dtype).view(-1, 1, *at.shape[1:])
-            (rows,) = torch.autograd.grad(at, q, seeds.expand(-1, *at.shape), is_grads_batched=True)
-        return rows.flatten(2).permute(1, 2, 0).contiguous()
 
     def moved(self, by: torch.Tensor) -> "Markers":
         """The same markers elsewhere on the body.
@@ -59,15 +45,6 @@ class Markers(ABC):
             InputError: of vertices themselves.
         """
         raise InputError("observed vertices are where they are: only markers on stems can be placed elsewhere.")
-
-    def to(self, like: torch.Tensor) -> Self:
-        """The same markers on the device and in the precision of a tensor."""
-        changed: dict[str, Any] = {}
-        for field in fields(self):  # type: ignore[arg-type]
-            value = getattr(self, field.name)
-            if isinstance(value, torch.Tensor):
-                changed[field.name] = value.to(like) if value.is_floating_point() else value.to(like.device)
-        return replace(self, **changed)  # type: ignore[type-var]
 
 
 @dataclass(frozen=True)
@@ -169,10 +146,6 @@ class JoinedMarkers(Markers):
         in_parts = by[torch.argsort(self.order).to(by.device)].split(counts)
         parts = tuple(part.moved(some) for part, some in zip(self.parts, in_parts, strict=True))
         return replace(self, parts=parts)
-
-    @override
-    def to(self, like: torch.Tensor) -> Self:
-        return replace(super().to(like), parts=tuple(part.to(like) for part in self.parts))
 
 
 def tangent_frames(corners: torch.Tensor, unstretch: torch.Tensor) -> torch.Tensor:

@@ -138,7 +138,7 @@ class _FromMarkers(Reconstructing):
         self._vertices = draw_markers(simulator, self._count, draws, settings.seed)
         self._markers = MarkerMap.at_vertices(torch.as_tensor(self._vertices, device=self.like.device), self.like.dtype)
         more = dict(settings.reconstruction) | {"modes": settings.drawn.modes}
-        self.method = make_reconstructor(simulator, **more, markers=self._markers)
+        self.method = make_reconstructor(simulator, **more, observation=self._markers)
         self.force = self.like.new_zeros(draws, *self.like.shape)
         self._padding = max(settings.drawn.counts) - self._count
         self.fields = {name: Field((draws,), "m", batch_axes=1) for name in ("error", "misfit")}

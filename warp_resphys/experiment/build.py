@@ -15,8 +15,8 @@ from pathlib import Path
 import torch
 from numpy.typing import ArrayLike
 
+from ..data.marker_view import MarkerView
 from ..data.markers import Markers, bind_markers
-from ..data.sight import Sight
 from ..dynamics.nonlinear_solver import SolverSettings
 from ..dynamics.simulator import Simulator
 from ..energies.materials import Material, make_material
@@ -240,7 +240,9 @@ def bound_markers(settings: BindingSettings, mesh: Mesh, places: ArrayLike, labe
     )
 
 
-def sight_of(settings: MarkerSettings, labels: Sequence[str], sets: tuple[tuple[int, ...], ...] = ()) -> Sight:
+def marker_view_of(
+    settings: MarkerSettings, labels: Sequence[str], sets: tuple[tuple[int, ...], ...] = ()
+) -> MarkerView:
     """How much recordings tell of where these tracked markers are, from the group ``markers``.
 
     Args:
@@ -249,9 +251,9 @@ def sight_of(settings: MarkerSettings, labels: Sequence[str], sets: tuple[tuple[
         sets: the numbers of those that are seen together, if not all are.
 
     Raises:
-        InputError: see `Sight`.
+        InputError: see `MarkerView`.
     """
-    return Sight.of([settings.tracked[label] for label in labels], settings.plane, settings.frame, sets)
+    return MarkerView.of([settings.tracked[label] for label in labels], settings.plane, settings.frame, sets)
 
 
 def build_simulator(

@@ -31,7 +31,7 @@ from ..settings.run import RunSettings
 from ..settings.stages import PlayedSettings
 from ..settings.trials import MarkerSettings, RecordedData, Trial
 from .actuators import Drive, drive_of
-from .build import build_body, build_material, build_simulator, finer, sight_of
+from .build import build_body, build_material, build_simulator, finer, marker_view_of
 from .files import STATIC, payload_inputs
 from .identify import ELASTIC
 from .reading import standing_enough
@@ -89,7 +89,7 @@ def _check_reconstruction(run: RunSettings, simulator: Simulator, modes: int | N
     """Makes the reconstruction from markers, with one marker."""
     probe = MarkerMap.at_vertices(torch.zeros(1, 1, dtype=torch.int64))
     more = {} if modes is None else {"modes": modes}
-    make_reconstructor(simulator, **dict(run.reconstruction) | more, markers=probe)
+    make_reconstructor(simulator, **dict(run.reconstruction) | more, observation=probe)
 
 
 def _check_control(run: RunSettings, body: Body) -> None:
@@ -143,7 +143,7 @@ def _check_recorded(run: RunSettings, data: RecordedData, markers: MarkerSetting
     trials = trials_of(run)
     begins = {trial.begins for trial in trials}
     _check_markers(run, data, markers, body, begins)
-    _check_sight(run, markers, trials)
+    _check_view(run, markers, trials)
     payload_inputs(body, data.payload_at, np.array([trial.payload for trial in trials]))
     if begins & {"held", "released"} and data.seconds is None:
         raise InputError("data.seconds is not set: say how much of each trial counts after its release, in s.")
@@ -196,7 +196,7 @@ def _check_markers(run: RunSettings, data: RecordedData, markers: MarkerSettings
         select_vertices(body.mesh, **markers.bind_to.arguments())
 
 
-def _check_sight(run: RunSettings, markers: MarkerSettings, trials: Sequence[Trial]) -> None:
+def _check_view(run: RunSettings, markers: MarkerSettings, trials: Sequence[Trial]) -> None:
     """Refuses what cannot be had of the markers that trials have."""
     tracked = [*markers.tracked]
     for trial in trials:
@@ -213,7 +213,7 @@ def _check_sight(run: RunSettings, markers: MarkerSettings, trials: Sequence[Tri
         )
     if markers.frame == "own":
         _check_sets(trials, tracked)
-    sight_of(markers, tracked, tuple({tuple(trial.tracked(tracked)) for trial in trials}))
+    marker_view_of(markers, tracked, tuple({tuple(trial.tracked(tracked)) for trial in trials}))
 
 
 def _check_sets(trials: Sequence[Trial], tracked: Sequence[str]) -> None:

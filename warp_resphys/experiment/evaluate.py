@@ -23,10 +23,10 @@ from ..settings.run import models_of
 from ..settings.stages import EvaluateStage, MeshCheckStage, TimeStage
 from ..stepping.state import State
 from .build import finer
+from .experiment import LEARNED, Experiment
 from .files import ERRORS, MESH_CHECK, ROLLOUTS, STATIC, TIMES, read_dataset, reconstruction_file
 from .models import POSE_STEPS, SIMFREE, ModelRollout, first_frame, learned_of
 from .parts import TrialPart, padded, remove_parts, split_into_parts, work_on
-from .scene import LEARNED, Scene
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -39,23 +39,23 @@ _FILTERED_SECONDS = 4.0  # that trials must last for the median filter over a se
 def evaluate(context: StageContext, workers: Workers = ALONE) -> None:
     """Writes rollouts.h5, what is observed of every model's roll-outs of the test trials, and errors.json."""
     settings: EvaluateStage = context.settings
-    scene, compared = Scene(settings, context.run_dir, "count"), _models(settings)
+    experiment, compared = Experiment(settings, context.run_dir, "count"), _models(settings)
     names = [name for group in settings.groups.values() for name in group]
-    filmed = _film_trial(scene, settings.groups["1"])
-    parts = _parts(context, scene, names, compared, filmed)
+    filmed = _film_trial(experiment, settings.groups["1"])
+    parts = _parts(context, experiment, names, compared, filmed)
     with_intervals = [model for model in INTERVAL_MODELS if model in compared]
-    calibrating = _parts(context, scene, settings.calibration, with_intervals, filmed, "calibration_")
+    calibrating = _parts(context, experiment, settings.calibration, with_intervals, filmed, "calibration_")
     work_on([part for each in (parts, calibrating) for some in each.values() for part in some], _rolled_out, workers)
-    order = [name for some in scene.alike(names) for name in some]
+    order = [name for some in experiment.alike(names) for name in some]
     rows = [order.index(name) for name in names]
-    observed = {model: _all_observed(scene, model, some)[rows] for model, some in parts.items()}
-    shown = _film_steps(int(float(scene.trials([filmed]).times.max()) / settings.time_step + 1e-6))
+    observed = {model: _all_observed(experiment, model, some)[rows] for model, some in parts.items()}
+    shown = _film_steps(int(float(experiment.trials([filmed]).times.max()) / settings.time_step + 1e-6))
     attributes = {"names": names, "time_step": settings.time_step, "film_trial": filmed}
     with atomic_hdf5(context.run_dir / ROLLOUTS, "rollouts", attributes) as file:
         for model, values in observed.items():
             create(file, f"{model}_observed", values, "m", time_axis=1)
             bodies = next(part.read("film") for part in parts[model] if filmed in part.names)
-            substeps = round(settings.time_step / scene.model_simulator(model).time_step)
+            substeps = round(settings.time_step / experiment.model_simulator(model).time_step)
             create(file, f"{model}_film", bodies[np.minimum(substeps * shown, len(bodies) - 1)], "m")
         create(file, "film_steps", shown)
     left = {
@@ -63,9 +63,9 @@ def evaluate(context: StageContext, workers: Workers = ALONE) -> None:
         for model, some in parts.items()
         if model in LEARNED and settings.range_guard
     }
-    found = summary(context, scene, settings.groups, observed, left)
+    found = summary(context, experiment, settings.groups, observed, left)
     if settings.calibration:
-        found |= _intervals(scene, calibrating, observed)
+        found |= _intervals(experiment, calibrating, observed)
     write_json(context.run_dir / ERRORS, found)
     remove_parts(context)
 
@@ -76,39 +76,49 @@ def _models(settings: EvaluateStage) -> list[str]:
 
 
 def _parts(
-    context: StageContext, scene: Scene, names: Sequence[str], models: Sequence[str], filmed: str, label: str = ""
+    context: StageContext,
+    experiment: Experiment,
+    names: Sequence[str],
+    models: Sequence[str],
+    filmed: str,
+    label: str = "",
 ) -> dict[str, list[TrialPart]]:
     """The roll-outs of some trials, by model."""
     found: dict[str, list[TrialPart]] = {model: [] for model in models}
-    for number, some in enumerate(scene.alike(names)):
+    for number, some in enumerate(experiment.alike(names)):
         for model, parts in found.items():
-            rests = POSE_STEPS if model == SIMFREE and scene.begins(some[0]) == STATIC else 0
-            frames = 1 + (rests or int(float(scene.trials(some).times.max()) / scene.model_simulator(model).time_step))
+            rests = POSE_STEPS if model == SIMFREE and experiment.begins(some[0]) == STATIC else 0
+            frames = 1 + (
+                rests or int(float(experiment.trials(some).times.max()) / experiment.model_simulator(model).time_step)
+            )
             parts += split_into_parts(
-                context, some, frames, f"{label}{model}{number}", (model, filmed), scene.settings.batch
+                context, some, frames, f"{label}{model}{number}", (model, filmed), experiment.settings.batch
             )
     return found
 
 
-def _all_observed(scene: Scene, model: str, parts: Sequence[TrialPart]) -> FloatArray:
+def _all_observed(experiment: Experiment, model: str, parts: Sequence[TrialPart]) -> FloatArray:
     """(R, T, M, 3) what is observed of a model's roll-outs [m], in the order of the parts."""
-    return padded([_observed(scene, model, part) for part in parts], scene.dataset.observed.shape[1])
+    return padded([_observed(experiment, model, part) for part in parts], experiment.dataset.observed.shape[1])
 
 
 def _intervals(
-    scene: Scene, calibrating: Mapping[str, Sequence[TrialPart]], tested: Mapping[str, FloatArray]
+    experiment: Experiment, calibrating: Mapping[str, Sequence[TrialPart]], tested: Mapping[str, FloatArray]
 ) -> dict[str, Any]:
     """Prediction intervals by model, and how often they hold in the test trials; see `learning.intervals`."""
-    settings, rest = scene.settings, scene.dataset.bound
+    settings, rest = experiment.settings, experiment.dataset.bound
     assert isinstance(settings, EvaluateStage)
     assert rest is not None
-    names = [name for some in scene.alike(settings.calibration) for name in some]
-    known, target = scene.dataset.observed[scene.dataset.rows(names)], _counted(scene, settings.groups["1"])
+    names = [name for some in experiment.alike(settings.calibration) for name in some]
+    known, target = (
+        experiment.dataset.observed[experiment.dataset.rows(names)],
+        _counted(experiment, settings.groups["1"]),
+    )
     learned = [row for row, name in enumerate(names) if name in settings.split.train]
-    known[learned, scene.learned_steps(known.shape[1] - 1) + 1 :] = np.nan  # The rest may be the test.
+    known[learned, experiment.learned_steps(known.shape[1] - 1) + 1 :] = np.nan  # The rest may be the test.
     found: dict[str, Any] = {}
     for model, parts in calibrating.items():
-        intervals = Intervals.calibrated(list(_all_observed(scene, model, parts)), list(known), rest)
+        intervals = Intervals.calibrated(list(_all_observed(experiment, model, parts)), list(known), rest)
         if intervals is not None:
             held = intervals.holds(list(tested[model][: len(target)]), list(target), rest)
             found[model] = {**intervals.plain(), **held}
@@ -116,26 +126,26 @@ def _intervals(
     return {"intervals": {"level": LEVEL, "calibrated_on": told, "models": found}} if found else {}
 
 
-def _counted(scene: Scene, names: Sequence[str]) -> FloatArray:
+def _counted(experiment: Experiment, names: Sequence[str]) -> FloatArray:
     """(R, T, M, 3) what was observed in some trials [m], NaN where that was learned from."""
-    observed = scene.dataset.observed[scene.dataset.rows(names)]
+    observed = experiment.dataset.observed[experiment.dataset.rows(names)]
     for row, name in enumerate(names):
-        if name in scene.settings.split.train:
-            observed[row, : scene.learned_steps(observed.shape[1] - 1) + 1] = np.nan
+        if name in experiment.settings.split.train:
+            observed[row, : experiment.learned_steps(observed.shape[1] - 1) + 1] = np.nan
     return observed
 
 
 def _rolled_out(part: TrialPart) -> ModelRollout:
     """A model over the trials of a part."""
-    scene = Scene(part.context.settings, part.context.run_dir, "count")
+    experiment = Experiment(part.context.settings, part.context.run_dir, "count")
     model, filmed = part.more
-    return ModelRollout(scene, model, part.names, learned_of(scene, model), filmed=filmed)
+    return ModelRollout(experiment, model, part.names, learned_of(experiment, model), filmed=filmed)
 
 
-def _observed(scene: Scene, model: str, part: TrialPart) -> FloatArray:
+def _observed(experiment: Experiment, model: str, part: TrialPart) -> FloatArray:
     """(R, T, M, 3) what is observed of a model's roll-outs at the frames of the trials [m]."""
     series, delay, shift = (torch.from_numpy(part.read(name)) for name in ("points", "delay", "shift"))
-    replay = scene.replay(scene.model_simulator(model), part.names)
+    replay = experiment.replay(experiment.model_simulator(model), part.names)
     start = Start(State(series[:, 0], series[:, 0]), delay, shift).to(replay.trials.observed)
     series = (series[:, -1:] if replay.is_static else series).to(replay.trials.observed)
     return np.asarray(replay.at_frames(series, start).cpu().numpy())
@@ -170,11 +180,11 @@ def intervals_of_folds(dataset: Path, folders: Mapping[str, Path]) -> dict[str, 
     return {"intervals": {"level": LEVEL, "calibrated_on": "folds", "models": found}} if found else {}
 
 
-def _film_trial(scene: Scene, names: Sequence[str]) -> str:
+def _film_trial(experiment: Experiment, names: Sequence[str]) -> str:
     """The test trial that moves most; its bodies are drawn."""
     found: dict[str, float] = {}
-    for some in scene.alike(names):
-        found |= dict(zip(some, scene.trials(some).amplitude.tolist(), strict=True))
+    for some in experiment.alike(names):
+        found |= dict(zip(some, experiment.trials(some).amplitude.tolist(), strict=True))
     return max(names, key=lambda name: found[name])
 
 
@@ -185,7 +195,7 @@ def _film_steps(steps: int) -> IntArray:
 
 def summary(
     context: StageContext,
-    scene: Scene,
+    experiment: Experiment,
     groups: Mapping[str, Sequence[str]],
     simulated: Mapping[str, FloatArray],
     left: Mapping[str, IntArray],
@@ -194,17 +204,17 @@ def summary(
 
     Args:
         context: of the stage.
-        scene: of the experiment.
+        experiment: of the experiment.
         groups: names of the trials by pressure scale, the nominal ones first.
         simulated: by model, (R, T, M, 3) what is observed of its roll-outs [m], NaN where one diverged.
         left: by model, (R,) the step at which a trial left the range of the training, or -1.
     """
-    settings, dataset = scene.settings, scene.dataset
+    settings, dataset = experiment.settings, experiment.dataset
     assert isinstance(settings, EvaluateStage)
     names, every = groups["1"], [name for group in groups.values() for name in group]
     count, step = len(names), settings.time_step
-    observed = _counted(scene, every)
-    first = [first_frame(scene, [name]) for name in every]
+    observed = _counted(experiment, every)
+    first = [first_frame(experiment, [name]) for name in every]
     models = dict(simulated)
     if dataset.bound is None:
         models["reconstruction"] = _reconstructed(context, names)
@@ -235,7 +245,7 @@ def summary(
                 scale: {m: _range(each[rows], groups[scale], step) for m, each in left.items()}
                 for scale, rows in at.items()
             }
-    sideways = _sideways(scene, names)
+    sideways = _sideways(experiment, names)
     return {**found, **({"sideways_mm": sideways} if sideways else {})}
 
 
@@ -291,16 +301,16 @@ def _range(left: IntArray, names: Sequence[str], step: float) -> dict[str, Any]:
     return {"left": len(gone), "first_s": gone}
 
 
-def _sideways(scene: Scene, names: Sequence[str]) -> dict[str, float]:
+def _sideways(experiment: Experiment, names: Sequence[str]) -> dict[str, float]:
     """How far sideways bodies were held [mm], as the identified simulator has it, where that was estimated."""
-    if scene.settings.release.sideways <= 0.0:
+    if experiment.settings.release.sideways <= 0.0:
         return {}
-    simulator = scene.model_simulator("resphys")
+    simulator = experiment.model_simulator("resphys")
     found: dict[str, float] = {}
-    for some in scene.alike(names):
-        if scene.begins(some[0]) != "released":
+    for some in experiment.alike(names):
+        if experiment.begins(some[0]) != "released":
             continue
-        shift = scene.start(scene.replay(simulator, some, "resphys")).shift
+        shift = experiment.start(experiment.replay(simulator, some, "resphys")).shift
         if shift is not None:
             found |= dict(zip(some, (1e3 * shift.norm(dim=2).mean(1)).tolist(), strict=True))
     return found
@@ -314,20 +324,20 @@ def time_models(context: StageContext) -> None:
     first to warm up.
     """
     settings: TimeStage = context.settings
-    scene = Scene(settings, context.run_dir, "count")
-    names = scene.moving(settings.groups["1"])
-    simulator = scene.model_simulator("resphys")
-    learned = learned_of(scene, "resphys")
-    starts = {name: scene.start(scene.replay(simulator, [name], "resphys")) for name in names}
-    rows: dict[str, tuple[str, Any, Any]] = {"simulation": ("simulation", None, scene.simulator("simulation"))}
+    experiment = Experiment(settings, context.run_dir, "count")
+    names = experiment.moving(settings.groups["1"])
+    simulator = experiment.model_simulator("resphys")
+    learned = learned_of(experiment, "resphys")
+    starts = {name: experiment.start(experiment.replay(simulator, [name], "resphys")) for name in names}
+    rows: dict[str, tuple[str, Any, Any]] = {"simulation": ("simulation", None, experiment.simulator("simulation"))}
     if settings.target is not None:
-        rows["target"] = ("simulation", None, scene.simulator("target"))
+        rows["target"] = ("simulation", None, experiment.simulator("target"))
     rows |= {"resphys": ("resphys", learned, simulator), "inference": ("resphys", learned, simulator)}
     times: dict[str, dict[str, float]] = {}
     steps = 0
     with Progress(context.name, len(rows) * len(names), "trials") as progress, torch.no_grad():
         for row, (model, known, stepping) in rows.items():
-            runs = [ModelRollout(scene, model, [name], known, starts[name], stepping) for name in names]
+            runs = [ModelRollout(experiment, model, [name], known, starts[name], stepping) for name in names]
             seconds = []
             for run in (runs[0], *runs):
                 state, steps = run.begin(), run.frames - 1
@@ -350,18 +360,18 @@ def check_mesh(context: StageContext) -> None:
     """
     settings: MeshCheckStage = context.settings
     other = settings.model_copy(update={"mesh": finer(settings.mesh, settings.mesh_check)})
-    scenes = [Scene(each, context.run_dir) for each in (settings, other)]
+    experiments = [Experiment(each, context.run_dir) for each in (settings, other)]
     model = "simulation" if settings.identified is None else "sysid"
-    groups = scenes[0].alike(settings.groups["1"])
-    found: dict[str, Any] = {"cells": [len(each.body.mesh.cells) for each in scenes], "model": model}
+    groups = experiments[0].alike(settings.groups["1"])
+    found: dict[str, Any] = {"cells": [len(each.body.mesh.cells) for each in experiments], "model": model}
     errors: list[list[FloatArray]] = [[], []]
     moved: list[FloatArray] = []
     with Progress(context.name, 2 * sum(map(len, groups)), "trials") as progress:
         try:
             for names in groups:
                 shown = []
-                for scene, each in zip(scenes, errors, strict=True):
-                    markers, trials = _simulated(scene, model, names)
+                for experiment, each in zip(experiments, errors, strict=True):
+                    markers, trials = _simulated(experiment, model, names)
                     seen = trials.seen.cpu().numpy()
                     each += _distances(markers, trials.observed.cpu().numpy(), seen)
                     shown.append(markers)
@@ -375,11 +385,11 @@ def check_mesh(context: StageContext) -> None:
     write_json(context.run_dir / MESH_CHECK, found)
 
 
-def _simulated(scene: Scene, model: str, names: Sequence[str]) -> tuple[FloatArray, Trials]:
+def _simulated(experiment: Experiment, model: str, names: Sequence[str]) -> tuple[FloatArray, Trials]:
     """(R, T, M, 3) markers of trials that begin alike, by a model without a force [m], and what was observed."""
-    replay = scene.replay(scene.model_simulator(model), names, model)
+    replay = experiment.replay(experiment.model_simulator(model), names, model)
     with torch.no_grad():
-        markers = replay(scene.start(replay, model), scene.parameters(model))[0]
+        markers = replay(experiment.start(replay, model), experiment.parameters(model))[0]
     return np.asarray(markers.cpu().numpy()), replay.trials
 
 

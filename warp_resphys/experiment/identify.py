@@ -18,8 +18,8 @@ from ..learning.placement import Accuracy
 from ..learning.replay import Replay, Start
 from ..settings.learning import RangeSettings
 from ..settings.stages import IdentifyStage
+from .experiment import MODELS, Experiment
 from .files import IDENTIFICATION
-from .scene import MODELS, Scene
 from .trials import evenly
 
 ELASTIC = ("youngs_modulus", "poissons_ratio")
@@ -38,7 +38,7 @@ def identify(context: StageContext) -> None:
     """
     settings: IdentifyStage = context.settings
     wanted, names = settings.identify, settings.split.train
-    scene = Scene(settings, context.run_dir)
+    experiment = Experiment(settings, context.run_dir)
     names = names if wanted.trials is None else tuple(evenly(names, wanted.trials))
     searches = {"sysid": wanted.parameters, "sysid_elastic": wanted.elastic or {}}
     ranges = {model: {name: bounds_of(each) for name, each in some.items()} for model, some in searches.items() if some}
@@ -49,10 +49,10 @@ def identify(context: StageContext) -> None:
     found, replays = {}, {}
     with Progress(context.name, evaluations, "evaluations at most", done) as progress:
         for model, bounds in ranges.items():
-            replays[model] = scene.replays(scene.simulator(kinds[model]), names)
-            placed = _placement(scene) if model == "sysid" else {}
+            replays[model] = experiment.replays(experiment.simulator(kinds[model]), names)
+            placed = _placement(experiment) if model == "sysid" else {}
             identifier = Identifier(replays[model], bounds, _seconds(settings, replays[model]), **placed)
-            guess = {**configured_parameters(scene.simulator(kinds[model]), bounds), **wanted.first_guess}
+            guess = {**configured_parameters(experiment.simulator(kinds[model]), bounds), **wanted.first_guess}
             guess = {name: guess[name] for name in bounds}
             found[model] = _search(settings, identifier, guess, kept[model], progress) | {"first_guess": guess}
     if wanted.grid is not None:
@@ -60,7 +60,7 @@ def identify(context: StageContext) -> None:
         grid = {name: each for name, each in dict(wanted.grid).items() if each is not None}
         axes = {name: Bounds(each.lower, each.upper, each.logarithmic) for name, each in grid.items()}
         others = {name: bounds for name, bounds in ranges["sysid"].items() if name not in axes}
-        identifier = Identifier(replays["sysid"], {**axes, **others}, seconds, **_placement(scene))
+        identifier = Identifier(replays["sysid"], {**axes, **others}, seconds, **_placement(experiment))
         counts = {name: each.points for name, each in grid.items()}
         found[_LANDSCAPE] = _landscape(identifier, counts, found["sysid"]["parameters"], kept[_LANDSCAPE])
     write_json(context.run_dir / IDENTIFICATION, found)
@@ -74,9 +74,9 @@ def bounds_of(settings: RangeSettings) -> Bounds:
     return Bounds(settings.lower, settings.upper, settings.logarithmic, prior)
 
 
-def _placement(scene: Scene) -> dict[str, Any]:
+def _placement(experiment: Experiment) -> dict[str, Any]:
     """What an `Identifier` is told of how well it is known where markers sit; nothing where that is not asked."""
-    settings = scene.settings
+    settings = experiment.settings
     assert isinstance(settings, IdentifyStage)
     wanted, markers = settings.identify.placement, settings.markers
     if wanted is None or markers is None:
@@ -84,7 +84,7 @@ def _placement(scene: Scene) -> dict[str, Any]:
     turn = None if wanted.turn is None else math.radians(wanted.turn)
     standing = [*markers.reference.values()] or [*markers.tracked.values()]
     accuracy = Accuracy(wanted.markers, wanted.shift, turn)
-    return {"accuracy": accuracy, "labels": scene.dataset.labels, "centre": np.mean(standing, axis=0).tolist()}
+    return {"accuracy": accuracy, "labels": experiment.dataset.labels, "centre": np.mean(standing, axis=0).tolist()}
 
 
 class _Kept:

@@ -20,16 +20,16 @@ from ..io.stages import StageContext
 from ..learning.markers_in_the_loop import MarkersInTheLoop, MotionLoss, Watched, cross_validated_epochs
 from ..learning.networks import ResidualForce, StateMap, build_model, build_next_state
 from ..learning.predictors import Range
-from ..learning.refinement import Motion, SolverInTheLoop, WindowLoss
+from ..learning.refinement import RefinementBatch, SolverInTheLoop, WindowLoss
 from ..learning.replay import Replay
 from ..learning.training import EpochTrainer, Samples, SequenceTrainer, Trainer
 from ..settings.learning import InTheLoopSettings, NetworkSettings, TrainingSettings
 from ..settings.stages import NetworkStage, RefineStage, TrainStage
 from .build import choose_device
+from .experiment import Experiment
 from .files import STATIC, reconstruction_file, training_file, weights_file
 from .models import SIMFREE, Learned, kind_of, load, rollout_error
 from .reconstruct import reconstructing_simulator
-from .scene import Scene
 
 log = logging.getLogger(__name__)
 _CHECKPOINT_SECONDS = 10.0
@@ -37,16 +37,16 @@ _CHECKPOINT_SECONDS = 10.0
 Snapshot = tuple[dict[str, torch.Tensor], dict[str, Any]]
 
 
-def samples_of(scene: Scene, model: str, names: Sequence[str], device: torch.device) -> Samples:
+def samples_of(experiment: Experiment, model: str, names: Sequence[str], device: torch.device) -> Samples:
     """The single steps of some trials that a model learns from, and poses, from which a body goes nowhere.
 
     States are in the frame of the base. The force that leads on is that of the rest shape where forces turn with the
     body; what replaces a simulator learns the displacement and the velocity where a step ends. What no marker saw has
     nothing to teach.
     """
-    parts = [_samples(scene, model, some, device) for some in scene.alike(names)]
+    parts = [_samples(experiment, model, some, device) for some in experiment.alike(names)]
     found = parts[0] if len(parts) == 1 else _joined(parts)
-    frames = None if model == SIMFREE else scene.frames(scene.model_simulator(model))
+    frames = None if model == SIMFREE else experiment.frames(experiment.model_simulator(model))
     if frames is None:
         return found
     return dataclasses.replace(found, outputs=(frames.to_rest(found.q, found.v, *found.outputs),))
@@ -59,25 +59,25 @@ def _joined(parts: Sequence[Samples]) -> Samples:
     return Samples(q, v, outputs, torch.cat(told) if told else None, tuple(n for each in parts for n in each.lengths))
 
 
-def _samples(scene: Scene, model: str, names: Sequence[str], device: torch.device) -> Samples:
+def _samples(experiment: Experiment, model: str, names: Sequence[str], device: torch.device) -> Samples:
     """Those of trials that begin alike; forces as they are."""
-    simulator, known = scene.model_simulator(model), model == SIMFREE and scene.dataset.velocity is not None
-    q, v, force, seen = _known(scene, names, device) if known else _reconstructed(scene, model, names, device)
-    base, like = scene.base(names, simulator), simulator.rest_positions
+    simulator, known = experiment.model_simulator(model), model == SIMFREE and experiment.dataset.velocity is not None
+    q, v, force, seen = _known(experiment, names, device) if known else _reconstructed(experiment, model, names, device)
+    base, like = experiment.base(names, simulator), simulator.rest_positions
     if base is not None:
         pairs = enumerate(zip(q.unbind(1), v.unbind(1), strict=True))
         inside = [base.enter(x.to(like), w.to(like), k) for k, (x, w) in pairs]
         q, v = (torch.stack(each, 1).to(q) for each in zip(*inside, strict=True))
         forces = enumerate(force.unbind(1))  # That of a frame belongs to the step before.
         force = torch.stack([base.force_inside(f.to(like), k - 1) for k, f in forces], 1).to(force)
-    if scene.begins(names[0]) == STATIC:
+    if experiment.begins(names[0]) == STATIC:
         q, v, force, seen = q[:, 1:2].expand(-1, 2, -1, -1), torch.zeros_like(v[:, :2]), force[:, :2], seen[:, :1]
     steps, whole = q.shape[1] - 1, bool(seen.all())
 
     def pick(field: torch.Tensor) -> torch.Tensor:
         return field.flatten(0, 1) if whole else field[seen]
 
-    told = scene.conditions(scene.replay(simulator, names), scene.parameters(model), model == SIMFREE)
+    told = experiment.conditions(experiment.replay(simulator, names), experiment.parameters(model), model == SIMFREE)
     if told is not None:  # (K, R, A), or (R, A) that is the same all the time
         told = told[:steps].swapaxes(0, 1) if told.ndim == 3 else told[:, None].expand(-1, steps, -1)
         told = pick(told.to(device))
@@ -85,24 +85,24 @@ def _samples(scene: Scene, model: str, names: Sequence[str], device: torch.devic
     lengths = tuple(seen.sum(1).tolist())
     if model != SIMFREE:
         return Samples(*now, (pick(force[:, 1:]),), told, lengths)
-    return Samples(*now, (pick(q[:, 1:]) - scene.like.to(q), pick(v[:, 1:])), told, lengths)
+    return Samples(*now, (pick(q[:, 1:]) - experiment.like.to(q), pick(v[:, 1:])), told, lengths)
 
 
 States = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 
 
-def _known(scene: Scene, names: Sequence[str], device: torch.device) -> States:
+def _known(experiment: Experiment, names: Sequence[str], device: torch.device) -> States:
     """The same as `_reconstructed`, of trials whose states a simulation knows, and without forces."""
-    dataset, rows = scene.dataset, scene.dataset.rows(names)
+    dataset, rows = experiment.dataset, experiment.dataset.rows(names)
     assert dataset.velocity is not None
     q, v = (torch.as_tensor(field[rows], device=device) for field in (dataset.observed, dataset.velocity))
     return q, v, torch.zeros((), device=device).expand_as(q), torch.ones(q.shape[0], q.shape[1] - 1, dtype=torch.bool)
 
 
-def _reconstructed(scene: Scene, model: str, names: Sequence[str], device: torch.device) -> States:
+def _reconstructed(experiment: Experiment, model: str, names: Sequence[str], device: torch.device) -> States:
     """Positions, velocities, forces (R, K + 1, N, 3) of trials that begin alike, and (R, K) whether steps were seen."""
     source = "resphys" if model == SIMFREE else model
-    with read_hdf5(scene.folder / reconstruction_file(source), "reconstruction") as file:
+    with read_hdf5(experiment.folder / reconstruction_file(source), "reconstruction") as file:
         order = [str(name) for name in file.attrs["names"]]
         rows = [order.index(name) for name in names]
         index = slice(rows[0], rows[-1] + 1) if rows == [*range(rows[0], rows[-1] + 1)] else rows
@@ -116,11 +116,11 @@ class Learning:
     """What is learned, from what, and how it is judged; the network and the way of training are open.
 
     Attributes:
-        scene: of the experiment.
+        experiment: of the experiment.
         model: name of what is learned.
     """
 
-    scene: Scene
+    experiment: Experiment
     model: str
 
     def trainer(self, settings: TrainingSettings) -> "Prepared":
@@ -129,14 +129,14 @@ class Learning:
         Raises:
             InputError: a setting out of range, or an empty split.
         """
-        split = self.scene.settings.split
-        device = choose_device(self.scene.settings.device)
-        train = samples_of(self.scene, self.model, split.train, device)
+        split = self.experiment.settings.split
+        device = choose_device(self.experiment.settings.device)
+        train = samples_of(self.experiment, self.model, split.train, device)
         if settings.in_the_loop is not None:
-            return _in_the_loop(self.scene, self.model, train, settings, settings.in_the_loop)
+            return _in_the_loop(self.experiment, self.model, train, settings, settings.in_the_loop)
         judged = split.validation or split.train
-        validation = samples_of(self.scene, self.model, judged, device) if split.validation else train
-        return _supervised(self.scene, self.model, train, validation, judged, settings)
+        validation = samples_of(self.experiment, self.model, judged, device) if split.validation else train
+        return _supervised(self.experiment, self.model, train, validation, judged, settings)
 
 
 @dataclass(frozen=True)
@@ -152,17 +152,17 @@ class Prepared:
     learned: Learned
 
 
-def _new_network(scene: Scene, model: str, train: Samples, settings: TrainingSettings) -> StateMap:
+def _new_network(experiment: Experiment, model: str, train: Samples, settings: TrainingSettings) -> StateMap:
     """An untrained network, with coders from the training steps; the same for the same seed."""
-    rest, network = scene.like.to(train.q.device), settings.network
-    if not scene.moving(scene.settings.split.train):
+    rest, network = experiment.like.to(train.q.device), settings.network
+    if not experiment.moving(experiment.settings.split.train):
         network = _limited(network, len(train.q), model)
     torch.manual_seed(settings.seed)
     config = dict(network)
     if model == SIMFREE:
         return build_next_state(config, rest, train.q, train.v, train.actuation)
     by_displacement = network.kind == "reduced" and network.force_basis == "displacement"
-    stiffness = RestStiffness(scene.model_simulator(model)) if by_displacement else None
+    stiffness = RestStiffness(experiment.model_simulator(model)) if by_displacement else None
     return build_model(config, rest, train.q, train.v, train.outputs[0], train.actuation, stiffness)
 
 
@@ -177,12 +177,17 @@ def _limited(network: NetworkSettings, poses: int, model: str) -> NetworkSetting
 
 
 def _supervised(
-    scene: Scene, model: str, train: Samples, validation: Samples, judged: Sequence[str], settings: TrainingSettings
+    experiment: Experiment,
+    model: str,
+    train: Samples,
+    validation: Samples,
+    judged: Sequence[str],
+    settings: TrainingSettings,
 ) -> Prepared:
     """Training on single steps, judged by roll-outs."""
-    network = _new_network(scene, model, train, settings)
-    learned = Learned(network, _range_of(scene, network, train), scene.settings.force_frame)
-    error = rollout_error(dataclasses.replace(scene, on_failure="count"), model, judged)
+    network = _new_network(experiment, model, train, settings)
+    learned = Learned(network, _range_of(experiment, network, train), experiment.settings.force_frame)
+    error = rollout_error(dataclasses.replace(experiment, on_failure="count"), model, judged)
     kind: type[Trainer[Any]] = Trainer if network.recurrent is None else SequenceTrainer
 
     def judge(weights: StateMap) -> float:
@@ -191,26 +196,29 @@ def _supervised(
     return Prepared(kind(network, train, validation, judge, dict(settings.trainer), settings.seed), learned)
 
 
-def _range_of(scene: Scene, network: StateMap, train: Samples) -> Range | None:
+def _range_of(experiment: Experiment, network: StateMap, train: Samples) -> Range | None:
     """The range of a network's inputs in training, in which roll-outs hold it, if that is asked for."""
-    assert isinstance(scene.settings, NetworkStage)
-    if not scene.settings.range_guard:
+    assert isinstance(experiment.settings, NetworkStage)
+    if not experiment.settings.range_guard:
         return None
     with torch.no_grad():
         return Range.of(network.encode(train.q, train.v, train.actuation))
 
 
 def _in_the_loop(
-    scene: Scene, model: str, samples: Samples, settings: TrainingSettings, loop: InTheLoopSettings
+    experiment: Experiment, model: str, samples: Samples, settings: TrainingSettings, loop: InTheLoopSettings
 ) -> Prepared:
     """Training on whole trials through the simulator.
 
     The reconstruction says in which modes bodies move and forces act. Without validation trials, each training trial is
     held out once to find how long training serves others; no epoch at all is one of the choices.
     """
-    config, split = dict(loop), scene.settings.split
-    parameters, simulator = scene.parameters(model), scene.model_simulator(model)
-    everyone, frames = scene.replays(simulator, split.train + split.validation, model), scene.frames(simulator)
+    config, split = dict(loop), experiment.settings.split
+    parameters, simulator = experiment.parameters(model), experiment.model_simulator(model)
+    everyone, frames = (
+        experiment.replays(simulator, split.train + split.validation, model),
+        experiment.frames(simulator),
+    )
 
     def loss(names: Sequence[str]) -> MotionLoss:
         watched = []
@@ -219,13 +227,13 @@ def _in_the_loop(
             rows = [some.index(name) for name in names if name in some]
             if rows:
                 part = Replay(simulator, replay.observe, replay.trials.select(rows))
-                told = scene.conditions(part, parameters)
-                base = scene.base(part.trials.names, simulator)
+                told = experiment.conditions(part, parameters)
+                base = experiment.base(part.trials.names, simulator)
                 watched.append(Watched(part, start.select(rows), told, frames, base))
         return MotionLoss(watched, parameters)
 
     def make_network() -> ResidualForce:
-        found = _new_network(scene, model, samples, settings)
+        found = _new_network(experiment, model, samples, settings)
         assert isinstance(found, ResidualForce)
         return found.double()
 
@@ -238,36 +246,36 @@ def _in_the_loop(
     judged = loss(validation) if validation else None
     trainer = MarkersInTheLoop(make_network(), loss(train), judged, config, epochs)
     trainer.begin()
-    learned = Learned(trainer.model, _range_of(scene, trainer.model, samples), scene.settings.force_frame)
+    learned = Learned(trainer.model, _range_of(experiment, trainer.model, samples), experiment.settings.force_frame)
     return Prepared(trainer, learned)
 
 
 def train(context: StageContext) -> None:
     """Trains a model: <model>.safetensors, with the weights that are selected, and training_<model>.json."""
     settings: TrainStage = context.settings
-    learning = Learning(Scene(settings, context.run_dir), settings.model)
+    learning = Learning(Experiment(settings, context.run_dir), settings.model)
     fit(context, settings.model, learning.trainer(settings.training))
 
 
 def refine(context: StageContext) -> None:
     """Trains a residual force on through the simulator: <model>_refined.safetensors and refinement_<model>.json."""
     settings: RefineStage = context.settings
-    model, scene = settings.model, Scene(settings, context.run_dir, "count")
-    simulator = scene.model_simulator(model)
+    model, experiment = settings.model, Experiment(settings, context.run_dir, "count")
+    simulator = experiment.model_simulator(model)
     learned = load(context.run_dir, model, choose_device(settings.device))
     network, refinement = learned.network, settings.refinement
     assert isinstance(network, ResidualForce)
     judged = settings.split.validation or settings.split.train
-    train_on, validate_on = (_motions(scene, model, names) for names in (settings.split.train, judged))
-    error = rollout_error(scene, model, judged)
+    train_on, validate_on = (_motions(experiment, model, names) for names in (settings.split.train, judged))
+    error = rollout_error(experiment, model, judged)
     loss = WindowLoss(
         network,
         partial(dataclasses.replace, simulator),  # One whose solver has seen nothing yet.
         refinement.window,
         refinement.batch_size,
-        observe=scene.observe_by(model),
-        parameters=scene.parameters(model),
-        frames=scene.frames(simulator, learned.force_frame),
+        observe=experiment.observe_by(model),
+        parameters=experiment.parameters(model),
+        frames=experiment.frames(simulator, learned.force_frame),
         range_=learned.range_,
     )
     trainer = SolverInTheLoop(network, loss, train_on, validate_on, lambda _: error(learned), dict(refinement))
@@ -277,17 +285,17 @@ def refine(context: StageContext) -> None:
         log.warning("%s: %d windows could not be simulated and were left out", context.name, left_out)
 
 
-def _motions(scene: Scene, model: str, names: Sequence[str]) -> list[Motion]:
+def _motions(experiment: Experiment, model: str, names: Sequence[str]) -> list[RefinementBatch]:
     """What windows of some trials start from, and where they should go: a motion for those that begin alike."""
     found = []
-    simulator = reconstructing_simulator(scene, model)
-    for replay, start in scene.replays(simulator, scene.moving(names), model):
-        some, target = replay.trials.names, scene.explained(replay, start)
-        known, device = scene.dataset.velocity is not None, simulator.rest_positions.device
-        q, v, *_ = _known(scene, some, device) if known else _reconstructed(scene, model, some, device)
+    simulator = reconstructing_simulator(experiment, model)
+    for replay, start in experiment.replays(simulator, experiment.moving(names), model):
+        some, target = replay.trials.names, experiment.explained(replay, start)
+        known, device = experiment.dataset.velocity is not None, simulator.rest_positions.device
+        q, v, *_ = _known(experiment, some, device) if known else _reconstructed(experiment, model, some, device)
         q, v = (field[:, : target.shape[1]].to(simulator.rest_positions) for field in (q, v))
-        told = scene.conditions(replay, scene.parameters(model))
-        found.append(Motion(q, v, target, replay.trials, told, scene.base(some, simulator)))
+        told = experiment.conditions(replay, experiment.parameters(model))
+        found.append(RefinementBatch(q, v, target, replay.trials, told, experiment.base(some, simulator)))
     return found
 
 

@@ -23,9 +23,9 @@ from ..learning.replay import Start
 from ..learning.rollout import Rollout
 from ..settings.stages import TestStage
 from ..stepping.state import State
+from .experiment import LEARNED, Experiment
 from .files import GIVEN, weights_file
 from .parts import ResumableRollout
-from .scene import LEARNED, Scene
 
 FloatArray = NDArray[np.float64]
 
@@ -45,7 +45,7 @@ class Learned:
     Attributes:
         network: that predicts a force, or the next state.
         range_: of its inputs in training, in which roll-outs hold it; None for no guard.
-        force_frame: whether its forces turn with the body, see `Scene.frames`.
+        force_frame: whether its forces turn with the body, see `Experiment.frames`.
     """
 
     network: StateMap
@@ -81,7 +81,7 @@ class ModelRollout(ResumableRollout):
     """A model over some trials that begin alike, step by step.
 
     Args:
-        scene: of the experiment.
+        experiment: of the experiment.
         model: its name.
         names: of the trials.
         learned: what it has learned; None for a simulator alone.
@@ -92,7 +92,7 @@ class ModelRollout(ResumableRollout):
 
     def __init__(
         self,
-        scene: Scene,
+        experiment: Experiment,
         model: str,
         names: Sequence[str],
         learned: Learned | None = None,
@@ -100,14 +100,14 @@ class ModelRollout(ResumableRollout):
         simulator: Simulator | None = None,
         filmed: str | None = None,
     ) -> None:
-        self.scene, self.model = scene, model
-        self.simulator = scene.model_simulator(model) if simulator is None else simulator
+        self.experiment, self.model = experiment, model
+        self.simulator = experiment.model_simulator(model) if simulator is None else simulator
         self.like = self.simulator.rest_positions
-        self.replay = scene.replay(self.simulator, names, model)
-        self.start = scene.start(self.replay, model) if start is None else start
-        parameters = scene.parameters(model)
+        self.replay = experiment.replay(self.simulator, names, model)
+        self.start = experiment.start(self.replay, model) if start is None else start
+        parameters = experiment.parameters(model)
         self._constants, self._inputs, self._resting = self.replay.setting(parameters)
-        self._told = None if learned is None else scene.conditions(self.replay, parameters, model == SIMFREE)
+        self._told = None if learned is None else experiment.conditions(self.replay, parameters, model == SIMFREE)
         self._first: State | None = None
         self._failed = False
         self._filmed = names.index(filmed) if filmed in names else None
@@ -123,8 +123,8 @@ class ModelRollout(ResumableRollout):
         predict = None
         if learned is not None:
             replaces = isinstance(learned.network, NextState)
-            frames = None if replaces else self.scene.frames(self.simulator, learned.force_frame)
-            base = self.scene.base(self.replay.trials.names, self.simulator)
+            frames = None if replaces else self.experiment.frames(self.simulator, learned.force_frame)
+            base = self.experiment.base(self.replay.trials.names, self.simulator)
             predict = LearnedPredictor(learned.network, self._told, learned.range_, frames, base)
         return Rollout(self.simulator, predict, self._inputs, self._constants), predict
 
@@ -140,7 +140,7 @@ class ModelRollout(ResumableRollout):
         """Steps that reach past all frames; of whole time steps of the experiment."""
         if self.replay.is_static:
             return POSE_STEPS if self.model == SIMFREE else 0
-        substeps = round(self.scene.settings.time_step / self.simulator.time_step)
+        substeps = round(self.experiment.settings.time_step / self.simulator.time_step)
         return -(-self.replay.steps(self.start) // substeps) * substeps
 
     @torch.no_grad()
@@ -216,9 +216,9 @@ class ModelRollout(ResumableRollout):
     def errors(self) -> list[FloatArray]:
         """Mean distances [mm] at those frames of each trial that are learned from; NaN where the roll-out diverged."""
         observed, steps = self.replay.trials.observed, self.frames - 1
-        observed = observed[:, : self.scene.learned_steps(observed.shape[1] - 1) + 1]
-        if self.scene.settings.train_fraction < 1.0:
-            steps = min(steps, self.scene.learned_steps(steps))
+        observed = observed[:, : self.experiment.learned_steps(observed.shape[1] - 1) + 1]
+        if self.experiment.settings.train_fraction < 1.0:
+            steps = min(steps, self.experiment.learned_steps(steps))
         series: list[torch.Tensor] = []
         with contextlib.suppress(ConvergenceError):
             self.state = self.beginning()
@@ -229,21 +229,21 @@ class ModelRollout(ResumableRollout):
         if not series:
             return [np.full(1, np.nan) for _ in observed]
         found = self.replay.at_frames(torch.stack(series[-1:] if self.replay.is_static else series, 1), self.start)
-        first = first_frame(self.scene, self.replay.trials.names)
+        first = first_frame(self.experiment, self.replay.trials.names)
         pairs = zip(found[:, first:].cpu().numpy(), observed[:, first:].cpu().numpy(), strict=True)
         return [marker_errors(x[: len(y)], y) for x, y in pairs]
 
 
-def first_frame(scene: Scene, names: Sequence[str]) -> int:
+def first_frame(experiment: Experiment, names: Sequence[str]) -> int:
     """From which frame on errors count: the state that a roll-out is given is none of its making."""
-    return int(scene.begins(names[0]) == GIVEN)
+    return int(experiment.begins(names[0]) == GIVEN)
 
 
-def rollout_error(scene: Scene, model: str, names: Sequence[str]) -> Callable[[Learned], float]:
+def rollout_error(experiment: Experiment, model: str, names: Sequence[str]) -> Callable[[Learned], float]:
     """What tells the mean error of a model over some trials [mm]; infinite where a roll-out diverged.
 
     Args:
-        scene: whose simulators count failures.
+        experiment: whose simulators count failures.
         model: one that learns.
         names: of the trials.
     """
@@ -251,7 +251,7 @@ def rollout_error(scene: Scene, model: str, names: Sequence[str]) -> Callable[[L
 
     def error(learned: Learned) -> float:
         if not runs:  # The beginnings of trials are estimated once, and only where someone asks.
-            runs.extend(ModelRollout(scene, model, some, learned) for some in scene.alike(names))
+            runs.extend(ModelRollout(experiment, model, some, learned) for some in experiment.alike(names))
         rows = [row for run in runs for row in run.with_learned(learned).errors()]
         mean = summarise(rows)["mean"]
         return float("inf") if mean is None else mean
@@ -259,8 +259,8 @@ def rollout_error(scene: Scene, model: str, names: Sequence[str]) -> Callable[[L
     return error
 
 
-def learned_of(scene: Scene, model: str) -> Learned | None:
+def learned_of(experiment: Experiment, model: str) -> Learned | None:
     """What a model has learned in this run; None for those that are simulators alone."""
-    assert isinstance(scene.settings, TestStage)
-    refined = model != SIMFREE and scene.settings.refined
-    return load(scene.folder, model, scene.like.device, refined) if model in LEARNED else None
+    assert isinstance(experiment.settings, TestStage)
+    refined = model != SIMFREE and experiment.settings.refined
+    return load(experiment.folder, model, experiment.like.device, refined) if model in LEARNED else None

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from ..data.actuation import NO_INPUT, check_inputs
 from ..data.base_motion import followed, in_frame, prescribed, rigid
+from ..data.marker_view import MarkerView
 from ..data.recordings.processing import fill_gaps, release_of, resample, trim_to_release
 from ..data.recordings.quality import check_base, check_motion
 from ..data.recordings.recording import Recording
 from ..data.recordings.release import Release, valve_opening
 from ..data.registration import Registration, register_markers
 from ..data.rigid import RigidTransform
-from ..data.sight import Sight
 from ..dynamics.simulator import Simulator
 from ..io.errors import DataFileError, listed
 from ..io.stages import StageContext
@@ -44,7 +44,7 @@ class Observed:
         trial: what is configured of it.
         raw: the configured markers that it has, the tracked ones first, as measured.
         columns: which of all tracked markers these are.
-        sight: how much it tells of where they are.
+        view: how much it tells of where they are.
         moving: the tracked ones from time zero on, short gaps filled, long ones NaN.
         still: (M', 3) where its markers were before time zero, in the frame of the recording [m].
         registration: of the markers at rest.
@@ -58,7 +58,7 @@ class Observed:
     trial: Trial
     raw: Recording
     columns: list[int]
-    sight: Sight
+    view: MarkerView
     moving: Recording
     still: FloatArray
     registration: Registration
@@ -70,12 +70,12 @@ class Observed:
     def to_body(self, points: FloatArray, shift: FloatArray) -> FloatArray:
         """What (..., M, 3) points of its markers tell in the frame of the body, moved by (M, 3) [m]."""
         moved = self.registration.transform.apply(points.reshape(-1, 3)).reshape(points.shape)
-        return self.sight.of_arrays(self.sight.of_arrays(moved) + shift)
+        return self.view.of_arrays(self.view.of_arrays(moved) + shift)
 
     @property
     def places(self) -> FloatArray:
         """(M, 3) what is told of where its tracked markers are while it is registered, in the frame of the body [m]."""
-        return self.sight.of_arrays(self.registration.positions[: len(self.columns)])
+        return self.view.of_arrays(self.registration.positions[: len(self.columns)])
 
 
 class Observer:
@@ -203,15 +203,15 @@ class Observer:
             )
         return poses
 
-    def _turned_back(self, places: FloatArray, sight: Sight) -> FloatArray:
-        """(M', 3) places in the frame of the recording, those of the tracked markers turned as the sight of them is.
+    def _turned_back(self, places: FloatArray, view: MarkerView) -> FloatArray:
+        """(M', 3) places in the frame of the recording, those of the tracked markers turned as the view of them is.
 
         What is told in a frame of their own is the same wherever they are: any motion that registers it will do.
         """
-        rotation, count = self.reader.rotation, len(sight.nominal)
-        if not sight.own or rotation is None:
+        rotation, count = self.reader.rotation, len(view.nominal)
+        if not view.own or rotation is None:
             return places
-        return np.concatenate([sight.of_arrays(places[:count] @ rotation.T) @ rotation, places[count:]])
+        return np.concatenate([view.of_arrays(places[:count] @ rotation.T) @ rotation, places[count:]])
 
     def _register(
         self,
@@ -223,7 +223,7 @@ class Observer:
     ) -> Registration:
         use = list(self.markers.reference) if only_reference else None
         return register_markers(
-            *(self._turned_back(places, self.reader.sight(trial)), expected, recording.labels),
+            *(self._turned_back(places, self.reader.view(trial)), expected, recording.labels),
             source=recording.source,
             largest_residual=self.markers.largest_residual,
             use=use,
@@ -256,8 +256,8 @@ class Observer:
         first = int(np.ceil(release.frame))
         whole = _frames(recording, first, first + len(moving.positions))
         base = self._base(trial, whole, moving, still, registration.transform)
-        sight, columns = self.reader.sight(trial), trial.tracked(self.tracked)
-        return Observed(trial, recording, columns, sight, moving, still, registration, driven, release, base=base)
+        view, columns = self.reader.view(trial), trial.tracked(self.tracked)
+        return Observed(trial, recording, columns, view, moving, still, registration, driven, release, base=base)
 
     def _driven(self, trial: Trial, recording: Recording) -> Observed:
         """A body that rests until its inputs come, or one in a pose."""
@@ -280,8 +280,8 @@ class Observer:
             moving = replace(moving, positions=_median(last, tracked)[None])
             driven = None if driven is None else np.median(driven[-frames:], axis=0)[None]
         base = None if static else self._base(trial, recording, moving, still, registration.transform)
-        sight, columns = self.reader.sight(trial), trial.tracked(self.tracked)
-        fields = (trial, recording, columns, sight, moving, still, registration, driven)
+        view, columns = self.reader.view(trial), trial.tracked(self.tracked)
+        fields = (trial, recording, columns, view, moving, still, registration, driven)
         return Observed(*fields, tells_places=tells, base=base)
 
     def _is_at_rest(self, driven: FloatArray) -> NDArray[np.bool_]:

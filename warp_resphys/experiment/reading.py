@@ -10,19 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..data.assignment import assign
+from ..data.marker_view import MarkerView
 from ..data.recordings.quality import check_passive
 from ..data.recordings.reading import read_recording
 from ..data.recordings.recording import Recording
 from ..data.recordings.text import Table
 from ..data.registration import axes_rotation
-from ..data.sight import Sight
 from ..dynamics.simulator import Simulator
 from ..io.errors import DataFileError, InputError, listed
 from ..settings.stages import ImportStage
 from ..settings.trials import ReadingSettings, Trial
 from ..stepping.inputs import Inputs
 from .actuators import Drive
-from .build import bound_markers, sight_of
+from .build import bound_markers, marker_view_of
 from .files import STATIC, payload_inputs
 from .simulate import vertical
 
@@ -73,9 +73,9 @@ class Reader:
         """Of the configured markers that a trial has, the tracked ones first."""
         return [*self.tracked_in(trial), *self.markers.reference]
 
-    def sight(self, trial: Trial) -> Sight:
+    def view(self, trial: Trial) -> MarkerView:
         """How much the recording of a trial tells of where its tracked markers are."""
-        return sight_of(self.markers, self.tracked_in(trial))
+        return marker_view_of(self.markers, self.tracked_in(trial))
 
     def expected(self, trial: Trial) -> FloatArray:
         """(M', 3) where the markers of a trial are when they are registered, on the undeformed body or as it hangs [m].
@@ -90,7 +90,7 @@ class Reader:
 
     def _seen(self, trial: Trial, places: FloatArray) -> FloatArray:
         """(M', 3) what is told of the markers of a trial, of where all tracked ones are."""
-        told = self.sight(trial).of_arrays(places[trial.tracked(self.tracked)])
+        told = self.view(trial).of_arrays(places[trial.tracked(self.tracked)])
         return np.concatenate([told, self._reference])
 
     def read(self, trials: Sequence[Trial]) -> list[Recording]:
@@ -116,7 +116,7 @@ class Reader:
 
     def _with_depth(self, trial: Trial, recording: Recording) -> Recording:
         """The same, with what is not seen of each marker as it is nominally."""
-        unseen = self.sight(trial).unseen
+        unseen = self.view(trial).unseen
         if unseen is None:
             return recording
         assert self.rotation is not None  # A plane needs data.axes.
@@ -188,7 +188,7 @@ class Reader:
             if trial.labels is not None:
                 found.append(recording)
                 continue
-            unseen, labels = self.sight(trial).unseen, self.labels(trial)
+            unseen, labels = self.view(trial).unseen, self.labels(trial)
             if unseen is not None:  # no depth, as the recordings have it
                 expected[row][:, unseen] = 0.0
             standing = list(range(len(self.tracked), len(labels)))

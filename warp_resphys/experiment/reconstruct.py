@@ -4,7 +4,6 @@ import dataclasses
 import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -22,9 +21,9 @@ from ..learning.rollout import Rollout
 from ..settings.stages import ReconstructStage
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
+from .experiment import Experiment
 from .files import RECONSTRUCTION, read_if_there, reconstruction_file
 from .parts import ResumableRollout, TrialPart, read_parts, remove_parts, split_into_parts, work_on
-from .scene import Scene
 
 log = logging.getLogger(__name__)
 
@@ -45,15 +44,15 @@ def reconstruct(context: StageContext, workers: Workers = ALONE) -> None:
     but nothing that learns these forces will go there.
     """
     settings: ReconstructStage = context.settings
-    scene, model = Scene(settings, context.run_dir), settings.model
+    experiment, model = Experiment(settings, context.run_dir), settings.model
     parts: list[TrialPart] = []
-    for number, names in enumerate(scene.alike(settings.reconstructed)):
-        last = float(scene.trials(names).times.max()) / scene.model_simulator(model).time_step
-        frames = max(scene.learned_steps(int(last + 1e-6)), 1) + 1
+    for number, names in enumerate(experiment.alike(settings.reconstructed)):
+        last = float(experiment.trials(names).times.max()) / experiment.model_simulator(model).time_step
+        frames = max(experiment.learned_steps(int(last + 1e-6)), 1) + 1
         parts += split_into_parts(context, names, frames, f"part{number}", batch=settings.batch)
     work_on(parts, _OfTrials, workers)
     order = [name for part in parts for name in part.names]
-    held = scene.moving(settings.split.validation)
+    held = experiment.moving(settings.split.validation)
     rows = [row for row, name in enumerate(order) if name in held]
     error, held_out = read_parts(parts, "error"), {}
     with atomic_hdf5(context.run_dir / reconstruction_file(model), "reconstruction", {"names": order}) as file:
@@ -63,7 +62,7 @@ def reconstruct(context: StageContext, workers: Workers = ALONE) -> None:
             create(file, name, values, unit, time_axis=1)
             held_out[name] = values[rows].copy()
     summary = {"mean_mm": float(np.nanmean(error)), "max_mm": float(np.nanmax(error))}
-    if rows and scene.dataset.bound is not None:
+    if rows and experiment.dataset.bound is not None:
         summary["replayed_mm"] = _replay(context, [order[row] for row in rows], {**held_out, "error": error[rows]})
     found = read_if_there(context.run_dir / RECONSTRUCTION)
     finite = {key: value if np.isfinite(value) else None for key, value in summary.items()}
@@ -84,9 +83,9 @@ def _replay(context: StageContext, names: Sequence[str], found: Mapping[str, Flo
     return replayed
 
 
-def reconstructing_simulator(scene: Scene, model: str) -> Simulator:
+def reconstructing_simulator(experiment: Experiment, model: str) -> Simulator:
     """The simulator of a model, see `without_ringing`."""
-    return without_ringing(scene.model_simulator(model), scene.dataset.bound is not None)
+    return without_ringing(experiment.model_simulator(model), experiment.observe)
 
 
 class Reconstructing(ResumableRollout):
@@ -125,21 +124,20 @@ class _OfTrials(Reconstructing):
 
     def __init__(self, part: TrialPart) -> None:
         settings: ReconstructStage = part.context.settings
-        scene = Scene(settings, part.context.run_dir)
-        simulator = reconstructing_simulator(scene, settings.model)
-        replay = self._replay = scene.replay(simulator, part.names, settings.model)
-        self._start, self.like = scene.start(replay, settings.model), simulator.rest_positions
-        self._constants, self._inputs, self._resting = replay.setting(scene.parameters(settings.model))
-        self._observed = scene.explained(replay, self._start)
+        experiment = Experiment(settings, part.context.run_dir)
+        simulator = reconstructing_simulator(experiment, settings.model)
+        replay = self._replay = experiment.replay(simulator, part.names, settings.model)
+        self._start, self.like = experiment.start(replay, settings.model), simulator.rest_positions
+        self._constants, self._inputs, self._resting = replay.setting(experiment.parameters(settings.model))
+        self._observed = experiment.explained(replay, self._start)
         if replay.is_static:  # A pose is where one step leads that lasts so long that inertia has no say.
             simulator = dataclasses.replace(simulator, time_step=_FOR_EVER, integrator="implicit_euler")
             self._observed = torch.cat([torch.full_like(self._observed, torch.nan), self._observed], 1)
             self._inputs = self._resting
-        markers: Any = None if scene.dataset.bound is None else replay.observe  # Full states have a faster way.
-        method = make_reconstructor(simulator, **dict(settings.reconstruction), markers=markers)
+        method = make_reconstructor(simulator, **dict(settings.reconstruction), observation=replay.observe)
         self.method = method.with_constants(self._constants)
         self.force = torch.zeros_like(self._start.state.q)
-        dtype = "float64" if scene.dataset.bound is None else "float32"
+        dtype = "float64" if experiment.dataset.bound is None else "float32"
         shape = (len(part.names), simulator.body.n_vertices, 3)
         self.fields = {name: Field(shape, unit, dtype, 1) for name, unit in _UNITS.items()}
         self.fields["error"] = Field((len(part.names),), "mm", dtype, 1)
@@ -174,13 +172,13 @@ def replayed_errors(
         names: of trials that begin alike.
         found: q [m], v [m/s] and the force [N] that leads there, each (B, K + 1, N, 3).
     """
-    scene = Scene(settings, run_dir, "count")
-    simulator = reconstructing_simulator(scene, settings.model)
-    replay = scene.replay(simulator, names, settings.model)
-    start = scene.start(replay, settings.model)
-    constants, inputs, resting = replay.setting(scene.parameters(settings.model))
-    observed = scene.explained(replay, start)
-    frames = scene.frames(simulator)
+    experiment = Experiment(settings, run_dir, "count")
+    simulator = reconstructing_simulator(experiment, settings.model)
+    replay = experiment.replay(simulator, names, settings.model)
+    start = experiment.start(replay, settings.model)
+    constants, inputs, resting = replay.setting(experiment.parameters(settings.model))
+    observed = experiment.explained(replay, start)
+    frames = experiment.frames(simulator)
     steps = (found["q"][:, :-1], found["v"][:, :-1], found["force"][:, 1:])
     known = [torch.from_numpy(each).to(simulator.rest_positions).unbind(1) for each in steps]
 

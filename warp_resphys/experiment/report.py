@@ -27,7 +27,8 @@ from ..report.notes import error_notes, kept_note, material_note, network_note, 
 from ..report.run_page import write_report
 from ..settings.run import RunSettings
 from .actuators import build_chambers, driving_quantity
-from .build import bound_markers, build_body, build_mesh, build_simulator, choose_device, sight_of
+from .build import bound_markers, build_body, build_mesh, build_simulator, choose_device, marker_view_of
+from .experiment import LEARNED
 from .files import (
     CONTROL,
     DATASET,
@@ -51,7 +52,6 @@ from .files import (
     read_if_there,
     training_file,
 )
-from .scene import LEARNED
 
 FloatArray = NDArray[np.float64]
 
@@ -227,8 +227,8 @@ def _seen(run: RunSettings, dataset: Dataset) -> dict[str, Any]:
     labels = dataset.labels
     if run.markers is None:
         return {}
-    sight = sight_of(run.markers, labels, dataset.sets)
-    return {"axes": tuple(axis for axis in range(3) if axis != sight.unseen), "own_frame": sight.own}
+    view = marker_view_of(run.markers, labels, dataset.sets)
+    return {"axes": tuple(axis for axis in range(3) if axis != view.unseen), "own_frame": view.own}
 
 
 def _read_scaled(folder: Path) -> Dataset | None:
@@ -254,14 +254,14 @@ def _as_seen(film: Film, dataset: Dataset, run: RunSettings, mesh: Mesh) -> Film
     """The same, with the bodies carried to where their markers are seen."""
     if dataset.bound is None or run.markers is None:
         return film
-    sight = sight_of(run.markers, dataset.labels, dataset.sets)
-    if not sight.own:
+    view = marker_view_of(run.markers, dataset.labels, dataset.sets)
+    if not view.own:
         return film
     has = np.flatnonzero(dataset.present[dataset.names.index(film.trial)]).tolist()
     markers = bound_markers(run.markers, mesh, dataset.bound, dataset.labels)
-    sight = sight.select(has)
+    view = view.select(has)
     at = {model: torch.from_numpy(each) for model, each in film.positions.items()}
-    return replace(film, positions={model: sight.carried(q, markers(q)[:, has]).numpy() for model, q in at.items()})
+    return replace(film, positions={model: view.carried(q, markers(q)[:, has]).numpy() for model, q in at.items()})
 
 
 def read_followed(folder: Path, run: RunSettings) -> list[FollowedPath]:

@@ -12,13 +12,13 @@ own parameters unless others are given. `tests/learning/test_library.py` checks 
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 
-from ..data.markers import Markers
+from ..data.observation import WHOLE_STATE, Observation, WholeState
 from ..data.trials import Trials
 from ..dynamics.simulator import Simulator
 from ..io.errors import InputError
@@ -44,23 +44,24 @@ class ObservedMotion:
         InputError: observations of another shape, of other vertices than the body has, or of which nothing was seen.
     """
 
-    # (T + 1, B, N, 3) positions of all vertices or, with `markers`, (T + 1, B, M, 3) of these; NaN where not seen. A
-    # `Trajectory.q` has this shape. (T + 1, N, 3) and (T + 1, M, 3) are one motion [m]
+    # (T + 1, B, M, D) what `observation` measured [its unit], NaN where a point was not seen; by default the positions
+    # of all vertices, as `Trajectory.q` has them. (T + 1, M, D) are one motion
     observed: torch.Tensor
     # positions and velocities with which the motions begin; None: at rest in equilibrium under `resting`
     start: State | None = None
     inputs: Inputs = field(default_factory=Inputs)  # that act during the motion, with or without an axis of time
     resting: Inputs = field(default_factory=Inputs)  # that hold the body before the motion, where `start` is None
-    markers: Markers | None = None  # where the observed points sit on the body, see `bind_markers`; None: all vertices
+    observation: Observation = WHOLE_STATE  # what was measured of the body, such as `bind_markers` returns
 
     def __post_init__(self) -> None:
         """Adds the axis of motions where there is one motion."""
         if self.observed.ndim == 3:
             object.__setattr__(self, "observed", self.observed[:, None])
-        if self.observed.ndim != 4 or self.observed.shape[-1] != 3 or len(self.observed) < 2:
+        dimension, unit = self.observation.dimension, self.observation.unit
+        if self.observed.ndim != 4 or self.observed.shape[-1] != dimension or len(self.observed) < 2:
             raise InputError(
-                f"observed has shape {tuple(self.observed.shape)}: it must be (time, motion, point, 3) in m, of two "
-                "times or more."
+                f"observed has shape {tuple(self.observed.shape)}: it must be (time, motion, point, {dimension}) in "
+                f"{unit}, of two times or more."
             )
 
     def replay(self, simulator: Simulator) -> tuple[Replay, Start]:
@@ -68,7 +69,7 @@ class ObservedMotion:
         like = simulator.rest_positions
         observed = self.observed.to(like).transpose(0, 1)
         count, frames = observed.shape[:2]
-        if self.markers is None and observed.shape[2] != len(like):
+        if isinstance(self.observation, WholeState) and observed.shape[2] != len(like):
             raise InputError(f"{observed.shape[2]} points were observed, but the body has {len(like)} vertices.")
         times = simulator.time_step * torch.arange(frames).to(like).expand(count, -1)
         names = tuple(f"motion {number}" for number in range(count))
@@ -78,8 +79,7 @@ class ObservedMotion:
             start = Start.resting(like.expand(count, -1, -1).clone())
         else:
             start = Start(self.start.map(lambda values: values.to(like)), like.new_zeros(count))
-        observe: Callable[[torch.Tensor], torch.Tensor] = torch.clone
-        return Replay(simulator, observe if self.markers is None else self.markers.to(like), trials), start
+        return Replay(simulator, self.observation.to(like), trials), start
 
 
 def identify(
@@ -143,13 +143,13 @@ def reconstruct(
         InputError: a setting out of range, or an input that the body does not take.
         ConvergenceError: a step without a solution.
     """
-    used = without_ringing(simulator, motion.markers is not None)
+    used = without_ringing(simulator, motion.observation)
     replay, start = motion.replay(used)
     with torch.no_grad():
         constants, inputs, resting = replay.setting(_values(used, parameters))
         state = replay.begin(start, constants, resting)
-        markers = motion.markers
-        method = make_reconstructor(used, **dict(settings or ReconstructionSettings()), markers=markers)
+        chosen = dict(settings or ReconstructionSettings())
+        method = make_reconstructor(used, **chosen, observation=motion.observation)
         method = method.with_constants(constants)
         force, rows = torch.zeros_like(state.q), []
         for step in range(replay.trials.observed.shape[1] - 1):
@@ -232,8 +232,8 @@ def evaluate(
         parameters: as for `reconstruct`.
 
     Returns:
-        (T + 1, B) mean distance of the observed points [m]; NaN where none was seen, infinite from where a simulation
-        diverged.
+        (T + 1, B) mean distance of the observed points in the unit of the observation, such as m; NaN where none was
+        seen, infinite from where a simulation diverged.
 
     Raises:
         InputError: an input that the body does not take.

@@ -18,6 +18,7 @@ import torch
 from typing_extensions import override
 
 from ..data.markers import Markers
+from ..data.observation import Observation
 
 _DIRECTIONS = 3
 _ITERATIONS = 4  # as turns of a few degrees are all but linear
@@ -103,17 +104,8 @@ class PlacedMarkers(Markers):
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
         return self.placement.apply(self.markers(positions))
 
-    @override
-    def to(self, like: torch.Tensor) -> "PlacedMarkers":
-        return replace(
-            self,
-            vertices=self.vertices.to(like.device),
-            markers=self.markers.to(like),
-            placement=self.placement.to(like),
-        )
 
-
-class Stems:
+class Stems(Observation):
     """Markers and what moving them by a metre would do, as points of one observation.
 
     Args:
@@ -125,11 +117,17 @@ class Stems:
 
     def __init__(self, markers: Markers, count: int) -> None:
         axes = torch.eye(_DIRECTIONS, dtype=torch.float64)
+        self._markers = markers
         self._all = [markers, *(markers.moved(axis.expand(count, 3)) for axis in axes)]
 
+    @override
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
         """(B, N, 3) positions to (B, 4 M, 3) points [m]."""
-        return torch.cat([each(positions) for each in self._all], 1)
+        return torch.cat([markers(positions) for markers in self._all], 1)
+
+    @override
+    def residual(self, shown: torch.Tensor, measured: torch.Tensor) -> torch.Tensor:
+        return self._markers.residual(shown, measured)
 
     @staticmethod
     def parts(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

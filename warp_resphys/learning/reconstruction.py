@@ -23,6 +23,7 @@ import torch
 from typing_extensions import override
 
 from ..data.markers import Markers
+from ..data.observation import WHOLE_STATE, Observation, WholeState
 from ..dynamics.modes import vibration_modes
 from ..dynamics.simulator import Constants, Simulator
 from ..io.errors import ConvergenceError, InputError
@@ -50,7 +51,7 @@ class Reconstructor(ABC):
     def __init__(
         self,
         simulator: Simulator,
-        markers: Markers | None,
+        observation: Observation,
         regularisation: float,
         tolerance: float,
         max_iterations: int,
@@ -63,19 +64,22 @@ class Reconstructor(ABC):
             raise InputError(f"reconstruction.max_iterations is {max_iterations}: it must be positive.")
         self.simulator, self.regularisation = simulator, regularisation
         self.tolerance, self.max_iterations = tolerance, max_iterations
-        self.markers = None if markers is None else markers.to(simulator.rest_positions)
-        if self.markers is not None:
-            self._check_markers(self.markers)
+        self.observation = observation.to(simulator.rest_positions)
+        if not isinstance(observation, WholeState):
+            self._check_sparse(observation)
         self._constants = simulator.prepare()
 
-    def _check_markers(self, markers: Markers) -> None:
+    def _check_sparse(self, observation: Observation) -> None:
         if not self.regularisation > 0.0:
             raise InputError(
                 f"reconstruction.regularisation is {self.regularisation:g}: it must be positive, as markers leave most "
                 "of the force open."
             )
         last = self.simulator.body.n_vertices - 1
-        if int(markers.vertices.min()) < 0 or int(markers.vertices.max()) > last:
+        if (
+            isinstance(observation, Markers)
+            and not 0 <= int(observation.vertices.min()) <= int(observation.vertices.max()) <= last
+        ):
             raise InputError(f"a marker is on a vertex that the body does not have: its vertices are 0 to {last}.")
 
     def with_constants(self, constants: Constants) -> Self:
@@ -96,7 +100,7 @@ class Reconstructor(ABC):
 
         Args:
             state: where the step starts.
-            observed: (B, N, 3) positions, or (B, m, 3) markers, NaN where one was not seen [m].
+            observed: (B, M, D) what the observation measured, NaN where a point was not seen [unit].
             inputs: what acts during the step; an external force adds to the one that is looked for.
             first_guess: (B, N, 3) force to start from, such as that of the step before [N]; not all methods use it.
 
@@ -130,7 +134,8 @@ class LeastSquares(Reconstructor):
         first_guess: torch.Tensor | None = None,
     ) -> Reconstruction:
         acting, constants = inputs or Inputs(), self._constants
-        step = Step(self.simulator, constants, state, acting, observed, self.regularisation, self.markers, self._basis)
+        observation, weight = self.observation, self.regularisation
+        step = Step(self.simulator, constants, state, acting, observed, weight, observation, self._basis)
         with threads_for(state.q[0].numel()), torch.no_grad():
             for number, kind in enumerate(self._problems, 1):
                 problem = kind(step)
@@ -166,14 +171,14 @@ class LBFGSB(Reconstructor):
         sim, like, acting = self.simulator, state.q, inputs or Inputs()
         free = sim.rest_positions.new_ones(sim.body.n_vertices, 1)
         free[sim.fixed] = 0.0
-        counts = torch.isfinite(observed) if self.markers is not None else free.bool()
+        whole = isinstance(self.observation, WholeState)
 
         def objective(values: np.ndarray) -> tuple[float, np.ndarray]:
             force = torch.as_tensor(values, device=like.device, dtype=like.dtype).reshape(like.shape)
             force.requires_grad_(True)
             end = sim.step(state, acting.plus(free * force), self._constants)[0].q
-            at = end if self.markers is None else self.markers(end)
-            misfit = torch.where(counts, at - observed, 0.0).square().sum()
+            residual = self.observation.residual(self.observation(end), observed)
+            misfit = (free * residual if whole else residual).square().sum()
             value = misfit + self.regularisation * force.square().sum()
             (gradient,) = torch.autograd.grad(value, force)
             # In units of lambda both the objective and its change are of the size of f^2.
@@ -201,12 +206,13 @@ class LBFGSB(Reconstructor):
         return Reconstruction(new, force, int(result.nit))
 
 
-def without_ringing(simulator: Simulator, markers: bool) -> Simulator:
+def without_ringing(simulator: Simulator, observation: Observation) -> Simulator:
     """Returns the simulator with an integrator whose velocities do not ring where markers are prescribed.
 
     Those of the midpoint rule do: v+ = 2 (q+ - q) / h - v keeps every deviation.
     """
-    return replace(simulator, integrator="bdf2") if markers and simulator.integrator == "midpoint" else simulator
+    rings = simulator.integrator == "midpoint" and not isinstance(observation, WholeState)
+    return replace(simulator, integrator="bdf2") if rings else simulator
 
 
 def make_reconstructor(
@@ -216,7 +222,7 @@ def make_reconstructor(
     tolerance: float,
     max_iterations: int,
     modes: int | None = None,
-    markers: Markers | None = None,
+    observation: Observation = WHOLE_STATE,
 ) -> Reconstructor:
     """The named method.
 
@@ -227,21 +233,21 @@ def make_reconstructor(
         tolerance: see the methods.
         max_iterations: after which a step has failed.
         modes: vibration modes that forces are made of; every force on the free vertices where left out.
-        markers: C, for as many environments as the states have; None for full states.
+        observation: C, for as many environments as the states have.
 
     Raises:
         InputError: an unknown method, modes for a method without them, a number out of range, or a marker on a vertex
             that the body does not have.
     """
     problems: dict[str, tuple[type[StepProblem], ...]] = {"gauss_newton": (FullStateProblem,)}
-    if markers is not None:
+    if not isinstance(observation, WholeState):
         damped = (MarkerForceProblem,)
         problems = {"gauss_newton": (MarkerPositionProblem, *damped), "levenberg_marquardt": damped}
     if method not in (*problems, "lbfgsb"):
         raise InputError(f"reconstruction.method is {method!r}: choose one of {', '.join(problems)}, lbfgsb.")
-    if modes is not None and markers is None:
+    if modes is not None and isinstance(observation, WholeState):
         raise InputError("reconstruction.modes is for bodies that are seen through markers: leave it out.")
     if modes is not None and method == "lbfgsb":
         raise InputError(f"{modes} modes are asked for, but reconstruction.method=lbfgsb has none: take gauss_newton.")
-    settings = (simulator, markers, regularisation, tolerance, max_iterations)
+    settings = (simulator, observation, regularisation, tolerance, max_iterations)
     return LBFGSB(*settings) if method == "lbfgsb" else LeastSquares(problems[method], modes, *settings)

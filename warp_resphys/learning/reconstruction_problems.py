@@ -8,7 +8,7 @@ from typing import ClassVar
 import torch
 from typing_extensions import override
 
-from ..data.markers import Markers
+from ..data.observation import WHOLE_STATE, Observation
 from ..dynamics.linearisation import Linearisation
 from ..dynamics.simulator import Constants, Simulator
 from ..io.errors import ConvergenceError
@@ -26,9 +26,9 @@ class Step:
     constants: Constants  # of the simulator
     state: State  # where it starts
     inputs: Inputs  # what acts during it
-    observed: torch.Tensor  # (B, N, 3) positions, or (B, m, 3) markers, NaN where one was not seen [m]
+    observed: torch.Tensor  # (B, M, D) what the observation measured, NaN where a point was not seen [unit]
     weight: float  # lambda [m^2/N^2]
-    markers: Markers | None = None  # C, for as many environments as the state has; None for positions
+    observation: Observation = WHOLE_STATE  # C, for as many environments as the state has
     basis: torch.Tensor | None = None  # (3 N, modes) of forces; None for every force on the free vertices
 
     def linearise(self) -> Linearisation:
@@ -36,14 +36,12 @@ class Step:
         return self.simulator.linearise(self.state, self.inputs, self.constants)
 
     def missing(self, end: torch.Tensor) -> torch.Tensor:
-        """(B, 3 m, 1) y - C(q+), zero where not seen [m]."""
-        assert self.markers is not None
-        return torch.where(torch.isfinite(self.observed), self.observed - self.markers(end), 0.0).flatten(1)[..., None]
+        """Returns y - C(q+), (B, M D, 1) [unit], zero where not seen."""
+        return -self.observation.residual(self.observation(end), self.observed).flatten(1)[..., None]
 
     def transposed_jacobian(self, end: torch.Tensor) -> torch.Tensor:
-        """(B, 3 N, 3 m) C'^T of the markers that were seen."""
-        assert self.markers is not None
-        return self.markers.transposed_jacobian(end) * torch.isfinite(self.observed).flatten(1)[:, None]
+        """Returns C'^T, (B, 3 N, M D), of the points that were seen."""
+        return self.observation.transposed_jacobian(end) * torch.isfinite(self.observed).flatten(1)[:, None]
 
 
 class StepProblem(Problem):

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from typing_extensions import override
 
+from ..data.observation import WHOLE_STATE, Observation
 from ..data.trials import Trials
 from ..dynamics.frames import BaseFrame, VertexFrames
 from ..dynamics.simulator import Simulator
@@ -21,7 +22,7 @@ from ..stepping.state import State
 from .full_batch import FullBatchTrainer
 from .networks import ResidualForce
 from .predictors import LearnedPredictor, Range
-from .replay import Observe, Replay
+from .replay import Replay
 from .rollout import FURTHEST, Rollout
 
 REFINEMENTS = ("none", "solver_in_the_loop")
@@ -30,7 +31,7 @@ _SMALLEST_UNIT = 1e-20  # mm^2
 
 
 @dataclass(frozen=True)
-class Motion:
+class RefinementBatch:
     """Trials that begin alike, at a simulator's steps.
 
     Attributes:
@@ -82,7 +83,7 @@ class WindowLoss:
             factor that a solver keeps would make it depend on what was computed before.
         window: k.
         batch_size: windows that are simulated at once.
-        observe: (B, N, 3) positions to (B, M, 3) observed points [m]; all vertices if left out.
+        observe: what sensors show of the body; all vertices if left out.
         parameters: (1,) physical parameters that were identified.
         frames: with which forces turn; None if they do not.
         range_: of the model's inputs, in which they are held; None for no guard.
@@ -94,7 +95,7 @@ class WindowLoss:
         make_simulator: Callable[[], Simulator],
         window: int,
         batch_size: int,
-        observe: Observe = lambda q: q,
+        observe: Observation = WHOLE_STATE,
         parameters: Mapping[str, torch.Tensor] | None = None,
         frames: VertexFrames | None = None,
         range_: Range | None = None,
@@ -102,13 +103,13 @@ class WindowLoss:
         self._model, self._make_simulator, self._observe = model, make_simulator, observe
         self._window, self._batch_size = window, batch_size
         self._parameters, self._frames, self._range = parameters or {}, frames, range_
-        self._memories: dict[int, tuple[Motion, dict[str, torch.Tensor]]] = {}  # by the motion's identity
+        self._memories: dict[int, tuple[RefinementBatch, dict[str, torch.Tensor]]] = {}  # by the motion's identity
         simulator = make_simulator()
         self._first_frame = 1 if simulator.integrator == "bdf2" else 0  # BDF2 looks back.
         rest = simulator.rest_positions
         self.failure = (1e3 * FURTHEST * float((rest.amax(0) - rest.amin(0)).max())) ** 2  # of a window [mm^2]
 
-    def side_by_side(self, motions: Sequence[Motion]) -> Windows:
+    def side_by_side(self, motions: Sequence[RefinementBatch]) -> Windows:
         """Windows that cover the trials, but for what is left over at their ends or not seen at all."""
         found = []
         for number, motion in enumerate(motions):
@@ -122,7 +123,7 @@ class WindowLoss:
         return Windows(*(torch.cat(each) for each in zip(*found, strict=True)))
 
     @torch.no_grad()
-    def measure(self, windows: Windows, motions: Sequence[Motion]) -> tuple[float, torch.Tensor]:
+    def measure(self, windows: Windows, motions: Sequence[RefinementBatch]) -> tuple[float, torch.Tensor]:
         """Mean squared distance [mm^2] of the windows that can be simulated, and (W,) bool: which of them cannot."""
         simulator = self._make_simulator()
         lost = torch.zeros(len(windows), dtype=torch.bool)
@@ -132,7 +133,7 @@ class WindowLoss:
             lost[part], squares = failed, [*squares, measured]
         return float(torch.cat(squares).mean()), lost
 
-    def backward(self, windows: Windows, motions: Sequence[Motion], unit: float) -> float:
+    def backward(self, windows: Windows, motions: Sequence[RefinementBatch], unit: float) -> float:
         """Mean squared distance in a unit [mm^2]; adds its gradient to those of the weights.
 
         A window that cannot be simulated counts as `FURTHEST` body lengths, without a gradient.
@@ -150,7 +151,7 @@ class WindowLoss:
             total += each * (float(squares.detach().sum()) + failed * self.failure)
         return total
 
-    def _remembered(self, simulator: Simulator, motion: Motion) -> dict[str, torch.Tensor]:
+    def _remembered(self, simulator: Simulator, motion: RefinementBatch) -> dict[str, torch.Tensor]:
         """Returns the memory of the energies where the windows of a motion start, by name, each (R, W, ...).
 
         It goes through every state of the motion from the first known one on, in which the body has been at rest for
@@ -183,7 +184,7 @@ class WindowLoss:
         return found
 
     def _distances(
-        self, simulator: Simulator, windows: Windows, motions: Sequence[Motion]
+        self, simulator: Simulator, windows: Windows, motions: Sequence[RefinementBatch]
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """(U,) mean squared distances [mm^2] of the windows that can be simulated, and (W,) bool: which cannot.
 
@@ -203,7 +204,9 @@ class WindowLoss:
             whole = whole[~failed.cpu()]
         return motion.q.new_zeros(0), lost
 
-    def _roll_out(self, simulator: Simulator, windows: Windows, motion: Motion) -> tuple[torch.Tensor, torch.Tensor]:
+    def _roll_out(
+        self, simulator: Simulator, windows: Windows, motion: RefinementBatch
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """(W,) mean squared distances [mm^2], and (W,) bool: which windows failed."""
         run, frame = windows.trial, windows.frame
         previous = None
@@ -261,8 +264,8 @@ class SolverInTheLoop(FullBatchTrainer):
         self,
         model: ResidualForce,
         loss: WindowLoss,
-        train: Sequence[Motion],
-        validation: Sequence[Motion],
+        train: Sequence[RefinementBatch],
+        validation: Sequence[RefinementBatch],
         rollout_error: Callable[[ResidualForce], float],
         config: Mapping[str, Any],
     ) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from typing_extensions import override
 
+from ..data.observation import Observation
 from ..data.trials import Trials
 from ..dynamics.modes import resolved, vibration_modes, with_signs
 from ..dynamics.simulator import Simulator
@@ -18,7 +19,7 @@ from ..linalg.least_squares import Move, Point, Problem, damped, minimise
 from ..settings.learning import ReleaseSettings
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
-from .replay import Observe, Replay, Start
+from .replay import Replay, Start
 
 _HOLD_ITERATIONS = 100
 _HOLD_TOLERANCE = 1e-7  # m, change of any position in the last iteration
@@ -28,7 +29,7 @@ _HOLD_WEIGHT = 1e-6  # w, in units of the largest diagonal entry of the first J^
 _RELEASE_TOLERANCE, _DIFFERENCE, _LONGEST_STEP = 1e-4, 0.05, 3.0  # in expected deviations
 
 
-def estimate_release(simulator: Simulator, markers: Observe, motions: Trials, settings: ReleaseSettings) -> Start:
+def estimate_release(simulator: Simulator, markers: Observation, motions: Trials, settings: ReleaseSettings) -> Start:
     """The beginning of every motion, as this simulator would have it.
 
     Args:
@@ -112,7 +113,7 @@ class _Held(Problem):
 
 
 def _initial_motion(
-    simulator: Simulator, markers: Observe, motions: Trials, held: Start, settings: ReleaseSettings
+    simulator: Simulator, markers: Observation, motions: Trials, held: Start, settings: ReleaseSettings
 ) -> Start:
     """What explains the first frames (`_ReleaseModel`).
 
@@ -182,7 +183,7 @@ class _ReleaseModel:
         settings: tell what is looked for.
     """
 
-    def __init__(self, simulator: Simulator, markers: Observe, held: Start, settings: ReleaseSettings) -> None:
+    def __init__(self, simulator: Simulator, markers: Observation, held: Start, settings: ReleaseSettings) -> None:
         self._markers, self._held = markers, held
         velocities = velocity_shapes(simulator, settings.velocity_modes)
         sideways = sideways_shapes(simulator) if settings.sideways > 0.0 else velocities[:0]

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from ..data.input_response import InputResponse, response_of
+from ..data.observation import Observation
 from ..data.trials import Trials
 from ..dynamics.simulator import Constants, Simulator
 from ..io.errors import ConvergenceError
@@ -23,7 +24,6 @@ _POSE_TOLERANCE = 1e-8  # m
 _POSE_MEMORY = 6  # iterations that are combined
 _POSE_RIDGE = 1e-12
 _POSE_PATIENCE = 20  # tries without a better one, after which a pose is given up
-Observe = Callable[[torch.Tensor], torch.Tensor]
 StepForce = Callable[[State, int], torch.Tensor]
 Parameters = Mapping[str, torch.Tensor]
 
@@ -75,7 +75,7 @@ class Replay:
 
     Args:
         simulator: of the body; its material gives the constants that no parameter sets.
-        observe: (B, N, 3) positions of the vertices to (B, M, 3) observed points [m].
+        observe: what sensors show of the body, M points.
         trials: what was observed.
 
     Attributes:
@@ -87,7 +87,7 @@ class Replay:
             ``pressure_factor``, ``pressure_delay`` and ``pressure_rise``.
     """
 
-    def __init__(self, simulator: Simulator, observe: Observe, trials: Trials) -> None:
+    def __init__(self, simulator: Simulator, observe: Observation, trials: Trials) -> None:
         self.simulator, self.observe, self.trials = simulator, observe, trials
         self.settled: torch.Tensor | None = None
         self.known = known_parameters(simulator)
@@ -194,8 +194,7 @@ class Replay:
 
     def errors(self, simulated: torch.Tensor) -> torch.Tensor:
         """(E, R, T, M, 3) simulated less observed points [m], zero where nothing was seen."""
-        difference = simulated - self.trials.observed
-        return torch.where(self.trials.seen[..., None], difference, 0.0)
+        return self.observe.residual(simulated, self.trials.observed)
 
 
 class _Settling:

@@ -352,7 +352,7 @@ def motion_instants(frames: Pixels, titles: Sequence[str], *, narrow: bool) -> F
     """Show the body at a few instants, and beside or below each picture its markers from nearby.
 
     Args:
-        frames: (F, H, 2 * W, 4) as they were drawn of `bodies.Motion.scene`.
+        frames: (F, H, 2 * W, 4) as they were drawn of `bodies.ComparedMotion.scene`.
         titles: Of the F instants.
         narrow: Whether the figure is for a narrow page.
     """

@@ -7,13 +7,13 @@ from typing import Any, Final
 
 import torch
 
+from ..data.marker_view import ViewedMarkers
 from ..data.markers import Markers
-from ..data.sight import SeenMarkers
 from ..dynamics.simulator import Simulator
-from ..experiment.build import bound_markers, build_body, build_simulator, sight_of
+from ..experiment.build import bound_markers, build_body, build_simulator, marker_view_of
+from ..experiment.experiment import LEARNED, MODELS, Experiment
 from ..experiment.files import ERRORS, IDENTIFICATION, fold_folder, read_if_there
 from ..experiment.models import SIMFREE, Learned, kind_of, learned_of
-from ..experiment.scene import LEARNED, MODELS, Scene
 from ..io.errors import DataFileError, InputError, listed
 from ..io.files import read_checkpoint, write_checkpoint
 from ..io.settings import Settings, parse
@@ -105,7 +105,7 @@ class Description:
         if self.markers is None or self.bound is None:
             return None
         found = bound_markers(self.markers, self.mesh, self.bound.numpy(), self.labels)
-        seen = SeenMarkers.of(found, sight_of(self.markers, self.labels, self.sets))
+        seen = ViewedMarkers.of(found, marker_view_of(self.markers, self.labels, self.sets))
         placed = self.placement
         return seen if placed is None else PlacedMarkers.of(seen, Placement.from_plain(placed, self.labels))
 
@@ -159,8 +159,8 @@ class Description:
         )
 
 
-def finished_scene(folder: Path) -> Scene:
-    """The scene of a run that is done.
+def finished_experiment(folder: Path) -> Experiment:
+    """The experiment of a run that is done.
 
     Raises:
         DataFileError: see `stages.finished_record`; or the run has a folder for each of its folds.
@@ -172,7 +172,7 @@ def finished_scene(folder: Path) -> Scene:
             raise DataFileError(
                 f"{folder} is a cross-validation, which has a robot for each fold: name one of {names}."
             )
-    return Scene(parse(EvaluateStage, finished_record(folder, _EVALUATE)["settings"]), folder)
+    return Experiment(parse(EvaluateStage, finished_record(folder, _EVALUATE)["settings"]), folder)
 
 
 def describe(folder: Path, model: str) -> Description:
@@ -183,29 +183,29 @@ def describe(folder: Path, model: str) -> Description:
         model: one of those that the experiment compares.
 
     Raises:
-        DataFileError: see `finished_scene`.
+        DataFileError: see `finished_experiment`.
         InputError: the experiment has no such model.
         MeshError: the file with its mesh is not there any more.
     """
-    scene = finished_scene(folder)
-    made = scene.settings
+    experiment = finished_experiment(folder)
+    made = experiment.settings
     assert isinstance(made, EvaluateStage)
     known = models_of(made.published, made.identified, made.correct_uncorrected)
     if model not in known:
         raise InputError(f"the model is {model!r}: {folder} has {listed(known)}.")
     kind, key = MODELS[model]
     kind = "simulation" if kind == "identified" and made.identified is None else kind
-    simulator, dataset = scene.simulator(kind), scene.dataset
+    simulator, dataset = experiment.simulator(kind), experiment.dataset
     found = read_if_there(folder / IDENTIFICATION).get(key or "", {})
     errors = read_if_there(folder / ERRORS)
     intervals = errors.get("intervals", {"level": LEVEL, "models": {}})
-    learned, actuation = learned_of(scene, model), made.actuation
-    told = None if learned is None else scene.told_of_base(simulator)
+    learned, actuation = learned_of(experiment, model), made.actuation
+    told = None if learned is None else experiment.told_of_base(simulator)
     return Description(
         name="/".join(folder.resolve().parts[-2:]),
         model=model,
-        settings=scene.settings_of(kind),
-        material=scene.material_of(kind),
+        settings=experiment.settings_of(kind),
+        material=experiment.material_of(kind),
         mesh=simulator.body.mesh,
         parameters=found.get("parameters", {}),
         uncertainty=found.get("uncertainty"),

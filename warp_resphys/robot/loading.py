@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from ..energies.strings import PAYLOAD
 from ..experiment.build import choose_device
+from ..experiment.experiment import Experiment
 from ..experiment.files import STATIC
-from ..experiment.scene import Scene
 from ..io.errors import DataFileError, InputError, listed
-from .description import Description, describe, finished_scene
+from .description import Description, describe, finished_experiment
 from .inputs import BASE
 from .motion import Motion
 from .robot import Robot
@@ -92,7 +92,7 @@ def trial_names(robot: Robot) -> tuple[str, ...]:
     Raises:
         InputError: it was loaded from a file.
     """
-    return _scene(robot).dataset.names
+    return _experiment(robot).dataset.names
 
 
 def recorded_trial(robot: Robot, name: str) -> RecordedTrial:
@@ -102,21 +102,21 @@ def recorded_trial(robot: Robot, name: str) -> RecordedTrial:
         InputError: there is no such trial, or the robot was loaded from a file.
         ConvergenceError: the body cannot be brought where the trial begins.
     """
-    scene = _scene(robot)
-    known = scene.dataset.names
+    experiment = _experiment(robot)
+    known = experiment.dataset.names
     if name not in known:
         raise InputError(f"the trial is {name!r}: {robot.folder} has {listed(known)}.")
-    simulator, model = scene.model_simulator(robot.description.model), robot.description.model
+    simulator, model = experiment.model_simulator(robot.description.model), robot.description.model
     with torch.no_grad():
-        replay = scene.replay(simulator, [name], model)
-        start = scene.start(replay, model)
-        constants, _, resting = replay.setting(scene.parameters(model))
+        replay = experiment.replay(simulator, [name], model)
+        start = experiment.start(replay, model)
+        constants, _, resting = replay.setting(experiment.parameters(model))
         inputs = {key: value.to(simulator.rest_positions) for key, value in replay.trials.inputs.actuation.items()}
-        load = float(scene.dataset.payload[scene.dataset.rows([name])[0]])
+        load = float(experiment.dataset.payload[experiment.dataset.rows([name])[0]])
         if load:
             inputs[PAYLOAD.name] = simulator.tensor([load])
-        base = scene.dataset.base_at([name], simulator.time_step)
-        if scene.begins(name) == STATIC:
+        base = experiment.dataset.base_at([name], simulator.time_step)
+        if experiment.begins(name) == STATIC:
             inputs = {key: value[-1] if value.ndim == 3 else value for key, value in inputs.items()}
             begun, steps = robot.settle(1, **inputs), 0
         else:
@@ -131,7 +131,7 @@ def recorded_trial(robot: Robot, name: str) -> RecordedTrial:
     return RecordedTrial(name, begun, steps, inputs, since, trials.observed[0].cpu().numpy(), shift)
 
 
-def _scene(robot: Robot) -> Scene:
+def _experiment(robot: Robot) -> Experiment:
     if robot.folder is None:
         raise InputError("the robot was loaded from a file, which has no trials: load its run folder for these.")
-    return finished_scene(robot.folder)
+    return finished_experiment(robot.folder)

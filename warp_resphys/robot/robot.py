@@ -14,9 +14,9 @@ from scipy.sparse import csc_array
 from ..data.input_response import InputResponse, response_of, told_of
 from ..dynamics.frames import BaseFrame, VertexFrames, base_movement, rotations
 from ..energies.strings import PAYLOAD, Strings
+from ..experiment.experiment import COROTATED
 from ..experiment.files import payload_inputs
 from ..experiment.models import POSE_STEPS
-from ..experiment.scene import COROTATED
 from ..io.errors import ConvergenceError, InputError
 from ..learning.networks import NextState
 from ..learning.parameters import MASS_FACTOR, check_known, constants_of, known_parameters

@@ -290,7 +290,7 @@ class RunSettings(SimulatorSettings):
         return found
 
     @model_validator(mode="after")
-    def _sight(self) -> Self:
+    def _view(self) -> Self:
         """What can be had of markers whose places recordings do not tell."""
         data, markers = self.recorded, self.markers
         if data is None or markers is None:

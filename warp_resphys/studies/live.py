@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..data.markers import Markers
 from ..data.rigid import RigidTransform, kabsch
-from ..experiment.build import bound_markers, sight_of
+from ..experiment.build import bound_markers, marker_view_of
 from ..io.errors import ConvergenceError, InputError
 from ..mesh.mesh import boundary_triangles, surface_vertices
 from ..robot.inputs import BASE
@@ -229,7 +229,7 @@ class LiveRobot:
 def _markers_on_body(robot: Robot) -> Markers | None:
     """Markers where they are on the body; None where they are seen so, and not in a frame of their own."""
     about = robot.description
-    if about.markers is None or about.bound is None or not sight_of(about.markers, about.labels, about.sets).own:
+    if about.markers is None or about.bound is None or not marker_view_of(about.markers, about.labels, about.sets).own:
         return None
     markers = bound_markers(about.markers, about.mesh, about.bound.numpy(), about.labels)
     return markers.to(robot.simulator.rest_positions)

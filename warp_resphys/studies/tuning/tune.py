@@ -13,9 +13,9 @@ from typing import Any
 from optuna import TrialPruned
 from optuna.trial import TrialState
 
+from ...experiment.experiment import LEARNED, Experiment
 from ...experiment.files import training_file
 from ...experiment.learn import Learning, Snapshot, run_epochs
-from ...experiment.scene import LEARNED, Scene
 from ...experiment.trials import folds_of, split_of
 from ...io.errors import DataFileError, InputError
 from ...io.fan_out import Advance, WorkerError, Workers, fan_out
@@ -195,7 +195,7 @@ def _work(search: Search, acquired: str, tell: Advance) -> None:
         tell: is called after each epoch and trial with how many trials that makes, and the best one; may raise.
     """
     training = stages_before(parse(RunSettings, search.config), search.tune.model, acquired)[-1]
-    learning = Learning(Scene(training.settings, search.run_dir), search.tune.model)
+    learning = Learning(Experiment(training.settings, search.run_dir), search.tune.model)
     fingerprint = _digest({**training.settings.plain(), **search.groups})
     waiting = False
     while (claim := search.study.claim()) is not None or (others := search.study.running()):

@@ -25,7 +25,7 @@ _LINE = 1e-3  # m: markers that are closer to a line do not tell how a body is t
 
 
 @dataclass(frozen=True)
-class Sight:
+class MarkerView:
     """How much of the places of m markers recordings tell.
 
     Attributes:
@@ -51,7 +51,7 @@ class Sight:
         plane: Sequence[str] | None = None,
         frame: str = "body",
         sets: tuple[tuple[int, ...], ...] = (),
-    ) -> "Sight":
+    ) -> "MarkerView":
         """From the values of a configuration.
 
         Raises:
@@ -88,12 +88,12 @@ class Sight:
         return self.plane is None and not self.own
 
     @cached_property
-    def _parts(self) -> "list[tuple[torch.Tensor, Sight]]":
-        """The numbers of each set, and the sight of its markers."""
+    def _parts(self) -> "list[tuple[torch.Tensor, MarkerView]]":
+        """The numbers of each set, and the view of its markers."""
         device = self.nominal.device
         return [(torch.tensor(some, device=device), self.select(some)) for some in self.sets]
 
-    def select(self, chosen: Sequence[int]) -> "Sight":
+    def select(self, chosen: Sequence[int]) -> "MarkerView":
         """Of some of the markers, which are seen together."""
         return replace(self, nominal=self.nominal[list(chosen)], sets=())
 
@@ -102,7 +102,7 @@ class Sight:
         """The number of the axis that is not seen."""
         return None if self.plane is None else next(i for i, axis in enumerate(_AXES) if axis not in self.plane)
 
-    def to(self, like: torch.Tensor) -> "Sight":
+    def to(self, like: torch.Tensor) -> "MarkerView":
         """The same on the device and in the precision of a tensor."""
         return replace(self, nominal=self.nominal.to(like))
 
@@ -166,28 +166,22 @@ class Sight:
 
 
 @dataclass(frozen=True)
-class SeenMarkers(Markers):
+class ViewedMarkers(Markers):
     """Markers as far as recordings tell where they are."""
 
     vertices: torch.Tensor
     markers: Markers  # where they are
-    sight: Sight
+    view: MarkerView
 
     @classmethod
-    def of(cls, markers: Markers, sight: Sight) -> Markers:
+    def of(cls, markers: Markers, view: MarkerView) -> Markers:
         """Markers seen so; themselves where all is told."""
-        return markers if sight.is_whole else cls(markers.vertices, markers, sight)
+        return markers if view.is_whole else cls(markers.vertices, markers, view)
 
     @override
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
-        return self.sight(self.markers(positions))
+        return self.view(self.markers(positions))
 
     @override
-    def moved(self, by: torch.Tensor) -> "SeenMarkers":
+    def moved(self, by: torch.Tensor) -> "ViewedMarkers":
         return replace(self, markers=self.markers.moved(by))
-
-    @override
-    def to(self, like: torch.Tensor) -> "SeenMarkers":
-        return replace(
-            self, vertices=self.vertices.to(like.device), markers=self.markers.to(like), sight=self.sight.to(like)
-        )

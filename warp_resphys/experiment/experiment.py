@@ -1,7 +1,7 @@
 """What the stages of an experiment share: the body, its trials, its simulators and its models."""
 
 import contextlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from ..data.input_response import InputResponse, told_of
+from ..data.marker_view import ViewedMarkers
 from ..data.markers import Markers
-from ..data.sight import SeenMarkers
+from ..data.observation import WHOLE_STATE, Observation
 from ..data.trials import Trials
 from ..dynamics.frames import BaseFrame, VertexFrames, base_movement
 from ..dynamics.simulator import Simulator
@@ -29,7 +30,7 @@ from ..settings.body import MaterialSettings, SimulatorSettings
 from ..settings.run import PublishedSettings
 from ..settings.stages import EvaluateStage, LearningStage, NetworkStage, TestStage, TimeStage
 from ..stepping.state import State
-from .build import bound_markers, build_body, build_simulator, sight_of
+from .build import bound_markers, build_body, build_simulator, marker_view_of
 from .files import DATASET, GIVEN, IDENTIFICATION, SCALED_DATASET, STATIC, Dataset, read_dataset
 
 COROTATED: Final = "corotated"
@@ -45,11 +46,10 @@ MODELS: Final[Mapping[str, tuple[str, str | None]]] = {
     "resphys": ("identified", "sysid"),
 }
 _STANDS_STILL = 1e-9  # m/s, rad/s
-Observe = Callable[[torch.Tensor], torch.Tensor]
 
 
 @dataclass(frozen=True)
-class Scene:
+class Experiment:
     """The trials and the simulators of an experiment.
 
     Attributes:
@@ -126,16 +126,16 @@ class Scene:
         return self.simulator("simulation").rest_positions
 
     @cached_property
-    def observe(self) -> Observe:
-        """(B, N, 3) positions to what is observed of them: (B, M, 3) markers, or all of them."""
+    def observe(self) -> Observation:
+        """What recordings show of the body: M markers, or all vertices."""
         if self.dataset.bound is None:
-            return lambda positions: positions
+            return WHOLE_STATE
         markers, labels = self.settings.markers, self.dataset.labels
         assert markers is not None
         found = bound_markers(markers, self.body.mesh, self.dataset.bound, labels)
-        return SeenMarkers.of(found, sight_of(markers, labels, self.dataset.sets)).to(self.like)
+        return ViewedMarkers.of(found, marker_view_of(markers, labels, self.dataset.sets)).to(self.like)
 
-    def observe_by(self, model: str) -> Observe:
+    def observe_by(self, model: str) -> Observation:
         """The same, with the markers where the identification of a model found that they sit."""
         key = MODELS[model][1]
         if key is None or self.settings.identified is None:

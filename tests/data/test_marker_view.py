@@ -5,17 +5,17 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from warp_resphys.data.marker_view import MarkerView, ViewedMarkers
 from warp_resphys.data.markers import bind_markers
-from warp_resphys.data.sight import SeenMarkers, Sight
 from warp_resphys.io.errors import InputError
 from warp_resphys.mesh.mesh import box_hexahedra
 
 NOMINAL = np.array([[0.0, 0.01, -0.07], [0.002, -0.02, -0.04], [0.0, 0.015, 0.036], [0.004, 0.0, 0.063]])
-SIGHTS = {
-    "plane": Sight.of(NOMINAL, plane=["x", "z"]),
-    "own": Sight.of(NOMINAL, frame="own"),
-    "own plane": Sight.of(NOMINAL, ["x", "z"], "own"),
-    "own plane, turned": Sight.of(NOMINAL, ["z", "y"], "own"),
+VIEWS = {
+    "plane": MarkerView.of(NOMINAL, plane=["x", "z"]),
+    "own": MarkerView.of(NOMINAL, frame="own"),
+    "own plane": MarkerView.of(NOMINAL, ["x", "z"], "own"),
+    "own plane, turned": MarkerView.of(NOMINAL, ["z", "y"], "own"),
 }
 
 
@@ -27,20 +27,20 @@ def shaken(scale=0.01, count=5):
     return NOMINAL + scale * np.random.default_rng(0).normal(size=(count, 4, 3))
 
 
-@pytest.mark.parametrize("name", SIGHTS)
+@pytest.mark.parametrize("name", VIEWS)
 def test_what_is_told_of_nominal_places_is_these(name):
-    np.testing.assert_allclose(SIGHTS[name].of_arrays(NOMINAL), NOMINAL, atol=1e-12)
+    np.testing.assert_allclose(VIEWS[name].of_arrays(NOMINAL), NOMINAL, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", SIGHTS)
+@pytest.mark.parametrize("name", VIEWS)
 def test_what_is_told_twice_is_told_once(name):
-    once = SIGHTS[name].of_arrays(shaken())
-    np.testing.assert_allclose(SIGHTS[name].of_arrays(once), once, atol=1e-12)
+    once = VIEWS[name].of_arrays(shaken())
+    np.testing.assert_allclose(VIEWS[name].of_arrays(once), once, atol=1e-12)
 
 
 def test_depth_is_not_told():
     points = shaken()
-    told = SIGHTS["plane"].of_arrays(points)
+    told = VIEWS["plane"].of_arrays(points)
     np.testing.assert_array_equal(told[..., [0, 2]], points[..., [0, 2]])
     np.testing.assert_array_equal(told[..., 1], np.broadcast_to(NOMINAL[:, 1], (5, 4)))
 
@@ -51,16 +51,16 @@ def test_depth_is_not_told():
 @pytest.mark.parametrize("angle", [0.3, -2.0, 3.1])
 def test_a_shape_is_told_wherever_it_is(name, axis, angle):
     """In three dimensions or in the plane, moved by any angle: the same shape, and no other."""
-    points, sight = shaken(), SIGHTS[name]
+    points, view = shaken(), VIEWS[name]
     shift = np.array([0.3, -0.2, 0.1])
-    np.testing.assert_allclose(sight.of_arrays(moved(points, angle, axis, shift)), sight.of_arrays(points), atol=1e-12)
-    spread = sight.of_arrays(points)
+    np.testing.assert_allclose(view.of_arrays(moved(points, angle, axis, shift)), view.of_arrays(points), atol=1e-12)
+    spread = view.of_arrays(points)
     assert np.abs(spread - spread[:1]).max() > 5e-3
 
 
 @pytest.mark.parametrize("name", ["own", "own plane"])
 def test_no_rigid_motion_is_closer_to_the_nominal_places(name):
-    told = SIGHTS[name].of_arrays(shaken())
+    told = VIEWS[name].of_arrays(shaken())
     error = np.square(told - NOMINAL).sum()
     axes = np.eye(3) if name == "own" else [[0.0, 1.0, 0.0]]
     for angle in (-1e-2, 1e-2):
@@ -71,42 +71,42 @@ def test_no_rigid_motion_is_closer_to_the_nominal_places(name):
     assert np.abs(told.mean(axis=1) - NOMINAL.mean(axis=0))[:, [0, 2]].max() < 1e-12
 
 
-@pytest.mark.parametrize("name", SIGHTS)
+@pytest.mark.parametrize("name", VIEWS)
 def test_gradients_at_rest_and_after_a_large_turn(name):
     """Against central differences, at the nominal places too, where the singular values of a plane's are no three."""
     turned = moved(shaken(count=2), 2.5, [0.0, 1.0, 0.0], 0.1)
     points = torch.as_tensor(np.concatenate([NOMINAL[None], turned])).requires_grad_()
-    assert torch.autograd.gradcheck(SIGHTS[name], (points,), eps=1e-6, atol=1e-7)
+    assert torch.autograd.gradcheck(VIEWS[name], (points,), eps=1e-6, atol=1e-7)
 
 
-@pytest.mark.parametrize("name", SIGHTS)
+@pytest.mark.parametrize("name", VIEWS)
 def test_a_body_is_carried_with_its_markers(name):
     """Where one of its points is a marker, that is where the marker is told to be; but for depth, which it keeps."""
-    points, sight = torch.as_tensor(moved(shaken(), 1.2, [0.0, 1.0, 0.0], 0.2)), SIGHTS[name]
+    points, view = torch.as_tensor(moved(shaken(), 1.2, [0.0, 1.0, 0.0], 0.2)), VIEWS[name]
     body = torch.cat([points, points.flip(-2) + 0.01], -2)
-    carried, told = sight.carried(body, points), sight(points)
-    if not sight.own:
+    carried, told = view.carried(body, points), view(points)
+    if not view.own:
         assert carried is body
         return
-    seen = [axis for axis in range(3) if axis != sight.unseen]
+    seen = [axis for axis in range(3) if axis != view.unseen]
     np.testing.assert_allclose(carried[:, :4, seen], told[..., seen], atol=1e-12)
-    if sight.plane is None:  # rigidly
+    if view.plane is None:  # rigidly
         np.testing.assert_allclose(torch.cdist(carried, carried), torch.cdist(body, body), atol=1e-12)
     else:
-        np.testing.assert_allclose(carried[..., sight.unseen], body[..., sight.unseen], atol=1e-12)
+        np.testing.assert_allclose(carried[..., view.unseen], body[..., view.unseen], atol=1e-12)
 
 
 def test_a_hidden_marker_hides_the_shape_of_its_frame_alone():
     points = shaken()
     points[2, 1] = np.nan
-    assert np.isnan(SIGHTS["own plane"].of_arrays(points)).all(axis=(1, 2)).tolist() == [
+    assert np.isnan(VIEWS["own plane"].of_arrays(points)).all(axis=(1, 2)).tolist() == [
         False,
         False,
         True,
         False,
         False,
     ]
-    told = SIGHTS["plane"].of_arrays(points)
+    told = VIEWS["plane"].of_arrays(points)
     assert np.argwhere(np.isnan(told).all(axis=2)).tolist() == [[2, 1]]
     assert np.isnan(told).sum() == 3  # its depth neither
 
@@ -117,12 +117,12 @@ def test_markers_that_tell_no_frame_hide_it(name):
     points[0] = 0.0  # as trackers write what they lost
     points[3] = [0.0, 0.01, 0.0] if name == "own plane" else np.linspace([0.0, 0.0, 0.0], [0.1, 0.0, 0.0], 4)
     points[4, 2] = np.inf
-    seen = np.isfinite(SIGHTS[name].of_arrays(points)).all(axis=(1, 2))
+    seen = np.isfinite(VIEWS[name].of_arrays(points)).all(axis=(1, 2))
     assert seen.tolist() == [False, True, True, False, False]
 
 
 def test_a_mirror_image_is_another_shape():
-    mirrored = SIGHTS["own"].of_arrays(NOMINAL * [1.0, -1.0, 1.0])
+    mirrored = VIEWS["own"].of_arrays(NOMINAL * [1.0, -1.0, 1.0])
     assert np.abs(mirrored - NOMINAL).max() > 1e-3
 
 
@@ -130,7 +130,7 @@ def test_seen_markers_of_a_body_that_is_carried_away_are_where_they_were():
     mesh = box_hexahedra(divisions=(5, 2, 2))
     places = np.array([[0.01, 0.0, 0.033], [0.05, 0.002, 0.033], [0.09, 0.03, 0.033]])
     markers = bind_markers(mesh, places, ["a", "b", "c"], kind="frame")
-    seen = SeenMarkers.of(markers, Sight.of(places, frame="own"))
+    seen = ViewedMarkers.of(markers, MarkerView.of(places, frame="own"))
     at = torch.as_tensor(moved(mesh.vertices, 1.0, [0.0, 0.6, 0.8], 0.5))[None]
     np.testing.assert_allclose(seen(at)[0], places, atol=1e-12)
     bent = at.clone()
@@ -145,7 +145,7 @@ def test_seen_markers_of_a_body_that_is_carried_away_are_where_they_were():
     single = seen.to(torch.zeros(1, dtype=torch.float32))(bent.float())
     assert single.dtype == torch.float32
     np.testing.assert_allclose(single.numpy(), seen(bent).numpy(), atol=1e-6)
-    assert SeenMarkers.of(markers, Sight.of(places)) is markers
+    assert ViewedMarkers.of(markers, MarkerView.of(places)) is markers
 
 
 @pytest.mark.parametrize(
@@ -163,7 +163,7 @@ def test_seen_markers_of_a_body_that_is_carried_away_are_where_they_were():
 )
 def test_what_tells_nothing_is_refused(arguments, said):
     with pytest.raises(InputError, match=said):
-        Sight.of(*arguments)
+        MarkerView.of(*arguments)
 
 
 def test_each_set_has_a_frame_of_its_own():
@@ -172,15 +172,15 @@ def test_each_set_has_a_frame_of_its_own():
     sets = ((0, 2, 3), (1, 4, 5, 6))
     points = torch.from_numpy(places + 0.01 * np.random.default_rng(3).normal(size=(5, 8, 3)))
     for plane in (None, ["x", "z"]):
-        found = Sight.of(places, plane, "own", sets)(points)
+        found = MarkerView.of(places, plane, "own", sets)(points)
         for some in sets:
-            alone = Sight.of(places[list(some)], plane, "own")(points[:, some])
+            alone = MarkerView.of(places[list(some)], plane, "own")(points[:, some])
             torch.testing.assert_close(found[:, some], alone, rtol=0.0, atol=1e-15)
-    torch.testing.assert_close(Sight.of(places, None, "own", sets)(points)[:, 7], points[:, 7])
+    torch.testing.assert_close(MarkerView.of(places, None, "own", sets)(points)[:, 7], points[:, 7])
 
 
 def test_sets_that_share_markers_are_refused():
     with pytest.raises(InputError, match="two trials have some markers in common, and not all"):
-        Sight.of(NOMINAL, frame="own", sets=((0, 1, 2), (1, 2, 3)))
+        MarkerView.of(NOMINAL, frame="own", sets=((0, 1, 2), (1, 2, 3)))
     with pytest.raises(InputError, match="the 2 markers that are seen together lie on one line"):
-        Sight.of(NOMINAL, frame="own", sets=((0, 1), (2, 3)))
+        MarkerView.of(NOMINAL, frame="own", sets=((0, 1), (2, 3)))

@@ -1,4 +1,5 @@
 # The public names of the package: `__init__.py` imports one from here when it is first used, type checkers all.
+from .data.camera import CameraMarkers as CameraMarkers
 from .data.markers import Markers as Markers
 from .data.markers import bind_markers as bind_markers
 from .data.observation import Observation as Observation

@@ -87,7 +87,6 @@ def test_in_single_precision(method, options):
         first = State(start.q.to(dtype), start.v.to(dtype))
         if method == "full":
             solver = make_reconstructor(sim, "gauss_newton", 1e-6, 1e-7, 40)
-            solver.observation = lambda q: q
         else:
             solver = make_sparse_reconstructor(sim, markers_at([5, 10]), method, 1e-6, 1e-6, 60, **options)
         q, force = reconstruct(solver, first, observed.to(dtype))
@@ -151,10 +150,10 @@ class TestGaussNewton:
     def test_environments_do_not_see_each_other(self):
         observed, start = observation(1, (0.02, 0.3))
         both = gauss_newton(simulator(), markers_at([5, 8], [9, 10]), 1e-6, **TIGHT)
-        together = both.step(start, both.markers(observed[1]))
+        together = both.step(start, both.observation(observed[1]))
         for b, row in enumerate(([5, 8], [9, 10])):
             one = gauss_newton(simulator(), markers_at(row), 1e-6, **TIGHT)
-            alone = one.step(State(start.q[b : b + 1], start.v[b : b + 1]), one.markers(observed[1, b : b + 1]))
+            alone = one.step(State(start.q[b : b + 1], start.v[b : b + 1]), one.observation(observed[1, b : b + 1]))
             np.testing.assert_allclose(alone.state.q[0], together.state.q[b], rtol=0, atol=1e-11)
 
     def test_clamped_and_absent_markers_add_nothing(self):

@@ -17,8 +17,8 @@ class Trials:
 
     names: tuple[str, ...]
     times: torch.Tensor  # (R, T) of the frames since time zero; trials that end early repeat their last time [s]
-    observed: torch.Tensor  # (R, T, M, 3) [m], NaN where nothing was seen and past a trial's end
-    held: torch.Tensor  # (R, M, 3) the same points before time zero [m]
+    observed: torch.Tensor  # (R, T, M, D) [unit of the observation], NaN where nothing was seen and past a trial's end
+    held: torch.Tensor  # (R, M, D) those points before time zero [unit]
     # what acts on the R environments, during each step of the simulation where it changes
     inputs: Inputs = field(default_factory=Inputs)
     # what acts on them before time zero, where they begin at rest; weights act before as after
@@ -30,9 +30,9 @@ class Trials:
         Raises:
             InputError: they do not, or nothing was seen of a trial.
         """
-        r, t, m, _ = self.observed.shape
+        r, t, m, d = self.observed.shape
         batches = [v.shape[i] for each in (self.inputs, self.resting) for v, i in each.axes().values()]
-        if self.times.shape != (r, t) or self.held.shape != (r, m, 3) or set(batches) - {r}:
+        if self.times.shape != (r, t) or self.held.shape != (r, m, d) or set(batches) - {r}:
             raise InputError("the times, the held points and the inputs do not belong to the same trials.")
         for name, seen in zip(self.names, self.seen, strict=True):
             if not bool(seen.any()):

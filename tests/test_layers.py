@@ -17,7 +17,7 @@ KERNELS = REPOSITORY / "kernels"
 def rows():
     """Row of each place in the table: `cli` for a module, `io/` for a folder."""
     text = (REPOSITORY / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    text = text[text.index("## Where things are") : text.index("## Five nouns")]
+    text = text[text.index("## Where things are") : text.index("## Six nouns")]
     cells = re.findall(r"^\| ((?:`[\w/]+`(?:, )?)+) \|", text, flags=re.MULTILINE)
     places = [(place, row) for row, cell in enumerate(cells) for place in re.findall(r"`([a-z_/]+)`", cell)]
     assert len({place for place, _ in places}) == len(places)

@@ -104,8 +104,8 @@ def files_read(run: RunSettings, mesh: MeshSettings) -> dict[str, str]:
     folder = Path((run.recorded.folder if run.recorded is not None else None) or ".").expanduser()
     moved = {motion.file for motion in run.motions().values() if motion.file is not None}
     found = {name: _digest(folder / name, "the file of base_motion") for name in sorted(moved)}
-    path: str | None = getattr(mesh, "path", None)
-    return found if path is None else {**found, path: digest(path)}
+    paths = [getattr(each, "path", None) for each in (mesh, *(part.mesh for part in run.parts.values()))]
+    return found | {path: digest(path) for path in paths if path is not None}
 
 
 def _digest(path: Path, key: str) -> str:

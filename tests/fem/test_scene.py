@@ -18,7 +18,7 @@ from warp_resphys import (
     box_tetrahedra,
     select_vertices,
 )
-from warp_resphys.io.errors import InputError
+from warp_resphys.io.errors import InputError, MeshError
 
 SOFT = Corotated(2e5, 0.45)
 
@@ -69,7 +69,7 @@ def test_materials_and_the_joined_mesh_of_a_scene():
     assert list(simulator.materials) == ["a", "b"]
     with pytest.raises(InputError, match="'b' has no material"):
         Simulator(scene, {"a": SOFT})
-    with pytest.raises(InputError, match="share no mesh"):
+    with pytest.raises(MeshError, match="cannot be joined"):
         Scene({"a": finger(), "ball": ball()}).mesh  # noqa: B018
     with pytest.raises(InputError, match="one or more bodies"):
         Scene({})

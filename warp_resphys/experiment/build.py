@@ -12,6 +12,7 @@ from functools import lru_cache
 from importlib import resources
 from pathlib import Path
 
+import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
@@ -21,14 +22,14 @@ from ..dynamics.nonlinear_solver import SolverSettings
 from ..dynamics.simulator import Simulator
 from ..energies.materials import Material, make_material
 from ..fem.body import Body
-from ..fem.rigid import Rigid
+from ..fem.rigid import Glue, Rigid
 from ..io.atomic import digest
 from ..io.errors import InputError, MeshError
 from ..io.settings import parse
 from ..mesh.arm import mesh_arm
 from ..mesh.arm_geometry import ArmGeometry
 from ..mesh.boxes import boxes_hexahedra
-from ..mesh.mesh import Mesh, box_hexahedra, box_tetrahedra, check_mesh, quadratic, select_cells, select_vertices
+from ..mesh.mesh import Mesh, box_hexahedra, box_tetrahedra, check_mesh, join, quadratic, select_cells, select_vertices
 from ..mesh.readers import read_mesh
 from ..mesh.rod import rod
 from ..mesh.tetrahedra import fill_surface
@@ -191,15 +192,16 @@ def build_body(settings: BodySettings, payload_at: PlaceSettings | None = None, 
         return _body(settings, payload_at, mesh)
     of_body = BodySettings.of(settings)
     place = None if payload_at is None else payload_at.model_dump_json()
-    return _built_body(of_body.model_dump_json(), place, _file_of(settings.mesh))
+    files = tuple(_file_of(mesh) for mesh in (settings.mesh, *(part.mesh for part in settings.parts.values())))
+    return _built_body(of_body.model_dump_json(), place, files)
 
 
 @lru_cache(maxsize=8)
-def _built_body(content: str, place: str | None, file: str | None) -> Body:
-    """The body of settings as JSON; ``file`` is the digest of the file of its mesh."""
+def _built_body(content: str, place: str | None, files: tuple[str | None, ...]) -> Body:
+    """The body of settings as JSON; ``files`` are the digests of the files of its meshes."""
     settings = parse(BodySettings, json.loads(content))
     payload_at = None if place is None else parse(PlaceSettings, json.loads(place))
-    return _body(settings, payload_at, build_mesh(settings.mesh))
+    return _body(settings, payload_at, whole_mesh(settings))
 
 
 def _body(settings: BodySettings, payload_at: PlaceSettings | None, mesh: Mesh) -> Body:
@@ -207,7 +209,41 @@ def _body(settings: BodySettings, payload_at: PlaceSettings | None, mesh: Mesh) 
     energies = build_actuators(settings, mesh, payload_at)
     fixed = select_vertices(mesh, **settings.fixed.arguments())
     rigid = {name: Rigid(**dict(part)) for name, part in settings.rigid.items()}
-    return Body(mesh, energies=tuple(energies), fixed=fixed, rigid=rigid, **dict(settings.physics))
+    glued = [_glue(mesh, settings, number) for number in range(len(settings.glued))]
+    physics = dict(settings.physics)
+    return Body(mesh, energies=tuple(energies), fixed=fixed, rigid=rigid, glued=glued, **physics)
+
+
+def whole_mesh(settings: BodySettings) -> Mesh:
+    """Returns the mesh of a body with those of its ``parts``, each of which is a region.
+
+    Raises:
+        InputError: an unknown arm.
+        MeshError: a mesh that cannot be read or simulated, or meshes with different kinds of cells.
+    """
+    mesh = build_mesh(settings.mesh)
+    if not settings.parts:
+        return mesh
+    parts = {}
+    for name, part in settings.parts.items():
+        own = build_mesh(part.mesh)
+        parts[name] = replace(own, vertices=own.vertices + np.asarray(part.shift))
+    joined = join({"body": mesh, **parts})
+    return replace(joined, regions={**joined.regions, **mesh.regions})
+
+
+def _glue(mesh: Mesh, settings: BodySettings, number: int) -> Glue:
+    """Returns the glue of one entry of ``glued``."""
+    glue = settings.glued[number]
+    try:
+        members = np.unique(mesh.cells[mesh.region(glue.region)])
+        mesh.region(glue.to)
+        vertices = np.intersect1d(select_vertices(mesh, **glue.at.arguments()), members)
+    except MeshError as error:
+        raise MeshError(f"glued[{number}]: {error}") from None
+    if not len(vertices):
+        raise MeshError(f"glued[{number}].at: no vertex of the region {glue.region!r} lies there.")
+    return Glue(vertices, glue.to, glue.tolerance)
 
 
 def _with_regions(mesh: Mesh, boxes: Mapping[str, BoxSettings]) -> Mesh:

@@ -27,7 +27,7 @@ from ..report.notes import error_notes, kept_note, material_note, network_note, 
 from ..report.run_page import write_report
 from ..settings.run import RunSettings
 from .actuators import build_chambers, driving_quantity
-from .build import bound_markers, build_body, build_mesh, build_simulator, choose_device, marker_view_of
+from .build import bound_markers, build_body, build_simulator, choose_device, marker_view_of, whole_mesh
 from .experiment import LEARNED
 from .files import (
     CONTROL,
@@ -187,7 +187,7 @@ def read_trials(folder: Path, run: RunSettings) -> TrialResults:
     """
     path = common_folder(folder) / DATASET
     dataset = read_dataset(path)
-    bound = build_mesh(run.mesh).vertices if dataset.bound is None else dataset.bound
+    bound = whole_mesh(run).vertices if dataset.bound is None else dataset.bound
     with read_hdf5(folder / ROLLOUTS, "rollouts") as file:
         rolled = tuple(str(each) for each in file.attrs["names"])
         scaled = _read_scaled(folder)

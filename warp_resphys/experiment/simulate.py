@@ -37,7 +37,7 @@ from ..settings.trials import BaseMotion, MotionSettings, MovingBase, ReleaseFro
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .actuators import driven_parts, driving_quantity
-from .build import bound_markers, build_mesh, build_simulator
+from .build import bound_markers, build_simulator, whole_mesh
 from .files import DATASET, GIVEN, STATIC, TRUTH, Dataset, payload_inputs
 from .parts import ResumableRollout, TrialPart, read_parts, remove_parts, split_into_parts, work_on
 
@@ -58,7 +58,7 @@ def simulate(context: StageContext) -> None:
     poses, times = None, settings.time_step * np.arange(frames, dtype=np.float64)
     if motion is not None:
         poses = np.stack([base_of(motion, trial, times, _scaled(settings, trial)) for trial in trials])
-        points = build_mesh(settings.mesh).vertices
+        points = whole_mesh(settings).vertices
         for each in poses:
             check_steps(each, points, "data.base_motion")
     parts = split_into_parts(context, names, frames)

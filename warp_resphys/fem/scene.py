@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..io.errors import InputError
-from ..mesh.mesh import Mesh
+from ..mesh.mesh import Mesh, join
 from ..stepping.inputs import Inputs
 from .body import Body
 from .coordinates import Coordinates
@@ -44,18 +44,9 @@ class Scene(Body):
         """The meshes of all bodies as one, whose regions are the bodies and, by ``body_region``, their regions.
 
         Raises:
-            InputError: the bodies have different kinds of cells.
+            MeshError: the bodies have different kinds of cells.
         """
-        kinds = {body.mesh.kind for body in self.bodies.values()}
-        if len(kinds) > 1:
-            raise InputError(f"the bodies of the scene have {' and '.join(sorted(kinds))} cells: they share no mesh.")
-        cells, regions, count = [], {}, 0
-        for name, body, first in self.members:
-            cells.append(body.mesh.cells + first)
-            regions[name] = np.arange(count, count + len(body.mesh.cells))
-            regions |= {f"{name}_{region}": count + own for region, own in body.mesh.regions.items()}
-            count += len(body.mesh.cells)
-        return Mesh(self.vertices, np.concatenate(cells), regions)
+        return join({name: body.mesh for name, body in self.bodies.items()})
 
     @property
     def members(self) -> Iterator[tuple[str, Body, int]]:

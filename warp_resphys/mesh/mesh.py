@@ -272,6 +272,29 @@ class Place:
         )
 
 
+def join(meshes: Mapping[str, Mesh]) -> Mesh:
+    """Returns several meshes as one that shares no vertices between them.
+
+    Its regions are the meshes by name and, as ``name_region``, their own regions.
+
+    Raises:
+        MeshError: the meshes have different kinds of cells.
+    """
+    kinds = {mesh.kind for mesh in meshes.values()}
+    if len(kinds) > 1:
+        raise MeshError(
+            f"meshes of {' and '.join(sorted(kinds))} cells cannot be joined: give {' and '.join(meshes)} cells of one "
+            "kind."
+        )
+    cells, regions, first, count = [], {}, 0, 0
+    for name, mesh in meshes.items():
+        cells.append(mesh.cells + first)
+        regions[name] = np.arange(count, count + len(mesh.cells))
+        regions |= {f"{name}_{region}": count + own for region, own in mesh.regions.items()}
+        first, count = first + len(mesh.vertices), count + len(mesh.cells)
+    return Mesh(np.concatenate([mesh.vertices for mesh in meshes.values()]), np.concatenate(cells), regions)
+
+
 def select_vertices(
     mesh: Mesh, x: Extent | None = None, y: Extent | None = None, z: Extent | None = None, tolerance: float = 1e-9
 ) -> IntArray:

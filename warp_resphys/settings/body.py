@@ -233,6 +233,22 @@ class RigidSettings(Settings):
     stiffness: Positive = setting(1.0e9, "of the energy that keeps it rigid", "Pa")
 
 
+class PartSettings(Settings):
+    """Another mesh of the body, with cells of the same kind, which are a region of the part's name."""
+
+    mesh: MeshSettings
+    shift: Vector = setting((0.0, 0.0, 0.0), "from the coordinates of its own mesh", "m")
+
+
+class GlueSettings(Settings):
+    """Vertices that stay where they are in another region, whose cells theirs need not match; see `fem.rigid.Glue`."""
+
+    region: Word = setting(description="whose vertices follow")
+    at: PlaceSettings = setting(description="which of its vertices")
+    to: Word = setting(description="region that they follow")
+    tolerance: Positive = setting(1.0e-3, "distance from that region that still counts", "m")
+
+
 class ChamberSettings(Settings):
     """Closed chambers of the mesh, each of which has a pressure."""
 
@@ -350,6 +366,8 @@ class BodySettings(Settings):
 
     mesh: MeshSettings
     physics: PhysicsSettings = PhysicsSettings()
+    parts: dict[str, PartSettings] = setting({}, "further meshes; the cells of the first one are the region 'body'")
+    glued: Many[GlueSettings] = setting((), "what holds meshes that do not match together")
     regions: dict[str, BoxSettings] = setting({}, "cells by the name of their region, beside those that a file names")
     rigid: dict[str, RigidSettings] = setting({}, "regions that are rigid parts")
     fixed: PlaceSettings = setting(description="vertices that are held")

@@ -13,9 +13,11 @@ from ..io.settings import Many, Settings, Vector
 from .body import (
     BoxSettings,
     ChamberSettings,
+    GlueSettings,
     MaterialSettings,
     MediumSettings,
     MuscleSettings,
+    PartSettings,
     PlaceSettings,
     RigidSettings,
     SimulatorSettings,
@@ -65,6 +67,8 @@ class PlayedSettings(Settings):
     """A simulated laboratory."""
 
     laboratory: PlaySettings
+    parts: dict[str, PartSettings]
+    glued: Many[GlueSettings]
     regions: dict[str, BoxSettings]
     rigid: dict[str, RigidSettings]
     fixed: PlaceSettings

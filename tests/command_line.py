@@ -10,6 +10,7 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from warp_resphys import cli
+from warp_resphys.io.settings import S, parse
 from warp_resphys.launch import freed
 
 
@@ -40,3 +41,8 @@ def configuration(name: str, *overrides: str) -> dict:
     """A configuration of the package as plain data."""
     with initialize_config_module("warp_resphys.conf", version_base="1.3"):
         return OmegaConf.to_container(compose(name, freed(overrides)), resolve=True)
+
+
+def settings_of(settings: type[S], name: str, *overrides: str) -> S:
+    """A configuration of the package, parsed into its class."""
+    return parse(settings, configuration(name, *overrides))

@@ -15,11 +15,13 @@ import pytest
 from hydra import compose, initialize_config_module
 from hydra._internal.utils import get_args_parser
 from omegaconf import OmegaConf
+from pydantic import ConfigDict
 
 from warp_resphys import __version__, cli, commands, launch
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.labels import run_label
 from warp_resphys.io.setting_errors import keys
+from warp_resphys.io.settings import Settings
 from warp_resphys.io.stages import StageInterrupted
 from warp_resphys.settings.run import RunSettings
 
@@ -56,6 +58,12 @@ def config_dir(tmp_path: Path) -> Path:
     return tmp_path / "conf"
 
 
+class AnyKeys(Settings):
+    """A configuration with any keys."""
+
+    model_config = ConfigDict(extra="allow")
+
+
 class Command:
     """Runs `warp-resphys` in this process, with a job of the test's choice."""
 
@@ -69,9 +77,9 @@ class Command:
         monkeypatch.setitem(sys.modules, EXPERIMENT, experiment)
         monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
 
-    def run(self, config: dict[str, Any], folder: Path) -> object:
+    def run(self, config: AnyKeys, folder: Path) -> object:
         self.outputs.append(os.path.relpath(folder))
-        return self.job(config)
+        return self.job(config.plain())
 
     def __call__(self, *arguments: str) -> tuple[int, str]:
         self.monkeypatch.setattr(sys, "argv", [*self.arguments, *arguments])
@@ -296,20 +304,21 @@ class TestCommands:
 
     @pytest.fixture
     def calls(self, command, config_dir, monkeypatch):
-        found = []
+        called = []
 
-        for name, each in commands.COMMANDS.items():
-            module, function = f"warp_resphys.{each.function}".split(":")
+        def recorder(name: str) -> Callable[[AnyKeys, Path], None]:
+            def record(config: AnyKeys, folder: Path) -> None:
+                called.append((name, config.plain()))
+
+            return record
+
+        for name, entry in commands.COMMANDS.items():
+            module, function = f"warp_resphys.{entry.function}".split(":")
             monkeypatch.setitem(sys.modules, module, sys.modules.get(module, types.ModuleType(module)))
-            monkeypatch.setattr(
-                sys.modules[module],
-                function,
-                lambda config, folder, name=name: found.append((name, config)),
-                raising=False,
-            )
+            monkeypatch.setattr(sys.modules[module], function, recorder(name), raising=False)
         for name in ("verify", "verify_gradients", "inspect_make_arm", "view_film"):
             (config_dir / f"{name}.yaml").write_text("defaults: [config, _self_]\nfiles: []\nrun: null")
-        return found
+        return called
 
     @pytest.mark.parametrize(
         ("arguments", "name", "seed"),
@@ -428,7 +437,8 @@ class TestProcess:
             [
                 "import signal, sys, time, types",
                 f"experiment = sys.modules[{EXPERIMENT!r}] = types.ModuleType('experiment')",
-                "def run(config, folder):",
+                "from warp_resphys.io.settings import Settings",
+                "def run(config: type('AnyKeys', (Settings,), {'model_config': {'extra': 'ignore'}}), folder):",
                 *(f"    {line}" for line in lines),
                 "experiment.run_experiment = run",
             ]

@@ -28,8 +28,8 @@ class Command:
 
     Attributes:
         purpose: what it is for, in a line.
-        function: as in ``studies.sizes:size_study``, below this package; it takes the configuration as plain data, and
-            the run folder.
+        function: as in ``studies.sizes:size_study``, below this package. It takes the settings, an object of the class
+            with which this parameter is annotated, and the run folder.
         word: the key of the configuration that takes one word after the command.
         words: the key that takes all words after the command, as a list.
     """
@@ -50,14 +50,14 @@ COMMANDS: Final[Mapping[str, Command]] = MappingProxyType(
             words="only",
         ),
         "inspect": Command(
-            "what is in a mesh, or how good a recording is", "studies.preparation:inspect", words="files"
+            "what is in a mesh, or how good a recording is", "studies.inspection:inspect", words="files"
         ),
         "inspect compare": Command(
             "a recording of a beam that is let go, beside its simulation",
             "studies.recording_comparison:compare",
             word="recording.path",
         ),
-        "inspect make-arm": Command("make the mesh of a pneumatic arm", "studies.preparation:make_arm"),
+        "inspect make-arm": Command("make the mesh of a pneumatic arm", "studies.mesh_inspection:make_arm"),
         "view": Command("a run's robot in the browser, to be driven and pulled", "studies.view:view", word="run"),
         "view film": Command("a film of a trial of a run, with any of its models", "studies.film:film", word="run"),
         "benchmark": Command("time steps, forward and backward, and their parts", "studies.benchmark:benchmark"),

@@ -10,7 +10,7 @@ from collections.abc import Container, Iterator, Sequence
 from importlib import import_module, resources
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, get_type_hints
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -30,6 +30,7 @@ from .io.atomic import is_disk_full
 from .io.errors import ResphysError, did_you_mean
 from .io.labels import OWN_OPTIONS, run_label
 from .io.pipes import ends_where_nobody_reads
+from .io.settings import parse
 
 INTERRUPTED: Final = 130
 # Commands that have the keys of `settings.run.RunSettings`, perhaps beside others.
@@ -45,7 +46,8 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
 
     Args:
         command: its name.
-        function: its module below this package and its function, as in "studies.sizes:size_study".
+        function: its module below this package and its function, as in "studies.sizes:size_study". The configuration
+            is parsed into the class with which its first parameter is annotated.
         arguments: for Hydra.
     """
     reported: list[BaseException] = []
@@ -61,10 +63,12 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
                     _show(config, shown)
                 return None
             module, _, name = function.partition(":")
-            settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+            values = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
             folder = Path(HydraConfig.get().runtime.output_dir)
             with ends_where_nobody_reads():
-                return getattr(import_module(f"{__package__}.{module}"), name)(settings, folder)
+                run = getattr(import_module(f"{__package__}.{module}"), name)
+                settings, *_ = get_type_hints(run).values()
+                return run(parse(settings, values), folder)
         except Exception as error:
             sentence = _explain(error, started)
             if sentence is None or full_error:

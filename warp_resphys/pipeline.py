@@ -55,7 +55,6 @@ from .io.atomic import digest
 from .io.errors import DataFileError
 from .io.fan_out import ALONE, Workers
 from .io.files import read_json, write_json
-from .io.settings import parse
 from .io.stages import Stage, StageContext, package_versions, resources_used, run_stages
 from .learning.metrics import summarise_folds
 from .report.conclusions import conclusions
@@ -279,13 +278,12 @@ def acquire(run: RunSettings, folder: Path, wait: bool = False) -> tuple[list[St
     return stages, str(read_json(folder / "stages" / f"{written}.json")["fingerprint"])
 
 
-def run_experiment(config: Mapping[str, Any], folder: Path) -> None:
+def run_experiment(run: RunSettings, folder: Path) -> None:
     """Runs what has changed, writes metrics.json into the run folder and prints the errors.
 
     Raises:
         InputError: a value that cannot be used.
     """
-    run = parse(RunSettings, config)
     prepare(run)
     if run.ablation is not None:
         run_stages(ablation_stages(run, files_read(run, run.mesh)), folder)
@@ -362,7 +360,7 @@ def _print(metrics: Mapping[str, Any], folder: Path, run: RunSettings) -> None:
         console.print(_driven(metrics["control"]["tracking"]))
     if "noise_mm" in metrics:
         console.print(f"The noise of the markers alone is {number_text(metrics['noise_mm'])} mm.")
-    for said in conclusions(metrics, run.plain()):
+    for said in conclusions(metrics, run):
         console.print(said, soft_wrap=True)
     console.print(f"Report: {folder / REPORT}", soft_wrap=True)
 

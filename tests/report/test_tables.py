@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from warp_resphys.io.errors import InputError
+from warp_resphys.io.settings import parse
 from warp_resphys.learning.metrics import PUBLISHED_MM, PUBLISHED_WINDOWS_MM, median_filter, published_errors
 from warp_resphys.mesh.mesh import box_hexahedra
 from warp_resphys.report.bodies import instants
@@ -16,6 +17,7 @@ from warp_resphys.report.identification_section import parameter_rows, placement
 from warp_resphys.report.page import MINUS, NO_BREAK_SPACE, NONE, Cell
 from warp_resphys.report.run_page import published_beside
 from warp_resphys.report.sections import against, horizon_table, quality_rows, residual_table, scale_table
+from warp_resphys.settings.learning import RangeSettings
 
 DOWN = np.array([0.0, 0.0, -9.8])
 
@@ -87,8 +89,8 @@ def test_control_is_told_by_controller_and_speed():
         "command_ms": {"receding_resphys": {"median": 2.0, "largest_of_20": 4.0}, "open_sysid": {}},
     }
     metrics["reduced"]["sysid"]["window_relative"] = 0.01
-    control = {"seconds": [4.0], "shapes": ["eight"], "tracked": ["A", "B"], "size": 0.04}
-    data = SimpleNamespace(metrics={"control": metrics}, settings={"control": control}, followed=())
+    control = SimpleNamespace(seconds=(4.0,), shapes=("eight",), tracked=("A", "B"), size=0.04)
+    data = SimpleNamespace(metrics={"control": metrics}, settings=SimpleNamespace(control=control), followed=())
     task, table, _, facts = control_section(data, None).blocks
     assert "the mean of A and B, follows 1 paths (eight) of 40 mm" in task.text
     plan, receding = table.rows
@@ -97,7 +99,7 @@ def test_control_is_told_by_controller_and_speed():
     assert (receding.answer, plan.answer) == (True, False)
     assert any("to 1.000 mm after corrections" in said and "to 4.000 mm before" in said for said in facts.items)
     assert any("a command takes 2.0 ms" in said for said in facts.items)
-    assert control_section(SimpleNamespace(metrics={}, settings={"control": None}), None) is None
+    assert control_section(SimpleNamespace(metrics={}, settings=SimpleNamespace(control=None)), None) is None
 
 
 class TestIdentification:
@@ -150,7 +152,8 @@ class TestIdentification:
     @pytest.mark.parametrize(("deviation", "informs"), [(2.5e3, True), (9.9e3, False)])
     def test_what_the_data_add_nothing_to_is_said_to_be_its_prior(self, identified, deviation, informs):
         identified["uncertainty"]["deviation"]["youngs_modulus"] = deviation
-        ranges = {"youngs_modulus": {"prior": {"mean": 250e3, "deviation": 10e3}}}
+        prior = {"mean": 250e3, "deviation": 10e3}
+        ranges = {"youngs_modulus": parse(RangeSettings, {"lower": 5e4, "upper": 2e6, "prior": prior})}
         said = uncertainty_text("sysid", identified, ranges)
         assert said.endswith("at 250 ± 10 kPa.") is not informs
 

@@ -1,9 +1,12 @@
 """What a run shows, in words: the verdict, the conclusions, notes, and numbers as they are written."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
-from configured import composed
+from configured import settings
 
+from warp_resphys.io.settings import parse
 from warp_resphys.learning.metrics import (
     PUBLISHED_MM,
     PUBLISHED_WINDOWS_MM,
@@ -32,6 +35,7 @@ from warp_resphys.report.verdict import (
     scale_text,
     vertex_verdict,
 )
+from warp_resphys.settings.learning import IdentifySettings
 
 
 def summary(mean, diverged=0):
@@ -136,14 +140,16 @@ class TestAdvice:
         assert said.startswith("In 2 of 3 folds, youngs_modulus was identified at its upper bound")
 
 
-SETTINGS = {
-    "simulation": {"youngs_modulus": 264e3, "poissons_ratio": 0.49, "model": "corotated"},
-    "identify": {
-        "parameters": {"youngs_modulus": {"lower": 5e4, "upper": 2e6, "logarithmic": True}},
-        "elastic": {"poissons_ratio": {"lower": 0.48, "upper": 0.4995}},
-        "first_guess": {},
-    },
-}
+SETTINGS = SimpleNamespace(
+    name="my_robot",
+    identify=parse(
+        IdentifySettings,
+        {
+            "parameters": {"youngs_modulus": {"lower": 5e4, "upper": 2e6, "logarithmic": True}},
+            "elastic": {"poissons_ratio": {"lower": 0.48, "upper": 0.4995}},
+        },
+    ),
+)
 
 
 def fold(simulation, sysid, resphys, epoch, modulus):
@@ -165,7 +171,7 @@ def test_conclusions_of_folds_and_of_one_split():
     alone = conclusions(metrics["folds"]["a"], SETTINGS)
     assert "leaves 50 % less" in said_of("sysid", alone)
     assert "adds nothing to SysID" in said_of("resphys", alone)
-    assert conclusions({"errors_mm": {}}, {}) == []
+    assert conclusions({"errors_mm": {}}, SETTINGS) == []
 
 
 def test_intervals_are_those_of_the_best_model():
@@ -208,11 +214,13 @@ def test_verdict_on_markers():
 
 
 def test_a_trial_whose_rest_is_the_test_is_not_called_unseen():
-    half = {"data": {"train": ["step"], "train_fraction": 0.5}}
-    assert learned_in_part(half, ["step"])
-    assert not learned_in_part(half, ["step", "other"])
-    assert not learned_in_part({"data": {"train": ["step"], "train_fraction": 1.0}}, ["step"])
-    assert not learned_in_part({"data": {"train": 35, "train_fraction": 0.5}}, ["step"])
+    def parted(train, train_fraction):
+        return SimpleNamespace(recorded=SimpleNamespace(train=train), train_fraction=train_fraction)
+
+    assert learned_in_part(parted(("step",), 0.5), ["step"])
+    assert not learned_in_part(parted(("step",), 0.5), ["step", "other"])
+    assert not learned_in_part(parted(("step",), 1.0), ["step"])
+    assert not learned_in_part(parted(35, 0.5), ["step"])
 
 
 def test_growth_and_scales():
@@ -261,10 +269,9 @@ def test_trials_out_of_range_are_counted_where_they_belong():
     ],
 )
 def test_it_is_said_whose_network_it_is(options, said):
-    config, refined = composed(*options), composed(*options, "refinement=solver_in_the_loop")
-    note = network_note(config["network"], config["trainer"], {})
+    note = network_note(settings(*options))
     assert all(words in note for words in said)
-    assert network_note(config["network"], config["trainer"], refined["refinement"]).startswith(note)
+    assert network_note(settings(*options, "refinement=solver_in_the_loop")).startswith(note)
 
 
 def test_it_is_said_which_weights_were_taken():

@@ -3,14 +3,12 @@
 import math
 
 import pytest
-from command_line import configuration, outcome
+from command_line import outcome, settings_of
 
 from warp_resphys.experiment.build import build_simulator
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_json
-from warp_resphys.io.settings import parse, parse_part
-from warp_resphys.settings.body import MaterialSettings, SimulatorSettings
-from warp_resphys.studies.benchmark import PARTS, released, run_benchmark
+from warp_resphys.studies.benchmark import PARTS, BenchmarkRun, released, run_benchmark
 
 TINY = [
     "mesh.divisions=[2,1,1]",
@@ -54,18 +52,16 @@ def test_every_case_is_measured_and_stands_on_the_page(folder, device):
 
 
 def test_quick_measures_the_coarsest_mesh_alone():
-    config = configuration("benchmark", *TINY, "benchmark.quick=true", "benchmark.cold_start=false", "device=cpu")
-    result = run_benchmark(config)
+    quick = ("benchmark.quick=true", "benchmark.cold_start=false", "device=cpu")
+    result = run_benchmark(settings_of(BenchmarkRun, "benchmark", *TINY, *quick))
     assert {(r["refinement"], r["batch"]) for r in result["steps"]} == {(1, 1)}
     assert result["cold_start"] is None
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_the_beam_hangs_under_the_weight(dtype):
-    config = configuration("benchmark", *TINY, "device=cpu", f"dtype={dtype}")
-    simulator = build_simulator(
-        parse_part(SimulatorSettings, config), parse(MaterialSettings, config["simulation"], "simulation")
-    )
+    settings = settings_of(BenchmarkRun, "benchmark", *TINY, "device=cpu", f"dtype={dtype}")
+    simulator = build_simulator(settings, settings.simulation)
     heavy, light = released(simulator, 0.1, 2), released(simulator, 0.0, 2)
     sag = (heavy.q - light.q)[:, :, 2].min(1).values
     assert float(sag[0]) < 1.3 * float(sag[1]) < 0.0
@@ -87,4 +83,4 @@ def test_the_beam_hangs_under_the_weight(dtype):
 )
 def test_what_cannot_be_measured_is_refused_first(overrides, message):
     with pytest.raises(InputError, match=message):
-        run_benchmark(configuration("benchmark", *TINY, "device=cpu", *overrides.split(";")))
+        run_benchmark(settings_of(BenchmarkRun, "benchmark", *TINY, "device=cpu", *overrides.split(";")))

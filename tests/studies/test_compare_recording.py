@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_module
-from omegaconf import OmegaConf
+from command_line import settings_of
 from scipy.spatial.transform import Rotation
 from sentences import offending
 
@@ -19,6 +18,7 @@ from warp_resphys.studies import recording_comparison
 from warp_resphys.studies.recording_comparison import (
     ComparisonSettings,
     NominalMarker,
+    NominalMarkers,
     Swing,
     compare_recording,
     follow_face,
@@ -42,8 +42,19 @@ ROTATION = Rotation.from_euler("xyz", [0.4, -1.5, 2.0])
 
 
 def configured(*overrides):
-    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        return OmegaConf.to_container(compose("inspect_compare", list(overrides)), resolve=True)
+    return settings_of(ComparisonSettings, "inspect_compare", *overrides)
+
+
+def swing_of(recording, tip=TIP, largest_residual=1e-3, release_frame=None):
+    """The measured swing, with the markers of this file."""
+    settings = configured("registration.longest_gap=5", f"registration.largest_residual={largest_residual}")
+    return measured_swing(
+        recording,
+        settings.changed(
+            markers=NominalMarkers(tip=tip, base=BASE),
+            recording=settings.recording.changed(release_frame=release_frame),
+        ),
+    )
 
 
 def recorded(displacement, release):
@@ -106,7 +117,7 @@ def test_measured_swing_is_in_the_frame_of_the_body():
     displacement = falling()
     recording = recorded(displacement, release=60)
     recording.positions[150:153, 1] = np.nan
-    swing = measured_swing(recording, TIP, BASE, longest_gap=5, largest_residual=1e-3)
+    swing = swing_of(recording)
     assert swing.release.frame == pytest.approx(60.0, abs=0.3)
     np.testing.assert_allclose(swing.rest_markers, [m.position for m in TIP], atol=2e-5)
     assert swing.registration_residual < 2e-5
@@ -119,27 +130,27 @@ def test_measured_swing_is_in_the_frame_of_the_body():
 
 def test_a_known_release_is_taken_over_and_checked():
     recording = recorded(falling(), release=60)
-    swing = measured_swing(recording, TIP, BASE, longest_gap=5, largest_residual=1e-3, release_frame=61.5)
+    swing = swing_of(recording, release_frame=61.5)
     assert swing.time[0] == pytest.approx(0.005)
     np.testing.assert_allclose(swing.rest_markers, [m.position for m in TIP], atol=2e-5)
     with pytest.raises(InputError, match="release_frame is 900: set it to one of the 360 frames"):
-        measured_swing(recording, TIP, BASE, longest_gap=5, largest_residual=1e-3, release_frame=900.0)
+        swing_of(recording, release_frame=900.0)
 
 
 def test_markers_in_the_wrong_order_are_noticed():
     recording = recorded(falling(), release=60)
     swapped = [marker("b", TIP[0].position), marker("a", TIP[1].position), TIP[2]]
     with pytest.raises(DataFileError, match=r"mm \(root mean square\) off their nominal positions"):
-        measured_swing(recording, swapped, BASE, longest_gap=5, largest_residual=4e-3)
+        swing_of(recording, swapped, largest_residual=4e-3)
 
 
 def test_comparison_of_a_simulation_with_its_own_recording(tmp_path, monkeypatch):
     """Release, registration, binding and estimators leave nothing of their own: the two swings are one."""
     config = configured("recording.path=swing.c3d", "simulation.time_step=0.01", "comparison.tail_seconds=0.5")
     tip = np.array([each.position for each in TIP])
-    truth = simulate_swing(parse(ComparisonSettings, config), tip, 2.2)
+    truth = simulate_swing(config, tip, 2.2)
     recording = recorded(truth.displacement, release=50)
-    labels = [marker["name"] for part in ("tip", "base") for marker in config["markers"][part]]
+    labels = [marker.name for marker in (*config.markers.tip, *config.markers.base)]
     recording = Recording(tuple(labels), recording.positions, 100.0, recording.source)
     monkeypatch.setattr(recording_comparison, "read_recording", lambda path: recording)
     result = compare_recording(config, tmp_path)
@@ -152,14 +163,14 @@ def test_comparison_of_a_simulation_with_its_own_recording(tmp_path, monkeypatch
     assert result["simulated"]["sag_mm"] == pytest.approx(-6.42, abs=0.03)
     written = json.loads((tmp_path / "comparison.json").read_text())
     assert written["relative_difference"] == difference
-    assert parse(ComparisonSettings, written["config"]) == parse(ComparisonSettings, config)
+    assert parse(ComparisonSettings, written["config"]) == config
     assert (tmp_path / "comparison.png").read_bytes().startswith(b"\x89PNG")
     assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_a_recording_in_which_nothing_moves_or_with_pressures_is_refused(tmp_path, monkeypatch):
     config = configured("recording.path=swing.c3d", "recording.release_frame=50")
-    labels = tuple(marker["name"] for part in ("tip", "base") for marker in config["markers"][part])
+    labels = tuple(marker.name for marker in (*config.markers.tip, *config.markers.base))
     still = Recording(labels, recorded(np.zeros((200, 3, 3)), release=50).positions, 100.0, Path("swing.c3d"))
     monkeypatch.setattr(recording_comparison, "read_recording", lambda path: still)
     with pytest.raises(DataFileError, match=r"swing\.c3d: 'Tip - 1', .* never move by more than"):
@@ -190,7 +201,7 @@ def test_hung_weight_lengthens_the_period():
     settings = ["simulation.time_step=0.01", "material.mass_damping=0", "material.stiffness_damping=0.001"]
     turns = []
     for name in ("bare", "load101"):
-        swing = simulate_swing(parse(ComparisonSettings, configured(f"recording={name}", *settings)), tip, 0.3)
+        swing = simulate_swing(configured(f"recording={name}", *settings), tip, 0.3)
         turns.append(swing.time[np.argmin(swing.deflection)])
     assert turns[1] / turns[0] == pytest.approx(np.sqrt((102.0 + 23.7) / 23.7), rel=0.1)
 
@@ -233,5 +244,5 @@ def test_gaps_are_filled_before_anything_else():
     recording = recorded(falling(), release=60)
     recording.positions[100:120, 2] = np.nan
     with pytest.raises(DataFileError, match="marker c is occluded in frames 100 to 119"):
-        measured_swing(recording, TIP, BASE, longest_gap=5, largest_residual=1e-3)
+        swing_of(recording)
     assert np.isfinite(fill_gaps(recording, 20).positions).all()

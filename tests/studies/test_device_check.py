@@ -2,11 +2,10 @@
 
 import pytest
 import torch
-from command_line import configuration, outcome
+from command_line import outcome, settings_of
 
 from warp_resphys.io.errors import InputError
-from warp_resphys.io.settings import parse
-from warp_resphys.studies.device_check import CheckSettings, bounded, experiment_checks, trajectory_checks
+from warp_resphys.studies.device_check import DeviceCheck, bounded, experiment_checks, trajectory_checks
 
 
 @pytest.mark.numerics
@@ -40,8 +39,8 @@ def test_an_error_in_the_place_of_a_figure_fails():
 
 def test_an_experiment_that_fails_is_a_failed_check(folder):
     overrides = ("check.experiments=[beam_oscillation]", "check.overrides=['trainer.epochs=0']")
-    settings = parse(CheckSettings, configuration("verify_device", *overrides)["check"])
-    (check,) = experiment_checks(settings, "cpu", folder)
+    settings = settings_of(DeviceCheck, "verify_device", *overrides)
+    (check,) = experiment_checks(settings.check, "cpu", folder)
     assert not check.passed
     assert "trainer.epochs is 0" in check.found
 

@@ -5,28 +5,25 @@ import sys
 import meshio
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_module
+from command_line import settings_of
 from matplotlib.image import imread
-from omegaconf import OmegaConf
 
 from warp_resphys import cli
 from warp_resphys.io.errors import InputError, MeshError
-from warp_resphys.io.settings import parse
-from warp_resphys.launch import freed
 from warp_resphys.mesh.arm import mesh_arm, name_surfaces
 from warp_resphys.mesh.arm_geometry import ArmGeometry
 from warp_resphys.mesh.cavities import open_cavities
 from warp_resphys.mesh.mesh import Mesh, boundary_faces, box_hexahedra, box_tetrahedra, quadratic
 from warp_resphys.mesh.quality import cell_volumes, scaled_jacobian
 from warp_resphys.mesh.readers import read_mesh, read_surfaces, read_vertices, write_mesh
-from warp_resphys.studies.inspection import Arm, Inspection
-from warp_resphys.studies.mesh_inspection import inspect_mesh, make_arm
+from warp_resphys.studies.inspection import Inspection
+from warp_resphys.studies.mesh_inspection import ArmMaking, inspect_mesh, make_arm
 
 
-def configured(name, *overrides):
-    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        config = OmegaConf.to_container(compose(name, freed(overrides)), resolve=True)
-        return parse(Inspection if name == "inspect" else Arm, config)
+def inspected(*overrides):
+    """The table of a mesh, by the name of the row."""
+    settings = settings_of(Inspection, "inspect", *overrides, "picture=false")
+    return rows_of(inspect_mesh(settings.mesh, settings.fixed, settings.density, None))
 
 
 def rows_of(text):
@@ -162,9 +159,9 @@ class TestNamedSurfaces:
             read_mesh(tmp_path / "arm.msh", units=wrong)
 
 
-def test_published_arm(tmp_path, shared_data):
+def test_published_arm(shared_data):
     path = shared_data / "sopra_mesh" / "sopra_494.vtk"
-    rows = rows_of(inspect_mesh(configured("inspect", f"mesh.path={path}", "fixed.z=0", "picture=false"), tmp_path))
+    rows = inspected(f"mesh.path={path}", "fixed.z=0")
     assert rows["vertices in the file"] == "494 = 1,482 degrees of freedom"
     assert rows["of these unused"].startswith("30 belong to no cell")
     assert rows["vertices"] == "464 = 1,392 degrees of freedom"
@@ -174,7 +171,7 @@ def test_published_arm(tmp_path, shared_data):
     assert rows["pieces"] == "1 of the body, 7 of its boundary"
     assert rows["open cavities"] == "none"
     with pytest.raises(MeshError, match="read with units=mm"):
-        inspect_mesh(configured("inspect", f"mesh.path={path}", "mesh.units=mm"), tmp_path)
+        inspected(f"mesh.path={path}", "mesh.units=mm")
 
 
 def test_any_mesh_that_an_experiment_may_have(folder, monkeypatch, capsys):
@@ -187,9 +184,9 @@ def test_any_mesh_that_an_experiment_may_have(folder, monkeypatch, capsys):
     assert not {"vertices in the file", "surfaces with a name", "Written:"} & rows.keys()
 
 
-def test_a_body_that_is_fixed_from_one_place_to_another(tmp_path):
-    config = configured("inspect", "mesh=rod", "+fixed.tolerance=1e-6", "fixed.z=[-0.1,-0.06]", "picture=false")
-    assert rows_of(inspect_mesh(config, tmp_path))["fixed"].endswith(" at z = -0.1 to -0.06 m, 125 of them used")
+def test_a_body_that_is_fixed_from_one_place_to_another():
+    rows = inspected("mesh=rod", "+fixed.tolerance=1e-6", "fixed.z=[-0.1,-0.06]")
+    assert rows["fixed"].endswith(" at z = -0.1 to -0.06 m, 125 of them used")
 
 
 def test_a_body_in_two_pieces_with_an_open_chamber(tmp_path, arm):
@@ -199,7 +196,7 @@ def test_a_body_in_two_pieces_with_an_open_chamber(tmp_path, arm):
         np.concatenate([mesh.cells, mesh.cells + len(mesh.vertices)]),
     )
     write_mesh(tmp_path / "two.vtu", apart)
-    rows = rows_of(inspect_mesh(configured("inspect", f"mesh.path={tmp_path}/two.vtu", "picture=false"), tmp_path))
+    rows = inspected(f"mesh.path={tmp_path}/two.vtu")
     assert rows["pieces"].startswith("2 of the body, 8 of its boundary")
     assert rows["open cavities"].count("cm2 around") == 6
     assert "pressure needs a closed chamber" in rows["open cavities"]
@@ -207,9 +204,9 @@ def test_a_body_in_two_pieces_with_an_open_chamber(tmp_path, arm):
     assert "fixed" not in rows
 
 
-def test_make_arm_writes_what_it_says(tmp_path):
-    text = make_arm(configured("inspect_make_arm", "mesh.size=0.01", "mesh.layers=0.03", "file=own.msh"), tmp_path)
-    rows = rows_of(text)
+def test_make_arm_writes_what_it_says(tmp_path, capsys):
+    make_arm(settings_of(ArmMaking, "inspect_make_arm", "mesh.layers=0.03", "file=own.msh"), tmp_path)
+    rows = rows_of(capsys.readouterr().out.partition("Written: ")[0])
     mesh = read_mesh(tmp_path / "own.msh")
     assert rows["vertices"] == f"{len(mesh.vertices)} = {3 * len(mesh.vertices):,} degrees of freedom"
     assert set(read_surfaces(tmp_path / "own.msh")) == set(name_surfaces(mesh))
@@ -233,7 +230,7 @@ def test_make_arm_writes_what_it_says(tmp_path):
 )
 def test_wrong_settings(tmp_path, overrides, error, message):
     with pytest.raises(error, match=message):
-        make_arm(configured("inspect_make_arm", *overrides), tmp_path)
+        make_arm(settings_of(ArmMaking, "inspect_make_arm", *overrides), tmp_path)
 
 
 @pytest.mark.parametrize(

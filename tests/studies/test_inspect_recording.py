@@ -5,9 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_module
+from command_line import settings_of
 from matplotlib.colors import to_rgb
-from omegaconf import OmegaConf
 
 from warp_resphys.data.recordings.arrays import write_recording
 from warp_resphys.data.recordings.quality import quality
@@ -15,17 +14,14 @@ from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.recordings.recording import Recording
 from warp_resphys.data.recordings.release import Release
 from warp_resphys.io.errors import DataFileError, InputError
-from warp_resphys.io.settings import parse
 from warp_resphys.studies.inspection import Inspection
-from warp_resphys.studies.preparation import with_files
 from warp_resphys.studies.recording_quality import inspect_recording, recording_quality
 
 LABELS = ("tip", "base 1", "base 2")
 
 
 def configured(*overrides):
-    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        return parse(Inspection, OmegaConf.to_container(compose("inspect", list(overrides)), resolve=True))
+    return settings_of(Inspection, "inspect", *overrides)
 
 
 def held_then_initial_motion(base=0.0):
@@ -55,7 +51,7 @@ def test_table_and_files(tmp_path, path):
     assert len({len(row.rstrip()) for row in rows[2:4]}) == 1
     assert any("tip is hidden for up to 20 frames; 20 frames are masked." in row for row in rows)
     assert any("base 1 jumps once, by 1.73 mm, in frame 90." in row for row in rows)
-    assert "Let go in frame 60." in text
+    assert "Released in frame 60." in text
     found = json.loads((tmp_path / "out" / "quality.json").read_text())
     assert found["release_frame"] == pytest.approx(60.4, abs=0.25)
     assert found["markers"][1]["jumps"] == [{"frame": 90, "mm": pytest.approx(1.73, abs=0.02)}]
@@ -66,7 +62,7 @@ def test_trials_are_compared(tmp_path, path):
     config = configured(f"recording.path={path}", "still=[base 1, base 2]", f"compare_with=[{tmp_path}/other.h5]")
     write_recording(tmp_path / "other.h5", held_then_initial_motion(base=0.002))
     text = inspect_recording(config, tmp_path / "out")
-    assert "other.h5: the base stands up to 2.00 mm from its place here; its markers moved by up to 0.0" in text
+    assert "other.h5: the base is shifted by up to 2.00 mm; its markers moved by up to 0.0" in text
     write_recording(tmp_path / "other.h5", held_then_initial_motion(base=0.03))
     with pytest.raises(DataFileError, match=r"other\.h5: base marker base 1 moved by \d+\.\d\d mm"):
         inspect_recording(config, tmp_path / "out")
@@ -96,10 +92,10 @@ def test_picture_shows_what_is_seen_filled_and_masked():
 
 
 def test_files_are_told_by_their_ends():
-    found = with_files(configured("files=[a.c3d,body.vtk,b.h5]"))
-    assert (found.recording.path, found.compare_with, found.mesh["path"]) == ("a.c3d", ("b.h5",), "body.vtk")
-    with pytest.raises(InputError, match=r"a\.msh and b\.msh are two meshes"):
-        with_files(configured("files=[a.msh,b.msh]"))
+    settings = configured("files=[a.c3d,body.vtk,b.h5]")
+    assert (settings.recording.path, settings.compare_with, settings.mesh.path) == ("a.c3d", ("b.h5",), "body.vtk")
+    with pytest.raises(InputError, match=r"^a\.msh and b\.msh are two meshes"):
+        configured("files=[a.msh,b.msh]")
 
 
 @pytest.mark.parametrize(

@@ -4,18 +4,17 @@ import csv
 
 import numpy as np
 import pytest
-from command_line import configuration, outcome
+from command_line import outcome, settings_of
 
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_json
-from warp_resphys.io.settings import parse
 from warp_resphys.mesh.arm import mesh_arm
 from warp_resphys.mesh.arm_geometry import ArmGeometry
-from warp_resphys.studies.locking import LockingCase, LockingStudy, cases, cheapest, converged, measure
+from warp_resphys.studies.locking import LockingCase, LockingRun, cases, cheapest, converged, measure
 
 
 def study(*overrides):
-    return parse(LockingStudy, configuration("benchmark_locking", *overrides)["study"], "study")
+    return settings_of(LockingRun, "benchmark_locking", *overrides).study
 
 
 def row(size, layers, value, element="hexahedron8", vertices=None):
@@ -85,7 +84,7 @@ def test_quadratic_hexahedra_are_nearer_to_the_converged_deflection_than_linear_
     """31.63 mm under gravity, of docs/results/2026-11-20-arm-mesh.md."""
     deflection = {}
     for nodes in (8, 20, 27):
-        mesh = LockingCase(f"hexahedron{nodes}", 0.01, 0.06).mesh(configuration("benchmark_locking")["mesh"])
+        mesh = LockingCase(f"hexahedron{nodes}", 0.01, 0.06).mesh(settings_of(LockingRun, "benchmark_locking").mesh)
         assert mesh.cells.shape[1] == nodes
         deflection[nodes] = measure(mesh, study(), timed=False)["gravity_mm"]
     assert deflection[8] < 0.9 * 31.63

@@ -12,13 +12,11 @@ from datetime import datetime
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_module
+from command_line import configuration, settings_of
 from main_job import end_of
-from omegaconf import OmegaConf
 
 from warp_resphys import cli
 from warp_resphys.io.errors import InputError
-from warp_resphys.launch import freed
 from warp_resphys.report.page import error_parts, number_text
 from warp_resphys.studies.rows import Reproduction
 from warp_resphys.studies.runs import Run, _Pace, execute
@@ -35,13 +33,8 @@ FAILING = 'experiments.beam_twist.overrides=["data.twist_axis=w"]'
 DEFAULT = Path("runs/beam_oscillation")
 
 
-def configured(*overrides):
-    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        return OmegaConf.to_container(compose("reproduce", list(overrides)), resolve=True)
-
-
-def plan(config):
-    return Reproduction.read(config).beams()
+def plan(*overrides):
+    return settings_of(Reproduction, "reproduce", *overrides).beams()
 
 
 def run(*arguments):
@@ -99,7 +92,7 @@ class TestPage:
             f"| Uncorrected simulation | 0.711 ± 0.002 5.1 ms a step | {times['mean']:.3f} ± {times['std']:.3f}" in text
         )
         for row in metrics(root, "marker_ablation", "default")["by_markers"]:
-            published = "below 0.1" if row["markers"] >= 4 else "not said"
+            published = "below 0.1" if row["markers"] >= 4 else "not given"
             assert f"| {row['markers']} | {published} | high | {number_text(row['median_mm'])} |" in text
         assert "| Degrees of freedom | 528 | 135 |" in text
         assert "| Testing trajectories | 5 | 2 |" in text
@@ -131,17 +124,17 @@ class TestPage:
 
 class TestPlan:
     def test_the_folders_are_those_of_the_ordinary_command(self):
-        runs = {each.name: each for each in plan(configured('overrides=["seed=1"]', "runs=elsewhere"))}
+        runs = {each.name: each for each in plan('overrides=["seed=1"]', "runs=elsewhere")}
         assert runs["beam_twist/published_physics"].folder == Path("elsewhere/beam_twist/physics=published,seed=1")
         assert runs["beam_twist/published_physics"].arguments == (
             "experiment=beam_twist",
             "physics=published",
             "seed=1",
         )
-        assert plan(configured())[0].folder == Path("runs/beam_oscillation/default")
+        assert plan()[0].folder == Path("runs/beam_oscillation/default")
 
     def test_every_configured_run_is_a_configuration(self):
-        assert [each.name for each in plan(configured())] == [
+        assert [each.name for each in plan()] == [
             *(
                 f"{beam}/{variant}"
                 for beam in ("beam_oscillation", "beam_twist")
@@ -149,13 +142,11 @@ class TestPlan:
             ),
             "marker_ablation/default",
         ]
-        runs = plan(configured("budget=quick"))
-        with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-            for each in runs:
-                assert compose("config", freed(each.arguments)).budget == "quick"
+        runs = plan("budget=quick")
+        assert all(configuration("config", *run.arguments)["budget"] == "quick" for run in runs)
 
     def test_only(self):
-        names = [each.name for each in plan(configured("only=[marker_ablation,beam_twist/default]"))]
+        names = [each.name for each in plan("only=[marker_ablation,beam_twist/default]")]
         assert names == ["beam_twist/default", "marker_ablation/default"]
 
     @pytest.mark.parametrize(
@@ -170,7 +161,7 @@ class TestPlan:
     )
     def test_bad_input(self, override, sentence):
         with pytest.raises(InputError, match=re.escape(sentence)):
-            plan(configured(override))
+            plan(override)
 
     def test_bad_input_on_the_command_line(self, folder):
         code, err = run("sopra_fibres", "hydra/job_logging=none", "hydra/hydra_logging=none")
@@ -197,9 +188,7 @@ def test_the_estimate_learns_from_the_runs_that_are_done(tmp_path):
 def test_a_run_that_ends_without_a_sentence_points_to_its_log(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "executable", "/bin/false")
     log = tmp_path / "log"
-    assert (
-        execute(Run("a", "b", (), tmp_path, 1.0), log, print) == f"it ended with exit code 1; what it said is in {log}"
-    )
+    assert execute(Run("a", "b", (), tmp_path, 1.0), log, print) == f"exit code 1; its output is in {log}"
 
 
 def test_ctrl_c_stops_the_run_and_keeps_what_it_has(folder):

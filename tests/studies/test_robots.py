@@ -6,13 +6,12 @@ import shutil
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_module
+from command_line import configuration, settings_of
 from main_job import end_of
-from omegaconf import OmegaConf
 
 from warp_resphys import cli
-from warp_resphys.launch import freed
 from warp_resphys.report.page import error_parts
+from warp_resphys.studies.rows import Reproduction
 
 SMALL = [
     *("mesh.layers=3", "mesh.nodes=20", "laboratory.mesh.layers=4", "laboratory.mesh.nodes=20"),
@@ -60,8 +59,8 @@ def test_a_robot_has_a_row_a_picture_and_what_was_tested(finished):
         assert [cell.split()[0] for cell in cells[1:5]] == means
         share = 1.0 - metrics["errors_mm"]["sysid"]["mean"] / metrics["errors_mm"]["simulation"]["mean"]
         assert cells[5].replace("\N{MINUS SIGN}", "-").startswith(f"{100.0 * share:.0f} % (")
-        assert "Tested on 2 trials, kept back: " in text
-        assert "mm elsewhere" in text
+        assert "Tested on 2 trials, held out: " in text
+        assert "A finer mesh moves the markers of the identified simulator by " in text
         assert "Tentacle: no folder tentacle" in text
     assert (finished / "docs/robots/sopra.png").is_file()
     page = (finished / "outputs/reproduce/robots/robots.html").read_text()
@@ -102,12 +101,12 @@ def test_robots_of_earlier_runs_keep_their_rows(finished, tmp_path, monkeypatch)
         (
             '{"sopra": {"mean": 1.0}}',
             [],
-            "robots.json is not what this version keeps of earlier runs (",
+            "robots.json was not written by this version (",
         ),
         (
             None,
             ["budget=quick"],
-            "has sopra with no more than its own settings, and this would replace it by one with budget=quick",
+            "has sopra with its own settings alone, and this run would replace it by one with budget=quick",
         ),
     ],
 )
@@ -137,25 +136,18 @@ def test_a_robot_that_fails_keeps_its_row_and_says_so(finished, tmp_path, monkey
     assert json.loads(Path("docs/robots.json").read_text()) == json.loads((finished / "docs/robots.json").read_text())
 
 
-def configured():
-    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        return OmegaConf.to_container(compose("reproduce"), resolve=True)["robots"]
-
-
 def test_every_robot_is_an_experiment_whose_files_are_known():
-    for robot in configured().values():
-        with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-            found = compose("config", freed([f"experiment={robot['experiment']}", *robot["overrides"]]))
-        assert found.name == robot["experiment"]
-        assert (robot["recordings"] is None) == ("files" not in robot)
-        assert all(len(digest) == 64 for digest in robot.get("files", {}).values())
+    for robot in settings_of(Reproduction, "reproduce").robots.values():
+        assert configuration("config", f"experiment={robot.experiment}", *robot.overrides)["name"] == robot.experiment
+        assert (robot.recordings is None) == (not robot.files)
+        assert all(len(digest) == 64 for digest in robot.files.values())
 
 
 @pytest.mark.parametrize(
     ("content", "said"),
     [
         (None, "is missing: fetch it again, or leave tentacle out"),
-        (b"0,1", "is another file than the one that tentacle was measured with"),
+        (b"0,1", "differs from the file that tentacle was measured with"),
     ],
 )
 def test_recordings_that_are_not_those_of_the_page_are_refused(content, said, tmp_path, monkeypatch):
@@ -164,8 +156,8 @@ def test_recordings_that_are_not_those_of_the_page_are_refused(content, said, tm
     folder.mkdir(parents=True)
     if content is not None:
         (folder / "m1_u01.csv").write_bytes(content)
-    for each in configured()["tentacle"]["files"] if content is not None else ():
-        (folder / each).write_bytes(content)
+    for file in settings_of(Reproduction, "reproduce").robots["tentacle"].files if content is not None else ():
+        (folder / file).write_bytes(content)
     code, err = run("data=shelf", "only=[tentacle]", *ARGUMENTS[2:])
     assert code == 2
     assert said in err

@@ -12,13 +12,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from configured import check, composed
+from configured import settings
 from main_job import IN_RUN, TINY, files, run
 from omegaconf import OmegaConf
 from optuna.trial import TrialState
 
 from warp_resphys import pipeline
 from warp_resphys.experiment import learn
+from warp_resphys.experiment.checks import check_run
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_checkpoint
 from warp_resphys.learning.training import Trainer
@@ -151,7 +152,7 @@ class TestSearch:
         assert [row["rollout_error_mm"] for row in table()] == ["inf", "inf"]
         assert json.loads((FOLDER / "tune.json").read_text())["best"] is None
         assert not Path("configs").exists()
-        assert "None of them came to a roll-out that stays finite" in (FOLDER / "tune.html").read_text()
+        assert "None of them has finite roll-outs" in (FOLDER / "tune.html").read_text()
 
 
 class Interrupted:
@@ -180,6 +181,7 @@ def start(hang: bool):
 import time
 from warp_resphys.learning.training import Trainer
 from warp_resphys.experiment import learn
+from warp_resphys.experiment.checks import check_run
 from warp_resphys.studies.tuning import results
 learn._CHECKPOINT_SECONDS = 0.0
 results._write_page = lambda *arguments: None
@@ -460,9 +462,9 @@ class TestBadInput:
         ],
     )
     def test_other_experiments_are_searched(self, overrides, groups):
-        config = composed(*overrides)
-        check(config)
-        _, space, _ = tune.check_tuning(config)
+        run_settings = settings(*overrides)
+        check_run(run_settings)
+        _, space, _ = tune.check_tuning(run_settings)
         assert {key.partition(".")[0] for key in space} == groups
 
     def test_settings_that_the_data_do_not_allow_end_the_search_and_the_trial_does_not_count(self, folder):

@@ -202,7 +202,7 @@ def report_ablation(context: StageContext) -> None:
     mesh, fixed = body.mesh, body.fixed_vertices
     surface = surface_vertices(mesh)
     counts = {"vertices": len(mesh.vertices), "surface": len(surface), "free": len(np.setdiff1d(surface, fixed))}
-    write_ablation_report(context.run_dir / REPORT, _metrics(context.run_dir, run), run.plain(), **counts)
+    write_ablation_report(context.run_dir / REPORT, _metrics(context.run_dir, run), run, **counts)
 
 
 def _metrics(folder: Path, run: RunSettings) -> dict[str, Any]:

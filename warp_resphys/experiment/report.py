@@ -86,7 +86,7 @@ def make_report(context: StageContext) -> None:
         truth=truth.get("material", {}),
         training=_histories(folder, False),
         refinement=_histories(folder, True),
-        network_note=_network_note(run) if learned else "",
+        network_note=network_note(run) if learned else "",
         kept_note=kept_note(metrics["networks"]),
         followed=read_followed(folder, run),
         simulator=material_note(run.simulation),
@@ -118,10 +118,10 @@ def _common_parts(run: RunSettings, metrics: Mapping[str, Any], body: Body) -> d
     """What all pages show."""
     return {
         "metrics": metrics,
-        "settings": run.plain(),
+        "settings": run,
         "mesh": body.mesh,
         "fixed": body.fixed_vertices,
-        "published_note": published_note(run.plain()),
+        "published_note": published_note(run),
     }
 
 
@@ -376,9 +376,3 @@ def read_recordings(folder: Path, run: RunSettings, mesh: Mesh, moved: Mapping[s
         feet=feet,
         mesh=mesh,
     )
-
-
-def _network_note(run: RunSettings) -> str:
-    """Which network predicts the residual force, and how it is trained."""
-    refinement = {} if run.refinement is None else run.refinement.plain()
-    return network_note(run.network.plain(), run.trainer.plain(), refinement)

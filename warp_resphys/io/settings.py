@@ -15,7 +15,6 @@ the class, which `parse` completes to the dotted key.
 
 import hashlib
 import json
-from collections.abc import Mapping
 from typing import Annotated, Any, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError
@@ -61,7 +60,7 @@ class Settings(BaseModel):
         Raises:
             InputError: a value that cannot be used.
         """
-        return parse(type(self), {**{name: getattr(self, name) for name in type(self).model_fields}, **values})
+        return parse(type(self), {**dict(self), **values})
 
     @classmethod
     def of(cls, source: "Settings", **values: Any) -> Self:
@@ -100,8 +99,3 @@ def parse(settings: type[S], values: Any, where: str = "") -> S:
     except ValidationError as error:
         schema = settings.model_json_schema()
         raise InputError(sentence(schema, values, where, error.errors(include_url=False))) from None
-
-
-def parse_part(settings: type[S], values: Mapping[str, Any], where: str = "") -> S:
-    """Makes an object of those values that its class has keys for; see `parse`."""
-    return parse(settings, {key: each for key, each in values.items() if key in settings.model_fields}, where)

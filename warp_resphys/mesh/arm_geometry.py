@@ -1,7 +1,7 @@
 """Measures of pneumatic arms: segments in a row, each with closed chambers around the axis."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass
 from math import isfinite
 from typing import Any
 
@@ -89,15 +89,6 @@ class ArmGeometry:
         """The radius of the outline at a height [m], 0 at the base and negative below it."""
         ends = np.array(self.stations[1:-1])
         return float(np.interp(-height, -ends, np.repeat(self.radii, 2)[1:-1]))
-
-
-def arm_geometry(config: Mapping[str, Any]) -> ArmGeometry:
-    """Returns the measures of an arm from a group with keys of `ArmGeometry`; missing ones have their defaults.
-
-    Raises:
-        MeshError: measures of which no arm can be made.
-    """
-    return ArmGeometry(**{field.name: config[field.name] for field in fields(ArmGeometry) if field.name in config})
 
 
 def numbers(name: str, given: Sequence[Any], positive: bool = True) -> tuple[float, ...]:

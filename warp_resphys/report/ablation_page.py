@@ -10,6 +10,7 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
+from ..settings.run import RunSettings
 from .figures import TONES, FloatArray, in_style, new_figure, use_logarithm
 from .page import (
     NO_BREAK_SPACE,
@@ -37,7 +38,7 @@ _COLUMNS: Final[Mapping[str, str]] = {
 
 
 def write_ablation_report(
-    path: Path, metrics: Mapping[str, Any], settings: Mapping[str, Any], *, vertices: int, surface: int, free: int
+    path: Path, metrics: Mapping[str, Any], settings: RunSettings, *, vertices: int, surface: int, free: int
 ) -> None:
     """Write the page, and its figure into `figures/` beside it.
 
@@ -52,11 +53,12 @@ def write_ablation_report(
     Raises:
         DataFileError: A file could not be written.
     """
-    rows, uncorrected = metrics["by_markers"], metrics["uncorrected_mm"]
+    rows, uncorrected, ablation = metrics["by_markers"], metrics["uncorrected_mm"], settings.ablation
+    assert ablation is not None
     caption = (
-        f"Mean distance of all {vertices} vertices from the target over the {settings['data']['steps']} steps of one "
+        f"Mean distance of all {vertices} vertices from the target over the {settings.data.steps} steps of one "
         "motion, of which the reconstruction sees the markers alone. The orange line is the median of "
-        f"{settings['ablation']['draws']} random sets of markers, the box extends from the lower to the upper "
+        f"{ablation.draws} random sets of markers, the box extends from the lower to the upper "
         "quartile, the whiskers to the smallest and the largest error."
     )
     note = (
@@ -69,6 +71,7 @@ def write_ablation_report(
             f" {', '.join(more)} markers are more than these, and are drawn from all {surface} surface vertices, as "
             "published."
         )
+    how = _how_reconstructed(ablation.modes, settings.reconstruction.regularisation)
     body = [Row(str(row["markers"]), [Cell(number_text(row[key])) for key in _COLUMNS]) for row in rows]
     with figures_beside(path) as folder:
         draw = partial(marker_boxes, box_errors(metrics), uncorrected)
@@ -77,25 +80,24 @@ def write_ablation_report(
         path,
         [
             Part("", [figure, PageTable("Markers", [*_COLUMNS.values()], body, note)]),
-            Part("How it was reconstructed", [Text(_how_reconstructed(settings))]),
+            Part("How it was reconstructed", [Text(how)]),
         ],
-        title=settings["title"],
-        kicker=experiment_kicker(settings["name"]),
+        title=settings.title,
+        kicker=experiment_kicker(settings.name),
         verdict=verdict(rows, uncorrected),
         metrics=metrics,
-        settings=settings,
+        settings=settings.plain(),
     )
     _LOG.info("report written: %s", path)
 
 
-def _how_reconstructed(settings: Mapping[str, Any]) -> str:
-    modes = settings["ablation"]["modes"]
+def _how_reconstructed(modes: int | None, regularisation: float) -> str:
     free = f"among the inertial forces of the {modes} slowest vibrations" if modes else "free at every vertex"
     return Markup(
         "Step by step from the known first state, with the force of least |markers&nbsp;–&nbsp;observed|<sup>2</sup> + "  # noqa: RUF001
         "λ&nbsp;|force|<sup>2</sup>, where λ is {}&nbsp;m²/N², {}. The published study takes "
         "1.0&nbsp;×&nbsp;10⁻⁴&nbsp;m²/N² for λ."  # noqa: RUF001
-    ).format(number_text(settings["reconstruction"]["regularisation"]), free)
+    ).format(number_text(regularisation), free)
 
 
 def verdict(rows: Sequence[Mapping[str, Any]], uncorrected: float) -> str:

@@ -8,6 +8,8 @@ from statistics import fmean
 from typing import Any, Final
 
 from ..learning.metrics import Gain, PublishedError, paired_gain, published_errors
+from ..settings.learning import IdentifySettings
+from ..settings.run import RunSettings
 from .page import MINUS
 
 # By model: what it is called, and what it adds to the first of these models that there is.
@@ -19,7 +21,7 @@ _STEPS: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = {
     "resphys": ("the learned force (ResPhys)", ("sysid", "simulation")),
 }
 _BASES: Final = {"simulation": "the uncorrected simulation", "sysid": "SysID"}
-_PLACES: Final = {"sysid": "parameters", "sysid_elastic": "elastic"}  # In the group `identify`.
+_GROUPS: Final = {"sysid": "parameters", "sysid_elastic": "elastic"}  # Keys of the ranges in the group `identify`.
 _LEARNED: Final = ("simfree", "resphys")  # Whose gains are published; what was identified differs.
 _CLOSE: Final = 1e-4  # Of a parameter's range.
 _REFINED: Final = "_refined"  # What a network refined through the simulator is called, after its model.
@@ -42,13 +44,13 @@ class Identified:
     has_prior: bool = False  # So that it may stay there.
 
 
-def conclusions(metrics: Mapping[str, Any], settings: Mapping[str, Any]) -> list[str]:
+def conclusions(metrics: Mapping[str, Any], settings: RunSettings) -> list[str]:
     """Return sentences on a run, from what metrics.json has of a split or of folds, and its configuration."""
     folds = list(metrics.get("folds", {}).values()) or [metrics]
     rows = held_out(metrics)
     errors = {model: [row.get(model) for row in rows] for model in (rows[0] if rows else ())}
-    said = gains(errors, epochs_kept(metrics), published_errors(settings.get("name", "")))
-    return said + intervals_text(metrics) + advice([_identified(fold, settings) for fold in folds])
+    said = gains(errors, epochs_kept(metrics), published_errors(settings.name))
+    return said + intervals_text(metrics) + advice([_identified(fold, settings.identify) for fold in folds])
 
 
 def held_out(metrics: Mapping[str, Any]) -> list[Mapping[str, float | None]]:
@@ -187,15 +189,15 @@ def _advice(identified: Identified) -> str:
     )
 
 
-def _identified(metrics: Mapping[str, Any], settings: Mapping[str, Any]) -> list[Identified]:
+def _identified(metrics: Mapping[str, Any], settings: IdentifySettings | None) -> list[Identified]:
     """The identified parameters of a fold, with their configured ranges."""
-    config = settings.get("identify") or {}
     identified = []
-    for model, place in _PLACES.items():
-        ranges = config.get(place) or {}
+    for model, group in _GROUPS.items():
+        ranges = (None if settings is None else getattr(settings, group)) or {}
         for name, value in metrics.get("parameters", {}).get(model, {}).items():
-            if own := ranges.get(name):
+            if name in ranges:
+                bounds = ranges[name]
                 start = metrics.get("first_guesses", {}).get(model, {}).get(name, math.nan)
-                key, has_prior = f"identify.{place}.{name}", own.get("prior") is not None
-                identified.append(Identified(key, value, own["lower"], own["upper"], start, has_prior))
+                key, has_prior = f"identify.{group}.{name}", bounds.prior is not None
+                identified.append(Identified(key, value, bounds.lower, bounds.upper, start, has_prior))
     return identified

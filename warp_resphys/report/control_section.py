@@ -7,6 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from ..settings.control import ControlSettings
 from .data import MODELS, RunReport
 from .page import NONE, Canvas, Cell, Items, PageTable, Part, Row, Text, mm_text, number_text, percent_text
 
@@ -22,11 +23,11 @@ def control_section(data: RunReport, canvas: Canvas) -> Part | None:
     """Return how well paths are followed; None where nothing is controlled, or no simulation plays the robot."""
     from . import control_figures
 
-    metrics, control = data.metrics.get("control") or {}, data.settings.get("control")
+    metrics, control = data.metrics.get("control") or {}, data.settings.control
     if not metrics or control is None:
         return None
     blocks: list[Any] = [Text(_task(control), "control"), _table(metrics["tracking"])]
-    slowest = max(control["seconds"])
+    slowest = max(control.seconds)
     drawn = [each for each in data.followed if each.seconds == slowest]
     if drawn:
         chosen = compared_controllers(control)
@@ -37,7 +38,7 @@ def control_section(data: RunReport, canvas: Canvas) -> Part | None:
             f"What was to be drawn in {slowest:g} s (grey), and what the simulated laboratory drew: {names}. The tip "
             "comes from where it hangs."
         )
-        plane = np.array([control["right"], control["up"]], dtype=np.float64)
+        plane = np.array([control.right, control.up], dtype=np.float64)
         blocks.append(
             canvas.figure("control", partial(control_figures.followed_paths, drawn, named, plane), alt, caption)
         )
@@ -58,11 +59,11 @@ def _words(controller: str) -> tuple[str, str]:
     return name.format(MODELS[rest][0] if rest in MODELS else rest), meaning
 
 
-def _task(control: Mapping[str, Any]) -> str:
-    shapes, tracked = control["shapes"], control["tracked"]
+def _task(control: ControlSettings) -> str:
+    shapes, tracked = control.shapes, control.tracked
     named = f"the mean of {', '.join(tracked[:-1])} and {tracked[-1]}" if len(tracked) > 1 else tracked[0]
     return (
-        f"A point, {named}, follows {len(shapes)} paths ({', '.join(shapes)}) of {1e3 * control['size']:g} mm, by "
+        f"A point, {named}, follows {len(shapes)} paths ({', '.join(shapes)}) of {1e3 * control.size:g} mm, by "
         "inputs within their bounds and rates, which are given to the simulation that plays the robot. Errors are "
         "distances of the point there from the path, at the same time, without the noise of the cameras."
     )
@@ -84,10 +85,10 @@ def _table(tracking: Mapping[str, Any]) -> PageTable:
     return PageTable("Mean error of the point [mm]", [f"Paths in {float(speed):g} s" for speed in tracking], rows)
 
 
-def compared_controllers(control: Mapping[str, Any]) -> list[str]:
-    """Return the controllers of the group ``control`` that are drawn."""
-    models = [model for model in control["models"] if model in ("sysid", control["models"][-1])]
-    return [*(f"open_{model}" for model in models), *(f"receding_{model}" for model in control["receding"][-1:])]
+def compared_controllers(control: ControlSettings) -> list[str]:
+    """Returns the names of the controllers that are drawn."""
+    models = [model for model in control.models if model in ("sysid", control.models[-1])]
+    return [*(f"open_{model}" for model in models), *(f"receding_{model}" for model in control.receding[-1:])]
 
 
 def _facts(metrics: Mapping[str, Any]) -> list[str]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..learning.metrics import PublishedError, published_errors
 from ..mesh.chambers import Chamber
 from ..mesh.mesh import Mesh
+from ..settings.run import RunSettings
 from ..stepping.quantity import Quantity
 
 FloatArray = NDArray[np.float64]
@@ -122,7 +123,7 @@ class RunReport:
     """Data of the page of a run, of a fold, or over the folds."""
 
     metrics: Mapping[str, Any]  # What `metrics.json` holds of a split, or of all folds.
-    settings: Mapping[str, Any]  # The run's configuration, nested.
+    settings: RunSettings  # The run's configuration.
     mesh: Mesh  # The undeformed body.
     fixed: IntArray  # Its vertices that are clamped.
     tip: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))  # Where all vertices are observed.
@@ -149,7 +150,7 @@ class RunReport:
     @property
     def experiment(self) -> str:
         """Its name."""
-        return str(self.settings["name"])
+        return self.settings.name
 
     @property
     def published(self) -> Mapping[str, PublishedError]:
@@ -165,12 +166,6 @@ class RunReport:
     def models(self) -> list[str]:
         """Models that have errors, in the order of the tables."""
         return [model for model in MODELS if model in self.metrics["errors_mm"]]
-
-    @property
-    def seconds(self) -> float | None:
-        """Seconds of each trial after its release that count; None for all of it."""
-        seconds: float | None = self.settings["data"].get("seconds")
-        return seconds
 
 
 def mean_distance(positions: FloatArray, target: FloatArray) -> FloatArray:

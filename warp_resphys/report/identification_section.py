@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from ..settings.learning import RangeSettings
 from .data import MODELS, FloatArray, RunReport
 from .page import MINUS, NO_BREAK_SPACE, NONE, Canvas, Cell, Drawn, PageTable, Part, Row, Text
 
@@ -47,7 +48,7 @@ def identification_section(data: RunReport, canvas: Canvas) -> Part | None:
         PageTable(MODELS[name][0], columns, parameter_rows(each, data.start, data.truth))
         for name, each in identified.items()
     ]
-    ranges = (data.settings.get("identify") or {}).get("parameters", {})
+    ranges = {} if data.settings.identify is None else data.settings.identify.parameters
     uncertain = [said for name, each in identified.items() if (said := uncertainty_text(name, each, ranges))]
     notes = []
     if uncertain:
@@ -172,7 +173,7 @@ def placement_text(name: str, placed: Mapping[str, Any]) -> str:
     return said.replace(" mm", f"{NO_BREAK_SPACE}mm")
 
 
-def uncertainty_text(name: str, identified: Mapping[str, Any], ranges: Mapping[str, Any]) -> str:
+def uncertainty_text(name: str, identified: Mapping[str, Any], ranges: Mapping[str, RangeSettings]) -> str:
     """Say which parameters the data of a model's identification cannot tell, or tell apart; empty if that is not known.
 
     Args:
@@ -200,9 +201,9 @@ def uncertainty_text(name: str, identified: Mapping[str, Any], ranges: Mapping[s
     ]
     said += f"; they cannot tell apart {', '.join(tied)}, by their correlation." if tied else "."
     for parameter, deviation in uncertainty["deviation"].items():
-        prior = (ranges.get(parameter) or {}).get("prior")
-        if prior is not None and deviation > _NOTHING_NEW * prior["deviation"]:
+        prior = ranges[parameter].prior if parameter in ranges else None
+        if prior is not None and deviation > _NOTHING_NEW * prior.deviation:
             _, unit, factor = _wording(parameter)
-            where = f"{_digits(prior['mean'], factor)} ± {_digits(prior['deviation'], factor)} {unit}".rstrip()
+            where = f"{_digits(prior.mean, factor)} ± {_digits(prior.deviation, factor)} {unit}".rstrip()
             said += f" They tell next to nothing of {words[parameter]}: it stays where its prior has it, at {where}."
     return said.replace(" %", f"{NO_BREAK_SPACE}%")

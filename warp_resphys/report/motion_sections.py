@@ -10,8 +10,6 @@ from typing import Any, Final
 import numpy as np
 from markupsafe import Markup
 
-from ..io.settings import parse
-from ..settings.body import MaterialSettings
 from .bodies import ComparedMotion, distance_scene, largest_distances
 from .camera import hangs
 from .data import (
@@ -232,7 +230,7 @@ def body_section(data: RunReport, canvas: Canvas) -> Part | None:
     def body(path: Path) -> Drawn:
         from .body_picture import MeshSummary, draw_mesh
 
-        constants = parse(MaterialSettings, data.settings["simulation"]).parameters
+        constants = data.settings.simulation.parameters
         density = fmean(value for name, value in constants.items() if name.endswith("density"))
         coloured = f"{quantity.per}s".capitalize()
         summary = MeshSummary(data.mesh, density, data.fixed, data.chambers, data.tendons, coloured)

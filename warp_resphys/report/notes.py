@@ -5,6 +5,7 @@ from typing import Any, Final
 
 from ..energies.materials import make_material
 from ..settings.body import MaterialSettings
+from ..settings.run import RunSettings
 from .page import number_text
 
 _SELECTED_BY: Final = {"rollout": "roll-out error", "validation_loss": "validation loss"}
@@ -39,11 +40,11 @@ _OF_AN_ARM: Final = {
 }
 
 
-def published_note(config: Mapping[str, Any]) -> str:
-    """Return how the published errors of an experiment came about."""
-    if config.get("markers") is None:
-        return _AGAINST + _MASS[config["physics"]["mass"]]
-    return _OF_AN_ARM[config["data"]["folder"] is None] if config.get("chambers") else _OF_A_BEAM
+def published_note(settings: RunSettings) -> str:
+    """Returns how the published errors of an experiment differ from ours."""
+    if settings.markers is None:
+        return _AGAINST + _MASS[settings.physics.mass]
+    return _OF_AN_ARM[settings.is_laboratory] if settings.chambers is not None else _OF_A_BEAM
 
 
 def error_notes(sideways: Mapping[str, float], truth: Mapping[str, Any], mesh_check: Mapping[str, Any]) -> list[str]:
@@ -78,23 +79,26 @@ def error_notes(sideways: Mapping[str, float], truth: Mapping[str, Any], mesh_ch
     ]
 
 
-def network_note(network: Mapping[str, Any], trainer: Mapping[str, Any], refinement: Mapping[str, Any]) -> str:
-    """Return which network predicts the residual force, and how it is trained; says where it is the published one."""
-    who = "the published network" if network.items() >= _PUBLISHED_NETWORK.items() else "our network"
+def network_note(settings: RunSettings) -> str:
+    """Returns the network of the residual force and its training, and whether these are the published ones."""
+    network, trainer = settings.network, settings.trainer
+    who = "the published network" if dict(network).items() >= _PUBLISHED_NETWORK.items() else "our network"
     basis = "force, positions and velocities of every vertex"
-    if network["kind"] == "reduced":
-        sizes = (network[f"{name}_modes"] for name in ("position", "velocity", "force"))
-        basis = "a reduced basis of {} position, {} velocity and {} force modes".format(*sizes)
-    blocks = "1 block" if network["blocks"] == 1 else f"{network['blocks']} blocks"
-    how = "as published" if trainer.items() >= _PUBLISHED_TRAINER.items() else "our way"
-    linear = "" if trainer["linear_noise"] is None else ", beside a linear part from ridge regression"
-    said = (
-        f"ResPhys: {who}, in {basis}, {blocks} of {network['layers']} hidden layers of {network['width']}{linear}; "
-        f"trained {how}, {trainer['epochs']} epochs, weights chosen by {_SELECTED_BY[trainer['selection']]}."
+    if network.kind == "reduced":
+        basis = (
+            f"a reduced basis of {network.position_modes} position, {network.velocity_modes} velocity and "
+            f"{network.force_modes} force modes"
+        )
+    blocks = f"{network.blocks} block{'s' if network.blocks > 1 else ''}"
+    how = "as published" if dict(trainer).items() >= _PUBLISHED_TRAINER.items() else "our way"
+    linear = "" if trainer.linear_noise is None else ", with a linear part from ridge regression"
+    text = (
+        f"ResPhys: {who}, in {basis}, {blocks} of {network.layers} hidden layers of {network.width}{linear}; trained "
+        f"{how}, {trainer.epochs} epochs, weights chosen by {_SELECTED_BY[trainer.selection]}."
     )
-    if refinement.get("kind", "none") != "none":
-        said += f" Then refined through the simulator, over windows of {refinement['window']} steps."
-    return said
+    if settings.refinement is not None:
+        text += f" Then refined through the simulator, over windows of {settings.refinement.window} steps."
+    return text
 
 
 def kept_note(networks: Mapping[str, Any]) -> str:

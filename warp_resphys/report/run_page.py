@@ -89,12 +89,12 @@ def write_report(path: Path, data: RunReport) -> None:
     write_page(
         path,
         [part for section in SECTIONS if (part := made[section]) is not None],
-        title=data.settings["title"],
+        title=data.settings.title,
         kicker=experiment_kicker(data.experiment),
         verdict=verdict(data),
         conclusions=conclusions(data.metrics, data.settings),
         metrics=data.metrics,
-        settings=data.settings,
+        settings=data.settings.plain(),
         timed=PageTable("Model", ["Wall time"], timed) if timed else None,
     )
     _LOG.info("report written: %s", path)
@@ -103,8 +103,9 @@ def write_report(path: Path, data: RunReport) -> None:
 def results_section(data: RunReport, canvas: Canvas) -> Part:
     """The errors of the models beside the published ones."""
     blocks: list[Any] = []
-    if data.sees_markers and data.settings["data"].get("folder") is None:
-        fibres = ", fibres around the chambers" if (data.settings.get("laboratory") or {}).get("fibres") else ""
+    if data.settings.is_laboratory:
+        laboratory = data.settings.laboratory
+        fibres = ", fibres around the chambers" if laboratory is not None and laboratory.fibres is not None else ""
         blocks.append(Text(Markup(_WITHOUT_RECORDINGS).format(fibres), "synthetic"))
     blocks += [_errors_table(data), Text(_what_is_measured(data), "what", note=True)]
     if data.network_note:
@@ -157,8 +158,8 @@ def published_beside(published: Mapping[str, Any], models: Sequence[str]) -> dic
 def _what_is_measured(data: RunReport) -> str:
     """Definition of the errors, with notes on what they contain."""
     trials, span = data.trials, ""
-    if data.seconds is not None:
-        span = f", the frames of the first {data.seconds:g} s after the release,"
+    if data.settings.trial_seconds is not None:
+        span = f", the frames of the first {data.settings.trial_seconds:g} s after the release,"
     if trials is None:
         said = (
             "Distance of the simulated markers from the measured ones, in millimetres: mean over the folds, in each of "

@@ -55,8 +55,7 @@ def model_table(
 def horizons_section(data: RunReport, canvas: Canvas) -> Part | None:
     """Return the errors by length of the roll-out."""
     table = horizon_table(data.metrics, PUBLISHED_WINDOWS_MM.get(data.experiment, {}))
-    longer = data.settings["data"].get("train_fraction", 1.0) < 1.0
-    title = "Longer than the training" if longer else "By length of the roll-out"
+    title = "Longer than the training" if data.settings.train_fraction < 1.0 else "By length of the roll-out"
     return None if table is None else Part(title, [table])
 
 

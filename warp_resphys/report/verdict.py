@@ -6,6 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from ..learning.metrics import PUBLISHED_WINDOWS_MM, PublishedError
+from ..settings.run import RunSettings
 from .conclusions import epochs_kept, untrained
 from .data import MODELS, RunReport
 from .page import NO_BREAK_SPACE, mm_text, published_parts
@@ -21,18 +22,18 @@ def verdict(data: RunReport) -> str:
     else:
         trials = tuple(data.pages) if data.trials is None else data.trials.names
         parted = learned_in_part(data.settings, trials)
-        said = [marker_verdict(errors, trials, data.seconds, folds=data.trials is None, parted=parted)]
-    if data.settings["data"].get("train_fraction", 1.0) < 1.0:
+        said = [marker_verdict(errors, trials, data.settings.trial_seconds, folds=data.trials is None, parted=parted)]
+    if data.settings.train_fraction < 1.0:
         published = PUBLISHED_WINDOWS_MM.get(data.experiment, {})
         said.append(growth_text(metrics.get("growth", {}), list(metrics.get("horizons", {})), published))
     said.append(scale_text(metrics.get("scales", {})))
     return unbroken(" ".join(each for each in said if each))
 
 
-def learned_in_part(settings: Mapping[str, Any], tested: Collection[str]) -> bool:
-    """Whether the trials that are tested were learned from, but for the rest of each that is the test."""
-    named = settings["data"].get("train")
-    return settings["data"].get("train_fraction", 1.0) < 1.0 and isinstance(named, list) and {*tested} <= {*named}
+def learned_in_part(settings: RunSettings, tested: Collection[str]) -> bool:
+    """Whether the first part of each test trial was used for training, and the test is the rest of it."""
+    train = None if settings.recorded is None else settings.recorded.train
+    return settings.train_fraction < 1.0 and isinstance(train, tuple) and {*tested} <= {*train}
 
 
 def unbroken(said: str) -> str:

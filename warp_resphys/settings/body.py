@@ -391,3 +391,11 @@ class SimulatorSettings(BodySettings):
     coupling: Literal["implicit", "explicit"] = setting(
         "implicit", "pressure acts on the chambers as they move, or as they are at the start of a step"
     )
+
+
+class SimulationSettings(SimulatorSettings):
+    """A simulator and the material of its body; the other keys of a run's configuration are ignored."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    simulation: MaterialSettings

@@ -23,7 +23,7 @@ Divisions = Annotated[tuple[Natural, Natural, Natural], Strict(False)]  # of a b
 
 
 class BeamStudy(Settings):
-    """Keys of every study of beams."""
+    """Settings that all studies of beams share."""
 
     size: Vector = setting(unit="m")
     youngs_modulus: Positive = setting(unit="Pa")
@@ -32,12 +32,12 @@ class BeamStudy(Settings):
 
 
 def beam_mesh(element: Element, size: Sequence[float], divisions: Sequence[int]) -> Mesh:
-    """A box of so many bricks along its axes; those of tetrahedra are split into six."""
+    """A box of bricks, by their number along its axes; for tetrahedra, each brick is split into six."""
     if element.startswith("tetrahedron"):
         return box_tetrahedra(size, divisions, order=2 if element == "tetrahedron10" else 1)
     return box_hexahedra(size, divisions, nodes=int(element.removeprefix("hexahedron")))
 
 
 def clamped(mesh: Mesh, **options: Any) -> Body:
-    """The body whose vertices at the smallest x are fixed."""
+    """A body with its vertices at the smallest x fixed."""
     return Body(mesh, fixed=select_vertices(mesh, x=float(mesh.vertices[:, 0].min())), **options)

@@ -19,21 +19,20 @@ from pydantic import Field
 from ..dynamics.assembly import HessianAssembly
 from ..dynamics.nonlinear_solver import SolverName
 from ..dynamics.simulator import Simulator
-from ..experiment.build import build_body, build_simulator, choose_device
+from ..experiment.build import build_body, build_simulator, choose_device, finer
 from ..io.errors import InputError
 from ..io.files import write_json
 from ..io.machine import hardware
 from ..io.progress import Progress
-from ..io.settings import Many, Natural, NotNegative, Positive, Settings, Some, Word, parse, parse_part, setting
+from ..io.settings import Many, Natural, NotNegative, Positive, Settings, Some, Word, parse, setting
 from ..io.stages import package_versions
 from ..linalg.threads import threads_for
-from ..settings.body import BodySettings, MaterialSettings, SimulatorSettings
+from ..settings.body import HexahedralBox, MeshSettings, SimulationSettings, TetrahedralBox
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
-from .command import show
 from .run_speed import command_sheet, environment_sheet, time_commands, time_environments
 from .runs import Results, made
-from .tables import Sheet
+from .tables import Sheet, show
 from .timing import TimedRollout, median_seconds, now, run_in_new_process, yardstick_seconds
 
 PAGE = "benchmark.html"
@@ -42,21 +41,21 @@ ByRefinement = Annotated[dict[Natural, Natural], Field(min_length=1)]
 
 
 class ElasticConstants(Settings):
-    """Elastic constants that a case takes in the place of the configured ones."""
+    """Elastic constants of a case, in place of the configured ones."""
 
     poissons_ratio: float
     youngs_modulus: Positive = setting(unit="Pa")
 
 
 class Batches(Settings):
-    """Numbers of environments, by kind of device."""
+    """Batch sizes by kind of device."""
 
     cpu: Some[Natural]
     cuda: Some[Natural]
 
 
 class SolverLimits(Settings):
-    """What a solver is timed for, in the place of the values for all of them."""
+    """Refinements, batch sizes and steps of one solver, in place of those of all solvers."""
 
     refinements: Some[Natural] | None = None
     batches: Some[Natural] | None = None
@@ -71,7 +70,7 @@ class TimedRun(Settings):
 
 
 class BenchmarkSettings(Settings):
-    """The group ``benchmark``; ``conf/benchmark.yaml`` has what the keys mean, and their values."""
+    """The group ``benchmark``; ``conf/benchmark.yaml`` explains its keys."""
 
     quick: bool
     solvers: Some[SolverName]
@@ -96,7 +95,7 @@ class BenchmarkSettings(Settings):
     results: Word | None
 
     def batches_of(self, solver: str, refinement: int, device: str) -> list[int]:
-        """Numbers of environments that a solver is timed with."""
+        """Batch sizes with which a solver is timed."""
         limits: SolverLimits = getattr(self, solver)
         if refinement not in (limits.refinements or [refinement]):
             return []
@@ -104,9 +103,15 @@ class BenchmarkSettings(Settings):
         return [batch for batch in batches if batch <= _at(self.largest_batch, refinement)]
 
     def steps_of(self, solver: str, refinement: int) -> int:
-        """Steps of a roll-out of a solver."""
+        """Number of steps of a roll-out with a solver."""
         limits: SolverLimits = getattr(self, solver)
         return limits.steps or _at(self.steps, refinement)
+
+
+class BenchmarkRun(SimulationSettings):
+    """The configuration ``benchmark``: the simulator that is timed, and how."""
+
+    benchmark: BenchmarkSettings
 
 
 # The coarsest mesh and a single environment, twice.
@@ -124,14 +129,14 @@ class BenchmarkCase:
     timed: TimedRollout
 
     def measure(self) -> None:
-        """Times a roll-out, and its gradient by the start, the force at every step and Young's modulus."""
+        """Times a roll-out, and its gradient with respect to start, force at every step and Young's modulus."""
         timed, modulus = self.timed, self.timed.simulator.tensor(self.material.youngs_modulus).reshape(1)
         forces = timed.start.q.new_zeros(timed.steps, *timed.start.q.shape).requires_grad_(True)
         timed.inputs = timed.inputs.replace(external_force=forces)
         timed.measure({"youngs_modulus": modulus.requires_grad_(True)})
 
     def row(self) -> dict[str, Any]:
-        """The case for the file; times are of one step of the whole batch."""
+        """The case as a row of benchmark.json; times are those of one step of the whole batch."""
         (forward, backward), (least_forward, least_backward) = self.timed.a_step(median), self.timed.a_step(min)
         return {
             "solver": self.solver,
@@ -150,9 +155,9 @@ class BenchmarkCase:
         }
 
 
-def benchmark(config: Mapping[str, Any], folder: Path) -> None:
+def benchmark(settings: BenchmarkRun, folder: Path) -> None:
     """Writes benchmark.json and a page into the run folder, and prints the tables of `run_benchmark`."""
-    result = run_benchmark(config)
+    result = run_benchmark(settings)
     write_json(folder / "benchmark.json", result)
     sheets = benchmark_sheets(result)
     show(*sheets, f"Written: {folder / 'benchmark.json'}")
@@ -160,10 +165,10 @@ def benchmark(config: Mapping[str, Any], folder: Path) -> None:
     verdict = f"{machine(result)}: medians over repeats; a yardstick, the same task in NumPy, takes its turn with them."
     made_by = made("benchmark", ("benchmark.environments.run", "benchmark.control.run"))
     results = Results("Benchmark", date, verdict, [*(sheet.for_page() for sheet in sheets), made_by])
-    results.write(folder / PAGE, config["benchmark"]["results"], f"{date}-benchmark-{device}")
+    results.write(folder / PAGE, settings.benchmark.results, f"{date}-benchmark-{device}")
 
 
-def run_benchmark(config: Mapping[str, Any]) -> dict[str, Any]:
+def run_benchmark(settings: BenchmarkRun) -> dict[str, Any]:
     """Measures everything that the group ``benchmark`` of a configuration asks for.
 
     Returns:
@@ -174,59 +179,51 @@ def run_benchmark(config: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         InputError: a configuration that cannot be simulated or refined.
     """
-    settings = parse(BenchmarkSettings, config["benchmark"], "benchmark")
-    settings = settings.changed(**_QUICK) if settings.quick else settings
-    config = {**config, **parse_part(SimulatorSettings, config).plain()}  # with the defaults of all keys
-    config["device"] = str(choose_device(config["device"]))  # the device that auto stands for
-    environments, control = _time_runs(settings, config["device"])  # first, since their folders may hold no run
+    timed = settings.benchmark.changed(**_QUICK) if settings.benchmark.quick else settings.benchmark
+    settings = settings.changed(device=str(choose_device(settings.device)), benchmark=timed)
+    # Runs come first: a folder without a run is an error that should not follow minutes of measurements.
+    trained, driven, repeats = timed.environments, timed.control.run, timed.repeats
+    environments = time_environments(Path(trained.run), trained.robots, repeats, settings.device) if trained.run else []
+    control = time_commands(Path(driven), repeats) if driven else []
     yardstick: list[float] = []
     steps: list[dict[str, Any]] = []
     parts: list[dict[str, Any]] = []
-    for refinement in settings.refinements:
-        cases = _cases(config, settings, refinement)
-        _take_turns(cases, settings, yardstick)
+    for refinement in timed.refinements:
+        cases = _cases(settings, refinement)
+        _take_turns(cases, timed, yardstick)
         steps += [case.row() for case in cases]
-        timed = {case.batch: case for case in reversed(cases)}
-        parts += [_time_parts(timed[batch], settings.parts_repeats) for batch in sorted(timed)]
+        by_batch = {case.batch: case for case in reversed(cases)}
+        parts += [_time_parts(by_batch[batch], timed.parts_repeats) for batch in sorted(by_batch)]
     return {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "hardware": {**hardware(), "torch threads": torch.get_num_threads()},
         "versions": package_versions(),
-        "settings": {**settings.plain(), "device": config["device"], "dtype": config["dtype"]},
+        "settings": {**timed.plain(), "device": settings.device, "dtype": settings.dtype},
         "yardstick_ms": 1e3 * median(yardstick),
         "steps": steps,
         "parts": parts,
-        "cold_start": cold_start(config) if settings.cold_start else None,
+        "cold_start": cold_start(settings) if timed.cold_start else None,
         "environments": environments,
         "control": control,
     }
 
 
-def _time_runs(settings: BenchmarkSettings, device: str) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Rows for the environments and for the controllers of runs, where they are named."""
-    trained, driven, repeats = settings.environments, settings.control.run, settings.repeats
-    environments = time_environments(Path(trained.run), trained.robots, repeats, device) if trained.run else []
-    return environments, time_commands(Path(driven), repeats) if driven else []
-
-
-def _cases(config: Mapping[str, Any], settings: BenchmarkSettings, refinement: int) -> list[BenchmarkCase]:
-    """Every combination of solver, material and batch, at its start and warmed up."""
-    body = build_body(parse_part(BodySettings, {**config, "mesh": _refined(config, refinement)}))
-    tolerances = {"relative_tolerance": settings.relative_tolerance, "max_iterations": settings.max_iterations}
+def _cases(settings: BenchmarkRun, refinement: int) -> list[BenchmarkCase]:
+    """Every combination of solver, material and batch size at a refinement, each warmed up."""
+    timed, body = settings.benchmark, build_body(settings.changed(mesh=_refined(settings, refinement)))
+    tolerances = {"relative_tolerance": timed.relative_tolerance, "max_iterations": timed.max_iterations}
     cases = []
-    for solver in settings.solvers:
-        steps = settings.steps_of(solver, refinement)
-        batches = settings.batches_of(solver, refinement, config["device"])
-        for material in settings.materials:
-            changed = {**config, "solver": {**config["solver"], "name": solver, **tolerances}}
-            made_of = parse_part(SimulatorSettings, changed)
-            constants = parse(MaterialSettings, {**config["simulation"], **material.plain()}, "simulation")
-            for batch in batches:
-                simulator = build_simulator(made_of, constants, body)
-                start, inputs = _start(simulator, settings, batch, steps)
-                simulator.rollout(start, 2, Inputs(**{name: value[:2] for name, value in inputs.fields.items()}))
-                timed = TimedRollout(simulator, start, steps, inputs)
-                cases.append(BenchmarkCase(solver, material, refinement, batch, timed))
+    for name in timed.solvers:
+        steps = timed.steps_of(name, refinement)
+        solved = settings.changed(solver=settings.solver.changed(name=name, **tolerances))
+        for material in timed.materials:
+            constants = settings.simulation.changed(**material.plain())
+            for batch in timed.batches_of(name, refinement, settings.device):
+                simulator = build_simulator(solved, constants, body)
+                start, inputs = _start(simulator, timed, batch, steps)
+                simulator.rollout(start, 2, Inputs(**{key: value[:2] for key, value in inputs.fields.items()}))
+                rollout = TimedRollout(simulator, start, steps, inputs)
+                cases.append(BenchmarkCase(name, material, refinement, batch, rollout))
     if not cases:
         raise InputError(
             f"benchmark.batches and benchmark.largest_batch leave none of refinement {refinement}: name a smaller one."
@@ -234,23 +231,22 @@ def _cases(config: Mapping[str, Any], settings: BenchmarkSettings, refinement: i
     return cases
 
 
-def _refined(config: Mapping[str, Any], refinement: int) -> dict[str, Any]:
-    """The group ``mesh`` of a refined box, or of a body with chambers, which has one refinement."""
-    mesh = dict(config["mesh"])
-    if "divisions" in mesh:
-        mesh["divisions"] = [refinement * int(d) for d in mesh["divisions"]]
-    elif config.get("chambers") is None:
+def _refined(settings: BenchmarkRun, refinement: int) -> MeshSettings:
+    """The mesh of a refined box, or of a body with chambers, which has refinement 1 alone."""
+    if isinstance(settings.mesh, HexahedralBox | TetrahedralBox):
+        return finer(settings.mesh, refinement)
+    if settings.chambers is None:
         raise InputError(
             "the benchmark refines a box, or drives a body with chambers: choose mesh=beam_hexahedra or "
             "mesh=beam_tetrahedra, or experiment=sopra."
         )
-    elif refinement != 1:
+    if refinement != 1:
         raise InputError("a body with chambers is taken as it is: set benchmark.refinements=[1].")
-    return mesh
+    return settings.mesh
 
 
 def _start(simulator: Simulator, settings: BenchmarkSettings, batch: int, steps: int) -> tuple[State, Inputs]:
-    """The state that a roll-out starts from: let go from a weight, or at rest before pressures come; and these."""
+    """Start and inputs of a roll-out: released from a weight or, with chambers, at rest before pressures rise."""
     chambers = simulator.counts.get("pressure", 0)
     if not chambers:
         return released(simulator, settings.tip_mass, batch), Inputs()
@@ -261,12 +257,12 @@ def _start(simulator: Simulator, settings: BenchmarkSettings, batch: int, steps:
 
 
 def _at(values: Mapping[int, int], refinement: int) -> int:
-    """The value for a refinement, or for the largest one that is named."""
+    """The value of a refinement; of one that is not listed, that of the largest."""
     return values.get(refinement, values[max(values)])
 
 
 def released(simulator: Simulator, mass: float, batch: int) -> State:
-    """Rest under a mass [kg] at the largest x, lighter in each further environment of a batch."""
+    """Equilibrium under a mass [kg] on the face of the largest x, lighter in each further environment of a batch."""
     x = simulator.rest_positions[:, 0]
     tip = x >= x.max() - 1e-9 * (x.max() - x.min())
     share = tip.to(simulator.dtype) / tip.sum()  # (N,)
@@ -286,7 +282,7 @@ def _take_turns(cases: list[BenchmarkCase], settings: BenchmarkSettings, yardsti
 
 
 def _time_parts(case: BenchmarkCase, repeats: int) -> dict[str, Any]:
-    """Milliseconds of each part of an iteration, for the whole batch, at the end of the case's last roll-out."""
+    """Milliseconds of the parts of a solver iteration, for the whole batch, in the last state of a case."""
     sim = case.timed.simulator
     workspace = sim.workspace(case.batch)
     potential, pattern = workspace.gather(), workspace.pattern
@@ -309,25 +305,25 @@ def _time_parts(case: BenchmarkCase, repeats: int) -> dict[str, Any]:
     return {"refinement": case.refinement, "batch": case.batch, "linear_solver": type(linear).__name__, **times}
 
 
-def cold_start(config: Mapping[str, Any]) -> dict[str, dict[str, float]]:
-    """Seconds that a new process takes to import, to get its kernels and to step, without a kernel cache and with it.
+def cold_start(settings: SimulationSettings) -> dict[str, dict[str, float]]:
+    """Seconds in which a new process imports, loads its kernels and steps, without (cold) and with a kernel cache.
 
     Raises:
         RuntimeError: the process failed.
     """
-    result = {}
+    result, values = {}, SimulationSettings.of(settings).plain()
     with tempfile.TemporaryDirectory() as cache:
         for name in ("cold", "warm"):
-            imported, times = run_in_new_process(first_step, config, environment={"WARP_CACHE_PATH": cache})
+            imported, times = run_in_new_process(first_step, values, environment={"WARP_CACHE_PATH": cache})
             result[name] = {"import_s": imported, **times}
     return result
 
 
-def first_step(config: Mapping[str, Any]) -> dict[str, float]:
-    """Seconds that a process takes for its first step of a configuration."""
+def first_step(values: dict[str, Any]) -> dict[str, float]:
+    """Seconds of the first step of this process, with `SimulationSettings` as plain data."""
     began = time.perf_counter()
-    material = parse(MaterialSettings, config["simulation"], "simulation")
-    simulator = build_simulator(parse_part(SimulatorSettings, config), material)
+    settings = parse(SimulationSettings, values)
+    simulator = build_simulator(settings, settings.simulation)
     state = simulator.rest_state()
     built = time.perf_counter()
     potential = simulator.workspace(1).potential

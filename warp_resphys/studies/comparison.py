@@ -1,4 +1,4 @@
-"""The page of published beams: published numbers beside ours, from the runs."""
+"""Sections of the page on published beams: published results and those of the runs."""
 
 import shlex
 from collections.abc import Mapping, Sequence
@@ -7,8 +7,6 @@ from typing import Any
 
 from ..experiment.build import build_mesh
 from ..experiment.report import read_trials
-from ..experiment.trials import VARIATIONS
-from ..io.settings import parse
 from ..learning import metrics as paper
 from ..mesh.mesh import select_vertices, surface_vertices
 from ..report import ablation_page, figures, motion_figures
@@ -30,6 +28,7 @@ from ..report.page import (
     published_parts,
 )
 from ..settings.run import RunSettings
+from ..settings.trials import RecordedData
 from .rows import Reproduction
 from .runs import Run
 
@@ -44,25 +43,23 @@ _TIMED = {
     "simulation": "Uncorrected simulation",
     "target": "Simulation with other parameters",
     "resphys": "Residual physics simulation",
-    "inference": "of it, the network alone",
+    "inference": "of which the network",
 }
-
-
 Runs = Mapping[str, Run]  # by variant
 
 
 def compare(reproduction: Reproduction, results: Sequence[Run], canvas: Canvas) -> tuple[str, list[Part]]:
-    """The page's verdict and its sections.
+    """Verdict and sections of the page.
 
     Args:
-        reproduction: of conf/reproduce.yaml.
-        results: runs that have ended, in order.
-        canvas: where the figures are drawn.
+        reproduction: the configuration.
+        results: finished runs, in order.
+        canvas: for the figures.
     """
     done: dict[str, dict[str, Run]] = {}
-    for each in results:
-        if each.failure is None:
-            done.setdefault(each.experiment, {})[each.variant] = each
+    for run in results:
+        if run.failure is None:
+            done.setdefault(run.experiment, {})[run.variant] = run
     studies = {name: runs for name, runs in done.items() if "errors_mm" in next(iter(runs.values())).metrics}
     set_up = {name: runs for name, runs in studies.items() if name in paper.PUBLISHED_SETUP}
     parts = [setup_section(reproduction, set_up)] if set_up else []
@@ -78,19 +75,19 @@ def compare(reproduction: Reproduction, results: Sequence[Run], canvas: Canvas) 
 
 
 def verdict(reproduction: Reproduction, done: Mapping[str, Runs]) -> str:
-    """The first run of each experiment in a sentence."""
-    said = []
+    """Sentences on the first run of each experiment."""
+    sentences = []
     for name, runs in done.items():
-        run, known = next(iter(runs.values())), reproduction.experiments[name]
+        run, beam = next(iter(runs.values())), reproduction.experiments[name]
         metrics = run.metrics
-        title = known.title if run.variant == known.variants[0] else f"{known.title} ({_label(reproduction, run)})"
+        title = beam.title if run.variant == beam.variants[0] else f"{beam.title} ({_label(reproduction, run)})"
         if "by_markers" in metrics:
-            said.append(f"{title}: {ablation_page.verdict(metrics['by_markers'], metrics['uncorrected_mm'])}")
+            sentences.append(f"{title}: {ablation_page.verdict(metrics['by_markers'], metrics['uncorrected_mm'])}")
             continue
         ours, published = number_text(metrics["errors_mm"]["resphys"]["mean"]), paper.PUBLISHED_MM.get(name, {})
         beside = f", published {published_parts(published['resphys'])[0]} mm" if "resphys" in published else ""
-        said.append(f"{title}: with the learned force, the mean error is {ours} mm{beside}.")
-    return " ".join(said).replace(" mm", f"{NO_BREAK_SPACE}mm") or "No run has succeeded."
+        sentences.append(f"{title}: with the learned force, the mean error is {ours} mm{beside}.")
+    return " ".join(sentences).replace(" mm", f"{NO_BREAK_SPACE}mm") or "No run has succeeded."
 
 
 def _label(reproduction: Reproduction, run: Run) -> str:
@@ -102,41 +99,44 @@ def _columns(reproduction: Reproduction, runs: Runs) -> list[str]:
 
 
 def _reasons(deviations: Sequence[str]) -> list[Text | Items]:
-    return [Text("Why they differ", heading=True), Items(deviations)] if deviations else []
+    return [Text("Reasons for deviations", heading=True), Items(deviations)] if deviations else []
 
 
 def setup_section(reproduction: Reproduction, studies: Mapping[str, Runs]) -> Part:
-    """The published tables of parameters, each experiment beside its published set-up."""
+    """Table of the parameters of each experiment, published and here."""
     columns: list[str] = []
     values: list[Mapping[str, float]] = []
     for name, runs in studies.items():
         columns += [f"{reproduction.experiments[name].title}, published", "here"]
         values += [paper.PUBLISHED_SETUP[name], _setup(next(iter(runs.values())).settings)]
     rows = [
-        Row(key[:1].upper() + key[1:], [Cell(_value(key, each[key])) if key in each else _NONE for each in values])
+        Row(key[:1].upper() + key[1:], [Cell(_value(key, row[key])) if key in row else _NONE for row in values])
         for key in values[1]
     ]
     note = "The incorrect beam is the simulator to correct, the correct one is its target."
     return Part("Set-up", [PageTable("", columns, rows, note)])
 
 
-def _setup(settings: Mapping[str, Any]) -> dict[str, float]:
-    """What the published tables of parameters list, of one run."""
-    data = settings["data"]
-    values = data[VARIATIONS[data["kind"]].key]
-    limits = data["limit"] or {}
+def _setup(settings: RunSettings) -> dict[str, float]:
+    """Parameters of a run that the published tables list."""
+    data = settings.data
+    assert not isinstance(data, RecordedData)
+    assert settings.target is not None
+    constants = {"incorrect": settings.simulation.constants, "correct": settings.target.constants}
+    limits = {} if data.limit is None else dict(data.limit)
+    counts = {name: len(getattr(data.amounts, name)) for name in _SPLITS}
     return {
-        "degrees of freedom": 3 * len(build_mesh(parse(RunSettings, settings).mesh).vertices),
+        "degrees of freedom": 3 * len(build_mesh(settings.mesh).vertices),
         **{
-            f"{key}, {which} beam": settings[source][constant]
+            f"{key}, {which} beam": values[constant]
             for key, constant in (("Poisson's ratio", "poissons_ratio"), ("Young's modulus", "youngs_modulus"))
-            for which, source in (("incorrect", "simulation"), ("correct", "target"))
+            for which, values in constants.items()
         },
-        "step size": settings["time_step"],
-        "time steps": data["steps"],
+        "step size": settings.time_step,
+        "time steps": data.steps,
         **{
-            f"{_SPLITS[name]} trajectories": min(len(values[name]), limits.get(name, len(values[name])))
-            for name in _SPLITS
+            f"{words} trajectories": min(counts[name], limits.get(name, counts[name]))
+            for name, words in _SPLITS.items()
         },
     }
 
@@ -148,7 +148,7 @@ def _value(key: str, value: float) -> str:
 
 
 def study_section(reproduction: Reproduction, name: str, runs: Runs, canvas: Canvas) -> Part:
-    """Roll-out errors of one experiment, and how they and the tip go over time."""
+    """Roll-out errors of an experiment, as a table and over time, and the motion of the tip."""
     group = reproduction.experiments[name]
     published = paper.PUBLISHED_MM.get(name, {})
     measured = [run.metrics["errors_mm"] for run in runs.values()]
@@ -165,8 +165,8 @@ def study_section(reproduction: Reproduction, name: str, runs: Runs, canvas: Can
         if model in published or any(model in errors for errors in measured)
     ]
     note = (
-        "Mean distance of the vertices over all test trajectories and steps, ± its standard deviation. A roll-out that "
-        "diverged leaves no mean. Reconstruction: the simulator with forces fitted to the test trajectory itself."
+        "Mean distance of the vertices over all test trajectories and steps, ± its standard deviation. There is no "
+        "mean if a roll-out diverged. Reconstruction: the simulator with forces fitted to the test trajectory itself."
     )
     table = PageTable("Roll-out error [mm]", _columns(reproduction, runs), rows, note)
     drawn = {role: runs[variant] for role, variant in group.drawn.items() if variant in runs}
@@ -176,41 +176,40 @@ def study_section(reproduction: Reproduction, name: str, runs: Runs, canvas: Can
 
 def _study_figures(reproduction: Reproduction, name: str, drawn: Mapping[str, Run], canvas: Canvas) -> list[Drawn]:
     settings = drawn["models"].settings
-    test = read_trials(drawn["models"].folder, parse(RunSettings, settings))
+    test = read_trials(drawn["models"].folder, settings)
     paths = {model: test.positions[model][test.worst] for model in ("simulation", "resphys")}
     errors = {model: test.errors_mm[model] for model in ("simulation", "simfree", "resphys")}
     if "published_network" in drawn:
         run = drawn["published_network"]
-        other = read_trials(run.folder, parse(RunSettings, run.settings))
+        other = read_trials(run.folder, run.settings)
         paths["published_network"] = other.positions["resphys"][test.worst]
         errors["published_network"] = other.errors_mm["resphys"]
-    published = {model: each.mean for model, each in paper.PUBLISHED_MM.get(name, {}).items() if model in errors}
+    published = {model: error.mean for model, error in paper.PUBLISHED_MM.get(name, {}).items() if model in errors}
     label = _label(reproduction, drawn["models"])
     lines = "; ".join(f"{MODEL_NAMES[model]} {error:g} mm" for model, error in published.items())
     beside = f" Dashed: the published means ({lines})." if published else ""
     return [
         canvas.figure(
             f"{name}_error_over_time",
-            partial(figures.error_over_time, errors, settings["time_step"], published),
+            partial(figures.error_over_time, errors, settings.time_step, published),
             f"Mean vertex error of the models over time, on a logarithmic axis.{beside}",
             f"Error over time ({label}): mean over the vertices, against the target. The line is the mean of the "
             f"{len(test.names)} test trajectories, the band spans the smallest to the largest of them.{beside}",
         ),
         canvas.figure(
             f"{name}_trajectory",
-            partial(motion_figures.tip_displacement, _tip_motion(settings, test, paths), settings["time_step"]),
+            partial(motion_figures.tip_displacement, _tip_motion(settings, test, paths), settings.time_step),
             "Tip displacement of target and models over time, and their distance from the target.",
-            f"Tip displacement of the test trajectory {test.names[test.worst]} ({label}), the target drawn wide "
-            "beneath the others. Lower panel: distance of the tip from the target's.",
+            f"Tip displacement of the test trajectory {test.names[test.worst]} ({label}); the wide line is the target. "
+            "Lower panel: distance of the tip from the target's.",
         ),
     ]
 
 
-def _tip_motion(settings: Mapping[str, Any], test: TrialResults, paths: Mapping[str, Any]) -> dict[str, Any]:
-    """(T + 1, 3) displacement of the tip [m] of the target and the models."""
-    run = parse(RunSettings, settings)
-    mesh = build_mesh(run.mesh)
-    tip = select_vertices(mesh, **run.tip.arguments())
+def _tip_motion(settings: RunSettings, test: TrialResults, paths: Mapping[str, Any]) -> dict[str, Any]:
+    """Displacement (T + 1, 3) of the tip [m] of the target and the models."""
+    mesh = build_mesh(settings.mesh)
+    tip = select_vertices(mesh, **settings.tip.arguments())
     rest = mesh.vertices[tip].mean(axis=0)
     whole = {"target": test.target[test.worst], **paths}
     return {name: q[:, tip].mean(axis=1) - rest for name, q in whole.items()}
@@ -218,7 +217,7 @@ def _tip_motion(settings: Mapping[str, Any], test: TrialResults, paths: Mapping[
 
 def timing_section(reproduction: Reproduction, runs: Runs) -> Part:
     """The published time benchmark."""
-    measured = [(run.metrics["seconds_per_test_trajectory"], run.settings["data"]["steps"]) for run in runs.values()]
+    measured = [(run.metrics["seconds_per_test_trajectory"], run.settings.data.steps or 1) for run in runs.values()]
     rows = [
         Row(
             label,
@@ -240,19 +239,20 @@ def _time_cell(mean: float, std: float, steps: int) -> Cell:
 
 
 def ablation_section(reproduction: Reproduction, name: str, runs: Runs, canvas: Canvas) -> Part:
-    """The published box plot of the marker ablation, as ours and in numbers."""
+    """The marker ablation as a box plot and a table, with the published results."""
     group, run = reproduction.experiments[name], next(iter(runs.values()))
     metrics, settings = run.metrics, run.settings
     rows = []
     for row in metrics["by_markers"]:
         count = row["markers"]
-        median = f"below {paper.PUBLISHED_MARKER_MEDIAN_MM:g}" if count >= paper.PUBLISHED_MARKERS else "not said"
+        median = f"below {paper.PUBLISHED_MARKER_MEDIAN_MM:g}" if count >= paper.PUBLISHED_MARKERS else "not given"
         spread = "small" if count >= paper.PUBLISHED_MARKERS_OF_SMALL_SPREAD else "high"
         ours = (number_text(row[key]) for key in ("median_mm", "interquartile_range_mm", "largest_mm"))
         rows.append(Row(str(count), [Cell(text) for text in (median, spread, *ours)]))
-    vertices = len(surface_vertices(build_mesh(parse(RunSettings, settings).mesh)))
+    assert settings.ablation is not None
+    vertices = len(surface_vertices(build_mesh(settings.mesh)))
     note = (
-        f"Error over all vertices and {settings['data']['steps']} steps, in mm, of {settings['ablation']['draws']} "
+        f"Error over all vertices and {settings.data.steps} steps, in mm, of {settings.ablation.draws} "
         f"random sets of markers among the {vertices} vertices of the surface. "
         f"Uncorrected: {number_text(metrics['uncorrected_mm'])} mm."
     )
@@ -265,28 +265,28 @@ def ablation_section(reproduction: Reproduction, name: str, runs: Runs, canvas: 
 
 
 def runs_section(reproduction: Reproduction, results: Sequence[Run]) -> Part:
-    """What was run: time and memory of each run, or why it failed."""
+    """Time and memory of each run, or why it failed, and the commands."""
     rows, failures = [], []
     for run in results:
         head = f"{reproduction.experiments[run.experiment].title}: {_label(reproduction, run)}"
         if run.failure is None:
             metrics = run.metrics
             memory = metrics["peak_memory_gib"]
-            taken = Cell(duration_text(sum(metrics["seconds"].values())))
-            rows.append(Row(head, [taken, _NONE if memory is None else Cell(f"{memory:.2f}")]))
+            duration = Cell(duration_text(sum(metrics["seconds"].values())))
+            rows.append(Row(head, [duration, _NONE if memory is None else Cell(f"{memory:.2f}")]))
         else:
             rows.append(Row(head, [Cell("failed"), _NONE]))
             failures.append(Text(f"Failed: {head}: {run.failure}"))
     note = (
-        "Time of each stage when it was last run, beside whatever else the machine did. Memory: with that of workers."
+        "Time: sum over the last run of each stage, on a machine with other load. Memory: including worker processes."
     )
     table = PageTable("Run", ["All stages", "Peak memory [GiB]"], rows, note)
     commands = Items([shlex.join(["warp-resphys", *run.arguments]) for run in results], code=True)
-    return Part("Runs", [*failures, table, Text("Each by itself", heading=True), commands])
+    return Part("Runs", [*failures, table, Text("Commands of the runs", heading=True), commands])
 
 
 def missing_section(published: Mapping[str, Mapping[str, paper.PublishedError]]) -> Part:
-    """The published experiments that no run reproduces yet."""
+    """Table of published results that no run reproduces yet."""
     models = {model: label for model, label in MODEL_NAMES.items() if model != "reconstruction"}
     rows = [
         Row(

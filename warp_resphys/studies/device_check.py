@@ -1,4 +1,4 @@
-"""Whether a device computes what the CPU does, and how fast: one command, and a page of its results."""
+"""Compares results and speed of a device with those of the CPU, and writes a page of results."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,18 +18,16 @@ from ..experiment.build import choose_device
 from ..experiment.files import METRICS
 from ..io.errors import ResphysError
 from ..io.files import write_json
-from ..io.settings import Many, Natural, Positive, Settings, Word, parse, parse_part
+from ..io.settings import Many, Natural, Positive, Settings, Word
 from ..io.stages import run_lock
 from ..linalg.choice import LINEAR_SOLVERS
 from ..mesh.mesh import Mesh
-from ..settings.body import SimulatorSettings
 from ..stepping.inputs import Inputs
 from .beam import ELEMENT_NAMES, Divisions, Element, beam_mesh, clamped
-from .benchmark import benchmark_sheets, machine, run_benchmark
-from .command import show
+from .benchmark import BenchmarkRun, benchmark_sheets, machine, run_benchmark
 from .gradient_check import check_gradients, pose
 from .runs import Results, Run, made, run_all
-from .tables import Sheet
+from .tables import Sheet, show
 
 PAGE = "check.html"
 POSITION_BOUND: Final = {torch.float64: 1e-8, torch.float32: 1e-5}  # m, over a trajectory
@@ -41,13 +39,19 @@ _CPU_ONLY: Final = {"banded"}
 
 
 class CheckSettings(Settings):
-    """The group ``check`` of ``conf/verify_device.yaml``, which has what the keys mean, and their values."""
+    """The group ``check``; ``conf/verify_device.yaml`` explains its keys."""
 
     steps: Natural
     experiments: Many[Word]
     overrides: Many[Word]
     minutes: Positive
     results: Word | None
+
+
+class DeviceCheck(BenchmarkRun):
+    """The configuration ``verify_device``: checks and benchmark of a device."""
+
+    check: CheckSettings
 
 
 class Check(NamedTuple):
@@ -61,7 +65,7 @@ class Check(NamedTuple):
 
 @dataclass(frozen=True)
 class CheckGroup:
-    """Checks of one kind, and the seconds that they took."""
+    """Checks of one kind and their duration [s]."""
 
     title: str
     checks: Sequence[Check]
@@ -80,7 +84,7 @@ class CheckGroup:
 
 
 def bounded(name: str, measure: Callable[[], float], bound: float, unit: str = "") -> Check:
-    """The check that a figure does not exceed a bound; an error in its place is a failure."""
+    """Checks that a figure does not exceed a bound; an error while it is measured is a failure."""
     unit = f" {unit}" if unit else ""
     try:
         figure = measure()
@@ -89,26 +93,25 @@ def bounded(name: str, measure: Callable[[], float], bound: float, unit: str = "
     return Check(name, f"{figure:.1e}{unit}", f"{bound:.0e}{unit}", figure <= bound)
 
 
-def check_device(config: Mapping[str, Any], folder: Path) -> None:
+def check_device(settings: DeviceCheck, folder: Path) -> None:
     """Prints the checks and the benchmark, and writes a page; exits with 1 where a check failed.
 
     Raises:
-        InputError: a value that cannot be used.
+        InputError: an unknown device.
         RunsInterrupted: Ctrl-C in an experiment.
     """
-    settings = parse(CheckSettings, config["check"], "check")
     wp.config.log_level = wp.LOG_WARNING
-    device = choose_device(parse_part(SimulatorSettings, config).device)
+    device, check = choose_device(settings.device), settings.check
     work = {
-        "Trajectories beside the CPU's": lambda: trajectory_checks(device, settings.steps),
+        "Trajectories beside the CPU's": lambda: trajectory_checks(device, check.steps),
         "Gradients beside differences": lambda: gradient_checks(device),
-        "Memory of torch and Warp": lambda: memory_checks(device, settings.steps),
+        "Memory of torch and Warp": lambda: memory_checks(device, check.steps),
     }
-    if settings.experiments:
-        work["Experiments, one epoch and their roll-outs"] = lambda: experiment_checks(settings, str(device), folder)
+    if check.experiments:
+        work["Experiments, one epoch and their roll-outs"] = lambda: experiment_checks(check, str(device), folder)
     with run_lock(folder):
         sections = [_run(title, checks) for title, checks in work.items()]
-        measured = run_benchmark({**config, "device": str(device)})
+        measured = run_benchmark(settings)
         write_json(folder / "benchmark.json", measured)
         sheets = benchmark_sheets(measured)
         show(*sheets)
@@ -121,13 +124,13 @@ def check_device(config: Mapping[str, Any], folder: Path) -> None:
         date = f"{datetime.now():%Y-%m-%d}"
         parts = [*(table.for_page() for table in tables), made("verify device")]
         results = Results("Check of a device", date, outcome, parts)
-        results.write(folder / PAGE, settings.results, f"{date}-check-{device.type}")
+        results.write(folder / PAGE, check.results, f"{date}-check-{device.type}")
     if failed:
         raise SystemExit(1)
 
 
 def _run(title: str, checks: Callable[[], Iterator[Check]]) -> CheckGroup:
-    """Runs the checks of a section, and prints them."""
+    """Runs checks of one kind and prints them."""
     began = time.perf_counter()
     done = list(checks())
     section = CheckGroup(title, done, time.perf_counter() - began)
@@ -138,7 +141,7 @@ def _run(title: str, checks: Callable[[], Iterator[Check]]) -> CheckGroup:
 def trajectory_checks(
     device: torch.device, steps: int, bounds: Mapping[torch.dtype, float] = POSITION_BOUND
 ) -> Iterator[Check]:
-    """Every solver in both number types against Newton's method on the CPU with LAPACK's banded factors."""
+    """Compares solvers, in float64 and float32, with Newton's method on the CPU with LAPACK's banded factors."""
     others = [name for name in LINEAR_SOLVERS if name != "auto" and (device.type == "cpu" or name not in _CPU_ONLY)]
     cases = [
         *((solver, "auto", torch.float64) for solver in SOLVERS),
@@ -158,13 +161,13 @@ def trajectory_checks(
 
 
 def _departure(beam: Callable[[], Simulator], reference: torch.Tensor) -> float:
-    """Largest distance of a vertex from a trajectory (T + 1, 2, N, 3) [m]."""
+    """Largest distance [m] of a beam's vertices from a trajectory (T + 1, 2, N, 3) [m]."""
     positions = _trajectory(beam(), len(reference) - 1).cpu().double()
     return float(torch.linalg.vector_norm(positions - reference, dim=-1).max())
 
 
 def gradient_checks(device: torch.device) -> Iterator[Check]:
-    """Adjoints against central differences, for every input and parameter."""
+    """Compares adjoints with central differences, for every input and parameter."""
     solver = SolverSettings("quasi_newton", relative_tolerance=1e-12)
     for ratio in RATIOS:
         simulator = _beam(_meshes()["8-node hexahedra"], ratio, solver=solver, device=device)
@@ -177,7 +180,7 @@ def _largest_error(simulator: Simulator, pose_name: str) -> float:
 
 
 def memory_checks(device: torch.device, steps: int) -> Iterator[Check]:
-    """Whether kernels write to torch's memory, where it was from the start, and nothing leaves the device."""
+    """Checks that kernels write into torch's memory, at the same address, and that states stay on the device."""
     simulator = _beam(_meshes()["8-node hexahedra"], 0.45, device=device)
     potential = simulator.workspace(2).parts[0][1].potential
     written: dict[str, Callable[[], torch.Tensor]] = {  # zero until a kernel has written them
@@ -199,7 +202,7 @@ def memory_checks(device: torch.device, steps: int) -> Iterator[Check]:
 
 
 def experiment_checks(settings: CheckSettings, device: str, folder: Path) -> Iterator[Check]:
-    """Whether experiments finish, by the ordinary command, in folders below that of the check."""
+    """Checks that experiments finish, by the command ``run``, in folders below that of the check."""
     overrides = (*settings.overrides, f"device={device}")
     runs = [
         Run(name, "", (f"experiment={name}", *overrides), folder / "runs" / name, settings.minutes)
@@ -222,6 +225,6 @@ def _beam(mesh: Mesh, poissons_ratio: float, **options: Any) -> Simulator:
 
 
 def _trajectory(simulator: Simulator, steps: int) -> torch.Tensor:
-    """(T + 1, 2, N, 3) of a beam that is let go from a bend, and one that is let go from a smaller one [m]."""
+    """Positions (T + 1, 2, N, 3) [m] of two beams that are released from different bends."""
     with torch.no_grad():
         return simulator.rollout(pose(simulator, "bent", 2), steps, Inputs()).q

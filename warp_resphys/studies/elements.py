@@ -1,8 +1,7 @@
 """Which element to take: static sag of the beam under its own weight and time of a step, by element and refinement."""
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import warp as wp
 from pydantic import Field
@@ -10,17 +9,16 @@ from pydantic import Field
 from ..dynamics.simulator import Simulator
 from ..energies.materials import Corotated
 from ..fem.elements import VolumeIntegration
-from ..io.settings import Natural, Some, parse
+from ..io.settings import Natural, Some
 from ..mesh.mesh import select_vertices
 from ..stepping.inputs import Inputs
 from .beam import ELEMENT_NAMES, BeamStudy, Divisions, beam_mesh, clamped
-from .command import show
-from .tables import Sheet
+from .tables import Sheet, show
 from .timing import step_time
 
 
 class ElementStudy(BeamStudy):
-    """The configuration ``benchmark_elements``, which has what the keys mean, and their values."""
+    """The configuration ``benchmark_elements``, which explains its keys."""
 
     divisions: Divisions
     integrations: Some[VolumeIntegration]
@@ -28,13 +26,8 @@ class ElementStudy(BeamStudy):
     steps: Natural
 
 
-def element_study(config: Mapping[str, Any], folder: Path) -> None:
-    """Prints the table.
-
-    Raises:
-        InputError: a value that cannot be used.
-    """
-    study = parse(ElementStudy, config)
+def element_study(study: ElementStudy, folder: Path) -> None:
+    """Prints the table."""
     wp.config.log_level = wp.LOG_WARNING
     rows = []
     for refinement in range(1, study.finest + 1):
@@ -51,7 +44,7 @@ def element_study(config: Mapping[str, Any], folder: Path) -> None:
                 cost = step_time(simulators[-1], simulators[-1].rest_state(), falling, study.repeats)
                 rows.append([name, integration, str(len(mesh.vertices)), *sags, f"{cost['step_ms']:.2f}"])
     ratios = [f"nu {ratio:g}" for ratio in study.poissons_ratios]
-    title = f"Static sag in mm, E {study.youngs_modulus / 1e3:g} kPa; what a step costs, {ratios[-1]}"
+    title = f"Static sag in mm, E {study.youngs_modulus / 1e3:g} kPa; time of a step, {ratios[-1]}"
     show(Sheet(title, ["element", "volume term", "vertices", *ratios, "step (ms)"], rows))
 
 

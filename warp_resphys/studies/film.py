@@ -1,8 +1,8 @@
-"""A film of any trial of a run and any models of it, or of the laboratory as controllers drove it."""
+"""The command `view film`: films of a trial with models of a run, or of the laboratory as controllers drove it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import torch
@@ -12,7 +12,7 @@ from ..control.replay import driven_settings, replay
 from ..experiment.files import METRICS, OPEN
 from ..io.errors import InputError
 from ..io.files import read_json
-from ..io.settings import Many, Positive, Settings, Word, parse, setting
+from ..io.settings import Many, Positive, Settings, Word, setting
 from ..io.stages import finished_record
 from ..report.bodies import ComparedMotion
 from ..report.camera import hangs
@@ -22,16 +22,16 @@ from ..report.driven_film import DrivenBodies
 from ..report.render import DrawingError, RenderScene, write_film
 from ..robot.loading import load, recorded_trial
 from ..robot.robot import Robot
-from .command import show
+from .tables import show
 
 _USUAL: Final = ("simulation", "resphys")
 _MOST_VIEWS: Final = 3  # of controllers, side by side
-_MOST_MARKERS: Final = 6  # vertices that are shown where every one is observed
-_AT_THE_TIP: Final = 0.97  # of the largest distance from what is fixed, from which on they are
+_MOST_MARKERS: Final = 6  # vertices of the tip that are shown where every vertex is observed
+_AT_THE_TIP: Final = 0.97  # distance of these from the fixed vertices, over the largest
 
 
 class FilmSettings(Settings):
-    """The configuration ``view_film``, which has what the keys mean, and their values."""
+    """The configuration ``view_film``, which explains its keys."""
 
     run: Word
     trial: Word | None
@@ -43,17 +43,16 @@ class FilmSettings(Settings):
     file: Word | None
 
 
-def film(config: Mapping[str, Any], folder: Path) -> None:
-    """Plays a trial by some models, or a driven motion by some controllers, and writes the film.
+def film(settings: FilmSettings, folder: Path) -> None:
+    """Writes a film of a trial with some models, or of a driven motion with some controllers.
 
-    It goes into the run folder, or where ``file`` says.
+    It is written into the run folder, or to ``file``.
 
     Raises:
         InputError: an unknown trial, model, motion or controller, a pose for a trial, or a machine that cannot draw.
         DataFileError: there is no finished run, or the film cannot be written.
     """
     del folder
-    settings = parse(FilmSettings, config)
     wp.config.log_level = wp.LOG_WARNING
     run = Path(settings.run).expanduser()
     if settings.motion is None:
@@ -75,21 +74,21 @@ def _film_of_trial(run: Path, settings: FilmSettings) -> tuple[str, RenderScene]
     finished_record(run, "evaluate")
     metrics, models, seconds = read_json(run / METRICS), settings.models, settings.seconds
     if models is None:
-        known = tuple(metrics["errors_mm"])
-        models = tuple(each for each in _USUAL if each in known) or known[:2]
+        available = tuple(metrics["errors_mm"])
+        models = tuple(model for model in _USUAL if model in available) or available[:2]
     name = metrics["per_trajectory"][0]["name"] if settings.trial is None else settings.trial
     motion = motion_of(run, name, models, np.inf if seconds is None else seconds)
     return name, motion.film(seconds, settings.slower)
 
 
 def _film_of_motion(run: Path, name: str, settings: FilmSettings) -> tuple[str, RenderScene]:
-    """Name and film of a motion as controllers drove it."""
+    """Name and film of a motion that controllers drove."""
     for key in ("trial", "models"):
         if getattr(settings, key) is not None:
-            raise InputError(f"{key} is of films of trials, and motion of one of control: leave one of them out.")
+            raise InputError(f"{key} is for films of trials, and motion for films of control: leave one of them out.")
     seconds, controllers, control = settings.seconds, settings.controllers, driven_settings(run).control
     if controllers is None:
-        controllers = tuple(each for each in compared_controllers(control.plain()) if each.startswith(OPEN))
+        controllers = tuple(name for name in compared_controllers(control) if name.startswith(OPEN))
     if len(controllers) > _MOST_VIEWS:
         raise InputError(f"controllers names {len(controllers)}: a film shows at most {_MOST_VIEWS} side by side.")
     played = replay(run, name, controllers, np.inf if seconds is None else seconds)
@@ -106,7 +105,7 @@ def _film_of_motion(run: Path, name: str, settings: FilmSettings) -> tuple[str, 
 
 
 def motion_of(run: Path, trial: str, models: Sequence[str], seconds: float = np.inf) -> ComparedMotion:
-    """Return the first seconds of a trial, as measured and as models of a run play it.
+    """Returns the first seconds of a trial, as measured and as simulated with models of a run.
 
     Raises:
         InputError: an unknown trial or model, or a pose.
@@ -120,7 +119,7 @@ def motion_of(run: Path, trial: str, models: Sequence[str], seconds: float = np.
         robot = load(run, model)
         played = recorded_trial(robot, trial)
         if not played.steps:
-            raise InputError(f"the trial {trial} is a pose, of which there is no film: choose a motion.")
+            raise InputError(f"the trial {trial} is a pose, which cannot be filmed: choose a motion.")
         with torch.no_grad():
             whole = played.play(robot)
         frames = np.flatnonzero((np.diff(played.times, prepend=-1.0) > 0.0) & (played.times <= seconds + 1e-9))
@@ -135,7 +134,7 @@ def motion_of(run: Path, trial: str, models: Sequence[str], seconds: float = np.
 
 
 def _shown(robot: Robot, count: int) -> np.ndarray:
-    """Numbers of the markers that are shown: all; or of some vertices at the tip, where every vertex is observed."""
+    """Indices of the markers that are shown: all, or some vertices at the tip where every vertex is observed."""
     if robot.labels:
         return np.arange(count)
     body = robot.simulator.body

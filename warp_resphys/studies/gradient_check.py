@@ -1,7 +1,7 @@
 """Adjoint gradients of a short roll-out against central differences, for every kind of parameter."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,14 +13,13 @@ import warp as wp
 from ..dynamics.simulator import Simulator
 from ..experiment.build import build_simulator
 from ..io.errors import InputError
-from ..io.settings import Count, Natural, Positive, Settings, Some, parse, parse_part, setting
+from ..io.settings import Count, Natural, Positive, Settings, Some, setting
 from ..mesh.poses import twisted
-from ..settings.body import MaterialSettings, SimulatorSettings
+from ..settings.body import SimulationSettings
 from ..stepping.inputs import Inputs
 from ..stepping.quantity import Quantity
 from ..stepping.state import State
-from .command import show
-from .tables import Sheet
+from .tables import Sheet, show
 
 Loss = Callable[[torch.Tensor], torch.Tensor]
 Pose = Literal["rest", "bent", "twisted"]
@@ -30,7 +29,7 @@ _ACCURACY = 1e-8  # relative, at which a difference is good enough
 
 
 class GradientSettings(Settings):
-    """The group ``gradcheck`` of ``conf/verify_gradients.yaml``, which has what the keys mean, and their values."""
+    """The group ``gradcheck``; ``conf/verify_gradients.yaml`` explains its keys."""
 
     poses: Some[Pose]
     poissons_ratios: Some[float]
@@ -43,20 +42,26 @@ class GradientSettings(Settings):
     stiffness_damping: Positive = setting(unit="s")
 
 
+class GradientCheck(SimulationSettings):
+    """The configuration ``verify_gradients``: the simulator whose gradients are checked, and how."""
+
+    gradcheck: GradientSettings
+
+
 @dataclass(frozen=True)
 class GradientRow:
     """One comparison of a directional derivative of the loss."""
 
     parameter: str
     adjoint: float
-    difference: float  # central differences
-    uncertainty: float = 0.0  # of the difference, by truncation and rounding
+    difference: float  # by central differences
+    uncertainty: float = 0.0  # of the difference, due to truncation and rounding
 
     @property
     def relative_error(self) -> float:
         """|adjoint - difference| over the larger magnitude.
 
-        Infinite where both vanish, since such a row compares nothing, and where one is not finite.
+        Infinite where both are zero, since nothing is compared then, and where one is not finite.
         """
         scale = max(abs(self.adjoint), abs(self.difference))
         error = abs(self.adjoint - self.difference) / scale if scale > 0.0 else math.inf
@@ -64,11 +69,11 @@ class GradientRow:
 
 
 def central_difference(function: Callable[[float], float]) -> tuple[float, float]:
-    """Derivative at zero of a function of one number, and about how far it may be off.
+    """Derivative at zero of a function of one number, and an estimate of its error.
 
     Central differences over steps of 1, 1/2, 1/4, ... are extrapolated to a step of zero (Ridders 1982). Truncation
-    makes the first extrapolations change from one step to the next, rounding the last ones: the one that changes least
-    is taken, and its change says how good it is.
+    error dominates the first extrapolations, rounding error the last ones: the one that changes least between steps is
+    returned, with this change as its error.
     """
     row: list[float] = []
     best, error = math.nan, math.inf
@@ -91,7 +96,7 @@ def pose(simulator: Simulator, name: str, batch: int) -> State:
     Args:
         simulator: of the body.
         name: one of `POSES`.
-        batch: environments; each is posed a little differently, but for the rest state.
+        batch: number of environments; their poses differ slightly, except at rest.
     """
     state = simulator.rest_state(batch)
     if name == "rest":
@@ -113,26 +118,26 @@ def check_gradients(
 ) -> list[GradientRow]:
     """Compares the directional derivatives of a random linear functional of all positions and velocities.
 
-    Constants vary within their range, so that no difference leaves it. One on a bound of it, such as damping of zero,
-    cannot be checked: give the simulator others.
+    Parameters vary within their bounds, which no difference exceeds. A parameter on a bound, such as damping of zero,
+    cannot be checked: give the simulator another value.
 
     Args:
         simulator: with a tight tolerance, in float64.
         pose_name: start of the roll-out (see `pose`).
-        steps: of the roll-out.
-        batch: environments.
-        seed: of directions and functional.
+        steps: number of steps of the roll-out.
+        batch: number of environments.
+        seed: of the random directions and functional.
 
     Returns:
-        A row for each of the initial positions and velocities, the inputs of the body, and its parameters, these as
-        one value, and with one for each environment and for each element or part.
+        A row for initial positions, initial velocities, each input and each parameter. Parameters are checked as one
+        value, as one for each environment, and as one for each element or part.
     """
     problem = _Problem(simulator, pose_name, steps, batch, seed)
     return [problem.compare(*case) for case in problem.cases()]
 
 
 class _Problem:
-    """A roll-out's loss as a function of one parameter at a time."""
+    """The loss of a roll-out as a function of one parameter at a time."""
 
     def __init__(self, simulator: Simulator, pose_name: str, steps: int, batch: int, seed: int) -> None:
         self.simulator, self.steps, self.batch = simulator, steps, batch
@@ -155,7 +160,7 @@ class _Problem:
         return self.simulator.tensor(torch.randn(*shape, generator=self.random, dtype=torch.float64))
 
     def loss(self, name: str, value: torch.Tensor) -> torch.Tensor:
-        """Of the roll-out with another value of a state's field, an input or a parameter."""
+        """Loss of the roll-out with another value of `q` or `v` of the start, an input or a parameter."""
         state, inputs, parameters = self.state, self.inputs, {}
         if name in ("q", "v"):
             state = State(value, state.v) if name == "q" else State(state.q, value)
@@ -167,7 +172,7 @@ class _Problem:
         return (self.weights[0] * trajectory.q).sum() + (self.weights[1] * trajectory.v).sum()
 
     def cases(self) -> Iterator[tuple[str, Loss, torch.Tensor, float]]:
-        """Name, loss, value and typical size of a change, of the state and every input and parameter."""
+        """Yields name, loss, value and typical size of a change of the start and of every input and parameter."""
         simulator = self.simulator
         length = float((self.state.q[0].max(0).values - self.state.q[0].min(0).values).max())
         sizes = {"q": 3e-4 * length, "v": 0.3 * length}
@@ -190,7 +195,7 @@ class _Problem:
                 yield title, vary, torch.zeros(shape, device=base.device, dtype=base.dtype), size
 
     def _varied(self, quantity: Quantity, base: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
-        """The loss by how a parameter varies in its range."""
+        """Loss with a parameter varied within its bounds by x."""
         return self.loss(quantity.name, quantity.varied(base, x))
 
     def compare(self, name: str, loss: Loss, value: torch.Tensor, size: float) -> GradientRow:
@@ -203,47 +208,36 @@ class _Problem:
         return GradientRow(name, float((gradient * direction).sum()), *difference)
 
 
-def gradcheck(config: Mapping[str, Any], folder: Path) -> None:
-    """Prints a table for every Poisson's ratio and pose; exits with 1 where an error exceeds the tolerance."""
-    wp.config.log_level = wp.LOG_WARNING
-    settings = parse(GradientSettings, config["gradcheck"], "gradcheck")
-    largest = 0.0
-    for poissons_ratio, pose_name, rows in check_configured(config, settings):
-        show(gradient_sheet(rows, f"nu = {poissons_ratio:g}, {pose_name}", settings.tolerance))
-        largest = max([largest, *(row.relative_error for row in rows)])
-    show(f"Largest relative error: {largest:.1e}, {settings.tolerance:.0e} allowed.")
-    if not largest <= settings.tolerance:
-        raise SystemExit(1)
-
-
-def check_configured(
-    config: Mapping[str, Any], settings: GradientSettings
-) -> Iterator[tuple[float, str, list[GradientRow]]]:
-    """Checks the gradients of a configured body, material and solver.
-
-    Yields:
-        Poisson's ratio, pose, and the comparisons there.
+def gradcheck(settings: GradientCheck, folder: Path) -> None:
+    """Prints a table for every Poisson's ratio and pose; exits with 1 where an error exceeds the tolerance.
 
     Raises:
-        ResphysError: a value that cannot be simulated, float32, whose rounding drowns differences, or no convergence.
+        ResphysError: a value that cannot be simulated, float32, whose rounding error hides differences, or no
+            convergence.
     """
-    made_of = parse_part(SimulatorSettings, config)
-    if made_of.dtype != "float64":
-        raise InputError(f"dtype is {made_of.dtype!r}: gradients are checked in float64.")
-    solver = made_of.solver.changed(relative_tolerance=settings.relative_tolerance)
-    material = parse(MaterialSettings, config["simulation"], "simulation")
-    simulator = build_simulator(made_of.changed(solver=solver), material)
-    damping = {"mass_damping": settings.mass_damping, "stiffness_damping": settings.stiffness_damping}
-    for poissons_ratio in settings.poissons_ratios:
+    wp.config.log_level = wp.LOG_WARNING
+    check = settings.gradcheck
+    if settings.dtype != "float64":
+        raise InputError(f"dtype is {settings.dtype!r}: gradients are checked in float64.")
+    solver = settings.solver.changed(relative_tolerance=check.relative_tolerance)
+    simulator = build_simulator(settings.changed(solver=solver), settings.simulation)
+    damping = {"mass_damping": check.mass_damping, "stiffness_damping": check.stiffness_damping}
+    largest = 0.0
+    for poissons_ratio in check.poissons_ratios:
         changed: dict[str, Any] = {"poissons_ratio": poissons_ratio, **damping}
         materials = {region: replace(material, **changed) for region, material in simulator.materials.items()}
         checked = replace(simulator, material=materials.get("", materials))
-        for name in settings.poses:
-            yield poissons_ratio, name, check_gradients(checked, name, settings.steps, settings.batch, settings.seed)
+        for name in check.poses:
+            rows = check_gradients(checked, name, check.steps, check.batch, check.seed)
+            show(gradient_sheet(rows, f"nu = {poissons_ratio:g}, {name}", check.tolerance))
+            largest = max([largest, *(row.relative_error for row in rows)])
+    show(f"Largest relative error: {largest:.1e}, {check.tolerance:.0e} allowed.")
+    if not largest <= check.tolerance:
+        raise SystemExit(1)
 
 
 def gradient_sheet(rows: list[GradientRow], title: str, tolerance: float) -> Sheet:
-    """Adjoint, difference, its uncertainty and relative error of each parameter, in red beyond the tolerance."""
+    """Table of adjoint, difference, its uncertainty and relative error; rows beyond the tolerance are red."""
     cells = [
         [row.parameter, f"{row.adjoint:.6e}", f"{row.difference:.6e}", f"{row.uncertainty:.1e}"]
         + [f"{row.relative_error:.1e}"]

@@ -1,40 +1,61 @@
-"""Settings of the commands that inspect meshes and recordings and make arms."""
+"""The command `inspect`: tables and pictures of a mesh and of recordings."""
 
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
-from ..io.settings import Count, Many, NotNegative, Positive, Settings, Word, setting
+from pydantic import model_validator
+
+from ..data.recordings.reading import READERS
+from ..io.errors import InputError
+from ..io.settings import Many, Positive, Word, setting
+from ..settings.body import MeshSettings, PlaceSettings
+from .mesh_inspection import inspect_mesh
+from .recording_quality import RecordingInspection, inspect_recording
 
 
-class RecordingFile(Settings):
-    """A recording, and what its file does not say or says wrongly."""
-
-    path: Word | None = None
-    units: Word | None = None
-    rate: Positive | None = setting(None, unit="Hz")
-    labels: Many[Word] | None = None
-
-
-class Inspection(Settings):
-    """What `warp-resphys inspect` looks at; conf/inspect.yaml describes the keys."""
+class Inspection(RecordingInspection):
+    """The configuration ``inspect``, which explains its keys."""
 
     files: Many[Word]
-    mesh: dict[str, Any] = setting(description="a group of conf/mesh")
-    fixed: dict[str, Any] = setting(description="vertices that are counted: x, y, z and tolerance", unit="m")
+    mesh: MeshSettings | None
+    fixed: PlaceSettings
     density: Positive = setting(unit="kg/m^3")
     picture: bool
-    recording: RecordingFile
-    still: Many[Word]
-    moving: Many[Word]
-    compare_with: Many[Word]
-    longest_gap: Count
-    least_jump: NotNegative = setting(unit="m")
-    largest_distortion: NotNegative = setting(unit="m")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _sort_files(cls, values: Any) -> Any:
+        """Moves ``files`` to their keys: the first recording, further ones to compare it with, and a mesh."""
+        if not isinstance(values, Mapping) or not isinstance(values["mesh"], Mapping):
+            return values
+        files = values["files"] if isinstance(values["files"], list) else []
+        recordings = [file for file in files if Path(str(file)).suffix.lower() in READERS]
+        meshes = [file for file in files if file not in recordings]
+        if len(meshes) > 1:
+            raise ValueError(f"{meshes[0]} and {meshes[1]} are two meshes: name one at a time.")
+        mesh, changed = {**values["mesh"], **({"path": meshes[0]} if meshes else {})}, dict(values)
+        if recordings:
+            changed["recording"] = {**values["recording"], "path": recordings[0]}
+            changed["compare_with"] = [*values["compare_with"], *recordings[1:]]
+        if mesh.get("path") is None:  # the key is there for every kind of mesh, but only some have files
+            mesh.pop("path", None)
+        changed["mesh"] = None if mesh["kind"] == "file" and "path" not in mesh else mesh
+        return changed
 
 
-class Arm(Settings):
-    """An arm that `warp-resphys inspect make-arm` makes."""
+def inspect(settings: Inspection, folder: Path) -> None:
+    """Prints tables; writes quality.json and quality.png of a recording, and mesh.png of a mesh.
 
-    file: Word
-    density: Positive = setting(unit="kg/m^3")
-    picture: bool
-    mesh: dict[str, Any] = setting(description="the group conf/mesh/arm_generated.yaml")
+    Raises:
+        ResphysError: nothing was named, or it cannot be used.
+    """
+    if settings.mesh is None and settings.recording.path is None:
+        raise InputError("nothing to inspect: name a mesh or a recording, as in warp-resphys inspect FILE.")
+    if settings.recording.path is not None:
+        print(inspect_recording(settings, folder))
+        print(f"Written: {folder / 'quality.json'}, {folder / 'quality.png'}")
+    if settings.mesh is not None:
+        print(inspect_mesh(settings.mesh, settings.fixed, settings.density, folder if settings.picture else None))
+        if settings.picture:
+            print(f"Written: {folder / 'mesh.png'}")

@@ -1,4 +1,4 @@
-"""A robot that is stepped as time goes on: driven by hand or as in a recorded trial, pulled, of another material."""
+"""A robot for interactive simulation: driven by hand or by a recorded trial, pulled, with changed parameters."""
 
 from collections.abc import Mapping
 from typing import Final
@@ -20,30 +20,30 @@ from ..stepping.quantity import Quantity
 FloatArray = NDArray[np.float64]
 MATERIAL: Final = ("youngs_modulus", "poissons_ratio", "density", "mass_damping", "stiffness_damping")
 _ROUNDING: Final = 1e-9  # Of times [s].
-_PATCH: Final = 0.06  # Radius of what a hand takes hold of, over the size of the body.
-_PULL: Final = 10.0  # Force of a pull over one length of the body, in weights of the body,
-_STIFFEST: Final = 0.25  # unless that were more than so much of its mass over the squared time step.
+_PATCH: Final = 0.06  # Radius of the surface patch that is grabbed, over the size of the body.
+_PULL: Final = 10.0  # Pulling force at a distance of one body size, in weights of the body.
+_STIFFEST: Final = 0.25  # Upper bound of the stiffness of a pull, in mass of the body over squared time step.
 _WIDE: Final = 1.4  # Logarithm of the factor by which a parameter may be changed.
-_BEYOND: Final = 1.25  # How much more than in the trials an input may be.
-_BASE_SPEED: Final = 1.0  # Of the base that a hand moves, in lengths of the body, and rad, a second.
-_MOVED: Final = (0.25, 0.5)  # How far the base may be moved, over the body's size, and turned [rad].
+_BEYOND: Final = 1.25  # Largest input, over that of the trials.
+_BASE_SPEED: Final = 1.0  # Largest speed of the base, in sizes of the body, and rad, a second.
+_MOVED: Final = (0.25, 0.5)  # Largest displacement of the base, over the body's size, and rotation [rad].
 
 
 class LiveRobot:
-    """A robot that is stepped, with what a hand does to it in between.
+    """A robot that is stepped, and interactions between the steps.
 
     Args:
-        robot: of one environment.
+        robot: with one environment.
 
     Attributes:
         size: longest side of the body [m].
         surface: (S,) vertices of its boundary.
         faces: (F, 3) triangles of these, numbered among them.
-        inputs: (C,) values by name, as they are commanded now.
-        limits: (low, high) of each input's parts (C,) that a hand may set.
-        parameters: what may be changed, by name: its quantity and the value that it had.
-        time: since the begin of the motion [s].
-        failure: why it stands still; empty where it does not.
+        inputs: (C,) commanded values by name.
+        limits: lowest and highest values (C,) of the parts of each input.
+        parameters: quantities and original values of the parameters that may be changed, by name.
+        time: since the start of the motion [s].
+        failure: why the simulation stopped; empty while it runs.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -52,39 +52,38 @@ class LiveRobot:
         self.size = float(np.ptp(mesh.vertices, axis=0).max())
         self.surface = surface_vertices(mesh)
         self.faces = np.searchsorted(self.surface, boundary_triangles(mesh))
-        self.inputs = {name: np.zeros(len(each.parts)) for name, each in robot.inputs.items()}
+        self.inputs = {name: np.zeros(len(robot_input.parts)) for name, robot_input in robot.inputs.items()}
         self.limits = {name: self._limits(name) for name in robot.inputs}
         self.parameters = {} if robot.is_data_driven else _changeable(robot)
         mass = float(robot.constants.mass.sum())
         weight = mass * float(np.linalg.norm(robot.simulator.gravity)) or mass
         self._stiffness = min(_PULL * weight / self.size, _STIFFEST * mass / robot.time_step**2)  # [N/m]
-        self._held: tuple[FloatArray, FloatArray] | None = None  # (N,) weights of what is held, and (3,) where to [m]
+        self._held: tuple[FloatArray, FloatArray] | None = None  # (N,) weights of held vertices, (3,) target [m]
         self._on_body = _markers_on_body(robot)
         self.trial: RecordedTrial | None = None
         self.failure = ""
         self.reset()
 
     def _limits(self, name: str) -> tuple[FloatArray, FloatArray]:
-        """Least and greatest values of an input's parts."""
+        """Lowest and highest values (C,) of the parts of an input."""
         robot_input = self._original.inputs[name]
         if name == BASE:
             far = np.repeat([_MOVED[0] * self.size, _MOVED[1]], 3)
             return -far, far
         if robot_input.low is None or robot_input.high is None:
             return np.zeros(len(robot_input.parts)), np.full(len(robot_input.parts), robot_input.quantity.typical)
-        least, most = np.minimum(robot_input.low, 0.0), np.maximum(robot_input.high, 0.0)
-        return _BEYOND * least, _BEYOND * most
+        return _BEYOND * np.minimum(robot_input.low, 0.0), _BEYOND * np.maximum(robot_input.high, 0.0)
 
-    # What is shown
+    # Views of the state
 
     @property
     def positions(self) -> FloatArray:
-        """(N, 3) of the vertices [m]."""
+        """Positions (N, 3) of the vertices [m]."""
         return np.asarray(self.state.q[0].double().cpu().numpy())
 
     @property
     def markers(self) -> FloatArray:
-        """(M, 3) as they are simulated [m]; none where every vertex is observed."""
+        """Simulated markers (M, 3) [m]; empty where every vertex is observed."""
         if not self.robot.labels:
             return np.empty((0, 3))
         seen = self._as_recorded()
@@ -92,9 +91,9 @@ class LiveRobot:
 
     @property
     def measured(self) -> FloatArray | None:
-        """(M, 3) what was observed in the trial at this time [m], between two frames linear in time.
+        """Measured markers (M, 3) of the trial at this time [m], interpolated linearly between frames.
 
-        NaN where nothing was seen; None without a trial.
+        NaN for hidden markers; None without a trial.
         """
         if self.trial is None:
             return None
@@ -107,13 +106,13 @@ class LiveRobot:
         return shown if self._on_body is None else self._to_body(self._as_recorded()).apply(shown)
 
     def _as_recorded(self) -> FloatArray:
-        """(M, 3) the simulated markers in the frame of the recordings [m]."""
+        """Simulated markers (M, 3) in the frame of the recordings [m]."""
         markers = self.robot.observe(self.state)[0].double().cpu().numpy()
         shift = None if self.trial is None else self.trial.shift
         return np.asarray(markers if shift is None else markers + shift)
 
     def _to_body(self, recorded: FloatArray) -> RigidTransform:
-        """From the frame of the recordings, in which markers (M, 3) are given, to that of the body."""
+        """Transform to the frame of the body from that of the recordings, in which markers (M, 3) are given [m]."""
         assert self._on_body is not None
         on_body = self._on_body(self.state.q)[0].double().cpu().numpy()
         seen = np.isfinite(recorded).all(axis=1)
@@ -121,23 +120,23 @@ class LiveRobot:
 
     @property
     def has_left(self) -> bool:
-        """Whether it has left the states that the learned force was trained on."""
+        """Whether the state is outside the training range of the learned force."""
         return bool(self.state.left[0])
 
     @property
     def is_pulled(self) -> bool:
-        """Whether a hand holds it."""
+        """Whether the body is grabbed."""
         return self._held is not None
 
-    # What a hand does
+    # Interactions
 
     def set_input(self, name: str, part: int, value: float) -> None:
-        """Commands a value; ends the trial that plays."""
+        """Commands a value; a trial that plays ends."""
         self.trial = None
         self.inputs[name][part] = value
 
     def set_parameter(self, name: str, value: float) -> None:
-        """Changes a parameter; the motion goes on.
+        """Changes a parameter; the motion continues.
 
         Raises:
             InputError: the value is out of range.
@@ -145,7 +144,7 @@ class LiveRobot:
         self.robot = self.robot.with_parameters(**{name: value})
 
     def grab(self, point: FloatArray) -> None:
-        """Takes hold of the surface around a point (3,) [m]."""
+        """Grabs the surface around a point (3,) [m]."""
         if self.robot.is_data_driven:
             raise InputError("a network in the simulator's place feels no force: view another model to pull it.")
         q = self.positions
@@ -156,26 +155,26 @@ class LiveRobot:
         self._held = weights, np.asarray(point, dtype=np.float64)
 
     def drag(self, target: FloatArray) -> None:
-        """Moves the point (3,) to which what is held is pulled [m]."""
+        """Sets the point (3,) [m] towards which the grabbed patch is pulled."""
         if self._held is not None:
             self._held = self._held[0], np.asarray(target, dtype=np.float64)
 
     def let_go(self) -> None:
-        """Pulls no longer."""
+        """Releases the grabbed patch."""
         self._held = None
 
     def play_trial(self, name: str | None) -> None:
-        """Begins a recorded trial where the identified robot begins it, or ends it.
+        """Starts a recorded trial from its initial state; None ends the trial.
 
         Raises:
             InputError: there is no such trial.
-            ConvergenceError: the body cannot be brought where it begins.
+            ConvergenceError: the initial state cannot be computed.
         """
         self.trial = None if name is None else recorded_trial(self._original, name)
         self.reset()
 
     def reset(self) -> None:
-        """Starts again: at the trial's start, or at rest without inputs."""
+        """Restarts from the initial state of the trial, or from rest without inputs."""
         self.time, self.failure, self._held = 0.0, "", None
         for values in self.inputs.values():
             values[:] = 0.0
@@ -186,10 +185,10 @@ class LiveRobot:
         """Undoes every change of a parameter."""
         self.robot = self._original
 
-    # What time does
+    # Time
 
     def step(self) -> bool:
-        """Simulates one time step, unless the trial is over or the simulation has failed; returns whether it did."""
+        """Simulates one time step; returns False where the trial is over or the simulation failed."""
         if self.failure or (self.trial is not None and self.time >= self.trial.times[-1] - _ROUNDING):
             return False
         acting = dict[str, torch.Tensor | FloatArray](self._commanded())
@@ -206,7 +205,7 @@ class LiveRobot:
         return True
 
     def _commanded(self) -> Mapping[str, FloatArray]:
-        """The inputs of the coming step; those of a trial are kept, to be seen."""
+        """Inputs of the next step; those of a trial are stored in `inputs` for display."""
         if self.trial is not None:
             number = round(self.time / self.robot.time_step)
             for name, value in self.trial.inputs.items():
@@ -219,7 +218,7 @@ class LiveRobot:
         return acting
 
     def _moved_base(self) -> FloatArray:
-        """(6,) the base on its way to where a hand has it, no faster than it may be."""
+        """Motion of the base (6,) towards its commanded value, at no more than `_BASE_SPEED`."""
         target = self.inputs[BASE]
         now = np.zeros(6) if self.state.base is None else self.state.base[-1, 0].double().cpu().numpy()
         far = np.repeat([self.size, 1.0], 3) * _BASE_SPEED * self.robot.time_step
@@ -227,7 +226,7 @@ class LiveRobot:
 
 
 def _markers_on_body(robot: Robot) -> Markers | None:
-    """Markers where they are on the body; None where they are seen so, and not in a frame of their own."""
+    """Markers in the frame of the body, where recordings have their own frame; None where these are the same."""
     about = robot.description
     if about.markers is None or about.bound is None or not marker_view_of(about.markers, about.labels, about.sets).own:
         return None
@@ -236,7 +235,7 @@ def _markers_on_body(robot: Robot) -> Markers | None:
 
 
 def _changeable(robot: Robot) -> dict[str, tuple[Quantity, float]]:
-    """Parameters that are one number, identified ones first, with their values."""
+    """Scalar parameters with their quantities and values, identified ones first."""
     simulator, changeable = robot.simulator, dict[str, tuple[Quantity, float]]()
     for name in (*robot.parameters, *MATERIAL):
         quantity = simulator.parameters.get(name)
@@ -249,9 +248,9 @@ def _changeable(robot: Robot) -> dict[str, tuple[Quantity, float]]:
 
 
 def range_of(quantity: Quantity, value: float) -> tuple[float, float]:
-    """Returns the lowest and highest value to which a parameter may be set, around its own."""
+    """Returns the lowest and highest value to which a parameter may be set, given its original value."""
     at = torch.tensor(value, dtype=torch.float64)
-    if value == quantity.lower:  # Such as no damping.
+    if value == quantity.lower:  # Such as zero damping.
         return value, value + quantity.typical
     low, high = (float(quantity.varied(at, torch.tensor(sign * _WIDE, dtype=torch.float64))) for sign in (-1, 1))
     return low, high

@@ -1,7 +1,7 @@
-"""How far the tip of an arm moves at rest, by element and refinement: which meshes are too stiff, and what they cost.
+"""Static deflection of an arm and time of a step, by element and refinement: shows which meshes lock.
 
-Coarse and nearly incompressible meshes lock: they bend less than the arm that they stand for. The value without the
-error of the mesh is extrapolated from hexahedra that are refined evenly, and borne out by another kind of element.
+Coarse meshes of nearly incompressible material lock: they bend less than the arm. The converged deflection is
+extrapolated from evenly refined hexahedra and compared with that of 10-node tetrahedra.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,25 +19,22 @@ from pydantic import Strict
 from ..dynamics.nonlinear_solver import SolverSettings
 from ..dynamics.simulator import GRAVITY, Simulator
 from ..energies.fibres import Fibres
-from ..energies.materials import make_material
 from ..energies.pressure import Pressure
+from ..experiment.build import build_material, build_mesh
 from ..fem.body import Body
 from ..io.atomic import atomic_path, digest
 from ..io.errors import InputError
 from ..io.files import read_json, write_json
 from ..io.progress import Progress
-from ..io.settings import Many, Natural, Positive, Settings, Share, Some, Word, parse, setting
-from ..mesh.arm import mesh_arm
-from ..mesh.arm_geometry import arm_geometry
+from ..io.settings import Many, Natural, Positive, Settings, Share, Word, setting
 from ..mesh.chambers import find_chambers
 from ..mesh.mesh import Mesh, quadratic
 from ..mesh.readers import read_mesh
 from ..report.figures import STYLE, TONES, new_figure, save_png
-from ..settings.body import GeneratedArm
+from ..settings.body import FibreSettings, GeneratedArm, MaterialSettings
 from ..stepping.inputs import Inputs
 from .beam import ELEMENT_NAMES, Element
-from .command import show, write_csv
-from .tables import Sheet
+from .tables import Sheet, show, write_csv
 from .timing import step_time
 
 LOADS: Final[Mapping[str, str]] = {
@@ -56,16 +53,8 @@ Hexahedra = Annotated[tuple[Positive, Positive, bool], Strict(False)]  # size an
 Tetrahedra = Annotated[tuple[Positive, bool], Strict(False)]  # size [m], whether timed
 
 
-class Windings(Settings):
-    """Fibres around the chambers."""
-
-    angles: Some[float] = setting(unit="degrees")
-    toe: Positive
-    stiffness: Positive = setting(unit="N/m")
-
-
 class LockingStudy(Settings):
-    """The group ``study`` of ``conf/benchmark_locking.yaml``, which has what the keys mean, and their values."""
+    """The group ``study``; ``conf/benchmark_locking.yaml`` explains its keys."""
 
     meshes: dict[Element, Many[Hexahedra] | Many[Tetrahedra]]
     file: Word | None
@@ -73,8 +62,8 @@ class LockingStudy(Settings):
     chamber: Natural
     pressure: float = setting(unit="Pa")
     tilt: float = setting(unit="degrees")
-    material: dict[str, Any]
-    fibres: Windings
+    material: MaterialSettings
+    fibres: FibreSettings
     relative_tolerance: Positive
     time_step: Positive = setting(unit="s")
     steps: Natural
@@ -82,39 +71,46 @@ class LockingStudy(Settings):
     within: Share
 
 
+class LockingRun(Settings):
+    """The configuration ``benchmark_locking``: the measures of an arm, and the study."""
+
+    mesh: GeneratedArm
+    study: LockingStudy
+
+
 @dataclass(frozen=True)
 class LockingCase:
     """A mesh of the study."""
 
     element: Element
-    size: float | None = None  # of the elements in the section [m]; None for a file
-    layers: float | None = None  # height of those of hexahedra [m]
-    file: str | None = None  # that it is read from
+    size: float | None = None  # of the elements in the cross-section [m]; None for a file
+    layers: float | None = None  # height of the layers of hexahedra [m]
+    file: str | None = None  # mesh file
     units: str = "m"  # of that file
-    timed: bool = True  # whether steps are timed, and the deflection without fibres is computed
+    timed: bool = True  # whether steps are timed and the deflection without fibres is computed
 
     @property
     def name(self) -> str:
-        """The name of a file for its results."""
+        """Name of the file with its results, without extension."""
         lengths = [f"{1e3 * length:g}" for length in (self.size, self.layers) if length is not None]
         return "_".join([self.element, *(lengths or ["file"])])
 
-    def mesh(self, geometry: Mapping[str, Any]) -> Mesh:
-        """The mesh, of an arm with these measures.
+    def mesh(self, arm: GeneratedArm) -> Mesh:
+        """The mesh, of an arm with the given measures unless it is read from a file.
 
         Raises:
-            MeshError: it cannot be made or read.
+            MeshError: the mesh cannot be made or read.
         """
         linear = self.element in ("hexahedron8", "tetrahedron4")
         if self.file is not None:
             return read_mesh(self.file, self.units, 1 if linear else 2, drop_unreferenced=True)
         cells = "hexahedra" if self.element.startswith("hexahedron") else "tetrahedra"
-        mesh, _ = mesh_arm(arm_geometry(geometry), float(self.size or 0.0), cells, self.layers)
+        mesh = build_mesh(arm.changed(size=self.size, layers=self.layers, cells=cells, order=1))
         return mesh if linear else quadratic(mesh, self.element)
 
 
 def cases(study: LockingStudy) -> list[LockingCase]:
-    """The meshes of a study: those of a file, then those that are made."""
+    """The meshes of a study: those of a file, then generated ones."""
     elements: tuple[Element, ...] = () if study.file is None else ("tetrahedron4", "tetrahedron10")
     return [
         *(LockingCase(element, file=study.file, units=study.units) for element in elements),
@@ -127,14 +123,15 @@ def cases(study: LockingStudy) -> list[LockingCase]:
 
 
 def measure(mesh: Mesh, study: LockingStudy, timed: bool = True) -> dict[str, Any]:
-    """Deflections of an arm that hangs along -z from its highest vertices, and the time of a step.
+    """Static deflections of an arm that hangs along -z from its highest vertices, and the time of a step.
 
     Returns:
-        ``vertices``, ``chamber_cm3`` of the chamber under pressure, ``<load>_mm`` of each of `LOADS`: how far the tip
-        moves towards +x, ``step_ms`` and ``iterations`` of a step; None for what `LockingCase.timed` leaves out.
+        ``vertices``, ``chamber_cm3`` of the chamber under pressure, ``<load>_mm`` for each of `LOADS`: displacement of
+        the tip towards +x; ``step_ms`` and ``iterations`` of a step. Values that are not computed unless ``timed`` are
+        None.
 
     Raises:
-        ResphysError: the mesh has no such chamber, or an equilibrium was not found.
+        ResphysError: the mesh has no such chamber, or no equilibrium was found.
     """
     chambers = find_chambers(mesh)
     number = study.chamber
@@ -147,7 +144,7 @@ def measure(mesh: Mesh, study: LockingStudy, timed: bool = True) -> dict[str, An
     driven = Pressure(chambers)
     bare = Body(mesh, fixed=fixed, energies=[driven])
     wound = Body(mesh, fixed=fixed, energies=[driven, Fibres(chambers, **study.fibres.plain())])
-    material = make_material(**study.material)
+    material = build_material(study.material, "study.material")
     pressure = torch.zeros(1, len(chambers), dtype=torch.float64)
     pressure[0, number - 1] = study.pressure
     tilt, weight = radians(study.tilt), abs(GRAVITY[2])
@@ -171,26 +168,26 @@ def measure(mesh: Mesh, study: LockingStudy, timed: bool = True) -> dict[str, An
         "iterations": None,
     }
     if timed:
-        ramp = 0.5 - 0.5 * np.cos(2.0 * pi * np.arange(1, study.steps + 1) / study.steps)  # swells and ebbs once
+        ramp = 0.5 - 0.5 * np.cos(2.0 * pi * np.arange(1, study.steps + 1) / study.steps)  # rises and falls once
         inputs = [Inputs(pressure=float(share) * pressure) for share in ramp]
         result |= step_time(hanging, hanging.static_equilibrium().detach(), inputs, study.repeats)
     return result
 
 
 def converged(rows: Sequence[Mapping[str, Any]], load: str) -> dict[str, float] | None:
-    """The deflection that refinement leads to, and how well two kinds of element agree on it.
+    """Extrapolates the converged deflection from hexahedra, and gives that of the finest tetrahedra beside it.
 
-    The error of hexahedra falls with the square of the size. Two meshes whose sizes in the section and along the arm
-    have one ratio r therefore lead to d + (d - d') / (r^2 - 1), d being the deflection of the finer one (Richardson
-    1911).
+    The error of hexahedra falls with the square of their size. Let d' and d be the deflections of two meshes, the
+    second finer by the same ratio r in the cross-section and along the arm. Their extrapolation is
+    d + (d - d') / (r^2 - 1) (Richardson 1911).
 
     Args:
         rows: results of `measure`, with the ``element``, ``size`` and ``layers`` of their `LockingCase`.
         load: one of `LOADS`.
 
     Returns:
-        ``mm``, the extrapolated deflection; ``finest_mm`` of the finest hexahedra that it rests on, ``other_mm`` of the
-        finest 10-node tetrahedra (NaN without any). None where no two hexahedral meshes have one ratio.
+        ``mm``, the extrapolated deflection; ``finest_mm`` of the finest hexahedra used; ``other_mm`` of the finest
+        10-node tetrahedra (NaN without any). None where no two hexahedral meshes are refined evenly.
     """
     key = f"{load}_mm"
     measured = [row for row in rows if row["size"] and row[key] is not None]
@@ -213,27 +210,27 @@ def converged(rows: Sequence[Mapping[str, Any]], load: str) -> dict[str, float] 
 
 
 def cheapest(rows: Sequence[Mapping[str, Any]], within: float) -> Mapping[str, Any] | None:
-    """The mesh with the fastest step among those whose deviations under gravity and with fibres are small enough."""
-    good = [
+    """The mesh with the fastest step whose deviations under gravity and with fibres are at most ``within``."""
+    accurate = [
         row
         for row in rows
         if row["step_ms"] is not None
         and row["size"]
         and all(abs(row.get(f"{load}_deviation", float("inf"))) <= within for load in ("gravity", "fibres"))
     ]
-    return min(good, key=lambda row: row["step_ms"], default=None)
+    return min(accurate, key=lambda row: row["step_ms"], default=None)
 
 
-def locking_study(config: Mapping[str, Any], folder: Path) -> None:
-    """Writes study.json, study.csv and study.png into the run folder, and prints the table and what follows from it.
+def locking_study(settings: LockingRun, folder: Path) -> None:
+    """Writes study.json, study.csv and study.png into the run folder, and prints the table and the conclusion.
 
-    The result of each mesh is kept in the folder ``meshes``: an interrupted study goes on where it was.
+    The result of each mesh is kept in the folder ``meshes``, from which an interrupted study continues.
 
     Raises:
-        ResphysError: a value that cannot be used, a mesh that cannot be made, or an equilibrium that was not found.
+        ResphysError: a mesh cannot be made, or no equilibrium was found.
     """
-    study = parse(LockingStudy, config["study"], "study")
-    rows = _measured(study, parse(GeneratedArm, config["mesh"], "mesh").plain(), folder)
+    study = settings.study
+    rows = _measured(settings, folder)
     limits = {load: converged(rows, load) for load in LOADS}
     for row in rows:
         for load, limit in limits.items():
@@ -249,22 +246,22 @@ def locking_study(config: Mapping[str, Any], folder: Path) -> None:
     show(_table(rows), conclusion, f"Written: {folder}/study.json, study.csv, study.png")
 
 
-def _measured(study: LockingStudy, mesh: Mapping[str, Any], folder: Path) -> list[dict[str, Any]]:
+def _measured(settings: LockingRun, folder: Path) -> list[dict[str, Any]]:
     """A row for each mesh, from an earlier study with the same settings or measured now."""
-    rows = []
-    geometry = {key: value for key, value in mesh.items() if key not in ("size", "layers", "cells", "order")}
-    # A result does not depend on the other meshes, nor on what is concluded from it.
+    rows, study = [], settings.study
+    geometry = settings.mesh.model_dump(mode="json", exclude={"size", "layers", "cells", "order"})
+    # A result does not depend on the other meshes, nor on the accuracy that is asked for.
     loads = study.model_dump(mode="json", exclude={"meshes", "file", "units", "within"})
     chosen = cases(study)
     with Progress("locking study", total=len(chosen), unit="meshes") as progress:
         for case in chosen:
             path = folder / "meshes" / f"{case.name}.json"
             content = None if case.file is None else digest(case.file)
-            settings = {"case": asdict(case), "content": content, "mesh": geometry, "study": loads}
+            used = {"case": asdict(case), "content": content, "mesh": geometry, "study": loads}
             kept = read_json(path) if path.exists() else {}
-            if kept.get("settings") != settings:
-                row = {"name": case.name, **asdict(case), **measure(case.mesh(mesh), study, case.timed)}
-                kept = {"settings": settings, "row": row}
+            if kept.get("settings") != used:
+                row = {"name": case.name, **asdict(case), **measure(case.mesh(settings.mesh), study, case.timed)}
+                kept = {"settings": used, "row": row}
                 write_json(path, kept)
             rows.append(kept["row"])
             progress.advance(mesh=case.name, tip=kept["row"]["fibres_mm"])
@@ -272,7 +269,7 @@ def _measured(study: LockingStudy, mesh: Mapping[str, Any], folder: Path) -> lis
 
 
 def deflections(rows: Sequence[Mapping[str, Any]], limits: Mapping[str, Any], within: float) -> Figure:
-    """Deflection of the tip against the number of vertices, a panel for each load and a line for each element."""
+    """Draws deflection of the tip over number of vertices, with a panel for each load and a line for each element."""
     figure = new_figure(3.2, 3.2, narrow=False)
     for axes, (load, title) in zip(figure.subplots(1, len(LOADS)), LOADS.items(), strict=True):
         axes.set(title=title, xscale="log", xlabel="vertices")
@@ -298,7 +295,7 @@ def deflections(rows: Sequence[Mapping[str, Any]], limits: Mapping[str, Any], wi
 
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> Sheet:
-    """Every mesh, with its deflections [mm] and, in per cent, how far they are from converged."""
+    """A row for each mesh, with its deflections [mm] and their deviations from the converged ones [%]."""
     lines = []
     for row in sorted(rows, key=lambda row: (ELEMENT_NAMES[row["element"]], row["file"] is not None, row["vertices"])):
         cells = []
@@ -315,7 +312,7 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> Sheet:
 
 
 def _conclusion(limits: Mapping[str, Any], best: Mapping[str, Any] | None, within: float) -> str:
-    """The converged values, and the mesh to take."""
+    """Sentences on the converged deflections and the cheapest mesh that is accurate enough."""
     values = [
         f"{LOADS[load]} {limit['mm']:.2f} mm (finest hexahedra {limit['finest_mm']:.2f}, finest 10-node tetrahedra "
         f"{limit['other_mm']:.2f})"
@@ -323,7 +320,7 @@ def _conclusion(limits: Mapping[str, Any], best: Mapping[str, Any] | None, withi
         if limit is not None
     ]
     if not values:
-        return "No two hexahedral meshes have one ratio of sizes, so nothing was extrapolated."
+        return "No two hexahedral meshes are refined evenly, so nothing was extrapolated."
     text = f"Converged, extrapolated from hexahedra: {'; '.join(values)}."
     if best is None:
         return f"{text} No mesh whose steps were timed is within {within:.0%} under gravity and with fibres."

@@ -1,4 +1,4 @@
-"""What there is to know about a mesh before it is simulated, and the commands that say it and make an arm."""
+"""Properties of a mesh as a table and a picture, and the command `inspect make-arm`."""
 
 from pathlib import Path
 from typing import Final
@@ -7,54 +7,66 @@ import numpy as np
 
 from ..experiment.build import build_mesh
 from ..io.errors import MeshError
-from ..io.settings import parse
-from ..mesh.arm import mesh_arm, name_surfaces
-from ..mesh.arm_geometry import arm_geometry
+from ..io.settings import Positive, Settings, Word, setting
+from ..mesh.arm import name_surfaces
 from ..mesh.cavities import MOST_TRIANGLES, open_cavities
 from ..mesh.chambers import find_chambers
-from ..mesh.mesh import FloatArray, Mesh, Place, boundary_triangles, connected_parts, quadratic, select_vertices
+from ..mesh.mesh import FloatArray, Mesh, Place, boundary_triangles, connected_parts, select_vertices
 from ..mesh.quality import scaled_jacobian
 from ..mesh.readers import read_mesh, read_surfaces, read_vertices, write_mesh
 from ..report.body_picture import MeshSummary, draw_mesh
-from ..settings.body import FileMesh, GeneratedArm, MeshGroup
-from .command import aligned
-from .inspection import Arm, Inspection
+from ..settings.body import FileMesh, GeneratedArm, MeshSettings, PlaceSettings
+from .tables import aligned
 
 _MILLI: Final = 1e3
 _CUBIC_CENTI: Final = 1e6
 
 
-def make_arm(arm: Arm, folder: Path) -> str:
-    """Generates an arm, writes the mesh and a picture, and returns a table.
+class ArmMaking(Settings):
+    """The configuration ``inspect_make_arm``, which explains its keys."""
+
+    file: Word
+    density: Positive = setting(unit="kg/m^3")
+    picture: bool
+    mesh: GeneratedArm
+
+
+def make_arm(settings: ArmMaking, folder: Path) -> None:
+    """Prints a table of a generated arm; writes its mesh and arm.png into the run folder.
+
+    With an absolute path in ``file``, the mesh is written there.
 
     Raises:
-        ResphysError: A setting of the wrong kind, or an arm that cannot be made.
+        ResphysError: an arm that cannot be made.
     """
-    settings = parse(GeneratedArm, arm.mesh, "mesh").plain()
-    if settings["order"] not in (1, 2) or (settings["order"] == 2 and settings["cells"] != "tetrahedra"):
-        raise MeshError(f"mesh.order is {settings['order']!r}: choose 1, or 2 for tetrahedra with edge midpoints.")
-    mesh, surfaces = mesh_arm(arm_geometry(settings), settings["size"], settings["cells"], settings["layers"])
-    if settings["order"] == 2:
-        mesh = quadratic(mesh)
-        surfaces = name_surfaces(mesh)
-    write_mesh(folder / arm.file, mesh, surfaces)
-    summary = MeshSummary(mesh, arm.density, np.unique(surfaces["base"]), find_chambers(mesh))
-    if arm.picture:
+    if settings.mesh.order == 2 and settings.mesh.cells != "tetrahedra":
+        raise MeshError("mesh.order is 2: choose 1, or 2 for tetrahedra with edge midpoints.")
+    mesh = build_mesh(settings.mesh)
+    surfaces = name_surfaces(mesh)
+    write_mesh(folder / settings.file, mesh, surfaces)
+    summary = MeshSummary(mesh, settings.density, np.unique(surfaces["base"]), find_chambers(mesh))
+    if settings.picture:
         draw_mesh(folder / "arm.png", summary)
-    return aligned([*summary_rows(summary), ("clamped at the base", f"{len(summary.fixed)} vertices")], left=2)
+    print(aligned([*summary_rows(summary), ("clamped at the base", f"{len(summary.fixed)} vertices")], left=2))
+    print(f"Written: {folder / settings.file}{f', {folder}/arm.png' if settings.picture else ''}")
 
 
-def inspect_mesh(settings: Inspection, folder: Path) -> str:
-    """Returns a table of what is in a mesh, and draws it.
+def inspect_mesh(settings: MeshSettings, fixed: PlaceSettings, density: float, pictures: Path | None) -> str:
+    """Returns a table of a mesh, and draws it.
+
+    Args:
+        settings: the group ``mesh``.
+        fixed: vertices that are counted and drawn; nothing for none.
+        density: for the mass [kg/m^3].
+        pictures: folder for mesh.png; None draws nothing.
 
     Raises:
-        ResphysError: A setting of the wrong kind, a file that cannot be read, or a mesh that cannot be simulated.
+        ResphysError: a file that cannot be read, or a mesh that cannot be simulated.
     """
     rows: list[tuple[str, str]] = []
-    read = settings.mesh["kind"] == "file"
-    if read:
-        own = parse(FileMesh, settings.mesh, "mesh")
-        path, units, order = own.path, own.units, own.order
+    is_file, names = isinstance(settings, FileMesh), ""
+    if isinstance(settings, FileMesh):
+        path, units, order = settings.path, settings.units, settings.order
         points = read_vertices(path, units)
         mesh = read_mesh(path, units, order, drop_unreferenced=True)
         unused = len(points) - len(read_mesh(path, units, drop_unreferenced=True).vertices)
@@ -64,30 +76,29 @@ def inspect_mesh(settings: Inspection, folder: Path) -> str:
         surfaces = read_surfaces(path, units, order, True)
         names = ", ".join(f"{name} ({len(faces)})" for name, faces in surfaces.items())
     else:
-        given = {key: each for key, each in settings.mesh.items() if (key, each) != ("path", None)}
-        mesh = build_mesh(parse(MeshGroup, {"mesh": given}).mesh)
+        mesh = build_mesh(settings)
         points = mesh.vertices
-    chosen = {axis: at for axis, at in settings.fixed.items() if at is not None and axis != "tolerance"}
-    place = Place(**settings.fixed) if chosen else None
-    fixed = np.empty(0, dtype=np.int64) if place is None else select_vertices(mesh, **settings.fixed)
-    summary = MeshSummary(mesh, settings.density, fixed, find_chambers(mesh))
+    where = fixed.arguments()
+    place = Place(**where) if where.keys() & {"x", "y", "z"} else None
+    vertices = np.empty(0, dtype=np.int64) if place is None else select_vertices(mesh, **where)
+    summary = MeshSummary(mesh, density, vertices, find_chambers(mesh))
     rows += summary_rows(summary)
     if place is not None:
-        rows.append(("fixed", f"{place.holds(points).sum()} vertices at {place} m, {len(fixed)} of them used"))
-    if read:
+        rows.append(("fixed", f"{place.holds(points).sum()} vertices at {place} m, {len(vertices)} of them used"))
+    if is_file:
         rows.append(("surfaces with a name", names or "none"))
     rows.append(("open cavities", _cavities(mesh)))
-    if settings.picture:
-        draw_mesh(folder / "mesh.png", summary)
+    if pictures is not None:
+        draw_mesh(pictures / "mesh.png", summary)
     return aligned(rows, left=2)
 
 
 def _cavities(mesh: Mesh) -> str:
-    """What there is to say of cavities that are open."""
-    found = open_cavities(mesh)
-    if found is None:
+    """Describes open cavities: area and centre of their openings."""
+    cavities = open_cavities(mesh)
+    if cavities is None:
         return f"not looked for on a boundary of more than {MOST_TRIANGLES:,} triangles"
-    places = [f"{1e4 * cavity.area:.1f} cm2 around ({_millimetres(cavity.centre)}) mm" for cavity in found]
+    places = [f"{1e4 * cavity.area:.1f} cm2 around ({_millimetres(cavity.centre)}) mm" for cavity in cavities]
     return f"{'; '.join(places)}: pressure needs a closed chamber" if places else "none"
 
 
@@ -96,7 +107,7 @@ def _millimetres(point: FloatArray) -> str:
 
 
 def summary_rows(summary: MeshSummary) -> list[tuple[str, str]]:
-    """Names and values of a table."""
+    """Rows of a table: sizes, mass, quality and chambers of a mesh."""
     mesh, (width, depth, height) = summary.mesh, _MILLI * np.ptp(summary.mesh.vertices, axis=0)
     body, boundary = (connected_parts(cells).max() + 1 for cells in (mesh.cells, boundary_triangles(mesh)))
     rows = [

@@ -1,8 +1,8 @@
 """A beam beside Newton's solver by vertex block descent (VBD): the time of a step at equal error.
 
-Both step the same tetrahedra. Their energies and masses are not quite the same, so each is judged by its own converged
-solution: an error is the mean distance of the vertices from there, over all steps. Both make their launches as graphs;
-a step of ours is one of a roll-out without gradients, in float64, the peer's are in float32.
+Both simulate the same tetrahedra. Their energies and masses differ slightly, so each is compared with its own converged
+solution: the error is the mean distance of the vertices from it, over all steps. Both launch their kernels as graphs.
+Our steps are those of a roll-out without gradients in float64; the peer computes in float32.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -22,20 +22,19 @@ from ..io.errors import InputError
 from ..io.files import write_json
 from ..io.machine import hardware
 from ..io.progress import Progress
-from ..io.settings import Natural, Positive, Settings, Some, Word, parse, setting
+from ..io.settings import Natural, Positive, Settings, Some, Word, setting
 from ..mesh.mesh import Mesh, select_vertices
 from .beam import BeamStudy, Divisions, beam_mesh, clamped
-from .command import show
-from .tables import Sheet
+from .tables import Sheet, show
 from .timing import now
 
 Positions = NDArray[np.float64]  # (T, N, 3) [m]
-Run = Callable[[], tuple[float, Positions]]  # seconds of a step, and where the vertices were
+Run = Callable[[], tuple[float, Positions]]  # returns seconds of a step and the positions of the vertices
 _CONVERGED: Final = 1e-11  # relative residual of our reference
 
 
 class TimeStep(Settings):
-    """Steps of one size."""
+    """Time steps of one length."""
 
     size: Positive = setting(unit="s")
     count: Natural
@@ -43,7 +42,7 @@ class TimeStep(Settings):
 
 
 class PeerStudy(BeamStudy):
-    """The configuration ``benchmark_peers``, which has what the keys mean, and their values."""
+    """The configuration ``benchmark_peers``, which explains its keys."""
 
     divisions: Divisions
     density: Positive = setting(unit="kg/m^3")
@@ -53,13 +52,12 @@ class PeerStudy(BeamStudy):
     device: Word
 
 
-def peer_study(config: Mapping[str, Any], folder: Path) -> None:
+def peer_study(study: PeerStudy, folder: Path) -> None:
     """Prints a table for every Poisson's ratio and time step, and writes peer_study.json.
 
     Raises:
-        InputError: a value that cannot be used, or Newton is not installed.
+        InputError: Newton is not installed.
     """
-    study = parse(PeerStudy, config)
     _newton()
     results = []
     for ratio in study.poissons_ratios:
@@ -78,7 +76,7 @@ def _newton() -> Any:
 
 
 def _compare(study: PeerStudy, ratio: float, step: TimeStep) -> list[dict[str, Any]]:
-    """Rows of ours and of the peer's, whose settings take turns."""
+    """Rows of our solver and of the peer's; their runs take turns."""
     mesh = beam_mesh("tetrahedron4", study.size, study.divisions)
     settings = {
         "quasi_newton": (_ours(study, mesh, ratio, step), _CONVERGED, study.tolerances),
@@ -102,7 +100,7 @@ def _compare(study: PeerStudy, ratio: float, step: TimeStep) -> list[dict[str, A
 
 
 def _ours(study: PeerStudy, mesh: Mesh, ratio: float, step: TimeStep) -> Callable[[float], Run]:
-    """Roll-outs of this simulator, by relative residual."""
+    """Prepares roll-outs of this simulator for a relative residual."""
     body = clamped(mesh)
     material = StableNeoHookean(density=study.density, youngs_modulus=study.youngs_modulus, poissons_ratio=ratio)
 
@@ -125,7 +123,7 @@ def _ours(study: PeerStudy, mesh: Mesh, ratio: float, step: TimeStep) -> Callabl
 
 
 def _theirs(study: PeerStudy, mesh: Mesh, ratio: float, step: TimeStep) -> Callable[[float], Run]:
-    """Roll-outs of the peer's, by iterations of a step; two steps are a graph."""
+    """Prepares roll-outs of the peer for a number of iterations a step; a graph holds two steps."""
     newton, device, modulus = _newton(), torch.device(study.device), study.youngs_modulus
     builder = newton.ModelBuilder(up_axis=newton.Axis.Z, gravity=(0.0, 0.0, -9.80709))
     builder.add_soft_mesh(
@@ -157,7 +155,7 @@ def _theirs(study: PeerStudy, mesh: Mesh, ratio: float, step: TimeStep) -> Calla
                 before.clear_forces()
                 solver.step(before, after, control, None, step.size)
 
-        two_steps()  # compiles the kernels, which a graph cannot
+        two_steps()  # compiles the kernels, which is not possible while a graph is captured
         with wp.ScopedCapture(device=str(device)) as capture:
             two_steps()
 
@@ -189,7 +187,7 @@ def _table(result: Mapping[str, Any]) -> Sheet:
 
 
 def at_equal_error(row: Mapping[str, Any], ours: Sequence[Mapping[str, Any]]) -> str:
-    """The least time of ours with no more than a row's error, for a row of the peer's; a dash if there is none."""
+    """Our least time at no more than the error of a row of the peer's, as text; a dash if none reaches it."""
     if row["solver"] != "VBD":
         return ""
     times = [own["ms"] for own in ours if own["error_mm"] <= row["error_mm"]]

@@ -1,11 +1,11 @@
-"""A recording of a beam that is let go, beside the simulation of the same beam with data-sheet material.
+"""Compares the recording of a released beam with a simulation of the beam with data-sheet material.
 
-The recording is registered to the frame of the simulated body, in which the clamped face lies in x = 0 and
-gravity points along -z. Arrays are in metres; T frames or steps, M markers, N vertices.
+The recording is registered to the frame of the simulated body, in which the clamped face lies in x = 0 and gravity
+points along -z. Arrays are in metres; T frames or steps, M markers, N vertices.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -33,23 +33,23 @@ from ..fem.elements import VolumeIntegration
 from ..io.atomic import atomic_path
 from ..io.errors import DataFileError, InputError
 from ..io.files import write_json
-from ..io.settings import Count, NotNegative, Positive, Settings, Some, Vector, Word, parse, setting
+from ..io.settings import Count, NotNegative, Positive, Settings, Some, Vector, Word, setting
 from ..mesh.mesh import box_hexahedra, select_vertices
 from ..report.figures import STYLE, TONES, save_png
 from ..settings.body import Integrator, MaterialSettings
 from .beam import Divisions
-from .command import aligned
+from .tables import aligned
 
 FloatArray = NDArray[np.float64]
 
 _MILLI: Final = 1e3
 _CLOSE_UP_SECONDS: Final = 1.4
-_HELD_FRAMES: Final = 20  # that give the rest position where the release is configured
+_HELD_FRAMES: Final = 20  # before a configured release, from which the rest position is taken
 _LINES: Final[Mapping[str, dict[str, Any]]] = {
     "measured": {"color": TONES["ink"].light, "linestyle": "none", "marker": "o", "markersize": 2.0},
     "simulated": {"color": TONES["simulation"].light, "linewidth": 1.3},
 }
-# What comparison.json tells of an oscillation: by its attribute, the key and the factor of its unit.
+# Keys of comparison.json and factors of their units, by attribute of an oscillation.
 _NUMBERS: Final[Mapping[str, tuple[str, float]]] = {
     "sag": ("sag_mm", _MILLI),
     "period": ("period_s", 1.0),
@@ -76,7 +76,7 @@ class NominalMarkers(Settings):
 
 
 class RegistrationSettings(Settings):
-    """When a recording is close enough to the nominal markers."""
+    """Tolerances of the registration to the nominal markers."""
 
     longest_gap: Count = setting(description="frames of an occlusion that are interpolated")
     largest_residual: NotNegative = setting(description="root mean square of the registration", unit="m")
@@ -92,7 +92,7 @@ class BeamSettings(Settings):
 
 
 class SwingSimulation(Settings):
-    """How the swing is simulated."""
+    """Settings of the simulated swing."""
 
     time_step: Positive = setting(unit="s")
     integrator: Integrator
@@ -103,7 +103,7 @@ class SwingSimulation(Settings):
 
 
 class WindowSettings(Settings):
-    """Spans of time that numbers are taken from."""
+    """Time spans from which results are computed."""
 
     fit_seconds: Positive = setting(unit="s")
     tail_seconds: Positive = setting(unit="s")
@@ -111,7 +111,7 @@ class WindowSettings(Settings):
 
 
 class SwingRecording(Settings):
-    """The group ``recording``: a file, and what hung on the beam."""
+    """The group ``recording``: a file, and the weight that hung on the beam."""
 
     name: Word
     title: Word
@@ -121,7 +121,7 @@ class SwingRecording(Settings):
 
 
 class ComparisonSettings(Settings):
-    """The configuration ``inspect_compare``, which has what the keys mean, and their values."""
+    """The configuration ``inspect_compare``, which explains its keys."""
 
     markers: NominalMarkers
     registration: RegistrationSettings
@@ -134,14 +134,14 @@ class ComparisonSettings(Settings):
 
 @dataclasses.dataclass(frozen=True)
 class Swing:
-    """Tip markers of a beam from its release on."""
+    """Motion of the tip markers of a beam after its release."""
 
     time: FloatArray  # (T,) [s] since the release
-    displacement: FloatArray  # (T, M, 3) [m] from where the markers were while the beam was held straight
+    displacement: FloatArray  # (T, M, 3) [m] from the positions while the beam was held straight
 
     @property
     def deflection(self) -> FloatArray:
-        """(T,) [m] mean displacement of the markers along z; negative is down."""
+        """Mean displacement (T,) of the markers along z [m]; negative is down."""
         return self.displacement[:, :, 2].mean(axis=1)
 
     @property
@@ -154,36 +154,21 @@ class Swing:
 class MeasuredSwing(Swing):
     """The swing of a recording."""
 
-    rest_markers: FloatArray  # (M, 3) [m] of the tip while the beam was held, in the frame of the body
+    rest_markers: FloatArray  # (M, 3) [m] tip markers while the beam was held, in the frame of the body
     release: Release  # in frames of the recording
-    registration_residual: float  # [m] root mean square, between measured and nominal markers at rest
+    registration_residual: float  # [m] root mean square distance of measured from nominal markers at rest
 
 
-def measured_swing(
-    recording: Recording,
-    tip: Sequence[NominalMarker],
-    base: Sequence[NominalMarker],
-    *,
-    longest_gap: int,
-    largest_residual: float,
-    release_frame: float | None = None,
-) -> MeasuredSwing:
-    """Finds the release, registers the recording by its markers at rest and follows the tip from then on.
-
-    Args:
-        recording: The recording.
-        tip: The markers of the tip.
-        base: The markers on the clamp.
-        longest_gap: The longest occlusion that is interpolated, in frames.
-        largest_residual: Registration residual [m] beyond which the markers are not the nominal ones.
-        release_frame: The release, where it is known; found from the tip if None.
+def measured_swing(recording: Recording, settings: ComparisonSettings) -> MeasuredSwing:
+    """Finds the release, registers the recording by its markers at rest, and follows the tip after the release.
 
     Raises:
-        ResphysError: A marker is missing or occluded for long, nothing is let go, or the markers do not fit.
+        ResphysError: a marker is missing or occluded for too long, no release is found, or the markers do not fit.
     """
-    markers = [*tip, *base]
+    tip, base, registration = settings.markers.tip, settings.markers.base, settings.registration
+    markers, release_frame = [*tip, *base], settings.recording.release_frame
     nominal = np.array([marker.position for marker in markers])
-    recording = fill_gaps(recording.select([marker.name for marker in markers]), longest_gap)
+    recording = fill_gaps(recording.select([marker.name for marker in markers]), registration.longest_gap)
     positions = recording.positions
     if release_frame is None:
         release = find_release(positions[:, : len(tip)].mean(axis=1), recording.rate, source=recording.source)
@@ -196,11 +181,11 @@ def measured_swing(
     held = np.median(positions[slice(*release.rest)], axis=0)
     motion = kabsch(held, nominal)
     residual = root_mean_square(motion.apply(held) - nominal)
-    if residual > largest_residual:
+    if residual > registration.largest_residual:
         raise DataFileError(
-            f"{recording.source}: the markers at rest are {1e3 * residual:.1f} mm (root mean square) off "
-            f"their nominal positions, more than {1e3 * largest_residual:.1f} mm; check the configured names "
-            "and positions."
+            f"{recording.source}: the markers at rest are {1e3 * residual:.1f} mm (root mean square) off their nominal "
+            f"positions, more than {1e3 * registration.largest_residual:.1f} mm; check the configured names and "
+            "positions."
         )
     rest_markers = motion.apply(held)[: len(tip)]
     swing = trim_to_release(recording, release)
@@ -210,28 +195,28 @@ def measured_swing(
 
 
 def follow_face(face: FloatArray, rest_face: FloatArray, markers: FloatArray) -> FloatArray:
-    """Displacement (T, M, 3) [m] of markers (M, 3) [m] on stems that follow the rigid motion of a face.
+    """Displacement (T, M, 3) [m] of markers on stems that follow the rigid motion of a face.
 
     Args:
         face: (T, S, 3) [m] vertices of the face over time.
-        rest_face: (S, 3) [m] the same at rest.
+        rest_face: (S, 3) [m] vertices of the face at rest.
         markers: (M, 3) [m] at rest.
     """
     return kabsch(np.broadcast_to(rest_face, face.shape), face).apply(markers) - markers
 
 
 def marker_error(measured: Swing, simulated: Swing, seconds: float) -> float:
-    """Mean distance [m] of simulated and measured markers over the measured frames of the first seconds."""
+    """Mean distance [m] between simulated and measured markers over the measured frames of the first seconds."""
     inside = measured.time <= min(seconds, simulated.time[-1])
     at_frames = CubicSpline(simulated.time, simulated.displacement)(measured.time[inside])
     return float(np.linalg.norm(at_frames - measured.displacement[inside], axis=-1).mean())
 
 
 def simulate_swing(settings: ComparisonSettings, rest_markers: FloatArray, seconds: float) -> Swing:
-    """Simulates the beam let go from straight and at rest for some seconds, and follows its markers (M, 3) [m].
+    """Simulates the beam, released straight and at rest, for some seconds and follows its markers (M, 3) [m].
 
     Raises:
-        ResphysError: A value in the configuration cannot be simulated, or a step did not converge.
+        ResphysError: a value in the configuration cannot be simulated, or a step did not converge.
     """
     shape, simulation = settings.body, settings.simulation
     length, _, height = shape.size
@@ -259,15 +244,14 @@ def simulate_swing(settings: ComparisonSettings, rest_markers: FloatArray, secon
     return Swing(time, follow_face(face, mesh.vertices[tip_face], rest_markers))
 
 
-def compare(config: Mapping[str, Any], folder: Path) -> None:
-    """Writes comparison.json and comparison.png into the run folder and prints the numbers; see `compare_recording`."""
-    result = compare_recording(config, folder)
-    print(aligned(comparison_table(result)))
+def compare(settings: ComparisonSettings, folder: Path) -> None:
+    """Writes comparison.json and comparison.png into the run folder and prints the results."""
+    print(aligned(comparison_table(compare_recording(settings, folder))))
     print(f"Written: {folder / 'comparison.json'}, {folder / 'comparison.png'}")
 
 
 def comparison_table(result: Mapping[str, Any]) -> list[list[str]]:
-    """Sag, period and decay of both swings, and how far they are apart, from what comparison.json holds."""
+    """Rows with sag, period and decay of both swings and their relative difference, from comparison.json."""
     rows = [["", *_LINES, "difference"]]
     for label, number in _COMPARED.items():
         values = [f"{result[name][_NUMBERS[number][0]]:.4g}" for name in _LINES]
@@ -275,27 +259,20 @@ def comparison_table(result: Mapping[str, Any]) -> list[list[str]]:
     return rows
 
 
-def compare_recording(config: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Measures and simulates a swing, and writes comparison.json, whose content it returns, and comparison.png.
+def compare_recording(settings: ComparisonSettings, folder: Path) -> dict[str, Any]:
+    """Measures and simulates a swing, writes comparison.json and comparison.png, and returns comparison.json.
 
     Raises:
-        ResphysError: A value in the configuration is wrong, the recording cannot be used, a step of the simulation did
-            not converge, or a file cannot be written.
+        ResphysError: the recording cannot be used, a step of the simulation did not converge, or a file cannot be
+            written.
     """
-    settings = parse(ComparisonSettings, config)
     path, markers, windows = settings.recording.path, settings.markers, settings.comparison
     if path is None:
         raise InputError("No recording given: set recording.path to one, as in recording.path=swing.c3d.")
     recording = read_recording(path)
     check_passive(recording)
     check_motion(recording, [marker.name for marker in markers.tip])
-    measured = measured_swing(
-        recording,
-        markers.tip,
-        markers.base,
-        **settings.registration.plain(),
-        release_frame=settings.recording.release_frame,
-    )
+    measured = measured_swing(recording, settings)
     simulated = simulate_swing(settings, measured.rest_markers, float(measured.time[-1]))
     oscillations = {
         name: measure_oscillation(swing.deflection, swing.rate, window=windows.fit_seconds, tail=windows.tail_seconds)
@@ -311,7 +288,7 @@ def compare_recording(config: Mapping[str, Any], folder: Path) -> dict[str, Any]
 
 
 def draw_comparison(measured: Swing, simulated: Swing, result: Mapping[str, Any]) -> Figure:
-    """Draws the deflection of the tip over time with what comparison.json holds beside it, and each marker below."""
+    """Draws the deflection of the tip over time, the results of comparison.json beside it, and each marker below."""
     labels = [marker["name"] for marker in result["config"]["markers"]["tip"]]
     swings = {"measured": measured, "simulated": simulated}
     with rc_context(STYLE):
@@ -353,14 +330,14 @@ def _notes(result: Mapping[str, Any]) -> str:
 
 
 def _summary(measured: MeasuredSwing, oscillations: Mapping[str, Oscillation], error: float) -> dict[str, Any]:
-    """The content of comparison.json, in millimetres and seconds, with (simulated - measured) / measured."""
+    """Content of comparison.json in millimetres and seconds; relative differences are over the measured value."""
     return {
         "release_frame": measured.release.frame,
         "rest_frames": list(measured.release.rest),
         "registration_residual_mm": _MILLI * measured.registration_residual,
         **{
-            name: {key: factor * getattr(found, number) for number, (key, factor) in _NUMBERS.items()}
-            for name, found in oscillations.items()
+            name: {key: factor * getattr(oscillation, number) for number, (key, factor) in _NUMBERS.items()}
+            for name, oscillation in oscillations.items()
         },
         "relative_difference": {
             name: getattr(oscillations["simulated"], name) / getattr(oscillations["measured"], name) - 1.0

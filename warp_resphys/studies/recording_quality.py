@@ -1,4 +1,4 @@
-"""The quality of a recording as a picture, and the command that makes it."""
+"""Quality of a recording as a table and a picture: occlusions, jumps, noise and drift of its markers."""
 
 from collections.abc import Sequence
 from itertools import cycle
@@ -29,9 +29,9 @@ from ..data.recordings.recording import Recording
 from ..io.atomic import atomic_path
 from ..io.errors import InputError
 from ..io.files import write_json
+from ..io.settings import Count, Many, NotNegative, Positive, Settings, Word, setting
 from ..report.figures import STYLE, TONES, new_figure, save_png
-from .command import aligned
-from .inspection import Inspection
+from .tables import aligned
 
 FloatArray = NDArray[np.float64]
 
@@ -43,11 +43,32 @@ _ROW: Final = 0.16  # [in] of a marker in the raster
 _LEGEND_COLUMNS: Final = 6
 
 
-def recording_quality(recording: Recording, result: Quality) -> Figure:
-    """Draw markers over time from their median place, what jumped, and what was hidden.
+class RecordingFile(Settings):
+    """A recording, and what its file does not say or says wrongly."""
 
-    Markers that should stand still have a panel of their own, with their distance from the median place. A line
-    breaks where a gap is masked; where it was filled, the line is thin. A triangle marks the first frame after a jump.
+    path: Word | None = None
+    units: Word | None = None
+    rate: Positive | None = setting(None, unit="Hz")
+    labels: Many[Word] | None = None
+
+
+class RecordingInspection(Settings):
+    """A recording whose quality is inspected, and others with which it is compared."""
+
+    recording: RecordingFile
+    still: Many[Word]
+    moving: Many[Word]
+    compare_with: Many[Word]
+    longest_gap: Count
+    least_jump: NotNegative = setting(unit="m")
+    largest_distortion: NotNegative = setting(unit="m")
+
+
+def recording_quality(recording: Recording, result: Quality) -> Figure:
+    """Draws displacements of markers from their median position over time, jumps and occlusions.
+
+    Markers that should stand still have their own panel, with their distance from the median position. A line breaks
+    where a gap is masked; where it was filled, the line is thin. A triangle marks the first frame after a jump.
     """
     several = [label for label, seen in zip(recording.labels, recording.seen.T, strict=True) if seen.sum() > 1]
     bridged = fill_gaps(recording.select(several), result.longest_gap, mask_long=True)
@@ -64,7 +85,7 @@ def recording_quality(recording: Recording, result: Quality) -> Figure:
                     _draw_marker(axes, panel, recording, bridged, marker, colours[marker.label])
             axes.set_ylabel("distance [mm]" if panel == "still" else f"{panel} [mm]")
             axes.yaxis.set_major_locator(MaxNLocator(4))
-            titles = {"x": "Markers, from their median place", "still": "Markers that should not move"}
+            titles = {"x": "Markers, from their median position", "still": "Markers that should not move"}
             axes.set_title(titles.get(panel, ""))
             if result.release is not None:
                 release = result.release.frame / result.rate
@@ -82,7 +103,7 @@ def recording_quality(recording: Recording, result: Quality) -> Figure:
 def _draw_marker(
     axes: Axes, panel: str, recording: Recording, bridged: Recording, marker: MarkerQuality, colour: str
 ) -> None:
-    """What the panel shows of a marker: thin where it is filled, with a triangle above each jump."""
+    """Draws a marker in a panel: thin where gaps were filled, with a triangle at each jump."""
     column = recording.labels.index(marker.label)
     middle = np.nanmedian(recording.positions[:, column], axis=0)
     moved = _MILLI * (bridged.positions[:, bridged.labels.index(marker.label)] - middle)
@@ -96,25 +117,25 @@ def _draw_marker(
     )
 
 
-def inspect_recording(settings: Inspection, folder: Path) -> str:
+def inspect_recording(settings: RecordingInspection, folder: Path) -> str:
     """Examines a recording, and writes quality.json and quality.png.
 
     Returns:
-        The table, and what a user should look at, as text.
+        The table and the warnings, as text.
 
     Raises:
-        ResphysError: A value in the configuration cannot be used, a recording cannot be read, or a marker on the base
-            was moved between two of them.
+        ResphysError: a value in the configuration cannot be used, a recording cannot be read, or a marker on the base
+            was moved between two recordings.
     """
     still, longest_gap = settings.still, settings.longest_gap
     if settings.compare_with and len(still) < 2:
         raise InputError("compare_with needs two or more markers on the base to compare: name them in still.")
     file = settings.recording
-    given = (file.units, file.rate, file.labels)
-    recording = read_recording(str(file.path), *given)
+    configured = (file.units, file.rate, file.labels)
+    recording = read_recording(str(file.path), *configured)
     release = release_of(recording, settings.moving, longest_gap) if settings.moving else None
     result = quality(recording, still, release, longest_gap=longest_gap, least_jump=settings.least_jump)
-    trials = [recording, *(read_recording(path, *given) for path in settings.compare_with)]
+    trials = [recording, *(read_recording(path, *configured) for path in settings.compare_with)]
     motions = compare_base(trials, still) if len(trials) > 1 else []
     figure = recording_quality(recording, result)
     write_json(folder / "quality.json", {**result.to_plain(), "base": [_plain(motion, still) for motion in motions]})
@@ -126,7 +147,7 @@ def inspect_recording(settings: Inspection, folder: Path) -> str:
 
 
 def _draw_seen(axes: Axes, recording: Recording, bridged: Recording, result: Quality) -> None:
-    """A row for each marker: seen, filled or masked, and its jumps."""
+    """Draws a row for each marker: frames in which it is seen, filled or masked, and its jumps."""
     height = len(recording.labels)
     states = np.full((height, len(recording.positions)), 2)
     states[recording.seen.T] = 0
@@ -152,18 +173,18 @@ def _draw_seen(axes: Axes, recording: Recording, bridged: Recording, result: Qua
 
 
 def _text(result: Quality, motions: Sequence[BaseMotion]) -> str:
-    """The table with a column for each quantity, then the warnings."""
+    """The table with a column for each quantity, then release, warnings and motion of the base."""
     lines = [aligned(quality_table(result))]
     seconds = result.frames / result.rate
     lines.append(f"{result.source}: {result.frames} frames, {seconds:.2f} s at {result.rate:g} Hz")
     if result.release is not None:
         held = result.release.rest
-        lines.append(f"Let go in frame {result.release.frame:.2f}; held still in frames {held[0]} to {held[1] - 1}.")
+        lines.append(f"Released in frame {result.release.frame:.2f}; held still in frames {held[0]} to {held[1] - 1}.")
     lines += result.warnings
     for motion in motions:
         lines.append(
-            f"{motion.source}: the base stands up to {_MILLI * motion.shift.max():.2f} mm from its place here; its "
-            f"markers moved by up to {_MILLI * motion.distortion.max():.2f} mm against each other."
+            f"{motion.source}: the base is shifted by up to {_MILLI * motion.shift.max():.2f} mm; its markers moved by "
+            f"up to {_MILLI * motion.distortion.max():.2f} mm relative to each other."
         )
     return "\n".join(lines)
 

@@ -1,4 +1,4 @@
-"""Results of the runs of robots, how they are kept, and the parts of the page on them."""
+"""Results of the runs of robots: how they are stored, and their sections on the page of robots."""
 
 import shlex
 from collections.abc import Container, Mapping, Sequence
@@ -15,7 +15,6 @@ from ..report.page import (
     NONE,
     Block,
     Cell,
-    Drawn,
     Items,
     PageTable,
     Part,
@@ -31,13 +30,13 @@ from .rows import RecordedRobot
 from .runs import Run
 
 _MODELS = ("simulation", "sysid", "simfree", "resphys")
-_GAINS = {"sysid": "simulation", "resphys": "sysid"}  # over what
+_GAINS = {"sysid": "simulation", "resphys": "sysid"}  # model: the one that it corrects
 _MACHINE = {"processor": "Processor", "cores used": "Cores used", "GPU": "GPU", "commit": "Commit"}
 _PACKAGES = ("python", "warp-lang", "torch")
 
 
 class Share(Settings):
-    """By which share a model takes away of another one's error on held-out trials; see `metrics.Gain`."""
+    """Share of another model's error on held-out trials that a model removes, as `metrics.Gain`."""
 
     share: float
     lower: float
@@ -48,12 +47,12 @@ class Share(Settings):
 class Measured(Settings):
     """Results of the run of a robot."""
 
-    day: Word = setting(description="on which its errors were measured (UTC)")
-    machine: dict[str, str] = setting(description="on which, with the commit and the packages")
+    day: Word = setting(description="of the measurement (UTC)")
+    machine: dict[str, str] = setting(description="hardware, commit and versions of packages")
     arguments: Many[Word] = setting(description="of the command, without folders of that machine")
-    beyond: Many[Word] = setting(description="those that are not the robot's own, such as budget=quick")
-    tested: Some[Word] = setting(description="trials")
-    how: Word = setting(description="the trials were kept from the training")
+    beyond: Many[Word] = setting(description="arguments beside those of the robot's row, such as budget=quick")
+    tested: Some[Word] = setting(description="test trials")
+    how: Word = setting(description="how the test trials were kept from the training")
     errors_mm: dict[str, dict[str, Any]] = setting(description="by model, as metrics.json has them")
     gains: dict[str, Share | None] = setting(description="by model over the one that it corrects; null: it diverged")
     intervals: dict[str, Any] | None = setting(description="of ResPhys, with coverage and half_width_mm")
@@ -62,11 +61,11 @@ class Measured(Settings):
 
     @classmethod
     def of_run(cls, run: Run, beyond: Sequence[str]) -> "Measured":
-        """Reads the folder of a run that has succeeded."""
+        """Reads the results from the folder of a successful run."""
         metrics, made = run.metrics, run.evaluation
         tested = list(metrics.get("folds", {})) or [row["name"] for row in metrics["per_trajectory"]]
-        how = "each of them kept back once" if "folds" in metrics and len(tested) > 1 else "kept back"
-        how = "in the part that was not learned from" if learned_in_part(run.settings, tested) else how
+        how = "each held out once" if "folds" in metrics and len(tested) > 1 else "held out"
+        how = "in the part that was not used for training" if learned_in_part(run.settings, tested) else how
         return cls(
             day=str(made["finished"]).partition("T")[0],
             machine={**made.get("machine", {}), **made["versions"]},
@@ -77,13 +76,13 @@ class Measured(Settings):
             errors_mm={model: metrics["errors_mm"][model] for model in _MODELS if model in metrics["errors_mm"]},
             gains={model: _gain(metrics, model, other) for model, other in _GAINS.items()},
             intervals=metrics.get("intervals", {}).get("models", {}).get("resphys"),
-            seconds=_seconds(metrics),
+            seconds=sum(sum(part["seconds"].values()) for part in (metrics, *metrics.get("folds", {}).values())),
             moved_mm=metrics.get("mesh_check", {}).get("moved_mm"),
         )
 
     @property
     def is_helped(self) -> bool:
-        """Whether the learned force is better than identification in nine of ten draws of several trials."""
+        """Whether the learned force reduces the error of identification, by the 90 % interval over several trials."""
         gain = self.gains["resphys"]
         return gain is not None and gain.trials > 1 and gain.lower > 0.0
 
@@ -92,133 +91,115 @@ def read_kept(path: Path | None) -> dict[str, Measured]:
     """Results of earlier runs, by robot; nothing where there is no file.
 
     Raises:
-        InputError: the file is not one of this version.
-        DataFileError: it is damaged.
+        InputError: the file was written by another version.
+        DataFileError: the file is damaged.
     """
     if path is None or not path.is_file():
         return {}
     try:
-        return {name: parse(Measured, each, name) for name, each in read_json(path).items()}
+        return {name: parse(Measured, row, name) for name, row in read_json(path).items()}
     except (InputError, AttributeError) as error:
         raise InputError(
-            f"{path} is not what this version keeps of earlier runs ({error}): move it away, and run all robots again."
+            f"{path} was not written by this version ({error}): move it away, and run all robots again."
         ) from error
 
 
 def check_kept(path: Path | None, names: Sequence[str], beyond: Sequence[str]) -> None:
-    """Refuses to put rows in place of those that were measured with other settings.
+    """Refuses to replace rows that were measured with other settings.
 
     Raises:
-        InputError: there is such a row; see also `read_kept`.
+        InputError: a robot has such a row; see also `read_kept`.
     """
-    known = read_kept(path)
+    kept = read_kept(path)
     for name in names:
-        if name in known and known[name].beyond != tuple(beyond):
-            said = [" ".join(each) or "no more than its own settings" for each in (known[name].beyond, beyond)]
+        if name in kept and kept[name].beyond != tuple(beyond):
+            old, new = (" ".join(arguments) or "its own settings alone" for arguments in (kept[name].beyond, beyond))
             raise InputError(
-                f"{path} has {name} with {said[0]}, and this would replace it by one with {said[1]}: give another "
-                "folder as results."
+                f"{path} has {name} with {old}, and this run would replace it by one with {new}: give another folder "
+                "as results."
             )
 
 
 def _gain(metrics: Mapping[str, Any], after: str, before: str) -> Share | None:
-    """By how much a model is better than another on held-out trials; None where a roll-out diverged."""
+    """Gain of a model over another on held-out trials; None where a roll-out diverged."""
     pairs = [(row.get(before), row.get(after)) for row in held_out(metrics)]
-    known = [(b, a) for b, a in pairs if a is not None and b]
-    if not known or len(known) < len(pairs):
+    finite = [(b, a) for b, a in pairs if a is not None and b]
+    if not finite or len(finite) < len(pairs):
         return None
-    return Share(**paired_gain([b for b, _ in known], [a for _, a in known])._asdict())
+    return Share(**paired_gain([b for b, _ in finite], [a for _, a in finite])._asdict())
 
 
-def _seconds(metrics: Mapping[str, Any]) -> float:
-    """Of all stages, those of the folds included."""
-    every = [metrics, *metrics.get("folds", {}).values()]
-    return float(sum(sum(each["seconds"].values()) for each in every))
-
-
-def summary(robots: Mapping[str, RecordedRobot], found: Mapping[str, Measured], failed: Container[str]) -> Part:
+def summary(robots: Mapping[str, RecordedRobot], measured: Mapping[str, Measured], failed: Container[str]) -> Part:
     """One row per robot. A robot whose run failed keeps its last known result."""
     rows = []
-    for name, each in found.items():
-        errors = each.errors_mm
+    for name, result in measured.items():
+        errors = result.errors_mm
         cells = [Cell(*error_parts(errors[model])) if model in errors else Cell(NONE) for model in _MODELS]
-        cells += [Cell(_gain_text(gain)) for gain in each.gains.values()]
-        cells += [Cell(_coverage(each.intervals)), Cell(duration_text(each.seconds))]
-        small = [robots[name].actuation, *each.beyond, *([f"failed since {each.day}"] if name in failed else [])]
+        cells += [Cell(_gain_text(gain)) for gain in result.gains.values()]
+        cells += [Cell(_coverage(result.intervals)), Cell(duration_text(result.seconds))]
+        small = [robots[name].actuation, *result.beyond, *([f"failed since {result.day}"] if name in failed else [])]
         rows.append(Row(robots[name].title, cells, small="; ".join(small)))
     note = (
-        "Mean distance of the markers in what no training and no identification saw [mm], ± the standard "
-        "deviation over trials. Less error: the share that SysID takes away of the uncorrected error, and ResPhys of "
-        "SysID's, with the interval that holds it in nine of ten draws of the trials (paired bootstrap). Coverage: of "
-        "the measured coordinates, those within the 90 % prediction intervals of ResPhys, and how wide these are on "
-        "average. Time: all stages, also of folds that ran at once, beside whatever else the machine did."
+        "Mean distance of the markers on data that neither training nor identification used [mm], ± the standard "
+        "deviation over trials. Less error: the share of the uncorrected error that SysID removes, and of SysID's "
+        "error that ResPhys removes, with its 90 % interval over the trials (paired bootstrap). Coverage: share of the "
+        "measured coordinates within the 90 % prediction intervals of ResPhys, and their mean half-width. Time: sum "
+        "over all stages, also of folds that ran in parallel, on a machine with other load."
     )
-    columns = [
-        "Uncorrected",
-        "SysID",
-        "SimFree",
-        "ResPhys",
-        "Less error by SysID",
-        "Less error by ResPhys",
-        "Coverage",
-        "Time",
-    ]
+    columns = ["Uncorrected", "SysID", "SimFree", "ResPhys"]
+    columns += ["Less error by SysID", "Less error by ResPhys", "Coverage", "Time"]
     return Part("All robots", [PageTable("Robot", columns, rows, note)] if rows else [])
 
 
 def _gain_text(gain: Share | None) -> str:
     if gain is None:
         return NONE
-    share, *ends = (f"{100.0 * each:.0f}".replace("-", MINUS) for each in (gain.share, gain.lower, gain.upper))
+    share, *ends = (f"{100.0 * value:.0f}".replace("-", MINUS) for value in (gain.share, gain.lower, gain.upper))
     return f"{share} %" if gain.trials == 1 else f"{share} % ({' to '.join(ends)})"
 
 
 def _coverage(intervals: Mapping[str, Any] | None) -> str:
-    """How often the prediction intervals of the learned force hold, and their mean half-width."""
+    """Coverage of the prediction intervals of the learned force, and their mean half-width."""
     if intervals is None:
         return NONE
     return f"{100.0 * intervals['coverage']:.0f} % (± {intervals['half_width_mm']:.2g} mm)"
 
 
-def details(name: str, robot: RecordedRobot, found: Measured, pictures: Path) -> Part:
-    """A robot: its picture, where its recordings come from, what was tested, and what was published."""
-    source = Text(f"{robot.actuation[:1].upper()}{robot.actuation[1:]}. {robot.source}")
-    count = len(found.tested)
-    said = [f"Tested on {count} trial{'s' if count > 1 else ''}, {found.how}: {', '.join(found.tested)}."]
-    if found.moved_mm is not None:
-        moved = number_text(found.moved_mm)
-        said.append(f"On a finer mesh the markers of the identified simulator are {moved} mm elsewhere.")
-    blocks: list[Block] = [*_drawn(name, robot, pictures), source, Text(" ".join(said))]
+def details(name: str, robot: RecordedRobot, result: Measured, pictures: Path) -> Part:
+    """A section on a robot: its picture, the source of its recordings, its test trials, and published results."""
+    count, path = len(result.tested), pictures / f"{name}.png"
+    alt = f"The body of {robot.title} and its markers."
+    text = [f"Tested on {count} trial{'s' if count > 1 else ''}, {result.how}: {', '.join(result.tested)}."]
+    if result.moved_mm is not None:
+        moved = number_text(result.moved_mm)
+        text.append(f"A finer mesh moves the markers of the identified simulator by {moved} mm.")
+    blocks: list[Block] = [
+        *([drawn_file(path, alt, "The body as it is simulated.")] if path.is_file() else []),
+        Text(f"{robot.actuation[:1].upper()}{robot.actuation[1:]}. {robot.source}"),
+        Text(" ".join(text)),
+    ]
     if robot.published:
         blocks += [Text("Published", heading=True), Items(robot.published)]
-    return Part(robot.title, [*blocks, Items([shlex.join(["warp-resphys", *found.arguments])], code=True)])
+    return Part(robot.title, [*blocks, Items([shlex.join(["warp-resphys", *result.arguments])], code=True)])
 
 
-def _drawn(name: str, robot: RecordedRobot, pictures: Path) -> list[Drawn]:
-    """The body; none where no picture was drawn."""
-    path = pictures / f"{name}.png"
-    if not path.is_file():
-        return []
-    return [drawn_file(path, f"The body of {robot.title} and its markers.", "The body as it is simulated.")]
-
-
-def machines(robots: Mapping[str, RecordedRobot], found: Mapping[str, Measured]) -> Part:
-    """When each robot was measured, on which machine and with which versions."""
+def machines(robots: Mapping[str, RecordedRobot], measured: Mapping[str, Measured]) -> Part:
+    """Day, machine and versions of packages of each robot's run."""
     columns = ["Measured", *_MACHINE.values(), *_PACKAGES]
     rows = [
         Row(
             robots[name].title,
-            [Cell(each.day), *(Cell(each.machine.get(key, NONE)) for key in (*_MACHINE, *_PACKAGES))],
+            [Cell(result.day), *(Cell(result.machine.get(key, NONE)) for key in (*_MACHINE, *_PACKAGES))],
         )
-        for name, each in found.items()
+        for name, result in measured.items()
     ]
     return Part("Machines and versions", [PageTable("Robot", columns, rows)] if rows else [])
 
 
-def verdict(robots: Mapping[str, RecordedRobot], found: Mapping[str, Measured]) -> str:
-    """The robots on which the learned force helps, in a sentence."""
-    if not found:
+def verdict(robots: Mapping[str, RecordedRobot], measured: Mapping[str, Measured]) -> str:
+    """A sentence on the robots for which the learned force helps."""
+    if not measured:
         return "No run has succeeded."
-    helped: Sequence[str] = [robots[name].title for name, each in found.items() if each.is_helped]
-    which = f"{len(helped)} of {len(found)} robots" + (f" ({', '.join(helped)})" if helped else "")
-    return f"The learned force takes away error that identification leaves, and other trials would show it, on {which}."
+    helped = [robots[name].title for name, result in measured.items() if result.is_helped]
+    which = f"{len(helped)} of {len(measured)} robots" + (f" ({', '.join(helped)})" if helped else "")
+    return f"The learned force reduces the error of identification, by its 90 % interval over the trials, on {which}."

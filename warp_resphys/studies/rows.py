@@ -1,14 +1,15 @@
-"""The table of conf/reproduce.yaml: published beams and recorded robots, and the runs that are asked for."""
+"""Settings of the command `reproduce`, conf/reproduce.yaml, and the runs of its rows: published beams and robots."""
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
+
+from pydantic import ConfigDict
 
 from ..data.recordings.segment import convert_segment
 from ..io.atomic import digest
 from ..io.errors import InputError
 from ..io.labels import run_label
-from ..io.settings import Many, Positive, Settings, Some, Word, parse, setting
+from ..io.settings import Many, Positive, Settings, Some, Word, setting
 from .runs import Run
 
 BEAMS, ROBOTS = "beams", "robots"  # words for all rows of a kind
@@ -40,14 +41,14 @@ class Beam(Settings):
 
 
 class RecordedRobot(Settings):
-    """A robot with a frozen split; others have recorded it, or a simulation plays it."""
+    """A robot with a fixed split of its trials, recorded by others or played by a simulation."""
 
     title: Word
     actuation: Word
     experiment: Word
     overrides: Many[Word]
     recordings: Word | None = setting(description="folder in `data`; null: a finer simulation plays the robot")
-    segment: Word | None = setting(None, "file of all trials of the published segment, which become recordings")
+    segment: Word | None = setting(None, "file with all trials of the published segment, converted into recordings")
     source: Word
     files: dict[str, str] = setting({}, "SHA-256 by file")
     published: Many[Word]
@@ -55,7 +56,7 @@ class RecordedRobot(Settings):
 
 
 class Timing(Settings):
-    """The published time benchmark: the experiment and the variants that stand beside it."""
+    """The published time benchmark: the experiment and the variants that are compared with it."""
 
     experiment: Word
     variants: Some[Word]
@@ -63,7 +64,9 @@ class Timing(Settings):
 
 
 class Reproduction(Settings):
-    """All rows, and what is asked of them."""
+    """The configuration ``reproduce``; keys of runs, which ``budget=quick`` adds to it, are ignored."""
+
+    model_config = ConfigDict(extra="ignore")
 
     budget: Literal["full", "quick"]
     data: Word | None = setting(description="folder with the folders of recordings")
@@ -76,25 +79,16 @@ class Reproduction(Settings):
     timing: Timing
     robots: dict[str, RecordedRobot]
 
-    @classmethod
-    def read(cls, config: Mapping[str, Any]) -> "Reproduction":
-        """From a composed configuration, to which ``budget=quick`` adds keys of runs; they are not for this command.
-
-        Raises:
-            InputError: a value that cannot be used.
-        """
-        return parse(cls, {key: value for key, value in config.items() if key in cls.model_fields})
-
     @property
     def beyond(self) -> tuple[str, ...]:
-        """The overrides that all runs have beside their own."""
+        """Overrides of all runs, beside those of their rows."""
         return (*self.overrides, *([] if self.budget == "full" else [f"budget={self.budget}"]))
 
     def beams(self) -> list[Run]:
-        """The runs of published beams that are asked for, in order.
+        """The selected runs of published beams, in order.
 
         Raises:
-            InputError: a name that does not exist.
+            InputError: an unknown name.
         """
         pairs = [(name, variant) for name, beam in self.experiments.items() for variant in beam.variants]
         for name, variant in pairs:
@@ -102,10 +96,10 @@ class Reproduction(Settings):
                 raise InputError(
                     f"experiments.{name}.variants names {variant!r}: there are {', '.join(self.variants)}."
                 )
-        known = [BEAMS, ROBOTS, *self.experiments, *self.robots, *("/".join(pair) for pair in pairs)]
+        names = [BEAMS, ROBOTS, *self.experiments, *self.robots, *("/".join(pair) for pair in pairs)]
         wanted = self.only or (BEAMS,)
-        if foreign := [name for name in wanted if name not in known]:
-            raise InputError(f"only names {foreign[0]!r}: there are {', '.join(known)}.")
+        if unknown := [name for name in wanted if name not in names]:
+            raise InputError(f"only names {unknown[0]!r}: there are {', '.join(names)}.")
         return [self._beam(*pair) for pair in pairs if {BEAMS, pair[0], "/".join(pair)} & {*wanted}]
 
     def _beam(self, name: str, variant: str) -> Run:
@@ -116,20 +110,20 @@ class Reproduction(Settings):
         return Run(name, variant, arguments, folder, getattr(chosen.minutes, self.budget))
 
     def wanted_robots(self) -> tuple[list[str], list[str]]:
-        """Names of the robots that are asked for: those that can be run, and those whose recordings are not there.
+        """Names of the selected robots: those that can be run, and those whose recordings are missing.
 
         Raises:
             InputError: none of them can be run.
         """
         wanted = set(self.only or ())
         chosen = [name for name in self.robots if {ROBOTS, name} & wanted]
-        absent = [name for name in chosen if not self._is_there(name)]
+        absent = [name for name in chosen if not self._can_run(name)]
         if chosen and len(absent) == len(chosen):
             where = ", ".join(str(self.robots[name].recordings) for name in absent)
             raise InputError(f"data is {self.data}, where there is none of {where}: give the folder with recordings.")
         return [name for name in chosen if name not in absent], absent
 
-    def _is_there(self, name: str) -> bool:
+    def _can_run(self, name: str) -> bool:
         return self.robots[name].recordings is None or (self.data is not None and self._place(name).is_dir())
 
     def _place(self, name: str) -> Path:
@@ -140,10 +134,10 @@ class Reproduction(Settings):
 
         Args:
             name: of the robot.
-            folder: for recordings that have to be converted.
+            folder: for converted recordings.
 
         Raises:
-            InputError: its recordings are not those that the row is about.
+            InputError: its recordings are not those of the row.
         """
         robot = self.robots[name]
         overrides = [*robot.overrides, *self.beyond]
@@ -161,13 +155,13 @@ class Reproduction(Settings):
 
 
 def _check_files(name: str, place: Path, files: dict[str, str]) -> None:
-    """Refuses recordings that are not those that the row is about."""
+    """Refuses recordings whose SHA-256 differs from that of the row."""
     for file, expected in files.items():
         path = place / file
         if not path.is_file():
             raise InputError(f"{path} is missing: fetch it again, or leave {name} out of `only`.")
-        if (found := digest(path)) != expected:
+        if (actual := digest(path)) != expected:
             raise InputError(
-                f"{path} is another file than the one that {name} was measured with (SHA-256 {found[:12]}…, not "
+                f"{path} differs from the file that {name} was measured with (SHA-256 {actual[:12]}…, not "
                 f"{expected[:12]}…): fetch it again, or run `experiment={name}` by itself."
             )

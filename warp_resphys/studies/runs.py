@@ -1,4 +1,4 @@
-"""Runs of the ordinary command, one after the other, and a page on what they left."""
+"""Runs of the command `run`, one after the other, and pages on their results."""
 
 import os
 import shlex
@@ -22,8 +22,10 @@ from ..io.errors import DataFileError, ResphysError
 from ..io.files import read_json, write_text
 from ..io.machine import commit, hardware
 from ..io.progress import clock
+from ..io.settings import parse
 from ..io.stages import package_versions
 from ..report.page import Cell, Drawn, Items, PageTable, Part, Row, markdown, write_page
+from ..settings.run import RunSettings
 
 _UP_TO_DATE_SECONDS = 8.0  # for a run that finds nothing to do
 _LINE_SECONDS = 60.0
@@ -37,48 +39,48 @@ class RunsInterrupted(KeyboardInterrupt):
 
 @dataclass(frozen=True)
 class Run:
-    """One run of the ordinary command."""
+    """A run of the command `run`."""
 
     experiment: str
     variant: str
     arguments: tuple[str, ...]  # of the command
-    folder: Path  # that it writes, the one that the ordinary command takes for the same arguments
-    minutes: float  # that it may take
-    failure: str | None = None  # the sentence that it failed with
+    folder: Path  # run folder, the one that the command `run` chooses for these arguments
+    minutes: float  # expected duration
+    failure: str | None = None  # error message of a failed run
 
     @property
     def name(self) -> str:
-        """As in the key ``only``."""
+        """Name of the run in the key ``only``."""
         return f"{self.experiment}/{self.variant}" if self.variant else self.experiment
 
     @property
     def metrics(self) -> dict[str, Any]:
-        """What `metrics.json` holds."""
+        """Content of metrics.json."""
         return dict(read_json(self.folder / METRICS))
 
     @property
-    def settings(self) -> dict[str, Any]:
-        """The whole configuration of the run."""
-        return dict(read_json(self.folder / "stages" / "report.json")["settings"]["config"])
+    def settings(self) -> RunSettings:
+        """The configuration of the run, from the record of its report."""
+        return parse(RunSettings, read_json(self.folder / "stages" / "report.json")["settings"]["config"])
 
     @property
     def evaluation(self) -> dict[str, Any]:
-        """What is kept of the stage that measured its errors, the last of those of its folds."""
-        paths = [path for each in (".", "fold_*") for path in self.folder.glob(f"{each}/stages/evaluate.json")]
-        return max((dict(read_json(path)) for path in paths), key=lambda found: str(found["finished"]))
+        """Record of the stage ``evaluate``; of a cross-validation, that of the last fold that finished."""
+        paths = [path for fold in (".", "fold_*") for path in self.folder.glob(f"{fold}/stages/evaluate.json")]
+        return max((dict(read_json(path)) for path in paths), key=lambda record: str(record["finished"]))
 
 
 @dataclass(frozen=True)
 class Results:
-    """A page on runs, as HTML, and in Markdown where asked."""
+    """A page of results, in HTML and in Markdown."""
 
     title: str
-    kicker: str  # Above the title, and after it in Markdown: a date
-    verdict: str  # Below it
+    kicker: str  # date, above the title and, in Markdown, after it
+    verdict: str  # below the title
     parts: Sequence[Part]
 
     def write(self, page: Path, copies: str | None, name: str) -> None:
-        """Writes the page, results.md beside it and, into the folder `copies`, name.md with its figures.
+        """Writes the page, results.md beside it and, into the folder ``copies``, name.md with its figures.
 
         Raises:
             DataFileError: a file cannot be written.
@@ -96,37 +98,36 @@ class Results:
 
 
 def made(command: str, hidden: Sequence[str] = ()) -> Part:
-    """How a page was made: by which command, on which machine, with which versions.
+    """The section on how a page was made: command, machine and versions of packages.
 
     Args:
         command: its name, as in "verify device".
-        hidden: keys whose values are folders of that machine.
+        hidden: keys whose values are folders of that machine; they are left out.
     """
-    known = {**hardware(), "commit": commit() or "not known", **package_versions()}
-    table = PageTable("Machine and versions", ["Here"], [Row(name, [Cell(value)]) for name, value in known.items()])
+    entries = {**hardware(), "commit": commit() or "not known", **package_versions()}
+    table = PageTable("Machine and versions", ["Here"], [Row(name, [Cell(value)]) for name, value in entries.items()])
     return Part("Command, machine and versions", [*command_part(command, hidden).blocks, table])
 
 
 def command_part(command: str, hidden: Sequence[str] = ()) -> Part:
-    """By which command a page was made; see `made`."""
-    given = [(each, each.partition("=")[0]) for each in HydraConfig.get().overrides.task]
-    line = shlex.join(
-        ["warp-resphys", *command.split(), *(f"{key}=FOLDER" if key in hidden else each for each, key in given)]
-    )
+    """The section with the command that made a page, with the arguments of `made`."""
+    keys = {override: override.partition("=")[0] for override in HydraConfig.get().overrides.task}
+    shown = (f"{key}=FOLDER" if key in hidden else override for override, key in keys.items())
+    line = shlex.join(["warp-resphys", *command.split(), *shown])
     return Part("Command", [Items([line], code=True)])
 
 
 def fail_for(results: Sequence[Run]) -> None:
-    """Raises a ResphysError where a run failed, after all that there is to show was written."""
+    """Raises a ResphysError where a run failed; called after the page was written."""
     if failed := [result.name for result in results if result.failure]:
         raise ResphysError(
-            f"{len(failed)} of {len(results)} runs failed ({', '.join(failed)}): the page says why; mend it and run "
+            f"{len(failed)} of {len(results)} runs failed ({', '.join(failed)}): the page says why; correct it and run "
             "the same command again."
         )
 
 
 def _copy(figures: Sequence[Path], folder: Path) -> None:
-    """Files into a folder of their own, in place of what is there."""
+    """Copies files into a folder, whose earlier content is removed."""
     try:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
@@ -139,7 +140,7 @@ def _copy(figures: Sequence[Path], folder: Path) -> None:
 
 
 def run_all(runs: Sequence[Run], logs: Path) -> list[Run]:
-    """Runs one after the other; one that fails does not keep the others from running.
+    """Executes runs one after the other; after a failed run, the others are still executed.
 
     Raises:
         RunsInterrupted: Ctrl-C.
@@ -157,8 +158,8 @@ def run_all(runs: Sequence[Run], logs: Path) -> list[Run]:
                 failure = execute(run, logs / f"{run.name.replace('/', '-')}.log", _follower(console, status.update))
         except KeyboardInterrupt as error:
             raise RunsInterrupted(
-                f"interrupted in run {number} of {len(runs)}, {run.name}; it keeps what it has, as do those before it, "
-                "and the same command goes on from there"
+                f"interrupted in run {number} of {len(runs)}, {run.name}; finished work is kept, and the same command "
+                "continues from there"
             ) from error
         pace.count(run, time.perf_counter() - start)
         if failure:
@@ -168,7 +169,7 @@ def run_all(runs: Sequence[Run], logs: Path) -> list[Run]:
 
 
 class _Pace:
-    """How long the runs that are left will take, from their minutes and from how long the others took."""
+    """Estimate of the remaining time, from the expected minutes of runs and the duration of finished ones."""
 
     def __init__(self, runs: Sequence[Run]) -> None:
         self._expected = {run.name: 60.0 * run.minutes for run in runs if not (run.folder / METRICS).is_file()}
@@ -176,12 +177,12 @@ class _Pace:
         self._taken = self._planned = 0.0
 
     def left(self) -> float:
-        """Seconds."""
+        """Remaining time [s]."""
         pace = self._taken / self._planned if self._planned else 1.0
         return pace * sum(self._expected.values()) + _UP_TO_DATE_SECONDS * len(self._there)
 
     def count(self, run: Run, seconds: float) -> None:
-        """Takes note of a run that is done."""
+        """Records the duration of a finished run."""
         self._there.discard(run.name)
         if run.name in self._expected:
             self._planned += self._expected.pop(run.name)
@@ -189,7 +190,7 @@ class _Pace:
 
 
 def _follower(console: Console, update: Callable[[str], None]) -> Callable[[str], None]:
-    """Shows a run's own lines: the latest in a terminal, one a minute in a log."""
+    """Returns a function that shows lines of a run: the latest in a terminal, one a minute in a log."""
     due = time.monotonic() + _LINE_SECONDS
 
     def follow(line: str) -> None:
@@ -204,12 +205,12 @@ def _follower(console: Console, update: Callable[[str], None]) -> Callable[[str]
 
 
 def execute(run: Run, log_file: Path, follow: Callable[[str], None]) -> str | None:
-    """Runs the ordinary command in a process of its own, out of reach of the terminal's Ctrl-C.
+    """Executes the command `run` in a separate process, which the terminal's Ctrl-C does not reach.
 
-    All that it says goes to a file, and each line of stderr to `follow`.
+    Its output goes to a file, and each line of stderr to ``follow``.
 
     Returns:
-        The sentence that it failed with, or None.
+        Error message of a failed run, or None.
     """
     place = str(run.folder).replace("\\", r"\\").replace("'", r"\'")
     command = [sys.executable, "-m", "warp_resphys.cli", *run.arguments, f"hydra.run.dir='{place}'"]
@@ -235,11 +236,11 @@ def execute(run: Run, log_file: Path, follow: Callable[[str], None]) -> str | No
             raise
     if child.returncode == 0:
         return None
-    return sentence or f"it ended with exit code {child.returncode}; what it said is in {log_file}"
+    return sentence or f"exit code {child.returncode}; its output is in {log_file}"
 
 
 def _stop(child: "subprocess.Popen[str]") -> str:
-    """Ends a run as Ctrl-C does, and by force if it does not listen; what it says at last."""
+    """Interrupts a run as Ctrl-C does, kills it if it does not end in time, and returns the rest of stderr."""
     child.send_signal(signal.SIGINT)
     try:
         return child.communicate(timeout=_PATIENCE)[1]

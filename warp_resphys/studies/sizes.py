@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from statistics import median
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, Literal
 
 import numpy as np
 
@@ -15,11 +15,10 @@ from ..io.files import write_json
 from ..io.machine import hardware
 from ..io.memory import peak_memory_gib
 from ..io.progress import Progress
-from ..io.settings import Natural, Positive, Some, Word, parse, setting
+from ..io.settings import Natural, Positive, Settings, Some, Word, parse, setting
 from ..linalg.choice import LinearSolverName
 from .beam import BeamStudy, Divisions, beam_mesh, clamped
-from .command import show
-from .tables import Sheet
+from .tables import Sheet, show
 from .timing import TimedRollout, run_in_new_process
 
 FIGURES: Final = ("forward_s", "adjoint_s", "memory_gib")
@@ -27,17 +26,17 @@ _FITTED: Final = 3  # largest sizes that exponents are fitted to
 Element = Literal["hexahedron8", "tetrahedron10"]
 
 
-class SizeCase(NamedTuple):
+class SizeCase(Settings):
     """A beam and a linear solver."""
 
     element: Element
     poissons_ratio: float
-    divisions: Sequence[int]
+    divisions: Divisions
     linear_solver: LinearSolverName
 
 
 class SizeStudy(BeamStudy):
-    """The configuration ``benchmark_sizes``, which has what the keys mean, and their values."""
+    """The configuration ``benchmark_sizes``, which explains its keys."""
 
     elements: Some[Element]
     hexahedron_divisions: Some[Divisions]
@@ -50,27 +49,30 @@ class SizeStudy(BeamStudy):
     device: Word
 
     def cases(self) -> list[SizeCase]:
-        """All cases, larger ones of their kind after smaller ones."""
+        """All cases, of each element, Poisson's ratio and solver in the order of size."""
         divisions = {"hexahedron8": self.hexahedron_divisions, "tetrahedron10": self.tetrahedron_divisions}
         return [
-            SizeCase(element, ratio, own, solver)
+            SizeCase(element=element, poissons_ratio=ratio, divisions=counts, linear_solver=solver)
             for element in self.elements
             for ratio in self.poissons_ratios
-            for own in divisions[element]
+            for counts in divisions[element]
             for solver in self.linear_solvers
         ]
 
 
-def size_study(config: Mapping[str, Any], folder: Path) -> None:
+class SizeTask(Settings):
+    """A case and its study, for a process of its own."""
+
+    study: SizeStudy
+    case: SizeCase
+
+
+def size_study(study: SizeStudy, folder: Path) -> None:
     """Prints a table and the exponents for every element and Poisson's ratio, and writes size_study.json.
 
-    Every case has a process of its own, so that its memory is its own too. One that fails or takes longer than
-    ``longest`` leaves a sentence in its row, and larger ones of its kind are left out.
-
-    Raises:
-        InputError: a value that cannot be used.
+    Every case runs in its own process, whose memory is measured. The row of a case that fails or takes longer than
+    ``longest`` holds the error; larger cases of its element, Poisson's ratio and solver are skipped.
     """
-    study = parse(SizeStudy, config)
     rows: list[dict[str, Any]] = []
     given_up = set()
     cases = study.cases()
@@ -78,30 +80,37 @@ def size_study(config: Mapping[str, Any], folder: Path) -> None:
         for case in cases:
             kind = (case.element, case.poissons_ratio, case.linear_solver)
             if kind not in given_up:
-                values = {"study": study.plain(), "case": case._asdict()}
                 try:
-                    _, result = run_in_new_process(measure, values, timeout=study.longest)
+                    task = SizeTask(study=study, case=case).plain()
+                    _, result = run_in_new_process(measure, task, timeout=study.longest)
                 except (TimeoutError, RuntimeError) as error:
                     result = {"failed": str(error)}
                     given_up.add(kind)
-                rows.append({**case._asdict(), **result})
+                rows.append({**case.plain(), **result})
                 write_json(folder / "size_study.json", {"hardware": hardware(), "study": study.plain(), "rows": rows})
             progress.advance()
     for element in study.elements:
         for ratio in study.poissons_ratios:
-            own = [row for row in rows if row["element"] == element and row["poissons_ratio"] == ratio]
-            show(_table(f"{element}, nu {ratio:g}, steps of {1e3 * study.time_step:g} ms", own), _fits(own))
+            same = [row for row in rows if row["element"] == element and row["poissons_ratio"] == ratio]
+            powers = {name: fit.values() for name, fit in exponents(same).items()}
+            powers = {name: fit.values() for name, fit in exponents(same).items()}
+            fits = [f"{name} {', '.join(f'{power:.2f}' for power in fit)}" for name, fit in powers.items()]
+            show(
+                _table(f"{element}, nu {ratio:g}, steps of {1e3 * study.time_step:g} ms", same),
+                f"Exponents of forward, adjoint and memory over the largest {_FITTED} sizes: {'; '.join(fits)}.\n",
+            )
 
 
-def measure(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Seconds of a step and its gradient by the start, the work of the solver in a step, and the process's memory.
+def measure(values: dict[str, Any]) -> dict[str, Any]:
+    """Seconds of a step and of its gradient with respect to the start, work of the solver, memory of the process.
 
-    Kernels and layouts are made by a first step and its gradient, which are not timed.
+    The first step and gradient compile kernels and make layouts, and are not timed.
 
     Args:
-        values: ``study``, the settings, and ``case``, the fields of a `SizeCase`, as plain data.
+        values: a `SizeTask` as plain data.
     """
-    study, case = parse(SizeStudy, values["study"]), SizeCase(**values["case"])
+    task = parse(SizeTask, values)
+    study, case = task.study, task.case
     body = clamped(beam_mesh(case.element, study.size, case.divisions))
     solver = SolverSettings(relative_tolerance=study.relative_tolerance, linear_solver=case.linear_solver)
     material = Corotated(study.youngs_modulus, case.poissons_ratio)
@@ -135,18 +144,13 @@ def _table(title: str, rows: Sequence[Mapping[str, Any]]) -> Sheet:
 
 
 def exponents(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, float]]:
-    """By solver, the powers of the number of unknowns that time and memory grow with, over the three largest sizes."""
+    """Fits exponents of time and memory against the number of unknowns to the three largest sizes, by solver."""
     powers: dict[str, dict[str, float]] = {}
     for solver in dict.fromkeys(row["linear_solver"] for row in rows):
-        own = [row for row in rows if row["linear_solver"] == solver and "failed" not in row][-_FITTED:]
-        if len(own) >= 2:
-            size = np.log([row["unknowns"] for row in own])
-            powers[solver] = {key: float(np.polyfit(size, np.log([row[key] for row in own]), 1)[0]) for key in FIGURES}
+        largest = [row for row in rows if row["linear_solver"] == solver and "failed" not in row][-_FITTED:]
+        if len(largest) >= 2:
+            size = np.log([row["unknowns"] for row in largest])
+            powers[solver] = {
+                key: float(np.polyfit(size, np.log([row[key] for row in largest]), 1)[0]) for key in FIGURES
+            }
     return powers
-
-
-def _fits(rows: Sequence[Mapping[str, Any]]) -> str:
-    fits = [
-        f"{solver} {', '.join(f'{power:.2f}' for power in own.values())}" for solver, own in exponents(rows).items()
-    ]
-    return f"Exponents of forward, adjoint and memory over the largest {_FITTED} sizes: {'; '.join(fits)}.\n"

@@ -1,18 +1,32 @@
-"""Tables that are shown in a terminal and on a page."""
+"""Tables of the studies: in a terminal, on a page, as text and as CSV."""
 
+import csv
+import io
+import sys
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, Final
 
+from rich.console import Console, RenderableType
 from rich.table import Table as TerminalTable
 
+from ..io.files import write_text
 from ..report.page import Cell, PageTable, Part, Row
-from .command import table_of
+
+_LOG_WIDTH: Final = 140  # of tables that go to a file, in characters
+
+
+def show(*parts: RenderableType) -> None:
+    """Prints tables and sentences, as wide as the terminal."""
+    console = Console(width=None if sys.stdout.isatty() else _LOG_WIDTH)
+    for part in parts:
+        console.print(part, markup=False, highlight=False, soft_wrap=isinstance(part, str))
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """A table of words; printed by rich, it is one of the terminal."""
+    """A table of text, for a terminal (rich prints it) and for a page."""
 
     title: str
     headings: Sequence[str]
@@ -22,18 +36,41 @@ class Sheet:
 
     @classmethod
     def of(cls, title: str, columns: str, rows: Iterable[Mapping[str, Any]]) -> "Sheet":
-        """The table of values of rows, by a template of a line such as ``solver {name} | time, ms {time:.2f}``."""
+        """Formats rows by a template of a line, such as ``solver {name} | time, ms {time:.2f}``."""
         headings, forms = zip(*(column.strip().rsplit(" ", 1) for column in columns.split("|")), strict=True)
         return cls(title, headings, [[form.format(**row) for form in forms] for row in rows])
 
     def __rich__(self) -> TerminalTable:
-        table = table_of(self.title, self.headings, self.rows)
-        for number in self.failed:
-            table.rows[number].style = "red"
+        table = TerminalTable(title=self.title)
+        for number, heading in enumerate(self.headings):
+            table.add_column(heading, justify="right" if number else "left")
+        for number, row in enumerate(self.rows):
+            table.add_row(*row, style="red" if number in self.failed else None)
         return table
 
     def for_page(self) -> Part:
-        """A section of a page."""
+        """The table as a section of a page."""
         first, *others = (heading[:1].upper() + heading[1:] for heading in self.headings)
         rows = [Row(name, [Cell(value) for value in values]) for name, *values in self.rows]
         return Part(self.title, [PageTable(first, others, rows, note=self.note)])
+
+
+def aligned(rows: Sequence[Sequence[str]], left: int = 1) -> str:
+    """Rows as lines of text, the first `left` columns aligned to the left, the others to the right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join(
+        "  ".join(
+            cell.ljust(width) if at < left else cell.rjust(width)
+            for at, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    )
+
+
+def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Writes rows as CSV, with a column for every key that any of them has."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(dict.fromkeys(key for row in rows for key in row)), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_text(path, text.getvalue())

@@ -1,13 +1,13 @@
-"""Reference trajectories of boxes, and how far a simulation with their own parameters departs from them.
+"""Reference trajectories of boxes, and deviations of simulations with the same parameters.
 
-The format is a NumPy archive without pickled objects that holds the keys of `REFERENCE_SHAPES`. It carries
-vertices only, in x-major order; the hexahedra between them follow from the distinct coordinates.
+A file is a NumPy archive without pickled objects with the keys of `REFERENCE_SHAPES`. It has vertices only, in x-major
+order; the hexahedra follow from the distinct coordinates.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from ..energies.materials import Material, make_material
 from ..experiment.build import choose_device
 from ..io.errors import ConvergenceError, DataFileError, InputError
 from ..io.files import read_arrays
-from ..io.settings import Natural, Positive, Settings, Some, Word, parse
+from ..io.settings import Many, Natural, Positive, Settings, Some, Word
 from ..mesh.mesh import Mesh, box_hexahedra
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
@@ -42,29 +42,28 @@ REFERENCE_SHAPES: dict[str, tuple[int | str, ...]] = {
     "q": ("T + 1", "N", 3),  # m, state 0 is the start
     "v": ("T + 1", "N", 3),  # m/s
 }
-_GRID_TOLERANCE = 1e-9  # of the box's length: distance within which coordinates count as equal
+_GRID_TOLERANCE = 1e-9  # distance within which coordinates count as equal, over the longest side of the box
 
 
 class VerifySettings(Settings):
-    """The configuration ``verify``, which has what the keys mean, and their values."""
+    """The configuration ``verify``, which explains its keys."""
 
-    files: Some[Word]
+    files: Many[Word]
     solvers: Some[SolverName]
     tolerance: Positive
     max_iterations: Natural
     device: Word
 
 
-def verify(config: Mapping[str, Any], folder: Path) -> None:
+def verify(settings: VerifySettings, folder: Path) -> None:
     """Prints the largest vertex error of each file and solver; exits with 1 where one exceeds `LARGEST_ERROR`.
 
     Raises:
-        InputError: no file is named, or a value cannot be used.
-        DataFileError: a file is no reference trajectory.
+        InputError: no file is named.
+        DataFileError: a file is not a reference trajectory.
     """
-    if not config["files"]:
+    if not settings.files:
         raise InputError("name reference trajectories, as in warp-resphys verify FILE...")
-    settings = parse(VerifySettings, config)
     wp.config.log_level = wp.LOG_WARNING
     device = choose_device(settings.device)
     references = {path: read_reference(path) for path in map(Path, settings.files)}
@@ -87,7 +86,7 @@ def verify(config: Mapping[str, Any], folder: Path) -> None:
 
 @dataclass(frozen=True)
 class ReferenceTrajectory:
-    """A recorded simulation of a box whose face at the smallest x is held."""
+    """A recorded simulation of a box whose face at the smallest x is fixed."""
 
     material: Material
     time_step: float  # [s]
@@ -99,7 +98,7 @@ class ReferenceTrajectory:
 
 
 class Comparison(NamedTuple):
-    """Departure of a simulation from a reference trajectory."""
+    """Deviation of a simulation from a reference trajectory."""
 
     largest_error: float  # distance of a vertex from the reference, over all steps [m]
     iterations: float  # mean global steps of the solver a time step
@@ -109,21 +108,21 @@ def read_reference(path: Path) -> ReferenceTrajectory:
     """Reads a reference trajectory from a NumPy archive (.npz) without pickled objects.
 
     Raises:
-        DataFileError: the file is missing or no such archive; it lacks entries, has others, or has some of wrong shape,
-            type or range; or its vertices are no box grid in x-major order.
+        DataFileError: the file is missing or not such an archive; it has missing or unknown entries, or values of wrong
+            shape, type or range; or its vertices are not a box grid in x-major order.
     """
-    read = read_arrays(path)
-    if "" in read:
+    arrays = read_arrays(path)
+    if "" in arrays:
         raise DataFileError(f"{path} is a single array: give a reference trajectory (.npz).")
-    missing = [name for name in REFERENCE_SHAPES if name not in read]
-    foreign = sorted(name for name in read if name not in REFERENCE_SHAPES)
-    found = [f"{problem} {', '.join(names)}" for problem, names in (("lacks", missing), ("has", foreign)) if names]
-    if found:
+    missing = [name for name in REFERENCE_SHAPES if name not in arrays]
+    unknown = sorted(name for name in arrays if name not in REFERENCE_SHAPES)
+    wrong = [f"{problem} {', '.join(names)}" for problem, names in (("lacks", missing), ("has", unknown)) if names]
+    if wrong:
         raise DataFileError(
-            f"{path} {' and '.join(found)}: a reference trajectory has {', '.join(REFERENCE_SHAPES)} and no more."
+            f"{path} {' and '.join(wrong)}: a reference trajectory has {', '.join(REFERENCE_SHAPES)} and no more."
         )
-    _check_values(read, path)
-    values = {name: np.asarray(value, dtype=np.float64) for name, value in read.items()}
+    _check_values(arrays, path)
+    values = {name: np.asarray(value, dtype=np.float64) for name, value in arrays.items()}
     dt = float(values["dt"])
     if not dt > 0.0:
         raise DataFileError(f"{path}: dt is {dt:g}: it must be positive, in seconds.")
@@ -137,7 +136,7 @@ def read_reference(path: Path) -> ReferenceTrajectory:
 
 
 def _check_values(values: Mapping[str, NDArray[np.generic]], path: Path) -> None:
-    """Refuses entries of another shape or type; f_ext and vertices say what T and N are."""
+    """Refuses entries of wrong shape or type, where f_ext and vertices define T and N."""
     steps, vertices = (next(iter(np.shape(values[name])), 0) for name in ("f_ext", "vertices"))
     sizes = {"T": steps, "N": vertices, "T + 1": steps + 1}
     for name, wanted in REFERENCE_SHAPES.items():
@@ -156,14 +155,14 @@ def _check_values(values: Mapping[str, NDArray[np.generic]], path: Path) -> None
 
 
 def box_of_vertices(vertices: FloatArray, source: str = "the mesh") -> Mesh:
-    """The box of hexahedra whose vertices are given.
+    """The box of hexahedra with the given vertices.
 
     Args:
         vertices: (N, 3) grid points in x-major order, z running fastest [m]; the spacing may vary.
-        source: what to name in an error.
+        source: file or mesh, for error messages.
 
     Raises:
-        DataFileError: the vertices are no such grid.
+        DataFileError: the vertices are not such a grid.
     """
     tolerance = _GRID_TOLERANCE * float(np.ptp(vertices, axis=0).max(initial=0.0))
     axes = [_distinct(vertices[:, axis], tolerance) for axis in range(3)]
@@ -172,14 +171,14 @@ def box_of_vertices(vertices: FloatArray, source: str = "the mesh") -> Mesh:
     if min(divisions) < 1 or grid.shape != vertices.shape or np.abs(grid - vertices).max() > tolerance:
         counts = " x ".join(str(len(axis)) for axis in axes)
         raise DataFileError(
-            f"{source}: {len(vertices)} vertices with {counts} distinct coordinates along x, y and z are no box grid "
-            "in x-major order (z runs fastest), from which alone the hexahedra can be recovered."
+            f"{source}: {len(vertices)} vertices with {counts} distinct coordinates along x, y and z are not a box "
+            "grid in x-major order (z runs fastest), which is needed to recover the hexahedra."
         )
     return Mesh(vertices, box_hexahedra(divisions=divisions).cells)
 
 
 def _distinct(coordinates: FloatArray, tolerance: float) -> FloatArray:
-    """Sorted coordinates that lie further apart than the tolerance."""
+    """Sorted coordinates without those within the tolerance of the one before."""
     ordered = np.sort(coordinates)
     return ordered[np.concatenate([[True], np.diff(ordered) > tolerance])]
 
@@ -187,10 +186,10 @@ def _distinct(coordinates: FloatArray, tolerance: float) -> FloatArray:
 def compare_with_reference(
     reference: ReferenceTrajectory, settings: SolverSettings, device: str | torch.device = "cpu"
 ) -> Comparison:
-    """Simulates a reference trajectory from its own start, loads and parameters, the way it was computed.
+    """Simulates a reference trajectory from its start, loads and parameters, and compares all vertices.
 
-    That is with implicit Euler, the mean element's mass at every vertex, full integration of both terms of the energy,
-    and the face at the smallest x held.
+    As in the reference: implicit Euler, the mean element mass at every vertex, full integration of both terms of the
+    energy, and the face at the smallest x fixed.
 
     Raises:
         ConvergenceError: the solver failed.

@@ -1,4 +1,4 @@
-"""A robot in the browser, simulated as one looks at it (viser)."""
+"""The command `view`: a live simulation of a robot in the browser, by viser."""
 
 import io
 import logging
@@ -6,7 +6,7 @@ import re
 import socket
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import redirect_stdout
 from functools import partial
 from html import escape
@@ -18,7 +18,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from ..io.errors import InputError, ResphysError
-from ..io.settings import Count, Positive, Settings, Word, parse, setting
+from ..io.settings import Count, Positive, Settings, Word, setting
 from ..report.bodies import sharp_edges
 from ..report.camera import upwards
 from ..report.figures import TONES
@@ -26,8 +26,8 @@ from ..report.render import MEASURED
 from ..robot.inputs import BASE
 from ..robot.loading import RecordedTrial, load, trial_names
 from ..robot.state import RobotState
-from .command import show
 from .live import LiveRobot, range_of
+from .tables import show
 
 if TYPE_CHECKING:
     import viser
@@ -45,7 +45,7 @@ _SPEEDS: Final = {"a tenth": 0.1, "a quarter": 0.25, "half": 0.5, "real time": 1
 
 
 class ViewSettings(Settings):
-    """The configuration ``view``, which has what the keys mean, and their values."""
+    """The configuration ``view``, which explains its keys."""
 
     run: Word
     model: Word
@@ -56,15 +56,14 @@ class ViewSettings(Settings):
     seconds: Positive | None = setting(unit="s")
 
 
-def view(config: Mapping[str, Any], folder: Path) -> None:
-    """Serves a page until it is interrupted, and says how many pictures a second it has shown.
+def view(settings: ViewSettings, folder: Path) -> None:
+    """Serves a page until it is interrupted, and prints its frame rate.
 
     Raises:
         InputError: no viser, a port that is in use, or an unknown model or trial.
         DataFileError: there is no finished run.
     """
     del folder
-    settings = parse(ViewSettings, config)
     port = _free_port(settings.host, settings.port)
     try:
         import viser
@@ -77,10 +76,10 @@ def view(config: Mapping[str, Any], folder: Path) -> None:
     live = LiveRobot(robot)
     if settings.trial is not None:
         live.play_trial(settings.trial)
-    live.step()  # Whatever is compiled at the first step is compiled before anyone looks.
+    live.step()  # Compiles the kernels of a step before the page is opened.
     live.reset()
     logging.getLogger("websockets").setLevel(logging.WARNING)
-    with redirect_stdout(io.StringIO()):  # Where it listens is said below.
+    with redirect_stdout(io.StringIO()):  # The address is printed below.
         server = viser.ViserServer(settings.host, port, label=robot.description.name, verbose=False)
     try:
         page = Page(server, live)
@@ -94,10 +93,10 @@ def view(config: Mapping[str, Any], folder: Path) -> None:
 
 
 def _free_port(host: str, port: int) -> int:
-    """A port that can be listened at: the one that is asked for, or any for zero.
+    """A port that can be bound: the given one, or any for zero.
 
     Raises:
-        InputError: it is in use, or cannot be listened at.
+        InputError: the port is in use or cannot be bound.
     """
     if port > _HIGHEST_PORT:
         raise InputError(f"port is {port}: there are none above {_HIGHEST_PORT}.")
@@ -106,7 +105,7 @@ def _free_port(host: str, port: int) -> int:
         try:
             tried.bind((host, port))
         except UnicodeError:
-            raise InputError(f"host is {host!r}, which is no name of a machine: 127.0.0.1 is this one.") from None
+            raise InputError(f"host is {host!r}, which is not the name of a machine: 127.0.0.1 is this one.") from None
         except OSError as error:
             raise InputError(
                 f"port {port} of {host} cannot be used ({error.strerror}): choose another with port=, 0 for any."
@@ -115,12 +114,13 @@ def _free_port(host: str, port: int) -> int:
 
 
 class Page:
-    """The page of a robot in a browser, and the requests that come from there.
+    """The page of a robot in a browser.
 
-    The robot is stepped in the thread that calls `run`; what a browser asks for waits there for the next picture.
+    The robot is stepped in the thread that calls `run`. Requests of browsers are queued and handled there, before the
+    next picture.
 
     Args:
-        server: whose page it is.
+        server: that serves the page.
         live: the robot.
     """
 
@@ -129,12 +129,12 @@ class Page:
         self._requests: list[Callable[[], None]] = []
         self._lock = threading.Lock()
         self._playing, self._speed, self._stopped = True, 1.0, False
-        self._holder: int | None = None  # Whose hand it is.
+        self._holder: int | None = None  # Client that drags the body.
         self._shown_state: RobotState | None = None
         self._shown_trial: RecordedTrial | None = None
         self.pictures = 0
         mesh = live.robot.simulator.body.mesh
-        self._scale = 1.0 / live.size  # Of what is shown: cameras are made for bodies of about a metre.
+        self._scale = 1.0 / live.size  # Of the scene: viser's cameras expect bodies of about a metre.
         self._middle = mesh.vertices.mean(axis=0)
         self._sharp = sharp_edges(mesh.vertices[live.surface], live.faces)
         self._set_scene()
@@ -177,7 +177,7 @@ class Page:
         )
 
         @self._body.on_drag
-        async def _(event: Any) -> None:  # In their order, as they are not awaited.
+        async def _(event: Any) -> None:  # Without awaiting, so that events are handled in their order.
             if event.phase == "start" and self._holder is None:
                 self._holder = event.client_id
                 self._ask(partial(live.grab, self._real(event.start_position)))
@@ -208,8 +208,7 @@ class Page:
         server, live = self._server, self._live
         gui, robot = server.gui, live.robot
         server.gui.configure_theme(dark_mode=False, show_logo=False)
-        described = robot.description
-        gui.add_markdown(f"**{_plain(described.name)}**, {described.model}\n\n{_HELP}")
+        gui.add_markdown(f"**{_plain(robot.description.name)}**, {robot.description.model}\n\n{_HELP}")
         self._status = gui.add_markdown("")
         self._play = gui.add_button("Pause")
         self._play.on_click(lambda _: self._ask(self._toggle))
@@ -243,7 +242,7 @@ class Page:
         dark.on_update(lambda _: gui.configure_theme(dark_mode=dark.value, show_logo=False))
 
     def _slider(self, name: str, part: int) -> Any:
-        """A slider for a part of an input, in the unit in which people read it."""
+        """A slider for a part of an input, in the unit of its quantity for display."""
         live, robot_input = self._live, self._live.robot.inputs[name]
         factor = robot_input.quantity.shown_factor if robot_input.quantity.shown_unit else 1.0
         unit = robot_input.quantity.shown_unit or robot_input.unit
@@ -254,8 +253,8 @@ class Page:
         slider = self._server.gui.add_slider(label, low, high, (high - low) / 500.0, min(max(0.0, low), high))
 
         def moved(event: Any) -> None:
-            if event.client is not None:  # Not where a trial has moved it.
-                self._ask(lambda: self._by_hand(name, part, slider.value / factor))  # As it is by then.
+            if event.client is not None:  # Not where a trial has moved the slider.
+                self._ask(lambda: self._by_hand(name, part, slider.value / factor))  # The value when it is handled.
 
         slider.on_update(moved)
         return slider
@@ -294,7 +293,7 @@ class Page:
             self._trial.value = _BY_HAND
 
     def _set_sliders(self) -> None:
-        """Moves the sliders of inputs to where they are."""
+        """Moves the sliders to the current values of the inputs."""
         for name, sliders in self._sliders.items():
             quantity = self._live.robot.inputs[name].quantity
             factor = quantity.shown_factor if quantity.shown_unit else 1.0
@@ -306,7 +305,7 @@ class Page:
     # Time
 
     def run(self, seconds: float | None) -> float:
-        """Simulates and shows, until it is interrupted or some seconds are over; the pictures a second."""
+        """Simulates and draws until it is interrupted or some seconds are over; returns pictures a second."""
         live, began, last, updated = self._live, time.perf_counter(), time.perf_counter(), 0.0
         due, simulated, counted = 0.0, 0.0, 0
         try:
@@ -371,7 +370,7 @@ class Page:
             cloud.visible = bool(len(seen))
 
     def _show_status(self, rate: float, pace: float) -> None:
-        """Writes time, rates and distances beside the body."""
+        """Shows time, rates and distance from the measured markers."""
         live = self._live
         lines = [f"{live.time:.2f} s, {rate:.0f} pictures a second, {pace:.2g} times real time"]
         measured = live.measured
@@ -379,9 +378,9 @@ class Page:
             where = live.markers if live.robot.labels else live.positions
             away = 1e3 * np.linalg.norm(where - measured, axis=1)
             if np.isfinite(away).any():
-                lines.append(f"{float(np.nanmean(away)):.2f} mm from what was measured")
+                lines.append(f"{float(np.nanmean(away)):.2f} mm from the measurement")
         if live.has_left:
-            lines.append("**The body has left the states of the training.**")
+            lines.append("**The body is outside the training range.**")
         if live.failure:
             lines.append(f"**{_plain(live.failure)}**")
         self._status.content = "\n\n".join(lines)
@@ -390,11 +389,11 @@ class Page:
 
 
 def _plain(text: str) -> str:
-    """A text as Markdown shows it, whatever is in it."""
+    """Escapes a text for Markdown."""
     return re.sub(r"([\\`*_{}\[\]()#+!|~-])", r"\\\1", escape(text, quote=False))
 
 
 def _bytes(tone: str) -> tuple[int, int, int]:
-    """Red, green and blue of a tone such as #1a5fb4."""
+    """Red, green and blue of a colour such as #1a5fb4, from 0 to 255."""
     red, green, blue = (int(tone[at : at + 2], 16) for at in (1, 3, 5))
     return red, green, blue

@@ -12,19 +12,18 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator, PercentForma
 from ...report.figures import STYLE, TONES, FloatArray, new_figure, use_logarithm
 from .space import Dimension
 
-_GIVEN_UP = TONES["muted"].light
-_TOLD = TONES["resphys"].light
+_STOPPED = TONES["muted"].light
+_TRIAL = TONES["resphys"].light
 _BEST = TONES["simulation"].light
 
 
 def search_history(errors: FloatArray, pruned: FloatArray, configured: float | None, *, narrow: bool) -> Figure:
-    """Draw what each trial came to, and the best so far.
+    """Draws the error of each trial, and the lowest error so far.
 
     Args:
-        errors: (R,) error [mm] of the trials that were trained to the end, by number; infinite where it diverged, NaN
-            for the other trials.
-        pruned: (R,) the smallest error [mm] of those that were given up; NaN for the other trials.
-        configured: error as configured [mm], to compare with; None where it diverges.
+        errors: (R,) errors [mm] of complete trials, by number; infinite where they diverged, NaN for other trials.
+        pruned: (R,) smallest errors [mm] of stopped trials; NaN for other trials.
+        configured: error of training as configured [mm]; None where it diverges.
         narrow: whether the figure is for a narrow page, here and below.
     """
     numbers, finite, lost = np.arange(len(errors)), np.isfinite(errors), np.isposinf(errors)
@@ -33,15 +32,15 @@ def search_history(errors: FloatArray, pruned: FloatArray, configured: float | N
         axes = figure.subplots()
         best = np.fmin.accumulate(np.where(finite, errors, np.nan))
         axes.step(numbers, best, where="post", color=_BEST, label="Best so far", zorder=1)
-        axes.plot(numbers[finite], errors[finite], "o", color=_TOLD, markersize=4.5, label="Trial")
+        axes.plot(numbers[finite], errors[finite], "o", color=_TRIAL, markersize=4.5, label="Trial")
         if np.isfinite(pruned).any():
-            axes.plot(numbers, pruned, "o", color=_GIVEN_UP, markersize=4.0, fillstyle="none", label="Given up")
+            axes.plot(numbers, pruned, "o", color=_STOPPED, markersize=4.0, fillstyle="none", label="Stopped")
         if configured is not None:
-            axes.axhline(configured, color=_GIVEN_UP, linewidth=1.1, linestyle="--", label="As configured")
+            axes.axhline(configured, color=_STOPPED, linewidth=1.1, linestyle="--", label="As configured")
         _errors_axis(axes)
         if lost.any():
             top = axes.get_ylim()[1]
-            axes.plot(numbers[lost], np.full(lost.sum(), top), "x", color=_GIVEN_UP, clip_on=False, label="Diverged")
+            axes.plot(numbers[lost], np.full(lost.sum(), top), "x", color=_STOPPED, clip_on=False, label="Diverged")
         axes.set(xlabel="trial", ylabel="validation roll-out\nerror [mm]", xlim=(-0.5, max(len(errors) - 0.5, 0.5)))
         axes.xaxis.set_major_locator(MaxNLocator(8, integer=True))
         handles, labels = axes.get_legend_handles_labels()
@@ -50,7 +49,7 @@ def search_history(errors: FloatArray, pruned: FloatArray, configured: float | N
 
 
 def importance_bars(importance: Mapping[str, float], *, narrow: bool) -> Figure:
-    """Draw how much each setting matters, as shares that sum to one; empty where too little is known."""
+    """Draws the importance of each setting, as shares that sum to one; a sentence where it is empty."""
     rows = sorted(importance.items(), key=lambda item: item[1])
     with mpl.rc_context(STYLE):
         height = 0.8 + 0.28 * max(len(rows), 3)
@@ -60,7 +59,7 @@ def importance_bars(importance: Mapping[str, float], *, narrow: bool) -> Figure:
             axes.set_axis_off()
             axes.text(0.5, 0.5, "known after four trials that did not diverge", ha="center", va="center")
             return figure
-        axes.barh([name for name, _ in rows], [share for _, share in rows], color=_TOLD, height=0.6)
+        axes.barh([name for name, _ in rows], [share for _, share in rows], color=_TRIAL, height=0.6)
         axes.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
         axes.xaxis.set_major_locator(MaxNLocator(5))
         axes.grid(visible=False, axis="y")
@@ -72,7 +71,7 @@ def importance_bars(importance: Mapping[str, float], *, narrow: bool) -> Figure:
 def setting_scatter(
     errors: FloatArray, settings: Sequence[Mapping[str, float | str]], space: Mapping[str, Dimension], *, narrow: bool
 ) -> Figure:
-    """Draw the error (R,) [mm] of each trial against each setting, a panel a setting; the best trial is marked."""
+    """Draws the errors (R,) [mm] of trials over each setting, with a panel for each; the best trial is marked."""
     columns = min(2 if narrow else 3, len(space))
     rows = math.ceil(len(space) / columns)
     shown = [i for i, error in enumerate(errors) if np.isfinite(error)]
@@ -83,7 +82,7 @@ def setting_scatter(
             axes.set_axis_off()
         for axes, (name, dimension) in zip(panels.flat, space.items(), strict=False):
             places = _places(axes, dimension, [settings[i][name] for i in shown])
-            axes.plot(places, errors[shown], "o", color=_TOLD, markersize=3.5, alpha=0.7)
+            axes.plot(places, errors[shown], "o", color=_TRIAL, markersize=3.5, alpha=0.7)
             if shown:
                 best = int(np.argmin(errors[shown]))
                 axes.plot(places[best], errors[shown][best], "o", color=_BEST, markersize=6)
@@ -95,7 +94,7 @@ def setting_scatter(
 
 
 def _errors_axis(axes: Axes) -> None:
-    """A logarithmic axis with two labels at least."""
+    """Sets a logarithmic axis with at least two labels."""
     use_logarithm(axes)
     low, high = axes.get_ylim()
     if low > 0.0 and high < 100.0 * low:
@@ -103,7 +102,7 @@ def _errors_axis(axes: Axes) -> None:
 
 
 def _places(axes: Axes, dimension: Dimension, values: Sequence[float | str]) -> FloatArray:
-    """Where the values of a setting lie on an axis, which is labelled with them."""
+    """Positions of the values of a setting on an axis, which is labelled with them."""
     axes.xaxis.set_minor_locator(NullLocator())
     if dimension.values:
         axes.set_xticks(range(len(dimension.values)), [str(value) for value in dimension.values])

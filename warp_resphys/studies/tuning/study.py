@@ -1,8 +1,8 @@
-"""A study that any number of processes work on: Optuna's journal, in one folder.
+"""An Optuna study in a folder, shared by any number of processes through a journal.
 
-Optuna has no heartbeats for journals. So a process holds the lock of a file for each trial that it runs, which the
-operating system lets go of whatever the process died of. A running trial whose lock is free has lost its process: it
-fails in the journal, and one of the same settings that continues it is enqueued.
+Optuna has no heartbeats for journals. Instead, a process holds a file lock for each trial that it runs, which the
+operating system releases when the process ends for any reason. A running trial whose lock is free has lost its process:
+it is marked as failed, and a trial with the same settings that continues it is enqueued.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ class Claim:
     """A trial that this process runs."""
 
     number: int  # from 0 on
-    settings: Mapping[str, Any]  # that are tried, by dotted key
+    settings: Mapping[str, Any]  # by dotted key
     trial: Trial
-    lock: FileLock  # to be released when this process leaves the trial
+    lock: FileLock  # released when this process leaves the trial
 
 
 @dataclass(frozen=True)
@@ -52,22 +52,22 @@ class Outcome:
     number: int  # from 0 on
     state: str  # complete, pruned, failed or running
     error: float | None  # the objective [mm]; infinite where everything diverged, None where there is none yet
-    settings: Mapping[str, Any]  # that were tried, by dotted key
-    seconds: float | None  # of computation, over all processes that had it [s]
+    settings: Mapping[str, Any]  # by dotted key
+    seconds: float | None  # of computation, summed over all processes that ran it [s]
 
 
 class Study:
-    """The study in a folder, as one of its processes sees it.
+    """The study in a folder, opened by one of its processes.
 
     Args:
-        folder: where the study is, or is to be made.
-        space: what each setting may be.
-        conditions: everything else that a trial's result depends on, as plain data.
-        trials: how many are to be finished, over all processes.
+        folder: of the study, which is created if it does not exist.
+        space: values of each setting, by dotted key.
+        conditions: everything else on which a trial's result depends, as plain data.
+        trials: number of trials to finish, over all processes.
         seed: of the sampler.
 
     Raises:
-        InputError: the study that is there has another space or other conditions.
+        InputError: the existing study has another space or other conditions.
         DataFileError: the folder cannot be written, or the journal is damaged.
     """
 
@@ -82,34 +82,34 @@ class Study:
             with self._lock:
                 journal.touch()
                 content = journal.read_bytes()
-                os.truncate(journal, content.rfind(b"\n") + 1)  # a line that a full disk left half written
+                os.truncate(journal, content.rfind(b"\n") + 1)  # drops a line that was cut off by a full disk
                 storage = JournalStorage(JournalFileBackend(str(journal)))
-                there = _NAME in optuna.get_all_study_names(storage)  # To create it again would write to the journal.
-                self._study = (optuna.load_study if there else optuna.create_study)(study_name=_NAME, storage=storage)
+                exists = _NAME in optuna.get_all_study_names(storage)  # creating it again would write to the journal
+                self._study = (optuna.load_study if exists else optuna.create_study)(study_name=_NAME, storage=storage)
         except OSError as error:
             raise DataFileError(f"cannot write {folder} ({error.strerror}): make it writable") from error
         except (ValueError, KeyError, AssertionError) as error:
             raise DataFileError(f"{journal} is damaged ({error}): delete it to start the study anew") from error
-        self._agree({"space": {key: str(each) for key, each in space.items()}, **to_plain(conditions)})
+        self._agree({"space": {key: str(dimension) for key, dimension in space.items()}, **to_plain(conditions)})
 
     def _agree(self, conditions: dict[str, Any]) -> None:
-        """Marks a new study with its conditions, and compares those of an old one."""
+        """Stores the conditions of a new study; compares those of an existing one."""
         if "conditions" not in self._study.user_attrs:
             self._study.set_user_attr("conditions", conditions)
-        there, here = dict(flatten(self._study.user_attrs["conditions"])), dict(flatten(conditions))
-        for key in sorted({*there, *here}, key=lambda key: (not key.startswith("space."), key)):
-            if there.get(key, "absent") != here.get(key, "absent"):
+        stored, new = dict(flatten(self._study.user_attrs["conditions"])), dict(flatten(conditions))
+        for key in sorted({*stored, *new}, key=lambda key: (not key.startswith("space."), key)):
+            if stored.get(key, "absent") != new.get(key, "absent"):
                 raise InputError(
-                    f"the study in {self.folder} has another setting: {key} was {there.get(key, 'absent')}, now it is "
-                    f"{here.get(key, 'absent')}; go on with the old setting, delete the folder, or name another study "
-                    "with tune.study=..."
+                    f"the study in {self.folder} has another setting: {key} was {stored.get(key, 'absent')}, now it is "
+                    f"{new.get(key, 'absent')}; use the old setting, delete the folder, or name another study with "
+                    "tune.study=..."
                 )
 
     def _trials(self, *states: TrialState) -> list[FrozenTrial]:
         return self._study.get_trials(deepcopy=False, states=states or None)
 
     def _numbered(self) -> Iterator[tuple[int, FrozenTrial]]:
-        """All trials with their numbers; those that continue another one have its number."""
+        """Yields all trials with their numbers; a trial that continues another one has its number."""
         count = 0
         for trial in self._trials():
             continues = trial.user_attrs.get(_CONTINUES)
@@ -117,65 +117,65 @@ class Study:
             count += continues is None
 
     def claim(self) -> Claim | None:
-        """A trial for this process: one that another process left, or a new one; None if there is none to take now."""
+        """Returns a trial for this process, one that another process lost or a new one; None if there is none."""
         with self._lock:
-            for number, trial in self._numbered():
-                if trial.state == TrialState.RUNNING:
+            for number, running in self._numbered():
+                if running.state == TrialState.RUNNING:
                     with suppress(Timeout), self._lock_of(number).acquire(timeout=0):
-                        self._study.tell(trial.number, state=TrialState.FAIL)
-                        self._study.enqueue_trial(trial.params, user_attrs={_CONTINUES: number})
+                        self._study.tell(running.number, state=TrialState.FAIL)
+                        self._study.enqueue_trial(running.params, user_attrs={_CONTINUES: number})
             if len(self._trials(TrialState.RUNNING, TrialState.COMPLETE, TrialState.PRUNED)) >= self.trials:
                 return None
-            waiting = [trial.user_attrs[_CONTINUES] for trial in self._trials(TrialState.WAITING)]
+            waiting = [lost.user_attrs[_CONTINUES] for lost in self._trials(TrialState.WAITING)]
             number = waiting[0] if waiting else len(dict(self._numbered()))
             lock = self._lock_of(number)
             lock.acquire()
-            # A trial draws the same settings whichever process asks for it, and no two trials draw alike.
+            # The sampler is seeded by trial, so that settings do not depend on the process.
             seed = int(np.random.SeedSequence([self._seed, number]).generate_state(1)[0])
             self._study.sampler = optuna.samplers.TPESampler(seed=seed)
-            asked = self._study.ask({key: each.distribution for key, each in self.space.items()})
-            asked.set_user_attr("process", f"{socket.gethostname()}:{os.getpid()}")
-            return Claim(number, self._settings(asked.params), asked, lock)
+            trial = self._study.ask({key: dimension.distribution for key, dimension in self.space.items()})
+            trial.set_user_attr("process", f"{socket.gethostname()}:{os.getpid()}")
+            return Claim(number, self._settings(trial.params), trial, lock)
 
     def _lock_of(self, number: int) -> FileLock:
         return FileLock(self.folder / "trials" / f"{number}.lock")
 
     def _settings(self, params: Mapping[str, Any]) -> dict[str, Any]:
-        return {key: each.value(params[key]) for key, each in self.space.items() if key in params}
+        return {key: dimension.value(params[key]) for key, dimension in self.space.items() if key in params}
 
     def end(self, claim: Claim, value: float | None, seconds: float, state: TrialState = TrialState.COMPLETE) -> None:
-        """Ends a trial with its objective, infinite where it diverged; one that fails does not count."""
-        with suppress(UpdateFinishedTrialError):  # A process that took this one for dead has taken the trial over.
+        """Ends a trial with its objective, infinite where it diverged; failed trials do not count."""
+        with suppress(UpdateFinishedTrialError):  # Another process took the trial over, as if this one had ended.
             claim.trial.set_user_attr("seconds", seconds)
             self._study.tell(claim.trial, value, state=state)
         claim.lock.release()
         (self.folder / "trials" / f"{claim.number}.lock").unlink(missing_ok=True)
 
     def outcomes(self) -> list[Outcome]:
-        """All trials so far, by number."""
-        found = []
+        """Returns all trials so far, by number."""
+        outcomes = []
         for number, trial in dict(self._numbered()).items():
             error = min(trial.intermediate_values.values(), default=None) if trial.value is None else trial.value
             state, seconds = _STATES.get(trial.state, "running"), trial.user_attrs.get("seconds")
-            found.append(Outcome(number, state, error, self._settings(trial.params), seconds))
-        return found
+            outcomes.append(Outcome(number, state, error, self._settings(trial.params), seconds))
+        return outcomes
 
     def finished(self) -> int:
-        """How many trials count as done, given up ones too."""
+        """Returns the number of finished trials, including stopped ones."""
         return len(self._trials(TrialState.COMPLETE, TrialState.PRUNED))
 
     def running(self) -> list[str]:
-        """The processes that run a trial now, as ``host:pid``."""
+        """Returns the processes that run a trial now, as ``host:pid``."""
         return [trial.user_attrs.get("process", "?") for trial in self._trials(TrialState.RUNNING)]
 
     def importance(self) -> dict[str, float]:
-        """How much each setting matters for being among the best quarter, summing to one; empty if too little is known.
+        """Returns the importance of each setting for being among the best quarter, summing to one.
 
-        By PED-ANOVA (Watanabe et al., 2023, arXiv:2304.10255).
+        It is computed by PED-ANOVA (Watanabe et al., 2023, arXiv:2304.10255); empty with fewer than four trials.
         """
         values = {trial.value for trial in self._trials(TrialState.COMPLETE) if trial.value is not None}
         if sum(map(math.isfinite, values)) < 4:
             return {}
         evaluator = optuna.importance.PedAnovaImportanceEvaluator(target_quantile=0.25)
-        found = optuna.importance.get_param_importances(self._study, evaluator=evaluator)
-        return {key: float(value) for key, value in found.items()}
+        importance = optuna.importance.get_param_importances(self._study, evaluator=evaluator)
+        return {key: float(value) for key, value in importance.items()}
